@@ -67,11 +67,7 @@ def shared_options() -> list[click.Option]:
 
 
 def merged_verbosity(ctx: click.Context) -> Verbosity:
-    """Return the verbosity of a context and of its parents, and take its options out of the parameters.
-
-    Raises:
-        click.UsageError: both `--verbose` and `--quiet` are given.
-    """
+    """Return the verbosity of a context and of its parents, and take its options out of the parameters."""
     above = ctx.obj if isinstance(ctx.obj, Verbosity) else Verbosity()
     merged = Verbosity(**{name: ctx.params.pop(name) or getattr(above, name) for name in _VERBOSITY})
     if merged.verbose and merged.quiet:

@@ -51,11 +51,7 @@ ENGINE = (
 
 
 def engine_for(values: Mapping[str, Any], at_a_time: int | None = None) -> Engine:
-    """Return the engine that the options choose, for at most so many jobs at a time.
-
-    Raises:
-        click.UsageError: a bad address, one that needs a certificate, or options of a cluster without one.
-    """
+    """Return the engine that the options choose, for at most so many jobs at a time."""
     if values["cluster"] is None:
         for option in ("certificates", "insecure", "storage"):
             if values[option]:
@@ -81,10 +77,6 @@ def cluster_address(text: str, values: Mapping[str, Any], option: str, *, is_nod
     """Return the address that an option or argument gives, with the certificate that the other options choose.
 
     A program that is a node of the cluster, on this machine, makes a missing certificate.
-
-    Raises:
-        click.UsageError: a bad address, or one that needs a certificate.
-        InputError: the certificate is missing, not valid now, or open to others.
     """
     from pipelines.jobs.cluster import (
         ClusterAddress,

@@ -71,13 +71,7 @@ class RunForecast:
 def forecast_run(
     workspace: Workspace, stages: tuple[StageSpec, ...], flags: Mapping[str, Flags], *, force: bool
 ) -> RunForecast:
-    """Return the forecast of a run of the stages; nothing is written.
-
-    Args:
-        workspace: may not exist yet.
-        stages: in the order of the pipeline.
-        flags: all options by stage, the remembered ones among them.
-        force: as of the run.
+    """Return the forecast of a run of the stages, as of `plan`; nothing is written.
 
     Raises:
         GeorefError: the run would be refused for its options, or for a missing file.

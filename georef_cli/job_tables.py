@@ -88,12 +88,9 @@ def dry_run(rows: Sequence[dict[str, Any]], together: int) -> list[Renderable]:
 def block_table(
     plan: BlockPlan, states: Mapping[int, str], processor_s: Mapping[int, float] | None = None
 ) -> list[Renderable]:
-    """Return the blocks of a plan, with what is known of their training.
+    """Return the blocks of a plan, with what is known of their training, by number of the block.
 
-    Args:
-        plan: the blocks.
-        states: by number of the block: `trained`, or why it must be trained.
-        processor_s: predicted time of one core, by number of the block; None: unknown.
+    A block is `trained`, or there is a reason why it must be. The time is that of one core; None: unknown.
     """
     heads = ["block", "photographs", "Gaussians", "in a view", "memory"] + ["processor time"] * bool(processor_s)
     table = plain_table(*heads, "", right=list(range(len(heads))))

@@ -29,13 +29,7 @@ class FirstThatFits:
 
 
 class ByWidth:
-    """Renderable with one form for wide terminals and another for narrow ones.
-
-    Args:
-        least: number of columns from which a terminal is wide.
-        wide: form with cells that may wrap.
-        narrow: form with fewer columns.
-    """
+    """Renderable with one form for terminals of at least so many columns, and one with fewer columns for others."""
 
     def __init__(self, least: int, wide: RenderableType, narrow: RenderableType) -> None:
         self._least, self._wide, self._narrow = least, wide, narrow
@@ -59,9 +53,7 @@ def plain_table(
 def figures(heads: Sequence[str], rows: Mapping[str, Sequence[str]]) -> FirstThatFits:
     """Return rows of figures: a line for each row, or a line for each figure where that is too wide.
 
-    Args:
-        heads: names of the figures; a line break separates group and name.
-        rows: by name, a text for each figure; markup.
+    A line break in a head separates group and name. The texts of the figures are markup.
     """
     wide = plain_table("", *heads, right=range(1, len(heads) + 1), no_wrap=range(len(heads) + 1))
     for name, cells in rows.items():

@@ -1,7 +1,5 @@
 """Command `georef train`."""
 
-from __future__ import annotations
-
 import click
 
 from georef_cli.stage import StageCommand

@@ -46,11 +46,7 @@ class MessageSender:
         self._stream, self._lock = stream, threading.Lock()
 
     def send(self, kind: str, **content: Any) -> None:
-        """Send one message.
-
-        Raises:
-            OSError: nobody reads the stream.
-        """
+        """Send one message; an OSError: nobody reads the stream."""
         with self._lock:
             self._stream.write(json.dumps({"kind": kind, **content}) + "\n")
             self._stream.flush()

@@ -53,11 +53,7 @@ def replace_text(path: Path, text: str) -> None:
 
 
 def replace_texts(texts: Mapping[Path, str]) -> None:
-    """Write text files; existing ones are replaced when all new ones are complete.
-
-    Raises:
-        OSError: a file cannot be written; the existing ones stay, and no draft is left.
-    """
+    """Write text files; existing ones are replaced when all new ones are complete, and otherwise stay."""
     drafts = {path: path.with_name(f"{path.name}.tmp") for path in texts}
     path = None
     try:
@@ -157,10 +153,7 @@ _MOST_UNPACKED, _SMALL_BYTES = 8, 256 * 1024 * 1024
 def file_size(path: Path, *, limit_bytes: int | None = None, kind: str = "file", field: str | None = None) -> int:
     """Return the size of a regular file in bytes; symbolic links are followed.
 
-    Args:
-        path: of the file.
-        limit_bytes: largest size that is accepted.
-        kind, field: what the file is, and the option that names it, for errors.
+    Errors name the kind of the file, and the option that names it.
 
     Raises:
         InputError: no such file, a folder, pipe, socket or device, or a file larger than the limit.

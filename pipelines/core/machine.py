@@ -16,11 +16,7 @@ _VARIABLES = (_STANDARD, "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_T
 
 
 def limit_threads(count: int) -> None:
-    """Limit the threads, at most to all cores, of libraries that are loaded from now on, also in child processes.
-
-    Raises:
-        ValueError: the count is less than 1.
-    """
+    """Limit the threads, from 1 to all cores, of libraries that are loaded from now on, also in child processes."""
     if count < 1:
         raise ValueError(f"{count} threads: at least 1 is needed")
     for name in _VARIABLES:

@@ -116,11 +116,7 @@ def _is_intact(path: Path, record: FileRecord, memo: Memo, *, by_content: bool) 
 
 
 def hash_file(path: Path, memo: Memo) -> str:
-    """Return the SHA-256 of a file, from the memo if it is there; the memo is extended.
-
-    Raises:
-        OSError: the file cannot be read.
-    """
+    """Return the SHA-256 of a file, from the memo if it is there; the memo is extended."""
     if path not in memo:
         file_size(path)
         with path.open("rb") as handle:

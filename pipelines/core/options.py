@@ -39,8 +39,7 @@ _LONG_KEY = re.compile(rf"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*
 class InputMarker:
     """Mark of a path whose content decides the stage's result: its fingerprint enters the manifest.
 
-    Attributes:
-        suffixes: of the files that count in a folder, in lower case; empty: all.
+    In a folder, files with the suffixes, in lower case, count; without any, all do.
     """
 
     suffixes: frozenset[str] = frozenset()
@@ -71,11 +70,7 @@ def from_text(parse: Callable[[str], object]) -> BeforeValidator:
 
 
 def listed_names(text: str, known: Collection[str], otherwise: str = "") -> tuple[str, ...]:
-    """Return the names in a text, where commas separate them.
-
-    Raises:
-        ValueError: an unknown name; `otherwise` ends the message, which names further valid texts.
-    """
+    """Return the names in a text with commas; a ValueError, ended by `otherwise`, names one that is not known."""
     names = tuple(text.split(","))
     unknown = [name for name in names if name not in known]
     if unknown:
@@ -167,11 +162,7 @@ def has_mark(info: FieldInfo, *kinds: type) -> bool:
 
 
 def names_of_flags(options_type: type[StageOptions], flags: Collection[str]) -> list[str]:
-    """Return the fields of the flags that a user names, without dashes in front: `gcp`, `max-image-size`.
-
-    Raises:
-        ValueError: no option has one of the names.
-    """
+    """Return the fields of flags as a user names them (`gcp`, `max-image-size`); a ValueError: one is unknown."""
     by_flag = {flag_name(options_type, name).removeprefix("--"): name for name in options_type.model_fields}
     named = [text.removeprefix("--").replace("_", "-") for text in flags]
     unknown = [text for text in named if text not in by_flag]

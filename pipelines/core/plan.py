@@ -57,12 +57,9 @@ def option_origins(workspace: Workspace, spec: StageSpec, flags: Flags | None = 
 
 @dataclass(frozen=True)
 class PlannedStage:
-    """What a run would do with a stage, and why.
+    """What a run would do with a stage, and why; its options that are no defaults, and all of them.
 
-    Attributes:
-        action: `perhaps`: it runs, unless the stages before it give the same products as before.
-        options: those whose value is no default, with their origins.
-        resolved: all options.
+    The action `perhaps`: it runs, unless the stages before it give the same products as before.
     """
 
     stage: str
@@ -143,7 +140,7 @@ def _action(
     if not reason:
         return "keep", manifest.key_figure
     try:
-        staleness.refuse_loss(workspace, present)
+        staleness.refuse_loss(workspace, spec, options, present.inputs.hashes)
     except InputError as error:
         return "refuse", str(error)
     inputs = staleness.changed_inputs(present.inputs.hashes, manifest.inputs)

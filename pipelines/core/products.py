@@ -82,12 +82,7 @@ AT_END = "at_end"
 
 
 class Caution(Product):
-    """Limit of a result, for machines and for people.
-
-    Attributes:
-        code: kind of the limit, for machines: lower-case words joined by hyphens (docs/accuracy.md lists them).
-        sentence: one full sentence for people.
-    """
+    """Limit of a result: one full sentence for people, and a code for machines (docs/accuracy.md lists them)."""
 
     code: Annotated[str, StringConstraints(pattern=r"^[a-z0-9]+(-[a-z0-9]+)*$")]
     sentence: Annotated[str, StringConstraints(min_length=1)]

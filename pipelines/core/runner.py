@@ -129,7 +129,7 @@ def run_stage(
         if previous is not None and resume != "never" and _goes_on(workspace, asked):
             previous = None
         if previous is None and not force:
-            staleness.refuse_loss(workspace, asked)
+            staleness.refuse_loss(workspace, spec, asked.options, asked.inputs.hashes)
         before = workspace.requests().get(spec.name, {})
         workspace.remember({spec.name: flags})
         if previous is not None:

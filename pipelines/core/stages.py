@@ -409,22 +409,14 @@ def products_of(spec: StageSpec) -> tuple[str, ...]:
 
 
 def named_deliverables(names: str | None) -> tuple[StageSpec, ...]:
-    """Return the stages of the deliverables in a text, such as `raster,cloud` or `all`; None names none.
-
-    Raises:
-        ValueError: an unknown name.
-    """
+    """Return the stages of the deliverables in a text (`raster,cloud`, `all`); a ValueError: one is unknown."""
     by_name = {spec.name.removeprefix("export-"): spec for spec in DELIVERABLES}
     listed = () if names is None else listed_names(names, (*by_name, "all"))
     return tuple(spec for name, spec in by_name.items() if name in listed or "all" in listed)
 
 
 def stage_slice(first: str | None, last: str | None) -> tuple[StageSpec, ...]:
-    """Return the stages from `first` to `last`, both included.
-
-    Raises:
-        GeorefError: `first` comes after `last`.
-    """
+    """Return the stages from `first` to `last`, both included; a GeorefError: `first` comes after `last`."""
     names = [spec.name for spec in PIPELINE]
     begin = names.index(first) if first else 0
     end = names.index(last) if last else len(names) - 1

@@ -80,11 +80,7 @@ def request(
 
 
 def stage_config(workspace: Workspace, spec: StageSpec, flags: Flags) -> StageOptions:
-    """Return the options of a stage: default < `georef.toml` < flags.
-
-    Raises:
-        InputError: an unknown or invalid option.
-    """
+    """Return the options of a stage: default < `georef.toml` < flags; an InputError names an invalid one."""
     tables = load_toml(workspace.config_file, BY_NAME)
     return resolve(spec.options, tables.get(spec.name, {}), flags, workspace.config_file, stage=spec.name)
 
@@ -180,13 +176,7 @@ class Finding:
 
 
 def finding(workspace: Workspace, spec: StageSpec, memo: Memo, *, by_content: bool = False) -> Finding:
-    """Return what lies in the folder of a stage.
-
-    Args:
-        workspace, spec: the stage in its workspace.
-        memo: hashes of files by path, extended here.
-        by_content: whether a file whose size and time of modification are unchanged is hashed too.
-    """
+    """Return what lies in the folder of a stage; memo and `by_content` are as for `damaged_files`."""
     if workspace.placed_by_hand(spec):
         return Finding(by_hand=True)
     try:
@@ -200,10 +190,7 @@ def finding(workspace: Workspace, spec: StageSpec, memo: Memo, *, by_content: bo
 def status(workspace: Workspace, memo: Memo | None = None, before: StageSpec | None = None) -> list[StageState]:
     """Return the state of every stage of the pipeline, in order, and of the deliverables that there are.
 
-    Args:
-        workspace: an existing workspace.
-        memo: hashes of products and of their files by path, extended here.
-        before: stage of the pipeline; only the stages ahead of it are returned.
+    Only the stages ahead of `before` are returned, if it is given. The memo of hashes by path is extended.
 
     Raises:
         InputError: the directory does not exist, or its `georef.toml` or `requests.json` is not valid.
@@ -305,11 +292,7 @@ def _readable_manifest(workspace: Workspace, spec: StageSpec) -> Manifest | None
 
 
 def must_exist(workspace: Workspace) -> None:
-    """Refuse a workspace that does not exist.
-
-    Raises:
-        InputError: the directory does not exist.
-    """
+    """Refuse a workspace that does not exist."""
     require_text(workspace.root)
     if not workspace.root.is_dir():
         raise InputError("no such workspace: `georef ingest` makes one", path=workspace.root)
@@ -324,11 +307,7 @@ def warn_of_stale_inputs(workspace: Workspace, spec: StageSpec, memo: Memo) -> N
 
 
 def refuse_damaged_inputs(workspace: Workspace, spec: StageSpec, memo: Memo) -> None:
-    """Refuse to build on a product that is not as its stage wrote it.
-
-    Raises:
-        InputError: a file of a stage that `spec` reads has changed since that stage ended.
-    """
+    """Refuse to build on a product that is not as its stage wrote it."""
     for producer in producers(spec):
         damage = why_damaged(finding(workspace, producer, memo, by_content=True).damaged)
         if damage:
@@ -359,31 +338,13 @@ def is_unfinished(workspace: Workspace, asked: Request) -> bool:
     return asked.spec.resumable and partial.is_of(asked.token) and not partial.is_worthless()
 
 
-def refuse_loss(workspace: Workspace, asked: Request) -> None:
-    """Refuse a request that would drop what an interrupted run for another request has done.
-
-    Raises:
-        InputError: names the work that would be lost, the difference, and how to continue or drop the run.
-    """
-    _refuse_loss(workspace, asked.spec, asked.options, asked.inputs.hashes)
-
-
-def refuse_loss_by_options(workspace: Workspace, spec: StageSpec, options: StageOptions) -> None:
-    """Refuse options that would drop an interrupted run, before its inputs are known.
-
-    With the options of a finished product, nothing may have to be run.
-
-    Raises:
-        InputError: as `refuse_loss`.
-    """
-    made = _readable_manifest(workspace, spec)
-    if made is None or changed_options(options, made.config):
-        _refuse_loss(workspace, spec, options, None)
-
-
-def _refuse_loss(
-    workspace: Workspace, spec: StageSpec, options: StageOptions, hashes: Mapping[str, str] | None
+def refuse_loss(
+    workspace: Workspace, spec: StageSpec, options: StageOptions, hashes: Mapping[str, str] | None = None
 ) -> None:
+    """Refuse options and hashes of inputs, as far as known, that would drop what an interrupted run has done.
+
+    The InputError names the work that would be lost, the difference, and how to continue or drop the run.
+    """
     partial = workspace.partial_product(spec)
     before = partial.request()
     if partial.progress() is None or before is None:
@@ -398,3 +359,13 @@ def _refuse_loss(
             path=partial.folder,
             hint=f"{command}, or --force",
         )
+
+
+def refuse_loss_by_options(workspace: Workspace, spec: StageSpec, options: StageOptions) -> None:
+    """Refuse options that would drop an interrupted run, before its inputs are known.
+
+    With the options of a finished product, nothing may have to be run.
+    """
+    made = _readable_manifest(workspace, spec)
+    if made is None or changed_options(options, made.config):
+        refuse_loss(workspace, spec, options)

@@ -89,11 +89,7 @@ class PartialProduct:
         (self.folder / TOKEN).write_text(token, encoding="utf-8")
 
     def go_on(self, token: str, *, insist: bool) -> bool:
-        """Return whether the folder holds a run for the same request, which can go on, and forget its failure.
-
-        Raises:
-            InputError: `insist`, and the folder holds a run for another request.
-        """
+        """Return whether to go on with a run for this request, and forget its failure; `insist` refuses another."""
         if self.folder.is_symlink() or not (self.folder / TOKEN).is_file():
             return False
         if self.is_of(token):
@@ -125,10 +121,7 @@ Resume = Literal["never", "if-same", "always"]
 class Summary:
     """Summary of a stage's result, for tables, `--json` and the log.
 
-    Attributes:
-        key_figure: one line for tables, e.g. "48 of 48 registered".
-        values: plain numbers and strings for `--json`.
-        cautions: limits of the product, those of its inputs among them.
+    The key figure is one line such as "48 of 48 registered". The cautions are those of the inputs too.
     """
 
     key_figure: str
@@ -183,11 +176,7 @@ class Workspace:
         return Workspace(self.root / place, self, lent, command)
 
     def path(self, product: str) -> Path:
-        """Return the path of a finished product.
-
-        Raises:
-            MissingProductError: the product does not exist; names the command that makes it.
-        """
+        """Return the path of a finished product; a MissingProductError names the command that makes it."""
         folder, _, inside = product.partition("/")
         path = self._folder(folder) / inside
         if not path.exists():
@@ -218,11 +207,7 @@ class Workspace:
         return self.root / "logs" / f"{spec.name}.log"
 
     def manifest(self, spec: StageSpec) -> Manifest | None:
-        """Return the manifest of a finished stage, or None.
-
-        Raises:
-            InputError: the manifest is damaged.
-        """
+        """Return the manifest of a finished stage, or None; an InputError: it is damaged."""
         path = self._folder(spec.folder) / MANIFEST
         return load_json(Manifest, path) if path.exists() else None
 
@@ -243,12 +228,7 @@ class Workspace:
     def lock(self, activity: str) -> Iterator[None]:
         """Hold the lock of the workspace, and complete or undo the renames of a killed writer.
 
-        Other processes are told the activity: the command that writes.
-
-        Raises:
-            WorkspaceBusyError: another process holds the lock.
-            InputError: the directory cannot be made or written.
-            StorageError: the disk failed while the lock was held.
+        Errors as of `WriteLock.hold`; and a StorageError: the disk failed while the lock was held.
         """
         with storage_failures(self.root), WriteLock(self.root).hold(activity):
             for spec in STAGES:
@@ -331,11 +311,7 @@ class Workspace:
             (self.root / name).replace(target)
 
     def requests(self) -> dict[str, dict[str, Any]]:
-        """Return the flags that stages were last requested with, by stage; `georef run` starts from them.
-
-        Raises:
-            InputError: `requests.json` is damaged.
-        """
+        """Return the flags that stages were last requested with, by stage; `georef run` starts from them."""
         return read_requests(self.root)
 
     def remember(self, flags: Mapping[str, Mapping[str, Any]]) -> None:

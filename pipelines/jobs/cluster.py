@@ -36,11 +36,7 @@ _RENEW = (
 
 
 def import_distributed() -> Any:
-    """Return Dask's library.
-
-    Raises:
-        BackendUnavailableError: it is not installed; names the extra.
-    """
+    """Return Dask's library; a BackendUnavailableError names the extra that installs it."""
     try:
         import distributed
     except ImportError as error:
@@ -53,11 +49,8 @@ def import_distributed() -> Any:
 def make_certificates(folder: Path) -> None:
     """Write a new certificate and its key, which are all that a machine needs to belong to a cluster.
 
-    The certificate is its own authority. It is valid for a year, as those that Dask makes for itself.
-
-    Raises:
-        InputError: the folder has a certificate already.
-        BackendUnavailableError: the extra is not installed.
+    The certificate is its own authority, valid for a year, as those that Dask makes for itself. An existing one is an
+    InputError.
     """
     distributed = import_distributed()
     try:
@@ -75,11 +68,7 @@ def make_certificates(folder: Path) -> None:
 
 
 def make_own_certificates(folder: Path) -> None:
-    """Make the certificate of a user's clusters where there is none; several programs may ask at once.
-
-    Raises:
-        BackendUnavailableError: the extra is not installed.
-    """
+    """Make the certificate of a user's clusters where there is none; several programs may ask at once."""
     if folder.is_dir() and any(folder.iterdir()):
         return
     folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -91,11 +80,7 @@ def make_own_certificates(folder: Path) -> None:
 
 
 def check_own_certificates(folder: Path) -> None:
-    """Check that nobody else can read a user's key, or put another in its place.
-
-    Raises:
-        InputError: folder or files belong to somebody else, or others have access.
-    """
+    """Refuse the key of a user that others can read, or that they can replace."""
     if os.name != "posix":
         return
     for path in (folder, folder / CERTIFICATE, folder / KEY):
@@ -113,12 +98,11 @@ def check_own_certificates(folder: Path) -> None:
 
 
 def check_certificates(folder: Path) -> None:
-    """Check that a folder has a certificate and its key, and that the certificate is valid now.
+    """Refuse a folder without certificate and key, or with a certificate that is not valid now.
 
     Raises:
         InputError: one is missing, everybody can read the key, or the certificate is none, has expired, or is not
             valid yet; names its dates.
-        BackendUnavailableError: the extra is not installed.
     """
     for name in (CERTIFICATE, KEY):
         if not (folder / name).is_file():
@@ -232,7 +216,6 @@ def connected(cluster: ClusterAddress) -> Iterator[Client]:
     """Connect to the scheduler while the context lasts.
 
     Raises:
-        BackendUnavailableError: the extra is not installed.
         ClusterError: no scheduler answers there, or it refuses the certificate.
     """
     distributed = import_distributed()

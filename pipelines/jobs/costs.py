@@ -96,10 +96,7 @@ class BlockCost:
     coefficients: FloatArray
 
     def of(self, pixels: float, visible: float, gaussians: float) -> float:
-        """Return the cost of a block with so many pixels and Gaussians in a view, and Gaussians in all.
-
-        Those that stand in for the rest of the survey count too.
-        """
+        """Return the cost for pixels and Gaussians of the block in a view, and all Gaussians, with its surroundings."""
         return float((_design(np.array([[pixels, visible, gaussians]])) @ self.coefficients).item())
 
     @staticmethod
@@ -124,7 +121,7 @@ def _design(sizes: FloatArray) -> FloatArray:
 
 
 class TimeLeft:
-    """Time that the remaining iterations will take, from the speed of those done and the work of each.
+    """Time of the remaining iterations, from the speed of those done and the work of each.
 
     The work is that of an iteration, counted from 1, in any unit.
     """

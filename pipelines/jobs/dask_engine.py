@@ -106,11 +106,7 @@ class ClusterRun:
         client.subscribe_topic(self._topic, lambda event: self._events.put(event[1]))
 
     def until_all_have_ended(self, title: str, stop: StopRequest) -> None:
-        """Start jobs where there is room, and follow them.
-
-        Raises:
-            ClusterError: the scheduler is lost, or no worker can run the jobs.
-        """
+        """Start jobs where there is room, and follow them."""
         is_stopping, stopped = False, math.inf
         while self._running or (self._waiting and not stop.requested):
             if stop.requested and not is_stopping:
@@ -296,7 +292,6 @@ class DaskEngine:
     another worker if there is one; after three failures it has failed. Workers that join are used, also later.
 
     Attributes:
-        cluster: the scheduler's address and certificate.
         at_a_time: most jobs at a time; None: as many as the workers take.
         storage: through which the files of the jobs go; None: the workers share the folders of the jobs.
     """

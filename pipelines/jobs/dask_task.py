@@ -32,13 +32,10 @@ _SEND_EVERY_S = 0.25
 
 
 class JobRequest(TypedDict):
-    """Request to a worker.
+    """Request to a worker: the arguments of `georef`, by this version, as one attempt at a job.
 
     Attributes:
         topic: of the events that the engine reads.
-        attempt: names this attempt at the job.
-        version: of this package.
-        arguments: of `georef`.
         token: file that a worker sees if it shares the folder of the job; empty: none is needed.
         parcel: parts that come from a storage; None: the folder is shared.
     """
@@ -149,11 +146,7 @@ _PRIVATE_PAGES = ("--no-dashboard", "--dashboard-address", "127.0.0.1:0")
 
 
 def run_scheduler(listen: ClusterAddress) -> None:
-    """Run a scheduler until it is interrupted.
-
-    Raises:
-        BackendUnavailableError: the extra is not installed.
-    """
+    """Run a scheduler until it is interrupted."""
     import_distributed()
     from distributed.cli.dask_scheduler import main
 
@@ -167,12 +160,7 @@ def run_worker(
 ) -> None:
     """Run a worker until it is interrupted, or its scheduler ends.
 
-    Args:
-        jobs: most jobs at a time; they share cores and memory, and each takes a GPU if it uses one.
-        name: for people; None: its address.
-
-    Raises:
-        BackendUnavailableError: the extra is not installed.
+    It runs at most so many jobs at a time, which share cores and memory; each takes a GPU if it uses one.
     """
     import_distributed()
     from distributed.cli.dask_worker import main

@@ -50,7 +50,6 @@ class JobEnd:
 
     Attributes:
         code: exit code; below zero the signal that ended the process.
-        seconds: from start to end.
         place: step that the job was at (`train`); empty if it named none.
         error: message of a job that failed, else empty.
     """
@@ -95,8 +94,7 @@ class Engine(Protocol):
 class JobLine:
     """Progress of a job as one line: its outermost task, with the task inside as its note.
 
-    Attributes:
-        place: latest note of the outermost task: the stage that runs.
+    Its place is the latest note of the outermost task: the stage that runs.
     """
 
     def __init__(self, progress: Progress, name: str) -> None:

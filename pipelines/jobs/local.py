@@ -37,12 +37,9 @@ _KILLED = "the system killed it, as it does when memory is short: run fewer at a
 
 @dataclass(frozen=True)
 class ProcessEnd:
-    """End of a process.
+    """End of a process: exit code, below zero the signal that ended it, and if it failed its message.
 
-    Attributes:
-        code: exit code; below zero the signal that ended it.
-        error: its message if it failed, else empty.
-        kind: kind of the failure (`GeorefError.code`); empty if it did not tell.
+    The kind is that of the failure (`GeorefError.code`); empty if it did not tell.
     """
 
     code: int
@@ -52,16 +49,10 @@ class ProcessEnd:
 
 
 class JobProcess:
-    """Running process of a job.
+    """Running process of a job, by the arguments of Python that start this program, and those of the program.
 
-    Args:
-        program: arguments of Python that start this program.
-        arguments: of the program.
-        take: gets the messages in a thread; false: it was none of progress or log.
-        ended: called at the end of the process, in the same thread.
-
-    Raises:
-        OSError: the process cannot be started.
+    `take` gets the messages in a thread; it returns false for one that is none of progress or log. `ended` is
+    called at the end of the process, in the same thread.
     """
 
     def __init__(

@@ -81,7 +81,6 @@ def load_missions(
     """Return the missions of a TOML file, or of a folder.
 
     Args:
-        path: of the file or folder.
         owners: options that a mission may have outside the tables of its stages, with the stages that they are for.
         last, deliver, flags: as of `Mission`; they override those of every mission.
 

@@ -62,28 +62,22 @@ class PartIndex(BaseModel):
 
 @dataclass(frozen=True)
 class Storage:
-    """Store that a URL of fsspec names, such as `s3://bucket/prefix` or `file:///mnt/exchange`."""
+    """Store that a URL of fsspec names, such as `s3://bucket/prefix` or `file:///mnt/exchange`.
+
+    All methods raise a StorageError if the store cannot be reached, and a BackendUnavailableError if a library for
+    this kind of store is not installed.
+    """
 
     url: str
 
     def check(self) -> None:
-        """Connect to the store.
-
-        Raises:
-            BackendUnavailableError: a library for this kind of store is not installed.
-            StorageError: the URL is wrong, or the store cannot be reached.
-        """
+        """Connect to the store."""
         with self._reached():
             store, home = self._place("")
             store.exists(home)
 
     def index(self, part: str) -> PartIndex | None:
-        """Return the index of a part; None: the store does not have it.
-
-        Raises:
-            StorageError: the store cannot be read.
-            InputError: the index is damaged, or names a path outside its part.
-        """
+        """Return the index of a part, or None; an InputError: it is damaged, or leads out of its part."""
         with self._reached():
             store, home = self._place(part)
             place = f"{home}.json"
@@ -102,13 +96,10 @@ class Storage:
             return index
 
     def send(self, folder: Path, part: str, writer: Writer, attempt: str = "") -> PartIndex:
-        """Copy a part of a folder into the store, and delete there what it has no more.
+        """Copy a part of a folder into the store for an attempt at a job, and delete there what it has no more.
 
-        A file that vanishes meanwhile, as when a stage ends, makes the copy start anew. The copy is for one attempt
-        at the job.
-
-        Raises:
-            StorageError: the store cannot be written, or another attempt has taken over from this worker.
+        A file that vanishes meanwhile, as when a stage ends, makes the copy start anew. A StorageError tells a worker
+        that another attempt at its job has taken over.
         """
         with self._reached():
             (store, home), before = self._place(part), self.index(part)
@@ -139,14 +130,9 @@ class Storage:
             return index
 
     def fetch(self, folder: Path, part: str, before: PartIndex | None = None) -> PartIndex | None:
-        """Copy a part from the store into a folder, and return its index; a file that is newer there stays.
+        """Copy a part from the store into a folder, and return its index, if any; a file that is newer there stays.
 
-        Files that the folder had sent `before`, and that are no longer listed, are deleted. None: the store does
-        not have the part.
-
-        Raises:
-            StorageError: the store cannot be read.
-            InputError: the index is damaged.
+        Files that the folder had sent `before`, and that are no longer listed, are deleted.
         """
         with self._reached():
             (store, home), index = self._place(part), self.index(part)
@@ -172,11 +158,6 @@ class Storage:
             return index
 
     def write_index(self, index: PartIndex) -> None:
-        """Write the index of a part.
-
-        Raises:
-            StorageError: the store cannot be written.
-        """
         with self._reached():
             store, home = self._place(index.part)
             store.pipe_file(f"{home}.json", json.dumps(index.model_dump(mode="json")).encode())
@@ -276,7 +257,6 @@ class EngineExchange:
 
         Raises:
             InputError: the job names no parts, or a part lies outside its folder.
-            StorageError: the storage failed.
         """
         if job.folder is None or job.writes is None:
             raise InputError(f"{job.name} cannot run through a storage: use a shared folder", field="--storage")
@@ -306,10 +286,6 @@ def worker_exchange(parcel: Parcel, scratch: Path) -> Iterator[None]:
 
     Meanwhile results are put back every minute, so that a lost worker loses little. The scratch folder is deleted
     in the end.
-
-    Raises:
-        InputError: an index in the storage is damaged.
-        StorageError: the storage failed.
     """
     storage, stopped = Storage(parcel["url"]), threading.Event()
 
