@@ -46,8 +46,7 @@ def batch(table: BatchTable, page: Path) -> list[Renderable]:
         for row in table.missions
         if row.failure is not None
     ]
-    states = ", ".join(f"{count} {state}" for state, count in table.counts.items())
-    ending = f"\n{len(table.missions)} missions: {states}. All of it is in {shown(str(page))}"
+    ending = f"\n{len(table.missions)} missions: {table.states}. All of it is in {shown(str(page))}"
     return [ByWidth(WIDE, wide, narrow), *(["", *failures] if failures else []), ending]
 
 

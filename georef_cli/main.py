@@ -111,27 +111,13 @@ class LazyGroup(click.Group):
                 formatter.write_dl([(name, e.help) for name, e in COMMANDS.items() if e.section == section])
 
 
-def _print_version(ctx: click.Context, _param: click.Parameter, value: bool) -> None:
-    if not value or ctx.resilient_parsing:
-        return
-    click.echo(f"{PROGRAM} {__version__}")
-    ctx.exit()
-
-
 @click.group(
     name=PROGRAM,
     cls=LazyGroup,
     params=list(shared_options()),
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-@click.option(
-    "--version",
-    is_flag=True,
-    is_eager=True,
-    expose_value=False,
-    callback=_print_version,
-    help="Show the version.",
-)
+@click.version_option(__version__, prog_name=PROGRAM, message="%(prog)s %(version)s", help="Show the version.")
 def cli() -> None:
     """From drone flights to georeferenced 3D Gaussian splats.
 

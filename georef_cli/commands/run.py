@@ -34,24 +34,16 @@ log = logging.getLogger(__name__)
 
 # Options of later stages that `run` offers too, with the stages that they are for. All other options are set in
 # georef.toml, or with the stage's own command.
+_EFFORT = ("preset", "iterations", "max_image_size", "max_gaussians", "crop_size", "blocks")
+_LIDAR = ("lidar", "lidar_crs", "lidar_vertical", "lidar_trajectory", "lidar_sigma", "lidar_register")
 LATER: dict[str, tuple[str, ...]] = {
     "mapper": ("sfm",),
     "import_model": ("sfm",),
     "max_residual": ("init-sim3",),
     "accept_contradiction": ("ingest", "init-sim3"),
-    "preset": ("train",),
-    "iterations": ("train",),
-    "max_image_size": ("train",),
-    "max_gaussians": ("train",),
-    "crop_size": ("train",),
-    "blocks": ("train",),
+    **dict.fromkeys(_EFFORT, ("train",)),
     "backend": ("train", "evaluate"),
-    "lidar": ("train",),
-    "lidar_crs": ("train",),
-    "lidar_vertical": ("train",),
-    "lidar_trajectory": ("train",),
-    "lidar_sigma": ("train",),
-    "lidar_register": ("train",),
+    **dict.fromkeys(_LIDAR, ("train",)),
     "seed": ("sfm", "init-sim3", "train"),
 }
 OWNERS: dict[str, tuple[str, ...]] = {**dict.fromkeys(IngestOptions.model_fields, ("ingest",)), **LATER}

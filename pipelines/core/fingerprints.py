@@ -27,8 +27,6 @@ _WHOLE_BYTES = 256 * 1024 * 1024
 _SAMPLES, _SAMPLE_BYTES = 64, 1024 * 1024
 _MOST_THREADS = 4
 
-Records = Mapping[str, Mapping[str, FileRecord]]
-
 
 @dataclass(frozen=True)
 class Fingerprints:
@@ -49,7 +47,7 @@ def fingerprints(
     options: StageOptions,
     memo: Memo,
     *,
-    known: Records | None = None,
+    known: Mapping[str, Mapping[str, FileRecord]] | None = None,
     progress: Progress = SILENT,
 ) -> Fingerprints:
     """Return the inputs of a stage: hashes of their content, wherever they lie.

@@ -25,10 +25,10 @@ from pipelines.core.errors import (
     WorkspaceBusyError,
     storage_failures,
 )
-from pipelines.core.files import remove
+from pipelines.core.files import remove, replace_text
 from pipelines.core.fingerprints import library_versions
 from pipelines.core.lock import WriteLock
-from pipelines.core.manifest import Manifest, Memo, record_files
+from pipelines.core.manifest import MANIFEST, Manifest, Memo, record_files
 from pipelines.core.options import REQUESTS, remembered
 from pipelines.core.products import AT_END, union
 from pipelines.core.progress import SILENT, Progress
@@ -228,12 +228,17 @@ def _goes_on(workspace: Workspace, asked: Request) -> bool:
 
 def _execute(workspace: Workspace, asked: Request, resume: Resume, progress: Progress, place: str) -> Manifest:
     spec, resolved = asked.spec, asked.options.model_dump(mode="json")
-    _tell_interrupted(workspace, asked, resume)
+    partial = workspace.partial_product(spec)
+    if spec.resumable and partial.folder.exists():
+        found = staleness.found_interrupted(workspace, spec)
+        if resume != "never" and partial.is_of(asked.token):
+            log.info("%s: goes on with an interrupted run: %s", spec.name, found)
+        else:
+            log.warning("%s: starts afresh; what an interrupted run had done is dropped: %s", spec.name, found)
     started, clock = now(), time.monotonic()
     summary = _run(workspace, asked, resume, progress, place)
-    out = workspace.partial(spec)
     for product in products_of(spec):
-        if not (out / product.removeprefix(f"{spec.folder}/")).exists():
+        if not (partial.folder / product.removeprefix(f"{spec.folder}/")).exists():
             raise RuntimeError(f"{spec.module} did not write {product}")
     for warning in summary.warnings:
         log.warning("%s: %s", spec.name, warning)
@@ -253,25 +258,13 @@ def _execute(workspace: Workspace, asked: Request, resume: Resume, progress: Pro
         values=summary.values,
         warnings=list(summary.warnings),
         cautions=summary.cautions,
-        files=record_files(out, spec.working),
+        files=record_files(partial.folder, spec.working),
         input_files=asked.inputs.files,
     )
     workspace.set_aside(staleness.finding(workspace, spec, {}).damaged)
     workspace.commit(spec, manifest)
     log.info("%s: %s (%s)", spec.name, summary.key_figure, duration(manifest.duration_s))
     return manifest
-
-
-def _tell_interrupted(workspace: Workspace, asked: Request, resume: Resume) -> None:
-    """Log what an interrupted run has left, and whether this one goes on with it."""
-    spec, partial = asked.spec, workspace.partial_product(asked.spec)
-    if not spec.resumable or not partial.folder.exists():
-        return
-    found = staleness.found_interrupted(workspace, spec)
-    if resume != "never" and partial.is_of(asked.token):
-        log.info("%s: goes on with an interrupted run: %s", spec.name, found)
-    else:
-        log.warning("%s: starts afresh; what an interrupted run had done is dropped: %s", spec.name, found)
 
 
 def _with_present_files(workspace: Workspace, asked: Request, manifest: Manifest) -> Manifest:
@@ -282,7 +275,7 @@ def _with_present_files(workspace: Workspace, asked: Request, manifest: Manifest
     if asked.inputs.files == manifest.input_files or not workspace.manifest(asked.spec):
         return manifest
     renewed = manifest.model_copy(update={"input_files": asked.inputs.files})
-    workspace.renew(asked.spec, renewed)
+    replace_text(workspace.root / asked.spec.folder / MANIFEST, f"{renewed.model_dump_json(indent=1)}\n")
     return renewed
 
 

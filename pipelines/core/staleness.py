@@ -227,8 +227,14 @@ def _state(workspace: Workspace, spec: StageSpec, flags: Flags, memo: Memo, stal
     if manifest is None:
         state: State = "failed" if failure else "interrupted" if interrupted else "missing"
         return StageState(spec.name, state, failure or "", interrupted=interrupted)
+    reason = damage
+    if not damage:
+        stage_config(workspace, spec, flags)  # a bad georef.toml is an error, not a state
+        try:
+            reason = why_stale(workspace, request(workspace, spec, flags, memo), manifest)
+        except (MissingProductError, InputError) as error:
+            reason = str(error)
     upstream = [producer.name for producer in producers(spec) if producer.name in stale]
-    reason = damage or _why_stale_now(workspace, spec, flags, manifest, memo)
     if upstream and not reason:
         reason = f"{', '.join(upstream)} {'are' if len(upstream) > 1 else 'is'} stale"
     later = f"a later run failed: {failure}" if failure else ""
@@ -250,14 +256,6 @@ def _interrupted(workspace: Workspace, spec: StageSpec) -> str:
         return ""
     command = f"; `{continuing_command(workspace, spec)}` goes on with it" if spec.resumable else ""
     return f"an interrupted run: {found_interrupted(workspace, spec)}{command}"
-
-
-def _why_stale_now(workspace: Workspace, spec: StageSpec, flags: Flags, manifest: Manifest, memo: Memo) -> str:
-    stage_config(workspace, spec, flags)  # a bad georef.toml is an error, not a state
-    try:
-        return why_stale(workspace, request(workspace, spec, flags, memo), manifest)
-    except (MissingProductError, InputError) as error:
-        return str(error)
 
 
 def producers(spec: StageSpec) -> list[StageSpec]:

@@ -295,9 +295,6 @@ class Workspace:
         replace_file(draft, partial / MANIFEST)  # It marks the folder as complete, even if the next rename fails.
         self._swap(spec)
 
-    def renew(self, spec: StageSpec, manifest: Manifest) -> None:
-        replace_text(self._folder(spec.folder) / MANIFEST, f"{manifest.model_dump_json(indent=1)}\n")
-
     def damaged(self, spec: StageSpec, manifest: Manifest, memo: Memo, *, by_content: bool) -> list[str]:
         """Return the files of a finished product, by workspace path, that are damaged; see `damaged_files`."""
         names = damaged_files(self._folder(spec.folder), manifest, memo, by_content=by_content)

@@ -72,8 +72,10 @@ class BatchTable(Product):
     missions: tuple[MissionRow, ...]
 
     @property
-    def counts(self) -> Counter[str]:
-        return Counter(row.state for row in self.missions)
+    def states(self) -> str:
+        """Number of missions by state, such as `3 done, 1 failed`."""
+        counts = Counter(row.state for row in self.missions)
+        return ", ".join(f"{count} {state}" for state, count in counts.items())
 
     @property
     def is_complete(self) -> bool:
@@ -140,10 +142,9 @@ def batch_page(table: BatchTable) -> Page:
     remarks = [row for row in table.missions if row.warnings or row.cautions]
     failed = [row for row in table.missions if row.failure is not None]
     facts = {"table": table, "links": links, "remarks": remarks, "failed": failed}
-    states = ", ".join(f"{count} {state}" for state, count in table.counts.items())
     return Page(
         title=f"Batch: {table.batch}",
-        subtitle=f"{len(table.missions)} missions: {states}",
+        subtitle=f"{len(table.missions)} missions: {table.states}",
         about={"Program": f"GeoRefGS {__version__}", "Made": moment(now())},
         sections=(
             Section("missions", "Missions", "missions.html", facts),

@@ -49,8 +49,8 @@ def import_distributed() -> Any:
 def make_certificates(folder: Path) -> None:
     """Write a new certificate and its key, which are all that a machine needs to belong to a cluster.
 
-    The certificate is its own authority, valid for a year, as those that Dask makes for itself. An existing one is an
-    InputError.
+    The certificate is its own authority, valid for a year, as those that Dask makes for itself. A second one in the
+    folder is an InputError.
     """
     distributed = import_distributed()
     try:

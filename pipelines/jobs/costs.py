@@ -96,7 +96,7 @@ class BlockCost:
     coefficients: FloatArray
 
     def of(self, pixels: float, visible: float, gaussians: float) -> float:
-        """Return the cost for pixels and Gaussians of the block in a view, and all Gaussians, with its surroundings."""
+        """Return the cost of a block with so many pixels and visible Gaussians in a view, and Gaussians in all."""
         return float((_design(np.array([[pixels, visible, gaussians]])) @ self.coefficients).item())
 
     @staticmethod

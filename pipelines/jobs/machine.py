@@ -73,6 +73,8 @@ class Machine:
 
 
 def inspect_machine() -> Machine:
+    devices = range(torch.cuda.device_count() if torch.cuda.is_available() else 0)
+    found = (torch.cuda.get_device_properties(index) for index in devices)
     return Machine(
         system=f"{platform.system()} {platform.release()} {platform.machine()}",
         python=platform.python_version(),
@@ -80,7 +82,7 @@ def inspect_machine() -> Machine:
         threads=thread_count(),
         memory_bytes=total_main_memory_bytes(),
         free_bytes=free_memory_bytes(torch.device("cpu")),
-        gpus=_gpus(),
+        gpus=tuple(Gpu(properties.name, int(properties.total_memory)) for properties in found),
         backends=tuple(_backend(name) for name in BACKENDS),
         cuda_parts=(*running_parts(), *compiling_parts()),
         cuda_kernels=kernels_ready(),
@@ -108,10 +110,3 @@ def _backend(name: BackendName) -> BackendState:
     except BackendUnavailableError as error:
         return BackendState(name, False, str(error))
     return BackendState(name, True, "")
-
-
-def _gpus() -> tuple[Gpu, ...]:
-    if not torch.cuda.is_available():
-        return ()
-    found = (torch.cuda.get_device_properties(index) for index in range(torch.cuda.device_count()))
-    return tuple(Gpu(properties.name, int(properties.total_memory)) for properties in found)

@@ -98,8 +98,8 @@ class Storage:
     def send(self, folder: Path, part: str, writer: Writer, attempt: str = "") -> PartIndex:
         """Copy a part of a folder into the store for an attempt at a job, and delete there what it has no more.
 
-        A file that vanishes meanwhile, as when a stage ends, makes the copy start anew. A StorageError tells a worker
-        that another attempt at its job has taken over.
+        A file that vanishes meanwhile, as when a stage ends, makes the copy start anew. A StorageError tells a
+        worker that another attempt at its job has taken over.
         """
         with self._reached():
             (store, home), before = self._place(part), self.index(part)
