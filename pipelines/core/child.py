@@ -155,9 +155,7 @@ def run_in_child(
 
     Args:
         task: `module:function`; the function takes a document and a `Progress`, and returns a document.
-        arguments: document for JSON.
         remedy: what to do if the child crashes.
-        progress: shows the tasks of the child.
         writes: folder that native code writes into; None: it writes nothing.
 
     Raises:

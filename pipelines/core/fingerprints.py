@@ -57,10 +57,8 @@ def fingerprints(
     - Folders that the options name count by the names and contents of the visible files in them that can matter.
 
     Args:
-        workspace, spec, options: the stage, in its workspace, with its options.
         memo: hashes of products and of their files by path, extended here: each is hashed once.
         known: earlier `files`: a file in a folder with the size and time of its record is not read again.
-        progress: shows the files that are read.
 
     Raises:
         MissingProductError: a product does not exist.

@@ -34,7 +34,6 @@ class Manifest(BaseModel):
         product_version: of the form of the product.
         config: resolved options by field.
         inputs: SHA-256 by product or flag, from `fingerprints`.
-        versions: of this package and its libraries.
         started: UTC.
         key_figure, values, cautions: as of the stage's `Summary`.
         files: files of the product by path in the stage's folder; empty in manifests of earlier versions.
@@ -92,7 +91,6 @@ def damaged_files(folder: Path, manifest: Manifest, memo: Memo, *, by_content: b
     Missing files do not count: a missing product makes its stage stale, and any other file may be deleted.
 
     Args:
-        folder, manifest: of the stage.
         memo: hashes of files by path, extended here.
         by_content: whether a file whose size and time of modification are unchanged is hashed too.
     """

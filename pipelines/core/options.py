@@ -182,11 +182,9 @@ def resolve(
     """Return validated options: default < `table` < `flags`.
 
     Args:
-        options_type: class of the options.
         table: the stage's table in `georef.toml`; its relative paths are relative to the folder of that file.
         flags: options that the user gave as flags, now or before, by field.
-        toml: path of `georef.toml`.
-        stage: name of the table, for errors.
+        toml, stage: path of `georef.toml`, and name of the table, for errors.
 
     Raises:
         InputError: an unknown key or a value out of range; names the file, table and key, or the flag.

@@ -166,7 +166,6 @@ class PlannedMission:
     Attributes:
         actions: what its run would do with each stage; none where the run will be refused.
         training_bytes: predicted peak of its training in main memory; 0 without one, or if unknown.
-        uses_gpu: whether it trains on a GPU.
         inputs: files and folders that its options name.
         refusal: reason why the run will be refused, else empty.
     """

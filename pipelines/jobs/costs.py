@@ -46,9 +46,8 @@ def reconstruction_pace(
 
     Args:
         photographs, pairs: numbers of photographs, and of pairs that are matched.
-        megapixels: of each, as features are looked for.
+        megapixels, max_features: of each, as features are looked for.
         doubled: whether features are looked for on twice that size, too.
-        max_features: of a photograph.
     """
     detection_s = _FEATURES_MEGAPIXEL_S if doubled else _OWN_SIZE_FEATURES_MEGAPIXEL_S
     found = megapixels * (_FEATURES_MEGAPIXEL if doubled else _OWN_SIZE_FEATURES_MEGAPIXEL)

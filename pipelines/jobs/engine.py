@@ -28,8 +28,7 @@ class Job:
     Attributes:
         name: for people, unique among the jobs of a run.
         arguments: of `georef`.
-        peak_bytes: predicted peak of the memory.
-        uses_gpu: whether it takes a whole GPU.
+        peak_bytes, uses_gpu: predicted peak of the memory, and whether it takes a whole GPU.
         folder: that its command works in, such as the workspace; a machine that does not see it cannot run the job.
         writes: file or folder in `folder` that it changes; needed where its files go through a storage.
         reads: further files and folders in `folder` that it needs there.
