@@ -2,8 +2,6 @@
 
 Exit codes: 0 done, 1 known failure, 2 usage, 130 interrupted. An unexpected exception keeps its traceback. All
 messages go to stderr; stdout is for the result, or with `--json` for the error as one JSON document.
-
-Ends of commands: exit code, message for people and document for programs of each kind of exception.
 """
 
 from __future__ import annotations
@@ -23,7 +21,7 @@ from typing import IO, TYPE_CHECKING, TextIO
 
 import click
 
-from georef_cli.verbosity import LineFormatter, SafeFormatter, Verbosity
+from georef_cli.verbosity import LineFormatter, SafeFormatter, Verbosity, stderr_sender
 from pipelines.core.errors import GeorefError, InputError, storage_error
 from pipelines.core.progress import SIGNALS
 from pipelines.core.sentences import printable, printable_lines
@@ -40,13 +38,7 @@ ErrorDocument = dict[str, str | int | None]
 
 @dataclass(frozen=True)
 class Ending:
-    """End of a command by an exception.
-
-    Attributes:
-        code: exit code.
-        message: text for stderr.
-        error: JSON form: code, message, path, line, field, hint.
-    """
+    """End of a command by an exception: exit code, text for stderr, and JSON form."""
 
     code: int
     message: str
@@ -64,11 +56,6 @@ def ending_of(error: BaseException) -> Ending | None:
         return None
     usage = isinstance(known, InputError) and known.is_usage
     return Ending(USAGE if usage else FAILED, f"error: {printable(str(known))}", known.document())
-
-
-def defect_document(error: BaseException) -> ErrorDocument:
-    """Return the JSON form of an exception that nobody foresaw."""
-    return _document("defect", f"{type(error).__name__}: {error}")
 
 
 def _of_click(error: click.ClickException) -> Ending:
@@ -92,12 +79,7 @@ FILE_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 
 
 def guarded(group: click.Group, arguments: Sequence[str] | None) -> int:
-    """Run the command line and return its exit code.
-
-    Args:
-        group: the commands.
-        arguments: of the command line; None: those of the process.
-    """
+    """Run the command line, by default that of the process, and return its exit code."""
     words = sys.argv[1:] if arguments is None else arguments
     as_json, tells_progress = "--json" in words, "--json-progress" in words
     try:
@@ -106,38 +88,25 @@ def guarded(group: click.Group, arguments: Sequence[str] | None) -> int:
             code = group.main(args=arguments, prog_name=group.name, standalone_mode=False)
             sys.stdout.flush()
     except BrokenPipeError:
-        # The reader of the pipe has closed it.
-        _drop_stdout()
+        _drop_stdout()  # Its reader has closed the pipe.
         return FAILED
     except (Exception, KeyboardInterrupt) as error:
         ending = ending_of(error)
-        document = defect_document(error) if ending is None else ending.error
+        document = _document("defect", f"{type(error).__name__}: {error}") if ending is None else ending.error
         if as_json:
-            _print_error(document)
+            from pipelines.core.products import dump_json  # here, because it imports the validation library
+
+            with contextlib.suppress(OSError):  # Stdout may be what has failed.
+                click.echo(dump_json({"error": document}))
         if tells_progress:
-            _send_error(document)
+            with contextlib.suppress(KeyboardInterrupt):  # Nobody reads it.
+                stderr_sender().send("error", code=document["code"])
         if ending is None:
             raise
         _say(ending.message)
         _drop_stdout()
         return ending.code
     return code if isinstance(code, int) else 0
-
-
-def _print_error(document: ErrorDocument) -> None:
-    """Print the document of an error on stdout, which may be what has failed."""
-    from pipelines.core.products import dump_json  # here, because it imports the validation library
-
-    with contextlib.suppress(OSError):
-        click.echo(dump_json({"error": document}))
-
-
-def _send_error(document: ErrorDocument) -> None:
-    """Send the kind of an error to the program that started this one."""
-    from georef_cli.verbosity import stderr_sender
-
-    with contextlib.suppress(KeyboardInterrupt):  # nobody reads it
-        stderr_sender().send("error", code=document["code"])
 
 
 def _say(text: str) -> None:
@@ -183,12 +152,7 @@ def _signals_interrupt() -> Iterator[None]:
 @contextmanager
 def logged_to_stderr(verbosity: Verbosity) -> Iterator[None]:
     """Print log records on stderr while the context lasts, and the traceback of its error if asked."""
-    if verbosity.json_progress:
-        handler = _sending_handler()
-    else:
-        handler = _terminal_handler() if sys.stderr.isatty() else _line_handler()
-    handler.setLevel(verbosity.level)
-    with _attached(handler, logging.DEBUG if verbosity.verbose else logging.INFO):
+    with _attached(_handler(verbosity), logging.DEBUG if verbosity.verbose else logging.INFO):
         try:
             yield
         except GeorefError:
@@ -227,24 +191,22 @@ def _attached(handler: logging.Handler, level: int) -> Iterator[None]:
             logging.getLogger(name).setLevel(before)
 
 
-def _sending_handler() -> logging.Handler:
-    from georef_cli.verbosity import stderr_sender
-    from pipelines.core.child import SentRecords
+def _handler(verbosity: Verbosity) -> logging.Handler:
+    """Return the handler of stderr: messages for a program, lines above the bars of a terminal, or plain lines."""
+    handler: logging.Handler
+    if verbosity.json_progress:
+        from pipelines.core.child import SentRecords
 
-    handler = SentRecords(stderr_sender())
-    handler.setFormatter(SafeFormatter())
-    return handler
+        handler = SentRecords(stderr_sender())
+        handler.setFormatter(SafeFormatter())
+    elif sys.stderr.isatty():
+        from georef_cli.display import ConsoleHandler, stderr_console
 
-
-def _terminal_handler() -> logging.Handler:
-    from georef_cli.display import ConsoleHandler, stderr_console
-
-    return ConsoleHandler(stderr_console())
-
-
-def _line_handler() -> logging.Handler:
-    handler = _StderrHandler(sys.stderr)
-    handler.setFormatter(LineFormatter())
+        handler = ConsoleHandler(stderr_console())
+    else:
+        handler = _StderrHandler(sys.stderr)
+        handler.setFormatter(LineFormatter())
+    handler.setLevel(verbosity.level)
     return handler
 
 
@@ -252,7 +214,6 @@ class _StderrHandler(logging.StreamHandler[TextIO]):
     """Handler that writes lines to stderr, and drops those for which a full disk has no room."""
 
     def handleError(self, record: logging.LogRecord) -> None:
-        """Report defects of a record, and no failure of the disk."""
         if not isinstance(sys.exc_info()[1], OSError):
             super().handleError(record)
 
@@ -260,8 +221,8 @@ class _StderrHandler(logging.StreamHandler[TextIO]):
 class _LateFileHandler(logging.Handler):
     """Handler that opens its file when the workspace has its first product, or else at the end of the command.
 
-    A command that is refused leaves neither file nor folder behind. Where the log cannot be written, nothing is
-    said: stderr has the same lines.
+    A command that is refused leaves neither file nor folder behind. A log that cannot be written is no error:
+    stderr has the same lines.
     """
 
     def __init__(self, workspace: Workspace, spec: StageSpec) -> None:
@@ -273,25 +234,21 @@ class _LateFileHandler(logging.Handler):
         self._failed = False
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Write a record, or hold it back."""
         self._held_back.append(self.format(record) + "\n")
         if self._file is not None or self._workspace.has_product():
             self._write()
 
     def _write(self) -> None:
-        """Write what was held back."""
         lines, self._held_back = self._held_back, []
+        if self._failed:
+            return
         try:
-            if not self._failed:
-                self._open().write("".join(lines).encode("utf-8", "backslashreplace"))
+            if self._file is None:
+                self.path.parent.mkdir(exist_ok=True)
+                self._file = self.path.open("ab", buffering=0)
+            self._file.write("".join(lines).encode("utf-8", "backslashreplace"))
         except OSError:
             self._failed = True
-
-    def _open(self) -> IO[bytes]:
-        if self._file is None:
-            self.path.parent.mkdir(exist_ok=True)
-            self._file = self.path.open("ab", buffering=0)
-        return self._file
 
     def close(self) -> None:
         """Write what was held back, unless the command was refused, and close the file."""
@@ -303,7 +260,6 @@ class _LateFileHandler(logging.Handler):
         super().close()
 
     def emit_end(self, error: BaseException) -> None:
-        """Record the error that ended a stage."""
         known = isinstance(error, GeorefError | KeyboardInterrupt)
         text = str(error) or type(error).__name__
         self.emit(

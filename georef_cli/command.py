@@ -17,13 +17,9 @@ _VERBOSITY = tuple(field.name for field in fields(Verbosity))
 
 
 class Command(click.Command):
-    """Command of the program, with the options that all commands share.
+    """Command of the program: its arguments and options, and those that all commands share.
 
-    Args:
-        name: of the command.
-        help: text with examples; its indentation is removed.
-        params: arguments and options of its own.
-        more: see `click.Command`.
+    The indentation of its help is removed.
     """
 
     def __init__(self, name: str, *, help: str, params: Sequence[click.Parameter] = (), **more: Any) -> None:
@@ -31,11 +27,7 @@ class Command(click.Command):
         super().__init__(name, help=inspect.cleandoc(help), params=[*params, *shared_options()], **more)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the command with the verbosity of its own line and of the group's options together.
-
-        Raises:
-            click.UsageError: both `--verbose` and `--quiet` are given.
-        """
+        """Run the command with the verbosity of its own line and of the group's options together."""
         ctx.obj = merged_verbosity(ctx)
         with boundary.logged_to_stderr(ctx.obj):
             return super().invoke(ctx)
@@ -75,11 +67,7 @@ def shared_options() -> list[click.Option]:
 
 
 def merged_verbosity(ctx: click.Context) -> Verbosity:
-    """Return the verbosity of a context and of its parents, and take its options out of the parameters.
-
-    Raises:
-        click.UsageError: both `--verbose` and `--quiet` are given.
-    """
+    """Return the verbosity of a context and of its parents, and take its options out of the parameters."""
     above = ctx.obj if isinstance(ctx.obj, Verbosity) else Verbosity()
     merged = Verbosity(**{name: ctx.params.pop(name) or getattr(above, name) for name in _VERBOSITY})
     if merged.verbose and merged.quiet:

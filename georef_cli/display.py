@@ -6,24 +6,18 @@ import logging
 import math
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Task,
-    TaskID,
-    TextColumn,
-)
+from rich.progress import BarColumn, MofNCompleteColumn, Task, TaskID, TextColumn
 from rich.progress import Progress as Bars
 from rich.progress import ProgressColumn as Column
 from rich.table import Column as TableColumn
 from rich.text import Text
 
-from georef_cli.verbosity import LineFormatter, Verbosity
+from georef_cli.verbosity import LineFormatter, Verbosity, stderr_sender
 from pipelines.core.products import AT_END
 from pipelines.core.progress import SILENT, Progress, ProgressTask
 
@@ -66,50 +60,40 @@ def is_told(verbosity: Verbosity) -> bool:
 def progress_for(verbosity: Verbosity) -> Progress:
     """Return the display of progress: bars on a terminal, log lines elsewhere; none with `--quiet`."""
     if verbosity.json_progress:
-        from georef_cli.verbosity import stderr_sender
-
         return stderr_sender()
     if verbosity.quiet:
         return SILENT
     return BarProgress(stderr_console()) if sys.stderr.isatty() else LineProgress()
 
 
-class SpeedColumn(Column):
-    """Column of steps per second, or of seconds per step below one step per second; empty for steps that differ."""
+class _TextColumn(Column):
+    def __init__(self, text: Callable[[Task], Text], *, no_wrap: bool = True) -> None:
+        super().__init__(TableColumn(no_wrap=no_wrap))
+        self._text = text
 
     def render(self, task: Task) -> Text:
-        """Return the speed of a task."""
-        speed = task.finished_speed or task.speed
-        if not speed or task.fields["left_s"] == math.inf:
-            return Text("")
-        return Text(f"{speed:.1f} it/s" if speed >= 1 else f"{1 / speed:.1f} s/it", style="progress.data.speed")
+        return self._text(task)
 
 
-class SoFarColumn(Column):
-    """Column of the time since the beginning, or that of a finished task."""
-
-    def render(self, task: Task) -> Text:
-        """Return the time."""
-        if task.finished:
-            return Text(clock(task.finished_time or 0.0))
-        return Text("" if task.elapsed is None else f"{clock(task.elapsed)} so far")
+def _speed(task: Task) -> Text:
+    """Return the steps per second, or the seconds per step where they are more; nothing for steps that differ."""
+    speed = task.finished_speed or task.speed
+    if not speed or task.fields["left_s"] == math.inf:
+        return Text("")
+    return Text(f"{speed:.1f} it/s" if speed >= 1 else f"{1 / speed:.1f} s/it", style="progress.data.speed")
 
 
-class LeftColumn(Column):
-    """Column of the time that is left: the task's own estimate, or from the speed of its steps."""
-
-    def render(self, task: Task) -> Text:
-        """Return the time; empty where it is unknown."""
-        left_s = task.time_remaining if task.fields["left_s"] is None else task.fields["left_s"]
-        return Text("" if left_s is None or math.isinf(left_s) or task.finished else f"{clock(left_s)} left")
+def _so_far(task: Task) -> Text:
+    """Return the time since the beginning, or that of a finished task."""
+    if task.finished:
+        return Text(clock(task.finished_time or 0.0))
+    return Text("" if task.elapsed is None else f"{clock(task.elapsed)} so far")
 
 
-class NoteColumn(Column):
-    """Column of the note, cut off where the line ends."""
-
-    def render(self, task: Task) -> Text:
-        """Return the note."""
-        return Text(task.fields["note"], no_wrap=True, overflow="ellipsis")
+def _left(task: Task) -> Text:
+    """Return the time that is left, by the task's own estimate or the speed of its steps; nothing if unknown."""
+    left_s = task.time_remaining if task.fields["left_s"] is None else task.fields["left_s"]
+    return Text("" if left_s is None or math.isinf(left_s) or task.finished else f"{clock(left_s)} left")
 
 
 def clock(seconds: float) -> str:
@@ -139,33 +123,27 @@ class BarProgress:
             yield _Bar(bars, bar)
         finally:
             bars.stop_task(bar)
-            self._make_room(bars)
+            # The height of the terminal has no room for the oldest of many finished bars.
+            finished = [task.id for task in bars.tasks if task.stop_time is not None]
+            for old in finished[: max(0, len(bars.tasks) + _MARGIN_LINES - self._console.height)]:
+                bars.remove_task(old)
             if outermost:
                 bars.stop()
                 self._bars = None
 
-    def _make_room(self, bars: Bars) -> None:
-        """Remove the oldest finished bars that the height of the terminal has no room for."""
-        finished = [task.id for task in bars.tasks if task.stop_time is not None]
-        for bar in finished[: max(0, len(bars.tasks) + _MARGIN_LINES - self._console.height)]:
-            bars.remove_task(bar)
-
     def _start(self) -> Bars:
         wide = self._console.width >= _WIDE
-        fixed: tuple[Column, ...] = (
+        columns: tuple[Column, ...] = (
             TextColumn("{task.description}", markup=False, table_column=TableColumn(no_wrap=True)),
             BarColumn(_WIDE_BAR if wide else _NARROW_BAR),
             MofNCompleteColumn(table_column=TableColumn(no_wrap=True)),
-            *([SpeedColumn(TableColumn(no_wrap=True))] if wide else []),
-            SoFarColumn(TableColumn(no_wrap=True)),
-            LeftColumn(TableColumn(no_wrap=True)),
+            *([_TextColumn(_speed)] if wide else []),
+            _TextColumn(_so_far),
+            _TextColumn(_left),
+            # The note is cut off where the line ends.
+            _TextColumn(lambda task: Text(task.fields["note"], no_wrap=True, overflow="ellipsis"), no_wrap=False),
         )
-        self._bars = Bars(
-            *fixed,
-            NoteColumn(),
-            console=self._console,
-            refresh_per_second=4,
-        )
+        self._bars = Bars(*columns, console=self._console, refresh_per_second=4)
         self._bars.start()
         return self._bars
 
@@ -176,7 +154,6 @@ class _Bar:
         self._note = ""
 
     def advance(self, steps: int = 1, note: str = "", left_s: float | None = None) -> None:
-        """Add `steps` to the bar, and show `note` behind it."""
         self._note = note or self._note
         self._bars.update(self._bar, advance=steps, note=self._note, left_s=left_s)
 
@@ -186,7 +163,6 @@ class LineProgress:
 
     @contextmanager
     def task(self, name: str, total: int | None = None) -> Iterator[ProgressTask]:
-        """Open a task that is logged in lines."""
         line = _Line(name, total)
         try:
             yield line
@@ -209,7 +185,6 @@ class _Line:
             self.log_count()
 
     def log_count(self) -> None:
-        """Log the count of the task."""
         self._logged = time.monotonic()
         elapsed_s = self._logged - self._started
         total = "" if self._total is None else f"/{self._total}"

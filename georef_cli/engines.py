@@ -20,52 +20,38 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
-def engine_options() -> list[click.Option]:
-    """Return the options that choose the engine."""
-    return [
-        click.Option(
-            ["--cluster"],
-            metavar="ADDRESS",
-            help="Run the jobs on the workers of the Dask scheduler at this address, such as tls://host:8786 "
-            "(docs/cluster.md; default: as processes of this machine).",
-        ),
-        *certificates_options(),
-        click.Option(
-            ["--storage"],
-            metavar="URL",
-            help="Object store through which files go to workers that share no folder, such as s3://bucket/prefix.",
-        ),
-    ]
-
-
-def certificates_options() -> list[click.Option]:
-    """Return the options `--certificates` and `--insecure`."""
-    return [
-        click.Option(
-            ["--certificates"],
-            type=click.Path(file_okay=False, resolve_path=True, path_type=Path),
-            metavar="DIR",
-            help="Folder with the certificate of the cluster, from `georef cluster certificates` (default: yours, "
-            "which the first scheduler or worker on 127.0.0.1 makes).",
-        ),
-        click.Option(
-            ["--insecure"],
-            is_flag=True,
-            help="Use no certificate. Every program of this machine, of any user, can then run programs as you.",
-        ),
-    ]
+CERTIFICATES = (
+    click.Option(
+        ["--certificates"],
+        type=click.Path(file_okay=False, resolve_path=True, path_type=Path),
+        metavar="DIR",
+        help="Folder with the certificate of the cluster, from `georef cluster certificates` (default: yours, "
+        "which the first scheduler or worker on 127.0.0.1 makes).",
+    ),
+    click.Option(
+        ["--insecure"],
+        is_flag=True,
+        help="Use no certificate. Every program of this machine, of any user, can then run programs as you.",
+    ),
+)
+ENGINE = (
+    click.Option(
+        ["--cluster"],
+        metavar="ADDRESS",
+        help="Run the jobs on the workers of the Dask scheduler at this address, such as tls://host:8786 "
+        "(docs/cluster.md; default: as processes of this machine).",
+    ),
+    *CERTIFICATES,
+    click.Option(
+        ["--storage"],
+        metavar="URL",
+        help="Object store through which files go to workers that share no folder, such as s3://bucket/prefix.",
+    ),
+)
 
 
 def engine_for(values: Mapping[str, Any], at_a_time: int | None = None) -> Engine:
-    """Return the engine that the options choose.
-
-    Args:
-        values: of the command's options.
-        at_a_time: most jobs at a time; None: as many as there is room for.
-
-    Raises:
-        click.UsageError: a bad address, one that needs a certificate, or options of a cluster without one.
-    """
+    """Return the engine that the options choose, for at most so many jobs at a time."""
     if values["cluster"] is None:
         for option in ("certificates", "insecure", "storage"):
             if values[option]:
@@ -81,11 +67,7 @@ def engine_for(values: Mapping[str, Any], at_a_time: int | None = None) -> Engin
 
 @contextmanager
 def asked_engine(values: Mapping[str, Any]) -> Iterator[None]:
-    """Let stages share their work with the engine that the options choose; without `--cluster`, with that in use.
-
-    Raises:
-        click.UsageError: as `engine_for`.
-    """
+    """Let stages share their work with the engine that `--cluster` chooses; without it, with that in use."""
     engine = engine_for(values)
     with nullcontext() if values["cluster"] is None else chosen_engine(engine):
         yield
@@ -94,15 +76,7 @@ def asked_engine(values: Mapping[str, Any]) -> Iterator[None]:
 def cluster_address(text: str, values: Mapping[str, Any], option: str, *, is_node: bool = False) -> ClusterAddress:
     """Return the address that an option or argument gives, with the certificate that the other options choose.
 
-    Args:
-        text: the address.
-        values: of the options of `certificates_options`.
-        option: for messages.
-        is_node: the program is a part of the cluster; on this machine, makes a missing certificate.
-
-    Raises:
-        click.UsageError: a bad address, or one that needs a certificate.
-        InputError: the certificate is missing, not valid now, or open to others.
+    A program that is a node of the cluster, on this machine, makes a missing certificate.
     """
     from pipelines.jobs.cluster import (
         ClusterAddress,
@@ -112,9 +86,9 @@ def cluster_address(text: str, values: Mapping[str, Any], option: str, *, is_nod
     )
 
     certificates: Path | None = values["certificates"]
-    if values["insecure"] and certificates is not None:
-        raise click.UsageError("--insecure uses no certificate: leave out --certificates.")
     if values["insecure"]:
+        if certificates is not None:
+            raise click.UsageError("--insecure uses no certificate: leave out --certificates.")
         log.warning(
             "--insecure: no certificate protects the cluster at %s. Every program of this machine, of any user, "
             "can run programs as you through it",

@@ -1,19 +1,15 @@
 """Forecast of a run: what its stages would do, for which photographs, for how long, with how much memory.
 
-Dry run: what the stages would do, with which options, for how long and with how much memory.
-
-Time left of a whole run, from the forecast of its stages and the pace of those that are done.
+A dry run prints it; a run tells from it, and from the pace of the stages that are done, what time it has left.
 """
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from georef_cli import tables
@@ -21,7 +17,7 @@ from georef_cli.layout import plain_table, shown
 from georef_cli.output import print_json, print_rich, size
 from georef_cli.tables import Renderable
 from pipelines.core.errors import GeorefError
-from pipelines.core.options import StageOptions, notation
+from pipelines.core.options import OptionsT, notation
 from pipelines.core.plan import PlannedStage, photograph_folder, plan
 from pipelines.core.products import load_json
 from pipelines.core.progress import SILENT, Progress
@@ -42,11 +38,10 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Photographs:
+class FoundPhotographs:
     """Photographs of a survey at a glance.
 
     Attributes:
-        count: their number.
         size_px: width and height of the first, or of the largest camera.
         bytes: size of the files; None: not known without reading a bag.
     """
@@ -61,15 +56,13 @@ class RunForecast:
     """Forecast of a run.
 
     Attributes:
-        planned: what each stage would do.
         photographs: of the survey; None: in a bag that was not read yet.
         seconds: about, by stage, of those that take long.
-        reconstruction: None where none would run, or before a bag is read.
-        training: None where none would run, or before a bag is read.
+        reconstruction, training: None where none would run, or before a bag is read.
     """
 
     planned: Sequence[PlannedStage]
-    photographs: Photographs | None
+    photographs: FoundPhotographs | None
     seconds: Mapping[str, float | None]
     reconstruction: ReconstructionForecast | None
     training: TrainingForecast | None
@@ -78,72 +71,54 @@ class RunForecast:
 def forecast_run(
     workspace: Workspace, stages: tuple[StageSpec, ...], flags: Mapping[str, Flags], *, force: bool
 ) -> RunForecast:
-    """Return the forecast of a run of the stages; nothing is written.
-
-    Args:
-        workspace: may not exist yet.
-        stages: in the order of the pipeline.
-        flags: all options by stage, the remembered ones among them.
-        force: as of the run.
+    """Return the forecast of a run of the stages, as of `plan`; nothing is written.
 
     Raises:
         GeorefError: the run would be refused for its options, or for a missing file.
     """
+    from pipelines.sfm.forecast import forecast as forecast_reconstruction
+    from pipelines.train.forecast import forecast as forecast_training
+
     planned = plan(workspace, stages, flags, force=force)
     photographs = _photographs(workspace, planned)
-    reconstruction, training = _reconstruction(planned, photographs), _training(planned, photographs)
+    reconstruction, training = None, None
+    if photographs is not None:
+        photo_px = photographs.size_px
+        if (sfm := _to_run(planned, SfmOptions)) is not None:
+            reconstruction = forecast_reconstruction(photographs.count, photo_px, sfm)
+        if (train := _to_run(planned, TrainOptions)) is not None:
+            training = forecast_training(photographs.count, photo_px, train)
+    seconds: dict[str, float | None] = {}
     for name, forecast in (("sfm", reconstruction), ("train", training)):
         if forecast is not None and forecast.refusal:
-            planned = [_refused(row, forecast.refusal) if row.stage == name else row for row in planned]
-    seconds: dict[str, float | None] = {}
-    for options, known in ((SfmOptions, reconstruction), (TrainOptions, training)):
-        row = _to_run(planned, options)
-        if row is not None and known is not None:
-            seconds[row.stage] = known.seconds
+            planned = [
+                replace(row, action="refuse", reason=forecast.refusal) if row.stage == name else row
+                for row in planned
+            ]
+        elif forecast is not None:
+            seconds[name] = forecast.seconds
     return RunForecast(planned, photographs, seconds, reconstruction, training)
 
 
 def checked_inputs(
     workspace: Workspace, planned: Sequence[PlannedStage], progress: Progress = SILENT
 ) -> Summary | None:
-    """Return the summary of the survey that `ingest` would make; None where it would not run. Nothing is written.
-
-    Raises:
-        InputError: as `ingest` itself would.
-    """
-    row = _to_run(planned, IngestOptions)
-    if row is None:
+    """Return the summary of the survey that `ingest` would make, unwritten; None where it would not run."""
+    asked = _to_run(planned, IngestOptions)
+    if asked is None:
         return None
     from pipelines.ingest.stage import check_inputs
 
-    assert isinstance(row.resolved, IngestOptions)
-    return check_inputs(workspace, row.resolved, progress)
+    return check_inputs(workspace, asked, progress)
 
 
-def _to_run(planned: Sequence[PlannedStage], options: type[StageOptions]) -> PlannedStage | None:
-    """Return the stage with such options that will run; None: it will not."""
-    going = (row for row in planned if row.action not in ("keep", "refuse"))
-    return next((row for row in going if isinstance(row.resolved, options)), None)
+def _to_run(planned: Sequence[PlannedStage], options: type[OptionsT]) -> OptionsT | None:
+    """Return the options of a class with which a stage will run; None: it will not."""
+    going = (row.resolved for row in planned if row.action not in ("keep", "refuse"))
+    return next((resolved for resolved in going if isinstance(resolved, options)), None)
 
 
-def _refused(row: PlannedStage, reason: str) -> PlannedStage:
-    return replace(row, action="refuse", reason=reason)
-
-
-def _reconstruction(
-    planned: Sequence[PlannedStage], photographs: Photographs | None
-) -> ReconstructionForecast | None:
-    """Return the forecast of the reconstruction; None where none would run, or before a bag is read."""
-    from pipelines.sfm.forecast import forecast
-
-    row = _to_run(planned, SfmOptions)
-    if row is None or photographs is None:
-        return None
-    assert isinstance(row.resolved, SfmOptions)
-    return forecast(photographs.count, photographs.size_px, row.resolved)
-
-
-def _photographs(workspace: Workspace, planned: list[PlannedStage]) -> Photographs | None:
+def _photographs(workspace: Workspace, planned: list[PlannedStage]) -> FoundPhotographs | None:
     """Return the photographs of the survey, or of the folder ahead of `ingest`; None for a bag not read yet."""
     ingest = next((row for row in planned if row.stage == "ingest" and row.action != "keep"), None)
     if ingest is None:
@@ -152,27 +127,14 @@ def _photographs(workspace: Workspace, planned: list[PlannedStage]) -> Photograp
         survey = load_json(Survey, workspace.path(SURVEY))
         folder = photograph_folder(workspace, survey.image_dir)
         sizes = [path.stat().st_size for image in survey.images if (path := folder / image.name).is_file()]
-        return Photographs(len(survey.images), survey.largest_photograph_px, sum(sizes) or None)
+        return FoundPhotographs(len(survey.images), survey.largest_photograph_px, sum(sizes) or None)
     assert isinstance(ingest.resolved, IngestOptions)
-    return None if ingest.resolved.images is None else _in_folder(ingest.resolved.images)
-
-
-def _in_folder(folder: Path) -> Photographs:
+    if ingest.resolved.images is None:
+        return None
     from pipelines.ingest.photo_folder import glance
 
-    count, total_bytes, size_px = glance(folder)
-    return Photographs(count, size_px, total_bytes)
-
-
-def _training(planned: Sequence[PlannedStage], photographs: Photographs | None) -> TrainingForecast | None:
-    """Return the forecast of the training; None where none would run, or before a bag is read."""
-    from pipelines.train.forecast import forecast
-
-    row = _to_run(planned, TrainOptions)
-    if row is None or photographs is None:
-        return None
-    assert isinstance(row.resolved, TrainOptions)
-    return forecast(photographs.count, photographs.size_px, row.resolved)
+    count, total_bytes, size_px = glance(ingest.resolved.images)
+    return FoundPhotographs(count, size_px, total_bytes)
 
 
 _STYLE = {
@@ -195,14 +157,6 @@ def print_dry_run(
     progress: Progress,
 ) -> None:
     """Print what a run of the stages would do, and what `ingest` would find; nothing is written.
-
-    Args:
-        workspace: may not exist yet.
-        stages: in the order of the pipeline.
-        flags: all options by stage, the remembered ones among them.
-        force: as of the run.
-        as_json: print one document.
-        progress: shows the reading of the photographs' tags.
 
     Raises:
         GeorefError: the run would be refused for its options or its input.
@@ -232,20 +186,20 @@ def print_dry_run(
     print_rich(*parts, "\n[dim]Nothing was run. Times are estimates for an idle machine.[/]")
 
 
-def announce_training(
+def announced_seconds(
     workspace: Workspace, stages: tuple[StageSpec, ...], flags: Mapping[str, Flags], *, force: bool
-) -> None:
-    """Log the forecast of the training that a run will come to, at its start: not after hours of other stages.
+) -> Mapping[str, float | None]:
+    """Return the forecast seconds of a run's stages that take long; none for a run that will be refused.
 
-    Args:
-        workspace, stages, flags, force: as for `print_dry_run`. A run that will be refused is announced by nothing.
+    The forecast of the training is logged at the start: not after hours of other stages.
     """
-    if all(spec.options is not TrainOptions for spec in stages):
-        return
-    with contextlib.suppress(GeorefError):
-        training = forecast_run(workspace, stages, flags, force=force).training
-        for sentence in () if training is None else training.sentences():
+    try:
+        run = forecast_run(workspace, stages, flags, force=force)
+        for sentence in () if run.training is None else run.training.sentences():
             log.info("train: %s", sentence)
+    except GeorefError:
+        return {}
+    return run.seconds
 
 
 def _document(workspace: Workspace, run: RunForecast, survey: Summary | None) -> dict[str, Any]:
@@ -270,14 +224,10 @@ def _document(workspace: Workspace, run: RunForecast, survey: Summary | None) ->
 
 
 class RunTimeLeft:
-    """Time that the remaining stages of a run will take.
+    """Time that the remaining stages of a run will take, from their forecast seconds; None: not known.
 
     Stages that the forecast knows no time for count as nothing: they take seconds. Stages that are done correct the
     forecast of the others, because one machine is slower than another by a factor.
-
-    Args:
-        seconds: forecast by stage, of those that take long; None: not known.
-        clock: returns seconds.
     """
 
     def __init__(self, seconds: Mapping[str, float | None], clock: Callable[[], float] = time.monotonic) -> None:
@@ -287,11 +237,9 @@ class RunTimeLeft:
         self._forecast_s = self._took_s = 0.0
 
     def begin(self) -> None:
-        """Begin to measure a stage."""
         self._began = self._clock()
 
     def end(self, stage: str) -> None:
-        """Note the end of a stage."""
         forecast_s = self._left.pop(stage, 0.0)
         if forecast_s:
             self._forecast_s += forecast_s

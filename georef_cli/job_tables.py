@@ -1,7 +1,4 @@
-"""Tables of `georef batch` for people.
-
-Tables of a training in blocks.
-"""
+"""Tables of many jobs for people: missions of a batch, blocks of a training."""
 
 from __future__ import annotations
 
@@ -12,15 +9,14 @@ from typing import TYPE_CHECKING, Any
 from georef_cli.forecast import RunForecast
 from georef_cli.layout import ByWidth, plain_table, shown
 from georef_cli.tables import WIDE, Renderable
-from pipelines.core.figures import ACCURACY_H, ACCURACY_V, CHECK_POINTS, MISSING, Headline
+from pipelines.core.figures import ACCURACY_H, ACCURACY_V, CHECK_POINTS, MISSING
 from pipelines.core.sentences import about, duration
-from pipelines.jobs.batch import BatchTable, MissionRow, PlannedMission
+from pipelines.jobs.batch import BatchTable, PlannedMission
 
 if TYPE_CHECKING:
     from pipelines.survey.block_plan import BlockPlan
 
 _STYLE = {"done": "green", "current": "green", "failed": "red", "interrupted": "yellow", "waiting": "dim"}
-_DASH = MISSING
 _ACCURACY = ("accuracy", *(f"{figure.label} {figure.unit}" for figure in (ACCURACY_H, ACCURACY_V)))
 
 
@@ -33,12 +29,16 @@ def batch(table: BatchTable, page: Path) -> list[Renderable]:
     narrow = plain_table("mission", "state", "took", *_ACCURACY, "remarks", right=(2, 4, 5, 6))
     for row in table.missions:
         state = f"[{_STYLE[row.state]}]{row.state}[/]"
-        accuracy = _accuracy(row.accuracy)
+        headline, images = row.accuracy, MISSING if row.images is None else str(row.images)
+        accuracy = [MISSING] * 3
+        if headline is not None:
+            accuracy = [headline.kind, ACCURACY_H.text(headline.rmse_h_m), ACCURACY_V.text(headline.rmse_v_m)]
+        photographs = images if row.images is None or row.registered is None else f"{row.registered} of {images}"
         took = duration(row.processing_s if row.seconds is None else row.seconds)
         remarks = str(len(row.warnings) + len(row.cautions) or "")
-        checks = CHECK_POINTS.text(None if row.accuracy is None else row.accuracy.check_points)
-        psnr = _DASH if row.test_psnr is None else f"{row.test_psnr:.2f}"
-        wide.add_row(shown(row.mission), state, took, _photographs(row), *accuracy, checks, psnr, remarks)
+        checks = CHECK_POINTS.text(None if headline is None else headline.check_points)
+        psnr = MISSING if row.test_psnr is None else f"{row.test_psnr:.2f}"
+        wide.add_row(shown(row.mission), state, took, photographs, *accuracy, checks, psnr, remarks)
         narrow.add_row(shown(row.mission), state, took, *accuracy, remarks)
     failures = [
         f"[red]{shown(row.mission)}[/] {shown(row.failure)}"
@@ -46,8 +46,7 @@ def batch(table: BatchTable, page: Path) -> list[Renderable]:
         for row in table.missions
         if row.failure is not None
     ]
-    states = ", ".join(f"{count} {state}" for state, count in table.counts.items())
-    ending = f"\n{len(table.missions)} missions: {states}. All of it is in {shown(str(page))}"
+    ending = f"\n{len(table.missions)} missions: {table.states}. All of it is in {shown(str(page))}"
     return [ByWidth(WIDE, wide, narrow), *(["", *failures] if failures else []), ending]
 
 
@@ -68,18 +67,13 @@ def dry_rows(missions: Iterable[tuple[PlannedMission, RunForecast | None]]) -> l
 
 
 def dry_run(rows: Sequence[dict[str, Any]], together: int) -> list[Renderable]:
-    """Return the table of a dry run.
-
-    Args:
-        rows: from `dry_rows`.
-        together: number of missions that run at a time.
-    """
+    """Return the table of the rows of a dry run, in which some missions run together."""
     table = plain_table("mission", "photographs", "about", "memory", "stages to run", right=[1, 2, 3])
     for row in rows:
         stages = ", ".join(stage for stage, action in row["stages"].items() if action != "keep")
         table.add_row(
             shown(row["mission"]),
-            _DASH if row["photographs"] is None else str(row["photographs"]),
+            MISSING if row["photographs"] is None else str(row["photographs"]),
             about(row["seconds"] or None),
             f"{row['peak_bytes'] / 2**30:.1f} GiB",
             f"[red]refused:[/] {shown(row['refusal'])}" if row["refusal"] else stages or "nothing to do",
@@ -90,31 +84,16 @@ def dry_run(rows: Sequence[dict[str, Any]], together: int) -> list[Renderable]:
     ]
 
 
-def _photographs(row: MissionRow) -> str:
-    if row.images is None:
-        return _DASH
-    return str(row.images) if row.registered is None else f"{row.registered} of {row.images}"
-
-
-def _accuracy(headline: Headline | None) -> tuple[str, str, str]:
-    if headline is None:
-        return _DASH, _DASH, _DASH
-    return headline.kind, ACCURACY_H.text(headline.rmse_h_m), ACCURACY_V.text(headline.rmse_v_m)
-
-
-def plan(
-    document: BlockPlan, states: Mapping[int, str], processor_s: Mapping[int, float] | None = None
+def block_table(
+    plan: BlockPlan, states: Mapping[int, str], processor_s: Mapping[int, float] | None = None
 ) -> list[Renderable]:
-    """Return the blocks of a plan, with what is known of their training.
+    """Return the blocks of a plan, with what is known of their training, by number of the block.
 
-    Args:
-        document: the plan.
-        states: by number of the block: `trained`, or why it must be trained.
-        processor_s: predicted time of one core, by number of the block; None: unknown.
+    A block is `trained`, or there is a reason why it must be. The time is that of one core; None: unknown.
     """
     heads = ["block", "photographs", "Gaussians", "in a view", "memory"] + ["processor time"] * bool(processor_s)
     table = plain_table(*heads, "", right=list(range(len(heads))))
-    for block in document.blocks:
+    for block in plan.blocks:
         table.add_row(
             str(block.id),
             str(len(block.cameras)),
@@ -124,10 +103,10 @@ def plan(
             *([about(processor_s[block.id])] if processor_s else []),
             shown(states.get(block.id, "")),
         )
-    number = len(document.blocks)
-    whole = f"{number} blocks of {document.photographs} photographs, {document.gaussians} Gaussians in all"
-    if document.memory_bytes is not None:
-        whole += f", for workers with {document.memory_bytes / 2**30:.1f} GiB"
+    number = len(plan.blocks)
+    whole = f"{number} blocks of {plan.photographs} photographs, {plan.gaussians} Gaussians in all"
+    if plan.memory_bytes is not None:
+        whole += f", for workers with {plan.memory_bytes / 2**30:.1f} GiB"
     if processor_s:
         whole += f"; about {about(sum(processor_s.values()))} of one core for all of them"
     return [table, whole]

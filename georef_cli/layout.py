@@ -1,11 +1,8 @@
-"""Tables that fit: the same figures in another form where the terminal is too narrow for the first.
-
-Text of others in rich tables and lines: shown literally, without markup and without escape sequences.
-"""
+"""Tables that fit the width of the terminal, and text of others, shown literally and without escape sequences."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.markup import escape
@@ -17,17 +14,12 @@ from pipelines.core.sentences import printable, printable_lines
 
 
 class FirstThatFits:
-    """Renderable that takes the first of several forms that needs no more than the width of the terminal.
-
-    Args:
-        forms: the widest first; the last is taken if none fits.
-    """
+    """Renderable that takes the first form that needs no more than the width of the terminal, or else the last."""
 
     def __init__(self, *forms: RenderableType) -> None:
         self._forms = forms
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Yield the form."""
         unlimited = options.update(max_width=10_000)
         for form in self._forms[:-1]:
             if Measurement.get(console, unlimited, form).maximum <= options.max_width:
@@ -37,40 +29,33 @@ class FirstThatFits:
 
 
 class ByWidth:
-    """Renderable with one form for wide terminals and another for narrow ones.
-
-    Args:
-        least: number of columns from which a terminal is wide.
-        wide: form with cells that may wrap.
-        narrow: form with fewer columns.
-    """
+    """Renderable with one form for terminals of at least so many columns, and one with fewer columns for others."""
 
     def __init__(self, least: int, wide: RenderableType, narrow: RenderableType) -> None:
         self._least, self._wide, self._narrow = least, wide, narrow
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Yield the form."""
         yield self._wide if options.max_width >= self._least else self._narrow
 
 
-def plain_table(*columns: str, header: bool = True, right: Sequence[int] = ()) -> Table:
-    """Return an empty table without lines; the columns `right` are right-aligned."""
+def plain_table(
+    *columns: str, header: bool = True, right: Sequence[int] = (), no_wrap: Sequence[int] = ()
+) -> Table:
+    """Return an empty table without lines; some columns are right-aligned, some are never wrapped."""
     table = Table(*columns, show_header=header, box=None, pad_edge=False)
     for index in right:
         table.columns[index].justify = "right"
+    for index in no_wrap:
+        table.columns[index].no_wrap = True
     return table
 
 
 def figures(heads: Sequence[str], rows: Mapping[str, Sequence[str]]) -> FirstThatFits:
     """Return rows of figures: a line for each row, or a line for each figure where that is too wide.
 
-    Args:
-        heads: names of the figures; a line break separates group and name.
-        rows: by name, a text for each figure; markup.
+    A line break in a head separates group and name. The texts of the figures are markup.
     """
-    wide = plain_table("", *heads, right=range(1, len(heads) + 1))
-    for column in wide.columns:
-        column.no_wrap = True
+    wide = plain_table("", *heads, right=range(1, len(heads) + 1), no_wrap=range(len(heads) + 1))
     for name, cells in rows.items():
         wide.add_row(name, *cells)
     tall = plain_table("", *rows, right=range(1, len(rows) + 1))
@@ -91,13 +76,5 @@ class Safe:
         self._renderable = renderable
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Yield the segments of the renderable, those with text made printable."""
-        yield from _safe(console.render(self._renderable, options))
-
-
-def _safe(segments: Iterable[Segment]) -> Iterable[Segment]:
-    for segment in segments:
-        if segment.control:
-            yield segment
-        else:
-            yield Segment(printable_lines(segment.text), segment.style)
+        for segment in console.render(self._renderable, options):
+            yield segment if segment.control else Segment(printable_lines(segment.text), segment.style)

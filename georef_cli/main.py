@@ -29,13 +29,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 @dataclass(frozen=True)
 class HelpLine:
-    """Line of `georef --help`.
-
-    Attributes:
-        module: module in `georef_cli.commands` that defines `command`.
-        section: heading above the line.
-        help: the text.
-    """
+    """Line of `georef --help` below the heading of its section; `georef_cli.commands.MODULE` defines `command`."""
 
     module: str
     section: str
@@ -84,11 +78,9 @@ class LazyGroup(click.Group):
     """Group whose subcommands are modules of `georef_cli.commands`, imported one at a time."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Return the names in the order of the table, which is that of the work."""
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Return the command of a name, imported now; None if there is none."""
         entry = COMMANDS.get(cmd_name)
         if entry is None:
             return None
@@ -109,7 +101,6 @@ class LazyGroup(click.Group):
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run a subcommand, which inherits the verbosity of the group's options, and return its result."""
         ctx.obj = merged_verbosity(ctx)
         return super().invoke(ctx)
 
@@ -120,27 +111,13 @@ class LazyGroup(click.Group):
                 formatter.write_dl([(name, e.help) for name, e in COMMANDS.items() if e.section == section])
 
 
-def _print_version(ctx: click.Context, _param: click.Parameter, value: bool) -> None:
-    if not value or ctx.resilient_parsing:
-        return
-    click.echo(f"{PROGRAM} {__version__}")
-    ctx.exit()
-
-
 @click.group(
     name=PROGRAM,
     cls=LazyGroup,
     params=list(shared_options()),
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-@click.option(
-    "--version",
-    is_flag=True,
-    is_eager=True,
-    expose_value=False,
-    callback=_print_version,
-    help="Show the version.",
-)
+@click.version_option(__version__, prog_name=PROGRAM, message="%(prog)s %(version)s", help="Show the version.")
 def cli() -> None:
     """From drone flights to georeferenced 3D Gaussian splats.
 

@@ -1,8 +1,6 @@
-"""Options of the commands: those that all commands share, and those of a stage.
+"""Options of the commands: those that commands share, and those of a stage, also as texts (`--set`).
 
 A stage's options are derived from its class of options (names, types, meaning, defaults): each is defined once.
-
-Options of any stage as texts: `--set train.sh_degree=1`.
 """
 
 from __future__ import annotations
@@ -15,61 +13,51 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 import click
 from pydantic.fields import FieldInfo
 
-from pipelines.core.options import StageOptions, flag_name, input_markers, is_written, notation, parse_toml
-from pipelines.core.plan import names_of_flags
+from pipelines.core.options import (
+    StageOptions,
+    WrittenMarker,
+    flag_name,
+    has_mark,
+    input_markers,
+    names_of_flags,
+    notation,
+    parse_toml,
+)
 from pipelines.core.stages import StageSpec
 from pipelines.core.workspace import Workspace
 
 _BOUNDS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
 
 
-class WorkspaceType(click.Path):
-    """Type of an argument that is a workspace directory."""
-
-    def __init__(self) -> None:
-        super().__init__(file_okay=False, resolve_path=True, path_type=Path)
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the workspace at a path."""
-        return value if isinstance(value, Workspace) else Workspace(Path(str(super().convert(value, param, ctx))))
-
-
-def workspace_argument() -> click.Argument:
-    """Return the argument of the workspace, shown as WS."""
-    return click.Argument(["workspace"], type=WorkspaceType(), metavar="WS")
-
-
-def json_option() -> click.Option:
-    """Return the option `--json`."""
-    return click.Option(["--json", "as_json"], is_flag=True, help="Print the result as one JSON document.")
+WORKSPACE = click.Argument(
+    ["workspace"],
+    type=click.Path(file_okay=False, resolve_path=True, path_type=Path),
+    callback=lambda _ctx, _param, root: Workspace(root),
+    metavar="WS",
+)
+JSON = click.Option(["--json", "as_json"], is_flag=True, help="Print the result as one JSON document.")
+DRY_RUN = click.Option(["--dry-run"], is_flag=True, help="Show what would be run, why, and how long; run nothing.")
+FORGET = click.Option(
+    ["--forget"],
+    multiple=True,
+    metavar="OPTION",
+    help="Forget this option of earlier commands (`--forget gcp`), or `all`.  [repeatable]",
+)
+SET = click.Option(
+    ["--set", "settings"],
+    multiple=True,
+    metavar="STAGE.OPTION=VALUE",
+    help="Set any option of a stage by its key in georef.toml (`--set train.sh_degree=1`).  [repeatable]",
+)
 
 
 def force_option(help_text: str = "Run even if the product is current.") -> click.Option:
-    """Return the option `--force`."""
+    """Return the option `--force`, which means something else for each command."""
     return click.Option(["--force"], is_flag=True, help=help_text)
 
 
-def dry_run_option() -> click.Option:
-    """Return the option `--dry-run`."""
-    return click.Option(["--dry-run"], is_flag=True, help="Show what would be run, why, and how long; run nothing.")
-
-
-def forget_option() -> click.Option:
-    """Return the option `--forget`."""
-    return click.Option(
-        ["--forget"],
-        multiple=True,
-        metavar="OPTION",
-        help="Forget this option of earlier commands (`--forget gcp`), or `all`.  [repeatable]",
-    )
-
-
 def forgotten(options_type: type[StageOptions], names: Iterable[str]) -> list[str]:
-    """Return the fields that the user names with `--forget`; `all` stands for each of them.
-
-    Raises:
-        click.UsageError: a name is no option.
-    """
+    """Return the fields that the user names with `--forget`; `all` stands for each of them."""
     if "all" in (named := list(names)):
         return list(options_type.model_fields)
     try:
@@ -85,13 +73,10 @@ def stage_options(options_type: type[StageOptions], only: Iterable[str] | None =
 
 
 def stage_option(options_type: type[StageOptions], name: str) -> click.Option:
-    """Return the click option of a field.
-
-    The option has no default of its own: its help states the field's.
-    """
+    """Return the click option of a field; it has no default of its own: its help states the field's."""
     info, flag = options_type.model_fields[name], flag_name(options_type, name)
     help_text = " ".join(filter(None, [info.description, _default_and_range(info)]))
-    if is_written(info):
+    if has_mark(info, WrittenMarker):
         return click.Option([flag, name], type=click.STRING, default=None, help=help_text)
     kind = _bare_type(info.annotation)
     if kind is bool:
@@ -135,36 +120,22 @@ def _click_type(kind: Any) -> click.ParamType[Any]:
 
 def _default_and_range(info: FieldInfo) -> str:
     """Return the default and range of a field as `[default: 1200; ≥ 128]`; empty without any."""
-    parts = []
-    if info.default not in (None, ()):
-        parts.append(f"default: {_shown(info)}")
+    parts, default = [], info.default
+    if has_mark(info, WrittenMarker):
+        default = notation(default) if default not in (None, ()) else None
+    elif isinstance(default, bool):
+        default = "on" if default else "off"
+    if default not in (None, ()):
+        parts.append(f"default: {default}")
     for bound, sign in _BOUNDS.items():
         parts += [f"{sign} {getattr(mark, bound)}" for mark in info.metadata if hasattr(mark, bound)]
     return f" [{'; '.join(parts)}]" if parts else ""
 
 
-def _shown(info: FieldInfo) -> str:
-    if is_written(info):
-        return notation(info.default)
-    return {True: "on", False: "off"}[info.default] if isinstance(info.default, bool) else str(info.default)
-
-
-def set_option() -> click.Option:
-    """Return the option `--set`."""
-    return click.Option(
-        ["--set", "settings"],
-        multiple=True,
-        metavar="STAGE.OPTION=VALUE",
-        help="Set any option of a stage by its key in georef.toml (`--set train.sh_degree=1`).  [repeatable]",
-    )
-
-
 def settings(texts: Iterable[str], stages: Iterable[StageSpec]) -> dict[str, dict[str, Any]]:
-    """Return the options that texts set, by stage and field.
+    """Return the options that texts set, by stage and field; only stages that will run have options.
 
-    Args:
-        texts: `stage.field=value`; the value is one of TOML, or else a plain text. Paths become absolute.
-        stages: that will run.
+    A text is `stage.field=value`; the value is one of TOML, or else a plain text. Paths become absolute.
 
     Raises:
         click.UsageError: no such form, stage or option.

@@ -1,7 +1,4 @@
-"""Results on stdout: a short text for people, or one JSON document.
-
-Overview of a result for people: `georef info`, and the end of `georef run`.
-"""
+"""Results on stdout: a short text for people, such as the overview of `georef info`, or one JSON document."""
 
 from __future__ import annotations
 
@@ -30,9 +27,16 @@ if TYPE_CHECKING:
 _UNITS = ("B", "kB", "MB", "GB", "TB")
 
 
-def whole(result: Overview) -> list[Renderable]:
+def overview_text(result: Overview) -> list[Renderable]:
     """Return the text of `georef info`: place, accuracy, files with their use, further deliverables, cautions."""
-    parts: list[Renderable] = [_headline(result), *_interrupted(result), _place(result), _files(result)]
+    wide = plain_table("\nfile", "\nsize", "\nmade", "\nstate", "\nuse", right=[1])
+    narrow = plain_table("\nfile", "\nsize", "\nstate", "\nuse", right=[1])
+    for file in result.files:
+        name, count, use = shown(file.path), size(file.bytes), shown(file.purpose)
+        state = f"[{tables.STATE_STYLE.get(file.state, 'dim')}]{file.state}[/]"
+        wide.add_row(name, count, tables.when(file.made), state, use)
+        narrow.add_row(name, count, state, use)
+    parts: list[Renderable] = [*_headline(result), _place(result), ByWidth(tables.WIDE, wide, narrow)]
     if result.further:
         parts.append("\n[bold]Not made yet[/]")
         parts += [
@@ -41,7 +45,7 @@ def whole(result: Overview) -> list[Renderable]:
     return [*parts, *tables.cautions(result.cautions)]
 
 
-def short(result: Overview) -> list[Renderable]:
+def run_ending(result: Overview) -> list[Renderable]:
     """Return the end of `georef run`: where the result is, how good it is, where the files are, what comes next."""
     workspace = result.workspace
     files = plain_table("", "", header=False)
@@ -58,7 +62,7 @@ def short(result: Overview) -> list[Renderable]:
         **({f"georef run {workspace} --deliver {names}": "further deliverables"} if names else {}),
     }
     steps = [f"  {shown(command)}  [dim]{use}[/]" for command, use in further.items()]
-    parts: list[Renderable] = ["", _headline(result), *_interrupted(result), _place(result, brief=True)]
+    parts: list[Renderable] = ["", *_headline(result), _place(result, brief=True)]
     return [*parts, f"\n[bold]Files[/] in {shown(str(workspace))}", files, "\n[bold]Next[/]", *steps]
 
 
@@ -68,25 +72,20 @@ def size(count: int) -> str:
     return f"{count / 1000**thousands:.{1 if thousands else 0}f} {_UNITS[thousands]}"
 
 
-def _headline(result: Overview) -> str:
-    """Return the first line: whether the result is that of the present inputs and options, its size, its place."""
+def _headline(result: Overview) -> list[str]:
+    """Return whether the result is that of the present inputs and options, its size and place, interrupted runs."""
     lat, lon, _ = result.center_lla
     place = f"{abs(lat):.6f}° {'S' if lat < 0 else 'N'}, {abs(lon):.6f}° {'W' if lon < 0 else 'E'}"
-    gaussians = f"{result.gaussians} Gaussians at {place}"
-    if not result.outdated:
-        return f"[bold]{shown(str(result.workspace))}[/]: {gaussians}"
-    first, *others = result.outdated
-    style, more = (
-        tables.STATE_STYLE[first.state],
-        f"; and {', '.join(row.stage for row in others)}" if others else "",
-    )
-    why = f"{first.stage}: {first.reason}{more}"
-    return f"[bold]{shown(str(result.workspace))}[/] is [{style}]{first.state}[/] ({shown(why)}): {gaussians}"
-
-
-def _interrupted(result: Overview) -> list[str]:
-    """Return a line for each stage beside whose product an interrupted run lies."""
-    return [f"[yellow]{stage}[/]: {shown(found)}" for stage, found in result.interrupted.items()]
+    state = ""
+    if result.outdated:
+        first, *others = result.outdated
+        more = f"; and {', '.join(row.stage for row in others)}" if others else ""
+        why = shown(f"{first.stage}: {first.reason}{more}")
+        state = f" is [{tables.STATE_STYLE[first.state]}]{first.state}[/] ({why})"
+    return [
+        f"[bold]{shown(str(result.workspace))}[/]{state}: {result.gaussians} Gaussians at {place}",
+        *(f"[yellow]{stage}[/]: {shown(found)}" for stage, found in result.interrupted.items()),
+    ]
 
 
 def _place(result: Overview, *, brief: bool = False) -> Table:
@@ -97,8 +96,9 @@ def _place(result: Overview, *, brief: bool = False) -> Table:
         "latitude": f"{bounds.south:.6f} … {bounds.north:.6f}°",
         "height": f"{bounds.height_m[0]:.2f} … {bounds.height_m[1]:.2f} m, ellipsoidal",
         bounds.crs: ", ".join(
-            f"{low:.{_decimals(unit)}f} … {high:.{_decimals(unit)}f} {unit}"
+            f"{low:.{decimals}f} … {high:.{decimals}f} {unit}"
             for low, high, unit in zip(bounds.low, bounds.high, bounds.units, strict=True)
+            for decimals in [6 if unit.startswith("deg") else 2]
         ),
     }
     if not brief:
@@ -109,32 +109,16 @@ def _place(result: Overview, *, brief: bool = False) -> Table:
         lines["accuracy"] += "; check points measure it (--checkpoints, --check)"
     if quality.psnr is not None:
         lines["test views"] = f"PSNR {quality.psnr:.2f} dB"
-    table = Table(show_header=False, box=None, pad_edge=False)
+    table = plain_table("", "", header=False)
     for name, text in lines.items():
         table.add_row(shown(name), shown(text))
     return table
-
-
-def _files(result: Overview) -> ByWidth:
-    wide = plain_table("\nfile", "\nsize", "\nmade", "\nstate", "\nuse", right=[1])
-    narrow = plain_table("\nfile", "\nsize", "\nstate", "\nuse", right=[1])
-    for file in result.files:
-        name, count, use = shown(file.path), size(file.bytes), shown(file.purpose)
-        state = f"[{tables.STATE_STYLE.get(file.state, 'dim')}]{file.state}[/]"
-        wide.add_row(name, count, tables.when(file.made), state, use)
-        narrow.add_row(name, count, state, use)
-    return ByWidth(tables.WIDE, wide, narrow)
-
-
-def _decimals(unit: str) -> int:
-    return 6 if unit.startswith("deg") else 2
 
 
 PIPED_WIDTH = 120
 
 
 def print_json(document: Any) -> None:
-    """Print one JSON document."""
     click.echo(dump_json(document))
 
 
@@ -148,7 +132,6 @@ def print_rich(*parts: RenderableType) -> None:
 
 
 def document_of(outcome: Outcome) -> dict[str, Any]:
-    """Return the JSON form of a stage's result."""
     manifest = outcome.manifest
     return {
         "stage": outcome.stage,
@@ -161,21 +144,15 @@ def document_of(outcome: Outcome) -> dict[str, Any]:
 
 
 def document_of_cautions(by_stage: Mapping[str, Sequence[Caution]]) -> list[dict[str, str]]:
-    """Return the JSON form of cautions by stage."""
     return [
         {"stage": stage, **caution.model_dump()} for stage, cautions in by_stage.items() for caution in cautions
     ]
 
 
 def print_outcome(workspace: Workspace, outcome: Outcome, *more: RenderableType, as_json: bool, told: bool) -> None:
-    """Print the result of a stage, then the cautions of the workspace.
+    """Print the result of a stage, what more there is to show of it, and the cautions of the workspace.
 
-    Args:
-        workspace: with the result.
-        outcome: of the stage.
-        more: printed below its figures.
-        as_json: print one document.
-        told: the log on the same terminal has shown the headline.
+    `told`: the log on the same terminal has shown the headline.
     """
     cautions = cautions_by_stage(workspace)
     if as_json:
@@ -195,13 +172,7 @@ def print_outcomes(
 ) -> None:
     """Print the results of several stages, the overview of the whole if there is one, and last the cautions.
 
-    Args:
-        workspace: with the results.
-        outcomes: of the stages.
-        result: the overview.
-        solved: evaluation of cameras without training; None: no part of the result.
-        as_json: print one document.
-        told: the log on the same terminal has shown the stages.
+    `solved` is the evaluation of cameras without training. `told`: the log on the same terminal has shown the rest.
     """
     cautions = cautions_by_stage(workspace)
     if solved is not None:
@@ -217,11 +188,11 @@ def print_outcomes(
     if not told:
         print_rich(tables.outcomes(outcomes))
     if result is not None:
-        print_rich(*short(result))
+        print_rich(*run_ending(result))
     else:
         if solved is not None:
             print_rich(*tables.report(solved))
-        print_rich(*tables.accuracy(headline_of(workspace) if solved is None else solved.headline))
+        print_rich(*tables.accuracy_line(headline_of(workspace) if solved is None else solved.headline))
         if told:
             print_rich(f"[bold]Next[/]: georef run {shown(str(workspace.root))} completes it")
     print_rich(*tables.cautions(cautions))

@@ -1,130 +1,140 @@
-"""Common part of the commands of single stages: build the command, run the stage, print its result.
+"""Common part of the commands of single stages: build the command, run the stage, print and deliver its result.
 
-Copies of products outside the workspace: complete or absent, and never over a file by accident.
-
-Common part of the commands of deliverables: run the stage, and copy what it made to where the user wants it.
+Copies of products outside the workspace are complete or absent, and never over a file by accident.
 """
 
 from __future__ import annotations
 
 import contextlib
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import click
+from rich.console import RenderableType
 
 from georef_cli import boundary, options
 from georef_cli.command import Command, merged_verbosity
 from georef_cli.display import is_told, progress_for
-from georef_cli.forecast import announce_training, print_dry_run
+from georef_cli.forecast import announced_seconds, print_dry_run
 from georef_cli.output import print_outcome
 from pipelines.core import runner
 from pipelines.core.errors import InputError, storage_failures
 from pipelines.core.files import remove, replace_file, replace_folder
 from pipelines.core.manifest import MANIFEST
+from pipelines.core.options import remembered
 from pipelines.core.stages import BY_NAME, StageSpec
 from pipelines.core.staleness import must_exist
 from pipelines.core.validators import require_text
-from pipelines.core.workspace import Resume
+from pipelines.core.workspace import Workspace
 
 
 class StageCommand(Command):
     """Command `georef STAGE WS …`: the options of the stage, `--force` and `--json`.
 
     Args:
-        name: of the stage.
-        doc: help, with examples.
-        extra: further options, passed to `act`.
+        extra: further options.
+        delivers: what `--to` copies: the stage's whole folder, or one file with its sidecars; None: nothing.
+        more: returns what is printed below the figures, from the workspace and the values of the options.
     """
 
-    def __init__(self, name: str, doc: str, extra: Sequence[click.Option] = ()) -> None:
-        self.spec = BY_NAME[name]
+    def __init__(
+        self,
+        name: str,
+        doc: str,
+        extra: Sequence[click.Option] = (),
+        *,
+        delivers: Literal["file", "folder"] | None = None,
+        more: Callable[[Workspace, Mapping[str, Any]], Sequence[RenderableType]] = lambda *_: (),
+    ) -> None:
+        self.spec, self._delivers, self._more = BY_NAME[name], delivers, more
+        what = "the folder" if delivers == "folder" else "the file and its sidecar"
+        target = click.Option(
+            ["--to", "-o", "target"],
+            type=click.Path(resolve_path=True, path_type=Path),
+            metavar="FOLDER" if delivers == "folder" else "FILE",
+            help=f"Copy {what} here as well; what exists is replaced only with --force.",
+        )
         super().__init__(
             name,
             params=[
-                options.workspace_argument(),
+                options.WORKSPACE,
                 *options.stage_options(self.spec.options),
                 *extra,
-                options.forget_option(),
-                options.dry_run_option(),
+                *([] if delivers is None else [target]),
+                options.FORGET,
+                options.DRY_RUN,
                 options.force_option(),
-                options.json_option(),
+                options.JSON,
             ],
             help=doc,
             callback=click.pass_context(self.act),
         )
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the command, or show what it would do."""
         if not ctx.params.pop("dry_run"):
             return super().invoke(ctx)
         ctx.obj = merged_verbosity(ctx)
         with boundary.logged_to_stderr(ctx.obj):
-            self.show_plan(ctx, ctx.params)
-        return 0
-
-    def show_plan(self, ctx: click.Context, values: Mapping[str, Any]) -> None:
-        """Print what the command would do."""
-        workspace = values["workspace"]
-        if self.spec.reads:
-            must_exist(workspace)
-        flags = {self.spec.name: self.flags(ctx, values)}
-        print_dry_run(
-            workspace,
-            (self.spec,),
-            flags,
-            force=values["force"],
-            as_json=values["as_json"],
-            progress=progress_for(ctx.obj),
-        )
-
-    def flags(self, ctx: click.Context, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the options of this and earlier commands."""
-        given = options.given(ctx, self.spec.options.model_fields)
-        forget = options.forgotten(self.spec.options, values["forget"])
-        return runner.remembered(values["workspace"], self.spec, given, forget)
-
-    def act(self, ctx: click.Context, **values: Any) -> None:
-        """Run the stage and print its result."""
-        outcome = self.run(ctx, values)
-        print_outcome(values["workspace"], outcome, as_json=values["as_json"], told=is_told(ctx.obj))
-
-    def run(self, ctx: click.Context, values: Mapping[str, Any], *, resume: Resume = "if-same") -> runner.Outcome:
-        """Return the outcome of the stage with the options that the user gave, now or before.
-
-        Args:
-            ctx: has the verbosity, and the origin of the options' values.
-            values: of all options.
-            resume: whether to continue an interrupted run.
-
-        Raises:
-            GeorefError: the stage failed.
-        """
-        workspace, flags = values["workspace"], self.flags(ctx, values)
-        announce_training(workspace, (self.spec,), {self.spec.name: flags}, force=values["force"])
-        with boundary.logged_to_file(workspace, self.spec):
-            return runner.run_stage(
+            workspace = ctx.params["workspace"]
+            if self.spec.reads:
+                must_exist(workspace)
+            print_dry_run(
                 workspace,
-                self.spec,
-                flags,
-                force=values["force"],
-                resume=resume,
+                (self.spec,),
+                self._flags(ctx, ctx.params),
+                force=ctx.params["force"],
+                as_json=ctx.params["as_json"],
                 progress=progress_for(ctx.obj),
             )
+        return 0
+
+    def _flags(self, ctx: click.Context, values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+        """Return the options of this and earlier commands, by stage."""
+        name = self.spec.name
+        given = options.given(ctx, self.spec.options.model_fields)
+        forget = options.forgotten(self.spec.options, values["forget"])
+        return remembered(values["workspace"].root, [name], {name: given}, {name: forget})
+
+    def act(self, ctx: click.Context, **values: Any) -> None:
+        """Run the stage, copy its result to the user's path, and print it.
+
+        Raises:
+            InputError: the path exists already, cannot be written, or names another format.
+            GeorefError: the stage failed.
+        """
+        workspace, force, target = values["workspace"], values["force"], values.get("target")
+        if target is not None:
+            check_target(target, self.spec, folder=self._delivers == "folder", overwrite=force)
+        flags = self._flags(ctx, values)
+        if self.spec.name == "train":
+            announced_seconds(workspace, (self.spec,), flags, force=force)
+        with boundary.logged_to_file(workspace, self.spec):
+            outcome = runner.run_stage(
+                workspace,
+                self.spec,
+                flags[self.spec.name],
+                force=force,
+                resume="always" if values.get("resume") else "if-same",
+                progress=progress_for(ctx.obj),
+            )
+        if target is not None:
+            with workspace.lock(self.spec.name):
+                product = workspace.path(self.spec.product)
+                if self._delivers == "folder":
+                    deliver_folder(workspace.root / self.spec.folder, target)
+                else:
+                    deliver(product, target)
+        more = self._more(workspace, values)
+        print_outcome(workspace, outcome, *more, as_json=values["as_json"], told=is_told(ctx.obj))
 
 
-def refuse_other_format(target: Path, spec: StageSpec, *, folder: bool) -> None:
-    """Refuse a target whose name says another format than the stage writes, or a folder with other content.
+def check_target(target: Path, spec: StageSpec, *, folder: bool, overwrite: bool) -> None:
+    """Refuse, before the work begins, a target to which the result cannot be written, or may not.
 
-    Args:
-        target: path that the user gave.
-        spec: the stage.
-        folder: whether it delivers a folder.
-
-    Raises:
-        InputError: the suffix of the name is not that of the product, or the folder is not an older deliverable.
+    Its name says another format than the stage writes; it is a folder with other content, or in a missing folder;
+    or it exists and may not be replaced.
     """
     suffix = Path(spec.product).suffix
     if folder and target.is_dir() and not (target / Path(spec.product).name).exists():
@@ -136,14 +146,6 @@ def refuse_other_format(target: Path, spec: StageSpec, *, folder: bool) -> None:
     if not folder and target.suffix.lower() != suffix:
         named = f"a {target.suffix} file" if target.suffix else "a name without a suffix"
         raise InputError(f"{spec.name} writes {suffix}, not {named}: end the name with {suffix}", path=target)
-
-
-def check_target(target: Path, *, overwrite: bool) -> None:
-    """Check, before the work begins, that its result can be written to `target`.
-
-    Raises:
-        InputError: the folder is missing, or the target exists and may not be replaced.
-    """
     require_text(target)
     if not target.parent.is_dir():
         raise InputError("no such folder: make it first", path=target.parent)
@@ -152,19 +154,16 @@ def check_target(target: Path, *, overwrite: bool) -> None:
 
 
 def deliver(source: Path, target: Path) -> None:
-    """Copy a file and its sidecars (`source.*`) to `target`.
-
-    The copies appear, or replace older files, when all of them are complete.
-
-    Raises:
-        StorageError: the target cannot be written.
-    """
+    """Copy a file and its sidecars (`source.*`) to `target`, which get their names when all are complete."""
     family = sorted(source.parent.glob(f"{source.name}*"))
     targets = [target.with_name(target.name + member.name.removeprefix(source.name)) for member in family]
     drafts = [path.with_name(f".{path.name}.partial") for path in targets]
     try:
         with storage_failures():
-            _copy(family, drafts, targets)
+            for member, draft in zip(family, drafts, strict=True):
+                shutil.copyfile(member, draft)
+            for draft, path in zip(drafts, targets, strict=True):
+                replace_file(draft, path)
     finally:
         for draft in drafts:
             with contextlib.suppress(OSError):
@@ -172,11 +171,7 @@ def deliver(source: Path, target: Path) -> None:
 
 
 def deliver_folder(source: Path, target: Path) -> None:
-    """Copy a stage's folder, without its manifest, to `target`, where it appears when it is complete.
-
-    Raises:
-        StorageError: the target cannot be written.
-    """
+    """Copy a stage's folder, without its manifest, to `target`, where it appears when it is complete."""
     draft, aside = (target.with_name(f".{target.name}.{part}") for part in ("partial", "old"))
     try:
         with storage_failures():
@@ -188,58 +183,3 @@ def deliver_folder(source: Path, target: Path) -> None:
             remove(draft)
             if target.exists():
                 remove(aside)
-
-
-def _copy(family: list[Path], drafts: list[Path], targets: list[Path]) -> None:
-    for member, draft in zip(family, drafts, strict=True):
-        shutil.copyfile(member, draft)
-    for draft, path in zip(drafts, targets, strict=True):
-        replace_file(draft, path)
-
-
-class DeliverableCommand(StageCommand):
-    """Command `georef export-… WS [--to PATH]` of a stage that makes something to hand over.
-
-    Args:
-        name: of the stage.
-        doc: help, with examples.
-        folder: whether the deliverable is the stage's whole folder; otherwise it is one file with its sidecars.
-        extra: further options, passed to `act`.
-    """
-
-    def __init__(self, name: str, doc: str, *, folder: bool = False, extra: Sequence[click.Option] = ()) -> None:
-        self.folder = folder
-        what = "the folder" if folder else "the file and its sidecar"
-        super().__init__(
-            name,
-            doc,
-            extra=[
-                *extra,
-                click.Option(
-                    ["--to", "-o", "target"],
-                    type=click.Path(resolve_path=True, path_type=Path),
-                    metavar="FOLDER" if folder else "FILE",
-                    help=f"Copy {what} here as well; what exists is replaced only with --force.",
-                ),
-            ],
-        )
-
-    def act(self, ctx: click.Context, **values: Any) -> None:
-        """Run the stage, copy its result to the user's path, and print it.
-
-        Raises:
-            InputError: the path exists already, cannot be written, or names another format.
-        """
-        workspace, target = values["workspace"], values["target"]
-        if target is not None:
-            refuse_other_format(target, self.spec, folder=self.folder)
-            check_target(target, overwrite=values["force"])
-        outcome = self.run(ctx, values)
-        if target is not None:
-            with workspace.lock(self.spec.name):
-                product = workspace.path(self.spec.product)
-                if self.folder:
-                    deliver_folder(workspace.root / self.spec.folder, target)
-                else:
-                    deliver(product, target)
-        print_outcome(workspace, outcome, as_json=values["as_json"], told=is_told(ctx.obj))

@@ -1,7 +1,4 @@
-"""Tables for people: typed products in, rich renderables out.
-
-Check and control points one by one: errors, and coordinates in a CRS of the user's.
-"""
+"""Tables for people: typed products in, rich renderables out."""
 
 from __future__ import annotations
 
@@ -15,7 +12,7 @@ from rich.table import Table
 
 from georef_cli.layout import ByWidth, FirstThatFits, figures, plain_table, shown
 from pipelines.compare.table import REFERENCE_HEADS, Comparison, cells, reference_cells, remarks_on
-from pipelines.core.figures import ERRORS, SHORT_WAYS, Headline
+from pipelines.core.figures import ERRORS, MISSING, SHORT_WAYS, Headline
 from pipelines.core.options import notation
 from pipelines.core.plan import OptionOrigin
 from pipelines.core.products import Caution
@@ -107,13 +104,12 @@ def origins(rows: Sequence[OptionOrigin]) -> list[Renderable]:
     ]
 
 
-def accuracy(headline: Headline | None) -> list[Renderable]:
+def accuracy_line(headline: Headline | None) -> list[Renderable]:
     """Return the line with the accuracy of the result; none before anything states it."""
     return [] if headline is None else [f"[bold]accuracy[/] {shown(headline.text)}"]
 
 
 def cautions(by_stage: Mapping[str, Sequence[Caution]]) -> list[Renderable]:
-    """Return the cautions, one line each."""
     return [
         f"[bold yellow]caution:[/] {shown(caution.sentence)} ({stage}, {caution.code})"
         for stage, of_stage in by_stage.items()
@@ -129,9 +125,13 @@ def outcome(workspace: Workspace, result: Outcome, *, headline: bool = True) -> 
     if headline:
         parts.append(f"[bold]{result.stage}[/]: {shown(manifest.key_figure)} ({effort})")
     if result.stage == "evaluate":
-        parts += report_of(workspace)
+        parts += report(read_report(workspace.path(REPORT)))
     elif manifest.values:
-        parts.append(_figures(manifest.values))
+        table = plain_table("", "", header=False, right=[1])  # Nested values are shown by --json only.
+        for name, value in manifest.values.items():
+            if isinstance(value, str | int | float) or value is None:
+                table.add_row(shown(name), shown(_number(value)))
+        parts.append(table)
     if not result.ran:  # the warnings of a stage that just ran are on stderr already
         parts += [f"[yellow]warning:[/] {shown(text)}" for text in manifest.warnings]
     return parts
@@ -198,15 +198,6 @@ def topics(rows: Iterable[Mapping[str, Any]]) -> ByWidth:
     return ByWidth(WIDE, table, narrow)
 
 
-def report_of(workspace: Workspace) -> list[Renderable]:
-    """Return the tables of a workspace's evaluation.
-
-    Raises:
-        InputError: the report is damaged.
-    """
-    return report(read_report(workspace.path(REPORT)))
-
-
 def report(document: EvaluationReport) -> list[Renderable]:
     """Return the tables of a report: test views, check points, cross-validation, σ, residuals of the fit.
 
@@ -223,7 +214,9 @@ def report(document: EvaluationReport) -> list[Renderable]:
         ),
         _accuracy(ways),
         _rows(f"{_CROSSED}, metres", {} if crossed is None else {"left out": dict(crossed)}, POINT_COLUMNS),
-        None if crossed is None or crossed.reason is None else _impossible(crossed.reason),
+        None
+        if crossed is None or crossed.reason is None
+        else Group(f"\n[bold]{_CROSSED}[/]", f"not possible: {shown(crossed.reason)}"),
         *_against_reference(document.reference),
         _rows("Predicted σ, metres", {} if cameras is None else {"cameras": dict(cameras)}, SIGMA_COLUMNS),
         _rows("Residuals of the fit (not an accuracy), metres", fit, POINT_COLUMNS),
@@ -251,10 +244,6 @@ def _against_reference(reference: ReferenceComparison | None) -> list[Group | No
     ]
 
 
-def _impossible(reason: str) -> Group:
-    return Group(f"\n[bold]{_CROSSED}[/]", f"not possible: {shown(reason)}")
-
-
 def _rows(title: str, rows: Mapping[str, Mapping[str, Any]], columns: Mapping[str, str]) -> Group | None:
     """Return a table under its title, with the rows and columns that have a figure; None without any."""
     known = {name: row for name, row in rows.items() if any(row.get(key) for key in columns)}
@@ -267,39 +256,27 @@ def _rows(title: str, rows: Mapping[str, Mapping[str, Any]], columns: Mapping[st
 
 def _accuracy(ways: Mapping[str, CheckPointErrors]) -> Group | None:
     """Return the accuracy by the check points after the standard, beside the prediction."""
-    rows = {way: _accuracy_row(errors) for way, errors in ways.items() if errors.with_survey is not None}
+    rows = {}
+    for way, errors in ways.items():
+        total, asprs, predicted = errors.with_survey, errors.asprs, errors.predicted
+        if total is None:
+            continue
+        rows[way] = {
+            **{ERRORS[key].label: getattr(total, key) for key in ("rmse_h_m", "rmse_v_m", "rmse_3d_m")},
+            "vegetated V": None if asprs.vegetated is None else asprs.vegetated.rmse_v_m,
+            "class H": asprs.horizontal_class,
+            "class V": asprs.vertical_class,
+            "class 3D": asprs.class_3d,
+            "σ H": None if predicted is None else predicted.rms_h_m,
+            "σ V": None if predicted is None else predicted.rms_v_m,
+        }
     columns = {head: head for row in rows.values() for head in row}
-    title = "Accuracy with the check points' own survey (ASPRS), and their predicted σ, metres"
-    return _rows(title, rows, columns)
-
-
-def _accuracy_row(errors: CheckPointErrors) -> dict[str, float | str | None]:
-    total, predicted = errors.with_survey, errors.predicted
-    return {
-        "RMSE H": None if total is None else total.rmse_h_m,
-        "RMSE V": None if total is None else total.rmse_v_m,
-        "RMSE 3D": None if total is None else total.rmse_3d_m,
-        "vegetated V": None if errors.asprs.vegetated is None else errors.asprs.vegetated.rmse_v_m,
-        "class H": errors.asprs.horizontal_class,
-        "class V": errors.asprs.vertical_class,
-        "class 3D": errors.asprs.class_3d,
-        "σ H": None if predicted is None else predicted.rms_h_m,
-        "σ V": None if predicted is None else predicted.rms_v_m,
-    }
-
-
-def _figures(values: Mapping[str, Any]) -> Table:
-    """Return plain values as a table of two columns; nested values are shown by `--json` only."""
-    table = plain_table("", "", header=False, right=[1])
-    for name, value in values.items():
-        if isinstance(value, str | int | float) or value is None:
-            table.add_row(shown(name), shown(_number(value)))
-    return table
+    return _rows("Accuracy with the check points' own survey (ASPRS), and their predicted σ, metres", rows, columns)
 
 
 def _number(value: Any) -> str:
     if value is None:
-        return "–"
+        return MISSING
     if isinstance(value, float):
         return f"{value:.4g}" if abs(value) >= 100 else f"{value:.3f}"
     return str(value)
@@ -321,17 +298,11 @@ _BLUNDER = "[red]![/] off by more than three times the class that the other poin
 
 def error_tables(report: EvaluationReport) -> list[Group]:
     """Return the tables of the errors of a report; none of a kind of points that there is not."""
-    lines = point_lines(report)
-    groups = {
-        "check": [line for line in lines if line.use == "check"],
-        "left out": [line for line in lines if line.way == "left out"],
-        "fit": [line for line in lines if line.way == "fit"],
-    }
-    tables = [
-        Group(f"\n[bold]{_TITLES[name]}[/]", _table(of_group, with_way=name == "check"))
-        for name, of_group in groups.items()
-        if of_group
-    ]
+    lines, tables = point_lines(report), []
+    for name, title in _TITLES.items():
+        of_group = [line for line in lines if name == (line.use if name == "check" else line.way)]
+        if of_group:
+            tables.append(Group(f"\n[bold]{title}[/]", _table(of_group, with_way=name == "check")))
     return [*tables, *([Group(_BLUNDER)] if any(line.is_blunder for line in lines) else [])]
 
 
@@ -340,9 +311,7 @@ def coordinate_tables(report: EvaluationReport) -> list[Group]:
     listed = report.coordinates
     if listed is None:
         return []
-    table = Table("point", "", "x", "y", "z", box=None, pad_edge=False)
-    for column in table.columns[2:]:
-        column.justify, column.no_wrap = "right", True
+    table = plain_table("point", "", "x", "y", "z", right=range(2, 5), no_wrap=range(2, 5))
     table.add_row("origin", "", *listed.texts(listed.origin))
     for point in listed.points:
         for way, xyz in (
@@ -351,7 +320,7 @@ def coordinate_tables(report: EvaluationReport) -> list[Group]:
             (SHORT_WAYS["model"], point.model),
         ):
             name = shown(point.name) if way == "surveyed" else ""
-            table.add_row(name, way, *(text or "–" for text in listed.texts(xyz)))
+            table.add_row(name, way, *(text or MISSING for text in listed.texts(xyz)))
     units = listed.units[0] if len(set(listed.units)) == 1 else ", ".join(listed.units)
     title = f"Check points in {shown(listed.crs)}, {shown(units)}; x is the easting or longitude"
     return [Group(f"\n[bold]{title}[/]", table, f"Heights: {shown(listed.heights)}.")]
@@ -359,16 +328,13 @@ def coordinate_tables(report: EvaluationReport) -> list[Group]:
 
 def _table(lines: Sequence[PointLine], *, with_way: bool) -> Table:
     has_sigma = any(line.sigma_m is not None for line in lines)
-    heads = ["point", *(["measured"] if with_way else []), "rays", "E", "N", "U", "H"]
-    table = Table(*heads, *(["σ H", "σ U"] if has_sigma else []), "", box=None, pad_edge=False)
-    for column in table.columns[1:-1]:
-        column.justify, column.no_wrap = "right", True
-    if with_way:
-        table.columns[1].justify = "left"
+    first = ["point", *(["measured"] if with_way else [])]
+    heads = [*first, "rays", "E", "N", "U", "H", *(["σ H", "σ U"] if has_sigma else [])]
+    table = plain_table(*heads, "", right=range(len(first), len(heads)), no_wrap=range(1, len(heads)))
     for line in lines:
         error, sigma = line.error_m, line.sigma_m
-        lengths = ["–"] * 4 if error is None else [*(f"{value:+.3f}" for value in error), _length(error[:2])]
-        predicted = ["–"] * 2 if sigma is None else [_length(sigma[:2]), f"{sigma[2]:.3f}"]
+        lengths = [MISSING] * 4 if error is None else [*(f"{value:+.3f}" for value in error), _length(error[:2])]
+        predicted = [MISSING] * 2 if sigma is None else [_length(sigma[:2]), f"{sigma[2]:.3f}"]
         table.add_row(
             shown(line.row.name),
             *([SHORT_WAYS[line.way]] if with_way else []),

@@ -1,7 +1,4 @@
-"""Verbosity of the program, and the form of its log lines.
-
-Log records and progress for a program, as lines of JSON on stderr: `--json-progress`.
-"""
+"""Verbosity of the program, the form of its log lines, and its messages for programs (`--json-progress`)."""
 
 from __future__ import annotations
 
@@ -18,14 +15,7 @@ from pipelines.core.sentences import printable, printable_lines
 
 @dataclass(frozen=True)
 class Verbosity:
-    """Verbosity of the program: the options of the group and of the command together.
-
-    Attributes:
-        verbose: show messages for debugging too.
-        quiet: show warnings and errors only.
-        traceback: show the traceback of an error.
-        json_progress: write messages and progress for a program.
-    """
+    """Verbosity of the program: the options of the group and of the command together."""
 
     verbose: bool = False
     quiet: bool = False
@@ -34,7 +24,6 @@ class Verbosity:
 
     @property
     def level(self) -> int:
-        """Least severe level that is shown on stderr."""
         return logging.DEBUG if self.verbose else logging.WARNING if self.quiet else logging.INFO
 
 
@@ -42,11 +31,9 @@ class SafeFormatter(logging.Formatter):
     """Formatter of records in one line each, but for tracebacks; nothing in them can steer a terminal."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:
-        """Return the line of a record."""
         return printable(super().formatMessage(record))
 
     def formatException(self, ei: Any) -> str:
-        """Return the lines of a traceback."""
         return printable_lines(super().formatException(ei))
 
 
@@ -66,7 +53,6 @@ class StderrSender(MessageSender):
         self._has_reader = True
 
     def send(self, kind: str, **content: Any) -> None:
-        """Send one message, unless nobody reads any more."""
         if not self._has_reader:
             return
         try:

@@ -10,21 +10,20 @@ import click
 
 from georef_cli import job_tables, options
 from georef_cli.command import Command
-from georef_cli.commands.run import OWNERS, deliver_option, slice_option
+from georef_cli.commands.run import DELIVER, OWNERS, deliverables, slice_option
 from georef_cli.display import progress_for
-from georef_cli.engines import engine_for, engine_options
+from georef_cli.engines import ENGINE, engine_for
 from georef_cli.forecast import RunForecast, checked_inputs, forecast_run
-from georef_cli.options import set_option, settings
+from georef_cli.options import SET, settings
 from georef_cli.output import print_json, print_rich
-from pipelines.core import runner
 from pipelines.core.errors import GeorefError
-from pipelines.core.options import input_paths
+from pipelines.core.options import input_paths, remembered
 from pipelines.core.plan import plan
 from pipelines.core.progress import Progress
 from pipelines.core.stages import BY_NAME
 from pipelines.core.staleness import stage_config
 from pipelines.jobs.batch import PlannedMission
-from pipelines.jobs.missions import Mission, MissionList, load_missions
+from pipelines.jobs.missions import Mission, load_missions
 
 log = logging.getLogger(__name__)
 
@@ -34,7 +33,9 @@ FAILED = 1
 def _batch(ctx: click.Context, **values: Any) -> int:
     from pipelines.jobs.batch import page_file, run_batch
 
-    listed = _missions(values)
+    flags = settings(values["settings"], BY_NAME.values())
+    listed = load_missions(values["missions"], OWNERS, values["last"], values["deliver"], flags)
+    deliverables(values["deliver"])  # refuses a bad name
     progress = progress_for(ctx.obj)
     forecasts = [_planned(mission, check=values["dry_run"], progress=progress) for mission in listed.missions]
     planned = [mission for mission, _ in forecasts]
@@ -55,34 +56,10 @@ def _batch(ctx: click.Context, **values: Any) -> int:
     return 0 if table.is_complete else FAILED
 
 
-def _missions(values: dict[str, Any]) -> MissionList:
-    """Return the missions, with the options of the command line for all of them.
-
-    Raises:
-        InputError: a bad name, key or value in the file.
-        click.UsageError: a bad option.
-    """
-    flags = settings(values["settings"], BY_NAME.values())
-    listed = load_missions(values["missions"], OWNERS)
-    try:
-        return listed.overridden(values["last"], values["deliver"], flags)
-    except ValueError as error:
-        raise click.UsageError(f"--deliver: {error}") from error
-
-
 def _planned(mission: Mission, *, check: bool, progress: Progress) -> tuple[PlannedMission, RunForecast | None]:
-    """Return a mission with what its run needs; the forecast is None where the run will be refused, or unknown.
-
-    Args:
-        mission: the mission.
-        check: whether to read its inputs as `ingest` would.
-        progress: shows that reading.
-    """
+    """Return a mission with what its run needs; the forecast is None where the run will be refused, or unknown."""
     try:
-        asked = {
-            spec.name: runner.remembered(mission.workspace, spec, mission.flags.get(spec.name, {}))
-            for spec in mission.stages
-        }
+        asked = remembered(mission.workspace.root, [spec.name for spec in mission.stages], mission.flags)
         rows = plan(mission.workspace, mission.stages, asked)
         actions = {row.stage: row.action for row in rows}
         if check:
@@ -113,11 +90,11 @@ command = Command(
             help="Run at most this many missions at a time (default: as many as cores and predicted memory allow).",
         ),
         slice_option(["--to", "--end-with"], "last", "Last stage to run, of every mission."),
-        deliver_option(),
-        set_option(),
-        *engine_options(),
-        options.dry_run_option(),
-        options.json_option(),
+        DELIVER,
+        SET,
+        *ENGINE,
+        options.DRY_RUN,
+        options.JSON,
     ],
     callback=click.pass_context(_batch),
     help="""Run many missions, several at a time, and put their results into one table.

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
-import click
 from rich.console import RenderableType
 from rich.table import Table
 
-from georef_cli.display import is_told
-from georef_cli.layout import shown
-from georef_cli.output import print_outcome
+from georef_cli.layout import plain_table, shown
 from georef_cli.stage import StageCommand
 from pipelines.core.products import load_json
 from pipelines.core.stages import RIG
@@ -20,26 +18,15 @@ from pipelines.survey.survey import RigCalibration
 _COMPONENTS = {"boresight": ("x", "y", "z"), "lever-arm": ("forward", "right", "down"), "time-offset": ("",)}
 
 
-def _tables(workspace: Workspace) -> tuple[RenderableType, ...]:
+def _tables(workspace: Workspace, values: Mapping[str, Any]) -> tuple[RenderableType, ...]:
+    if values["as_json"]:
+        return ()
     calibration = load_json(RigCalibration, workspace.path(RIG))
     return (_estimates(calibration), _residuals(calibration)) if calibration.estimates else ()
 
 
-class CalibrateCommand(StageCommand):
-    """Command of the stage that also prints the table of the estimates."""
-
-    def act(self, ctx: click.Context, **values: Any) -> None:
-        """Run the stage and print its result."""
-        workspace, outcome, as_json = values["workspace"], self.run(ctx, values), values["as_json"]
-        estimates = () if as_json else _tables(workspace)
-        print_outcome(workspace, outcome, *estimates, as_json=as_json, told=is_told(ctx.obj))
-
-
 def _estimates(calibration: RigCalibration) -> Table:
-    """Return the table of the estimates, a line for each component."""
-    table = Table("", "estimated", "± σ", "ingest", "unit", "", box=None, pad_edge=False)
-    for column in table.columns[1:4]:
-        column.justify = "right"
+    table = plain_table("", "estimated", "± σ", "ingest", "unit", "", right=(1, 2, 3))
     for estimate in calibration.estimates:
         applied = "applied" if estimate in calibration.applied else "[dim]not applied[/]"
         components = zip(
@@ -64,7 +51,7 @@ def _residuals(calibration: RigCalibration) -> str:
     return shown(f"left over: {', '.join(parts)} ({images} images, {points} control points)")
 
 
-command = CalibrateCommand(
+command = StageCommand(
     "calibrate",
     """Estimate time offset, boresight and lever arm from the SfM cameras.
 
@@ -80,4 +67,5 @@ command = CalibrateCommand(
       georef calibrate flight --estimate time-offset --max-offset 5
       georef calibrate flight --estimate time-offset,boresight,lever-arm --apply
     """,
+    more=_tables,
 )

@@ -31,7 +31,7 @@ command = Command(
         click.Argument(
             ["folder"], type=click.Path(file_okay=False, resolve_path=True, path_type=Path), metavar="DIR"
         ),
-        options.json_option(),
+        options.JSON,
     ],
     callback=_certificates,
     help="""Make the certificate that the machines of a cluster share: cluster.pem and cluster.key in DIR.

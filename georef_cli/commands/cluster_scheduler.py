@@ -8,7 +8,7 @@ import click
 
 from georef_cli import options
 from georef_cli.command import Command
-from georef_cli.engines import certificates_options, cluster_address
+from georef_cli.engines import CERTIFICATES, cluster_address
 from georef_cli.output import print_json
 
 
@@ -30,8 +30,8 @@ command = Command(
             metavar="HOST:PORT",
             help="Where to listen (default: port 8786 of every network with --certificates, else of 127.0.0.1).",
         ),
-        *certificates_options(),
-        options.json_option(),
+        *CERTIFICATES,
+        options.JSON,
     ],
     callback=_scheduler,
     help="""Start the scheduler of a cluster (docs/cluster.md). It runs until Ctrl-C.

@@ -8,7 +8,7 @@ import click
 
 from georef_cli import options
 from georef_cli.command import Command
-from georef_cli.engines import certificates_options, cluster_address
+from georef_cli.engines import CERTIFICATES, cluster_address
 from georef_cli.output import print_json
 from pipelines.core.errors import ResourceError
 from pipelines.core.machine import free_main_memory_bytes, thread_count
@@ -34,23 +34,20 @@ def _worker(
     if memory_gib is None and free is None:
         raise ResourceError("the free memory is not known here: give --memory")
     memory_bytes = int(memory_gib * _GIB) if memory_gib is not None else int(_USABLE * (free or 0))
-    count = _gpus() if gpus is None else gpus
-    run_worker(scheduler, jobs=jobs, cores=thread_count(), memory_bytes=memory_bytes, gpus=count, name=name)
+    if gpus is None:
+        from pipelines.jobs.machine import inspect_machine
+
+        gpus = len(inspect_machine().gpus)
+    run_worker(scheduler, jobs=jobs, cores=thread_count(), memory_bytes=memory_bytes, gpus=gpus, name=name)
     if as_json:
-        print_json({"scheduler": scheduler.url, "jobs": jobs, "memory_bytes": memory_bytes, "gpus": count})
-
-
-def _gpus() -> int:
-    from pipelines.jobs.machine import inspect_machine
-
-    return len(inspect_machine().gpus)
+        print_json({"scheduler": scheduler.url, "jobs": jobs, "memory_bytes": memory_bytes, "gpus": gpus})
 
 
 command = Command(
     "cluster worker",
     params=[
         click.Argument(["address"], metavar="ADDRESS"),
-        *certificates_options(),
+        *CERTIFICATES,
         click.Option(
             ["--jobs"],
             type=click.IntRange(min=1),
@@ -68,7 +65,7 @@ command = Command(
             ["--gpus"], type=click.IntRange(min=0), metavar="N", help="Number of GPUs (default: as found)."
         ),
         click.Option(["--name"], metavar="NAME", help="Name for messages (default: its address)."),
-        options.json_option(),
+        options.JSON,
     ],
     callback=_worker,
     help="""Lend this machine to a cluster (docs/cluster.md), until Ctrl-C or the end of the scheduler.

@@ -37,7 +37,7 @@ def _compare(ctx: click.Context, **values: Any) -> None:
 command = Command(
     "compare",
     params=[
-        options.workspace_argument(),
+        options.WORKSPACE,
         click.Option(
             ["--configs"],
             default=",".join(BY_CONFIGURATION),
@@ -45,7 +45,7 @@ command = Command(
         ),
         *options.stage_options(TrainOptions, COMMON_TRAIN_OPTIONS),
         options.force_option("Run the stages of the configurations even if their products are current."),
-        options.json_option(),
+        options.JSON,
     ],
     callback=click.pass_context(_compare),
     help="""Run the ablation on one survey and put its figures into one table.

@@ -49,7 +49,11 @@ def _lines(machine: Machine) -> list[tuple[str, str]]:
         reason = "see below" if backend.name == "cuda" else shown(backend.reason)
         state = "[green]available[/]" if backend.available else f"[yellow]no[/]: {reason}"
         lines.append((f"backend {backend.name}", state))
-    lines += _cuda_lines(machine)
+    for part in machine.cuda_parts:
+        text = f"[yellow]missing[/]: {shown(part.remedy)}" if part.found is None else shown(part.found)
+        lines.append((f"  {part.name}", text))
+    uncompiled = "not compiled yet: the first use compiles them, or `georef doctor --compile-cuda` now"
+    lines.append(("  kernels", shown(machine.cuda_kernels or uncompiled)))
     grids = machine.grids[:_MOST_GRIDS]
     more = f" and {len(machine.grids) - len(grids)} more" if len(machine.grids) > len(grids) else ""
     none = (
@@ -64,16 +68,6 @@ def _lines(machine: Machine) -> list[tuple[str, str]]:
     return [*lines, ("versions", shown(versions))]
 
 
-def _cuda_lines(machine: Machine) -> list[tuple[str, str]]:
-    """Return what the cuda backend needs; markup."""
-    lines = [
-        (f"  {part.name}", f"[yellow]missing[/]: {shown(part.remedy)}" if part.found is None else shown(part.found))
-        for part in machine.cuda_parts
-    ]
-    none = "not compiled yet: the first use compiles them, or `georef doctor --compile-cuda` now"
-    return [*lines, ("  kernels", shown(machine.cuda_kernels or none))]
-
-
 def _gib(count: int | None) -> str:
     return "unknown" if count is None else f"{count / 2**30:.1f} GiB"
 
@@ -81,7 +75,7 @@ def _gib(count: int | None) -> str:
 command = Command(
     "doctor",
     params=[
-        options.json_option(),
+        options.JSON,
         click.Option(
             ["--compile-cuda"],
             is_flag=True,

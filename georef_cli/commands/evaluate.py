@@ -2,31 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import click
+from rich.console import Group
 
-from georef_cli.display import is_told
-from georef_cli.output import print_outcome
 from georef_cli.stage import StageCommand
 from georef_cli.tables import coordinate_tables, error_tables
 from pipelines.core.stages import REPORT
+from pipelines.core.workspace import Workspace
 from pipelines.survey.report import read_report
 
 
-class EvaluateCommand(StageCommand):
-    """Command of the stage, with `--points`."""
-
-    def act(self, ctx: click.Context, **values: Any) -> None:
-        """Run the stage and print its result, with coordinates and errors point by point if they are wanted."""
-        outcome, workspace = self.run(ctx, values), values["workspace"]
-        report = read_report(workspace.path(REPORT))
-        errors = error_tables(report) if values["points"] else []
-        parts = (*coordinate_tables(report), *errors)
-        print_outcome(workspace, outcome, *parts, as_json=values["as_json"], told=is_told(ctx.obj))
+def _tables(workspace: Workspace, values: Mapping[str, Any]) -> list[Group]:
+    """Return coordinates, and errors point by point if they are wanted."""
+    report = read_report(workspace.path(REPORT))
+    return [*coordinate_tables(report), *(error_tables(report) if values["points"] else [])]
 
 
-command = EvaluateCommand(
+command = StageCommand(
     "evaluate",
     """Measure test views and check points.
 
@@ -46,4 +41,5 @@ command = EvaluateCommand(
       georef evaluate flight --reference scan.laz --reference-sigma 0.02
     """,
     extra=[click.Option(["--points"], is_flag=True, help="Print the errors of every check and control point.")],
+    more=_tables,
 )

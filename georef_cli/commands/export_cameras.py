@@ -1,10 +1,8 @@
 """Command `georef export-cameras`."""
 
-from __future__ import annotations
+from georef_cli.stage import StageCommand
 
-from georef_cli.stage import DeliverableCommand
-
-command = DeliverableCommand(
+command = StageCommand(
     "export-cameras",
     """Write the trained cameras and lenses, placed on Earth.
 
@@ -17,5 +15,5 @@ command = DeliverableCommand(
       georef export-cameras flight
       georef export-cameras flight --crs EPSG:32632 --to handover/cameras
     """,
-    folder=True,
+    delivers="folder",
 )

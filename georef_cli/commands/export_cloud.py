@@ -1,10 +1,8 @@
 """Command `georef export-cloud`."""
 
-from __future__ import annotations
+from georef_cli.stage import StageCommand
 
-from georef_cli.stage import DeliverableCommand
-
-command = DeliverableCommand(
+command = StageCommand(
     "export-cloud",
     """Write the surface as a georeferenced point cloud (LAZ).
 
@@ -18,4 +16,5 @@ command = DeliverableCommand(
       georef export-cloud flight --crs EPSG:32632+3855 --spacing 0.1 --to flight.laz
       georef export-cloud flight --crs EPSG:25832 --vertical EPSG:7837 --ply
     """,
+    delivers="file",
 )

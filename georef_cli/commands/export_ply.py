@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from georef_cli import options
-from georef_cli.stage import DeliverableCommand
+from georef_cli.stage import StageCommand
 from pipelines.deliver.options import MeasurableOptions
 
 _DOC = """Write the splat as a PLY with its place on Earth.
@@ -26,18 +26,13 @@ _DOC = """Write the splat as a PLY with its place on Earth.
       georef export-ply flight --measurable
     """
 _OF_MEASURABLE = ("disc_spacing", "repaint_passes")
-_MEASURABLE = DeliverableCommand("export-measurable", _DOC)
+_MEASURABLE = StageCommand("export-measurable", _DOC, delivers="file")
 
 
-class PlyCommand(DeliverableCommand):
+class PlyCommand(StageCommand):
     """Command of the stage `export-ply`, or with --measurable of `export-measurable`."""
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the command of one of the two stages.
-
-        Raises:
-            click.UsageError: an option of --measurable without it.
-        """
         if ctx.params.pop("measurable"):
             return _MEASURABLE.invoke(ctx)
         if given := options.given(ctx, _OF_MEASURABLE):
@@ -57,4 +52,5 @@ command = PlyCommand(
         ),
         *options.stage_options(MeasurableOptions, _OF_MEASURABLE),
     ],
+    delivers="file",
 )

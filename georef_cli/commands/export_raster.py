@@ -1,10 +1,8 @@
 """Command `georef export-raster`."""
 
-from __future__ import annotations
+from georef_cli.stage import StageCommand
 
-from georef_cli.stage import DeliverableCommand
-
-command = DeliverableCommand(
+command = StageCommand(
     "export-raster",
     """Write orthophoto, surface model (DSM) and their predicted σ as Cloud Optimized GeoTIFF in a CRS.
 
@@ -18,5 +16,5 @@ command = DeliverableCommand(
       georef export-raster flight --crs EPSG:32632+3855 --gsd 0.05 --contours 1
       georef export-raster flight --to delivery/raster
     """,
-    folder=True,
+    delivers="folder",
 )

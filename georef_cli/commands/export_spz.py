@@ -1,10 +1,8 @@
 """Command `georef export-spz`."""
 
-from __future__ import annotations
+from georef_cli.stage import StageCommand
 
-from georef_cli.stage import DeliverableCommand
-
-command = DeliverableCommand(
+command = StageCommand(
     "export-spz",
     """Write the splat as SPZ, for viewers on the web.
 
@@ -16,4 +14,5 @@ command = DeliverableCommand(
       georef export-spz flight
       georef export-spz flight --to splat.spz --spz-version 4
     """,
+    delivers="file",
 )

@@ -1,10 +1,8 @@
 """Command `georef export-tiles`."""
 
-from __future__ import annotations
+from georef_cli.stage import StageCommand
 
-from georef_cli.stage import DeliverableCommand
-
-command = DeliverableCommand(
+command = StageCommand(
     "export-tiles",
     """Write the splat as 3D Tiles, for web globes such as CesiumJS.
 
@@ -18,5 +16,5 @@ command = DeliverableCommand(
       georef export-tiles flight --to www/flight --max-tile-gaussians 100000
       georef export-tiles flight --crs EPSG:2056 --cesium Cesium/
     """,
-    folder=True,
+    delivers="folder",
 )

@@ -1,7 +1,5 @@
 """Command `georef geolocate`."""
 
-from __future__ import annotations
-
 from georef_cli.stage import StageCommand
 
 command = StageCommand(

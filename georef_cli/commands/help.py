@@ -18,7 +18,6 @@ class TopicType(click.ParamType[str]):
     name = "topic"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """Return the name."""
         if value not in _names(ctx):
             self.fail(f"{value!r} is no topic and no command; the topics are {', '.join(TOPICS)}", param, ctx)
         return str(value)
@@ -26,7 +25,6 @@ class TopicType(click.ParamType[str]):
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
     ) -> list[click.shell_completion.CompletionItem]:
-        """Return the names that begin with a text."""
         return [click.shell_completion.CompletionItem(n) for n in _names(ctx) if n.startswith(incomplete)]
 
 
@@ -37,31 +35,26 @@ def _names(ctx: click.Context | None) -> list[str]:
 
 
 def _help(ctx: click.Context, topic: str | None, as_json: bool) -> None:
-    text = _overview() if topic is None else _text(ctx, topic)
+    if topic is None:
+        width = max(map(len, TOPICS))
+        rows = [f"  {name:{width}}  {title}" for name, title in TOPICS.items()]
+        text = "\n".join(["Topics of `georef help TOPIC`:", *rows, "", "`georef help COMMAND` explains a command."])
+    elif topic in TOPICS:
+        text = topic_text(topic)
+    else:
+        assert ctx.parent is not None and isinstance(ctx.parent.command, click.Group)
+        explained = ctx.parent.command.get_command(ctx.parent, topic)
+        assert explained is not None
+        text = explained.get_help(click.Context(explained, info_name=topic, parent=ctx.parent))
     if as_json:
         print_json({"topic": topic, "text": text})
     else:
         click.echo(text.rstrip("\n"))
 
 
-def _text(ctx: click.Context, topic: str) -> str:
-    if topic in TOPICS:
-        return topic_text(topic)
-    assert ctx.parent is not None and isinstance(ctx.parent.command, click.Group)
-    command = ctx.parent.command.get_command(ctx.parent, topic)
-    assert command is not None
-    return command.get_help(click.Context(command, info_name=topic, parent=ctx.parent))
-
-
-def _overview() -> str:
-    width = max(map(len, TOPICS))
-    rows = [f"  {name:{width}}  {title}" for name, title in TOPICS.items()]
-    return "\n".join(["Topics of `georef help TOPIC`:", *rows, "", "`georef help COMMAND` explains a command."])
-
-
 command = Command(
     "help",
-    params=[click.Argument(["topic"], required=False, type=TopicType(), metavar="[TOPIC]"), options.json_option()],
+    params=[click.Argument(["topic"], required=False, type=TopicType(), metavar="[TOPIC]"), options.JSON],
     callback=click.pass_context(_help),
     help="""Explain a topic or a command.
 

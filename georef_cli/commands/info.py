@@ -8,7 +8,7 @@ import click
 
 from georef_cli import options
 from georef_cli.command import Command
-from georef_cli.output import print_json, print_rich
+from georef_cli.output import overview_text, print_json, print_rich
 from pipelines.core.options import resolve
 from pipelines.core.staleness import must_exist
 from pipelines.core.workspace import Workspace
@@ -16,7 +16,6 @@ from pipelines.survey.options import CrsOptions
 
 
 def _info(ctx: click.Context, workspace: Workspace, as_json: bool, **_values: Any) -> None:
-    from georef_cli.output import whole
     from pipelines.deliver.overview import overview
 
     must_exist(workspace)
@@ -25,12 +24,12 @@ def _info(ctx: click.Context, workspace: Workspace, as_json: bool, **_values: An
     if as_json:
         print_json(result.feature())
     else:
-        print_rich(*whole(result))
+        print_rich(*overview_text(result))
 
 
 command = Command(
     "info",
-    params=[options.workspace_argument(), *options.stage_options(CrsOptions), options.json_option()],
+    params=[options.WORKSPACE, *options.stage_options(CrsOptions), options.JSON],
     callback=click.pass_context(_info),
     help="""Show where on Earth the result is, how good it is, what was made and what each file is for.
 

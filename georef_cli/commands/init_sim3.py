@@ -1,7 +1,5 @@
 """Command `georef init-sim3`."""
 
-from __future__ import annotations
-
 from georef_cli.stage import StageCommand
 
 command = StageCommand(

@@ -33,7 +33,7 @@ command = Command(
     "inspect",
     params=[
         click.Argument(["bag"], type=click.Path(resolve_path=True, path_type=Path), metavar="BAG"),
-        options.json_option(),
+        options.JSON,
     ],
     callback=click.pass_context(_inspect),
     help="""Show what a ROS bag holds.

@@ -1,10 +1,8 @@
 """Command `georef report`."""
 
-from __future__ import annotations
+from georef_cli.stage import StageCommand
 
-from georef_cli.stage import DeliverableCommand
-
-command = DeliverableCommand(
+command = StageCommand(
     "report",
     """Write the report of the survey: one page with all that is known of it, and its PDF with --pdf.
 
@@ -18,4 +16,5 @@ command = DeliverableCommand(
       georef report flight --pdf --crs EPSG:32632+3855
       georef report flight --to handover/report.html
     """,
+    delivers="file",
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -12,16 +12,16 @@ import click
 from georef_cli import boundary, options
 from georef_cli.command import Command
 from georef_cli.display import is_told, progress_for
-from georef_cli.forecast import RunTimeLeft, announce_training, forecast_run, print_dry_run
-from georef_cli.options import set_option, settings
+from georef_cli.forecast import RunTimeLeft, announced_seconds, print_dry_run
+from georef_cli.options import SET, settings
 from georef_cli.output import print_outcomes
 from pipelines.core import runner
 from pipelines.core.errors import GeorefError
-from pipelines.core.plan import names_of_flags
+from pipelines.core.options import names_of_flags, remembered
 from pipelines.core.progress import SILENT, ProgressTask
 from pipelines.core.sentences import about
 from pipelines.core.stages import BY_NAME, DELIVERABLES, MODEL, PIPELINE, StageSpec, named_deliverables, stage_slice
-from pipelines.core.staleness import Flags, must_exist
+from pipelines.core.staleness import must_exist
 from pipelines.core.workspace import Workspace
 from pipelines.ingest.options import IngestOptions
 from pipelines.survey.options import CrsOptions
@@ -34,51 +34,48 @@ log = logging.getLogger(__name__)
 
 # Options of later stages that `run` offers too, with the stages that they are for. All other options are set in
 # georef.toml, or with the stage's own command.
+_EFFORT = ("preset", "iterations", "max_image_size", "max_gaussians", "crop_size", "blocks")
+_LIDAR = ("lidar", "lidar_crs", "lidar_vertical", "lidar_trajectory", "lidar_sigma", "lidar_register")
 LATER: dict[str, tuple[str, ...]] = {
     "mapper": ("sfm",),
     "import_model": ("sfm",),
     "max_residual": ("init-sim3",),
     "accept_contradiction": ("ingest", "init-sim3"),
-    "preset": ("train",),
-    "iterations": ("train",),
-    "max_image_size": ("train",),
-    "max_gaussians": ("train",),
-    "crop_size": ("train",),
-    "blocks": ("train",),
+    **dict.fromkeys(_EFFORT, ("train",)),
     "backend": ("train", "evaluate"),
-    "lidar": ("train",),
-    "lidar_crs": ("train",),
-    "lidar_vertical": ("train",),
-    "lidar_trajectory": ("train",),
-    "lidar_sigma": ("train",),
-    "lidar_register": ("train",),
+    **dict.fromkeys(_LIDAR, ("train",)),
     "seed": ("sfm", "init-sim3", "train"),
 }
-_DELIVERABLE_NAMES = ", ".join(spec.name.removeprefix("export-") for spec in DELIVERABLES)
 OWNERS: dict[str, tuple[str, ...]] = {**dict.fromkeys(IngestOptions.model_fields, ("ingest",)), **LATER}
+DELIVER = click.Option(
+    ["--deliver"],
+    metavar="NAMES",
+    help=f"Make these as well: {', '.join(spec.name.removeprefix('export-') for spec in DELIVERABLES)}, with "
+    "commas, or all. Their options are set in georef.toml or with their own commands.",
+)
 
 
 def _run(ctx: click.Context, **values: Any) -> None:
     if values["first"] and values["rerun_from"]:
         raise click.UsageError("--from and --rerun-from exclude each other.")
     first = values["first"] or values["rerun_from"]
-    stages = (*_stages(first, values["last"]), *_deliverables(values["deliver"]))
+    try:
+        stages = stage_slice(first, values["last"])
+    except GeorefError as error:
+        raise click.UsageError(str(error)) from error
+    stages += deliverables(values["deliver"])
     flags = _flags(ctx, stages, settings(values["settings"], stages))
     workspace = values["workspace"]
     forget, force = _forgotten(values["forget"], stages), values["force"] or values["rerun_from"] is not None
     if stages[0].reads:
         must_exist(workspace)
-    asked = {
-        spec.name: runner.remembered(workspace, spec, flags.get(spec.name, {}), forget.get(spec.name, ()))
-        for spec in stages
-    }
+    asked = remembered(workspace.root, [spec.name for spec in stages], flags, forget)
     if values["dry_run"]:
         print_dry_run(
             workspace, stages, asked, force=force, as_json=values["as_json"], progress=progress_for(ctx.obj)
         )
         return
-    announce_training(workspace, stages, asked, force=force)
-    left = RunTimeLeft(_forecast_seconds(workspace, stages, asked, force=force))
+    left = RunTimeLeft(announced_seconds(workspace, stages, asked, force=force))
     progress = progress_for(ctx.obj)
     # A program that follows several runs shows how many stages of each are done; bars and lines name the stages.
     with (progress if ctx.obj.json_progress else SILENT).task("stages", len(stages)) as done:
@@ -108,16 +105,6 @@ def _counted(workspace: Workspace, spec: StageSpec, done: ProgressTask, left: Ru
         yield
     left.end(spec.name)
     done.advance(1, spec.name, left.seconds)
-
-
-def _forecast_seconds(
-    workspace: Workspace, stages: tuple[StageSpec, ...], asked: Mapping[str, Flags], *, force: bool
-) -> Mapping[str, float | None]:
-    """Return the forecast seconds of the stages that take long; none for a run that will be refused."""
-    try:
-        return forecast_run(workspace, stages, asked, force=force).seconds
-    except GeorefError:
-        return {}
 
 
 def _overview(workspace: Workspace) -> Overview | None:
@@ -150,19 +137,8 @@ def _evaluated_cameras(workspace: Workspace) -> EvaluationReport | None:
         return None
 
 
-def _stages(first: str | None, last: str | None) -> tuple[StageSpec, ...]:
-    try:
-        return stage_slice(first, last)
-    except GeorefError as error:
-        raise click.UsageError(str(error)) from error
-
-
-def _deliverables(text: str | None) -> tuple[StageSpec, ...]:
-    """Return the stages of the deliverables in a text, such as `raster,cloud` or `all`.
-
-    Raises:
-        click.UsageError: an unknown name.
-    """
+def deliverables(text: str | None) -> tuple[StageSpec, ...]:
+    """Return the stages of the deliverables in a text, such as `raster,cloud` or `all`."""
     try:
         return named_deliverables(text)
     except ValueError as error:
@@ -170,11 +146,7 @@ def _deliverables(text: str | None) -> tuple[StageSpec, ...]:
 
 
 def _forgotten(names: Sequence[str], stages: Sequence[StageSpec]) -> dict[str, list[str]]:
-    """Return the fields that the user names with `--forget`, by stage.
-
-    Raises:
-        click.UsageError: a name is an option of none of the stages.
-    """
+    """Return the fields that the user names with `--forget`, by stage."""
     if "all" in names:
         return {spec.name: list(spec.options.model_fields) for spec in stages}
     by_stage: dict[str, list[str]] = {}
@@ -190,11 +162,7 @@ def _forgotten(names: Sequence[str], stages: Sequence[StageSpec]) -> dict[str, l
 def _flags(
     ctx: click.Context, stages: tuple[StageSpec, ...], flags: dict[str, dict[str, Any]]
 ) -> dict[str, dict[str, Any]]:
-    """Return the given options by stage, those of `--set` among them.
-
-    Raises:
-        click.UsageError: an option is for stages that do not run.
-    """
+    """Return the given options by stage, those of `--set` among them."""
     running = {spec.name for spec in stages}
     for name, value in options.given(ctx, OWNERS).items():
         owners = [owner for owner in OWNERS[name] if owner in running]
@@ -208,16 +176,6 @@ def _flags(
     return flags
 
 
-def deliver_option() -> click.Option:
-    """Return the option `--deliver`."""
-    return click.Option(
-        ["--deliver"],
-        metavar="NAMES",
-        help=f"Make these as well: {_DELIVERABLE_NAMES}, with commas, or all. Their options are set in "
-        "georef.toml or with their own commands.",
-    )
-
-
 def slice_option(flags: list[str], dest: str, help_text: str) -> click.Option:
     """Return an option that names a stage of the pipeline."""
     return click.Option([*flags, dest], type=click.Choice([spec.name for spec in PIPELINE]), help=help_text)
@@ -226,17 +184,17 @@ def slice_option(flags: list[str], dest: str, help_text: str) -> click.Option:
 command = Command(
     "run",
     params=[
-        options.workspace_argument(),
+        options.WORKSPACE,
         slice_option(["--from"], "first", "First stage to run."),
         slice_option(["--rerun-from"], "rerun_from", "First stage to run, with --force."),
         slice_option(["--to", "--end-with"], "last", "Last stage to run."),
         *(options.stage_option(BY_NAME[owners[0]].options, name) for name, owners in OWNERS.items()),
-        deliver_option(),
-        set_option(),
-        options.forget_option(),
-        options.dry_run_option(),
+        DELIVER,
+        SET,
+        options.FORGET,
+        options.DRY_RUN,
         options.force_option("Run the stages even if their products are current."),
-        options.json_option(),
+        options.JSON,
     ],
     callback=click.pass_context(_run),
     help="""Run all stages, or some, skipping what is current.

@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from georef_cli.display import progress_for
-from georef_cli.engines import asked_engine, engine_options
+from georef_cli.engines import ENGINE, asked_engine
 from georef_cli.output import print_json
 from georef_cli.stage import StageCommand
 
@@ -20,7 +20,6 @@ _CHUNK = click.Option(
 
 class _SfmCommand(StageCommand):
     def act(self, ctx: click.Context, **values: Any) -> None:
-        """Run the stage, or work on one of its chunks."""
         name = values.pop("chunk")
         if name is None:
             with asked_engine(values):
@@ -49,5 +48,5 @@ command = _SfmCommand(
       georef sfm flight --import colmap/sparse/0
       georef sfm flight --cluster tls://scheduler:8786 --certificates certificates
     """,
-    extra=[_CHUNK, *engine_options()],
+    extra=[_CHUNK, *ENGINE],
 )

@@ -42,7 +42,7 @@ command = Command(
         ),
         *options.stage_options(SimulateOptions),
         options.force_option("Replace an earlier simulation in DIR."),
-        options.json_option(),
+        options.JSON,
     ],
     callback=click.pass_context(_simulate),
     help="""Simulate a survey whose truth is known exactly.

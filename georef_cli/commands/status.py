@@ -23,7 +23,7 @@ def _status(workspace: Workspace, with_options: bool, as_json: bool) -> None:
     accuracy = headline_of(workspace)
     origins = [row for spec in BY_NAME.values() for row in option_origins(workspace, spec)] if with_options else []
     if not as_json:
-        print_rich(tables.states(rows, cautions), *tables.accuracy(accuracy), *tables.cautions(cautions))
+        print_rich(tables.states(rows, cautions), *tables.accuracy_line(accuracy), *tables.cautions(cautions))
         if with_options:
             print_rich(*tables.origins(origins))
         return
@@ -41,13 +41,13 @@ def _status(workspace: Workspace, with_options: bool, as_json: bool) -> None:
 command = Command(
     "status",
     params=[
-        options.workspace_argument(),
+        options.WORKSPACE,
         click.Option(
             ["--options", "with_options"],
             is_flag=True,
             help="Show the options that are no defaults too: remembered from earlier commands, or of georef.toml.",
         ),
-        options.json_option(),
+        options.JSON,
     ],
     callback=_status,
     help="""Show the state of every stage: missing, current, stale (its inputs or options have changed since),

@@ -1,26 +1,10 @@
 """Command `georef train`."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import click
 
-from georef_cli.display import is_told
-from georef_cli.output import print_outcome
 from georef_cli.stage import StageCommand
 
-
-class TrainCommand(StageCommand):
-    """Command of the stage, with `--resume`."""
-
-    def act(self, ctx: click.Context, **values: Any) -> None:
-        """Run or resume the stage, and print its result."""
-        outcome = self.run(ctx, values, resume="always" if values["resume"] else "if-same")
-        print_outcome(values["workspace"], outcome, as_json=values["as_json"], told=is_told(ctx.obj))
-
-
-command = TrainCommand(
+command = StageCommand(
     "train",
     """Train the Gaussians together with the similarity and the cameras.
 

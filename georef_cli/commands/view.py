@@ -41,10 +41,10 @@ def _view(ctx: click.Context, workspace: Workspace, open_page: bool, as_json: bo
 command = Command(
     "view",
     params=[
-        options.workspace_argument(),
+        options.WORKSPACE,
         *options.stage_options(ViewOptions),
         click.Option(["--open/--no-open", "open_page"], default=False, help="Open the page in a browser at once."),
-        options.json_option(),
+        options.JSON,
     ],
     callback=click.pass_context(_view),
     help="""See the trained model in a browser, and measure in it.

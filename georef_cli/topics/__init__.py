@@ -19,11 +19,7 @@ TOPICS = {
 
 
 def topic_text(name: str) -> str:
-    """Return the text of a topic.
-
-    Args:
-        name: one of `TOPICS`.
-    """
+    """Return the text of one of `TOPICS`."""
     text = resources.files(__name__).joinpath(f"{name}.txt").read_text(encoding="utf-8")
     return text.replace("PRESETS", _presets()) if name == "presets" else text
 

@@ -19,7 +19,8 @@ from scipy.sparse import bsr_matrix, csr_matrix, eye, kron
 from pipelines.adjust.accuracy_grid import AccuracyGrid
 from pipelines.adjust.system import NormalMatrix
 from pipelines.core.errors import InputError
-from pipelines.core.products import load_npz, save_npz
+from pipelines.core.files import read_npz
+from pipelines.core.products import save_npz
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.geometry.bundle import (
     Network,
@@ -296,7 +297,7 @@ def load_posterior(path: Path, solution: Adjustment, sfm: SparseModel) -> Poster
     Raises:
         InputError: the file is damaged, or of another solution.
     """
-    arrays, n = load_npz(path, (*_ARRAYS, *AccuracyGrid.NO_ARRAYS)), len(solution.cameras)
+    arrays, n = read_npz(path, (*_ARRAYS, *AccuracyGrid.NO_ARRAYS)), len(solution.cameras)
     border, corner, position, followed, lens, camera_cov = (arrays[name] for name in _ARRAYS[3:])
     known, width = len(followed[0]) - 6 * n if followed.ndim == 2 else -1, len(corner)
     fits = (

@@ -1,14 +1,8 @@
-"""Work of native libraries in a process of its own, which ends with an interrupt and with its parent.
+"""Processes that this program starts: how Python is called, what they tell, and native code in a child.
 
-Native code hears no signals while it works, and its failed checks abort the process. In a child both are harmless:
-an interrupt kills the child at once, and a crash becomes one error. Parent and child exchange lines of JSON.
-
-Messages of a process to the one that started it: log records and progress as lines of JSON.
-
-How this program starts Python again, for native code, jobs, workers and compilers: the one place that knows.
-
-Python looks for modules in the current folder first when it is started with `-m` or `-c`. That folder belongs to
-the photographs, and a `queue.py` among them is a file of the user, not code of this program.
+A process tells the one that has started it its log and its progress as lines of JSON. Native code hears no signals
+while it works, and its failed checks abort the process. In a child both are harmless: an interrupt kills the child
+at once, and a crash becomes one error.
 """
 
 from __future__ import annotations
@@ -46,62 +40,41 @@ log = logging.getLogger(__name__)
 
 
 class MessageSender:
-    """Sender of messages, and the `Progress` of its process.
-
-    Args:
-        stream: that the receiver reads.
-    """
+    """Sender of messages to the receiver that reads a stream; also the `Progress` of its process, and its tasks."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream, self._lock = stream, threading.Lock()
 
     def send(self, kind: str, **content: Any) -> None:
-        """Send one message.
-
-        Raises:
-            OSError: nobody reads the stream.
-        """
+        """Send one message; an OSError: nobody reads the stream."""
         with self._lock:
             self._stream.write(json.dumps({"kind": kind, **content}) + "\n")
             self._stream.flush()
 
     @contextmanager
     def task(self, name: str, total: int | None = None) -> Iterator[ProgressTask]:
-        """Open a task that the receiver shows."""
         self.send("begin", name=name, total=total)
         try:
-            yield _SentTask(self)
+            yield self
         finally:
             self.send("end")
 
-
-class _SentTask:
-    def __init__(self, sender: MessageSender) -> None:
-        self._sender = sender
-
     def advance(self, steps: int = 1, note: str = "", left_s: float | None = None) -> None:
-        """Send the steps."""
-        self._sender.send("advance", steps=steps, note=note, left_s=left_s)
+        """Advance the innermost task."""
+        self.send("advance", steps=steps, note=note, left_s=left_s)
 
 
 class SentRecords(logging.Handler):
-    """Handler that sends log records."""
-
     def __init__(self, sender: MessageSender) -> None:
         super().__init__()
         self._sender = sender
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Send a record."""
         self._sender.send("log", name=record.name, level=record.levelno, text=self.format(record))
 
 
 class MessageReceiver:
-    """Receiver that shows the tasks of another process, and logs its records as those of this process.
-
-    Args:
-        progress: shows the tasks.
-    """
+    """Receiver that shows the tasks of another process, and logs its records as those of this process."""
 
     def __init__(self, progress: Progress) -> None:
         self._progress = progress
@@ -124,7 +97,6 @@ class MessageReceiver:
         return True
 
     def log(self, name: str, level: int, text: str) -> None:
-        """Log a record of the other process."""
         logging.getLogger(name).log(level, "%s", text)
 
     def close(self) -> None:
@@ -139,10 +111,10 @@ _HOME = Path(__file__).parents[2]
 
 
 def python_command(arguments: Sequence[str]) -> list[str]:
-    """Return the command that runs this Python, which takes no module from the current folder.
+    """Return the command that runs this Python with arguments, such as `-m` and a module.
 
-    Args:
-        arguments: of Python, such as `-m` and a module.
+    Python looks for modules in the current folder first when it is started with `-m` or `-c`. That folder belongs
+    to the photographs, and a `queue.py` among them is a file of the user, not code of this program.
     """
     return [sys.executable, "-P", *arguments]
 
@@ -160,7 +132,6 @@ def python_environment() -> dict[str, str]:
 
 
 def _is_current(folder: Path) -> bool:
-    """Return whether a folder is the current one, by whatever name."""
     try:
         return folder.samefile(os.curdir)
     except OSError:  # Python lists a `python311.zip` that does not exist.
@@ -180,16 +151,12 @@ def run_in_child(
     *,
     writes: Path | None = None,
 ) -> Any:
-    """Return the result of a function that runs in a child process.
-
-    Log records and progress of the child appear as those of this process.
+    """Return the result of a function that runs in a child process, whose log and progress appear as this one's.
 
     Args:
         task: `module:function`; the function takes a document and a `Progress`, and returns a document.
-        arguments: document for JSON.
         remedy: what to do if the child crashes.
-        progress: shows the tasks of the child.
-        writes: folder that the function writes into, if native code writes there.
+        writes: folder that native code writes into; None: it writes nothing.
 
     Raises:
         GeorefError: raised by the function, with its message.
@@ -226,11 +193,7 @@ def run_in_child(
 
 
 def _follow(process: subprocess.Popen[str], arguments: Mapping[str, Any], progress: Progress) -> Any:
-    """Hand over the arguments, and follow the child's messages to its result.
-
-    Raises:
-        EOFError: the child ended without a result.
-    """
+    """Hand over the arguments, and follow the child's messages to its result; an EOFError: it ended without one."""
     assert process.stdin is not None
     assert process.stdout is not None
     document = {"arguments": arguments, "level": logging.getLogger(_LIBRARY).getEffectiveLevel()}
@@ -262,7 +225,6 @@ def _storage_failure(native_log: IO[str], folder: Path | None) -> StorageError |
 
 
 def _error(message: Mapping[str, Any]) -> Exception:
-    """Return the exception of the child."""
     if message["kind"] != "error":
         return RuntimeError(f"in a child process:\n{message['text']}")
     kind = getattr(errors, message["type"], GeorefError)

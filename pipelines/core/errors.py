@@ -1,7 +1,6 @@
 """Known failures; each message states the fault, its place and the remedy.
 
-The command line prints a `GeorefError` as one message and exits with 1. Every other exception is a defect and keeps
-its traceback.
+The command line prints a `GeorefError` as one message. Every other exception is a defect and keeps its traceback.
 """
 
 from __future__ import annotations
@@ -31,15 +30,7 @@ class GeorefError(Exception):
 
 
 class InputError(GeorefError):
-    """Bad input: a file, a line or field of it, or an option.
-
-    Args:
-        message: the fault and its remedy.
-        path: the file at fault.
-        line: 1-based line number in `path`.
-        field: column, tag or option at fault.
-        hint: the remedy, where it is known apart from the message.
-    """
+    """Bad input: a file, a line (counted from 1) or field of it, or an option."""
 
     code = "input"
 
@@ -80,12 +71,7 @@ class InputError(GeorefError):
 
 
 class MissingProductError(GeorefError):
-    """Missing product of another stage.
-
-    Args:
-        product: workspace-relative path of the product.
-        command: the command line that makes it.
-    """
+    """Missing product of another stage: its workspace path, and the command line that makes it."""
 
     code = "missing-product"
 
@@ -193,7 +179,7 @@ def storage_error(error: BaseException, place: Path | None = None) -> StorageErr
 
     Args:
         error: the exception.
-        place: file or folder that was written, for failures that name none: those of a full disk, mostly.
+        place: file or folder that was written, for failures that name none, mostly those of a full disk.
     """
     seen: set[int] = set()
     cause: BaseException | None = error
@@ -210,26 +196,14 @@ def storage_error(error: BaseException, place: Path | None = None) -> StorageErr
 
 
 def storage_error_in(text: str, path: Path) -> StorageError | None:
-    """Return the storage failure that the messages of a native library name, or None.
-
-    Args:
-        text: messages of SQLite or of the C library.
-        path: of the file or folder that was written.
-    """
+    """Return the storage failure at a path that messages of SQLite or of the C library name, or None."""
     reason = next((reason for words, reason in _NATIVE_WORDS.items() if words in text), None)
     return None if reason is None else StorageError(f"{path}: {_STORAGE_REASONS[reason]}")
 
 
 @contextmanager
 def storage_failures(place: Path | None = None) -> Iterator[None]:
-    """Turn storage failures of any library into `StorageError` while the context lasts.
-
-    Args:
-        place: as of `storage_error`.
-
-    Raises:
-        StorageError: a disk or file system failed.
-    """
+    """Turn storage failures of any library into `StorageError` while the context lasts; `place` as above."""
     try:
         yield
     except GeorefError:

@@ -20,13 +20,9 @@ SHORT_WAYS = {"camera": "triangulated", "model": "surface"}  # for narrow column
 
 @dataclass(frozen=True)
 class Figure:
-    """Accuracy figure as people read it.
+    """Accuracy figure as people read it: the head of its column, that of its line, and the form of its text.
 
-    Attributes:
-        label: short name, as the head of a column.
-        meaning: the figure in words, as the head of a line.
-        unit: of the text; empty for a number of points.
-        decimals: of the text.
+    Its unit is empty for a number of points.
     """
 
     label: str
@@ -102,5 +98,4 @@ class Headline(Product):
 
     @property
     def sentence(self) -> str:
-        """The same with its subject, as a part of a line."""
         return f"accuracy {self.text}"

@@ -1,9 +1,7 @@
-"""Checks of input files before they are opened: what can be read to its end, and how much memory it asks for.
+"""Files that survive a power failure, flushed before a name leads to them; and checks before files are read.
 
 A named pipe blocks its reader until somebody writes, and a device may deliver bytes without end. Archives state how
 large their content is: a few kilobytes can ask for gigabytes.
-
-Files that survive a power failure: flushed to the disk before a name leads to them.
 """
 
 from __future__ import annotations
@@ -31,11 +29,7 @@ _PROBE_BYTES = 1 << 20
 
 
 def replace_file(draft: Path, path: Path) -> None:
-    """Rename a complete draft to `path`; after a power failure `path` is the old or the new file, whole.
-
-    Raises:
-        OSError: the draft cannot be flushed or renamed.
-    """
+    """Rename a complete draft to `path`; after a power failure `path` is the old or the new file, whole."""
     sync_file(draft)
     draft.replace(path)
     sync_folder(path.parent)
@@ -43,11 +37,7 @@ def replace_file(draft: Path, path: Path) -> None:
 
 @contextmanager
 def replacing(path: Path, draft: Path) -> Iterator[None]:
-    """Rename a draft to `path` when it was written; one that cannot be completed keeps no room on a full disk.
-
-    Raises:
-        OSError: the file cannot be written; an existing one stays.
-    """
+    """Rename a draft to `path` when it was written; one that cannot be completed keeps no room on a full disk."""
     try:
         yield
         replace_file(draft, path)
@@ -58,20 +48,12 @@ def replacing(path: Path, draft: Path) -> Iterator[None]:
 
 
 def replace_text(path: Path, text: str) -> None:
-    """Write a text file; an existing file is replaced when the new one is complete.
-
-    Raises:
-        OSError: the file cannot be written; the existing one stays.
-    """
+    """Write a text file; an existing file is replaced when the new one is complete."""
     replace_texts({path: text})
 
 
 def replace_texts(texts: Mapping[Path, str]) -> None:
-    """Write text files; existing ones are replaced when all new ones are complete.
-
-    Raises:
-        OSError: a file cannot be written; the existing ones stay, and no draft is left.
-    """
+    """Write text files; existing ones are replaced when all new ones are complete, and otherwise stay."""
     drafts = {path: path.with_name(f"{path.name}.tmp") for path in texts}
     path = None
     try:
@@ -94,9 +76,6 @@ def replace_folder(draft: Path, folder: Path, aside: Path) -> None:
     """Rename a complete and flushed draft to `folder`; an existing folder is moved to `aside` first.
 
     If the draft cannot be renamed, the existing folder returns to its place.
-
-    Raises:
-        OSError: a folder cannot be renamed.
     """
     if folder.exists():
         remove(aside)
@@ -174,11 +153,7 @@ _MOST_UNPACKED, _SMALL_BYTES = 8, 256 * 1024 * 1024
 def file_size(path: Path, *, limit_bytes: int | None = None, kind: str = "file", field: str | None = None) -> int:
     """Return the size of a regular file in bytes; symbolic links are followed.
 
-    Args:
-        path: of the file.
-        limit_bytes: largest size that is accepted.
-        kind: what the file is, for errors.
-        field: option that names the file, for errors.
+    Errors name the kind of the file, and the option that names it.
 
     Raises:
         InputError: no such file, a folder, pipe, socket or device, or a file larger than the limit.
@@ -200,13 +175,9 @@ def file_size(path: Path, *, limit_bytes: int | None = None, kind: str = "file",
 
 
 def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, NDArray[Any]]:
-    """Read arrays of an NPZ file, without pickle.
+    """Read the named arrays of an NPZ file, or all, without pickle.
 
     The header of each array is compared with the size of its entry before any data are read.
-
-    Args:
-        path: of the file.
-        names: arrays to read; None for all.
 
     Raises:
         InputError: unreadable, without one of the arrays, of objects, or with arrays that unpack to more than eight

@@ -1,7 +1,4 @@
-"""Hashes of the inputs of a stage: equal hashes and equal options mean an equal product.
-
-Versions of this package and of the libraries whose results depend on their version.
-"""
+"""Hashes of a stage's inputs (equal hashes and options mean an equal product), and versions of its libraries."""
 
 from __future__ import annotations
 
@@ -30,8 +27,6 @@ _WHOLE_BYTES = 256 * 1024 * 1024
 _SAMPLES, _SAMPLE_BYTES = 64, 1024 * 1024
 _MOST_THREADS = 4
 
-Records = Mapping[str, Mapping[str, FileRecord]]
-
 
 @dataclass(frozen=True)
 class Fingerprints:
@@ -52,7 +47,7 @@ def fingerprints(
     options: StageOptions,
     memo: Memo,
     *,
-    known: Records | None = None,
+    known: Mapping[str, Mapping[str, FileRecord]] | None = None,
     progress: Progress = SILENT,
 ) -> Fingerprints:
     """Return the inputs of a stage: hashes of their content, wherever they lie.
@@ -62,12 +57,8 @@ def fingerprints(
     - Folders that the options name count by the names and contents of the visible files in them that can matter.
 
     Args:
-        workspace: holds the products.
-        spec: the stage.
-        options: the stage's options.
         memo: hashes of products and of their files by path, extended here: each is hashed once.
         known: earlier `files`: a file in a folder with the size and time of its record is not read again.
-        progress: shows the files that are read.
 
     Raises:
         MissingProductError: a product does not exist.
@@ -84,7 +75,7 @@ def fingerprints(
                 raise InputError("no such file or folder", path=path, field=flag)
             if path.is_dir():
                 files = _input_files(path, workspace.root, markers[name])
-                records = _records(path, files, (known or {}).get(flag, {}), progress)
+                records = _records(files, (known or {}).get(flag, {}), progress)
                 result.files[flag] = records
                 result.hashes[flag] = _hash_listing({inside: record.sha256 for inside, record in records.items()})
             else:
@@ -108,7 +99,9 @@ def _hash_part(workspace: Workspace, part: ProductPart, memo: Memo) -> dict[str,
     except ValueError:  # not JSON: the stage that reads the product raises the error
         values = None
     if values is None or (_is_empty(values) and not part.optional):
-        return {part.product: _hash_product(path, memo)}
+        if path not in memo and path.is_dir():
+            memo[path] = _hash_listing({name: hash_file(file, memo) for name, file in _files(path).items()})
+        return {part.product: hash_file(path, memo)}
     if _is_empty(values):
         return {}
     text = json.dumps(values, sort_keys=True)
@@ -149,17 +142,6 @@ def _is_empty(value: Any) -> bool:
     return value is None or (isinstance(value, list) and all(_is_empty(item) for item in value))
 
 
-def _hash_product(path: Path, memo: Memo) -> str:
-    if path not in memo:
-        if path.is_dir():
-            memo[path] = _hash_listing(
-                {_text(file.relative_to(path)): hash_file(file, memo) for file in _files(path)}
-            )
-        else:
-            hash_file(path, memo)
-    return memo[path]
-
-
 def _hash_listing(hashes: Mapping[str, str]) -> str:
     """Return the hash of names and hashes of files."""
     lines = "".join(f"{name}={hashes[name]}\n" for name in sorted(hashes))
@@ -180,14 +162,14 @@ def _hash_file(path: Path) -> str:
 
 
 def _records(
-    folder: Path, files: Sequence[Path], known: Mapping[str, FileRecord], progress: Progress
+    files: Mapping[str, Path], known: Mapping[str, FileRecord], progress: Progress
 ) -> dict[str, FileRecord]:
-    """Return records of files by their path in a folder; those as a known record has them are not read."""
-    by_name = {_text(file.relative_to(folder)): file for file in files}
-    records = {name: known[name] for name, file in by_name.items() if name in known and _is_as(known[name], file)}
-    unread = {name: file for name, file in by_name.items() if name not in records}
+    """Return records of files by name; those as a known record has them are not read."""
+    records = {name: known[name] for name, file in files.items() if name in known and _is_as(known[name], file)}
+    unread = {name: file for name, file in files.items() if name not in records}
     if unread:
-        with progress.task("input files", len(unread)) as task, ThreadPoolExecutor(_threads()) as pool:
+        threads = min(_MOST_THREADS, os.cpu_count() or 1)
+        with progress.task("input files", len(unread)) as task, ThreadPoolExecutor(threads) as pool:
             for name, record in zip(unread, pool.map(_record, unread.values()), strict=True):
                 records[name] = record
                 task.advance()
@@ -209,30 +191,25 @@ def _record(path: Path) -> FileRecord:
     return FileRecord(size=stat.st_size, mtime_ns=stat.st_mtime_ns, sha256=sha256)
 
 
-def _text(name: Path) -> str:
-    """Return a path as text that JSON can hold."""
-    return name.as_posix().encode("utf-8", "backslashreplace").decode()
-
-
-def _threads() -> int:
-    return min(_MOST_THREADS, os.cpu_count() or 1)
-
-
-def _input_files(folder: Path, workspace_root: Path, marker: InputMarker) -> list[Path]:
+def _input_files(folder: Path, workspace_root: Path, marker: InputMarker) -> dict[str, Path]:
     """Return the visible files that count in a folder; a workspace inside the folder is left out."""
     # Resolved, because `workspace/../photos` is not in the workspace.
     place, workspace = folder.resolve(), workspace_root.resolve()
-    return [
-        file
-        for file in _files(folder)
+    return {
+        name: file
+        for name, file in _files(folder).items()
         if not any(part.startswith(".") for part in file.relative_to(folder).parts)
         and not (place / file.relative_to(folder)).is_relative_to(workspace)
         and (not marker.suffixes or file.suffix.lower() in marker.suffixes)
-    ]
+    }
 
 
-def _files(folder: Path) -> list[Path]:
-    return sorted(file for file in folder.rglob("*") if file.is_file())
+def _files(folder: Path) -> dict[str, Path]:
+    """Return the files below a folder by their path in it, as text that JSON can hold."""
+    return {
+        file.relative_to(folder).as_posix().encode("utf-8", "backslashreplace").decode(): file
+        for file in sorted(file for file in folder.rglob("*") if file.is_file())
+    }
 
 
 LIBRARIES = ("numpy", "pycolmap", "torch", "numba", "pyproj")

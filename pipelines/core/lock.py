@@ -29,20 +29,15 @@ _IN_PROCESS = " in process "
 
 @dataclass(frozen=True)
 class WriteLock:
-    """Right to write in a folder, held by at most one process.
-
-    Attributes:
-        folder: the folder; made when the lock is first held.
-    """
+    """Right to write in a folder, held by at most one process; the folder is made when the lock is first held."""
 
     folder: Path
 
     @contextmanager
     def hold(self, activity: str, patience_s: float = _PATIENCE_S) -> Iterator[None]:
-        """Hold the lock while the context lasts.
+        """Hold the lock while the context lasts; other processes are told the activity: the command that writes.
 
         Args:
-            activity: the command that writes, for the error message of other processes.
             patience_s: so long another process may still hold the lock.
 
         Raises:
@@ -64,12 +59,6 @@ class WriteLock:
                 (self.folder / name).unlink(missing_ok=True)
 
     def _locked_file(self, patience_s: float) -> BinaryIO:
-        """Return the open and locked file.
-
-        Raises:
-            WorkspaceBusyError: another process holds the lock.
-            InputError: the folder cannot be made, written or locked.
-        """
         while True:
             try:
                 self.folder.mkdir(parents=True, exist_ok=True)

@@ -1,9 +1,7 @@
-"""Number of threads that this process and its children compute with.
+"""Threads that this process and its children compute with, and main memory, of the machine or of a container.
 
 OpenMP, BLAS and numba read their variables when they are loaded. The limit is therefore set before the first stage
 is imported.
-
-Main memory: what is free on the machine, or in the container of this process, and what the process has held.
 """
 
 from __future__ import annotations
@@ -18,14 +16,7 @@ _VARIABLES = (_STANDARD, "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_T
 
 
 def limit_threads(count: int) -> None:
-    """Limit the threads of libraries that are loaded from now on, here and in child processes.
-
-    Args:
-        count: 1 or more; more than there are cores counts as all of them.
-
-    Raises:
-        ValueError: the count is less than 1.
-    """
+    """Limit the threads, from 1 to all cores, of libraries that are loaded from now on, also in child processes."""
     if count < 1:
         raise ValueError(f"{count} threads: at least 1 is needed")
     for name in _VARIABLES:
@@ -70,7 +61,6 @@ def peak_memory_bytes() -> int | None:
 
 
 def _kib_of(table: Path, name: str) -> int | None:
-    """Return a value of a table of the system; None if it is not there."""
     try:
         lines = table.read_text(encoding="utf-8", errors="replace").splitlines()
         return next((int(line.split()[1]) for line in lines if line.startswith(name)), None)
@@ -82,8 +72,12 @@ def _free_in_system() -> int | None:
     if sys.platform == "win32":
         status = _WindowsMemory(length=ctypes.sizeof(_WindowsMemory))
         return status.free_bytes if ctypes.windll.kernel32.GlobalMemoryStatusEx(ctypes.byref(status)) else None
-    if (kib := _kib_of(Path("/proc/meminfo"), "MemAvailable:")) is not None:
-        return 1024 * kib
+    kib = _kib_of(Path("/proc/meminfo"), "MemAvailable:")
+    return total_main_memory_bytes() if kib is None else 1024 * kib
+
+
+def total_main_memory_bytes() -> int | None:
+    """Return the memory of the machine; None if the system does not state it."""
     try:
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError, OSError):

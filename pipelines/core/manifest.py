@@ -28,21 +28,14 @@ class FileRecord(BaseModel):
 
 
 class Manifest(BaseModel):
-    """Record of how a product was made: inputs, resolved options, versions, time, and key figure.
+    """Record of how a product was made.
 
     Attributes:
-        format_version: version of the manifest's format.
-        stage: the subcommand.
         product_version: of the form of the product.
         config: resolved options by field.
         inputs: SHA-256 by product or flag, from `fingerprints`.
-        versions: versions of this package and its libraries.
         started: UTC.
-        duration_s: wall-clock time.
-        key_figure: one line for tables.
-        values: plain numbers and strings for `--json`.
-        warnings: messages that the user should read.
-        cautions: limits of the product, those of its inputs among them.
+        key_figure, values, cautions: as of the stage's `Summary`.
         files: files of the product by path in the stage's folder; empty in manifests of earlier versions.
         input_files: files in the folders that options name, by flag and path in that folder.
     """
@@ -79,12 +72,7 @@ class Manifest(BaseModel):
 
 
 def record_files(folder: Path, left_out: Iterable[str]) -> dict[str, FileRecord]:
-    """Return the records of the files below a stage's folder.
-
-    Args:
-        folder: of the stage.
-        left_out: files or folders, by their path in the folder, that other programs may change.
-    """
+    """Return the records of the files below a stage's folder; `left_out` are those that other programs change."""
     records = {}
     for path in sorted(path for path in folder.rglob("*") if path.is_file()):
         inside = path.relative_to(folder)
@@ -103,8 +91,6 @@ def damaged_files(folder: Path, manifest: Manifest, memo: Memo, *, by_content: b
     Missing files do not count: a missing product makes its stage stale, and any other file may be deleted.
 
     Args:
-        folder: of the stage.
-        manifest: has the records.
         memo: hashes of files by path, extended here.
         by_content: whether a file whose size and time of modification are unchanged is hashed too.
     """
@@ -128,11 +114,7 @@ def _is_intact(path: Path, record: FileRecord, memo: Memo, *, by_content: bool) 
 
 
 def hash_file(path: Path, memo: Memo) -> str:
-    """Return the SHA-256 of a file, from the memo if it is there; the memo is extended.
-
-    Raises:
-        OSError: the file cannot be read.
-    """
+    """Return the SHA-256 of a file, from the memo if it is there; the memo is extended."""
     if path not in memo:
         file_size(path)
         with path.open("rb") as handle:

@@ -1,17 +1,12 @@
 """Options of the stages, each with its default, range and meaning in one place.
 
-Precedence: default < the workspace's `georef.toml` (one table a stage) < command-line flag. The command line
-derives its flags from these classes, so that a default exists once. Unknown keys and values out of range are
-errors that name the key. The options of a stage are defined in `options.py` of its room.
+Precedence: default < the workspace's `georef.toml` (one table a stage) < flags remembered in `requests.json` < flag
+(`resolve`, `remembered`). The command line derives its flags from the classes of options, so that a default exists
+once. Unknown keys and values out of range are errors that name the key.
 
 Options hold parsed values. An option that users write as text (`0.1,0,-0.3`, `2s`, `auto`) has a type with two
 annotations: `from_text` parses the text of a flag, of `georef.toml` and of an earlier version's manifest; `WRITTEN`
 marks the flag as text for the command line.
-
-Options that stages were last requested with, in `requests.json` of a workspace.
-
-Input paths are remembered as absolute paths, together with the place of the workspace. A path that is gone after
-the workspace was moved is looked for where it would lie if it had been moved along.
 """
 
 from __future__ import annotations
@@ -20,7 +15,7 @@ import json
 import os
 import re
 import tomllib
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -44,8 +39,7 @@ _LONG_KEY = re.compile(rf"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*
 class InputMarker:
     """Mark of a path whose content decides the stage's result: its fingerprint enters the manifest.
 
-    Attributes:
-        suffixes: of the files that count in a folder, in lower case; empty: all.
+    In a folder, files with the suffixes, in lower case, count; without any, all do.
     """
 
     suffixes: frozenset[str] = frozenset()
@@ -76,16 +70,7 @@ def from_text(parse: Callable[[str], object]) -> BeforeValidator:
 
 
 def listed_names(text: str, known: Collection[str], otherwise: str = "") -> tuple[str, ...]:
-    """Return the names in a text, where commas separate them.
-
-    Args:
-        text: e.g. `boresight,lever-arm`.
-        known: the valid names.
-        otherwise: ending of the error message, which names further valid texts.
-
-    Raises:
-        ValueError: an unknown name.
-    """
+    """Return the names in a text with commas; a ValueError, ended by `otherwise`, names one that is not known."""
     names = tuple(text.split(","))
     unknown = [name for name in names if name not in known]
     if unknown:
@@ -153,8 +138,8 @@ def input_paths(options: StageOptions) -> dict[str, Path]:
 
 def decisive_fields(options_type: type[StageOptions]) -> list[str]:
     """Return the options whose values decide a stage's result: all but those of effort, and paths of inputs."""
-    fields, no_value = options_type.model_fields, (EffortMarker, InputMarker)
-    return [name for name, info in fields.items() if not any(isinstance(mark, no_value) for mark in _marks(info))]
+    fields = options_type.model_fields
+    return [name for name, info in fields.items() if not has_mark(info, EffortMarker, InputMarker)]
 
 
 def as_flags(options: StageOptions, names: Collection[str]) -> str:
@@ -171,9 +156,19 @@ def as_flags(options: StageOptions, names: Collection[str]) -> str:
     return " ".join(words)
 
 
-def is_written(info: FieldInfo) -> bool:
-    """Return whether users write an option as text."""
-    return any(isinstance(mark, WrittenMarker) for mark in _marks(info))
+def has_mark(info: FieldInfo, *kinds: type) -> bool:
+    """Return whether an option has a mark of one of these kinds."""
+    return any(isinstance(mark, kinds) for mark in _marks(info))
+
+
+def names_of_flags(options_type: type[StageOptions], flags: Collection[str]) -> list[str]:
+    """Return the fields of flags as a user names them (`gcp`, `max-image-size`); a ValueError: one is unknown."""
+    by_flag = {flag_name(options_type, name).removeprefix("--"): name for name in options_type.model_fields}
+    named = [text.removeprefix("--").replace("_", "-") for text in flags]
+    unknown = [text for text in named if text not in by_flag]
+    if unknown:
+        raise ValueError(f"{unknown[0]!r} is no option; the options are {', '.join(by_flag)}")
+    return [by_flag[text] for text in named]
 
 
 def resolve(
@@ -187,18 +182,20 @@ def resolve(
     """Return validated options: default < `table` < `flags`.
 
     Args:
-        options_type: class of the options.
         table: the stage's table in `georef.toml`; its relative paths are relative to the folder of that file.
-        flags: options that the user gave as flags, by field.
-        toml: path of `georef.toml`.
-        stage: name of the table, for errors.
+        flags: options that the user gave as flags, now or before, by field.
+        toml, stage: path of `georef.toml`, and name of the table, for errors.
 
     Raises:
         InputError: an unknown key or a value out of range; names the file, table and key, or the flag.
     """
-    merged = {**_anchored(options_type, table, toml.parent), **flags}
+    inputs = input_markers(options_type)
+    anchored = {
+        key: str(toml.parent / value) if isinstance(value, str) and key in inputs else value
+        for key, value in table.items()
+    }
     try:
-        options = options_type.model_validate(merged)
+        options = options_type.model_validate({**anchored, **flags})
     except ValidationError as error:
         first = error.errors()[0]
         key = str(first["loc"][0]) if first["loc"] else "?"
@@ -216,11 +213,7 @@ def resolve(
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Return the document of a TOML file, whose size was checked before.
-
-    Raises:
-        InputError: the file cannot be read or is not TOML.
-    """
+    """Return the document of a TOML file, whose size was checked before."""
     try:
         return parse_toml(path.read_text(encoding="utf-8-sig"))
     except ValueError as error:
@@ -254,11 +247,7 @@ def parse_toml(text: str) -> dict[str, Any]:
 
 
 def _require_integers(value: Any) -> None:
-    """Refuse integers beyond 64 bits, which TOML does not have.
-
-    Raises:
-        ValueError: there is one.
-    """
+    """Refuse integers beyond 64 bits, which TOML does not have."""
     if isinstance(value, int) and not -_INTEGERS <= value < _INTEGERS:
         raise ValueError
     parts = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
@@ -290,21 +279,31 @@ def _marks(info: FieldInfo) -> list[object]:
     return [*info.metadata, *(mark for member in members for mark in getattr(member, "__metadata__", ()))]
 
 
-def _anchored(options_type: type[StageOptions], table: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Return the table with its input paths made absolute."""
-    inputs = input_markers(options_type)
-    return {
-        key: str(folder / value) if isinstance(value, str) and key in inputs else value
-        for key, value in table.items()
-    }
-
-
 REQUESTS = "requests.json"
 _PLACE = "workspace"  # no stage has this name
 
 
+def remembered(
+    root: Path,
+    stages: Iterable[str],
+    flags: Mapping[str, Mapping[str, Any]],
+    forget: Mapping[str, Collection[str]] | None = None,
+) -> dict[str, dict[str, Any]]:
+    """Return by stage the options last requested, but those to forget, overridden by flags."""
+    asked = {}
+    before = read_requests(root)
+    for stage in stages:
+        forgotten = (forget or {}).get(stage, ())
+        kept = {name: value for name, value in before.get(stage, {}).items() if name not in forgotten}
+        asked[stage] = {**kept, **flags.get(stage, {})}
+    return asked
+
+
 def read_requests(root: Path) -> dict[str, dict[str, Any]]:
     """Return the options that the stages of a workspace were last requested with, by stage.
+
+    Input paths are remembered as absolute paths, with the place of the workspace. A path that is gone after the
+    workspace was moved is looked for where it would lie if it had been moved along.
 
     Raises:
         InputError: `requests.json` is damaged.

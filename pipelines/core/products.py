@@ -1,11 +1,9 @@
-"""Typed products of the stages: base class, reading and writing. The products themselves are types in `scene/`.
+"""Products of the stages: base class, reading and writing, and the cautions that they carry on from their inputs.
 
 JSON products are pydantic models. They are validated when loaded, because users can replace a product by hand.
 Arrays are stored as NPZ without pickle. Frames and units are those of docs/conventions.md: `geo` is East-North-Up
 metres at the survey's origin, `local` the SfM model's frame, `model` the metric, origin-shifted frame of the
 Gaussians.
-
-Cautions: limits of a result that its next reader must know. Products carry those of their inputs on.
 """
 
 from __future__ import annotations
@@ -15,11 +13,10 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, StringConstraints, ValidationError
 
 from pipelines.core.errors import InputError
-from pipelines.core.files import file_size, read_npz
+from pipelines.core.files import file_size
 from pipelines.core.types import Matrix3, Quaternion
 from pipelines.core.validators import covariance, image_name, unit_quaternion
 
@@ -68,11 +65,7 @@ def load_json(product_type: type[ProductT], path: Path) -> ProductT:
 
 
 def dump_json(document: Any) -> str:
-    """Return the JSON text of a plain document: no NaN, stable order.
-
-    Raises:
-        ValueError: the document holds NaN or an infinity.
-    """
+    """Return the JSON text of a plain document, which may hold no NaN and no infinity."""
     return json.dumps(document, indent=1, allow_nan=False)
 
 
@@ -82,30 +75,14 @@ def save_npz(path: Path, arrays: dict[str, Any]) -> None:
     np.savez(path, **{name: np.asarray(array) for name, array in arrays.items()})  # type: ignore[arg-type]
 
 
-def load_npz(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
-    """Read the named arrays of an NPZ file, without pickle.
-
-    Raises:
-        InputError: the file is unreadable, or lacks one of the arrays.
-    """
-    return read_npz(path, names)
-
-
 # Code of the caution that nothing checks the σ of the positions: no accuracy is stated then.
 NOT_CHECKED = "not-checked"
-
-
 # Attribute of log records with a caution: the command line repeats cautions at its end.
 AT_END = "at_end"
 
 
 class Caution(Product):
-    """Limit of a result, for machines and for people.
-
-    Attributes:
-        code: kind of the limit, for machines: lower-case words joined by hyphens (docs/accuracy.md lists them).
-        sentence: one full sentence for people.
-    """
+    """Limit of a result: one full sentence for people, and a code for machines (docs/accuracy.md lists them)."""
 
     code: Annotated[str, StringConstraints(pattern=r"^[a-z0-9]+(-[a-z0-9]+)*$")]
     sentence: Annotated[str, StringConstraints(min_length=1)]

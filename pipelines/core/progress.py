@@ -1,9 +1,7 @@
-"""Progress of long work.
+"""Progress of long work, and interrupts that wait until its step is done and saved.
 
 Library code opens a task and advances it. The command line supplies a `Progress` that draws a bar or prints lines.
 The default is silent.
-
-Delayed interrupts: a loop ends its step and saves first.
 """
 
 from __future__ import annotations
@@ -39,18 +37,16 @@ class Progress(Protocol):
         """Open a task that is closed when the context ends."""
 
 
-class _SilentTask:
-    def advance(self, steps: int = 1, note: str = "", left_s: float | None = None) -> None:
-        """Do nothing."""
-
-
 class SilentProgress:
-    """Progress without output, for library use and tests."""
+    """Progress without output, for library use and tests; it is its own task."""
 
     @contextmanager
     def task(self, name: str, total: int | None = None) -> Iterator[ProgressTask]:
         """Open a task that shows nothing."""
-        yield _SilentTask()
+        yield self
+
+    def advance(self, steps: int = 1, note: str = "", left_s: float | None = None) -> None:
+        """Do nothing."""
 
 
 SILENT = SilentProgress()
@@ -63,7 +59,7 @@ if sys.platform == "win32":  # There SIGTERM kills without a handler; another pr
 
 @dataclass
 class StopRequest:
-    """Flag that a signal sets: whether the user has requested a stop."""
+    """Whether the user has requested a stop, by a signal."""
 
     requested: bool = False
 

@@ -1,7 +1,4 @@
-"""Runner of the stages in a workspace; stages whose product is current are skipped.
-
-Traces of a refused command: a workspace that was not there before, and in which no stage has ended.
-"""
+"""Runner of the stages in a workspace; those whose product is current are skipped."""
 
 from __future__ import annotations
 
@@ -13,12 +10,11 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
-from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
 
+from pipelines.core import staleness
 from pipelines.core.errors import (
     ConvergenceError,
     DamagedPartialError,
@@ -29,35 +25,16 @@ from pipelines.core.errors import (
     WorkspaceBusyError,
     storage_failures,
 )
-from pipelines.core.files import remove
+from pipelines.core.files import remove, replace_text
 from pipelines.core.fingerprints import library_versions
 from pipelines.core.lock import WriteLock
-from pipelines.core.manifest import Manifest, Memo, record_files
-from pipelines.core.options import REQUESTS
+from pipelines.core.manifest import MANIFEST, Manifest, Memo, record_files
+from pipelines.core.options import REQUESTS, remembered
 from pipelines.core.products import AT_END, union
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.sentences import duration
 from pipelines.core.stages import STAGES, StageSpec, products_of
-from pipelines.core.staleness import (
-    BY_HAND,
-    Flags,
-    Request,
-    cautions_by_stage,
-    continuing_command,
-    damaged_product,
-    extendable_product,
-    found_interrupted,
-    is_unfinished,
-    must_exist,
-    refuse_damaged_inputs,
-    refuse_loss,
-    refuse_loss_by_options,
-    request,
-    stage_config,
-    warn_of_stale_inputs,
-    why_damaged,
-    why_stale,
-)
+from pipelines.core.staleness import BY_HAND, Flags, Request
 from pipelines.core.workspace import Resume, StageRun, Summary, Workspace, now
 
 log = logging.getLogger(__name__)
@@ -68,13 +45,7 @@ def no_traces_of_refusal(workspace: Workspace) -> Iterator[None]:
     """Remove what a command wrote, if it fails before the first product of a new workspace.
 
     Files of others in the folder stay, `georef.toml` among them. An interrupted command keeps what it has written:
-    it can be completed.
-
-    Args:
-        workspace: not locked by this process.
-
-    Raises:
-        GeorefError: the failure.
+    it can be completed. The workspace is not locked by this process.
     """
     missing = [folder for folder in (workspace.root, *workspace.root.parents) if not folder.exists()]
     is_new = workspace.base is None and not workspace.has_begun()
@@ -120,17 +91,6 @@ class Outcome:
     manifest: Manifest
 
 
-@dataclass(frozen=True)
-class _Job:
-    """Stage to run, with the arguments of `run_stage`."""
-
-    workspace: Workspace
-    asked: Request
-    resume: Resume
-    progress: Progress
-    place: str
-
-
 @storage_failures()
 def run_stage(
     workspace: Workspace,
@@ -148,13 +108,10 @@ def run_stage(
     The flags are remembered for `run_pipeline`, unless the stage refuses its input.
 
     Args:
-        workspace: holds the products that the stage reads, and receives its product.
-        spec: the stage.
         flags: only the options that the user gave, by field.
         force: run even if the product is current, and start afresh.
         renew: run even if the product is current, with all that its parts have left.
         resume: whether to continue an interrupted run (see `Workspace.begin`), or to extend a finished product.
-        progress: shows the stage's tasks.
         place: place of the stage in a longer run, for the log: `stage 2 of 8`.
 
     Raises:
@@ -162,23 +119,23 @@ def run_stage(
         GeorefError: any other known failure; the previous product stays whole.
     """
     if spec.reads:
-        must_exist(workspace)
+        staleness.must_exist(workspace)
     with no_traces_of_refusal(workspace), workspace.lock(spec.name):
         memo: Memo = {}
-        asked = request(workspace, spec, flags, memo, progress)
-        warn_of_stale_inputs(workspace, spec, memo)
-        refuse_damaged_inputs(workspace, spec, memo)
+        asked = staleness.request(workspace, spec, flags, memo, progress)
+        staleness.warn_of_stale_inputs(workspace, spec, memo)
+        staleness.refuse_damaged_inputs(workspace, spec, memo)
         previous = None if force or renew else _current(workspace, asked, memo)
         if previous is not None and resume != "never" and _goes_on(workspace, asked):
             previous = None
         if previous is None and not force:
-            refuse_loss(workspace, asked)
+            staleness.refuse_loss(workspace, spec, asked.options, asked.inputs.hashes)
         before = workspace.requests().get(spec.name, {})
         workspace.remember({spec.name: flags})
         if previous is not None:
             return Outcome(spec.name, False, _with_present_files(workspace, asked, previous))
         try:
-            manifest = _execute(_Job(workspace, asked, "never" if force else resume, progress, place))
+            manifest = _execute(workspace, asked, "never" if force else resume, progress, place)
         except InputError:
             workspace.remember({spec.name: before})
             raise
@@ -202,29 +159,22 @@ def run_pipeline(
     stage costs no hours, and a run that is killed early is later completed with the same options.
 
     Args:
-        workspace: holds the products of all stages.
-        stages: the stages, in the order of the pipeline.
         flags: options by stage; they override the remembered options of the stage.
         forget: remembered options by stage that no longer count.
         force: run also the stages whose product is current, and start all afresh.
-        progress: shows the tasks of the stages.
         around: makes the context in which a stage runs.
 
     Raises:
         GeorefError: the first failure.
     """
     if stages[0].reads:
-        must_exist(workspace)
+        staleness.must_exist(workspace)
     before = workspace.requests()
-    forget = forget or {}
-    asked = {
-        spec.name: remembered(workspace, spec, flags.get(spec.name, {}), forget.get(spec.name, ()))
-        for spec in stages
-    }
+    asked = remembered(workspace.root, [spec.name for spec in stages], flags, forget)
     for spec in stages:
-        options = stage_config(workspace, spec, asked[spec.name])
+        options = staleness.stage_config(workspace, spec, asked[spec.name])
         if not force:
-            refuse_loss_by_options(workspace, spec, options)
+            staleness.refuse_loss_by_options(workspace, spec, options)
     outcomes: list[Outcome] = []
     with no_traces_of_refusal(workspace):
         with workspace.lock("run"):
@@ -251,12 +201,6 @@ def run_pipeline(
     return outcomes
 
 
-def remembered(workspace: Workspace, spec: StageSpec, flags: Flags, forget: Collection[str] = ()) -> dict[str, Any]:
-    """Return the options that a stage was last requested with but those of `forget`, overridden by `flags`."""
-    before = workspace.requests().get(spec.name, {})
-    return {**{name: value for name, value in before.items() if name not in forget}, **flags}
-
-
 def _goes_on(workspace: Workspace, asked: Request) -> bool:
     """Return whether to go on with an interrupted run beside a current product, and tell what lies there.
 
@@ -264,14 +208,14 @@ def _goes_on(workspace: Workspace, asked: Request) -> bool:
     deleted; what another request can continue stays.
     """
     spec, partial = asked.spec, workspace.partial_product(asked.spec)
-    if not partial.exists() or workspace.placed_by_hand(spec):
+    if not partial.folder.exists() or workspace.placed_by_hand(spec):
         return False
-    found = found_interrupted(workspace, spec)
-    if is_unfinished(workspace, asked):
+    found = staleness.found_interrupted(workspace, spec)
+    if staleness.is_unfinished(workspace, asked):
         log.info("%s: an interrupted run lies beside the finished product: %s", spec.name, found)
         return True
     if spec.resumable and partial.progress() is not None:
-        command = continuing_command(workspace, spec)
+        command = staleness.continuing_command(workspace, spec)
         log.warning(
             "%s: beside this product lies an interrupted run: %s; `%s` goes on with it, --force drops it",
             spec.name, found, command,
@@ -282,19 +226,23 @@ def _goes_on(workspace: Workspace, asked: Request) -> bool:
     return False
 
 
-def _execute(job: _Job) -> Manifest:
-    workspace, asked = job.workspace, job.asked
+def _execute(workspace: Workspace, asked: Request, resume: Resume, progress: Progress, place: str) -> Manifest:
     spec, resolved = asked.spec, asked.options.model_dump(mode="json")
-    _tell_interrupted(job)
+    partial = workspace.partial_product(spec)
+    if spec.resumable and partial.folder.exists():
+        found = staleness.found_interrupted(workspace, spec)
+        if resume != "never" and partial.is_of(asked.token):
+            log.info("%s: goes on with an interrupted run: %s", spec.name, found)
+        else:
+            log.warning("%s: starts afresh; what an interrupted run had done is dropped: %s", spec.name, found)
     started, clock = now(), time.monotonic()
-    summary = _run(job)
-    out = workspace.partial(spec)
+    summary = _run(workspace, asked, resume, progress, place)
     for product in products_of(spec):
-        if not (out / product.removeprefix(f"{spec.folder}/")).exists():
+        if not (partial.folder / product.removeprefix(f"{spec.folder}/")).exists():
             raise RuntimeError(f"{spec.module} did not write {product}")
     for warning in summary.warnings:
         log.warning("%s: %s", spec.name, warning)
-    carried = set(union(*cautions_by_stage(workspace, before=spec).values()))
+    carried = set(union(*staleness.cautions_by_stage(workspace, before=spec).values()))
     for caution in summary.cautions:
         if caution not in carried:
             log.warning("%s: %s", spec.name, caution.sentence, extra={AT_END: True})
@@ -310,25 +258,13 @@ def _execute(job: _Job) -> Manifest:
         values=summary.values,
         warnings=list(summary.warnings),
         cautions=summary.cautions,
-        files=record_files(out, spec.working),
+        files=record_files(partial.folder, spec.working),
         input_files=asked.inputs.files,
     )
-    workspace.set_aside(damaged_product(workspace, spec, {}, by_content=False))
+    workspace.set_aside(staleness.finding(workspace, spec, {}).damaged)
     workspace.commit(spec, manifest)
     log.info("%s: %s (%s)", spec.name, summary.key_figure, duration(manifest.duration_s))
     return manifest
-
-
-def _tell_interrupted(job: _Job) -> None:
-    """Log what an interrupted run has left, and whether this one goes on with it."""
-    spec, partial = job.asked.spec, job.workspace.partial_product(job.asked.spec)
-    if not spec.resumable or not partial.exists():
-        return
-    found = found_interrupted(job.workspace, spec)
-    if job.resume != "never" and partial.is_of(job.asked.token):
-        log.info("%s: goes on with an interrupted run: %s", spec.name, found)
-    else:
-        log.warning("%s: starts afresh; what an interrupted run had done is dropped: %s", spec.name, found)
 
 
 def _with_present_files(workspace: Workspace, asked: Request, manifest: Manifest) -> Manifest:
@@ -339,33 +275,29 @@ def _with_present_files(workspace: Workspace, asked: Request, manifest: Manifest
     if asked.inputs.files == manifest.input_files or not workspace.manifest(asked.spec):
         return manifest
     renewed = manifest.model_copy(update={"input_files": asked.inputs.files})
-    workspace.renew(asked.spec, renewed)
+    replace_text(workspace.root / asked.spec.folder / MANIFEST, f"{renewed.model_dump_json(indent=1)}\n")
     return renewed
 
 
-def _run(job: _Job) -> Summary:
-    """Run the module of a stage; afresh, if the partial product to be continued is damaged.
-
-    Raises:
-        GeorefError: a known failure, which is recorded.
-    """
-    workspace, asked, place = job.workspace, job.asked, job.place
-    spec, token = asked.spec, asked.token
-    out, resumed = workspace.begin(spec, token, job.resume)
-    extends = None if job.resume == "never" else extendable_product(workspace, asked)
+def _run(workspace: Workspace, asked: Request, resume: Resume, progress: Progress, place: str) -> Summary:
+    """Run the module of a stage; afresh, if the partial product to be continued is damaged."""
+    spec, token, afresh = asked.spec, asked.token, resume == "never"
+    out, resumed = workspace.begin(spec, token, resume)
+    extends = None if afresh else staleness.extendable_product(workspace, asked)
     log.info("%s: %s%s", spec.name, "resumed" if resumed else "started", f", {place}" if place else "")
     try:
         with storage_failures(out):
-            run = _module(workspace, asked).run
-            afresh = job.resume == "never"
+            module = importlib.import_module(spec.module)
+            if spec.in_parts and module.made_in_parts(workspace, asked.options):
+                module = importlib.import_module(spec.in_parts)
             try:
-                summary: Summary = run(
-                    StageRun(workspace, out, job.progress, resumed, extends, afresh), asked.options
+                summary: Summary = module.run(
+                    StageRun(workspace, out, progress, resumed, extends, afresh), asked.options
                 )
             except DamagedPartialError as error:
                 log.warning("%s: starts afresh; what the interrupted run left is damaged (%s)", spec.name, error)
                 out, _ = workspace.begin(spec, token, "never")
-                summary = run(StageRun(workspace, out, job.progress, afresh=afresh), asked.options)
+                summary = module.run(StageRun(workspace, out, progress, afresh=afresh), asked.options)
     except GeorefError as error:
         workspace.partial_product(spec).fail(str(error), worthless=isinstance(error, _RESULTS))
         raise
@@ -381,19 +313,11 @@ def _run(job: _Job) -> Summary:
     return summary
 
 
-def _module(workspace: Workspace, asked: Request) -> ModuleType:
-    """Return the module that makes a stage's product, whole or in parts."""
-    spec = asked.spec
-    module = importlib.import_module(spec.module)
-    if spec.in_parts and module.made_in_parts(workspace, asked.options):
-        return importlib.import_module(spec.in_parts)
-    return module
-
-
 def _current(workspace: Workspace, asked: Request, memo: Memo) -> Manifest | None:
     """Return the manifest of a product that need not be made again, or None."""
     spec = asked.spec
-    if workspace.placed_by_hand(spec):
+    found = staleness.finding(workspace, spec, memo, by_content=True)
+    if found.by_hand:
         log.info("%s: %s was %s and is kept; --force replaces it", spec.name, spec.product, BY_HAND)
         return Manifest(
             stage=spec.name,
@@ -406,17 +330,12 @@ def _current(workspace: Workspace, asked: Request, memo: Memo) -> Manifest | Non
             values={},
             warnings=[],
         )
-    try:
-        manifest = workspace.manifest(spec)
-    except InputError as error:
-        log.warning("%s: made again, because %s", spec.name, error)
-        return None
-    if manifest is None:
-        return None
-    damage = why_damaged(workspace.damaged(spec, manifest, memo, by_content=True))
-    if damage:
-        log.warning("%s: damaged, made again: %s", spec.name, damage)
-        return None
-    reason = why_stale(workspace, asked, manifest)
-    log.info("%s: %s", spec.name, f"made again: {reason}" if reason else f"current: {manifest.key_figure}")
-    return None if reason else manifest
+    if found.unreadable:
+        log.warning("%s: made again, because %s", spec.name, found.unreadable)
+    elif found.damaged:
+        log.warning("%s: damaged, made again: %s", spec.name, staleness.why_damaged(found.damaged))
+    elif (manifest := found.manifest) is not None:
+        reason = staleness.why_stale(workspace, asked, manifest)
+        log.info("%s: %s", spec.name, f"made again: {reason}" if reason else f"current: {manifest.key_figure}")
+        return None if reason else manifest
+    return None

@@ -1,6 +1,4 @@
-"""Parts of sentences for people.
-
-Text made safe for terminals and pages: names and records of others hold control characters without effect.
+"""Parts of sentences for people, and texts of others made safe for terminals and pages.
 
 A terminal obeys escape sequences, and marks that turn the direction of writing show another name than there is.
 """
@@ -49,16 +47,13 @@ def printable(text: str) -> str:
     """Return a text in which unsafe characters, line breaks among them, are written as escapes such as `\\x1b`."""
     if text.isascii() and text.isprintable():
         return text
-    return "".join(_escaped(sign) if _is_unsafe(sign) else sign for sign in text)
+    return "".join(
+        _escaped(sign) if unicodedata.category(sign) in _UNSAFE and sign not in _HARMLESS else sign for sign in text
+    )
 
 
 def printable_lines(text: str) -> str:
-    """Return a text of several lines with every line made printable."""
     return "\n".join(printable(line) for line in text.split("\n"))
-
-
-def _is_unsafe(sign: str) -> bool:
-    return unicodedata.category(sign) in _UNSAFE and sign not in _HARMLESS
 
 
 def _escaped(sign: str) -> str:

@@ -66,9 +66,9 @@ class ProductPart:
     brings: tuple[str, ...] = ()
 
 
-def whole(*products: str) -> tuple[ProductPart, ...]:
-    """Return the parts that are whole products."""
-    return tuple(ProductPart(product) for product in products)
+def whole_products(*products: str, optional: bool = False) -> tuple[ProductPart, ...]:
+    """Return the parts of a stage's input that are whole products."""
+    return tuple(ProductPart(product, optional=optional) for product in products)
 
 
 # Photographs count by content, wherever their folder lies. Messages to the user change no result, and points
@@ -94,11 +94,8 @@ APPLIED_RIG = ProductPart(
 
 # The solution with its covariances, which is init-sim3's until training goes on from it.
 SOLVED = (
-    *whole(SPARSE, SIM3),
-    *(
-        ProductPart(product, optional=True)
-        for product in (ADJUSTMENT, SIM3_POSTERIOR, MODEL, TRAIN_POSTERIOR, GAUSSIANS)
-    ),
+    *whole_products(SPARSE, SIM3),
+    *whole_products(ADJUSTMENT, SIM3_POSTERIOR, MODEL, TRAIN_POSTERIOR, GAUSSIANS, optional=True),
 )
 
 # The accuracy of the result, which every file to hand over states.
@@ -113,10 +110,8 @@ class StageSpec:
         name: the subcommand; in tables, `georef.toml` and logs, also where `called` is another.
         module: module that defines `run(stage, options) -> Summary`.
         options_place: `module:class` of its options.
-        folder: its folder in the workspace.
         reads: products, or parts of them, that decide its result.
         product: workspace path of its main product.
-        title: one line of help.
         resumable: whether a partial product can be continued.
         growing: options of which a larger value continues the finished product.
         also: further products in its folder, besides those that the stages of the pipeline read.
@@ -183,7 +178,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         module="pipelines.adjust.calibrate",
         options_place="pipelines.adjust.options:CalibrateOptions",
         folder="calibrate",
-        reads=(MEASURED, *whole(SPARSE), ProductPart(TRACK, optional=True)),
+        reads=(MEASURED, *whole_products(SPARSE), ProductPart(TRACK, optional=True)),
         product=RIG,
         title="Estimate time offset, boresight and lever arm after sfm.",
     ),
@@ -192,7 +187,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         module="pipelines.adjust.geolocate",
         options_place="pipelines.adjust.options:GeolocateOptions",
         folder="geolocate",
-        reads=(MEASURED, *whole(SPARSE), APPLIED_RIG),
+        reads=(MEASURED, *whole_products(SPARSE), APPLIED_RIG),
         product=POINTS,
         title="Intersect every SfM point on Earth from the measured positions and attitudes.",
     ),
@@ -201,7 +196,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         module="pipelines.adjust.init_sim3",
         options_place="pipelines.adjust.options:InitSim3Options",
         folder="sim3",
-        reads=(MEASURED, *whole(SPARSE, POINTS), APPLIED_RIG),
+        reads=(MEASURED, *whole_products(SPARSE, POINTS), APPLIED_RIG),
         product=SIM3,
         title="Estimate the similarity from the SfM model to the Earth.",
         product_version=2,  # beside the similarity, the adjustment
@@ -212,7 +207,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         module="pipelines.train.stage",
         options_place="pipelines.train.options:TrainOptions",
         folder="train",
-        reads=(MEASURED, *whole(SPARSE, SIM3, ADJUSTMENT, SIM3_POSTERIOR, POINTS), APPLIED_RIG),
+        reads=(MEASURED, *whole_products(SPARSE, SIM3, ADJUSTMENT, SIM3_POSTERIOR, POINTS), APPLIED_RIG),
         product=MODEL,
         title="Train the Gaussians together with the similarity and the cameras.",
         resumable=True,
@@ -236,7 +231,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         module="pipelines.deliver.ply",
         options_place="pipelines.deliver.options:ExportPlyOptions",
         folder="export",
-        reads=(MEASURED, *whole(MODEL, GAUSSIANS), APPLIED_RIG, HEADLINE),
+        reads=(MEASURED, *whole_products(MODEL, GAUSSIANS), APPLIED_RIG, HEADLINE),
         product=SPLAT,
         title="Write the splat as a PLY with its place on Earth.",
     ),
@@ -249,7 +244,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         module="pipelines.deliver.measurable",
         options_place="pipelines.deliver.options:MeasurableOptions",
         folder="measurable",
-        reads=(MEASURED, *whole(SPARSE, MODEL, GAUSSIANS), APPLIED_RIG, HEADLINE),
+        reads=(MEASURED, *whole_products(SPARSE, MODEL, GAUSSIANS), APPLIED_RIG, HEADLINE),
         product=MEASURABLE_SPLAT,
         title="Write a second PLY whose centres lie on the surface, for viewers that measure by them.",
         resumable=True,
@@ -260,7 +255,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         module="pipelines.deliver.raster",
         options_place="pipelines.deliver.options:ExportRasterOptions",
         folder="raster",
-        reads=(MEASURED, *whole(SPARSE, MODEL, TRAIN_POSTERIOR, GAUSSIANS, SIM3), APPLIED_RIG, HEADLINE),
+        reads=(MEASURED, *whole_products(SPARSE, MODEL, TRAIN_POSTERIOR, GAUSSIANS, SIM3), APPLIED_RIG, HEADLINE),
         product="raster/orthophoto.tif",
         title="Write orthophoto, surface model and their σ as rasters in a CRS.",
         resumable=True,
@@ -271,7 +266,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         module="pipelines.deliver.cloud",
         options_place="pipelines.deliver.options:ExportCloudOptions",
         folder="cloud",
-        reads=(MEASURED, *whole(SPARSE, MODEL, TRAIN_POSTERIOR, GAUSSIANS, SIM3), APPLIED_RIG, HEADLINE),
+        reads=(MEASURED, *whole_products(SPARSE, MODEL, TRAIN_POSTERIOR, GAUSSIANS, SIM3), APPLIED_RIG, HEADLINE),
         product=CLOUD,
         title="Write the surface as a georeferenced point cloud (LAZ).",
         resumable=True,
@@ -281,7 +276,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         module="pipelines.deliver.spz",
         options_place="pipelines.deliver.options:ExportSpzOptions",
         folder="spz",
-        reads=(MEASURED, *whole(MODEL, GAUSSIANS), APPLIED_RIG, HEADLINE),
+        reads=(MEASURED, *whole_products(MODEL, GAUSSIANS), APPLIED_RIG, HEADLINE),
         product=SPZ,
         title="Write the splat as SPZ, for viewers on the web.",
     ),
@@ -290,7 +285,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         module="pipelines.deliver.tiles",
         options_place="pipelines.deliver.options:ExportTilesOptions",
         folder="tiles",
-        reads=(MEASURED, *whole(MODEL, GAUSSIANS), APPLIED_RIG, HEADLINE),
+        reads=(MEASURED, *whole_products(MODEL, GAUSSIANS), APPLIED_RIG, HEADLINE),
         product=TILES,
         title="Write the splat as 3D Tiles, for web globes.",
         also=(TILES_GLB,),
@@ -317,23 +312,11 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         options_place="pipelines.report.options:ReportOptions",
         folder="report",
         reads=(
-            *whole(SURVEY, REPORT),
+            *whole_products(SURVEY, REPORT),
             *SOLVED,
             APPLIED_RIG,
-            *(
-                ProductPart(product, optional=True)
-                for product in (
-                    RENDERS,
-                    ACCURACY_MAP,
-                    REFERENCE_MAP,
-                    REFERENCE_HISTOGRAM,
-                    METRICS,
-                    LIDAR,
-                    LIDAR_MAP,
-                    ORTHOPHOTO_PREVIEW,
-                    HILLSHADE,
-                )
-            ),
+            *whole_products(RENDERS, ACCURACY_MAP, REFERENCE_MAP, REFERENCE_HISTOGRAM, optional=True),
+            *whole_products(METRICS, LIDAR, LIDAR_MAP, ORTHOPHOTO_PREVIEW, HILLSHADE, optional=True),
         ),
         product=REPORT_PAGE,
         title="Write the report of the survey: one page with all that is known of it.",
@@ -347,7 +330,7 @@ ADJUST = StageSpec(
     module="pipelines.sfm.pose_prior",
     options_place="pipelines.sfm.options:AdjustOptions",
     folder="adjust",
-    reads=(MEASURED, *whole(SPARSE), APPLIED_RIG),
+    reads=(MEASURED, *whole_products(SPARSE), APPLIED_RIG),
     product="adjust/sparse",
     title="Adjust the bundle with the fixes as priors of the camera positions.",
     also=("adjust/geo_from_local.json", "adjust/adjustment.json", "adjust/adjustment.npz"),
@@ -359,7 +342,7 @@ PLAN_BLOCKS = StageSpec(
     module="pipelines.train.blocks.plan",
     options_place="pipelines.train.blocks.options:PlanOptions",
     folder="plan",
-    reads=(MEASURED, *whole(SPARSE, SIM3, ADJUSTMENT), APPLIED_RIG),
+    reads=(MEASURED, *whole_products(SPARSE, SIM3, ADJUSTMENT), APPLIED_RIG),
     product=BLOCK_PLAN,
     title="Divide the survey into blocks.",
 )
@@ -368,7 +351,7 @@ SOLVE = StageSpec(
     module="pipelines.train.blocks.solution",
     options_place="pipelines.train.options:SolutionOptions",
     folder="solution",
-    reads=(MEASURED, *whole(SPARSE, SIM3, ADJUSTMENT), APPLIED_RIG),
+    reads=(MEASURED, *whole_products(SPARSE, SIM3, ADJUSTMENT), APPLIED_RIG),
     product=SOLUTION,
     title="Take over the adjustment, and estimate the exposures, for all blocks.",
 )
@@ -377,7 +360,7 @@ TRAIN_SCAFFOLD = StageSpec(
     module="pipelines.train.blocks.scaffold",
     options_place="pipelines.train.options:TrainOptions",
     folder="scaffold",
-    reads=(MEASURED, *whole(SPARSE, SIM3, SOLUTION), APPLIED_RIG),
+    reads=(MEASURED, *whole_products(SPARSE, SIM3, SOLUTION), APPLIED_RIG),
     product=SCAFFOLD,
     title="Train a coarse model of the whole, which stands in for the other blocks.",
     resumable=True,
@@ -388,7 +371,7 @@ TRAIN_BLOCK = StageSpec(
     module="pipelines.train.blocks.block",
     options_place="pipelines.train.options:BlockTrainOptions",
     folder="block",
-    reads=(MEASURED, *whole(SPARSE, SIM3, BLOCK_PLAN, SOLUTION, SCAFFOLD), APPLIED_RIG),
+    reads=(MEASURED, *whole_products(SPARSE, SIM3, BLOCK_PLAN, SOLUTION, SCAFFOLD), APPLIED_RIG),
     product=BLOCK_GAUSSIANS,
     title="Train the Gaussians of one block.",
     resumable=True,
@@ -401,7 +384,7 @@ TRAIN_SEAMS = StageSpec(
     module="pipelines.train.blocks.seams",
     options_place="pipelines.train.options:SeamOptions",
     folder="seams",
-    reads=(MEASURED, *whole(SPARSE, SIM3, BLOCK_PLAN, SOLUTION, SCAFFOLD), APPLIED_RIG),
+    reads=(MEASURED, *whole_products(SPARSE, SIM3, BLOCK_PLAN, SOLUTION, SCAFFOLD), APPLIED_RIG),
     product=FIRST_CELL,
     title="Adapt the Gaussians along the seams of the blocks to each other.",
     resumable=True,
@@ -426,22 +409,14 @@ def products_of(spec: StageSpec) -> tuple[str, ...]:
 
 
 def named_deliverables(names: str | None) -> tuple[StageSpec, ...]:
-    """Return the stages of the deliverables in a text, such as `raster,cloud` or `all`; None names none.
-
-    Raises:
-        ValueError: an unknown name.
-    """
+    """Return the stages of the deliverables in a text (`raster,cloud`, `all`); a ValueError: one is unknown."""
     by_name = {spec.name.removeprefix("export-"): spec for spec in DELIVERABLES}
     listed = () if names is None else listed_names(names, (*by_name, "all"))
-    return DELIVERABLES if "all" in listed else tuple(spec for name, spec in by_name.items() if name in listed)
+    return tuple(spec for name, spec in by_name.items() if name in listed or "all" in listed)
 
 
 def stage_slice(first: str | None, last: str | None) -> tuple[StageSpec, ...]:
-    """Return the stages from `first` to `last`, both included.
-
-    Raises:
-        GeorefError: `first` comes after `last`.
-    """
+    """Return the stages from `first` to `last`, both included; a GeorefError: `first` comes after `last`."""
     names = [spec.name for spec in PIPELINE]
     begin = names.index(first) if first else 0
     end = names.index(last) if last else len(names) - 1

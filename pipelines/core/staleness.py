@@ -1,20 +1,21 @@
-"""State of every stage: a product is current if its inputs and options are those of now.
+"""State of every stage, which `run`, `status` and `--dry-run` ask for here, and the checks ahead of a stage.
 
-Checks ahead of a stage: stale or damaged inputs, and earlier work that would be lost or can be extended.
+A product is current if its inputs and options are those of now. A stage warns of stale inputs, and refuses damaged
+ones, and a request that would lose what an interrupted run has done.
 """
 
 from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal
 
 from pipelines.core.errors import InputError, MissingProductError
-from pipelines.core.fingerprints import Fingerprints, Records, fingerprints
+from pipelines.core.fingerprints import Fingerprints, fingerprints
 from pipelines.core.manifest import MANIFEST, Manifest, Memo
 from pipelines.core.options import StageOptions, as_flags, decisive_fields, load_toml, resolve
 from pipelines.core.products import Caution, union
@@ -32,15 +33,10 @@ Flags = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class StageState:
-    """Row of `georef status`.
+    """Row of `georef status`: a stage, its product, and the run that made it.
 
     Attributes:
-        stage: the subcommand.
-        state: of its product.
         reason: why the product is not current, or why the latest run failed.
-        finished: end of the run that made the product.
-        duration_s: of that run.
-        key_figure: of the product.
         interrupted: what an interrupted run has left, and what goes on with it; empty without one.
     """
 
@@ -78,26 +74,13 @@ def request(
         MissingProductError: a product that the stage reads does not exist.
         InputError: an unknown or invalid option, or a missing file.
     """
-    options = stage_config(workspace, spec, flags)
-    known = _input_files(workspace, spec)
+    options, made = stage_config(workspace, spec, flags), _readable_manifest(workspace, spec)
+    known = None if made is None else made.input_files
     return Request(spec, options, fingerprints(workspace, spec, options, memo, known=known, progress=progress))
 
 
-def _input_files(workspace: Workspace, spec: StageSpec) -> Records:
-    """Return the records of the input files that the product was made from; none without a readable manifest."""
-    try:
-        manifest = workspace.manifest(spec)
-    except InputError:
-        return {}
-    return {} if manifest is None else manifest.input_files
-
-
 def stage_config(workspace: Workspace, spec: StageSpec, flags: Flags) -> StageOptions:
-    """Return the options of a stage: default < `georef.toml` < flags.
-
-    Raises:
-        InputError: an unknown or invalid option.
-    """
+    """Return the options of a stage: default < `georef.toml` < flags; an InputError names an invalid one."""
     tables = load_toml(workspace.config_file, BY_NAME)
     return resolve(spec.options, tables.get(spec.name, {}), flags, workspace.config_file, stage=spec.name)
 
@@ -118,13 +101,7 @@ def why_stale(workspace: Workspace, asked: Request, manifest: Manifest) -> str:
 
 
 def changed_options(options: StageOptions, config: Mapping[str, Any], but: Collection[str] = ()) -> str:
-    """Return which options differ from recorded ones, as a reason; empty if none does.
-
-    Args:
-        options: of now.
-        config: as recorded, by field.
-        but: options that do not count.
-    """
+    """Return which options but those of `but` differ from recorded ones, as a reason; empty if none does."""
     try:
         before = type(options).model_validate(config)
     except ValueError:
@@ -137,11 +114,11 @@ def changed_options(options: StageOptions, config: Mapping[str, Any], but: Colle
 def found_interrupted(workspace: Workspace, spec: StageSpec) -> str:
     """Return what an interrupted run has left: how far it came, when, and with which options."""
     partial = workspace.partial_product(spec)
-    options = _options_of_partial(workspace, spec)
-    fields = () if options is None else decisive_fields(spec.options)
-    changed = [name for name in fields if getattr(options, name) != spec.options.model_fields[name].default]
-    words = "" if options is None or not changed else f", with {as_flags(options, changed)}"
-    return partial.found() + words
+    options, defaults = _options_of_partial(workspace, spec), spec.options.model_fields
+    if options is None:
+        return partial.found()
+    changed = [name for name in decisive_fields(spec.options) if getattr(options, name) != defaults[name].default]
+    return partial.found() + (f", with {as_flags(options, changed)}" if changed else "")
 
 
 def continuing_command(workspace: Workspace, spec: StageSpec) -> str:
@@ -171,7 +148,7 @@ def changed_inputs(inputs: Mapping[str, str], recorded: Mapping[str, str]) -> st
     return f"{', '.join(changed)} changed" if changed else ""
 
 
-def why_damaged(files: list[str]) -> str:
+def why_damaged(files: Sequence[str]) -> str:
     """Return the reason why a product with these changed files is damaged; empty without any."""
     if not files:
         return ""
@@ -181,44 +158,119 @@ def why_damaged(files: list[str]) -> str:
     )
 
 
+@dataclass(frozen=True)
+class Finding:
+    """What lies in the folder of a stage.
+
+    Attributes:
+        manifest: None: there is none that can be read.
+        by_hand: whether all products are there without a manifest.
+        unreadable: why the manifest cannot be read; empty: it can, or there is none.
+        damaged: files that differ from the manifest's records, by workspace path.
+    """
+
+    manifest: Manifest | None = None
+    by_hand: bool = False
+    unreadable: str = ""
+    damaged: tuple[str, ...] = ()
+
+
+def finding(workspace: Workspace, spec: StageSpec, memo: Memo, *, by_content: bool = False) -> Finding:
+    """Return what lies in the folder of a stage; memo and `by_content` are as for `damaged_files`."""
+    if workspace.placed_by_hand(spec):
+        return Finding(by_hand=True)
+    try:
+        manifest = workspace.manifest(spec)
+    except InputError as error:
+        return Finding(unreadable=str(error))
+    damaged = [] if manifest is None else workspace.damaged(spec, manifest, memo, by_content=by_content)
+    return Finding(manifest, damaged=tuple(damaged))
+
+
 def status(workspace: Workspace, memo: Memo | None = None, before: StageSpec | None = None) -> list[StageState]:
     """Return the state of every stage of the pipeline, in order, and of the deliverables that there are.
 
-    Args:
-        workspace: an existing workspace.
-        memo: hashes of products and of their files by path, extended here.
-        before: stage of the pipeline; only the stages ahead of it are returned.
+    Only the stages ahead of `before` are returned, if it is given. The memo of hashes by path is extended.
 
     Raises:
         InputError: the directory does not exist, or its `georef.toml` or `requests.json` is not valid.
     """
     must_exist(workspace)
-    look = _Look(workspace, {} if memo is None else memo, workspace.requests())
-    writer = workspace.writer()
-    rows = []
-    made = [spec for spec in DELIVERABLES if before is None and _has_begun(workspace, spec)]
-    for spec in (*_ahead_of(before), *made):
-        row = look.at(spec)
+    memo = {} if memo is None else memo
+    requests, writer = workspace.requests(), workspace.writer()
+    begun = [
+        spec
+        for spec in (DELIVERABLES if before is None else ())
+        if (workspace.root / spec.folder).exists() or workspace.partial(spec).exists()
+    ]
+    rows: list[StageState] = []
+    stale: set[str] = set()
+    for spec in (*_ahead_of(before), *begun):
+        row = _state(workspace, spec, requests.get(spec.name, {}), memo, stale)
+        if row.state in ("stale", "damaged"):
+            stale.add(spec.name)
         rows.append(replace(row, state="running", reason="") if spec.name == writer else row)
     return rows
+
+
+def _state(workspace: Workspace, spec: StageSpec, flags: Flags, memo: Memo, stale: Collection[str]) -> StageState:
+    """Return the state of a stage, which the stale stages upstream make stale."""
+    if spec.folder in workspace.lent:  # The runs of the lending workspace keep it current.
+        return StageState(spec.name, "current", "")
+    found = finding(workspace, spec, memo)
+    if found.by_hand:
+        return StageState(spec.name, "current", BY_HAND)
+    failure, interrupted = workspace.partial_product(spec).failure(), _interrupted(workspace, spec)
+    if found.unreadable:
+        return StageState(spec.name, "stale", found.unreadable)
+    manifest, damage = found.manifest, why_damaged(found.damaged)
+    if manifest is None:
+        state: State = "failed" if failure else "interrupted" if interrupted else "missing"
+        return StageState(spec.name, state, failure or "", interrupted=interrupted)
+    reason = damage
+    if not damage:
+        stage_config(workspace, spec, flags)  # a bad georef.toml is an error, not a state
+        try:
+            reason = why_stale(workspace, request(workspace, spec, flags, memo), manifest)
+        except (MissingProductError, InputError) as error:
+            reason = str(error)
+    upstream = [producer.name for producer in producers(spec) if producer.name in stale]
+    if upstream and not reason:
+        reason = f"{', '.join(upstream)} {'are' if len(upstream) > 1 else 'is'} stale"
+    later = f"a later run failed: {failure}" if failure else ""
+    return StageState(
+        spec.name,
+        "damaged" if damage else "stale" if reason else "current",
+        "; ".join(filter(None, (reason, later))),
+        manifest.finished,
+        manifest.duration_s,
+        manifest.key_figure,
+        interrupted,
+    )
+
+
+def _interrupted(workspace: Workspace, spec: StageSpec) -> str:
+    """Return what an interrupted run has left, and what goes on with it; empty without one, or if it failed."""
+    partial = workspace.partial_product(spec)
+    if not partial.folder.exists() or partial.is_worthless():
+        return ""
+    command = f"; `{continuing_command(workspace, spec)}` goes on with it" if spec.resumable else ""
+    return f"an interrupted run: {found_interrupted(workspace, spec)}{command}"
+
+
+def producers(spec: StageSpec) -> list[StageSpec]:
+    return list(dict.fromkeys(producer_of(part.product) for part in spec.reads))
 
 
 def cautions_by_stage(workspace: Workspace, before: StageSpec | None = None) -> dict[str, tuple[Caution, ...]]:
     """Return the cautions of a workspace's products, each under the first stage that has it, in order.
 
-    A damaged manifest tells none; `status` names it.
-
-    Args:
-        workspace: holds the manifests.
-        before: stage of the pipeline; only the stages ahead of it are read.
+    Only the stages of the pipeline ahead of `before` are read, if it is given. A damaged manifest tells none.
     """
     by_stage: dict[str, tuple[Caution, ...]] = {}
     known: set[Caution] = set()
     for spec in (*_ahead_of(before), *(DELIVERABLES if before is None else ())):
-        try:
-            manifest = workspace.manifest(spec)
-        except InputError:
-            continue
+        manifest = _readable_manifest(workspace, spec)
         new = () if manifest is None else tuple(c for c in union(manifest.cautions) if c not in known)
         known.update(new)
         if new:
@@ -230,116 +282,6 @@ def _ahead_of(before: StageSpec | None) -> tuple[StageSpec, ...]:
     return PIPELINE[: PIPELINE.index(before) if before in PIPELINE else len(PIPELINE)]
 
 
-def _has_begun(workspace: Workspace, spec: StageSpec) -> bool:
-    return (workspace.root / spec.folder).exists() or workspace.partial(spec).exists()
-
-
-def must_exist(workspace: Workspace) -> None:
-    """Refuse a workspace that does not exist.
-
-    Raises:
-        InputError: the directory does not exist.
-    """
-    require_text(workspace.root)
-    if not workspace.root.is_dir():
-        raise InputError("no such workspace: `georef ingest` makes one", path=workspace.root)
-
-
-@dataclass
-class _Look:
-    """Pass along the pipeline that carries staleness downstream."""
-
-    workspace: Workspace
-    memo: Memo
-    requests: dict[str, dict[str, Any]]
-    stale: set[str] = field(default_factory=set)
-
-    def at(self, spec: StageSpec) -> StageState:
-        """Return the state of the next stage."""
-        row = self._state(spec)
-        if row.state in ("stale", "damaged"):
-            self.stale.add(spec.name)
-        return row
-
-    def _state(self, spec: StageSpec) -> StageState:
-        if spec.folder in self.workspace.lent:  # The runs of the lending workspace keep it current.
-            return StageState(spec.name, "current", "")
-        if self.workspace.placed_by_hand(spec):
-            return StageState(spec.name, "current", BY_HAND)
-        failure = self.workspace.failure(spec)
-        interrupted = self._interrupted(spec)
-        try:
-            manifest = self.workspace.manifest(spec)
-        except InputError as error:
-            return StageState(spec.name, "stale", str(error))
-        if manifest is None:
-            state: State = "failed" if failure else "interrupted" if interrupted else "missing"
-            return StageState(spec.name, state, failure or "", interrupted=interrupted)
-        damage = why_damaged(self.workspace.damaged(spec, manifest, self.memo, by_content=False))
-        reason = damage or self._reason(spec, manifest)
-        later = f"a later run failed: {failure}" if failure else ""
-        return StageState(
-            spec.name,
-            "damaged" if damage else "stale" if reason else "current",
-            "; ".join(filter(None, (reason, later))),
-            manifest.finished,
-            manifest.duration_s,
-            manifest.key_figure,
-            interrupted,
-        )
-
-    def _interrupted(self, spec: StageSpec) -> str:
-        """Return what an interrupted run has left, and what goes on with it; empty without one, or if it failed."""
-        partial = self.workspace.partial_product(spec)
-        if not partial.exists() or (partial.failure() is not None and partial.progress() is None):
-            return ""
-        found = f"an interrupted run: {found_interrupted(self.workspace, spec)}"
-        command = f"; `{continuing_command(self.workspace, spec)}` goes on with it" if spec.resumable else ""
-        return found + command
-
-    def _reason(self, spec: StageSpec, manifest: Manifest) -> str:
-        """Return the reason why a product is stale: its own inputs and options, or a stale stage upstream."""
-        flags = self.requests.get(spec.name, {})
-        stage_config(self.workspace, spec, flags)  # a bad georef.toml is an error, not a state
-        try:
-            own = why_stale(self.workspace, request(self.workspace, spec, flags, self.memo), manifest)
-        except (MissingProductError, InputError) as error:
-            return str(error)
-        producers = dict.fromkeys(producer_of(part.product).name for part in spec.reads)
-        upstream = [name for name in producers if name in self.stale]
-        return own or (f"{', '.join(upstream)} {'are' if len(upstream) > 1 else 'is'} stale" if upstream else "")
-
-
-def warn_of_stale_inputs(workspace: Workspace, spec: StageSpec, memo: Memo) -> None:
-    """Log a warning for each stale stage whose product `spec` reads."""
-    producers = {producer_of(part.product).name for part in spec.reads}
-    for row in status(workspace, memo, before=spec):
-        if row.stage in producers and row.state == "stale":
-            log.warning("%s builds on %s, which is stale (%s)", spec.name, row.stage, row.reason)
-
-
-def refuse_damaged_inputs(workspace: Workspace, spec: StageSpec, memo: Memo) -> None:
-    """Refuse to build on a product that is not as its stage wrote it.
-
-    Raises:
-        InputError: a file of a stage that `spec` reads has changed since that stage ended.
-    """
-    for producer in dict.fromkeys(producer_of(part.product) for part in spec.reads):
-        files = damaged_product(workspace, producer, memo, by_content=True)
-        if files:
-            raise InputError(
-                f"{why_damaged(files)}: `georef run {(workspace.base or workspace).root}` makes it again; to "
-                f"keep it as it is, delete {producer.folder}/{MANIFEST}",
-                path=workspace.root,
-            )
-
-
-def damaged_product(workspace: Workspace, spec: StageSpec, memo: Memo, *, by_content: bool) -> list[str]:
-    """Return the files of a finished product that differ from its manifest; none without a readable manifest."""
-    manifest = _readable_manifest(workspace, spec)
-    return [] if manifest is None else workspace.damaged(spec, manifest, memo, by_content=by_content)
-
-
 def _readable_manifest(workspace: Workspace, spec: StageSpec) -> Manifest | None:
     try:
         return workspace.manifest(spec)
@@ -347,13 +289,42 @@ def _readable_manifest(workspace: Workspace, spec: StageSpec) -> Manifest | None
         return None
 
 
+def must_exist(workspace: Workspace) -> None:
+    """Refuse a workspace that does not exist."""
+    require_text(workspace.root)
+    if not workspace.root.is_dir():
+        raise InputError("no such workspace: `georef ingest` makes one", path=workspace.root)
+
+
+def warn_of_stale_inputs(workspace: Workspace, spec: StageSpec, memo: Memo) -> None:
+    """Log a warning for each stale stage whose product `spec` reads."""
+    read = {producer.name for producer in producers(spec)}
+    for row in status(workspace, memo, before=spec):
+        if row.stage in read and row.state == "stale":
+            log.warning("%s builds on %s, which is stale (%s)", spec.name, row.stage, row.reason)
+
+
+def refuse_damaged_inputs(workspace: Workspace, spec: StageSpec, memo: Memo) -> None:
+    """Refuse to build on a product that is not as its stage wrote it."""
+    for producer in producers(spec):
+        damage = why_damaged(finding(workspace, producer, memo, by_content=True).damaged)
+        if damage:
+            raise InputError(
+                f"{damage}: `georef run {(workspace.base or workspace).root}` makes it again; to "
+                f"keep it as it is, delete {producer.folder}/{MANIFEST}",
+                path=workspace.root,
+            )
+
+
 def extendable_product(workspace: Workspace, asked: Request) -> Path | None:
     """Return the folder of a finished product that differs from the request in growing options only, or None."""
-    spec, manifest = asked.spec, _readable_manifest(workspace, asked.spec)
-    if not spec.growing or manifest is None or damaged_product(workspace, spec, {}, by_content=False):
+    spec = asked.spec
+    found = finding(workspace, spec, {}) if spec.growing else Finding()
+    if found.manifest is None or found.damaged:
         return None
-    changed = changed_options(asked.options, manifest.config, but=spec.growing)
-    return None if changed or changed_inputs(asked.inputs.hashes, manifest.inputs) else workspace.root / spec.folder
+    changed = changed_options(asked.options, found.manifest.config, but=spec.growing)
+    changed = changed or changed_inputs(asked.inputs.hashes, found.manifest.inputs)
+    return None if changed else workspace.root / spec.folder
 
 
 def is_unfinished(workspace: Workspace, asked: Request) -> bool:
@@ -362,48 +333,37 @@ def is_unfinished(workspace: Workspace, asked: Request) -> bool:
     What a run has left that failed by its nature, such as a training that diverged, leads to the same failure.
     """
     partial = workspace.partial_product(asked.spec)
-    worthless = partial.failure() is not None and partial.progress() is None
-    return asked.spec.resumable and partial.is_of(asked.token) and not worthless
+    return asked.spec.resumable and partial.is_of(asked.token) and not partial.is_worthless()
 
 
-def refuse_loss(workspace: Workspace, asked: Request) -> None:
-    """Refuse a request that would drop what an interrupted run for another request has done.
+def refuse_loss(
+    workspace: Workspace, spec: StageSpec, options: StageOptions, hashes: Mapping[str, str] | None = None
+) -> None:
+    """Refuse options and hashes of inputs, as far as known, that would drop what an interrupted run has done.
 
-    Raises:
-        InputError: names the work that would be lost, the difference, and how to continue or drop the run.
+    The InputError names the work that would be lost, the difference, and how to continue or drop the run.
     """
-    partial = workspace.partial_product(asked.spec)
+    partial = workspace.partial_product(spec)
     before = partial.request()
     if partial.progress() is None or before is None:
         return
-    config, inputs = before
-    reason = changed_options(asked.options, config) or changed_inputs(asked.inputs.hashes, inputs)
+    reason = changed_options(options, before[0]) or ("" if hashes is None else changed_inputs(hashes, before[1]))
     if reason:
-        raise _loss(workspace, asked.spec, reason)
+        command = continuing_command(workspace, spec)
+        how = "" if reason.startswith("option") else " with the former input"
+        raise InputError(
+            f"an interrupted {spec.name} would be lost ({found_interrupted(workspace, spec)}), because {reason}: "
+            f"`{command}`{how} continues it, --force drops it",
+            path=partial.folder,
+            hint=f"{command}, or --force",
+        )
 
 
 def refuse_loss_by_options(workspace: Workspace, spec: StageSpec, options: StageOptions) -> None:
     """Refuse options that would drop an interrupted run, before its inputs are known.
 
     With the options of a finished product, nothing may have to be run.
-
-    Raises:
-        InputError: as `refuse_loss`.
     """
-    partial, made = workspace.partial_product(spec), _readable_manifest(workspace, spec)
-    before = partial.request()
-    if partial.progress() is None or before is None or (made and not changed_options(options, made.config)):
-        return
-    if reason := changed_options(options, before[0]):
-        raise _loss(workspace, spec, reason)
-
-
-def _loss(workspace: Workspace, spec: StageSpec, reason: str) -> InputError:
-    command = continuing_command(workspace, spec)
-    how = "" if reason.startswith("option") else " with the former input"
-    return InputError(
-        f"an interrupted {spec.name} would be lost ({found_interrupted(workspace, spec)}), because {reason}: "
-        f"`{command}`{how} continues it, --force drops it",
-        path=workspace.partial(spec),
-        hint=f"{command}, or --force",
-    )
+    made = _readable_manifest(workspace, spec)
+    if made is None or changed_options(options, made.config):
+        refuse_loss(workspace, spec, options)

@@ -28,11 +28,7 @@ def stays_inside(path: str) -> bool:
 
 
 def require_text(path: Path, field: str | None = None) -> None:
-    """Refuse a path that is not UTF-8 text: it could not be recorded.
-
-    Raises:
-        InputError: the path has bytes that are not UTF-8.
-    """
+    """Refuse a path that is not UTF-8 text: it could not be recorded."""
     try:
         str(path).encode("utf-8")
     except UnicodeEncodeError as error:
@@ -40,22 +36,14 @@ def require_text(path: Path, field: str | None = None) -> None:
 
 
 def image_name(name: str) -> str:
-    """Return an image name that is relative to the folder of photographs and stays inside.
-
-    Raises:
-        ValueError: the name leaves the folder.
-    """
+    """Return an image name that is relative to the folder of photographs and stays inside."""
     if not stays_inside(name):
         raise ValueError(f"{name!r} leaves the folder of photographs: names are relative to it")
     return name
 
 
 def image_dir(path: str) -> str:
-    """Return the path of a folder of photographs: absolute, or relative and inside the workspace.
-
-    Raises:
-        ValueError: a relative path leaves the workspace.
-    """
+    """Return the path of a folder of photographs: absolute, or relative and inside the workspace."""
     pure = PurePosixPath(path)
     if not pure.is_absolute() and pure.parts and not stays_inside(path):
         raise ValueError(f"{path!r} leaves the workspace: give an absolute path")
@@ -63,11 +51,7 @@ def image_dir(path: str) -> str:
 
 
 def unit_quaternion(quat: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
-    """Return a quaternion of length 1, in either order.
-
-    Raises:
-        ValueError: the length differs from 1 by more than 1e-3.
-    """
+    """Return a quaternion of length 1 ± 1e-3, in either order."""
     length = float(np.linalg.norm(quat))
     if abs(length - 1) > _UNIT_TOLERANCE:
         raise ValueError(f"a rotation is a quaternion of length 1, this has {length:g}")
@@ -75,11 +59,8 @@ def unit_quaternion(quat: tuple[float, float, float, float]) -> tuple[float, flo
 
 
 def covariance(rows: tuple[Vector3, Vector3, Vector3]) -> tuple[Vector3, Vector3, Vector3]:
-    """Return a covariance (3, 3) that is symmetric and positive definite, and therefore invertible.
-
-    Raises:
-        ValueError: the matrix is not symmetric, or its least eigenvalue is not above 1e-12 of its greatest.
-    """
+    """Return a covariance (3, 3) that is symmetric and positive definite: its least eigenvalue is above 1e-12 of
+    its greatest, and it can be inverted."""
     matrix = np.array(rows)
     values = np.linalg.eigvalsh(matrix)
     if not np.allclose(matrix, matrix.T, rtol=1e-6) or values[0] <= _LEAST_EIGENVALUE_RATIO * values[-1]:

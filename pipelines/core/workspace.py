@@ -3,8 +3,6 @@
 Every stage owns one folder with a `manifest.json`. A stage writes into `<folder>.partial`, and the complete folder
 is renamed: a killed stage leaves the previous product whole. The next writer completes or undoes an interrupted
 rename. One writer at a time holds the workspace's lock.
-
-Partial product of a stage: the request that it was begun for, how far it came, and why it failed.
 """
 
 from __future__ import annotations
@@ -35,22 +33,15 @@ _MOST_TEXT_BYTES = 1 << 20
 
 @dataclass(frozen=True)
 class PartialProduct:
-    """Folder that a stage writes into until its product is complete.
+    """Folder `<stage folder>.partial`, which a stage writes into until its product is complete.
 
-    The request, as a text, is the first file to be deleted: a half deleted folder is never continued.
-
-    Attributes:
-        folder: `<stage folder>.partial`.
+    It holds the request that the run was begun for, how far it came, and why it failed. The request, as a text, is
+    the first file to be deleted: a half deleted folder is never continued.
     """
 
     folder: Path
 
-    def exists(self) -> bool:
-        """Return whether a run has begun and not ended."""
-        return self.folder.exists()
-
     def is_of(self, token: str) -> bool:
-        """Return whether the run was begun for the same request."""
         return _text(self.folder / TOKEN) == token
 
     def request(self) -> tuple[dict[str, Any], dict[str, str]] | None:
@@ -74,22 +65,17 @@ class PartialProduct:
             return f"{verb} {moment:%Y-%m-%d %H:%M}"
         return progress or "half deleted"
 
-    def record_progress(self, text: str) -> None:
-        """Record how far the run has come (`1500 of 7000 iterations`): from now on it is not dropped unasked."""
-        replace_text(self.folder / PROGRESS, text)
-
     def failure(self) -> str | None:
         """Return the message with which the run failed, or None; a full disk leaves an empty file."""
         return _text(self.folder / FAILURE) or None
 
-    def fail(self, message: str, *, worthless: bool = False) -> None:
-        """Record the message with which the run failed; a full disk has no room even for that.
+    def is_worthless(self) -> bool:
+        """Return whether the run failed with nothing worth keeping."""
+        return self.failure() is not None and self.progress() is None
 
-        Args:
-            message: of the error.
-            worthless: whether what the run has done may be dropped unasked.
-        """
-        with contextlib.suppress(OSError):
+    def fail(self, message: str, *, worthless: bool = False) -> None:
+        """Record the message with which the run failed; what a worthless run has done may be dropped unasked."""
+        with contextlib.suppress(OSError):  # A full disk has no room even for that.
             if worthless:
                 (self.folder / PROGRESS).unlink(missing_ok=True)
             (self.folder / FAILURE).write_text(message, encoding="utf-8", errors="backslashreplace")
@@ -103,11 +89,7 @@ class PartialProduct:
         (self.folder / TOKEN).write_text(token, encoding="utf-8")
 
     def go_on(self, token: str, *, insist: bool) -> bool:
-        """Return whether the folder holds a run for the same request, which can go on, and forget its failure.
-
-        Raises:
-            InputError: `insist`, and the folder holds a run for another request.
-        """
+        """Return whether to go on with a run for this request, and forget its failure; `insist` refuses another."""
         if self.folder.is_symlink() or not (self.folder / TOKEN).is_file():
             return False
         if self.is_of(token):
@@ -119,11 +101,6 @@ class PartialProduct:
                 path=self.folder,
             )
         return False
-
-    def tidy(self) -> None:
-        """Delete the notes on the run, which is complete."""
-        for name in (TOKEN, PROGRESS):
-            (self.folder / name).unlink(missing_ok=True)
 
 
 def _text(path: Path) -> str | None:
@@ -144,11 +121,7 @@ Resume = Literal["never", "if-same", "always"]
 class Summary:
     """Summary of a stage's result, for tables, `--json` and the log.
 
-    Attributes:
-        key_figure: one line for tables, e.g. "48 of 48 registered".
-        values: plain numbers and strings for `--json`.
-        warnings: messages that the user should read.
-        cautions: limits of the product, those of its inputs among them.
+    The key figure is one line such as "48 of 48 registered". The cautions are those of the inputs too.
     """
 
     key_figure: str
@@ -164,7 +137,6 @@ class StageRun:
     Attributes:
         workspace: finished products of other stages, to be read through `workspace.path`.
         out: folder to write into; it becomes the stage's folder when complete.
-        progress: shows the stage's tasks.
         resumed: whether `out` holds the partial product of an interrupted run with the same inputs and options.
         extends: the stage's finished folder, made from the same inputs with smaller values of its growing options;
             the run may start from it, and does not change it. None: there is none.
@@ -180,7 +152,7 @@ class StageRun:
 
     def record_progress(self, text: str) -> None:
         """Record how far the run has come (`1500 of 7000 iterations`): from now on it is not dropped unasked."""
-        PartialProduct(self.out).record_progress(text)
+        replace_text(self.out / PROGRESS, text)
 
 
 @dataclass(frozen=True)
@@ -188,7 +160,6 @@ class Workspace:
     """Workspace directory, or a variant of one that shares some of its products.
 
     Attributes:
-        root: the directory.
         base: for a variant, the workspace that it varies; that one holds the photographs, the cache and
             `georef.toml`.
         lent: for a variant, stage folders outside it, by name. The variant reads them and never writes them.
@@ -201,21 +172,11 @@ class Workspace:
     command: str = ""
 
     def variant(self, place: str, lent: Mapping[str, Path], command: str) -> Workspace:
-        """Return a variant in the folder `place` of this workspace; some stages run in it with other options.
-
-        Args:
-            place: path relative to `root`.
-            lent: by name, the folders of all stages that the variant reads but does not run.
-            command: that makes the variant's products: `compare`.
-        """
+        """Return a variant in a folder of this workspace, in which some stages run with other options."""
         return Workspace(self.root / place, self, lent, command)
 
     def path(self, product: str) -> Path:
-        """Return the path of a finished product.
-
-        Raises:
-            MissingProductError: the product does not exist; names the command that makes it.
-        """
+        """Return the path of a finished product; a MissingProductError names the command that makes it."""
         folder, _, inside = product.partition("/")
         path = self._folder(folder) / inside
         if not path.exists():
@@ -223,12 +184,10 @@ class Workspace:
         return path
 
     def has(self, product: str) -> bool:
-        """Return whether a product exists."""
         folder, _, inside = product.partition("/")
         return (self._folder(folder) / inside).exists()
 
     def command_of(self, spec: StageSpec) -> str:
-        """Return the command that makes the product of a stage here."""
         home = (self.base or self).root
         return f"georef {self.command} {home}" if self.command else spec.command(home)
 
@@ -242,19 +201,13 @@ class Workspace:
 
     @property
     def config_file(self) -> Path:
-        """Path of the workspace's `georef.toml`."""
         return (self.base or self).root / CONFIG_FILE
 
     def log_file(self, spec: StageSpec) -> Path:
-        """Return the path of a stage's log."""
         return self.root / "logs" / f"{spec.name}.log"
 
     def manifest(self, spec: StageSpec) -> Manifest | None:
-        """Return the manifest of a finished stage, or None.
-
-        Raises:
-            InputError: the manifest is damaged.
-        """
+        """Return the manifest of a finished stage, or None; an InputError: it is damaged."""
         path = self._folder(spec.folder) / MANIFEST
         return load_json(Manifest, path) if path.exists() else None
 
@@ -262,10 +215,6 @@ class Workspace:
         """Return whether all products of a stage exist without a manifest."""
         folder = self.root / spec.folder
         return not (folder / MANIFEST).exists() and all((self.root / p).exists() for p in products_of(spec))
-
-    def failure(self, spec: StageSpec) -> str | None:
-        """Return the message with which the latest run of a stage failed, or None."""
-        return self.partial_product(spec).failure()
 
     def partial(self, spec: StageSpec) -> Path:
         """Return the folder that a stage writes into until it is complete."""
@@ -275,20 +224,11 @@ class Workspace:
         """Return the partial product of a stage, which may not exist."""
         return PartialProduct(self.partial(spec))
 
-    def _old(self, spec: StageSpec) -> Path:
-        return self.root / f".{spec.folder}.old"
-
     @contextmanager
     def lock(self, activity: str) -> Iterator[None]:
         """Hold the lock of the workspace, and complete or undo the renames of a killed writer.
 
-        Args:
-            activity: the command that writes, for the error message of other processes.
-
-        Raises:
-            WorkspaceBusyError: another process holds the lock.
-            InputError: the directory cannot be made or written.
-            StorageError: the disk failed while the lock was held.
+        Errors as of `WriteLock.hold`; and a StorageError: the disk failed while the lock was held.
         """
         with storage_failures(self.root), WriteLock(self.root).hold(activity):
             for spec in STAGES:
@@ -309,7 +249,7 @@ class Workspace:
         return WriteLock(self.root).activity()
 
     def _recover(self, spec: StageSpec) -> None:
-        final, old = self.root / spec.folder, self._old(spec)
+        final, old = self.root / spec.folder, self.root / f".{spec.folder}.old"
         if (self.partial(spec) / MANIFEST).exists():  # complete: only the renames are missing
             self._swap(spec)
         elif old.exists() and not final.exists():
@@ -317,9 +257,10 @@ class Workspace:
         remove(old)
 
     def _swap(self, spec: StageSpec) -> None:
-        final, old, partial = self.root / spec.folder, self._old(spec), self.partial(spec)
+        final, old, partial = self.root / spec.folder, self.root / f".{spec.folder}.old", self.partial(spec)
         _refuse_what_is_no_folder(final)
-        self.partial_product(spec).tidy()
+        for name in (TOKEN, PROGRESS):
+            (partial / name).unlink(missing_ok=True)
         replace_folder(partial, final, old)
         remove(old)
 
@@ -336,8 +277,7 @@ class Workspace:
             The folder, and whether it holds a run to be continued.
 
         Raises:
-            InputError: `resume` is `always`, and the interrupted run has another token; or the stage's folder is a
-                symbolic link or a file.
+            InputError: `resume` refuses the interrupted run, or the stage's folder is a symbolic link or a file.
         """
         partial = self.partial_product(spec)
         _refuse_what_is_no_folder(self.root / spec.folder)
@@ -355,21 +295,9 @@ class Workspace:
         replace_file(draft, partial / MANIFEST)  # It marks the folder as complete, even if the next rename fails.
         self._swap(spec)
 
-    def renew(self, spec: StageSpec, manifest: Manifest) -> None:
-        """Replace the manifest of a finished stage."""
-        replace_text(self._folder(spec.folder) / MANIFEST, f"{manifest.model_dump_json(indent=1)}\n")
-
     def damaged(self, spec: StageSpec, manifest: Manifest, memo: Memo, *, by_content: bool) -> list[str]:
-        """Return the files of a finished product, by workspace path, that differ from the manifest's records.
-
-        Args:
-            spec: the stage.
-            manifest: of the product.
-            memo: hashes of files by path, extended here.
-            by_content: whether a file whose size and time of modification are unchanged is hashed too.
-        """
-        folder = self._folder(spec.folder)
-        names = damaged_files(folder, manifest, memo, by_content=by_content)
+        """Return the files of a finished product, by workspace path, that are damaged; see `damaged_files`."""
+        names = damaged_files(self._folder(spec.folder), manifest, memo, by_content=by_content)
         return [f"{spec.folder}/{name}" for name in names]
 
     def set_aside(self, product_files: Sequence[str]) -> None:
@@ -380,24 +308,15 @@ class Workspace:
             (self.root / name).replace(target)
 
     def requests(self) -> dict[str, dict[str, Any]]:
-        """Return the flags that stages were last requested with, by stage; `georef run` starts from them.
-
-        Raises:
-            InputError: `requests.json` is damaged.
-        """
+        """Return the flags that stages were last requested with, by stage; `georef run` starts from them."""
         return read_requests(self.root)
 
     def remember(self, flags: Mapping[str, Mapping[str, Any]]) -> None:
-        """Record the flags that stages were requested with, by stage."""
+        """Record the flags that some stages are requested with, by stage."""
         write_requests(self.root, {**self.requests(), **flags})
 
 
 def _refuse_what_is_no_folder(folder: Path) -> None:
-    """Refuse a stage folder that could not be replaced by a rename.
-
-    Raises:
-        InputError: the folder is a symbolic link or a file.
-    """
     if folder.is_symlink():
         raise InputError(
             "is a symbolic link, and a stage replaces its folder as a whole: put the folder itself there, or the "

@@ -1,9 +1,4 @@
-"""Run of a batch: each mission is `georef run` in a process of its own, and the table follows their ends.
-
-Table of a batch: state, accuracy, time and warnings of each mission.
-
-Files of a batch: its table as JSON and as a page, beside the missions.
-"""
+"""Batch of missions: each is `georef run` in a process of its own, and a table beside them follows their ends."""
 
 from __future__ import annotations
 
@@ -11,10 +6,10 @@ import contextlib
 import json
 import logging
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 from urllib.parse import quote
 
 from pipelines import __version__
@@ -43,19 +38,14 @@ class MissionRow(Product):
     """Row of the table.
 
     Attributes:
-        mission: its name.
         workspace: path of its workspace, relative to the folder of the batch.
         state: `waiting`: not run by this batch yet; `current`: there was nothing to do.
-        failure: reason of the failure, with the stage.
-        log: log of the stage that failed, relative to the folder of the batch.
+        failure, log: reason of the failure, with the stage; log of that stage, relative to the folder of the batch.
         seconds: of this run; None: it did not run.
         processing_s: of all stages, whenever they ran.
         images, registered: number of photographs, and of those in the SfM model.
-        accuracy: headline of its result.
         test_psnr: mean over the test views, dB.
         report: page of `georef report`, relative to the folder of the batch.
-        warnings: of the stages.
-        cautions: limits of the result.
     """
 
     mission: str
@@ -75,22 +65,17 @@ class MissionRow(Product):
 
 
 class BatchTable(Product):
-    """Table of the missions.
-
-    Attributes:
-        format_version: version of the format.
-        batch: name of the batch.
-        missions: one row for each mission.
-    """
+    """Table of the missions of a batch."""
 
     format_version: Literal[1] = 1
     batch: str
     missions: tuple[MissionRow, ...]
 
     @property
-    def counts(self) -> Counter[str]:
-        """Number of missions by state."""
-        return Counter(row.state for row in self.missions)
+    def states(self) -> str:
+        """Number of missions by state, such as `3 done, 1 failed`."""
+        counts = Counter(row.state for row in self.missions)
+        return ", ".join(f"{count} {state}" for state, count in counts.items())
 
     @property
     def is_complete(self) -> bool:
@@ -99,13 +84,7 @@ class BatchTable(Product):
 
 
 def mission_row(mission: Mission, state: MissionState, end: JobEnd | None = None) -> MissionRow:
-    """Return the row of a mission; it has figures if the mission has its result.
-
-    Args:
-        mission: the mission.
-        state: of the mission.
-        end: of its run; None: it did not run.
-    """
+    """Return the row of a mission; it has figures if the mission has its result. Without an end, it did not run."""
     seconds = None if end is None else round(end.seconds, 3)
     row = MissionRow(mission=mission.name, workspace=mission.place, state=state, seconds=seconds)
     if state == "failed" and end is not None:
@@ -119,13 +98,7 @@ def mission_row(mission: Mission, state: MissionState, end: JobEnd | None = None
     return row.model_copy(update=_figures(mission)) if state in ("done", "current") else row
 
 
-def state_of(end: JobEnd) -> MissionState:
-    """Return the state of a mission whose run has ended."""
-    return "done" if end.is_done else "interrupted" if end.is_interrupted else "failed"
-
-
 def _figures(mission: Mission) -> dict[str, object]:
-    """Return the figures of a mission's products, by field of the row."""
     workspace = mission.workspace
     manifests: dict[str, Manifest] = {}
     for spec in mission.stages:
@@ -137,7 +110,7 @@ def _figures(mission: Mission) -> dict[str, object]:
         "processing_s": round(sum(manifest.duration_s for manifest in manifests.values()), 3),
         "images": _count(manifests, "ingest", "images"),
         "registered": _count(manifests, "sfm", "registered"),
-        "warnings": _unique(text for manifest in manifests.values() for text in manifest.warnings),
+        "warnings": tuple(dict.fromkeys(text for manifest in manifests.values() for text in manifest.warnings)),
         "cautions": union(*cautions_by_stage(workspace).values()),
         "accuracy": headline_of(workspace),
         "report": f"{mission.place}/{REPORT_PAGE}" if (workspace.root / REPORT_PAGE).is_file() else None,
@@ -154,43 +127,24 @@ def _count(manifests: dict[str, Manifest], stage: str, name: str) -> int | None:
     return value if isinstance(value, int) else None
 
 
-def _unique(texts: Iterable[str]) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(texts))
-
-
-_ROOM = __name__.rpartition(".")[0]
-
-
-def json_file(folder: Path, batch: str) -> Path:
-    """Return the path of a batch's table as JSON."""
-    return folder / f"{batch}.batch.json"
-
-
 def page_file(folder: Path, batch: str) -> Path:
-    """Return the path of a batch's page."""
     return folder / f"{batch}.batch.html"
 
 
 def write_batch(folder: Path, table: BatchTable) -> None:
-    """Write the table as JSON and as a page; existing files are replaced when the new ones are complete.
-
-    Raises:
-        OSError: a file cannot be written; the existing one stays.
-    """
-    write_page(batch_page(table), _ROOM, page_file(folder, table.batch))
-    replace_text(json_file(folder, table.batch), table.model_dump_json(indent=1) + "\n")
+    """Write the table as JSON and as a page; existing files are replaced when the new ones are complete."""
+    write_page(batch_page(table), __package__, page_file(folder, table.batch))
+    replace_text(folder / f"{table.batch}.batch.json", table.model_dump_json(indent=1) + "\n")
 
 
 def batch_page(table: BatchTable) -> Page:
-    """Return the page of a batch."""
     links = {row.mission: quote(row.report) for row in table.missions if row.report is not None}
     remarks = [row for row in table.missions if row.warnings or row.cautions]
     failed = [row for row in table.missions if row.failure is not None]
     facts = {"table": table, "links": links, "remarks": remarks, "failed": failed}
-    states = ", ".join(f"{count} {state}" for state, count in table.counts.items())
     return Page(
         title=f"Batch: {table.batch}",
-        subtitle=f"{len(table.missions)} missions: {states}",
+        subtitle=f"{len(table.missions)} missions: {table.states}",
         about={"Program": f"GeoRefGS {__version__}", "Made": moment(now())},
         sections=(
             Section("missions", "Missions", "missions.html", facts),
@@ -210,12 +164,10 @@ class PlannedMission:
     """Mission with the forecast of its run.
 
     Attributes:
-        mission: the mission.
         actions: what its run would do with each stage; none where the run will be refused.
+        training_bytes: predicted peak of its training in main memory; 0 without one, or if unknown.
         inputs: files and folders that its options name.
         refusal: reason why the run will be refused, else empty.
-        training_bytes: predicted peak of its training in main memory; 0 without one, or if unknown.
-        uses_gpu: whether it trains on a GPU.
     """
 
     mission: Mission
@@ -227,12 +179,10 @@ class PlannedMission:
 
     @property
     def is_current(self) -> bool:
-        """Whether there is nothing to do."""
         return bool(self.actions) and all(action == "keep" for action in self.actions.values())
 
     @property
     def peak_bytes(self) -> int:
-        """Predicted peak of the memory of its run."""
         return BASE_BYTES + self.training_bytes
 
     def job(self, folder: Path) -> Job:
@@ -255,12 +205,7 @@ def run_batch(
     """Run the missions that are not current, and return the table of all; one that fails stops no other.
 
     The table is written beside the missions at the beginning and at the end of each mission, as JSON and as a page.
-
-    Args:
-        listed: the missions.
-        planned: the same with their forecasts, in the same order.
-        engine: runs them.
-        progress: shows all missions, and one line for each that runs.
+    `planned` are the missions of the list with their forecasts, in the same order.
 
     Raises:
         KeyboardInterrupt: the user stopped the batch; the missions that ran have saved their work.
@@ -275,7 +220,8 @@ def run_batch(
         return BatchTable(batch=listed.name, missions=tuple(rows.values()))
 
     def ended(end: JobEnd) -> None:
-        rows[end.job.name] = mission_row(by_name[end.job.name], state_of(end), end)
+        state: MissionState = "done" if end.is_done else "interrupted" if end.is_interrupted else "failed"
+        rows[end.job.name] = mission_row(by_name[end.job.name], state, end)
         with contextlib.suppress(OSError):  # It stops no mission; the last writing tells.
             write_batch(listed.folder, table())
 
@@ -290,11 +236,7 @@ def run_batch(
 
 
 def _write_last(listed: MissionList, table: BatchTable) -> None:
-    """Write the table; where missions have failed, which tell why, a table that cannot be written is a warning.
-
-    Raises:
-        StorageError: all missions are complete, and the table cannot be written.
-    """
+    """Write the table; where missions have failed, which tell why, a table that cannot be written is a warning."""
     try:
         with storage_failures(listed.folder):
             write_batch(listed.folder, table)
@@ -307,8 +249,9 @@ def _write_last(listed: MissionList, table: BatchTable) -> None:
 def run_arguments(mission: Mission) -> tuple[str, ...]:
     """Return the arguments of `georef` that run a mission; paths in them are absolute."""
     running = {spec.name for spec in mission.stages}
+    # TOML's form of a value, for which JSON's form of texts, numbers and lists will do.
     settings = [
-        f"{stage}.{option}={_literal(value)}"
+        f"{stage}.{option}={json.dumps(str(value) if isinstance(value, Path) else value, ensure_ascii=False)}"
         for stage, flags in mission.flags.items()
         if stage in running
         for option, value in flags.items()
@@ -319,8 +262,3 @@ def run_arguments(mission: Mission) -> tuple[str, ...]:
         *(("--deliver", mission.deliver) if mission.deliver else ()),
         *(word for setting in settings for word in ("--set", setting)),
     )
-
-
-def _literal(value: Any) -> str:
-    """Return a value as TOML writes it, for which JSON's form of texts, numbers and lists will do."""
-    return json.dumps(str(value) if isinstance(value, Path) else value, ensure_ascii=False)

@@ -1,12 +1,8 @@
-"""Access to a Dask cluster: its address and certificate, and what its workers offer.
+"""Access to a Dask cluster: its certificate, its address, and what its workers offer.
 
 Dask executes what it is sent, and a scheduler obeys everybody who reaches it. Connections therefore need a
-certificate on both sides, or never leave this machine.
-
-Certificates of a Dask cluster: made, kept for their owner alone, and checked where a cluster is used.
-
-Dask executes what it is sent: whoever holds the key of a cluster can run programs on all its machines, as the user
-who has started it.
+certificate on both sides, or never leave this machine. Whoever holds the key of a cluster can run programs on all
+its machines, as the user who has started it: certificates are for their owner alone, and are checked at every use.
 """
 
 from __future__ import annotations
@@ -32,6 +28,7 @@ if TYPE_CHECKING:
 CERTIFICATE, KEY = "cluster.pem", "cluster.key"
 _OF_OTHERS, _OF_EVERYBODY = 0o077, 0o007  # bits of a mode
 _MINUTES = "%Y-%m-%d %H:%M UTC"
+_NEEDS_CRYPTOGRAPHY = "certificates need cryptography: install it with `pip install 'georefgs[cluster]'`"
 _RENEW = (
     f"delete {CERTIFICATE} and {KEY} there, make new ones by `georef cluster certificates`, copy them to every "
     "machine of the cluster, and start scheduler and workers again"
@@ -39,11 +36,7 @@ _RENEW = (
 
 
 def import_distributed() -> Any:
-    """Return Dask's library.
-
-    Raises:
-        BackendUnavailableError: it is not installed; names the extra.
-    """
+    """Return Dask's library; a BackendUnavailableError names the extra that installs it."""
     try:
         import distributed
     except ImportError as error:
@@ -56,18 +49,14 @@ def import_distributed() -> Any:
 def make_certificates(folder: Path) -> None:
     """Write a new certificate and its key, which are all that a machine needs to belong to a cluster.
 
-    The certificate is its own authority. It is valid for a year, as those that Dask makes for itself. Folder and
-    files are for their owner alone.
-
-    Raises:
-        InputError: the folder has a certificate already.
-        BackendUnavailableError: the extra is not installed.
+    The certificate is its own authority, valid for a year, as those that Dask makes for itself. A second one in the
+    folder is an InputError.
     """
     distributed = import_distributed()
     try:
         security = distributed.Security.temporary()
     except ImportError as error:
-        raise _needs_cryptography() from error
+        raise BackendUnavailableError(_NEEDS_CRYPTOGRAPHY) from error
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     for name, text in ((KEY, security.tls_client_key), (CERTIFICATE, security.tls_client_cert)):
         try:
@@ -79,11 +68,7 @@ def make_certificates(folder: Path) -> None:
 
 
 def make_own_certificates(folder: Path) -> None:
-    """Make the certificate of a user's clusters where there is none; several programs may ask at once.
-
-    Raises:
-        BackendUnavailableError: the extra is not installed.
-    """
+    """Make the certificate of a user's clusters where there is none; several programs may ask at once."""
     if folder.is_dir() and any(folder.iterdir()):
         return
     folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -95,11 +80,7 @@ def make_own_certificates(folder: Path) -> None:
 
 
 def check_own_certificates(folder: Path) -> None:
-    """Check that nobody else can read a user's key, or put another in its place.
-
-    Raises:
-        InputError: folder or files belong to somebody else, or others have access.
-    """
+    """Refuse the key of a user that others can read, or that they can replace."""
     if os.name != "posix":
         return
     for path in (folder, folder / CERTIFICATE, folder / KEY):
@@ -117,12 +98,11 @@ def check_own_certificates(folder: Path) -> None:
 
 
 def check_certificates(folder: Path) -> None:
-    """Check that a folder has a certificate and its key, and that the certificate is valid now.
+    """Refuse a folder without certificate and key, or with a certificate that is not valid now.
 
     Raises:
         InputError: one is missing, everybody can read the key, or the certificate is none, has expired, or is not
             valid yet; names its dates.
-        BackendUnavailableError: the extra is not installed.
     """
     for name in (CERTIFICATE, KEY):
         if not (folder / name).is_file():
@@ -136,7 +116,7 @@ def check_certificates(folder: Path) -> None:
     try:
         from cryptography import x509
     except ImportError as error:
-        raise _needs_cryptography() from error
+        raise BackendUnavailableError(_NEEDS_CRYPTOGRAPHY) from error
     path = folder / CERTIFICATE
     try:
         certificates = x509.load_pem_x509_certificates(path.read_bytes())
@@ -150,12 +130,6 @@ def check_certificates(folder: Path) -> None:
         if now < since:
             clock = f"the clock of this machine says {now:{_MINUTES}}: set it, or {_RENEW}"
             raise InputError(f"is valid from {since:{_MINUTES}} on, and {clock}", path=path)
-
-
-def _needs_cryptography() -> BackendUnavailableError:
-    return BackendUnavailableError(
-        "certificates need cryptography: install it with `pip install 'georefgs[cluster]'`"
-    )
 
 
 PORT = 8786
@@ -186,7 +160,7 @@ class ClusterAddress:
         if not self.host or scheme not in ("tls", "tcp"):
             raise ValueError(f"{self.address!r} is no address such as tls://host:{PORT}")
         if self.certificates is None:
-            if scheme == "tls" or not is_loopback(self.host):
+            if scheme == "tls" or not is_on_this_machine(self.address):
                 raise ValueError(
                     f"{self.address} needs certificates: without them only tcp://127.0.0.1 is used, because "
                     "everybody who reaches a scheduler can run programs on its workers"
@@ -198,17 +172,14 @@ class ClusterAddress:
 
     @property
     def host(self) -> str:
-        """Host name or number."""
         return self._parts.hostname or ""
 
     @property
     def port(self) -> int:
-        """Port."""
         return self._parts.port or PORT
 
     @property
     def url(self) -> str:
-        """Address as Dask writes it."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{self._parts.scheme}://{host}:{self.port}"
 
@@ -226,15 +197,15 @@ class ClusterAddress:
 
 def is_on_this_machine(address: str) -> bool:
     """Return whether an address is that of this machine, seen by itself only."""
-    return is_loopback(_parts(address, "tls").hostname or "")
+    host = _parts(address, "tls").hostname or ""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
 
 
 def _parts(address: str, scheme: str) -> SplitResult:
-    """Return the parts of an address, with this scheme if it has none.
-
-    Raises:
-        ValueError: it is none.
-    """
+    """Return the parts of an address, with this scheme if it has none; a ValueError if it is none."""
     parts = urlsplit(address if "://" in address else f"{scheme}://{address}")
     _ = parts.port  # raises if it is none
     return parts
@@ -245,7 +216,6 @@ def connected(cluster: ClusterAddress) -> Iterator[Client]:
     """Connect to the scheduler while the context lasts.
 
     Raises:
-        BackendUnavailableError: the extra is not installed.
         ClusterError: no scheduler answers there, or it refuses the certificate.
     """
     distributed = import_distributed()
@@ -272,25 +242,9 @@ def connected(cluster: ClusterAddress) -> Iterator[Client]:
             client.close(timeout=5)
 
 
-def is_loopback(host: str) -> bool:
-    """Return whether a host is this machine, seen by itself only."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
-
-
 @dataclass(frozen=True)
 class Place:
-    """Worker of the cluster, and what it offers to jobs.
-
-    Attributes:
-        address: of the worker; another one after its restart.
-        name: for people.
-        slots: number of jobs at a time.
-        memory_bytes: for all jobs together.
-        gpus: number of GPUs.
-    """
+    """Worker of the cluster, and what it offers to all its jobs together; its restart gives it another address."""
 
     address: str
     name: str
@@ -298,21 +252,9 @@ class Place:
     memory_bytes: int
     gpus: int
 
-    def admits(self, job: Job, running: Sequence[Job], largest_bytes: int) -> bool:
-        """Return whether a job may run beside others; one that is too large for all runs alone on the largest."""
-        gpus_taken = sum(other.uses_gpu for other in running)
-        if len(running) >= self.slots or (job.uses_gpu and gpus_taken >= self.gpus):
-            return False
-        taken = sum(min(other.peak_bytes, self.memory_bytes) for other in running)
-        return taken + min(job.peak_bytes, largest_bytes) <= self.memory_bytes
-
 
 def places_of(workers: Mapping[str, Mapping[str, Any]]) -> dict[str, Place]:
-    """Return the workers that offer memory to jobs, by address.
-
-    Args:
-        workers: from the scheduler, by address.
-    """
+    """Return the workers that offer memory to jobs, by address, from what the scheduler tells of them."""
     return {
         address: Place(
             address,
@@ -331,15 +273,22 @@ def place_for(
 ) -> Place | None:
     """Return the worker for a job: the one with the fewest jobs that has room, or None.
 
+    A job that is too large for all workers runs alone on the largest. Workers on which it has failed are avoided,
+    unless there are no others.
+
     Args:
-        job: that waits.
-        places: workers by address.
-        running: jobs by address of their worker.
-        avoided: addresses of workers on which the job has failed; they are chosen if there are no others.
+        places, running: workers, and the jobs that run on them, by address.
+        avoided: addresses.
     """
-    largest = max((place.memory_bytes for place in places.values()), default=0)
+    largest_bytes = max((place.memory_bytes for place in places.values()), default=0)
+
+    def has_room(place: Place) -> bool:
+        beside = running.get(place.address, ())
+        if len(beside) >= place.slots or (job.uses_gpu and sum(other.uses_gpu for other in beside) >= place.gpus):
+            return False
+        taken = sum(min(other.peak_bytes, place.memory_bytes) for other in beside)
+        return taken + min(job.peak_bytes, largest_bytes) <= place.memory_bytes
+
     others = [place for address, place in places.items() if address not in avoided]
-    free = [
-        place for place in others or places.values() if place.admits(job, running.get(place.address, ()), largest)
-    ]
+    free = filter(has_room, others or places.values())
     return min(free, key=lambda place: len(running.get(place.address, ())), default=None)

@@ -36,7 +36,6 @@ class ReconstructionPace:
 
     @property
     def total_s(self) -> float:
-        """Seconds of one core for all steps."""
         return self.features_s + self.matching_s + self.mapping_s
 
 
@@ -46,11 +45,9 @@ def reconstruction_pace(
     """Return about how many seconds one core needs for each step.
 
     Args:
-        photographs: number of photographs.
-        megapixels: of each, as features are looked for.
-        pairs: of photographs that are matched.
+        photographs, pairs: numbers of photographs, and of pairs that are matched.
+        megapixels, max_features: of each, as features are looked for.
         doubled: whether features are looked for on twice that size, too.
-        max_features: of a photograph.
     """
     detection_s = _FEATURES_MEGAPIXEL_S if doubled else _OWN_SIZE_FEATURES_MEGAPIXEL_S
     found = megapixels * (_FEATURES_MEGAPIXEL if doubled else _OWN_SIZE_FEATURES_MEGAPIXEL)
@@ -77,8 +74,7 @@ def iteration_seconds(pixels: float, gaussians: float, *, surface: bool, windows
     """Return the seconds of one iteration on the machine of `MEASURED_ON`.
 
     Args:
-        pixels: of the photograph.
-        gaussians: number of Gaussians.
+        pixels, gaussians: of the photograph, and of the whole model.
         surface: whether surface losses hold the Gaussians.
         windows: number of windows in which the photograph is seen, one at an iteration.
     """
@@ -99,13 +95,7 @@ class BlockCost:
     coefficients: FloatArray
 
     def of(self, pixels: float, visible: float, gaussians: float) -> float:
-        """Return the cost.
-
-        Args:
-            pixels: of the block in a view.
-            visible: number of the Gaussians in a view.
-            gaussians: number of all Gaussians, those that stand in for the rest among them.
-        """
+        """Return the cost of a block with so many pixels and visible Gaussians in a view, and Gaussians in all."""
         return float((_design(np.array([[pixels, visible, gaussians]])) @ self.coefficients).item())
 
     @staticmethod
@@ -130,12 +120,9 @@ def _design(sizes: FloatArray) -> FloatArray:
 
 
 class TimeLeft:
-    """Time that the remaining iterations will take, from the speed of those done and the work of each.
+    """Time of the remaining iterations, from the speed of those done and the work of each.
 
-    Args:
-        work: of an iteration, counted from 1, in any unit.
-        iterations: length of the training.
-        clock: returns seconds.
+    The work is that of an iteration, counted from 1, in any unit.
     """
 
     def __init__(
@@ -146,7 +133,6 @@ class TimeLeft:
         self._begun: tuple[int, float] | None = None
 
     def start(self, iteration: int) -> None:
-        """Begin to measure the speed, after `iteration`."""
         self._begun = iteration, self._clock()
 
     def after(self, iteration: int) -> float | None:

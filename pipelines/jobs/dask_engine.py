@@ -3,8 +3,6 @@
 The engine chooses the worker of each job, as the local engine chooses what runs beside what; Dask carries the jobs
 and the events. A job ends with the event of its worker. A cancelled task is the one sign to stop a job: Ctrl-C, the
 end of the engine and the end of the scheduler all lead to it, and the job saves its work.
-
-Jobs of one call of the cluster's engine: where they run, how they fare, and what comes after a failure.
 """
 
 from __future__ import annotations
@@ -49,9 +47,7 @@ class PendingJob:
     """Job that has not ended.
 
     Attributes:
-        job: the job.
         token: file that its worker must see.
-        failures: so far.
         avoided: addresses of workers on which it has failed.
         not_before: time of the next attempt at the earliest.
         busy_since: time since which its folder is locked by another process; None: it is not.
@@ -67,8 +63,6 @@ class PendingJob:
 
 @dataclass
 class _Attempt:
-    """Attempt at a job, which runs on a worker."""
-
     pending: PendingJob
     place: Place
     future: Future[None]
@@ -77,33 +71,27 @@ class _Attempt:
     has_started: bool = False
 
 
+@dataclass
 class ClusterRun:
-    """Jobs of one call of the engine.
+    """Jobs of one call of the engine: where they run, how they fare, and what comes after a failure.
 
-    Args:
-        client: connected to the scheduler.
+    Attributes:
         waiting: jobs in the order in which they begin where resources allow.
         at_a_time: most jobs at a time.
         exchange: through which files go; None: they are shared.
         ended: called at the end of each job.
-        progress: shows a line for each job that runs.
-        task: counts the jobs that have ended.
+        progress, task: show a line for each job that runs, and count those that have ended.
     """
 
-    def __init__(
-        self,
-        client: Client,
-        waiting: list[PendingJob],
-        at_a_time: int,
-        exchange: EngineExchange | None,
-        *,
-        ended: Callable[[JobEnd], None],
-        progress: Progress,
-        task: ProgressTask,
-    ) -> None:
-        self._client, self._waiting, self._at_a_time = client, waiting, at_a_time
-        self._exchange = exchange
-        self._told, self._progress, self._task = ended, progress, task
+    client: Client
+    waiting: list[PendingJob]
+    at_a_time: int
+    exchange: EngineExchange | None
+    ended: Callable[[JobEnd], None]
+    progress: Progress
+    task: ProgressTask
+
+    def __post_init__(self) -> None:
         self._running: dict[str, _Attempt] = {}
         self._places: dict[str, Place] = {}
         self._unfit: set[str] = set()
@@ -111,16 +99,12 @@ class ClusterRun:
         self._warned = ""
         self._topic = f"georef-{uuid.uuid4().hex}"
         self._events: queue.Queue[dict[str, Any]] = queue.Queue()
-        client.subscribe_topic(self._topic, lambda event: self._events.put(event[1]))
+        self.client.subscribe_topic(self._topic, lambda event: self._events.put(event[1]))
 
     def until_all_have_ended(self, title: str, stop: StopRequest) -> None:
-        """Start jobs where there is room, and follow them.
-
-        Raises:
-            ClusterError: the scheduler is lost, or no worker can run the jobs.
-        """
+        """Start jobs where there is room, and follow them."""
         is_stopping, stopped = False, math.inf
-        while self._running or (self._waiting and not stop.requested):
+        while self._running or (self.waiting and not stop.requested):
             if stop.requested and not is_stopping:
                 is_stopping, stopped = True, time.monotonic()
                 log.warning("stopping %d %s: Ctrl-C again does not wait for them", len(self._running), title)
@@ -138,24 +122,25 @@ class ClusterRun:
         """Cancel what still runs, and close its lines."""
         for attempt in self._running.values():
             attempt.display.close()
-        if self._client.status == "running":
-            self._client.cancel([attempt.future for attempt in self._running.values()])
-            self._client.unsubscribe_topic(self._topic)
+        if self.client.status == "running":
+            self.client.cancel([attempt.future for attempt in self._running.values()])
+            self.client.unsubscribe_topic(self._topic)
 
     def _refresh(self, is_stopping: bool) -> None:
-        """Look which workers there are; jobs of lost workers have failed there.
-
-        Raises:
-            ClusterError: the scheduler is lost.
-        """
+        """Look which workers there are; jobs of lost workers have failed there."""
         if time.monotonic() - self._refreshed < _REFRESH_EVERY_S:
             return
         try:
-            if self._client.status != "running":
+            if self.client.status != "running":
                 raise OSError
-            workers = self._client.scheduler_info()["workers"]
+            workers = self.client.scheduler_info()["workers"]
         except (OSError, TimeoutError, RuntimeError) as error:
-            self._lose_scheduler(error)
+            for name, attempt in list(self._running.items()):
+                self._finish(name, ProcessEnd(INTERRUPTED, time.monotonic() - attempt.since))
+            raise ClusterError(
+                "the scheduler is lost: the jobs save their work and stop; start scheduler and workers, then "
+                "repeat the command, which goes on"
+            ) from error
         self._places = {
             address: place for address, place in places_of(workers).items() if address not in self._unfit
         }
@@ -169,55 +154,28 @@ class ClusterRun:
                 why = "its task was cancelled" if is_cancelled else "its worker was lost"
                 self._end(name, ProcessEnd(1, seconds, why, _LOST), is_stopping)
 
-    def _lose_scheduler(self, cause: Exception) -> None:
-        """Tell that the running jobs are interrupted.
-
-        Raises:
-            ClusterError: always.
-        """
-        for name, attempt in list(self._running.items()):
-            self._finish(name, ProcessEnd(INTERRUPTED, time.monotonic() - attempt.since))
-        raise ClusterError(
-            "the scheduler is lost: the jobs save their work and stop; start scheduler and workers, then repeat "
-            "the command, which goes on"
-        ) from cause
-
     def _start(self) -> None:
-        """Start waiting jobs on workers that have room.
-
-        Raises:
-            ClusterError: no worker can run the jobs.
-        """
         if self._unfit and not self._places and not self._running:
             raise ClusterError(f"no worker can run the jobs: {self._warned}")
         now = time.monotonic()
-        for pending in list(self._waiting):
-            if len(self._running) >= self._at_a_time:
+        for pending in list(self.waiting):
+            if len(self._running) >= self.at_a_time:
                 return
             if now < pending.not_before:
                 continue
-            place = place_for(pending.job, self._places, self._jobs_by_worker(), pending.avoided)
+            by_worker: dict[str, list[Job]] = {}
+            for attempt in self._running.values():
+                by_worker.setdefault(attempt.place.address, []).append(attempt.pending.job)
+            place = place_for(pending.job, self._places, by_worker, pending.avoided)
             if place is not None:
-                self._waiting.remove(pending)
+                self.waiting.remove(pending)
                 self._submit(pending, place)
-        if not self._running and not any(pending.not_before > now for pending in self._waiting):
-            self._warn_of_waiting()
-
-    def _jobs_by_worker(self) -> dict[str, list[Job]]:
-        by_worker: dict[str, list[Job]] = {}
-        for attempt in self._running.values():
-            by_worker.setdefault(attempt.place.address, []).append(attempt.pending.job)
-        return by_worker
-
-    def _warn_of_waiting(self) -> None:
-        """Tell once why nothing runs."""
-        if not self._waiting:
-            return
-        wanted = "a GPU" if self._places else f"{MEMORY}, as those of `georef cluster worker` do"
-        text = f"waiting: no worker offers {wanted}"
-        if text != self._warned:
-            self._warned = text
-            log.warning("%s", text)
+        if self.waiting and not self._running and all(pending.not_before <= now for pending in self.waiting):
+            wanted = "a GPU" if self._places else f"{MEMORY}, as those of `georef cluster worker` do"
+            text = f"waiting: no worker offers {wanted}"
+            if text != self._warned:
+                self._warned = text
+                log.warning("%s", text)
 
     def _submit(self, pending: PendingJob, place: Place) -> None:
         attempt = uuid.uuid4().hex
@@ -227,17 +185,17 @@ class ClusterRun:
             version=__version__,
             arguments=list(pending.job.arguments),
             token=pending.token,
-            parcel=None if self._exchange is None else self._exchange.send(pending.job, attempt),
+            parcel=None if self.exchange is None else self.exchange.send(pending.job, attempt),
         )
         resources = {MEMORY: min(pending.job.peak_bytes, place.memory_bytes)}
         if pending.job.uses_gpu:
             resources[GPU] = 1
         log.info("%s: started on %s", pending.job.name, place.name)
-        future = self._client.submit(
+        future = self.client.submit(
             run_job, request, key=f"georef-{attempt}", workers=[place.address], resources=resources, pure=False
         )
         future.add_done_callback(lambda future: self._events.put({"attempt": attempt, "future": future}))
-        display = JobDisplay(self._progress, pending.job.name)
+        display = JobDisplay(self.progress, pending.job.name)
         self._running[attempt] = _Attempt(pending, place, future, display, time.monotonic())
 
     def _take_events(self, is_stopping: bool) -> None:
@@ -309,17 +267,17 @@ class ClusterRun:
         attempt = self._running.pop(name)
         attempt.display.close()
         attempt.pending.not_before = time.monotonic() + pause_s
-        self._waiting.insert(0, attempt.pending)
+        self.waiting.insert(0, attempt.pending)
 
     def _finish(self, name: str, end: ProcessEnd) -> None:
         attempt = self._running.pop(name)
         attempt.display.close()
-        if self._exchange is not None:
-            self._exchange.collect(attempt.pending.job)
+        if self.exchange is not None:
+            self.exchange.collect(attempt.pending.job)
         job_end = JobEnd(attempt.pending.job, end.code, end.seconds, attempt.display.place, end.error)
         tell_end(job_end)
-        self._task.advance(left_s=math.inf)
-        self._told(job_end)
+        self.task.advance(left_s=math.inf)
+        self.ended(job_end)
 
 
 @dataclass(frozen=True)
@@ -330,7 +288,6 @@ class DaskEngine:
     another worker if there is one; after three failures it has failed. Workers that join are used, also later.
 
     Attributes:
-        cluster: the scheduler's address and certificate.
         at_a_time: most jobs at a time; None: as many as the workers take.
         storage: through which the files of the jobs go; None: the workers share the folders of the jobs.
     """
@@ -340,7 +297,6 @@ class DaskEngine:
     storage: Storage | None = None
 
     def together(self, jobs: Sequence[Job]) -> int:
-        """Return how many of the jobs run at a time at the beginning; see `Engine`."""
         with connected(self.cluster) as client:
             places = places_of(client.scheduler_info()["workers"])
         running: dict[str, list[Job]] = {}
@@ -357,7 +313,6 @@ class DaskEngine:
             ClusterError: there is no scheduler, it is lost, or no worker can run the jobs.
             InputError: a job needs files that cannot go through the storage.
             StorageError: the storage failed.
-            KeyboardInterrupt: see `Engine`.
         """
         exchange = None
         if self.storage is not None:
@@ -371,7 +326,7 @@ class DaskEngine:
         ):
             waiting = [PendingJob(job, tokens.get(job.folder, "")) for job in jobs]
             at_a_time = self.at_a_time or len(jobs)
-            run = ClusterRun(client, waiting, at_a_time, exchange, ended=ended, progress=progress, task=task)
+            run = ClusterRun(client, waiting, at_a_time, exchange, ended, progress, task)
             try:
                 run.until_all_have_ended(title, stop)
             finally:

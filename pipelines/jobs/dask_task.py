@@ -1,12 +1,7 @@
-"""Job on a worker of a Dask cluster: runs it as a process, and sends its messages and its end to the engine.
+"""Dask's side of a cluster: the job on a worker, which is a process of this program, and the nodes themselves.
 
-The payload is a document of names and paths. The program that runs is fixed.
-
-Nodes of a Dask cluster on this machine: scheduler and worker.
-
-Dask's own programs run; this module gives them the options that a safe cluster of this package needs.
-
-Tokens: files by which a worker recognises that it shares a folder, and not only its name.
+The payload is a document of names and paths. The program that runs is fixed. The nodes are Dask's own programs with
+the options that a safe cluster of this package needs.
 """
 
 from __future__ import annotations
@@ -37,13 +32,10 @@ _SEND_EVERY_S = 0.25
 
 
 class JobRequest(TypedDict):
-    """Request to a worker.
+    """Request to a worker: the arguments of `georef`, by this version, as one attempt at a job.
 
     Attributes:
         topic: of the events that the engine reads.
-        attempt: names this attempt at the job.
-        version: of this package.
-        arguments: of `georef`.
         token: file that a worker sees if it shares the folder of the job; empty: none is needed.
         parcel: parts that come from a storage; None: the folder is shared.
     """
@@ -66,9 +58,9 @@ def run_job(request: JobRequest) -> None:
 
     worker = get_worker()
     events = _Events(worker, request)
-    events.send(started=True)
+    events.flush(started=True)
     end = _obstacle(request) or _run_where_its_files_are(worker, request, events)
-    events.send(ended=dataclasses.asdict(end))
+    events.flush(ended=dataclasses.asdict(end))
 
 
 def _obstacle(request: JobRequest) -> ProcessEnd | None:
@@ -81,7 +73,6 @@ def _obstacle(request: JobRequest) -> ProcessEnd | None:
 
 
 def _run_where_its_files_are(worker: Any, request: JobRequest, events: _Events) -> ProcessEnd:
-    """Run the job in the shared folder, or in a scratch folder with its parts."""
     parcel, arguments = request["parcel"], request["arguments"]
     if parcel is None:
         return _run(worker, arguments, events)
@@ -109,15 +100,11 @@ def _run(worker: Any, arguments: Sequence[str], events: _Events) -> ProcessEnd:
             return ends.get(timeout=_SEND_EVERY_S)
         except queue.Empty:
             events.flush()
-        if is_wanted and not _is_wanted(worker, key):
+        task = worker.state.tasks.get(key)
+        goes_on = worker.status.name in ("running", "paused") and task is not None and task.state == "executing"
+        if is_wanted and not goes_on:
             is_wanted = False
             running.interrupt()
-
-
-def _is_wanted(worker: Any, key: Any) -> bool:
-    """Return whether a worker is to go on with its task."""
-    task = worker.state.tasks.get(key)
-    return worker.status.name in ("running", "paused") and task is not None and task.state == "executing"
 
 
 class _Events:
@@ -144,20 +131,14 @@ class _Events:
                 self._messages.append(dict(message))
         return True
 
-    def flush(self) -> None:
-        """Send the messages that were kept."""
+    def flush(self, **content: Any) -> None:
+        """Send the messages that were kept, and one event with this content, if any."""
         with self._lock:
             messages, self._messages = self._messages, []
-        if messages:
-            self._log(messages=messages)
-
-    def send(self, **content: Any) -> None:
-        """Send what was kept, and one event."""
-        self.flush()
-        self._log(**content)
-
-    def _log(self, **content: Any) -> None:
-        self._worker.log_event(self._request["topic"], {"attempt": self._request["attempt"], **content})
+        events: list[dict[str, Any]] = [{"messages": messages}, content]
+        for event in events:
+            if any(event.values()):
+                self._worker.log_event(self._request["topic"], {"attempt": self._request["attempt"], **event})
 
 
 # The pages of the status servers are not encrypted and ask for no certificate.
@@ -165,11 +146,7 @@ _PRIVATE_PAGES = ("--no-dashboard", "--dashboard-address", "127.0.0.1:0")
 
 
 def run_scheduler(listen: ClusterAddress) -> None:
-    """Run a scheduler until it is interrupted.
-
-    Raises:
-        BackendUnavailableError: the extra is not installed.
-    """
+    """Run a scheduler until it is interrupted."""
     import_distributed()
     from distributed.cli.dask_scheduler import main
 
@@ -183,16 +160,7 @@ def run_worker(
 ) -> None:
     """Run a worker until it is interrupted, or its scheduler ends.
 
-    Args:
-        scheduler: its address.
-        jobs: most jobs at a time.
-        cores: that they share.
-        memory_bytes: that they share.
-        gpus: number of GPUs; a job takes one.
-        name: for people; None: its address.
-
-    Raises:
-        BackendUnavailableError: the extra is not installed.
+    It runs at most so many jobs at a time, which share cores and memory; each takes a GPU if it uses one.
     """
     import_distributed()
     from distributed.cli.dask_worker import main
@@ -219,8 +187,7 @@ def _call(main: object, arguments: Sequence[str]) -> None:
 def folder_tokens(folders: Iterable[Path | None]) -> Iterator[dict[Path | None, str]]:
     """Put a token into each folder while the context lasts, and return their paths by folder.
 
-    Raises:
-        OSError: a folder cannot be written.
+    By this file a worker recognises that it shares a folder, and not only its name.
     """
     name = f".georef-{uuid.uuid4().hex}"
     tokens: dict[Path | None, str] = {

@@ -1,7 +1,4 @@
-"""Jobs, their ends, and the interface of the engines that run them.
-
-Display of one job: the messages of its process as one line of the progress, and as records of the log.
-"""
+"""Jobs, their ends, their display as one line each, and the interface of the engines that run them."""
 
 from __future__ import annotations
 
@@ -31,8 +28,7 @@ class Job:
     Attributes:
         name: for people, unique among the jobs of a run.
         arguments: of `georef`.
-        peak_bytes: predicted peak of the memory.
-        uses_gpu: whether it takes a whole GPU.
+        peak_bytes, uses_gpu: predicted peak of the memory, and whether it takes a whole GPU.
         folder: that its command works in, such as the workspace; a machine that does not see it cannot run the job.
         writes: file or folder in `folder` that it changes; needed where its files go through a storage.
         reads: further files and folders in `folder` that it needs there.
@@ -52,9 +48,7 @@ class JobEnd:
     """End of a job.
 
     Attributes:
-        job: the job.
         code: exit code; below zero the signal that ended the process.
-        seconds: from start to end.
         place: step that the job was at (`train`); empty if it named none.
         error: message of a job that failed, else empty.
     """
@@ -89,7 +83,6 @@ class Engine(Protocol):
             title: what the jobs are, for the display: `missions`.
             jobs: in the order in which they begin where resources allow.
             ended: called in this thread at the end of each job.
-            progress: shows a task for all jobs, and one for each that runs.
 
         Raises:
             KeyboardInterrupt: the user stopped the run. The jobs that ran have saved their work, and `ended` was
@@ -100,8 +93,7 @@ class Engine(Protocol):
 class JobLine:
     """Progress of a job as one line: its outermost task, with the task inside as its note.
 
-    Attributes:
-        place: latest note of the outermost task: the stage that runs.
+    Its place is the latest note of the outermost task: the stage that runs.
     """
 
     def __init__(self, progress: Progress, name: str) -> None:
@@ -111,7 +103,6 @@ class JobLine:
 
     @contextmanager
     def task(self, name: str, total: int | None = None) -> Iterator[ProgressTask]:
-        """Open a task of the job."""
         if self._outer is not None:
             yield _InnerTask(self, name, total)
             return
@@ -123,7 +114,6 @@ class JobLine:
                 self._outer = None
 
     def advance(self, steps: int = 1, note: str = "", left_s: float | None = None) -> None:
-        """Advance the outermost task."""
         self.place = note or self.place
         self.show(steps, self.place)
 
@@ -139,7 +129,6 @@ class _InnerTask:
         self._done, self._note = 0, ""
 
     def advance(self, steps: int = 1, note: str = "", left_s: float | None = None) -> None:
-        """Add steps, and show their count as the note of the line."""
         self._done, self._note = self._done + steps, note.strip() or self._note
         count = f"{self._name} {self._done}" + ("" if self._total is None else f"/{self._total}")
         left = "" if not left_s or math.isinf(left_s) else f"{duration(left_s)} left"
@@ -151,10 +140,6 @@ class JobDisplay(MessageReceiver):
     """Receiver of a job's messages: its tasks are one line, and its log records name it.
 
     Only warnings are logged by default: many jobs say much.
-
-    Args:
-        progress: shows the line.
-        name: of the job.
     """
 
     def __init__(self, progress: Progress, name: str) -> None:
@@ -163,17 +148,14 @@ class JobDisplay(MessageReceiver):
 
     @property
     def place(self) -> str:
-        """Step that the job is at."""
         return self._line.place
 
     def log(self, name: str, level: int, text: str) -> None:
-        """Log a record of the job."""
         shown = level if level >= logging.WARNING else logging.DEBUG
         log.log(shown, "%s: %s", self._name, text)
 
 
 def tell_end(end: JobEnd) -> None:
-    """Log the end of a job."""
     if end.is_done:
         log.info("%s: done (%s)", end.job.name, duration(end.seconds))
     elif end.is_interrupted:

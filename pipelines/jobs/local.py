@@ -1,13 +1,8 @@
-"""Engine on this machine: as many processes at a time as cores and memory allow.
+"""Engine on this machine, the process of one job, and the engine in use, which the command line chooses.
 
-Process of one job: this program again, which tells its progress, its log and its error as messages.
-
-A crash of the process is the end of its job, and of no other. The process stops when its reader is gone
-(`georef_cli/verbosity.py`), so that no job outlives a killed parent for long.
-
-Engine that the stages of this command share their work with: chosen by the command line, used by a stage.
-
-A stage that consists of many parts asks for it. The runner and the workspace know of no engine.
+A process is this program again, which tells its progress, its log and its error as messages. Its crash is the end
+of its job, and of no other. It stops when its reader is gone (`georef_cli/verbosity.py`), so that no job outlives a
+killed parent for long.
 """
 
 from __future__ import annotations
@@ -42,13 +37,9 @@ _KILLED = "the system killed it, as it does when memory is short: run fewer at a
 
 @dataclass(frozen=True)
 class ProcessEnd:
-    """End of a process.
+    """End of a process: exit code, below zero the signal that ended it, and if it failed its message.
 
-    Attributes:
-        code: exit code; below zero the signal that ended it.
-        seconds: from start to end.
-        error: its message if it failed, else empty.
-        kind: kind of the failure (`GeorefError.code`); empty if it did not tell.
+    The kind is that of the failure (`GeorefError.code`); empty if it did not tell.
     """
 
     code: int
@@ -58,17 +49,10 @@ class ProcessEnd:
 
 
 class JobProcess:
-    """Running process of a job.
+    """Running process of a job, by the arguments of Python that start this program, and those of the program.
 
-    Args:
-        program: arguments of Python that start this program.
-        arguments: of the program.
-        threads: that the job computes with.
-        take: gets the messages in a thread; false: it was none of progress or log.
-        ended: called at the end of the process, in the same thread.
-
-    Raises:
-        OSError: the process cannot be started.
+    `take` gets the messages in a thread; it returns false for one that is none of progress or log. `ended` is
+    called at the end of the process, in the same thread.
     """
 
     def __init__(
@@ -129,7 +113,8 @@ class JobProcess:
         said = next((line for line in reversed(self._plain) if line.strip()), "")
         text = said.removeprefix("error: ").removeprefix("Error: ")
         if code < 0:
-            ending = _KILLED if code == -_SIGKILL else f"it crashed ({_name(-code)})"
+            name = next((known.name for known in signal.Signals if known == -code), f"signal {-code}")
+            ending = _KILLED if code == -_SIGKILL else f"it crashed ({name})"
             return f"{ending}: {text}" if text else ending
         return text or f"it ended with exit code {code}"
 
@@ -141,13 +126,6 @@ def _message(line: str) -> dict[str, Any] | None:
     except (ValueError, RecursionError):
         return None
     return message if isinstance(message, dict) and "kind" in message else None
-
-
-def _name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"
 
 
 _OWN_GROUP: dict[str, Any]
@@ -170,9 +148,7 @@ class LocalEngine:
     """Engine that runs jobs as processes of this machine.
 
     Attributes:
-        at_a_time: most jobs at a time.
-        cores: that the jobs share.
-        free_bytes: memory that the jobs share; None: unknown, only their number is limited.
+        cores, free_bytes: that the jobs share; memory None: unknown, only the number of jobs is limited.
         program: arguments of Python that start this program.
     """
 
@@ -182,7 +158,6 @@ class LocalEngine:
     program: tuple[str, ...] = field(default_factory=lambda: child.THIS_PROGRAM)
 
     def together(self, jobs: Sequence[Job]) -> int:
-        """Return how many of the jobs run at a time at the beginning; see `Engine`."""
         return max(len(self._startable(jobs, [])), 1)
 
     def run(self, title: str, jobs: Sequence[Job], ended: Callable[[JobEnd], None], progress: Progress) -> None:
@@ -191,24 +166,33 @@ class LocalEngine:
         A job that needs more memory than there is runs alone. Smaller jobs pass one that has to wait for memory.
         """
         threads = max(self.cores // self.together(jobs), 1)
-        waiting, running = list(jobs), dict[str, _RunningJob]()
+        waiting, running = list(jobs), dict[Job, JobProcess]()
+        finished: queue.Queue[JobEnd] = queue.Queue()
+
+        def start(job: Job) -> JobProcess:
+            display = JobDisplay(progress, job.name)
+
+            def put(end: ProcessEnd) -> None:
+                display.close()
+                finished.put(JobEnd(job, end.code, end.seconds, display.place, end.error))
+
+            return JobProcess(self.program, job.arguments, threads, display.take, put)
 
         def end_of(end: JobEnd) -> None:
             tell_end(end)
             task.advance(left_s=math.inf)
             ended(end)
 
-        finished: queue.Queue[JobEnd] = queue.Queue()
         with progress.task(title, len(jobs)) as task, deferred_interrupts() as stop:
             try:
                 is_stopping = False
                 while running or (waiting and not stop.requested):
                     if not stop.requested:
-                        for job in self._startable(waiting, [other.job for other in running.values()]):
+                        for job in self._startable(waiting, list(running)):
                             log.info("%s: started with %d thread%s", job.name, threads, "" if threads == 1 else "s")
                             waiting.remove(job)
                             try:
-                                running[job.name] = _RunningJob(job, self.program, threads, progress, finished)
+                                running[job] = start(job)
                             except OSError as error:  # a command line that is too long, no more processes
                                 end_of(JobEnd(job, 1, 0.0, "", f"cannot be started: {error.strerror}"))
                     elif not is_stopping:
@@ -220,7 +204,7 @@ class LocalEngine:
                         end = finished.get(timeout=_LOOK_EVERY_S)
                     except queue.Empty:
                         continue
-                    del running[end.job.name]
+                    del running[end.job]
                     end_of(end)
             finally:
                 for job_process in running.values():
@@ -232,33 +216,15 @@ class LocalEngine:
         """Return the waiting jobs that may start beside those that run."""
         beside = list(running)
         for job in waiting:
-            if self._admits(job, beside):
+            needed = job.peak_bytes + sum(other.peak_bytes for other in beside)
+            has_room = (
+                len(beside) < self.at_a_time
+                and not (job.uses_gpu and any(other.uses_gpu for other in beside))
+                and (self.free_bytes is None or needed <= _USABLE * self.free_bytes)
+            )
+            if has_room or not beside:
                 beside.append(job)
         return beside[len(running) :]
-
-    def _admits(self, job: Job, running: Sequence[Job]) -> bool:
-        """Return whether a job may run beside others."""
-        if not running:
-            return True
-        if len(running) >= self.at_a_time or (job.uses_gpu and any(other.uses_gpu for other in running)):
-            return False
-        needed = job.peak_bytes + sum(other.peak_bytes for other in running)
-        return self.free_bytes is None or needed <= _USABLE * self.free_bytes
-
-
-class _RunningJob(JobProcess):
-    """Process of a job, whose messages are shown, and whose end is put into a queue."""
-
-    def __init__(
-        self, job: Job, program: Sequence[str], threads: int, progress: Progress, finished: queue.Queue[JobEnd]
-    ) -> None:
-        self.job, self._finished = job, finished
-        self._display = JobDisplay(progress, job.name)
-        super().__init__(program, job.arguments, threads, self._display.take, self._put)
-
-    def _put(self, end: ProcessEnd) -> None:
-        self._display.close()
-        self._finished.put(JobEnd(self.job, end.code, end.seconds, self._display.place, end.error))
 
 
 _CHOSEN: ContextVar[Engine | None] = ContextVar("engine", default=None)
@@ -266,7 +232,7 @@ _CHOSEN: ContextVar[Engine | None] = ContextVar("engine", default=None)
 
 @contextmanager
 def chosen_engine(engine: Engine) -> Iterator[None]:
-    """Let the stages that run in this context share their work with an engine."""
+    """Let the stages that run in this context share their work with an engine; the runner knows of none."""
     token = _CHOSEN.set(engine)
     try:
         yield
@@ -274,20 +240,10 @@ def chosen_engine(engine: Engine) -> Iterator[None]:
         _CHOSEN.reset(token)
 
 
-def engine_in_use() -> Engine:
-    """Return the engine of this context; by default, processes that share all cores and the free memory."""
-    cores = thread_count()
-    return _CHOSEN.get() or LocalEngine(cores, cores, free_main_memory_bytes())
-
-
 def failed_of(title: str, jobs: Sequence[Job], ended: Callable[[JobEnd], None], progress: Progress) -> list[JobEnd]:
-    """Run jobs on the engine in use, and return the ends of those that have failed.
+    """Run jobs on the engine in use, as `Engine.run` does, and return the ends of those that have failed.
 
-    Args:
-        title, jobs, ended, progress: as for `Engine.run`.
-
-    Raises:
-        KeyboardInterrupt: the user stopped the run; the jobs that ran have saved their work.
+    By default, they are processes that share all cores and the free memory.
     """
     failed: list[JobEnd] = []
 
@@ -297,5 +253,7 @@ def failed_of(title: str, jobs: Sequence[Job], ended: Callable[[JobEnd], None], 
         ended(end)
 
     if jobs:
-        engine_in_use().run(title, jobs, take, progress)
+        cores = thread_count()
+        engine = _CHOSEN.get() or LocalEngine(cores, cores, free_main_memory_bytes())
+        engine.run(title, jobs, take, progress)
     return failed

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 from dataclasses import dataclass
 
@@ -10,7 +9,7 @@ import torch
 
 from pipelines.core.errors import BackendUnavailableError
 from pipelines.core.fingerprints import library_versions
-from pipelines.core.machine import available_cores, thread_count
+from pipelines.core.machine import available_cores, thread_count, total_main_memory_bytes
 from pipelines.core.progress import Progress
 from pipelines.geodesy.operations import grid_folders, installed_grids
 from pipelines.report.chromium import named_or_installed
@@ -28,7 +27,7 @@ _LIBRARIES = (
 
 @dataclass(frozen=True)
 class Gpu:
-    """GPU that torch sees: its name, and its memory in bytes."""
+    """GPU that torch sees, and its memory."""
 
     name: str
     bytes: int
@@ -49,18 +48,12 @@ class Machine:
 
     Attributes:
         system: operating system, its release, and the processor's architecture.
-        python: version.
-        cores: that this process may use.
-        threads: that stages compute with (`--threads`).
+        cores, threads: cores that this process may use, and threads that stages compute with (`--threads`).
         memory_bytes, free_bytes: main memory; None: the system does not state it.
-        gpus: that torch sees.
-        backends: of the rasteriser.
         cuda_parts: what the cuda backend needs, and what compiles its kernels.
         cuda_kernels: place of the compiled kernels; None: the first use compiles them.
-        grid_folders: in which PROJ looks for grids.
-        grids: file names of the installed geoid models and datum shifts.
+        grid_folders, grids: where PROJ looks for grids; file names of the installed geoid models and datum shifts.
         chromium: path of Chromium or Chrome; None: not found.
-        versions: of this package and its libraries.
     """
 
     system: str
@@ -80,15 +73,16 @@ class Machine:
 
 
 def inspect_machine() -> Machine:
-    """Return what was found on this machine."""
+    devices = range(torch.cuda.device_count() if torch.cuda.is_available() else 0)
+    found = (torch.cuda.get_device_properties(index) for index in devices)
     return Machine(
         system=f"{platform.system()} {platform.release()} {platform.machine()}",
         python=platform.python_version(),
         cores=available_cores(),
         threads=thread_count(),
-        memory_bytes=_memory_bytes(),
+        memory_bytes=total_main_memory_bytes(),
         free_bytes=free_memory_bytes(torch.device("cpu")),
-        gpus=_gpus(),
+        gpus=tuple(Gpu(properties.name, int(properties.total_memory)) for properties in found),
         backends=tuple(_backend(name) for name in BACKENDS),
         cuda_parts=(*running_parts(), *compiling_parts()),
         cuda_kernels=kernels_ready(),
@@ -116,17 +110,3 @@ def _backend(name: BackendName) -> BackendState:
     except BackendUnavailableError as error:
         return BackendState(name, False, str(error))
     return BackendState(name, True, "")
-
-
-def _gpus() -> tuple[Gpu, ...]:
-    if not torch.cuda.is_available():
-        return ()
-    found = (torch.cuda.get_device_properties(index) for index in range(torch.cuda.device_count()))
-    return tuple(Gpu(properties.name, int(properties.total_memory)) for properties in found)
-
-
-def _memory_bytes() -> int | None:
-    try:
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError, OSError):
-        return None

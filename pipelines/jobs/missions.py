@@ -44,8 +44,7 @@ class Mission:
 
     Attributes:
         name: unique in the batch, and a name of a folder.
-        workspace: its workspace, which may not exist yet.
-        place: path of the workspace, relative to the folder of the batch.
+        workspace, place: its workspace, which may not exist yet; path of it, relative to the folder of the batch.
         last: last stage to run; None: all.
         deliver: names of deliverables, as for `georef run --deliver`.
         flags: options by stage and field.
@@ -60,45 +59,30 @@ class Mission:
 
     @property
     def stages(self) -> tuple[StageSpec, ...]:
-        """Stages to run."""
         return (*stage_slice(None, self.last), *named_deliverables(self.deliver))
-
-    def overridden(self, last: str | None, deliver: str | None, flags: Mapping[str, Flags]) -> Mission:
-        """Return the mission with what the command line gives for all missions."""
-        merged = {stage: {**self.flags.get(stage, {}), **flags.get(stage, {})} for stage in (*self.flags, *flags)}
-        return replace(self, last=last or self.last, deliver=deliver or self.deliver, flags=merged)
 
 
 @dataclass(frozen=True)
 class MissionList:
-    """Missions of a batch.
-
-    Attributes:
-        name: of the batch: that of the file or folder.
-        folder: holds the workspaces, and receives the table of results.
-        missions: in order.
-    """
+    """Missions of a batch, which has the name of its file or folder; the folder receives the table of results."""
 
     name: str
     folder: Path
     missions: tuple[Mission, ...]
 
-    def overridden(self, last: str | None, deliver: str | None, flags: Mapping[str, Flags]) -> MissionList:
-        """Return the missions with what the command line gives for all of them.
 
-        Raises:
-            ValueError: `deliver` names no deliverable.
-        """
-        named_deliverables(deliver)
-        return replace(self, missions=tuple(mission.overridden(last, deliver, flags) for mission in self.missions))
-
-
-def load_missions(path: Path, owners: Owners) -> MissionList:
+def load_missions(
+    path: Path,
+    owners: Owners,
+    last: str | None = None,
+    deliver: str | None = None,
+    flags: Mapping[str, Flags] | None = None,
+) -> MissionList:
     """Return the missions of a TOML file, or of a folder.
 
     Args:
-        path: of the file or folder.
         owners: options that a mission may have outside the tables of its stages, with the stages that they are for.
+        last, deliver, flags: as of `Mission`; they override those of every mission.
 
     Raises:
         InputError: no such file, or a bad name, key or value; names file, mission and key.
@@ -106,15 +90,24 @@ def load_missions(path: Path, owners: Owners) -> MissionList:
     listed = _in_folder(path) if path.is_dir() else _in_file(path, owners)
     if not listed.missions:
         raise InputError("holds no mission", path=path)
-    return listed
+    missions = tuple(
+        replace(
+            mission,
+            last=last or mission.last,
+            deliver=deliver or mission.deliver,
+            flags=_merged(mission.flags, flags or {}),
+        )
+        for mission in listed.missions
+    )
+    return replace(listed, missions=missions)
+
+
+def _merged(flags: Mapping[str, Flags], more: Mapping[str, Flags]) -> dict[str, Flags]:
+    return {stage: {**flags.get(stage, {}), **more.get(stage, {})} for stage in (*flags, *more)}
 
 
 def _in_folder(folder: Path) -> MissionList:
-    """Return the missions of a folder: its folders with photographs, with `georef.toml`, or begun before.
-
-    Raises:
-        InputError: a folder leads outside, or cannot be used as a name.
-    """
+    """Return the missions of a folder: its folders with photographs, with `georef.toml`, or begun before."""
     signs = (USUAL_INPUTS["images"], CONFIG_FILE, REQUESTS)
     found = []
     for root in sorted(folder.iterdir()):
@@ -157,32 +150,20 @@ def _in_file(path: Path, owners: Owners) -> MissionList:
 
 @dataclass(frozen=True)
 class _Settings:
-    """Checked content of a table of the file."""
-
     own: Mapping[str, str]
     flags: Mapping[str, Flags]
 
 
 @dataclass(frozen=True)
 class _Table:
-    """Reader of `[defaults]` or of one mission's table.
-
-    Attributes:
-        path: of the file.
-        name: of the table, for errors: `missions.north`.
-        owners: see `load_missions`.
-    """
+    """Reader of `[defaults]` or of one mission's table; `owners` as of `load_missions`."""
 
     path: Path
     name: str
     owners: Owners
 
     def read(self, table: Any) -> _Settings:
-        """Return the content of the table.
-
-        Raises:
-            InputError: an unknown key or a bad value.
-        """
+        """Return the content of the table, or raise an InputError for an unknown key or a bad value."""
         if not isinstance(table, dict):
             raise InputError("expected a table", path=self.path, field=self.name)
         own: dict[str, str] = {}
@@ -246,10 +227,7 @@ def _mission(path: Path, name: str, table: Any, defaults: _Settings, owners: Own
     _require_name(name, path, label)
     own = _Table(path, label, owners).read(table)
     settings = {**defaults.own, **own.own}
-    flags = {
-        stage: {**defaults.flags.get(stage, {}), **own.flags.get(stage, {})}
-        for stage in dict.fromkeys((*defaults.flags, *own.flags))
-    }
+    flags = _merged(defaults.flags, own.flags)
     for stage, given in flags.items():
         try:
             BY_NAME[stage].options.model_validate(given)

@@ -3,8 +3,7 @@
 A part is a file or folder inside a folder of jobs, such as a workspace. The store holds an index of it, and one
 object for each file in the state that the index lists; an object is never changed. The index is written after the
 objects, so that an interrupted copy leaves the part as it was. Only files whose size or time differs are copied.
-
-Exchange of a job's files between engine and workers through a storage: named parts of one folder, no others.
+Engine and workers exchange the named parts of one folder, and no others.
 """
 
 from __future__ import annotations
@@ -15,11 +14,11 @@ import logging
 import os
 import shutil
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal, TypedDict, TypeVar
+from typing import Any, Literal, TypedDict
 from urllib.parse import urlsplit
 
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -39,7 +38,6 @@ _AT_ONCE = 64
 # Stores of buckets; to make a folder there would make a bucket that is misspelt.
 _WITHOUT_FOLDERS = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "adl")
 
-_Result = TypeVar("_Result")
 Writer = Literal["engine", "worker"]
 
 
@@ -47,8 +45,7 @@ class PartIndex(BaseModel):
     """Index of a part.
 
     Attributes:
-        format_version: of this document.
-        part: relative path of the part.
+        part: its relative path.
         attempt: at the job that the part was sent for; workers of earlier attempts may not write any more.
         writer: who wrote it; `worker`: the engine has not collected it.
         files: size in bytes and time of change in nanoseconds by path, relative to the folder of the part.
@@ -67,166 +64,117 @@ class PartIndex(BaseModel):
 class Storage:
     """Store that a URL of fsspec names, such as `s3://bucket/prefix` or `file:///mnt/exchange`.
 
-    Attributes:
-        url: of the store.
+    All methods raise a StorageError if the store cannot be reached, and a BackendUnavailableError if a library for
+    this kind of store is not installed.
     """
 
     url: str
 
     def check(self) -> None:
-        """Connect to the store.
-
-        Raises:
-            BackendUnavailableError: a library for this kind of store is not installed.
-            StorageError: the URL is wrong, or the store cannot be reached.
-        """
-        self._reached(lambda: self._store().exists(self._home("")))
+        """Connect to the store."""
+        with self._reached():
+            store, home = self._place("")
+            store.exists(home)
 
     def index(self, part: str) -> PartIndex | None:
-        """Return the index of a part; None: the store does not have it.
-
-        Raises:
-            StorageError: the store cannot be read.
-            InputError: the index is damaged, or names a path outside its part.
-        """
-        return self._reached(lambda: self._index(part))
+        """Return the index of a part, or None; an InputError: it is damaged, or leads out of its part."""
+        with self._reached():
+            store, home = self._place(part)
+            place = f"{home}.json"
+            if not store.exists(place):
+                return None
+            if store.size(place) > _MOST_INDEX_BYTES:
+                raise InputError("is too large for an index", path=place)
+            try:
+                index = PartIndex.model_validate_json(store.cat_file(place))
+            except ValidationError as error:
+                raise InputError(
+                    f"is a damaged index: delete it; {error.errors()[0]['msg']}", path=place
+                ) from error
+            if index.part != part or not all(name == "." or stays_inside(name) for name in index.files):
+                raise InputError("lists what does not belong to its part: delete it", path=place)
+            return index
 
     def send(self, folder: Path, part: str, writer: Writer, attempt: str = "") -> PartIndex:
-        """Copy a part of a folder into the store, and delete there what it has no more.
+        """Copy a part of a folder into the store for an attempt at a job, and delete there what it has no more.
 
-        A file that vanishes meanwhile, as when a stage ends, makes the copy start anew.
-
-        Args:
-            folder: that holds the part.
-            part: relative path of a file or folder.
-            writer: whose copy it is.
-            attempt: at the job that it is for.
-
-        Raises:
-            StorageError: the store cannot be written, or another attempt has taken over from this worker.
+        A file that vanishes meanwhile, as when a stage ends, makes the copy start anew. A StorageError tells a
+        worker that another attempt at its job has taken over.
         """
-        return self._reached(lambda: self._send(folder, part, writer, attempt))
+        with self._reached():
+            (store, home), before = self._place(part), self.index(part)
+            if writer == "worker" and before is not None and before.attempt != attempt:
+                raise StorageError(f"{part}: another attempt at the job has taken over")
+            held = set() if before is None else {_object(name, state) for name, state in before.files.items()}
+            if urlsplit(self.url).scheme not in _WITHOUT_FOLDERS:
+                store.makedirs(home, exist_ok=True)
+            while True:
+                files = dict(_files_of(folder / part))
+                try:
+                    keys = {name: _object(name, state) for name, state in files.items()}
+                    for names in _batches([name for name, key in keys.items() if key not in held]):
+                        places = [f"{home}/{keys[name]}" for name in names]
+                        store.put([str(folder / part / name) for name in names], places)
+                        held.update(keys[name] for name in names)
+                    break
+                except FileNotFoundError:
+                    if all((folder / part / name).exists() for name in files):
+                        raise
+            index = PartIndex(part=part, attempt=attempt, writer=writer, files=files)
+            if index != before:
+                self.write_index(index)
+                wanted = set(keys.values())
+                for place in store.ls(home, detail=False):
+                    if place.rpartition("/")[2] not in wanted:
+                        store.rm_file(place)
+            return index
 
     def fetch(self, folder: Path, part: str, before: PartIndex | None = None) -> PartIndex | None:
-        """Copy a part from the store into a folder; a file that is newer there stays.
+        """Copy a part from the store into a folder, and return its index, if any; a file that is newer there stays.
 
-        Args:
-            folder: that receives the part.
-            part: its relative path.
-            before: what the folder had sent: files that are no longer listed are deleted.
-
-        Returns:
-            The index; None: the store does not have the part.
-
-        Raises:
-            StorageError: the store cannot be read.
-            InputError: the index is damaged.
+        Files that the folder had sent `before`, and that are no longer listed, are deleted.
         """
-        return self._reached(lambda: self._fetch(folder, part, before))
+        with self._reached():
+            (store, home), index = self._place(part), self.index(part)
+            if index is None:
+                return None
+            older = [name for name, state in index.files.items() if _is_older(folder / part / name, state)]
+            for names in _batches(older):
+                paths = [folder / part / name for name in names]
+                for path in paths:
+                    path.parent.mkdir(parents=True, exist_ok=True)
+                    if not path.parent.resolve().is_relative_to(folder.resolve()):
+                        raise InputError("a symbolic link leads out of the folder", path=path)
+                drafts = [path.with_name(path.name + _DRAFT) for path in paths]
+                objects = [f"{home}/{_object(name, index.files[name])}" for name in names]
+                store.get(objects, [str(draft) for draft in drafts])
+                for name, path, draft in zip(names, paths, drafts, strict=True):
+                    time_ns = index.files[name][1]
+                    os.utime(draft, ns=(time_ns, time_ns))
+                    draft.replace(path)
+            for name, state in ({} if before is None else before.files).items():
+                if name not in index.files and _state_of(folder / part / name) == tuple(state):
+                    (folder / part / name).unlink()
+            return index
 
-    def _index(self, part: str) -> PartIndex | None:
-        store, place = self._store(), self._index_place(part)
-        if not store.exists(place):
-            return None
-        if store.size(place) > _MOST_INDEX_BYTES:
-            raise InputError("is too large for an index", path=place)
-        try:
-            index = PartIndex.model_validate_json(store.cat_file(place))
-        except ValidationError as error:
-            raise InputError(f"is a damaged index: delete it; {error.errors()[0]['msg']}", path=place) from error
-        if index.part != part or not all(name == "." or stays_inside(name) for name in index.files):
-            raise InputError("lists what does not belong to its part: delete it", path=place)
-        return index
+    def write_index(self, index: PartIndex) -> None:
+        with self._reached():
+            store, home = self._place(index.part)
+            store.pipe_file(f"{home}.json", json.dumps(index.model_dump(mode="json")).encode())
 
-    def _send(self, folder: Path, part: str, writer: Writer, attempt: str) -> PartIndex:
-        store, before, home = self._store(), self._index(part), self._home(part)
-        if writer == "worker" and before is not None and before.attempt != attempt:
-            raise StorageError(f"{part}: another attempt at the job has taken over")
-        held = set() if before is None else {_object(name, state) for name, state in before.files.items()}
-        if urlsplit(self.url).scheme not in _WITHOUT_FOLDERS:
-            store.makedirs(home, exist_ok=True)
-        while True:
-            files = dict(_files_of(folder / part))
-            try:
-                keys = {name: _object(name, state) for name, state in files.items()}
-                for names in _batches([name for name, key in keys.items() if key not in held]):
-                    places = [f"{home}/{keys[name]}" for name in names]
-                    store.put([str(folder / part / name) for name in names], places)
-                    held.update(keys[name] for name in names)
-                break
-            except FileNotFoundError:
-                if all((folder / part / name).exists() for name in files):
-                    raise
-        index = PartIndex(part=part, attempt=attempt, writer=writer, files=files)
-        if index != before:
-            self._write_index(index)
-            wanted = set(keys.values())
-            for place in store.ls(home, detail=False):
-                if place.rpartition("/")[2] not in wanted:
-                    store.rm_file(place)
-        return index
-
-    def _fetch(self, folder: Path, part: str, before: PartIndex | None) -> PartIndex | None:
-        store, index = self._store(), self._index(part)
-        if index is None:
-            return None
-        for names in _batches(
-            [name for name, state in index.files.items() if _is_older(folder / part / name, state)]
-        ):
-            paths = [folder / part / name for name in names]
-            for path in paths:
-                path.parent.mkdir(parents=True, exist_ok=True)
-                if not path.parent.resolve().is_relative_to(folder.resolve()):
-                    raise InputError("a symbolic link leads out of the folder", path=path)
-            drafts = [path.with_name(path.name + _DRAFT) for path in paths]
-            keys = [_object(name, index.files[name]) for name in names]
-            store.get([f"{self._home(part)}/{key}" for key in keys], [str(draft) for draft in drafts])
-            for name, path, draft in zip(names, paths, drafts, strict=True):
-                time_ns = index.files[name][1]
-                os.utime(draft, ns=(time_ns, time_ns))
-                draft.replace(path)
-        for name in () if before is None else before.files.keys() - index.files.keys():
-            if _state_of(folder / part / name) == tuple(before.files[name]):  # type: ignore[union-attr]
-                (folder / part / name).unlink()
-        return index
-
-    def mark_collected(self, index: PartIndex) -> None:
-        """Note that the engine has a part as a worker left it.
-
-        Raises:
-            StorageError: the store cannot be written.
-        """
-        self._reached(lambda: self._write_index(index.model_copy(update={"writer": "engine"})))
-
-    def _write_index(self, index: PartIndex) -> None:
-        place = self._index_place(index.part)
-        self._store().pipe_file(place, json.dumps(index.model_dump(mode="json")).encode())
-
-    def _index_place(self, part: str) -> str:
-        return f"{self._home(part)}.json"
-
-    def _home(self, part: str) -> str:
-        """Return the folder of a part's objects, as the library of the store writes it."""
+    def _place(self, part: str) -> tuple[Any, str]:
+        """Return the library of the store, and the folder of a part's objects as that library writes it."""
         import fsspec
 
-        root = fsspec.core.url_to_fs(self.url)[1].rstrip("/")
-        return f"{root}/{_digest(part)}"
+        store, root = fsspec.core.url_to_fs(self.url)
+        return store, f"{root.rstrip('/')}/{_digest(part)}"
 
-    def _store(self) -> Any:
-        import fsspec
-
-        return fsspec.core.url_to_fs(self.url)[0]
-
-    def _reached(self, action: Callable[[], _Result]) -> _Result:
-        """Return the result of an action on the store.
-
-        Raises:
-            BackendUnavailableError: a library is not installed.
-            StorageError: the store failed.
-        """
+    @contextmanager
+    def _reached(self) -> Iterator[None]:
+        """Turn failures of the store into known ones while the context lasts."""
         try:
-            return action()
-        except (InputError, StorageError):
+            yield
+        except GeorefError:
             raise
         except ImportError as error:
             raise BackendUnavailableError(f"{self.url}: {error}") from error
@@ -274,7 +222,6 @@ def _batches(names: list[str]) -> Iterator[list[str]]:
 
 
 def _object(name: str, state: tuple[int, int]) -> str:
-    """Return the name of the object that holds a file in a state."""
     return _digest(f"{name}\0{state[0]}\0{state[1]}")
 
 
@@ -286,14 +233,9 @@ _SAVE_EVERY_S = 60.0
 
 
 class Parcel(TypedDict):
-    """Parts of a job, as a worker is told.
+    """Parts of a job, as a worker is told: those that it reads, and the one that it reads and writes.
 
-    Attributes:
-        url: of the storage.
-        folder: of the engine; it stands at the beginning of paths in the arguments.
-        attempt: at the job.
-        reads: parts that the job reads, relative to the folder.
-        writes: part that the job reads and writes.
+    The parts are relative to the folder of the engine, which stands at the beginning of paths in the arguments.
     """
 
     url: str
@@ -304,11 +246,7 @@ class Parcel(TypedDict):
 
 
 class EngineExchange:
-    """Side of the engine, whose folder has everything before and after a run.
-
-    Args:
-        storage: that the workers use.
-    """
+    """Side of the engine, whose folder has everything before and after a run."""
 
     def __init__(self, storage: Storage) -> None:
         self._storage = storage
@@ -319,7 +257,6 @@ class EngineExchange:
 
         Raises:
             InputError: the job names no parts, or a part lies outside its folder.
-            StorageError: the storage failed.
         """
         if job.folder is None or job.writes is None:
             raise InputError(f"{job.name} cannot run through a storage: use a shared folder", field="--storage")
@@ -332,12 +269,7 @@ class EngineExchange:
         return Parcel(url=self._storage.url, folder=str(job.folder), attempt=attempt, reads=reads, writes=writes)
 
     def collect(self, job: Job) -> None:
-        """Take the results of a job into the folder of the engine.
-
-        Raises:
-            InputError: the index in the storage is damaged.
-            StorageError: the storage failed.
-        """
+        """Take the results of a job into the folder of the engine."""
         if job.folder is not None and job.writes is not None:
             self._collect(job.folder.resolve(), _part(job.folder.resolve(), job.writes))
 
@@ -345,22 +277,15 @@ class EngineExchange:
         index = self._storage.index(part)
         if index is not None and index.writer == "worker":
             self._storage.fetch(folder, part, self._sent.get(part))
-            self._storage.mark_collected(index)
+            self._storage.write_index(index.model_copy(update={"writer": "engine"}))
 
 
 @contextmanager
 def worker_exchange(parcel: Parcel, scratch: Path) -> Iterator[None]:
     """Fetch the parts of a job into a scratch folder, and put its results back when the context ends.
 
-    Meanwhile results are put back every minute, so that a lost worker loses little.
-
-    Args:
-        parcel: the parts.
-        scratch: folder of this job, which is deleted in the end.
-
-    Raises:
-        InputError: an index in the storage is damaged.
-        StorageError: the storage failed.
+    Meanwhile results are put back every minute, so that a lost worker loses little. The scratch folder is deleted
+    in the end.
     """
     storage, stopped = Storage(parcel["url"]), threading.Event()
 
@@ -393,11 +318,6 @@ def arguments_in(parcel: Parcel, arguments: Sequence[str], scratch: Path) -> lis
 
 
 def _part(folder: Path, path: Path) -> str:
-    """Return a path relative to a folder.
-
-    Raises:
-        InputError: it lies outside.
-    """
     try:
         return path.resolve().relative_to(folder).as_posix()
     except ValueError:

@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from pipelines.core.errors import InputError
-from pipelines.core.products import load_npz
+from pipelines.core.files import read_npz
 from pipelines.splat.losses import image_similarity
 
 # PSNR of equal images: a report has no infinity. Rounding to 8 bits alone gives 59 dB.
@@ -86,7 +86,7 @@ class Lpips:
         Raises:
             InputError: not an NPZ file of such weights.
         """
-        arrays = load_npz(weights, tuple(_shapes()))
+        arrays = read_npz(weights, tuple(_shapes()))
         for name, shape in _shapes().items():
             if arrays[name].shape != shape or not np.isfinite(arrays[name]).all():
                 raise InputError(f"expected finite numbers of shape {shape}", path=weights, field=name)

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.core.errors import InputError
-from pipelines.core.products import Caution, Covariance3, Product, Rotation, load_npz, save_npz
+from pipelines.core.files import read_npz
+from pipelines.core.products import Caution, Covariance3, Product, Rotation, save_npz
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.geometry.similarity import SimilarityRecord
 from pipelines.robust.statistics import ResidualStats
@@ -127,7 +128,7 @@ class GeolocatedPoints:
         Raises:
             InputError: the file is no NPZ file with these arrays.
         """
-        arrays = load_npz(path, tuple(field.name for field in fields(cls)))
+        arrays = read_npz(path, tuple(field.name for field in fields(cls)))
         for name, (kind, shape) in _POINT_ARRAYS.items():
             array = arrays[name]
             if array.dtype.kind not in kind or array.shape != (len(arrays["point_id"].ravel()), *shape):

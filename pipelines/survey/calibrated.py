@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.core.errors import InputError, MissingProductError
-from pipelines.core.products import load_json, load_npz, save_npz
+from pipelines.core.files import read_npz
+from pipelines.core.products import load_json, save_npz
 from pipelines.core.stages import RIG, SURVEY, TRACK
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.core.workspace import Workspace
@@ -97,7 +98,7 @@ class NavigationTrack:
         Raises:
             InputError: the file is no NPZ file with these arrays, or an array has another form.
         """
-        arrays = load_npz(path, tuple(field.name for field in fields(cls)))
+        arrays = read_npz(path, tuple(field.name for field in fields(cls)))
         lengths: dict[str, int] = {}
         for name, (kind, *shape) in _TRACK_ARRAYS.items():
             array = arrays[name]

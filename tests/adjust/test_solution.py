@@ -15,7 +15,8 @@ from pipelines.adjust.posterior import Posterior, load_posterior, save_posterior
 from pipelines.adjust.solution import adjusted
 from pipelines.adjust.system import cost_at, minimise
 from pipelines.core.errors import InputError
-from pipelines.core.products import load_npz, save_npz
+from pipelines.core.files import read_npz
+from pipelines.core.products import save_npz
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.survey.marks import mark_rays
@@ -86,7 +87,7 @@ def test_file_holds_every_covariance(tmp_path: Path) -> None:
     assert (np.diag(of_lens) > 0).all()
     with pytest.raises(InputError, match="cannot be read"):
         load_posterior(tmp_path / "none.npz", posterior.solution, FLIGHT.model)
-    arrays = load_npz(path, tuple(np.load(path).files))
+    arrays = read_npz(path, tuple(np.load(path).files))
     save_npz(path, arrays | {"position": arrays["position"][1:]})
     with pytest.raises(InputError, match="does not belong"):
         load_posterior(path, posterior.solution, FLIGHT.model)

@@ -10,7 +10,7 @@ from georef_cli.output import print_outcomes, size
 from pipelines.core.manifest import MANIFEST, Manifest
 from pipelines.core.products import save_json
 from pipelines.core.stages import BY_NAME, MODEL, SPLAT
-from pipelines.core.workspace import Workspace, now
+from pipelines.core.workspace import StageRun, Workspace, now
 from pipelines.deliver.overview import overview
 from pipelines.survey.options import CrsOptions
 from tests.cli_runs import Georef
@@ -66,7 +66,7 @@ def test_an_interrupted_run_beside_the_result_is_told(real_georef: Georef, fligh
     record_stage(flight, "train")
     partial = flight.partial_product(BY_NAME["train"])
     partial.begin("")
-    partial.record_progress("20 of 40 iterations")
+    StageRun(flight, partial.folder).record_progress("20 of 40 iterations")
     assert "train: an interrupted run: 20 of 40 iterations, saved 20" in real_georef("info", flight.root).out
     document = real_georef("info", flight.root, "--json").document
     assert f"`georef train {flight.root}` goes on with it" in document["properties"]["interrupted"]["train"]

@@ -256,7 +256,7 @@ def test_failure_that_is_no_text_is_shown_as_far_as_it_is(workspace: Workspace) 
     partial = workspace.partial(TRAIN)
     partial.mkdir(parents=True)
     (partial / "failure.txt").write_bytes(b"no \xe3 overlap")
-    assert workspace.failure(TRAIN) == "no \ufffd overlap"
+    assert workspace.partial_product(TRAIN).failure() == "no \ufffd overlap"
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, '{"a":' * 100_000])
