@@ -35,13 +35,11 @@ from pipelines.ingest.bag_streams import (
 )
 from pipelines.ingest.image_poses import RECEIVERS, ImagePoses, with_defaults
 from pipelines.ingest.navigation import (
-    LEAST_IMAGES,
     FlightRecord,
     RecordedNavigation,
     camera_poses,
     given_rig,
     require_enough,
-    too_few,
 )
 from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
@@ -208,7 +206,7 @@ def read_bag(
         )
     if len(photos) > _MANY_FRAMES and options.every is None:
         notes.warn(f"all {len(photos)} frames were taken: --every 2s or --every 5m takes fewer")
-    require_enough(photos, path, "--bag", notes)
+    require_enough(len(photos), path, "--bag", notes)
     cameras, camera_of = lens_priors(photos, topics, streams.info, options, notes)
     time_s = clock.time_s[numbers]
     rig = rig_at(time_s + options.time_offset_s, navigation, streams, given_rig(options), notes)
@@ -237,8 +235,7 @@ def count_frames(path: Path, options: IngestOptions, notes: Notes, progress: Pro
     clock, navigation = streams.clocks[image], navigation_of(streams, options, notes)
     located = complete(navigation.positions.at(clock.time_s + options.time_offset_s).position) & clock.usable
     count = int(clock.usable.sum())
-    if count < LEAST_IMAGES:
-        raise too_few(count, path, "--bag", notes)
+    require_enough(count, path, "--bag", notes)
     return count, int(located.sum())
 
 

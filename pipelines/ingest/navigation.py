@@ -1,8 +1,7 @@
 """Everything that a flight left: photographs, their cameras, measured poses, and the navigation by time.
 
-The navigation as recorded, Earth-centred, until the survey's frame is known.
-
-From the places and attitudes that the instruments measured to those of the cameras: lever arm and boresight.
+The navigation is as recorded, Earth-centred, until the survey's frame is known. Lever arm and boresight lead from
+the places and attitudes that the instruments measured to those of the cameras.
 """
 
 from __future__ import annotations
@@ -24,6 +23,8 @@ from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo
 from pipelines.survey.calibrated import NavigationTrack
 from pipelines.survey.survey import CameraPrior
+
+LEAST_IMAGES = 3
 
 
 @dataclass(frozen=True)
@@ -48,41 +49,6 @@ class RecordedNavigation:
     image_time_s: FloatArray
     time_offset_s: float
 
-    def in_geo(self, origin: Origin) -> NavigationTrack | None:
-        """Return the navigation in the frame at an origin; None if it has no positions."""
-        if not len(self.positions):
-            return None
-        mounts, arms = self.rig.of_each(len(self.images))
-        return NavigationTrack(
-            position_time_s=self.positions.time_s,
-            antenna_in_geo=enu_from_ecef(self.positions.position, origin),
-            sigma_m=self.positions.sigma_m,
-            attitude_time_s=self.attitudes.time_s,
-            geo_from_body=self._geo_from_body(origin),
-            image=np.array(self.images, dtype=np.str_),
-            image_time_s=self.image_time_s,
-            cam_from_body=mounts,
-            antenna_in_body=arms,
-            nominal_from_cam=self.rig.nominal_from_cam,
-            time_offset_s=np.array(self.time_offset_s),
-            max_gap_s=np.array(self.positions.max_gap_s),
-            body_known=np.array(self.body_known),
-        )
-
-    def _geo_from_body(self, origin: Origin) -> FloatArray:
-        """Turn attitudes against north and up where each was taken into the frame at the origin.
-
-        Where attitudes begin or end beyond the positions, the first or last position stands for the place: at
-        45° latitude north turns by a second of arc in 30 m.
-        """
-        clock = self.positions.time_s
-        time_s = np.clip(self.attitudes.time_s, clock[0], clock[-1])
-        place = replace(self.positions, max_gap_s=np.inf).at(time_s).position
-        return geo_from_enu_at(lla_from_ecef(place), origin) @ self.attitudes.rotation
-
-
-LEAST_IMAGES = 3
-
 
 @dataclass(frozen=True)
 class FlightRecord:
@@ -105,20 +71,43 @@ class FlightRecord:
     navigation: RecordedNavigation | None
 
 
-def require_enough(photos: Sequence[Photo], source: Path, field: str, notes: Notes) -> None:
-    """Refuse fewer photographs than a survey needs.
+def track_in_geo(recorded: RecordedNavigation, origin: Origin) -> NavigationTrack | None:
+    """Return the navigation in the frame at an origin; None if it has no positions."""
+    positions, attitudes = recorded.positions, recorded.attitudes
+    if not len(positions):
+        return None
+    mounts, arms = recorded.rig.of_each(len(recorded.images))
+    # Attitudes are turned from north and up where each was taken. Where they begin or end beyond the positions, the
+    # first or last position stands for the place: at 45° latitude north turns by a second of arc in 30 m.
+    time_s = np.clip(attitudes.time_s, positions.time_s[0], positions.time_s[-1])
+    place = replace(positions, max_gap_s=np.inf).at(time_s).position
+    return NavigationTrack(
+        position_time_s=positions.time_s,
+        antenna_in_geo=enu_from_ecef(positions.position, origin),
+        sigma_m=positions.sigma_m,
+        attitude_time_s=attitudes.time_s,
+        geo_from_body=geo_from_enu_at(lla_from_ecef(place), origin) @ attitudes.rotation,
+        image=np.array(recorded.images, dtype=np.str_),
+        image_time_s=recorded.image_time_s,
+        cam_from_body=mounts,
+        antenna_in_body=arms,
+        nominal_from_cam=recorded.rig.nominal_from_cam,
+        time_offset_s=np.array(recorded.time_offset_s),
+        max_gap_s=np.array(positions.max_gap_s),
+        body_known=np.array(recorded.body_known),
+    )
+
+
+def require_enough(count: int, source: Path, field: str, notes: Notes) -> None:
+    """Refuse fewer photographs than a survey needs, with everything that was noted on the way.
 
     Raises:
         InputError: fewer than three.
     """
-    if len(photos) < LEAST_IMAGES:
-        raise too_few(len(photos), source, field, notes)
-
-
-def too_few(count: int, source: Path, field: str, notes: Notes) -> InputError:
-    """Return the error of fewer photographs than a survey needs, with everything that was noted on the way."""
-    reasons = "".join(f"; {warning}" for warning in notes.warnings)
-    return InputError(f"{count} usable images, a survey needs {LEAST_IMAGES}{reasons}", path=source, field=field)
+    if count < LEAST_IMAGES:
+        reasons = "".join(f"; {warning}" for warning in notes.warnings)
+        message = f"{count} usable images, a survey needs {LEAST_IMAGES}{reasons}"
+        raise InputError(message, path=source, field=field)
 
 
 def given_rig(options: IngestOptions) -> Rig:

@@ -17,11 +17,10 @@ from pipelines.core.progress import SILENT, Progress
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.ingest.bag_flight import count_frames, read_bag
 from pipelines.ingest.folder_flight import read_folder
-from pipelines.ingest.ground_points import list_ground_points, tie_ground_points
-from pipelines.ingest.navigation import FlightRecord
+from pipelines.ingest.ground_points import read_ground_files, tie_marks
 from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions, check_options
-from pipelines.ingest.survey_assembly import SurveyInputs, assemble_survey, nowhere
+from pipelines.ingest.survey_assembly import assemble_survey, require_placed
 from pipelines.survey.calibrated import NavigationTrack
 from pipelines.survey.survey import Survey
 
@@ -61,10 +60,9 @@ def check_inputs(workspace: Workspace, options: IngestOptions, progress: Progres
         return _summary(survey_and_track(options, None, progress, decode=False)[0])
     notes = Notes()
     check_options(options, workspace.root)
-    list_ground_points(options, notes)
+    read_ground_files(options, notes)
     frames, located = count_frames(options.bag, options, notes, progress)
-    if not located and options.gcp is None:
-        raise nowhere()
+    require_placed(located > 0 or options.gcp is not None)
     return Summary(f"a bag with {frames} frames, {located} of them with a position", {}, tuple(notes.warnings))
 
 
@@ -87,41 +85,31 @@ def survey_and_track(
     Args:
         options: of `ingest`.
         frames: where the photographs of a bag are written; without a bag, nothing is.
-        progress: whom to tell.
+        progress: of the reading.
         decode: whether to decode photographs to their end, as their hashes need; otherwise their heads are read.
 
     Raises:
         InputError: as `run`.
     """
     notes = Notes()
-    inputs = _read_inputs(options, frames, notes, progress, decode=decode)
-    return assemble_survey(inputs, options, notes)
-
-
-def _read_inputs(
-    options: IngestOptions, frames: Path | None, notes: Notes, progress: Progress, *, decode: bool
-) -> SurveyInputs:
     check_options(options, frames)
     if options.estimated:
         notes.assume(
             f"{', '.join(options.estimated)}: as given, until `georef run` or `georef calibrate` has estimated it "
             "after sfm"
         )
-    ground = list_ground_points(options, notes)  # ahead of the photographs, which take minutes
-    flight = _read_flight(options, frames, notes, progress, decode=decode)
-    sizes = {photo.name: (photo.file.width, photo.file.height) for photo in flight.photos}
-    control, check = tie_ground_points(ground, sizes, options, notes)
-    return SurveyInputs(flight, control, check)
-
-
-def _read_flight(
-    options: IngestOptions, frames: Path | None, notes: Notes, progress: Progress, *, decode: bool
-) -> FlightRecord:
+    ground = read_ground_files(options, notes)  # ahead of the photographs, which take minutes
     if options.bag is not None and frames is not None:
-        return read_bag(options.bag, options, frames, notes, progress)
-    if options.images is not None:
-        return read_folder(options.images, options, notes, progress, decode=decode)
-    raise InputError("give the folder of photographs, or a --bag", field="--images")
+        flight = read_bag(options.bag, options, frames, notes, progress)
+    elif options.images is not None:
+        flight = read_folder(options.images, options, notes, progress, decode=decode)
+    else:
+        raise InputError("give the folder of photographs, or a --bag", field="--images")
+    sizes = {photo.name: (photo.file.width, photo.file.height) for photo in flight.photos}
+    control, check = (
+        None if file is None else tie_marks(file, sizes, options.sigma_mark, notes) for file in ground
+    )
+    return assemble_survey(flight, control, check, options, notes)
 
 
 def _copy_images(survey: Survey, stage: StageRun) -> None:
