@@ -247,9 +247,9 @@ def _sigma_of_ecef(table: FloatArray) -> FloatArray:
 
 def _off_earth(xyz: FloatArray, form: _Form) -> BoolArray:
     if form != "ecef":
-        return (np.abs(xyz[:, 1]) > 90) | (np.abs(xyz[:, 0]) > 360)
+        return np.asarray((np.abs(xyz[:, 1]) > 90) | (np.abs(xyz[:, 0]) > 360))
     distance = np.linalg.norm(xyz, axis=1)
-    return (distance < _EARTH_M[0]) | (distance > _EARTH_M[1])
+    return np.asarray((distance < _EARTH_M[0]) | (distance > _EARTH_M[1]))
 
 
 def _times(clock: str, rows: Sequence[tuple[int, list[str]]], path: Path) -> FloatArray:

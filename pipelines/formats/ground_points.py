@@ -135,7 +135,7 @@ def read_geo(path: Path) -> PoseTable:
     values = np.array(numbers)
     angles, accuracy = values[:, 3:6] + _GIMBAL_FROM_ODM_DEG, values[:, 6:8]
     refuse_first(
-        (accuracy <= 0.0).any(axis=1),
+        np.any(accuracy <= 0.0, axis=1),
         lambda _: "must be above zero",
         path=path,
         lines=table.lines,

@@ -13,12 +13,11 @@ from typing import Any
 import numpy as np
 
 from pipelines.core.progress import SILENT, Progress
-from pipelines.formats.bag import COMPRESSED, IMAGE, INFO, Bag, RawMessage, UndecodableError, open_bag
-from pipelines.ingest import bag_messages as bag_transforms
-from pipelines.ingest.bag_messages import ATTITUDES, BASE, POSITIONS, Transforms
-from pipelines.ingest.bag_streams import RequestedTopics, SelectedTopics, select_topics
+from pipelines.formats.bag import Bag, RawMessage, UndecodableError, open_bag
+from pipelines.ingest.bag_messages import BASE, GEODETIC_HEIGHTS, TRANSFORM_TYPES, Transforms
+from pipelines.ingest.bag_streams import SelectedTopics, select_topics
+from pipelines.ingest.options import IngestOptions
 
-_KNOWN = {IMAGE, COMPRESSED, INFO, *POSITIONS, *ATTITUDES}
 # A gap is worth telling if it is this many times the usual step.
 _GAP_STEPS = 3.0
 
@@ -84,10 +83,10 @@ def inspect_bag(path: Path, progress: Progress = SILENT) -> BagReport:
         InputError: it cannot be opened.
     """
     with open_bag(path) as bag:
-        topics = select_topics(bag, RequestedTopics())
+        topics = select_topics(bag, IngestOptions())
         tallies = {name: _Tally() for name in bag.topics}
         transforms = Transforms()
-        with progress.task("bag", bag.message_count) as task:
+        with progress.task("bag", sum(topic.count for topic in bag.topics.values())) as task:
             for message in bag.messages(list(bag.topics)):
                 _count(bag, message, tallies[message.topic], transforms)
                 task.advance()
@@ -109,7 +108,7 @@ def inspect_bag(path: Path, progress: Progress = SILENT) -> BagReport:
 
 
 def _count(bag: Bag, message: RawMessage, tally: _Tally, transforms: Transforms) -> None:
-    is_frames = message.type in (bag_transforms.TYPE, bag_transforms.OLD_TYPE)
+    is_frames = message.type in TRANSFORM_TYPES
     if not tally.described or is_frames:
         tally.described = True
         try:
@@ -166,7 +165,7 @@ def _missing(
         missing.append("no CameraInfo for the photographs: the focal length is assumed, or give --focal-px")
     if topics.fix is None:
         missing.append("no positions: ground control points alone can place the model (--gcp)")
-    elif not POSITIONS[bag.topics[topics.fix].type].geodetic:
+    elif bag.topics[topics.fix].type not in GEODETIC_HEIGHTS:
         missing.append(f"{topics.fix} is in a local frame: give --origin LAT,LON,HEIGHT of its zero")
     if topics.attitude is None:
         missing.append("no attitudes: a lever arm cannot be applied")

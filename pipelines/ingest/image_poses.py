@@ -1,7 +1,4 @@
-"""Measured positions and attitudes of images, with σ, whatever they were read from.
-
-σ of positions: by option, else by the file, else by the kind of receiver.
-"""
+"""Measured positions and attitudes of images, whatever they were read from; σ by option, by file or by receiver."""
 
 from __future__ import annotations
 
@@ -32,7 +29,7 @@ class ImagePoses:
         position_in_ecef: (N, 3) metres.
         sigma_enu_m: (N, 3).
         sigma_source: (N,) who gave σ.
-        receivers: (N,) kinds of receiver, of `position_sigma.RECEIVERS`, as recorded.
+        receivers: (N,) kinds of receiver, of `RECEIVERS`, as recorded.
         enu_from_cam: (N, 3, 3) attitude against north and up at the camera.
         attitude_source: (N,) where it is from.
         sigma_attitude_deg: (N,) σ that the attitudes state.
@@ -90,7 +87,8 @@ def with_defaults(
         notes: the defaults that were assumed.
     """
     from_file = complete(stated)
-    sigma = np.where(np.isfinite(stated), stated, [_default(receiver) for receiver in receivers])
+    defaults = np.array([RECEIVER_SIGMA_M[receiver] for receiver in receivers]).reshape(-1, 2)
+    sigma = np.where(np.isfinite(stated), stated, defaults[:, [0, 0, 1]])
     if options.sigma_h is not None:
         sigma[:, :2] = options.sigma_h
     if options.sigma_v is not None:
@@ -105,8 +103,3 @@ def with_defaults(
     overridden = options.sigma_h is not None or options.sigma_v is not None
     sources: list[SigmaSource] = ["option" if overridden else "file" if row else "default" for row in from_file]
     return sigma, tuple(sources)
-
-
-def _default(receiver: str) -> tuple[float, float, float]:
-    horizontal_m, vertical_m = RECEIVER_SIGMA_M[receiver]
-    return horizontal_m, horizontal_m, vertical_m
