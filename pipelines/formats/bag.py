@@ -1,4 +1,4 @@
-"""ROS bags, read one message at a time: rosbag2 folders, bare mcap and sqlite3 files, ROS 1 bags; their photographs.
+"""ROS bags, read a message at a time: rosbag2 folders, bare mcap and sqlite3 files, ROS 1 bags; their photographs.
 
 Definitions of message types come from the bag, else from the ROS distribution. PX4's messages are in no
 distribution: for them the layout of `DEFINITIONS` counts that fits the message. A damaged definition harms its own
