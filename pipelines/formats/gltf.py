@@ -33,7 +33,7 @@ def encode_glb(
     Args:
         spz: an SPZ file of version 2 or 3, in the z-up frame.
         count: number of its Gaussians.
-        sh_degree: degree of its spherical harmonics.
+        sh_degree: of its spherical harmonics.
         bounds: least and largest coordinates of the centres.
         extras: metadata for `asset.extras`.
 

@@ -35,11 +35,7 @@ _LONGEST_NAME = 100  # of a column that means something
 
 
 def write_table(path: Path, rows: Iterable[Iterable[object]]) -> None:
-    """Write rows of cells; the file appears whole or not at all.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """Write rows of cells; the file appears whole or not at all."""
     replace_text(path, table_text(rows))
 
 
@@ -94,11 +90,7 @@ def _check_line(text: str, path: Path, line: int) -> None:
 
 
 def numbered_lines(path: Path) -> list[tuple[int, str]]:
-    """Return the lines that are not blank, without spaces around them, and their numbers.
-
-    Raises:
-        InputError: as `read_lines`.
-    """
+    """Return the lines that are not blank, without spaces around them, and their numbers; see `read_lines`."""
     return [(at, text.strip()) for at, text in enumerate(read_lines(path), start=1) if text.strip()]
 
 
@@ -150,7 +142,10 @@ def is_number(text: str, *, decimal_comma: bool = True) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """Line of a table: its cells by position, with the places of the columns that are known."""
+    """Line of a table: its cells by position, with the places of the columns that are known.
+
+    What is no number or no name is refused by an `InputError` with file, line and column.
+    """
 
     path: Path
     line: int
@@ -164,44 +159,28 @@ class Row:
         return self.cells[at].strip() if at < len(self.cells) else ""
 
     def named(self, column: str) -> str:
-        """Return a cell.
-
-        Raises:
-            InputError: it is empty.
-        """
+        """Return a cell that is not empty."""
         text = self.text(column)
         if not text:
             raise InputError("has no name", path=self.path, line=self.line, field=column)
         return text
 
     def number(self, column: str) -> float:
-        """Return the number of a cell; NaN if it is empty or there is no such column.
-
-        Raises:
-            InputError: not a number.
-        """
+        """Return the number of a cell; NaN if it is empty or there is no such column."""
         if column not in self.columns:
             return math.nan
         text, comma = self.text(column), self.decimal_comma
         return number_of(text, path=self.path, line=self.line, field=column, decimal_comma=comma)
 
     def finite(self, column: str) -> float:
-        """Return the number of a cell.
-
-        Raises:
-            InputError: not a number, or empty.
-        """
+        """Return the number of a cell that is not empty."""
         value = self.number(column)
         if math.isnan(value):
             raise InputError("is not a number", path=self.path, line=self.line, field=column)
         return value
 
     def sigma_m(self, column: str) -> float | None:
-        """Return the σ of a cell; None if it is empty, zero, or there is no such column.
-
-        Raises:
-            InputError: not a number, or negative.
-        """
+        """Return the σ of a cell, not negative; None if it is empty, zero, or there is no such column."""
         value = self.number(column)
         if value < 0:
             message = f"{value:g} is no σ: it must be above zero"
@@ -226,7 +205,7 @@ class Table:
 
     @property
     def lines(self) -> IntArray:
-        """Line of each row (N,)."""
+        """(N,) line of each row."""
         return np.array([row.line for row in self.rows], dtype=np.int64)
 
     def has(self, columns: Sequence[str]) -> bool:
@@ -269,11 +248,7 @@ def split(text: str, separator: str | None, *, path: Path, line: int) -> list[st
 def rows(
     path: Path, lines: Sequence[tuple[int, str]], separator: str | None, columns: Mapping[str, int]
 ) -> Iterator[Row]:
-    """Yield the rows of numbered lines.
-
-    Raises:
-        InputError: a line is no CSV.
-    """
+    """Yield the rows of numbered lines; see `split`."""
     for line, text in lines:
         cells = split(text, separator, path=path, line=line)
         yield Row(path, line, cells, columns, separator not in (",", None))
@@ -293,12 +268,7 @@ def named_columns(
 ) -> tuple[dict[str, int], tuple[str, ...]]:
     """Return the place of each column by its canonical name, and the names that mean nothing here.
 
-    Args:
-        header: its cells.
-        aliases: canonical name of each plain one.
-        path: for errors.
-        line: for errors.
-        plain: makes a plain name of a cell.
+    `plain` makes a plain name of a cell, and `aliases` has the canonical one of each.
 
     Raises:
         InputError: two columns have one meaning.
@@ -319,18 +289,7 @@ def named_columns(
 def refuse_first(
     bad: BoolArray, message: Callable[[int], str], *, path: Path, lines: Sequence[int] | IntArray, field: str
 ) -> None:
-    """Refuse the first row that is bad, if any is.
-
-    Args:
-        bad: (N,).
-        message: the fault of a row.
-        path: of the table.
-        lines: (N,) line of each row.
-        field: column at fault.
-
-    Raises:
-        InputError: a row is bad.
-    """
+    """Raise an InputError for the first row that is bad (N,), with the message on it and its line (N,)."""
     if bad.any():
         row = int(np.argmax(bad))
         raise InputError(message(row), path=path, line=int(lines[row]), field=field)
@@ -339,11 +298,7 @@ def refuse_first(
 def require_range(
     values: FloatArray, low: float, high: float, *, path: Path, lines: Sequence[int] | IntArray, field: str
 ) -> None:
-    """Refuse the first of values (N,) outside a range; NaN passes.
-
-    Raises:
-        InputError: a value is outside.
-    """
+    """Raise an InputError for the first of values (N,) outside a range; NaN passes."""
 
     def message(row: int) -> str:
         return f"{values[row]:g} is out of range {low:g} … {high:g}"
