@@ -24,18 +24,12 @@ _EPSG_OF = {"EGM84": 5798, "EGM96": 5773, "EGM2008": 3855}
 
 @dataclass(frozen=True)
 class VerticalChoice:
-    """A vertical datum as an option names it.
-
-    Attributes:
-        name: `ellipsoidal`, `EGM96` … or `EPSG:n`.
-        epsg: code of the vertical CRS; None for ellipsoidal heights.
-    """
+    """A vertical datum as an option names it, and the code of its vertical CRS; None for ellipsoidal heights."""
 
     name: str
     epsg: int | None
 
     def __str__(self) -> str:
-        """Return the name, which `parse_vertical` reads."""
         return self.name
 
 
@@ -62,22 +56,12 @@ def name_of(epsg: int) -> str:
     return next((name for name, code in _EPSG_OF.items() if code == epsg), f"EPSG:{epsg}")
 
 
-def assumed_ellipsoidal(note: str) -> VerticalDatum:
-    """Return the datum of heights that no file states; `note` names their source, and its usual fault."""
-    return VerticalDatum(name=ELLIPSOIDAL, stated=False, note=note)
-
-
 def missing_grid_error(
     datum: str | None, crs_name: str, grids: Sequence[str], folder: str, path: Path | str | None
 ) -> InputError:
     """Return the error for points of a CRS that need `grids`, of which none is in PROJ's data `folder`.
 
-    Args:
-        datum: of the heights, if they do not count from the ellipsoid.
-        crs_name: the CRS.
-        grids: file names.
-        folder: where PROJ looks.
-        path: file of the points.
+    `datum` is that of the heights, if they do not count from the ellipsoid.
     """
     problem = f"points of {crs_name} cannot be brought to WGS84"
     instead = "Or give coordinates in another CRS"

@@ -18,7 +18,7 @@ from pipelines.formats.trajectory_csv import complete
 from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import Origin, ecef_from_enu, ecef_from_lla
 from pipelines.geodesy.operations import WGS84
-from pipelines.geodesy.vertical import VerticalDatum, assumed_ellipsoidal
+from pipelines.geodesy.vertical import ELLIPSOIDAL, VerticalDatum
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.trajectory import Rig, Trajectory, frame_from_frd
 from pipelines.ingest.bag_messages import BASE, GEODETIC_HEIGHTS
@@ -90,7 +90,7 @@ def _positions(streams: BagStreams, options: IngestOptions, notes: Notes) -> tup
     if series is None or not len(series.stamps):
         if series is not None:
             notes.warn(f"no message of {series.topic} has a usable position")
-        return Trajectory.from_samples(np.empty(0)), VerticalDatum(name="ellipsoidal", stated=True)
+        return Trajectory.from_samples(np.empty(0)), VerticalDatum(name=ELLIPSOIDAL, stated=True)
     values = series.table()
     if series.type in GEODETIC_HEIGHTS:
         position_in_ecef, vertical = _geodetic(series, options, notes)
@@ -104,7 +104,8 @@ def _positions(streams: BagStreams, options: IngestOptions, notes: Notes) -> tup
     else:
         lat_deg, lon_deg, alt_m = options.origin
         position_in_ecef = ecef_from_enu(values[:, :3], Origin(lat_deg=lat_deg, lon_deg=lon_deg, alt_m=alt_m))
-        vertical = assumed_ellipsoidal("height of --origin taken as ellipsoidal")
+        note = "height of --origin taken as ellipsoidal"
+        vertical = VerticalDatum(name=ELLIPSOIDAL, stated=False, note=note)
         notes.assume(f"the frame {series.world!r} of {series.topic} is East-North-Up, with its zero at --origin")
     positions = Trajectory.from_samples(
         series.time_s[series.usable],
@@ -120,7 +121,7 @@ def _geodetic(series: TopicSamples, options: IngestOptions, notes: Notes) -> tup
     crs, heights = parse_crs(WGS84, vertical=options.vertical), GEODETIC_HEIGHTS[series.type]
     if options.vertical is None:
         notes.assume(f"heights of {series.topic} are {heights}; if its driver does otherwise, see --vertical")
-    by_definition = VerticalDatum(name="ellipsoidal", stated=True, note=heights)
+    by_definition = VerticalDatum(name=ELLIPSOIDAL, stated=True, note=heights)
     lla = crs.lla_from_xyz(series.table()[:, [1, 0, 2]])
     return ecef_from_lla(lla), crs.vertical if crs.vertical.stated else by_definition
 

@@ -22,7 +22,7 @@ from pipelines.formats.trajectory_csv import complete
 from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import ecef_from_enu_rotation, ecef_from_lla, lla_from_ecef
 from pipelines.geodesy.operations import WGS84
-from pipelines.geodesy.vertical import FOOT_M, MOST_GEOID_M, assumed_ellipsoidal
+from pipelines.geodesy.vertical import ELLIPSOIDAL, FOOT_M, MOST_GEOID_M, VerticalDatum
 from pipelines.geometry.rotations import geo_from_cam
 from pipelines.ingest.image_poses import ImagePoses, with_defaults
 from pipelines.ingest.notes import Notes
@@ -63,6 +63,7 @@ def poses_from_tags(photos: Sequence[Photo], options: IngestOptions, notes: Note
     stated = np.array([_stated_sigma(photo.tags) for photo in photos])
     receivers = tuple(_receiver(photo.tags) for photo in photos)
     sigma, sigma_source = with_defaults(stated, receivers, located, options, notes)
+    assumed = VerticalDatum(name=ELLIPSOIDAL, stated=False, note=_EXIF_NOTE)
     return ImagePoses(
         position_in_ecef=position_in_ecef,
         sigma_enu_m=sigma,
@@ -74,7 +75,7 @@ def poses_from_tags(photos: Sequence[Photo], options: IngestOptions, notes: Note
         time_s=photo_times(photos),
         source="exif",
         crs_name=WGS84,
-        vertical=crs.vertical if crs.vertical.stated else assumed_ellipsoidal(_EXIF_NOTE),
+        vertical=crs.vertical if crs.vertical.stated else assumed,
     )
 
 
