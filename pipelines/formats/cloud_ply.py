@@ -218,12 +218,7 @@ def _set_columns(vertex: np.ndarray, names: Sequence[str], values: np.ndarray) -
 
 
 class CloudPlyWriter:
-    """Writer of a binary PLY file in chunks; a context manager.
-
-    Args:
-        path: of the file.
-        comments: lines for people, such as the CRS; ASCII alone is kept.
-    """
+    """Writer of a binary PLY file in chunks; a context manager. Comments are for people; ASCII alone is kept."""
 
     def __init__(self, path: Path, comments: list[str]) -> None:
         self._comments = [" ".join(line.split()).encode("ascii", "ignore").decode() for line in comments]

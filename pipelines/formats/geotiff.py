@@ -105,15 +105,7 @@ def write_mosaic(
     kind: RasterKind,
     tags: Mapping[str, str],
 ) -> None:
-    """Write the mosaic of parts as a Cloud Optimized GeoTIFF.
-
-    Args:
-        path: of the raster.
-        parts: path, first column and first row of each part, all in one folder.
-        frame: of the raster.
-        kind: its bands.
-        tags: its metadata.
-    """
+    """Write parts in one folder, with first column and first row of each, as a Cloud Optimized GeoTIFF."""
     import rasterio
     import rasterio.shutil
 

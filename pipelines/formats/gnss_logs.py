@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipelines.core.errors import InputError
-from pipelines.core.types import BoolArray, FloatArray, IntArray
+from pipelines.core.types import FloatArray, IntArray
 from pipelines.formats.exif import RTK_FIXED, RTK_FLOAT
 from pipelines.formats.tables import number_of, numbered_lines, refuse_first, require_range
 from pipelines.formats.trajectory_csv import PoseTable
@@ -170,9 +170,11 @@ def read_pos(path: Path) -> PoseTable:
     else:
         # σ are those of north, east, up.
         xyz, sigma = table[:, [1, 0, 2]], np.where(table[:, 5:8] > 0, table[:, 5:8], np.nan)[:, [1, 0, 2]]
-    refuse_first(
-        _off_earth(xyz, header.form), lambda _: "is no place on Earth", path=path, lines=at_lines, field="position"
-    )
+    off_earth = (np.abs(xyz[:, 1]) > 90) | (np.abs(xyz[:, 0]) > 360)
+    if header.form == "ecef":
+        distance = np.linalg.norm(xyz, axis=1)
+        off_earth = (distance < _EARTH_M[0]) | (distance > _EARTH_M[1])
+    refuse_first(off_earth, lambda _: "is no place on Earth", path=path, lines=at_lines, field="position")
     return PoseTable(
         path=path,
         source="pos",
@@ -243,13 +245,6 @@ def _sigma_of_ecef(table: FloatArray) -> FloatArray:
     ecef_from_enu = ecef_from_enu_rotation(lla_from_ecef(table[:, :3]))
     variance = np.einsum("nji,njk,nki->ni", ecef_from_enu, cov, ecef_from_enu)
     return np.sqrt(np.where(variance > 0, variance, np.nan))
-
-
-def _off_earth(xyz: FloatArray, form: _Form) -> BoolArray:
-    if form != "ecef":
-        return np.asarray((np.abs(xyz[:, 1]) > 90) | (np.abs(xyz[:, 0]) > 360))
-    distance = np.linalg.norm(xyz, axis=1)
-    return np.asarray((distance < _EARTH_M[0]) | (distance > _EARTH_M[1]))
 
 
 def _times(clock: str, rows: Sequence[tuple[int, list[str]]], path: Path) -> FloatArray:

@@ -14,8 +14,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
-from types import MappingProxyType, TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,7 +28,6 @@ from pipelines.formats.cloud_ply import CloudChunk, CloudPoints
 if TYPE_CHECKING:
     import laspy
 
-_POINT_FORMAT = 7  # RGB and time of LAS 1.4
 _TEXT_AREA = ("LASF_Spec", 3)  # record for plain text
 _RGB16 = 257  # 255 becomes 65535
 DEGREE_STEP, METRE_STEP = 1e-9, 1e-3  # 0.1 mm on the ground, and 1 mm
@@ -46,7 +45,6 @@ _COVARIANCE = {  # name of each element of the upper triangle, with its row and 
     for column, second in enumerate(_AXES)
     if row <= column
 }
-_LIDAR_POINT_FORMAT = 6
 _ANGLE_STEP_DEG = 0.006
 _HEADER_BYTES = 227  # of LAS 1.0; later versions have more
 _VLR_BYTES = 54
@@ -185,44 +183,42 @@ class LazFile:
 
     Args:
         path: of the file.
-        point_format: number of the format of its points.
         wkt1: CRS as WKT1.
         angular: whether the first two coordinates are angles.
         near: (3,) coordinates near the points; the file counts from these, rounded to integers.
         software: program that writes.
-        system: origin of the points.
-        written: date in the header.
-        text: description for people, in English.
-        extra: name and meaning of further float32 columns.
+        written: date in the header; None: today.
+        text: description for people, in English: vertical datum, meaning of σ.
     """
+
+    point_format: ClassVar[int]
+    system: ClassVar[str]  # origin of the points
+    extra: ClassVar[Mapping[str, str]] = {}  # name and meaning of further float32 columns
 
     def __init__(
         self,
         path: Path,
-        point_format: int,
         *,
         wkt1: str,
         angular: bool,
         near: ArrayLike,
         software: str,
-        system: str,
-        written: date,
+        written: date | None = None,
         text: str = "",
-        extra: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         import laspy
 
-        header = laspy.LasHeader(version="1.4", point_format=point_format)
+        header = laspy.LasHeader(version="1.4", point_format=self.point_format)
         header.scales = np.array([DEGREE_STEP, DEGREE_STEP, METRE_STEP] if angular else [METRE_STEP] * 3)
         header.offsets = np.round(np.asarray(near, dtype=np.float64))
-        header.generating_software, header.system_identifier = software, system
-        header.creation_date = written
+        header.generating_software, header.system_identifier = software, self.system
+        header.creation_date = written or date.today()
         header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(wkt1))
         header.global_encoding.wkt = True
         if text:
             header.vlrs.append(laspy.VLR(*_TEXT_AREA, "Text Area Description", text.encode("utf-8") + b"\0"))
-        if extra:
-            columns = [laspy.ExtraBytesParams(name, "f4", description=text) for name, text in extra.items()]
+        if self.extra:
+            columns = [laspy.ExtraBytesParams(name, "f4", description=what) for name, what in self.extra.items()]
             header.add_extra_dims(columns)
         self._header = header
         self._writer: laspy.LasWriter = laspy.open(path, mode="w", header=header, do_compress=True)
@@ -248,21 +244,10 @@ class LazFile:
 
 
 class LazWriter(LazFile):
-    """Writer of a LAZ file of a surface, with colour, normal and σ (point format 7); see `LazFile`."""
+    """Writer of a LAZ file of a surface, with colour, normal and σ; see `LazFile`."""
 
-    def __init__(self, path: Path, *, wkt1: str, angular: bool, near: ArrayLike, software: str, text: str) -> None:
-        super().__init__(
-            path,
-            _POINT_FORMAT,
-            wkt1=wkt1,
-            angular=angular,
-            near=near,
-            software=software,
-            system="photogrammetry",
-            written=date.today(),
-            text=text,
-            extra=_EXTRA | dict.fromkeys(_COVARIANCE, "covariance in square metres"),
-        )
+    point_format, system = 7, "photogrammetry"  # RGB and time of LAS 1.4
+    extra = _EXTRA | dict.fromkeys(_COVARIANCE, "covariance in square metres")
 
     def write(self, points: CloudPoints) -> None:
         """Append points.
@@ -301,21 +286,9 @@ class LidarReturns:
 
 
 class LidarWriter(LazFile):
-    """Writer of a LAZ file of a scanner: class, time, strip and angle of each beam (point format 6)."""
+    """Writer of a LAZ file of a scanner: class, time, strip and angle of each beam; see `LazFile`."""
 
-    def __init__(
-        self, path: Path, *, wkt1: str, angular: bool, near: FloatArray, software: str, written: date
-    ) -> None:
-        super().__init__(
-            path,
-            _LIDAR_POINT_FORMAT,
-            wkt1=wkt1,
-            angular=angular,
-            near=near,
-            software=software,
-            system="simulated",
-            written=written,
-        )
+    point_format, system = 6, "simulated"
 
     def write(self, returns: LidarReturns) -> None:
         """Append the returns."""

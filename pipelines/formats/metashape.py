@@ -228,18 +228,11 @@ def read_markers(path: Path) -> GroundPoints:
         InputError: no header, no rows, a column is missing, a cell is no number, or one point at two places.
     """
     table, geographic = _reference(path)
-    points = [
-        ListedPoint(
-            line=row.line,
-            name=row.text("label"),
-            xyz=(row.finite("x"), row.finite("y"), row.finite("z")),
-            sigma_h_m=row.sigma_m("sigma_h") or row.sigma_m("sigma"),
-            sigma_v_m=row.sigma_m("sigma_v") or row.sigma_m("sigma"),
-            is_check=not _is_enabled(row),
-        )
-        for row in table.rows
-        if row.text("x")
-    ]
+    points = []
+    for row in table.rows:
+        if row.text("x"):
+            xyz = (row.finite("x"), row.finite("y"), row.finite("z"))
+            points.append(ListedPoint(row.line, row.text("label"), xyz, *_sigma_m(row), not _is_enabled(row)))
     if not points:
         raise InputError("has no marker with coordinates", path=path)
     return GroundPoints(
@@ -262,7 +255,7 @@ def read_cameras(path: Path) -> PoseTable:
     table, geographic = _reference(path)
     on = np.array([_is_enabled(row) for row in table.rows])
     xyz = np.array([[row.number(name) for name in "xyz"] for row in table.rows])
-    sigma = np.array([_sigma_enu_m(row) for row in table.rows])
+    sigma = np.array([_sigma_m(row) for row in table.rows], dtype=np.float64)[:, [0, 0, 1]]  # NaN for None
     angles = np.array([[row.number(name) for name in ("yaw", "pitch", "roll")] for row in table.rows])
     gimbal = angles + _GIMBAL_FROM_MOUNT_DEG
     return PoseTable(
@@ -321,6 +314,6 @@ def _is_enabled(row: Row) -> bool:
     return "enabled" not in row.columns or row.text("enabled").lower() not in _OFF
 
 
-def _sigma_enu_m(row: Row) -> tuple[float, float, float]:
-    horizontal = row.sigma_m("sigma_h") or row.sigma_m("sigma") or np.nan
-    return horizontal, horizontal, row.sigma_m("sigma_v") or row.sigma_m("sigma") or np.nan
+def _sigma_m(row: Row) -> tuple[float | None, float | None]:
+    """Return σ horizontal and vertical."""
+    return row.sigma_m("sigma_h") or row.sigma_m("sigma"), row.sigma_m("sigma_v") or row.sigma_m("sigma")

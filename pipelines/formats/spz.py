@@ -110,12 +110,8 @@ def read_spz(path: Path) -> SplatArrays:
 def encode_spz(splat: SplatArrays, version: SpzVersion = 3, fractional_bits: int = FRACTIONAL_BITS) -> bytes:
     """Return the bytes of an SPZ file.
 
-    Opacities, colours, scales and harmonics beyond the format's range are clamped to it.
-
-    Args:
-        splat: N ≥ 1 Gaussians of degree 0 to 3.
-        version: 3 or 4.
-        fractional_bits: positions have steps of 2^−bits m and lie within ±2^(23 − bits) m.
+    Opacities, colours, scales and harmonics beyond the format's range are clamped to it. Positions have steps of
+    2^−bits m and lie within ±2^(23 − bits) m.
 
     Raises:
         InputError: values that are not finite, a rotation of length zero, or positions out of range.

@@ -34,7 +34,7 @@ from pipelines.core.types import FloatArray
 from pipelines.geodesy.enu import ecef_from_enu_rotation, ecef_from_lla, lla_from_ecef
 from pipelines.geodesy.operations import Operation, OperationRequest, best_operation, proj_errors
 from pipelines.geodesy.plausible import ListedPoints, check_area, horizontal_of, rough_lon_lat
-from pipelines.geodesy.vertical import ELLIPSOIDAL, VerticalChoice, VerticalDatum, name_of
+from pipelines.geodesy.vertical import ELLIPSOIDAL, NAME_OF_EPSG, VerticalChoice, VerticalDatum
 
 _BARE_NAME = re.compile(r"[\w.-]+")
 _GRIDS = re.compile(r'(?<!\w)\w*grids?\s*=\s*"?([^\s"]*)', re.IGNORECASE)
@@ -140,13 +140,11 @@ class PointCrs:
     ) -> FloatArray:
         """Return WGS84 latitude, longitude (degrees), ellipsoidal height (m) (N, 3) of points (N, 3) in this CRS.
 
-        Args:
-            xyz: longitude or easting, latitude or northing, height; X, Y, Z of a geocentric CRS.
-            path: file of the points, for errors.
-            lines: its line of each point, for errors.
+        The order is longitude or easting, latitude or northing, height; X, Y, Z of a geocentric CRS.
 
         Raises:
-            InputError: a point out of range or far outside the CRS's area, a missing grid, or no transformation.
+            InputError: a point out of range or far outside the CRS's area, a missing grid, or no transformation;
+                names the file and the line of the point.
         """
         points = np.asarray(xyz, dtype=np.float64).reshape(-1, 3)
         if not len(points):
@@ -263,7 +261,7 @@ def _point_crs(crs: CRS, name: str, vertical: VerticalChoice | None) -> PointCrs
         if crs.is_compound:
             upright = crs.sub_crs_list[1]
             epsg = upright.to_epsg()
-            datum = upright.name if epsg is None else name_of(epsg)
+            datum = upright.name if epsg is None else NAME_OF_EPSG.get(epsg, f"EPSG:{epsg}")
             stated = VerticalDatum(name=datum, stated=True, note=f"{upright.name}, part of {short}")
         return PointCrs(short, stated, True, axes[2].unit_name, crs, 1.0, True)
     if vertical is not None and vertical.epsg is not None:

@@ -20,6 +20,7 @@ ELLIPSOIDAL = "ellipsoidal"
 MOST_GEOID_M = 110.0  # between the ellipsoid and any geoid
 FOOT_M = 0.3048  # international foot; the US survey foot differs by 2e-6
 _EPSG_OF = {"EGM84": 5798, "EGM96": 5773, "EGM2008": 3855}
+NAME_OF_EPSG = {code: name for name, code in _EPSG_OF.items()}  # `EPSG:5773` and `EGM96` are the same datum
 
 
 @dataclass(frozen=True)
@@ -48,12 +49,8 @@ def parse_vertical(text: str) -> VerticalChoice:
     if match is None:
         known = ", ".join([ELLIPSOIDAL, *_EPSG_OF, "EPSG:n"])
         raise InputError(f"{text!r} is no vertical datum: give one of {known}", field="--vertical")
-    return VerticalChoice(name_of(int(match[1])), int(match[1]))
-
-
-def name_of(epsg: int) -> str:
-    """Return the short name of a vertical CRS, so that `EPSG:5773` and `EGM96` are the same datum."""
-    return next((name for name, code in _EPSG_OF.items() if code == epsg), f"EPSG:{epsg}")
+    epsg = int(match[1])
+    return VerticalChoice(NAME_OF_EPSG.get(epsg, f"EPSG:{epsg}"), epsg)
 
 
 def missing_grid_error(

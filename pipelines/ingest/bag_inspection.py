@@ -8,7 +8,6 @@ from __future__ import annotations
 from array import array
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -90,12 +89,8 @@ def inspect_bag(path: Path, progress: Progress = SILENT) -> BagReport:
             for message in bag.messages(list(bag.topics)):
                 _count(bag, message, tallies[message.topic], transforms)
                 task.advance()
-        uses = {
-            topics.image: "photographs",
-            topics.info: "lens",
-            topics.fix: "positions",
-            topics.attitude: "attitudes",
-        }
+        uses = {topics.image: "photographs", topics.info: "lens", topics.fix: "positions"}
+        uses[topics.attitude] = "attitudes"
         if topics.fix is not None and topics.fix == topics.attitude:
             uses[topics.fix] = "positions, attitudes"
         reports = tuple(
@@ -115,19 +110,15 @@ def _count(bag: Bag, message: RawMessage, tally: _Tally, transforms: Transforms)
             decoded = bag.decode(message)
             if is_frames:
                 transforms.add(decoded, static=message.topic.endswith("static"))
-            _describe(decoded, tally)
+            header = getattr(decoded, "header", None)
+            if header is not None:
+                tally.stamped = bool(header.stamp.sec or header.stamp.nanosec)
+                tally.frame = str(header.frame_id)
+            tally.child = str(getattr(decoded, "child_frame_id", ""))
         except UndecodableError as error:
             tally.problem = str(error)[:200]
     stamp = bag.header_stamp_ns(message) if tally.stamped else None
     tally.times.append(stamp or message.bag_ns)
-
-
-def _describe(message: Any, tally: _Tally) -> None:
-    header = getattr(message, "header", None)
-    if header is not None:
-        tally.stamped = bool(header.stamp.sec or header.stamp.nanosec)
-        tally.frame = str(header.frame_id)
-    tally.child = str(getattr(message, "child_frame_id", ""))
 
 
 def _report(name: str, kind: str, use: str, tally: _Tally) -> TopicReport:

@@ -40,17 +40,8 @@ def write_photos(
 ) -> tuple[list[Photo], list[int]]:
     """Write the chosen frames into `folder` as `frame_nnnnnn.jpg` or `.png`, numbered as in the bag.
 
-    Args:
-        bag: open.
-        images: stamps of the photographs.
-        place: (N, 3) Cartesian positions at those times, NaN where unknown.
-        options: which frames to take.
-        folder: to write into.
-        notes: frames that were left out.
-        progress: a step a message.
-
-    Returns:
-        The photographs, and the number of each one's message.
+    `place` (N, 3) has Cartesian positions at the times of the images, NaN where unknown. Photographs are returned
+    with the number of each one's message.
     """
     folder.mkdir(parents=True, exist_ok=True)
     writer, topic, count = ImageWriter(), images.topic, len(images.time_s)

@@ -33,6 +33,7 @@ from pipelines.robust.statistics import mad_sigma
 
 # Vertical over horizontal σ of a fix that states only the horizontal one.
 _VERTICAL_RATIO = 2.0
+_RECEIVER = {RTK_FIXED: "RTK fixed", RTK_FLOAT: "RTK float"}
 _EXIF_NOTE = "EXIF altitude, which is often above a geoid or barometric, taken as ellipsoidal: see --vertical"
 _SIGMAS, _LEAST_M = 4.0, 1.0
 _MOST_CONTRADICTING = 1 / 3
@@ -48,7 +49,10 @@ def poses_from_tags(photos: Sequence[Photo], options: IngestOptions, notes: Note
     Raises:
         InputError: `--vertical` names a geoid whose grid is missing.
     """
-    xyz = np.array([_lon_lat_alt(photo.tags) for photo in photos])
+    xyz = np.full((len(photos), 3), np.nan)
+    for row, photo in enumerate(photos):
+        if photo.tags.gps is not None:
+            xyz[row] = photo.tags.gps.lon_deg, photo.tags.gps.lat_deg, _or_nan(altitude_m(photo.tags))
     located = complete(xyz)
     flat = [photo.name for photo in photos if photo.tags.gps is not None and altitude_m(photo.tags) is None]
     notes.warn_counted(
@@ -61,7 +65,8 @@ def poses_from_tags(photos: Sequence[Photo], options: IngestOptions, notes: Note
     position_in_ecef = np.full((len(photos), 3), np.nan)
     position_in_ecef[located] = ecef_from_lla(crs.lla_from_xyz(xyz[located]))
     stated = np.array([_stated_sigma(photo.tags) for photo in photos])
-    receivers = tuple(_receiver(photo.tags) for photo in photos)
+    flags = [0 if photo.tags.dji is None else photo.tags.dji.rtk_flag or 0 for photo in photos]
+    receivers = tuple(_RECEIVER.get(flag, "single-frequency") for flag in flags)
     sigma, sigma_source = with_defaults(stated, receivers, located, options, notes)
     assumed = VerticalDatum(name=ELLIPSOIDAL, stated=False, note=_EXIF_NOTE)
     return ImagePoses(
@@ -103,11 +108,6 @@ def gimbal_attitudes(photos: Sequence[Photo]) -> FloatArray:
     return enu_from_cam
 
 
-def _lon_lat_alt(tags: PhotoTags) -> tuple[float, float, float]:
-    gps = tags.gps
-    return (np.nan, np.nan, np.nan) if gps is None else (gps.lon_deg, gps.lat_deg, _or_nan(altitude_m(tags)))
-
-
 def _stated_sigma(tags: PhotoTags) -> FloatArray:
     """Return σ east, north, up (3,) that the tags state, NaN if none."""
     if tags.dji is not None and tags.dji.rtk_sigma_enu_m is not None:
@@ -115,11 +115,6 @@ def _stated_sigma(tags: PhotoTags) -> FloatArray:
     if tags.gps is not None and tags.gps.sigma_h_m is not None:
         return tags.gps.sigma_h_m * np.array([1.0, 1.0, _VERTICAL_RATIO])
     return np.full(3, np.nan)
-
-
-def _receiver(tags: PhotoTags) -> str:
-    flag = None if tags.dji is None else tags.dji.rtk_flag
-    return {RTK_FIXED: "RTK fixed", RTK_FLOAT: "RTK float"}.get(flag or 0, "single-frequency")
 
 
 def _or_nan(value: float | None) -> float:

@@ -45,14 +45,7 @@ _MOST_SPREAD_S = 3.0
 def read_folder(
     folder: Path, options: IngestOptions, notes: Notes, progress: Progress = SILENT, *, decode: bool = True
 ) -> FlightRecord:
-    """Read photographs, and the trajectory or `geo.txt` that the options name.
-
-    Args:
-        folder: of the photographs.
-        options: of `ingest`.
-        notes: what is assumed and doubtful.
-        progress: a step a photograph.
-        decode: as of `scan_folder`.
+    """Read photographs, and the trajectory or `geo.txt` that the options name; `decode` as of `scan_folder`.
 
     Raises:
         ContradictionError: the files contradict each other.

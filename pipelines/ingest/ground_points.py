@@ -159,11 +159,7 @@ def _placed(listed: GroundPoints, options: IngestOptions, notes: Notes) -> Groun
 def tie_marks(file: GroundFile, sizes: Mapping[str, tuple[int, int]], sigma_px: float, notes: Notes) -> GroundFile:
     """Return the points of a file with their marks in the images; marks in images that are not here are noted.
 
-    Args:
-        file: the points, and their marks as listed.
-        sizes: width and height of each image by name.
-        sigma_px: σ of a mark.
-        notes: what was left out.
+    `sizes` has width and height of each image by name.
 
     Raises:
         InputError: two marks of a point in one image, a mark outside its image, or no mark in any image here.

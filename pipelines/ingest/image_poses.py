@@ -79,12 +79,7 @@ def with_defaults(
 ) -> tuple[FloatArray, tuple[SigmaSource, ...]]:
     """Return σ east, north, up (N, 3) by precedence, and who gave it (N,).
 
-    Args:
-        stated: (N, 3) σ of the file, NaN where it is silent.
-        receivers: (N,) kinds of receiver.
-        located: (N,) which images have a position: defaults of others are not noted.
-        options: σ that the user gave.
-        notes: the defaults that were assumed.
+    σ of the file (N, 3) are NaN where it is silent. Defaults are noted but for images without a position.
     """
     from_file = complete(stated)
     defaults = np.array([RECEIVER_SIGMA_M[receiver] for receiver in receivers]).reshape(-1, 2)

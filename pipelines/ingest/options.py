@@ -1,7 +1,4 @@
-"""The options of `georef ingest`: what it reads, and what it assumes where the files are silent.
-
-Options of `ingest` that contradict each other, refused before anything is read.
-"""
+"""The options of `georef ingest`; those that contradict each other are refused before anything is read."""
 
 from __future__ import annotations
 
@@ -169,11 +166,7 @@ _BAG_ONLY = ("image_topic", "fix_topic", "attitude_topic", "every", "origin")
 
 
 def check_options(options: IngestOptions, frames: Path | None) -> None:
-    """Refuse options that make no survey.
-
-    Args:
-        options: of `ingest`.
-        frames: where the photographs of a bag can be written, or None.
+    """Refuse options that make no survey; photographs of a bag need a place, `frames`, to be written to.
 
     Raises:
         InputError: names the option.

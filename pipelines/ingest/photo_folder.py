@@ -38,11 +38,7 @@ def scan_folder(root: Path, notes: Notes, progress: Progress = SILENT, *, decode
     Left out are files that are empty, damaged or too large, links that lead out of the folder, and all but the
     first of identical files. Hidden files and folders are not looked at.
 
-    Args:
-        root: the folder.
-        notes: files that are left out.
-        progress: a step a file.
-        decode: whether to decode each file to its end; otherwise its head alone is read, in about a millisecond.
+    Each file is decoded to its end; without `decode` its head alone is read, in about a millisecond.
 
     Raises:
         InputError: no such folder, or no JPEG, PNG or TIFF file in it.

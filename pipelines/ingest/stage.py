@@ -67,11 +67,7 @@ def check_inputs(workspace: Workspace, options: IngestOptions, progress: Progres
 
 
 def _refuse_inside_photographs(workspace: Workspace, options: IngestOptions) -> None:
-    """Refuse a workspace whose files would count as photographs.
-
-    Raises:
-        InputError: the workspace lies inside the folder of photographs.
-    """
+    """Refuse a workspace whose files would count as photographs."""
     if options.images is not None and workspace.root.resolve().is_relative_to(options.images.resolve()):
         message = "the workspace lies inside the folder of photographs: put it elsewhere"
         raise InputError(message, path=workspace.root)
@@ -82,11 +78,8 @@ def survey_and_track(
 ) -> tuple[Survey, NavigationTrack | None]:
     """Return the survey, and the navigation in the same frame where it was recorded by time.
 
-    Args:
-        options: of `ingest`.
-        frames: where the photographs of a bag are written; without a bag, nothing is.
-        progress: of the reading.
-        decode: whether to decode photographs to their end, as their hashes need; otherwise their heads are read.
+    Photographs of a bag are written into `frames`; without a bag, nothing is. Photographs are decoded to their end,
+    as their hashes need; without `decode`, their heads are read.
 
     Raises:
         InputError: as `run`.

@@ -211,6 +211,7 @@ def _turned(sigma_enu_m: FloatArray, position_in_ecef: FloatArray, origin: Origi
 
 
 def _attitudes(poses: ImagePoses, origin: Origin, options: IngestOptions) -> list[Attitude | None]:
+    """Return attitudes in geo; σ by precedence: option, then file, then the source's default."""
     attitudes: list[Attitude | None] = [None] * len(poses.position_in_ecef)
     rows = np.flatnonzero(np.isfinite(poses.enu_from_cam).all(axis=(1, 2))).tolist()
     # Without a position, north is the origin's: within a survey it turns by minutes of arc.
@@ -219,21 +220,14 @@ def _attitudes(poses: ImagePoses, origin: Origin, options: IngestOptions) -> lis
     geo_from_cam = geo_from_enu_at(place, origin) @ poses.enu_from_cam[rows]
     for row, quat in zip(rows, quat_xyzw_from_matrix(geo_from_cam), strict=True):
         x, y, z, w = (float(value) for value in quat)
-        attitudes[row] = Attitude(
-            quat_xyzw=(x, y, z, w),
-            sigma_deg=_attitude_sigma_deg(poses, row, options),
-            source=poses.attitude_source[row],
-        )
+        source = poses.attitude_source[row]
+        sigma_deg = SIGMA_GIMBAL_DEG if source == "gimbal" else SIGMA_TABLE_ATTITUDE_DEG
+        if np.isfinite(poses.sigma_attitude_deg[row]):
+            sigma_deg = float(poses.sigma_attitude_deg[row])
+        if options.sigma_attitude is not None:
+            sigma_deg = options.sigma_attitude
+        attitudes[row] = Attitude(quat_xyzw=(x, y, z, w), sigma_deg=sigma_deg, source=source)
     return attitudes
-
-
-def _attitude_sigma_deg(poses: ImagePoses, row: int, options: IngestOptions) -> float:
-    """Return σ by precedence: option, then file, then the source's default."""
-    if options.sigma_attitude is not None:
-        return options.sigma_attitude
-    if np.isfinite(poses.sigma_attitude_deg[row]):
-        return float(poses.sigma_attitude_deg[row])
-    return SIGMA_GIMBAL_DEG if poses.attitude_source[row] == "gimbal" else SIGMA_TABLE_ATTITUDE_DEG
 
 
 def _vector(values: ArrayLike) -> Vector3:
