@@ -306,9 +306,6 @@ class ImageWriter:
 
     JPEG and PNG in a `CompressedImage` stay as they are. A raw `Image` becomes a PNG without loss, but for 16 bits,
     which become 8 by the same factor for the whole bag: the first image decides how many bits are in use.
-
-    Attributes:
-        bits: bits in use of 16-bit images; None before the first.
     """
 
     bits: int | None = None

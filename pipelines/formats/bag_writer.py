@@ -36,8 +36,7 @@ class BagCamera:
     """Camera in the terms of `CameraInfo`.
 
     Attributes:
-        width, height: pixels.
-        focal_px: focal length; center_px: principal point, the centre of the top-left pixel being (0.5, 0.5).
+        center_px: principal point, the centre of the top-left pixel being (0.5, 0.5).
         distortion: (k1, k2, p1, p2, k3), model plumb_bob.
         cam_from_body: (3, 3) nominal mounting, body forward-right-down.
     """
@@ -55,15 +54,13 @@ class BagFlight:
     """Records of a flight. Stamps are nanoseconds since 1970, each sensor's on its own clock.
 
     Attributes:
-        camera: calibration.
-        image_stamp_ns: (N,) of the photographs.
-        image_paths: N JPEG files.
-        fix_stamp_ns: (M,) of the fixes.
+        image_stamp_ns: (N,) of the N JPEG files.
+        fix_stamp_ns: (M,).
         fix_lla: (M, 3) degrees and ellipsoidal metres.
         fix_sigma_enu_m: (3,) σ that the receiver states.
         fix_status: of `NavSatStatus`.
         antenna_in_body: (3,) metres, forward-right-down.
-        imu_stamp_ns: (K,) of the attitudes.
+        imu_stamp_ns: (K,).
         imu_enu_from_body: (K, 3, 3), body forward-right-down.
         imu_rate, imu_force: (K, 3) rad/s and m/s², forward-right-down.
         imu_sigma_deg: σ of the attitude per axis.

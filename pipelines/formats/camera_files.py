@@ -48,12 +48,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Lens:
-    """Intrinsics as nerfstudio has them.
-
-    Attributes:
-        intrinsics: by nerfstudio's names.
-        error_px: largest distance within the image from the lens that they stand for.
-    """
+    """Intrinsics by nerfstudio's names, and the largest distance in the image from the lens they stand for."""
 
     model: str
     intrinsics: dict[str, float | int]

@@ -44,13 +44,7 @@ class CloudChunk:
 
 
 class CloudFile(Protocol):
-    """File of points whose header has been checked.
-
-    Attributes:
-        path: of the file.
-        count: number of points.
-        crs: of the file as a text; None: the file states none.
-    """
+    """File of points whose header has been checked; `crs` is None where the file states none."""
 
     @property
     def path(self) -> Path: ...
@@ -171,9 +165,9 @@ class CloudPoints:
     """P points in a CRS.
 
     Attributes:
-        position: (P, 3) in the CRS, easting or longitude first.
+        position: (P, 3), easting or longitude first.
         normal: (P, 3) unit vectors along the axes of the CRS.
-        rgb: (P, 3) uint8.
+        rgb: (P, 3).
         cov_m2: (P, 3, 3) covariance in m², axes east, north, up; NaN: unknown.
     """
 

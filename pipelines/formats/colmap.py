@@ -7,7 +7,6 @@ and `reconstruction_io_text.cc` of COLMAP 4.
 
 from __future__ import annotations
 
-import logging
 import mmap
 import signal
 import struct
@@ -27,8 +26,6 @@ from pipelines.core.types import FloatArray, IntArray
 from pipelines.core.validators import stays_inside
 from pipelines.geometry.cameras import Camera
 from pipelines.geometry.sparse_model import SparseModel
-
-log = logging.getLogger(__name__)
 
 FILES = ("rigs", "cameras", "frames", "images", "points3D")
 _REQUIRED = ("cameras", "images", "points3D")

@@ -42,16 +42,13 @@ class DjiTags:
     Attributes:
         gimbal_yaw_pitch_roll_deg: Z-Y-X from North-East-Down.
         rtk_flag: 50 fixed, 34 float, 16 single point, 0 none.
-        rtk_sigma_enu_m: σ east, north, up.
         absolute_altitude_m: above the same reference as `GPSAltitude`.
-        relative_altitude_m: above take-off.
     """
 
     gimbal_yaw_pitch_roll_deg: Vector3 | None = None
     rtk_flag: int | None = None
     rtk_sigma_enu_m: Vector3 | None = None
     absolute_altitude_m: float | None = None
-    relative_altitude_m: float | None = None
 
 
 @dataclass(frozen=True)
@@ -71,8 +68,8 @@ class LensTags:
 
     Attributes:
         focal_35mm_mm: focal length of the same angle of view on 35 mm film.
-        px_per_mm: resolution of the original image.
-        taken_width_px: longer side of the original image, which may have been scaled since.
+        px_per_mm: resolution of the original image, which may have been scaled since.
+        taken_width_px: longer side of the original image.
         zoom: digital zoom, 1 without zoom.
     """
 
@@ -89,8 +86,7 @@ class PhotoTags:
 
     Attributes:
         orientation: 1 for upright.
-        timestamp_s: seconds since 1970 UTC.
-        time_source: source of the time zone.
+        timestamp_s: seconds since 1970 UTC; `time_source` is the source of the time zone.
         problems: why tags were not used, one phrase each.
     """
 
@@ -281,7 +277,6 @@ def read_dji(data: bytes) -> DjiTags | None:
         rtk_flag=None if (flag := _xmp_number(values, "RtkFlag")) is None else int(flag),
         rtk_sigma_enu_m=sigma if sigma is not None and min(sigma) > 0.0 else None,
         absolute_altitude_m=_xmp_number(values, "AbsoluteAltitude"),
-        relative_altitude_m=_xmp_number(values, "RelativeAltitude"),
     )
 
 

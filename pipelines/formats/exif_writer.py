@@ -30,8 +30,7 @@ class DroneTags:
         stamp_ns: UTC, nanoseconds since 1970.
         lat_deg, lon_deg, alt_m: WGS84, ellipsoidal.
         relative_alt_m: above the place of take-off.
-        yaw_pitch_roll_deg: the gimbal's.
-        body_yaw_pitch_roll_deg: the aircraft's.
+        yaw_pitch_roll_deg: the gimbal's; `body_yaw_pitch_roll_deg`: the aircraft's.
         sigma_enu_m: σ that the receiver states; None: a plain receiver, which states no σ.
     """
 

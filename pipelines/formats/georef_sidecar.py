@@ -137,8 +137,7 @@ class CrsSidecar(_CamelCase):
         crs_wkt: WKT2:2019; without a vertical part, `vertical_datum` says what the heights count from.
         units: of the three coordinates, easting or longitude first.
         epoch: year of the coordinates in a dynamic datum; None: not stated.
-        operation: published operation from WGS84.
-        operation_accuracy_m: its accuracy; None: not known.
+        operation: published operation from WGS84, and its accuracy; None: not known.
         bounds: least and largest of each coordinate.
         accuracy: headline of the result; None: nothing stated it when the file was written.
         sigma: predicted σ of the file's points or cells; None: not known, or nothing checks it.

@@ -26,11 +26,8 @@ _GDAL_TYPE = {"uint8": "Byte", "float32": "Float32"}
 class RasterFrame:
     """Place of a raster's cells: rows from the north, columns from the west.
 
-    Attributes:
-        wkt: CRS as WKT1, which keeps the codes of its parts.
-        west, north: outer corner of the first cell, in the CRS's units, easting or longitude first.
-        step_x, step_y: size of a cell, > 0.
-        columns, rows: numbers of cells.
+    `wkt` is the CRS as WKT1, which keeps the codes of its parts. `west`, `north` is the outer corner of the first
+    cell, in the CRS's units, and the steps are the sizes of a cell, > 0.
     """
 
     wkt: str

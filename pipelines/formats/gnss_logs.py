@@ -78,12 +78,12 @@ class CameraEvents:
     """N events of a camera.
 
     Attributes:
-        lines: (N,) line of each.
+        lines: (N,).
         number: (N,) of the photograph.
         time_s: (N,) seconds since 1970 UTC.
         lon_lat_alt: (N, 3) of the camera, degrees and ellipsoidal metres; NaN without a position.
         sigma_enu_m: (N, 3); NaN where unknown.
-        receiver: (N,) kind of receiver, as of `PoseTable`.
+        receiver: (N,) as of `PoseTable`.
         camera_from_antenna_enu_m: (N, 3) from the antenna to the camera.
     """
 

@@ -38,15 +38,7 @@ from pipelines.formats.trajectory_csv import PoseTable, camera_quaternions, comp
 
 @dataclass(frozen=True)
 class ListedPoint:
-    """Surveyed point of a file.
-
-    Attributes:
-        line: where it stands first.
-        xyz: coordinates in the order of the file's `GroundPoints.in_order_of_crs`.
-        sigma_h_m: horizontal σ; None: the file states none.
-        sigma_v_m: vertical σ.
-        is_check: whether the file calls it a check point.
-    """
+    """Surveyed point of a file: its first line, coordinates by `GroundPoints.in_order_of_crs`, and σ if stated."""
 
     line: int
     name: str

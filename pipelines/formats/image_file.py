@@ -27,12 +27,7 @@ _TIFF_WIDTH, _TIFF_HEIGHT = 256, 257
 
 @dataclass(frozen=True)
 class ImageFile:
-    """Photograph that decodes.
-
-    Attributes:
-        width, height: pixels as stored, before any EXIF orientation.
-        sha256: of the whole file, hexadecimal.
-    """
+    """Photograph that decodes: pixels as stored, before any EXIF orientation, and the hash of the whole file."""
 
     width: int
     height: int

@@ -268,14 +268,13 @@ class LazWriter(LazFile):
 
 @dataclass(frozen=True)
 class LidarReturns:
-    """P returns of one strip.
+    """P returns of one strip, numbered from 1.
 
     Attributes:
         position: (P, 3) in the CRS, easting or longitude first.
         classification: (P,) class of LAS.
-        gps_time_s: (P,) time.
+        gps_time_s: (P,).
         scan_angle_deg: (P,) of the beam across the strip.
-        strip: number of the strip, from 1.
     """
 
     position: FloatArray

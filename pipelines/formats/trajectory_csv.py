@@ -36,16 +36,14 @@ class PoseTable:
     """N rows of a trajectory, all that the file has. Absent columns are None, absent cells NaN.
 
     Attributes:
-        source: kind of file.
-        lines: (N,) line of each row.
+        lines: (N,).
         names: image of each row.
         time_s: (N,) seconds since 1970; a text without a zone is read as UTC.
         xyz: (N, 3) longitude or easting, latitude or northing, height, in the file's CRS.
         geographic: whether the columns were called latitude and longitude; None if the CRS alone decides.
         quat_xyzw: (N, 4) rotations camera → East-North-Up at the camera.
-        sigma_enu_m: (N, 3) σ east, north, up.
-        receiver: (N,) kind of receiver, as the solution has it: `RTK fixed`, `RTK float`, `single-frequency` or
-            `unknown receiver`.
+        sigma_enu_m: (N, 3).
+        receiver: (N,) `RTK fixed`, `RTK float`, `single-frequency` or `unknown receiver`, as the solution has it.
         crs_text: the CRS that the file states.
         assumed_crs: CRS of a file that states none, where `--crs` names none either; None: WGS84 for latitude and
             longitude, and otherwise it must be named.

@@ -81,13 +81,7 @@ def _closed(ring: FloatArray) -> list[list[float]] | None:
 
 @dataclass(frozen=True)
 class ContourLine:
-    """Line of equal height.
-
-    Attributes:
-        height: in the unit of the CRS's heights.
-        xy: (K, 2) in the CRS, easting or longitude first.
-        is_major: whether it is one of every fifth, drawn thicker.
-    """
+    """Line of equal height (K, 2) in the CRS, easting or longitude first; every fifth is major, drawn thicker."""
 
     height: float
     xy: FloatArray

@@ -60,7 +60,6 @@ class PointCrs:
         name: as the file or option gave it, spaces tidied.
         vertical: what the heights count from.
         states_vertical: whether the CRS itself said so (compound, 3D or geocentric).
-        height_unit: name of the heights' unit.
     """
 
     name: str

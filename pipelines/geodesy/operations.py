@@ -33,13 +33,7 @@ _GRID_SUFFIXES = (".tif", ".gtx", ".gsb")
 
 @dataclass(frozen=True)
 class Operation:
-    """How PROJ gets from a CRS to WGS84.
-
-    Attributes:
-        name: PROJ's description.
-        accuracy_m: as published; None if unknown.
-        missing_grids: with which there would be a better one.
-    """
+    """How PROJ gets from a CRS to WGS84, how well (None: unknown), and grids with which it would do better."""
 
     name: str
     accuracy_m: float | None

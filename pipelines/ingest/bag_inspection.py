@@ -29,11 +29,10 @@ class TopicReport:
         use: what `ingest` would take from it, or "".
         messages: that could be read.
         rate_hz: by the median step between stamps; None for fewer than two messages.
-        first_s, last_s: time span; `longest_gap_s`: in it.
-        gaps: steps of more than three times the median.
+        first_s, last_s: time span; `longest_gap_s`: in it; `gaps`: steps of more than three times the median.
         backwards: stamps that are not later than the one before.
         clock: "stamp", or "recording" where messages have none.
-        frame: of the first message; `child`: its child frame.
+        frame: of the first message, and its child frame.
         problem: why the type or its messages cannot be read.
     """
 

@@ -119,15 +119,13 @@ class TopicSamples:
     """Samples of one topic in the order of recording.
 
     Attributes:
-        type: of its messages.
         stamps: nanoseconds of the message's own clock; 0 where it has none.
         bag_times: nanoseconds of the recorder's clock.
         values: `width` numbers a sample.
         receivers: the kind of receiver of each sample.
         frame: of the first sample; `world`: its local frame; `axes`: of the frame.
         problems: how many messages were left out, by reason.
-        time_s: (N,) seconds on the clock of all topics, once all are read.
-        usable: (N,) which of these times are usable.
+        time_s: (N,) seconds on the clock of all topics, once all are read; `usable`: (N,) which of them are.
     """
 
     topic: str
@@ -166,13 +164,10 @@ class BagStreams:
     """The small messages of a bag.
 
     Attributes:
-        path: of the bag.
         images: stamps of every message of the image topic; its frame is that of the first.
         positions: latitude, longitude, height (or east, north, up) and their σ.
         attitudes: quaternion xyzw frame → East-North-Up, and σ in degrees.
-        transforms: the frames.
         info: first `CameraInfo`, or None.
-        info_topic: its topic.
     """
 
     path: Path

@@ -32,16 +32,7 @@ Use = Literal["control", "check"]
 
 @dataclass(frozen=True)
 class GroundPoint:
-    """A surveyed point.
-
-    Attributes:
-        position_in_ecef: (3,) metres.
-        line: where the point first stands.
-        sigma_h_m: horizontal σ; None: the file states none.
-        sigma_v_m: vertical σ.
-        is_check: whether the file calls it a check point.
-        marks: in images that are here.
-    """
+    """A surveyed point (3,) in ECEF: the line where it first stands, σ if stated, marks in images that are here."""
 
     name: str
     position_in_ecef: FloatArray

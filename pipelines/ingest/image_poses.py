@@ -31,12 +31,10 @@ class ImagePoses:
         sigma_source: (N,) who gave σ.
         receivers: (N,) kinds of receiver, of `RECEIVERS`, as recorded.
         enu_from_cam: (N, 3, 3) attitude against north and up at the camera.
-        attitude_source: (N,) where it is from.
+        attitude_source: (N,).
         sigma_attitude_deg: (N,) σ that the attitudes state.
         time_s: (N,) seconds since 1970 UTC.
-        source: where positions are from.
-        crs_name: their CRS.
-        vertical: the datum that their heights counted from.
+        source: of the positions, with their CRS and the datum that their heights counted from.
         recorded: the Earth-centred trajectory that images were matched with by time, None where it was by name.
     """
 

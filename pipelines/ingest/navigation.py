@@ -36,8 +36,7 @@ class RecordedNavigation:
         attitudes: rotations body → East-North-Up at the antenna, forward-right-down.
         rig: of the N photographs, as `ingest` was told or as `/tf` has it.
         body_known: whether the body's axes are known; where not, the camera's nominal axes stand for them.
-        images: names of the photographs.
-        image_time_s: (N,) their times on the camera's clock.
+        image_time_s: (N,) times of the photographs on the camera's clock.
         time_offset_s: navigation clock minus camera clock.
     """
 
@@ -52,16 +51,7 @@ class RecordedNavigation:
 
 @dataclass(frozen=True)
 class FlightRecord:
-    """What was read of a flight.
-
-    Attributes:
-        folder: of the photographs.
-        photos: the N photographs.
-        cameras: before any reconstruction.
-        camera_of: id of each photograph's camera, by name.
-        poses: measured, of the N photographs.
-        navigation: None where it was not recorded by time.
-    """
+    """What was read of a flight; `navigation` is None where it was not recorded by time."""
 
     folder: Path
     photos: list[Photo]
