@@ -62,17 +62,11 @@ def check_files(path: Path) -> None:
 
 
 def refuse_large_chunk(path: Path, uncompressed_bytes: int) -> None:
-    """Refuse a chunk that unpacks to more than 200 MiB.
-
-    Raises:
-        InputError: states the size and a command that rewrites the bag.
-    """
+    """Refuse a chunk that unpacks to more than 200 MiB, with its size and a command that rewrites the bag."""
     if uncompressed_bytes > MAX_CHUNK_BYTES:
-        raise InputError(
-            f"has a chunk of {uncompressed_bytes / 2**20:.0f} MiB (limit {MAX_CHUNK_BYTES // 2**20}): rewrite it "
-            "with smaller ones, e.g. `mcap compress --chunk-size 4194304`",
-            path=path,
-        )
+        size = f"{uncompressed_bytes / 2**20:.0f} MiB (limit {MAX_CHUNK_BYTES // 2**20})"
+        remedy = "rewrite it with smaller ones, e.g. `mcap compress --chunk-size 4194304`"
+        raise InputError(f"has a chunk of {size}: {remedy}", path=path)
 
 
 def unpacked(data: bytes, limit_bytes: int = MAX_CHUNK_BYTES) -> bytes:

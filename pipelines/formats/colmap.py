@@ -205,10 +205,7 @@ def pycolmap_module() -> Any:
     """Return pycolmap, imported so that the process's signals stay as they are.
 
     On import, pycolmap handles SIGTERM by a stack trace and the end of the process: an interrupted stage would not
-    end cleanly.
-
-    Raises:
-        BackendUnavailableError: pycolmap is not installed.
+    end cleanly. Without pycolmap, a BackendUnavailableError names the remedy.
     """
     try:
         import pycolmap
@@ -308,12 +305,7 @@ def _check(model: SparseModel, path: Path) -> None:
 def write_sparse(model: SparseModel, path: Path) -> None:
     """Write a model in COLMAP's binary form; `read_sparse` returns the same model, and COLMAP opens it.
 
-    Every image gets its own frame and every camera a trivial rig. The folder is made if missing.
-
-    Raises:
-        BackendUnavailableError: pycolmap is not installed.
-        StorageError: the disk is full.
-        OSError: the folder cannot be made.
+    Every image gets its own frame and every camera a trivial rig. Raises as `write_reconstruction`.
     """
     pycolmap = pycolmap_module()
     reconstruction = pycolmap.Reconstruction()

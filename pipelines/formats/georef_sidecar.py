@@ -187,9 +187,5 @@ def write_sidecar(sidecar: GeorefSidecar | CrsSidecar, artefact: Path) -> None:
 
 
 def read_sidecar(artefact: Path) -> GeorefSidecar:
-    """Read the sidecar of a file.
-
-    Raises:
-        InputError: no sidecar, or not of this form; names the field.
-    """
+    """Read the sidecar of a file; an InputError names the field that is missing or not of this form."""
     return load_json(GeorefSidecar, sidecar_path(artefact))

@@ -69,8 +69,7 @@ class GroundPoints:
         marks: of these points; a file of another kind may have them.
         crs_text: CRS that the file states; None: it states none.
         geographic: whether the file calls its columns longitude and latitude; None if the CRS alone decides.
-        in_order_of_crs: whether the first two coordinates stand in the order of the axes of the CRS; otherwise
-            easting or longitude is first.
+        in_order_of_crs: whether the coordinates are in the order of the axes of the CRS; else the easting is first.
         unknown_columns: names in the header that mean nothing here.
         left_out: places of marks that the file itself does not count as made by a person.
     """

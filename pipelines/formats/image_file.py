@@ -63,11 +63,7 @@ def read_head(path: Path) -> bytes:
 
 
 def require_unchanged(data: bytes, sha256: str, path: Path) -> None:
-    """Refuse a photograph that is not the recorded one, by the hash of the whole file; empty: none was recorded.
-
-    Raises:
-        InputError: the hashes differ.
-    """
+    """Refuse a photograph whose hash is not the recorded one of the whole file; empty: none was recorded."""
     if sha256 and hashlib.sha256(data).hexdigest() != sha256:
         remedy = "put it back, or run `georef ingest` again"
         raise InputError(f"the photograph has changed since `georef ingest` read it: {remedy}", path=path)

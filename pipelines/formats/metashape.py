@@ -276,11 +276,7 @@ def read_cameras(path: Path) -> PoseTable:
 
 
 def _reference(path: Path) -> tuple[Table, bool | None]:
-    """Return a reference table, and True if its header has longitudes, else None.
-
-    Raises:
-        InputError: no header, no row, or a column is missing.
-    """
+    """Return a reference table, and True if its header has longitudes, else None."""
     lines = numbered_lines(path)
     found = next(((at, text) for at, text in lines if HEADER.match(text)), None)
     if found is None:

@@ -148,11 +148,7 @@ def read_centres(path: Path) -> Float32Array:
 
 
 def read_logit_opacities(path: Path) -> Float32Array:
-    """Read the logits (N,) of the opacities of Gaussians alone.
-
-    Raises:
-        InputError: as `read_splat_ply`.
-    """
+    """Read the logits (N,) of the opacities of Gaussians alone, as `read_splat_ply`."""
     return _columns(_read_rows(path), ("opacity",))[:, 0]
 
 

@@ -79,12 +79,7 @@ class _Layout:
 
 
 def write_spz(path: Path, splat: SplatArrays, version: SpzVersion = 3) -> None:
-    """Write Gaussians; the file appears whole or not at all.
-
-    Raises:
-        InputError: as `encode_spz`.
-        OSError: the file cannot be written.
-    """
+    """Write Gaussians; the file appears whole or not at all; raises as `encode_spz`."""
     data = encode_spz(splat, version)
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(path.name + ".tmp")
@@ -141,11 +136,7 @@ def encode_spz(splat: SplatArrays, version: SpzVersion = 3, fractional_bits: int
 
 
 def decode_spz(data: bytes, path: Path | None = None) -> SplatArrays:
-    """Return the Gaussians in the bytes of an SPZ file.
-
-    Raises:
-        InputError: as `read_spz`; names the path.
-    """
+    """Return the Gaussians in the bytes of an SPZ file; raises as `read_spz`, and names the path."""
     limit_bytes = max(_SMALL_BYTES, _MOST_UNPACKED * len(data))
     unpacked = _unpacked_gzip if data[:2] == b"\x1f\x8b" else _unpacked_zstd
     try:

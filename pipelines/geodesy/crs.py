@@ -187,21 +187,14 @@ class PointCrs:
         return xyz
 
     def operation(self, lla: ArrayLike) -> Operation:
-        """Return the transformation that serves points `lla` (N, 3), for the record.
-
-        Raises:
-            InputError: as `lla_from_xyz`.
-        """
+        """Return the transformation that serves points `lla` (N, 3), for the record; raises as `lla_from_xyz`."""
         points = np.asarray(lla, dtype=np.float64).reshape(-1, 3)
         return self._operation(points[:, 1], points[:, 0])[1]
 
     def serving(self, lla: ArrayLike) -> PointCrs:
         """Return the same CRS with the operation that serves points `lla` (N, 3), for every later call.
 
-        Points that are transformed in several calls have no step between them then.
-
-        Raises:
-            InputError: as `xyz_from_lla`.
+        Points that are transformed in several calls have no step between them then. Raises as `xyz_from_lla`.
         """
         self.xyz_from_lla(lla)
         points = np.asarray(lla, dtype=np.float64).reshape(-1, 3)

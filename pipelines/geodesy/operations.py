@@ -52,11 +52,7 @@ class OperationRequest:
 
 @contextmanager
 def proj_errors(name: str, path: Path | str | None = None) -> Iterator[None]:
-    """Turn the exceptions of PROJ into errors that name the CRS and the file.
-
-    Raises:
-        InputError: PROJ refuses the CRS or the points.
-    """
+    """Turn the exceptions of PROJ into InputErrors that name the CRS and the file."""
     try:
         yield
     except ProjError as error:

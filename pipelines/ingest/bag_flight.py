@@ -72,8 +72,7 @@ def read_bag(
 def count_frames(path: Path, options: IngestOptions, notes: Notes, progress: Progress = SILENT) -> tuple[int, int]:
     """Return the number of frames with a usable stamp, and of those with a position; nothing is written.
 
-    Raises:
-        InputError: as `read_bag`, but for frames that are damaged, blurred or passed over.
+    Raises as `read_bag`, but for frames that are damaged, blurred or passed over.
     """
     with open_bag(path) as bag:
         streams = read_streams(bag, options, notes, progress)

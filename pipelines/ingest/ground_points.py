@@ -235,11 +235,7 @@ def _are_one(first: GroundPoint, second: GroundPoint) -> bool:
 
 
 def require_near(file: GroundFile, middle_in_ecef: FloatArray) -> None:
-    """Refuse points that are nowhere near the cameras, whose middle is (3,) in ECEF.
-
-    Raises:
-        InputError: a point more than 50 km away.
-    """
+    """Refuse a file with a point more than 50 km from the cameras, whose middle is (3,) in ECEF."""
     for point in file.points:
         distance_m = float(np.linalg.norm(point.position_in_ecef - middle_in_ecef))
         if distance_m > _RANGE_M:

@@ -89,11 +89,7 @@ def track_in_geo(recorded: RecordedNavigation, origin: Origin) -> NavigationTrac
 
 
 def require_enough(count: int, source: Path, field: str, notes: Notes) -> None:
-    """Refuse fewer photographs than a survey needs, with everything that was noted on the way.
-
-    Raises:
-        InputError: fewer than three.
-    """
+    """Refuse fewer photographs than a survey needs, with everything that was noted on the way."""
     if count < LEAST_IMAGES:
         reasons = "".join(f"; {warning}" for warning in notes.warnings)
         message = f"{count} usable images, a survey needs {LEAST_IMAGES}{reasons}"
@@ -133,14 +129,8 @@ def camera_poses(
 ) -> tuple[FloatArray, FloatArray]:
     """Return camera centres in ECEF (N, 3) and attitudes camera → East-North-Up (N, 3, 3), NaN where unknown.
 
-    A position that a lever arm would move, but without an attitude to move it by, is left out and noted.
-
-    Args:
-        antenna_in_ecef: (N, 3) metres.
-        enu_from_body: (N, 3, 3) attitudes against north and up at the antenna.
-        rig: of the photographs.
-        names: of the photographs, for the note.
-        notes: positions that were left out.
+    A position that a lever arm would move, but without an attitude to move it by, is left out and noted. The
+    antenna's places are ECEF (N, 3), and the body's attitudes (N, 3, 3) against north and up there.
     """
     # With the antenna at zero, its own East-North-Up is a Cartesian frame that needs no place on Earth.
     offset_in_enu, enu_from_cam = with_rig(np.zeros_like(antenna_in_ecef), enu_from_body, rig)

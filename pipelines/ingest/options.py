@@ -166,11 +166,7 @@ _BAG_ONLY = ("image_topic", "fix_topic", "attitude_topic", "every", "origin")
 
 
 def check_options(options: IngestOptions, frames: Path | None) -> None:
-    """Refuse options that make no survey; photographs of a bag need a place, `frames`, to be written to.
-
-    Raises:
-        InputError: names the option.
-    """
+    """Refuse options that make no survey; photographs of a bag need a place, `frames`, to be written to."""
     if options.bag is not None:
         _check_bag(options, frames)
     elif given := [name for name in _BAG_ONLY if getattr(options, name) is not None]:

@@ -147,9 +147,7 @@ class ImageNames:
                 form.setdefault(key, []).append(name)
 
     def find(self, text: str, *, path: Path, line: int) -> str | None:
-        """Return the image that `text` names, or None.
-
-        Backslashes separate folders too.
+        """Return the image that `text` names, or None; backslashes separate folders too.
 
         Raises:
             InputError: it leaves the image folder, or fits several images equally well; names path and line.

@@ -48,12 +48,9 @@ def run(stage: StageRun, options: IngestOptions) -> Summary:
 
 
 def check_inputs(workspace: Workspace, options: IngestOptions, progress: Progress = SILENT) -> Summary:
-    """Return the summary of what `run` would make; nothing is written.
+    """Return the summary of what `run` would make, or raise as `run`; nothing is written.
 
     Of photographs, sizes and tags are read: damage behind them is found by `run`. Of a bag, all but the pixels.
-
-    Raises:
-        InputError: as `run`.
     """
     _refuse_inside_photographs(workspace, options)
     if options.bag is None:
@@ -76,13 +73,10 @@ def _refuse_inside_photographs(workspace: Workspace, options: IngestOptions) -> 
 def survey_and_track(
     options: IngestOptions, frames: Path | None, progress: Progress = SILENT, *, decode: bool = True
 ) -> tuple[Survey, NavigationTrack | None]:
-    """Return the survey, and the navigation in the same frame where it was recorded by time.
+    """Return the survey, and the navigation in the same frame where it was recorded by time; raises as `run`.
 
     Photographs of a bag are written into `frames`; without a bag, nothing is. Photographs are decoded to their end,
     as their hashes need; without `decode`, their heads are read.
-
-    Raises:
-        InputError: as `run`.
     """
     notes = Notes()
     check_options(options, frames)

@@ -112,11 +112,7 @@ def assemble_survey(
 
 
 def require_placed(placed: bool) -> None:
-    """Refuse a survey that nothing places on Earth.
-
-    Raises:
-        InputError: names the options that would.
-    """
+    """Refuse a survey that nothing places on Earth."""
     if not placed:
         raise InputError(
             "no image has a position, and there are no ground control points: give --trajectory, --geo or --gcp"
