@@ -24,8 +24,16 @@ from pipelines.geometry.trajectory import Rig, Trajectory, frame_from_frd
 from pipelines.ingest.bag_messages import BASE, GEODETIC_HEIGHTS
 from pipelines.ingest.bag_photos import lens_priors, write_photos
 from pipelines.ingest.bag_streams import BagStreams, TopicSamples, read_streams
-from pipelines.ingest.image_poses import RECEIVERS, ImagePoses, with_defaults
-from pipelines.ingest.navigation import FlightRecord, RecordedNavigation, camera_poses, given_rig, require_enough
+from pipelines.ingest.flight_record import (
+    RECEIVERS,
+    FlightRecord,
+    ImagePoses,
+    RecordedNavigation,
+    camera_poses,
+    given_rig,
+    require_enough,
+    with_defaults,
+)
 from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
 

@@ -24,7 +24,7 @@ from pipelines.geodesy.enu import ecef_from_enu_rotation, ecef_from_lla, lla_fro
 from pipelines.geodesy.operations import WGS84
 from pipelines.geodesy.vertical import ELLIPSOIDAL, FOOT_M, MOST_GEOID_M, VerticalDatum
 from pipelines.geometry.rotations import geo_from_cam
-from pipelines.ingest.image_poses import ImagePoses, with_defaults
+from pipelines.ingest.flight_record import ImagePoses, with_defaults
 from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo

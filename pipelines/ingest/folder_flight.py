@@ -23,9 +23,9 @@ from pipelines.formats.trajectory_csv import PoseTable, read_trajectory
 from pipelines.geodesy.enu import ecef_from_enu_rotation, lla_from_ecef
 from pipelines.geometry.trajectory import Rig, Trajectory
 from pipelines.ingest.exif_poses import poses_from_tags
-from pipelines.ingest.image_poses import ImagePoses
-from pipelines.ingest.navigation import (
+from pipelines.ingest.flight_record import (
     FlightRecord,
+    ImagePoses,
     RecordedNavigation,
     at_cameras,
     body_mount,

@@ -26,9 +26,15 @@ from pipelines.geodesy.enu import (
 )
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
+from pipelines.ingest.flight_record import (
+    LEAST_IMAGES,
+    RECEIVERS,
+    FlightRecord,
+    ImagePoses,
+    SigmaSource,
+    track_in_geo,
+)
 from pipelines.ingest.ground_points import GroundFile, GroundPoint, require_near, split_checks, unmarked_points
-from pipelines.ingest.image_poses import RECEIVERS, ImagePoses, SigmaSource
-from pipelines.ingest.navigation import LEAST_IMAGES, FlightRecord, track_in_geo
 from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
 from pipelines.survey.calibrated import FIX_RANGE_M, NavigationTrack, require_estimable

@@ -18,7 +18,7 @@ from pipelines.geodesy.enu import ecef_from_lla
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.trajectory import Trajectory
 from pipelines.ingest.exif_poses import altitude_m, compare_with_exif, gimbal_attitudes, photo_times
-from pipelines.ingest.image_poses import RECEIVERS, AttitudeSource, ImagePoses, with_defaults
+from pipelines.ingest.flight_record import RECEIVERS, AttitudeSource, ImagePoses, with_defaults
 from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import ImageNames, Photo
