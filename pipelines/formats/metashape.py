@@ -24,7 +24,16 @@ import numpy as np
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size
 from pipelines.formats.ground_points import GroundPoints, ListedMark, ListedPoint, without_repeats
-from pipelines.formats.tables import Row, Table, bare_name, named_columns, numbered_lines, rows, separator_of, split
+from pipelines.formats.tables import (
+    Row,
+    Table,
+    bare_name,
+    named_columns,
+    numbered_lines,
+    rows_of,
+    separator_of,
+    split,
+)
 from pipelines.formats.trajectory_csv import PoseTable, camera_quaternions, complete
 
 if TYPE_CHECKING:
@@ -290,15 +299,9 @@ def _reference(path: Path) -> tuple[Table, bool | None]:
     if missing:
         raise InputError(f"the header names no {', '.join(missing)}", path=path, line=header_line)
     kept = [(at, text) for at, text in lines if at > header_line and not text.startswith("#")]
-    table = Table(
-        path,
-        header_line,
-        columns,
-        tuple(name for name in unknown if bare_name(name) and not _RESULT.search(name)),
-        list(rows(path, kept, separator, columns)),
-        crs_text,
-        crs_line,
-    )
+    named = tuple(name for name in unknown if bare_name(name) and not _RESULT.search(name))
+    listed = rows_of(path, kept, separator, columns)
+    table = Table(path, header_line, columns, named, listed, crs_text, crs_line)
     if not table.rows:
         raise InputError("has a header but no rows", path=path)
     for row in table.rows:

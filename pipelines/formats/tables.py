@@ -14,7 +14,7 @@ import csv
 import io
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -245,13 +245,12 @@ def split(text: str, separator: str | None, *, path: Path, line: int) -> list[st
         raise InputError(f"is no CSV: {error}", path=path, line=line) from error
 
 
-def rows(
+def rows_of(
     path: Path, lines: Sequence[tuple[int, str]], separator: str | None, columns: Mapping[str, int]
-) -> Iterator[Row]:
-    """Yield the rows of numbered lines; see `split`."""
-    for line, text in lines:
-        cells = split(text, separator, path=path, line=line)
-        yield Row(path, line, cells, columns, separator not in (",", None))
+) -> list[Row]:
+    """Return the rows of numbered lines; see `split`."""
+    comma = separator not in (",", None)
+    return [Row(path, line, split(text, separator, path=path, line=line), columns, comma) for line, text in lines]
 
 
 def bare_name(text: str) -> str:
