@@ -1,10 +1,8 @@
-"""Reading of ROS bags, one message at a time: rosbag2 folders and bare files (mcap, sqlite3), and ROS 1 bags.
+"""ROS bags, read a message at a time: rosbag2 folders, bare mcap and sqlite3 files, ROS 1 bags; their photographs.
 
 Definitions of message types come from the bag, else from the ROS distribution. PX4's messages are in no
-distribution: for them the layout of `bag.definitions` counts that fits the message. A damaged definition harms its
-own topic only.
-
-Decoding of photographs from ROS messages.
+distribution: for them the layout of `DEFINITIONS` counts that fits the message. A damaged definition harms its own
+topic only.
 """
 
 from __future__ import annotations
@@ -68,7 +66,7 @@ class Bag:
 
     def __init__(self, path: Path, reader: Any, ros2: bool) -> None:
         self.path, self._reader, self._ros2 = path, reader, ros2
-        self._packed = _unpack_here(reader)
+        self._packed = _leave_packed(reader)
         self._connections = list(reader.connections)
         # Any file of a split bag may have the definition.
         links = [link for part in _parts(reader) for link in part.connections] + self._connections
@@ -83,11 +81,6 @@ class Bag:
         self.topics = {
             name: BagTopic(name, kind, count) for (name, kind), count in sorted(counts.items(), reverse=True)
         }
-
-    @property
-    def message_count(self) -> int:
-        """Number of messages of all topics, by the bag's index."""
-        return sum(topic.count for topic in self.topics.values())
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
         """Yield the messages of these topics by time of recording.
@@ -119,10 +112,9 @@ class Bag:
             UndecodableError: the message does not fit, or has no known definition.
         """
         store = self._store(message)
+        deserialize = store.deserialize_cdr if self._ros2 else store.deserialize_ros1
         try:
-            if self._ros2:
-                return store.deserialize_cdr(message.data, message.type)
-            return store.deserialize_ros1(message.data, message.type)
+            return deserialize(message.data, message.type)
         except Exception as error:  # hostile bytes make generated code raise any error
             raise UndecodableError(f"{type(error).__name__}: {error}") from error
 
@@ -139,11 +131,10 @@ class Bag:
     def header_stamp_ns(self, message: RawMessage) -> int | None:
         """Return the stamp of a message that begins with a `std_msgs/Header`, without decoding it; None if zero."""
         try:
-            if not self._ros2:
-                sec, nanosec = struct.unpack_from("<II", message.data, 4)
-            else:
-                order = "<" if message.data[1] & 1 else ">"
-                sec, nanosec = struct.unpack_from(f"{order}iI", message.data, 4)
+            layout = "<II"
+            if self._ros2:
+                layout = "<iI" if message.data[1] & 1 else ">iI"
+            sec, nanosec = struct.unpack_from(layout, message.data, 4)
         except (struct.error, IndexError):
             return None
         return sec * 1_000_000_000 + nanosec or None
@@ -202,67 +193,49 @@ def open_bag(path: Path) -> Iterator[Bag]:
     Raises:
         InputError: no bag, damaged beyond opening, or with chunks too large for memory.
     """
-    ros2 = path.suffix != ".bag"
-    reader = _reader(path, ros2)
+    if not path.exists():
+        raise InputError("no such bag", path=path, field="--bag")
+    if path.is_dir() and not (path / "metadata.yaml").exists():
+        message = "has no metadata.yaml: give the .mcap or .db3 file in it, or `ros2 bag reindex` the folder"
+        raise InputError(message, path=path, field="--bag")
+    if not path.is_dir() and path.suffix not in (".bag", ".mcap", ".db3"):
+        message = "is no bag: give a rosbag2 folder, or a .mcap, .db3 or .bag file"
+        raise InputError(message, path=path, field="--bag")
+    reader = _opened(path)
     try:
-        reader.open()
-    except InputError:
-        raise
-    except KeyError as error:
-        if error.args[0] not in _FOREIGN_SCHEMAS:
-            raise InputError(f"is no bag, or is damaged ({_describe(error)}): {_REPAIR}", path=path) from error
-        raise InputError(
-            f"has a topic in {error.args[0]!r}, which is not ROS 2's: leave it out with `mcap filter`", path=path
-        ) from error
-    except Exception as error:  # truncated and forged files make the parser raise any error
-        raise InputError(f"is no bag, or is damaged ({_describe(error)}): {_REPAIR}", path=path) from error
-    try:
-        _check_chunks(reader, path)
-        _check_topics(reader, path)
-        yield Bag(path, reader, ros2)
+        for part in _parts(reader):
+            chunks = getattr(part, "chunks", ())
+            refuse_large_chunk(path, max((chunk.uncompressed_size for chunk in chunks), default=0))
+        for link in reader.connections:  # SQLite and YAML have any type in any place
+            types = isinstance(link.topic, str), isinstance(link.msgtype, str), isinstance(link.msgcount, int)
+            if not all(types):
+                raise InputError(f"is damaged (topic {str(link.topic)[:40]!r}): {_REPAIR}", path=path)
+        yield Bag(path, reader, path.suffix != ".bag")
     finally:
         reader.close()
 
 
-def _reader(path: Path, ros2: bool) -> Any:
+def _opened(path: Path) -> Any:
+    """Return the open reader of rosbags."""
     from rosbags import rosbag1, rosbag2
 
-    if not path.exists():
-        raise InputError("no such bag", path=path, field="--bag")
-    if path.is_dir() and not (path / "metadata.yaml").exists():
-        raise InputError(
-            "has no metadata.yaml: give the .mcap or .db3 file in it, or `ros2 bag reindex` the folder",
-            path=path,
-            field="--bag",
-        )
-    if not path.is_dir() and path.suffix not in (".bag", ".mcap", ".db3"):
-        raise InputError(
-            "is no bag: give a rosbag2 folder, or a .mcap, .db3 or .bag file", path=path, field="--bag"
-        )
     try:
         check_files(path)
         bound_decompressors()
-        return rosbag2.Reader(path) if ros2 else rosbag1.Reader(path)
+        reader: Any = rosbag1.Reader(path) if path.suffix == ".bag" else rosbag2.Reader(path)
+        reader.open()
     except InputError:
         raise
-    except Exception as error:
-        raise InputError(f"is no bag, or is damaged ({_describe(error)}): {_REPAIR}", path=path) from error
+    except Exception as error:  # truncated and forged files make the parser raise any error
+        if isinstance(error, KeyError) and error.args[0] in _FOREIGN_SCHEMAS:
+            message = f"has a topic in {error.args[0]!r}, which is not ROS 2's: leave it out with `mcap filter`"
+            raise InputError(message, path=path) from error
+        cause = f"{type(error).__name__}: {error}".rstrip(": ").rstrip(".")
+        raise InputError(f"is no bag, or is damaged ({cause}): {_REPAIR}", path=path) from error
+    return reader
 
 
-def _check_chunks(reader: Any, path: Path) -> None:
-    for storage in _parts(reader):
-        largest = max((chunk.uncompressed_size for chunk in getattr(storage, "chunks", ())), default=0)
-        refuse_large_chunk(path, largest)
-
-
-def _check_topics(reader: Any, path: Path) -> None:
-    """Refuse topics whose names, types or counts are none: SQLite and YAML have any type in any place."""
-    for link in reader.connections:
-        if not (isinstance(link.topic, str) and isinstance(link.msgtype, str) and isinstance(link.msgcount, int)):
-            raise InputError(f"is damaged (topic {str(link.topic)[:40]!r}): {_REPAIR}", path=path)
-
-
-def _unpack_here(reader: Any) -> bool:
+def _leave_packed(reader: Any) -> bool:
     """Return whether messages are compressed one by one, and let rosbags hand them over packed."""
     storage: Any = getattr(reader, "storage", None)
     if getattr(getattr(storage, "metadata", None), "compression_mode", None) != "message":
@@ -279,11 +252,27 @@ def _parts(reader: Any) -> list[Any]:
 
 @lru_cache(maxsize=256)
 def _stated_store(definition: Any, kind: str) -> Any:
-    """Return a typestore with the types of a definition; the code that decodes them is generated once."""
-    from rosbags.typesys import Stores, get_typestore
+    """Return a typestore with the types of a definition, in ROS's message language or in IDL.
+
+    The code that decodes them is generated once.
+    """
+    from rosbags.interfaces import MessageDefinitionFormat
+    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.EMPTY)
-    store.register(_parsed(definition, kind))
+    if definition.format == MessageDefinitionFormat.MSG:
+        store.register(get_types_from_msg(definition.data, kind))
+        return store
+    rule = "=" * 80 + "\n"
+    # rosbags' parser takes no directives; the definitions that they include follow below.
+    text = re.sub(r"^[ \t]*#.*$", "", definition.data, flags=re.MULTILINE)
+    texts = [text]
+    if text.startswith(f"{rule}IDL: "):
+        texts = [part.partition("\n")[2] for part in text.split(rule)[1:]]
+    types: dict[str, Any] = {}
+    for part in texts:
+        types.update(get_types_from_idl(part))
+    store.register(types)
     return store
 
 
@@ -293,28 +282,6 @@ def _common_store(ros2: bool) -> Any:
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_JAZZY if ros2 else Stores.ROS1_NOETIC)
-
-
-def _parsed(definition: Any, kind: str) -> Any:
-    """Return the types of a definition, in ROS's message language or in IDL."""
-    from rosbags.interfaces import MessageDefinitionFormat
-    from rosbags.typesys import get_types_from_idl, get_types_from_msg
-
-    if definition.format == MessageDefinitionFormat.MSG:
-        return get_types_from_msg(definition.data, kind)
-    rule = "=" * 80 + "\n"
-    # rosbags' parser takes no directives; the definitions that they include follow below.
-    text = re.sub(r"^[ \t]*#.*$", "", definition.data, flags=re.MULTILINE)
-    if not text.startswith(f"{rule}IDL: "):
-        return get_types_from_idl(text)
-    types: dict[str, Any] = {}
-    for part in text.split(rule)[1:]:
-        types.update(get_types_from_idl(part.partition("\n")[2]))
-    return types
-
-
-def _describe(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}".rstrip(": ").rstrip(".")
 
 
 IMAGE, COMPRESSED, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/CameraInfo"
@@ -339,9 +306,6 @@ class ImageWriter:
 
     JPEG and PNG in a `CompressedImage` stay as they are. A raw `Image` becomes a PNG without loss, but for 16 bits,
     which become 8 by the same factor for the whole bag: the first image decides how many bits are in use.
-
-    Attributes:
-        bits: bits in use of 16-bit images; None before the first.
     """
 
     bits: int | None = None
@@ -368,16 +332,13 @@ class ImageWriter:
             raise BadImageError(f"encoding {message.encoding!r} is none of {', '.join(ENCODINGS)}")
         raw = _rows(message, _PIXEL_BYTES[encoding])
         if encoding.endswith("16"):
-            return _to_bgr(
-                self._eight_bits(raw.view(">u2" if message.is_bigendian else "<u2")), encoding[:-2] + "8"
-            )
+            pixels: NDArray[np.uint16] = raw.view(">u2" if message.is_bigendian else "<u2")
+            if self.bits is None:
+                used = int(pixels.max(initial=1)).bit_length()
+                self.bits = next(bits for bits in (8, 10, 12, 14, 16) if used <= bits)
+            raw = np.minimum(pixels >> (self.bits - 8), 255).astype(np.uint8)
+            encoding = encoding[:-2] + "8"
         return _to_bgr(raw, encoding)
-
-    def _eight_bits(self, pixels: NDArray[np.uint16]) -> ByteArray:
-        if self.bits is None:
-            used = int(pixels.max(initial=1)).bit_length()
-            self.bits = next(bits for bits in (8, 10, 12, 14, 16) if used <= bits)
-        return np.asarray(np.minimum(pixels >> (self.bits - 8), 255).astype(np.uint8))
 
 
 def sharpness(data: bytes) -> float:

@@ -1,12 +1,11 @@
-"""Limits of a bag, checked before rosbags opens it: sizes of records and chunks, and what they unpack to.
+"""Limits of a bag, checked before rosbags opens it, and layouts of PX4's messages for bags without definitions.
 
 rosbags trusts sizes: it allocates what a record claims, unpacks what a compressed block holds, and has all chunks
 in memory that overlap in time.
 
-Layouts of PX4's messages for bags that do not carry their own definitions (sqlite3 bags up to ROS 2 Humble).
-
-After `msg/*.msg` of PX4-Autopilot and px4_msgs. Fields changed between releases. The length of a message reveals
-its layout, together with the distance of `timestamp_sample` from `timestamp`.
+sqlite3 bags up to ROS 2 Humble do not carry definitions. The layouts are after `msg/*.msg` of PX4-Autopilot and
+px4_msgs. Fields changed between releases. The length of a message reveals its layout, together with the distance of
+`timestamp_sample` from `timestamp`.
 """
 
 from __future__ import annotations
@@ -14,8 +13,8 @@ from __future__ import annotations
 import mmap
 import struct
 import sys
-from collections.abc import Collection, Iterator
-from functools import cache
+from collections.abc import Callable, Collection, Iterator
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -44,10 +43,7 @@ class _Chunk(NamedTuple):
 
 
 def check_files(path: Path) -> None:
-    """Refuse a bag whose files are no regular files, or ask for more memory than any recorder's.
-
-    Args:
-        path: bag file, or folder of a rosbag2.
+    """Refuse a bag, file or folder, whose files are no regular files, or ask for more memory than any recorder's.
 
     Raises:
         InputError: names the file and its fault.
@@ -66,17 +62,11 @@ def check_files(path: Path) -> None:
 
 
 def refuse_large_chunk(path: Path, uncompressed_bytes: int) -> None:
-    """Refuse a chunk that unpacks to more than 200 MiB.
-
-    Raises:
-        InputError: states the size and a command that rewrites the bag.
-    """
+    """Refuse a chunk that unpacks to more than 200 MiB, with its size and a command that rewrites the bag."""
     if uncompressed_bytes > MAX_CHUNK_BYTES:
-        raise InputError(
-            f"has a chunk of {uncompressed_bytes / 2**20:.0f} MiB (limit {MAX_CHUNK_BYTES // 2**20}): rewrite it "
-            "with smaller ones, e.g. `mcap compress --chunk-size 4194304`",
-            path=path,
-        )
+        size = f"{uncompressed_bytes / 2**20:.0f} MiB (limit {MAX_CHUNK_BYTES // 2**20})"
+        remedy = "rewrite it with smaller ones, e.g. `mcap compress --chunk-size 4194304`"
+        raise InputError(f"has a chunk of {size}: {remedy}", path=path)
 
 
 def unpacked(data: bytes, limit_bytes: int = MAX_CHUNK_BYTES) -> bytes:
@@ -101,26 +91,22 @@ def unpacked(data: bytes, limit_bytes: int = MAX_CHUNK_BYTES) -> bytes:
 @cache
 def bound_decompressors() -> None:
     """Let rosbags unpack chunks of mcap and of ROS 1 up to the limit only."""
+    from bz2 import BZ2Decompressor
+
     from lz4.frame import LZ4FrameDecompressor
     from rosbags.rosbag1 import reader as rosbag1
     from rosbags.rosbag2 import storage_mcap
 
-    def lz4(data: bytes, limit_bytes: int = MAX_CHUNK_BYTES) -> bytes:
-        return _at_most(LZ4FrameDecompressor().decompress(data, max_length=limit_bytes + 1), limit_bytes)
-
-    def bz2(data: bytes) -> bytes:
-        from bz2 import BZ2Decompressor
-
-        return _at_most(BZ2Decompressor().decompress(data, max_length=MAX_CHUNK_BYTES + 1), MAX_CHUNK_BYTES)
-
+    lz4, bz2 = partial(_unpacked_chunk, LZ4FrameDecompressor), partial(_unpacked_chunk, BZ2Decompressor)
     storage_mcap.DECOMPRESSORS.update({"lz4": lz4, "zstd": unpacked})
     rosbag1.decompressors.update({"lz4": lz4, "bz2": bz2})
 
 
-def _at_most(data: bytes, limit_bytes: int) -> bytes:
-    if len(data) > limit_bytes:
+def _unpacked_chunk(decompressor: Callable[[], Any], data: bytes, limit_bytes: int = MAX_CHUNK_BYTES) -> bytes:
+    chunk: bytes = decompressor().decompress(data, max_length=limit_bytes + 1)
+    if len(chunk) > limit_bytes:
         raise ValueError(f"a chunk unpacks to more than {limit_bytes / 2**20:.0f} MiB")
-    return data
+    return chunk
 
 
 def _zstd() -> Any:
@@ -214,176 +200,92 @@ def _together(chunks: Collection[_Chunk]) -> int:
     return greatest
 
 
+def _layout(*parts: str) -> str:
+    """Return a definition in ROS's message language: of each type and its names, a line a name."""
+    lines = [line.split() for part in parts for line in part.splitlines()]
+    return "".join(f"{line[0]} {name}\n" for line in lines for name in line[1:])
+
+
+_NO_SAMPLE, _SAMPLE = "uint64 timestamp", "uint64 timestamp timestamp_sample"
 _ATTITUDE = """
-uint64 timestamp
-{sample}
-float32[4] q
-float32[4] delta_q_reset
-uint8 quat_reset_counter
-"""
-
-_GLOBAL_POSITION_1_11 = """
-uint64 timestamp
-float64 lat
-float64 lon
-float32 alt
-float32 alt_ellipsoid
-float32 delta_alt
-uint8 lat_lon_reset_counter
-uint8 alt_reset_counter
-float32 vel_n
-float32 vel_e
-float32 vel_d
-float32 yaw
-float32 eph
-float32 epv
-float32 terrain_alt
-bool terrain_alt_valid
-bool dead_reckoning
-"""
-
-_GLOBAL_POSITION_1_14 = """
-uint64 timestamp
-uint64 timestamp_sample
-float64 lat
-float64 lon
-float32 alt
-float32 alt_ellipsoid
-float32 delta_alt
-uint8 lat_lon_reset_counter
-uint8 alt_reset_counter
-float32 eph
-float32 epv
-float32 terrain_alt
-bool terrain_alt_valid
-bool dead_reckoning
-"""
-
-_GLOBAL_POSITION_1_16 = """
-uint64 timestamp
-uint64 timestamp_sample
-float64 lat
-float64 lon
-float32 alt
-float32 alt_ellipsoid
-bool lat_lon_valid
-bool alt_valid
-float32 delta_alt
-float32 delta_terrain
-uint8 lat_lon_reset_counter
-uint8 alt_reset_counter
-uint8 terrain_reset_counter
-float32 eph
-float32 epv
-float32 terrain_alt
-bool terrain_alt_valid
-bool dead_reckoning
-"""
-
+float32[4] q delta_q_reset
+uint8 quat_reset_counter"""
+_POSITION = """
+float64 lat lon
+float32 alt alt_ellipsoid delta_alt
+uint8 lat_lon_reset_counter alt_reset_counter"""
+_POSITION_1_16 = """
+float64 lat lon
+float32 alt alt_ellipsoid
+bool lat_lon_valid alt_valid
+float32 delta_alt delta_terrain
+uint8 lat_lon_reset_counter alt_reset_counter terrain_reset_counter"""
+_ERRORS = """
+float32 eph epv terrain_alt
+bool terrain_alt_valid dead_reckoning"""
 _GPS = """
-uint64 timestamp
-uint64 timestamp_sample
-uint32 device_id
-{place}
-float32 s_variance_m_s
-float32 c_variance_rad
+float32 s_variance_m_s c_variance_rad
 uint8 fix_type
-float32 eph
-float32 epv
-float32 hdop
-float32 vdop
+float32 eph epv hdop vdop
 int32 noise_per_ms
 uint16 automatic_gain_control
 uint8 jamming_state
 int32 jamming_indicator
-uint8 spoofing_state
-{authentication}
-float32 vel_m_s
-float32 vel_n_m_s
-float32 vel_e_m_s
-float32 vel_d_m_s
-float32 cog_rad
+uint8 spoofing_state"""
+_VELOCITY = """
+float32 vel_m_s vel_n_m_s vel_e_m_s vel_d_m_s cog_rad
 bool vel_ned_valid
 int32 timestamp_time_relative
 uint64 time_utc_usec
-uint8 satellites_used
-{error}
-float32 heading
-float32 heading_offset
-float32 heading_accuracy
-float32 rtcm_injection_rate
-uint8 selected_rtcm_instance
-{tail}
-"""
-
-_WHOLE = "int32 lat\nint32 lon\nint32 alt\nint32 alt_ellipsoid"
-_DEGREES = "float64 latitude_deg\nfloat64 longitude_deg\nfloat64 altitude_msl_m\nfloat64 altitude_ellipsoid_m"
+uint8 satellites_used"""
+_HEADING = """
+float32 heading heading_offset heading_accuracy rtcm_injection_rate
+uint8 selected_rtcm_instance"""
+_WHOLE = "uint32 device_id\nint32 lat lon alt alt_ellipsoid"
+_DEGREES = "uint32 device_id\nfloat64 latitude_deg longitude_deg altitude_msl_m altitude_ellipsoid_m"
 _RTCM = "bool rtcm_crc_failed\nuint8 rtcm_msg_used"
-_QUALITY = "\n".join(
-    f"uint8 quality_{name}" for name in ("corrections", "receiver", "gnss_signals", "post_processing")
-)
-_ANTENNA = "\n".join(f"float32 antenna_offset_{axis}" for axis in "xyz")
-_SINCE_1_16 = {"place": _DEGREES, "authentication": "uint8 authentication_state", "error": "uint32 system_error"}
-
-_ODOMETRY_OLD = """
-uint64 timestamp
-{sample}
-uint8 local_frame
-float32 x
-float32 y
-float32 z
-float32[4] q
-float32[4] q_offset
-float32[21] pose_covariance
-{velocity_frame}
-float32 vx
-float32 vy
-float32 vz
-float32 rollspeed
-float32 pitchspeed
-float32 yawspeed
-float32[21] velocity_covariance
-"""
-
+_QUALITY = "uint8 quality_corrections quality_receiver quality_gnss_signals quality_post_processing"
+_ANTENNA = "float32 antenna_offset_x antenna_offset_y antenna_offset_z"
+_AUTHENTICATION, _SYSTEM_ERROR = "uint8 authentication_state", "uint32 system_error"
+_GPS_1_16 = (_SAMPLE, _DEGREES, _GPS, _AUTHENTICATION, _VELOCITY, _SYSTEM_ERROR, _HEADING, _RTCM)
 _ODOMETRY = """
-uint64 timestamp
-uint64 timestamp_sample
 uint8 pose_frame
 float32[3] position
 float32[4] q
 uint8 velocity_frame
-float32[3] velocity
-float32[3] angular_velocity
-float32[3] position_variance
-float32[3] orientation_variance
-float32[3] velocity_variance
+float32[3] velocity angular_velocity position_variance orientation_variance velocity_variance
 uint8 reset_counter
-int8 quality
-"""
-
-_SAMPLE = "uint64 timestamp_sample"
+int8 quality"""
+_OLD_POSE = """
+uint8 local_frame
+float32 x y z
+float32[4] q q_offset
+float32[21] pose_covariance"""
+_OLD_VELOCITY = """
+float32 vx vy vz rollspeed pitchspeed yawspeed
+float32[21] velocity_covariance"""
 
 # Layouts of each message from the newest to the oldest, by the release in which the layout first appeared.
 DEFINITIONS: dict[str, dict[str, str]] = {
     "px4_msgs/msg/SensorGps": {
-        "1.17": _GPS.format(**_SINCE_1_16, tail=f"{_RTCM}\n{_ANTENNA}"),
-        "1.16 with quality": _GPS.format(**_SINCE_1_16, tail=f"{_RTCM}\n{_QUALITY}"),
-        "1.16": _GPS.format(**_SINCE_1_16, tail=_RTCM),
-        "1.15": _GPS.format(place=_DEGREES, authentication="", error="", tail=_RTCM),
-        "1.14": _GPS.format(place=_WHOLE, authentication="", error="", tail=""),
+        "1.17": _layout(*_GPS_1_16, _ANTENNA),
+        "1.16 with quality": _layout(*_GPS_1_16, _QUALITY),
+        "1.16": _layout(*_GPS_1_16),
+        "1.15": _layout(_SAMPLE, _DEGREES, _GPS, _VELOCITY, _HEADING, _RTCM),
+        "1.14": _layout(_SAMPLE, _WHOLE, _GPS, _VELOCITY, _HEADING),
     },
     "px4_msgs/msg/VehicleAttitude": {
-        "1.14": _ATTITUDE.format(sample=_SAMPLE),
-        "1.11": _ATTITUDE.format(sample=""),
+        "1.14": _layout(_SAMPLE, _ATTITUDE),
+        "1.11": _layout(_NO_SAMPLE, _ATTITUDE),
     },
     "px4_msgs/msg/VehicleGlobalPosition": {
-        "1.16": _GLOBAL_POSITION_1_16,
-        "1.14": _GLOBAL_POSITION_1_14,
-        "1.11": _GLOBAL_POSITION_1_11,
+        "1.16": _layout(_SAMPLE, _POSITION_1_16, _ERRORS),
+        "1.14": _layout(_SAMPLE, _POSITION, _ERRORS),
+        "1.11": _layout(_NO_SAMPLE, _POSITION, "float32 vel_n vel_e vel_d yaw", _ERRORS),
     },
     "px4_msgs/msg/VehicleOdometry": {
-        "1.14": _ODOMETRY,
-        "1.12": _ODOMETRY_OLD.format(sample=_SAMPLE, velocity_frame="uint8 velocity_frame"),
-        "1.11": _ODOMETRY_OLD.format(sample="", velocity_frame=""),
+        "1.14": _layout(_SAMPLE, _ODOMETRY),
+        "1.12": _layout(_SAMPLE, _OLD_POSE, "uint8 velocity_frame", _OLD_VELOCITY),
+        "1.11": _layout(_NO_SAMPLE, _OLD_POSE, _OLD_VELOCITY),
     },
 }

@@ -36,8 +36,7 @@ class BagCamera:
     """Camera in the terms of `CameraInfo`.
 
     Attributes:
-        width, height: pixels.
-        focal_px: focal length; center_px: principal point, the centre of the top-left pixel being (0.5, 0.5).
+        center_px: principal point, the centre of the top-left pixel being (0.5, 0.5).
         distortion: (k1, k2, p1, p2, k3), model plumb_bob.
         cam_from_body: (3, 3) nominal mounting, body forward-right-down.
     """
@@ -55,15 +54,13 @@ class BagFlight:
     """Records of a flight. Stamps are nanoseconds since 1970, each sensor's on its own clock.
 
     Attributes:
-        camera: calibration.
-        image_stamp_ns: (N,) of the photographs.
-        image_paths: N JPEG files.
-        fix_stamp_ns: (M,) of the fixes.
+        image_stamp_ns: (N,) of the N JPEG files.
+        fix_stamp_ns: (M,).
         fix_lla: (M, 3) degrees and ellipsoidal metres.
         fix_sigma_enu_m: (3,) σ that the receiver states.
         fix_status: of `NavSatStatus`.
         antenna_in_body: (3,) metres, forward-right-down.
-        imu_stamp_ns: (K,) of the attitudes.
+        imu_stamp_ns: (K,).
         imu_enu_from_body: (K, 3, 3), body forward-right-down.
         imu_rate, imu_force: (K, 3) rad/s and m/s², forward-right-down.
         imu_sigma_deg: σ of the attitude per axis.
@@ -90,7 +87,6 @@ def write_bag(path: Path, storage: Literal["mcap", "sqlite3"], flight: BagFlight
     from rosbags.typesys import Stores, get_typestore
 
     typestore = get_typestore(Stores.ROS2_JAZZY)
-    messages = _Messages(flight, typestore.types)
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
     count = 0
     with Writer(path, version=9, storage_plugin=plugin) as writer:
@@ -98,7 +94,7 @@ def write_bag(path: Path, storage: Literal["mcap", "sqlite3"], flight: BagFlight
             topic: writer.add_connection(topic, kind, typestore=typestore, offered_qos_profiles=_qos(topic))
             for topic, kind in _TYPES.items()
         }
-        for topic, stamp_ns, message in messages.in_order():
+        for topic, stamp_ns, message in _messages(flight, typestore.types):
             writer.write(links[topic], stamp_ns, typestore.serialize_cdr(message, _TYPES[topic]))
             count += 1
     return count
@@ -119,85 +115,73 @@ def _qos(topic: str) -> list[Any]:
     ]  # fmt: skip
 
 
-class _Messages:
-    """Messages of a flight, made of a typestore's classes."""
+def _messages(flight: BagFlight, types: Any) -> Iterator[tuple[str, int, Any]]:
+    """Yield (topic, stamp, message) by time; a photograph is read only when its message is due."""
+    streams = [(FIX_TOPIC, flight.fix_stamp_ns), (IMU_TOPIC, flight.imu_stamp_ns)]
+    streams += [(INFO_TOPIC, flight.image_stamp_ns), (IMAGE_TOPIC, flight.image_stamp_ns)]
+    make = (_fix, _imu, _info, _image)
+    first = min(int(stamps[0]) for _, stamps in streams)
+    yield TF_TOPIC, first, _transforms(flight, types, first)
+    rank = np.concatenate([np.full(len(stamps), k) for k, (_, stamps) in enumerate(streams)])
+    index = np.concatenate([np.arange(len(stamps)) for _, stamps in streams])
+    stamp = np.concatenate([stamps for _, stamps in streams])
+    for k in np.lexsort((rank, stamp)):
+        topic, stamp_ns = streams[rank[k]][0], int(stamp[k])
+        yield topic, stamp_ns, make[rank[k]](flight, types, int(index[k]), stamp_ns)
 
-    def __init__(self, flight: BagFlight, types: Any) -> None:
-        self._flight, self._types = flight, types
 
-    def in_order(self) -> Iterator[tuple[str, int, Any]]:
-        """Yield (topic, stamp, message) by time; a photograph is read only when its message is due."""
-        flight = self._flight
-        streams = [(FIX_TOPIC, flight.fix_stamp_ns), (IMU_TOPIC, flight.imu_stamp_ns)]
-        streams += [(INFO_TOPIC, flight.image_stamp_ns), (IMAGE_TOPIC, flight.image_stamp_ns)]
-        first = min(int(stamps[0]) for _, stamps in streams)
-        yield TF_TOPIC, first, self._transforms(first)
-        rank = np.concatenate([np.full(len(stamps), k) for k, (_, stamps) in enumerate(streams)])
-        index = np.concatenate([np.arange(len(stamps)) for _, stamps in streams])
-        stamp = np.concatenate([stamps for _, stamps in streams])
-        make = (self._fix, self._imu, self._info, self._image)
-        for k in np.lexsort((rank, stamp)):
-            yield streams[rank[k]][0], int(stamp[k]), make[rank[k]](int(index[k]), int(stamp[k]))
+def _header(types: Any, stamp_ns: int, frame: str) -> Any:
+    time = types["builtin_interfaces/msg/Time"](stamp_ns // 1_000_000_000, stamp_ns % 1_000_000_000)
+    return types["std_msgs/msg/Header"](time, frame)
 
-    def _new(self, kind: str, *values: Any) -> Any:
-        return self._types[kind](*values)
 
-    def _header(self, stamp_ns: int, frame: str) -> Any:
-        time = self._new("builtin_interfaces/msg/Time", stamp_ns // 1_000_000_000, stamp_ns % 1_000_000_000)
-        return self._new("std_msgs/msg/Header", time, frame)
+def _fix(flight: BagFlight, types: Any, i: int, stamp_ns: int) -> Any:
+    status = types["sensor_msgs/msg/NavSatStatus"](flight.fix_status, 1)
+    cov = np.diag(np.square(flight.fix_sigma_enu_m)).ravel()
+    return types["sensor_msgs/msg/NavSatFix"](
+        _header(types, stamp_ns, ANTENNA), status, *flight.fix_lla[i].tolist(), cov, 2
+    )
 
-    def _vector(self, values: FloatArray) -> Any:
-        return self._new("geometry_msgs/msg/Vector3", *(float(value) for value in values))
 
-    def _quaternion(self, rotation: FloatArray) -> Any:
-        return self._new("geometry_msgs/msg/Quaternion", *(float(v) for v in quat_xyzw_from_matrix(rotation)))
+def _imu(flight: BagFlight, types: Any, i: int, stamp_ns: int) -> Any:
+    vector, quaternion = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"]
+    attitude = quat_xyzw_from_matrix(flight.imu_enu_from_body[i] @ _FLU_FROM_FRD)
+    rate, force = _FLU_FROM_FRD @ flight.imu_rate[i], _FLU_FROM_FRD @ flight.imu_force[i]
+    cov = np.eye(3).ravel() * np.radians(flight.imu_sigma_deg) ** 2
+    unknown = np.zeros(9)
+    return types["sensor_msgs/msg/Imu"](
+        _header(types, stamp_ns, IMU), quaternion(*attitude.tolist()), cov, vector(*rate.tolist()), unknown,
+        vector(*force.tolist()), unknown,
+    )  # fmt: skip
 
-    def _fix(self, i: int, stamp_ns: int) -> Any:
-        status = self._new("sensor_msgs/msg/NavSatStatus", self._flight.fix_status, 1)
-        lat, lon, alt = (float(value) for value in self._flight.fix_lla[i])
-        cov = np.diag(np.square(self._flight.fix_sigma_enu_m)).ravel()
-        return self._new(
-            "sensor_msgs/msg/NavSatFix", self._header(stamp_ns, ANTENNA), status, lat, lon, alt, cov, 2
-        )
 
-    def _imu(self, i: int, stamp_ns: int) -> Any:
-        flight = self._flight
-        attitude = flight.imu_enu_from_body[i] @ _FLU_FROM_FRD
-        cov = np.eye(3).ravel() * np.radians(flight.imu_sigma_deg) ** 2
-        unknown = np.zeros(9)
-        return self._new(
-            "sensor_msgs/msg/Imu", self._header(stamp_ns, IMU), self._quaternion(attitude), cov,
-            self._vector(_FLU_FROM_FRD @ flight.imu_rate[i]), unknown,
-            self._vector(_FLU_FROM_FRD @ flight.imu_force[i]), unknown,
-        )  # fmt: skip
+def _info(flight: BagFlight, types: Any, _i: int, stamp_ns: int) -> Any:
+    camera = flight.camera
+    # ROS counts pixels from the centre of the first one, COLMAP from its corner.
+    focal, cx, cy = camera.focal_px, camera.center_px[0] - 0.5, camera.center_px[1] - 0.5
+    return types["sensor_msgs/msg/CameraInfo"](
+        _header(types, stamp_ns, CAMERA), camera.height, camera.width, "plumb_bob", np.array(camera.distortion),
+        np.array([focal, 0, cx, 0, focal, cy, 0, 0, 1.0]), np.eye(3).ravel(),
+        np.array([focal, 0, cx, 0, 0, focal, cy, 0, 0, 0, 1.0, 0]), 0, 0,
+        types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False),
+    )  # fmt: skip
 
-    def _info(self, _i: int, stamp_ns: int) -> Any:
-        camera = self._flight.camera
-        # ROS counts pixels from the centre of the first one, COLMAP from its corner.
-        focal, cx, cy = camera.focal_px, camera.center_px[0] - 0.5, camera.center_px[1] - 0.5
-        return self._new(
-            "sensor_msgs/msg/CameraInfo", self._header(stamp_ns, CAMERA), camera.height, camera.width, "plumb_bob",
-            np.array(camera.distortion), np.array([focal, 0, cx, 0, focal, cy, 0, 0, 1.0]), np.eye(3).ravel(),
-            np.array([focal, 0, cx, 0, 0, focal, cy, 0, 0, 0, 1.0, 0]), 0, 0,
-            self._new("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False),
-        )  # fmt: skip
 
-    def _image(self, i: int, stamp_ns: int) -> Any:
-        data = np.frombuffer(self._flight.image_paths[i].read_bytes(), dtype=np.uint8)
-        return self._new("sensor_msgs/msg/CompressedImage", self._header(stamp_ns, CAMERA), "jpeg", data)
+def _image(flight: BagFlight, types: Any, i: int, stamp_ns: int) -> Any:
+    data = np.frombuffer(flight.image_paths[i].read_bytes(), dtype=np.uint8)
+    return types["sensor_msgs/msg/CompressedImage"](_header(types, stamp_ns, CAMERA), "jpeg", data)
 
-    def _transforms(self, stamp_ns: int) -> Any:
-        flight = self._flight
-        links = (
-            (CAMERA, np.zeros(3), _FLU_FROM_FRD @ flight.camera.cam_from_body.T),
-            (ANTENNA, _FLU_FROM_FRD @ flight.antenna_in_body, np.eye(3)),
-            (IMU, np.zeros(3), np.eye(3)),
-        )
-        transforms = [
-            self._new(
-                "geometry_msgs/msg/TransformStamped", self._header(stamp_ns, BODY), child,
-                self._new("geometry_msgs/msg/Transform", self._vector(shift), self._quaternion(rotation)),
-            )
-            for child, shift, rotation in links
-        ]  # fmt: skip
-        return self._new("tf2_msgs/msg/TFMessage", transforms)
+
+def _transforms(flight: BagFlight, types: Any, stamp_ns: int) -> Any:
+    vector, quaternion = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"]
+    transform, stamped = types["geometry_msgs/msg/Transform"], types["geometry_msgs/msg/TransformStamped"]
+    transforms = []
+    for child, shift, rotation in (
+        (CAMERA, np.zeros(3), _FLU_FROM_FRD @ flight.camera.cam_from_body.T),
+        (ANTENNA, _FLU_FROM_FRD @ flight.antenna_in_body, np.eye(3)),
+        (IMU, np.zeros(3), np.eye(3)),
+    ):
+        turn = quaternion(*quat_xyzw_from_matrix(rotation).tolist())
+        header = _header(types, stamp_ns, BODY)
+        transforms.append(stamped(header, child, transform(vector(*shift.tolist()), turn)))
+    return types["tf2_msgs/msg/TFMessage"](transforms)

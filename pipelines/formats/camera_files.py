@@ -1,13 +1,12 @@
-"""Cameras as nerfstudio's `transforms.json` (its documentation, "Data conventions").
+"""Cameras as files: nerfstudio's `transforms.json`, and a table as CSV.
 
-A frame has `transform_matrix`, world ← camera with OpenGL's axes (x right, y up, z backward), and the intrinsics of
-its photograph in pixels, the centre of the top-left pixel at (0.5, 0.5). One camera model serves all frames:
-`OPENCV` (k1, k2, k3, p1, p2) or `OPENCV_FISHEYE` (k1 … k4).
+`transforms.json` (nerfstudio's documentation, "Data conventions"): a frame has `transform_matrix`, world ← camera
+with OpenGL's axes (x right, y up, z backward), and the intrinsics of its photograph in pixels, the centre of the
+top-left pixel at (0.5, 0.5). One camera model serves all frames: `OPENCV` (k1, k2, k3, p1, p2) or `OPENCV_FISHEYE`
+(k1 … k4).
 
-Table of cameras as CSV: position, angles in both conventions, and σ.
-
-`read_trajectory` of `trajectory_csv` reads position, yaw, pitch, roll and σ back, so that a table can be the input
-of another survey. A σ that is not known is an empty cell.
+The table has position, angles in both conventions, and σ; a σ that is not known is an empty cell. `read_trajectory`
+reads position, yaw, pitch, roll and σ back, so that a table can be the input of another survey.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.core.files import replace_file
+from pipelines.core.files import replace_text
 from pipelines.core.products import dump_json
 from pipelines.core.types import FloatArray
 from pipelines.formats.tables import write_table
@@ -28,6 +27,13 @@ from pipelines.geometry.cameras import Camera, distort, full_parameters, undisto
 _FISHEYE = "OPENCV_FISHEYE"
 _CAM_FROM_GL = np.diag([1.0, -1.0, -1.0])
 _LENS_SAMPLES = 25  # pixels along each side of an image that a lens is fitted to
+_METRES, _DEGREES, _ANGLE = "%.4f", "%.9f", "%.6f"  # 0.1 mm; 0.1 mm on the ground; 1 cm at 500 km
+_EASTING_NORTHING = ("x", "y", "z")
+_GEOGRAPHIC = ("longitude", "latitude", "altitude")
+_MAP_ANGLES = ("omega_deg", "phi_deg", "kappa_deg")
+_GIMBAL = ("yaw_deg", "pitch_deg", "roll_deg")
+_SIGMA = ("sigma_e_m", "sigma_n_m", "sigma_u_m")
+_SIGMA_ANGLES = ("sigma_omega_deg", "sigma_phi_deg", "sigma_kappa_deg")
 
 
 @dataclass(frozen=True)
@@ -42,13 +48,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Lens:
-    """Intrinsics as nerfstudio has them.
-
-    Attributes:
-        model: `OPENCV` or `OPENCV_FISHEYE`.
-        intrinsics: by nerfstudio's names.
-        error_px: largest distance within the image from the lens that they stand for.
-    """
+    """Intrinsics by nerfstudio's names, and the largest distance in the image from the lens they stand for."""
 
     model: str
     intrinsics: dict[str, float | int]
@@ -90,45 +90,20 @@ def _polynomial(camera: Camera, focal: FloatArray, center: FloatArray) -> tuple[
 
 
 def write_transforms(path: Path, frames: Sequence[Frame], lenses: Sequence[Lens]) -> None:
-    """Write `transforms.json`; the file appears whole or not at all.
-
-    Args:
-        path: of the file.
-        frames: the photographs; `file_path` becomes their name.
-        lenses: of each frame, all of one model.
+    """Write `transforms.json` of photographs and their lenses; the file appears whole or not at all.
 
     Raises:
         ValueError: the lenses have different models, or there is no frame.
-        OSError: the file cannot be written.
     """
     models = {lens.model for lens in lenses}
     if len(models) != 1:
         raise ValueError(f"expected one camera model, got {sorted(models)}")
-    document: dict[str, Any] = {
-        "camera_model": models.pop(),
-        "frames": [
-            {"file_path": frame.name, **lens.intrinsics, "transform_matrix": _opengl(frame).tolist()}
-            for frame, lens in zip(frames, lenses, strict=True)
-        ],
-    }
-    draft = path.with_name(path.name + ".tmp")
-    draft.write_text(dump_json(document) + "\n", encoding="utf-8")
-    replace_file(draft, path)
-
-
-def _opengl(frame: Frame) -> FloatArray:
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = frame.world_from_cam @ _CAM_FROM_GL, frame.center_in_world
-    return matrix
-
-
-_METRES, _DEGREES, _ANGLE = "%.4f", "%.9f", "%.6f"  # 0.1 mm; 0.1 mm on the ground; 1 cm at 500 km
-_EASTING_NORTHING = ("x", "y", "z")
-_GEOGRAPHIC = ("longitude", "latitude", "altitude")
-_MAP_ANGLES = ("omega_deg", "phi_deg", "kappa_deg")
-_GIMBAL = ("yaw_deg", "pitch_deg", "roll_deg")
-_SIGMA = ("sigma_e_m", "sigma_n_m", "sigma_u_m")
-_SIGMA_ANGLES = ("sigma_omega_deg", "sigma_phi_deg", "sigma_kappa_deg")
+    listed: list[dict[str, Any]] = []
+    for frame, lens in zip(frames, lenses, strict=True):
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = frame.world_from_cam @ _CAM_FROM_GL, frame.center_in_world
+        listed.append({"file_path": frame.name, **lens.intrinsics, "transform_matrix": matrix.tolist()})
+    replace_text(path, dump_json({"camera_model": models.pop(), "frames": listed}) + "\n")
 
 
 @dataclass(frozen=True)
@@ -136,7 +111,6 @@ class CameraTable:
     """Cameras of n photographs.
 
     Attributes:
-        name: n names.
         split: of each, `train` or `test`.
         position: (n, 3) in a CRS: easting, northing, height, or longitude, latitude, height.
         geographic: whether the first two are degrees.
@@ -157,23 +131,11 @@ class CameraTable:
 
 
 def write_camera_table(path: Path, table: CameraTable) -> None:
-    """Write the table; the file appears whole or not at all.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """Write the table; the file appears whole or not at all."""
     plan = _DEGREES if table.geographic else _METRES
     forms = [plan, plan, _METRES, *[_ANGLE] * 6, *[_METRES] * 3, *[_ANGLE] * 3]
-    numbers = np.concatenate(
-        [
-            table.position,
-            table.omega_phi_kappa_deg,
-            table.yaw_pitch_roll_deg,
-            table.sigma_enu_m,
-            table.sigma_angles_deg,
-        ],
-        axis=1,
-    )
+    angles = (table.omega_phi_kappa_deg, table.yaw_pitch_roll_deg)
+    numbers = np.concatenate([table.position, *angles, table.sigma_enu_m, table.sigma_angles_deg], axis=1)
     position = _GEOGRAPHIC if table.geographic else _EASTING_NORTHING
     header = ("name", "split", *position, *_MAP_ANGLES, *_GIMBAL, *_SIGMA, *_SIGMA_ANGLES)
     rows = (

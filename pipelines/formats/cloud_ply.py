@@ -1,21 +1,13 @@
-"""PLY files of georeferenced points: full coordinates as doubles, so that no offset can be lost.
+"""Clouds of points, as files hold them, and PLY files of them.
 
-CloudCompare reads them and offers a shift for its display. Programs that keep float32 coordinates need the LAZ.
-
-Points of a cloud as its file holds them, a part at a time.
-
-PLY files of points, read in chunks: binary, with the vertices first.
-
-A PLY has no CRS. Faces and other elements after the vertices are not read.
-
-Points of a cloud, as its file formats write them.
-
-PLY of points with their uncertainty, for viewers.
+Coordinates are written as doubles, so that no offset can be lost. CloudCompare reads them and offers a shift for
+its display. Programs that keep float32 coordinates need the LAZ. A PLY has no CRS. PLYs are read in chunks, binary
+and with the vertices first; faces and other elements after these are not read.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -27,8 +19,6 @@ from plyfile import PlyData, PlyElement
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size
 from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray
-
-UNCLASSIFIED, GROUND, BUILDING = 1, 2, 6  # classes of LAS
 
 
 @dataclass(frozen=True)
@@ -50,18 +40,11 @@ class CloudChunk:
     gps_time_s: FloatArray | None
 
     def __len__(self) -> int:
-        """Return the number of points."""
         return len(self.position)
 
 
 class CloudFile(Protocol):
-    """File of points whose header has been checked.
-
-    Attributes:
-        path: of the file.
-        count: number of points.
-        crs: of the file as a text; None: the file states none.
-    """
+    """File of points whose header has been checked; `crs` is None where the file states none."""
 
     @property
     def path(self) -> Path: ...
@@ -69,10 +52,8 @@ class CloudFile(Protocol):
     def count(self) -> int: ...
     @property
     def crs(self) -> str | None: ...
-
     def chunks(self, size: int) -> Iterator[CloudChunk]:
         """Yield all points in chunks of at most `size`."""
-        ...
 
 
 _HEADER_LIMIT = 64 * 1024
@@ -89,12 +70,7 @@ _COARSEST_M = 5e-4  # half a step of float32 coordinates that is still exact eno
 
 @dataclass(frozen=True)
 class PlyCloudFile:
-    """PLY file of points; see `CloudFile`.
-
-    Attributes:
-        dtype: of a vertex.
-        offset: of the first vertex in the file.
-    """
+    """PLY file of points; see `CloudFile`. `dtype` is that of a vertex, `offset` the place of the first one."""
 
     path: Path
     count: int
@@ -113,15 +89,9 @@ class PlyCloudFile:
             part = rows[first : first + size]
             position = np.column_stack([part[axis] for axis in "xyz"]).astype(np.float64)
             self._check_precision(position)
-            classes = self._column(part, _CLASS_NAMES)
-            none = np.zeros(len(part), dtype=bool)
-            yield CloudChunk(
-                position,
-                np.zeros(len(part), np.uint8) if classes is None else np.clip(classes, 0, 255).astype(np.uint8),
-                none,
-                none,
-                self._column(part, _TIME_NAMES),
-            )
+            classes, none = self._column(part, _CLASS_NAMES), np.zeros(len(part), dtype=bool)
+            kinds = np.zeros(len(part)) if classes is None else np.clip(classes, 0, 255)
+            yield CloudChunk(position, kinds.astype(np.uint8), none, none, self._column(part, _TIME_NAMES))
 
     def _column(self, part: np.ndarray, names: tuple[str, ...]) -> np.ndarray | None:
         known = [name for name in names if name in (self.dtype.names or ())]
@@ -195,9 +165,9 @@ class CloudPoints:
     """P points in a CRS.
 
     Attributes:
-        position: (P, 3) in the CRS, easting or longitude first.
+        position: (P, 3), easting or longitude first.
         normal: (P, 3) unit vectors along the axes of the CRS.
-        rgb: (P, 3) uint8.
+        rgb: (P, 3).
         cov_m2: (P, 3, 3) covariance in m², axes east, north, up; NaN: unknown.
     """
 
@@ -217,7 +187,6 @@ class CloudPoints:
         return np.asarray(np.sqrt(self.cov_m2[:, 2, 2]))
 
     def __len__(self) -> int:
-        """Return the number of points."""
         return len(self.position)
 
 
@@ -229,15 +198,21 @@ _VERTEX = [
 ]  # fmt: skip
 _NAMES = {"<f8": "double", "<f4": "float", "u1": "uchar"}
 _COUNT_DIGITS = 20
+_COLOURS = ("red", "green", "blue")
+_POINT_VERTEX = [
+    ("x", "<f8"), ("y", "<f8"), ("z", "<f8"),
+    ("red", "u1"), ("green", "u1"), ("blue", "u1"),
+    ("sigma", "<f4"), ("inlier", "u1"),
+]  # fmt: skip
+
+
+def _set_columns(vertex: np.ndarray, names: Sequence[str], values: np.ndarray) -> None:
+    for column, name in enumerate(names):
+        vertex[name] = values[:, column]
 
 
 class CloudPlyWriter:
-    """Writer of a binary PLY file in chunks; a context manager.
-
-    Args:
-        path: of the file.
-        comments: lines for people, such as the CRS; ASCII alone is kept.
-    """
+    """Writer of a binary PLY file in chunks; a context manager. Comments are for people; ASCII alone is kept."""
 
     def __init__(self, path: Path, comments: list[str]) -> None:
         self._comments = [" ".join(line.split()).encode("ascii", "ignore").decode() for line in comments]
@@ -246,7 +221,6 @@ class CloudPlyWriter:
         self._file.write(self._header())
 
     def __enter__(self) -> CloudPlyWriter:
-        """Return the writer."""
         return self
 
     def __exit__(
@@ -262,11 +236,9 @@ class CloudPlyWriter:
     def write(self, points: CloudPoints) -> None:
         """Append points."""
         vertex = np.empty(len(points), dtype=_VERTEX)
-        for column, axis in enumerate("xyz"):
-            vertex[axis] = points.position[:, column]
-            vertex["n" + axis] = points.normal[:, column]
-        for column, colour in enumerate(("red", "green", "blue")):
-            vertex[colour] = points.rgb[:, column]
+        _set_columns(vertex, ("x", "y", "z"), points.position)
+        _set_columns(vertex, ("nx", "ny", "nz"), points.normal)
+        _set_columns(vertex, _COLOURS, points.rgb)
         vertex["sigma_h"], vertex["sigma_v"] = points.sigma_h_m, points.sigma_v_m
         self._file.write(vertex.tobytes())
         self._count += len(points)
@@ -280,33 +252,17 @@ class CloudPlyWriter:
         return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
 
 
-_POINT_VERTEX = [
-    ("x", "<f8"), ("y", "<f8"), ("z", "<f8"),
-    ("red", "u1"), ("green", "u1"), ("blue", "u1"),
-    ("sigma", "<f4"), ("inlier", "u1"),
-]  # fmt: skip
-
-
 def write_point_ply(
     path: Path, position: FloatArray, rgb: ByteArray, sigma_m: FloatArray, inlier: BoolArray
 ) -> None:
-    """Write points with their colour and uncertainty, in binary.
+    """Write points (N, 3) with their colour (N, 3), σ (N,) along the worst axis and use (N,), for viewers.
 
     Points without a position (NaN) are left out, because viewers fail on them.
-
-    Args:
-        path: of the file.
-        position: (N, 3).
-        rgb: (N, 3).
-        sigma_m: (N,) σ along the worst axis.
-        inlier: (N,).
     """
     finite = np.isfinite(position).all(axis=1)
     vertex = np.empty(int(finite.sum()), dtype=_POINT_VERTEX)
-    for column, axis in enumerate("xyz"):
-        vertex[axis] = position[finite, column]
-    for column, colour in enumerate(("red", "green", "blue")):
-        vertex[colour] = rgb[finite, column]
+    _set_columns(vertex, ("x", "y", "z"), position[finite])
+    _set_columns(vertex, _COLOURS, rgb[finite])
     vertex["sigma"], vertex["inlier"] = sigma_m[finite], inlier[finite]
     path.parent.mkdir(parents=True, exist_ok=True)
     PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(path))

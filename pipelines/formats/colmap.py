@@ -1,16 +1,12 @@
-"""COLMAP sparse models, binary or text, as flat numpy arrays.
+"""COLMAP sparse models, binary or text, as flat numpy arrays, read and written.
 
-Check of a COLMAP model before COLMAP reads it: every count fits the file, and every reference exists.
-
-COLMAP trusts the counts in its binary files. A forged track length of 2³⁶ is read for ever, past the end of the
-file. Layouts after `reconstruction_io_binary.cc` and `reconstruction_io_text.cc` of COLMAP 4.
-
-Flat numpy arrays as COLMAP sparse models, written as COLMAP writes them.
+COLMAP trusts the counts in its binary files: a forged track length of 2³⁶ is read for ever, past the end of the
+file. Before COLMAP reads a model, every count is held against the file. Layouts after `reconstruction_io_binary.cc`
+and `reconstruction_io_text.cc` of COLMAP 4.
 """
 
 from __future__ import annotations
 
-import logging
 import mmap
 import signal
 import struct
@@ -31,28 +27,25 @@ from pipelines.core.validators import stays_inside
 from pipelines.geometry.cameras import Camera
 from pipelines.geometry.sparse_model import SparseModel
 
-log = logging.getLogger(__name__)
-
 FILES = ("rigs", "cameras", "frames", "images", "points3D")
 _REQUIRED = ("cameras", "images", "points3D")
-_OBSERVATION_BYTES, _TRACK_BYTES = 24, 8
+_OBSERVATION_BYTES, _TRACK_BYTES, _FRAME_DATA_BYTES = 24, 8, 16
 _LONGEST_NAME = 4096
 # Parameters of COLMAP's camera models by number of the model, from SIMPLE_PINHOLE on.
 _CAMERA_PARAMS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)
 _INVALID_CAMERA = "has a camera model that is unknown"
 _INVALID_NAME = "has a name that is not UTF-8"
+# COLMAP logs a line for each step; only its errors are of use here.
+_COLMAP_ERRORS_ONLY = 2
+_INVALID_POINT = np.uint64(2**64 - 1)
 
 
 class _CutOffError(ValueError):
     """A record that reaches beyond the end of its file."""
 
 
-def check_model_files(folder: Path) -> None:
-    """Refuse a COLMAP model, binary or text, whose files do not hold what they state.
-
-    Raises:
-        InputError: no model, not regular files, or counts and sizes that disagree; names the file.
-    """
+def _check_model_files(folder: Path) -> None:
+    """Refuse a COLMAP model, binary or text, whose files do not hold what they state."""
     if not folder.is_dir():
         raise InputError("no such folder; expected a COLMAP model (cameras, images, points3D)", path=folder)
     suffix = next((s for s in (".bin", ".txt") if all((folder / (n + s)).exists() for n in _REQUIRED)), None)
@@ -119,6 +112,10 @@ class _Bytes:
             raise _CutOffError
         return at
 
+    def end_of_list(self, at: int, count_at: int, width: int, item_bytes: int) -> int:
+        """Return the end of a list of items, which begins at `at` and whose length stands at `count_at`."""
+        return self.end(at + item_bytes * self.unsigned(count_at, width))
+
 
 def _camera(record: _Bytes, at: int) -> int:
     model = record.unsigned(at + 4, 4)
@@ -136,15 +133,7 @@ def _image(record: _Bytes, at: int) -> int:
         record.data[name_at:name_end].decode("utf-8")
     except UnicodeDecodeError as error:
         raise ValueError(_INVALID_NAME) from error
-    return record.end(name_end + 9 + _OBSERVATION_BYTES * record.unsigned(name_end + 1, 8))
-
-
-def _point(record: _Bytes, at: int) -> int:
-    return record.end(at + 51 + _TRACK_BYTES * record.unsigned(at + 43, 8))
-
-
-def _frame(record: _Bytes, at: int) -> int:
-    return record.end(at + 68 + 16 * record.unsigned(at + 64, 4))
+    return record.end_of_list(name_end + 9, name_end + 1, 8, _OBSERVATION_BYTES)
 
 
 def _rig(record: _Bytes, at: int) -> int:
@@ -157,15 +146,14 @@ def _rig(record: _Bytes, at: int) -> int:
     return at
 
 
+# The end of a record that begins at a place, by file.
 _RECORDS: dict[str, Callable[[_Bytes, int], int]] = {
-    "rigs": _rig, "cameras": _camera, "frames": _frame, "images": _image, "points3D": _point,
-}  # fmt: skip
-
-
-# COLMAP logs a line for each step; only its errors are of use here.
-_COLMAP_ERRORS_ONLY = 2
-
-_INVALID_POINT = np.uint64(2**64 - 1)
+    "rigs": _rig,
+    "cameras": _camera,
+    "frames": lambda record, at: record.end_of_list(at + 68, at + 64, 4, _FRAME_DATA_BYTES),
+    "images": _image,
+    "points3D": lambda record, at: record.end_of_list(at + 51, at + 43, 8, _TRACK_BYTES),
+}
 
 
 def read_sparse(path: Path) -> SparseModel:
@@ -217,10 +205,7 @@ def pycolmap_module() -> Any:
     """Return pycolmap, imported so that the process's signals stay as they are.
 
     On import, pycolmap handles SIGTERM by a stack trace and the end of the process: an interrupted stage would not
-    end cleanly.
-
-    Raises:
-        BackendUnavailableError: pycolmap is not installed.
+    end cleanly. Without pycolmap, a BackendUnavailableError names the remedy.
     """
     try:
         import pycolmap
@@ -255,22 +240,15 @@ def write_reconstruction(reconstruction: Any, folder: Path) -> None:
     """
     folder.mkdir(parents=True, exist_ok=True)
     reconstruction.write_binary(str(folder))
+    counts = []
     try:
-        copy = load_reconstruction(folder)
-        whole = _counts(copy) == _counts(reconstruction)
+        for model in (reconstruction, load_reconstruction(folder)):
+            counts.append((model.num_images(), model.num_points3D(), model.compute_num_observations()))
+        whole = counts[0] == counts[1]
     except InputError:
         whole = False
     if not whole:
-        failure = storage_failure_of(folder) or StorageError(f"{folder}: the model could not be written whole")
-        raise failure
-
-
-def _counts(reconstruction: Any) -> tuple[int, int, int]:
-    return (
-        reconstruction.num_images(),
-        reconstruction.num_points3D(),
-        reconstruction.compute_num_observations(),
-    )
+        raise storage_failure_of(folder) or StorageError(f"{folder}: the model could not be written whole")
 
 
 def load_reconstruction(path: Path) -> Any:
@@ -281,7 +259,7 @@ def load_reconstruction(path: Path) -> Any:
         BackendUnavailableError: pycolmap is not installed.
     """
     pycolmap = pycolmap_module()
-    check_model_files(path)
+    _check_model_files(path)
     try:
         return pycolmap.Reconstruction(str(path))
     except (ValueError, RuntimeError, IndexError, MemoryError) as error:
@@ -310,11 +288,12 @@ def _observations(images: list[Any], point_ids: IntArray) -> tuple[IntArray, Int
 
 
 def _check(model: SparseModel, path: Path) -> None:
-    for name in ("rotation_cam_from_local", "translation_cam_from_local", "point_in_local", "obs_xy_px"):
-        if not np.isfinite(getattr(model, name)).all():
+    names = ("rotation_cam_from_local", "translation_cam_from_local", "point_in_local", "obs_xy_px")
+    values = [(name, getattr(model, name)) for name in names]
+    values += [("camera params", camera.params) for camera in model.cameras.values()]
+    for name, numbers in values:
+        if not np.isfinite(numbers).all():
             raise InputError("contains values that are not finite: reconstruct again", path=path, field=name)
-    if any(not np.isfinite(camera.params).all() for camera in model.cameras.values()):
-        raise InputError("contains values that are not finite: reconstruct again", path=path, field="camera params")
     if len(set(model.image_name)) != len(model.image_name):
         raise InputError("two images have the same name", path=path, field="images")
     astray = next((name for name in model.image_name if not stays_inside(name)), None)
@@ -326,24 +305,14 @@ def _check(model: SparseModel, path: Path) -> None:
 def write_sparse(model: SparseModel, path: Path) -> None:
     """Write a model in COLMAP's binary form; `read_sparse` returns the same model, and COLMAP opens it.
 
-    Every image gets its own frame and every camera a trivial rig. The folder is made if missing.
-
-    Raises:
-        BackendUnavailableError: pycolmap is not installed.
-        StorageError: the disk is full.
-        OSError: the folder cannot be made.
+    Every image gets its own frame and every camera a trivial rig. Raises as `write_reconstruction`.
     """
     pycolmap = pycolmap_module()
     reconstruction = pycolmap.Reconstruction()
     for camera_id, camera in model.cameras.items():
+        size = {"width": camera.width, "height": camera.height}
         reconstruction.add_camera_with_trivial_rig(
-            pycolmap.Camera(
-                camera_id=camera_id,
-                model=camera.model,
-                width=camera.width,
-                height=camera.height,
-                params=camera.params,
-            )
+            pycolmap.Camera(camera_id=camera_id, model=camera.model, params=camera.params, **size)
         )
     rank = _add_images(reconstruction, model)
     _add_points(reconstruction, model, rank)

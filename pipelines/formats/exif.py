@@ -1,11 +1,8 @@
-"""EXIF of a photograph: position, time and lens, together with DJI's XMP.
+"""Tags of a photograph: EXIF's position, time and lens, and DJI's XMP with gimbal angles, RTK state and altitudes.
 
 Thousands of programs write EXIF. A tag that cannot be trusted (a zero denominator, a latitude without its
-hemisphere, 0° 0°) counts as absent, and the reason is kept for the log.
-
-DJI's XMP in attribute and element form: gimbal angles, RTK state and σ, altitudes.
-
-The packet must be short and lie in the first or last mebibyte of a file. defusedxml refuses entities and document
+hemisphere, 0° 0°) counts as absent, and the reason is kept for the log. DJI's XMP has attribute or element form;
+its packet must be short and lie in the first or last mebibyte of a file. defusedxml refuses entities and document
 types.
 """
 
@@ -27,112 +24,6 @@ _OPEN, _CLOSE = b"<x:xmpmeta", b"</x:xmpmeta>"
 
 RTK_FIXED = 50
 RTK_FLOAT = 34
-
-
-@dataclass(frozen=True)
-class DjiTags:
-    """DJI's tags; None if absent.
-
-    Attributes:
-        gimbal_yaw_pitch_roll_deg: Z-Y-X from North-East-Down.
-        rtk_flag: 50 fixed, 34 float, 16 single point, 0 none.
-        rtk_sigma_enu_m: σ east, north, up.
-        absolute_altitude_m: above the same reference as `GPSAltitude`.
-        relative_altitude_m: above take-off.
-    """
-
-    gimbal_yaw_pitch_roll_deg: Vector3 | None = None
-    rtk_flag: int | None = None
-    rtk_sigma_enu_m: Vector3 | None = None
-    absolute_altitude_m: float | None = None
-    relative_altitude_m: float | None = None
-
-
-class XmpError(ValueError):
-    """A packet exists, but cannot be read."""
-
-
-def read_dji(data: bytes) -> DjiTags | None:
-    """Return DJI's tags of a photograph, or None without an XMP packet.
-
-    Args:
-        data: the file.
-
-    Raises:
-        XmpError: a packet that is too long or not well formed.
-    """
-    packet = find_packet(data)
-    if packet is None:
-        return None
-    values = _values(packet)
-    return DjiTags(
-        gimbal_yaw_pitch_roll_deg=_triple(values, "GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree"),
-        rtk_flag=None if (flag := _xmp_number(values, "RtkFlag")) is None else int(flag),
-        rtk_sigma_enu_m=_positive_triple(_triple(values, "RtkStdLon", "RtkStdLat", "RtkStdHgt")),
-        absolute_altitude_m=_xmp_number(values, "AbsoluteAltitude"),
-        relative_altitude_m=_xmp_number(values, "RelativeAltitude"),
-    )
-
-
-def find_packet(data: bytes) -> bytes | None:
-    """Return the XMP packet in the first or last mebibyte of a file, or None.
-
-    Raises:
-        XmpError: the packet is longer than 256 KiB or has no end.
-    """
-    for part in (data[:_SEARCHED], data[max(_SEARCHED, len(data) - _SEARCHED) :]):
-        begin = part.find(_OPEN)
-        if begin < 0:
-            continue
-        end = part.find(_CLOSE, begin, begin + _MAX_PACKET)
-        if end < 0:
-            raise XmpError("the XMP packet has no end within 256 KiB")
-        return part[begin : end + len(_CLOSE)]
-    return None
-
-
-def _values(packet: bytes) -> dict[str, str]:
-    """Return simple properties of either form by local name; the first of a name counts."""
-    from defusedxml.common import DefusedXmlException
-    from defusedxml.ElementTree import fromstring
-
-    try:
-        root: Element = fromstring(packet, forbid_dtd=True)
-    except (ParseError, DefusedXmlException, ValueError) as error:
-        raise XmpError(f"the XMP packet is not well formed: {error}") from error
-    properties: dict[str, str] = {}
-    for element in root.iter():
-        for key, text in element.attrib.items():
-            properties.setdefault(_local(key), text)
-        if element.text and not len(element):
-            properties.setdefault(_local(element.tag), element.text)
-    return properties
-
-
-def _local(name: str) -> str:
-    return name.rsplit("}", maxsplit=1)[-1]
-
-
-def _xmp_number(values: dict[str, str], key: str) -> float | None:
-    try:
-        value = float(values[key])
-    except (KeyError, ValueError):
-        return None
-    return value if math.isfinite(value) else None
-
-
-def _triple(values: dict[str, str], *keys: str) -> Vector3 | None:
-    first, second, third = (_xmp_number(values, key) for key in keys)
-    if first is None or second is None or third is None:
-        return None
-    return (first, second, third)
-
-
-def _positive_triple(values: Vector3 | None) -> Vector3 | None:
-    """Return σ, or None for zeros: DJI writes zero for an unknown σ."""
-    return values if values is not None and min(values) > 0.0 else None
-
-
 _JPEG = b"\xff\xd8"
 _TIFF = (b"II*\x00", b"MM\x00*")
 # A JPEG's EXIF lies in one of its first segments of 64 KiB. The parser gets no more than this head.
@@ -145,15 +36,24 @@ TimeSource = Literal["offset", "gps", "assumed UTC"]
 
 
 @dataclass(frozen=True)
-class GpsTag:
-    """Position of a photograph.
+class DjiTags:
+    """DJI's tags; None if absent.
 
     Attributes:
-        lat_deg, lon_deg: degrees.
-        alt_m: metres; None if only the altitude is missing.
-        sigma_h_m: horizontal σ, if stated.
-        datum: name of the map datum; empty for WGS84.
+        gimbal_yaw_pitch_roll_deg: Z-Y-X from North-East-Down.
+        rtk_flag: 50 fixed, 34 float, 16 single point, 0 none.
+        absolute_altitude_m: above the same reference as `GPSAltitude`.
     """
+
+    gimbal_yaw_pitch_roll_deg: Vector3 | None = None
+    rtk_flag: int | None = None
+    rtk_sigma_enu_m: Vector3 | None = None
+    absolute_altitude_m: float | None = None
+
+
+@dataclass(frozen=True)
+class GpsTag:
+    """Position of a photograph; without a name, the map datum is WGS84."""
 
     lat_deg: float
     lon_deg: float
@@ -167,10 +67,9 @@ class LensTags:
     """Tags of the lens; None if absent.
 
     Attributes:
-        focal_mm: real focal length.
         focal_35mm_mm: focal length of the same angle of view on 35 mm film.
-        px_per_mm: resolution of the original image.
-        taken_width_px: longer side of the original image, which may have been scaled since.
+        px_per_mm: resolution of the original image, which may have been scaled since.
+        taken_width_px: longer side of the original image.
         zoom: digital zoom, 1 without zoom.
     """
 
@@ -186,14 +85,8 @@ class PhotoTags:
     """Metadata of a photograph.
 
     Attributes:
-        make: manufacturer.
-        model: camera.
-        orientation: EXIF orientation, 1 for upright.
-        lens: focal length and the tags that scale it.
-        timestamp_s: seconds since 1970 UTC.
-        time_source: source of the time zone.
-        gps: position.
-        dji: DJI's XMP.
+        orientation: 1 for upright.
+        timestamp_s: seconds since 1970 UTC; `time_source` is the source of the time zone.
         problems: why tags were not used, one phrase each.
     """
 
@@ -214,11 +107,7 @@ class PhotoTags:
 
 
 def read_tags(data: bytes) -> PhotoTags:
-    """Return EXIF and DJI XMP of a photograph; tags that cannot be read become `problems`, never an error.
-
-    Args:
-        data: the file.
-    """
+    """Return EXIF and DJI XMP of a photograph; tags that cannot be read become `problems`, never an error."""
     problems: list[str] = []
     tags = _exif(data, problems)
     try:
@@ -276,14 +165,11 @@ def _gps(tags: Mapping[str, Any], problems: list[str]) -> GpsTag | None:
         return None
     datum = _text(tags, "GPS GPSMapDatum")
     plain = datum.upper().replace("-", "").replace(" ", "")
-    return GpsTag(lat, lon, _altitude(tags), _first(tags, _GPS_H_ERROR), "" if plain in _WGS84_NAMES else datum)
-
-
-def _altitude(tags: Mapping[str, Any]) -> float | None:
     altitude = _number(tags, "GPS GPSAltitude")
-    if altitude is None:
-        return None
-    return -altitude if _number(tags, "GPS GPSAltitudeRef") in _BELOW_ZERO else altitude
+    if altitude is not None and _number(tags, "GPS GPSAltitudeRef") in _BELOW_ZERO:
+        altitude = -altitude
+    sigma_h_m = next(filter(None, (_positive(_number(tags, key)) for key in _GPS_H_ERROR)), None)
+    return GpsTag(lat, lon, altitude, sigma_h_m, "" if plain in _WGS84_NAMES else datum)
 
 
 def _lens(tags: Mapping[str, Any]) -> LensTags:
@@ -359,10 +245,6 @@ def _number(tags: Mapping[str, Any], key: str) -> float | None:
     return values[0] if values else None
 
 
-def _first(tags: Mapping[str, Any], keys: tuple[str, ...]) -> float | None:
-    return next((value for key in keys if (value := _positive(_number(tags, key))) is not None), None)
-
-
 def _positive(value: float | None) -> float | None:
     return value if value is not None and value > 0.0 else None
 
@@ -373,3 +255,73 @@ def _degrees(tags: Mapping[str, Any], key: str) -> float | None:
     if not 1 <= len(values) <= 3 or min(values) < 0.0:
         return None
     return sum(value / 60.0**power for power, value in enumerate(values))
+
+
+class XmpError(ValueError):
+    """A packet exists, but cannot be read."""
+
+
+def read_dji(data: bytes) -> DjiTags | None:
+    """Return DJI's tags of a photograph, or None without an XMP packet.
+
+    Raises:
+        XmpError: a packet that is too long or not well formed.
+    """
+    packet = _find_packet(data)
+    if packet is None:
+        return None
+    values = _values(packet)
+    sigma = _triple(values, "RtkStdLon", "RtkStdLat", "RtkStdHgt")  # DJI writes zero for an unknown σ
+    return DjiTags(
+        gimbal_yaw_pitch_roll_deg=_triple(values, "GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree"),
+        rtk_flag=None if (flag := _xmp_number(values, "RtkFlag")) is None else int(flag),
+        rtk_sigma_enu_m=sigma if sigma is not None and min(sigma) > 0.0 else None,
+        absolute_altitude_m=_xmp_number(values, "AbsoluteAltitude"),
+    )
+
+
+def _find_packet(data: bytes) -> bytes | None:
+    """Return the XMP packet in the first or last mebibyte of a file, or None."""
+    for part in (data[:_SEARCHED], data[max(_SEARCHED, len(data) - _SEARCHED) :]):
+        begin = part.find(_OPEN)
+        if begin < 0:
+            continue
+        end = part.find(_CLOSE, begin, begin + _MAX_PACKET)
+        if end < 0:
+            raise XmpError("the XMP packet has no end within 256 KiB")
+        return part[begin : end + len(_CLOSE)]
+    return None
+
+
+def _values(packet: bytes) -> dict[str, str]:
+    """Return simple properties of either form by local name; the first of a name counts."""
+    from defusedxml.common import DefusedXmlException
+    from defusedxml.ElementTree import fromstring
+
+    try:
+        root: Element = fromstring(packet, forbid_dtd=True)
+    except (ParseError, DefusedXmlException, ValueError) as error:
+        raise XmpError(f"the XMP packet is not well formed: {error}") from error
+    properties: dict[str, str] = {}
+    for element in root.iter():
+        listed = list(element.attrib.items())
+        if element.text and not len(element):
+            listed.append((element.tag, element.text))
+        for name, text in listed:
+            properties.setdefault(name.rsplit("}", maxsplit=1)[-1], text)
+    return properties
+
+
+def _xmp_number(values: dict[str, str], key: str) -> float | None:
+    try:
+        value = float(values[key])
+    except (KeyError, ValueError):
+        return None
+    return value if math.isfinite(value) else None
+
+
+def _triple(values: dict[str, str], *keys: str) -> Vector3 | None:
+    first, second, third = (_xmp_number(values, key) for key in keys)
+    if first is None or second is None or third is None:
+        return None
+    return (first, second, third)

@@ -27,13 +27,10 @@ class DroneTags:
     """Tags that a drone writes into a photograph.
 
     Attributes:
-        width, height: pixels.
-        focal_px: focal length.
         stamp_ns: UTC, nanoseconds since 1970.
         lat_deg, lon_deg, alt_m: WGS84, ellipsoidal.
         relative_alt_m: above the place of take-off.
-        yaw_pitch_roll_deg: the gimbal's.
-        body_yaw_pitch_roll_deg: the aircraft's.
+        yaw_pitch_roll_deg: the gimbal's; `body_yaw_pitch_roll_deg`: the aircraft's.
         sigma_enu_m: σ that the receiver states; None: a plain receiver, which states no σ.
     """
 
@@ -143,10 +140,8 @@ def _tiff(tags: DroneTags) -> bytes:
     exif_at = start + len(_directory(main, start))
     gps_at = exif_at + len(_directory(exif, exif_at))
     main[0x8769], main[0x8825] = _long(exif_at), _long(gps_at)
-    return (
-        b"II*\x00" + struct.pack("<L", start) + _directory(main, start) + _directory(exif, exif_at)
-        + _directory(gps, gps_at)
-    )  # fmt: skip
+    directories = ((main, start), (exif, exif_at), (gps, gps_at))
+    return b"II*\x00" + struct.pack("<L", start) + b"".join(_directory(*placed) for placed in directories)
 
 
 def _directory(entries: Mapping[int, Entry], offset: int) -> bytes:

@@ -17,7 +17,7 @@ from pydantic import ConfigDict, Field, field_validator, model_validator
 from pydantic.alias_generators import to_camel
 
 from pipelines.core.figures import Headline
-from pipelines.core.files import replace_file
+from pipelines.core.files import replace_text
 from pipelines.core.products import Caution, Product, load_json
 from pipelines.core.types import FloatArray, Matrix4, Quaternion, Row7, Vector3
 from pipelines.geodesy.vertical import VerticalDatum
@@ -53,13 +53,8 @@ class GeoreferenceSigma(Product):
 def _matrix_of(fields: dict[str, Any]) -> Matrix4:
     """Return the matrix of a sidecar's similarity, row by row; sidecars of earlier versions do not hold it."""
     similarity = Similarity(fields["scale"], matrix_from_quat_xyzw(fields["rotation"]), np.array(fields["origin"]))
-    first, second, third, last = (_vector4(row) for row in similarity.matrix())
+    first, second, third, last = map(tuple, similarity.matrix().tolist())
     return first, second, third, last
-
-
-def _vector4(row: FloatArray) -> tuple[float, float, float, float]:
-    x, y, z, w = row.tolist()
-    return x, y, z, w
 
 
 class GeorefSidecar(_CamelCase):
@@ -140,16 +135,13 @@ class CrsSidecar(_CamelCase):
     Attributes:
         crs: as the user named it, or the default.
         crs_wkt: WKT2:2019; without a vertical part, `vertical_datum` says what the heights count from.
-        vertical_datum: of the heights in the file.
         units: of the three coordinates, easting or longitude first.
         epoch: year of the coordinates in a dynamic datum; None: not stated.
-        operation: published operation from WGS84.
-        operation_accuracy_m: its accuracy; None: not known.
+        operation: published operation from WGS84, and its accuracy; None: not known.
         bounds: least and largest of each coordinate.
         accuracy: headline of the result; None: nothing stated it when the file was written.
         sigma: predicted σ of the file's points or cells; None: not known, or nothing checks it.
         assumed: what the user did not state.
-        cautions: limits of the place and its accuracy.
     """
 
     format: Literal["georefgs"] = "georefgs"
@@ -191,16 +183,9 @@ def sidecar_path(artefact: Path) -> Path:
 
 def write_sidecar(sidecar: GeorefSidecar | CrsSidecar, artefact: Path) -> None:
     """Write the sidecar beside its file; the sidecar appears whole or not at all."""
-    path = sidecar_path(artefact)
-    draft = path.with_name(path.name + ".tmp")
-    draft.write_text(sidecar.model_dump_json(by_alias=True, indent=1) + "\n", encoding="utf-8")
-    replace_file(draft, path)
+    replace_text(sidecar_path(artefact), sidecar.model_dump_json(by_alias=True, indent=1) + "\n")
 
 
 def read_sidecar(artefact: Path) -> GeorefSidecar:
-    """Read the sidecar of a file.
-
-    Raises:
-        InputError: no sidecar, or not of this form; names the field.
-    """
+    """Read the sidecar of a file; an InputError names the field that is missing or not of this form."""
     return load_json(GeorefSidecar, sidecar_path(artefact))

@@ -19,7 +19,6 @@ from pipelines.core.files import replace_file
 NODATA = -9999.0
 _CACHE_BYTES = 256 * 1024 * 1024
 _BLOCK_PX = 512
-
 _GDAL_TYPE = {"uint8": "Byte", "float32": "Float32"}
 
 
@@ -27,11 +26,8 @@ _GDAL_TYPE = {"uint8": "Byte", "float32": "Float32"}
 class RasterFrame:
     """Place of a raster's cells: rows from the north, columns from the west.
 
-    Attributes:
-        wkt: CRS as WKT1, which keeps the codes of its parts.
-        west, north: outer corner of the first cell, in the CRS's units, easting or longitude first.
-        step_x, step_y: size of a cell, > 0.
-        columns, rows: numbers of cells.
+    `wkt` is the CRS as WKT1, which keeps the codes of its parts. `west`, `north` is the outer corner of the first
+    cell, in the CRS's units, and the steps are the sizes of a cell, > 0.
     """
 
     wkt: str
@@ -50,12 +46,8 @@ class RasterFrame:
     @property
     def bounds(self) -> tuple[float, float, float, float]:
         """West, south, east, north of the outer edge."""
-        return (
-            self.west,
-            self.north - self.rows * self.step_y,
-            self.west + self.columns * self.step_x,
-            self.north,
-        )
+        south, east = self.north - self.rows * self.step_y, self.west + self.columns * self.step_x
+        return self.west, south, east, self.north
 
 
 @dataclass(frozen=True)
@@ -76,13 +68,7 @@ class RasterKind:
 
 
 def write_part(path: Path, values: NDArray[Any], frame: RasterFrame) -> None:
-    """Write the cells of a part; the file appears whole or not at all.
-
-    Args:
-        path: of the part.
-        values: (bands, rows, columns) of the raster's type; NaN becomes `NODATA`.
-        frame: of the part.
-    """
+    """Write cells (bands, rows, columns) of a part; NaN becomes `NODATA`. The file appears whole or not at all."""
     import rasterio
     from rasterio.transform import from_origin
 
@@ -116,15 +102,7 @@ def write_mosaic(
     kind: RasterKind,
     tags: Mapping[str, str],
 ) -> None:
-    """Write the mosaic of parts as a Cloud Optimized GeoTIFF.
-
-    Args:
-        path: of the raster.
-        parts: path, first column and first row of each part, all in one folder.
-        frame: of the raster.
-        kind: its bands.
-        tags: metadata of the raster.
-    """
+    """Write parts in one folder, with first column and first row of each, as a Cloud Optimized GeoTIFF."""
     import rasterio
     import rasterio.shutil
 
@@ -176,6 +154,8 @@ def _vrt(
     parts: Sequence[tuple[Path, int, int]], frame: RasterFrame, kind: RasterKind, tags: Mapping[str, str]
 ) -> bytes:
     """Return the mosaic as XML that GDAL reads (https://gdal.org/drivers/raster/vrt.html)."""
+    import rasterio
+
     root = ElementTree.Element("VRTDataset", rasterXSize=str(frame.columns), rasterYSize=str(frame.rows))
     ElementTree.SubElement(root, "SRS").text = frame.wkt
     corner = (frame.west, frame.step_x, 0.0, frame.north, 0.0, -frame.step_y)
@@ -183,7 +163,10 @@ def _vrt(
     metadata = ElementTree.SubElement(root, "Metadata")
     for key, value in tags.items():
         ElementTree.SubElement(metadata, "MDI", key=key).text = value
-    sizes = [_size(path) for path, _, _ in parts]
+    sizes = []
+    for path, _, _ in parts:
+        with rasterio.open(path) as part:
+            sizes.append((part.width, part.height))
     for number, band in enumerate(kind.bands, start=1):
         element = ElementTree.SubElement(root, "VRTRasterBand", dataType=_GDAL_TYPE[kind.dtype], band=str(number))
         ElementTree.SubElement(element, "Description").text = band.description
@@ -200,10 +183,3 @@ def _vrt(
                 place = {"xOff": str(x), "yOff": str(y), "xSize": str(columns), "ySize": str(rows)}
                 ElementTree.SubElement(source, name, place)
     return b"<?xml version='1.0' encoding='utf-8'?>\n" + bytes(ElementTree.tostring(root, encoding="utf-8"))
-
-
-def _size(path: Path) -> tuple[int, int]:
-    import rasterio
-
-    with rasterio.open(path) as part:
-        return part.width, part.height

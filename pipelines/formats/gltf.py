@@ -28,14 +28,9 @@ _LARGEST_FILE = 2**32 - 1
 def encode_glb(
     spz: bytes, count: int, sh_degree: int, bounds: tuple[Vector3, Vector3], extras: dict[str, Any] | None = None
 ) -> bytes:
-    """Return a glb of Gaussians in a z-up frame.
+    """Return a glb of an SPZ file of version 2 or 3 in a z-up frame.
 
-    Args:
-        spz: an SPZ file of version 2 or 3, in the z-up frame.
-        count: number of its Gaussians.
-        sh_degree: degree of its spherical harmonics.
-        bounds: least and largest coordinates of the centres.
-        extras: metadata for `asset.extras`.
+    `bounds` are the least and largest coordinates of the centres, and `extras` metadata for `asset.extras`.
 
     Raises:
         ValueError: the SPZ is too large for a glb.

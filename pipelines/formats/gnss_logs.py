@@ -1,16 +1,14 @@
-"""DJI's timestamp file (`…_Timestamp.MRK`): time, position and σ of the camera at each event of a flight.
+"""Logs of GNSS receivers: DJI's timestamp file of a camera's events, and RTKLIB's solution of an antenna.
 
-A line has, between tabs: number, second, [week], north,N east,E down,V latitude,Lat longitude,Lon height,Ellh,
-three σ (N, E, V), flag,Q. Position and ellipsoidal height are those of the camera; north, east and down in
-millimetres lead there from the antenna (DJI's manuals of Phantom 4 RTK and Zenmuse P1).
+`…_Timestamp.MRK`: a line has, between tabs: number, second, [week], north,N east,E down,V latitude,Lat
+longitude,Lon height,Ellh, three σ (N, E, V), flag,Q. Position and ellipsoidal height are those of the camera;
+north, east and down in millimetres lead there from the antenna (DJI's manuals of Phantom 4 RTK and Zenmuse P1).
+
+`.pos`: the header, in lines that begin with %, states the clock (GPST, UTC or JST), the form of the coordinates and
+the surface of the heights. Rows have the time in two cells, as a date or as GPS week and second of the week.
+Source: RTKLIB's manual, appendix B.1.
 
 GPS time: weeks since 1980-01-06 and seconds, ahead of UTC by the leap seconds since then (IERS Bulletin C).
-
-RTKLIB's solution (`.pos`): positions of an antenna by time, with σ.
-
-The header, in lines that begin with %, states the clock (GPST, UTC or JST), the form of the coordinates and the
-surface of the heights. Rows have the time in two cells, as a date or as GPS week and second of the week. Source:
-RTKLIB's manual, appendix B.1.
 """
 
 from __future__ import annotations
@@ -28,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.formats.exif import RTK_FIXED, RTK_FLOAT
-from pipelines.formats.tables import number, read_lines
+from pipelines.formats.tables import number_of, numbered_lines, refuse_first, require_range
 from pipelines.formats.trajectory_csv import PoseTable
 from pipelines.geodesy.enu import ecef_from_enu_rotation, lla_from_ecef
 
@@ -67,6 +65,10 @@ _LINE = re.compile(
     rf"{_NUMBER}\s*,\s*{_NUMBER}\s*,\s*{_NUMBER}\s+(\d{{1,3}})\s*,\s*Q"
 )
 _LAYOUT = "number, second, [week], n,N e,E v,V, lat,Lat lon,Lon h,Ellh, three σ, flag,Q"
+_EVENT_RANGES = (
+    (1, 0.0, WEEK_S, "second of week"), (6, -90.0, 90.0, "Lat"), (7, -180.0, 180.0, "Lon"),
+    (8, -1000.0, 20_000.0, "Ellh"), (9, 0.0, 1e6, "σ"), (10, 0.0, 1e6, "σ"), (11, 0.0, 1e6, "σ"),
+)  # fmt: skip
 _NO_POSITION = 0
 _DJI_RECEIVER = {RTK_FIXED: "RTK fixed", RTK_FLOAT: "RTK float"}
 
@@ -76,13 +78,12 @@ class CameraEvents:
     """N events of a camera.
 
     Attributes:
-        path: their file.
-        lines: (N,) line of each.
+        lines: (N,).
         number: (N,) of the photograph.
         time_s: (N,) seconds since 1970 UTC.
         lon_lat_alt: (N, 3) of the camera, degrees and ellipsoidal metres; NaN without a position.
         sigma_enu_m: (N, 3); NaN where unknown.
-        receiver: (N,) kind of receiver, as of `PoseTable`.
+        receiver: (N,) as of `PoseTable`.
         camera_from_antenna_enu_m: (N, 3) from the antenna to the camera.
     """
 
@@ -105,10 +106,8 @@ def read_mrk(path: Path) -> CameraEvents:
     lines: list[int] = []
     values: list[list[float]] = []
     line_of: dict[int, int] = {}
-    for line, text in enumerate(read_lines(path), start=1):
-        if not text.strip():
-            continue
-        match = _LINE.fullmatch(text.strip())
+    for line, text in numbered_lines(path):
+        match = _LINE.fullmatch(text)
         if match is None:
             raise InputError(f"is no line of a DJI timestamp file: {_LAYOUT}", path=path, line=line)
         number = int(match[1])
@@ -117,9 +116,10 @@ def read_mrk(path: Path) -> CameraEvents:
             raise InputError(message, path=path, line=line)
         line_of[number] = line
         lines.append(line)
-        values.append([float(text) for text in match.groups()])
+        values.append([float(value) for value in match.groups()])
     table = np.array(values)
-    _check_marks(table, path, lines)
+    for column, low, high, field in _EVENT_RANGES:
+        require_range(table[:, column], low, high, path=path, lines=lines, field=field)
     known = table[:, 12] != _NO_POSITION
     north_east_down_m = table[:, 3:6] / 1000
     sigma = table[:, [10, 9, 11]]
@@ -133,18 +133,6 @@ def read_mrk(path: Path) -> CameraEvents:
         receiver=np.array([_DJI_RECEIVER.get(int(flag), "single-frequency") for flag in table[:, 12]]),
         camera_from_antenna_enu_m=north_east_down_m[:, [1, 0, 2]] * np.array([1.0, 1.0, -1.0]),
     )
-
-
-def _check_marks(table: FloatArray, path: Path, lines: list[int]) -> None:
-    """Raise for the first value out of range."""
-    for column, low, high, field in (
-        (1, 0, WEEK_S, "second of week"), (6, -90, 90, "Lat"), (7, -180, 180, "Lon"), (8, -1000, 20_000, "Ellh"),
-        (9, 0, 1e6, "σ"), (10, 0, 1e6, "σ"), (11, 0, 1e6, "σ"),
-    ):  # fmt: skip
-        bad = np.flatnonzero((table[:, column] < low) | (table[:, column] > high))
-        if len(bad):
-            message = f"{table[bad[0], column]:g} is out of range {low:g} … {high:g}"
-            raise InputError(message, path=path, line=lines[bad[0]], field=field)
 
 
 _JST_S = 9 * 3600.0
@@ -169,9 +157,10 @@ def read_pos(path: Path) -> PoseTable:
         InputError: no header, a baseline instead of positions, no row, too few cells, a cell that is no number, or
             a value out of range.
     """
-    lines = [(at, text.strip()) for at, text in enumerate(read_lines(path), start=1) if text.strip()]
+    lines = numbered_lines(path)
     header = _header([(at, text) for at, text in lines if text.startswith("%")], path)
     rows = [(at, re.split(r"[\s,;]+", text.strip(",;"))) for at, text in lines if not text.startswith("%")]
+    at_lines = np.array([at for at, _ in rows], dtype=np.int64)
     if not rows:
         raise InputError("has a header but no rows", path=path)
     places = 7 if header.form == "sexagesimal" else 3
@@ -181,11 +170,15 @@ def read_pos(path: Path) -> PoseTable:
     else:
         # σ are those of north, east, up.
         xyz, sigma = table[:, [1, 0, 2]], np.where(table[:, 5:8] > 0, table[:, 5:8], np.nan)[:, [1, 0, 2]]
-    _check_solutions(xyz, header.form, path, [at for at, _ in rows])
+    off_earth = (np.abs(xyz[:, 1]) > 90) | (np.abs(xyz[:, 0]) > 360)
+    if header.form == "ecef":
+        distance = np.linalg.norm(xyz, axis=1)
+        off_earth = (distance < _EARTH_M[0]) | (distance > _EARTH_M[1])
+    refuse_first(off_earth, lambda _: "is no place on Earth", path=path, lines=at_lines, field="position")
     return PoseTable(
         path=path,
         source="pos",
-        lines=np.array([at for at, _ in rows], dtype=np.int64),
+        lines=at_lines,
         names=None,
         time_s=_times(header.clock, [(at, cells[:2]) for at, cells in rows], path),
         xyz=xyz,
@@ -229,10 +222,10 @@ def _numbers(cells: Sequence[str], places: int, path: Path, line: int) -> list[f
     """Return three coordinates, quality, satellites, three σ and three correlated σ; NaN for what is missing."""
     if len(cells) < places:
         raise InputError(f"has {len(cells) + 2} cells, expected time, position, quality …", path=path, line=line)
-    values = [number(text, path=path, line=line, field="position") for text in cells[:places]]
+    values = [number_of(text, path=path, line=line, field="position") for text in cells[:places]]
     if places == 7:
         values = [_degrees(cells[0], values[:3]), _degrees(cells[3], values[3:6]), values[6]]
-    rest = [number(text, path=path, line=line, field="quality and σ") for text in cells[places : places + 8]]
+    rest = [number_of(text, path=path, line=line, field="quality and σ") for text in cells[places : places + 8]]
     return values + rest + [np.nan] * (8 - len(rest))
 
 
@@ -254,32 +247,20 @@ def _sigma_of_ecef(table: FloatArray) -> FloatArray:
     return np.sqrt(np.where(variance > 0, variance, np.nan))
 
 
-def _check_solutions(xyz: FloatArray, form: _Form, path: Path, lines: Sequence[int]) -> None:
-    if form == "ecef":
-        distance = np.linalg.norm(xyz, axis=1)
-        good = ~((distance < _EARTH_M[0]) | (distance > _EARTH_M[1]))
-    else:
-        good = ~((np.abs(xyz[:, 1]) > 90) | (np.abs(xyz[:, 0]) > 360))
-    bad = np.flatnonzero(~good)
-    if len(bad):
-        raise InputError("is no place on Earth", path=path, line=lines[bad[0]], field="position")
-
-
 def _times(clock: str, rows: Sequence[tuple[int, list[str]]], path: Path) -> FloatArray:
     """Return seconds since 1970 UTC (N,)."""
-    by_week = "/" not in rows[0][1][0]
-    if by_week:
-        table = np.array([[number(text, path=path, line=at, field="time") for text in cells] for at, cells in rows])
-        bad = np.flatnonzero(
-            ~((table[:, 0] >= 0) & (table[:, 0] < 1e5) & (table[:, 1] >= 0) & (table[:, 1] <= WEEK_S))
-        )
-        if len(bad):
-            raise InputError("is no GPS week and second", path=path, line=rows[bad[0]][0], field="time")
-        return unix_from_week(table[:, 0], table[:, 1])
-    time_s = np.array([_date(cells, path, at) for at, cells in rows])
-    if clock == "GPST":
-        return unix_from_gps(time_s)
-    return time_s - _JST_S if clock == "JST" else time_s
+    if "/" in rows[0][1][0]:
+        time_s = np.array([_date(cells, path, at) for at, cells in rows])
+        if clock == "GPST":
+            return unix_from_gps(time_s)
+        return time_s - _JST_S if clock == "JST" else time_s
+    week, second = np.array(
+        [[number_of(text, path=path, line=at, field="time") for text in cells] for at, cells in rows]
+    ).T
+    good = (week >= 0) & (week < 1e5) & (second >= 0) & (second <= WEEK_S)
+    lines = [at for at, _ in rows]
+    refuse_first(~good, lambda _: "is no GPS week and second", path=path, lines=lines, field="time")
+    return unix_from_week(week, second)
 
 
 def _date(cells: Sequence[str], path: Path, line: int) -> float:

@@ -27,12 +27,7 @@ _TIFF_WIDTH, _TIFF_HEIGHT = 256, 257
 
 @dataclass(frozen=True)
 class ImageFile:
-    """Photograph that decodes.
-
-    Attributes:
-        width, height: pixels as stored, before any EXIF orientation.
-        sha256: of the whole file, hexadecimal.
-    """
+    """Photograph that decodes: pixels as stored, before any EXIF orientation, and the hash of the whole file."""
 
     width: int
     height: int
@@ -68,30 +63,16 @@ def read_head(path: Path) -> bytes:
 
 
 def require_unchanged(data: bytes, sha256: str, path: Path) -> None:
-    """Refuse a photograph that is not the recorded one.
-
-    Args:
-        data: the file.
-        sha256: recorded hash of the whole file, hexadecimal; empty: none was recorded.
-        path: its name, for errors.
-
-    Raises:
-        InputError: the hashes differ.
-    """
+    """Refuse a photograph whose hash is not the recorded one of the whole file; empty: none was recorded."""
     if sha256 and hashlib.sha256(data).hexdigest() != sha256:
-        raise InputError(
-            "the photograph has changed since `georef ingest` read it: put it back, or run `georef ingest` again",
-            path=path,
-        )
+        remedy = "put it back, or run `georef ingest` again"
+        raise InputError(f"the photograph has changed since `georef ingest` read it: {remedy}", path=path)
 
 
 def inspect_image(data: bytes, path: Path, *, decode: bool = True) -> ImageFile:
     """Return size and hash of a JPEG, PNG or TIFF file, after decoding it to its end.
 
-    Args:
-        data: the file.
-        path: its name, for errors.
-        decode: whether `data` is the whole file, to be decoded; otherwise it is the head, and so is what is hashed.
+    Without `decode`, the data are a head that is not decoded, and what is hashed is the head.
 
     Raises:
         InputError: no such image, more than 400 million pixels, or it does not decode.

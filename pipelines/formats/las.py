@@ -1,27 +1,24 @@
-"""LAZ files of georeferenced points with colour, normal and σ (LAS 1.4, point format 7).
-
-The CRS is stated as WKT1 in GDAL's dialect: LAS 1.4 predates WKT2, which readers refuse there.
-
-LAS and LAZ files, read in chunks (LAS 1.0 to 1.4, point formats 0 to 10).
+"""LAS and LAZ files: clouds read in chunks (LAS 1.0 to 1.4), surfaces and laser scans written (LAS 1.4).
 
 The header is compared with the file's size before any point is read: neither the number of points nor the table of
 compressed chunks can ask for more memory than the file justifies.
 
-LAZ files of a laser scanner: class, time, strip and angle of each beam (LAS 1.4, point format 6).
+The CRS is written as WKT1 in GDAL's dialect: LAS 1.4 predates WKT2, which readers refuse there.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size
@@ -31,7 +28,6 @@ from pipelines.formats.cloud_ply import CloudChunk, CloudPoints
 if TYPE_CHECKING:
     import laspy
 
-_POINT_FORMAT = 7  # RGB and time of LAS 1.4
 _TEXT_AREA = ("LASF_Spec", 3)  # record for plain text
 _RGB16 = 257  # 255 becomes 65535
 DEGREE_STEP, METRE_STEP = 1e-9, 1e-3  # 0.1 mm on the ground, and 1 mm
@@ -49,110 +45,7 @@ _COVARIANCE = {  # name of each element of the upper triangle, with its row and 
     for column, second in enumerate(_AXES)
     if row <= column
 }
-
-
-def laz_header(
-    point_format: int, *, wkt1: str, angular: bool, near: Any, software: str, system: str, written: date
-) -> laspy.LasHeader:
-    """Return the header of a LAZ file (LAS 1.4).
-
-    Args:
-        point_format: number of the format of its points.
-        wkt1: CRS as WKT1.
-        angular: whether the first two coordinates are angles.
-        near: (3,) coordinates near the points; the file counts from these, rounded to integers.
-        software: program that writes.
-        system: origin of the points.
-        written: date.
-    """
-    import laspy
-
-    header = laspy.LasHeader(version="1.4", point_format=point_format)
-    header.scales = np.array([DEGREE_STEP, DEGREE_STEP, METRE_STEP] if angular else [METRE_STEP] * 3)
-    header.offsets = np.round(np.asarray(near, dtype=np.float64))
-    header.generating_software, header.system_identifier = software, system
-    header.creation_date = written
-    header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(wkt1))
-    header.global_encoding.wkt = True
-    return header
-
-
-class LazFile:
-    """LAZ file of single returns that is written in chunks; a context manager."""
-
-    def __init__(self, path: Path, header: laspy.LasHeader) -> None:
-        import laspy
-
-        self._header = header
-        self._writer: laspy.LasWriter = laspy.open(path, mode="w", header=header, do_compress=True)
-
-    def __enter__(self) -> Self:
-        """Return the writer."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Complete the file."""
-        self._writer.close()
-
-    def _record(self, position: FloatArray) -> laspy.ScaleAwarePointRecord:
-        """Return a record of points (P, 3), each of them the only return of its beam."""
-        import laspy
-
-        record = laspy.ScaleAwarePointRecord.zeros(len(position), header=self._header)
-        for column, name in enumerate(("x", "y", "z")):
-            setattr(record, name, position[:, column])
-        record["return_number"][:] = 1
-        record["number_of_returns"][:] = 1
-        return record
-
-
-class LazWriter(LazFile):
-    """Writer of a LAZ file of a surface.
-
-    Args:
-        path: of the file.
-        wkt1: CRS as WKT1.
-        angular: whether the first two coordinates are angles.
-        near: (3,) coordinates near the points; the file counts from these, rounded to integers.
-        software: program that writes.
-        text: description for people, in English: vertical datum, meaning of σ.
-    """
-
-    def __init__(self, path: Path, *, wkt1: str, angular: bool, near: Any, software: str, text: str) -> None:
-        import laspy
-
-        system, today = "photogrammetry", date.today()
-        header = laz_header(
-            _POINT_FORMAT, wkt1=wkt1, angular=angular, near=near, software=software, system=system, written=today
-        )
-        header.vlrs.append(laspy.VLR(*_TEXT_AREA, "Text Area Description", text.encode("utf-8") + b"\0"))
-        header.add_extra_dims(
-            [
-                laspy.ExtraBytesParams(name, "f4", description=meaning)
-                for name, meaning in (_EXTRA | dict.fromkeys(_COVARIANCE, "covariance in square metres")).items()
-            ]
-        )
-        super().__init__(path, header)
-
-    def write(self, points: CloudPoints) -> None:
-        """Append points.
-
-        Raises:
-            OverflowError: a coordinate is further from `near` than the file's integers reach (2147 km or 2.1°).
-        """
-        record = self._record(points.position)
-        for column, name in enumerate(("red", "green", "blue")):
-            setattr(record, name, points.rgb[:, column].astype(np.uint16) * _RGB16)
-        for column, name in enumerate(("nx", "ny", "nz")):
-            record[name] = points.normal[:, column]
-        record["sigma_h"], record["sigma_v"] = points.sigma_h_m, points.sigma_v_m
-        for name, (row, column) in _COVARIANCE.items():
-            record[name] = points.cov_m2[:, row, column]
-        self._writer.write_points(record)
-
-
+_ANGLE_STEP_DEG = 0.006
 _HEADER_BYTES = 227  # of LAS 1.0; later versions have more
 _VLR_BYTES = 54
 _POINT_BITS_LEAST = 0.05  # LAZ spends more on each point, even on equal ones
@@ -213,11 +106,7 @@ def open_las(path: Path) -> LasFile:
 
 
 def _check_head(path: Path, size: int) -> None:
-    """Refuse a file whose records or table of chunks would reach beyond its end.
-
-    Raises:
-        InputError: the file is damaged, or no LAS file.
-    """
+    """Refuse a file whose records or table of chunks would reach beyond its end, and one that is no LAS file."""
     with path.open("rb") as stream:
         head = stream.read(_HEADER_BYTES)
         if len(head) < _HEADER_BYTES or head[:4] != b"LASF":
@@ -289,20 +178,103 @@ def _damage(path: Path) -> Iterator[None]:
         raise InputError(f"damaged LAS file: {' '.join(str(error).split())[:200]}", path=path) from error
 
 
-_LIDAR_POINT_FORMAT = 6
-_ANGLE_STEP_DEG = 0.006
+class LazFile:
+    """LAZ file of single returns that is written in chunks; a context manager.
+
+    Args:
+        path: of the file.
+        wkt1: CRS as WKT1.
+        angular: whether the first two coordinates are angles.
+        near: (3,) coordinates near the points; the file counts from these, rounded to integers.
+        software: program that writes.
+        written: date in the header; None: today.
+        text: description for people, in English: vertical datum, meaning of σ.
+    """
+
+    point_format: ClassVar[int]
+    system: ClassVar[str]  # origin of the points
+    extra: ClassVar[Mapping[str, str]] = {}  # name and meaning of further float32 columns
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        wkt1: str,
+        angular: bool,
+        near: ArrayLike,
+        software: str,
+        written: date | None = None,
+        text: str = "",
+    ) -> None:
+        import laspy
+
+        header = laspy.LasHeader(version="1.4", point_format=self.point_format)
+        header.scales = np.array([DEGREE_STEP, DEGREE_STEP, METRE_STEP] if angular else [METRE_STEP] * 3)
+        header.offsets = np.round(np.asarray(near, dtype=np.float64))
+        header.generating_software, header.system_identifier = software, self.system
+        header.creation_date = written or date.today()
+        header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(wkt1))
+        header.global_encoding.wkt = True
+        if text:
+            header.vlrs.append(laspy.VLR(*_TEXT_AREA, "Text Area Description", text.encode("utf-8") + b"\0"))
+        if self.extra:
+            columns = [laspy.ExtraBytesParams(name, "f4", description=what) for name, what in self.extra.items()]
+            header.add_extra_dims(columns)
+        self._header = header
+        self._writer: laspy.LasWriter = laspy.open(path, mode="w", header=header, do_compress=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._writer.close()
+
+    def _record(self, position: FloatArray) -> laspy.ScaleAwarePointRecord:
+        """Return a record of points (P, 3), each of them the only return of its beam."""
+        import laspy
+
+        record = laspy.ScaleAwarePointRecord.zeros(len(position), header=self._header)
+        for column, name in enumerate(("x", "y", "z")):
+            setattr(record, name, position[:, column])
+        record["return_number"][:] = 1
+        record["number_of_returns"][:] = 1
+        return record
+
+
+class LazWriter(LazFile):
+    """Writer of a LAZ file of a surface, with colour, normal and σ; see `LazFile`."""
+
+    point_format, system = 7, "photogrammetry"  # RGB and time of LAS 1.4
+    extra = _EXTRA | dict.fromkeys(_COVARIANCE, "covariance in square metres")
+
+    def write(self, points: CloudPoints) -> None:
+        """Append points.
+
+        Raises:
+            OverflowError: a coordinate is further from `near` than the file's integers reach (2147 km or 2.1°).
+        """
+        record = self._record(points.position)
+        for column, name in enumerate(("red", "green", "blue")):
+            setattr(record, name, points.rgb[:, column].astype(np.uint16) * _RGB16)
+        for column, name in enumerate(("nx", "ny", "nz")):
+            record[name] = points.normal[:, column]
+        record["sigma_h"], record["sigma_v"] = points.sigma_h_m, points.sigma_v_m
+        for name, (row, column) in _COVARIANCE.items():
+            record[name] = points.cov_m2[:, row, column]
+        self._writer.write_points(record)
 
 
 @dataclass(frozen=True)
 class LidarReturns:
-    """P returns of one strip.
+    """P returns of one strip, numbered from 1.
 
     Attributes:
         position: (P, 3) in the CRS, easting or longitude first.
         classification: (P,) class of LAS.
-        gps_time_s: (P,) time.
+        gps_time_s: (P,).
         scan_angle_deg: (P,) of the beam across the strip.
-        strip: number of the strip, from 1.
     """
 
     position: FloatArray
@@ -313,30 +285,9 @@ class LidarReturns:
 
 
 class LidarWriter(LazFile):
-    """Writer of a LAZ file of a scanner.
+    """Writer of a LAZ file of a scanner: class, time, strip and angle of each beam; see `LazFile`."""
 
-    Args:
-        path: of the file.
-        wkt1: CRS as WKT1.
-        angular: whether the first two coordinates are angles.
-        near: (3,) coordinates near the points; the file counts from these, rounded to integers.
-        software: program that writes.
-        written: date in the header.
-    """
-
-    def __init__(
-        self, path: Path, *, wkt1: str, angular: bool, near: FloatArray, software: str, written: date
-    ) -> None:
-        header = laz_header(
-            _LIDAR_POINT_FORMAT,
-            wkt1=wkt1,
-            angular=angular,
-            near=near,
-            software=software,
-            system="simulated",
-            written=written,
-        )
-        super().__init__(path, header)
+    point_format, system = 6, "simulated"
 
     def write(self, returns: LidarReturns) -> None:
         """Append the returns."""

@@ -1,21 +1,20 @@
-"""Metashape's markers with their projections (Tools ▸ Export ▸ Export Markers, XML).
+"""Metashape's markers with their projections (XML), and its reference table of cameras or markers.
 
-A camera's label names the image. The centre of the top-left pixel is (0.5, 0.5), as here. Projections that are not
-pinned were placed by Metashape and not by a person: they are left out. A marker whose reference is not enabled is a
-check point. defusedxml refuses entities and document type definitions.
+Markers (Tools ▸ Export ▸ Export Markers): a camera's label names the image. The centre of the top-left pixel is
+(0.5, 0.5), as here. Projections that are not pinned were placed by Metashape and not by a person: they are left
+out. A marker whose reference is not enabled is a check point. defusedxml refuses entities and document type
+definitions.
 
-Metashape's reference table (File ▸ Export ▸ Export Reference): cameras, or markers without their marks.
-
-A comment states the CRS as WKT, and another one is the header: `#Label,X/Longitude,Y/Latitude,Z/Altitude,…`. X is
-the easting or longitude. Yaw, pitch and roll are those of the camera's mount: pitch 0 looks straight down. Columns
-with `_est` and errors are results of Metashape and are not read.
+Reference (File ▸ Export ▸ Export Reference): a comment states the CRS as WKT, and another one is the header:
+`#Label,X/Longitude,Y/Latitude,Z/Altitude,…`. X is the easting or longitude. Yaw, pitch and roll are those of the
+camera's mount: pitch 0 looks straight down. Columns with `_est` and errors are results of Metashape and are not
+read.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 from xml.sax import ContentHandler, SAXException
@@ -24,11 +23,18 @@ import numpy as np
 
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size
-from pipelines.core.types import FloatArray
 from pipelines.formats.ground_points import GroundPoints, ListedMark, ListedPoint, without_repeats
-from pipelines.formats.tables import Row, named_columns, read_lines, rows, separator_of, split
-from pipelines.formats.trajectory_csv import PoseTable, complete
-from pipelines.geometry.rotations import geo_from_cam, quat_xyzw_from_matrix
+from pipelines.formats.tables import (
+    Row,
+    Table,
+    bare_name,
+    named_columns,
+    numbered_lines,
+    rows_of,
+    separator_of,
+    split,
+)
+from pipelines.formats.trajectory_csv import PoseTable, camera_quaternions, complete
 
 if TYPE_CHECKING:
     from xml.sax.xmlreader import AttributesImpl, Locator
@@ -95,11 +101,9 @@ class _Reader(ContentHandler):
         self._left_out: list[str] = []
 
     def setDocumentLocator(self, locator: Locator) -> None:
-        """Keep the parser's place, for errors."""
         self._place = locator
 
     def startElement(self, name: str, attrs: AttributesImpl) -> None:
-        """Read an element that begins."""
         self.events += 1
         values = {str(key): str(value) for key, value in attrs.items()}
         parent = self._open[-1] if self._open else ""
@@ -124,14 +128,12 @@ class _Reader(ContentHandler):
             self._read_projection(values)
 
     def endElement(self, name: str) -> None:
-        """Close an element."""
         self.events += 1
         self._open.pop()
         if name == "marker":
             self._marker = self._projected = None
 
     def characters(self, content: str) -> None:
-        """Gather the text of the CRS."""
         self.events += 1
         if self._open and self._open[-1] == "reference":
             self._crs += content
@@ -140,7 +142,6 @@ class _Reader(ContentHandler):
                 raise InputError(message, path=self._path, line=self.line)
 
     def result(self) -> GroundPoints:
-        """Return the points and marks that were read."""
         if not self._points:
             raise InputError("has no marker with coordinates: is it an export of markers?", path=self._path)
         known = {point.name for point in self._points}
@@ -162,7 +163,6 @@ class _Reader(ContentHandler):
 
     @property
     def line(self) -> int:
-        """Line that is being read."""
         return 1 if self._place is None else int(self._place.getLineNumber() or 1)
 
     def _read_point(self, values: dict[str, str]) -> None:
@@ -215,7 +215,7 @@ class _Reader(ContentHandler):
 REFERENCE = "Metashape's reference"
 HEADER = re.compile(r"#\s*label\b", re.IGNORECASE)
 _CRS = re.compile(r"#\s*CoordinateSystem:\s*(.*)", re.IGNORECASE)
-_GIMBAL_FROM_MOUNT_PITCH_DEG = -90.0
+_GIMBAL_FROM_MOUNT_DEG = np.array([0.0, -90.0, 0.0])
 _ALIASES = {
     "label": "label",
     **dict.fromkeys(("x/longitude", "x/easting", "x", "longitude", "easting"), "x"),
@@ -228,7 +228,6 @@ _ALIASES = {
     **dict.fromkeys(("enable", "enabled"), "enabled"),
 }
 _RESULT = re.compile(r"error|est|variance|var\b|omega|phi|kappa|projections", re.IGNORECASE)
-_DISABLED = frozenset({"0", "false"})
 
 
 def read_markers(path: Path) -> GroundPoints:
@@ -237,19 +236,12 @@ def read_markers(path: Path) -> GroundPoints:
     Raises:
         InputError: no header, no rows, a column is missing, a cell is no number, or one point at two places.
     """
-    table = _Reference(path)
-    points = [
-        ListedPoint(
-            line=row.line,
-            name=row.text("label"),
-            xyz=(row.finite("x"), row.finite("y"), row.finite("z")),
-            sigma_h_m=row.sigma_m("sigma_h") or row.sigma_m("sigma"),
-            sigma_v_m=row.sigma_m("sigma_v") or row.sigma_m("sigma"),
-            is_check=not _is_enabled(row),
-        )
-        for row in table.rows
-        if row.text("x")
-    ]
+    table, geographic = _reference(path)
+    points = []
+    for row in table.rows:
+        if row.text("x"):
+            xyz = (row.finite("x"), row.finite("y"), row.finite("z"))
+            points.append(ListedPoint(row.line, row.text("label"), xyz, *_sigma_m(row), not _is_enabled(row)))
     if not points:
         raise InputError("has no marker with coordinates", path=path)
     return GroundPoints(
@@ -258,8 +250,8 @@ def read_markers(path: Path) -> GroundPoints:
         points=without_repeats(points, path),
         crs_text=table.crs_text,
         crs_line=table.crs_line,
-        geographic=table.geographic,
-        unknown_columns=table.unknown_columns,
+        geographic=geographic,
+        unknown_columns=table.unknown,
     )
 
 
@@ -269,76 +261,58 @@ def read_cameras(path: Path) -> PoseTable:
     Raises:
         InputError: no header, no rows, a column is missing, or a cell is no number.
     """
-    table = _Reference(path)
+    table, geographic = _reference(path)
     on = np.array([_is_enabled(row) for row in table.rows])
-    xyz = np.array([[row.number("x"), row.number("y"), row.number("z")] for row in table.rows])
-    sigma = np.array([_sigma_enu_m(row) for row in table.rows])
+    xyz = np.array([[row.number(name) for name in "xyz"] for row in table.rows])
+    sigma = np.array([_sigma_m(row) for row in table.rows], dtype=np.float64)[:, [0, 0, 1]]  # NaN for None
+    angles = np.array([[row.number(name) for name in ("yaw", "pitch", "roll")] for row in table.rows])
+    gimbal = angles + _GIMBAL_FROM_MOUNT_DEG
     return PoseTable(
         path=path,
         source="metashape",
-        lines=np.array([row.line for row in table.rows], dtype=np.int64),
+        lines=table.lines,
         names=tuple(row.text("label") for row in table.rows),
         time_s=None,
         xyz=np.where(on[:, None], xyz, np.nan),
-        geographic=table.geographic,
-        quat_xyzw=_quaternions(table.rows),
+        geographic=geographic,
+        quat_xyzw=camera_quaternions(gimbal) if complete(gimbal).any() else None,
         sigma_enu_m=sigma if np.isfinite(sigma).any() else None,
         crs_text=table.crs_text,
         crs_line=table.crs_line,
-        unknown_columns=table.unknown_columns,
-        header_line=table.header_line,
+        unknown_columns=table.unknown,
+        header_line=table.header_line or 1,
     )
 
 
-class _Reference:
-    """Header and rows of a reference table.
-
-    Raises:
-        InputError: no header, no row, or a column is missing.
-    """
-
-    def __init__(self, path: Path) -> None:
-        lines = [(at, text.strip()) for at, text in enumerate(read_lines(path), start=1) if text.strip()]
-        header = next(((at, text) for at, text in lines if HEADER.match(text)), None)
-        if header is None:
-            raise InputError("has no line that begins with #Label", path=path)
-        self.header_line, text = header
-        stated = next(((at, found[1]) for at, text in lines if (found := _CRS.match(text))), None)
-        self.crs_line = 1 if stated is None else stated[0]
-        self.crs_text = None if stated is None else stated[1]
-        self.geographic = True if "longitude" in text.lower() else None
-        separator = separator_of(text)
-        cells = split(text.lstrip("# "), separator, path=path, line=self.header_line)
-        columns, unknown = named_columns(cells, _ALIASES, path, self.header_line)
-        self.unknown_columns = tuple(name for name in unknown if not _RESULT.search(name))
-        missing = [name for name in ("label", "x", "y", "z") if name not in columns]
-        if missing:
-            raise InputError(f"the header names no {', '.join(missing)}", path=path, line=self.header_line)
-        kept = [(at, text) for at, text in lines if at > self.header_line and not text.startswith("#")]
-        self.rows: list[Row] = list(rows(path, kept, separator, columns))
-        if not self.rows:
-            raise InputError("has a header but no rows", path=path)
-        unnamed = next((row for row in self.rows if not row.text("label")), None)
-        if unnamed is not None:
-            raise InputError("has no name", path=path, line=unnamed.line, field="label")
+def _reference(path: Path) -> tuple[Table, bool | None]:
+    """Return a reference table, and True if its header has longitudes, else None."""
+    lines = numbered_lines(path)
+    found = next(((at, text) for at, text in lines if HEADER.match(text)), None)
+    if found is None:
+        raise InputError("has no line that begins with #Label", path=path)
+    header_line, header = found
+    crs_line, crs_text = next(((at, crs[1]) for at, text in lines if (crs := _CRS.match(text))), (1, None))
+    separator = separator_of(header)
+    cells = split(header.lstrip("# "), separator, path=path, line=header_line)
+    columns, unknown = named_columns(cells, _ALIASES, path, header_line)
+    missing = [name for name in ("label", "x", "y", "z") if name not in columns]
+    if missing:
+        raise InputError(f"the header names no {', '.join(missing)}", path=path, line=header_line)
+    kept = [(at, text) for at, text in lines if at > header_line and not text.startswith("#")]
+    named = tuple(name for name in unknown if bare_name(name) and not _RESULT.search(name))
+    listed = rows_of(path, kept, separator, columns)
+    table = Table(path, header_line, columns, named, listed, crs_text, crs_line)
+    if not table.rows:
+        raise InputError("has a header but no rows", path=path)
+    for row in table.rows:
+        row.named("label")
+    return table, True if "longitude" in header.lower() else None
 
 
 def _is_enabled(row: Row) -> bool:
-    return "enabled" not in row.columns or row.text("enabled").lower() not in _DISABLED
+    return "enabled" not in row.columns or row.text("enabled").lower() not in _OFF
 
 
-def _sigma_enu_m(row: Row) -> tuple[float, float, float]:
-    horizontal = row.sigma_m("sigma_h") or row.sigma_m("sigma") or np.nan
-    return horizontal, horizontal, row.sigma_m("sigma_v") or row.sigma_m("sigma") or np.nan
-
-
-def _quaternions(table: Sequence[Row]) -> FloatArray | None:
-    """Return rotations camera → East-North-Up (N, 4), NaN where a row has no angles; None without any."""
-    angles = np.array([[row.number(name) for name in ("yaw", "pitch", "roll")] for row in table])
-    known = complete(angles)
-    if not known.any():
-        return None
-    result = np.full((len(table), 4), np.nan)
-    gimbal = angles[known] + np.array([0.0, _GIMBAL_FROM_MOUNT_PITCH_DEG, 0.0])
-    result[known] = quat_xyzw_from_matrix(geo_from_cam(gimbal))
-    return result
+def _sigma_m(row: Row) -> tuple[float | None, float | None]:
+    """Return σ horizontal and vertical."""
+    return row.sigma_m("sigma_h") or row.sigma_m("sigma"), row.sigma_m("sigma_v") or row.sigma_m("sigma")

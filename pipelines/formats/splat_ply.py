@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.lib import recfunctions
-from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from pipelines.core.errors import InputError
@@ -26,6 +25,12 @@ _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALE = ("scale_0", "scale_1", "scale_2")
 _ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 _REST_COUNTS = (0, 9, 24, 45)  # degree 0 to 3: three channels of (degree + 1)² − 1
+_WIDTHS = {
+    **dict.fromkeys(("char", "uchar", "int8", "uint8"), 1),
+    **dict.fromkeys(("short", "ushort", "int16", "uint16"), 2),
+    **dict.fromkeys(("int", "uint", "float", "int32", "uint32", "float32"), 4),
+    **dict.fromkeys(("double", "float64"), 8),
+}
 
 
 @dataclass(frozen=True)
@@ -64,13 +69,13 @@ def write_splat_ply(path: Path, splat: SplatArrays) -> None:
 
     Raises:
         ValueError: shapes do not agree.
-        OSError: the file cannot be written.
     """
     count, coefficients = len(splat), splat.sh.shape[1]
     rest_count = 3 * (coefficients - 1)
     if rest_count not in _REST_COUNTS or splat.sh.shape != (count, coefficients, 3):
         raise ValueError(f"expected spherical harmonics (N, 1 | 4 | 9 | 16, 3), got {splat.sh.shape}")
-    names = _property_names(rest_count)
+    rest = [f"f_rest_{i}" for i in range(rest_count)]
+    names = [*_POSITION, *_NORMAL, *_DC, *rest, "opacity", *_SCALE, *_ROTATION]
     rows = np.empty((count, len(names)), dtype="<f4")
     rows[:, :3], rows[:, 3:6], rows[:, 6:9] = splat.means, 0.0, splat.sh[:, 0]
     rows[:, 9 : 9 + rest_count] = splat.sh[:, 1:].transpose(0, 2, 1).reshape(count, rest_count)
@@ -88,54 +93,47 @@ def join_splat_plys(parts: Sequence[Path], path: Path) -> int:
 
     No more than one part is in memory; the file appears whole or not at all.
 
-    Args:
-        parts: at least one, as `write_splat_ply` writes them.
-        path: of the file.
-
     Raises:
         InputError: a part is not a PLY of that form, or has other properties than the first one.
-        OSError: the file cannot be written.
     """
-    tables = [_read_table(part) for part in parts]
-    for table in tables[1:]:
-        if table.names != tables[0].names:
-            raise InputError(f"has other properties than {parts[0]}: they cannot be joined", path=table.path)
-    count = sum(len(table) for table in tables)
+    plys = [_read_rows(part) for part in parts]
+    for ply in plys[1:]:
+        if ply.names != plys[0].names:
+            raise InputError(f"has other properties than {parts[0]}: they cannot be joined", path=ply.path)
+    count = sum(len(ply.rows) for ply in plys)
     draft = path.with_name(path.name + ".tmp")
     with draft.open("wb") as stream:
-        stream.write(_header(count, tables[0].names))
-        for table in tables:
-            table.columns(table.names).astype("<f4", copy=False).tofile(stream)
+        lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+        lines += [*(f"property float {name}" for name in plys[0].names), "end_header\n"]
+        stream.write("\n".join(lines).encode("ascii"))
+        for ply in plys:
+            _columns(ply, ply.names).astype("<f4", copy=False).tofile(stream)
     replace_file(draft, path)
     return count
 
 
 def read_splat_ply(path: Path, rows: slice = slice(None)) -> SplatArrays:
-    """Read Gaussians of any SH degree from 0 to 3; other properties are ignored.
-
-    Args:
-        path: of the file.
-        rows: the Gaussians to read; the others stay unread.
+    """Read Gaussians of any SH degree from 0 to 3, all or some rows; other properties are ignored.
 
     Raises:
         InputError: no such file, not a PLY of that form, cut off, or with values that are not finite.
     """
-    table = _read_table(path, rows)
-    rest_count = sum(name.startswith("f_rest_") for name in table.names)
+    ply = _read_rows(path, rows)
+    rest_count = sum(name.startswith("f_rest_") for name in ply.names)
     if rest_count not in _REST_COUNTS:
         raise InputError(
             f"{rest_count} coefficients; degree 0 to 3 has {', '.join(map(str, _REST_COUNTS))}",
             path=path,
             field="f_rest",
         )
-    higher = table.columns(tuple(f"f_rest_{i}" for i in range(rest_count)))
+    higher = _columns(ply, tuple(f"f_rest_{i}" for i in range(rest_count)))
     higher = higher.reshape(len(higher), 3, rest_count // 3)
-    dc = table.columns(_DC)[:, None, :]
+    dc = _columns(ply, _DC)[:, None, :]
     return SplatArrays(
-        means=table.columns(_POSITION),
-        quats_wxyz=table.columns(_ROTATION),
-        log_scales=table.columns(_SCALE),
-        logit_opacities=table.columns(("opacity",))[:, 0],
+        means=_columns(ply, _POSITION),
+        quats_wxyz=_columns(ply, _ROTATION),
+        log_scales=_columns(ply, _SCALE),
+        logit_opacities=_columns(ply, ("opacity",))[:, 0],
         sh=np.concatenate([dc, higher.transpose(0, 2, 1)], axis=1),
     )
 
@@ -146,70 +144,53 @@ def read_centres(path: Path) -> Float32Array:
     Raises:
         InputError: as `read_splat_ply`.
     """
-    return _read_table(path).columns(_POSITION)
+    return _columns(_read_rows(path), _POSITION)
 
 
 def read_logit_opacities(path: Path) -> Float32Array:
-    """Read the logits (N,) of the opacities of Gaussians alone.
-
-    Raises:
-        InputError: as `read_splat_ply`.
-    """
-    return _read_table(path).columns(("opacity",))[:, 0]
+    """Read the logits (N,) of the opacities of Gaussians alone, as `read_splat_ply`."""
+    return _columns(_read_rows(path), ("opacity",))[:, 0]
 
 
-def _header(count: int, names: Sequence[str]) -> bytes:
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
-    return "\n".join([*lines, *(f"property float {name}" for name in names), "end_header\n"]).encode("ascii")
+@dataclass(frozen=True)
+class _PlyRows:
+    """Rows (N, K) of a file and the names of their columns."""
+
+    path: Path
+    names: tuple[str, ...]
+    rows: Float32Array
 
 
-def _property_names(rest_count: int) -> list[str]:
-    return [*_POSITION, *_NORMAL, *_DC, *(f"f_rest_{i}" for i in range(rest_count)), "opacity", *_SCALE, *_ROTATION]
-
-
-def _read_table(path: Path, rows: slice = slice(None)) -> _Table:
+def _read_rows(path: Path, rows: slice = slice(None)) -> _PlyRows:
     _check_header(path)
     try:
         vertices = PlyData.read(str(path), mmap="r")["vertex"].data
     except (PlyParseError, ValueError, OverflowError, KeyError) as error:
         raise InputError(f"damaged PLY file: {error}", path=path) from error
-    return _Table(path, tuple(vertices.dtype.names), vertices[rows])
+    # With one type for all columns, as the format demands, this is a view; a file of mixed types is converted.
+    values = recfunctions.structured_to_unstructured(vertices[rows], dtype=np.float32)
+    return _PlyRows(path, tuple(vertices.dtype.names), values)
 
 
-class _Table:
-    """Rows of the file and the names of their columns."""
-
-    def __init__(self, path: Path, names: tuple[str, ...], vertices: NDArray[np.void]) -> None:
-        self.path = path
-        self.names = names
-        # With one type for all columns, as the format demands, this is a view; a file of mixed types is converted.
-        self._rows = recfunctions.structured_to_unstructured(vertices, dtype=np.float32)
-
-    def __len__(self) -> int:
-        return len(self._rows)
-
-    def columns(self, names: tuple[str, ...]) -> Float32Array:
-        missing = [name for name in names if name not in self.names]
-        if missing:
-            raise InputError(
-                "the property is missing: this PLY does not hold Gaussians", path=self.path, field=missing[0]
-            )
-        index = [self.names.index(name) for name in names]
-        first = index[0] if index else 0
-        span = slice(first, first + len(index))
-        block = (
-            self._rows[:, span] if index == list(range(*span.indices(len(self.names)))) else self._rows[:, index]
+def _columns(ply: _PlyRows, names: tuple[str, ...]) -> Float32Array:
+    missing = [name for name in names if name not in ply.names]
+    if missing:
+        message = "the property is missing: this PLY does not hold Gaussians"
+        raise InputError(message, path=ply.path, field=missing[0])
+    index = [ply.names.index(name) for name in names]
+    first = index[0] if index else 0
+    span = slice(first, first + len(index))
+    in_order = index == list(range(*span.indices(len(ply.names))))
+    values = np.array(ply.rows[:, span] if in_order else ply.rows[:, index], dtype=np.float32)
+    finite = np.isfinite(values).all(axis=1)
+    if not finite.all():
+        raise InputError(
+            f"{int((~finite).sum())} of {len(values)} Gaussians have values that are not finite, "
+            f"the first is number {int(np.argmin(finite))}",
+            path=ply.path,
+            field=" ".join(names[:4]),
         )
-        values = np.array(block, dtype=np.float32)
-        finite = np.isfinite(values).all(axis=1)
-        if not finite.all():
-            raise InputError(
-                f"{int((~finite).sum())} of {len(values)} Gaussians have values that are not finite, "
-                f"the first is number {int(np.argmin(finite))}",
-                path=self.path,
-                field=" ".join(names[:4]),
-            )
-        return values
+    return values
 
 
 def _check_header(path: Path) -> None:
@@ -241,11 +222,3 @@ def _check_header(path: Path) -> None:
             f"{max(body, 0)} bytes: it is empty, cut off or damaged",
             path=path,
         )
-
-
-_WIDTHS = {
-    **dict.fromkeys(("char", "uchar", "int8", "uint8"), 1),
-    **dict.fromkeys(("short", "ushort", "int16", "uint16"), 2),
-    **dict.fromkeys(("int", "uint", "float", "int32", "uint32", "float32"), 4),
-    **dict.fromkeys(("double", "float64"), 8),
-}

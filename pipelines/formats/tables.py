@@ -1,11 +1,11 @@
-"""Tables of text with separators, where a header may stand, or stand in a comment.
+"""Tables of text, as people and spreadsheets write them: named columns, units in headers, decimal commas, comments.
 
-Tables as CSV, which people open in spreadsheets: a name that would be a formula there begins with an apostrophe.
+A reader of a kind of file states its columns and their meaning. Limits of size, byte order marks, line ends, and
+the file, line and column of each error are here.
 
-`=`, `+`, `-`, `@`, tab and carriage return begin formulas (OWASP, CSV injection). Names of points and photographs
-come from files of other people. Numbers stay as they are. `plain_text` gives names back as they were.
-
-Reading of text from people and spreadsheets: byte order marks, line ends, decimal commas, limits.
+Tables are also written here. People open them in spreadsheets, where `=`, `+`, `-`, `@`, tab and carriage return
+begin formulas (OWASP, CSV injection), and names of points and photographs come from other people: such a text
+begins with an apostrophe. Numbers stay as they are. `plain_text` gives names back as they were.
 """
 
 from __future__ import annotations
@@ -14,23 +14,28 @@ import csv
 import io
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size, replace_text
+from pipelines.core.types import BoolArray, FloatArray, IntArray
 
 _FORMULA = re.compile(r"'*[=+\-@\t\r]")  # those of names that begin with apostrophes, too: nothing is ambiguous
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+_NO_UTF8 = re.compile("[\udc80-\udcff]")  # what `surrogateescape` makes of such bytes
+_BEGINNING_BYTES = 64 * 1024
+# A line becomes a kilobyte of cells: these bound the memory of a table to about a gibibyte.
+MAX_BYTES, MOST_LINES, LONGEST_LINE = 128 * 1024 * 1024, 1_000_000, 64 * 1024
+_SEPARATORS = ";\t,"
+_LONGEST_NAME = 100  # of a column that means something
 
 
 def write_table(path: Path, rows: Iterable[Iterable[object]]) -> None:
-    """Write rows of cells; the file appears whole or not at all.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """Write rows of cells; the file appears whole or not at all."""
     replace_text(path, table_text(rows))
 
 
@@ -41,21 +46,15 @@ def table_text(rows: Iterable[Iterable[object]]) -> str:
     return text.getvalue()
 
 
-def plain_text(cell: str) -> str:
-    """Return the text that `write_table` was given for a cell."""
-    return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
-
-
 def _cell(value: object) -> object:
     if isinstance(value, str) and _FORMULA.match(value) and not _NUMBER.fullmatch(value):
         return f"'{value}"
     return value
 
 
-_NO_UTF8 = re.compile("[\udc80-\udcff]")  # what `surrogateescape` makes of such bytes
-_BEGINNING_BYTES = 64 * 1024
-# A line becomes a kilobyte of cells: these bound the memory of a table to about a gibibyte.
-MAX_BYTES, MOST_LINES, LONGEST_LINE = 128 * 1024 * 1024, 1_000_000, 64 * 1024
+def plain_text(cell: str) -> str:
+    """Return the text that `write_table` was given for a cell."""
+    return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
 
 
 def read_lines(path: Path) -> list[str]:
@@ -70,7 +69,8 @@ def read_lines(path: Path) -> list[str]:
         file_size(path, limit_bytes=MAX_BYTES, kind="text table")
         with path.open(encoding="utf-8-sig", errors="surrogateescape") as handle:
             while text := handle.readline(LONGEST_LINE + 1):
-                lines.append(_checked(text, path, len(lines) + 1))
+                _check_line(text, path, len(lines) + 1)
+                lines.append(text.removesuffix("\n"))
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", path=path) from error
     if not any(map(str.strip, lines)):
@@ -78,12 +78,7 @@ def read_lines(path: Path) -> list[str]:
     return lines
 
 
-def _checked(text: str, path: Path, line: int) -> str:
-    """Return a line without its end.
-
-    Raises:
-        InputError: see `read_lines`.
-    """
+def _check_line(text: str, path: Path, line: int) -> None:
     if line > MOST_LINES:
         raise InputError(f"has more than {MOST_LINES} lines, the limit for a text table", path=path)
     if len(text) > LONGEST_LINE:
@@ -92,7 +87,11 @@ def _checked(text: str, path: Path, line: int) -> str:
         raise InputError("not UTF-8 text: save the file as UTF-8", path=path, line=line)
     if "\x00" in text:
         raise InputError("contains zero bytes: not a text file, or UTF-16; save it as UTF-8", path=path)
-    return text.removesuffix("\n")
+
+
+def numbered_lines(path: Path) -> list[tuple[int, str]]:
+    """Return the lines that are not blank, without spaces around them, and their numbers; see `read_lines`."""
+    return [(at, text.strip()) for at, text in enumerate(read_lines(path), start=1) if text.strip()]
 
 
 def beginning(path: Path) -> str:
@@ -109,18 +108,13 @@ def beginning(path: Path) -> str:
         raise InputError(f"cannot be read: {error.strerror}", path=path) from error
 
 
-def number(text: str, *, path: Path, line: int, field: str, decimal_comma: bool = False) -> float:
-    """Return a number as a person writes it; `nan`, `inf` and an empty cell are NaN.
+def number_of(text: str, *, path: Path, line: int, field: str, decimal_comma: bool = False) -> float:
+    """Return the number in a cell as a person writes it; `nan`, `inf` and an empty cell are NaN.
 
-    Args:
-        text: the cell.
-        path: for errors.
-        line: for errors.
-        field: for errors.
-        decimal_comma: whether `46,02` is a number, because commas do not separate cells.
+    With `decimal_comma`, `46,02` is a number, because commas do not separate cells.
 
     Raises:
-        InputError: not a number.
+        InputError: not a number; names path, line and field.
     """
     cell = text.strip()
     if not cell:
@@ -137,60 +131,98 @@ def number(text: str, *, path: Path, line: int, field: str, decimal_comma: bool 
     return value if math.isfinite(value) else math.nan
 
 
-_SEPARATORS = ";\t,"
-_LONGEST_NAME = 100  # of a column that means something
+def is_number(text: str, *, decimal_comma: bool = True) -> bool:
+    """Return whether a cell is a number."""
+    try:
+        float(text.strip().replace(",", ".", 1) if decimal_comma else text)
+    except ValueError:
+        return False
+    return True
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """Line of a table: its cells by position, with the names of the columns that are known."""
+    """Line of a table: its cells by position, with the places of the columns that are known.
+
+    What is no number or no name is refused by an `InputError` with file, line and column.
+    """
 
     path: Path
     line: int
     cells: list[str]
     columns: Mapping[str, int]
-    decimal_comma: bool
+    decimal_comma: bool = False
 
     def text(self, column: str) -> str:
         """Return a cell, without spaces around it; empty if the row is too short."""
         at = self.columns[column]
         return self.cells[at].strip() if at < len(self.cells) else ""
 
-    def number(self, column: str) -> float:
-        """Return the number of a cell; NaN if it is empty or there is no such column.
+    def named(self, column: str) -> str:
+        """Return a cell that is not empty."""
+        text = self.text(column)
+        if not text:
+            raise InputError("has no name", path=self.path, line=self.line, field=column)
+        return text
 
-        Raises:
-            InputError: not a number.
-        """
+    def number(self, column: str) -> float:
+        """Return the number of a cell; NaN if it is empty or there is no such column."""
         if column not in self.columns:
             return math.nan
-        return number(
-            self.text(column), path=self.path, line=self.line, field=column, decimal_comma=self.decimal_comma
-        )
+        text, comma = self.text(column), self.decimal_comma
+        return number_of(text, path=self.path, line=self.line, field=column, decimal_comma=comma)
 
     def finite(self, column: str) -> float:
-        """Return the number of a cell.
-
-        Raises:
-            InputError: not a number, or empty.
-        """
+        """Return the number of a cell that is not empty."""
         value = self.number(column)
         if math.isnan(value):
             raise InputError("is not a number", path=self.path, line=self.line, field=column)
         return value
 
     def sigma_m(self, column: str) -> float | None:
-        """Return the σ of a cell; None if it is empty, zero, or there is no such column.
-
-        Raises:
-            InputError: not a number, or negative.
-        """
+        """Return the σ of a cell, not negative; None if it is empty, zero, or there is no such column."""
         value = self.number(column)
         if value < 0:
-            raise InputError(
-                f"{value:g} is no σ: it must be above zero", path=self.path, line=self.line, field=column
-            )
+            message = f"{value:g} is no σ: it must be above zero"
+            raise InputError(message, path=self.path, line=self.line, field=column)
         return value if value > 0 else None
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of a file, with its header: line (None: it has none), known columns, and names that mean nothing here.
+
+    `crs_text` is the CRS that a line of the file states; None: it states none.
+    """
+
+    path: Path
+    header_line: int | None
+    columns: Mapping[str, int]
+    unknown: tuple[str, ...]
+    rows: list[Row]
+    crs_text: str | None = None
+    crs_line: int = 1
+
+    @property
+    def lines(self) -> IntArray:
+        """(N,) line of each row."""
+        return np.array([row.line for row in self.rows], dtype=np.int64)
+
+    def has(self, columns: Sequence[str]) -> bool:
+        """Return whether a group of columns is there: all of them, or none.
+
+        Raises:
+            InputError: a part of them.
+        """
+        present = [name for name in columns if name in self.columns]
+        if present and len(present) < len(columns):
+            missing = ", ".join(name for name in columns if name not in self.columns)
+            raise InputError(f"has {', '.join(present)} but not {missing}", path=self.path, line=self.header_line)
+        return bool(present)
+
+    def numbers(self, columns: Sequence[str]) -> FloatArray:
+        """Return the numbers of columns (N, K); NaN where empty."""
+        return np.stack([[row.number(column) for row in self.rows] for column in columns], axis=-1)
 
 
 def separator_of(line: str) -> str | None:
@@ -213,25 +245,29 @@ def split(text: str, separator: str | None, *, path: Path, line: int) -> list[st
         raise InputError(f"is no CSV: {error}", path=path, line=line) from error
 
 
-def rows(
+def rows_of(
     path: Path, lines: Sequence[tuple[int, str]], separator: str | None, columns: Mapping[str, int]
-) -> Iterator[Row]:
-    """Yield the rows of numbered lines.
+) -> list[Row]:
+    """Return the rows of numbered lines; see `split`."""
+    comma = separator not in (",", None)
+    return [Row(path, line, split(text, separator, path=path, line=line), columns, comma) for line, text in lines]
 
-    Raises:
-        InputError: a line is no CSV.
-    """
-    for line, text in lines:
-        cells = split(text, separator, path=path, line=line)
-        yield Row(path, line, cells, columns, separator not in (",", None))
+
+def bare_name(text: str) -> str:
+    """Return the name of a column without what does not matter: case, units in brackets, spaces and underscores."""
+    return re.sub(r"[(\[][^)\]]*[)\]]|[\s_#]", "", text[:_LONGEST_NAME]).lower()
 
 
 def named_columns(
-    header: Sequence[str], aliases: Mapping[str, str], path: Path, line: int
+    header: Sequence[str],
+    aliases: Mapping[str, str],
+    path: Path,
+    line: int,
+    plain: Callable[[str], str] = bare_name,
 ) -> tuple[dict[str, int], tuple[str, ...]]:
     """Return the place of each column by its canonical name, and the names that mean nothing here.
 
-    Case, units in brackets, spaces and underscores do not matter.
+    `plain` makes a plain name of a cell, and `aliases` has the canonical one of each.
 
     Raises:
         InputError: two columns have one meaning.
@@ -239,10 +275,9 @@ def named_columns(
     columns: dict[str, int] = {}
     unknown = []
     for at, text in enumerate(header):
-        name = re.sub(r"[(\[][^)\]]*[)\]]|[\s_#]", "", text[:_LONGEST_NAME]).lower()
-        key = aliases.get(name)
+        key = aliases.get(plain(text))
         if key is None:
-            unknown += [text.strip()] if name else []
+            unknown.append(text.strip())
         elif key in columns:
             raise InputError(f"two columns for {key}: {header[columns[key]]}, {text}", path=path, line=line)
         else:
@@ -250,10 +285,21 @@ def named_columns(
     return columns, tuple(unknown)
 
 
-def is_number(text: str) -> bool:
-    """Return whether a cell is a number, with decimal point or comma."""
-    try:
-        float(text.strip().replace(",", ".", 1))
-    except ValueError:
-        return False
-    return True
+def refuse_first(
+    bad: BoolArray, message: Callable[[int], str], *, path: Path, lines: Sequence[int] | IntArray, field: str
+) -> None:
+    """Raise an InputError for the first row that is bad (N,), with the message on it and its line (N,)."""
+    if bad.any():
+        row = int(np.argmax(bad))
+        raise InputError(message(row), path=path, line=int(lines[row]), field=field)
+
+
+def require_range(
+    values: FloatArray, low: float, high: float, *, path: Path, lines: Sequence[int] | IntArray, field: str
+) -> None:
+    """Raise an InputError for the first of values (N,) outside a range; NaN passes."""
+
+    def message(row: int) -> str:
+        return f"{values[row]:g} is out of range {low:g} … {high:g}"
+
+    refuse_first((values < low) | (values > high), message, path=path, lines=lines, field=field)

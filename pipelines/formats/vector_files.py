@@ -1,6 +1,7 @@
-"""GeoJSON (RFC 7946): longitude and latitude in WGS84 degrees, outer rings anticlockwise, cut at the date line.
+"""Vectors as files: features as GeoJSON, and contour lines as GeoPackage and DXF.
 
-Contour lines as GeoPackage and DXF: a line a height, with the height as attribute and as z.
+GeoJSON (RFC 7946) has longitude and latitude in WGS84 degrees, outer rings anticlockwise, cut at the date line.
+Contours are a line a height, with the height as attribute and as z.
 """
 
 from __future__ import annotations
@@ -20,9 +21,10 @@ from pipelines.core.files import replace_file, replace_text
 from pipelines.core.types import FloatArray
 from pipelines.geometry.footprints import clipped_ring
 
-_DECIMALS = 8  # of a degree: 1 mm
-
 Json = dict[str, Any]
+_DECIMALS = 8  # of a degree: 1 mm
+_LINE_STRING_Z = 1002  # OGC 06-103r4, table 8
+_MINOR, _MAJOR = "CONTOURS", "CONTOURS_MAJOR"
 
 
 def polygon(lon_lat: ArrayLike) -> Json | None:
@@ -36,7 +38,9 @@ def polygon(lon_lat: ArrayLike) -> Json | None:
     ring = ring.copy()
     ring[:, 0] -= 360.0 * np.round((ring[:, 0] - ring[0, 0]) / 360.0)
     turned = [ring + np.array([turn, 0.0]) for turn in (-360.0, 0.0, 360.0)]
-    rings = [closed for part in turned if (closed := _closed(_between_date_lines(part))) is not None]
+    east_of = [clipped_ring(part, part[:, 0] + 180.0) for part in turned]
+    between = [clipped_ring(part, 180.0 - part[:, 0]) for part in east_of]
+    rings = [closed for part in between if (closed := _closed(part)) is not None]
     if not rings:
         return None
     if len(rings) == 1:
@@ -47,16 +51,13 @@ def polygon(lon_lat: ArrayLike) -> Json | None:
 def feature(geometry: Json | None, properties: Mapping[str, Any], bbox: Sequence[float] | None = None) -> Json:
     """Return a feature; NaN among the properties becomes null."""
     box = {} if bbox is None else {"bbox": list(bbox)}
-    known = {name: None if _is_nan(value) else value for name, value in properties.items()}
+    known = dict(properties)
+    known |= {name: None for name, value in known.items() if isinstance(value, float) and math.isnan(value)}
     return {"type": "Feature", **box, "geometry": geometry, "properties": known}
 
 
 def write_features(path: Path, features: Sequence[Json]) -> None:
-    """Write a FeatureCollection, one feature a line; the file appears whole or not at all.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """Write a FeatureCollection, one feature a line; the file appears whole or not at all."""
     replace_text(path, features_text(features))
 
 
@@ -64,11 +65,6 @@ def features_text(features: Sequence[Json]) -> str:
     """Return a FeatureCollection as text, one feature a line."""
     lines = ",\n".join(json.dumps(one, allow_nan=False, ensure_ascii=False) for one in features)
     return f'{{"type": "FeatureCollection", "features": [\n{lines}\n]}}\n'
-
-
-def _between_date_lines(ring: FloatArray) -> FloatArray:
-    east_of = clipped_ring(ring, ring[:, 0] + 180.0)
-    return clipped_ring(east_of, 180.0 - east_of[:, 0])
 
 
 def _closed(ring: FloatArray) -> list[list[float]] | None:
@@ -83,23 +79,9 @@ def _closed(ring: FloatArray) -> list[list[float]] | None:
     return [*outline.tolist(), outline[0].tolist()]
 
 
-def _is_nan(value: object) -> bool:
-    return isinstance(value, float) and math.isnan(value)
-
-
-_LINE_STRING_Z = 1002  # OGC 06-103r4, table 8
-_MINOR, _MAJOR = "CONTOURS", "CONTOURS_MAJOR"
-
-
 @dataclass(frozen=True)
 class ContourLine:
-    """Line of equal height.
-
-    Attributes:
-        height: in the unit of the CRS's heights.
-        xy: (K, 2) in the CRS, easting or longitude first.
-        is_major: whether it is one of every fifth, drawn thicker.
-    """
+    """Line of equal height (K, 2) in the CRS, easting or longitude first; every fifth is major, drawn thicker."""
 
     height: float
     xy: FloatArray
@@ -112,9 +94,13 @@ def write_contours_gpkg(path: Path, lines: Sequence[ContourLine], wkt: str) -> N
 
     draft = path.with_name(f".{path.name}")  # GDAL takes the format from the suffix
     draft.unlink(missing_ok=True)
+    shapes = []
+    for line in lines:  # as WKB
+        points = np.column_stack([line.xy, np.full(len(line.xy), line.height)])
+        shapes.append(struct.pack("<BII", 1, _LINE_STRING_Z, len(points)) + points.astype("<f8").tobytes())
     pyogrio.raw.write(
         draft,
-        geometry=np.array([_wkb(line) for line in lines], dtype=object),
+        geometry=np.array(shapes, dtype=object),
         field_data=[
             np.array([line.height for line in lines], dtype=np.float64),
             np.array([line.is_major for line in lines], dtype=np.bool_),
@@ -143,8 +129,3 @@ def write_contours_dxf(path: Path, lines: Sequence[ContourLine]) -> None:
     draft = path.with_name(path.name + ".tmp")
     document.saveas(draft)
     replace_file(draft, path)
-
-
-def _wkb(line: ContourLine) -> bytes:
-    points = np.column_stack([line.xy, np.full(len(line.xy), line.height)])
-    return struct.pack("<BII", 1, _LINE_STRING_Z, len(points)) + points.astype("<f8").tobytes()

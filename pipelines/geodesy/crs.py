@@ -1,25 +1,24 @@
-"""Coordinate reference systems: from any that PROJ knows to WGS84 and back, point by point.
+"""Coordinate reference systems: from any that PROJ knows to WGS84 and back, point by point, and the axes of map
+grids.
 
-The only module that uses pyproj, and the only one that thinks about axis order: `xyz` here is always easting or
-longitude first, as in ODM's files and PROJ's visualisation order; `lla` is latitude first, as everywhere else.
+The only module that thinks about axis order: `xyz` here is always easting or longitude first, as in ODM's files and
+PROJ's visualisation order; `lla` is latitude first, as everywhere else.
 
 One operation serves all points of a call, or neighbours on two sides of an operation's border would be torn apart
 by metres. `pipelines.geodesy.operations` chooses it, and refuses where a grid is missing.
 
-Texts of a CRS that would open files: refused before PROJ sees them.
-
-PROJ strings, WKT and PROJJSON may name files of grids, triangulations and definitions, and PROJ opens any path. A
-grid that PROJ finds by its bare name, in its own folders, is accepted.
-
-Axes of a map grid at a place: how far grid north lies from true north.
+PROJ strings, WKT and PROJJSON may name files of grids, triangulations and definitions, and PROJ opens any path:
+such texts are refused before PROJ sees them. A grid that PROJ finds by its bare name, in its own folders, is
+accepted.
 """
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +34,7 @@ from pipelines.core.types import FloatArray
 from pipelines.geodesy.enu import ecef_from_enu_rotation, ecef_from_lla, lla_from_ecef
 from pipelines.geodesy.operations import Operation, OperationRequest, best_operation, proj_errors
 from pipelines.geodesy.plausible import ListedPoints, check_area, horizontal_of, rough_lon_lat
-from pipelines.geodesy.vertical import ELLIPSOIDAL, VerticalChoice, VerticalDatum, assumed_ellipsoidal, name_of
+from pipelines.geodesy.vertical import ELLIPSOIDAL, NAME_OF_EPSG, VerticalChoice, VerticalDatum
 
 _BARE_NAME = re.compile(r"[\w.-]+")
 _GRIDS = re.compile(r'(?<!\w)\w*grids?\s*=\s*"?([^\s"]*)', re.IGNORECASE)
@@ -43,44 +42,6 @@ _FILES = re.compile(r"(?<!\w)(?:init|file|catalog)\s*=", re.IGNORECASE)
 _PIPELINE = re.compile(r"(?<!\w)(?:proj\s*=\s*pipeline|\+step)(?!\w)", re.IGNORECASE)
 _WKT_FILE = re.compile(r"PARAMETERFILE", re.IGNORECASE)
 _WKT_FILE_NAME = re.compile(r'PARAMETERFILE\s*[\[(]\s*"[^"]*"\s*,\s*"([^"]*)"', re.IGNORECASE)
-
-
-def file_in(text: str) -> str | None:
-    """Return the part of a CRS text that would open a file outside PROJ's own folders; None if there is none."""
-    forbidden = _FILES.search(text) or _PIPELINE.search(text)
-    if forbidden:
-        return forbidden[0]
-    for grids in _GRIDS.finditer(text):
-        if not all(_is_bare(name) for name in grids[1].split(",")):
-            return grids[0]
-    names = _WKT_FILE_NAME.findall(text)
-    if len(names) != len(_WKT_FILE.findall(text)):
-        return "PARAMETERFILE"
-    if text.lstrip().startswith("{"):
-        names += _values(text)
-    return next((name for name in names if not _is_bare(name)), None)
-
-
-def _is_bare(name: str) -> bool:
-    return _BARE_NAME.fullmatch(name.removeprefix("@")) is not None  # @ marks an optional grid
-
-
-def _values(text: str) -> Iterator[str]:
-    """Yield the texts that stand for values of parameters in PROJJSON."""
-    try:
-        pending: list[Any] = [json.loads(text)]
-    except (ValueError, RecursionError):
-        return  # PROJ refuses it, too
-    while pending:
-        item = pending.pop()
-        if isinstance(item, dict):
-            if isinstance(item.get("value"), str):
-                yield item["value"]
-            pending += item.values()
-        elif isinstance(item, list):
-            pending += item
-
-
 ECEF = "EPSG:4978"
 _MAX_TEXT = 20_000
 _ELLIPSOID_HEIGHT = (
@@ -88,6 +49,7 @@ _ELLIPSOID_HEIGHT = (
     'AXIS["Up",UP]]'
 )
 _UTM = re.compile(r"WGS\s?84\s*/?\s*UTM(?:\s+zone)?\s+(\d{1,2})\s*([NS])", re.IGNORECASE)
+_STEP_M = 10.0  # long against the rounding of eastings and northings, short against the curvature of a grid
 
 
 @dataclass(frozen=True)
@@ -98,7 +60,6 @@ class PointCrs:
         name: as the file or option gave it, spaces tidied.
         vertical: what the heights count from.
         states_vertical: whether the CRS itself said so (compound, 3D or geocentric).
-        height_unit: name of the heights' unit.
     """
 
     name: str
@@ -121,17 +82,19 @@ class PointCrs:
         return bool(self._crs.is_geocentric)
 
     @property
+    def _plan_axes(self) -> list[Any]:
+        source = self._crs.source_crs if self._crs.is_bound else None
+        return list(horizontal_of(source or self._crs).axis_info[:2])
+
+    @property
     def northing_first(self) -> bool:
         """Whether the register has the northing or latitude first, and the easting or longitude second."""
-        source = self._crs.source_crs if self._crs.is_bound else None
-        first, second = (axis.direction.lower() for axis in horizontal_of(source or self._crs).axis_info[:2])
-        return (first, second) == ("north", "east")
+        return [axis.direction.lower() for axis in self._plan_axes] == ["north", "east"]
 
     @property
     def units(self) -> tuple[str, str, str]:
         """Names of the three coordinates' units."""
-        source = self._crs.source_crs if self._crs.is_bound else None
-        first, second = (axis.unit_name for axis in horizontal_of(source or self._crs).axis_info[:2])
+        first, second = (axis.unit_name for axis in self._plan_axes)
         return first, second, self.height_unit
 
     @property
@@ -145,8 +108,7 @@ class PointCrs:
     @property
     def horizontal_unit(self) -> float:
         """The horizontal unit in metres; of a geographic CRS in radians."""
-        source = self._crs.source_crs if self._crs.is_bound else None
-        return float(horizontal_of(source or self._crs).axis_info[0].unit_conversion_factor)
+        return float(self._plan_axes[0].unit_conversion_factor)
 
     @property
     def wkt(self) -> str:
@@ -177,13 +139,11 @@ class PointCrs:
     ) -> FloatArray:
         """Return WGS84 latitude, longitude (degrees), ellipsoidal height (m) (N, 3) of points (N, 3) in this CRS.
 
-        Args:
-            xyz: longitude or easting, latitude or northing, height; X, Y, Z of a geocentric CRS.
-            path: file of the points, for errors.
-            lines: its line of each point, for errors.
+        The order is longitude or easting, latitude or northing, height; X, Y, Z of a geocentric CRS.
 
         Raises:
-            InputError: a point out of range or far outside the CRS's area, a missing grid, or no transformation.
+            InputError: a point out of range or far outside the CRS's area, a missing grid, or no transformation;
+                names the file and the line of the point.
         """
         points = np.asarray(xyz, dtype=np.float64).reshape(-1, 3)
         if not len(points):
@@ -227,21 +187,14 @@ class PointCrs:
         return xyz
 
     def operation(self, lla: ArrayLike) -> Operation:
-        """Return the transformation that serves points `lla` (N, 3), for the record.
-
-        Raises:
-            InputError: as `lla_from_xyz`.
-        """
+        """Return the transformation that serves points `lla` (N, 3), for the record; raises as `lla_from_xyz`."""
         points = np.asarray(lla, dtype=np.float64).reshape(-1, 3)
         return self._operation(points[:, 1], points[:, 0])[1]
 
     def serving(self, lla: ArrayLike) -> PointCrs:
         """Return the same CRS with the operation that serves points `lla` (N, 3), for every later call.
 
-        Points that are transformed in several calls have no step between them then.
-
-        Raises:
-            InputError: as `xyz_from_lla`.
+        Points that are transformed in several calls have no step between them then. Raises as `xyz_from_lla`.
         """
         self.xyz_from_lla(lla)
         points = np.asarray(lla, dtype=np.float64).reshape(-1, 3)
@@ -277,86 +230,64 @@ def parse_crs(
     `vertical`, or above the WGS84 ellipsoid, which the result calls stated or assumed. A CRS that has a vertical
     part keeps it. Heights above a vertical CRS are in that CRS's unit.
 
-    Args:
-        text: the CRS.
-        vertical: datum of the heights where `text` is silent.
-        path: file in which it stands, for errors.
-        line: its line there.
-        field: or the option.
-
     Raises:
-        InputError: not a CRS, or not one of points on Earth.
+        InputError: not a CRS, or not one of points on Earth; names the file and line in which it stands, or the
+            field or option.
     """
     name = " ".join(text.split())
+    refusal = partial(InputError, path=path, line=line, field=field)
     try:
-        crs = _parse(name, path, line, field)
+        crs = _parse(name, refusal)
         if not (crs.is_geographic or crs.is_projected or crs.is_geocentric):
-            raise InputError(
-                f"{_short(name)} is a {crs.type_name}, which places no points on Earth",
-                path=path,
-                line=line,
-                field=field,
-            )
+            raise refusal(f"{_short(name)} is a {crs.type_name}, which places no points on Earth")
         return _point_crs(crs, name, vertical)
     except ProjError as error:  # of a CRS that PROJ reads, but whose parts it does not combine
-        raise InputError(f"PROJ cannot use {_short(name)!r}: {error}", path=path, line=line, field=field) from error
+        raise refusal(f"PROJ cannot use {_short(name)!r}: {error}") from error
 
 
 def _point_crs(crs: CRS, name: str, vertical: VerticalChoice | None) -> PointCrs:
-    horizontal = horizontal_of(crs)
     axes = (crs.source_crs or crs if crs.is_bound else crs).axis_info
+    short = _short(name)
     if len(axes) == 3:
-        stated = _own_vertical(crs, _short(name))
-        return PointCrs(_short(name), stated, True, axes[2].unit_name, crs, 1.0, True)
+        stated = VerticalDatum(name=ELLIPSOIDAL, stated=True, note=f"part of {short}")
+        if crs.is_compound:
+            upright = crs.sub_crs_list[1]
+            epsg = upright.to_epsg()
+            datum = upright.name if epsg is None else NAME_OF_EPSG.get(epsg, f"EPSG:{epsg}")
+            stated = VerticalDatum(name=datum, stated=True, note=f"{upright.name}, part of {short}")
+        return PointCrs(short, stated, True, axes[2].unit_name, crs, 1.0, True)
     if vertical is not None and vertical.epsg is not None:
         upright = _vertical_crs(vertical)
         whole = CompoundCRS(f"{crs.name} + {upright.name}", [crs, upright])
         stated = VerticalDatum(name=vertical.name, stated=True, note="--vertical")
-        return PointCrs(_short(name), stated, False, upright.axis_info[0].unit_name, whole, 1.0, True)
-    datum_of = (
-        VerticalDatum(name=ELLIPSOIDAL, stated=True, note="--vertical")
-        if vertical is not None
-        else assumed_ellipsoidal(f"{_short(name)} says nothing of heights")
-    )
-    unit = ("metre", 1.0) if horizontal.is_geographic else (axes[0].unit_name, axes[0].unit_conversion_factor)
-    return PointCrs(_short(name), datum_of, False, unit[0], crs, unit[1], False)
+        return PointCrs(short, stated, False, upright.axis_info[0].unit_name, whole, 1.0, True)
+    note = "--vertical" if vertical is not None else f"{short} says nothing of heights"
+    datum_of = VerticalDatum(name=ELLIPSOIDAL, stated=vertical is not None, note=note)
+    geographic = horizontal_of(crs).is_geographic
+    unit = ("metre", 1.0) if geographic else (axes[0].unit_name, axes[0].unit_conversion_factor)
+    return PointCrs(short, datum_of, False, unit[0], crs, unit[1], False)
 
 
-def _parse(name: str, path: Path | str | None, line: int | None, field: str | None) -> CRS:
+def _parse(name: str, refusal: Callable[[str], InputError]) -> CRS:
     if len(name) > _MAX_TEXT:
-        raise InputError(f"no CRS is {len(name)} characters long", path=path, line=line, field=field)
+        raise refusal(f"no CRS is {len(name)} characters long")
     file = file_in(name)
     if file is not None:
-        raise InputError(
-            f"{_short(file)!r} would open a file: give EPSG:n, or a grid by its bare name in PROJ's own folders",
-            path=path,
-            line=line,
-            field=field,
+        raise refusal(
+            f"{_short(file)!r} would open a file: give EPSG:n, or a grid by its bare name in PROJ's own folders"
         )
     utm = _UTM.fullmatch(name)
     if utm:
         zone, south = int(utm[1]), utm[2].upper() == "S"
         if not 1 <= zone <= 60:
-            raise InputError(f"UTM has zones 1 to 60, not {zone}", path=path, line=line, field=field)
+            raise refusal(f"UTM has zones 1 to 60, not {zone}")
         return CRS.from_epsg((32700 if south else 32600) + zone)
     try:
         return CRS.from_user_input(name)
     except CRSError as error:
-        raise InputError(
-            f"{_short(name)!r} is no CRS that PROJ knows: give EPSG:n, EPSG:n+m, PROJ string, WGS84 UTM 16N or WKT",
-            path=path,
-            line=line,
-            field=field,
+        raise refusal(
+            f"{_short(name)!r} is no CRS that PROJ knows: give EPSG:n, EPSG:n+m, PROJ string, WGS84 UTM 16N or WKT"
         ) from error
-
-
-def _own_vertical(crs: CRS, name: str) -> VerticalDatum:
-    if not crs.is_compound:
-        return VerticalDatum(name=ELLIPSOIDAL, stated=True, note=f"part of {name}")
-    upright = crs.sub_crs_list[1]
-    epsg = upright.to_epsg()
-    short = upright.name if epsg is None else name_of(epsg)
-    return VerticalDatum(name=short, stated=True, note=f"{upright.name}, part of {name}")
 
 
 def _vertical_crs(choice: VerticalChoice) -> CRS:
@@ -371,9 +302,6 @@ def _vertical_crs(choice: VerticalChoice) -> CRS:
 
 def _short(name: str) -> str:
     return name if len(name) <= 120 else name[:117] + "…"
-
-
-_STEP_M = 10.0  # long against the rounding of eastings and northings, short against the curvature of a grid
 
 
 def grid_from_enu(crs: PointCrs, lla: ArrayLike) -> FloatArray:
@@ -403,3 +331,39 @@ def grid_from_enu(crs: PointCrs, lla: ArrayLike) -> FloatArray:
             "whose coordinates are easting and northing"
         )
     return rotations
+
+
+def file_in(text: str) -> str | None:
+    """Return the part of a CRS text that would open a file outside PROJ's own folders; None if there is none."""
+    forbidden = _FILES.search(text) or _PIPELINE.search(text)
+    if forbidden:
+        return forbidden[0]
+    for grids in _GRIDS.finditer(text):
+        if not all(_is_bare(name) for name in grids[1].split(",")):
+            return grids[0]
+    names = _WKT_FILE_NAME.findall(text)
+    if len(names) != len(_WKT_FILE.findall(text)):
+        return "PARAMETERFILE"
+    if text.lstrip().startswith("{"):
+        names += _values(text)
+    return next((name for name in names if not _is_bare(name)), None)
+
+
+def _is_bare(name: str) -> bool:
+    return _BARE_NAME.fullmatch(name.removeprefix("@")) is not None  # @ marks an optional grid
+
+
+def _values(text: str) -> Iterator[str]:
+    """Yield the texts that stand for values of parameters in PROJJSON."""
+    try:
+        pending: list[Any] = [json.loads(text)]
+    except (ValueError, RecursionError):
+        return  # PROJ refuses it, too
+    while pending:
+        item = pending.pop()
+        if isinstance(item, dict):
+            if isinstance(item.get("value"), str):
+                yield item["value"]
+            pending += item.values()
+        elif isinstance(item, list):
+            pending += item

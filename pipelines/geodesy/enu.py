@@ -66,11 +66,6 @@ def lla_of(origin: Origin) -> FloatArray:
     return np.array([origin.lat_deg, origin.lon_deg, origin.alt_m])
 
 
-def ecef_of(origin: Origin) -> FloatArray:
-    """Return the origin in Earth-centred metres (3,)."""
-    return ecef_from_lla(lla_of(origin))
-
-
 def ecef_from_enu_rotation(lla: ArrayLike) -> FloatArray:
     """Return rotations (…, 3, 3) whose columns are east, north, up at `lla` (…, 3), in Earth-centred axes."""
     points = _checked(lla)
@@ -84,12 +79,14 @@ def ecef_from_enu_rotation(lla: ArrayLike) -> FloatArray:
 
 def ecef_from_enu(enu: ArrayLike, origin: Origin) -> FloatArray:
     """Return Earth-centred points (…, 3) of tangent-plane points (…, 3) at `origin`; all in metres."""
-    return _checked(enu) @ ecef_from_enu_rotation(lla_of(origin)).T + ecef_of(origin)
+    lla = lla_of(origin)
+    return _checked(enu) @ ecef_from_enu_rotation(lla).T + ecef_from_lla(lla)
 
 
 def enu_from_ecef(ecef: ArrayLike, origin: Origin) -> FloatArray:
     """Return tangent-plane points (…, 3) at `origin` of Earth-centred points (…, 3); all in metres."""
-    return (_checked(ecef) - ecef_of(origin)) @ ecef_from_enu_rotation(lla_of(origin))
+    lla = lla_of(origin)
+    return (_checked(ecef) - ecef_from_lla(lla)) @ ecef_from_enu_rotation(lla)
 
 
 def lla_from_enu(enu: ArrayLike, origin: Origin) -> FloatArray:

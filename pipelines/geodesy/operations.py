@@ -1,10 +1,8 @@
-"""The way from a CRS to WGS84 that serves a set of points, or why there is none.
+"""The way from a CRS to WGS84 that serves a set of points, or why there is none, and PROJ's grids on this machine.
 
 PROJ would rather answer than fail: without a geoid's grid it applies a *ballpark* transformation, that is none, and
 a grid that a PROJ string calls optional (`+nadgrids=@file`) is a shift of zero where it is missing. Here both are
 errors that name the grid.
-
-Grids of PROJ on this machine: geoid models and datum shifts.
 """
 
 from __future__ import annotations
@@ -17,7 +15,7 @@ from pathlib import Path
 
 from pyproj import CRS, Transformer
 from pyproj.crs import CoordinateOperation
-from pyproj.datadir import get_user_data_dir
+from pyproj.datadir import get_data_dir, get_user_data_dir
 from pyproj.exceptions import ProjError
 from pyproj.transformer import AreaOfInterest, TransformerGroup
 
@@ -30,17 +28,12 @@ _WGS84_3D = "EPSG:4979"
 _NO_SHIFT = "@null"  # a PROJ string's way to say that there is none
 # Ellipsoids of frames that follow the Earth's centre, as WGS84 does: semi-major axis and inverse flattening.
 _MODERN_AXIS_M, _MODERN_FLATTENING = 6378137.0, (298.25, 298.26)
+_GRID_SUFFIXES = (".tif", ".gtx", ".gsb")
 
 
 @dataclass(frozen=True)
 class Operation:
-    """How PROJ gets from a CRS to WGS84.
-
-    Attributes:
-        name: PROJ's description.
-        accuracy_m: as published; None if unknown.
-        missing_grids: grids with which there would be a better one.
-    """
+    """How PROJ gets from a CRS to WGS84, how well (None: unknown), and grids with which it would do better."""
 
     name: str
     accuracy_m: float | None
@@ -59,11 +52,7 @@ class OperationRequest:
 
 @contextmanager
 def proj_errors(name: str, path: Path | str | None = None) -> Iterator[None]:
-    """Turn the exceptions of PROJ into errors that name the CRS and the file.
-
-    Raises:
-        InputError: PROJ refuses the CRS or the points.
-    """
+    """Turn the exceptions of PROJ into InputErrors that name the CRS and the file."""
     try:
         yield
     except ProjError as error:
@@ -135,17 +124,17 @@ def _no_operation(request: OperationRequest) -> InputError:
         "a PROJ string), or give another CRS"
     )
     ellipsoid = horizontal.ellipsoid
-    if ellipsoid is not None and _is_modern(ellipsoid.semi_major_metre, ellipsoid.inverse_flattening):
+    low, high = _MODERN_FLATTENING
+    if (
+        ellipsoid is not None
+        and abs(ellipsoid.semi_major_metre - _MODERN_AXIS_M) < 1e-3
+        and low < ellipsoid.inverse_flattening < high
+    ):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # "you will lose information": the datum, which is stated
             projection = horizontal.to_proj4().replace(" +no_defs", "").replace(" +type=crs", "")
         message += f". If its datum is WGS84 as closely as you need: {projection} +towgs84=0,0,0"
     return InputError(message, path=request.path)
-
-
-def _is_modern(axis_m: float, inverse_flattening: float) -> bool:
-    low, high = _MODERN_FLATTENING
-    return abs(axis_m - _MODERN_AXIS_M) < 1e-3 and low < inverse_flattening < high
 
 
 def _area(lon: FloatArray, lat: FloatArray) -> AreaOfInterest:
@@ -164,14 +153,9 @@ def _wrapped(lon_deg: float) -> float:
     return lon_deg - 360.0 * round(lon_deg / 360.0) if abs(lon_deg) > 180.0 else lon_deg
 
 
-_SUFFIXES = (".tif", ".gtx", ".gsb")
-
-
 def grid_folders() -> list[Path]:
     """Return the existing folders in which PROJ looks for grids."""
-    from pyproj import datadir
-
-    named = [*datadir.get_data_dir().split(";"), datadir.get_user_data_dir()]
+    named = [*get_data_dir().split(";"), get_user_data_dir()]
     folders = [Path(part) for text in named for part in (text.split(":") if "/" in text else [text]) if part]
     return [folder for folder in dict.fromkeys(folders) if folder.is_dir()]
 
@@ -179,4 +163,4 @@ def grid_folders() -> list[Path]:
 def installed_grids() -> list[str]:
     """Return the file names of the grids in PROJ's folders, sorted."""
     files = (file for folder in grid_folders() for file in folder.iterdir())
-    return sorted({file.name for file in files if file.suffix.lower() in _SUFFIXES})
+    return sorted({file.name for file in files if file.suffix.lower() in _GRID_SUFFIXES})

@@ -78,11 +78,7 @@ def rough_lon_lat(crs: CRS, listed: ListedPoints) -> tuple[FloatArray, FloatArra
 
 
 def check_area(crs: CRS, lon: FloatArray, lat: FloatArray, listed: ListedPoints) -> None:
-    """Refuse points at `lon`, `lat` (N,) more than 3° outside the CRS's area of use, if it has one.
-
-    Raises:
-        InputError: names the first such point.
-    """
+    """Refuse points at `lon`, `lat` (N,) more than 3° outside the CRS's area of use, if it has one."""
     area = horizontal_of(crs).area_of_use
     if area is not None:
         bounds = f"{area.south:g} … {area.north:g}° N, {area.west:g} … {area.east:g}° E"

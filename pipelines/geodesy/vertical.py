@@ -20,22 +20,17 @@ ELLIPSOIDAL = "ellipsoidal"
 MOST_GEOID_M = 110.0  # between the ellipsoid and any geoid
 FOOT_M = 0.3048  # international foot; the US survey foot differs by 2e-6
 _EPSG_OF = {"EGM84": 5798, "EGM96": 5773, "EGM2008": 3855}
+NAME_OF_EPSG = {code: name for name, code in _EPSG_OF.items()}  # `EPSG:5773` and `EGM96` are the same datum
 
 
 @dataclass(frozen=True)
 class VerticalChoice:
-    """A vertical datum as an option names it.
-
-    Attributes:
-        name: `ellipsoidal`, `EGM96` … or `EPSG:n`.
-        epsg: code of the vertical CRS; None for ellipsoidal heights.
-    """
+    """A vertical datum as an option names it, and the code of its vertical CRS; None for ellipsoidal heights."""
 
     name: str
     epsg: int | None
 
     def __str__(self) -> str:
-        """Return the name, which `parse_vertical` reads."""
         return self.name
 
 
@@ -54,17 +49,8 @@ def parse_vertical(text: str) -> VerticalChoice:
     if match is None:
         known = ", ".join([ELLIPSOIDAL, *_EPSG_OF, "EPSG:n"])
         raise InputError(f"{text!r} is no vertical datum: give one of {known}", field="--vertical")
-    return VerticalChoice(name_of(int(match[1])), int(match[1]))
-
-
-def name_of(epsg: int) -> str:
-    """Return the short name of a vertical CRS, so that `EPSG:5773` and `EGM96` are the same datum."""
-    return next((name for name, code in _EPSG_OF.items() if code == epsg), f"EPSG:{epsg}")
-
-
-def assumed_ellipsoidal(note: str) -> VerticalDatum:
-    """Return the datum of heights that no file states; `note` names their source, and its usual fault."""
-    return VerticalDatum(name=ELLIPSOIDAL, stated=False, note=note)
+    epsg = int(match[1])
+    return VerticalChoice(NAME_OF_EPSG.get(epsg, f"EPSG:{epsg}"), epsg)
 
 
 def missing_grid_error(
@@ -72,12 +58,7 @@ def missing_grid_error(
 ) -> InputError:
     """Return the error for points of a CRS that need `grids`, of which none is in PROJ's data `folder`.
 
-    Args:
-        datum: of the heights, if they do not count from the ellipsoid.
-        crs_name: the CRS.
-        grids: file names.
-        folder: where PROJ looks.
-        path: file of the points.
+    `datum` is that of the heights, if they do not count from the ellipsoid.
     """
     problem = f"points of {crs_name} cannot be brought to WGS84"
     instead = "Or give coordinates in another CRS"

@@ -8,17 +8,15 @@ from __future__ import annotations
 from array import array
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from pipelines.core.progress import SILENT, Progress
-from pipelines.formats.bag import COMPRESSED, IMAGE, INFO, Bag, RawMessage, UndecodableError, open_bag
-from pipelines.ingest import bag_messages as bag_transforms
-from pipelines.ingest.bag_messages import ATTITUDES, BASE, POSITIONS, Transforms
-from pipelines.ingest.bag_streams import RequestedTopics, SelectedTopics, select_topics
+from pipelines.formats.bag import Bag, RawMessage, UndecodableError, open_bag
+from pipelines.ingest.bag_messages import BASE, GEODETIC_HEIGHTS, TRANSFORM_TYPES, Transforms
+from pipelines.ingest.bag_streams import SelectedTopics, select_topics
+from pipelines.ingest.options import IngestOptions
 
-_KNOWN = {IMAGE, COMPRESSED, INFO, *POSITIONS, *ATTITUDES}
 # A gap is worth telling if it is this many times the usual step.
 _GAP_STEPS = 3.0
 
@@ -31,11 +29,10 @@ class TopicReport:
         use: what `ingest` would take from it, or "".
         messages: that could be read.
         rate_hz: by the median step between stamps; None for fewer than two messages.
-        first_s, last_s: time span; `longest_gap_s`: in it.
-        gaps: steps of more than three times the median.
+        first_s, last_s: time span; `longest_gap_s`: in it; `gaps`: steps of more than three times the median.
         backwards: stamps that are not later than the one before.
         clock: "stamp", or "recording" where messages have none.
-        frame: of the first message; `child`: its child frame.
+        frame: of the first message, and its child frame.
         problem: why the type or its messages cannot be read.
     """
 
@@ -84,19 +81,15 @@ def inspect_bag(path: Path, progress: Progress = SILENT) -> BagReport:
         InputError: it cannot be opened.
     """
     with open_bag(path) as bag:
-        topics = select_topics(bag, RequestedTopics())
+        topics = select_topics(bag, IngestOptions())
         tallies = {name: _Tally() for name in bag.topics}
         transforms = Transforms()
-        with progress.task("bag", bag.message_count) as task:
+        with progress.task("bag", sum(topic.count for topic in bag.topics.values())) as task:
             for message in bag.messages(list(bag.topics)):
                 _count(bag, message, tallies[message.topic], transforms)
                 task.advance()
-        uses = {
-            topics.image: "photographs",
-            topics.info: "lens",
-            topics.fix: "positions",
-            topics.attitude: "attitudes",
-        }
+        uses = {topics.image: "photographs", topics.info: "lens", topics.fix: "positions"}
+        uses[topics.attitude] = "attitudes"
         if topics.fix is not None and topics.fix == topics.attitude:
             uses[topics.fix] = "positions, attitudes"
         reports = tuple(
@@ -109,26 +102,22 @@ def inspect_bag(path: Path, progress: Progress = SILENT) -> BagReport:
 
 
 def _count(bag: Bag, message: RawMessage, tally: _Tally, transforms: Transforms) -> None:
-    is_frames = message.type in (bag_transforms.TYPE, bag_transforms.OLD_TYPE)
+    is_frames = message.type in TRANSFORM_TYPES
     if not tally.described or is_frames:
         tally.described = True
         try:
             decoded = bag.decode(message)
             if is_frames:
                 transforms.add(decoded, static=message.topic.endswith("static"))
-            _describe(decoded, tally)
+            header = getattr(decoded, "header", None)
+            if header is not None:
+                tally.stamped = bool(header.stamp.sec or header.stamp.nanosec)
+                tally.frame = str(header.frame_id)
+            tally.child = str(getattr(decoded, "child_frame_id", ""))
         except UndecodableError as error:
             tally.problem = str(error)[:200]
     stamp = bag.header_stamp_ns(message) if tally.stamped else None
     tally.times.append(stamp or message.bag_ns)
-
-
-def _describe(message: Any, tally: _Tally) -> None:
-    header = getattr(message, "header", None)
-    if header is not None:
-        tally.stamped = bool(header.stamp.sec or header.stamp.nanosec)
-        tally.frame = str(header.frame_id)
-    tally.child = str(getattr(message, "child_frame_id", ""))
 
 
 def _report(name: str, kind: str, use: str, tally: _Tally) -> TopicReport:
@@ -166,7 +155,7 @@ def _missing(
         missing.append("no CameraInfo for the photographs: the focal length is assumed, or give --focal-px")
     if topics.fix is None:
         missing.append("no positions: ground control points alone can place the model (--gcp)")
-    elif not POSITIONS[bag.topics[topics.fix].type].geodetic:
+    elif bag.topics[topics.fix].type not in GEODETIC_HEIGHTS:
         missing.append(f"{topics.fix} is in a local frame: give --origin LAT,LON,HEIGHT of its zero")
     if topics.attitude is None:
         missing.append("no attitudes: a lever arm cannot be applied")

@@ -1,10 +1,8 @@
-"""Positions and attitudes out of ROS messages: one small adapter a message type.
+"""Positions and attitudes out of ROS messages, and the tree of frames of `/tf` and `/tf_static`.
 
 World and body axes by REP-103, REP-105, REP-145 and REP-147, and PX4's own. A frame whose name ends in `_ned` is
 North-East-Down, one that ends in `_frd` Forward-Right-Down, as MAVROS names them. What a message does not know is
 NaN; why a message cannot be used is its `problem`.
-
-`/tf` and `/tf_static`: where the frames of an aircraft are, one in another.
 """
 
 from __future__ import annotations
@@ -17,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pipelines.core.types import FloatArray
+from pipelines.core.types import FloatArray, Quaternion, Vector3
 from pipelines.geometry.rotations import ENU_FROM_NED, matrix_from_quat_xyzw, quat_xyzw_from_matrix
 from pipelines.geometry.trajectory import Trajectory
 
@@ -45,8 +43,8 @@ class PositionSample:
         problem: why it cannot be used, or "".
     """
 
-    place: tuple[float, float, float]
-    sigma_enu_m: tuple[float, float, float]
+    place: Vector3
+    sigma_enu_m: Vector3
     frame: str
     world: str = ""
     receiver: str = "unknown receiver"
@@ -57,37 +55,28 @@ class PositionSample:
 class AttitudeSample:
     """An attitude as a message states it: a frame's own axes into East-North-Up, σ in degrees or NaN."""
 
-    quat_xyzw: tuple[float, float, float, float]
+    quat_xyzw: Quaternion
     sigma_deg: float
     frame: str
     axes: Axes
     problem: str = ""
 
 
-@dataclass(frozen=True)
-class PositionType:
-    """How to read positions of a message type; lower ranks are preferred. `heights` is what they count from."""
-
-    rank: int
-    geodetic: bool
-    heights: str
-    read: Callable[[Any], PositionSample]
-
-
-@dataclass(frozen=True)
-class AttitudeType:
-    """How to read attitudes of a message type; lower ranks are preferred."""
-
-    rank: int
-    read: Callable[[Any], AttitudeSample]
-
-
-def axes_of(frame: str) -> Axes:
+def body_axes(frame: str) -> Axes:
     """Return a frame's axes by its name: FRD for `…_frd`, `…_ned`, the camera's for `…optical…`, else FLU."""
     name = frame.lower()
     if name.endswith(("_frd", "_ned")):
         return "frd"
     return "optical" if "optical" in name else "flu"
+
+
+def stamp_ns(message: Any) -> int | None:
+    """Return a message's own stamp in nanoseconds: its header's, or PX4's microseconds; None where it is zero."""
+    header = getattr(message, "header", None)
+    if header is not None:
+        return header.stamp.sec * 1_000_000_000 + header.stamp.nanosec or None
+    sample = getattr(message, "timestamp_sample", 0) or getattr(message, "timestamp", 0)
+    return int(sample) * 1000 or None
 
 
 def _fix(message: Any) -> PositionSample:
@@ -120,90 +109,6 @@ def _sensor_gps(message: Any) -> PositionSample:
     return PositionSample(place, _eph_epv(message), "gps", receiver=receiver, problem=problem)
 
 
-def _odometry_position(message: Any) -> PositionSample:
-    return _local(message.pose.pose.position, message, message.child_frame_id or BASE, message.pose.covariance)
-
-
-def _pose_cov_position(message: Any) -> PositionSample:
-    return _local(message.pose.pose.position, message, BASE, message.pose.covariance)
-
-
-def _pose_position(message: Any) -> PositionSample:
-    return _local(message.pose.position, message, BASE, None)
-
-
-def _px4_odometry_position(message: Any) -> PositionSample:
-    ned, variance = _px4_pose(message)
-    east, north, up = ENU_FROM_NED @ ned
-    sigma = _sigmas(np.abs(ENU_FROM_NED) @ variance)
-    place = (float(east), float(north), float(up))
-    problem = "" if _px4_is_ned(message) else "its frame is not North-East-Down"
-    if not all(map(math.isfinite, place)):
-        problem = "position is NaN"
-    return PositionSample(place, sigma, BASE, world="PX4's local NED", problem=problem)
-
-
-def _imu(message: Any) -> AttitudeSample:
-    frame = message.header.frame_id
-    covariance = np.asarray(message.orientation_covariance, dtype=np.float64)
-    unknown = covariance[0] == -1.0
-    ned = axes_of(frame) == "frd"
-    return _attitude(message.orientation, covariance[[0, 4, 8]], frame or BASE, ned, unknown)
-
-
-def _odometry_attitude(message: Any) -> AttitudeSample:
-    variance = np.asarray(message.pose.covariance, dtype=np.float64)[[21, 28, 35]]
-    return _attitude(message.pose.pose.orientation, variance, message.child_frame_id or BASE, _is_ned(message))
-
-
-def _pose_cov_attitude(message: Any) -> AttitudeSample:
-    variance = np.asarray(message.pose.covariance, dtype=np.float64)[[21, 28, 35]]
-    return _attitude(message.pose.pose.orientation, variance, BASE, _is_ned(message))
-
-
-def _pose_attitude(message: Any) -> AttitudeSample:
-    return _attitude(message.pose.orientation, np.zeros(3), BASE, _is_ned(message))
-
-
-def _px4_attitude(message: Any) -> AttitudeSample:
-    return _from_ned_frd(message.q, np.full(3, np.nan))
-
-
-def _px4_odometry_attitude(message: Any) -> AttitudeSample:
-    attitude = _from_ned_frd(message.q, getattr(message, "orientation_variance", np.full(3, np.nan)))
-    return attitude if _px4_is_ned(message) else replace(attitude, problem="its frame is not North-East-Down")
-
-
-POSITIONS: dict[str, PositionType] = {
-    "sensor_msgs/msg/NavSatFix": PositionType(0, True, "ellipsoidal by the definition of NavSatFix", _fix),
-    "px4_msgs/msg/SensorGps": PositionType(1, True, "PX4's altitude above the ellipsoid", _sensor_gps),
-    "px4_msgs/msg/VehicleGlobalPosition": PositionType(
-        2, True, "PX4's altitude above the ellipsoid", _global_position
-    ),
-    "nav_msgs/msg/Odometry": PositionType(3, False, "those of --origin", _odometry_position),
-    "geometry_msgs/msg/PoseWithCovarianceStamped": PositionType(4, False, "those of --origin", _pose_cov_position),
-    "geometry_msgs/msg/PoseStamped": PositionType(5, False, "those of --origin", _pose_position),
-    "px4_msgs/msg/VehicleOdometry": PositionType(6, False, "those of --origin", _px4_odometry_position),
-}
-ATTITUDES: dict[str, AttitudeType] = {
-    "sensor_msgs/msg/Imu": AttitudeType(0, _imu),
-    "px4_msgs/msg/VehicleAttitude": AttitudeType(1, _px4_attitude),
-    "nav_msgs/msg/Odometry": AttitudeType(2, _odometry_attitude),
-    "geometry_msgs/msg/PoseWithCovarianceStamped": AttitudeType(3, _pose_cov_attitude),
-    "geometry_msgs/msg/PoseStamped": AttitudeType(4, _pose_attitude),
-    "px4_msgs/msg/VehicleOdometry": AttitudeType(5, _px4_odometry_attitude),
-}
-
-
-def stamp_ns(message: Any) -> int | None:
-    """Return a message's own stamp in nanoseconds: its header's, or PX4's microseconds; None where it is zero."""
-    header = getattr(message, "header", None)
-    if header is not None:
-        return header.stamp.sec * 1_000_000_000 + header.stamp.nanosec or None
-    sample = getattr(message, "timestamp_sample", 0) or getattr(message, "timestamp", 0)
-    return int(sample) * 1000 or None
-
-
 def _geodetic_problem(place: Sequence[float]) -> str:
     lat, lon, alt = place
     if not (math.isfinite(lat) and math.isfinite(lon)):
@@ -213,7 +118,34 @@ def _geodetic_problem(place: Sequence[float]) -> str:
     return "" if math.isfinite(alt) else "altitude is NaN"
 
 
-def _sigmas(variance: Any) -> tuple[float, float, float]:
+def _local(position: Any, message: Any, frame: str = "", covariance: Any = None) -> PositionSample:
+    values = np.array([position.x, position.y, position.z], dtype=np.float64)
+    variance = np.zeros(3) if covariance is None else np.asarray(covariance, dtype=np.float64)[[0, 7, 14]]
+    if _is_ned(message):
+        values, variance = ENU_FROM_NED @ values, np.abs(ENU_FROM_NED) @ variance
+    x, y, z = (float(value) for value in values)
+    problem = "" if np.isfinite(values).all() else "position is NaN"
+    world = message.header.frame_id or "odom"
+    return PositionSample((x, y, z), _sigmas(variance), frame or BASE, world=world, problem=problem)
+
+
+def _px4_local(message: Any) -> PositionSample:
+    if hasattr(message, "position"):
+        ned = np.asarray(message.position, dtype=np.float64)
+        variance = np.asarray(message.position_variance, np.float64)
+    else:  # px4_msgs up to release 1.13: the upper triangle of a 6×6 covariance, row by row
+        ned = np.array([message.x, message.y, message.z], dtype=np.float64)
+        variance = np.asarray(message.pose_covariance, dtype=np.float64)[[0, 6, 11]]
+    east, north, up = ENU_FROM_NED @ ned
+    place = (float(east), float(north), float(up))
+    problem = "" if _px4_is_ned(message) else "its frame is not North-East-Down"
+    if not all(map(math.isfinite, place)):
+        problem = "position is NaN"
+    sigma = _sigmas(np.abs(ENU_FROM_NED) @ variance)
+    return PositionSample(place, sigma, BASE, world="PX4's local NED", problem=problem)
+
+
+def _sigmas(variance: Any) -> Vector3:
     """Return σ of three variances; NaN all where one is not positive, or absurd."""
     values = np.asarray(variance, dtype=np.float64)
     if not (np.isfinite(values).all() and (values > 0).all() and (values < _LARGEST_SIGMA_M**2).all()):
@@ -222,7 +154,7 @@ def _sigmas(variance: Any) -> tuple[float, float, float]:
     return float(x), float(y), float(z)
 
 
-def _eph_epv(message: Any) -> tuple[float, float, float]:
+def _eph_epv(message: Any) -> Vector3:
     h, v = float(message.eph), float(message.epv)
     good = math.isfinite(h) and math.isfinite(v) and 0 < h < _LARGEST_SIGMA_M and 0 < v < _LARGEST_SIGMA_M
     return (h / math.sqrt(2.0), h / math.sqrt(2.0), v) if good else _NAN3
@@ -232,30 +164,27 @@ def _is_ned(message: Any) -> bool:
     return str(message.header.frame_id).lower().endswith("_ned")
 
 
-def _local(position: Any, message: Any, frame: str, covariance: Any) -> PositionSample:
-    values = np.array([position.x, position.y, position.z], dtype=np.float64)
-    variance = np.zeros(3) if covariance is None else np.asarray(covariance, dtype=np.float64)[[0, 7, 14]]
-    if _is_ned(message):
-        values, variance = ENU_FROM_NED @ values, np.abs(ENU_FROM_NED) @ variance
-    x, y, z = (float(value) for value in values)
-    problem = "" if np.isfinite(values).all() else "position is NaN"
-    return PositionSample(
-        (x, y, z), _sigmas(variance), frame, world=message.header.frame_id or "odom", problem=problem
-    )
-
-
-def _px4_pose(message: Any) -> tuple[np.ndarray, np.ndarray]:
-    if hasattr(message, "position"):
-        return np.asarray(message.position, dtype=np.float64), np.asarray(message.position_variance, np.float64)
-    # px4_msgs up to release 1.13: the upper triangle of a 6×6 covariance, row by row.
-    place = np.array([message.x, message.y, message.z], dtype=np.float64)
-    return place, np.asarray(message.pose_covariance, dtype=np.float64)[[0, 6, 11]]
-
-
 def _px4_is_ned(message: Any) -> bool:
     if hasattr(message, "pose_frame"):
         return bool(message.pose_frame == _POSE_FRAME_NED)
     return bool(message.local_frame == 0)
+
+
+def _imu(message: Any) -> AttitudeSample:
+    frame = message.header.frame_id
+    covariance = np.asarray(message.orientation_covariance, dtype=np.float64)
+    ned, unknown = body_axes(frame) == "frd", covariance[0] == -1.0
+    return _attitude(message.orientation, covariance[[0, 4, 8]], frame or BASE, ned, unknown)
+
+
+def _pose(orientation: Any, message: Any, frame: str = "", covariance: Any = None) -> AttitudeSample:
+    variance = np.zeros(3) if covariance is None else np.asarray(covariance, dtype=np.float64)[[21, 28, 35]]
+    return _attitude(orientation, variance, frame or BASE, _is_ned(message))
+
+
+def _px4_odometry(message: Any) -> AttitudeSample:
+    attitude = _from_ned_frd(message.q, getattr(message, "orientation_variance", np.full(3, np.nan)))
+    return attitude if _px4_is_ned(message) else replace(attitude, problem="its frame is not North-East-Down")
 
 
 def _attitude(quaternion: Any, variance: Any, frame: str, ned: bool, unknown: bool = False) -> AttitudeSample:
@@ -264,7 +193,7 @@ def _attitude(quaternion: Any, variance: Any, frame: str, ned: bool, unknown: bo
     if ned and not problem:
         values = quat_xyzw_from_matrix(ENU_FROM_NED @ matrix_from_quat_xyzw(values))
     x, y, z, w = (float(value) for value in values)
-    return AttitudeSample((x, y, z, w), _sigma_deg(variance), frame, axes_of(frame), problem)
+    return AttitudeSample((x, y, z, w), _sigma_deg(variance), frame, body_axes(frame), problem)
 
 
 def _from_ned_frd(quat_wxyz: Any, variance: Any) -> AttitudeSample:
@@ -292,8 +221,37 @@ def _sigma_deg(variance: Any) -> float:
     return float(np.degrees(np.sqrt(values.mean()))) if values.mean() < np.pi**2 else math.nan
 
 
-TYPE = "tf2_msgs/msg/TFMessage"
-OLD_TYPE = "tf/msg/tfMessage"
+# Readers of positions and attitudes by message type, the preferred types first.
+POSITIONS: dict[str, Callable[[Any], PositionSample]] = {
+    "sensor_msgs/msg/NavSatFix": _fix,
+    "px4_msgs/msg/SensorGps": _sensor_gps,
+    "px4_msgs/msg/VehicleGlobalPosition": _global_position,
+    "nav_msgs/msg/Odometry": lambda m: _local(m.pose.pose.position, m, m.child_frame_id, m.pose.covariance),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": lambda m: _local(
+        m.pose.pose.position, m, covariance=m.pose.covariance
+    ),
+    "geometry_msgs/msg/PoseStamped": lambda m: _local(m.pose.position, m),
+    "px4_msgs/msg/VehicleOdometry": _px4_local,
+}
+# What heights count from in the types with latitude and longitude; the others are of a local frame.
+GEODETIC_HEIGHTS = {
+    "sensor_msgs/msg/NavSatFix": "ellipsoidal by the definition of NavSatFix",
+    "px4_msgs/msg/SensorGps": "PX4's altitude above the ellipsoid",
+    "px4_msgs/msg/VehicleGlobalPosition": "PX4's altitude above the ellipsoid",
+}
+ATTITUDES: dict[str, Callable[[Any], AttitudeSample]] = {
+    "sensor_msgs/msg/Imu": _imu,
+    "px4_msgs/msg/VehicleAttitude": lambda m: _from_ned_frd(m.q, np.full(3, np.nan)),
+    "nav_msgs/msg/Odometry": lambda m: _pose(m.pose.pose.orientation, m, m.child_frame_id, m.pose.covariance),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": lambda m: _pose(
+        m.pose.pose.orientation, m, covariance=m.pose.covariance
+    ),
+    "geometry_msgs/msg/PoseStamped": lambda m: _pose(m.pose.orientation, m),
+    "px4_msgs/msg/VehicleOdometry": _px4_odometry,
+}
+
+
+TRANSFORM_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _MAX_LINKS = 1000
 _MAX_STEPS = 64
 
@@ -326,7 +284,7 @@ class Transforms:
             values = (
                 stamp.sec + stamp.nanosec * 1e-9, shift.x, shift.y, shift.z, turn.x, turn.y, turn.z, turn.w,
             )  # fmt: skip
-            child, parent = _name(transform.child_frame_id), _name(transform.header.frame_id)
+            child, parent = transform.child_frame_id.lstrip("/"), transform.header.frame_id.lstrip("/")
             norm = float(np.linalg.norm(values[4:]))
             known = child in self._links or len(self._links) < _MAX_LINKS
             if not np.isfinite(values).all() or abs(norm - 1) > 0.05 or child == parent or not known:
@@ -342,8 +300,7 @@ class Transforms:
 
         Rows are NaN where a moving link on the way has no samples around the time.
         """
-        to, of = _name(to), _name(of)
-        up_to, up_of = self._ancestors(to), self._ancestors(of)
+        up_to, up_of = self._ancestors(to.lstrip("/")), self._ancestors(of.lstrip("/"))
         common = next((frame for frame in up_of if frame in up_to), None)
         if common is None:
             return None
@@ -383,7 +340,3 @@ def _at(link: _Link, time_s: FloatArray) -> tuple[FloatArray, FloatArray]:
     )
     there = motion.at(time_s)
     return there.rotation, there.position
-
-
-def _name(frame: str) -> str:
-    return frame.lstrip("/")

@@ -1,13 +1,9 @@
-"""Photographs out of a bag: which frames to take, and each as a file, one at a time.
-
-The calibrated camera that a `CameraInfo` states.
-"""
+"""Photographs out of a bag: which frames to take, each as a file, one at a time, and their lens."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +15,7 @@ from pipelines.core.types import FloatArray
 from pipelines.formats.bag import BadImageError, Bag, ImageWriter, UndecodableError, sharpness
 from pipelines.formats.exif import PhotoTags
 from pipelines.formats.image_file import MAX_PIXELS, inspect_image
-from pipelines.ingest.bag_streams import SampleTimes, SelectedTopics
+from pipelines.ingest.bag_streams import BagStreams, TopicSamples
 from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import Every, IngestOptions
 from pipelines.ingest.photo_folder import Photo, camera_priors
@@ -32,41 +28,9 @@ _LEAST_NEIGHBOURS = 3
 _STEP_SLACK_S = 1e-6
 
 
-@dataclass
-class _FrameChooser:
-    """Tells which frames are due."""
-
-    every: Every | None
-    last: FloatArray | None = None  # time, or place, of the frame taken last
-
-    def due(self, time_s: float, place: FloatArray | None) -> bool:
-        if self.every is None or self.last is None:
-            return self.every is None or self.every.unit == "s" or place is not None
-        if self.every.unit == "s":
-            return bool(time_s - self.last[0] >= self.every.step - _STEP_SLACK_S)
-        return place is not None and bool(np.linalg.norm(place - self.last) >= self.every.step)
-
-    def record(self, time_s: float, place: FloatArray | None) -> None:
-        self.last = place if self.every is not None and self.every.unit == "m" else np.array([time_s])
-
-
-class _BlurDetector:
-    """Judges sharpness against the frames looked at before, taken or not: a dull scene is not blurred for ever."""
-
-    def __init__(self) -> None:
-        self._recent: deque[float] = deque(maxlen=_NEIGHBOURS)
-
-    def blurred(self, data: bytes) -> bool:
-        current = sharpness(data)
-        usual = float(np.median(self._recent)) if len(self._recent) >= _LEAST_NEIGHBOURS else 0.0
-        self._recent.append(current)
-        return current < _BLURRED * usual
-
-
 def write_photos(
     bag: Bag,
-    topic: str,
-    clock: SampleTimes,
+    images: TopicSamples,
     place: FloatArray,
     *,
     options: IngestOptions,
@@ -74,35 +38,25 @@ def write_photos(
     notes: Notes,
     progress: Progress = SILENT,
 ) -> tuple[list[Photo], list[int]]:
-    """Write the chosen frames of `topic` into `folder` as `frame_nnnnnn.jpg` or `.png`, numbered as in the bag.
+    """Write the chosen frames into `folder` as `frame_nnnnnn.jpg` or `.png`, numbered as in the bag.
 
-    Args:
-        bag: open.
-        topic: of the photographs.
-        clock: times of the topic's messages.
-        place: (N, 3) Cartesian positions at those times, NaN where unknown.
-        options: which frames to take.
-        folder: to write into.
-        notes: frames that were left out.
-        progress: a step a message.
-
-    Returns:
-        The photographs, and the number of each one's message.
+    `place` (N, 3) has Cartesian positions at the times of the images, NaN where unknown. Photographs are returned
+    with the number of each one's message.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    writer, chooser, blur = ImageWriter(), _FrameChooser(options.every), _BlurDetector()
+    writer, topic, count = ImageWriter(), images.topic, len(images.time_s)
     photos: list[Photo] = []
     numbers: list[int] = []
     failed: list[str] = []
+    recent: deque[float] = deque(maxlen=_NEIGHBOURS)
     blurred, hashes, copies = 0, set(), 0
-    with progress.task("photographs", len(clock.time_s)) as task:
+    with progress.task("photographs", count) as task:
         for number, message in enumerate(bag.messages([topic])):
             task.advance()
-            if number >= len(clock.time_s) or not clock.usable[number]:
+            if number >= count or not images.usable[number]:
                 continue
-            time_s = float(clock.time_s[number])
-            position = place[number] if np.isfinite(place[number]).all() else None
-            if not chooser.due(time_s, position):
+            last = numbers[-1] if numbers else None
+            if options.every is not None and not _is_due(options.every, images.time_s, place, last, number):
                 continue
             try:
                 data, suffix = writer.encoded(message.type, bag.decode(message))
@@ -111,7 +65,7 @@ def write_photos(
             except (UndecodableError, BadImageError, InputError) as error:
                 failed.append(f"message {number} ({str(error)[:120]})")
                 continue
-            if options.skip_blurred and blur.blurred(data):
+            if options.skip_blurred and _is_blurred(data, recent):
                 blurred += 1
                 continue
             if file.sha256 in hashes:
@@ -119,9 +73,8 @@ def write_photos(
                 continue
             hashes.add(file.sha256)
             (folder / name).write_bytes(data)
-            photos.append(Photo(name, file, PhotoTags(timestamp_s=time_s)))
+            photos.append(Photo(name, file, PhotoTags(timestamp_s=float(images.time_s[number]))))
             numbers.append(number)
-            chooser.record(time_s, position)
     notes.warn_counted(failed, f"image of {topic} was left out", f"images of {topic} were left out")
     if blurred:
         notes.warn(f"{blurred} frames are blurred and were passed over")
@@ -132,43 +85,52 @@ def write_photos(
     return photos, numbers
 
 
+def _is_due(every: Every, time_s: FloatArray, place: FloatArray, last: int | None, number: int) -> bool:
+    """Return whether a frame is far enough from the one taken last; a frame without a place is not, in metres."""
+    if every.unit == "s":
+        return last is None or bool(time_s[number] - time_s[last] >= every.step - _STEP_SLACK_S)
+    if not np.isfinite(place[number]).all():
+        return False
+    return last is None or bool(np.linalg.norm(place[number] - place[last]) >= every.step)
+
+
+def _is_blurred(data: bytes, recent: deque[float]) -> bool:
+    """Judge sharpness against the frames looked at before, taken or not: a dull scene is not blurred for ever."""
+    current = sharpness(data)
+    usual = float(np.median(recent)) if len(recent) >= _LEAST_NEIGHBOURS else 0.0
+    recent.append(current)
+    return current < _BLURRED * usual
+
+
 def lens_priors(
-    photos: Sequence[Photo], topics: SelectedTopics, info: Any | None, options: IngestOptions, notes: Notes
+    photos: Sequence[Photo], streams: BagStreams, options: IngestOptions, notes: Notes
 ) -> tuple[tuple[CameraPrior, ...], dict[str, int]]:
     """Return one calibrated camera of all photographs, or else assumed ones; and the id of each one's camera.
 
-    Args:
-        photos: the photographs.
-        topics: whose names tell rectified images.
-        info: first `CameraInfo`.
-        options: `--focal-px` is stronger than the bag.
-        notes: how the lens was found.
+    The names of the topics tell rectified images. `--focal-px` is stronger than the bag's `CameraInfo`.
     """
     sizes = {(photo.file.width, photo.file.height) for photo in photos}
-    if info is None or options.focal_px is not None or len(sizes) != 1:
+    if streams.info is None or options.focal_px is not None or len(sizes) != 1:
         return camera_priors(photos, options.focal_px, notes)
-    rectified = "rect" in str(topics.image).rpartition("/")[2] or "_rect" in str(topics.image)
-    prior, remark = camera_prior(info, rectified)
+    topic = streams.images.topic
+    prior, remark = _camera_prior(streams.info, "rect" in topic.rpartition("/")[2] or "_rect" in topic)
     (width, height) = next(iter(sizes))
-    fitted = scaled_prior(prior, width, height) if prior is not None else None
+    fitted = _scaled_prior(prior, width, height) if prior is not None else None
     if prior is not None and fitted is None:
         remark = f"CameraInfo is of images of {prior.width}×{prior.height}, these are {width}×{height}"
     if fitted is None:
         notes.warn(f"{remark}: it is not used")
         return camera_priors(photos, options.focal_px, notes)
-    notes.assume(f"lens from {topics.info}: {remark}")
+    notes.assume(f"lens from {streams.info_topic}: {remark}")
     return (fitted,), {photo.name: 1 for photo in photos}
 
 
-def camera_prior(message: Any, rectified: bool) -> tuple[CameraPrior | None, str]:
+def _camera_prior(message: Any, rectified: bool) -> tuple[CameraPrior | None, str]:
     """Return the calibration of a `CameraInfo` and a remark on it; no prior where it is not calibrated.
 
-    ROS counts pixels from the centre of the first one, COLMAP from its corner.
-
-    Args:
-        message: the `CameraInfo`.
-        rectified: the images are rectified already: `p` applies, and no distortion is left.
+    Of rectified images `p` applies, and no distortion is left.
     """
+    # ROS counts pixels from the centre of the first one, COLMAP from its corner.
     matrix = _numbers(message, "p" if rectified else "k").reshape(3, -1)
     fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5
     width, height = int(message.width), int(message.height)
@@ -182,10 +144,8 @@ def camera_prior(message: Any, rectified: bool) -> tuple[CameraPrior | None, str
         name, lens = "", lens[:0]
     model, extra = _lens(name, lens)
     if model == "":
-        return (
-            None,
-            f"CameraInfo has distortion_model {name!r} with {len(lens)} coefficients, which is not supported",
-        )
+        remark = f"CameraInfo has distortion_model {name!r} with {len(lens)} coefficients, which is not supported"
+        return None, remark
     params = tuple(float(value) for value in (fx, fy, cx, cy, *extra))
     prior = CameraPrior(
         camera_id=1, model=model, width=width, height=height, params=params, focal_source="calibrated"
@@ -193,7 +153,7 @@ def camera_prior(message: Any, rectified: bool) -> tuple[CameraPrior | None, str
     return prior, f"CameraInfo ({state}): {model} with a focal length of {fx:.1f} px"
 
 
-def scaled_prior(prior: CameraPrior, width: int, height: int) -> CameraPrior | None:
+def _scaled_prior(prior: CameraPrior, width: int, height: int) -> CameraPrior | None:
     """Return the calibration for images of another size but the same shape; None if the shape differs."""
     factor = width / prior.width
     if abs(prior.height * factor - height) > 1.0:

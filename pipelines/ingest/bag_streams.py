@@ -1,15 +1,13 @@
-"""The small messages of a bag, read in one pass: stamps of the photographs, positions, attitudes, frames, lens.
+"""The small messages of a bag: which topics to read, and their samples, gathered in one pass and put on one clock.
 
 Photographs pass by undecoded here, so that memory does not grow with them.
-
-Which topics of a bag to use: by type, by rule where several fit, or as the user says.
 """
 
 from __future__ import annotations
 
 from array import array
 from collections import Counter
-from collections.abc import Container, Mapping
+from collections.abc import Container, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,21 +18,15 @@ from pipelines.core.errors import InputError
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.formats.bag import COMPRESSED, IMAGE, INFO, Bag, BagTopic, RawMessage, UndecodableError
-from pipelines.ingest import bag_messages as bag_transforms
-from pipelines.ingest.bag_messages import ATTITUDES, POSITIONS, Axes, Transforms, stamp_ns
+from pipelines.ingest.bag_messages import ATTITUDES, POSITIONS, TRANSFORM_TYPES, Axes, Transforms, stamp_ns
 from pipelines.ingest.notes import Notes
+from pipelines.ingest.options import IngestOptions
 
 # Pictures that are no photographs.
 _NOT_PHOTOS = ("depth", "disparity", "mask", "confidence", "segmentation", "thermal", "theora")
-
-
-@dataclass(frozen=True)
-class RequestedTopics:
-    """Topics that the user named."""
-
-    image: str | None = None
-    fix: str | None = None
-    attitude: str | None = None
+_DAY_NS = 86_400_000_000_000
+# A stamp this far off the others, against the recorder's clock, is no late message but a wrong clock.
+_JUMP_NS = 60_000_000_000
 
 
 @dataclass(frozen=True)
@@ -48,11 +40,11 @@ class SelectedTopics:
     remarks: tuple[str, ...]
 
 
-def select_topics(bag: Bag, requested: RequestedTopics) -> SelectedTopics:
-    """Select the topics to read.
+def select_topics(bag: Bag, options: IngestOptions) -> SelectedTopics:
+    """Select the topics to read: those that the options name, else by rule.
 
     Images: names that tell of depth, masks and the like come last, then topics with a `CameraInfo` beside them
-    first, then those with more messages. Positions and attitudes: by the order of types in `messages`
+    first, then those with more messages. Positions and attitudes: by the order of types in `bag_messages`
     (receivers before estimators before local frames), then those with more messages. Attitudes only where the
     first message has one. Equals go by name.
 
@@ -61,21 +53,28 @@ def select_topics(bag: Bag, requested: RequestedTopics) -> SelectedTopics:
     """
     remarks: list[str] = []
     images = sorted(_of(bag, (IMAGE, COMPRESSED)), key=lambda topic: _image_rank(bag, topic))
-    image = _pick(bag, images, requested.image, flag="--image-topic", subject="photographs", remarks=remarks)
-    fixes = sorted(_of(bag, POSITIONS), key=lambda topic: (POSITIONS[topic.type].rank, -topic.count, topic.name))
-    fix = _pick(bag, fixes, requested.fix, flag="--fix-topic", subject="positions", remarks=remarks)
-    attitudes = sorted(
-        _of(bag, ATTITUDES), key=lambda topic: (ATTITUDES[topic.type].rank, -topic.count, topic.name)
-    )
-    if requested.attitude is None:
+    image = _pick(bag, images, options.image_topic, flag="--image-topic", subject="photographs", remarks=remarks)
+    fixes = _by_type(bag, POSITIONS)
+    fix = _pick(bag, fixes, options.fix_topic, flag="--fix-topic", subject="positions", remarks=remarks)
+    attitudes = _by_type(bag, ATTITUDES)
+    if options.attitude_topic is None:
         attitudes = [topic for topic in attitudes if _has_attitude(bag, topic)]
     attitude = _pick(
-        bag, attitudes, requested.attitude, flag="--attitude-topic", subject="attitudes", remarks=remarks
+        bag, attitudes, options.attitude_topic, flag="--attitude-topic", subject="attitudes", remarks=remarks
     )
-    return SelectedTopics(image, info_topic(bag, image), fix, attitude, tuple(remarks))
+    return SelectedTopics(image, _info_topic(bag, image), fix, attitude, tuple(remarks))
 
 
-def info_topic(bag: Bag, image: str | None) -> str | None:
+def _of(bag: Bag, types: Container[str]) -> list[BagTopic]:
+    return [topic for topic in bag.topics.values() if topic.count and topic.type in types]
+
+
+def _by_type(bag: Bag, types: Iterable[str]) -> list[BagTopic]:
+    order = list(types)
+    return sorted(_of(bag, order), key=lambda topic: (order.index(topic.type), -topic.count, topic.name))
+
+
+def _info_topic(bag: Bag, image: str | None) -> str | None:
     """Return the `CameraInfo` of an image topic: in its namespace, or the only one."""
     infos = _of(bag, (INFO,))
     if image is not None:
@@ -87,20 +86,16 @@ def info_topic(bag: Bag, image: str | None) -> str | None:
     return infos[0].name if len(infos) == 1 else None
 
 
-def _of(bag: Bag, types: Container[str]) -> list[BagTopic]:
-    return [topic for topic in bag.topics.values() if topic.count and topic.type in types]
-
-
 def _image_rank(bag: Bag, topic: BagTopic) -> tuple[bool, bool, int, str]:
     name = topic.name.lower()
-    beside = info_topic(bag, topic.name)
+    beside = _info_topic(bag, topic.name)
     near = beside is not None and topic.name.startswith(beside.removesuffix("camera_info"))
     return any(word in name for word in _NOT_PHOTOS), not near, -topic.count, topic.name
 
 
 def _has_attitude(bag: Bag, topic: BagTopic) -> bool:
     message = bag.first(topic.name)
-    return message is not None and not ATTITUDES[topic.type].read(message).problem
+    return message is not None and not ATTITUDES[topic.type](message).problem
 
 
 def _pick(
@@ -119,24 +114,18 @@ def _pick(
     return names[0] if names else None
 
 
-DAY_NS = 86_400_000_000_000
-# A stamp this far off the others, against the recorder's clock, is no late message but a wrong clock.
-_JUMP_NS = 60_000_000_000
-
-
 @dataclass
 class TopicSamples:
     """Samples of one topic in the order of recording.
 
     Attributes:
-        topic: its name.
-        type: of its messages.
         stamps: nanoseconds of the message's own clock; 0 where it has none.
         bag_times: nanoseconds of the recorder's clock.
         values: `width` numbers a sample.
         receivers: the kind of receiver of each sample.
         frame: of the first sample; `world`: its local frame; `axes`: of the frame.
         problems: how many messages were left out, by reason.
+        time_s: (N,) seconds on the clock of all topics, once all are read; `usable`: (N,) which of them are.
     """
 
     topic: str
@@ -150,6 +139,8 @@ class TopicSamples:
     world: str = ""
     axes: Axes = "flu"
     problems: Counter[str] = field(default_factory=Counter)
+    time_s: FloatArray = field(default_factory=lambda: np.empty(0))
+    usable: BoolArray = field(default_factory=lambda: np.empty(0, dtype=bool))
 
     def add(self, stamp: int | None, bag_ns: int, values: tuple[float, ...] = (), receiver: str = "") -> None:
         """Append a sample."""
@@ -158,17 +149,14 @@ class TopicSamples:
         self.values.extend(values)
         self.receivers.append(receiver)
 
+    @property
+    def messages(self) -> int:
+        """Number of messages, with those that were left out."""
+        return len(self.stamps) + sum(self.problems.values())
+
     def table(self) -> FloatArray:
         """Return the values (N, width)."""
         return np.frombuffer(self.values, dtype=np.float64).reshape(-1, self.width)
-
-
-@dataclass(frozen=True)
-class SampleTimes:
-    """When the samples of a topic were taken: seconds (N,), and which of them are usable (N,)."""
-
-    time_s: FloatArray
-    usable: BoolArray
 
 
 @dataclass(frozen=True)
@@ -176,60 +164,65 @@ class BagStreams:
     """The small messages of a bag.
 
     Attributes:
-        path: of the bag.
-        images: stamps of every message of the image topic; `image_frame`: frame of the first.
+        images: stamps of every message of the image topic; its frame is that of the first.
         positions: latitude, longitude, height (or east, north, up) and their σ.
         attitudes: quaternion xyzw frame → East-North-Up, and σ in degrees.
-        transforms: the frames.
         info: first `CameraInfo`, or None.
-        clocks: when the samples were taken, by topic.
     """
 
     path: Path
     images: TopicSamples
-    image_frame: str
     positions: TopicSamples | None
     attitudes: TopicSamples | None
     transforms: Transforms
     info: Any | None
-    clocks: Mapping[str, SampleTimes]
+    info_topic: str | None
 
 
-def read_streams(bag: Bag, topics: SelectedTopics, notes: Notes, progress: Progress = SILENT) -> BagStreams:
-    """Read everything but the pictures; messages that cannot be used are counted and noted."""
-    assert topics.image is not None
-    images = _series(bag, topics.image, 0)
-    positions = None if topics.fix is None else _series(bag, topics.fix, 6)
-    attitudes = None if topics.attitude is None else _series(bag, topics.attitude, 5)
-    transforms, image_frame, info = Transforms(), "", None
-    kinds = (bag_transforms.TYPE, bag_transforms.OLD_TYPE)
-    frames = [topic.name for topic in bag.topics.values() if topic.type in kinds]
+def read_streams(bag: Bag, options: IngestOptions, notes: Notes, progress: Progress = SILENT) -> BagStreams:
+    """Read everything but the pictures; messages that cannot be used are counted and noted.
+
+    Raises:
+        InputError: no photographs, or a named topic that does not fit.
+    """
+    topics = select_topics(bag, options)
+    if topics.image is None:
+        problem = "has no topic of sensor_msgs/Image or CompressedImage: see `georef inspect`"
+        raise InputError(problem, path=bag.path)
+    notes.assume(
+        f"topics: photographs from {topics.image}, lens from {topics.info or 'none'}, positions from "
+        f"{topics.fix or 'none'}, attitudes from {topics.attitude or 'none'}"
+    )
+    for remark in topics.remarks:
+        notes.assume(remark)
+    images, positions, attitudes = (
+        None if topic is None else TopicSamples(topic, bag.topics[topic].type, width)
+        for topic, width in ((topics.image, 0), (topics.fix, 6), (topics.attitude, 5))
+    )
+    assert images is not None
+    transforms, info = Transforms(), None
+    frames = [topic.name for topic in bag.topics.values() if topic.type in TRANSFORM_TYPES]
     wanted = {topics.image, *frames, *filter(None, (topics.info, topics.fix, topics.attitude))}
     undecodable: dict[str, list[str]] = {}
-    total = sum(bag.topics[name].count for name in wanted)
-    with progress.task("bag", total) as task:
+    with progress.task("bag", sum(bag.topics[name].count for name in wanted)) as task:
         for message in bag.messages(wanted):
             task.advance()
             try:
                 if message.topic == images.topic:
                     images.add(bag.header_stamp_ns(message), message.bag_ns)
-                    image_frame = image_frame or _frame(bag, message)
+                    images.frame = images.frame or _frame(bag, message)
                 elif message.topic == topics.info:
                     info = info or bag.decode(message)
                 elif message.topic in frames:
                     transforms.add(bag.decode(message), static=message.topic.endswith("static"))
                 else:
-                    _navigation(bag, message, positions, attitudes)
+                    _add_navigation(bag.decode(message), message, positions, attitudes)
             except UndecodableError as error:
                 undecodable.setdefault(message.topic, []).append(str(error)[:120])
     series = [samples for samples in (images, positions, attitudes) if samples is not None]
     _note_losses(bag, series, undecodable, transforms.refused, notes)
-    clocks = settle_clocks(series, notes)
-    return BagStreams(bag.path, images, image_frame, positions, attitudes, transforms, info, clocks)
-
-
-def _series(bag: Bag, topic: str, width: int) -> TopicSamples:
-    return TopicSamples(topic, bag.topics[topic].type, width)
+    _settle_clocks(series, notes)
+    return BagStreams(bag.path, images, positions, attitudes, transforms, info, topics.info)
 
 
 def _note_losses(
@@ -240,7 +233,7 @@ def _note_losses(
     if refused:
         notes.warn(f"{refused} transforms in /tf are not finite or not possible and were left out")
     if bag.damage is not None:
-        count = sum(_count(samples) for samples in series)
+        count = sum(samples.messages for samples in series)
         notes.warn(f"{bag.path.name} is damaged: it could be read for {count} messages only ({bag.damage})")
     if bag.fallback_types:
         notes.assume(
@@ -248,7 +241,7 @@ def _note_losses(
         )
     for samples in series:
         for problem, count in samples.problems.items():
-            notes.warn(f"{count} of {_count(samples)} messages of {samples.topic} were left out: {problem}")
+            notes.warn(f"{count} of {samples.messages} messages of {samples.topic} were left out: {problem}")
 
 
 def _frame(bag: Bag, message: RawMessage) -> str:
@@ -259,16 +252,12 @@ def _frame(bag: Bag, message: RawMessage) -> str:
         return ""
 
 
-def _count(series: TopicSamples) -> int:
-    return len(series.stamps) + sum(series.problems.values())
-
-
-def _navigation(
-    bag: Bag, message: RawMessage, positions: TopicSamples | None, attitudes: TopicSamples | None
+def _add_navigation(
+    decoded: Any, message: RawMessage, positions: TopicSamples | None, attitudes: TopicSamples | None
 ) -> None:
-    decoded = bag.decode(message)
+    """Add a message to the positions, the attitudes, or both: one topic may have both."""
     if positions is not None and message.topic == positions.topic:
-        position = POSITIONS[message.type].read(decoded)
+        position = POSITIONS[message.type](decoded)
         if position.problem:
             positions.problems[position.problem] += 1
         else:
@@ -277,7 +266,7 @@ def _navigation(
             values = (*position.place, *position.sigma_enu_m)
             positions.add(stamp_ns(decoded), message.bag_ns, values, position.receiver)
     if attitudes is not None and message.topic == attitudes.topic:
-        attitude = ATTITUDES[message.type].read(decoded)
+        attitude = ATTITUDES[message.type](decoded)
         if attitude.problem:
             attitudes.problems[attitude.problem] += 1
         else:
@@ -286,8 +275,8 @@ def _navigation(
             attitudes.add(stamp_ns(decoded), message.bag_ns, (*attitude.quat_xyzw, attitude.sigma_deg))
 
 
-def settle_clocks(series: list[TopicSamples], notes: Notes) -> dict[str, SampleTimes]:
-    """Return times on one clock for all topics, in seconds: the messages' own stamps, where they have any.
+def _settle_clocks(series: list[TopicSamples], notes: Notes) -> None:
+    """Put the samples of all topics on one clock, in seconds: the messages' own stamps, where they have any.
 
     Messages without a stamp get the time of recording. Topics that count from another epoch than the rest (since
     boot) are brought to the recorder's clock by the median difference; if all do (a simulator's time), they keep
@@ -302,9 +291,8 @@ def settle_clocks(series: list[TopicSamples], notes: Notes) -> dict[str, SampleT
         topic: int(np.median((stamp - bag)[stamp != 0])) if (stamp != 0).any() else 0
         for topic, (stamp, bag) in raw.items()
     }
-    other_epoch = {topic for topic in raw if len(raw[topic][0]) and abs(offset[topic]) > DAY_NS}
+    other_epoch = {topic for topic in raw if len(raw[topic][0]) and abs(offset[topic]) > _DAY_NS}
     mixed = bool(other_epoch) and len(other_epoch) < sum(len(stamp) > 0 for stamp, _ in raw.values())
-    clocks = {}
     for topic, (stamp, bag) in raw.items():
         without = int((stamp == 0).sum())
         if without:
@@ -321,8 +309,9 @@ def settle_clocks(series: list[TopicSamples], notes: Notes) -> dict[str, SampleT
         latest = np.maximum.accumulate(np.where(usable, time, np.iinfo(np.int64).min))
         backwards = usable & np.concatenate([[False], time[1:] <= latest[:-1]])
         _note_left_out(notes, backwards, topic, "have a stamp that is not later than one before")
-        clocks[topic] = SampleTimes(time / 1e9, usable & ~backwards)
-    return clocks
+        for samples in series:
+            if samples.topic == topic:  # positions and attitudes may be of one topic
+                samples.time_s, samples.usable = time / 1e9, usable & ~backwards
 
 
 def _note_left_out(notes: Notes, bad: BoolArray, topic: str, reason: str) -> None:

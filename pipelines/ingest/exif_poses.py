@@ -1,6 +1,4 @@
-"""Poses of images from the photographs' own tags: EXIF, and DJI's XMP.
-
-Positions of a table against those in the photographs' EXIF, image by image, in view of the σ of both.
+"""Poses of images from the photographs' own tags, EXIF and DJI's XMP, and a table's positions against these.
 
 EXIF is not used where a table is given. But two receivers that disagree by far more than their σ are a
 contradiction that nothing later would notice: heights in feet, another zone, exchanged axes, times that are off.
@@ -24,9 +22,9 @@ from pipelines.formats.trajectory_csv import complete
 from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import ecef_from_enu_rotation, ecef_from_lla, lla_from_ecef
 from pipelines.geodesy.operations import WGS84
-from pipelines.geodesy.vertical import FOOT_M, MOST_GEOID_M, assumed_ellipsoidal
+from pipelines.geodesy.vertical import ELLIPSOIDAL, FOOT_M, MOST_GEOID_M, VerticalDatum
 from pipelines.geometry.rotations import geo_from_cam
-from pipelines.ingest.image_poses import AttitudeSource, ImagePoses, with_defaults
+from pipelines.ingest.flight_record import ImagePoses, with_defaults
 from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo
@@ -35,7 +33,14 @@ from pipelines.robust.statistics import mad_sigma
 
 # Vertical over horizontal σ of a fix that states only the horizontal one.
 _VERTICAL_RATIO = 2.0
+_RECEIVER = {RTK_FIXED: "RTK fixed", RTK_FLOAT: "RTK float"}
 _EXIF_NOTE = "EXIF altitude, which is often above a geoid or barometric, taken as ellipsoidal: see --vertical"
+_SIGMAS, _LEAST_M = 4.0, 1.0
+_MOST_CONTRADICTING = 1 / 3
+# Another unit shows if heights differ by this many times what σ allow, and that unit leaves this part of a height.
+_EVIDENT, _UNIT_PART = 2.0, 0.05
+_KILOMETRES_M = 2_000.0
+_LEAST_TIMED = 6  # photographs, for a velocity
 
 
 def poses_from_tags(photos: Sequence[Photo], options: IngestOptions, notes: Notes) -> ImagePoses:
@@ -44,7 +49,10 @@ def poses_from_tags(photos: Sequence[Photo], options: IngestOptions, notes: Note
     Raises:
         InputError: `--vertical` names a geoid whose grid is missing.
     """
-    xyz = np.array([_lon_lat_alt(photo.tags) for photo in photos])
+    xyz = np.full((len(photos), 3), np.nan)
+    for row, photo in enumerate(photos):
+        if photo.tags.gps is not None:
+            xyz[row] = photo.tags.gps.lon_deg, photo.tags.gps.lat_deg, _or_nan(altitude_m(photo.tags))
     located = complete(xyz)
     flat = [photo.name for photo in photos if photo.tags.gps is not None and altitude_m(photo.tags) is None]
     notes.warn_counted(
@@ -57,21 +65,22 @@ def poses_from_tags(photos: Sequence[Photo], options: IngestOptions, notes: Note
     position_in_ecef = np.full((len(photos), 3), np.nan)
     position_in_ecef[located] = ecef_from_lla(crs.lla_from_xyz(xyz[located]))
     stated = np.array([_stated_sigma(photo.tags) for photo in photos])
-    receivers = tuple(_receiver(photo.tags) for photo in photos)
+    flags = [0 if photo.tags.dji is None else photo.tags.dji.rtk_flag or 0 for photo in photos]
+    receivers = tuple(_RECEIVER.get(flag, "single-frequency") for flag in flags)
     sigma, sigma_source = with_defaults(stated, receivers, located, options, notes)
-    gimbal: list[AttitudeSource] = ["gimbal" for _ in photos]
+    assumed = VerticalDatum(name=ELLIPSOIDAL, stated=False, note=_EXIF_NOTE)
     return ImagePoses(
         position_in_ecef=position_in_ecef,
         sigma_enu_m=sigma,
         sigma_source=sigma_source,
         receivers=receivers,
         enu_from_cam=gimbal_attitudes(photos),
-        attitude_source=tuple(gimbal),
+        attitude_source=tuple("gimbal" for _ in photos),
         sigma_attitude_deg=np.full(len(photos), np.nan),
         time_s=photo_times(photos),
         source="exif",
         crs_name=WGS84,
-        vertical=crs.vertical if crs.vertical.stated else assumed_ellipsoidal(_EXIF_NOTE),
+        vertical=crs.vertical if crs.vertical.stated else assumed,
     )
 
 
@@ -99,11 +108,6 @@ def gimbal_attitudes(photos: Sequence[Photo]) -> FloatArray:
     return enu_from_cam
 
 
-def _lon_lat_alt(tags: PhotoTags) -> tuple[float, float, float]:
-    gps = tags.gps
-    return (np.nan, np.nan, np.nan) if gps is None else (gps.lon_deg, gps.lat_deg, _or_nan(altitude_m(tags)))
-
-
 def _stated_sigma(tags: PhotoTags) -> FloatArray:
     """Return σ east, north, up (3,) that the tags state, NaN if none."""
     if tags.dji is not None and tags.dji.rtk_sigma_enu_m is not None:
@@ -113,34 +117,14 @@ def _stated_sigma(tags: PhotoTags) -> FloatArray:
     return np.full(3, np.nan)
 
 
-def _receiver(tags: PhotoTags) -> str:
-    flag = None if tags.dji is None else tags.dji.rtk_flag
-    return {RTK_FIXED: "RTK fixed", RTK_FLOAT: "RTK float"}.get(flag or 0, "single-frequency")
-
-
 def _or_nan(value: float | None) -> float:
     return np.nan if value is None else value
-
-
-_SIGMAS, _LEAST_M = 4.0, 1.0
-_MOST_CONTRADICTING = 1 / 3
-# Another unit shows if heights differ by this many times what σ allow, and that unit leaves this part of a height.
-_EVIDENT, _UNIT_PART = 2.0, 0.05
-_KILOMETRES_M = 2_000.0
-_LEAST_TIMED = 6  # photographs, for a velocity
 
 
 def compare_with_exif(
     poses: ImagePoses, photos: Sequence[Photo], path: Path, options: IngestOptions, notes: Notes
 ) -> None:
-    """Compare the positions of a table with those of EXIF.
-
-    Args:
-        poses: by the table.
-        photos: the photographs.
-        path: of the table.
-        options: of `ingest`.
-        notes: cautions of what differs.
+    """Compare the positions of a table, whose file is `path`, with those of EXIF; what differs is a caution.
 
     Raises:
         ContradictionError: most positions differ beyond the σ of both, and the options do not accept that.
@@ -165,9 +149,9 @@ def compare_with_exif(
         sigma_m=sigma[:, :2],
         time_s=exif.time_s[both],
     )
-    heights = _heights(np.column_stack([in_table, lla[:, 2]]), apart[:, 2], sigma[:, 2], path)
-    found = [*_horizontal(places, path), *heights]
-    for fatal, caution in found:
+    heights_m = np.column_stack([in_table, lla[:, 2]])
+    found = (_horizontal(places, path), _heights(heights_m, apart[:, 2], sigma[:, 2], path))
+    for fatal, caution in filter(None, found):
         if fatal and not options.accept_contradiction:
             raise ContradictionError(
                 f"{path}: {caution.sentence}. Correct what is wrong, or go on with --accept-contradiction"
@@ -185,31 +169,25 @@ class _Places:
     sigma_m: FloatArray  # (n, 2)
     time_s: FloatArray  # (n,) NaN where unknown
 
-    @property
-    def apart(self) -> FloatArray:
-        return self.table - self.exif
 
-
-def _horizontal(places: _Places, path: Path) -> list[tuple[bool, Caution]]:
-    distance = np.hypot(*places.apart.T)
+def _horizontal(places: _Places, path: Path) -> tuple[bool, Caution] | None:
+    """Return the caution of positions that differ, and whether it is fatal."""
+    distance = np.hypot(*(places.table - places.exif).T)
     allowed = np.maximum(_SIGMAS * np.hypot(*places.sigma_m.T), _LEAST_M)
     contradicting = distance > allowed
     if contradicting.mean() <= _MOST_CONTRADICTING:
-        return []
+        return None
     cause = _cause(places, float(np.median(distance)), float(np.median(allowed)) / _SIGMAS)
     sentence = f"{int(contradicting.sum())} of {len(distance)} positions in {path.name} {cause}"
-    return [(True, Caution(code="table-against-exif", sentence=sentence))]
+    return True, Caution(code="table-against-exif", sentence=sentence)
 
 
 def _cause(places: _Places, typical_m: float, sigma_m: float) -> str:
-    """Return how most positions differ, by the first pattern that leaves less than half of the difference.
+    """Return how most positions differ, by the first pattern that leaves less than half of the median distance.
 
-    Args:
-        places: of table and EXIF.
-        typical_m: median distance between both.
-        sigma_m: σ of that distance.
+    `sigma_m` is the σ of that distance.
     """
-    apart, names = places.apart, places.name
+    apart, names = places.table - places.exif, places.name
     if typical_m > _KILOMETRES_M:
         return f"are {typical_m / 1000:.0f} km from those in EXIF: another CRS or zone, or exchanged axes?"
     if scatter_about_median(apart) < 0.2 * typical_m:
@@ -252,7 +230,7 @@ def _clock_offset(places: _Places) -> float | None:
     if len(order) < _LEAST_TIMED or not np.isfinite(time_s).all() or np.diff(time_s).min() <= 0.0:
         return None
     velocity = np.gradient(places.exif[order], time_s, axis=0)
-    apart = places.apart[order]
+    apart = (places.table - places.exif)[order]
     offset = float((velocity * apart).sum() / max((velocity**2).sum(), 1e-9))
     left = scatter_about_median(apart - offset * velocity)
     return offset if left < 0.5 * scatter_about_median(apart) else None
@@ -260,23 +238,20 @@ def _clock_offset(places: _Places) -> float | None:
 
 def _heights(
     heights_m: FloatArray, apart_m: FloatArray, sigma_m: FloatArray, path: Path
-) -> list[tuple[bool, Caution]]:
-    """Compare heights (n, 2) of table and EXIF, which are apart (n,), with the σ (n,) of both."""
+) -> tuple[bool, Caution] | None:
+    """Return the caution of heights (n, 2) of table and EXIF that are too far apart (n,) for the σ (n,) of both."""
     offset, spread = float(np.median(apart_m)), mad_sigma(apart_m)
     allowed = max(_SIGMAS * float(np.median(sigma_m)), _LEAST_M)
     if abs(offset) <= allowed:
-        return []
-    for factor, cause in (
-        (FOOT_M, "in feet, and taken for metres"),
-        (1 / FOOT_M, "in metres, and taken for feet"),
-    ):
+        return None
+    for factor, cause in ((FOOT_M, "in feet, and taken for metres"), (1 / FOOT_M, "in metres, and taken for feet")):
         left = abs(float(np.median(heights_m[:, 0] * factor - heights_m[:, 1])))
         tolerance = max(_UNIT_PART * abs(float(np.median(heights_m[:, 1]))), allowed / _SIGMAS)
         if abs(offset) > _EVIDENT * allowed and left < tolerance:
             sentence = f"the heights in {path.name} are {cause}: those in EXIF are {factor:.4g} times as large"
-            return [(True, Caution(code="feet", sentence=sentence))]
+            return True, Caution(code="feet", sentence=sentence)
     sentence = (
         f"the heights in {path.name} differ from those in EXIF by {offset:+.1f} m (± {spread:.1f} m): one is above "
         "the ellipsoid, the other above a geoid, the take-off or a barometer's zero; see --vertical"
     )
-    return [(abs(offset) > MOST_GEOID_M, Caution(code="heights-apart", sentence=sentence))]
+    return abs(offset) > MOST_GEOID_M, Caution(code="heights-apart", sentence=sentence)

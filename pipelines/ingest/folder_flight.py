@@ -1,23 +1,31 @@
-"""A flight out of a folder of photographs, with or without a table of poses."""
+"""A flight out of a folder of photographs: with their tags alone, with a table of poses, or with DJI's events.
+
+Events are tied to photographs by the number in a photograph's name.
+"""
 
 from __future__ import annotations
 
-from pathlib import Path
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from pipelines.core.errors import InputError
+from pipelines.core.errors import ContradictionError, InputError
 from pipelines.core.progress import SILENT, Progress
-from pipelines.core.types import FloatArray
-from pipelines.formats.gnss_logs import read_mrk
+from pipelines.core.types import FloatArray, IntArray
+from pipelines.formats.gnss_logs import FIRST_LINE, CameraEvents, read_mrk, read_pos
 from pipelines.formats.ground_points import read_geo
-from pipelines.formats.trajectory_csv import PoseTable
+from pipelines.formats.metashape import HEADER, REFERENCE, read_cameras
+from pipelines.formats.tables import beginning
+from pipelines.formats.trajectory_csv import PoseTable, read_trajectory
+from pipelines.geodesy.enu import ecef_from_enu_rotation, lla_from_ecef
 from pipelines.geometry.trajectory import Rig, Trajectory
-from pipelines.ingest.camera_events import at_times_of_events, event_of_each, from_antenna_to_camera, read_positions
 from pipelines.ingest.exif_poses import poses_from_tags
-from pipelines.ingest.image_poses import ImagePoses
-from pipelines.ingest.navigation import (
+from pipelines.ingest.flight_record import (
     FlightRecord,
+    ImagePoses,
     RecordedNavigation,
     at_cameras,
     body_mount,
@@ -29,23 +37,30 @@ from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo, camera_priors, scan_folder
 from pipelines.ingest.table_poses import poses_from_table
 
+_EVENT_NUMBER = re.compile(r"(?<!\d)\d{4}(?!\d)")  # DJI_20240501120000_0007_V, DJI_0007, 100_0042_0007
+# The camera's clock has whole seconds and may be hours off, but runs evenly: a photograph counted wrongly shows.
+_MOST_SPREAD_S = 3.0
+
 
 def read_folder(
     folder: Path, options: IngestOptions, notes: Notes, progress: Progress = SILENT, *, decode: bool = True
 ) -> FlightRecord:
-    """Read photographs, and the trajectory or `geo.txt` that the options name.
-
-    Args:
-        folder: of the photographs.
-        options: of `ingest`.
-        notes: what is assumed and doubtful.
-        progress: a step a photograph.
-        decode: as of `scan_folder`.
+    """Read photographs, and the trajectory or `geo.txt` that the options name; `decode` as of `scan_folder`.
 
     Raises:
+        ContradictionError: the files contradict each other.
         InputError: anything wrong with the files, or too few photographs.
     """
-    photos = _usable_photos(folder, notes, progress, decode=decode)
+    photos = scan_folder(folder, notes, progress, decode=decode)
+    require_enough(len(photos), folder, "--images", notes)
+    for problem in sorted({problem for photo in photos for problem in photo.tags.problems}):
+        with_it = [photo.name for photo in photos if problem in photo.tags.problems]
+        notes.warn_counted(with_it, f"image where {problem}", f"images where {problem}")
+    notes.warn_counted(
+        [photo.name for photo in photos if photo.tags.orientation != 1],
+        "image has an EXIF orientation, which is ignored: pixels count as stored",
+        "images have an EXIF orientation, which is ignored: pixels count as stored",
+    )
     poses = _poses(photos, options, notes)
     if options.time_offset_s and poses.recorded is None:
         raise InputError(
@@ -61,38 +76,126 @@ def read_folder(
     return FlightRecord(folder.resolve(), photos, cameras, camera_of, poses, navigation)
 
 
-def _usable_photos(folder: Path, notes: Notes, progress: Progress, *, decode: bool) -> list[Photo]:
-    photos = scan_folder(folder, notes, progress, decode=decode)
-    require_enough(photos, folder, "--images", notes)
-    for problem in sorted({problem for photo in photos for problem in photo.tags.problems}):
-        names = [photo.name for photo in photos if problem in photo.tags.problems]
-        notes.warn_counted(names, f"image where {problem}", f"images where {problem}")
-    notes.warn_counted(
-        [photo.name for photo in photos if photo.tags.orientation != 1],
-        "image has an EXIF orientation, which is ignored: pixels count as stored",
-        "images have an EXIF orientation, which is ignored: pixels count as stored",
-    )
-    return photos
-
-
 def _poses(photos: list[Photo], options: IngestOptions, notes: Notes) -> ImagePoses:
-    table = _pose_table(photos, options, notes)
-    if table is None:
+    if options.trajectory is not None:
+        table = _read_positions(options.trajectory, photos, notes)
+    elif options.geo is not None:
+        table = read_geo(options.geo)
+    else:
         return poses_from_tags(photos, options, notes)
     if options.events is None:
         return poses_from_table(table, photos, options, notes)
     if table.names is not None:
         raise InputError("is for a --trajectory by time: this one names its images", field="--events")
     events = read_mrk(options.events)
-    rows = event_of_each(events, photos, notes)
-    poses = poses_from_table(table, at_times_of_events(events, photos, rows), options, notes)
-    return from_antenna_to_camera(poses, events, rows)
+    rows = _event_of_each(events, photos, notes)
+    timed = []
+    for photo, row in zip(photos, rows, strict=True):
+        time_s = float(events.time_s[row]) if row >= 0 else None
+        timed.append(replace(photo, tags=replace(photo.tags, timestamp_s=time_s, time_source=None)))
+    poses = poses_from_table(table, timed, options, notes)
+    # From the antenna to the camera, by the events' offsets.
+    moved = np.flatnonzero(poses.located & (rows >= 0))
+    position = poses.position_in_ecef.copy()
+    ecef_from_enu = ecef_from_enu_rotation(lla_from_ecef(position[moved]))
+    position[moved] += np.einsum("nij,nj->ni", ecef_from_enu, events.camera_from_antenna_enu_m[rows[moved]])
+    return replace(poses, position_in_ecef=position, recorded=None)
 
 
-def _pose_table(photos: list[Photo], options: IngestOptions, notes: Notes) -> PoseTable | None:
-    if options.trajectory is not None:
-        return read_positions(options.trajectory, photos, notes)
-    return None if options.geo is None else read_geo(options.geo)
+def _read_positions(path: Path, photos: Sequence[Photo], notes: Notes) -> PoseTable:
+    """Read a table of poses; the kind of the file follows from its content, and is noted.
+
+    1. The first line begins with %: RTKLIB's solution.
+    2. The first line is an event of DJI's timestamp file: that.
+    3. A line begins with `#Label`: Metashape's reference.
+    4. Anything else: a CSV with a header.
+    """
+    lines = [line for line in beginning(path).splitlines() if line.strip()]
+    if lines and lines[0].startswith("%"):
+        notes.assume(f"{path.name} is read as RTKLIB's solution: positions of the antenna")
+        return read_pos(path)
+    if lines and FIRST_LINE.match(lines[0]):
+        notes.assume(f"{path.name} is read as DJI's timestamp file: positions of the camera, by photograph number")
+        return _positions_of_events(read_mrk(path), photos, notes)
+    if any(HEADER.match(line) for line in lines):
+        notes.assume(f"{path.name} is read as {REFERENCE}")
+        return read_cameras(path)
+    return read_trajectory(path)
+
+
+def _positions_of_events(events: CameraEvents, photos: Sequence[Photo], notes: Notes) -> PoseTable:
+    """Return the positions of the photographs' events, as a table by name."""
+    row_of_photo = _event_of_each(events, photos, notes)
+    rows = row_of_photo[row_of_photo >= 0]
+    return PoseTable(
+        path=events.path,
+        source="mrk",
+        lines=events.lines[rows],
+        names=tuple(photo.name for photo, row in zip(photos, row_of_photo, strict=True) if row >= 0),
+        time_s=events.time_s[rows],
+        xyz=events.lon_lat_alt[rows],
+        geographic=True,
+        sigma_enu_m=events.sigma_enu_m[rows],
+        receiver=events.receiver[rows],
+        assumed_crs="EPSG:4979",
+    )
+
+
+def _event_of_each(events: CameraEvents, photos: Sequence[Photo], notes: Notes) -> IntArray:
+    """Return the row of each photograph's event (N,), −1 without one; what did not fit is noted.
+
+    Raises:
+        InputError: one number in two folders, or no event fits.
+        ContradictionError: the times in EXIF are not those of the events.
+    """
+    row_of = {int(number): row for row, number in enumerate(events.number)}
+    rows = np.full(len(photos), -1)
+    for at, photo in enumerate(photos):
+        numbers = _EVENT_NUMBER.findall(PurePosixPath(photo.name).stem)
+        if numbers:
+            rows[at] = row_of.get(int(numbers[-1]), -1)
+    tied = [(photo, int(row)) for photo, row in zip(photos, rows, strict=True) if row >= 0]
+    folders = sorted({PurePosixPath(photo.name).parent.as_posix() for photo, _ in tied})
+    if not folders:
+        raise InputError(
+            f"has the events {events.number.min()} to {events.number.max()}, and no photograph has such a number "
+            f"in its name, as DJI_0007.JPG has: the folder has {photos[0].name!r} …",
+            path=events.path,
+        )
+    if len(folders) > 1:
+        raise InputError(
+            "counts the photographs of one flight, but its numbers occur in several folders "
+            f"({', '.join(folders[:3])}): take one folder and its file",
+            path=events.path,
+        )
+    _refuse_other_times(events, [(photo, row) for photo, row in tied if photo.tags.timestamp_s])
+    notes.warn_counted(
+        [photo.name for photo, row in zip(photos, rows, strict=True) if row < 0],
+        f"image has no event in {events.path.name}",
+        f"images have no event in {events.path.name}",
+    )
+    unused = np.setdiff1d(np.arange(len(events.number)), rows)
+    notes.warn_counted(
+        [f"{events.path.name}:{events.lines[row]}" for row in unused.tolist()],
+        "event has no photograph here",
+        "events have no photographs here",
+    )
+    return rows
+
+
+def _refuse_other_times(events: CameraEvents, timed: Sequence[tuple[Photo, int]]) -> None:
+    """Refuse events whose times are not those of their photographs, up to the offset of the camera's clock."""
+    if len(timed) < 2:
+        return
+    apart_s = np.array([events.time_s[row] - (photo.tags.timestamp_s or 0.0) for photo, row in timed])
+    off_s = np.abs(apart_s - np.median(apart_s))
+    if off_s.max() > _MOST_SPREAD_S:
+        worst = timed[int(off_s.argmax())][0].name
+        raise ContradictionError(
+            f"{events.path}: by number, {int((off_s > _MOST_SPREAD_S).sum())} of {len(timed)} photographs do not "
+            f"have the times of their events (EXIF of {worst}: {off_s.max():.0f} s off): is it the file of another "
+            "flight?"
+        )
 
 
 def _navigation(

@@ -34,12 +34,9 @@ class Notes:
             self.cautions.append(caution)
 
     def warn_counted(self, items: Sequence[str], singular: str, plural: str) -> None:
-        """Record one warning for all `items`, with their count and the first few; none if there are none.
+        """Record one warning for all items (files, or places as `file:line`), with their count and the first few.
 
-        Args:
-            items: file names or `file:line` places.
-            singular: the fault of one, e.g. "image is empty and was left out".
-            plural: the same for many, e.g. "images are empty and were left out".
+        The fault of one, e.g. "image is empty and was left out", is `singular`, and that of many is `plural`.
         """
         if items:
             self.warn(f"{len(items)} {singular if len(items) == 1 else plural}: {shortened(items)}")

@@ -1,7 +1,4 @@
-"""The options of `georef ingest`: what it reads, and what it assumes where the files are silent.
-
-Options of `ingest` that contradict each other, refused before anything is read.
-"""
+"""The options of `georef ingest`; those that contradict each other are refused before anything is read."""
 
 from __future__ import annotations
 
@@ -169,15 +166,7 @@ _BAG_ONLY = ("image_topic", "fix_topic", "attitude_topic", "every", "origin")
 
 
 def check_options(options: IngestOptions, frames: Path | None) -> None:
-    """Refuse options that make no survey.
-
-    Args:
-        options: of `ingest`.
-        frames: where the photographs of a bag can be written, or None.
-
-    Raises:
-        InputError: names the option.
-    """
+    """Refuse options that make no survey; photographs of a bag need a place, `frames`, to be written to."""
     if options.bag is not None:
         _check_bag(options, frames)
     elif given := [name for name in _BAG_ONLY if getattr(options, name) is not None]:

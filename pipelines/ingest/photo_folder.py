@@ -1,8 +1,6 @@
-"""A folder of photographs: which files are usable images, and their tags.
+"""A folder of photographs: which files are usable images, which of them a name in a table means, and their cameras.
 
-Which image a name in somebody's table means.
-
-Cameras before any reconstruction: focal length in pixels from a photograph's lens tags.
+Cameras are those before any reconstruction: focal length in pixels from a photograph's lens tags.
 """
 
 from __future__ import annotations
@@ -40,43 +38,38 @@ def scan_folder(root: Path, notes: Notes, progress: Progress = SILENT, *, decode
     Left out are files that are empty, damaged or too large, links that lead out of the folder, and all but the
     first of identical files. Hidden files and folders are not looked at.
 
-    Args:
-        root: the folder.
-        notes: files that are left out.
-        progress: a step a file.
-        decode: whether to decode each file to its end; otherwise its head alone is read, in about a millisecond.
+    Each file is decoded to its end; without `decode` its head alone is read, in about a millisecond.
 
     Raises:
         InputError: no such folder, or no JPEG, PNG or TIFF file in it.
     """
     if not root.is_dir():
         raise InputError("no such folder of photographs", path=root, field="--images")
-    paths = sorted(_candidates(root), key=lambda path: path.relative_to(root).as_posix())
-    inside = [path for path in paths if path.resolve().is_relative_to(root.resolve())]
+    names = sorted(path.relative_to(root).as_posix() for path in _candidates(root))
+    inside = [name for name in names if (root / name).resolve().is_relative_to(root.resolve())]
     notes.warn_counted(
-        [_name(path, root) for path in paths if path not in set(inside)],
+        sorted(set(names) - set(inside)),
         "image is a link that leaves the folder and was left out",
         "images are links that leave the folder and were left out",
     )
-    named = [path for path in inside if stays_inside(_name(path, root))]
+    usable = [name for name in inside if stays_inside(name)]
     notes.warn_counted(
-        [ascii(_name(path, root)) for path in inside if path not in set(named)],
+        [ascii(name) for name in sorted(set(inside) - set(usable))],
         "image has a name that is no text and was left out",
         "images have names that are no text and were left out",
     )
-    inside = named
-    if not inside:
+    if not usable:
         raise InputError("holds no JPEG, PNG or TIFF image", path=root, field="--images")
     photos: list[Photo] = []
     damaged: list[str] = []
     inspected = partial(_inspect, root=root, decode=decode)
-    with progress.task("images", len(inside)) as task, ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
-        for path, photo in zip(inside, pool.map(inspected, inside), strict=True):
+    with progress.task("images", len(usable)) as task, ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
+        for name, photo in zip(usable, pool.map(inspected, usable), strict=True):
             task.advance()
             if isinstance(photo, Photo):
                 photos.append(photo)
             else:
-                damaged.append(f"{_name(path, root)} ({photo})")
+                damaged.append(f"{name} ({photo})")
     notes.warn_counted(damaged, "image was left out", "images were left out")
     return _without_duplicates(photos, notes)
 
@@ -106,11 +99,12 @@ def _candidates(root: Path) -> Iterator[Path]:
                 yield Path(folder) / name
 
 
-def _inspect(path: Path, root: Path, *, decode: bool) -> Photo | str:
+def _inspect(name: str, root: Path, *, decode: bool) -> Photo | str:
     """Return the photograph, or the reason why it is none."""
+    path = root / name
     try:
         data = read_bytes(path) if decode else read_head(path)
-        return Photo(_name(path, root), inspect_image(data, path, decode=decode), read_tags(data))
+        return Photo(name, inspect_image(data, path, decode=decode), read_tags(data))
     except InputError as error:
         return str(error).removeprefix(f"{path}: ")
 
@@ -121,10 +115,6 @@ def _beginning(path: Path) -> bytes:
         return read_head(path)
     except InputError:
         return b""
-
-
-def _name(path: Path, root: Path) -> str:
-    return path.relative_to(root).as_posix()
 
 
 def _without_duplicates(photos: list[Photo], notes: Notes) -> list[Photo]:
@@ -157,33 +147,23 @@ class ImageNames:
                 form.setdefault(key, []).append(name)
 
     def find(self, text: str, *, path: Path, line: int) -> str | None:
-        """Return the image that `text` names, or None.
-
-        Args:
-            text: as the table has it; backslashes separate folders too.
-            path: the table, for errors.
-            line: its line, for errors.
+        """Return the image that `text` names, or None; backslashes separate folders too.
 
         Raises:
-            InputError: it leaves the image folder, or fits several images equally well.
+            InputError: it leaves the image folder, or fits several images equally well; names path and line.
         """
         name = text.strip().replace("\\", "/").removeprefix("./")
         pure = PurePosixPath(name)
         if pure.is_absolute() or ".." in pure.parts or name[1:2] == ":":
-            raise InputError(
-                f"{text!r} leaves the image folder: name images relative to it", path=path, line=line, field="image"
-            )
+            message = f"{text!r} leaves the image folder: name images relative to it"
+            raise InputError(message, path=path, line=line, field="image")
         if name in self._exact:
             return name
         for form, key in zip(self._forms, _keys(name), strict=True):
             candidates = form.get(key, [])
             if len(candidates) > 1:
-                raise InputError(
-                    f"{text!r} may be {' or '.join(candidates[:3])}: name it with its folder and suffix",
-                    path=path,
-                    line=line,
-                    field="image",
-                )
+                message = f"{text!r} may be {' or '.join(candidates[:3])}: name it with its folder and suffix"
+                raise InputError(message, path=path, line=line, field="image")
             if candidates:
                 return candidates[0]
         return None
@@ -214,11 +194,6 @@ def focal_px(tags: PhotoTags, width: int, height: int) -> tuple[float, FocalSour
     In this order: real focal length and the sensor's width in a table; real focal length and focal plane
     resolution (scaled by how much smaller the image is than when it was taken); 35 mm equivalent by the diagonal
     (CIPA DCG-001); else 0.85 of the longer side.
-
-    Args:
-        tags: of the photograph.
-        width: of the stored image in pixels.
-        height: of the stored image in pixels.
     """
     lens, long_side = tags.lens, max(width, height)
     sensor_mm = _SENSOR_WIDTH_MM.get(tags.model.strip().upper())
@@ -241,10 +216,7 @@ def camera_priors(
 ) -> tuple[tuple[CameraPrior, ...], dict[str, int]]:
     """Return a prior for each size, camera model and focal length; and the id of each image's camera by name.
 
-    Args:
-        photos: the images.
-        given_focal_px: focal length to use instead of EXIF's.
-        notes: how each focal length was found.
+    A given focal length counts instead of EXIF's. How each was found is noted.
     """
     cameras: dict[tuple[int, int, str, float], CameraPrior] = {}
     camera_of: dict[str, int] = {}

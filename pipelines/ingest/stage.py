@@ -17,11 +17,10 @@ from pipelines.core.progress import SILENT, Progress
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.ingest.bag_flight import count_frames, read_bag
 from pipelines.ingest.folder_flight import read_folder
-from pipelines.ingest.ground_points import list_ground_points, tie_ground_points
-from pipelines.ingest.navigation import FlightRecord
+from pipelines.ingest.ground_points import read_ground_files, tie_marks
 from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions, check_options
-from pipelines.ingest.survey_assembly import SurveyInputs, assemble_survey, nowhere
+from pipelines.ingest.survey_assembly import assemble_survey, require_placed
 from pipelines.survey.calibrated import NavigationTrack
 from pipelines.survey.survey import Survey
 
@@ -49,31 +48,23 @@ def run(stage: StageRun, options: IngestOptions) -> Summary:
 
 
 def check_inputs(workspace: Workspace, options: IngestOptions, progress: Progress = SILENT) -> Summary:
-    """Return the summary of what `run` would make; nothing is written.
+    """Return the summary of what `run` would make, or raise as `run`; nothing is written.
 
     Of photographs, sizes and tags are read: damage behind them is found by `run`. Of a bag, all but the pixels.
-
-    Raises:
-        InputError: as `run`.
     """
     _refuse_inside_photographs(workspace, options)
     if options.bag is None:
         return _summary(survey_and_track(options, None, progress, decode=False)[0])
     notes = Notes()
     check_options(options, workspace.root)
-    list_ground_points(options, notes)
+    read_ground_files(options, notes)
     frames, located = count_frames(options.bag, options, notes, progress)
-    if not located and options.gcp is None:
-        raise nowhere()
+    require_placed(located > 0 or options.gcp is not None)
     return Summary(f"a bag with {frames} frames, {located} of them with a position", {}, tuple(notes.warnings))
 
 
 def _refuse_inside_photographs(workspace: Workspace, options: IngestOptions) -> None:
-    """Refuse a workspace whose files would count as photographs.
-
-    Raises:
-        InputError: the workspace lies inside the folder of photographs.
-    """
+    """Refuse a workspace whose files would count as photographs."""
     if options.images is not None and workspace.root.resolve().is_relative_to(options.images.resolve()):
         message = "the workspace lies inside the folder of photographs: put it elsewhere"
         raise InputError(message, path=workspace.root)
@@ -82,46 +73,30 @@ def _refuse_inside_photographs(workspace: Workspace, options: IngestOptions) -> 
 def survey_and_track(
     options: IngestOptions, frames: Path | None, progress: Progress = SILENT, *, decode: bool = True
 ) -> tuple[Survey, NavigationTrack | None]:
-    """Return the survey, and the navigation in the same frame where it was recorded by time.
+    """Return the survey, and the navigation in the same frame where it was recorded by time; raises as `run`.
 
-    Args:
-        options: of `ingest`.
-        frames: where the photographs of a bag are written; without a bag, nothing is.
-        progress: whom to tell.
-        decode: whether to decode photographs to their end, as their hashes need; otherwise their heads are read.
-
-    Raises:
-        InputError: as `run`.
+    Photographs of a bag are written into `frames`; without a bag, nothing is. Photographs are decoded to their end,
+    as their hashes need; without `decode`, their heads are read.
     """
     notes = Notes()
-    inputs = _read_inputs(options, frames, notes, progress, decode=decode)
-    return assemble_survey(inputs, options, notes)
-
-
-def _read_inputs(
-    options: IngestOptions, frames: Path | None, notes: Notes, progress: Progress, *, decode: bool
-) -> SurveyInputs:
     check_options(options, frames)
     if options.estimated:
         notes.assume(
             f"{', '.join(options.estimated)}: as given, until `georef run` or `georef calibrate` has estimated it "
             "after sfm"
         )
-    ground = list_ground_points(options, notes)  # ahead of the photographs, which take minutes
-    flight = _read_flight(options, frames, notes, progress, decode=decode)
-    sizes = {photo.name: (photo.file.width, photo.file.height) for photo in flight.photos}
-    control, check = tie_ground_points(ground, sizes, options, notes)
-    return SurveyInputs(flight, control, check)
-
-
-def _read_flight(
-    options: IngestOptions, frames: Path | None, notes: Notes, progress: Progress, *, decode: bool
-) -> FlightRecord:
+    ground = read_ground_files(options, notes)  # ahead of the photographs, which take minutes
     if options.bag is not None and frames is not None:
-        return read_bag(options.bag, options, frames, notes, progress)
-    if options.images is not None:
-        return read_folder(options.images, options, notes, progress, decode=decode)
-    raise InputError("give the folder of photographs, or a --bag", field="--images")
+        flight = read_bag(options.bag, options, frames, notes, progress)
+    elif options.images is not None:
+        flight = read_folder(options.images, options, notes, progress, decode=decode)
+    else:
+        raise InputError("give the folder of photographs, or a --bag", field="--images")
+    sizes = {photo.name: (photo.file.width, photo.file.height) for photo in flight.photos}
+    control, check = (
+        None if file is None else tie_marks(file, sizes, options.sigma_mark, notes) for file in ground
+    )
+    return assemble_survey(flight, control, check, options, notes)
 
 
 def _copy_images(survey: Survey, stage: StageRun) -> None:

@@ -1,14 +1,13 @@
 """One survey in one frame out of everything that was read, and what is assumed and doubtful about it.
 
-Images and surveyed points as the survey records them: positions, attitudes and covariances in geo.
-
-Sessions of fixes that share one error, of a base station, a receiver or a day, and the σ of that error.
+Images and surveyed points get their positions, attitudes and covariances in geo. Fixes that share one error, of a
+base station, a receiver or a day, form a session, with the σ of that error.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -27,9 +26,15 @@ from pipelines.geodesy.enu import (
 )
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
-from pipelines.ingest.ground_points import GroundFile, GroundPoint, UnmarkedPoints, require_near, split_checks
-from pipelines.ingest.image_poses import RECEIVERS, ImagePoses, SigmaSource
-from pipelines.ingest.navigation import LEAST_IMAGES, FlightRecord
+from pipelines.ingest.flight_record import (
+    LEAST_IMAGES,
+    RECEIVERS,
+    FlightRecord,
+    ImagePoses,
+    SigmaSource,
+    track_in_geo,
+)
+from pipelines.ingest.ground_points import GroundFile, GroundPoint, require_near, split_checks, unmarked_points
 from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
 from pipelines.survey.calibrated import FIX_RANGE_M, NavigationTrack, require_estimable
@@ -37,22 +42,108 @@ from pipelines.survey.survey import Attitude, Fix, FixSession, Survey, SurveyedP
 
 SIGMA_GIMBAL_DEG = 2.0
 SIGMA_TABLE_ATTITUDE_DEG = 1.0
+# σ of the common error horizontal and vertical in metres, by kind of receiver. No file tells it: the σ in files are
+# those of single positions against the base station, not of the base station itself.
+COMMON_SIGMA_M = {
+    "RTK fixed": (0.03, 0.05),
+    "RTK float": (0.3, 0.6),
+    "single-frequency": (1.5, 3.0),
+    "unknown receiver": (2.0, 4.0),
+}
+# Gap in time after which the base station may stand elsewhere, and the satellites do.
+SESSION_GAP_S = 4 * 3600.0
+# Median σ, horizontal, up to which a receiver that does not tell its solution has had one of that kind.
+_FIXED_SIGMA_M, _FLOAT_SIGMA_M = 0.1, 1.0
+
+SigmaGroup = Literal["fixes", "control points", "marks", "attitudes"]
 
 
-def image_records(
+def assemble_survey(
+    flight: FlightRecord,
+    control: GroundFile | None,
+    check: GroundFile | None,
+    options: IngestOptions,
+    notes: Notes,
+) -> tuple[Survey, NavigationTrack | None]:
+    """Return the survey, and the navigation in the same frame where it was recorded by time.
+
+    The origin is the median of the image positions (of the control points if there are none), rounded to 10⁻⁵
+    degrees and a metre. Every `test_every`-th image by name is held out, beginning with the first.
+
+    Raises:
+        InputError: nothing has a position, points that are nowhere near the images or of both kinds, or a rig to
+            estimate without the navigation for it.
+    """
+    flight = replace(flight, poses=_without_far_fixes(flight, notes))
+    poses, files = flight.poses, [file for file in (control, check) if file is not None]
+    controls, checks = split_checks(control, check, options.check)
+    _require_checks(checks, options.vegetated)
+    marked, marked_checks = ([point for point in points if point.is_marked] for points in (controls, checks))
+    unmarked = unmarked_points(controls, checks, notes)
+    located = bool(poses.located.any())
+    if located:
+        middle_in_ecef = ecef_from_lla(median_lla(poses.located_lla))
+        for file in files:
+            require_near(file, middle_in_ecef)
+    origin = _origin(poses, marked)
+    _note_coverage(flight, len(marked), notes)
+    if options.test_every and not _held_out(len(flight.photos), options.test_every):
+        notes.warn(f"{len(flight.photos)} images are too few to hold any out for testing")
+    track = None if flight.navigation is None else track_in_geo(flight.navigation, origin)
+    if options.estimated:
+        require_estimable(track, options.estimated, "--estimate" if options.estimate else "--time-offset")
+    sessions, session_of = fix_sessions(poses, options, notes)
+    survey = Survey(
+        origin=origin,
+        source_crs=poses.crs_name if located or control is None else control.crs.name,
+        vertical=_vertical(poses, files, notes),
+        image_dir=str(flight.folder),
+        cameras=flight.cameras,
+        images=_images(flight, session_of, origin, options),
+        sessions=sessions,
+        control_points=_surveyed(marked, origin, options),
+        check_points=_surveyed(marked_checks, origin, options),
+        unmarked_points=tuple(
+            UnmarkedPoint(**record.model_dump(), use=use)
+            for use, points in unmarked.items()
+            for record in _surveyed(points, origin, options)
+        ),
+        assumptions=tuple(notes.assumptions),
+        warnings=tuple(notes.warnings),
+        cautions=tuple(notes.cautions),
+        estimate=options.estimated,
+        default_sigmas=_default_sigmas(poses, marked, options),
+    )
+    return survey, track
+
+
+def require_placed(placed: bool) -> None:
+    """Refuse a survey that nothing places on Earth."""
+    if not placed:
+        raise InputError(
+            "no image has a position, and there are no ground control points: give --trajectory, --geo or --gcp"
+        )
+
+
+def _require_checks(checks: Sequence[GroundPoint], vegetated: Sequence[str]) -> None:
+    """Refuse names of points under vegetation that are no check points."""
+    known = {point.name for point in checks}
+    for name in vegetated:
+        if name not in known:
+            raise InputError(
+                f"{name!r} is no check point: there are {', '.join(sorted(known)) or 'none'} (--checkpoints, "
+                "--check)",
+                field="--vegetated",
+            )
+
+
+def _images(
     flight: FlightRecord, session_of: IntArray, origin: Origin, options: IngestOptions
 ) -> tuple[SurveyImage, ...]:
-    """Return the photographs with fixes and attitudes in the frame at an origin, and their split.
-
-    Args:
-        flight: photographs and their measured poses.
-        session_of: (N,) session of each fix.
-        origin: of the frame.
-        options: of `ingest`.
-    """
+    """Return the photographs with fixes and attitudes in the frame at an origin, and their split."""
     poses = flight.poses
     fixes, attitudes = _fixes(poses, session_of, origin), _attitudes(poses, origin, options)
-    test = held_out(len(flight.photos), options.test_every)
+    test = _held_out(len(flight.photos), options.test_every)
     return tuple(
         SurveyImage(
             name=photo.name,
@@ -67,22 +158,25 @@ def image_records(
     )
 
 
-def held_out(count: int, every: int) -> range:
+def _held_out(count: int, every: int) -> range:
     """Return the rows of the test images: every N-th, none where that would leave too few to train on."""
     rows = range(0, count, every) if every else range(0)
     return rows if count - len(rows) >= LEAST_IMAGES else range(0)
 
 
-def point_records(
-    points: Sequence[GroundPoint], origin: Origin, options: IngestOptions
-) -> tuple[SurveyedPoint, ...]:
-    """Return control or check points in the frame at an origin."""
+def _surveyed(points: Sequence[GroundPoint], origin: Origin, options: IngestOptions) -> tuple[SurveyedPoint, ...]:
+    """Return ground points in the frame at an origin; σ by precedence: option, then file, then default."""
     if not points:
         return ()
+    stated = options.model_fields_set
+    sigma_m = []
+    for point in points:
+        horizontal_m = (None if "sigma_gcp_h" in stated else point.sigma_h_m) or options.sigma_gcp_h
+        vertical_m = (None if "sigma_gcp_v" in stated else point.sigma_v_m) or options.sigma_gcp_v
+        sigma_m.append((horizontal_m, horizontal_m, vertical_m))
     position_in_ecef = np.array([point.position_in_ecef for point in points])
     position = enu_from_ecef(position_in_ecef, origin)
-    sigma_m = np.array([_sigma_enu_m(point, options) for point in points])
-    covariance = _turned(sigma_m, position_in_ecef, origin)
+    covariance = _turned(np.array(sigma_m), position_in_ecef, origin)
     return tuple(
         SurveyedPoint(
             name=point.name,
@@ -93,23 +187,6 @@ def point_records(
         )
         for row, point in enumerate(points)
     )
-
-
-def unmarked_records(points: UnmarkedPoints, origin: Origin, options: IngestOptions) -> tuple[UnmarkedPoint, ...]:
-    """Return points without enough marks in the frame at an origin."""
-    return tuple(
-        UnmarkedPoint(**record.model_dump(), use=use)
-        for use, of_use in points.items()
-        for record in point_records(of_use, origin, options)
-    )
-
-
-def _sigma_enu_m(point: GroundPoint, options: IngestOptions) -> Vector3:
-    """Return σ by precedence: option, then file, then default."""
-    stated = options.model_fields_set
-    horizontal = point.sigma_h_m if point.sigma_h_m and "sigma_gcp_h" not in stated else options.sigma_gcp_h
-    vertical = point.sigma_v_m if point.sigma_v_m and "sigma_gcp_v" not in stated else options.sigma_gcp_v
-    return horizontal, horizontal, vertical
 
 
 def _fixes(poses: ImagePoses, session_of: IntArray, origin: Origin) -> list[Fix | None]:
@@ -136,6 +213,7 @@ def _turned(sigma_enu_m: FloatArray, position_in_ecef: FloatArray, origin: Origi
 
 
 def _attitudes(poses: ImagePoses, origin: Origin, options: IngestOptions) -> list[Attitude | None]:
+    """Return attitudes in geo; σ by precedence: option, then file, then the source's default."""
     attitudes: list[Attitude | None] = [None] * len(poses.position_in_ecef)
     rows = np.flatnonzero(np.isfinite(poses.enu_from_cam).all(axis=(1, 2))).tolist()
     # Without a position, north is the origin's: within a survey it turns by minutes of arc.
@@ -144,21 +222,14 @@ def _attitudes(poses: ImagePoses, origin: Origin, options: IngestOptions) -> lis
     geo_from_cam = geo_from_enu_at(place, origin) @ poses.enu_from_cam[rows]
     for row, quat in zip(rows, quat_xyzw_from_matrix(geo_from_cam), strict=True):
         x, y, z, w = (float(value) for value in quat)
-        attitudes[row] = Attitude(
-            quat_xyzw=(x, y, z, w),
-            sigma_deg=_attitude_sigma_deg(poses, row, options),
-            source=poses.attitude_source[row],
-        )
+        source = poses.attitude_source[row]
+        sigma_deg = SIGMA_GIMBAL_DEG if source == "gimbal" else SIGMA_TABLE_ATTITUDE_DEG
+        if np.isfinite(poses.sigma_attitude_deg[row]):
+            sigma_deg = float(poses.sigma_attitude_deg[row])
+        if options.sigma_attitude is not None:
+            sigma_deg = options.sigma_attitude
+        attitudes[row] = Attitude(quat_xyzw=(x, y, z, w), sigma_deg=sigma_deg, source=source)
     return attitudes
-
-
-def _attitude_sigma_deg(poses: ImagePoses, row: int, options: IngestOptions) -> float:
-    """Return σ by precedence: option, then file, then the source's default."""
-    if options.sigma_attitude is not None:
-        return options.sigma_attitude
-    if np.isfinite(poses.sigma_attitude_deg[row]):
-        return float(poses.sigma_attitude_deg[row])
-    return SIGMA_GIMBAL_DEG if poses.attitude_source[row] == "gimbal" else SIGMA_TABLE_ATTITUDE_DEG
 
 
 def _vector(values: ArrayLike) -> Vector3:
@@ -170,20 +241,6 @@ def _matrix(values: FloatArray) -> Matrix3:
     return (_vector(values[0]), _vector(values[1]), _vector(values[2]))
 
 
-# σ of the common error horizontal and vertical in metres, by kind of receiver. No file tells it: the σ in files are
-# those of single positions against the base station, not of the base station itself.
-COMMON_SIGMA_M = {
-    "RTK fixed": (0.03, 0.05),
-    "RTK float": (0.3, 0.6),
-    "single-frequency": (1.5, 3.0),
-    "unknown receiver": (2.0, 4.0),
-}
-# Gap in time after which the base station may stand elsewhere, and the satellites do.
-SESSION_GAP_S = 4 * 3600.0
-# Median σ, horizontal, up to which a receiver that does not tell its solution has had one of that kind.
-_FIXED_SIGMA_M, _FLOAT_SIGMA_M = 0.1, 1.0
-
-
 def fix_sessions(
     poses: ImagePoses, options: IngestOptions, notes: Notes
 ) -> tuple[tuple[FixSession, ...], IntArray]:
@@ -191,13 +248,9 @@ def fix_sessions(
 
     Positions of one kind of receiver form a session as long as none comes more than four hours after the one before
     it. Where the time of one is unknown, all of its kind form one session: a session too many would count as an
-    independent check of a common error.
-
-    Args:
-        poses: measured, of the N images.
-        options: σ that the user gave.
-        notes: the defaults that were assumed.
+    independent check of a common error. σ of that error is by option, else by the kind of receiver.
     """
+    given_h, given_v = options.sigma_common_h, options.sigma_common_v
     sessions: list[FixSession] = []
     session_of = np.zeros(len(poses.receivers), dtype=np.int64)
     located, sigma_h_m = poses.located, poses.sigma_enu_m[:, :2].max(axis=1)
@@ -207,7 +260,10 @@ def fix_sessions(
         session_of[rows] = len(sessions) + by_time
         for number in np.unique(by_time):
             kind = _kind(receiver, float(np.median(sigma_h_m[rows[by_time == number]])))
-            sessions.append(_session(kind, options))
+            horizontal_m, vertical_m = COMMON_SIGMA_M[kind]
+            h_m, v_m = horizontal_m if given_h is None else given_h, vertical_m if given_v is None else given_v
+            source: SigmaSource = "default" if given_h is None and given_v is None else "option"
+            sessions.append(FixSession(receiver=kind, sigma_common_m=(h_m, h_m, v_m), sigma_source=source))
     counts = np.bincount(session_of[located], minlength=len(sessions))
     for kind in COMMON_SIGMA_M:
         of_kind = sum(
@@ -239,25 +295,13 @@ def _kind(receiver: str, sigma_h_m: float) -> str:
     return "RTK float" if receiver == RECEIVERS[-1] and sigma_h_m <= _FLOAT_SIGMA_M else receiver
 
 
-def _session(kind: str, options: IngestOptions) -> FixSession:
-    horizontal_m, vertical_m = COMMON_SIGMA_M[kind]
-    given_h, given_v = options.sigma_common_h, options.sigma_common_v
-    h_m, v_m = horizontal_m if given_h is None else given_h, vertical_m if given_v is None else given_v
-    overridden = given_h is not None or given_v is not None
-    source: SigmaSource = "option" if overridden else "default"
-    return FixSession(receiver=kind, sigma_common_m=(h_m, h_m, v_m), sigma_source=source)
-
-
 def _note_default(kind: str, count: int, options: IngestOptions, notes: Notes) -> None:
     horizontal_m, vertical_m = COMMON_SIGMA_M[kind]
-    defaults = {
-        "--sigma-common-h": f"{horizontal_m:g} m horizontal",
-        "--sigma-common-v": f"{vertical_m:g} m vertical",
-    }
-    if options.sigma_common_h is not None:
-        del defaults["--sigma-common-h"]
-    if options.sigma_common_v is not None:
-        del defaults["--sigma-common-v"]
+    defaults = {}
+    if options.sigma_common_h is None:
+        defaults["--sigma-common-h"] = f"{horizontal_m:g} m horizontal"
+    if options.sigma_common_v is None:
+        defaults["--sigma-common-v"] = f"{vertical_m:g} m vertical"
     if defaults:
         notes.assume(
             f"σ of the error that the positions of a session share ({count}): {', '.join(defaults.values())} "
@@ -265,76 +309,16 @@ def _note_default(kind: str, count: int, options: IngestOptions, notes: Notes) -
         )
 
 
-@dataclass(frozen=True)
-class SurveyInputs:
-    """Everything that was read for a survey; the files of ground points may be absent."""
-
-    flight: FlightRecord
-    control: GroundFile | None
-    check: GroundFile | None
-
-
-def assemble_survey(
-    inputs: SurveyInputs, options: IngestOptions, notes: Notes
-) -> tuple[Survey, NavigationTrack | None]:
-    """Return the survey, and the navigation in the same frame where it was recorded by time.
-
-    The origin is the median of the image positions (of the control points if there are none), rounded to 10⁻⁵
-    degrees and a metre. Every `test_every`-th image by name is held out, beginning with the first.
-
-    Raises:
-        InputError: nothing has a position, points that are nowhere near the images or of both kinds, or a rig to
-            estimate without the navigation for it.
-    """
-    flight = replace(inputs.flight, poses=_without_far_fixes(inputs.flight, notes))
-    poses, files = flight.poses, [file for file in (inputs.control, inputs.check) if file is not None]
-    points = split_checks(inputs.control, inputs.check, options.check)
-    points.require_checks(options.vegetated)
-    control, check = points.control, points.check
-    points.note_unmarked(notes)
-    located = bool(poses.located.any())
-    if located:
-        middle_in_ecef = ecef_from_lla(median_lla(poses.located_lla))
-        for file in files:
-            require_near(file, middle_in_ecef)
-    origin = _origin(poses, control)
-    _note_coverage(flight, len(control), notes)
-    if options.test_every and not held_out(len(flight.photos), options.test_every):
-        notes.warn(f"{len(flight.photos)} images are too few to hold any out for testing")
-    track = None if flight.navigation is None else flight.navigation.in_geo(origin)
-    if options.estimated:
-        require_estimable(track, options.estimated, "--estimate" if options.estimate else "--time-offset")
-    sessions, session_of = fix_sessions(poses, options, notes)
-    survey = Survey(
-        origin=origin,
-        source_crs=poses.crs_name if located or inputs.control is None else inputs.control.crs_name,
-        vertical=_vertical(poses, files, notes),
-        image_dir=str(flight.folder),
-        cameras=flight.cameras,
-        images=image_records(flight, session_of, origin, options),
-        sessions=sessions,
-        control_points=point_records(control, origin, options),
-        check_points=point_records(check, origin, options),
-        unmarked_points=unmarked_records(points.unmarked, origin, options),
-        assumptions=tuple(notes.assumptions),
-        warnings=tuple(notes.warnings),
-        cautions=tuple(notes.cautions),
-        estimate=options.estimated,
-        default_sigmas=_default_sigmas(poses, control, options),
-    )
-    return survey, track
-
-
 def _default_sigmas(
     poses: ImagePoses, control: Sequence[GroundPoint], options: IngestOptions
-) -> tuple[Literal["fixes", "control points", "marks", "attitudes"], ...]:
+) -> tuple[SigmaGroup, ...]:
     """Return the groups of measurements whose σ neither a file nor an option states."""
     stated = options.model_fields_set
     points_stated = {"sigma_gcp_h", "sigma_gcp_v"} <= stated or (
         bool(control) and all(point.sigma_h_m and point.sigma_v_m for point in control)
     )
     attitudes = np.isfinite(poses.enu_from_cam).all(axis=(1, 2)).any() and options.sigma_attitude is None
-    groups: list[tuple[bool, Literal["fixes", "control points", "marks", "attitudes"]]] = [
+    groups: list[tuple[bool, SigmaGroup]] = [
         ("default" in poses.sigma_source, "fixes"),
         (not points_stated, "control points"),
         ("sigma_mark" not in stated, "marks"),
@@ -362,17 +346,9 @@ def _origin(poses: ImagePoses, control: Sequence[GroundPoint]) -> Origin:
     places = poses.located_lla
     if not len(places) and control:
         places = lla_from_ecef([point.position_in_ecef for point in control])
-    if not len(places):
-        raise nowhere()
+    require_placed(len(places) > 0)
     lat, lon, alt = median_lla(places)
     return Origin(lat_deg=round(float(lat), 5), lon_deg=round(float(lon), 5), alt_m=round(float(alt)))
-
-
-def nowhere() -> InputError:
-    """Return the error of a survey that nothing places on Earth."""
-    return InputError(
-        "no image has a position, and there are no ground control points: give --trajectory, --geo or --gcp"
-    )
 
 
 def _note_coverage(flight: FlightRecord, points: int, notes: Notes) -> None:
@@ -391,7 +367,7 @@ def _note_coverage(flight: FlightRecord, points: int, notes: Notes) -> None:
 def _vertical(poses: ImagePoses, files: Sequence[GroundFile], notes: Notes) -> VerticalDatum:
     """Return the datum of the image positions, or of the control points if there are none; note all assumptions."""
     datums = {"the images": poses.vertical} if poses.located.any() else {}
-    datums |= {file.path.name: file.vertical for file in files}
+    datums |= {file.path.name: file.crs.vertical for file in files}
     for place, datum in datums.items():
         if not datum.stated:
             notes.assume(f"heights of {place} are {datum.name}: {datum.note}")

@@ -1,14 +1,9 @@
-"""Poses of images from a table: a CSV trajectory, or OpenDroneMap's `geo.txt`.
-
-Rows of a table of poses brought to the survey's images: by name, or by time.
-
-Which rows of a table of poses count, and what is said of the others.
-"""
+"""Poses of images from a table: its usable rows on Earth, brought to the images by name or by time."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -16,18 +11,114 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.core.errors import InputError
-from pipelines.core.types import FloatArray
+from pipelines.core.types import FloatArray, IntArray
 from pipelines.formats.trajectory_csv import PoseTable, complete
 from pipelines.geodesy.crs import PointCrs
 from pipelines.geodesy.enu import ecef_from_lla
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.trajectory import Trajectory
 from pipelines.ingest.exif_poses import altitude_m, compare_with_exif, gimbal_attitudes, photo_times
-from pipelines.ingest.image_poses import RECEIVERS, AttitudeSource, ImagePoses, with_defaults
+from pipelines.ingest.flight_record import RECEIVERS, AttitudeSource, ImagePoses, with_defaults
 from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import ImageNames, Photo
 from pipelines.ingest.reference_system import crs_of_table, note_operation
+
+
+def poses_from_table(table: PoseTable, photos: Sequence[Photo], options: IngestOptions, notes: Notes) -> ImagePoses:
+    """Return positions, and attitudes if the table has them; else attitudes from XMP.
+
+    Rows are matched by name if the table has names, else by time. An image without a row has no position here,
+    even if its EXIF has one: two receivers are not mixed unseen.
+
+    Raises:
+        ContradictionError: the positions contradict those in EXIF.
+        InputError: no row with a position, no CRS for x,y,z, contradicting options, impossible coordinates, or no
+            image matched.
+    """
+    table = usable_rows(table, notes)
+    crs = crs_of_table(table, options, notes)
+    images = [photo.name for photo in photos]
+    if table.names is not None:
+        table = _with_heights(match_by_name(table, images, notes), photos, crs, notes)
+    measured = _measured(table, crs, options, notes)
+    receiver = np.full(len(table.lines), RECEIVERS[-1]) if table.receiver is None else table.receiver
+    time_s = photo_times(photos)
+    recorded = None
+    if table.names is not None:
+        place = {name: row for row, name in enumerate(images)}
+        rows = [place[name] for name in table.names]
+        at_images = _spread(measured, rows, len(photos))
+        time_s = np.where(np.isfinite(at_images.time_s), at_images.time_s, time_s)
+        row_of = dict(zip(rows, receiver, strict=True))
+        receivers = tuple(str(row_of.get(row, RECEIVERS[-1])) for row in range(len(photos)))
+    else:
+        order = np.argsort(measured.time_s, kind="stable")
+        order = order[np.isfinite(measured.time_s[order])]
+        recorded = _rows(measured, order)
+        at_images = match_by_time(recorded, photos, table.path, options, notes)
+        receivers = _worse_neighbour(receiver[order], recorded.time_s, time_s + options.time_offset_s)
+    located = complete(at_images.position)
+    notes.warn_counted(
+        [images[row] for row in np.flatnonzero(~located)],
+        f"image has no position in {table.path.name}",
+        f"images have no position in {table.path.name}",
+    )
+    sigma, sigma_source = with_defaults(at_images.sigma_m, receivers, located, options, notes)
+    from_file = np.asarray(np.isfinite(at_images.rotation).all(axis=(1, 2)))
+    attitude_source: list[AttitudeSource] = [table.source if row else "gimbal" for row in from_file]
+    poses = ImagePoses(
+        position_in_ecef=at_images.position,
+        sigma_enu_m=sigma,
+        sigma_source=sigma_source,
+        receivers=receivers,
+        enu_from_cam=np.where(from_file[:, None, None], at_images.rotation, gimbal_attitudes(photos)),
+        attitude_source=tuple(attitude_source),
+        sigma_attitude_deg=np.full(len(photos), np.nan),
+        time_s=time_s,
+        source=table.source,
+        crs_name=crs.name,
+        vertical=crs.vertical,
+        recorded=recorded,
+    )
+    compare_with_exif(poses, photos, table.path, options, notes)
+    return poses
+
+
+def usable_rows(table: PoseTable, notes: Notes) -> PoseTable:
+    """Return the rows that have a position, without repeats of a moment where rows have no names.
+
+    The rows that are left out are noted, and so are unknown columns and times without a zone. A row of `geo.txt`
+    may lack its height.
+
+    Raises:
+        InputError: no row has a position.
+    """
+    file = table.path.name
+    notes.warn_counted(
+        [f"{file}:{table.header_line} ({name or 'unnamed'})" for name in table.unknown_columns],
+        "column is unknown and was ignored",
+        "columns are unknown and were ignored",
+    )
+    if table.zoneless_times:
+        notes.assume(f"times without a zone in {file} are UTC")
+    needed, gaps = (2, "NaN") if table.source == "geo.txt" else (3, "empty or NaN")
+    located = complete(table.xyz[:, :needed])
+    places = [f"{file}:{line}" for line in table.lines[~located]]
+    notes.warn_counted(places, f"row has no position ({gaps})", f"rows have no position ({gaps})")
+    if not located.any():
+        raise InputError("no row has a position", path=table.path)
+    table = table.take(located)
+    if table.names is not None or table.time_s is None:
+        return table
+    _, first = np.unique(table.time_s, return_index=True)
+    repeated = np.setdiff1d(np.arange(len(table.lines)), first)
+    notes.warn_counted(
+        [f"{file}:{line}" for line in table.lines[repeated]],
+        "row repeats an earlier time and was left out",
+        "rows repeat earlier times and were left out",
+    )
+    return table.take(np.sort(first))
 
 
 def match_by_name(table: PoseTable, images: list[str], notes: Notes) -> PoseTable:
@@ -46,10 +137,8 @@ def match_by_name(table: PoseTable, images: list[str], notes: Notes) -> PoseTabl
             unknown.append(f"{table.path.name}:{line} ({text})")
             continue
         if name in row_of:
-            earlier = int(table.lines[row_of[name]])
-            raise InputError(
-                f"{name} has a row already, in line {earlier}", path=table.path, line=line, field="image"
-            )
+            message = f"{name} has a row already, in line {int(table.lines[row_of[name]])}"
+            raise InputError(message, path=table.path, line=line, field="image")
         if Path(text.replace("\\", "/")).name != Path(name).name:
             loose.append(f"{table.path.name}:{line} ({text} for {name})")
         row_of[name] = row
@@ -65,7 +154,7 @@ def match_by_name(table: PoseTable, images: list[str], notes: Notes) -> PoseTabl
         "row names its image with another case or without suffix",
         "rows name their images with another case or without suffix",
     )
-    matched = table.take(np.array([row_of[name] for name in row_of], dtype=np.int64))
+    matched = table.take(np.array(list(row_of.values()), dtype=np.int64))
     return replace(matched, names=tuple(row_of))
 
 
@@ -75,8 +164,10 @@ def match_by_time(
     """Return the trajectory at the times of the photographs (N rows), NaN where it does not reach.
 
     Raises:
-        InputError: no photograph has a time, or none of them lies within the trajectory.
+        InputError: no row or no photograph has a time, or none of them lies within the trajectory.
     """
+    if not len(trajectory):
+        raise InputError("no row has a time", path=path, field="timestamp")
     time_s = photo_times(photos)
     timeless = [photo.name for photo in photos if photo.tags.timestamp_s is None]
     notes.warn_counted(timeless, "image has no time in EXIF", "images have no time in EXIF")
@@ -101,159 +192,6 @@ def _span(time_s: FloatArray) -> str:
     return " to ".join(end.strftime("%Y-%m-%d %H:%M:%S UTC") for end in ends)
 
 
-def usable_rows(table: PoseTable, notes: Notes) -> PoseTable:
-    """Return the rows that have a position, without repeats of a moment where rows have no names.
-
-    The rows that are left out are noted, and so are unknown columns and times without a zone. A row of `geo.txt`
-    may lack its height.
-
-    Raises:
-        InputError: no row has a position.
-    """
-    notes.warn_counted(
-        [f"{table.path.name}:{table.header_line} ({name or 'unnamed'})" for name in table.unknown_columns],
-        "column is unknown and was ignored",
-        "columns are unknown and were ignored",
-    )
-    if table.zoneless_times:
-        notes.assume(f"times without a zone in {table.path.name} are UTC")
-    return _without_repeats(_with_positions(table, notes), notes)
-
-
-def _with_positions(table: PoseTable, notes: Notes) -> PoseTable:
-    needed, gaps = (2, "NaN") if table.source == "geo.txt" else (3, "empty or NaN")
-    located = complete(table.xyz[:, :needed])
-    places = [f"{table.path.name}:{line}" for line in table.lines[~located]]
-    notes.warn_counted(places, f"row has no position ({gaps})", f"rows have no position ({gaps})")
-    if not located.any():
-        raise InputError("no row has a position", path=table.path)
-    return table.take(located)
-
-
-def _without_repeats(table: PoseTable, notes: Notes) -> PoseTable:
-    if table.names is not None or table.time_s is None:
-        return table
-    _, first = np.unique(table.time_s, return_index=True)
-    repeated = np.setdiff1d(np.arange(len(table)), first)
-    places = [f"{table.path.name}:{line}" for line in table.lines[repeated]]
-    notes.warn_counted(
-        places, "row repeats an earlier time and was left out", "rows repeat earlier times and were left out"
-    )
-    return table.take(np.sort(first))
-
-
-def poses_from_table(table: PoseTable, photos: Sequence[Photo], options: IngestOptions, notes: Notes) -> ImagePoses:
-    """Return positions, and attitudes if the table has them; else attitudes from XMP.
-
-    Rows are matched by name if the table has names, else by time. An image without a row has no position here,
-    even if its EXIF has one: two receivers are not mixed unseen.
-
-    Raises:
-        ContradictionError: the positions contradict those in EXIF.
-        InputError: no row with a position, no CRS for x,y,z, contradicting options, impossible coordinates, or no
-            image matched.
-    """
-    table = usable_rows(table, notes)
-    crs = crs_of_table(table, options, notes)
-    images = [photo.name for photo in photos]
-    if table.names is not None:
-        table = _with_heights(match_by_name(table, images, notes), photos, crs, notes)
-    lla = crs.lla_from_xyz(table.xyz, path=table.path, lines=table.lines.tolist())
-    note_operation(crs, lla, notes)
-    if table.sigma_enu_m is not None and "foot" in crs.units[0]:
-        notes.assume(f"σ in {table.path.name} are in metres, although {crs.name} counts in feet")
-    if table.names is not None:
-        placed = _by_name(table, ecef_from_lla(lla), photos)
-    else:
-        placed = _by_time(table, ecef_from_lla(lla), photos, options, notes)
-    located = complete(placed.position_in_ecef)
-    notes.warn_counted(
-        [images[row] for row in np.flatnonzero(~located)],
-        f"image has no position in {table.path.name}",
-        f"images have no position in {table.path.name}",
-    )
-    sigma, sigma_source = with_defaults(placed.sigma_enu_m, placed.receivers, located, options, notes)
-    from_file = np.asarray(np.isfinite(placed.enu_from_cam).all(axis=(1, 2)))
-    attitude_source: list[AttitudeSource] = [table.source if row else "gimbal" for row in from_file]
-    poses = ImagePoses(
-        position_in_ecef=placed.position_in_ecef,
-        sigma_enu_m=sigma,
-        sigma_source=sigma_source,
-        receivers=placed.receivers,
-        enu_from_cam=np.where(from_file[:, None, None], placed.enu_from_cam, gimbal_attitudes(photos)),
-        attitude_source=tuple(attitude_source),
-        sigma_attitude_deg=np.full(len(photos), np.nan),
-        time_s=np.where(np.isfinite(placed.time_s), placed.time_s, photo_times(photos)),
-        source=table.source,
-        crs_name=crs.name,
-        vertical=crs.vertical,
-        recorded=placed.recorded,
-    )
-    compare_with_exif(poses, photos, table.path, options, notes)
-    return poses
-
-
-@dataclass(frozen=True)
-class _Placed:
-    """The table's rows at the N images, as `ImagePoses` names them; NaN where an image has none."""
-
-    position_in_ecef: FloatArray
-    enu_from_cam: FloatArray
-    sigma_enu_m: FloatArray
-    receivers: tuple[str, ...]
-    time_s: FloatArray
-    recorded: Trajectory | None
-
-
-def _by_name(table: PoseTable, position_in_ecef: FloatArray, photos: Sequence[Photo]) -> _Placed:
-    index = {photo.name: row for row, photo in enumerate(photos)}
-    rows = [index[name] for name in table.names or ()]
-
-    def spread(values: FloatArray) -> FloatArray:
-        placed = np.full((len(photos), *values.shape[1:]), np.nan)
-        placed[rows] = values
-        return placed
-
-    receivers = [RECEIVERS[-1]] * len(photos)
-    for row, receiver in zip(rows, _receivers(table), strict=True):
-        receivers[row] = receiver
-    return _Placed(
-        position_in_ecef=spread(position_in_ecef),
-        enu_from_cam=spread(_attitudes(table)),
-        sigma_enu_m=spread(_sigma(table)),
-        receivers=tuple(receivers),
-        time_s=spread(_times(table)),
-        recorded=None,
-    )
-
-
-def _by_time(
-    table: PoseTable, position_in_ecef: FloatArray, photos: Sequence[Photo], options: IngestOptions, notes: Notes
-) -> _Placed:
-    time_s = _times(table)
-    order = np.argsort(time_s, kind="stable")
-    order = order[np.isfinite(time_s[order])]
-    if not len(order):
-        raise InputError("no row has a time", path=table.path, field="timestamp")
-    recorded = Trajectory.from_samples(
-        time_s[order],
-        position=position_in_ecef[order],
-        rotation=_attitudes(table)[order],
-        sigma_m=_sigma(table)[order],
-        max_gap_s=options.max_gap,
-    )
-    matched = match_by_time(recorded, photos, table.path, options, notes)
-    image_time_s = photo_times(photos)
-    return _Placed(
-        position_in_ecef=matched.position,
-        enu_from_cam=matched.rotation,
-        sigma_enu_m=matched.sigma_m,
-        receivers=_worse_neighbour(_receivers(table)[order], time_s[order], image_time_s + options.time_offset_s),
-        time_s=image_time_s,
-        recorded=recorded,
-    )
-
-
 def _with_heights(table: PoseTable, photos: Sequence[Photo], crs: PointCrs, notes: Notes) -> PoseTable:
     """Fill heights that a table by name lacks from EXIF, and leave out the rows where that has none either."""
     lacking = np.flatnonzero(np.isnan(table.xyz[:, 2]))
@@ -274,16 +212,44 @@ def _with_heights(table: PoseTable, photos: Sequence[Photo], crs: PointCrs, note
     return replace(table, xyz=xyz).take(filled)
 
 
-def _times(table: PoseTable) -> FloatArray:
-    return np.full(len(table), np.nan) if table.time_s is None else table.time_s
+def _measured(table: PoseTable, crs: PointCrs, options: IngestOptions, notes: Notes) -> Trajectory:
+    """Return the rows Earth-centred, in the order of the file; NaN where a row has no time, attitude or σ."""
+    lla = crs.lla_from_xyz(table.xyz, path=table.path, lines=table.lines.tolist())
+    note_operation(crs, lla, notes)
+    if table.sigma_enu_m is not None and "foot" in crs.units[0]:
+        notes.assume(f"σ in {table.path.name} are in metres, although {crs.name} counts in feet")
+    enu_from_cam = np.full((len(lla), 3, 3), np.nan)
+    if table.quat_xyzw is not None:
+        turned = complete(table.quat_xyzw)
+        enu_from_cam[turned] = matrix_from_quat_xyzw(table.quat_xyzw[turned])
+    return Trajectory.from_samples(
+        np.full(len(lla), np.nan) if table.time_s is None else table.time_s,
+        position=ecef_from_lla(lla),
+        rotation=enu_from_cam,
+        sigma_m=table.sigma_enu_m,
+        max_gap_s=options.max_gap,
+    )
 
 
-def _sigma(table: PoseTable) -> FloatArray:
-    return np.full((len(table), 3), np.nan) if table.sigma_enu_m is None else table.sigma_enu_m
+def _rows(samples: Trajectory, rows: IntArray) -> Trajectory:
+    return replace(
+        samples,
+        time_s=samples.time_s[rows],
+        position=samples.position[rows],
+        rotation=samples.rotation[rows],
+        sigma_m=samples.sigma_m[rows],
+        sigma_deg=samples.sigma_deg[rows],
+    )
 
 
-def _receivers(table: PoseTable) -> NDArray[np.str_]:
-    return np.full(len(table), RECEIVERS[-1]) if table.receiver is None else table.receiver
+def _spread(samples: Trajectory, rows: Sequence[int], count: int) -> Trajectory:
+    """Return samples of N images of which a table has only those at `rows`; NaN for the others."""
+    source = np.full(count, -1)
+    source[rows] = np.arange(len(rows))
+    spread = _rows(samples, source)
+    for values in (spread.time_s, spread.position, spread.rotation, spread.sigma_m):
+        values[source < 0] = np.nan
+    return spread
 
 
 def _worse_neighbour(receivers: NDArray[np.str_], time_s: FloatArray, at_s: FloatArray) -> tuple[str, ...]:
@@ -291,12 +257,3 @@ def _worse_neighbour(receivers: NDArray[np.str_], time_s: FloatArray, at_s: Floa
     rank = np.array([RECEIVERS.index(receiver) for receiver in receivers])
     after = np.clip(np.searchsorted(time_s, at_s), 0, len(time_s) - 1)
     return tuple(RECEIVERS[row] for row in np.maximum(rank[np.clip(after - 1, 0, None)], rank[after]))
-
-
-def _attitudes(table: PoseTable) -> FloatArray:
-    """Return rotations camera → East-North-Up (N, 3, 3), NaN where a row has none."""
-    enu_from_cam = np.full((len(table), 3, 3), np.nan)
-    if table.quat_xyzw is not None:
-        turned = complete(table.quat_xyzw)
-        enu_from_cam[turned] = matrix_from_quat_xyzw(table.quat_xyzw[turned])
-    return enu_from_cam

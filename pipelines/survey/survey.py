@@ -158,7 +158,7 @@ class FixSession(Product):
     """Fixes that share one error beside their own: of the base station, the receiver, or the day.
 
     Attributes:
-        receiver: kind of receiver, of `ingest.image_poses.RECEIVERS`.
+        receiver: kind of receiver, of `ingest.flight_record.RECEIVERS`.
         sigma_common_m: σ of the common error east, north, up in metres; 0: none along that axis.
         sigma_source: source of that σ: the recording, an option, or the default by receiver.
     """

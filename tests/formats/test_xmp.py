@@ -24,7 +24,7 @@ def test_attribute_form() -> None:
     assert tags.gimbal_yaw_pitch_roll_deg == (45.0, -89.9, 0.0)
     assert tags.rtk_flag == 50
     assert tags.rtk_sigma_enu_m == (0.012, 0.011, 0.025)  # longitude's σ is the one to the east
-    assert (tags.absolute_altitude_m, tags.relative_altitude_m) == (198.31, 39.8)
+    assert tags.absolute_altitude_m == 198.31
 
 
 def test_element_form() -> None:

@@ -18,7 +18,7 @@ from pipelines.core.staleness import status
 from pipelines.core.workspace import Workspace
 from pipelines.geodesy.enu import ecef_from_lla
 from pipelines.geodesy.vertical import VerticalDatum
-from pipelines.ingest.image_poses import RECEIVER_SIGMA_M, RECEIVERS, ImagePoses
+from pipelines.ingest.flight_record import RECEIVER_SIGMA_M, RECEIVERS, ImagePoses
 from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.stage import survey_and_track

@@ -11,10 +11,11 @@ from pipelines.core.errors import InputError
 from pipelines.geodesy.enu import ecef_from_lla
 from pipelines.ingest.ground_points import (
     GroundFile,
-    list_ground_points,
+    read_ground_files,
     require_near,
     split_checks,
-    tie_ground_points,
+    tie_marks,
+    unmarked_points,
 )
 from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
@@ -28,9 +29,9 @@ def _read(tmp_path: Path, rows: str, name: str = "gcp_list.txt", notes: Notes | 
     path = tmp_path / name
     path.write_text("EPSG:4979\n" + rows)
     options, notes = IngestOptions(gcp=path), notes or Notes()
-    file, _ = tie_ground_points(list_ground_points(options, notes), SIZES, options, notes)
+    file, _ = read_ground_files(options, notes)
     assert file is not None
-    return file
+    return tie_marks(file, SIZES, options.sigma_mark, notes)
 
 
 def test_points_and_marks(tmp_path: Path) -> None:
@@ -43,13 +44,13 @@ def test_points_and_marks(tmp_path: Path) -> None:
     )
     mark = file.points[0].marks[1]
     assert (mark.image, mark.x_px, mark.y_px, mark.sigma_px) == ("b.jpg", 11.5, 21.5, 0.5)
-    assert file.vertical.stated and file.vertical.name == "ellipsoidal"
+    assert file.crs.vertical.stated and file.crs.vertical.name == "ellipsoidal"
     assert notes.warnings == [
         "1 mark is in an image that is not here: gcp_list.txt:6 (absent.jpg)",
     ]
-    split = split_checks(file, None, [])
-    assert [point.name for point in split.control] == ["G1", "G2"]
-    split.note_unmarked(notes)
+    control, check = split_checks(file, None, [])
+    assert [point.name for point in control if point.is_marked] == ["G1", "G2"]
+    unmarked_points(control, check, notes)
     assert notes.warnings[1:] == [
         "1 ground point has marks in fewer than 2 images, and enters nothing until it is marked: G3 (control)"
     ]
@@ -76,9 +77,9 @@ def test_refusals(tmp_path: Path, rows: str, message: str) -> None:
 
 
 def test_named_control_points_become_check_points(tmp_path: Path) -> None:
-    split = split_checks(_read(tmp_path, G1 + G2), None, ["G2"])
-    assert [point.name for point in split.control] == ["G1"]
-    assert [point.name for point in split.check] == ["G2"]
+    control, check = split_checks(_read(tmp_path, G1 + G2), None, ["G2"])
+    assert [point.name for point in control] == ["G1"]
+    assert [point.name for point in check] == ["G2"]
 
 
 def test_an_unknown_name_is_refused_with_the_known_ones(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from pipelines.formats.trajectory_csv import PoseTable
 from pipelines.geodesy import enu
 from pipelines.geometry.rotations import geo_from_cam
 from pipelines.ingest.exif_poses import poses_from_tags
-from pipelines.ingest.image_poses import RECEIVER_SIGMA_M, ImagePoses
+from pipelines.ingest.flight_record import RECEIVER_SIGMA_M, ImagePoses
 from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo

@@ -15,7 +15,7 @@ from pipelines.formats.image_file import ImageFile
 from pipelines.geodesy.enu import Origin, ecef_from_enu, ecef_from_lla, lla_from_ecef
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.ingest.exif_poses import compare_with_exif
-from pipelines.ingest.image_poses import ImagePoses
+from pipelines.ingest.flight_record import ImagePoses
 from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo

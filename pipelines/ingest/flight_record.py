@@ -1,0 +1,227 @@
+"""What a flight left, whatever it was read from: photographs, their cameras, measured poses, navigation by time.
+
+σ of positions is by option, by file, or by the kind of receiver. The navigation is as recorded, Earth-centred,
+until the survey's frame is known. Lever arm and boresight lead from the places and attitudes that the instruments
+measured to those of the cameras.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from pipelines.core.errors import InputError
+from pipelines.core.types import BoolArray, FloatArray
+from pipelines.formats.trajectory_csv import complete
+from pipelines.geodesy.enu import Origin, ecef_from_enu_rotation, enu_from_ecef, geo_from_enu_at, lla_from_ecef
+from pipelines.geodesy.vertical import VerticalDatum
+from pipelines.geometry.trajectory import Rig, Trajectory, boresight, mount, with_rig
+from pipelines.ingest.notes import Notes
+from pipelines.ingest.options import IngestOptions
+from pipelines.ingest.photo_folder import Photo
+from pipelines.survey.calibrated import NavigationTrack
+from pipelines.survey.survey import CameraPrior
+
+PoseSource = Literal["exif", "csv", "geo.txt", "metashape", "pos", "mrk", "bag"]
+SigmaSource = Literal["file", "option", "default"]
+AttitudeSource = Literal["gimbal", "csv", "geo.txt", "metashape", "pos", "mrk", "bag"]
+LEAST_IMAGES = 3
+# σ horizontal and vertical in metres where the file is silent, by kind of receiver, from the best to the worst.
+RECEIVER_SIGMA_M = {
+    "RTK fixed": (0.02, 0.03),
+    "RTK float": (0.5, 1.0),
+    "single-frequency": (2.5, 5.0),
+    "unknown receiver": (5.0, 10.0),
+}
+RECEIVERS = tuple(RECEIVER_SIGMA_M)
+
+
+@dataclass(frozen=True)
+class ImagePoses:
+    """Measured poses of N images; NaN rows where nothing was measured.
+
+    Attributes:
+        position_in_ecef: (N, 3) metres.
+        sigma_enu_m: (N, 3).
+        sigma_source: (N,) who gave σ.
+        receivers: (N,) kinds of receiver, of `RECEIVERS`, as recorded.
+        enu_from_cam: (N, 3, 3) attitude against north and up at the camera.
+        attitude_source: (N,).
+        sigma_attitude_deg: (N,) σ that the attitudes state.
+        time_s: (N,) seconds since 1970 UTC.
+        source: of the positions, with their CRS and the datum that their heights counted from.
+        recorded: the Earth-centred trajectory that images were matched with by time, None where it was by name.
+    """
+
+    position_in_ecef: FloatArray
+    sigma_enu_m: FloatArray
+    sigma_source: tuple[SigmaSource, ...]
+    receivers: tuple[str, ...]
+    enu_from_cam: FloatArray
+    attitude_source: tuple[AttitudeSource, ...]
+    sigma_attitude_deg: FloatArray
+    time_s: FloatArray
+    source: PoseSource
+    crs_name: str
+    vertical: VerticalDatum
+    recorded: Trajectory | None = None
+
+    @property
+    def located(self) -> BoolArray:
+        """Which images have a position (N,)."""
+        return complete(self.position_in_ecef)
+
+    @property
+    def located_lla(self) -> FloatArray:
+        """WGS84 latitude, longitude and ellipsoidal height of the images that have a position (K, 3)."""
+        return lla_from_ecef(self.position_in_ecef[self.located])
+
+
+@dataclass(frozen=True)
+class RecordedNavigation:
+    """The navigation on its own clock, and how the cameras of N photographs sit in it.
+
+    Attributes:
+        positions: of the antenna, Earth-centred.
+        attitudes: rotations body → East-North-Up at the antenna, forward-right-down.
+        rig: of the N photographs, as `ingest` was told or as `/tf` has it.
+        body_known: whether the body's axes are known; where not, the camera's nominal axes stand for them.
+        image_time_s: (N,) times of the photographs on the camera's clock.
+        time_offset_s: navigation clock minus camera clock.
+    """
+
+    positions: Trajectory
+    attitudes: Trajectory
+    rig: Rig
+    body_known: bool
+    images: tuple[str, ...]
+    image_time_s: FloatArray
+    time_offset_s: float
+
+
+@dataclass(frozen=True)
+class FlightRecord:
+    """What was read of a flight; `navigation` is None where it was not recorded by time."""
+
+    folder: Path
+    photos: list[Photo]
+    cameras: tuple[CameraPrior, ...]
+    camera_of: dict[str, int]
+    poses: ImagePoses
+    navigation: RecordedNavigation | None
+
+
+def with_defaults(
+    stated: FloatArray, receivers: Sequence[str], located: BoolArray, options: IngestOptions, notes: Notes
+) -> tuple[FloatArray, tuple[SigmaSource, ...]]:
+    """Return σ east, north, up (N, 3) by precedence, and who gave it (N,).
+
+    σ of the file (N, 3) are NaN where it is silent. Defaults are noted but for images without a position.
+    """
+    from_file = complete(stated)
+    defaults = np.array([RECEIVER_SIGMA_M[receiver] for receiver in receivers]).reshape(-1, 2)
+    sigma = np.where(np.isfinite(stated), stated, defaults[:, [0, 0, 1]])
+    if options.sigma_h is not None:
+        sigma[:, :2] = options.sigma_h
+    if options.sigma_v is not None:
+        sigma[:, 2] = options.sigma_v
+    for receiver in sorted(set(receivers)):
+        rows = located & ~from_file & (np.array(receivers) == receiver)
+        horizontal_m, vertical_m = RECEIVER_SIGMA_M[receiver]
+        parts = [f"{horizontal_m:g} m horizontal"] if options.sigma_h is None else []
+        parts += [f"{vertical_m:g} m vertical"] if options.sigma_v is None else []
+        if rows.any() and parts:
+            notes.assume(f"σ of positions without one ({int(rows.sum())}): {', '.join(parts)} ({receiver})")
+    overridden = options.sigma_h is not None or options.sigma_v is not None
+    sources: list[SigmaSource] = ["option" if overridden else "file" if row else "default" for row in from_file]
+    return sigma, tuple(sources)
+
+
+def track_in_geo(recorded: RecordedNavigation, origin: Origin) -> NavigationTrack | None:
+    """Return the navigation in the frame at an origin; None if it has no positions."""
+    positions, attitudes = recorded.positions, recorded.attitudes
+    if not len(positions):
+        return None
+    mounts, arms = recorded.rig.of_each(len(recorded.images))
+    # Attitudes are turned from north and up where each was taken. Where they begin or end beyond the positions, the
+    # first or last position stands for the place: at 45° latitude north turns by a second of arc in 30 m.
+    time_s = np.clip(attitudes.time_s, positions.time_s[0], positions.time_s[-1])
+    place = replace(positions, max_gap_s=np.inf).at(time_s).position
+    return NavigationTrack(
+        position_time_s=positions.time_s,
+        antenna_in_geo=enu_from_ecef(positions.position, origin),
+        sigma_m=positions.sigma_m,
+        attitude_time_s=attitudes.time_s,
+        geo_from_body=geo_from_enu_at(lla_from_ecef(place), origin) @ attitudes.rotation,
+        image=np.array(recorded.images, dtype=np.str_),
+        image_time_s=recorded.image_time_s,
+        cam_from_body=mounts,
+        antenna_in_body=arms,
+        nominal_from_cam=recorded.rig.nominal_from_cam,
+        time_offset_s=np.array(recorded.time_offset_s),
+        max_gap_s=np.array(positions.max_gap_s),
+        body_known=np.array(recorded.body_known),
+    )
+
+
+def require_enough(count: int, source: Path, field: str, notes: Notes) -> None:
+    """Refuse fewer photographs than a survey needs, with everything that was noted on the way."""
+    if count < LEAST_IMAGES:
+        reasons = "".join(f"; {warning}" for warning in notes.warnings)
+        message = f"{count} usable images, a survey needs {LEAST_IMAGES}{reasons}"
+        raise InputError(message, path=source, field=field)
+
+
+def given_rig(options: IngestOptions) -> Rig:
+    """Return the rig that the options state."""
+    return Rig(
+        cam_from_body=None if options.camera_mount is None else mount(options.camera_mount),
+        antenna_in_body=None if options.lever_arm is None else np.array(options.lever_arm),
+        nominal_from_cam=boresight(options.boresight),
+    )
+
+
+def body_mount(rig: Rig) -> FloatArray:
+    """Return the mount (3, 3); where none is stated, the camera's nominal axes stand for the body's."""
+    return np.eye(3) if rig.cam_from_body is None else rig.cam_from_body
+
+
+def at_cameras(poses: ImagePoses, rig: Rig, names: Sequence[str], notes: Notes) -> ImagePoses:
+    """Bring positions of the antenna to the camera, and attitudes of the nominal camera to the true one.
+
+    Raises:
+        InputError: a lever arm without the mount, whose axes it is given in.
+    """
+    if rig.antenna_in_body is not None and rig.cam_from_body is None:
+        raise InputError("is given in the body's axes: give --camera-mount YAW,PITCH,ROLL too", field="--lever-arm")
+    mounted = replace(rig, cam_from_body=body_mount(rig))
+    enu_from_body = poses.enu_from_cam @ body_mount(rig)
+    position_in_ecef, enu_from_cam = camera_poses(poses.position_in_ecef, enu_from_body, mounted, names, notes)
+    return replace(poses, position_in_ecef=position_in_ecef, enu_from_cam=enu_from_cam)
+
+
+def camera_poses(
+    antenna_in_ecef: FloatArray, enu_from_body: FloatArray, rig: Rig, names: Sequence[str], notes: Notes
+) -> tuple[FloatArray, FloatArray]:
+    """Return camera centres in ECEF (N, 3) and attitudes camera → East-North-Up (N, 3, 3), NaN where unknown.
+
+    A position that a lever arm would move, but without an attitude to move it by, is left out and noted. The
+    antenna's places are ECEF (N, 3), and the body's attitudes (N, 3, 3) against north and up there.
+    """
+    # With the antenna at zero, its own East-North-Up is a Cartesian frame that needs no place on Earth.
+    offset_in_enu, enu_from_cam = with_rig(np.zeros_like(antenna_in_ecef), enu_from_body, rig)
+    located = complete(antenna_in_ecef)
+    lost = np.flatnonzero(located & ~complete(offset_in_enu))
+    notes.warn_counted(
+        [names[row] for row in lost.tolist()],
+        "position is without an attitude to apply the lever arm by, and was left out",
+        "positions are without attitudes to apply the lever arm by, and were left out",
+    )
+    ecef_from_enu = ecef_from_enu_rotation(lla_from_ecef(antenna_in_ecef[located]))
+    position_in_ecef = antenna_in_ecef.copy()
+    position_in_ecef[located] += np.einsum("nij,nj->ni", ecef_from_enu, offset_in_enu[located])
+    return position_in_ecef, enu_from_cam
