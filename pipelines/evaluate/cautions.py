@@ -27,9 +27,6 @@ def cautions_of_prediction(
     """Return the limits of the predicted accuracy.
 
     Args:
-        solved: the survey.
-        posterior: gives the prediction.
-        by_camera: errors of the triangulated check points.
         of_initial: whether the points are measured with the initial similarity.
     """
     if of_initial:

@@ -185,12 +185,7 @@ def triangulated_check_points(solved: SolvedSurvey, posterior: Posterior) -> Che
 
 
 def check_points_on_surface(renderer: ModelRenderer, progress: Progress) -> CheckPointErrors:
-    """Return the errors of the check points as places of the Gaussians' surface behind their marks.
-
-    Args:
-        renderer: of the trained model.
-        progress: shows the depth maps.
-    """
+    """Return the errors of the check points as places of the Gaussians' surface behind their marks."""
     trained = renderer.trained
     points, rays = trained.survey.check_points, mark_rays(trained.survey.check_points, trained.sparse)
     position = points_by_model(trained, rays, _depth_maps(renderer, rays, progress))

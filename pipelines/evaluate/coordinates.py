@@ -24,7 +24,6 @@ def target_crs(text: str, survey: Survey) -> PointCrs:
     """Return the CRS in which to list positions of a survey.
 
     Args:
-        text: name of the CRS, such as EPSG:32632.
         survey: its origin must lie within the area of the CRS.
 
     Raises:
@@ -39,8 +38,6 @@ def coordinates_in(crs: PointCrs, checkpoints: CheckPoints, survey: Survey) -> C
     """Return each check point as surveyed and as measured, and the origin of `geo`, in a CRS.
 
     Args:
-        crs: from `target_crs`.
-        checkpoints: errors of the check points.
         survey: has the same check points, and the origin.
 
     Raises:
@@ -102,11 +99,6 @@ def write_point_table(path: Path, report: EvaluationReport, survey: Survey) -> N
     """Write one line for each point and way in which it was measured; what is not known stays empty.
 
     The place is the surveyed one. With `--crs`, check points have their coordinates there too.
-
-    Args:
-        path: of the CSV file.
-        report: of the same survey.
-        survey: has the surveyed positions.
     """
     place = _places(survey)
     in_crs = report.coordinates
@@ -123,7 +115,6 @@ def write_camera_sigma(path: Path, names: Sequence[str], cov: FloatArray) -> Non
     """Write one line for each camera: σ of its position and of its rotations, along east, north and up.
 
     Args:
-        path: of the CSV file.
         names: n photographs.
         cov: (n, 6, 6) of (δθ [rad], δc [m]).
     """

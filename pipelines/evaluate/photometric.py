@@ -33,11 +33,7 @@ _COLUMNS = 48  # across a view: neighbouring rays meet neighbouring ground
 
 
 class TrainingCoverage:
-    """Coverage of views by the training views.
-
-    Args:
-        renderer: knows cameras and poses of all views.
-    """
+    """Coverage of views by the training views."""
 
     def __init__(self, renderer: ModelRenderer) -> None:
         self._renderer = renderer
@@ -49,9 +45,6 @@ class TrainingCoverage:
         """Return the mask (H, W) of the pixels of a view whose ground at least two training views show.
 
         None without SfM points. Pixels without ground, such as sky, are not covered.
-
-        Args:
-            index: of the view.
         """
         if self._surface is None:
             return None
@@ -100,11 +93,8 @@ def compare_test_views(
     guess.
 
     Args:
-        renderer: of the trained model.
         lpips_weights: NPZ file; None: no LPIPS.
         save_render: saves the first views side by side with their photographs.
-        progress: shows the views.
-        saved: number of views for `save_render`.
 
     Raises:
         InputError: a photograph or the weights cannot be read.

@@ -103,12 +103,9 @@ def compare_with_reference(
     """Return the comparison of a trained survey with a reference.
 
     Args:
-        renderer: of the trained model.
-        files: the reference.
         grid: predicted σ of the georeference; None: not known.
         options: of the stage, with `reference`.
         scratch: folder for depth maps and sorted points; removed at the end.
-        progress: shows depth maps, points and squares.
 
     Raises:
         InputError: a damaged file, a missing grid, a reference of another place, or no room on the disk.

@@ -114,7 +114,6 @@ def plane_normals(position: FloatArray, spacing_m: float) -> FloatArray:
 
     Args:
         position: (P, 3) metres, about `spacing_m` apart.
-        spacing_m: between the points.
     """
     count = min(_NEIGHBOURS, len(position))
     if count < 4:
@@ -137,7 +136,6 @@ class TiledPoints:
 
     Args:
         folder: scratch folder, made if missing.
-        side_m: of the squares.
     """
 
     def __init__(self, folder: Path, side_m: float) -> None:
@@ -147,7 +145,6 @@ class TiledPoints:
         folder.mkdir(parents=True, exist_ok=True)
 
     def __len__(self) -> int:
-        """Return the number of points."""
         return sum(self._count.values())
 
     @property

@@ -132,11 +132,8 @@ def draw_accuracy(
     """Write a map of the predicted accuracy, with cameras, control and check points, errors and coordinates.
 
     Args:
-        grid: predicted σ.
-        solved: the survey.
         report: errors of triangulated points, and residuals of control points.
         crs: of the coordinates beside the map; None: longitude and latitude.
-        path: of the picture.
     """
     survey = solved.survey
     raster = SigmaRaster(grid.raster(grid.sigma_h_m), grid.raster(grid.sigma_v_m), grid.corner_in_geo, grid.size_m)
@@ -220,9 +217,6 @@ def evaluate(
     """Return the report on a solved survey.
 
     Args:
-        solved: the survey.
-        posterior: its covariances.
-        options: of the stage.
         crs: CRS in which the report lists the check points too; None: none.
         rendered: what the Gaussians show; None: nothing is trained yet.
 

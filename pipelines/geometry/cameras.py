@@ -2,9 +2,8 @@
 
 Pixels have the centre of the top-left pixel at (0.5, 0.5). Rays are normalised coordinates (x/z, y/z) in the
 camera frame: x right, y down, z forward. Every model is brought into one of two forms, OpenCV's rational lens
-(FULL_OPENCV, of which the simpler models are special cases) or the equidistant fisheye.
-
-Lenses whose parameters change: their parameter vector, its effect on bearings and on undistorted images.
+(FULL_OPENCV, of which the simpler models are special cases) or the equidistant fisheye. `Lenses` holds the cameras
+of all images with their parameters as one vector, which an adjustment changes.
 """
 
 from __future__ import annotations
@@ -105,8 +104,7 @@ class Camera:
     @property
     def mean_focal_px(self) -> float:
         """Mean of the two focal lengths in pixels."""
-        focal, _, _ = _split_params(self)
-        return float(focal.mean())
+        return float(full_parameters(self)[:2].mean())
 
 
 def parameter_names(camera: Camera) -> tuple[str, ...]:
@@ -138,7 +136,7 @@ def undistort(camera: Camera, xy_px: ArrayLike) -> FloatArray:
     Raises:
         InputError: unknown camera model, or a wrong number of parameters.
     """
-    focal, center, distortion = _split_params(camera)
+    focal, center, distortion = np.split(full_parameters(camera), [2, 4])
     target = (np.asarray(xy_px, dtype=np.float64) - center) / focal
     if not distortion.any() and camera.model != "OPENCV_FISHEYE":
         return target
@@ -162,9 +160,8 @@ def project_each(cameras: dict[int, Camera], camera_of: IntArray, points_in_cam:
     """Return pixels (M, 2) of points that have a camera each; NaN as in `project`.
 
     Args:
-        cameras: by key.
-        camera_of: (M,) key of each point's camera.
-        points_in_cam: (M, 3) in the frame of that camera.
+        camera_of: (M,) keys of `cameras`.
+        points_in_cam: (M, 3), each in the frame of its camera.
     """
     pixels = np.empty((len(points_in_cam), 2))
     for key, camera in cameras.items():
@@ -179,7 +176,7 @@ def distort(camera: Camera, ray: ArrayLike) -> FloatArray:
     Raises:
         InputError: as `undistort`.
     """
-    focal, center, distortion = _split_params(camera)
+    focal, center, distortion = np.split(full_parameters(camera), [2, 4])
     normalised = np.asarray(ray, dtype=np.float64)
     flat = normalised.reshape(-1, 2)
     bent = _distort_fisheye(flat, distortion) if _is_fisheye(camera) else _distort_rational(flat, distortion)[0]
@@ -207,12 +204,6 @@ def full_parameters(camera: Camera) -> FloatArray:
     if not (full[:2] > 0).all():
         raise InputError(f"focal length {full[0]:g} px is not positive")
     return full
-
-
-def _split_params(camera: Camera) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return focal lengths (2,), principal point (2,) and distortion (8,), zero for terms that the model lacks."""
-    full = full_parameters(camera)
-    return full[:2], full[2:4], full[4:]
 
 
 def _distort_rational(ray: FloatArray, lens: FloatArray) -> tuple[FloatArray, tuple[FloatArray, ...]]:
@@ -280,12 +271,7 @@ def _undistort_fisheye(target: FloatArray, lens: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class CameraPoses:
-    """Poses of n cameras in the frame `model`.
-
-    Attributes:
-        cam_from_model: (n, 3, 3) rotations.
-        cam_center_in_model: (n, 3) metres.
-    """
+    """Poses of n cameras in the frame `model`: rotations (n, 3, 3) and centres (n, 3) in metres."""
 
     cam_from_model: FloatArray
     cam_center_in_model: FloatArray
@@ -355,13 +341,9 @@ class Lenses:
 def parameter_derivative(
     function: Callable[[Camera], FloatArray], camera: Camera, index: int, step: float
 ) -> FloatArray:
-    """Return the central difference of a function of a camera by one of its parameters.
+    """Return the central difference of a function of a camera by parameter `index`.
 
-    Args:
-        function: of the camera.
-        camera: where to differentiate.
-        index: of the parameter.
-        step: of the parameter, relative to the larger of its magnitude and 1.
+    The step is relative to the larger of the parameter's magnitude and 1.
     """
     shift = np.zeros(len(camera.params))
     shift[index] = step * max(1.0, abs(float(camera.params[index])))

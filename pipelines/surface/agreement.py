@@ -180,8 +180,6 @@ def without_rims(depth: Float32Array, reach_px: int, rim: float) -> Float32Array
 
     Args:
         depth: along the optical axis, 0 where unknown.
-        reach_px: half the window's side.
-        rim: see `AgreementSettings`.
     """
     height, width = depth.shape
     inverse = np.where(depth > 0, 1 / np.maximum(depth, 1e-9), np.nan)
@@ -219,9 +217,7 @@ def surface_prior(estimate: DepthEstimate, agreed: Float32Array, camera: StereoC
     """Return the prior at the pixels of a finer camera: depths that views agree on, elsewhere the view's own.
 
     Args:
-        estimate: the view's own depths, on coarse pixels.
         agreed: (H, W) depths that views agree on, on the same pixels; 0 elsewhere.
-        camera: the finer camera.
     """
     normals, own = estimate.sweep.normals, estimate.depth()
     own = np.where(np.isfinite(own) & (own > 0), own, 0).astype(np.float32)
@@ -247,12 +243,6 @@ def refine(
     """Compare a view with its neighbours at offsets around a prior, and keep the best.
 
     A best match at either end of the range means that the surface lies outside of it: its score becomes −1.
-
-    Args:
-        reference: view whose surface is wanted.
-        neighbours: one or more views of the same place from elsewhere.
-        prior: rough surface at the pixels of `reference`.
-        settings: of the comparison.
 
     Raises:
         ValueError: no neighbours.

@@ -69,10 +69,8 @@ def seen_surfels(surfels: Surfels, cam_from_world: FloatArray, center: FloatArra
     """Return the discs that a camera sees.
 
     Args:
-        surfels: the discs, in the world.
         cam_from_world: (3, 3) rotation.
         center: (3,) camera centre, in the world.
-        camera: the pinhole.
     """
     in_cam = (surfels.position - center) @ cam_from_world.T
     normal = surfels.normal @ cam_from_world.T
@@ -147,7 +145,6 @@ def crossings(
         end: (P, 3) ends of the beams, in the grid.
         start: (P, 3) their starts, elsewhere than the ends.
         low: (3,) low corner of the grid.
-        cell_m: side of the cells.
         shape: (3,) number of cells.
     """
     count = np.zeros(tuple(shape.tolist()), dtype=np.uint8)

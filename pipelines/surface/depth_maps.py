@@ -75,8 +75,6 @@ class DepthMaps:
 
     Args:
         folder: cache, in which each scene has a folder of its own.
-        scene: cameras and SfM points.
-        images: undistorted photographs.
         options: of the depth maps; None: the defaults.
     """
 

@@ -45,7 +45,6 @@ class Candidates:
     pixel_m: FloatArray
 
     def __len__(self) -> int:
-        """Return the number of points."""
         return len(self.position)
 
     @staticmethod
@@ -189,10 +188,7 @@ def plan_squares(
     """Return the squares that hold the surface, none with more candidates than memory has room for.
 
     Args:
-        views: surface of the training views.
-        geo_from_model: similarity.
         spacing_m: side of the voxels; squares consist of whole voxels, so that no voxel is cut.
-        coarsest_m: pixels that are wider on the surface do not count.
         step: every `step`-th row and column of a view gives candidates.
     """
     look = max(_SAMPLE_PX, step)
@@ -277,7 +273,6 @@ class SurfaceCloud:
     sigma_m: FloatArray
 
     def __len__(self) -> int:
-        """Return the number of points."""
         return len(self.position)
 
 
@@ -287,9 +282,6 @@ def fusion_settings(
     """Return the settings for a cloud.
 
     Args:
-        views: surface of the training views.
-        geo_from_model: similarity.
-        min_views: least number of views that agree on a point.
         spacing_m: side of the voxels; None: the width of a pixel on the surface.
     """
     pixel_m = pixel_on_surface_m(views, geo_from_model)
@@ -310,9 +302,6 @@ def fused_squares(
 
     Args:
         views: surface of the training views, with colours.
-        geo_from_model: similarity.
-        settings: spacing, and what counts.
-        progress: shows the squares.
     """
     step = max(1, int(settings.spacing_m / pixel_on_surface_m(views, geo_from_model)))
     squares = plan_squares(views, geo_from_model, settings.spacing_m, settings.coarsest_m, step)

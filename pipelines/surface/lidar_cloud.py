@@ -39,9 +39,7 @@ class ScannerTrack:
         """Return the track of a CSV file: time, and latitude, longitude, altitude or x, y, z.
 
         Args:
-            path: of the file, on the clock of the cloud's points.
             stated: CRS and vertical datum of the cloud, which those of a track without a CRS are.
-            origin: of geo.
 
         Raises:
             InputError: an unreadable file, or one without times.
@@ -110,7 +108,6 @@ class LidarCloud:
     scanner_in_model: FloatArray | None = None
 
     def __len__(self) -> int:
-        """Return the number of points."""
         return len(self.position_in_model)
 
     def part(self, rows: IntArray | np.ndarray) -> LidarCloud:
@@ -151,11 +148,7 @@ def read_cloud(
     """Return the points of the clouds in the scene, as dense as the photographs resolve it.
 
     Args:
-        files: the clouds.
-        scene: cameras and SfM points.
-        survey: has the origin of `geo`.
         pixel_m: size of a pixel of the photographs on the surface.
-        progress: shows the points read.
         track: of the scanner; None: not known.
 
     Raises:

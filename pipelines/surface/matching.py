@@ -133,8 +133,6 @@ def _add_across(reference: Any, padded: Any, half: int, sums: Any) -> None:
     Args:
         reference: (W + 2 half,) row of the reference, mirrored at its ends.
         padded: (W + 2 half,) likewise of the neighbour, as the reference sees it.
-        half: of the window.
-        sums: output.
     """
     width = sums.shape[1]
     for k in range(2 * half + 1):
@@ -167,7 +165,6 @@ def _correlate_row(ring: Any, shown: Any, mean: Any, inverse_sigma: Any, total: 
         mean: (W,) of the reference's windows.
         inverse_sigma: (W,) of the reference's windows.
         total: (3, W) scratch.
-        score: output.
     """
     window, width = ring.shape[0], shown.shape[0]
     share = np.float32(1.0 / (window * window))
@@ -295,13 +292,7 @@ class MatchSettings:
 
 
 class Matcher:
-    """Compares a photograph (H, W) with its neighbours under hypotheses of depth.
-
-    Args:
-        reference: view whose surface is wanted.
-        neighbours: one or more views of the same place from elsewhere.
-        settings: of the comparison.
-    """
+    """Compares a photograph (H, W) with its neighbours under hypotheses of depth."""
 
     def __init__(self, reference: StereoView, neighbours: list[StereoView], settings: MatchSettings) -> None:
         grey, side = reference.grey, (settings.window_px, settings.window_px)

@@ -71,7 +71,6 @@ class MeasuredCloud:
     voxel_m: float
 
     def __len__(self) -> int:
-        """Return the number of points."""
         return len(self.position_in_geo)
 
     def part(self, rows: IntArray | np.ndarray) -> MeasuredCloud:
@@ -101,7 +100,6 @@ class CloudFiles:
 
     Args:
         path: file, or folder whose LAS, LAZ and PLY files are taken, also from its subfolders.
-        stated: CRS that the user states.
 
     Attributes:
         count: number of points.
@@ -130,10 +128,6 @@ class CloudFiles:
 
     def chunks(self, origin: Origin, progress: Progress = SILENT) -> Iterator[MeasuredCloud]:
         """Yield all valid points in geo, a chunk at a time and not thinned.
-
-        Args:
-            origin: of geo.
-            progress: shows the points read.
 
         Raises:
             InputError: a damaged file, points outside their CRS, or a missing grid.
@@ -175,12 +169,6 @@ def read_thinned(
     """Return one point of each voxel that the clouds meet, the first.
 
     Memory holds at most three times `thinning.most` points.
-
-    Args:
-        files: the clouds.
-        origin: of geo.
-        thinning: voxels, limit and box.
-        progress: shows the points read.
 
     Raises:
         InputError: as `CloudFiles.chunks`; or no point lies in the box.

@@ -120,10 +120,7 @@ def depth_around(renderer: ModelRenderer, camera: int, xy: FloatArray, reach_px:
     rounding decides how its depth is taken, and another window would round in another way.
 
     Args:
-        renderer: of the trained model.
-        camera: index of the camera.
         xy: (2,) x/z and y/z of the ray.
-        reach_px: pixels to each side of the ray's.
     """
     pose = renderer.pose(camera)
     pinhole = pose.pinhole
@@ -141,8 +138,6 @@ def surface_hits(trained: TrainedSurvey, rays: MarkRays, maps: Sequence[DepthMap
     """Return where the rays of marks meet the surface of their own views.
 
     Args:
-        trained: the trained model.
-        rays: of K marks.
         maps: K, the depth around each mark in its view.
     """
     position, at_edge = np.full((len(rays), 3), np.nan), np.zeros(len(rays), dtype=bool)
@@ -164,7 +159,6 @@ def points_by_model(trained: TrainedSurvey, rays: MarkRays, maps: Sequence[Depth
     than two.
 
     Args:
-        trained: the trained model.
         rays: K marks of J points.
         maps: K, the depth around each mark in its view.
     """
@@ -229,11 +223,7 @@ class NoSurface:
 
 
 class SurfaceReader:
-    """Reader of the surface of a trained model.
-
-    Args:
-        renderer: of the model.
-    """
+    """Reader of the surface of a trained model."""
 
     def __init__(self, renderer: ModelRenderer) -> None:
         self.renderer, self._trained = renderer, renderer.trained

@@ -54,7 +54,6 @@ class PlaneMatches:
     wall: BoolArray
 
     def __len__(self) -> int:
-        """Return the number of points."""
         return len(self.distance_m)
 
 

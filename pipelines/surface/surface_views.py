@@ -49,7 +49,6 @@ def shows_photograph(rendered: ByteArray, photograph: ByteArray) -> BoolArray:
     of the render, in a window around the pixel. Brightness and exposure have no influence on where it is low.
 
     Args:
-        rendered: RGB.
         photograph: RGB, undistorted, of the same camera and size.
     """
     shown, given = (
@@ -85,9 +84,7 @@ class ModelRenderer:
     """Renderer of the trained model from its own cameras, at the size of the training photographs.
 
     Args:
-        trained: the trained model.
         images: undistorted photographs of the same cameras.
-        backend: the rasteriser.
     """
 
     def __init__(self, trained: TrainedSurvey, images: ImageCache, backend: Rasterizer) -> None:
@@ -110,12 +107,7 @@ class ModelRenderer:
         return self._pinholes.of(index)
 
     def render(self, index: int, *, depth: bool = False) -> Render:
-        """Return the render of camera `index`, without gradients.
-
-        Args:
-            index: of the camera.
-            depth: render depths as well.
-        """
+        """Return the render of camera `index`, without gradients."""
         return self.render_from(self.pose(index), depth=depth)
 
     def pose(self, index: int) -> ViewPose:
@@ -127,8 +119,6 @@ class ModelRenderer:
         """Return the render of any camera, without gradients.
 
         Args:
-            pose: of the camera.
-            depth: render depths as well.
             window: part of the image to render; None: all of it.
         """
         model = self.trained.model
@@ -149,7 +139,6 @@ class ModelRenderer:
         """Return the depth (H, W) in metres of the surface along the z axis of any camera; 0: no surface.
 
         Args:
-            pose: of the camera.
             window: part of the image to render; None: all of it.
         """
         return np.asarray(_measured(self.render_from(pose, depth=True, window=window)).cpu().numpy())
@@ -206,11 +195,8 @@ class SurfaceViews:
     """Depth maps of all training cameras, at the size of the training photographs.
 
     Args:
-        renderer: of the trained model.
         folder: scratch folder, made if missing. It belongs to the maps alone: maps that are there are continued.
-        colours: keep the colours of the renders too.
         confirmed: keep only depths where the render shows its photograph (`surface.surface_views`).
-        progress: shows the renders.
 
     Raises:
         InputError: the maps do not fit on the disk.
@@ -238,7 +224,6 @@ class SurfaceViews:
         self._rgb = _mapped(folder / _COLOURS, np.dtype(np.uint8), 3 * int(self._start[-1])) if colours else None
 
     def __len__(self) -> int:
-        """Return the number of views."""
         return len(self.cameras)
 
     def view(self, number: int) -> SurfaceView:

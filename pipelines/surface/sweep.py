@@ -108,10 +108,8 @@ def plane_sweep(
     plane.
 
     Args:
-        reference: view whose surface is wanted.
         neighbours: one or more views of the same place from elsewhere.
         sweeps: planes by direction, the likelier directions first.
-        settings: of the comparison.
 
     Raises:
         ValueError: no neighbours, no sweep, or one of fewer than three planes.
@@ -213,14 +211,7 @@ class PointVisibility:
 
 
 def best_neighbours(visibility: PointVisibility, view: int, among: IntArray, count: int) -> list[int]:
-    """Return at most `count` views that share most points with `view` under good angles, best first.
-
-    Args:
-        visibility: of the SfM points.
-        view: index of the view.
-        among: indices of the views to choose from.
-        count: most views.
-    """
+    """Return at most `count` views that share most points with `view` under good angles, best first."""
     seen = visibility.points_in_view(view)
     seen = seen[np.linspace(0, len(seen) - 1, min(len(seen), _MOST_POINTS)).astype(np.int64)]
     rows = np.isin(visibility.obs_point, seen) & np.isin(visibility.obs_view, among) & (visibility.obs_view != view)

@@ -108,7 +108,6 @@ def support(
 
     Args:
         point_in_world: (N, 3) metres, finite.
-        views: depth maps and cameras.
         up_in_world: (3,) unit vector.
         tolerance: largest difference of depths that agree, as a part of the depth.
         normal_in_world: (N, 3) unit normals with an arbitrary sign; NaN where unknown.
@@ -364,10 +363,7 @@ def seen_surface(
     """Return the depth maps of a reference.
 
     Args:
-        viewpoints: cameras.
         position_in_geo: (P, 3) points of the reference, one a voxel.
-        voxel_m: side of the voxels.
-        progress: shows the photographs.
     """
     blocks = _position_blocks(position_in_geo)
     maps: list[Float32Array] = []
