@@ -1,7 +1,4 @@
-"""Positions of the report in a CRS that the user names: ENU → ECEF → CRS, point by point.
-
-Errors of every check and control point, and σ of every camera, as tables for other programs.
-"""
+"""Positions of the report in a CRS that the user names, and its tables of points and cameras for other programs."""
 
 from __future__ import annotations
 
@@ -20,11 +17,8 @@ from pipelines.survey.report import CheckPointErrors, CheckPoints, Coordinates, 
 from pipelines.survey.survey import Survey
 
 
-def target_crs(text: str, survey: Survey) -> PointCrs:
-    """Return the CRS in which to list positions of a survey.
-
-    Args:
-        survey: its origin must lie within the area of the CRS.
+def report_crs(text: str, survey: Survey) -> PointCrs:
+    """Return the CRS, such as EPSG:32632, in which to list positions of a survey.
 
     Raises:
         InputError: the text is not a CRS, the CRS is not for this place, or a grid that it needs is not installed.
@@ -36,9 +30,6 @@ def target_crs(text: str, survey: Survey) -> PointCrs:
 
 def coordinates_in(crs: PointCrs, checkpoints: CheckPoints, survey: Survey) -> Coordinates:
     """Return each check point as surveyed and as measured, and the origin of `geo`, in a CRS.
-
-    Args:
-        survey: has the same check points, and the origin.
 
     Raises:
         InputError: a point lies outside the CRS's domain.

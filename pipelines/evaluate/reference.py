@@ -6,10 +6,6 @@
 3. In each square, distances are measured both ways and along the reference's normals (`distances`).
 4. Recall counts points that three photographs saw, and precision the model's points where the reference covers the
    plan.
-
-Cautions of a comparison with a reference.
-
-Map and histogram of a comparison with a reference.
 """
 
 from __future__ import annotations
@@ -32,23 +28,24 @@ from pipelines.evaluate.reference_distances import (
     CLASSES,
     Box,
     ComparisonSettings,
+    CorePoints,
     TiledPoints,
     compare_square,
     plane_normals,
-    require_m3c2,
+    require_py4dgeo,
 )
-from pipelines.evaluate.reference_figures import THRESHOLDS_M, CoreTable, DistanceTally, level_of_detection
+from pipelines.evaluate.reference_figures import THRESHOLDS_M, DistanceTally, level_of_detection
 from pipelines.geodesy.enu import Origin
 from pipelines.geometry.footprints import first_of_voxels
 from pipelines.geometry.similarity import Similarity
 from pipelines.report.plots.charts import write_distance_histogram, write_distance_map
 from pipelines.surface.fusion import FusionSettings, fused_squares, fusion_settings
-from pipelines.surface.measured_cloud import CloudFiles, MeasuredCloud, Thinning, read_thinned
-from pipelines.surface.registration import Fit, fit_alignment
+from pipelines.surface.measured_cloud import CloudReader, MeasuredCloud, Thinning, read_thinned
+from pipelines.surface.registration import fit_alignment
 from pipelines.surface.surface_views import ModelRenderer, SurfaceViews
 from pipelines.surface.visibility import SeenSurface, Viewpoints, seen_surface
 from pipelines.survey.options import CloudCrs
-from pipelines.survey.report_parts import ReferenceComparison
+from pipelines.survey.report_parts import ReferenceComparison, ReferenceShift
 from pipelines.survey.trained_survey import TrainedSurvey, scene_points
 
 _SQUARE_M = 32.0  # two million points of the reference at the most, in voxels of 0.025 m
@@ -63,21 +60,22 @@ class ComparedReference:
     """Figures of the comparison, and the core points for map and histogram."""
 
     comparison: ReferenceComparison
-    table: CoreTable
+    cores: CorePoints
+    lod_m: FloatArray
     assumptions: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class _Model:
-    """The model's cloud, and the similarity by which it was moved; None: it was not."""
+    """The model's cloud, its shift against the reference, and the similarity by which it was moved; None: not."""
 
     points: TiledPoints
     settings: FusionSettings
-    fit: Fit | None
+    shift: ReferenceShift | None
     moved: Similarity | None
 
 
-def open_reference(options: EvaluateOptions) -> CloudFiles | None:
+def open_reference(options: EvaluateOptions) -> CloudReader | None:
     """Return the reference of `--reference`, its headers and CRS checked; None without that option.
 
     Raises:
@@ -86,14 +84,14 @@ def open_reference(options: EvaluateOptions) -> CloudFiles | None:
     """
     if options.reference is None:
         return None
-    require_m3c2()
+    require_py4dgeo()
     stated = CloudCrs(options.reference_crs, options.reference_vertical, "--reference")
-    return CloudFiles(options.reference, stated)
+    return CloudReader(options.reference, stated)
 
 
 def compare_with_reference(
     renderer: ModelRenderer,
-    files: CloudFiles,
+    files: CloudReader,
     grid: AccuracyGrid | None,
     options: EvaluateOptions,
     *,
@@ -126,7 +124,6 @@ def compare_with_reference(
     sigma_m = _georeference_sigma(cores.position, cores.normal, trained, grid)
     known = np.zeros(len(cores.position)) if sigma_m is None or model.moved is not None else sigma_m
     lod_m = level_of_detection(cores.noise_m, np.hypot(known, options.reference_sigma))
-    table = CoreTable(cores, lod_m)
     comparison = ReferenceComparison(
         name=options.reference.name,
         crs=files.crs_names,
@@ -137,13 +134,13 @@ def compare_with_reference(
         model_spacing_m=model.settings.spacing_m,
         sigma_m=options.reference_sigma,
         georeference_sigma_m=None if sigma_m is None or not len(sigma_m) else float(np.median(sigma_m)),
-        shift=None if model.fit is None else model.fit.shift,
+        shift=model.shift,
         aligned="none" if model.moved is None else options.reference_align,
         cylinder_m=settings.core_m,
-        groups=tally.groups(table),
+        groups=tally.groups(cores, lod_m),
     )
     remove(scratch)
-    return ComparedReference(comparison, table, files.assumptions)
+    return ComparedReference(comparison, cores, lod_m, files.assumptions)
 
 
 def _compare(
@@ -185,26 +182,20 @@ def _model(
         raise DegenerateGeometryError("no point of the surface is seen alike by three training views: train longer")
     sparse = overview.position_in_geo[first_of_voxels(overview.position_in_geo, 2 * _OVERVIEW_M)]
     normal, kind = plane_normals(sparse, 2 * _OVERVIEW_M), options.reference_align
-    fit = fit_alignment(np.concatenate(sample), sparse, normal, 2 * _OVERVIEW_M, kind)
+    found = fit_alignment(np.concatenate(sample), sparse, normal, 2 * _OVERVIEW_M, kind)
     if kind == "none":
-        return _Model(delivered, settings, fit, None)
-    if fit is None:
+        return _Model(delivered, settings, None if found is None else found[1], None)
+    if found is None:
         raise DegenerateGeometryError(
             f"--reference-align {kind}: the surface and the reference have too little in common to move one onto "
             "the other, or nothing in them fixes all axes: compare without it"
         )
-    similarity = fit.reference_from_model
-    return _Model(_moved(delivered, similarity, scratch / "moved"), settings, fit, similarity)
-
-
-def _moved(points: TiledPoints, similarity: Similarity, folder: Path) -> TiledPoints:
-    """Return points in the place that a similarity gives them."""
-    moved = TiledPoints(folder, points.side_m)
-    for square in sorted(points.squares):
-        rows, own = points.around(square, 0.0)
-        normal = rows["normal"][own] @ similarity.rotation.T
-        moved.append(similarity.apply(rows["position"][own]), normal, None)
-    return moved
+    similarity, shift = found
+    moved = TiledPoints(scratch / "moved", delivered.side_m)
+    for name in sorted(delivered.squares):
+        rows, own = delivered.around(name, 0.0)
+        moved.append(similarity.apply(rows["position"][own]), rows["normal"][own] @ similarity.rotation.T, None)
+    return _Model(moved, settings, shift, similarity)
 
 
 def _viewpoints(renderer: ModelRenderer, moved: Similarity | None) -> Viewpoints:
@@ -219,7 +210,9 @@ def _viewpoints(renderer: ModelRenderer, moved: Similarity | None) -> Viewpoints
     )
 
 
-def _sorted_reference(files: CloudFiles, origin: Origin, box: Box, folder: Path, progress: Progress) -> TiledPoints:
+def _sorted_reference(
+    files: CloudReader, origin: Origin, box: Box, folder: Path, progress: Progress
+) -> TiledPoints:
     """Return the points of the reference within the box of the scene, in squares."""
     (low, high), reference = box, TiledPoints(folder, _SQUARE_M)
     for chunk in files.chunks(origin, progress):
@@ -296,7 +289,7 @@ def cautions_of_reference(found: ComparedReference) -> tuple[Caution, ...]:
 
 def draw_reference(found: ComparedReference, folder: Path) -> None:
     """Write map and histogram of the distances along the normals; nothing if none was measured."""
-    cores, lod_m = found.table.cores, found.table.lod_m
+    cores, lod_m = found.cores, found.lod_m
     known = np.isfinite(cores.distance_m)
     if not known.any():
         return

@@ -1,12 +1,7 @@
-"""Distances between the model's cloud and the reference in one square of the plan.
+"""Distances between the model's cloud and the reference in one square of the plan, as memory holds it.
 
-Distances between two clouds along the normals of one of them (M3C2), by py4dgeo.
-
-Lague, Brodu and Leroux 2013, doi 10.1016/j.isprsjprs.2013.04.009.
-
-Normals of a cloud from the nearest points.
-
-Points of clouds on the disk, by squares of the plan: memory holds one square and its margin.
+Distances along the normals of the reference are M3C2 (Lague, Brodu and Leroux 2013,
+doi 10.1016/j.isprsjprs.2013.04.009), by py4dgeo.
 """
 
 from __future__ import annotations
@@ -23,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from pipelines.core.errors import BackendUnavailableError, InputError
 from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
-from pipelines.geometry.footprints import first_of_voxels
+from pipelines.geometry.footprints import first_of_voxels, rows_by_square, rows_of
 from pipelines.surface.visibility import SeenSurface
 
 LEAST_POINTS = 4  # in the cylinder, of each cloud
@@ -41,15 +36,6 @@ class M3c2Distances:
 
     distance_m: FloatArray
     noise_m: FloatArray
-
-
-def require_m3c2() -> None:
-    """Import py4dgeo, so that its absence is told before work starts.
-
-    Raises:
-        BackendUnavailableError: py4dgeo is not installed.
-    """
-    _py4dgeo()
 
 
 def m3c2(
@@ -74,7 +60,7 @@ def m3c2(
     nothing = np.full(len(core), np.nan)
     if not (len(core) and len(first) and len(second)):
         return M3c2Distances(nothing, nothing.copy())
-    py4dgeo = _py4dgeo()
+    py4dgeo = require_py4dgeo()
     middle = core.mean(axis=0)
     algorithm = py4dgeo.M3C2(
         epochs=(py4dgeo.Epoch(first - middle), py4dgeo.Epoch(second - middle)),
@@ -91,7 +77,12 @@ def m3c2(
     return M3c2Distances(np.where(known, distance, np.nan), np.where(known, noise, np.nan))
 
 
-def _py4dgeo() -> Any:
+def require_py4dgeo() -> Any:
+    """Import py4dgeo; its absence is to be told before work starts.
+
+    Raises:
+        BackendUnavailableError: py4dgeo is not installed.
+    """
     try:
         import py4dgeo
     except ImportError as error:
@@ -173,14 +164,10 @@ class TiledPoints:
             rows["normal"] = normal
         if classification is not None:
             rows["classification"] = classification
-        square = np.floor(position[:, :2] / self.side_m).astype(np.int64)
-        order = np.lexsort(square.T)
-        starts = np.flatnonzero(np.any(np.diff(square[order], axis=0, prepend=square[order][:1] - 1), axis=1))
-        for part in np.split(order, starts[1:]) if len(order) else []:
-            name = (int(square[part[0], 0]), int(square[part[0], 1]))
-            with self._path(name).open("ab") as file:
+        for square, part in rows_by_square(position, self.side_m):
+            with self._path(square).open("ab") as file:
                 file.write(rows[part].tobytes())
-            self._count[name] = self._count.get(name, 0) + len(part)
+            self._count[square] = self._count.get(square, 0) + len(part)
 
     def around(self, square: Square, margin_m: float) -> tuple[NDArray[np.void], NDArray[np.bool_]]:
         """Return the rows in a square and its margin, and which of them lie in the square itself."""
@@ -261,10 +248,6 @@ class Kinds:
     of_class: IntArray
     of_slope: IntArray
 
-    def part(self, rows: IntArray | BoolArray) -> Kinds:
-        """Return the kinds of some rows."""
-        return Kinds(self.of_class[rows], self.of_slope[rows])
-
 
 @dataclass(frozen=True)
 class CorePoints:
@@ -332,11 +315,11 @@ def compare_square(
     measured = m3c2(every, model_every, place[cores], normal[cores], radius_m=settings.core_m, reach_m=_REACH_M)
     return SquareDistances(
         to_reference,
-        kinds.part(nearest),
+        rows_of(kinds, nearest),
         to_model,
-        kinds.part(is_seen),
+        rows_of(kinds, is_seen),
         int(own.sum()),
-        CorePoints(place[cores], normal[cores], measured.distance_m, measured.noise_m, kinds.part(cores)),
+        CorePoints(place[cores], normal[cores], measured.distance_m, measured.noise_m, rows_of(kinds, cores)),
     )
 
 

@@ -78,6 +78,20 @@ class Pinhole:
         return depth.reshape(-1, 1) * self.rays(np.stack([column, row], axis=1) + 0.5)
 
 
+@dataclass(frozen=True)
+class ViewPose:
+    """Undistorted camera of H × W pixels, with its rotation (3, 3) and centre (3,), metres in `model`."""
+
+    pinhole: Pinhole
+    cam_from_model: FloatArray
+    center_in_model: FloatArray
+
+    def rays(self) -> FloatArray:
+        """Return viewing rays (H, W, 3) in `model`, of length one along the optical axis."""
+        x, y = np.meshgrid(np.arange(self.pinhole.width) + 0.5, np.arange(self.pinhole.height) + 0.5)
+        return self.pinhole.rays(np.stack([x, y], axis=-1)) @ self.cam_from_model
+
+
 def pose_matrix(cam_from_world: FloatArray, cam_center_in_world: FloatArray) -> FloatArray:
     """Return the pose (4, 4) cam ← world of a camera with a rotation (3, 3) and a centre (3,)."""
     matrix = np.eye(4)

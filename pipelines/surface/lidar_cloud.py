@@ -1,7 +1,4 @@
-"""LiDAR cloud of the scene: points with the planes around them, in `model`.
-
-Track of a scanner: its place at the time of each point of a LiDAR cloud.
-"""
+"""LiDAR cloud of the scene: points with the planes around them, in `model`, and the track of its scanner."""
 
 from __future__ import annotations
 
@@ -17,8 +14,9 @@ from pipelines.core.types import ByteArray, FloatArray, IntArray
 from pipelines.formats.trajectory_csv import read_trajectory
 from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import Origin, ecef_from_lla, enu_from_ecef
+from pipelines.geometry.footprints import rows_of
 from pipelines.geometry.trajectory import Trajectory
-from pipelines.surface.measured_cloud import CloudFiles, Thinning, read_thinned
+from pipelines.surface.measured_cloud import CloudReader, Thinning, read_thinned
 from pipelines.survey.options import CloudCrs
 from pipelines.survey.scene import Scene
 from pipelines.survey.survey import Survey
@@ -111,19 +109,9 @@ class LidarCloud:
         return len(self.position_in_model)
 
     def part(self, rows: IntArray | np.ndarray) -> LidarCloud:
-        """Return the points of some rows."""
-        return LidarCloud(
-            self.position_in_model[rows],
-            self.normal_in_model[rows],
-            self.roughness_m[rows],
-            self.reach_m[rows],
-            self.classification[rows],
-            self.voxel_m,
-            None if self.scanner_in_model is None else self.scanner_in_model[rows],
-        )
+        return rows_of(self, rows)
 
     def moved(self, shift: FloatArray) -> LidarCloud:
-        """Return the cloud shifted by a vector (3,)."""
         scanner = None if self.scanner_in_model is None else self.scanner_in_model + shift
         return replace(self, position_in_model=self.position_in_model + shift, scanner_in_model=scanner)
 
@@ -137,7 +125,7 @@ class LidarCloud:
 
 
 def read_cloud(
-    files: CloudFiles,
+    files: CloudReader,
     scene: Scene,
     survey: Survey,
     pixel_m: float,
