@@ -38,19 +38,12 @@ from pipelines.survey.trained_survey import SolvedSurvey, fix_differences, point
 
 @dataclass(frozen=True)
 class RemeasuredPoints:
-    """J surveyed points, measured in the model.
-
-    Attributes:
-        points: positions and covariances of the survey.
-        error_in_geo: (J, 3) m, measured minus surveyed; NaN for a point that was not measured.
-        rays: (J,) number of marks in registered images.
-        cov_in_geo: (J, 3, 3) m², predicted covariance of the measured positions; None: no prediction.
-    """
+    """J surveyed points, measured in the model."""
 
     points: tuple[SurveyedPoint, ...]
-    error_in_geo: FloatArray
-    rays: IntArray
-    cov_in_geo: FloatArray | None = None
+    error_in_geo: FloatArray  # (J, 3) m, measured minus surveyed; NaN for a point that was not measured
+    rays: IntArray  # (J,) number of marks in registered images
+    cov_in_geo: FloatArray | None = None  # (J, 3, 3) m², predicted of the measured positions; None: no prediction
 
     @property
     def is_measured(self) -> BoolArray:
@@ -94,7 +87,6 @@ def _assess(measured: RemeasuredPoints, area_km2: float | None = None) -> Assess
 
 
 def _figures(measured: RemeasuredPoints, assessment: Assessment) -> dict[str, Any]:
-    """Return the fields of a section on points, whatever their role."""
     among_all = np.zeros(len(measured.points), dtype=bool)
     among_all[measured.is_measured] = assessment.blunder
     blunder = among_all.tolist()
@@ -198,7 +190,6 @@ def cross_validate(solved: SolvedSurvey) -> CrossValidation:
 def _compared(
     points: tuple[SurveyedPoint, ...], position_in_geo: FloatArray, rays: MarkRays, cov: FloatArray | None = None
 ) -> RemeasuredPoints:
-    """Return surveyed points with the errors of their measured positions (J, 3)."""
     surveyed = np.array([point.position_in_geo for point in points]).reshape(-1, 3)
     return RemeasuredPoints(points, position_in_geo - surveyed, rays.marks_of_point, cov)
 

@@ -57,7 +57,7 @@ _SAMPLE = 20_000  # points of the reference that tell its spacing
 
 @dataclass(frozen=True)
 class ComparedReference:
-    """Figures of the comparison, and the core points for map and histogram."""
+    """Figures of the comparison, and the core points with their levels of detection for map and histogram."""
 
     comparison: ReferenceComparison
     cores: CorePoints
@@ -111,7 +111,9 @@ def compare_with_reference(
     """
     assert options.reference is not None  # the caller opened its files
     trained = renderer.trained
-    box = _bounds(trained)
+    points = scene_points(trained)
+    margin = np.array([_MARGIN_M, _MARGIN_M, _MARGIN_UP_M])  # a reference may lie above or below the scene
+    box = points.min(axis=0) - margin, points.max(axis=0) + margin
     thinning = Thinning(_OVERVIEW_M, _MOST_OVERVIEW, *box)
     overview = read_thinned(files, trained.survey.origin, thinning, progress)
     model = _model(renderer, overview, options, scratch, progress)
@@ -158,17 +160,9 @@ def _compare(
     return tally
 
 
-def _bounds(trained: TrainedSurvey) -> Box:
-    """Return the corners (3,) of the box around the scene; a reference may lie above or below it."""
-    points = scene_points(trained)
-    margin = np.array([_MARGIN_M, _MARGIN_M, _MARGIN_UP_M])
-    return points.min(axis=0) - margin, points.max(axis=0) + margin
-
-
 def _model(
     renderer: ModelRenderer, overview: MeasuredCloud, options: EvaluateOptions, scratch: Path, progress: Progress
 ) -> _Model:
-    """Return the model's cloud in squares, and its shift against the reference."""
     geo_from_model = renderer.trained.geo_from_model
     views = SurfaceViews(renderer, scratch / "depth_maps", colours=True, confirmed=True, progress=progress)
     settings = fusion_settings(views, geo_from_model, _LEAST_VIEWS)
@@ -213,7 +207,6 @@ def _viewpoints(renderer: ModelRenderer, moved: Similarity | None) -> Viewpoints
 def _sorted_reference(
     files: CloudReader, origin: Origin, box: Box, folder: Path, progress: Progress
 ) -> TiledPoints:
-    """Return the points of the reference within the box of the scene, in squares."""
     (low, high), reference = box, TiledPoints(folder, _SQUARE_M)
     for chunk in files.chunks(origin, progress):
         place = chunk.position_in_geo
@@ -234,10 +227,7 @@ def _spacing(reference: TiledPoints) -> float:
 
 
 def _georeference_sigma(
-    position: FloatArray,
-    normal: FloatArray,
-    trained: TrainedSurvey,
-    grid: AccuracyGrid | None,
+    position: FloatArray, normal: FloatArray, trained: TrainedSurvey, grid: AccuracyGrid | None
 ) -> FloatArray | None:
     """Return the predicted σ (C,) of the georeference along normals; None: not known."""
     if grid is None or not len(position) or not is_checked(trained.model.cautions):
@@ -251,40 +241,36 @@ _SEEN = 0.05
 
 def cautions_of_reference(found: ComparedReference) -> tuple[Caution, ...]:
     """Return the limits of a comparison with a reference."""
-    comparison, sentences = found.comparison, []
+    comparison, cautions = found.comparison, []
+
+    def warn(code: str, sentence: str) -> None:
+        cautions.append(Caution(code=code, sentence=sentence))
+
     for assumption in found.assumptions:
-        sentences.append(("reference-heights", assumption[0].upper() + assumption[1:] + "."))
+        warn("reference-heights", assumption[0].upper() + assumption[1:] + ".")
     fine = max(comparison.spacing_m, comparison.model_spacing_m)
     least = comparison.groups[0].scores[0].threshold_m
     if fine > least:
-        sentences.append(
-            (
-                "reference-spacing",
-                f"Points are {fine:.3f} m apart: shares within shorter distances, and C2C, say more about the "
-                "spacing than about the surface. M3C2 does not depend on it.",
-            )
+        warn(
+            "reference-spacing",
+            f"Points are {fine:.3f} m apart: shares within shorter distances, and C2C, say more about the "
+            "spacing than about the surface. M3C2 does not depend on it.",
         )
     shift = comparison.shift
     if shift is not None and comparison.aligned == "none":
         sigma = [max(s, comparison.georeference_sigma_m or 0.0, comparison.sigma_m) for s in shift.sigma_m]
         if any(abs(value) > _SHIFTED_SIGMAS * s for value, s in zip(shift.enu_m, sigma, strict=True)):
-            sentences.append(
-                (
-                    "reference-shifted",
-                    "The model lies off the reference as a whole: moving it by "
-                    f"{shift.enu_m[0]:+.3f} m east, {shift.enu_m[1]:+.3f} m north and {shift.enu_m[2]:+.3f} m up "
-                    "fits best, which is more than three times the σ of both (--reference-align shift judges the "
-                    "shape alone).",
-                )
+            warn(
+                "reference-shifted",
+                "The model lies off the reference as a whole: moving it by "
+                f"{shift.enu_m[0]:+.3f} m east, {shift.enu_m[1]:+.3f} m north and {shift.enu_m[2]:+.3f} m up "
+                "fits best, which is more than three times the σ of both (--reference-align shift judges the "
+                "shape alone).",
             )
     if comparison.seen < _SEEN:
-        sentences.append(
-            (
-                "reference-unseen",
-                f"Photographs saw {100 * comparison.seen:.1f} % of the reference's points within the scene.",
-            )
-        )
-    return tuple(Caution(code=code, sentence=sentence) for code, sentence in sentences)
+        seen = f"Photographs saw {100 * comparison.seen:.1f} % of the reference's points within the scene."
+        warn("reference-unseen", seen)
+    return tuple(cautions)
 
 
 def draw_reference(found: ComparedReference, folder: Path) -> None:

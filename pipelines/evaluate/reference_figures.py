@@ -40,20 +40,16 @@ class DistanceTally:
         shape = (len(CLASSES), len(SLOPES) + 1, _BINS)
         self._to_reference, self._to_model = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
         self._cores: list[CorePoints] = []
-        self.points = 0
+        self.points = self.seen = 0  # of the reference: all, and those that photographs saw
 
     def add(self, found: SquareDistances) -> None:
         """Add a square."""
         _count(self._to_reference, found.to_reference_m, found.model_kinds)
         _count(self._to_model, found.to_model_m, found.reference_kinds)
         self.points += found.points
+        self.seen += len(found.to_model_m)
         if len(found.cores.position):
             self._cores.append(found.cores)
-
-    @property
-    def seen(self) -> int:
-        """Number of the reference's points that photographs saw."""
-        return int(self._to_model.sum())
 
     def cores(self) -> CorePoints:
         """Return the core points of all squares."""

@@ -76,22 +76,11 @@ def summarise(report: EvaluationReport) -> Summary:
     test = report.test_views
     values: dict[str, Any] = {"accuracy": report.headline.model_dump()}
     if test is not None:
-        values |= {
-            "views": test.views,
-            "psnr": test.psnr,
-            "psnr_covered": test.psnr_covered,
-            "covered_share": test.covered_share,
-            "psnr_compensated": test.psnr_compensated,
-            "ssim": test.ssim,
-        }
+        names = ("views", "psnr", "psnr_covered", "covered_share", "psnr_compensated", "ssim")
+        values |= {name: getattr(test, name) for name in names}
     for way, errors in report.checkpoints.by_way.items():
-        values |= {
-            f"{way}_count": errors.count,
-            f"{way}_mean_h_m": errors.mean_h_m,
-            f"{way}_rmse_h_m": errors.rmse_h_m,
-            f"{way}_rmse_v_m": errors.rmse_v_m,
-            f"{way}_rmse_3d_m": errors.rmse_3d_m,
-        }
+        figures = ("count", "mean_h_m", "rmse_h_m", "rmse_v_m", "rmse_3d_m")
+        values |= {f"{way}_{name}": getattr(errors, name) for name in figures}
     key_figure = f"{report.headline.sentence}; {_test_views(test)}"
     return Summary(key_figure, values, _warnings(report), report.cautions)
 
@@ -240,7 +229,6 @@ def evaluate(
 
 
 def _rendered(stage: StageRun, trained: TrainedSurvey, posterior: Posterior, options: EvaluateOptions) -> Rendered:
-    """Return what the Gaussians show, with the pictures written."""
     files, progress = open_reference(options), stage.progress
     images = photographs(trained.sfm, trained.survey, stage.workspace, trained.model.max_image_size)
     images.build(progress)
@@ -260,7 +248,6 @@ def _rendered(stage: StageRun, trained: TrainedSurvey, posterior: Posterior, opt
 
 
 def _refuse_what_needs_gaussians(stage: StageRun, options: EvaluateOptions) -> None:
-    """Refuse options that ask for what only a trained model shows."""
     for flag, value in (("--reference", options.reference), ("--lpips-weights", options.lpips_weights)):
         if value is not None:
             command = stage.workspace.command_of(BY_NAME["train"])

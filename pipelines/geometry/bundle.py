@@ -70,17 +70,11 @@ class Network:
 
 @dataclass(frozen=True)
 class LinearisedBundle:
-    """Jacobians of M observations in pixels.
+    """Jacobians of M observations in pixels."""
 
-    Attributes:
-        jacobian_pose: (M, 2, 6), by (δω, δc) of the camera, as in `geometry.correction_basis.CorrectionBasis`.
-        jacobian_point: (M, 2, 3).
-        jacobian_intrinsics: (M, 2, P), P the longest parameter list; zero beyond a shorter one.
-    """
-
-    jacobian_pose: FloatArray
-    jacobian_point: FloatArray
-    jacobian_intrinsics: FloatArray
+    jacobian_pose: FloatArray  # (M, 2, 6), by (δω, δc) of the camera, as in `CorrectionBasis`
+    jacobian_point: FloatArray  # (M, 2, 3)
+    jacobian_intrinsics: FloatArray  # (M, 2, P), P the longest parameter list; zero beyond a shorter one
 
 
 def with_positive_depths(network: Network) -> Network:
@@ -140,12 +134,7 @@ def lens_slots(network: Network) -> IntArray:
 
 
 def sparse_jacobian(blocks: FloatArray, column_block: IntArray, count: int) -> csr_matrix:
-    """Return the sparse matrix (2 M, w · count) with one block (2, w) for each observation.
-
-    Args:
-        blocks: (M, 2, w).
-        column_block: (M,) block column of each.
-    """
+    """Return the sparse matrix (2 M, w · count) with blocks (M, 2, w) in block columns (M,)."""
     rows, height, width = blocks.shape
     columns = column_block[:, None, None] * width + np.arange(width)[None, None, :]
     columns = np.broadcast_to(columns, blocks.shape)
@@ -182,25 +171,17 @@ _MEAN_WEIGHTED_SQUARE = _HALF_SCALE2 * (1 - _MEAN_WEIGHT)
 class EliminatedPoints:
     """Normal equations of n poses and L lens parameters, with the points eliminated.
 
-    Attributes:
-        poses: (6 n, 6 n) sparse, in blocks (6, 6).
-        cross: (6 n, L).
-        lens: (L, L).
-        pose_pull: (6 n, 7) of the poses on the points' similarity.
-        lens_pull: (L, 7) of the lens on it.
-        modes: (7, 7) information on it.
-        pose_slope, lens_slope: (6 n,), (L,) gradient of half the weighted squares; zero where SfM has left the
-            observations at their minimum.
+    Slopes are gradients of half the weighted squares; zero where SfM left the observations at their minimum.
     """
 
-    poses: bsr_matrix
-    cross: FloatArray
-    lens: FloatArray
-    pose_pull: FloatArray
-    lens_pull: FloatArray
-    modes: FloatArray
-    pose_slope: FloatArray
-    lens_slope: FloatArray
+    poses: bsr_matrix  # (6 n, 6 n) sparse, in blocks (6, 6)
+    cross: FloatArray  # (6 n, L)
+    lens: FloatArray  # (L, L)
+    pose_pull: FloatArray  # (6 n, 7) of the poses on the points' similarity
+    lens_pull: FloatArray  # (L, 7) of the lens on it
+    modes: FloatArray  # (7, 7) information on it
+    pose_slope: FloatArray  # (6 n,)
+    lens_slope: FloatArray  # (L,)
 
 
 @dataclass(frozen=True)
@@ -375,7 +356,6 @@ def _eliminated(
     *,
     ridge: float,
 ) -> EliminatedPoints:
-    """Eliminate the points of a chunk."""
     n, points = len(network.camera_id), len(network.point_in_world)
     linearised, scaled = linearise_bundle(network), root_weight[:, None, None]
     by_pose, by_point = linearised.jacobian_pose * scaled, linearised.jacobian_point * scaled

@@ -102,13 +102,7 @@ def pose_matrix(cam_from_world: FloatArray, cam_center_in_world: FloatArray) -> 
 
 @dataclass(frozen=True)
 class Camera:
-    """Intrinsics of a COLMAP camera model.
-
-    Attributes:
-        model: COLMAP's name of the model, e.g. "OPENCV".
-        width, height: image size in pixels.
-        params: (P,) float64, COLMAP's parameters of that model, in pixels where they are lengths.
-    """
+    """Intrinsics of a COLMAP camera model such as OPENCV, with its parameters (P,); lengths are in pixels."""
 
     model: str
     width: int
@@ -171,12 +165,7 @@ def project(camera: Camera, point_in_cam: ArrayLike) -> FloatArray:
 
 
 def project_each(cameras: dict[int, Camera], camera_of: IntArray, points_in_cam: FloatArray) -> FloatArray:
-    """Return pixels (M, 2) of points that have a camera each; NaN as in `project`.
-
-    Args:
-        camera_of: (M,) keys of `cameras`.
-        points_in_cam: (M, 3), each in the frame of its camera.
-    """
+    """Return pixels (M, 2) of points (M, 3), each in the frame of its camera (M,), a key; NaN as in `project`."""
     pixels = np.empty((len(points_in_cam), 2))
     for key, camera in cameras.items():
         rows = np.flatnonzero(camera_of == key)
@@ -302,14 +291,10 @@ _LEAST_RAYS = 8
 
 @dataclass(frozen=True)
 class Lenses:
-    """Cameras of n images.
+    """Cameras of n images: `camera_id` (n,) are keys of `cameras`.
 
     Changes of their parameters form one vector (L,): a parameter list for each of `cameras`, in their order. All
     lists have the length of the longest, with zeros beyond a shorter one.
-
-    Attributes:
-        cameras: by camera id.
-        camera_id: (n,) keys of `cameras`.
     """
 
     cameras: dict[int, Camera]

@@ -24,12 +24,9 @@ _BISECTIONS = 16
 
 
 class PointSurface:
-    """Surface through a cloud of points: at each place, the height of the nearest point, freed of outliers.
+    """Surface through points (N, 3), N ≥ 1, z up: the height of the nearest one, freed of outliers.
 
     That height is the median of the nearest points, the point itself among them.
-
-    Args:
-        points: (N, 3) with z up, metres; N ≥ 1.
     """
 
     def __init__(self, points: FloatArray) -> None:
@@ -47,12 +44,9 @@ class PointSurface:
 
 @dataclass(frozen=True)
 class Footprint:
-    """Outline of what a photograph shows.
+    """Outline (K, 3) of what a photograph shows, z up, anticlockwise seen from above, not closed; K = 0: no ground.
 
-    Attributes:
-        outline: (K, 3) metres, z up, anticlockwise seen from above, not closed; K = 0: the photograph shows no
-            ground.
-        clipped: whether the photograph also shows what lies above the horizon, or too near below it to be placed.
+    `clipped`: the photograph also shows what lies above the horizon, or too near below it to be placed.
     """
 
     outline: FloatArray

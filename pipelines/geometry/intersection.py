@@ -33,15 +33,10 @@ from pipelines.robust.statistics import cauchy_loss, cauchy_weight, chi2_quantil
 
 @dataclass(frozen=True)
 class CommonRotation:
-    """A rotation error that all cameras share, as when SfM's rotations were aligned to geo as a whole.
+    """A rotation error that all cameras share, as when SfM's rotations were aligned to geo as a whole."""
 
-    Attributes:
-        cov_rad2: (3, 3) of the rotation vector in geo.
-        gain: (n, 3, 3) rotation in rad per metre of error of each camera's centre, from which it was estimated.
-    """
-
-    cov_rad2: FloatArray
-    gain: FloatArray
+    cov_rad2: FloatArray  # (3, 3) of the rotation vector in geo
+    gain: FloatArray  # (n, 3, 3) rad per metre of error of each camera's centre, from which it was estimated
 
 
 @dataclass(frozen=True)
@@ -164,7 +159,6 @@ def intersect_rays(rays: Rays, cameras: UncertainCameras, point_count: int) -> I
 
 
 def _intersect_chunk(rays: Rays, cameras: UncertainCameras, intersections: Intersections, chosen: IntArray) -> None:
-    """Intersect the chosen rays, and write their points into `intersections`."""
     bundle, ids = _ray_bundle(rays, cameras, chosen)
     fit = _fit_rays(bundle, cameras)
     position, used = fit.position, fit.used
@@ -194,7 +188,6 @@ def _intersect_chunk(rays: Rays, cameras: UncertainCameras, intersections: Inter
 
 
 def _ray_bundle(rays: Rays, cameras: UncertainCameras, chosen: IntArray) -> tuple[_RayBundle, IntArray]:
-    """Return the chosen rays in geo, and the ids (p,) of their points."""
     point, view, xy = rays.point[chosen], rays.view[chosen], rays.xy[chosen]
     start = np.flatnonzero(np.diff(point, prepend=point[0] - 1))
     owner = np.repeat(np.arange(len(start)), np.diff(np.append(start, len(point))))
@@ -209,8 +202,6 @@ def _ray_bundle(rays: Rays, cameras: UncertainCameras, chosen: IntArray) -> tupl
 
 @dataclass
 class _RayFit:
-    """State of a chunk's solution."""
-
     position: FloatArray  # (p, 3), from the bundle's shift
     whitener: FloatArray  # (m, 2, 3)
     information: FloatArray  # (m, 3, 3), W = Gᵀ G

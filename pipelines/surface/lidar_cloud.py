@@ -34,10 +34,9 @@ class ScannerTrack:
 
     @classmethod
     def read(cls, path: Path, stated: CloudCrs, origin: Origin) -> ScannerTrack:
-        """Return the track of a CSV file: time, and latitude, longitude, altitude or x, y, z.
+        """Return the track of a CSV file on the clock of the cloud's points.
 
-        Args:
-            stated: CRS and vertical datum of the cloud, which those of a track without a CRS are.
+        The file has time, and latitude, longitude, altitude or x, y, z. A track without a CRS has the cloud's.
 
         Raises:
             InputError: an unreadable file, or one without times.
@@ -133,11 +132,7 @@ def read_cloud(
     progress: Progress = SILENT,
     track: ScannerTrack | None = None,
 ) -> LidarCloud:
-    """Return the points of the clouds in the scene, as dense as the photographs resolve it.
-
-    Args:
-        pixel_m: size of a pixel of the photographs on the surface.
-        track: of the scanner; None: not known.
+    """Return the points of the clouds in the scene, as dense as pixels of `pixel_m` on the surface resolve it.
 
     Raises:
         InputError: as `read_thinned` and `ScannerTrack.at`, or too few points in the scene.

@@ -329,19 +329,12 @@ def _projections(reference: StereoView, neighbours: list[StereoView]) -> tuple[F
 
 @dataclass(frozen=True)
 class Winner:
-    """Best of a sequence of hypotheses at each pixel.
+    """Best of a sequence of hypotheses at each pixel (H, W)."""
 
-    Attributes:
-        hypothesis: (H, W) its number, with a fraction.
-        score: (H, W) correlation, −1 … 1.
-        curvature: (H, W) minus the second derivative of the score by the number.
-        inner: (H, W) whether scores of the hypotheses before and after exist.
-    """
-
-    hypothesis: FloatArray
-    score: Float32Array
-    curvature: Float32Array
-    inner: BoolArray
+    hypothesis: FloatArray  # its number, with a fraction
+    score: Float32Array  # correlation, −1 … 1
+    curvature: Float32Array  # minus the second derivative of the score by the number
+    inner: BoolArray  # whether scores of the hypotheses before and after exist
 
 
 class WinnerTakesAll:

@@ -38,18 +38,12 @@ _SPACING_CHANGE = 2**0.5  # of the voxels, where the points would become too man
 
 @dataclass(frozen=True)
 class Thinning:
-    """How many points to keep, and where.
-
-    Attributes:
-        voxel_m: side of the voxels, of which each keeps one point.
-        most: limit of the points; beyond, the voxels grow.
-        low_in_geo, high_in_geo: (3,) corners of the box outside which points are dropped; None: no limit.
-    """
+    """How many points to keep, and where: one a voxel, in a box."""
 
     voxel_m: float
-    most: int = 20_000_000
-    low_in_geo: FloatArray | None = None
-    high_in_geo: FloatArray | None = None
+    most: int = 20_000_000  # limit of the points; beyond, the voxels grow
+    low_in_geo: FloatArray | float = -np.inf  # (3,) corners of the box outside which points are dropped
+    high_in_geo: FloatArray | float = np.inf
 
 
 @dataclass(frozen=True)
@@ -128,7 +122,9 @@ class CloudReader:
                         lla = (serving or crs).lla_from_xyz(chunk.position, path=file.path)
                         # One operation serves the file: neighbours in two chunks keep their distance.
                         serving = serving or crs.serving(lla)
-                        yield _in_geo(chunk, lla, origin)
+                        place, count = enu_from_ecef(ecef_from_lla(lla), origin), len(chunk)
+                        time = np.full(count, np.nan) if chunk.gps_time_s is None else chunk.gps_time_s
+                        yield MeasuredCloud(place, chunk.classification, np.ones(count, np.int64), time, 0.0)
                     task.advance(len(raw))
 
     def _valid(self, chunk: CloudChunk, path: Path) -> CloudChunk:
@@ -157,7 +153,8 @@ def read_thinned(
     voxel_m, held = thinning.voxel_m, 0
     waiting: list[MeasuredCloud] = []
     for chunk in files.chunks(origin, progress):
-        inside = _inside(chunk.position_in_geo, thinning)
+        place = chunk.position_in_geo
+        inside = np.asarray(((place >= thinning.low_in_geo) & (place <= thinning.high_in_geo)).all(axis=1))
         files.tally.outside += int((~inside).sum())
         part = _thinned([rows_of(chunk, inside)], voxel_m)
         waiting, held = [*waiting, part], held + len(part)
@@ -203,22 +200,6 @@ def _thinned(parts: list[MeasuredCloud], voxel_m: float) -> MeasuredCloud:
     return replace(rows_of(cloud, first[order]), weight=weight[order])
 
 
-def _inside(position: FloatArray, thinning: Thinning) -> np.ndarray:
-    inside = np.ones(len(position), dtype=bool)
-    if thinning.low_in_geo is not None:
-        inside &= (position >= thinning.low_in_geo).all(axis=1)
-    if thinning.high_in_geo is not None:
-        inside &= (position <= thinning.high_in_geo).all(axis=1)
-    return inside
-
-
-def _in_geo(chunk: CloudChunk, lla: FloatArray, origin: Origin) -> MeasuredCloud:
-    count = len(chunk)
-    time = np.full(count, np.nan) if chunk.gps_time_s is None else chunk.gps_time_s
-    place = enu_from_ecef(ecef_from_lla(lla), origin)
-    return MeasuredCloud(place, chunk.classification, np.ones(count, np.int64), time, 0.0)
-
-
 def _short_name(name: str) -> str:
     """Return the name that a WKT gives its CRS; any other text itself."""
     found = re.match(r'\w+\["([^"]+)"', name)
@@ -227,19 +208,19 @@ def _short_name(name: str) -> str:
 
 def _paths(path: Path, stated: CloudCrs) -> list[Path]:
     """Return the files of a path in the order of their names."""
-    if path.is_dir():
-        files = sorted(
-            file
-            for file in path.rglob("*")
-            if file.suffix.lower() in CLOUD_SUFFIXES
-            and not any(part[0] == "." for part in file.relative_to(path).parts)
-        )
-        if not files:
-            raise InputError("no LAS, LAZ or PLY file in this folder", path=path, field=stated.flag)
-        if len(files) > _MOST_FILES:
-            raise InputError(f"{len(files)} files (limit {_MOST_FILES})", path=path, field=stated.flag)
-        return files
-    return [path]
+    if not path.is_dir():
+        return [path]
+    files = sorted(
+        file
+        for file in path.rglob("*")
+        if file.suffix.lower() in CLOUD_SUFFIXES
+        and not any(part[0] == "." for part in file.relative_to(path).parts)
+    )
+    if not files:
+        raise InputError("no LAS, LAZ or PLY file in this folder", path=path, field=stated.flag)
+    if len(files) > _MOST_FILES:
+        raise InputError(f"{len(files)} files (limit {_MOST_FILES})", path=path, field=stated.flag)
+    return files
 
 
 def _opened(path: Path, stated: CloudCrs) -> CloudFile:

@@ -237,8 +237,17 @@ class SurfaceViews:
         """Append the maps that are missing to the files."""
         sizes = {_DEPTHS: 4, _COLOURS: 3} if colours else {_DEPTHS: 4}
         paths = {self.folder / name: size for name, size in sizes.items()}
-        done = min(_complete(path, size * self._start) for path, size in paths.items())
-        _require_space(self.folder, sum(paths.values()) * int(self._start[-1] - self._start[done]))
+        there = [path.stat().st_size if path.exists() else 0 for path in paths]
+        whole = min(held // size for held, size in zip(there, paths.values(), strict=True))  # pixels in all files
+        done = int(np.searchsorted(self._start, whole, side="right")) - 1
+        needed = sum(paths.values()) * int(self._start[-1] - self._start[done])
+        free = shutil.disk_usage(self.folder).free - _SPARE_BYTES
+        if needed > free:
+            raise InputError(
+                f"the depth maps of the training views need {needed / 2**30:.1f} GiB, and "
+                f"{max(free, 0) / 2**30:.1f} GiB are free: make room on this disk",
+                path=self.folder,
+            )
         with ExitStack() as files, progress.task("depth maps", len(self)) as task:
             handles = [files.enter_context(path.open("ab")) for path in paths]
             for handle, size in zip(handles, paths.values(), strict=True):
@@ -254,19 +263,3 @@ class SurfaceViews:
                     handle.flush()
                     os.fsync(handle.fileno())  # The size counts after a power failure too.
                 task.advance()
-
-
-def _complete(path: Path, end: IntArray) -> int:
-    """Return the number of maps that a file holds whole; `end` (V + 1,) are their ends in bytes, from 0."""
-    size = path.stat().st_size if path.exists() else 0
-    return int(np.searchsorted(end, size, side="right")) - 1
-
-
-def _require_space(folder: Path, needed: int) -> None:
-    free = shutil.disk_usage(folder).free - _SPARE_BYTES
-    if needed > free:
-        raise InputError(
-            f"the depth maps of the training views need {needed / 2**30:.1f} GiB, and "
-            f"{max(free, 0) / 2**30:.1f} GiB are free: make room on this disk",
-            path=folder,
-        )
