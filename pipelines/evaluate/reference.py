@@ -65,16 +65,6 @@ class ComparedReference:
     assumptions: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class _Model:
-    """The model's cloud, its shift against the reference, and the similarity by which it was moved; None: not."""
-
-    points: TiledPoints
-    settings: FusionSettings
-    shift: ReferenceShift | None
-    moved: Similarity | None
-
-
 def open_reference(options: EvaluateOptions) -> CloudReader | None:
     """Return the reference of `--reference`, its headers and CRS checked; None without that option.
 
@@ -116,15 +106,15 @@ def compare_with_reference(
     box = points.min(axis=0) - margin, points.max(axis=0) + margin
     thinning = Thinning(_OVERVIEW_M, _MOST_OVERVIEW, *box)
     overview = read_thinned(files, trained.survey.origin, thinning, progress)
-    model = _model(renderer, overview, options, scratch, progress)
-    seen = seen_surface(_viewpoints(renderer, model.moved), overview.position_in_geo, overview.voxel_m, progress)
+    model, fusion, shift, moved = _model(renderer, overview, options, scratch, progress)
+    seen = seen_surface(_viewpoints(renderer, moved), overview.position_in_geo, overview.voxel_m, progress)
     reference = _sorted_reference(files, trained.survey.origin, box, scratch / "reference", progress)
     spacing_m = _spacing(reference)
-    settings = ComparisonSettings.of_spacings(spacing_m, model.settings.spacing_m, min(THRESHOLDS_M), box)
-    tally = _compare(reference, model.points, seen, settings, progress)
+    settings = ComparisonSettings.of_spacings(spacing_m, fusion.spacing_m, min(THRESHOLDS_M), box)
+    tally = _compare(reference, model, seen, settings, progress)
     cores = tally.cores()
     sigma_m = _georeference_sigma(cores.position, cores.normal, trained, grid)
-    known = np.zeros(len(cores.position)) if sigma_m is None or model.moved is not None else sigma_m
+    known = np.zeros(len(cores.position)) if sigma_m is None or moved is not None else sigma_m
     lod_m = level_of_detection(cores.noise_m, np.hypot(known, options.reference_sigma))
     comparison = ReferenceComparison(
         name=options.reference.name,
@@ -132,12 +122,12 @@ def compare_with_reference(
         points=tally.points,
         seen=tally.seen / max(tally.points, 1),
         spacing_m=spacing_m,
-        model_points=len(model.points),
-        model_spacing_m=model.settings.spacing_m,
+        model_points=len(model),
+        model_spacing_m=fusion.spacing_m,
         sigma_m=options.reference_sigma,
         georeference_sigma_m=None if sigma_m is None or not len(sigma_m) else float(np.median(sigma_m)),
-        shift=model.shift,
-        aligned="none" if model.moved is None else options.reference_align,
+        shift=shift,
+        aligned="none" if moved is None else options.reference_align,
         cylinder_m=settings.core_m,
         groups=tally.groups(cores, lod_m),
     )
@@ -162,7 +152,8 @@ def _compare(
 
 def _model(
     renderer: ModelRenderer, overview: MeasuredCloud, options: EvaluateOptions, scratch: Path, progress: Progress
-) -> _Model:
+) -> tuple[TiledPoints, FusionSettings, ReferenceShift | None, Similarity | None]:
+    """Return the model's cloud, its shift against the reference, and any similarity by which it was moved."""
     geo_from_model = renderer.trained.geo_from_model
     views = SurfaceViews(renderer, scratch / "depth_maps", colours=True, confirmed=True, progress=progress)
     settings = fusion_settings(views, geo_from_model, _LEAST_VIEWS)
@@ -178,7 +169,7 @@ def _model(
     normal, kind = plane_normals(sparse, 2 * _OVERVIEW_M), options.reference_align
     found = fit_alignment(np.concatenate(sample), sparse, normal, 2 * _OVERVIEW_M, kind)
     if kind == "none":
-        return _Model(delivered, settings, None if found is None else found[1], None)
+        return delivered, settings, None if found is None else found[1], None
     if found is None:
         raise DegenerateGeometryError(
             f"--reference-align {kind}: the surface and the reference have too little in common to move one onto "
@@ -189,7 +180,7 @@ def _model(
     for name in sorted(delivered.squares):
         rows, own = delivered.around(name, 0.0)
         moved.append(similarity.apply(rows["position"][own]), rows["normal"][own] @ similarity.rotation.T, None)
-    return _Model(moved, settings, shift, similarity)
+    return moved, settings, shift, similarity
 
 
 def _viewpoints(renderer: ModelRenderer, moved: Similarity | None) -> Viewpoints:

@@ -30,26 +30,16 @@ _STEP = 1e-6
 
 @dataclass(frozen=True)
 class Network:
-    """Bundle of n cameras, N points and M observations in a metric frame `world`.
+    """Bundle of n cameras, N points and M observations in a metric frame `world`."""
 
-    Attributes:
-        cameras: intrinsics by camera id.
-        camera_id: (n,) keys of `cameras`.
-        cam_from_world: (n, 3, 3) rotations.
-        cam_center_in_world: (n, 3) metres.
-        point_in_world: (N, 3) metres.
-        obs_point, obs_image: (M,) indices.
-        obs_xy_px: (M, 2) pixels.
-    """
-
-    cameras: dict[int, Camera]
-    camera_id: IntArray
-    cam_from_world: FloatArray
-    cam_center_in_world: FloatArray
-    point_in_world: FloatArray
-    obs_point: IntArray
-    obs_image: IntArray
-    obs_xy_px: FloatArray
+    cameras: dict[int, Camera]  # intrinsics by camera id
+    camera_id: IntArray  # (n,) keys of `cameras`
+    cam_from_world: FloatArray  # (n, 3, 3) rotations
+    cam_center_in_world: FloatArray  # (n, 3) metres
+    point_in_world: FloatArray  # (N, 3) metres
+    obs_point: IntArray  # (M,) indices
+    obs_image: IntArray  # (M,) indices
+    obs_xy_px: FloatArray  # (M, 2) pixels
 
     def rays(self) -> FloatArray:
         """Return the vectors (M, 3) from the camera's centre to the point of each observation."""

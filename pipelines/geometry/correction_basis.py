@@ -32,18 +32,12 @@ class CorrectionBasis:
 
     The lens parameters correlate with the poses. Their error, (L,) in the order of `geometry.cameras.Lenses`, is
     lens_matrix @ z plus an error with covariance `lens_cov` that is independent of z.
-
-    Attributes:
-        matrix: (n, 6, k), rows (δω, δc), k = 6 n − 7.
-        sigma_px: σ of an image coordinate, estimated from the residuals.
-        lens_matrix: (L, k).
-        lens_cov: (L, L).
     """
 
-    matrix: FloatArray
-    sigma_px: float
-    lens_matrix: FloatArray
-    lens_cov: FloatArray
+    matrix: FloatArray  # (n, 6, k), rows (δω, δc), k = 6 n − 7
+    sigma_px: float  # σ of an image coordinate, estimated from the residuals
+    lens_matrix: FloatArray  # (L, k)
+    lens_cov: FloatArray  # (L, L)
 
 
 def correction_basis(bundle: BundleInformation, *, lens_follows: bool = True) -> CorrectionBasis:

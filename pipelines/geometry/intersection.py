@@ -41,23 +41,14 @@ class CommonRotation:
 
 @dataclass(frozen=True)
 class UncertainCameras:
-    """n cameras in geo, with errors that are independent between cameras (but for `common`).
+    """n cameras in geo, with errors that are independent between cameras (but for `common`)."""
 
-    Attributes:
-        center_in_geo: (n, 3) metres.
-        rotation_geo_from_cam: (n, 3, 3).
-        cov_center_in_geo: (n, 3, 3) m², of the position.
-        sigma_attitude_rad: (n,) per axis.
-        sigma_ray: (n,) σ of x/z and y/z: σ of the pixel over the focal length.
-        common: rotation error of all cameras together, or None.
-    """
-
-    center_in_geo: FloatArray
-    rotation_geo_from_cam: FloatArray
-    cov_center_in_geo: FloatArray
-    sigma_attitude_rad: FloatArray
-    sigma_ray: FloatArray
-    common: CommonRotation | None = None
+    center_in_geo: FloatArray  # (n, 3) metres
+    rotation_geo_from_cam: FloatArray  # (n, 3, 3)
+    cov_center_in_geo: FloatArray  # (n, 3, 3) m², of the position
+    sigma_attitude_rad: FloatArray  # (n,) per axis
+    sigma_ray: FloatArray  # (n,) σ of x/z and y/z: σ of the pixel over the focal length
+    common: CommonRotation | None = None  # rotation error of all cameras together, or None
 
 
 @dataclass(frozen=True)
@@ -71,25 +62,15 @@ class Rays:
 
 @dataclass(frozen=True)
 class Intersections:
-    """Positions of N points at which rays intersect.
+    """Positions of N points at which rays intersect."""
 
-    Attributes:
-        position_in_geo: (N, 3) metres, NaN with fewer than two rays or parallel ones.
-        cov_in_geo: (N, 3, 3) m², NaN likewise.
-        ray_count: (N,) rays used.
-        max_angle_deg: (N,) largest angle between two used rays.
-        condition: (N,) condition number of the normal matrix; infinite where there is no position.
-        consistent: (N,) most rays agree within their σ, and the point lies in front of all that do.
-        used: (M,) rays that were used.
-    """
-
-    position_in_geo: FloatArray
-    cov_in_geo: FloatArray
-    ray_count: NDArray[np.int32]
-    max_angle_deg: FloatArray
-    condition: FloatArray
-    consistent: BoolArray
-    used: BoolArray
+    position_in_geo: FloatArray  # (N, 3) metres, NaN with fewer than two rays or parallel ones
+    cov_in_geo: FloatArray  # (N, 3, 3) m², NaN likewise
+    ray_count: NDArray[np.int32]  # (N,) rays used
+    max_angle_deg: FloatArray  # (N,) largest angle between two used rays
+    condition: FloatArray  # (N,) condition number of the normal matrix; infinite where there is no position
+    consistent: BoolArray  # (N,) most rays agree within their σ, and the point lies in front of all that do
+    used: BoolArray  # (M,) rays that were used
 
     @classmethod
     def none(cls, point_count: int, ray_count: int = 0) -> Intersections:

@@ -25,7 +25,6 @@ from pipelines.surface.agreement import AgreementSettings, agreed_depth, refine,
 from pipelines.surface.matching import UNSEEN, MatchSettings, StereoView
 from pipelines.surface.sweep import (
     NormalMap,
-    PointVisibility,
     SweepPlanes,
     SweepResult,
     best_neighbours,
@@ -76,13 +75,9 @@ class DepthMaps:
     ) -> None:
         self.scene, self.images = scene, images
         self._options = options or StereoOptions()
-        sparse = scene.sparse
-        self._visibility = PointVisibility(
-            scene.point_in_model, scene.poses.cam_center_in_model, sparse.obs_point, sparse.obs_image
-        )
         count = self._options.neighbours
         # All neighbours of a view need the view's own planes and neighbours again, and these do not change.
-        self._neighbours = cache(lambda index: best_neighbours(self._visibility, index, scene.train, count))
+        self._neighbours = cache(lambda index: best_neighbours(scene.network, index, scene.train, count))
         self._planes = cache(self._find_planes)
         self.folder = folder / self._key()
 

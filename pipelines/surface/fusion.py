@@ -42,34 +42,21 @@ _COARSEST = 2.0  # width of the pixels that are used, in medians: beyond lies th
 
 @dataclass(frozen=True)
 class FusionSettings:
-    """Settings of the fusion.
+    """Settings of the fusion."""
 
-    Attributes:
-        spacing_m: side of the voxels.
-        coarsest_m: wider pixels are left out.
-        min_views: least number of views that agree on a point.
-    """
-
-    spacing_m: float
-    coarsest_m: float
-    min_views: int
+    spacing_m: float  # side of the voxels
+    coarsest_m: float  # wider pixels are left out
+    min_views: int  # least number of views that agree on a point
 
 
 @dataclass(frozen=True)
 class SurfaceCloud:
-    """P points of the surface in `geo`.
+    """P points of the surface in `geo`."""
 
-    Attributes:
-        position: (P, 3) metres.
-        normal: (P, 3) unit vectors towards the cameras.
-        rgb: (P, 3) uint8.
-        sigma_m: (P,) σ of the surface along the normal, without that of the georeference.
-    """
-
-    position: FloatArray
-    normal: FloatArray
-    rgb: ByteArray
-    sigma_m: FloatArray
+    position: FloatArray  # (P, 3) metres
+    normal: FloatArray  # (P, 3) unit vectors towards the cameras
+    rgb: ByteArray  # (P, 3) uint8
+    sigma_m: FloatArray  # (P,) σ of the surface along the normal, without that of the georeference
 
     def __len__(self) -> int:
         return len(self.position)

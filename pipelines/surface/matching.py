@@ -238,19 +238,12 @@ def camera_matrix(camera: Pinhole, offset_px: float = 0.0) -> FloatArray:
 
 @dataclass(frozen=True)
 class MatchSettings:
-    """Settings of the comparison.
+    """Settings of the comparison."""
 
-    Attributes:
-        window_px: side of the correlation window, odd.
-        reach_px: radius of the guided filter that averages correlations.
-        edge_grey: step in grey levels across which the filter does not average.
-        views: number of neighbours that count, the best of all.
-    """
-
-    window_px: int = 5
-    reach_px: int = 6
-    edge_grey: float = 10.0
-    views: int = 3
+    window_px: int = 5  # side of the correlation window, odd
+    reach_px: int = 6  # radius of the guided filter that averages correlations
+    edge_grey: float = 10.0  # step in grey levels across which the filter does not average
+    views: int = 3  # number of neighbours that count, the best of all
 
     @property
     def support_px(self) -> int:

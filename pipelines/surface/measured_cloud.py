@@ -48,21 +48,13 @@ class Thinning:
 
 @dataclass(frozen=True)
 class MeasuredCloud:
-    """P points in geo.
+    """P points in geo."""
 
-    Attributes:
-        position_in_geo: (P, 3) metres.
-        classification: (P,) class of LAS; 0: never classified.
-        weight: (P,) int64, number of measured points in its voxel.
-        gps_time_s: (P,) time of the file; NaN: none.
-        voxel_m: side of the voxels at the end.
-    """
-
-    position_in_geo: FloatArray
-    classification: ByteArray
-    weight: IntArray
-    gps_time_s: FloatArray
-    voxel_m: float
+    position_in_geo: FloatArray  # (P, 3) metres
+    classification: ByteArray  # (P,) class of LAS; 0: never classified
+    weight: IntArray  # (P,) int64, number of measured points in its voxel
+    gps_time_s: FloatArray  # (P,) time of the file; NaN: none
+    voxel_m: float  # side of the voxels at the end
 
     def __len__(self) -> int:
         return len(self.position_in_geo)

@@ -29,18 +29,12 @@ _SAME_SURFACE = 0.01  # of the depth: largest difference between pixels of one s
 
 @dataclass(frozen=True)
 class DepthMap:
-    """Depth of the surface as one camera sees it: the whole view, or a window of it.
+    """Depth of the surface as one camera sees it: the whole view, or a window of it."""
 
-    Attributes:
-        pinhole: of the whole view.
-        depth_m: (h, w) along the camera's z axis; 0: no surface.
-        left, top: pixels of the view to the left of the window, and above it.
-    """
-
-    pinhole: Pinhole
-    depth_m: FloatArray
-    left: int = 0
-    top: int = 0
+    pinhole: Pinhole  # of the whole view
+    depth_m: FloatArray  # (h, w) along the camera's z axis; 0: no surface
+    left: int = 0  # pixels of the view to the left of the window, and above it
+    top: int = 0  # pixels of the view to the left of the window, and above it
 
     def holds(self, xy: FloatArray) -> bool:
         """Return whether the pixel of a ray (2,) is here."""
@@ -173,17 +167,11 @@ class Sight:
 
 @dataclass(frozen=True)
 class SurfacePoint:
-    """Measured point of the surface.
+    """Measured point of the surface."""
 
-    Attributes:
-        position_in_geo: (3,) metres.
-        cov_of_surface: (3, 3) m² of the surface alone: errors of similarity, cameras and lens come on top.
-        cameras: (V,) indices of the cameras that show it.
-    """
-
-    position_in_geo: FloatArray
-    cov_of_surface: FloatArray
-    cameras: IntArray
+    position_in_geo: FloatArray  # (3,) metres
+    cov_of_surface: FloatArray  # (3, 3) m² of the surface alone: errors of similarity, cameras and lens come on top
+    cameras: IntArray  # (V,) indices of the cameras that show it
 
 
 @dataclass(frozen=True)

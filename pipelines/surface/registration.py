@@ -41,19 +41,12 @@ _ITERATIONS = 30
 
 @dataclass(frozen=True)
 class PlaneMatches:
-    """M points on planes that the photographs show.
+    """M points on planes that the photographs show."""
 
-    Attributes:
-        point_in_model: (M, 3) of the cloud.
-        normal_in_model: (M, 3) towards the photographs.
-        distance_m: (M,) surface of the photographs minus the point, along the normal.
-        wall: (M,) whether the plane is upright.
-    """
-
-    point_in_model: FloatArray
-    normal_in_model: FloatArray
-    distance_m: FloatArray
-    wall: BoolArray
+    point_in_model: FloatArray  # (M, 3) of the cloud
+    normal_in_model: FloatArray  # (M, 3) towards the photographs
+    distance_m: FloatArray  # (M,) surface of the photographs minus the point, along the normal
+    wall: BoolArray  # (M,) whether the plane is upright
 
     def __len__(self) -> int:
         return len(self.distance_m)
@@ -61,21 +54,13 @@ class PlaneMatches:
 
 @dataclass(frozen=True)
 class Registration:
-    """Shift of a cloud.
+    """Shift of a cloud."""
 
-    Attributes:
-        shift_m: (3,) cloud minus surface of the photographs.
-        covariance_m2: (3, 3) of the comparison alone.
-        wall_bias_m: surface of the photographs minus the cloud on walls, outwards.
-        spread_m: robust σ of the distances that remain.
-        matches: the points, at the shift of the last round.
-    """
-
-    shift_m: FloatArray
-    covariance_m2: FloatArray
-    wall_bias_m: float
-    spread_m: float
-    matches: PlaneMatches
+    shift_m: FloatArray  # (3,) cloud minus surface of the photographs
+    covariance_m2: FloatArray  # (3, 3) of the comparison alone
+    wall_bias_m: float  # surface of the photographs minus the cloud on walls, outwards
+    spread_m: float  # robust σ of the distances that remain
+    matches: PlaneMatches  # the points, at the shift of the last round
 
 
 def registration(cloud: LidarCloud, views: DepthViews, seed: int) -> Registration:

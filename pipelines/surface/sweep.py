@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
+from pipelines.geometry.bundle import Network
 from pipelines.geometry.cameras import ViewPose
 from pipelines.surface.matching import UNSEEN, Matcher, MatchSettings, StereoView, Winner, WinnerTakesAll
 
@@ -22,16 +23,10 @@ _CLEARLY = 0.05  # of the score: margin by which planes of another direction mus
 
 @dataclass(frozen=True)
 class SweepPlanes:
-    """Parallel planes: normal · X = offset.
+    """Parallel planes: normal · X = offset; parts outside the scene's lowest and highest place are not compared."""
 
-    Attributes:
-        normal_in_model: (3,) unit vector.
-        offset_m: (D,) monotonic, at least three.
-        height_m: lowest and highest place of the scene; the parts of planes beyond are not compared.
-    """
-
-    normal_in_model: FloatArray
-    offset_m: FloatArray
+    normal_in_model: FloatArray  # (3,) unit vector
+    offset_m: FloatArray  # (D,) monotonic, at least three
     height_m: tuple[float, float] = (-math.inf, math.inf)
 
 
@@ -181,30 +176,20 @@ _STEP_PX = 1.0  # between two planes in the neighbours
 _LEAST_PLANES, _MOST_PLANES = 16, 256
 
 
-@dataclass(frozen=True)
-class PointVisibility:
-    """Observations (M,) of points (N, 3) in views with centres (n, 3)."""
-
-    point_in_model: FloatArray
-    center_in_model: FloatArray
-    obs_point: IntArray
-    obs_view: IntArray
-
-
-def best_neighbours(visibility: PointVisibility, view: int, among: IntArray, count: int) -> list[int]:
+def best_neighbours(network: Network, view: int, among: IntArray, count: int) -> list[int]:
     """Return at most `count` views that share most points with `view` under good angles, best first."""
-    seen = np.unique(visibility.obs_point[visibility.obs_view == view])
+    seen = np.unique(network.obs_point[network.obs_image == view])
     seen = seen[np.linspace(0, len(seen) - 1, min(len(seen), _MOST_POINTS)).astype(np.int64)]
-    rows = np.isin(visibility.obs_point, seen) & np.isin(visibility.obs_view, among) & (visibility.obs_view != view)
-    point, other = visibility.obs_point[rows], visibility.obs_view[rows]
-    from_view = visibility.point_in_model[point] - visibility.center_in_model[view]
-    from_other = visibility.point_in_model[point] - visibility.center_in_model[other]
+    rows = np.isin(network.obs_point, seen) & np.isin(network.obs_image, among) & (network.obs_image != view)
+    point, other = network.obs_point[rows], network.obs_image[rows]
+    from_view = network.point_in_world[point] - network.cam_center_in_world[view]
+    from_other = network.point_in_world[point] - network.cam_center_in_world[other]
     cosine = (from_view * from_other).sum(axis=1) / np.maximum(
         np.linalg.norm(from_view, axis=1) * np.linalg.norm(from_other, axis=1), 1e-12
     )
     away = np.degrees(np.arccos(np.clip(cosine, -1, 1))) - _BEST_ANGLE_DEG
     sigma = np.where(away < 0, _SIGMA_BELOW_DEG, _SIGMA_ABOVE_DEG)
-    worth = np.bincount(other, np.exp(-0.5 * (away / sigma) ** 2), minlength=len(visibility.center_in_model))
+    worth = np.bincount(other, np.exp(-0.5 * (away / sigma) ** 2), minlength=len(network.cam_center_in_world))
     worth[np.bincount(other, minlength=len(worth)) < _LEAST_SHARED] = 0
     order = np.argsort(-worth, kind="stable")[:count]
     return [int(index) for index in order if worth[index] > 0]

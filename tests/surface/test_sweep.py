@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pipelines.geometry.bundle import Network
 from pipelines.geometry.cameras import ViewPose
 from pipelines.surface.agreement import AgreementSettings, agreed_depth
 from pipelines.surface.matching import MatchSettings, StereoView
 from pipelines.surface.sweep import (
-    PointVisibility,
     SweepPlanes,
     SweepResult,
     best_neighbours,
@@ -107,15 +107,19 @@ def grid_points() -> np.ndarray:
 def test_neighbours_are_those_under_good_angles(ring: list[StereoView]) -> None:
     points = grid_points()
     count = len(points)
-    visibility = PointVisibility(
-        points,
-        np.array([view.camera.center_in_model for view in ring]),
-        np.tile(np.arange(count), len(ring)),
-        np.repeat(np.arange(len(ring)), count),
+    network = Network(
+        cameras={},
+        camera_id=np.zeros(len(ring), np.int64),
+        cam_from_world=np.array([view.camera.cam_from_model for view in ring]),
+        cam_center_in_world=np.array([view.camera.center_in_model for view in ring]),
+        point_in_world=points,
+        obs_point=np.tile(np.arange(count), len(ring)),
+        obs_image=np.repeat(np.arange(len(ring)), count),
+        obs_xy_px=np.zeros((len(ring) * count, 2)),
     )
-    neighbours = best_neighbours(visibility, 2, np.arange(len(ring)), 2)
+    neighbours = best_neighbours(network, 2, np.arange(len(ring)), 2)
     assert set(neighbours) == {1, 3}  # 13° and less from the scene; the next ones are at 26°
-    assert 5 not in best_neighbours(visibility, 2, np.array([0, 1, 3, 4]), 9)
+    assert 5 not in best_neighbours(network, 2, np.array([0, 1, 3, 4]), 9)
 
 
 def test_planes_follow_the_view(ring: list[StereoView]) -> None:
