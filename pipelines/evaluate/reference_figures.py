@@ -17,7 +17,7 @@ from pipelines.evaluate.reference_distances import (
     Kinds,
     SquareDistances,
 )
-from pipelines.geometry.footprints import joined
+from pipelines.geometry.footprints import joined_rows
 from pipelines.survey.report_parts import CloudDistances, M3c2Figures, ReferenceGroup, SurfaceScore
 
 THRESHOLDS_M = (0.05, 0.1, 0.3)
@@ -54,7 +54,7 @@ class DistanceTally:
     def cores(self) -> CorePoints:
         """Return the core points of all squares."""
         parts = [_NO_CORES, *self._cores]
-        return replace(joined(parts), kinds=joined([part.kinds for part in parts]))
+        return replace(joined_rows(parts), kinds=joined_rows([part.kinds for part in parts]))
 
     def groups(self, cores: CorePoints, lod_m: FloatArray) -> tuple[ReferenceGroup, ...]:
         """Return the figures of the whole, and of all classes and slopes that have points.

@@ -174,7 +174,7 @@ def rows_of(record: RecordT, rows: IntArray | BoolArray) -> RecordT:
     return type(record)(**(vars(record) | arrays))
 
 
-def joined(records: Sequence[RecordT]) -> RecordT:
+def joined_rows(records: Sequence[RecordT]) -> RecordT:
     """Return the rows of all dataclasses of arrays (P, …), at least one; what is no array is that of the first."""
     arrays = {
         name: np.concatenate([vars(record)[name] for record in records])

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, ByteArray, FloatArray, IntArray
-from pipelines.geometry.footprints import joined, voxel_keys
+from pipelines.geometry.footprints import joined_rows, voxel_keys
 from pipelines.geometry.similarity import Similarity
 from pipelines.surface.surface_views import SurfaceView, SurfaceViews
 from pipelines.surface.visibility import Support
@@ -110,7 +110,7 @@ def fused_squares(
             )
             parts = [part for part in found if part is not None]
             if parts:
-                yield _fuse(joined(parts), views, geo_from_model, square, settings)
+                yield _fuse(joined_rows(parts), views, geo_from_model, square, settings)
             task.advance()
 
 

@@ -23,7 +23,7 @@ from pipelines.formats.cloud_ply import CloudChunk, CloudFile, open_cloud_ply
 from pipelines.formats.las import open_las
 from pipelines.geodesy.crs import PointCrs, parse_crs
 from pipelines.geodesy.enu import Origin, ecef_from_lla, enu_from_ecef
-from pipelines.geometry.footprints import joined, rows_of, voxel_keys
+from pipelines.geometry.footprints import joined_rows, rows_of, voxel_keys
 from pipelines.survey.options import CLOUD_SUFFIXES, CloudCrs
 
 log = logging.getLogger(__name__)
@@ -177,7 +177,7 @@ def _limited(parts: list[MeasuredCloud], voxel_m: float, most: int) -> MeasuredC
 
 def _thinned(parts: list[MeasuredCloud], voxel_m: float) -> MeasuredCloud:
     """Return the first point of each voxel, with the number of points in the voxel."""
-    cloud = replace(joined(parts), voxel_m=voxel_m)
+    cloud = replace(joined_rows(parts), voxel_m=voxel_m)
     position = cloud.position_in_geo
     if not len(position):
         return cloud

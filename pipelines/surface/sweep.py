@@ -55,7 +55,7 @@ class NormalMap:
 
     def offset(self, camera: ViewPose, depth: Float32Array) -> FloatArray:
         """Return offsets (H, W) of the points at depths (H, W) of a camera: inverts `depth`."""
-        return np.asarray(self.normal_in_model @ camera.center_in_model + depth * self.offset_per_metre(camera))
+        return self.normal_in_model @ camera.center_in_model + depth * self.offset_per_metre(camera)
 
 
 @dataclass(frozen=True)

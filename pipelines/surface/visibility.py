@@ -305,7 +305,7 @@ class SeenSurface:
 
     def sees(self, position_in_geo: FloatArray) -> BoolArray:
         """Return whether enough photographs saw points (P, 3)."""
-        return np.asarray(support(position_in_geo, self.views, _UPWARDS, self.tolerance).views >= LEAST_VIEWS)
+        return support(position_in_geo, self.views, _UPWARDS, self.tolerance).views >= LEAST_VIEWS
 
 
 def seen_surface(
