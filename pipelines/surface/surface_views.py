@@ -28,7 +28,7 @@ from pipelines.geometry.cameras import Pinhole, ViewPose, pose_matrix
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Render, Window
 from pipelines.splat.spatial import SpatialBlocks
 from pipelines.splat.surface import measured_depth
-from pipelines.surface.visibility import DepthViews, Support, support
+from pipelines.surface.visibility import DepthViews, Support, Viewpoints, support
 from pipelines.survey.photographs import ImageCache
 from pipelines.survey.trained_survey import TrainedSurvey, trained_pinholes
 
@@ -179,7 +179,7 @@ class SurfaceViews:
         self.folder = folder
         self._trained = renderer.trained
         self.cameras = renderer.trained.indices("train")
-        self.pinholes = [renderer.pinhole(index) for index in self.cameras]
+        self.pinholes = tuple(renderer.pinhole(index) for index in self.cameras)
         pixels = [pinhole.width * pinhole.height for pinhole in self.pinholes]
         self._start = np.concatenate([[0], np.cumsum(pixels)]).astype(np.int64)
         folder.mkdir(parents=True, exist_ok=True)
@@ -224,7 +224,7 @@ class SurfaceViews:
         """
         geo_from_model, poses = self._trained.geo_from_model, self._trained.poses
         rotation, center = poses.cam_from_model[self.cameras], poses.cam_center_in_model[self.cameras]
-        views = DepthViews.of(rotation, center, self.pinholes, self._depth)
+        views = DepthViews.of(Viewpoints(rotation, center, self.pinholes), self._depth)
         up_in_model = geo_from_model.rotation.T @ [0.0, 0.0, 1.0]
         return support(point_in_model, views, up_in_model, tolerance, normal_in_model).scaled(geo_from_model.scale)
 

@@ -13,7 +13,6 @@ hides. The model has no say: a surface that training missed was seen all the sam
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -40,6 +39,15 @@ _SUMS = _DIRECTION + 3
 
 
 @dataclass(frozen=True)
+class Viewpoints:
+    """Cameras of V undistorted photographs: rotations (V, 3, 3), centres (V, 3) in metres, and pinholes."""
+
+    cam_from_world: FloatArray
+    center_in_world: FloatArray
+    pinholes: tuple[Pinhole, ...]
+
+
+@dataclass(frozen=True)
 class DepthViews:
     """V depth maps with their cameras, in one frame (metres).
 
@@ -60,18 +68,12 @@ class DepthViews:
     depth_m: Float32Array
 
     @classmethod
-    def of(
-        cls,
-        cam_from_world: FloatArray,
-        center_in_world: FloatArray,
-        pinholes: Sequence[Pinhole],
-        depth_m: Float32Array,
-    ) -> DepthViews:
-        """Return the maps of pinholes, which lie one after the other in `depth_m` (P,)."""
-        intrinsics = np.array([[camera.fx, camera.fy, camera.cx, camera.cy] for camera in pinholes])
-        size = np.array([[camera.width, camera.height] for camera in pinholes], dtype=np.int64)
+    def of(cls, cameras: Viewpoints, depth_m: Float32Array) -> DepthViews:
+        """Return the maps of cameras, which lie one after the other in `depth_m` (P,)."""
+        intrinsics = np.array([[pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy] for pinhole in cameras.pinholes])
+        size = np.array([[pinhole.width, pinhole.height] for pinhole in cameras.pinholes], dtype=np.int64)
         start = np.concatenate([[0], np.cumsum(size.prod(axis=1))[:-1]])
-        return cls(cam_from_world, center_in_world, intrinsics, size, start, depth_m)
+        return cls(cameras.cam_from_world, cameras.center_in_world, intrinsics, size, start, depth_m)
 
 
 @dataclass(frozen=True)
@@ -288,15 +290,6 @@ _UPWARDS = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
-class Viewpoints:
-    """Cameras of V undistorted photographs: rotations (V, 3, 3), centres (V, 3) in metres, and pinholes."""
-
-    cam_from_geo: FloatArray
-    center_in_geo: FloatArray
-    pinholes: tuple[Pinhole, ...]
-
-
-@dataclass(frozen=True)
 class SeenSurface:
     """Depth maps of a reference from the photographs."""
 
@@ -325,7 +318,7 @@ def seen_surface(
     depths = []
     with progress.task("photographs of the reference", len(viewpoints.pinholes)) as task:
         for rotation, center, pinhole in zip(
-            viewpoints.cam_from_geo, viewpoints.center_in_geo, viewpoints.pinholes, strict=True
+            viewpoints.cam_from_world, viewpoints.center_in_world, viewpoints.pinholes, strict=True
         ):
             shown = _in_view(blocks, rotation, center, pinhole)
             depths.append(float(np.median(shown[:, 2])) if len(shown) else np.inf)
@@ -333,12 +326,8 @@ def seen_surface(
             shrink = float(np.clip(_CELL_VOXELS * voxel_m * pinhole.fx / depths[-1], 1, pinhole.width))
             maps.append(_depth_map(shown, pinhole, shrink if len(shown) else float(pinhole.width)))
             task.advance()
-    views = DepthViews.of(
-        viewpoints.cam_from_geo,
-        viewpoints.center_in_geo,
-        [coarse for coarse, _ in maps],
-        np.concatenate([depth.ravel() for _, depth in maps]),
-    )
+    coarse = replace(viewpoints, pinholes=tuple(pinhole for pinhole, _ in maps))
+    views = DepthViews.of(coarse, np.concatenate([depth.ravel() for _, depth in maps]))
     return SeenSurface(views, _TOLERANCE_VOXELS * voxel_m / float(np.median(depths)))
 
 
