@@ -99,7 +99,8 @@ class CameraInformation:
             self._of_lens = cho_factor(within, lower=True)
         except (np.linalg.LinAlgError, DegenerateGeometryError) as error:
             raise DegenerateGeometryError(_OPEN) from error
-        least = min(self._factor.least_pivot, float(np.diag(self._of_lens[0]).min(initial=1.0)))
+        least_pivot = min(np.diag(pivot.diagonal).min() for pivot in self._factor.pivots if pivot.diagonal.size)
+        least = min(float(least_pivot), float(np.diag(self._of_lens[0]).min(initial=1.0)))
         if least**2 < _WORST_SCALED:
             raise DegenerateGeometryError(_OPEN)
 

@@ -13,7 +13,7 @@ from pipelines.core.products import Caution, load_json, save_json
 from pipelines.core.stages import METRICS, RENDERS, REPORT, SURVEY
 from pipelines.core.types import Vector3
 from pipelines.core.workspace import Workspace
-from pipelines.evaluate.check_points import MeasuredPoints, check_point_errors
+from pipelines.evaluate.check_points import RemeasuredPoints, check_point_errors
 from pipelines.report.plots.charts import labelled
 from pipelines.survey.photographs import write_render
 from pipelines.survey.report import ViewFigures, write_report
@@ -55,7 +55,7 @@ def evaluated_workspace(root: Path, rename: str = "") -> Evaluated:
     survey = survey.model_copy(update=changed)
     save_json(survey, root / SURVEY)
     _write_photographs(scene, root / "photos")
-    measured = MeasuredPoints(
+    measured = RemeasuredPoints(
         survey.check_points,
         error_in_geo=np.tile(ERROR_M, (CHECK_POINTS, 1)),
         rays=np.array([len(point.marks) for point in survey.check_points]),

@@ -6,15 +6,16 @@ import cv2
 import numpy as np
 
 from pipelines.core.types import Float32Array
-from pipelines.surface.agreement import AgreementSettings, DepthEstimate
+from pipelines.geometry.cameras import ViewPose
+from pipelines.surface.agreement import AgreementSettings
 from pipelines.surface.matching import (
     NOISE_VARIANCE,
     UNSEEN,
     MatchSettings,
-    StereoCamera,
     StereoView,
-    opencv_camera_matrix,
+    camera_matrix,
 )
+from pipelines.surface.sweep import SweepResult
 
 
 def score_of_depth(
@@ -28,12 +29,10 @@ def score_of_depth(
     return np.where(depth > 0, score, np.float32(UNSEEN))
 
 
-def warped(camera: StereoCamera, other: StereoView, depth: np.ndarray) -> Float32Array:
+def warped(camera: ViewPose, other: StereoView, depth: np.ndarray) -> Float32Array:
     """Return the other view's grey levels (H, W) at the depths of a camera's rays; 0 outside its image."""
-    place = camera.center_in_world + np.maximum(depth, 0)[..., None] * camera.rays() - other.camera.center_in_world
-    x, y, z = np.moveaxis(
-        place @ (opencv_camera_matrix(other.camera.pinhole) @ other.camera.cam_from_world).T, -1, 0
-    )
+    place = camera.center_in_model + np.maximum(depth, 0)[..., None] * camera.rays() - other.camera.center_in_model
+    x, y, z = np.moveaxis(place @ (camera_matrix(other.camera.pinhole, 0.5) @ other.camera.cam_from_model).T, -1, 0)
     u, v = (along / np.where(z > 0, z, 1) for along in (x, y))
     height, width = other.grey.shape
     inside = (z > 0) & (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
@@ -56,18 +55,16 @@ def correlation(image: Float32Array, other: Float32Array, settings: MatchSetting
     return np.where(other == 0, UNSEEN, level).astype(np.float32)
 
 
-def agreed_by_numpy(
-    reference: DepthEstimate, others: list[DepthEstimate], settings: AgreementSettings
-) -> np.ndarray:
+def agreed_by_numpy(reference: SweepResult, others: list[SweepResult], settings: AgreementSettings) -> np.ndarray:
     """Return the depths (H, W) of `agreed_depth`, from whole arrays."""
     own, rays = reference.depth(), reference.camera.rays()
-    good = (reference.sweep.score > settings.least_score) & np.isfinite(own) & (own > 0)
-    point = reference.camera.center_in_world + np.where(good, own, 1.0)[..., None] * rays
-    weight = (reference.sweep.normals.offset_per_metre(reference.camera) * reference.sweep.sharpness) ** 2
+    good = (reference.score > settings.least_score) & np.isfinite(own) & (own > 0)
+    point = reference.camera.center_in_model + np.where(good, own, 1.0)[..., None] * rays
+    weight = (reference.normals.offset_per_metre(reference.camera) * reference.sharpness) ** 2
     total, agree, through = np.zeros(own.shape), np.zeros(own.shape), np.zeros(own.shape)
     for other in others:
-        camera, sweep = other.camera, other.sweep
-        in_cam = (point - camera.center_in_world) @ camera.cam_from_world.T
+        camera, sweep = other.camera, other
+        in_cam = (point - camera.center_in_model) @ camera.cam_from_model.T
         ahead, pinhole = np.where(in_cam[..., 2] > 0, in_cam[..., 2], 1.0), camera.pinhole
         column = np.floor(pinhole.fx * in_cam[..., 0] / ahead + pinhole.cx).astype(int)
         row = np.floor(pinhole.fy * in_cam[..., 1] / ahead + pinhole.cy).astype(int)
@@ -75,10 +72,10 @@ def agreed_by_numpy(
         seen &= (column >= 0) & (column < camera.pinhole.width)
         row, column = np.where(seen, row, 0), np.where(seen, column, 0)
         seen &= sweep.score[row, column] > settings.least_score
-        normal = sweep.normals.normal_in_world[row, column]
+        normal = sweep.normals.normal_in_model[row, column]
         offset = (point * normal).sum(axis=-1)
         residual, along = sweep.offset_m[row, column] - offset, (rays * normal).sum(axis=-1)
-        through += seen & (residual / (offset - normal @ camera.center_in_world) > settings.free)
+        through += seen & (residual / (offset - normal @ camera.center_in_model) > settings.free)
         near = seen & (np.abs(residual) < settings.steps * sweep.step_m[row, column])
         near &= np.abs(residual / along) < 0.1 * own
         of_view = np.where(near, (along * sweep.sharpness[row, column]) ** 2, 0.0)

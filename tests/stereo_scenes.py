@@ -5,15 +5,14 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from pipelines.geometry.cameras import Pinhole
-from pipelines.surface.agreement import DepthEstimate
-from pipelines.surface.matching import MatchSettings, StereoCamera, StereoView
-from pipelines.surface.sweep import NormalMap, Planes, plane_sweep
+from pipelines.geometry.cameras import Pinhole, ViewPose
+from pipelines.surface.matching import MatchSettings, StereoView
+from pipelines.surface.sweep import NormalMap, SweepPlanes, SweepResult, plane_sweep
 
 CAMERA = Pinhole(120, 90, 110.0, 110.0, 60.0, 45.0)
 GROUND_M, ROOF_M, ROOF_SIDE_M = 0.0, 6.0, 8.0
 TEXEL_M = 0.1
-LEVEL = Planes(np.array([0.0, 0.0, 1.0]), np.arange(-4.0, 10.0, 0.5))
+LEVEL = SweepPlanes(np.array([0.0, 0.0, 1.0]), np.arange(-4.0, 10.0, 0.5))
 # A pixel is 0.36 m wide on the ground, neighbours are 20° apart: a tenth of a pixel is 0.1 m of height.
 TENTH_PX_M = 0.1
 
@@ -38,14 +37,14 @@ def painted(seed: int, right_m: np.ndarray, up_m: np.ndarray) -> np.ndarray:
     return np.asarray(cv2.remap(texture(seed), column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP))
 
 
-def photographed(camera: StereoCamera, grey: np.ndarray) -> StereoView:
+def photographed(camera: ViewPose, grey: np.ndarray) -> StereoView:
     """Return a view of grey levels (H, W), clipped to 0 … 255."""
     return StereoView(camera, np.clip(grey + 1, 1, 256).astype(np.float32))
 
 
-def true_depth(camera: StereoCamera) -> np.ndarray:
+def true_depth(camera: ViewPose) -> np.ndarray:
     """Return the depth (H, W) of the first surface along each ray: the square roof, or the ground."""
-    rays, center = camera.rays(), camera.center_in_world
+    rays, center = camera.rays(), camera.center_in_model
     roof = (ROOF_M - center[2]) / rays[..., 2]
     on_roof = center + roof[..., None] * rays
     hit = (np.abs(on_roof[..., :2]) < ROOF_SIDE_M / 2).all(axis=-1)
@@ -54,7 +53,7 @@ def true_depth(camera: StereoCamera) -> np.ndarray:
 
 def shot(azimuth_deg: float, brightness: float = 1.0, pinhole: Pinhole = CAMERA) -> StereoView:
     rotation, center = looking_at_origin(azimuth_deg)
-    camera = StereoCamera(pinhole, rotation, center)
+    camera = ViewPose(pinhole, rotation, center)
     place = center + true_depth(camera)[..., None] * camera.rays()
     ground, roof = (painted(seed, place[..., 0], place[..., 1]) for seed in (1, 2))
     return photographed(camera, brightness * np.where(place[..., 2] > 0.5 * ROOF_M, roof, ground))
@@ -62,7 +61,7 @@ def shot(azimuth_deg: float, brightness: float = 1.0, pinhole: Pinhole = CAMERA)
 
 def level_normals(pinhole: Pinhole = CAMERA) -> NormalMap:
     """Return the normal map of level planes at all pixels."""
-    return NormalMap(LEVEL.normal_in_world[None], np.zeros((pinhole.height, pinhole.width), np.uint8))
+    return NormalMap(LEVEL.normal_in_model[None], np.zeros((pinhole.height, pinhole.width), np.uint8))
 
 
 def ring_of_views(pinhole: Pinhole = CAMERA) -> list[StereoView]:
@@ -75,8 +74,6 @@ def neighbours_of(ring: list[StereoView], index: int) -> list[StereoView]:
     return [view for place, view in enumerate(ring) if 0 < abs(place - index) <= 2]
 
 
-def depth_estimate(ring: list[StereoView], index: int) -> DepthEstimate:
+def depth_estimate(ring: list[StereoView], index: int) -> SweepResult:
     """Return the depths that a sweep of level planes gives a view of the ring."""
-    return DepthEstimate(
-        ring[index].camera, plane_sweep(ring[index], neighbours_of(ring, index), [LEVEL], MatchSettings())
-    )
+    return plane_sweep(ring[index], neighbours_of(ring, index), [LEVEL], MatchSettings())

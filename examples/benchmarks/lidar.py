@@ -42,7 +42,7 @@ from pipelines.simulate.stage import RecordedFlight, fly_survey, write_lidar_fli
 from pipelines.simulate.truth import Truth
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.depth_maps import DepthMaps
-from pipelines.surface.measured_cloud import CloudFiles
+from pipelines.surface.measured_cloud import CloudReader
 from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey.options import CloudCrs
 from pipelines.survey.report import read_report
@@ -164,7 +164,7 @@ def comparison(workspace: Workspace, flight: RecordedFlight, unchanged: Path, us
     survey, scene = adjusted.survey, adjusted.scene
     images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
     images.build(SILENT)
-    maps, files = DepthMaps(workspace.cache / "surface", scene, images), CloudFiles(used, options.lidar_stated)
+    maps, files = DepthMaps(workspace.cache / "surface", scene, images), CloudReader(used, options.lidar_stated)
     maps.build(SILENT)
     compared = compared_lidar(
         options, files, maps, survey,
@@ -188,7 +188,7 @@ def comparison(workspace: Workspace, flight: RecordedFlight, unchanged: Path, us
 
 def points_of(cloud: Path, flight: RecordedFlight) -> cKDTree:
     """Points of a cloud, in the frame of the flight's world."""
-    chunks = CloudFiles(cloud, CloudCrs()).chunks(flight.world.origin)
+    chunks = CloudReader(cloud, CloudCrs()).chunks(flight.world.origin)
     return cKDTree(np.concatenate([chunk.position_in_geo for chunk in chunks]))
 
 

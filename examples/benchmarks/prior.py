@@ -25,7 +25,7 @@ from pipelines.core.products import load_json
 from pipelines.core.stages import REPORT, SURVEY
 from pipelines.core.workspace import Workspace
 from pipelines.geodesy.enu import ecef_from_enu
-from pipelines.surface.measured_cloud import CloudFiles
+from pipelines.surface.measured_cloud import CloudReader
 from pipelines.survey.options import CloudCrs
 from pipelines.survey.report import read_report
 from pipelines.survey.survey import Survey
@@ -69,7 +69,7 @@ def write_moved(workspace: Workspace, cloud: Path, path: Path) -> None:
     assert shift is not None and shift.shift is not None
     reference_from_model = np.vstack([shift.shift.reference_from_model, [0, 0, 0, 1]])
     model_from_reference = np.linalg.inv(reference_from_model)
-    chunks = CloudFiles(cloud, CloudCrs()).chunks(origin)
+    chunks = CloudReader(cloud, CloudCrs()).chunks(origin)
     points = np.concatenate([chunk.position_in_geo for chunk in chunks])
     moved = ecef_from_enu(points @ model_from_reference[:3, :3].T + model_from_reference[:3, 3], origin)
     rows = np.empty(len(moved), [("x", "f8"), ("y", "f8"), ("z", "f8")])

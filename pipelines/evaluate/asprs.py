@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pipelines.core.types import BoolArray, FloatArray
+from pipelines.robust.statistics import residual_stats
 from pipelines.survey.report import AsprsStatement, ErrorStats, Rmse, TotalRmse, VegetatedAccuracy
 
 STANDARD = "ASPRS, Edition 2, Version 2, 2024"
@@ -94,23 +95,16 @@ def error_stats(error_in_geo: ArrayLike) -> ErrorStats:
     error = np.asarray(error_in_geo, dtype=np.float64).reshape(-1, 3)
     if len(error) == 0:
         return ErrorStats(count=0, **dict.fromkeys(name for name in ErrorStats.model_fields if name != "count"))
-    mean, square = error.mean(axis=0).tolist(), (error**2).mean(axis=0)
-    horizontal, vertical = np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2])
+    (east, north, up), size = error.mean(axis=0).tolist(), np.abs(error)
+    horizontal = np.hypot(error[:, 0], error[:, 1])
     return ErrorStats(
-        count=len(error),
-        mean_e_m=mean[0],
-        mean_n_m=mean[1],
-        mean_u_m=mean[2],
-        mean_h_m=float(horizontal.mean()),
+        **residual_stats(error).model_dump(),
+        mean_e_m=east,
+        mean_n_m=north,
+        mean_u_m=up,
         median_h_m=float(np.median(horizontal)),
-        rmse_e_m=float(np.sqrt(square[0])),
-        rmse_n_m=float(np.sqrt(square[1])),
-        rmse_h_m=float(np.sqrt(square[0] + square[1])),
-        rmse_v_m=float(np.sqrt(square[2])),
-        rmse_3d_m=float(np.sqrt(square.sum())),
         max_h_m=float(horizontal.max()),
-        max_v_m=float(vertical.max()),
-        max_3d_m=float(np.sqrt((error**2).sum(axis=1).max())),
+        max_v_m=float(size[:, 2].max()),
     )
 
 

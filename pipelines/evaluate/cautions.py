@@ -24,18 +24,25 @@ _SINGULAR = 1e-12  # of the largest variance
 def cautions_of_prediction(
     solved: SolvedSurvey, posterior: Posterior, by_camera: CheckPointErrors, *, of_initial: bool
 ) -> tuple[Caution, ...]:
-    """Return the limits of the predicted accuracy.
-
-    Args:
-        solved: the survey.
-        posterior: gives the prediction.
-        by_camera: errors of the triangulated check points.
-        of_initial: whether the points are measured with the initial similarity.
-    """
+    """Return the limits of the predicted accuracy, of points that may be measured with the initial similarity."""
     if of_initial:
         sentence = "Measured with the initial similarity: the prediction is that of the adjusted one."
         return (Caution(code="prediction-of-adjusted-similarity", sentence=sentence),)
-    test = _test_by_check_points(solved, posterior, frozenset(by_camera.blunders))
+    points = solved.survey.check_points
+    if len(points) < _LEAST_POINTS:
+        return ()
+    rays = mark_rays(points, solved.sparse)
+    position = points_by_camera(solved, rays)
+    variance = np.diagonal(posterior.of_marked_points(position, rays), axis1=1, axis2=2)
+    known = np.asarray(np.isfinite(position + variance).all(axis=1))
+    if known.sum() < _LEAST_POINTS:
+        return ()
+    chosen = [point for point, is_known in zip(points, known, strict=True) if is_known]
+    error = position[known] - np.array([point.position_in_geo for point in chosen])
+    cov = posterior.jointly_of_marked_points(position[known], rays.of_points(known))
+    cov = cov + block_diag(*(point.cov_in_geo for point in chosen))
+    names = tuple(point.name for point in chosen)
+    test = refutation(names, error.ravel(), cov, frozenset(by_camera.blunders))
     return () if test is None else (test,)
 
 
@@ -54,7 +61,10 @@ def refutation(
     """
     if len(names) < _LEAST_POINTS:
         return None
-    squared, freedom = _squared_whitened(error, cov)
+    variance, axis = np.linalg.eigh((cov + cov.T) / 2)
+    regular = variance > _SINGULAR * variance[-1]
+    white = (axis.T @ error)[regular] / np.sqrt(variance[regular])
+    squared, freedom = float(white @ white), int(regular.sum())
     least, most = (float(chi2_quantile(quantile, freedom)) for quantile in _RANGE)
     if least <= squared <= most:
         return None
@@ -100,29 +110,3 @@ def dependent_check_points(survey: Survey) -> tuple[Caution, ...]:
         f"that their errors say little of the accuracy: {listed(tuple(pairs))}."
     )
     return (Caution(code="check-point-not-independent", sentence=sentence),)
-
-
-def _test_by_check_points(solved: SolvedSurvey, posterior: Posterior, blunders: frozenset[str]) -> Caution | None:
-    """Return the caution of the test of a prediction by the check points that it determines."""
-    points = solved.survey.check_points
-    if len(points) < _LEAST_POINTS:
-        return None
-    rays = mark_rays(points, solved.sparse)
-    position = points_by_camera(solved, rays)
-    variance = np.diagonal(posterior.of_marked_points(position, rays), axis1=1, axis2=2)
-    known = np.asarray(np.isfinite(position + variance).all(axis=1))
-    if known.sum() < _LEAST_POINTS:
-        return None
-    chosen = [point for point, is_known in zip(points, known, strict=True) if is_known]
-    error = position[known] - np.array([point.position_in_geo for point in chosen])
-    cov = posterior.jointly_of_marked_points(position[known], rays.of_points(known))
-    cov = cov + block_diag(*(point.cov_in_geo for point in chosen))
-    return refutation(tuple(point.name for point in chosen), error.ravel(), cov, blunders)
-
-
-def _squared_whitened(error: FloatArray, cov: FloatArray) -> tuple[float, int]:
-    """Return eᵀ C⁺ e of errors (n,), and its degrees of freedom: the rank of the covariance (n, n)."""
-    variance, axis = np.linalg.eigh((cov + cov.T) / 2)
-    regular = variance > _SINGULAR * variance[-1]
-    white = (axis.T @ error)[regular] / np.sqrt(variance[regular])
-    return float(white @ white), int(regular.sum())

@@ -1,11 +1,13 @@
 """Surveyed points, measured in the solved survey: check points, cross-validation, and residuals of the fit.
 
-Sections of the report on surveyed points: errors, accuracy after ASPRS, and predicted accuracy.
+The sections of the report have their errors, accuracy after ASPRS, and predicted accuracy.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import compress
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +24,6 @@ from pipelines.survey.report import (
     CheckPointErrors,
     ControlResiduals,
     CrossValidation,
-    Fit,
     FixResiduals,
     PointError,
     PointResidual,
@@ -36,20 +37,13 @@ from pipelines.survey.trained_survey import SolvedSurvey, fix_differences, point
 
 
 @dataclass(frozen=True)
-class MeasuredPoints:
-    """J surveyed points, measured in the model.
-
-    Attributes:
-        points: positions and covariances of the survey.
-        error_in_geo: (J, 3) m, measured minus surveyed; NaN for a point that was not measured.
-        rays: (J,) number of marks in registered images.
-        cov_in_geo: (J, 3, 3) m², predicted covariance of the measured positions; None: no prediction.
-    """
+class RemeasuredPoints:
+    """J surveyed points, measured in the model."""
 
     points: tuple[SurveyedPoint, ...]
-    error_in_geo: FloatArray
-    rays: IntArray
-    cov_in_geo: FloatArray | None = None
+    error_in_geo: FloatArray  # (J, 3) m, measured minus surveyed; NaN for a point that was not measured
+    rays: IntArray  # (J,) number of marks in registered images
+    cov_in_geo: FloatArray | None = None  # (J, 3, 3) m², predicted of the measured positions; None: no prediction
 
     @property
     def is_measured(self) -> BoolArray:
@@ -62,49 +56,23 @@ class MeasuredPoints:
         return np.array([point.cov_in_geo for point in self.points]).reshape(-1, 3, 3)
 
 
-def check_point_errors(measured: MeasuredPoints, area_km2: float | None) -> CheckPointErrors:
-    """Return the report's section on check points.
-
-    Args:
-        measured: J check points.
-        area_km2: of the scene; None: not known.
-    """
+def check_point_errors(measured: RemeasuredPoints, area_km2: float | None) -> CheckPointErrors:
+    """Return the report's section on check points in a scene of an area; None: not known."""
     assessment = _assess(measured, area_km2)
-    blunder = _among_all(assessment, measured)
-    return CheckPointErrors(
-        **assessment.stats.model_dump(),
-        survey=assessment.survey,
-        with_survey=assessment.with_survey,
-        asprs=assessment.asprs,
-        without_blunders=assessment.without_blunders,
-        blunders=_names(measured, blunder),
-        predicted=_predicted_sigma(measured),
-        points=_rows(measured, blunder),
-    )
+    return CheckPointErrors(**_figures(measured, assessment), asprs=assessment.asprs)
 
 
-def cross_validation_errors(measured: MeasuredPoints) -> CrossValidation:
+def cross_validation_errors(measured: RemeasuredPoints) -> CrossValidation:
     """Return the report's section on control points, each measured by a solution without that point.
 
     The section states no class, because control points are not check points.
     """
     assessment = _assess(measured)
-    blunder = _among_all(assessment, measured)
     impossible = "no control point can be spared, or none entered the adjustment"
-    return CrossValidation(
-        **assessment.stats.model_dump(),
-        survey=assessment.survey,
-        with_survey=assessment.with_survey,
-        without_blunders=assessment.without_blunders,
-        blunders=_names(measured, blunder),
-        predicted=_predicted_sigma(measured),
-        points=_rows(measured, blunder),
-        reason=None if assessment.stats.count else impossible,
-    )
+    return CrossValidation(**_figures(measured, assessment), reason=None if assessment.stats.count else impossible)
 
 
-def point_residuals(measured: MeasuredPoints) -> tuple[PointResidual, ...]:
-    """Return one row for each point: its name, marks and residual."""
+def _residuals(measured: RemeasuredPoints) -> tuple[PointResidual, ...]:
     residual = _by_axis(measured.error_in_geo)
     return tuple(
         PointResidual(name=point.name, rays=rays, de_m=east, dn_m=north, du_m=up)
@@ -112,28 +80,32 @@ def point_residuals(measured: MeasuredPoints) -> tuple[PointResidual, ...]:
     )
 
 
-def _assess(measured: MeasuredPoints, area_km2: float | None = None) -> Assessment:
+def _assess(measured: RemeasuredPoints, area_km2: float | None = None) -> Assessment:
     known = measured.is_measured
     vegetated = np.array([point.land_cover == "vegetated" for point in measured.points], dtype=bool)
     return assess(measured.error_in_geo[known], measured.cov_survey[known], vegetated[known], area_km2)
 
 
-def _among_all(assessment: Assessment, measured: MeasuredPoints) -> list[bool]:
-    """Return for each of all J points whether it is a blunder."""
-    blunder = np.zeros(len(measured.points), dtype=bool)
-    blunder[measured.is_measured] = assessment.blunder
-    return [bool(is_blunder) for is_blunder in blunder]
+def _figures(measured: RemeasuredPoints, assessment: Assessment) -> dict[str, Any]:
+    among_all = np.zeros(len(measured.points), dtype=bool)
+    among_all[measured.is_measured] = assessment.blunder
+    blunder = among_all.tolist()
+    return {
+        **assessment.stats.model_dump(),
+        "survey": assessment.survey,
+        "with_survey": assessment.with_survey,
+        "without_blunders": assessment.without_blunders,
+        "blunders": tuple(point.name for point in compress(measured.points, blunder)),
+        "predicted": _predicted_sigma(measured),
+        "points": _rows(measured, blunder),
+    }
 
 
-def _names(measured: MeasuredPoints, chosen: list[bool]) -> tuple[str, ...]:
-    return tuple(point.name for point, is_chosen in zip(measured.points, chosen, strict=True) if is_chosen)
-
-
-def _rows(measured: MeasuredPoints, blunder: list[bool]) -> PointRows:
+def _rows(measured: RemeasuredPoints, blunder: list[bool]) -> PointRows:
     """Return one row for each point, with its predicted σ if there is a prediction."""
     rows = [
         PointError(**residual.model_dump(), blunder=is_blunder)
-        for residual, is_blunder in zip(point_residuals(measured), blunder, strict=True)
+        for residual, is_blunder in zip(_residuals(measured), blunder, strict=True)
     ]
     if measured.cov_in_geo is None:
         return tuple(rows)
@@ -159,7 +131,7 @@ def rms_sigma(cov: FloatArray) -> RmsSigma:
     return RmsSigma(count=len(known), rms_h_m=float(np.sqrt(east + north)), rms_v_m=float(np.sqrt(up)))
 
 
-def _predicted_sigma(measured: MeasuredPoints) -> PredictedSigma | None:
+def _predicted_sigma(measured: RemeasuredPoints) -> PredictedSigma | None:
     """Return the predicted σ, and the mean of error² over variance, by axis.
 
     The variance includes the survey's. The mean is 1 on the average if both variances are true.
@@ -185,15 +157,15 @@ def triangulated_check_points(solved: SolvedSurvey, posterior: Posterior) -> Che
 
 
 def check_points_on_surface(renderer: ModelRenderer, progress: Progress) -> CheckPointErrors:
-    """Return the errors of the check points as places of the Gaussians' surface behind their marks.
-
-    Args:
-        renderer: of the trained model.
-        progress: shows the depth maps.
-    """
+    """Return the errors of the check points as places of the Gaussians' surface behind their marks."""
     trained = renderer.trained
     points, rays = trained.survey.check_points, mark_rays(trained.survey.check_points, trained.sparse)
-    position = points_by_model(trained, rays, _depth_maps(renderer, rays, progress))
+    maps: list[DepthMap] = []
+    with progress.task("depth at marks", len(rays)) as task:
+        for camera, xy in zip(rays.camera, rays.xy, strict=True):
+            maps.append(depth_around(renderer, int(camera), xy))
+            task.advance()
+    position = points_by_model(trained, rays, maps)
     return check_point_errors(_compared(points, position, rays), scene_area_km2(trained))
 
 
@@ -212,43 +184,28 @@ def cross_validate(solved: SolvedSurvey) -> CrossValidation:
             error[index] = row.left_out_error_m
             cov[index] = np.array(row.left_out_cov_m2) - np.array(point.cov_in_geo)
     rays = mark_rays(points, solved.sparse).marks_of_point
-    return cross_validation_errors(MeasuredPoints(points, error, rays, cov))
-
-
-def fit_residuals(solved: SolvedSurvey) -> Fit:
-    """Return the residuals of fixes and control points: the fit of the solution, not its accuracy."""
-    return Fit(gnss=_fix_residuals(solved), gcp=_control_residuals(solved))
-
-
-def _depth_maps(renderer: ModelRenderer, rays: MarkRays, progress: Progress) -> list[DepthMap]:
-    """Return the depth of the surface around each mark."""
-    maps = []
-    with progress.task("depth at marks", len(rays)) as task:
-        for camera, xy in zip(rays.camera, rays.xy, strict=True):
-            maps.append(depth_around(renderer, int(camera), xy))
-            task.advance()
-    return maps
+    return cross_validation_errors(RemeasuredPoints(points, error, rays, cov))
 
 
 def _compared(
     points: tuple[SurveyedPoint, ...], position_in_geo: FloatArray, rays: MarkRays, cov: FloatArray | None = None
-) -> MeasuredPoints:
-    """Return surveyed points with the errors of their measured positions (J, 3)."""
+) -> RemeasuredPoints:
     surveyed = np.array([point.position_in_geo for point in points]).reshape(-1, 3)
-    return MeasuredPoints(points, position_in_geo - surveyed, rays.marks_of_point, cov)
+    return RemeasuredPoints(points, position_in_geo - surveyed, rays.marks_of_point, cov)
 
 
-def _control_residuals(solved: SolvedSurvey) -> ControlResiduals:
+def control_residuals(solved: SolvedSurvey) -> ControlResiduals:
+    """Return the residuals of the control points: the fit of the solution, not its accuracy."""
     points = solved.survey.control_points
     rays = mark_rays(points, solved.sparse)
     measured = _compared(points, points_by_camera(solved, rays), rays)
     rejected = np.isin([point.name for point in points], solved.model.control_outliers)
     stats = residual_stats(measured.error_in_geo[measured.is_measured & ~rejected])
-    return ControlResiduals(**stats.model_dump(), outliers=int(rejected.sum()), points=point_residuals(measured))
+    return ControlResiduals(**stats.model_dump(), outliers=int(rejected.sum()), points=_residuals(measured))
 
 
-def _fix_residuals(solved: SolvedSurvey) -> FixResiduals:
-    """Return the residuals of the fixes, without outliers."""
+def fix_residuals(solved: SolvedSurvey) -> FixResiduals:
+    """Return the residuals of the fixes without outliers: the fit of the solution, not its accuracy."""
     fixes = fix_differences(solved)
     stats = residual_stats(fixes.difference_in_geo[~fixes.is_outlier])
     return FixResiduals(**stats.model_dump(), outliers=int(fixes.is_outlier.sum()))

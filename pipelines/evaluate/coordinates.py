@@ -1,7 +1,4 @@
-"""Positions of the report in a CRS that the user names: ENU → ECEF → CRS, point by point.
-
-Errors of every check and control point, and σ of every camera, as tables for other programs.
-"""
+"""Positions of the report in a CRS that the user names, and its tables of points and cameras for other programs."""
 
 from __future__ import annotations
 
@@ -20,12 +17,8 @@ from pipelines.survey.report import CheckPointErrors, CheckPoints, Coordinates, 
 from pipelines.survey.survey import Survey
 
 
-def target_crs(text: str, survey: Survey) -> PointCrs:
-    """Return the CRS in which to list positions of a survey.
-
-    Args:
-        text: name of the CRS, such as EPSG:32632.
-        survey: its origin must lie within the area of the CRS.
+def report_crs(text: str, survey: Survey) -> PointCrs:
+    """Return the CRS, such as EPSG:32632, in which to list positions of a survey.
 
     Raises:
         InputError: the text is not a CRS, the CRS is not for this place, or a grid that it needs is not installed.
@@ -37,11 +30,6 @@ def target_crs(text: str, survey: Survey) -> PointCrs:
 
 def coordinates_in(crs: PointCrs, checkpoints: CheckPoints, survey: Survey) -> Coordinates:
     """Return each check point as surveyed and as measured, and the origin of `geo`, in a CRS.
-
-    Args:
-        crs: from `target_crs`.
-        checkpoints: errors of the check points.
-        survey: has the same check points, and the origin.
 
     Raises:
         InputError: a point lies outside the CRS's domain.
@@ -102,11 +90,6 @@ def write_point_table(path: Path, report: EvaluationReport, survey: Survey) -> N
     """Write one line for each point and way in which it was measured; what is not known stays empty.
 
     The place is the surveyed one. With `--crs`, check points have their coordinates there too.
-
-    Args:
-        path: of the CSV file.
-        report: of the same survey.
-        survey: has the surveyed positions.
     """
     place = _places(survey)
     in_crs = report.coordinates
@@ -123,7 +106,6 @@ def write_camera_sigma(path: Path, names: Sequence[str], cov: FloatArray) -> Non
     """Write one line for each camera: σ of its position and of its rotations, along east, north and up.
 
     Args:
-        path: of the CSV file.
         names: n photographs.
         cov: (n, 6, 6) of (δθ [rad], δc [m]).
     """

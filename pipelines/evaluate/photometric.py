@@ -1,16 +1,14 @@
 """Photometric figures of the test views: training fits neither Gaussians nor cameras to their photographs.
 
-Part of a test view that training views show as well: elsewhere the photograph tests nothing but the guess.
-
-The ground of a pixel is where its ray meets the surface through the SfM points. What stands before it is not asked
-for. The splat itself decides nothing here: no hole or floater in it excuses a pixel, and all configurations of a
-comparison are tested on the same pixels.
+Where no training views show the ground as well, a photograph tests nothing but the guess. The ground of a pixel is
+where its ray meets the surface through the SfM points. What stands before it is not asked for. The splat itself
+decides nothing here: no hole or floater in it excuses a pixel, and all configurations of a comparison are tested on
+the same pixels.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -33,11 +31,7 @@ _COLUMNS = 48  # across a view: neighbouring rays meet neighbouring ground
 
 
 class TrainingCoverage:
-    """Coverage of views by the training views.
-
-    Args:
-        renderer: knows cameras and poses of all views.
-    """
+    """Coverage of views by the training views."""
 
     def __init__(self, renderer: ModelRenderer) -> None:
         self._renderer = renderer
@@ -49,9 +43,6 @@ class TrainingCoverage:
         """Return the mask (H, W) of the pixels of a view whose ground at least two training views show.
 
         None without SfM points. Pixels without ground, such as sky, are not covered.
-
-        Args:
-            index: of the view.
         """
         if self._surface is None:
             return None
@@ -100,11 +91,8 @@ def compare_test_views(
     guess.
 
     Args:
-        renderer: of the trained model.
         lpips_weights: NPZ file; None: no LPIPS.
         save_render: saves the first views side by side with their photographs.
-        progress: shows the views.
-        saved: number of views for `save_render`.
 
     Raises:
         InputError: a photograph or the weights cannot be read.
@@ -118,10 +106,21 @@ def compare_test_views(
             render = renderer.render(index).colour.clamp(0, 1).cpu()
             photo = torch.from_numpy(np.array(renderer.images.image(index))).float() / 255.0
             mask = torch.from_numpy(np.array(renderer.images.mask(index)))
-            pair = _Pair(render, photo, mask, coverage.covered(index))
-            views.append(_figures(name, pair, distance))
+            covered = coverage.covered(index)
+            covered = None if covered is None else covered & mask
+            affine = fitted_affine(render, photo, mask)
+            figures = ViewFigures(
+                image=name,
+                psnr=psnr(render, photo, mask),
+                psnr_compensated=psnr(with_affine(render, affine), photo, mask),
+                ssim=ssim(render, photo, mask),
+                lpips=None if distance is None else distance(render, photo, mask),
+                covered_share=None if covered is None else float(covered.sum() / mask.sum()),
+                psnr_covered=None if covered is None or not covered.any() else psnr(render, photo, covered),
+            )
+            views.append(figures)
             if place < saved:
-                save_render(name, _side_by_side(photo, render, views[-1]))
+                save_render(name, _side_by_side(photo, render, figures))
             task.advance()
     return PhotometricFigures(
         views=len(views),
@@ -133,31 +132,6 @@ def compare_test_views(
         lpips=_mean(view.lpips for view in views),
         lpips_reason=_NO_WEIGHTS if distance is None else None,
         per_view=tuple(views),
-    )
-
-
-@dataclass(frozen=True)
-class _Pair:
-    """Render (H, W, 3) and photograph, colours 0 … 1; the pixels that count (H, W), and those that are covered."""
-
-    render: Tensor
-    photo: Tensor
-    mask: Tensor
-    covered: Tensor | None
-
-
-def _figures(name: str, pair: _Pair, distance: Lpips | None) -> ViewFigures:
-    """Return the figures of a render against its photograph."""
-    render, photo, mask = pair.render, pair.photo, pair.mask
-    covered = None if pair.covered is None else pair.covered & mask
-    return ViewFigures(
-        image=name,
-        psnr=psnr(render, photo, mask),
-        psnr_compensated=psnr(with_affine(render, fitted_affine(render, photo, mask)), photo, mask),
-        ssim=ssim(render, photo, mask),
-        lpips=None if distance is None else distance(render, photo, mask),
-        covered_share=None if covered is None else float(covered.sum() / mask.sum()),
-        psnr_covered=None if covered is None or not covered.any() else psnr(render, photo, covered),
     )
 
 

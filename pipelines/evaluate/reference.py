@@ -6,10 +6,6 @@
 3. In each square, distances are measured both ways and along the reference's normals (`distances`).
 4. Recall counts points that three photographs saw, and precision the model's points where the reference covers the
    plan.
-
-Cautions of a comparison with a reference.
-
-Map and histogram of a comparison with a reference.
 """
 
 from __future__ import annotations
@@ -32,23 +28,24 @@ from pipelines.evaluate.reference_distances import (
     CLASSES,
     Box,
     ComparisonSettings,
+    CorePoints,
     TiledPoints,
     compare_square,
     plane_normals,
-    require_m3c2,
+    require_py4dgeo,
 )
-from pipelines.evaluate.reference_figures import THRESHOLDS_M, CoreTable, DistanceTally, level_of_detection
+from pipelines.evaluate.reference_figures import THRESHOLDS_M, DistanceTally, level_of_detection
 from pipelines.geodesy.enu import Origin
 from pipelines.geometry.footprints import first_of_voxels
 from pipelines.geometry.similarity import Similarity
 from pipelines.report.plots.charts import write_distance_histogram, write_distance_map
 from pipelines.surface.fusion import FusionSettings, fused_squares, fusion_settings
-from pipelines.surface.measured_cloud import CloudFiles, MeasuredCloud, Thinning, read_thinned
-from pipelines.surface.registration import Fit, fit_alignment
+from pipelines.surface.measured_cloud import CloudReader, MeasuredCloud, Thinning, read_thinned
+from pipelines.surface.registration import fit_alignment
 from pipelines.surface.surface_views import ModelRenderer, SurfaceViews
 from pipelines.surface.visibility import SeenSurface, Viewpoints, seen_surface
 from pipelines.survey.options import CloudCrs
-from pipelines.survey.report_parts import ReferenceComparison
+from pipelines.survey.report_parts import ReferenceComparison, ReferenceShift
 from pipelines.survey.trained_survey import TrainedSurvey, scene_points
 
 _SQUARE_M = 32.0  # two million points of the reference at the most, in voxels of 0.025 m
@@ -60,24 +57,15 @@ _SAMPLE = 20_000  # points of the reference that tell its spacing
 
 @dataclass(frozen=True)
 class ComparedReference:
-    """Figures of the comparison, and the core points for map and histogram."""
+    """Figures of the comparison, and the core points with their levels of detection for map and histogram."""
 
     comparison: ReferenceComparison
-    table: CoreTable
+    cores: CorePoints
+    lod_m: FloatArray
     assumptions: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class _Model:
-    """The model's cloud, and the similarity by which it was moved; None: it was not."""
-
-    points: TiledPoints
-    settings: FusionSettings
-    fit: Fit | None
-    moved: Similarity | None
-
-
-def open_reference(options: EvaluateOptions) -> CloudFiles | None:
+def open_reference(options: EvaluateOptions) -> CloudReader | None:
     """Return the reference of `--reference`, its headers and CRS checked; None without that option.
 
     Raises:
@@ -86,14 +74,14 @@ def open_reference(options: EvaluateOptions) -> CloudFiles | None:
     """
     if options.reference is None:
         return None
-    require_m3c2()
+    require_py4dgeo()
     stated = CloudCrs(options.reference_crs, options.reference_vertical, "--reference")
-    return CloudFiles(options.reference, stated)
+    return CloudReader(options.reference, stated)
 
 
 def compare_with_reference(
     renderer: ModelRenderer,
-    files: CloudFiles,
+    files: CloudReader,
     grid: AccuracyGrid | None,
     options: EvaluateOptions,
     *,
@@ -103,12 +91,9 @@ def compare_with_reference(
     """Return the comparison of a trained survey with a reference.
 
     Args:
-        renderer: of the trained model.
-        files: the reference.
         grid: predicted σ of the georeference; None: not known.
         options: of the stage, with `reference`.
         scratch: folder for depth maps and sorted points; removed at the end.
-        progress: shows depth maps, points and squares.
 
     Raises:
         InputError: a damaged file, a missing grid, a reference of another place, or no room on the disk.
@@ -116,37 +101,38 @@ def compare_with_reference(
     """
     assert options.reference is not None  # the caller opened its files
     trained = renderer.trained
-    box = _bounds(trained)
+    points = scene_points(trained)
+    margin = np.array([_MARGIN_M, _MARGIN_M, _MARGIN_UP_M])  # a reference may lie above or below the scene
+    box = points.min(axis=0) - margin, points.max(axis=0) + margin
     thinning = Thinning(_OVERVIEW_M, _MOST_OVERVIEW, *box)
     overview = read_thinned(files, trained.survey.origin, thinning, progress)
-    model = _model(renderer, overview, options, scratch, progress)
-    seen = seen_surface(_viewpoints(renderer, model.moved), overview.position_in_geo, overview.voxel_m, progress)
+    model, fusion, shift, moved = _model(renderer, overview, options, scratch, progress)
+    seen = seen_surface(_viewpoints(renderer, moved), overview.position_in_geo, overview.voxel_m, progress)
     reference = _sorted_reference(files, trained.survey.origin, box, scratch / "reference", progress)
     spacing_m = _spacing(reference)
-    settings = ComparisonSettings.of_spacings(spacing_m, model.settings.spacing_m, min(THRESHOLDS_M), box)
-    tally = _compare(reference, model.points, seen, settings, progress)
+    settings = ComparisonSettings.of_spacings(spacing_m, fusion.spacing_m, min(THRESHOLDS_M), box)
+    tally = _compare(reference, model, seen, settings, progress)
     cores = tally.cores()
     sigma_m = _georeference_sigma(cores.position, cores.normal, trained, grid)
-    known = np.zeros(len(cores.position)) if sigma_m is None or model.moved is not None else sigma_m
+    known = np.zeros(len(cores.position)) if sigma_m is None or moved is not None else sigma_m
     lod_m = level_of_detection(cores.noise_m, np.hypot(known, options.reference_sigma))
-    table = CoreTable(cores, lod_m)
     comparison = ReferenceComparison(
         name=options.reference.name,
         crs=files.crs_names,
         points=tally.points,
         seen=tally.seen / max(tally.points, 1),
         spacing_m=spacing_m,
-        model_points=len(model.points),
-        model_spacing_m=model.settings.spacing_m,
+        model_points=len(model),
+        model_spacing_m=fusion.spacing_m,
         sigma_m=options.reference_sigma,
         georeference_sigma_m=None if sigma_m is None or not len(sigma_m) else float(np.median(sigma_m)),
-        shift=None if model.fit is None else model.fit.shift,
-        aligned="none" if model.moved is None else options.reference_align,
+        shift=shift,
+        aligned="none" if moved is None else options.reference_align,
         cylinder_m=settings.core_m,
-        groups=tally.groups(table),
+        groups=tally.groups(cores, lod_m),
     )
     remove(scratch)
-    return ComparedReference(comparison, table, files.assumptions)
+    return ComparedReference(comparison, cores, lod_m, files.assumptions)
 
 
 def _compare(
@@ -164,17 +150,10 @@ def _compare(
     return tally
 
 
-def _bounds(trained: TrainedSurvey) -> Box:
-    """Return the corners (3,) of the box around the scene; a reference may lie above or below it."""
-    points = scene_points(trained)
-    margin = np.array([_MARGIN_M, _MARGIN_M, _MARGIN_UP_M])
-    return points.min(axis=0) - margin, points.max(axis=0) + margin
-
-
 def _model(
     renderer: ModelRenderer, overview: MeasuredCloud, options: EvaluateOptions, scratch: Path, progress: Progress
-) -> _Model:
-    """Return the model's cloud in squares, and its shift against the reference."""
+) -> tuple[TiledPoints, FusionSettings, ReferenceShift | None, Similarity | None]:
+    """Return the model's cloud, its shift against the reference, and any similarity by which it was moved."""
     geo_from_model = renderer.trained.geo_from_model
     views = SurfaceViews(renderer, scratch / "depth_maps", colours=True, confirmed=True, progress=progress)
     settings = fusion_settings(views, geo_from_model, _LEAST_VIEWS)
@@ -188,26 +167,20 @@ def _model(
         raise DegenerateGeometryError("no point of the surface is seen alike by three training views: train longer")
     sparse = overview.position_in_geo[first_of_voxels(overview.position_in_geo, 2 * _OVERVIEW_M)]
     normal, kind = plane_normals(sparse, 2 * _OVERVIEW_M), options.reference_align
-    fit = fit_alignment(np.concatenate(sample), sparse, normal, 2 * _OVERVIEW_M, kind)
+    found = fit_alignment(np.concatenate(sample), sparse, normal, 2 * _OVERVIEW_M, kind)
     if kind == "none":
-        return _Model(delivered, settings, fit, None)
-    if fit is None:
+        return delivered, settings, None if found is None else found[1], None
+    if found is None:
         raise DegenerateGeometryError(
             f"--reference-align {kind}: the surface and the reference have too little in common to move one onto "
             "the other, or nothing in them fixes all axes: compare without it"
         )
-    similarity = fit.reference_from_model
-    return _Model(_moved(delivered, similarity, scratch / "moved"), settings, fit, similarity)
-
-
-def _moved(points: TiledPoints, similarity: Similarity, folder: Path) -> TiledPoints:
-    """Return points in the place that a similarity gives them."""
-    moved = TiledPoints(folder, points.side_m)
-    for square in sorted(points.squares):
-        rows, own = points.around(square, 0.0)
-        normal = rows["normal"][own] @ similarity.rotation.T
-        moved.append(similarity.apply(rows["position"][own]), normal, None)
-    return moved
+    similarity, shift = found
+    moved = TiledPoints(scratch / "moved", delivered.side_m)
+    for name in sorted(delivered.squares):
+        rows, own = delivered.around(name, 0.0)
+        moved.append(similarity.apply(rows["position"][own]), rows["normal"][own] @ similarity.rotation.T, None)
+    return moved, settings, shift, similarity
 
 
 def _viewpoints(renderer: ModelRenderer, moved: Similarity | None) -> Viewpoints:
@@ -222,8 +195,9 @@ def _viewpoints(renderer: ModelRenderer, moved: Similarity | None) -> Viewpoints
     )
 
 
-def _sorted_reference(files: CloudFiles, origin: Origin, box: Box, folder: Path, progress: Progress) -> TiledPoints:
-    """Return the points of the reference within the box of the scene, in squares."""
+def _sorted_reference(
+    files: CloudReader, origin: Origin, box: Box, folder: Path, progress: Progress
+) -> TiledPoints:
     (low, high), reference = box, TiledPoints(folder, _SQUARE_M)
     for chunk in files.chunks(origin, progress):
         place = chunk.position_in_geo
@@ -244,10 +218,7 @@ def _spacing(reference: TiledPoints) -> float:
 
 
 def _georeference_sigma(
-    position: FloatArray,
-    normal: FloatArray,
-    trained: TrainedSurvey,
-    grid: AccuracyGrid | None,
+    position: FloatArray, normal: FloatArray, trained: TrainedSurvey, grid: AccuracyGrid | None
 ) -> FloatArray | None:
     """Return the predicted σ (C,) of the georeference along normals; None: not known."""
     if grid is None or not len(position) or not is_checked(trained.model.cautions):
@@ -261,45 +232,41 @@ _SEEN = 0.05
 
 def cautions_of_reference(found: ComparedReference) -> tuple[Caution, ...]:
     """Return the limits of a comparison with a reference."""
-    comparison, sentences = found.comparison, []
+    comparison, cautions = found.comparison, []
+
+    def warn(code: str, sentence: str) -> None:
+        cautions.append(Caution(code=code, sentence=sentence))
+
     for assumption in found.assumptions:
-        sentences.append(("reference-heights", assumption[0].upper() + assumption[1:] + "."))
+        warn("reference-heights", assumption[0].upper() + assumption[1:] + ".")
     fine = max(comparison.spacing_m, comparison.model_spacing_m)
     least = comparison.groups[0].scores[0].threshold_m
     if fine > least:
-        sentences.append(
-            (
-                "reference-spacing",
-                f"Points are {fine:.3f} m apart: shares within shorter distances, and C2C, say more about the "
-                "spacing than about the surface. M3C2 does not depend on it.",
-            )
+        warn(
+            "reference-spacing",
+            f"Points are {fine:.3f} m apart: shares within shorter distances, and C2C, say more about the "
+            "spacing than about the surface. M3C2 does not depend on it.",
         )
     shift = comparison.shift
     if shift is not None and comparison.aligned == "none":
         sigma = [max(s, comparison.georeference_sigma_m or 0.0, comparison.sigma_m) for s in shift.sigma_m]
         if any(abs(value) > _SHIFTED_SIGMAS * s for value, s in zip(shift.enu_m, sigma, strict=True)):
-            sentences.append(
-                (
-                    "reference-shifted",
-                    "The model lies off the reference as a whole: moving it by "
-                    f"{shift.enu_m[0]:+.3f} m east, {shift.enu_m[1]:+.3f} m north and {shift.enu_m[2]:+.3f} m up "
-                    "fits best, which is more than three times the σ of both (--reference-align shift judges the "
-                    "shape alone).",
-                )
+            warn(
+                "reference-shifted",
+                "The model lies off the reference as a whole: moving it by "
+                f"{shift.enu_m[0]:+.3f} m east, {shift.enu_m[1]:+.3f} m north and {shift.enu_m[2]:+.3f} m up "
+                "fits best, which is more than three times the σ of both (--reference-align shift judges the "
+                "shape alone).",
             )
     if comparison.seen < _SEEN:
-        sentences.append(
-            (
-                "reference-unseen",
-                f"Photographs saw {100 * comparison.seen:.1f} % of the reference's points within the scene.",
-            )
-        )
-    return tuple(Caution(code=code, sentence=sentence) for code, sentence in sentences)
+        seen = f"Photographs saw {100 * comparison.seen:.1f} % of the reference's points within the scene."
+        warn("reference-unseen", seen)
+    return tuple(cautions)
 
 
 def draw_reference(found: ComparedReference, folder: Path) -> None:
     """Write map and histogram of the distances along the normals; nothing if none was measured."""
-    cores, lod_m = found.table.cores, found.table.lod_m
+    cores, lod_m = found.cores, found.lod_m
     known = np.isfinite(cores.distance_m)
     if not known.any():
         return

@@ -1,12 +1,7 @@
-"""Distances between the model's cloud and the reference in one square of the plan.
+"""Distances between the model's cloud and the reference in one square of the plan, as memory holds it.
 
-Distances between two clouds along the normals of one of them (M3C2), by py4dgeo.
-
-Lague, Brodu and Leroux 2013, doi 10.1016/j.isprsjprs.2013.04.009.
-
-Normals of a cloud from the nearest points.
-
-Points of clouds on the disk, by squares of the plan: memory holds one square and its margin.
+Distances along the normals of the reference are M3C2 (Lague, Brodu and Leroux 2013,
+doi 10.1016/j.isprsjprs.2013.04.009), by py4dgeo.
 """
 
 from __future__ import annotations
@@ -23,33 +18,11 @@ from scipy.spatial import cKDTree
 
 from pipelines.core.errors import BackendUnavailableError, InputError
 from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
-from pipelines.geometry.footprints import first_of_voxels
+from pipelines.geometry.footprints import first_of_voxels, rows_by_square, rows_of
 from pipelines.surface.visibility import SeenSurface
 
 LEAST_POINTS = 4  # in the cylinder, of each cloud
 CONFIDENCE_95 = 1.96
-
-
-@dataclass(frozen=True)
-class M3c2Distances:
-    """Distances at C core points.
-
-    Attributes:
-        distance_m: (C,) second cloud minus first along the normals; NaN where one has too few points.
-        noise_m: (C,) σ of the distance that the roughness of both clouds causes.
-    """
-
-    distance_m: FloatArray
-    noise_m: FloatArray
-
-
-def require_m3c2() -> None:
-    """Import py4dgeo, so that its absence is told before work starts.
-
-    Raises:
-        BackendUnavailableError: py4dgeo is not installed.
-    """
-    _py4dgeo()
 
 
 def m3c2(
@@ -60,8 +33,10 @@ def m3c2(
     *,
     radius_m: float,
     reach_m: float,
-) -> M3c2Distances:
-    """Return the distances of two clouds at core points.
+) -> tuple[FloatArray, FloatArray]:
+    """Return the distances of two clouds at C core points, and their σ (C,) from the roughness of both clouds.
+
+    Distances count from the first cloud to the second along the normals; NaN where one has too few points.
 
     Args:
         first: (P, 3) metres.
@@ -73,8 +48,8 @@ def m3c2(
     """
     nothing = np.full(len(core), np.nan)
     if not (len(core) and len(first) and len(second)):
-        return M3c2Distances(nothing, nothing.copy())
-    py4dgeo = _py4dgeo()
+        return nothing, nothing.copy()
+    py4dgeo = require_py4dgeo()
     middle = core.mean(axis=0)
     algorithm = py4dgeo.M3C2(
         epochs=(py4dgeo.Epoch(first - middle), py4dgeo.Epoch(second - middle)),
@@ -88,10 +63,15 @@ def m3c2(
     known &= np.isfinite(distance)
     with np.errstate(invalid="ignore"):
         noise = uncertainty["lodetection"] / CONFIDENCE_95
-    return M3c2Distances(np.where(known, distance, np.nan), np.where(known, noise, np.nan))
+    return np.where(known, distance, np.nan), np.where(known, noise, np.nan)
 
 
-def _py4dgeo() -> Any:
+def require_py4dgeo() -> Any:
+    """Import py4dgeo; its absence is to be told before work starts.
+
+    Raises:
+        BackendUnavailableError: py4dgeo is not installed.
+    """
     try:
         import py4dgeo
     except ImportError as error:
@@ -110,12 +90,7 @@ _FARTHEST = 6.0  # spacings: a point whose neighbours lie further off stands alo
 
 
 def plane_normals(position: FloatArray, spacing_m: float) -> FloatArray:
-    """Return unit normals (P, 3), upwards, of planes through the neighbours of points; NaN for lone points.
-
-    Args:
-        position: (P, 3) metres, about `spacing_m` apart.
-        spacing_m: between the points.
-    """
+    """Return unit normals (P, 3), upwards, of planes through neighbours `spacing_m` apart; NaN for lone points."""
     count = min(_NEIGHBOURS, len(position))
     if count < 4:
         return np.full(position.shape, np.nan)
@@ -133,12 +108,7 @@ _SPARE_BYTES = 1 << 28  # of the disk, to be left free
 
 
 class TiledPoints:
-    """Points in `geo` with a normal and a class, in a file a square.
-
-    Args:
-        folder: scratch folder, made if missing.
-        side_m: of the squares.
-    """
+    """Points in `geo` with a normal and a class, in a file a square of the plan, in a scratch folder."""
 
     def __init__(self, folder: Path, side_m: float) -> None:
         self.side_m = side_m
@@ -147,7 +117,6 @@ class TiledPoints:
         folder.mkdir(parents=True, exist_ok=True)
 
     def __len__(self) -> int:
-        """Return the number of points."""
         return sum(self._count.values())
 
     @property
@@ -158,12 +127,7 @@ class TiledPoints:
     def append(
         self, position: FloatArray, normal: FloatArray | Float32Array | None, classification: ByteArray | None
     ) -> None:
-        """Append points.
-
-        Args:
-            position: (P, 3) in geo, metres.
-            normal: (P, 3); None: unknown, written as zeros.
-            classification: (P,) class of LAS; None: 0.
+        """Append points (P, 3) with normals (P, 3), unknown ones written as zeros, and classes (P,) of LAS, or 0.
 
         Raises:
             InputError: the disk is full.
@@ -176,14 +140,10 @@ class TiledPoints:
             rows["normal"] = normal
         if classification is not None:
             rows["classification"] = classification
-        square = np.floor(position[:, :2] / self.side_m).astype(np.int64)
-        order = np.lexsort(square.T)
-        starts = np.flatnonzero(np.any(np.diff(square[order], axis=0, prepend=square[order][:1] - 1), axis=1))
-        for part in np.split(order, starts[1:]) if len(order) else []:
-            name = (int(square[part[0], 0]), int(square[part[0], 1]))
-            with self._path(name).open("ab") as file:
+        for square, part in rows_by_square(position, self.side_m):
+            with self._path(square).open("ab") as file:
                 file.write(rows[part].tobytes())
-            self._count[name] = self._count.get(name, 0) + len(part)
+            self._count[square] = self._count.get(square, 0) + len(part)
 
     def around(self, square: Square, margin_m: float) -> tuple[NDArray[np.void], NDArray[np.bool_]]:
         """Return the rows in a square and its margin, and which of them lie in the square itself."""
@@ -218,19 +178,12 @@ _CORE_SPACINGS = 3.0  # between core points: a cylinder of this radius holds abo
 
 @dataclass(frozen=True)
 class ComparisonSettings:
-    """Settings of the comparison, in metres.
+    """Settings of the comparison, in metres."""
 
-    Attributes:
-        voxel_m: side of the voxels of which one point of the reference counts.
-        core_m: between core points, and radius of the cylinders.
-        cover_m: side of the cells of the plan that the reference covers if they hold one of its points.
-        cut: corners (3,) of the box outside of which the reference was left out; None: all of it is there.
-    """
-
-    voxel_m: float
-    core_m: float
-    cover_m: float
-    cut: Box | None = None
+    voxel_m: float  # side of the voxels of which one point of the reference counts
+    core_m: float  # between core points, and radius of the cylinders
+    cover_m: float  # side of the cells of the plan that the reference covers if they hold one of its points
+    cut: Box | None = None  # outside of which the reference was left out; None: all of it is there
 
     @classmethod
     def of_spacings(
@@ -254,58 +207,32 @@ class ComparisonSettings:
 
 @dataclass(frozen=True)
 class Kinds:
-    """Class and slope of P points.
+    """Class and slope of P points."""
 
-    Attributes:
-        of_class: (P,) index in `CLASSES`.
-        of_slope: (P,) index in `SLOPES`; the number of slopes where the slope is not known.
-    """
-
-    of_class: IntArray
-    of_slope: IntArray
-
-    def part(self, rows: IntArray | BoolArray) -> Kinds:
-        """Return the kinds of some rows."""
-        return Kinds(self.of_class[rows], self.of_slope[rows])
+    of_class: IntArray  # (P,) index in `CLASSES`
+    of_slope: IntArray  # (P,) index in `SLOPES`; the number of slopes where the slope is not known
 
 
 @dataclass(frozen=True)
 class CorePoints:
-    """M3C2 at C places of the reference that photographs saw.
+    """M3C2 at C places of the reference that photographs saw."""
 
-    Attributes:
-        position: (C, 3) in geo.
-        normal: (C, 3) towards the cameras.
-        distance_m: (C,) model minus reference; NaN: not measured.
-        noise_m: (C,) σ from the roughness of both clouds.
-        kinds: class and slope.
-    """
-
-    position: FloatArray
-    normal: FloatArray
-    distance_m: FloatArray
-    noise_m: FloatArray
+    position: FloatArray  # (C, 3) in geo
+    normal: FloatArray  # (C, 3) towards the cameras
+    distance_m: FloatArray  # (C,) model minus reference; NaN: not measured
+    noise_m: FloatArray  # (C,) σ from the roughness of both clouds
     kinds: Kinds
 
 
 @dataclass(frozen=True)
 class SquareDistances:
-    """Distances in one square, in metres; those beyond `FARTHEST_M` are infinite.
+    """Distances in one square, in metres; those beyond `FARTHEST_M` are infinite."""
 
-    Attributes:
-        to_reference_m: (M,) of the model's points that the reference covers.
-        model_kinds: class and slope of the nearest points of the reference.
-        to_model_m: (R,) of the reference's points that photographs saw.
-        reference_kinds: their class and slope.
-        points: number of the reference's points, seen or not.
-        cores: M3C2.
-    """
-
-    to_reference_m: FloatArray
-    model_kinds: Kinds
-    to_model_m: FloatArray
+    to_reference_m: FloatArray  # (M,) of the model's points that the reference covers
+    model_kinds: Kinds  # of the nearest points of the reference
+    to_model_m: FloatArray  # (R,) of the reference's points that photographs saw
     reference_kinds: Kinds
-    points: int
+    points: int  # of the reference, seen or not
     cores: CorePoints
 
 
@@ -332,24 +259,21 @@ def compare_square(
     usable = np.flatnonzero(is_seen & np.isfinite(normal[:, 0]) & settings.uncut(place))
     cores = usable[first_of_voxels(place[usable], settings.core_m)]
     model_every = _at_random(model_rows["position"])
-    measured = m3c2(every, model_every, place[cores], normal[cores], radius_m=settings.core_m, reach_m=_REACH_M)
+    distance_m, noise_m = m3c2(
+        every, model_every, place[cores], normal[cores], radius_m=settings.core_m, reach_m=_REACH_M
+    )
     return SquareDistances(
         to_reference,
-        kinds.part(nearest),
+        rows_of(kinds, nearest),
         to_model,
-        kinds.part(is_seen),
+        rows_of(kinds, is_seen),
         int(own.sum()),
-        CorePoints(place[cores], normal[cores], measured.distance_m, measured.noise_m, kinds.part(cores)),
+        CorePoints(place[cores], normal[cores], distance_m, noise_m, rows_of(kinds, cores)),
     )
 
 
 def kinds_of(classification: NDArray[np.uint8], normal: FloatArray) -> Kinds:
-    """Return class and slope of points.
-
-    Args:
-        classification: (P,) of LAS.
-        normal: (P, 3) unit vectors with an arbitrary sign; NaN: not known.
-    """
+    """Return the kinds of points, by classes (P,) of LAS and unit normals (P, 3), NaN where not known."""
     slope = np.degrees(np.arccos(np.clip(np.abs(normal[:, 2]), 0, 1)))
     steep = slope > _WALL_DEG
     building = np.isin(classification, _BUILDING)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -18,6 +17,7 @@ from pipelines.evaluate.reference_distances import (
     Kinds,
     SquareDistances,
 )
+from pipelines.geometry.footprints import joined_rows
 from pipelines.survey.report_parts import CloudDistances, M3c2Figures, ReferenceGroup, SurfaceScore
 
 THRESHOLDS_M = (0.05, 0.1, 0.3)
@@ -33,19 +33,6 @@ _NO_CORES = CorePoints(
 )
 
 
-@dataclass(frozen=True)
-class CoreTable:
-    """Core points of all squares, with the σ that both clouds' places have.
-
-    Attributes:
-        cores: the points.
-        lod_m: (C,) level of detection, 95 %.
-    """
-
-    cores: CorePoints
-    lod_m: FloatArray
-
-
 class DistanceTally:
     """Counts of the distances of all squares, by class and slope."""
 
@@ -53,76 +40,56 @@ class DistanceTally:
         shape = (len(CLASSES), len(SLOPES) + 1, _BINS)
         self._to_reference, self._to_model = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
         self._cores: list[CorePoints] = []
-        self.points = 0
+        self.points = self.seen = 0  # of the reference: all, and those that photographs saw
 
     def add(self, found: SquareDistances) -> None:
         """Add a square."""
         _count(self._to_reference, found.to_reference_m, found.model_kinds)
         _count(self._to_model, found.to_model_m, found.reference_kinds)
         self.points += found.points
+        self.seen += len(found.to_model_m)
         if len(found.cores.position):
             self._cores.append(found.cores)
-
-    @property
-    def seen(self) -> int:
-        """Number of the reference's points that photographs saw."""
-        return int(self._to_model.sum())
-
-    @property
-    def model_points(self) -> int:
-        """Number of the model's points that the reference covers."""
-        return int(self._to_reference.sum())
 
     def cores(self) -> CorePoints:
         """Return the core points of all squares."""
         parts = [_NO_CORES, *self._cores]
+        return replace(joined_rows(parts), kinds=joined_rows([part.kinds for part in parts]))
 
-        def joined(values: Callable[[CorePoints], np.ndarray]) -> np.ndarray:
-            return np.concatenate([values(part) for part in parts])
+    def groups(self, cores: CorePoints, lod_m: FloatArray) -> tuple[ReferenceGroup, ...]:
+        """Return the figures of the whole, and of all classes and slopes that have points.
 
-        return CorePoints(
-            joined(lambda part: part.position),
-            joined(lambda part: part.normal),
-            joined(lambda part: part.distance_m),
-            joined(lambda part: part.noise_m),
-            Kinds(joined(lambda part: part.kinds.of_class), joined(lambda part: part.kinds.of_slope)),
-        )
+        `lod_m` (C,) are the core points' levels of detection, 95 %, with the σ that both clouds' places have.
+        """
 
-    def groups(self, table: CoreTable) -> tuple[ReferenceGroup, ...]:
-        """Return the figures of the whole, and of all classes and slopes that have points."""
-        kinds, every = table.cores.kinds, slice(None)
-        has_classes = bool(self._to_model[1:].any() or self._to_reference[1:].any())
-        groups = [self._group("all", "all", (every, every), table, kinds.of_class >= 0)]
+        def group(
+            name: str,
+            kind: Literal["all", "class", "slope"],
+            part: tuple[int | slice, int | slice],
+            chosen: BoolArray,
+        ) -> ReferenceGroup:
+            to_reference, to_model = (
+                counts[part].reshape(-1, _BINS).sum(axis=0) for counts in (self._to_reference, self._to_model)
+            )
+            return ReferenceGroup(
+                name=name,
+                kind=kind,
+                seen_points=int(to_model.sum()),
+                m3c2=m3c2_figures(cores.distance_m[chosen], lod_m[chosen]),
+                c2c=_cloud_distances(to_reference),
+                scores=tuple(_score(threshold, to_reference, to_model) for threshold in THRESHOLDS_M),
+            )
+
+        kinds, every = cores.kinds, slice(None)
+        groups = [group("all", "all", (every, every), kinds.of_class >= 0)]
+        if self._to_model[1:].any() or self._to_reference[1:].any():
+            groups += [
+                group(name, "class", (place, every), kinds.of_class == place) for place, name in enumerate(CLASSES)
+            ]
         groups += [
-            self._group(name, "class", (place, every), table, kinds.of_class == place)
-            for place, name in enumerate(CLASSES)
-            if has_classes
+            group(name, "slope", (every, place), kinds.of_slope == place) for place, name in enumerate(SLOPES)
         ]
-        groups += [
-            self._group(name, "slope", (every, place), table, kinds.of_slope == place)
-            for place, name in enumerate(SLOPES)
-        ]
-        return tuple(group for group in groups if group.kind == "all" or group.seen_points or group.c2c.count)
-
-    def _group(
-        self,
-        name: str,
-        kind: Literal["all", "class", "slope"],
-        part: tuple[int | slice, int | slice],
-        table: CoreTable,
-        cores: BoolArray,
-    ) -> ReferenceGroup:
-        to_reference, to_model = (
-            counts[part].reshape(-1, _BINS).sum(axis=0) for counts in (self._to_reference, self._to_model)
-        )
-        return ReferenceGroup(
-            name=name,
-            kind=kind,
-            seen_points=int(to_model.sum()),
-            m3c2=m3c2_figures(table.cores.distance_m[cores], table.lod_m[cores]),
-            c2c=_cloud_distances(to_reference),
-            scores=tuple(_score(threshold, to_reference, to_model) for threshold in THRESHOLDS_M),
-        )
+        return tuple(each for each in groups if each.kind == "all" or each.seen_points or each.c2c.count)
 
 
 def m3c2_figures(distance_m: FloatArray, lod_m: FloatArray) -> M3c2Figures:
@@ -147,7 +114,7 @@ def m3c2_figures(distance_m: FloatArray, lod_m: FloatArray) -> M3c2Figures:
 
 def level_of_detection(noise_m: FloatArray, registration_m: FloatArray) -> FloatArray:
     """Return the level of detection, 95 %, of distances with σ of noise and of the clouds' places, both (C,)."""
-    return np.asarray(CONFIDENCE_95 * (noise_m + registration_m))
+    return CONFIDENCE_95 * (noise_m + registration_m)
 
 
 def _count(counts: IntArray, distance_m: FloatArray, kinds: Kinds) -> None:

@@ -5,10 +5,6 @@ as `points.csv`, the σ of every camera as `cameras.csv`, and the predicted accu
 and `accuracy.png`; of a trained model also side-by-side renders. With `--reference`, the surface is compared with a
 cloud; `reference_map.png` and `reference_histogram.png` show the distances. Check points enter no solution.
 Residuals of observations that entered one are reported as a fit, not as an accuracy (docs/accuracy.md).
-
-Headline, figures, warnings and cautions of an evaluation.
-
-Picture of the predicted accuracy, with the errors of the surveyed points as arrows.
 """
 
 from __future__ import annotations
@@ -35,12 +31,13 @@ from pipelines.evaluate.asprs import few_points
 from pipelines.evaluate.cautions import cautions_of_prediction, dependent_check_points
 from pipelines.evaluate.check_points import (
     check_points_on_surface,
+    control_residuals,
     cross_validate,
-    fit_residuals,
+    fix_residuals,
     rms_sigma,
     triangulated_check_points,
 )
-from pipelines.evaluate.coordinates import coordinates_in, target_crs, write_camera_sigma, write_point_table
+from pipelines.evaluate.coordinates import coordinates_in, report_crs, write_camera_sigma, write_point_table
 from pipelines.evaluate.options import EvaluateOptions
 from pipelines.evaluate.photometric import compare_test_views
 from pipelines.evaluate.reference import (
@@ -52,7 +49,6 @@ from pipelines.evaluate.reference import (
 )
 from pipelines.geodesy.crs import PointCrs
 from pipelines.geodesy.enu import Origin, ecef_from_enu, lla_from_ecef
-from pipelines.geometry.similarity import SimilarityRecord
 from pipelines.report.plots.maps import MapCoordinates, MapPoints, NamedPlaces, SigmaRaster, write_accuracy_map
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.surface_views import ModelRenderer
@@ -63,6 +59,7 @@ from pipelines.survey.report import (
     CheckPointErrors,
     CheckPoints,
     EvaluationReport,
+    Fit,
     Photometric,
     PhotometricFigures,
     PointResidual,
@@ -79,22 +76,11 @@ def summarise(report: EvaluationReport) -> Summary:
     test = report.test_views
     values: dict[str, Any] = {"accuracy": report.headline.model_dump()}
     if test is not None:
-        values |= {
-            "views": test.views,
-            "psnr": test.psnr,
-            "psnr_covered": test.psnr_covered,
-            "covered_share": test.covered_share,
-            "psnr_compensated": test.psnr_compensated,
-            "ssim": test.ssim,
-        }
+        names = ("views", "psnr", "psnr_covered", "covered_share", "psnr_compensated", "ssim")
+        values |= {name: getattr(test, name) for name in names}
     for way, errors in report.checkpoints.by_way.items():
-        values |= {
-            f"{way}_count": errors.count,
-            f"{way}_mean_h_m": errors.mean_h_m,
-            f"{way}_rmse_h_m": errors.rmse_h_m,
-            f"{way}_rmse_v_m": errors.rmse_v_m,
-            f"{way}_rmse_3d_m": errors.rmse_3d_m,
-        }
+        figures = ("count", "mean_h_m", "rmse_h_m", "rmse_v_m", "rmse_3d_m")
+        values |= {f"{way}_{name}": getattr(errors, name) for name in figures}
     key_figure = f"{report.headline.sentence}; {_test_views(test)}"
     return Summary(key_figure, values, _warnings(report), report.cautions)
 
@@ -131,12 +117,7 @@ def draw_accuracy(
 ) -> None:
     """Write a map of the predicted accuracy, with cameras, control and check points, errors and coordinates.
 
-    Args:
-        grid: predicted σ.
-        solved: the survey.
-        report: errors of triangulated points, and residuals of control points.
-        crs: of the coordinates beside the map; None: longitude and latitude.
-        path: of the picture.
+    The coordinates are in a CRS; None: longitude and latitude.
     """
     survey = solved.survey
     raster = SigmaRaster(grid.raster(grid.sigma_h_m), grid.raster(grid.sigma_v_m), grid.corner_in_geo, grid.size_m)
@@ -169,13 +150,7 @@ def _coordinates(origin: Origin, crs: PointCrs | None) -> MapCoordinates:
 
 @dataclass(frozen=True)
 class Rendered:
-    """What the Gaussians of a trained model show.
-
-    Attributes:
-        photometric: figures of the test views.
-        points: errors of the check points on the rendered surface.
-        reference: comparison with a reference cloud; None: not asked for.
-    """
+    """What the Gaussians of a trained model show: test views, check points on the surface, and any reference."""
 
     photometric: Photometric
     points: CheckPointErrors
@@ -191,7 +166,7 @@ def run(stage: StageRun, options: EvaluateOptions) -> Summary:
         GeorefError: a product, a photograph or the LPIPS weights cannot be read, or the CRS cannot be used.
     """
     solved = load_solved(stage.workspace, options.similarity)
-    crs = None if options.crs is None else target_crs(options.crs, solved.survey)
+    crs = None if options.crs is None else report_crs(options.crs, solved.survey)
     posterior = posterior_of(stage.workspace, solved.model, solved.sfm)
     if isinstance(solved, TrainedSurvey):
         rendered = _rendered(stage, solved, posterior, options)
@@ -220,9 +195,6 @@ def evaluate(
     """Return the report on a solved survey.
 
     Args:
-        solved: the survey.
-        posterior: its covariances.
-        options: of the stage.
         crs: CRS in which the report lists the check points too; None: none.
         rendered: what the Gaussians show; None: nothing is trained yet.
 
@@ -230,6 +202,7 @@ def evaluate(
         InputError: a point lies outside the CRS's domain.
     """
     model = solved.model
+    log_scale, *_, east, north, up = np.sqrt(np.diag(model.geo_from_model.covariance)).tolist()
     camera = triangulated_check_points(solved, posterior)
     checkpoints = CheckPoints(camera=camera, model=None if rendered is None else rendered.points)
     scene = model.accuracy or AccuracySummary(cells=0, reason="the adjustment states no σ")
@@ -240,9 +213,9 @@ def evaluate(
         checkpoints=checkpoints,
         cross_validation=cross_validate(solved) if options.cross_validate else None,
         accuracy=scene,
-        fit=fit_residuals(solved),
+        fit=Fit(gnss=fix_residuals(solved), gcp=control_residuals(solved)),
         cameras=rms_sigma(posterior.camera_cov[:, 3:, 3:]) if is_checked(model.cautions) else None,
-        similarity=_similarity_sigma(model.geo_from_model),
+        similarity=SimilaritySigma(sigma_ln_scale=log_scale, sigma_translation_m=(east, north, up)),
         coordinates=None if crs is None else coordinates_in(crs, checkpoints, solved.survey),
         reference=None if reference is None else reference.comparison,
         variance_factors=model.variance_factors,
@@ -256,7 +229,6 @@ def evaluate(
 
 
 def _rendered(stage: StageRun, trained: TrainedSurvey, posterior: Posterior, options: EvaluateOptions) -> Rendered:
-    """Return what the Gaussians show, with the pictures written."""
     files, progress = open_reference(options), stage.progress
     images = photographs(trained.sfm, trained.survey, stage.workspace, trained.model.max_image_size)
     images.build(progress)
@@ -276,18 +248,7 @@ def _rendered(stage: StageRun, trained: TrainedSurvey, posterior: Posterior, opt
 
 
 def _refuse_what_needs_gaussians(stage: StageRun, options: EvaluateOptions) -> None:
-    """Refuse options that ask for what only a trained model shows.
-
-    Raises:
-        InputError: names the option, and the command that trains.
-    """
     for flag, value in (("--reference", options.reference), ("--lpips-weights", options.lpips_weights)):
         if value is not None:
             command = stage.workspace.command_of(BY_NAME["train"])
             raise InputError(f"needs a trained model: run `{command}` first, or leave the option out", field=flag)
-
-
-def _similarity_sigma(record: SimilarityRecord) -> SimilaritySigma:
-    """Return σ of ln s and of the translation, from a covariance in the order ln s, three angles, translation."""
-    log_scale, *_, east, north, up = np.sqrt(np.diag(record.covariance)).tolist()
-    return SimilaritySigma(sigma_ln_scale=log_scale, sigma_translation_m=(east, north, up))

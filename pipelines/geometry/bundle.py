@@ -1,6 +1,4 @@
-"""Bundle of photographs: cameras, points, image observations, and the derivatives of the observations.
-
-Information that bundle adjustment leaves in the camera poses, as a sparse matrix.
+"""Bundle of photographs: observations, their derivatives, and the information that they leave in the camera poses.
 
 The points are eliminated from the normal matrix of the bundle (Schur complement). Two cameras stay coupled only if
 they see a common point, so that the memory grows with the number of cameras and not with its square. Two dense
@@ -10,6 +8,7 @@ similarity, which no observation resists.
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -23,7 +22,7 @@ from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.geometry.cameras import Camera, parameter_derivative, project, project_each
 from pipelines.geometry.rotations import skew
-from pipelines.geometry.similarity import Similarity
+from pipelines.geometry.similarity import Similarity, jacobian_at
 from pipelines.robust.statistics import CAUCHY_SCALE2, cauchy_weight, rayleigh_sigma
 
 _STEP = 1e-6
@@ -31,74 +30,64 @@ _STEP = 1e-6
 
 @dataclass(frozen=True)
 class Network:
-    """Bundle of n cameras, N points and M observations in a metric frame `world`.
+    """Bundle of n cameras, N points and M observations in a metric frame `world`."""
 
-    Attributes:
-        cameras: intrinsics by camera id.
-        camera_id: (n,) keys of `cameras`.
-        cam_from_world: (n, 3, 3) rotations.
-        cam_center_in_world: (n, 3) metres.
-        point_in_world: (N, 3) metres.
-        obs_point, obs_image: (M,) indices.
-        obs_xy_px: (M, 2) pixels.
-    """
+    cameras: dict[int, Camera]  # intrinsics by camera id
+    camera_id: IntArray  # (n,) keys of `cameras`
+    cam_from_world: FloatArray  # (n, 3, 3) rotations
+    cam_center_in_world: FloatArray  # (n, 3) metres
+    point_in_world: FloatArray  # (N, 3) metres
+    obs_point: IntArray  # (M,) indices
+    obs_image: IntArray  # (M,) indices
+    obs_xy_px: FloatArray  # (M, 2) pixels
 
-    cameras: dict[int, Camera]
-    camera_id: IntArray
-    cam_from_world: FloatArray
-    cam_center_in_world: FloatArray
-    point_in_world: FloatArray
-    obs_point: IntArray
-    obs_image: IntArray
-    obs_xy_px: FloatArray
+    def rays(self) -> FloatArray:
+        """Return the vectors (M, 3) from the camera's centre to the point of each observation."""
+        ray = self.point_in_world[self.obs_point]
+        ray -= self.cam_center_in_world[self.obs_image]
+        return ray
+
+    def part(self, points: slice, rows: IntArray | BoolArray) -> Network:
+        """Return the network of a range of the points, with some rows of their observations."""
+        return replace(
+            self,
+            point_in_world=self.point_in_world[points],
+            obs_point=self.obs_point[rows] - (points.start or 0),
+            obs_image=self.obs_image[rows],
+            obs_xy_px=self.obs_xy_px[rows],
+        )
 
 
 @dataclass(frozen=True)
 class LinearisedBundle:
-    """Jacobians of M observations in pixels.
+    """Jacobians of M observations in pixels."""
 
-    Attributes:
-        jacobian_pose: (M, 2, 6), by (δω, δc) of the camera, as in `geometry.correction_basis.CorrectionBasis`.
-        jacobian_point: (M, 2, 3).
-        jacobian_intrinsics: (M, 2, P), P the longest parameter list; zero beyond a shorter one.
-    """
-
-    jacobian_pose: FloatArray
-    jacobian_point: FloatArray
-    jacobian_intrinsics: FloatArray
+    jacobian_pose: FloatArray  # (M, 2, 6), by (δω, δc) of the camera, as in `CorrectionBasis`
+    jacobian_point: FloatArray  # (M, 2, 3)
+    jacobian_intrinsics: FloatArray  # (M, 2, P), P the longest parameter list; zero beyond a shorter one
 
 
 def with_positive_depths(network: Network) -> Network:
     """Return the network without observations of points behind their camera, which an imported model may hold."""
     positive = has_positive_depth(network)
-    if positive.all():
-        return network
-    return replace(
-        network,
-        obs_point=network.obs_point[positive],
-        obs_image=network.obs_image[positive],
-        obs_xy_px=network.obs_xy_px[positive],
-    )
+    return network if positive.all() else network.part(slice(None), positive)
 
 
 def has_positive_depth(network: Network) -> BoolArray:
     """Return the mask (M,) of the observations whose points lie in front of their camera."""
-    ray = network.point_in_world[network.obs_point] - network.cam_center_in_world[network.obs_image]
-    return np.asarray(np.einsum("mj,mj->m", network.cam_from_world[network.obs_image, 2], ray) > 0)
+    return np.asarray(np.einsum("mj,mj->m", network.cam_from_world[network.obs_image, 2], network.rays()) > 0)
 
 
 def projection_residuals(network: Network) -> FloatArray:
     """Return the residuals (M, 2) in pixels, projected minus observed; all points lie in front of their cameras."""
-    ray = network.point_in_world[network.obs_point] - network.cam_center_in_world[network.obs_image]
-    in_cam = np.einsum("mij,mj->mi", network.cam_from_world[network.obs_image], ray)
+    in_cam = np.einsum("mij,mj->mi", network.cam_from_world[network.obs_image], network.rays())
     projected = project_each(network.cameras, network.camera_id[network.obs_image], in_cam)
     return np.asarray(projected - network.obs_xy_px)
 
 
 def linearise_bundle(network: Network) -> LinearisedBundle:
     """Return the derivatives of the observations; all points lie in front of their cameras."""
-    ray = network.point_in_world[network.obs_point] - network.cam_center_in_world[network.obs_image]
-    rotation = network.cam_from_world[network.obs_image]
+    ray, rotation = network.rays(), network.cam_from_world[network.obs_image]
     in_cam = np.einsum("mij,mj->mi", rotation, ray)
     count = len(ray)
     longest = max(len(camera.params) for camera in network.cameras.values())
@@ -135,13 +124,7 @@ def lens_slots(network: Network) -> IntArray:
 
 
 def sparse_jacobian(blocks: FloatArray, column_block: IntArray, count: int) -> csr_matrix:
-    """Return the sparse matrix (2 M, w · count) with one block (2, w) for each observation.
-
-    Args:
-        blocks: (M, 2, w).
-        column_block: (M,) block column of each.
-        count: number of block columns.
-    """
+    """Return the sparse matrix (2 M, w · count) with blocks (M, 2, w) in block columns (M,)."""
     rows, height, width = blocks.shape
     columns = column_block[:, None, None] * width + np.arange(width)[None, None, :]
     columns = np.broadcast_to(columns, blocks.shape)
@@ -152,8 +135,7 @@ def sparse_jacobian(blocks: FloatArray, column_block: IntArray, count: int) -> c
 def similarity_modes(cam_center_in_world: FloatArray) -> FloatArray:
     """Return the movements (n, 6, 7) of the cameras under an infinitesimal similarity about their mean centre.
 
-    Rows (δω, δc) as in
-    `geometry.correction_basis.CorrectionBasis`, columns (ln s, rotation, translation).
+    Rows (δω, δc) as in `geometry.correction_basis.CorrectionBasis`, columns (ln s, rotation, translation).
     """
     arm = cam_center_in_world - cam_center_in_world.mean(axis=0)
     modes = np.zeros((len(arm), 6, 7))
@@ -179,37 +161,17 @@ _MEAN_WEIGHTED_SQUARE = _HALF_SCALE2 * (1 - _MEAN_WEIGHT)
 class EliminatedPoints:
     """Normal equations of n poses and L lens parameters, with the points eliminated.
 
-    Attributes:
-        poses: (6 n, 6 n) sparse, in blocks (6, 6).
-        cross: (6 n, L).
-        lens: (L, L).
-        pose_pull: (6 n, 7) of the poses on the points' similarity.
-        lens_pull: (L, 7) of the lens on it.
-        modes: (7, 7) information on it.
-        pose_slope, lens_slope: (6 n,), (L,) gradient of half the weighted squares; zero where SfM has left the
-            observations at their minimum.
+    Slopes are gradients of half the weighted squares; zero where SfM left the observations at their minimum.
     """
 
-    poses: bsr_matrix
-    cross: FloatArray
-    lens: FloatArray
-    pose_pull: FloatArray
-    lens_pull: FloatArray
-    modes: FloatArray
-    pose_slope: FloatArray
-    lens_slope: FloatArray
-
-    def __add__(self, other: EliminatedPoints) -> EliminatedPoints:
-        return EliminatedPoints(
-            self.poses + other.poses,
-            self.cross + other.cross,
-            self.lens + other.lens,
-            self.pose_pull + other.pose_pull,
-            self.lens_pull + other.lens_pull,
-            self.modes + other.modes,
-            self.pose_slope + other.pose_slope,
-            self.lens_slope + other.lens_slope,
-        )
+    poses: bsr_matrix  # (6 n, 6 n) sparse, in blocks (6, 6)
+    cross: FloatArray  # (6 n, L)
+    lens: FloatArray  # (L, L)
+    pose_pull: FloatArray  # (6 n, 7) of the poses on the points' similarity
+    lens_pull: FloatArray  # (L, 7) of the lens on it
+    modes: FloatArray  # (7, 7) information on it
+    pose_slope: FloatArray  # (6 n,)
+    lens_slope: FloatArray  # (L,)
 
 
 @dataclass(frozen=True)
@@ -247,7 +209,16 @@ class BundleInformation:
 
         Parameters that no observation reveals have rows of zeros.
         """
-        return _lens_elimination(self.sums)
+        diagonal = np.diag(self.sums.lens)
+        used = np.flatnonzero(diagonal > 0)  # shorter parameter lists leave empty columns
+        scale = 1.0 / np.sqrt(diagonal[used])
+        block = self.sums.lens[np.ix_(used, used)] * scale[:, None] * scale + 1e-9 * np.eye(len(used))
+        follows = np.zeros((len(diagonal), len(self.sums.cross)))
+        information, cov = np.zeros_like(self.sums.lens), np.zeros_like(self.sums.lens)
+        follows[used] = -scale[:, None] * np.linalg.solve(block, (self.sums.cross[:, used] * scale).T)
+        information[np.ix_(used, used)] = block / scale[:, None] / scale
+        cov[np.ix_(used, used)] = scale[:, None] * np.linalg.solve(block, np.eye(len(used))) * scale
+        return follows, information, cov
 
     def turned(self, new_from_old: Similarity, cam_center_in_new: FloatArray) -> BundleInformation:
         """Return the same information in another frame, whose cameras have centres (n, 3)."""
@@ -289,7 +260,6 @@ def bundle_information(
     2. Chunks of points are eliminated one after the other, so that memory holds the derivatives of one chunk.
 
     Args:
-        network: the bundle.
         sigma_px: (M,) stated σ of the observations; None: one σ for all is estimated from the residuals.
         at_minimum: whether SfM has left the observations at their minimum, so that their slope is zero.
 
@@ -305,11 +275,11 @@ def bundle_information(
         raise DegenerateGeometryError(
             f"{observations} observations do not determine {n} cameras and {points} points"
         )
-    ray = network.point_in_world[network.obs_point] - network.cam_center_in_world[network.obs_image]
-    typical_m = float(np.median(np.linalg.norm(ray, axis=1)))
+    typical_m = float(np.median(np.linalg.norm(network.rays(), axis=1)))
     residual, variance = projection_residuals(network), 1.0
     if sigma_px is None:
-        weight = _robust_weights(residual)
+        length = np.linalg.norm(residual, axis=1)
+        weight = cauchy_weight((length / max(rayleigh_sigma(length), 1e-9)) ** 2, 2)
         variance = float((weight[:, None] * residual**2).sum() / (_MEAN_WEIGHTED_SQUARE * redundancy))
         root_weight = np.sqrt(weight / (_MEAN_WEIGHT * variance))
     else:
@@ -322,12 +292,6 @@ def bundle_information(
         loosest_sigma_m=_LOOSEST_RELATIVE_SIGMA * typical_m,
         sigma_px=float(np.sqrt(variance)),
     )
-
-
-def _robust_weights(residual: FloatArray) -> FloatArray:
-    length = np.linalg.norm(residual, axis=1)
-    scale = max(rayleigh_sigma(length), 1e-9)
-    return cauchy_weight((length / scale) ** 2, 2)
 
 
 def eliminate_points(
@@ -350,34 +314,26 @@ def eliminate_points(
         ridge: added to the information on a point, relative to its trace, for a point that its rays leave open.
     """
     total: EliminatedPoints | None = None
-    for part, points, rows in _chunks_of_points(network):
+    for part, points, rows in chunks_of_points(network, _CHUNK):
         known, own_pull = (None if array is None else array[points] for array in (surveyed, pull))
         left = None if residual is None else residual[rows]
         sums = _eliminated(part, root_weight[rows], known, left, own_pull, ridge=ridge)
-        total = sums if total is None else total + sums
+        if total is not None:
+            sums = EliminatedPoints(*map(operator.add, vars(total).values(), vars(sums).values()))
+        total = sums
     assert total is not None
     return total
 
 
-def _chunks_of_points(network: Network) -> Iterator[tuple[Network, slice, IntArray]]:
-    """Yield networks with a part of the points each, with the rows of these points and of their observations."""
+def chunks_of_points(network: Network, size: int) -> Iterator[tuple[Network, slice, IntArray]]:
+    """Yield networks of about `size` observations, with the rows of their points and of their observations."""
     order = np.argsort(network.obs_point, kind="stable")
     last = np.cumsum(np.bincount(network.obs_point, minlength=len(network.point_in_world)))
     first_point = first = 0
     while first_point < len(last):
-        next_point = max(int(np.searchsorted(last, first + _CHUNK, side="right")), first_point + 1)
-        rows = order[first : last[next_point - 1]]
-        yield (
-            replace(
-                network,
-                point_in_world=network.point_in_world[first_point:next_point],
-                obs_point=network.obs_point[rows] - first_point,
-                obs_image=network.obs_image[rows],
-                obs_xy_px=network.obs_xy_px[rows],
-            ),
-            slice(first_point, next_point),
-            rows,
-        )
+        next_point = max(int(np.searchsorted(last, first + size, side="right")), first_point + 1)
+        points, rows = slice(first_point, next_point), order[first : last[next_point - 1]]
+        yield network.part(points, rows), points, rows
         first_point, first = next_point, int(last[next_point - 1])
 
 
@@ -390,7 +346,6 @@ def _eliminated(
     *,
     ridge: float,
 ) -> EliminatedPoints:
-    """Eliminate the points of a chunk."""
     n, points = len(network.camera_id), len(network.point_in_world)
     linearised, scaled = linearise_bundle(network), root_weight[:, None, None]
     by_pose, by_point = linearised.jacobian_pose * scaled, linearised.jacobian_point * scaled
@@ -408,7 +363,8 @@ def _eliminated(
     own = _blocks(transposed @ by_pose, network.obs_image, network.obs_image, (n, n))
     pose = sparse_jacobian(by_pose, network.obs_image, n)
     intrinsics_point = intrinsics.T @ sparse_jacobian(white, network.obs_point, points)
-    moved = (np.swapaxes(root, 1, 2) @ _point_similarity_modes(network)).reshape(3 * points, 7)
+    by_similarity = jacobian_at(network.point_in_world, network.cam_center_in_world.mean(axis=0))
+    moved = (np.swapaxes(root, 1, 2) @ by_similarity).reshape(3 * points, 7)
     white_residual = np.zeros(2 * len(root_weight))
     if residual is not None:
         white_residual = (residual * root_weight[:, None]).ravel()
@@ -436,23 +392,3 @@ def _blocks(blocks: FloatArray, row: IntArray, column: IntArray, shape: tuple[in
     matrix = bsr_matrix((blocks[order], column[order], pointer), shape=size)
     matrix.sum_duplicates()
     return matrix
-
-
-def _lens_elimination(sums: EliminatedPoints) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return how the lens follows the poses (L, 6 n), its information about that (L, L), and the covariance."""
-    diagonal = np.diag(sums.lens)
-    used = np.flatnonzero(diagonal > 0)  # shorter parameter lists leave empty columns
-    scale = 1.0 / np.sqrt(diagonal[used])
-    block = sums.lens[np.ix_(used, used)] * scale[:, None] * scale + 1e-9 * np.eye(len(used))
-    follows = np.zeros((len(diagonal), len(sums.cross)))
-    information, cov = np.zeros_like(sums.lens), np.zeros_like(sums.lens)
-    follows[used] = -scale[:, None] * np.linalg.solve(block, (sums.cross[:, used] * scale).T)
-    information[np.ix_(used, used)] = block / scale[:, None] / scale
-    cov[np.ix_(used, used)] = scale[:, None] * np.linalg.solve(block, np.eye(len(used))) * scale
-    return follows, information, cov
-
-
-def _point_similarity_modes(network: Network) -> FloatArray:
-    """Return the movements (N, 3, 7) of points under an infinitesimal similarity about the mean camera centre."""
-    arm = network.point_in_world - network.cam_center_in_world.mean(axis=0)
-    return np.concatenate([arm[:, :, None], -skew(arm), np.tile(np.eye(3), (len(arm), 1, 1))], axis=2)

@@ -2,9 +2,8 @@
 
 Pixels have the centre of the top-left pixel at (0.5, 0.5). Rays are normalised coordinates (x/z, y/z) in the
 camera frame: x right, y down, z forward. Every model is brought into one of two forms, OpenCV's rational lens
-(FULL_OPENCV, of which the simpler models are special cases) or the equidistant fisheye.
-
-Lenses whose parameters change: their parameter vector, its effect on bearings and on undistorted images.
+(FULL_OPENCV, of which the simpler models are special cases) or the equidistant fisheye. `Lenses` holds the cameras
+of all images with their parameters as one vector, which an adjustment changes.
 """
 
 from __future__ import annotations
@@ -79,6 +78,20 @@ class Pinhole:
         return depth.reshape(-1, 1) * self.rays(np.stack([column, row], axis=1) + 0.5)
 
 
+@dataclass(frozen=True)
+class ViewPose:
+    """Undistorted camera of H × W pixels, with its rotation (3, 3) and centre (3,), metres in `model`."""
+
+    pinhole: Pinhole
+    cam_from_model: FloatArray
+    center_in_model: FloatArray
+
+    def rays(self) -> FloatArray:
+        """Return viewing rays (H, W, 3) in `model`, of length one along the optical axis."""
+        x, y = np.meshgrid(np.arange(self.pinhole.width) + 0.5, np.arange(self.pinhole.height) + 0.5)
+        return self.pinhole.rays(np.stack([x, y], axis=-1)) @ self.cam_from_model
+
+
 def pose_matrix(cam_from_world: FloatArray, cam_center_in_world: FloatArray) -> FloatArray:
     """Return the pose (4, 4) cam ← world of a camera with a rotation (3, 3) and a centre (3,)."""
     matrix = np.eye(4)
@@ -89,13 +102,7 @@ def pose_matrix(cam_from_world: FloatArray, cam_center_in_world: FloatArray) -> 
 
 @dataclass(frozen=True)
 class Camera:
-    """Intrinsics of a COLMAP camera model.
-
-    Attributes:
-        model: COLMAP's name of the model, e.g. "OPENCV".
-        width, height: image size in pixels.
-        params: (P,) float64, COLMAP's parameters of that model, in pixels where they are lengths.
-    """
+    """Intrinsics of a COLMAP camera model such as OPENCV, with its parameters (P,); lengths are in pixels."""
 
     model: str
     width: int
@@ -105,8 +112,7 @@ class Camera:
     @property
     def mean_focal_px(self) -> float:
         """Mean of the two focal lengths in pixels."""
-        focal, _, _ = _split_params(self)
-        return float(focal.mean())
+        return float(full_parameters(self)[:2].mean())
 
 
 def parameter_names(camera: Camera) -> tuple[str, ...]:
@@ -138,7 +144,7 @@ def undistort(camera: Camera, xy_px: ArrayLike) -> FloatArray:
     Raises:
         InputError: unknown camera model, or a wrong number of parameters.
     """
-    focal, center, distortion = _split_params(camera)
+    focal, center, distortion = np.split(full_parameters(camera), [2, 4])
     target = (np.asarray(xy_px, dtype=np.float64) - center) / focal
     if not distortion.any() and camera.model != "OPENCV_FISHEYE":
         return target
@@ -159,13 +165,7 @@ def project(camera: Camera, point_in_cam: ArrayLike) -> FloatArray:
 
 
 def project_each(cameras: dict[int, Camera], camera_of: IntArray, points_in_cam: FloatArray) -> FloatArray:
-    """Return pixels (M, 2) of points that have a camera each; NaN as in `project`.
-
-    Args:
-        cameras: by key.
-        camera_of: (M,) key of each point's camera.
-        points_in_cam: (M, 3) in the frame of that camera.
-    """
+    """Return pixels (M, 2) of points (M, 3), each in the frame of its camera (M,), a key; NaN as in `project`."""
     pixels = np.empty((len(points_in_cam), 2))
     for key, camera in cameras.items():
         rows = np.flatnonzero(camera_of == key)
@@ -179,7 +179,7 @@ def distort(camera: Camera, ray: ArrayLike) -> FloatArray:
     Raises:
         InputError: as `undistort`.
     """
-    focal, center, distortion = _split_params(camera)
+    focal, center, distortion = np.split(full_parameters(camera), [2, 4])
     normalised = np.asarray(ray, dtype=np.float64)
     flat = normalised.reshape(-1, 2)
     bent = _distort_fisheye(flat, distortion) if _is_fisheye(camera) else _distort_rational(flat, distortion)[0]
@@ -207,12 +207,6 @@ def full_parameters(camera: Camera) -> FloatArray:
     if not (full[:2] > 0).all():
         raise InputError(f"focal length {full[0]:g} px is not positive")
     return full
-
-
-def _split_params(camera: Camera) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return focal lengths (2,), principal point (2,) and distortion (8,), zero for terms that the model lacks."""
-    full = full_parameters(camera)
-    return full[:2], full[2:4], full[4:]
 
 
 def _distort_rational(ray: FloatArray, lens: FloatArray) -> tuple[FloatArray, tuple[FloatArray, ...]]:
@@ -280,12 +274,7 @@ def _undistort_fisheye(target: FloatArray, lens: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class CameraPoses:
-    """Poses of n cameras in the frame `model`.
-
-    Attributes:
-        cam_from_model: (n, 3, 3) rotations.
-        cam_center_in_model: (n, 3) metres.
-    """
+    """Poses of n cameras in the frame `model`: rotations (n, 3, 3) and centres (n, 3) in metres."""
 
     cam_from_model: FloatArray
     cam_center_in_model: FloatArray
@@ -302,14 +291,10 @@ _LEAST_RAYS = 8
 
 @dataclass(frozen=True)
 class Lenses:
-    """Cameras of n images.
+    """Cameras of n images: `camera_id` (n,) are keys of `cameras`.
 
     Changes of their parameters form one vector (L,): a parameter list for each of `cameras`, in their order. All
     lists have the length of the longest, with zeros beyond a shorter one.
-
-    Attributes:
-        cameras: by camera id.
-        camera_id: (n,) keys of `cameras`.
     """
 
     cameras: dict[int, Camera]
@@ -355,13 +340,9 @@ class Lenses:
 def parameter_derivative(
     function: Callable[[Camera], FloatArray], camera: Camera, index: int, step: float
 ) -> FloatArray:
-    """Return the central difference of a function of a camera by one of its parameters.
+    """Return the central difference of a function of a camera by parameter `index`.
 
-    Args:
-        function: of the camera.
-        camera: where to differentiate.
-        index: of the parameter.
-        step: of the parameter, relative to the larger of its magnitude and 1.
+    The step is relative to the larger of the parameter's magnitude and 1.
     """
     shift = np.zeros(len(camera.params))
     shift[index] = step * max(1.0, abs(float(camera.params[index])))

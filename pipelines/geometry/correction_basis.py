@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from pipelines.core.types import FloatArray
-from pipelines.geometry.bundle import BundleInformation, Network, bundle_information
+from pipelines.geometry.bundle import BundleInformation
 
 _COPIES = 4  # information, its factor, the basis, and a Jacobian or a normal matrix of the same size
 
@@ -32,22 +32,16 @@ class CorrectionBasis:
 
     The lens parameters correlate with the poses. Their error, (L,) in the order of `geometry.cameras.Lenses`, is
     lens_matrix @ z plus an error with covariance `lens_cov` that is independent of z.
-
-    Attributes:
-        matrix: (n, 6, k), rows (δω, δc), k = 6 n − 7.
-        sigma_px: σ of an image coordinate, estimated from the residuals.
-        lens_matrix: (L, k).
-        lens_cov: (L, L).
     """
 
-    matrix: FloatArray
-    sigma_px: float
-    lens_matrix: FloatArray
-    lens_cov: FloatArray
+    matrix: FloatArray  # (n, 6, k), rows (δω, δc), k = 6 n − 7
+    sigma_px: float  # σ of an image coordinate, estimated from the residuals
+    lens_matrix: FloatArray  # (L, k)
+    lens_cov: FloatArray  # (L, L)
 
 
-def correction_basis(network: Network, *, lens_follows: bool = True) -> CorrectionBasis:
-    """Return whitened, gauge-free coordinates of the camera corrections.
+def correction_basis(bundle: BundleInformation, *, lens_follows: bool = True) -> CorrectionBasis:
+    """Return whitened, gauge-free coordinates of the camera corrections of a bundle at its minimum.
 
     The points hold the gauge. Under each correction the points follow the cameras and their lens; the mean
     similarity of this movement, weighted by the information of each point, is zero.
@@ -57,18 +51,9 @@ def correction_basis(network: Network, *, lens_follows: bool = True) -> Correcti
     the images little, and fixes reveal it. Cost O((6 n)³).
 
     Args:
-        network: the bundle at its minimum.
         lens_follows: whether the caller moves the lens by `lens_matrix` with the cameras. Otherwise the lens is
             held, and the points follow through it as it is.
-
-    Raises:
-        DegenerateGeometryError: fewer observations than unknowns.
     """
-    return basis_of(bundle_information(network), lens_follows=lens_follows)
-
-
-def basis_of(bundle: BundleInformation, *, lens_follows: bool = True) -> CorrectionBasis:
-    """Return the basis of `correction_basis` from the information of the bundle."""
     follows, _, lens_cov = bundle.lens_elimination
     root, complement = _root(bundle)
     flat = solve_triangular(root, complement.T, lower=True).T * bundle.unit[:, None]

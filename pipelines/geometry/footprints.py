@@ -1,17 +1,19 @@
 """Footprints of photographs: the rays of the image's border, intersected with the surface of the scene.
 
-Thinning of points on a grid of voxels of one size, or of a size that varies from point to point.
+Sets of points: their voxels, their squares of the plan, and the rows of a record of arrays.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from pipelines.core.machine import thread_count
-from pipelines.core.types import FloatArray, IntArray
+from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.geometry.cameras import Camera, undistort
 
 _PER_SIDE = 16  # border pixels: the bow of a lens and the relief show in the outline
@@ -22,12 +24,9 @@ _BISECTIONS = 16
 
 
 class PointSurface:
-    """Surface through a cloud of points: at each place, the height of the nearest point, freed of outliers.
+    """Surface through points (N, 3), N ≥ 1, z up: the height of the nearest one, freed of outliers.
 
     That height is the median of the nearest points, the point itself among them.
-
-    Args:
-        points: (N, 3) with z up, metres; N ≥ 1.
     """
 
     def __init__(self, points: FloatArray) -> None:
@@ -45,12 +44,9 @@ class PointSurface:
 
 @dataclass(frozen=True)
 class Footprint:
-    """Outline of what a photograph shows.
+    """Outline (K, 3) of what a photograph shows, z up, anticlockwise seen from above, not closed; K = 0: no ground.
 
-    Attributes:
-        outline: (K, 3) metres, z up, anticlockwise seen from above, not closed; K = 0: the photograph shows no
-            ground.
-        clipped: whether the photograph also shows what lies above the horizon, or too near below it to be placed.
+    `clipped`: the photograph also shows what lies above the horizon, or too near below it to be placed.
     """
 
     outline: FloatArray
@@ -78,8 +74,7 @@ def footprint(rays: FloatArray, center: FloatArray, surface: PointSurface) -> Fo
        height.
     3. Where the relief makes the outline cross itself, the outline is that on the plane of its median height.
     """
-    unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    below = _below_horizon(unit)
+    unit, below = _below_horizon(rays)
     clipped = bool((below < 0).any())
     seen = clipped_ring(unit, below)
     if len(seen) < 3 or center[2] <= surface.median:
@@ -99,17 +94,18 @@ def ground_points(rays: FloatArray, center: FloatArray, surface: PointSurface) -
     ray that never runs above the surface ends at the median height.
     """
     points = np.full(rays.shape, np.nan)
-    unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    falls = _below_horizon(unit) > 0
+    unit, below = _below_horizon(rays)
+    falls = below > 0
     if center[2] > surface.median and falls.any():
         ray = unit[falls] / -unit[falls, 2:]
         points[falls] = center + _depths(ray, center, surface)[:, None] * ray
     return points
 
 
-def _below_horizon(unit: FloatArray) -> FloatArray:
-    """Return by how much rays (K, 3) of length one point further down than the shallowest that are placed."""
-    return np.asarray(-unit[:, 2] - _SHALLOWEST * np.hypot(unit[:, 0], unit[:, 1]))
+def _below_horizon(rays: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return rays (K, 3) of length one, and by how much they point further down than the shallowest placed ones."""
+    unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    return unit, -unit[:, 2] - _SHALLOWEST * np.hypot(unit[:, 0], unit[:, 1])
 
 
 def _depths(ray: FloatArray, center: FloatArray, surface: PointSurface) -> FloatArray:
@@ -132,11 +128,9 @@ def _depths(ray: FloatArray, center: FloatArray, surface: PointSurface) -> Float
 
 
 def clipped_ring(ring: FloatArray, inside: FloatArray) -> FloatArray:
-    """Return the part of a ring (K, d) where a function is not negative (Sutherland and Hodgman 1974).
+    """Return the part of a ring (K, d), not closed, where a function is not negative (Sutherland and Hodgman 1974).
 
-    Args:
-        ring: corners, not closed.
-        inside: (K,) the function at the corners; linear between them.
+    `inside` (K,) is the function at the corners, linear between them.
     """
     kept = []
     for index in range(len(ring)):
@@ -171,15 +165,37 @@ def _area(outline: FloatArray) -> float:
 
 _SMALLEST_M = 1e-6
 _LARGEST_NUMBER = 2**62
+RecordT = TypeVar("RecordT")
+
+
+def rows_of(record: RecordT, rows: IntArray | BoolArray) -> RecordT:
+    """Return the same dataclass of arrays (P, …), with some of their rows; what is no array stays."""
+    arrays = {name: value[rows] for name, value in vars(record).items() if isinstance(value, np.ndarray)}
+    return type(record)(**(vars(record) | arrays))
+
+
+def joined_rows(records: Sequence[RecordT]) -> RecordT:
+    """Return the rows of all dataclasses of arrays (P, …), at least one; what is no array is that of the first."""
+    arrays = {
+        name: np.concatenate([vars(record)[name] for record in records])
+        for name, value in vars(records[0]).items()
+        if isinstance(value, np.ndarray)
+    }
+    return type(records[0])(**(vars(records[0]) | arrays))
+
+
+def rows_by_square(points: FloatArray, side_m: float) -> list[tuple[tuple[int, int], IntArray]]:
+    """Return the squares of the plan that hold points (P, 2 or more), and the rows of the points in each."""
+    if not len(points):
+        return []
+    square = np.floor(points[:, :2] / side_m).astype(np.int64)
+    order = np.lexsort(square.T)
+    starts = np.flatnonzero(np.any(np.diff(square[order], axis=0), axis=1)) + 1
+    return [((int(square[rows[0], 0]), int(square[rows[0], 1])), rows) for rows in np.split(order, starts)]
 
 
 def voxel_keys(points: FloatArray, side_m: float) -> IntArray:
-    """Return a number (P,) for the voxel of each point, the same for points of one voxel.
-
-    Args:
-        points: (P, 3) metres, P ≥ 1.
-        side_m: side of the voxels.
-    """
+    """Return a number (P,) for the voxel of each of P ≥ 1 points (P, 3), the same for points of one voxel."""
     return _row_numbers(np.floor(points / side_m).astype(np.int64))
 
 
@@ -191,11 +207,9 @@ def first_of_voxels(points: FloatArray, side_m: float) -> IntArray:
 
 
 def thin_to_voxels(points: FloatArray, side_m: FloatArray) -> IntArray:
-    """Return ascending indices of one point a voxel, the first.
+    """Return ascending indices of the first of points (P, 3) in each voxel.
 
-    Args:
-        points: (P, 3) metres.
-        side_m: (P,) wanted side of each point's voxel; rounded to a power of two, so that equal sides share a grid.
+    The wanted sides (P,) of the points' voxels are rounded to powers of two, so that equal sides share a grid.
     """
     if not len(points):
         return np.zeros(0, dtype=np.int64)

@@ -11,23 +11,21 @@ weights and propagates Σ_X = J Σ_obs Jᵀ. Here every ray is whitened first:
 
 Rays are flat arrays sorted by point. The rays of a point are a run (a segment) of the arrays.
 
-Image rays of cameras whose poses carry errors, and the points at which they meet (`geometry.intersection`).
-
-Points of a bundle, moved to where cameras that have changed now see them.
+`refined_points` moves the points of a bundle to where cameras that have changed now see them.
 """
 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.core.machine import thread_count
 from pipelines.core.types import BoolArray, FloatArray, IntArray
-from pipelines.geometry.bundle import Network
+from pipelines.geometry.bundle import Network, chunks_of_points
 from pipelines.geometry.cameras import project_each
 from pipelines.geometry.rotations import skew
 from pipelines.robust.statistics import cauchy_loss, cauchy_weight, chi2_quantile, huber_weight
@@ -35,36 +33,22 @@ from pipelines.robust.statistics import cauchy_loss, cauchy_weight, chi2_quantil
 
 @dataclass(frozen=True)
 class CommonRotation:
-    """A rotation error that all cameras share, as when SfM's rotations were aligned to geo as a whole.
+    """A rotation error that all cameras share, as when SfM's rotations were aligned to geo as a whole."""
 
-    Attributes:
-        cov_rad2: (3, 3) of the rotation vector in geo.
-        gain: (n, 3, 3) rotation in rad per metre of error of each camera's centre, from which it was estimated.
-    """
-
-    cov_rad2: FloatArray
-    gain: FloatArray
+    cov_rad2: FloatArray  # (3, 3) of the rotation vector in geo
+    gain: FloatArray  # (n, 3, 3) rad per metre of error of each camera's centre, from which it was estimated
 
 
 @dataclass(frozen=True)
 class UncertainCameras:
-    """n cameras in geo, with errors that are independent between cameras (but for `common`).
+    """n cameras in geo, with errors that are independent between cameras (but for `common`)."""
 
-    Attributes:
-        center_in_geo: (n, 3) metres.
-        rotation_geo_from_cam: (n, 3, 3).
-        cov_center_in_geo: (n, 3, 3) m², of the position.
-        sigma_attitude_rad: (n,) per axis.
-        sigma_ray: (n,) σ of x/z and y/z: σ of the pixel over the focal length.
-        common: rotation error of all cameras together, or None.
-    """
-
-    center_in_geo: FloatArray
-    rotation_geo_from_cam: FloatArray
-    cov_center_in_geo: FloatArray
-    sigma_attitude_rad: FloatArray
-    sigma_ray: FloatArray
-    common: CommonRotation | None = None
+    center_in_geo: FloatArray  # (n, 3) metres
+    rotation_geo_from_cam: FloatArray  # (n, 3, 3)
+    cov_center_in_geo: FloatArray  # (n, 3, 3) m², of the position
+    sigma_attitude_rad: FloatArray  # (n,) per axis
+    sigma_ray: FloatArray  # (n,) σ of x/z and y/z: σ of the pixel over the focal length
+    common: CommonRotation | None = None  # rotation error of all cameras together, or None
 
 
 @dataclass(frozen=True)
@@ -78,25 +62,15 @@ class Rays:
 
 @dataclass(frozen=True)
 class Intersections:
-    """Positions of N points at which rays intersect.
+    """Positions of N points at which rays intersect."""
 
-    Attributes:
-        position_in_geo: (N, 3) metres, NaN with fewer than two rays or parallel ones.
-        cov_in_geo: (N, 3, 3) m², NaN likewise.
-        ray_count: (N,) rays used.
-        max_angle_deg: (N,) largest angle between two used rays.
-        condition: (N,) condition number of the normal matrix; infinite where there is no position.
-        consistent: (N,) most rays agree within their σ, and the point lies in front of all that do.
-        used: (M,) rays that were used.
-    """
-
-    position_in_geo: FloatArray
-    cov_in_geo: FloatArray
-    ray_count: NDArray[np.int32]
-    max_angle_deg: FloatArray
-    condition: FloatArray
-    consistent: BoolArray
-    used: BoolArray
+    position_in_geo: FloatArray  # (N, 3) metres, NaN with fewer than two rays or parallel ones
+    cov_in_geo: FloatArray  # (N, 3, 3) m², NaN likewise
+    ray_count: NDArray[np.int32]  # (N,) rays used
+    max_angle_deg: FloatArray  # (N,) largest angle between two used rays
+    condition: FloatArray  # (N,) condition number of the normal matrix; infinite where there is no position
+    consistent: BoolArray  # (N,) most rays agree within their σ, and the point lies in front of all that do
+    used: BoolArray  # (M,) rays that were used
 
     @classmethod
     def none(cls, point_count: int, ray_count: int = 0) -> Intersections:
@@ -142,17 +116,11 @@ class _RayBundle:
         return _RayBundle(start, owner, *fields, self.shift), rays
 
     def sum_by_point(self, values: FloatArray) -> FloatArray:
-        """Return the sums (p, …) of values (m, …) over the rays of each point."""
         return np.asarray(np.add.reduceat(values, self.start, axis=0))
 
 
 def intersect_rays(rays: Rays, cameras: UncertainCameras, point_count: int) -> Intersections:
-    """Intersect the rays of each point.
-
-    Args:
-        rays: of all points, sorted by point.
-        cameras: their poses and errors.
-        point_count: N.
+    """Intersect the rays of each of N points.
 
     Raises:
         ValueError: `rays.point` is not ascending.
@@ -162,27 +130,16 @@ def intersect_rays(rays: Rays, cameras: UncertainCameras, point_count: int) -> I
     intersections = Intersections.none(point_count, len(rays.point))
     counts = np.bincount(rays.point, minlength=point_count)
     usable = np.flatnonzero(counts[rays.point] >= 2)
-    cuts = _chunk_cuts(rays.point[usable])
-
-    def work(chunk: int) -> None:
-        _intersect_chunk(rays, cameras, usable[cuts[chunk] : cuts[chunk + 1]], intersections)
-
+    point = rays.point[usable]
+    # Chunks never end within a point; those without rays are left out.
+    starts = np.unique(np.searchsorted(point, point[_CHUNK_RAYS::_CHUNK_RAYS]))
+    chunks = [chosen for chosen in np.split(usable, starts) if len(chosen)]
     with ThreadPoolExecutor(thread_count()) as pool:  # numpy lets go of the interpreter in these sizes
-        list(pool.map(work, range(len(cuts) - 1)))
+        list(pool.map(partial(_intersect_chunk, rays, cameras, intersections), chunks))
     return intersections
 
 
-def _chunk_cuts(point: IntArray) -> IntArray:
-    """Cut sorted rays into chunks of about `_CHUNK_RAYS`, never within a point."""
-    wanted = np.arange(_CHUNK_RAYS, len(point), _CHUNK_RAYS)
-    cuts = np.searchsorted(point, point[wanted]) if len(wanted) else wanted
-    return np.unique(np.concatenate([[0], cuts, [len(point)]])).astype(np.int64)
-
-
-def _intersect_chunk(rays: Rays, cameras: UncertainCameras, chosen: IntArray, intersections: Intersections) -> None:
-    """Intersect the chosen rays, and write their points into `intersections`."""
-    if len(chosen) == 0:
-        return
+def _intersect_chunk(rays: Rays, cameras: UncertainCameras, intersections: Intersections, chosen: IntArray) -> None:
     bundle, ids = _ray_bundle(rays, cameras, chosen)
     fit = _fit_rays(bundle, cameras)
     position, used = fit.position, fit.used
@@ -212,7 +169,6 @@ def _intersect_chunk(rays: Rays, cameras: UncertainCameras, chosen: IntArray, in
 
 
 def _ray_bundle(rays: Rays, cameras: UncertainCameras, chosen: IntArray) -> tuple[_RayBundle, IntArray]:
-    """Return the chosen rays in geo, and the ids (p,) of their points."""
     point, view, xy = rays.point[chosen], rays.view[chosen], rays.xy[chosen]
     start = np.flatnonzero(np.diff(point, prepend=point[0] - 1))
     owner = np.repeat(np.arange(len(start)), np.diff(np.append(start, len(point))))
@@ -227,8 +183,6 @@ def _ray_bundle(rays: Rays, cameras: UncertainCameras, chosen: IntArray) -> tupl
 
 @dataclass
 class _RayFit:
-    """State of a chunk's solution."""
-
     position: FloatArray  # (p, 3), from the bundle's shift
     whitener: FloatArray  # (m, 2, 3)
     information: FloatArray  # (m, 3, 3), W = Gᵀ G
@@ -239,8 +193,7 @@ def _fit_rays(bundle: _RayBundle, cameras: UncertainCameras) -> _RayFit:
     """Fit points by least squares, and robustly where a ray is out of its σ."""
     across = np.eye(3) - bundle.direction[:, :, None] * bundle.direction[:, None, :]  # A = I − d dᵀ
     position = _solve_points(bundle, across)  # eq. 9 with equal weights: near enough for the distances
-    whitener = _whitener(bundle, cameras, position)
-    information = _information(whitener)
+    whitener, information = _whitener(bundle, cameras, position)
     fit = _RayFit(_solve_points(bundle, information), whitener, information, np.ones(len(bundle.owner), dtype=bool))
     squared = _squared_residuals(whitener, fit.position[bundle.owner] - bundle.center)
     degrees = 2 * np.diff(np.append(bundle.start, len(bundle.owner))) - 3
@@ -263,13 +216,13 @@ def _fit_robust(bundle: _RayBundle, cameras: UncertainCameras, start: _RayFit) -
     No outlier can mask the single minimum of the first. The last gives full weight, as the covariance assumes.
     """
     position, whitener, information = start.position, start.whitener, start.information
-    for steps, weigh in ((_CONVEX_STEPS, _near_median_weight), (_REDESCENDING_STEPS, _redescending_weight)):
+    convex, redescending = partial(huber_weight, scale=_CONVEX_SCALE), partial(cauchy_weight, dimension=2)
+    for steps, weigh in ((_CONVEX_STEPS, convex), (_REDESCENDING_STEPS, redescending)):
         pull = (information @ bundle.center[..., None])[..., 0]
         for _ in range(steps):
             weight = weigh(_squared_residuals(whitener, position[bundle.owner] - bundle.center))
             position = _solve_points(bundle, information * weight[:, None, None], pull * weight[:, None])
-        whitener = _whitener(bundle, cameras, position)  # the distances have changed
-        information = _information(whitener)
+        whitener, information = _whitener(bundle, cameras, position)  # the distances have changed
     used = np.ones(len(bundle.owner), dtype=bool)
     for _ in range(2):
         used = _squared_residuals(whitener, position[bundle.owner] - bundle.center) <= _RAY_GATE
@@ -277,16 +230,8 @@ def _fit_robust(bundle: _RayBundle, cameras: UncertainCameras, start: _RayFit) -
     return _RayFit(position, whitener, information, used)
 
 
-def _redescending_weight(squared: FloatArray) -> FloatArray:
-    return cauchy_weight(squared, 2)
-
-
-def _near_median_weight(squared: FloatArray) -> FloatArray:
-    return huber_weight(squared, _CONVEX_SCALE)
-
-
-def _whitener(bundle: _RayBundle, cameras: UncertainCameras, position: FloatArray) -> FloatArray:
-    """Return G (m, 2, 3) such that G (X − C) has unit covariance, for the three error sources of eqs 10–12."""
+def _whitener(bundle: _RayBundle, cameras: UncertainCameras, position: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return G (m, 2, 3) such that G (X − C) has unit covariance for the errors of eqs 10–12, and W = Gᵀ G."""
     basis = _axes_across(bundle.direction)
     offset = position[bundle.owner] - bundle.center
     distance = (offset * bundle.direction).sum(axis=1)
@@ -305,7 +250,7 @@ def _whitener(bundle: _RayBundle, cameras: UncertainCameras, position: FloatArra
     rows = np.empty_like(basis)
     rows[:, 0] = first[:, None] * basis[:, 0]
     rows[:, 1] = second[:, None] * (basis[:, 1] - ratio[:, None] * basis[:, 0])
-    return rows
+    return rows, np.swapaxes(rows, 1, 2) @ rows
 
 
 def _axes_across(direction: FloatArray) -> FloatArray:
@@ -318,10 +263,6 @@ def _axes_across(direction: FloatArray) -> FloatArray:
     basis[:, 0, 0], basis[:, 0, 1], basis[:, 0, 2] = 1.0 + sign * x * x * a, sign * b, -sign * x
     basis[:, 1, 0], basis[:, 1, 1], basis[:, 1, 2] = b, sign + y * y * a, -y
     return basis
-
-
-def _information(whitener: FloatArray) -> FloatArray:
-    return np.asarray(np.swapaxes(whitener, 1, 2) @ whitener)
 
 
 def _squared_residuals(whitener: FloatArray, offset: FloatArray) -> FloatArray:
@@ -342,10 +283,7 @@ def _solve_points(bundle: _RayBundle, information: FloatArray, pull: FloatArray 
 def _common_covariance(
     bundle: _RayBundle, cameras: UncertainCameras, common: CommonRotation, response: FloatArray, offset: FloatArray
 ) -> FloatArray:
-    """Return the covariance (p, 3, 3) that the common rotation adds: its own, and that with the centres.
-
-    `response` (m, 3, 3) is ∂X/∂C of each ray, `offset` (m, 3) is X − C.
-    """
+    # The common rotation's own covariance, and that with the centres; ∂X/∂C of each ray and X − C.
     by_rotation = bundle.sum_by_point(response @ -skew(offset))
     shared = cameras.cov_center_in_geo @ np.swapaxes(common.gain, 1, 2)
     by_center = bundle.sum_by_point(response @ shared[bundle.view])
@@ -379,9 +317,7 @@ _CHUNK = 300_000  # observations: 0.1 GB of working arrays
 class RefinedPoints:
     """N points of a network.
 
-    Attributes:
-        point_in_world: (N, 3) metres.
-        error_px: (N,) mean reprojection error; NaN for a point that no camera sees in front of it.
+    `error_px` (N,) is the mean reprojection error; NaN for a point that no camera sees in front of it.
     """
 
     point_in_world: FloatArray
@@ -393,87 +329,58 @@ def refined_points(network: Network) -> RefinedPoints:
 
     Gauss–Newton with Cauchy's kernel from the points' present positions; a step that does not lower a point's error
     is not taken.
-
-    Args:
-        network: observations sorted by point.
     """
     refined = RefinedPoints(network.point_in_world.copy(), np.full(len(network.point_in_world), np.nan))
-    for points, observations in _chunks(network):
-        part = replace(
-            network,
-            point_in_world=network.point_in_world[points],
-            obs_point=network.obs_point[observations] - points.start,
-            obs_image=network.obs_image[observations],
-            obs_xy_px=network.obs_xy_px[observations],
-        )
+    for part, points, _ in chunks_of_points(network, _CHUNK):
         refined.point_in_world[points], refined.error_px[points] = _refine(part)
     return refined
 
 
-def _chunks(network: Network) -> list[tuple[slice, slice]]:
-    """Return slices of points and of their observations, about `_CHUNK` observations each."""
-    count = len(network.point_in_world)
-    starts = np.searchsorted(network.obs_point, np.arange(count + 1))
-    cuts = np.searchsorted(starts, np.arange(0, max(int(starts[-1]), 1), _CHUNK)).tolist()
-    cuts = sorted({*cuts, count})
-    return [(slice(a, b), slice(int(starts[a]), int(starts[b]))) for a, b in pairwise(cuts)]
-
-
 def _refine(network: Network) -> tuple[FloatArray, FloatArray]:
-    point = network.point_in_world
-    residual, usable = _residuals(network, point)
-    cost = _cost(network, residual, usable)
+    residual, usable = _residuals(network)
+    cost = _sums(network, usable * cauchy_loss((residual**2).sum(axis=1), 2))
     for _ in range(_STEPS):
-        jacobian = _jacobian(network, point, residual, usable)
+        jacobian = _jacobian(network, residual, usable)
         weight = usable * cauchy_weight((residual**2).sum(axis=1), 2)
         normal = _sums(network, weight[:, None, None] * np.swapaxes(jacobian, 1, 2) @ jacobian)
         pull = _sums(network, weight[:, None] * np.einsum("mda,md->ma", jacobian, residual))
         trace = np.trace(normal, axis1=1, axis2=2)
         damping = np.where(trace > 0, _DAMPING * trace, 1.0)
         step = np.linalg.solve(normal + damping[:, None, None] * np.eye(3), pull[..., None])[..., 0]
-        moved = point - step
-        moved_residual, moved_usable = _residuals(network, moved)
-        moved_cost = _cost(network, moved_residual, moved_usable)
+        moved = replace(network, point_in_world=network.point_in_world - step)
+        moved_residual, moved_usable = _residuals(moved)
+        moved_cost = _sums(network, moved_usable * cauchy_loss((moved_residual**2).sum(axis=1), 2))
         better = (moved_cost < cost) & (_sums(network, (usable & ~moved_usable).astype(float)) == 0)
-        point = np.where(better[:, None], moved, point)
-        cost = np.where(better, moved_cost, cost)
+        point = np.where(better[:, None], moved.point_in_world, network.point_in_world)
+        network, cost = replace(network, point_in_world=point), np.where(better, moved_cost, cost)
         taken = better[network.obs_point]
         residual = np.where(taken[:, None], moved_residual, residual)
         usable = np.where(taken, moved_usable, usable)
     seen = _sums(network, usable.astype(float))
     total = _sums(network, usable * np.linalg.norm(residual, axis=1))
-    return point, np.where(seen > 0, total / np.maximum(seen, 1), np.nan)
+    return network.point_in_world, np.where(seen > 0, total / np.maximum(seen, 1), np.nan)
 
 
-def _in_cam(network: Network, point: FloatArray) -> FloatArray:
-    ray = point[network.obs_point] - network.cam_center_in_world[network.obs_image]
-    return np.asarray(np.einsum("mij,mj->mi", network.cam_from_world[network.obs_image], ray))
-
-
-def _project(network: Network, in_cam: FloatArray) -> FloatArray:
-    return project_each(network.cameras, network.camera_id[network.obs_image], in_cam)
-
-
-def _residuals(network: Network, point: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Return projected minus observed (M, 2), and the mask of points before their camera; zero behind it."""
-    residual = _project(network, _in_cam(network, point)) - network.obs_xy_px
+def _residuals(network: Network) -> tuple[FloatArray, BoolArray]:
+    """Return projected minus observed (M, 2), zero behind the camera, and the mask of points before theirs."""
+    in_cam = np.einsum("mij,mj->mi", network.cam_from_world[network.obs_image], network.rays())
+    residual = project_each(network.cameras, network.camera_id[network.obs_image], in_cam) - network.obs_xy_px
     usable = np.asarray(np.isfinite(residual).all(axis=1))
     return np.where(usable[:, None], residual, 0.0), usable
 
 
-def _jacobian(network: Network, point: FloatArray, residual: FloatArray, usable: BoolArray) -> FloatArray:
+def _jacobian(network: Network, residual: FloatArray, usable: BoolArray) -> FloatArray:
     """Return the derivative (M, 2, 3) of the residuals by their points, by differences along the camera's axes."""
-    in_cam = _in_cam(network, point)
+    rotation, camera_of = network.cam_from_world[network.obs_image], network.camera_id[network.obs_image]
+    in_cam = np.einsum("mij,mj->mi", rotation, network.rays())
     step = _DIFFERENCE * np.maximum(np.abs(in_cam[:, 2]), 1e-3)
     here = residual + network.obs_xy_px
-    by_cam = [(_project(network, in_cam + step[:, None] * axis) - here) / step[:, None] for axis in np.eye(3)]
-    jacobian = np.stack(by_cam, axis=-1) @ network.cam_from_world[network.obs_image]
+    by_cam = [
+        (project_each(network.cameras, camera_of, in_cam + step[:, None] * axis) - here) / step[:, None]
+        for axis in np.eye(3)
+    ]
+    jacobian = np.stack(by_cam, axis=-1) @ rotation
     return np.where((usable & np.isfinite(jacobian).all(axis=(1, 2)))[:, None, None], jacobian, 0.0)
-
-
-def _cost(network: Network, residual: FloatArray, usable: BoolArray) -> FloatArray:
-    """Return the sums (N,) of Cauchy's kernel over the observations of each point."""
-    return _sums(network, usable * cauchy_loss((residual**2).sum(axis=1), 2))
 
 
 def _sums(network: Network, values: FloatArray) -> FloatArray:
@@ -481,4 +388,4 @@ def _sums(network: Network, values: FloatArray) -> FloatArray:
     flat = values.reshape(len(values), -1)
     count = len(network.point_in_world)
     sums = [np.bincount(network.obs_point, column, count).astype(np.float64) for column in flat.T]
-    return np.asarray(np.stack(sums, axis=-1).reshape(count, *values.shape[1:]))
+    return np.stack(sums, axis=-1).reshape(count, *values.shape[1:])

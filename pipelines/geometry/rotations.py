@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 from pipelines.core.types import FloatArray
 
 # Columns: the gimbal's forward, right and down axes seen from a camera (x right, y down, z forward).
-_CAM_FROM_GIMBAL = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+_CAM_FROM_GIMBAL: FloatArray = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 # Photogrammetry's image axes (x right, y up, z backward) seen from a camera.
 _CAM_FROM_PHOTO = np.diag([1.0, -1.0, -1.0])
 # Also the attitude in East-North-Up of a body (forward, right, down) that is level and heads north.
-ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+ENU_FROM_NED: FloatArray = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 _LOCKED = 1e-9  # cosine of φ below which ω and κ turn about the same axis
 
 
@@ -85,10 +85,7 @@ def geo_from_cam(yaw_pitch_roll_deg: ArrayLike) -> FloatArray:
     The angles turn North-East-Down into the gimbal's forward-right-down axes, in the order Z-Y-X (yaw, pitch,
     roll). Pitch −90 looks straight down; the camera looks along the gimbal's forward axis.
     """
-    angles = np.asarray(yaw_pitch_roll_deg, dtype=np.float64)
-    ned_from_gimbal = Rotation.from_euler("ZYX", angles.reshape(-1, 3), degrees=True).as_matrix()
-    rotation = ENU_FROM_NED @ np.asarray(ned_from_gimbal) @ _CAM_FROM_GIMBAL.T
-    return np.asarray(rotation.reshape(*angles.shape[:-1], 3, 3))
+    return ENU_FROM_NED @ _from_angles_deg("ZYX", yaw_pitch_roll_deg) @ _CAM_FROM_GIMBAL.T
 
 
 def yaw_pitch_roll_deg(geo_from_cam_rotation: ArrayLike) -> FloatArray:
@@ -96,12 +93,7 @@ def yaw_pitch_roll_deg(geo_from_cam_rotation: ArrayLike) -> FloatArray:
 
     For a camera that looks straight down or up, yaw and roll turn about the same axis: roll is then zero.
     """
-    matrix = np.asarray(geo_from_cam_rotation, dtype=np.float64)
-    ned_from_gimbal = ENU_FROM_NED.T @ matrix @ _CAM_FROM_GIMBAL
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Gimbal lock", category=UserWarning)
-        angles = Rotation.from_matrix(ned_from_gimbal.reshape(-1, 3, 3)).as_euler("ZYX", degrees=True)
-    return np.asarray(angles).reshape(*matrix.shape[:-2], 3)
+    return _angles_deg("ZYX", ENU_FROM_NED.T @ np.asarray(geo_from_cam_rotation, np.float64) @ _CAM_FROM_GIMBAL)
 
 
 def map_from_cam(omega_phi_kappa_deg: ArrayLike) -> FloatArray:
@@ -111,10 +103,7 @@ def map_from_cam(omega_phi_kappa_deg: ArrayLike) -> FloatArray:
     ω = φ = κ = 0 a camera looks straight down, and the upper edge of its image faces north (Bäumker and Heimes
     2001, New calibration and computing method for direct georeferencing; PIX4D has the same angles).
     """
-    angles = np.asarray(omega_phi_kappa_deg, dtype=np.float64)
-    map_from_photo = Rotation.from_euler("XYZ", angles.reshape(-1, 3), degrees=True).as_matrix()
-    rotation = np.asarray(map_from_photo) @ _CAM_FROM_PHOTO.T
-    return np.asarray(rotation.reshape(*angles.shape[:-1], 3, 3))
+    return _from_angles_deg("XYZ", omega_phi_kappa_deg) @ _CAM_FROM_PHOTO.T
 
 
 def omega_phi_kappa_deg(map_from_cam_rotation: ArrayLike) -> FloatArray:
@@ -122,20 +111,26 @@ def omega_phi_kappa_deg(map_from_cam_rotation: ArrayLike) -> FloatArray:
 
     ω and κ lie within ±180°, φ within ±90°. With φ = ±90°, ω and κ turn about the same axis: κ is then zero.
     """
-    matrix = np.asarray(map_from_cam_rotation, dtype=np.float64)
+    return _angles_deg("XYZ", np.asarray(map_from_cam_rotation, np.float64) @ _CAM_FROM_PHOTO)
+
+
+def _from_angles_deg(order: str, angles_deg: ArrayLike) -> FloatArray:
+    angles = np.asarray(angles_deg, dtype=np.float64)
+    matrix = np.asarray(Rotation.from_euler(order, angles.reshape(-1, 3), degrees=True).as_matrix())
+    return np.asarray(matrix.reshape(*angles.shape[:-1], 3, 3))
+
+
+def _angles_deg(order: str, rotation: FloatArray) -> FloatArray:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Gimbal lock", category=UserWarning)
-        angles = Rotation.from_matrix((matrix @ _CAM_FROM_PHOTO).reshape(-1, 3, 3)).as_euler("XYZ", degrees=True)
-    return np.asarray(angles).reshape(*matrix.shape[:-2], 3)
+        angles = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_euler(order, degrees=True)
+    return np.asarray(angles).reshape(*rotation.shape[:-2], 3)
 
 
 def omega_phi_kappa_jacobian(omega_phi_kappa_deg: ArrayLike) -> FloatArray:
-    """Return derivatives (…, 3, 3) of ω, φ, κ by a small rotation δθ about the map axes: R' = Exp(δθ) R.
+    """Return derivatives (…, 3, 3) of ω, φ, κ (…, 3) in degrees by a small rotation δθ about the map axes.
 
-    Angles and δθ are in the same unit; NaN at φ = ±90°.
-
-    Args:
-        omega_phi_kappa_deg: (…, 3) the angles, degrees.
+    R' = Exp(δθ) R. Changes of the angles and δθ are in the same unit; NaN at φ = ±90°.
     """
     omega, phi, _ = np.moveaxis(np.radians(np.asarray(omega_phi_kappa_deg, dtype=np.float64)), -1, 0)
     # The axes of the three turns in map axes: x; then y, turned by ω; then z, turned by ω and φ.

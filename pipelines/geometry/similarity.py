@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,12 +32,11 @@ class Similarity:
         return Similarity(self.scale * other.scale, self.rotation @ other.rotation, self.apply(other.translation))
 
     def inverse(self) -> Similarity:
-        """The similarity that undoes this one."""
         rotation = self.rotation.T
         return Similarity(1.0 / self.scale, rotation, -rotation @ self.translation / self.scale)
 
     def matrix(self) -> FloatArray:
-        """As a 4×4 matrix for homogeneous points."""
+        """Return the matrix (4, 4) for homogeneous points."""
         matrix = np.eye(4)
         matrix[:3, :3] = self.scale * self.rotation
         matrix[:3, 3] = self.translation
@@ -45,7 +44,6 @@ class Similarity:
 
     @classmethod
     def from_record(cls, record: SimilarityRecord) -> Similarity:
-        """From its stored form."""
         return cls(record.scale, matrix_from_quat_xyzw(record.quat_xyzw), np.array(record.translation))
 
     def to_record(
@@ -62,10 +60,10 @@ class Similarity:
             from_frame=from_frame,
             to_frame=to_frame,
             scale=float(self.scale),
-            quat_xyzw=_tuple(quat_xyzw_from_matrix(self.rotation)),
-            translation=_tuple(self.translation),
-            pivot=_tuple(np.asarray(pivot)),
-            covariance=tuple(_tuple(row) for row in cov),
+            quat_xyzw=tuple(quat_xyzw_from_matrix(self.rotation).tolist()),
+            translation=tuple(self.translation.tolist()),
+            pivot=tuple(np.asarray(pivot, dtype=np.float64).tolist()),
+            covariance=tuple(tuple(row) for row in cov.tolist()),
         )
 
 
@@ -92,11 +90,7 @@ def second_moment_at(points: ArrayLike, covariance: ArrayLike, pivot: ArrayLike)
     """Return the second moment (3 N, 3 N) of the second-order errors that an uncertain similarity causes.
 
     With A = δ ln s I + [δω]× the error is ½ A² (p − pivot), quadratic in Gaussian parameters (Isserlis' theorem).
-
-    Args:
-        points: (N, 3) in the target frame.
-        covariance: (7, 7) of (δ ln s, δω, δt) about `pivot`.
-        pivot: (3,) in the target frame.
+    Points (N, 3), covariance (7, 7) of (δ ln s, δω, δt) and pivot (3,) are those of `covariance_at`.
     """
     arm = np.asarray(points, dtype=np.float64) - np.asarray(pivot, dtype=np.float64)
     cov = np.asarray(covariance, dtype=np.float64)[:4, :4]
@@ -160,10 +154,6 @@ def _checked(
         raise DegenerateGeometryError(f"a similarity needs 3 points, there are {len(p)}")
     w = np.ones(len(p)) if weights is None else np.asarray(weights, dtype=np.float64)
     return p, q, w / w.sum()
-
-
-def _tuple(values: ArrayLike) -> tuple[Any, ...]:
-    return tuple(float(value) for value in np.asarray(values))
 
 
 class SimilarityRecord(Product):

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
@@ -39,9 +40,16 @@ class _Front:
 
 
 @dataclass(frozen=True)
-class _Pivot:
+class Pivot:
+    """Columns of the factor that one front eliminates, at the rows `own` (o,) and `border` (b,) of the matrix."""
+
+    own: IntArray
+    border: IntArray
     diagonal: FloatArray  # (o, o) lower triangle
     below: FloatArray  # (b, o)
+
+
+_solved = partial(solve_triangular, lower=True, check_finite=False)
 
 
 class SparseCholesky:
@@ -59,49 +67,36 @@ class SparseCholesky:
     def __init__(self, matrix: bsr_matrix, position: FloatArray) -> None:
         self._width = matrix.blocksize[0]
         self._fronts = _dissection(matrix, position)
-        self._pivots = self._factorised(matrix)
-
-    @property
-    def entries(self) -> int:
-        """Number of stored entries of the factor."""
-        return sum(pivot.diagonal.size + pivot.below.size for pivot in self._pivots)
-
-    @property
-    def least_pivot(self) -> float:
-        """Smallest entry on the diagonal of the factor."""
-        return float(
-            min((np.diag(pivot.diagonal).min() for pivot in self._pivots if pivot.diagonal.size), default=0.0)
-        )
+        self.pivots = self._factorised(matrix)
 
     def solve(self, right: FloatArray) -> FloatArray:
         """Return the product (n · w, m) of the inverse matrix and vectors (n · w, m)."""
-        solution = np.array(right, dtype=np.float64).reshape(-1, self._width, right.shape[1])
-        for front, pivot in zip(self._fronts, self._pivots, strict=True):
-            own = _solved(pivot.diagonal, self._taken(solution, front.own))
-            self._put(solution, front.own, own)
-            self._put(solution, front.border, self._taken(solution, front.border) - pivot.below @ own)
-        return self.coloured(solution.reshape(right.shape))
+        solution = np.array(right, dtype=np.float64, order="C")
+        for pivot in self.pivots:
+            own = _solved(pivot.diagonal, solution[pivot.own])
+            solution[pivot.own] = own
+            solution[pivot.border] -= pivot.below @ own
+        return self.coloured(solution)
 
     def coloured(self, white: FloatArray) -> FloatArray:
         """Return vectors (n · w, m) with the inverse matrix as their covariance, from white noise (n · w, m)."""
-        solution = np.array(white, dtype=np.float64).reshape(-1, self._width, white.shape[1])
-        for front, pivot in zip(reversed(self._fronts), reversed(self._pivots), strict=True):
-            own = self._taken(solution, front.own) - pivot.below.T @ self._taken(solution, front.border)
-            self._put(solution, front.own, _solved(pivot.diagonal, own, transposed=True))
-        return solution.reshape(white.shape)
+        solution = np.array(white, dtype=np.float64, order="C")
+        for pivot in reversed(self.pivots):
+            own = solution[pivot.own] - pivot.below.T @ solution[pivot.border]
+            solution[pivot.own] = _solved(pivot.diagonal, own, trans=1)
+        return solution
 
     def inverse_form(self, right: csc_matrix) -> FloatArray:
         """Return the symmetric product rightᵀ A⁻¹ right (m, m) of a sparse matrix (n · w, m).
 
         Only the fronts on the way from the entries of `right` to the last separator take part.
         """
-        reduced = np.asarray(right.toarray()).reshape(-1, self._width, right.shape[1])
-        form = np.zeros((right.shape[1], right.shape[1]))
-        for front, pivot in zip(self._fronts, self._pivots, strict=True):
-            own = self._taken(reduced, front.own)
+        reduced, form = right.toarray(order="C"), np.zeros((right.shape[1], right.shape[1]))
+        for pivot in self.pivots:
+            own = reduced[pivot.own]
             if own.any():
                 own = _solved(pivot.diagonal, own)
-                self._put(reduced, front.border, self._taken(reduced, front.border) - pivot.below @ own)
+                reduced[pivot.border] -= pivot.below @ own
                 form += own.T @ own
         return form
 
@@ -118,7 +113,7 @@ class SparseCholesky:
         """Yield the places of each front that were eliminated there, and the inverse (o · w, o · w) among them."""
         above: dict[int, FloatArray] = {}
         for index in reversed(range(len(self._fronts))):
-            front, pivot = self._fronts[index], self._pivots[index]
+            front, pivot = self._fronts[index], self.pivots[index]
             on_border = above.pop(index, np.zeros((len(pivot.below), len(pivot.below))))
             root_inverse = _solved(pivot.diagonal, np.eye(len(pivot.diagonal)))
             response = pivot.below @ root_inverse
@@ -126,30 +121,32 @@ class SparseCholesky:
             among = root_inverse.T @ root_inverse - response.T @ across
             yield front.own, among
             whole = np.block([[among, across.T], [across, on_border]])
+            places = np.concatenate([pivot.own, pivot.border])
+            order = np.argsort(places)
             for child in front.children:
-                rows = self._rows(_places_among(self._fronts[child].border, front))
+                rows = order[np.searchsorted(places[order], self.pivots[child].border)]
                 above[child] = whole[np.ix_(rows, rows)]
 
-    def _factorised(self, matrix: bsr_matrix) -> list[_Pivot]:
-        pivots: list[_Pivot] = []
+    def _factorised(self, matrix: bsr_matrix) -> list[Pivot]:
+        pivots: list[Pivot] = []
         updates: dict[int, FloatArray] = {}
-        place_in_front = np.full(matrix.shape[0] // self._width, -1, dtype=np.int64)
+        width, place_in_front = self._width, np.full(matrix.shape[0] // self._width, -1, dtype=np.int64)
         for index, front in enumerate(self._fronts):
             places = np.concatenate([front.own, front.border])
             place_in_front[places] = np.arange(len(places))
             dense = self._assembled(matrix, front, place_in_front)
             for child in front.children:
-                rows = self._rows(place_in_front[self._fronts[child].border])
+                rows = _rows(place_in_front[self._fronts[child].border], width)
                 dense[np.ix_(rows, rows)] += updates.pop(child)
             place_in_front[places] = -1
-            size = len(front.own) * self._width
+            size = len(front.own) * width
             try:
                 diagonal = cholesky(dense[:size, :size], lower=True, check_finite=False)
             except np.linalg.LinAlgError:
                 raise DegenerateGeometryError("the observations do not determine all cameras") from None
             below = np.ascontiguousarray(_solved(diagonal, dense[size:, :size].T).T)
             updates[index] = dense[size:, size:] - below @ below.T
-            pivots.append(_Pivot(diagonal, below))
+            pivots.append(Pivot(_rows(front.own, width), _rows(front.border, width), diagonal, below))
         return pivots
 
     def _assembled(self, matrix: bsr_matrix, front: _Front, place_in_front: IntArray) -> FloatArray:
@@ -163,16 +160,10 @@ class SparseCholesky:
         dense[row[kept], :, column[kept]] = np.swapaxes(matrix.data[slots[kept]], 1, 2)
         return dense.reshape(count * width, count * width)
 
-    def _rows(self, places: IntArray) -> IntArray:
-        return np.asarray((places[:, None] * self._width + np.arange(self._width)).ravel(), dtype=np.int64)
 
-    @staticmethod
-    def _taken(vectors: FloatArray, places: IntArray) -> FloatArray:
-        return vectors[places].reshape(-1, vectors.shape[2])
-
-    @staticmethod
-    def _put(vectors: FloatArray, places: IntArray, values: FloatArray) -> None:
-        vectors[places] = values.reshape(len(places), *vectors.shape[1:])
+def _rows(places: IntArray, width: int) -> IntArray:
+    """Return the rows of the matrix that belong to block rows, one block row after the other."""
+    return (places[:, None] * width + np.arange(width)).ravel()
 
 
 def _dissection(matrix: bsr_matrix, position: FloatArray) -> list[_Front]:
@@ -225,14 +216,3 @@ def _slots(matrix: bsr_matrix, rows: IntArray) -> IntArray:
     count = np.diff(matrix.indptr)[rows]
     start = np.repeat(matrix.indptr[rows] - np.concatenate([[0], np.cumsum(count)[:-1]]), count)
     return np.asarray(start + np.arange(int(count.sum())), dtype=np.int64)
-
-
-def _places_among(wanted: IntArray, front: _Front) -> IntArray:
-    """Return where places lie in a front."""
-    places = np.concatenate([front.own, front.border])
-    order = np.argsort(places)
-    return order[np.searchsorted(places[order], wanted)]
-
-
-def _solved(triangle: FloatArray, right: FloatArray, *, transposed: bool = False) -> FloatArray:
-    return np.asarray(solve_triangular(triangle, right, lower=True, trans=int(transposed), check_finite=False))

@@ -52,16 +52,13 @@ class SparseModel:
         return np.asarray(-np.einsum("nji,nj->ni", self.rotation_cam_from_local, self.translation_cam_from_local))
 
     def image_index(self) -> dict[str, int]:
-        """Return the index of each image by its name."""
         return {name: index for index, name in enumerate(self.image_name)}
 
     def camera_of(self, image: int) -> Camera:
-        """Return the intrinsics of the image with that index."""
         return self.cameras[int(self.image_camera_id[image])]
 
     @property
     def lenses(self) -> Lenses:
-        """Cameras of the images, whose parameters may change."""
         return Lenses(self.cameras, self.image_camera_id)
 
     def of_images(self, images: IntArray) -> SparseModel:
@@ -92,5 +89,5 @@ class SparseModel:
         )
 
     def points_in(self, image: int) -> IntArray:
-        """Return ascending indices (K,) of the points that are observed in the image with that index."""
+        """Return ascending indices (K,) of the points that an image observes."""
         return np.unique(self.obs_point[self.obs_image == image])

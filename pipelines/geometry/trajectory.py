@@ -1,4 +1,4 @@
-"""A motion recorded by time, and its places and rotations between the samples.
+"""A motion recorded by time, and how camera, antenna and body are put together: mount, boresight, lever arm.
 
 The rules of every interpolation in time:
 
@@ -6,8 +6,6 @@ The rules of every interpolation in time:
 2. Elsewhere an instant within a millisecond of a sample takes that sample: clocks write milliseconds.
 3. All other instants are NaN: nothing is extrapolated.
 4. A quantity that one of the two samples lacks (NaN) is NaN.
-
-How camera, antenna and body are put together: mount, boresight, lever arm.
 
 The body is Forward-Right-Down. The mount is the planned rotation between body and camera; the boresight is the
 small rotation from the true camera axes to those that the mount says.
@@ -79,7 +77,7 @@ class Trajectory:
         return _bracket(self.time_s, time_s, self.max_gap_s).covered
 
     def at(self, time_s: FloatArray) -> Trajectory:
-        """Return the motion at times (n,), after the rules above; NaN where they give nothing."""
+        """Return the motion at times (n,)."""
         bracket = _bracket(self.time_s, time_s, self.max_gap_s)
         return Trajectory(
             time_s,
@@ -92,9 +90,7 @@ class Trajectory:
 
 
 @dataclass(frozen=True)
-class _Bracket:
-    """The samples before and after each of n times, the part of the way between them, and whether they count."""
-
+class _Bracket:  # samples before and after each of n times, the part of the way between, and whether they count
     before: IntArray
     after: IntArray
     part: FloatArray
@@ -175,7 +171,6 @@ def with_rig(antenna: FloatArray, frame_from_body: FloatArray, rig: Rig) -> tupl
     Args:
         antenna: (N, 3) metres in any Cartesian frame, or in one for each photograph.
         frame_from_body: (N, 3, 3) attitudes of the body, forward-right-down, in that frame.
-        rig: of the photographs.
     """
     mounts, arms = rig.of_each(len(antenna))
     arms = np.nan_to_num(arms)

@@ -19,17 +19,11 @@ _STEPS = 20
 
 @dataclass(frozen=True)
 class TwoGroups:
-    """Offsets that gather about two places.
+    """Offsets that gather about two places."""
 
-    Attributes:
-        second: (n,) mask of the smaller group.
-        apart: (d,) middle of the smaller group minus that of the larger.
-        scatter: robust σ per axis about the middle of the wider group.
-    """
-
-    second: BoolArray
-    apart: FloatArray
-    scatter: float
+    second: BoolArray  # (n,) the smaller group
+    apart: FloatArray  # (d,) middle of the smaller group minus that of the larger
+    scatter: float  # robust σ per axis about the middle of the wider group
 
 
 def scatter_about_median(offsets: ArrayLike) -> float:
@@ -84,11 +78,9 @@ def two_groups(offsets: ArrayLike) -> TwoGroups | None:
 
 
 def blunders_among(offsets: ArrayLike, sigma: float) -> BoolArray | None:
-    """Return the mask (n,) of the blunders among offsets (n, d) whose majority agrees, or None if none stands out.
+    """Return the mask (n,) of the blunders among n ≥ 1 offsets (n, d) whose majority agrees; None: none stands out.
 
-    Args:
-        offsets: n ≥ 1 offsets.
-        sigma: σ per axis of a good one; the scatter of the better half counts if it is larger.
+    `sigma` is that of a good one per axis; the scatter of the better half counts if it is larger.
     """
     array = np.asarray(offsets, dtype=np.float64)
     scale = max(scatter_about_median(array), sigma)

@@ -1,19 +1,13 @@
-"""Statistics of residuals: robust scale, consistency, and the figures of reports.
+"""Statistics of residuals, robust kernels, and RANSAC with a truncated loss (MSAC, doi 10.1006/cviu.1999.0832).
 
-Robust kernels of a whitened residual: losses, weights, and their means under plain noise.
-
-The argument is r² (any shape), the squared length of a residual in units of its σ. A weight ρ'(r²) in (0, 1] is the
-derivative of its loss ρ, which is r² for small residuals.
-
-Tuning constants by dimension of the residual:
+The argument of a kernel is r² (any shape), the squared length of a residual in units of its σ. A weight ρ'(r²) in
+(0, 1] is the derivative of its loss ρ, which is r² for small residuals. Tuning constants by dimension:
 
 - Huber in one dimension: 95 % efficiency for Gaussian errors (Huber 1964, doi 10.1214/aoms/1177703732).
 - Cauchy in two dimensions (image residuals): 95 % efficiency of one coordinate (Holland and Welsch 1977,
   doi 10.1080/03610927708827533), as in COLMAP's adjustments.
 - Cauchy in one and in three dimensions (distances, positions, attitudes): the 95 % quantile of χ², COLMAP's scale
   for position priors.
-
-RANSAC with an adaptive number of draws and a truncated loss (MSAC, doi 10.1006/cviu.1999.0832).
 """
 
 from __future__ import annotations
@@ -49,15 +43,12 @@ def huber_weight(squared: ArrayLike, scale: float = HUBER_95) -> FloatArray:
 
 
 def cauchy_weight(squared: ArrayLike, dimension: int) -> FloatArray:
-    """Return Cauchy's weight 1 / (1 + r²/c²) of residuals of a dimension.
-
-    The weight redescends: the start must be near the solution.
-    """
+    """Return Cauchy's weight 1 / (1 + r²/c²); it redescends: the start must be near the solution."""
     return np.asarray(1.0 / (1.0 + np.asarray(squared, dtype=np.float64) / CAUCHY_SCALE2[dimension]))
 
 
 def cauchy_loss(squared: ArrayLike, dimension: int) -> FloatArray:
-    """Return Cauchy's loss c² ln(1 + r²/c²) of residuals of a dimension."""
+    """Return Cauchy's loss c² ln(1 + r²/c²)."""
     scale2 = CAUCHY_SCALE2[dimension]
     return np.asarray(scale2 * np.log1p(np.asarray(squared, dtype=np.float64) / scale2))
 
@@ -172,19 +163,10 @@ ModelT = TypeVar("ModelT")
 
 @dataclass(frozen=True)
 class RansacOptions:
-    """Sample size, gate and number of draws.
-
-    Attributes:
-        sample_size: observations that determine a model.
-        gate: largest squared whitened residual of an inlier.
-        max_draws: limit of draws.
-        confidence: required probability of at least one draw without outliers.
-    """
-
-    sample_size: int
-    gate: float
+    sample_size: int  # observations that determine a model
+    gate: float  # largest squared whitened residual of an inlier
     max_draws: int = 500
-    confidence: float = 0.9999
+    confidence: float = 0.9999  # probability of at least one draw without outliers
 
 
 @dataclass(frozen=True)
@@ -206,11 +188,8 @@ def ransac(
     """Return the model with the smallest truncated cost over `count` observations.
 
     Args:
-        count: number of observations.
         fit: makes a model from the chosen indices; may raise `DegenerateGeometryError`.
         squared_residuals: whitened squared residuals (count,) of a model.
-        options: sample size, gate and number of draws.
-        rng: draws the samples.
 
     Raises:
         DegenerateGeometryError: too few observations, or no draw gave a model.

@@ -1,12 +1,8 @@
-"""Numba kernel that compares the depths of views; it holds no GIL, so that threads share the views.
+"""Agreement between the depths of several views (geometric consistency), and their refinement on finer pixels.
 
-Agreement between the depths of several views (geometric consistency): depths of one view alone are chance.
-
-Refinement of a surface on finer pixels: each pixel compares hypotheses around its own prior only.
-
-The scheme is that of cascaded cost volumes (Gu et al., doi 10.1109/CVPR42600.2020.00257). A window across the edge
-of a roof then sees the roof where the roof is, and the ground where the ground is. A sweep of planes takes that
-ground for roof.
+Depths of one view alone are chance. In the refinement, each pixel compares hypotheses around its own prior only, as
+in cascaded cost volumes (Gu et al., doi 10.1109/CVPR42600.2020.00257). A window across the edge of a roof then sees
+the roof where the roof is, and the ground where the ground is. A sweep of planes takes that ground for roof.
 """
 
 from __future__ import annotations
@@ -19,9 +15,9 @@ import cv2
 import numpy as np
 from numba import njit
 
-from pipelines.core.types import Float32Array, FloatArray
-from pipelines.geometry.cameras import Pinhole
-from pipelines.surface.matching import UNSEEN, Matcher, MatchSettings, StereoCamera, StereoView, WinnerTakesAll
+from pipelines.core.types import Float32Array
+from pipelines.geometry.cameras import ViewPose
+from pipelines.surface.matching import UNSEEN, Matcher, MatchSettings, StereoView, WinnerTakesAll, camera_matrix
 from pipelines.surface.sweep import NormalMap, SweepResult, sweep_result
 
 # ruff: noqa: PLR0917  (kernels take arrays, not objects)
@@ -36,7 +32,7 @@ def compare_depths(
     ray_from_pixel: Any,
     center: Any,
     other_center: Any,
-    pixel_from_world: Any,
+    pixel_from_model: Any,
     other: Any,
     other_index: Any,
     other_normals: Any,
@@ -44,14 +40,14 @@ def compare_depths(
     sums: Any,
     counts: Any,
 ) -> None:
-    """Compare the points of a view with the surface of one other view, and add up what the comparison says.
+    """Compare the points of a view with the surface of one other view, without the GIL, and add up what it says.
 
     Args:
         depth: (H, W) float64 along the optical axis of the view; 0: no point.
         ray_from_pixel: (3, 3), from pixel (column, row, 1) to a ray of length one along the axis.
-        center: (3,) of the view in `world`.
+        center: (3,) of the view in `model`.
         other_center: (3,) of the other view.
-        pixel_from_world: (3, 3) homogeneous pixel in the other view of a place relative to its centre.
+        pixel_from_model: (3, 3) homogeneous pixel in the other view of a place relative to its centre.
         other: (4, h, w) float32: offset, score, step and sharpness of the other view.
         other_index: (h, w) rows of `other_normals`.
         other_normals: (F, 3).
@@ -72,11 +68,11 @@ def compare_depths(
             r2 = ray_from_pixel[2, 0] * x + ray_from_pixel[2, 1] * y + ray_from_pixel[2, 2]
             p0, p1, p2 = center[0] + length * r0, center[1] + length * r1, center[2] + length * r2
             q0, q1, q2 = p0 - other_center[0], p1 - other_center[1], p2 - other_center[2]
-            z = pixel_from_world[2, 0] * q0 + pixel_from_world[2, 1] * q1 + pixel_from_world[2, 2] * q2
+            z = pixel_from_model[2, 0] * q0 + pixel_from_model[2, 1] * q1 + pixel_from_model[2, 2] * q2
             if z <= 0:
                 continue
-            across = (pixel_from_world[0, 0] * q0 + pixel_from_world[0, 1] * q1 + pixel_from_world[0, 2] * q2) / z
-            down = (pixel_from_world[1, 0] * q0 + pixel_from_world[1, 1] * q1 + pixel_from_world[1, 2] * q2) / z
+            across = (pixel_from_model[0, 0] * q0 + pixel_from_model[0, 1] * q1 + pixel_from_model[0, 2] * q2) / z
+            down = (pixel_from_model[1, 0] * q0 + pixel_from_model[1, 1] * q1 + pixel_from_model[1, 2] * q2) / z
             if not (across >= 0 and across < columns and down >= 0 and down < rows):
                 continue
             column, row = int(across), int(down)
@@ -100,18 +96,6 @@ def compare_depths(
 
 
 @dataclass(frozen=True)
-class DepthEstimate:
-    """Depths of one view, estimated by a sweep or its refinement."""
-
-    camera: StereoCamera
-    sweep: SweepResult
-
-    def depth(self) -> FloatArray:
-        """Return the depth (H, W) along the optical axis."""
-        return self.sweep.normals.depth(self.camera, self.sweep.offset_m)
-
-
-@dataclass(frozen=True)
 class AgreementSettings:
     """Thresholds of agreement.
 
@@ -132,43 +116,35 @@ class AgreementSettings:
     rim: float = 0.01
 
 
-def agreed_depth(
-    reference: DepthEstimate, others: list[DepthEstimate], settings: AgreementSettings
-) -> Float32Array:
-    """Return depths (H, W) along the optical axis of `reference`, the mean of the views that agree; 0 if few do.
+def agreed_depth(own: SweepResult, others: list[SweepResult], settings: AgreementSettings) -> Float32Array:
+    """Return depths (H, W) along the optical axis of `own`, the mean of the views that agree; 0 if few do.
 
-    1. Each point of the reference is reprojected into each other view. The residual is the distance to the surface
-       of that view along its normal: on a plane, pixels need not coincide.
+    1. Each point of `own` is reprojected into each other view. The residual is the distance to the surface of that
+       view along its normal: on a plane, pixels need not coincide.
     2. Views weigh by the square of the sharpness of their peaks, because noise of the score moves a blunt peak
        further. A view without a baseline agrees with any depth.
     3. Where too many views look through a point, the point is no surface, even if others agree: all views from one
        side of a roof take the ground beside it for roof.
     """
-    own, depth = reference.sweep, reference.depth()
+    camera, depth = own.camera, own.depth()
     good = (own.score > settings.least_score) & np.isfinite(depth) & (depth > 0)
     length = np.where(good, depth, 0.0)
-    per_metre = own.normals.offset_per_metre(reference.camera)
+    per_metre = own.normals.offset_per_metre(camera)
     sums, counts = np.zeros((2, *depth.shape)), np.zeros((2, *depth.shape), np.int32)
     sums[1] = (per_metre * own.sharpness) ** 2
     limits = np.array([settings.least_score, settings.steps, settings.free])
-    camera = reference.camera
     for other in others:
-        surface = other.sweep
         compare_depths(
-            *(length, camera.cam_from_world.T @ np.linalg.inv(_camera_matrix(camera.pinhole))),
-            *(camera.center_in_world, other.camera.center_in_world),
-            _camera_matrix(other.camera.pinhole) @ other.camera.cam_from_world,
-            np.stack([surface.offset_m, surface.score, surface.step_m, surface.sharpness]),
-            *(surface.normals.index, surface.normals.normals_in_world, limits, sums, counts),
+            *(length, camera.cam_from_model.T @ np.linalg.inv(camera_matrix(camera.pinhole))),
+            *(camera.center_in_model, other.camera.center_in_model),
+            camera_matrix(other.camera.pinhole) @ other.camera.cam_from_model,
+            np.stack([other.offset_m, other.score, other.step_m, other.sharpness]),
+            *(other.normals.index, other.normals.normals_in_model, limits, sums, counts),
         )
     views, through = counts
     agreed = good & (views >= settings.least_views) & (through < settings.most_through * views)
     mean = length + np.divide(sums[0], sums[1], out=np.zeros_like(length), where=agreed)
     return np.where(agreed, mean, 0.0).astype(np.float32)
-
-
-def _camera_matrix(camera: Pinhole) -> FloatArray:
-    return np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
 
 
 def without_rims(depth: Float32Array, reach_px: int, rim: float) -> Float32Array:
@@ -177,11 +153,6 @@ def without_rims(depth: Float32Array, reach_px: int, rim: float) -> Float32Array
     Foreground fattening is the reason: the contrast of an edge dominates the windows across it, so that the ground
     beside a roof matches as roof. The outermost half window of a surface is therefore none. The test compares
     inverse depths, which are linear on a plane however steep the view.
-
-    Args:
-        depth: along the optical axis, 0 where unknown.
-        reach_px: half the window's side.
-        rim: see `AgreementSettings`.
     """
     height, width = depth.shape
     inverse = np.where(depth > 0, 1 / np.maximum(depth, 1e-9), np.nan)
@@ -202,40 +173,28 @@ _SPECKLE_PX = 5  # parts smaller than half of this are chance where one view alo
 
 @dataclass(frozen=True)
 class SurfacePrior:
-    """Rough surface to start a refinement from.
-
-    Attributes:
-        normals: directions of the offsets.
-        offset_m: (H, W) of the surface at each pixel of a view.
-        step_m: (H, W) between two hypotheses.
-    """
+    """Rough surface to start a refinement from: offsets (H, W), and the steps (H, W) between two hypotheses."""
 
     normals: NormalMap
     offset_m: Float32Array
     step_m: Float32Array
 
 
-def surface_prior(estimate: DepthEstimate, agreed: Float32Array, camera: StereoCamera) -> SurfacePrior:
-    """Return the prior at the pixels of a finer camera: depths that views agree on, elsewhere the view's own.
-
-    Args:
-        estimate: the view's own depths, on coarse pixels.
-        agreed: (H, W) depths that views agree on, on the same pixels; 0 elsewhere.
-        camera: the finer camera.
-    """
-    normals, own = estimate.sweep.normals, estimate.depth()
+def surface_prior(coarse: SweepResult, agreed: Float32Array, camera: ViewPose) -> SurfacePrior:
+    """Return the prior at the pixels of a finer camera: the agreed depths (H, W), else the own ones."""
+    normals, own = coarse.normals, coarse.depth()
     own = np.where(np.isfinite(own) & (own > 0), own, 0).astype(np.float32)
     own = np.asarray(cv2.medianBlur(own, _SPECKLE_PX), np.float32)
-    offset = normals.offset(estimate.camera, np.where(agreed > 0, agreed, own))
+    offset = normals.offset(coarse.camera, np.where(agreed > 0, agreed, own))
     size = (camera.pinhole.width, camera.pinhole.height)
     finer = [
         # Interpolation between roof and ground would make offsets at which nothing lies.
         cv2.resize(image, size, interpolation=cv2.INTER_NEAREST)
-        for image in (normals.index, offset.astype(np.float32), estimate.sweep.step_m / np.float32(_STEPS))
+        for image in (normals.index, offset.astype(np.float32), coarse.step_m / np.float32(_STEPS))
     ]
     which = np.asarray(finer[0], np.uint8)
     return SurfacePrior(
-        NormalMap(normals.normals_in_world, which),
+        NormalMap(normals.normals_in_model, which),
         np.asarray(finer[1], np.float32),
         np.asarray(finer[2], np.float32),
     )
@@ -247,12 +206,6 @@ def refine(
     """Compare a view with its neighbours at offsets around a prior, and keep the best.
 
     A best match at either end of the range means that the surface lies outside of it: its score becomes −1.
-
-    Args:
-        reference: view whose surface is wanted.
-        neighbours: one or more views of the same place from elsewhere.
-        prior: rough surface at the pixels of `reference`.
-        settings: of the comparison.
 
     Raises:
         ValueError: no neighbours.
@@ -267,5 +220,5 @@ def refine(
         search.add(matcher(middle + np.float32(number) * step))
     winner = search.winner()
     offset = prior.offset_m + (winner.hypothesis - _REACH) * prior.step_m
-    refined = sweep_result(winner, prior.normals, offset, prior.step_m)
+    refined = sweep_result(winner, reference.camera, prior.normals, offset, prior.step_m)
     return replace(refined, score=np.where(winner.inner, refined.score, np.float32(UNSEEN)))

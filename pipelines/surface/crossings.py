@@ -1,4 +1,6 @@
-"""Visibility of surfels: which points of a cloud a camera sees, when each hides what lies behind its disc.
+"""Visibility of surfels, and crossings of the cells of a grid by beams.
+
+A camera sees the points of a cloud of which each hides what lies behind its disc:
 
 1. A point covers a disc on its plane. The disc is drawn into a depth buffer, pixel by pixel, at the depth of the
    plane. For discs seen at a grazing angle, the distance from the point's depth is limited to `_SLANT` times the
@@ -6,8 +8,6 @@
 2. A point is seen if no disc at its own pixel is nearer than its own by more than its radius.
 
 Discs grow over silhouettes by their radius: a point close behind an edge counts as hidden.
-
-Crossings of the cells of a grid by beams.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.geometry.cameras import Pinhole
+from pipelines.geometry.footprints import rows_of
 
 # ruff: noqa: PLR0917  (kernels take arrays, not objects)
 
@@ -32,13 +33,7 @@ _MOST_PX = 12  # limit of a disc's radius
 
 @dataclass(frozen=True)
 class Surfels:
-    """P discs.
-
-    Attributes:
-        position: (P, 3) metres.
-        normal: (P, 3) unit vectors with an arbitrary sign.
-        radius_m: (P,).
-    """
+    """P discs: positions (P, 3) in metres, unit normals (P, 3) with an arbitrary sign, radii (P,)."""
 
     position: FloatArray
     normal: FloatArray
@@ -47,13 +42,7 @@ class Surfels:
 
 @dataclass(frozen=True)
 class SeenSurfels:
-    """K discs that a camera sees.
-
-    Attributes:
-        rows: (K,) among all.
-        row, column: (K,) pixels.
-        depth_m: (K,) along the camera's z axis.
-    """
+    """K discs that a camera sees: their rows among all, pixels, and depths along the camera's z axis."""
 
     rows: IntArray
     row: IntArray
@@ -62,18 +51,11 @@ class SeenSurfels:
 
     def part(self, kept: np.ndarray) -> SeenSurfels:
         """Return the discs of a mask (K,)."""
-        return SeenSurfels(self.rows[kept], self.row[kept], self.column[kept], self.depth_m[kept])
+        return rows_of(self, kept)
 
 
 def seen_surfels(surfels: Surfels, cam_from_world: FloatArray, center: FloatArray, camera: Pinhole) -> SeenSurfels:
-    """Return the discs that a camera sees.
-
-    Args:
-        surfels: the discs, in the world.
-        cam_from_world: (3, 3) rotation.
-        center: (3,) camera centre, in the world.
-        camera: the pinhole.
-    """
+    """Return the discs that a camera with a rotation (3, 3) and a centre (3,) sees."""
     in_cam = (surfels.position - center) @ cam_from_world.T
     normal = surfels.normal @ cam_from_world.T
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
@@ -147,7 +129,7 @@ def crossings(
         end: (P, 3) ends of the beams, in the grid.
         start: (P, 3) their starts, elsewhere than the ends.
         low: (3,) low corner of the grid.
-        cell_m: side of the cells.
+        cell_m: side of its cells.
         shape: (3,) number of cells.
     """
     count = np.zeros(tuple(shape.tolist()), dtype=np.uint8)

@@ -20,20 +20,12 @@ import numpy as np
 from pipelines.core.machine import thread_count
 from pipelines.core.progress import SILENT, Progress, ProgressTask
 from pipelines.core.types import ByteArray, Float32Array
-from pipelines.geometry.cameras import Pinhole
-from pipelines.surface.agreement import (
-    AgreementSettings,
-    DepthEstimate,
-    agreed_depth,
-    refine,
-    surface_prior,
-    without_rims,
-)
-from pipelines.surface.matching import UNSEEN, MatchSettings, StereoCamera, StereoView
+from pipelines.geometry.cameras import Pinhole, ViewPose
+from pipelines.surface.agreement import AgreementSettings, agreed_depth, refine, surface_prior, without_rims
+from pipelines.surface.matching import UNSEEN, MatchSettings, StereoView
 from pipelines.surface.sweep import (
     NormalMap,
-    Planes,
-    PointVisibility,
+    SweepPlanes,
     SweepResult,
     best_neighbours,
     plane_sweep,
@@ -75,8 +67,6 @@ class DepthMaps:
 
     Args:
         folder: cache, in which each scene has a folder of its own.
-        scene: cameras and SfM points.
-        images: undistorted photographs.
         options: of the depth maps; None: the defaults.
     """
 
@@ -85,12 +75,9 @@ class DepthMaps:
     ) -> None:
         self.scene, self.images = scene, images
         self._options = options or StereoOptions()
-        sparse = scene.sparse
-        self._visibility = PointVisibility(
-            scene.point_in_model, scene.poses.cam_center_in_model, sparse.obs_point, sparse.obs_image
-        )
+        count = self._options.neighbours
         # All neighbours of a view need the view's own planes and neighbours again, and these do not change.
-        self._neighbours = cache(self._find_neighbours)
+        self._neighbours = cache(lambda index: best_neighbours(scene.network, index, scene.train, count))
         self._planes = cache(self._find_planes)
         self.folder = folder / self._key()
 
@@ -135,31 +122,38 @@ class DepthMaps:
                 pool.shutdown(cancel_futures=True)
                 raise
 
-    def camera(self, index: int) -> Pinhole:
-        """Return the camera of a depth map."""
-        return self._pinhole(index, "fine")
+    def camera(self, index: int, kind: str = "fine") -> Pinhole:
+        """Return the camera of a depth map, or of the sweep's coarse pixels."""
+        longest_px = self._options.coarse_px if kind == "coarse" else self._options.fine_px
+        return self.images.pinhole(index).limited(longest_px)
 
     def depth(self, index: int) -> Float32Array:
         """Return the depth (H, W) in metres along a training view's optical axis, mapped from disk; 0: unknown."""
         array: Float32Array = np.load(self._path(index, "depth"), mmap_mode="r", allow_pickle=False)
         return array
 
-    def rgb(self, index: int) -> ByteArray:
-        """Return the photograph (H, W, 3) at the pixels of its depth map."""
-        return self._rgb(self.camera(index), index)
+    def rgb(self, index: int, kind: str = "fine") -> ByteArray:
+        """Return the photograph (H, W, 3) at the pixels of `camera`."""
+        whole, pinhole = self.images.pinhole(index), self.camera(index, kind)
+        # A view is read by all of its neighbours: large photographs are shrunken once. Nothing must be cut off.
+        most = max(max(whole.width, whole.height) // (2 * self._options.fine_px), 1)
+        shrink = max(s for s in range(1, most + 1) if whole.width % s == 0 == whole.height % s)
+        image = np.array(self.images.shrunken(index, shrink))
+        small = cv2.resize(image, (pinhole.width, pinhole.height), interpolation=cv2.INTER_AREA)
+        return np.asarray(small, np.uint8)
 
     def _sweep(self, index: int) -> Float32Array:
         sweeps, others = self._planes(index), self._neighbours(index)
         if not sweeps:
-            return _empty_maps(self._pinhole(index, "coarse"))
-        reference, *views = (self._view(self._pinhole(j, "coarse"), j) for j in (index, *others))
+            return _empty_maps(self.camera(index, "coarse"))
+        reference, *views = (self._view(j, "coarse") for j in (index, *others))
         return _packed(plane_sweep(reference, views, sweeps, self._options.matching))
 
     def _refine(self, index: int) -> Float32Array:
         own = self._surface(index, "coarse")
         if own is None:
             return _empty_maps(self.camera(index))
-        reference, *views = (self._view(self.camera(j), j) for j in (index, *self._neighbours(index)))
+        reference, *views = (self._view(j, "fine") for j in (index, *self._neighbours(index)))
         prior = surface_prior(own, self._agreed(own, index, "coarse"), reference.camera)
         return _packed(refine(reference, views, prior, self._options.refining))
 
@@ -169,56 +163,39 @@ class DepthMaps:
             return np.zeros((self.camera(index).height, self.camera(index).width), dtype=np.float32)
         return self._agreed(own, index, "fine")
 
-    def _agreed(self, own: DepthEstimate, index: int, kind: str) -> Float32Array:
+    def _agreed(self, own: SweepResult, index: int, kind: str) -> Float32Array:
         """Return the depths (H, W) on which views agree; 0 elsewhere."""
         others, options = [self._surface(j, kind) for j in self._neighbours(index)], self._options
         depth = agreed_depth(own, [other for other in others if other is not None], options.agreement)
         # Refined depths started from the sweep: its window sets the width of a rim on fine pixels too.
-        window_px = options.matching.window_px * own.camera.pinhole.width / self._pinhole(index, "coarse").width
+        window_px = options.matching.window_px * own.camera.pinhole.width / self.camera(index, "coarse").width
         return without_rims(depth, int(window_px / 2), options.agreement.rim)
 
-    def _surface(self, index: int, kind: str) -> DepthEstimate | None:
+    def _surface(self, index: int, kind: str) -> SweepResult | None:
         sweeps = self._planes(index)
         if not sweeps:
             return None
-        pinhole = self._pinhole(index, kind)
         normal_index, *rest = np.load(self._path(index, kind), mmap_mode="r", allow_pickle=False)
-        normals = NormalMap(np.stack([planes.normal_in_world for planes in sweeps]), normal_index.astype(np.uint8))
-        return DepthEstimate(self._camera(pinhole, index), SweepResult(normals, *rest))
+        normals = NormalMap(np.stack([planes.normal_in_model for planes in sweeps]), normal_index.astype(np.uint8))
+        return SweepResult(self._pose(index, kind), normals, *rest)
 
-    def _find_planes(self, index: int) -> list[Planes]:
+    def _find_planes(self, index: int) -> list[SweepPlanes]:
         others = self._neighbours(index)
         if not others:
             return []
-        points = self.scene.point_in_model[self._visibility.points_in_view(index)]
-        cameras = [self._camera(self._pinhole(j, "coarse"), j) for j in others]
-        return planes_for(self._camera(self._pinhole(index, "coarse"), index), cameras, points)
+        points = self.scene.point_in_model[self.scene.sparse.points_in(index)]
+        pose, *around = (self._pose(j, "coarse") for j in (index, *others))
+        return planes_for(pose, around, points)
 
-    def _find_neighbours(self, index: int) -> list[int]:
-        return best_neighbours(self._visibility, index, self.scene.train, self._options.neighbours)
-
-    def _pinhole(self, index: int, kind: str) -> Pinhole:
-        longest_px = self._options.coarse_px if kind == "coarse" else self._options.fine_px
-        return self.images.pinhole(index).limited(longest_px)
-
-    def _camera(self, pinhole: Pinhole, index: int) -> StereoCamera:
+    def _pose(self, index: int, kind: str) -> ViewPose:
         poses = self.scene.poses
-        return StereoCamera(pinhole, poses.cam_from_model[index], poses.cam_center_in_model[index])
+        return ViewPose(self.camera(index, kind), poses.cam_from_model[index], poses.cam_center_in_model[index])
 
-    def _view(self, pinhole: Pinhole, index: int) -> StereoView:
-        grey = cv2.cvtColor(self._rgb(pinhole, index), cv2.COLOR_RGB2GRAY).astype(np.float32) + 1
+    def _view(self, index: int, kind: str) -> StereoView:
+        grey = cv2.cvtColor(self.rgb(index, kind), cv2.COLOR_RGB2GRAY).astype(np.float32) + 1
         mask = np.array(self.images.mask(index), dtype=np.uint8)
         grey[cv2.resize(mask, grey.shape[::-1], interpolation=cv2.INTER_NEAREST) == 0] = 0
-        return StereoView(self._camera(pinhole, index), grey)
-
-    def _rgb(self, pinhole: Pinhole, index: int) -> ByteArray:
-        whole = self.images.pinhole(index)
-        # A view is read by all of its neighbours: large photographs are shrunken once. Nothing must be cut off.
-        most = max(max(whole.width, whole.height) // (2 * self._options.fine_px), 1)
-        shrink = max(s for s in range(1, most + 1) if whole.width % s == 0 == whole.height % s)
-        image = np.array(self.images.shrunken(index, shrink))
-        small = cv2.resize(image, (pinhole.width, pinhole.height), interpolation=cv2.INTER_AREA)
-        return np.asarray(small, np.uint8)
+        return StereoView(self._pose(index, kind), grey)
 
     def _path(self, index: int, kind: str) -> Path:
         return self.folder / f"{index:06d}.{kind}.npy"

@@ -1,8 +1,7 @@
-"""Candidates of the point cloud: the pixels of the depth maps with their normals, where a surface is smooth.
+"""Fusion of the depth maps to a point cloud: one point a voxel, on the mean surface of the views that agree.
 
-Plan of the work: squares whose candidates fit into the memory, and the views that show each of them.
-
-Fusion of the candidates: one point a voxel, on the mean surface of the views that agree.
+Candidates are the pixels of the maps with their normals, where a surface is smooth. Work goes square by square of
+the plan, so that the candidates of one fit into the memory.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, ByteArray, FloatArray, IntArray
-from pipelines.geometry.footprints import voxel_keys
+from pipelines.geometry.footprints import joined_rows, voxel_keys
 from pipelines.geometry.similarity import Similarity
 from pipelines.surface.surface_views import SurfaceView, SurfaceViews
 from pipelines.surface.visibility import Support
@@ -26,40 +25,107 @@ _REACH_PX = 2  # of the differences that give a normal
 _BEND = 0.01  # limit of |z/z₁ + z/z₂ − 2| for a depth z between opposite neighbours z₁, z₂ on a smooth surface
 _LOOK_PX = 8  # between the pixels that tell which part of a view shows a square
 _GRAZING = 0.17  # least cosine between ray and normal (80°): blurred edges bridge two surfaces along the rays
+# Memory: candidates of one square, of about 100 bytes each, with the copies that sorting them makes.
+_MOST_CANDIDATES = 4_000_000
+_SAMPLE_PX = 8  # between the pixels from which sizes and extent are estimated
+_LEAST_VOXELS = 16  # along the side of a square
+_MARGIN = 4  # spacings around a square: fusion moves points by less, mostly
+_MOST_THROUGH = 0.5  # largest number of views that look through a point, as a part of those that agree
+# σ of a ray through a photograph, in pixels of the training size: on simulated flights, this and the views' own
+# disagreement explain the distances to the true surface at 68 of 100 points.
+_SIGMA_PX = 0.25
+# A point is left out if its σ exceeds this part of the pixel: beyond, one point in five was a floater on simulated
+# flights.
+_RESOLVED = 1.0
+_COARSEST = 2.0  # width of the pixels that are used, in medians: beyond lies the background, which few rays fix
 
 
 @dataclass(frozen=True)
-class Candidates:
-    """P points of the surface in `geo`.
+class FusionSettings:
+    """Settings of the fusion."""
 
-    Attributes:
-        position: (P, 3) metres.
-        normal: (P, 3) unit vectors towards the camera.
-        rgb: (P, 3) uint8.
-        pixel_m: (P,) width of a pixel at the point.
+    spacing_m: float  # side of the voxels
+    coarsest_m: float  # wider pixels are left out
+    min_views: int  # least number of views that agree on a point
+
+
+@dataclass(frozen=True)
+class SurfaceCloud:
+    """P points of the surface in `geo`."""
+
+    position: FloatArray  # (P, 3) metres
+    normal: FloatArray  # (P, 3) unit vectors towards the cameras
+    rgb: ByteArray  # (P, 3) uint8
+    sigma_m: FloatArray  # (P,) σ of the surface along the normal, without that of the georeference
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+
+def pixel_on_surface_m(views: SurfaceViews, geo_from_model: Similarity) -> float:
+    """Return the median width of a pixel on the surface in metres, over the views' medians.
+
+    Raises:
+        DegenerateGeometryError: no view shows a surface.
     """
+    medians = []
+    for view in map(views.view, range(len(views))):
+        depth = view.depth_m[::_SAMPLE_PX, ::_SAMPLE_PX]
+        if (depth > 0).any():
+            medians.append(geo_from_model.scale * float(np.median(depth[depth > 0])) / view.pinhole.fx)
+    if not medians:
+        raise DegenerateGeometryError(
+            f"none of {len(views)} training views shows a surface on which the others agree: train longer, or with "
+            "--dense"
+        )
+    return float(np.median(medians))
+
+
+def fusion_settings(
+    views: SurfaceViews, geo_from_model: Similarity, min_views: int, spacing_m: float | None = None
+) -> FusionSettings:
+    """Return the settings for a cloud; no side of the voxels: the width of a pixel on the surface."""
+    pixel_m = pixel_on_surface_m(views, geo_from_model)
+    return FusionSettings(spacing_m or pixel_m, _COARSEST * pixel_m, min_views)
+
+
+def fused_squares(
+    views: SurfaceViews, geo_from_model: Similarity, settings: FusionSettings, progress: Progress = SILENT
+) -> Iterator[SurfaceCloud]:
+    """Yield the cloud square by square of the plan, in bounded memory, from views with colours.
+
+    1. Pixels of all views that show a smooth surface are the candidates.
+    2. Candidates of a voxel are replaced by their mean, with the mean of their normals and colours.
+    3. Points on which fewer than `min_views` views agree are dropped, those that too many views look through, and
+       those whose σ exceeds a pixel.
+    4. Each point moves along its normal to the mean surface of the views that agree.
+    5. The moved points are thinned again, since layers of one surface meet.
+    """
+    step = max(1, int(settings.spacing_m / pixel_on_surface_m(views, geo_from_model)))
+    squares = _plan(views, geo_from_model, settings, step)
+    with progress.task("squares", len(squares)) as task:
+        for square, shown_by in squares:
+            found = (
+                _candidates(views.view(int(number)), geo_from_model, square, settings, step) for number in shown_by
+            )
+            parts = [part for part in found if part is not None]
+            if parts:
+                yield _fuse(joined_rows(parts), views, geo_from_model, square, settings)
+            task.advance()
+
+
+@dataclass(frozen=True)
+class _Candidates:
+    """As `SurfaceCloud`, with the width (P,) of a pixel at the point."""
 
     position: FloatArray
     normal: FloatArray
     rgb: ByteArray
     pixel_m: FloatArray
 
-    def __len__(self) -> int:
-        """Return the number of points."""
-        return len(self.position)
-
-    @staticmethod
-    def concatenate(parts: list[Candidates]) -> Candidates:
-        """Return the points of all parts; at least one part."""
-        return Candidates(*(np.concatenate([vars(part)[name] for part in parts]) for name in vars(parts[0])))
-
-    def part(self, rows: IntArray | BoolArray) -> Candidates:
-        """Return the points of the given rows."""
-        return Candidates(*(values[rows] for values in vars(self).values()))
-
 
 @dataclass(frozen=True)
-class Square:
+class _Square:
     """Square of the plan, east and north in `geo`, half open towards north and east."""
 
     corner_m: tuple[float, float]
@@ -71,26 +137,15 @@ class Square:
         return np.asarray(((offset >= -margin_m) & (offset < self.side_m + margin_m)).all(axis=-1))
 
 
-@dataclass(frozen=True)
-class Look:
-    """Pixels that are looked at.
+def _candidates(
+    view: SurfaceView, geo_from_model: Similarity, square: _Square, settings: FusionSettings, step: int
+) -> _Candidates | None:
+    """Return the candidates of a view in a square and its margin, in every `step`-th row and column.
 
-    Attributes:
-        square: in `geo`.
-        margin_m: around the square.
-        coarsest_m: pixels that are wider on the surface are left out.
-        step: every `step`-th row and column counts.
+    None: the view shows none of it.
     """
-
-    square: Square
-    margin_m: float
-    coarsest_m: float
-    step: int
-
-
-def candidates_in(view: SurfaceView, geo_from_model: Similarity, look: Look) -> Candidates | None:
-    """Return the candidates of a view with colours in a square and its margin; None: it shows none of it."""
-    window = _window(view, geo_from_model, look)
+    margin_m = _MARGIN * settings.spacing_m
+    window = _window(view, geo_from_model, square, margin_m)
     if window is None or view.rgb is None:
         return None
     rows, columns = window
@@ -104,19 +159,20 @@ def candidates_in(view: SurfaceView, geo_from_model: Similarity, look: Look) -> 
     distance = np.maximum(np.linalg.norm(towards, axis=-1), np.finfo(np.float64).tiny)
     cosine = np.einsum("hwi,hwi->hw", normal, towards) / distance
     pixel_m = geo_from_model.scale * depth / view.pinhole.fx
-    chosen = known & (np.abs(cosine) > _GRAZING) & (pixel_m < look.coarsest_m)
-    chosen &= look.square.holds(point, look.margin_m)
-    chosen &= (row % look.step == look.step // 2) & (column % look.step == look.step // 2)
+    chosen = known & (np.abs(cosine) > _GRAZING) & (pixel_m < settings.coarsest_m) & square.holds(point, margin_m)
+    chosen &= (row % step == step // 2) & (column % step == step // 2)
     towards_camera = normal[chosen] * np.sign(cosine[chosen])[:, None]
-    return Candidates(point[chosen], towards_camera, view.rgb[rows, columns][chosen], pixel_m[chosen])
+    return _Candidates(point[chosen], towards_camera, view.rgb[rows, columns][chosen], pixel_m[chosen])
 
 
-def _window(view: SurfaceView, geo_from_model: Similarity, look: Look) -> tuple[slice, slice] | None:
+def _window(
+    view: SurfaceView, geo_from_model: Similarity, square: _Square, margin_m: float
+) -> tuple[slice, slice] | None:
     """Return rows and columns that hold the pixels of a view in a square, but for slivers of a few pixels."""
     height, width = view.depth_m.shape
     rows, columns = np.nonzero(view.depth_m[::_LOOK_PX, ::_LOOK_PX])
     rows, columns = _LOOK_PX * rows, _LOOK_PX * columns
-    inside = look.square.holds(geo_from_model.apply(view.points(rows, columns)), look.margin_m)
+    inside = square.holds(geo_from_model.apply(view.points(rows, columns)), margin_m)
     if not inside.any():
         return None
     spare = _LOOK_PX + _REACH_PX
@@ -150,54 +206,18 @@ def _normals(point: FloatArray, depth: FloatArray) -> tuple[FloatArray, BoolArra
     return normal, known
 
 
-# Memory: candidates of one square, of about 100 bytes each, with the copies that sorting them makes.
-_MOST_CANDIDATES = 4_000_000
-_SAMPLE_PX = 8  # between the pixels from which sizes and extent are estimated
-_LEAST_VOXELS = 16  # along the side of a square
+def _plan(
+    views: SurfaceViews, geo_from_model: Similarity, settings: FusionSettings, step: int
+) -> list[tuple[_Square, IntArray]]:
+    """Return the squares that hold the surface, and the numbers of the views that may show each.
 
-
-@dataclass(frozen=True)
-class PlannedSquare:
-    """Square of the plan with the numbers of the views that may show it."""
-
-    square: Square
-    views: IntArray
-
-
-def pixel_on_surface_m(views: SurfaceViews, geo_from_model: Similarity) -> float:
-    """Return the median width of a pixel on the surface in metres, over the views' medians.
-
-    Raises:
-        DegenerateGeometryError: no view shows a surface.
+    None has more candidates than memory has room for. Squares consist of whole voxels, so that no voxel is cut.
     """
-    medians = []
-    for view in map(views.view, range(len(views))):
-        depth = view.depth_m[::_SAMPLE_PX, ::_SAMPLE_PX]
-        if (depth > 0).any():
-            medians.append(geo_from_model.scale * float(np.median(depth[depth > 0])) / view.pinhole.fx)
-    if not medians:
-        raise DegenerateGeometryError(
-            f"none of {len(views)} training views shows a surface on which the others agree: train longer, or with "
-            "--dense"
-        )
-    return float(np.median(medians))
-
-
-def plan_squares(
-    views: SurfaceViews, geo_from_model: Similarity, spacing_m: float, coarsest_m: float, step: int
-) -> list[PlannedSquare]:
-    """Return the squares that hold the surface, none with more candidates than memory has room for.
-
-    Args:
-        views: surface of the training views.
-        geo_from_model: similarity.
-        spacing_m: side of the voxels; squares consist of whole voxels, so that no voxel is cut.
-        coarsest_m: pixels that are wider on the surface do not count.
-        step: every `step`-th row and column of a view gives candidates.
-    """
-    look = max(_SAMPLE_PX, step)
-    unit_m = _LEAST_VOXELS * spacing_m
-    shown = [_cells(views.view(number), geo_from_model, unit_m, coarsest_m, look) for number in range(len(views))]
+    look, unit_m = max(_SAMPLE_PX, step), _LEAST_VOXELS * settings.spacing_m
+    shown = [
+        _cells(view, geo_from_model, unit_m, settings.coarsest_m, look)
+        for view in map(views.view, range(len(views)))
+    ]
     cells = np.concatenate([cell for cell, _ in shown]) if shown else np.zeros((0, 2), np.int64)
     if not len(cells):
         return []
@@ -214,8 +234,8 @@ def plan_squares(
     # A margin around a square is narrower than a cell: views of the neighbouring cells may show it too.
     low, high = ((cells - 1) >> level, (cells + 1) >> level)
     return [
-        PlannedSquare(
-            Square((float(place[0] * side_m), float(place[1] * side_m)), side_m),
+        (
+            _Square((float(place[0] * side_m), float(place[1] * side_m)), side_m),
             np.unique(owner[((low <= place) & (place <= high)).all(axis=1)]),
         )
         for place in squares
@@ -234,103 +254,11 @@ def _cells(
     return cell, count
 
 
-_MARGIN = 4  # spacings around a square: fusion moves points by less, mostly
-_MOST_THROUGH = 0.5  # largest number of views that look through a point, as a part of those that agree
-# σ of a ray through a photograph, in pixels of the training size: on simulated flights, this and the views' own
-# disagreement explain the distances to the true surface at 68 of 100 points.
-_SIGMA_PX = 0.25
-# A point is left out if its σ exceeds this part of the pixel: beyond, one point in five was a floater on simulated
-# flights.
-_RESOLVED = 1.0
-_COARSEST = 2.0  # width of the pixels that are used, in medians: beyond lies the background, which few rays fix
-
-
-@dataclass(frozen=True)
-class FusionSettings:
-    """Settings of the fusion.
-
-    Attributes:
-        spacing_m: side of the voxels.
-        coarsest_m: wider pixels are left out.
-        min_views: least number of views that agree on a point.
-    """
-
-    spacing_m: float
-    coarsest_m: float
-    min_views: int
-
-
-@dataclass(frozen=True)
-class SurfaceCloud:
-    """P points of the surface in `geo`.
-
-    Attributes:
-        position: (P, 3) metres.
-        normal: (P, 3) unit vectors towards the cameras.
-        rgb: (P, 3) uint8.
-        sigma_m: (P,) σ of the surface along the normal, without that of the georeference.
-    """
-
-    position: FloatArray
-    normal: FloatArray
-    rgb: ByteArray
-    sigma_m: FloatArray
-
-    def __len__(self) -> int:
-        """Return the number of points."""
-        return len(self.position)
-
-
-def fusion_settings(
-    views: SurfaceViews, geo_from_model: Similarity, min_views: int, spacing_m: float | None = None
-) -> FusionSettings:
-    """Return the settings for a cloud.
-
-    Args:
-        views: surface of the training views.
-        geo_from_model: similarity.
-        min_views: least number of views that agree on a point.
-        spacing_m: side of the voxels; None: the width of a pixel on the surface.
-    """
-    pixel_m = pixel_on_surface_m(views, geo_from_model)
-    return FusionSettings(spacing_m or pixel_m, _COARSEST * pixel_m, min_views)
-
-
-def fused_squares(
-    views: SurfaceViews, geo_from_model: Similarity, settings: FusionSettings, progress: Progress = SILENT
-) -> Iterator[SurfaceCloud]:
-    """Yield the cloud square by square of the plan, in bounded memory.
-
-    1. Pixels of all views that show a smooth surface are the candidates.
-    2. Candidates of a voxel are replaced by their mean, with the mean of their normals and colours.
-    3. Points on which fewer than `min_views` views agree are dropped, those that too many views look through, and
-       those whose σ exceeds a pixel.
-    4. Each point moves along its normal to the mean surface of the views that agree.
-    5. The moved points are thinned again, since layers of one surface meet.
-
-    Args:
-        views: surface of the training views, with colours.
-        geo_from_model: similarity.
-        settings: spacing, and what counts.
-        progress: shows the squares.
-    """
-    step = max(1, int(settings.spacing_m / pixel_on_surface_m(views, geo_from_model)))
-    squares = plan_squares(views, geo_from_model, settings.spacing_m, settings.coarsest_m, step)
-    with progress.task("squares", len(squares)) as task:
-        for planned in squares:
-            look = Look(planned.square, _MARGIN * settings.spacing_m, settings.coarsest_m, step)
-            found = (candidates_in(views.view(int(number)), geo_from_model, look) for number in planned.views)
-            parts = [part for part in found if part is not None]
-            if parts:
-                yield fuse(Candidates.concatenate(parts), views, geo_from_model, planned.square, settings)
-            task.advance()
-
-
-def fuse(
-    candidates: Candidates,
+def _fuse(
+    candidates: _Candidates,
     views: SurfaceViews,
     geo_from_model: Similarity,
-    square: Square,
+    square: _Square,
     settings: FusionSettings,
 ) -> SurfaceCloud:
     """Return the cloud of a square from the candidates in it and in its margin."""

@@ -1,7 +1,4 @@
-"""LiDAR cloud of the scene: points with the planes around them, in `model`.
-
-Track of a scanner: its place at the time of each point of a LiDAR cloud.
-"""
+"""LiDAR cloud of the scene: points with the planes around them, in `model`, and the track of its scanner."""
 
 from __future__ import annotations
 
@@ -17,8 +14,9 @@ from pipelines.core.types import ByteArray, FloatArray, IntArray
 from pipelines.formats.trajectory_csv import read_trajectory
 from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import Origin, ecef_from_lla, enu_from_ecef
+from pipelines.geometry.footprints import rows_of
 from pipelines.geometry.trajectory import Trajectory
-from pipelines.surface.measured_cloud import CloudFiles, Thinning, read_thinned
+from pipelines.surface.measured_cloud import CloudReader, Thinning, read_thinned
 from pipelines.survey.options import CloudCrs
 from pipelines.survey.scene import Scene
 from pipelines.survey.survey import Survey
@@ -36,12 +34,9 @@ class ScannerTrack:
 
     @classmethod
     def read(cls, path: Path, stated: CloudCrs, origin: Origin) -> ScannerTrack:
-        """Return the track of a CSV file: time, and latitude, longitude, altitude or x, y, z.
+        """Return the track of a CSV file on the clock of the cloud's points.
 
-        Args:
-            path: of the file, on the clock of the cloud's points.
-            stated: CRS and vertical datum of the cloud, which those of a track without a CRS are.
-            origin: of geo.
+        The file has time, and latitude, longitude, altitude or x, y, z. A track without a CRS has the cloud's.
 
         Raises:
             InputError: an unreadable file, or one without times.
@@ -110,23 +105,12 @@ class LidarCloud:
     scanner_in_model: FloatArray | None = None
 
     def __len__(self) -> int:
-        """Return the number of points."""
         return len(self.position_in_model)
 
     def part(self, rows: IntArray | np.ndarray) -> LidarCloud:
-        """Return the points of some rows."""
-        return LidarCloud(
-            self.position_in_model[rows],
-            self.normal_in_model[rows],
-            self.roughness_m[rows],
-            self.reach_m[rows],
-            self.classification[rows],
-            self.voxel_m,
-            None if self.scanner_in_model is None else self.scanner_in_model[rows],
-        )
+        return rows_of(self, rows)
 
     def moved(self, shift: FloatArray) -> LidarCloud:
-        """Return the cloud shifted by a vector (3,)."""
         scanner = None if self.scanner_in_model is None else self.scanner_in_model + shift
         return replace(self, position_in_model=self.position_in_model + shift, scanner_in_model=scanner)
 
@@ -140,7 +124,7 @@ class LidarCloud:
 
 
 def read_cloud(
-    files: CloudFiles,
+    files: CloudReader,
     scene: Scene,
     survey: Survey,
     pixel_m: float,
@@ -148,15 +132,7 @@ def read_cloud(
     progress: Progress = SILENT,
     track: ScannerTrack | None = None,
 ) -> LidarCloud:
-    """Return the points of the clouds in the scene, as dense as the photographs resolve it.
-
-    Args:
-        files: the clouds.
-        scene: cameras and SfM points.
-        survey: has the origin of `geo`.
-        pixel_m: size of a pixel of the photographs on the surface.
-        progress: shows the points read.
-        track: of the scanner; None: not known.
+    """Return the points of the clouds in the scene, as dense as pixels of `pixel_m` on the surface resolve it.
 
     Raises:
         InputError: as `read_thinned` and `ScannerTrack.at`, or too few points in the scene.

@@ -1,11 +1,4 @@
-"""Photographs with known cameras, as stereo compares them.
-
-Numba kernels of photometric matching; they hold no GIL, so that threads match several views at once.
-
-All loops run along image rows and without branches: LLVM makes vector instructions of them. Floating-point flags
-exclude NaN and infinity, which callers therefore keep out.
-
-Photometric matching of a photograph with its neighbours, hypothesis by hypothesis; the best hypothesis wins.
+"""Photometric matching of a photograph with its neighbours, hypothesis by hypothesis; the best hypothesis wins.
 
 1. Normalised cross-correlation compares photographs: exposure does not change it.
 2. The neighbours that agree best count (Kang, Szeliski & Chai, doi 10.1109/CVPR.2001.990462): an obstacle hides a
@@ -13,6 +6,10 @@ Photometric matching of a photograph with its neighbours, hypothesis by hypothes
 3. A guided filter averages the correlations of each hypothesis, but not across edges of the photograph (Rhemann et
    al., doi 10.1109/CVPR.2011.5995372). Ground without texture needs a wide window; beside the edge of a roof a wide
    window sees the roof.
+
+The kernels hold no GIL, so that threads match several views at once. All loops run along image rows and without
+branches: LLVM makes vector instructions of them. Floating-point flags exclude NaN and infinity, which callers
+therefore keep out.
 """
 
 from __future__ import annotations
@@ -25,50 +22,9 @@ import numpy as np
 from numba import njit
 
 from pipelines.core.types import BoolArray, Float32Array, FloatArray
-from pipelines.geometry.cameras import Pinhole
-
-
-@dataclass(frozen=True)
-class StereoCamera:
-    """Undistorted camera in a metric frame `world`.
-
-    Attributes:
-        pinhole: of H × W pixels.
-        cam_from_world: (3, 3) rotation.
-        center_in_world: (3,).
-    """
-
-    pinhole: Pinhole
-    cam_from_world: FloatArray
-    center_in_world: FloatArray
-
-    def rays(self) -> FloatArray:
-        """Return viewing rays (H, W, 3) in `world`, of length one along the optical axis."""
-        x, y = np.meshgrid(np.arange(self.pinhole.width) + 0.5, np.arange(self.pinhole.height) + 0.5)
-        return np.asarray(self.pinhole.rays(np.stack([x, y], axis=-1)) @ self.cam_from_world)
-
-
-@dataclass(frozen=True)
-class StereoView:
-    """Photograph with its camera.
-
-    Attributes:
-        camera: of H × W pixels.
-        grey: (H, W), 1 … 256; 0 outside the photograph's valid part.
-    """
-
-    camera: StereoCamera
-    grey: Float32Array
-
-
-def opencv_camera_matrix(camera: Pinhole) -> FloatArray:
-    """Return the camera matrix (3, 3) with pixels counted from the centre of the first, as OpenCV does."""
-    return np.array([[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]])
-
+from pipelines.geometry.cameras import Pinhole, ViewPose
 
 # ruff: noqa: PLR0917  (kernels take arrays, not objects)
-
-
 _FAST = {"contract", "nsz", "arcp", "reassoc", "nnan", "ninf"}
 _UNSEEN = np.float32(-1.0)  # correlation outside a neighbour's image
 NOISE_VARIANCE = np.float32(0.3)  # grey levels²: windows that vary less than the sensor's noise do not correlate
@@ -130,11 +86,7 @@ def _sample_row(grey: Any, stride: int, place: Any, fraction: Any, miss: Any, sh
 def _add_across(reference: Any, padded: Any, half: int, sums: Any) -> None:
     """Write Σ other, Σ other², Σ reference · other over windows along a row into sums (3, W).
 
-    Args:
-        reference: (W + 2 half,) row of the reference, mirrored at its ends.
-        padded: (W + 2 half,) likewise of the neighbour, as the reference sees it.
-        half: of the window.
-        sums: output.
+    Both rows (W + 2 half,) are mirrored at their ends; `padded` is that of the neighbour, as the reference sees it.
     """
     width = sums.shape[1]
     for k in range(2 * half + 1):
@@ -167,7 +119,6 @@ def _correlate_row(ring: Any, shown: Any, mean: Any, inverse_sigma: Any, total: 
         mean: (W,) of the reference's windows.
         inverse_sigma: (W,) of the reference's windows.
         total: (3, W) scratch.
-        score: output.
     """
     window, width = ring.shape[0], shown.shape[0]
     share = np.float32(1.0 / (window * window))
@@ -273,20 +224,26 @@ _FURTHEST_M = 1e7  # hypotheses beyond are as good as infinite, and kernels need
 
 
 @dataclass(frozen=True)
+class StereoView:
+    """Photograph (H, W) with its camera; grey levels 1 … 256, 0 outside the photograph's valid part."""
+
+    camera: ViewPose
+    grey: Float32Array
+
+
+def camera_matrix(camera: Pinhole, offset_px: float = 0.0) -> FloatArray:
+    """Return the camera matrix (3, 3); OpenCV counts pixels from the centre of the first, an offset of 0.5."""
+    return np.array([[camera.fx, 0, camera.cx - offset_px], [0, camera.fy, camera.cy - offset_px], [0, 0, 1]])
+
+
+@dataclass(frozen=True)
 class MatchSettings:
-    """Settings of the comparison.
+    """Settings of the comparison."""
 
-    Attributes:
-        window_px: side of the correlation window, odd.
-        reach_px: radius of the guided filter that averages correlations.
-        edge_grey: step in grey levels across which the filter does not average.
-        views: number of neighbours that count, the best of all.
-    """
-
-    window_px: int = 5
-    reach_px: int = 6
-    edge_grey: float = 10.0
-    views: int = 3
+    window_px: int = 5  # side of the correlation window, odd
+    reach_px: int = 6  # radius of the guided filter that averages correlations
+    edge_grey: float = 10.0  # step in grey levels across which the filter does not average
+    views: int = 3  # number of neighbours that count, the best of all
 
     @property
     def support_px(self) -> int:
@@ -295,13 +252,7 @@ class MatchSettings:
 
 
 class Matcher:
-    """Compares a photograph (H, W) with its neighbours under hypotheses of depth.
-
-    Args:
-        reference: view whose surface is wanted.
-        neighbours: one or more views of the same place from elsewhere.
-        settings: of the comparison.
-    """
+    """Compares a photograph (H, W) with its neighbours under hypotheses of depth."""
 
     def __init__(self, reference: StereoView, neighbours: list[StereoView], settings: MatchSettings) -> None:
         grey, side = reference.grey, (settings.window_px, settings.window_px)
@@ -321,12 +272,10 @@ class Matcher:
         self._guided: tuple[slice, cv2.ximgproc.GuidedFilter] | None = None
 
     def __call__(self, depth: Float32Array, rows: slice | None = None) -> Float32Array:
-        """Return the score (h, W) of a hypothesis in some rows of the view.
+        """Return the score (h, W) of depths (H, W) along the optical axis in some rows of the view; None: all.
 
-        Args:
-            depth: (H, W) along the optical axis; not positive: no hypothesis, UNSEEN.
-            rows: first row and the row after the last; None: all. Rows within the settings' `support_px` of either
-                end are less exact.
+        Depths that are not positive are no hypothesis: UNSEEN. Rows within the settings' `support_px` of either end
+        are less exact.
         """
         part = rows or slice(0, len(self._grey))
         seen = (depth > 0) & (depth < _FURTHEST_M)
@@ -362,30 +311,23 @@ def _stacked(images: list[Float32Array]) -> tuple[Float32Array, Float32Array]:
 def _projections(reference: StereoView, neighbours: list[StereoView]) -> tuple[Float32Array, Float32Array]:
     """Return matrices (n, 3, 3) and vectors (n, 3) that project pixels with depths into neighbours."""
     camera = reference.camera
-    world_from_pixel = camera.cam_from_world.T @ np.linalg.inv(opencv_camera_matrix(camera.pinhole))
+    model_from_pixel = camera.cam_from_model.T @ np.linalg.inv(camera_matrix(camera.pinhole, 0.5))
     per_depth, starts = [], []
     for view in neighbours:
-        pixel_from_world = opencv_camera_matrix(view.camera.pinhole) @ view.camera.cam_from_world
-        per_depth.append(pixel_from_world @ world_from_pixel)
-        starts.append(pixel_from_world @ (camera.center_in_world - view.camera.center_in_world))
+        pixel_from_model = camera_matrix(view.camera.pinhole, 0.5) @ view.camera.cam_from_model
+        per_depth.append(pixel_from_model @ model_from_pixel)
+        starts.append(pixel_from_model @ (camera.center_in_model - view.camera.center_in_model))
     return np.array(per_depth, np.float32), np.array(starts, np.float32)
 
 
 @dataclass(frozen=True)
 class Winner:
-    """Best of a sequence of hypotheses at each pixel.
+    """Best of a sequence of hypotheses at each pixel (H, W)."""
 
-    Attributes:
-        hypothesis: (H, W) its number, with a fraction.
-        score: (H, W) correlation, −1 … 1.
-        curvature: (H, W) minus the second derivative of the score by the number.
-        inner: (H, W) whether scores of the hypotheses before and after exist.
-    """
-
-    hypothesis: FloatArray
-    score: Float32Array
-    curvature: Float32Array
-    inner: BoolArray
+    hypothesis: FloatArray  # its number, with a fraction
+    score: Float32Array  # correlation, −1 … 1
+    curvature: Float32Array  # minus the second derivative of the score by the number
+    inner: BoolArray  # whether scores of the hypotheses before and after exist
 
 
 class WinnerTakesAll:

@@ -23,7 +23,7 @@ from pipelines.formats.cloud_ply import CloudChunk, CloudFile, open_cloud_ply
 from pipelines.formats.las import open_las
 from pipelines.geodesy.crs import PointCrs, parse_crs
 from pipelines.geodesy.enu import Origin, ecef_from_lla, enu_from_ecef
-from pipelines.geometry.footprints import voxel_keys
+from pipelines.geometry.footprints import joined_rows, rows_of, voxel_keys
 from pipelines.survey.options import CLOUD_SUFFIXES, CloudCrs
 
 log = logging.getLogger(__name__)
@@ -38,51 +38,26 @@ _SPACING_CHANGE = 2**0.5  # of the voxels, where the points would become too man
 
 @dataclass(frozen=True)
 class Thinning:
-    """How many points to keep, and where.
-
-    Attributes:
-        voxel_m: side of the voxels, of which each keeps one point.
-        most: limit of the points; beyond, the voxels grow.
-        low_in_geo, high_in_geo: (3,) corners of the box outside which points are dropped; None: no limit.
-    """
+    """How many points to keep, and where: one a voxel, in a box."""
 
     voxel_m: float
-    most: int = 20_000_000
-    low_in_geo: FloatArray | None = None
-    high_in_geo: FloatArray | None = None
+    most: int = 20_000_000  # limit of the points; beyond, the voxels grow
+    low_in_geo: FloatArray | float = -np.inf  # (3,) corners of the box outside which points are dropped
+    high_in_geo: FloatArray | float = np.inf
 
 
 @dataclass(frozen=True)
 class MeasuredCloud:
-    """P points in geo.
+    """P points in geo."""
 
-    Attributes:
-        position_in_geo: (P, 3) metres.
-        classification: (P,) class of LAS; 0: never classified.
-        weight: (P,) int64, number of measured points in its voxel.
-        gps_time_s: (P,) time of the file; NaN: none.
-        voxel_m: side of the voxels at the end.
-    """
-
-    position_in_geo: FloatArray
-    classification: ByteArray
-    weight: IntArray
-    gps_time_s: FloatArray
-    voxel_m: float
+    position_in_geo: FloatArray  # (P, 3) metres
+    classification: ByteArray  # (P,) class of LAS; 0: never classified
+    weight: IntArray  # (P,) int64, number of measured points in its voxel
+    gps_time_s: FloatArray  # (P,) time of the file; NaN: none
+    voxel_m: float  # side of the voxels at the end
 
     def __len__(self) -> int:
-        """Return the number of points."""
         return len(self.position_in_geo)
-
-    def part(self, rows: IntArray | np.ndarray) -> MeasuredCloud:
-        """Return the points of some rows."""
-        return MeasuredCloud(
-            self.position_in_geo[rows],
-            self.classification[rows],
-            self.weight[rows],
-            self.gps_time_s[rows],
-            self.voxel_m,
-        )
 
 
 @dataclass
@@ -96,15 +71,15 @@ class ReadTally:
     outside: int = 0
 
 
-class CloudFiles:
+class CloudReader:
     """Files of one or several clouds, whose headers and CRS have been checked.
 
     Args:
         path: file, or folder whose LAS, LAZ and PLY files are taken, also from its subfolders.
-        stated: CRS that the user states.
 
     Attributes:
         count: number of points.
+        crs_names: names of the CRSs of the files, without repetition.
         assumptions: sentences on what the files do not say.
 
     Raises:
@@ -117,23 +92,15 @@ class CloudFiles:
         self.count = sum(file.count for file in self._files)
         self.tally = ReadTally()
         silent = {_short_name(crs.name) for crs in self._crs if not crs.vertical.stated}
+        self.crs_names = tuple(dict.fromkeys(_short_name(crs.name) for crs in self._crs))
         self.assumptions = tuple(
             f"the heights of the cloud were taken as ellipsoidal: {name} has no vertical part "
             f"({stated.flag}-vertical states one)"
             for name in sorted(silent)
         )
 
-    @property
-    def crs_names(self) -> tuple[str, ...]:
-        """Names of the CRSs of the files, without repetition."""
-        return tuple(dict.fromkeys(_short_name(crs.name) for crs in self._crs))
-
     def chunks(self, origin: Origin, progress: Progress = SILENT) -> Iterator[MeasuredCloud]:
         """Yield all valid points in geo, a chunk at a time and not thinned.
-
-        Args:
-            origin: of geo.
-            progress: shows the points read.
 
         Raises:
             InputError: a damaged file, points outside their CRS, or a missing grid.
@@ -147,7 +114,9 @@ class CloudFiles:
                         lla = (serving or crs).lla_from_xyz(chunk.position, path=file.path)
                         # One operation serves the file: neighbours in two chunks keep their distance.
                         serving = serving or crs.serving(lla)
-                        yield _in_geo(chunk, lla, origin)
+                        place, count = enu_from_ecef(ecef_from_lla(lla), origin), len(chunk)
+                        time = np.full(count, np.nan) if chunk.gps_time_s is None else chunk.gps_time_s
+                        yield MeasuredCloud(place, chunk.classification, np.ones(count, np.int64), time, 0.0)
                     task.advance(len(raw))
 
     def _valid(self, chunk: CloudChunk, path: Path) -> CloudChunk:
@@ -160,101 +129,67 @@ class CloudFiles:
         self.tally.noise += int(noise.sum())
         self.tally.withheld += int((chunk.withheld & ~noise).sum())
         self.tally.overlap += int((chunk.overlap & ~noise & ~chunk.withheld).sum())
-        return CloudChunk(
-            chunk.position[keep],
-            chunk.classification[keep],
-            chunk.overlap[keep],
-            chunk.withheld[keep],
-            None if chunk.gps_time_s is None else chunk.gps_time_s[keep],
-        )
+        return rows_of(chunk, keep)
 
 
 def read_thinned(
-    files: CloudFiles, origin: Origin, thinning: Thinning, progress: Progress = SILENT
+    files: CloudReader, origin: Origin, thinning: Thinning, progress: Progress = SILENT
 ) -> MeasuredCloud:
     """Return one point of each voxel that the clouds meet, the first.
 
     Memory holds at most three times `thinning.most` points.
 
-    Args:
-        files: the clouds.
-        origin: of geo.
-        thinning: voxels, limit and box.
-        progress: shows the points read.
-
     Raises:
-        InputError: as `CloudFiles.chunks`; or no point lies in the box.
+        InputError: as `CloudReader.chunks`; or no point lies in the box.
     """
     voxel_m, held = thinning.voxel_m, 0
     waiting: list[MeasuredCloud] = []
     for chunk in files.chunks(origin, progress):
-        inside = _inside(chunk.position_in_geo, thinning)
+        place = chunk.position_in_geo
+        inside = np.asarray(((place >= thinning.low_in_geo) & (place <= thinning.high_in_geo)).all(axis=1))
         files.tally.outside += int((~inside).sum())
-        part = _thinned([chunk.part(inside)], voxel_m)
+        part = _thinned([rows_of(chunk, inside)], voxel_m)
         waiting, held = [*waiting, part], held + len(part)
         if held > 2 * thinning.most:
-            merged, voxel_m = _limited(waiting, voxel_m, thinning.most)
-            waiting, held = [merged], len(merged)
+            merged = _limited(waiting, voxel_m, thinning.most)
+            waiting, held, voxel_m = [merged], len(merged), merged.voxel_m
     if not held:
         raise InputError(
             f"none of the {files.tally.read} points lies where the photographs look: another place, or a wrong CRS "
             f"({', '.join(files.crs_names)})"
         )
-    cloud, voxel_m = _limited(waiting, voxel_m, thinning.most)
+    cloud = _limited(waiting, voxel_m, thinning.most)
     log.info(
         "lidar: %d of %d points kept in voxels of %.3f m; dropped: %d noise, %d withheld, %d overlap, %d outside",
-        len(cloud), files.tally.read, voxel_m, files.tally.noise, files.tally.withheld, files.tally.overlap,
+        len(cloud), files.tally.read, cloud.voxel_m, files.tally.noise, files.tally.withheld, files.tally.overlap,
         files.tally.outside,
     )  # fmt: skip
     return cloud
 
 
-def _limited(parts: list[MeasuredCloud], voxel_m: float, most: int) -> tuple[MeasuredCloud, float]:
-    """Return the points of all parts, thinned until they are no more than `most`, and the side of the voxels."""
+def _limited(parts: list[MeasuredCloud], voxel_m: float, most: int) -> MeasuredCloud:
+    """Return the points of all parts, thinned until they are no more than `most`."""
     cloud = _thinned(parts, voxel_m)
     while len(cloud) > most:
-        voxel_m *= _SPACING_CHANGE
-        cloud = _thinned([cloud], voxel_m)
-    return cloud, voxel_m
+        cloud = _thinned([cloud], cloud.voxel_m * _SPACING_CHANGE)
+    return cloud
 
 
 def _thinned(parts: list[MeasuredCloud], voxel_m: float) -> MeasuredCloud:
     """Return the first point of each voxel, with the number of points in the voxel."""
-    position = np.concatenate([part.position_in_geo for part in parts])
+    cloud = replace(joined_rows(parts), voxel_m=voxel_m)
+    position = cloud.position_in_geo
     if not len(position):
-        return replace(parts[0], voxel_m=voxel_m)
+        return cloud
     low, high = position.min(axis=0), position.max(axis=0)
     if not (high - low < _KEY_SIDE * voxel_m).all():
         reach_m = float((high - low).max())
         raise InputError(f"points {reach_m / 1000:.0f} km apart do not fit into voxels of {voxel_m:g} m")
     keys = voxel_keys(position, voxel_m)
     _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
-    weight = np.bincount(inverse, np.concatenate([part.weight for part in parts])).astype(np.int64)
+    weight = np.bincount(inverse, cloud.weight).astype(np.int64)
     order = np.argsort(first)
-    rows = first[order]
-    return MeasuredCloud(
-        position[rows],
-        np.concatenate([part.classification for part in parts])[rows],
-        weight[order],
-        np.concatenate([part.gps_time_s for part in parts])[rows],
-        voxel_m,
-    )
-
-
-def _inside(position: FloatArray, thinning: Thinning) -> np.ndarray:
-    inside = np.ones(len(position), dtype=bool)
-    if thinning.low_in_geo is not None:
-        inside &= (position >= thinning.low_in_geo).all(axis=1)
-    if thinning.high_in_geo is not None:
-        inside &= (position <= thinning.high_in_geo).all(axis=1)
-    return inside
-
-
-def _in_geo(chunk: CloudChunk, lla: FloatArray, origin: Origin) -> MeasuredCloud:
-    count = len(chunk)
-    time = np.full(count, np.nan) if chunk.gps_time_s is None else chunk.gps_time_s
-    place = enu_from_ecef(ecef_from_lla(lla), origin)
-    return MeasuredCloud(place, chunk.classification, np.ones(count, np.int64), time, 0.0)
+    return replace(rows_of(cloud, first[order]), weight=weight[order])
 
 
 def _short_name(name: str) -> str:
@@ -265,19 +200,19 @@ def _short_name(name: str) -> str:
 
 def _paths(path: Path, stated: CloudCrs) -> list[Path]:
     """Return the files of a path in the order of their names."""
-    if path.is_dir():
-        files = sorted(
-            file
-            for file in path.rglob("*")
-            if file.suffix.lower() in CLOUD_SUFFIXES
-            and not any(part[0] == "." for part in file.relative_to(path).parts)
-        )
-        if not files:
-            raise InputError("no LAS, LAZ or PLY file in this folder", path=path, field=stated.flag)
-        if len(files) > _MOST_FILES:
-            raise InputError(f"{len(files)} files (limit {_MOST_FILES})", path=path, field=stated.flag)
-        return files
-    return [path]
+    if not path.is_dir():
+        return [path]
+    files = sorted(
+        file
+        for file in path.rglob("*")
+        if file.suffix.lower() in CLOUD_SUFFIXES
+        and not any(part[0] == "." for part in file.relative_to(path).parts)
+    )
+    if not files:
+        raise InputError("no LAS, LAZ or PLY file in this folder", path=path, field=stated.flag)
+    if len(files) > _MOST_FILES:
+        raise InputError(f"{len(files)} files (limit {_MOST_FILES})", path=path, field=stated.flag)
+    return files
 
 
 def _opened(path: Path, stated: CloudCrs) -> CloudFile:

@@ -1,13 +1,8 @@
 """Points of the trained model's surface: under a line of sight, or behind the marks of a surveyed point.
 
-A viewer that picks the centres of Gaussians, or the depth of its own picture, measures other points than
-`evaluate` does. Here the depth under a line of sight is that on which the training views agree, each read off its
-own render as `evaluate` reads it (`surface.picking`).
-
-Surveyed points on the rendered surface: places of the Gaussians' surface behind their marks.
-
-This is the accuracy for a reader who intersects the rendered surface. A viewer that picks the centres of Gaussians
-measures other points.
+A viewer that picks the centres of Gaussians, or the depth of its own picture, measures other points. Here the depth
+under a line of sight is that on which the training views agree, each read off its own render, as `evaluate` reads
+it behind the marks. The accuracy is that for a reader who intersects the rendered surface.
 """
 
 from __future__ import annotations
@@ -17,12 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.core.types import BoolArray, FloatArray, IntArray
-from pipelines.geometry.cameras import Pinhole
+from pipelines.core.types import FloatArray, IntArray
+from pipelines.geometry.cameras import Pinhole, ViewPose
 from pipelines.geometry.rotations import rotation_towards
 from pipelines.robust.statistics import spatial_median
 from pipelines.splat.rasterizer.api import Window
-from pipelines.surface.surface_views import ModelRenderer, ViewPose
+from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey.marks import MarkRays
 from pipelines.survey.trained_survey import TrainedSurvey
 
@@ -34,18 +29,12 @@ _SAME_SURFACE = 0.01  # of the depth: largest difference between pixels of one s
 
 @dataclass(frozen=True)
 class DepthMap:
-    """Depth of the surface as one camera sees it: the whole view, or a window of it.
+    """Depth of the surface as one camera sees it: the whole view, or a window of it."""
 
-    Attributes:
-        pinhole: of the whole view.
-        depth_m: (h, w) along the camera's z axis; 0: no surface.
-        left, top: pixels of the view to the left of the window, and above it.
-    """
-
-    pinhole: Pinhole
-    depth_m: FloatArray
-    left: int = 0
-    top: int = 0
+    pinhole: Pinhole  # of the whole view
+    depth_m: FloatArray  # (h, w) along the camera's z axis; 0: no surface
+    left: int = 0  # pixels of the view to the left of the window, and above it
+    top: int = 0  # pixels of the view to the left of the window, and above it
 
     def holds(self, xy: FloatArray) -> bool:
         """Return whether the pixel of a ray (2,) is here."""
@@ -91,39 +80,14 @@ class DepthMap:
         return camera.fx * float(xy[0]) + camera.cx, camera.fy * float(xy[1]) + camera.cy
 
 
-@dataclass(frozen=True)
-class SurfaceHits:
-    """Places of the surface on K rays, each as the ray's own view shows it.
-
-    Attributes:
-        position_in_model: (K, 3) metres; NaN: no surface.
-        at_edge: (K,) whether the surface ends within a pixel of the ray.
-    """
-
-    position_in_model: FloatArray
-    at_edge: BoolArray
-
-    def counted(self, rows: IntArray) -> IntArray:
-        """Return the rows that count for one point, among its own: those on unbroken surface, if two or more are.
-
-        Beside an edge of the surface, a fraction of a pixel decides between roof and ground.
-        """
-        rows = rows[np.isfinite(self.position_in_model[rows]).all(axis=1)]
-        unbroken = rows[~self.at_edge[rows]]
-        return unbroken if len(unbroken) >= LEAST_VIEWS else rows
-
-
 def depth_around(renderer: ModelRenderer, camera: int, xy: FloatArray, reach_px: int = REACH_PX) -> DepthMap:
-    """Return the depth within some pixels of a ray; empty if the ray misses the image.
+    """Return the depth of a camera within some pixels of a ray; empty if the ray misses the image.
 
     Everybody who measures renders the same small windows. Where the Gaussians of a pixel nearly lie on one surface,
     rounding decides how its depth is taken, and another window would round in another way.
 
     Args:
-        renderer: of the trained model.
-        camera: index of the camera.
         xy: (2,) x/z and y/z of the ray.
-        reach_px: pixels to each side of the ray's.
     """
     pose = renderer.pose(camera)
     pinhole = pose.pinhole
@@ -134,47 +98,48 @@ def depth_around(renderer: ModelRenderer, camera: int, xy: FloatArray, reach_px:
     height = min(int(row) + reach_px + 1, pinhole.height) - top
     if width < 1 or height < 1:
         return DepthMap(pinhole, np.zeros((0, 0)))
-    return DepthMap(pinhole, renderer.depth_from(pose, Window(left, top, width, height)), left, top)
-
-
-def surface_hits(trained: TrainedSurvey, rays: MarkRays, maps: Sequence[DepthMap]) -> SurfaceHits:
-    """Return where the rays of marks meet the surface of their own views.
-
-    Args:
-        trained: the trained model.
-        rays: of K marks.
-        maps: K, the depth around each mark in its view.
-    """
-    position, at_edge = np.full((len(rays), 3), np.nan), np.zeros(len(rays), dtype=bool)
-    for row, (camera, xy, view) in enumerate(zip(rays.camera, rays.xy, maps, strict=True)):
-        depth = view.depth_at(xy)
-        if depth > 0:
-            in_cam = depth * np.append(xy, 1.0)
-            position[row] = (
-                trained.poses.cam_from_model[camera].T @ in_cam + trained.poses.cam_center_in_model[camera]
-            )
-            at_edge[row] = view.is_at_edge(xy)
-    return SurfaceHits(position, at_edge)
+    return DepthMap(pinhole, renderer.depth_m(pose, Window(left, top, width, height)), left, top)
 
 
 def points_by_model(trained: TrainedSurvey, rays: MarkRays, maps: Sequence[DepthMap]) -> FloatArray:
     """Return the points (J, 3) in `geo` at which the model's surface lies behind their marks.
 
-    The result is the spatial median of the views that count (`SurfaceHits.counted`); NaN for a point with fewer
-    than two.
+    The result is the spatial median of the views that count; NaN for a point with fewer than two.
 
     Args:
         trained: the trained model.
         rays: K marks of J points.
         maps: K, the depth around each mark in its view.
     """
-    hits = surface_hits(trained, rays, maps)
     middle = np.full((len(rays.point_id), 3), np.nan)
     for point in range(len(middle)):
-        counted = hits.counted(np.flatnonzero(rays.point == point))
-        if len(counted) >= LEAST_VIEWS:
-            middle[point] = spatial_median(hits.position_in_model[counted])
+        _, place = _counted_hits(trained, rays, maps, np.flatnonzero(rays.point == point))
+        if len(place) >= LEAST_VIEWS:
+            middle[point] = spatial_median(place)
     return trained.geo_from_model.apply(middle)
+
+
+def _counted_hits(
+    trained: TrainedSurvey, rays: MarkRays, maps: Sequence[DepthMap], rows: IntArray
+) -> tuple[IntArray, FloatArray]:
+    """Return the marks of one point that count, and where (V, 3) in `model` their rays meet the views' own surface.
+
+    Rays on unbroken surface count, if two or more are: beside an edge of the surface, a fraction of a pixel decides
+    between roof and ground.
+    """
+    poses, slopes = trained.poses, rays.xy[rows]
+    position, at_edge = np.full((len(rows), 3), np.nan), np.zeros(len(rows), dtype=bool)
+    for index, (camera, xy) in enumerate(zip(rays.camera[rows], slopes, strict=True)):
+        view = maps[rows[index]]
+        depth = view.depth_at(xy)
+        if depth > 0:
+            in_cam = depth * np.append(xy, 1.0)
+            position[index] = poses.cam_from_model[camera].T @ in_cam + poses.cam_center_in_model[camera]
+            at_edge[index] = view.is_at_edge(xy)
+    known = np.isfinite(position).all(axis=1)
+    unbroken = known & ~at_edge
+    counted = unbroken if unbroken.sum() >= LEAST_VIEWS else known
+    return rows[counted], position[counted]
 
 
 _MOST_VIEWS = 12  # that read a point: the most detailed of those that hold its place
@@ -189,13 +154,7 @@ _HALF_PX = 500  # of the image around a line of sight
 
 @dataclass(frozen=True)
 class Sight:
-    """Line of sight through a pixel of a view.
-
-    Attributes:
-        start_in_model: (3,) metres.
-        direction_in_model: (3,) unit vector.
-        pixel_rad: width of a pixel as an angle.
-    """
+    """Line of sight through a pixel of a view: start (3,) in metres, unit vector (3,), width of a pixel."""
 
     start_in_model: FloatArray
     direction_in_model: FloatArray
@@ -203,22 +162,16 @@ class Sight:
 
     def at(self, distance_m: float) -> FloatArray:
         """Return the place (3,) in `model` at a distance."""
-        return np.asarray(self.start_in_model + distance_m * self.direction_in_model)
+        return self.start_in_model + distance_m * self.direction_in_model
 
 
 @dataclass(frozen=True)
 class SurfacePoint:
-    """Measured point of the surface.
+    """Measured point of the surface."""
 
-    Attributes:
-        position_in_geo: (3,) metres.
-        cov_of_surface: (3, 3) m² of the surface alone: errors of similarity, cameras and lens come on top.
-        cameras: (V,) indices of the cameras that show it.
-    """
-
-    position_in_geo: FloatArray
-    cov_of_surface: FloatArray
-    cameras: IntArray
+    position_in_geo: FloatArray  # (3,) metres
+    cov_of_surface: FloatArray  # (3, 3) m² of the surface alone: errors of similarity, cameras and lens come on top
+    cameras: IntArray  # (V,) indices of the cameras that show it
 
 
 @dataclass(frozen=True)
@@ -229,11 +182,7 @@ class NoSurface:
 
 
 class SurfaceReader:
-    """Reader of the surface of a trained model.
-
-    Args:
-        renderer: of the model.
-    """
+    """Reader of the surface of a trained model."""
 
     def __init__(self, renderer: ModelRenderer) -> None:
         self.renderer, self._trained = renderer, renderer.trained
@@ -282,20 +231,16 @@ class SurfaceReader:
         """Return the surface behind the marks of one point, as `evaluate` measures it on the rendered surface.
 
         σ is the RMS difference of the views.
-
-        Args:
-            rays: marks of a single point.
         """
         maps = [
             depth_around(self.renderer, int(camera), xy) for camera, xy in zip(rays.camera, rays.xy, strict=True)
         ]
-        hits = surface_hits(self._trained, rays, maps)
-        counted = hits.counted(np.arange(len(rays)))
-        if len(counted) < LEAST_VIEWS:
+        counted, place = _counted_hits(self._trained, rays, maps, np.arange(len(rays)))
+        if len(place) < LEAST_VIEWS:
             return NoSurface("fewer than two photographs show a surface behind the marks")
-        middle = spatial_median(hits.position_in_model[counted])
+        middle = spatial_median(place)
         geo_from_model = self._trained.geo_from_model
-        apart = (hits.position_in_model[counted] - middle) @ geo_from_model.rotation.T * geo_from_model.scale
+        apart = (place - middle) @ geo_from_model.rotation.T * geo_from_model.scale
         distance = np.linalg.norm(apart, axis=1)
         near = apart[distance <= 3 * np.median(distance)]  # the median leaves the others out, too
         cov = near.T @ near / max(len(near) - 1, 1)
@@ -306,7 +251,7 @@ class SurfaceReader:
         size, focal = 2 * _HALF_PX + 1, 1.0 / sight.pixel_rad
         pinhole = Pinhole(size, size, focal, focal, size / 2, size / 2)
         pose = ViewPose(pinhole, rotation_towards(sight.direction_in_model), sight.start_in_model)
-        depth = self.renderer.depth_from(pose, Window(_HALF_PX, _HALF_PX, 1, 1))
+        depth = self.renderer.depth_m(pose, Window(_HALF_PX, _HALF_PX, 1, 1))
         return float(depth[0, 0]) or None
 
     def _most_detailed(self, place: FloatArray) -> list[int]:

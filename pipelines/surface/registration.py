@@ -1,4 +1,6 @@
-"""Registration of a LiDAR cloud: its shift against the surface of the photographs, with its σ.
+"""Registration of clouds by points of one and planes of the other.
+
+A LiDAR cloud has its shift against the surface of the photographs, with its σ:
 
 1. The photographs' surface near a LiDAR point is read off the depth maps that show it. Its distance to the point
    along the point's normal is an observation of the shift along that normal.
@@ -7,7 +9,7 @@
 3. Cauchy's weights bound the effect of what has changed since. σ is that of clusters of 5 m (sandwich estimator,
    doi 10.1093/biomet/73.1.13), because errors of neighbouring points are not independent.
 
-Shift or similarity between the model and a reference, by points of one and planes of the other.
+The model has a shift or a similarity against a reference, by the reference's planes, with the same weights and σ.
 """
 
 from __future__ import annotations
@@ -18,9 +20,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from pipelines.core.errors import DegenerateGeometryError
-from pipelines.core.types import BoolArray, FloatArray, Matrix34
+from pipelines.core.types import BoolArray, FloatArray
 from pipelines.geometry.similarity import Similarity, jacobian_at, perturbation
-from pipelines.robust.statistics import CAUCHY_SCALE2, cauchy_weight, mad_sigma
+from pipelines.robust.statistics import cauchy_weight, mad_sigma
 from pipelines.surface.lidar_cloud import LidarCloud
 from pipelines.surface.visibility import DepthViews, Support, support
 from pipelines.survey.report_parts import Alignment, ReferenceShift
@@ -39,42 +41,26 @@ _ITERATIONS = 30
 
 @dataclass(frozen=True)
 class PlaneMatches:
-    """M points on planes that the photographs show.
+    """M points on planes that the photographs show."""
 
-    Attributes:
-        point_in_model: (M, 3) of the cloud.
-        normal_in_model: (M, 3) towards the photographs.
-        distance_m: (M,) surface of the photographs minus the point, along the normal.
-        wall: (M,) whether the plane is upright.
-    """
-
-    point_in_model: FloatArray
-    normal_in_model: FloatArray
-    distance_m: FloatArray
-    wall: BoolArray
+    point_in_model: FloatArray  # (M, 3) of the cloud
+    normal_in_model: FloatArray  # (M, 3) towards the photographs
+    distance_m: FloatArray  # (M,) surface of the photographs minus the point, along the normal
+    wall: BoolArray  # (M,) whether the plane is upright
 
     def __len__(self) -> int:
-        """Return the number of points."""
         return len(self.distance_m)
 
 
 @dataclass(frozen=True)
 class Registration:
-    """Shift of a cloud.
+    """Shift of a cloud."""
 
-    Attributes:
-        shift_m: (3,) cloud minus surface of the photographs.
-        covariance_m2: (3, 3) of the comparison alone.
-        wall_bias_m: surface of the photographs minus the cloud on walls, outwards.
-        spread_m: robust σ of the distances that remain.
-        matches: the points, at the shift of the last round.
-    """
-
-    shift_m: FloatArray
-    covariance_m2: FloatArray
-    wall_bias_m: float
-    spread_m: float
-    matches: PlaneMatches
+    shift_m: FloatArray  # (3,) cloud minus surface of the photographs
+    covariance_m2: FloatArray  # (3, 3) of the comparison alone
+    wall_bias_m: float  # surface of the photographs minus the cloud on walls, outwards
+    spread_m: float  # robust σ of the distances that remain
+    matches: PlaneMatches  # the points, at the shift of the last round
 
 
 def registration(cloud: LidarCloud, views: DepthViews, seed: int) -> Registration:
@@ -125,11 +111,9 @@ def _solved(matches: PlaneMatches) -> tuple[FloatArray, FloatArray, float]:
         design[:, 3] = 0.0
     prior = np.diag([0.0, 0.0, 0.0, 1.0])  # of 1 m, so that a scene without walls is no singular case
     value = np.zeros(4)
-    weight = np.ones(len(matches))
     for _ in range(_ITERATIONS):
         residual = matches.distance_m - design @ value
-        spread = max(mad_sigma(residual), 1e-4)
-        weight = 1.0 / (1.0 + (residual / spread) ** 2 / CAUCHY_SCALE2[1])
+        weight, spread = _weights(residual)
         normal = design.T @ (weight[:, None] * design) / spread**2 + prior
         step = np.linalg.solve(normal, design.T @ (weight * residual) / spread**2 - prior @ value)
         value = value + step
@@ -138,12 +122,21 @@ def _solved(matches: PlaneMatches) -> tuple[FloatArray, FloatArray, float]:
     if np.linalg.eigvalsh(normal[:3, :3])[0] * spread**2 < 1e-3 * len(matches):
         raise DegenerateGeometryError("the planes of the LiDAR face one direction: its shift is not determined")
     residual = matches.distance_m - design @ value
-    cell = np.floor(matches.point_in_model / _CLUSTER_M).astype(np.int64)
-    _, cluster = np.unique(cell, axis=0, return_inverse=True)
-    score = np.zeros((cluster.max() + 1, 4))
-    np.add.at(score, cluster.ravel(), (weight * residual)[:, None] * design / spread**2)
+    score = _summed_by_cell((weight * residual)[:, None] * design / spread**2, matches.point_in_model, _CLUSTER_M)
     inverse = np.linalg.inv(normal)
     return value, np.asarray(inverse @ (score.T @ score) @ inverse), spread
+
+
+def _weights(residual: FloatArray) -> tuple[FloatArray, float]:
+    """Return Cauchy's weights (M,) of residuals in metres, and their robust σ."""
+    spread = max(mad_sigma(residual), 1e-4)
+    return cauchy_weight((residual / spread) ** 2, 1), spread
+
+
+def _summed_by_cell(scores: FloatArray, position: FloatArray, side_m: float) -> FloatArray:
+    """Return the sums (C, k) of scores (M, k) over the cells of a grid in which points (M, 2 or 3) lie."""
+    _, cell = np.unique(np.floor(position / side_m).astype(np.int64), axis=0, return_inverse=True)
+    return np.stack([np.bincount(cell.ravel(), column) for column in scores.T], axis=1)
 
 
 _ALIGNMENT_ITERATIONS = 40
@@ -154,23 +147,10 @@ _LEAST_PAIRS = 100
 _MOST_CONDITION = 1e10  # of the normal matrix: beyond, nothing fixes an axis, as on a plane
 
 
-@dataclass(frozen=True)
-class Fit:
-    """Placement of the model on the reference.
-
-    Attributes:
-        reference_from_model: similarity in geo.
-        shift: it as figures.
-    """
-
-    reference_from_model: Similarity
-    shift: ReferenceShift
-
-
 def fit_alignment(
     model: FloatArray, reference: FloatArray, normal: FloatArray, spacing_m: float, kind: Alignment
-) -> Fit | None:
-    """Return the placement of the model on the reference.
+) -> tuple[Similarity, ReferenceShift] | None:
+    """Return the similarity reference ← model in geo, and its figures.
 
     None: the clouds have too little in common, or nothing fixes an axis.
 
@@ -196,7 +176,7 @@ def fit_alignment(
             return None
         n, arm = normal[row[near]], reference[row[near]] - points[near]
         residual = np.einsum("ni,ni->n", n, arm)
-        weight = cauchy_weight((residual / max(float(mad_sigma(residual)), 1e-4)) ** 2, 1)
+        weight, _ = _weights(residual)
         design = np.einsum("ni,nij->nj", n, jacobian_at(points[near], pivot))[:, free]
         normal_matrix = (design * weight[:, None]).T @ design
         if np.linalg.cond(normal_matrix) > _MOST_CONDITION:
@@ -206,40 +186,16 @@ def fit_alignment(
         placed = perturbation(delta, pivot) @ placed
         scores, used = design * (weight * residual)[:, None], points[near]
         trim_m = max(_SHRINK * trim_m, _LEAST_TRIM_SPACINGS * spacing_m)
-    return Fit(placed, _shift(placed, pivot, kind, normal_matrix=normal_matrix, scores=scores, points=used))
-
-
-def _shift(
-    placed: Similarity,
-    pivot: FloatArray,
-    kind: Alignment,
-    *,
-    normal_matrix: FloatArray,
-    scores: FloatArray,
-    points: FloatArray,
-) -> ReferenceShift:
-    """Return the figures of a placement.
-
-    Its σ is that of the spread of the scores between parts of the scene, and never less than that of their spread
-    between points: if one part alone fixes an axis, as with a single wall, its scores sum up to zero.
-    """
-    _, part = np.unique(np.floor(points[:, :2] / _PART_M), axis=0, return_inverse=True)
-    sums = np.stack([np.bincount(part.ravel(), column) for column in scores.T], axis=1)
-    spreads = [np.linalg.norm(np.linalg.solve(normal_matrix, each.T), axis=1) for each in (sums, scores)]
-    sigma = np.maximum(*spreads)[-3:]
+    # One part alone may fix an axis, as with a single wall, and its scores sum up to zero: points are the least σ.
+    by_part = _summed_by_cell(scores, used[:, :2], _PART_M)
+    spreads = [np.linalg.norm(np.linalg.solve(normal_matrix, each.T), axis=1) for each in (by_part, scores)]
     east, north, up = (placed.apply(pivot) - pivot).tolist()
-    cosine = (np.trace(placed.rotation) - 1) / 2
-    return ReferenceShift(
+    cosine, similar = (np.trace(placed.rotation) - 1) / 2, kind == "similarity"
+    return placed, ReferenceShift(
         enu_m=(east, north, up),
-        sigma_m=tuple(sigma.tolist()),
-        scale_ppm=1e6 * (placed.scale - 1) if kind == "similarity" else 0.0,
-        turn_deg=float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))) if kind == "similarity" else 0.0,
-        reference_from_model=_rows(placed),
-        points=len(points),
+        sigma_m=tuple(np.maximum(*spreads)[-3:].tolist()),
+        scale_ppm=1e6 * (placed.scale - 1) if similar else 0.0,
+        turn_deg=float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))) if similar else 0.0,
+        reference_from_model=tuple(tuple(row) for row in placed.matrix()[:3].tolist()),
+        points=len(used),
     )
-
-
-def _rows(placed: Similarity) -> Matrix34:
-    """Return the rows of [sR | t]."""
-    first, second, third = ((a, b, c, d) for a, b, c, d in placed.matrix()[:3].tolist())
-    return first, second, third

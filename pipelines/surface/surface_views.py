@@ -1,12 +1,8 @@
-"""Surface of the trained model, as its training cameras see it: depth maps to measure in.
+"""Renders of the trained model, and its surface as its training cameras see it: depth maps to measure in.
 
 The maps of thousands of photographs exceed the memory. They lie in files of a scratch folder, mapped into memory.
 Maps are written one after the other. The size of a file therefore tells how many are complete, and an interrupted
 stage goes on after those.
-
-Where a render shows its photograph: elsewhere, the model has no surface that the photograph confirms.
-
-Rendering of the trained model from its own cameras.
 """
 
 from __future__ import annotations
@@ -15,7 +11,7 @@ import os
 import shutil
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +24,11 @@ from pipelines.core.errors import InputError
 from pipelines.core.files import remove
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
-from pipelines.geometry.cameras import Pinhole, pose_matrix
+from pipelines.geometry.cameras import Pinhole, ViewPose, pose_matrix
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Render, Window
 from pipelines.splat.spatial import SpatialBlocks
 from pipelines.splat.surface import measured_depth
-from pipelines.surface.visibility import DepthViews, Support, support
+from pipelines.surface.visibility import DepthViews, Support, Viewpoints, support
 from pipelines.survey.photographs import ImageCache
 from pipelines.survey.trained_survey import TrainedSurvey, trained_pinholes
 
@@ -42,52 +38,29 @@ _LEAST_CONTRAST = 6.0  # grey levels of 255: a fainter pattern is noise, and con
 
 
 def shows_photograph(rendered: ByteArray, photograph: ByteArray) -> BoolArray:
-    """Return where a render (H, W, 3) shows the contrast of its photograph (H, W, 3): (H, W).
+    """Return where (H, W) a render (H, W, 3) shows the contrast of its undistorted photograph (H, W, 3).
 
-    A wall that is missing in the model, or a roof that was painted on the ground, appears blurred. The share of the
-    photograph's contrast in the render is the slope of a straight line from grey levels of the photograph to those
-    of the render, in a window around the pixel. Brightness and exposure have no influence on where it is low.
-
-    Args:
-        rendered: RGB.
-        photograph: RGB, undistorted, of the same camera and size.
+    Elsewhere, the model has no surface that the photograph confirms: a wall that is missing in the model, or a roof
+    that was painted on the ground, appears blurred. The share of the photograph's contrast in the render is the
+    slope of a straight line from grey levels of the photograph to those of the render, in a window around the
+    pixel. Brightness and exposure have no influence on where it is low.
     """
     shown, given = (
         cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY) for image in (rendered, photograph)
     )
     render, photo = shown.astype(np.float32), given.astype(np.float32)
-    mean_render, mean_photo = _mean(render), _mean(photo)
-    variance = _mean(photo * photo) - mean_photo**2
-    covariance = _mean(photo * render) - mean_photo * mean_render
+    mean = partial(cv2.boxFilter, ddepth=-1, ksize=(_WINDOW_PX, _WINDOW_PX))
+    mean_render, mean_photo = mean(render), mean(photo)
+    variance = mean(photo * photo) - mean_photo**2
+    covariance = mean(photo * render) - mean_photo * mean_render
     return np.asarray((covariance >= _LEAST_SHARE * variance) | (variance < _LEAST_CONTRAST**2))
-
-
-def _mean(image: Float32Array) -> Float32Array:
-    return np.asarray(cv2.boxFilter(image, -1, (_WINDOW_PX, _WINDOW_PX)))
-
-
-@dataclass(frozen=True)
-class ViewPose:
-    """Camera somewhere in the scene.
-
-    Attributes:
-        pinhole: of its image.
-        cam_from_model: (3, 3) rotation.
-        center_in_model: (3,) metres.
-    """
-
-    pinhole: Pinhole
-    cam_from_model: FloatArray
-    center_in_model: FloatArray
 
 
 class ModelRenderer:
     """Renderer of the trained model from its own cameras, at the size of the training photographs.
 
     Args:
-        trained: the trained model.
         images: undistorted photographs of the same cameras.
-        backend: the rasteriser.
     """
 
     def __init__(self, trained: TrainedSurvey, images: ImageCache, backend: Rasterizer) -> None:
@@ -109,29 +82,20 @@ class ModelRenderer:
         """Return the pinhole of camera `index`, at the size of its render."""
         return self._pinholes.of(index)
 
-    def render(self, index: int, *, depth: bool = False) -> Render:
-        """Return the render of camera `index`, without gradients.
-
-        Args:
-            index: of the camera.
-            depth: render depths as well.
-        """
-        return self.render_from(self.pose(index), depth=depth)
-
     def pose(self, index: int) -> ViewPose:
         """Return the pose of camera `index`."""
         poses = self.trained.poses
         return ViewPose(self.pinhole(index), poses.cam_from_model[index], poses.cam_center_in_model[index])
 
-    def render_from(self, pose: ViewPose, *, depth: bool = False, window: Window | None = None) -> Render:
-        """Return the render of any camera, without gradients.
+    def render(self, view: int | ViewPose, *, depth: bool = False, window: Window | None = None) -> Render:
+        """Return the render of a camera, by its index or from anywhere, without gradients.
 
         Args:
-            pose: of the camera.
+            view: index of a camera, or a pose.
             depth: render depths as well.
             window: part of the image to render; None: all of it.
         """
-        model = self.trained.model
+        model, pose = self.trained.model, view if isinstance(view, ViewPose) else self.pose(view)
         matrix = pose_matrix(pose.cam_from_model, pose.center_in_model)
         settings = RasterSettings(model.sh_degree, model.background, depth=depth, window=window)
         gaussians = self._gaussians
@@ -141,21 +105,12 @@ class ModelRenderer:
         with torch.no_grad():
             return self._backend.render(gaussians, cam_from_model, pose.pinhole, settings)
 
-    def depth_m(self, index: int) -> FloatArray:
-        """Return the depth (H, W) in metres of the surface along the z axis of camera `index`; 0: no surface."""
-        return self.depth_from(self.pose(index))
-
-    def depth_from(self, pose: ViewPose, window: Window | None = None) -> FloatArray:
-        """Return the depth (H, W) in metres of the surface along the z axis of any camera; 0: no surface.
-
-        Args:
-            pose: of the camera.
-            window: part of the image to render; None: all of it.
-        """
-        return np.asarray(_measured(self.render_from(pose, depth=True, window=window)).cpu().numpy())
+    def depth_m(self, view: int | ViewPose, window: Window | None = None) -> FloatArray:
+        """Return the depth (H, W) in metres of the surface along the z axis of a camera; 0: no surface."""
+        return np.asarray(_measured(self.render(view, depth=True, window=window)).cpu().numpy())
 
     def surface(self, index: int) -> tuple[Float32Array, ByteArray]:
-        """Return the depth (H, W) as `depth_m` does, and the colours (H, W, 3) of the same render."""
+        """Return the depth (H, W) of camera `index` as `depth_m` does, and the colours (H, W, 3) of its render."""
         view = self.render(index, depth=True)
         rgb = (255 * view.colour.clamp(0, 1)).round().to(torch.uint8)
         return _measured(view).cpu().numpy().astype(np.float32), rgb.cpu().numpy()
@@ -181,8 +136,6 @@ class SurfaceView:
     Attributes:
         camera: index among the cameras of the trained model.
         pinhole: at the size of the maps.
-        cam_from_model: (3, 3) rotation.
-        cam_center_in_model: (3,) metres.
         depth_m: (H, W) along the camera's z axis, read-only; 0: no surface.
         rgb: (H, W, 3) colours of the render, read-only; None if they are not kept. They have no
             exposure of a photograph, so that views meet without a seam.
@@ -199,18 +152,16 @@ class SurfaceView:
         """Return the places (P, 3) in `model` of the surface at pixels, in metres."""
         ray = self.pinhole.rays(np.stack([columns, rows], axis=-1) + 0.5)
         depth = self.depth_m[rows, columns].astype(np.float64)
-        return np.asarray((depth[..., None] * ray) @ self.cam_from_model + self.cam_center_in_model)
+        return (depth[..., None] * ray) @ self.cam_from_model + self.cam_center_in_model
 
 
 class SurfaceViews:
     """Depth maps of all training cameras, at the size of the training photographs.
 
     Args:
-        renderer: of the trained model.
         folder: scratch folder, made if missing. It belongs to the maps alone: maps that are there are continued.
         colours: keep the colours of the renders too.
-        confirmed: keep only depths where the render shows its photograph (`surface.surface_views`).
-        progress: shows the renders.
+        confirmed: keep only depths where the render shows its photograph (`shows_photograph`).
 
     Raises:
         InputError: the maps do not fit on the disk.
@@ -228,24 +179,26 @@ class SurfaceViews:
         self.folder = folder
         self._trained = renderer.trained
         self.cameras = renderer.trained.indices("train")
-        self.pinholes = [renderer.pinhole(index) for index in self.cameras]
+        self.pinholes = tuple(renderer.pinhole(index) for index in self.cameras)
         pixels = [pinhole.width * pinhole.height for pinhole in self.pinholes]
         self._start = np.concatenate([[0], np.cumsum(pixels)]).astype(np.int64)
         folder.mkdir(parents=True, exist_ok=True)
         self._confirmed = confirmed
         self._render(renderer, colours, progress)
-        self._depth = _mapped(folder / _DEPTHS, np.dtype(np.float32), int(self._start[-1]))
-        self._rgb = _mapped(folder / _COLOURS, np.dtype(np.uint8), 3 * int(self._start[-1])) if colours else None
+        self._depth = np.memmap(folder / _DEPTHS, np.float32, "r", shape=(int(self._start[-1]),)).view(np.ndarray)
+        self._rgb: ByteArray | None = None
+        if colours:
+            shape = (int(self._start[-1]), 3)
+            self._rgb = np.memmap(folder / _COLOURS, np.uint8, "r", shape=shape).view(np.ndarray)
 
     def __len__(self) -> int:
-        """Return the number of views."""
         return len(self.cameras)
 
     def view(self, number: int) -> SurfaceView:
         """Return view `number` of 0 … len − 1."""
         camera, pinhole, poses = self.cameras[number], self.pinholes[number], self._trained.poses
         part, size = slice(*self._start[number : number + 2]), (pinhole.height, pinhole.width)
-        rgb = None if self._rgb is None else self._rgb.reshape(-1, 3)[part].reshape(*size, 3)
+        rgb = None if self._rgb is None else self._rgb[part].reshape(*size, 3)
         return SurfaceView(
             camera,
             pinhole,
@@ -270,14 +223,8 @@ class SurfaceViews:
             tolerance: largest difference of depths on one surface, as a part of the depth.
         """
         geo_from_model, poses = self._trained.geo_from_model, self._trained.poses
-        views = DepthViews(
-            poses.cam_from_model[self.cameras],
-            poses.cam_center_in_model[self.cameras],
-            np.array([[pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy] for pinhole in self.pinholes]),
-            np.array([[pinhole.width, pinhole.height] for pinhole in self.pinholes]),
-            self._start[:-1],
-            self._depth,
-        )
+        rotation, center = poses.cam_from_model[self.cameras], poses.cam_center_in_model[self.cameras]
+        views = DepthViews.of(Viewpoints(rotation, center, self.pinholes), self._depth)
         up_in_model = geo_from_model.rotation.T @ [0.0, 0.0, 1.0]
         return support(point_in_model, views, up_in_model, tolerance, normal_in_model).scaled(geo_from_model.scale)
 
@@ -290,8 +237,17 @@ class SurfaceViews:
         """Append the maps that are missing to the files."""
         sizes = {_DEPTHS: 4, _COLOURS: 3} if colours else {_DEPTHS: 4}
         paths = {self.folder / name: size for name, size in sizes.items()}
-        done = min(_complete(path, size * self._start) for path, size in paths.items())
-        _require_space(self.folder, sum(paths.values()) * int(self._start[-1] - self._start[done]))
+        there = [path.stat().st_size if path.exists() else 0 for path in paths]
+        whole = min(held // size for held, size in zip(there, paths.values(), strict=True))  # pixels in all files
+        done = int(np.searchsorted(self._start, whole, side="right")) - 1
+        needed = sum(paths.values()) * int(self._start[-1] - self._start[done])
+        free = shutil.disk_usage(self.folder).free - _SPARE_BYTES
+        if needed > free:
+            raise InputError(
+                f"the depth maps of the training views need {needed / 2**30:.1f} GiB, and "
+                f"{max(free, 0) / 2**30:.1f} GiB are free: make room on this disk",
+                path=self.folder,
+            )
         with ExitStack() as files, progress.task("depth maps", len(self)) as task:
             handles = [files.enter_context(path.open("ab")) for path in paths]
             for handle, size in zip(handles, paths.values(), strict=True):
@@ -307,23 +263,3 @@ class SurfaceViews:
                     handle.flush()
                     os.fsync(handle.fileno())  # The size counts after a power failure too.
                 task.advance()
-
-
-def _complete(path: Path, end: IntArray) -> int:
-    """Return the number of maps that a file holds whole; `end` (V + 1,) are their ends in bytes, from 0."""
-    size = path.stat().st_size if path.exists() else 0
-    return int(np.searchsorted(end, size, side="right")) - 1
-
-
-def _require_space(folder: Path, needed: int) -> None:
-    free = shutil.disk_usage(folder).free - _SPARE_BYTES
-    if needed > free:
-        raise InputError(
-            f"the depth maps of the training views need {needed / 2**30:.1f} GiB, and "
-            f"{max(free, 0) / 2**30:.1f} GiB are free: make room on this disk",
-            path=folder,
-        )
-
-
-def _mapped(path: Path, dtype: np.dtype[Any], count: int) -> NDArray[Any]:
-    return np.memmap(path, dtype=dtype, mode="r", shape=(count,)).view(np.ndarray)

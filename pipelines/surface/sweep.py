@@ -1,9 +1,7 @@
 """Plane-sweep stereo: the plane, among many parallel planes, on which a photograph looks like its neighbours.
 
 After Collins (doi 10.1109/CVPR.1996.517097) and, for planes along a scene's dominant direction, Gallup et al.
-(doi 10.1109/CVPR.2007.383245).
-
-Choice of the views and planes to compare a view with, from the SfM points that views share.
+(doi 10.1109/CVPR.2007.383245). The SfM points that views share tell the views and planes to compare a view with.
 """
 
 from __future__ import annotations
@@ -15,73 +13,57 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
-from pipelines.surface.matching import (
-    UNSEEN,
-    Matcher,
-    MatchSettings,
-    StereoCamera,
-    StereoView,
-    Winner,
-    WinnerTakesAll,
-)
+from pipelines.geometry.bundle import Network
+from pipelines.geometry.cameras import ViewPose
+from pipelines.surface.matching import UNSEEN, Matcher, MatchSettings, StereoView, Winner, WinnerTakesAll
 
 _ROWS = 8  # strips begin and end at multiples of this number
 _CLEARLY = 0.05  # of the score: margin by which planes of another direction must fit better than the first
 
 
 @dataclass(frozen=True)
-class Planes:
-    """Parallel planes: normal · X = offset.
+class SweepPlanes:
+    """Parallel planes: normal · X = offset; parts outside the scene's lowest and highest place are not compared."""
 
-    Attributes:
-        normal_in_world: (3,) unit vector.
-        offset_m: (D,) monotonic, at least three.
-        height_m: lowest and highest place of the scene; the parts of planes beyond are not compared.
-    """
-
-    normal_in_world: FloatArray
-    offset_m: FloatArray
+    normal_in_model: FloatArray  # (3,) unit vector
+    offset_m: FloatArray  # (D,) monotonic, at least three
     height_m: tuple[float, float] = (-math.inf, math.inf)
 
 
 @dataclass(frozen=True)
 class NormalMap:
-    """Normal of each pixel's surface, one of few; offsets along it locate the surface.
+    """Normal of each pixel's surface, one of few; offsets along it locate the surface."""
 
-    Attributes:
-        normals_in_world: (F, 3) unit vectors.
-        index: (H, W) of each pixel's normal.
-    """
-
-    normals_in_world: FloatArray
-    index: ByteArray
+    normals_in_model: FloatArray  # (F, 3) unit vectors
+    index: ByteArray  # (H, W) of each pixel's normal
 
     @property
-    def normal_in_world(self) -> FloatArray:
+    def normal_in_model(self) -> FloatArray:
         """Normals (H, W, 3) of the pixels, unit vectors."""
-        return self.normals_in_world[self.index]
+        return self.normals_in_model[self.index]
 
-    def offset_per_metre(self, camera: StereoCamera) -> FloatArray:
+    def offset_per_metre(self, camera: ViewPose) -> FloatArray:
         """Return the offset (H, W) that a camera's ray gains by a metre of depth."""
-        return np.asarray(np.einsum("hwi,hwi->hw", camera.rays(), self.normal_in_world))
+        return np.asarray(np.einsum("hwi,hwi->hw", camera.rays(), self.normal_in_model))
 
-    def depth(self, camera: StereoCamera, offset_m: Float32Array) -> FloatArray:
+    def depth(self, camera: ViewPose, offset_m: Float32Array) -> FloatArray:
         """Return depths (H, W) along the optical axis at which a camera's rays meet planes of offsets (H, W)."""
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray(
-                (offset_m - self.normal_in_world @ camera.center_in_world) / self.offset_per_metre(camera)
+                (offset_m - self.normal_in_model @ camera.center_in_model) / self.offset_per_metre(camera)
             )
 
-    def offset(self, camera: StereoCamera, depth: Float32Array) -> FloatArray:
+    def offset(self, camera: ViewPose, depth: Float32Array) -> FloatArray:
         """Return offsets (H, W) of the points at depths (H, W) of a camera: inverts `depth`."""
-        return np.asarray(self.normal_in_world @ camera.center_in_world + depth * self.offset_per_metre(camera))
+        return self.normal_in_model @ camera.center_in_model + depth * self.offset_per_metre(camera)
 
 
 @dataclass(frozen=True)
 class SweepResult:
-    """Best plane at each pixel.
+    """Best plane at each pixel of a view: its depths, by a sweep or its refinement.
 
     Attributes:
+        camera: the view's.
         normals: direction of that plane.
         offset_m: (H, W) refined between planes by a parabola through the neighbouring scores; NaN if no plane lies
             in front of the camera.
@@ -91,15 +73,20 @@ class SweepResult:
             from nearly the same place, or see little texture. The σ of the offset goes with its inverse.
     """
 
+    camera: ViewPose
     normals: NormalMap
     offset_m: Float32Array
     score: Float32Array
     step_m: Float32Array
     sharpness: Float32Array
 
+    def depth(self) -> FloatArray:
+        """Return the depth (H, W) along the optical axis."""
+        return self.normals.depth(self.camera, self.offset_m)
+
 
 def plane_sweep(
-    reference: StereoView, neighbours: list[StereoView], sweeps: list[Planes], settings: MatchSettings
+    reference: StereoView, neighbours: list[StereoView], sweeps: list[SweepPlanes], settings: MatchSettings
 ) -> SweepResult:
     """Compare a view with its neighbours on every plane, and keep the best plane at each pixel.
 
@@ -108,10 +95,8 @@ def plane_sweep(
     plane.
 
     Args:
-        reference: view whose surface is wanted.
         neighbours: one or more views of the same place from elsewhere.
         sweeps: planes by direction, the likelier directions first.
-        settings: of the comparison.
 
     Raises:
         ValueError: no neighbours, no sweep, or one of fewer than three planes.
@@ -122,16 +107,15 @@ def plane_sweep(
     matcher = Matcher(reference, neighbours, settings)
     results = [_sweep(reference.camera, planes, matcher, settings.support_px) for planes in sweeps]
     best = np.argmax([result.score - (_CLEARLY if number else 0) for number, result in enumerate(results)], axis=0)
-    normals = NormalMap(np.stack([planes.normal_in_world for planes in sweeps]), best.astype(np.uint8))
+    normals = NormalMap(np.stack([planes.normal_in_model for planes in sweeps]), best.astype(np.uint8))
     offset, score, step, sharpness = (
         np.choose(best, [getattr(result, name) for result in results])
         for name in ("offset_m", "score", "step_m", "sharpness")
     )
-    return SweepResult(normals, offset, score, step, sharpness)
+    return SweepResult(reference.camera, normals, offset, score, step, sharpness)
 
 
-def _sweep(camera: StereoCamera, planes: Planes, matcher: Matcher, support_px: int) -> SweepResult:
-    """Return the best planes of one direction."""
+def _sweep(camera: ViewPose, planes: SweepPlanes, matcher: Matcher, support_px: int) -> SweepResult:
     shape = (camera.pinhole.height, camera.pinhole.width)
     search = WinnerTakesAll(shape)
     for depth, visible in _scene_on_planes(planes, camera):
@@ -145,18 +129,18 @@ def _sweep(camera: StereoCamera, planes: Planes, matcher: Matcher, support_px: i
     offset_m = np.interp(winner.hypothesis, np.arange(len(planes.offset_m)), planes.offset_m)
     offset_m[winner.score <= UNSEEN] = np.nan
     step_m = np.abs(np.gradient(planes.offset_m))[np.rint(winner.hypothesis).astype(np.int64)]
-    normals = NormalMap(planes.normal_in_world[None], np.zeros(offset_m.shape, np.uint8))
-    return sweep_result(winner, normals, offset_m, step_m)
+    normals = NormalMap(planes.normal_in_model[None], np.zeros(offset_m.shape, np.uint8))
+    return sweep_result(winner, camera, normals, offset_m, step_m)
 
 
-def _scene_on_planes(planes: Planes, camera: StereoCamera) -> Iterator[tuple[Float32Array, BoolArray]]:
+def _scene_on_planes(planes: SweepPlanes, camera: ViewPose) -> Iterator[tuple[Float32Array, BoolArray]]:
     """Yield for each plane its depth (H, W), and the mask (H, W) of the pixels that see the scene on it."""
-    rays, center = camera.rays(), camera.center_in_world
-    along, (lowest, highest) = rays @ planes.normal_in_world, planes.height_m
+    rays, center = camera.rays(), camera.center_in_model
+    along, (lowest, highest) = rays @ planes.normal_in_model, planes.height_m
     with np.errstate(divide="ignore"):
         per_gap = (1 / along).astype(np.float32)
     rise = rays[..., 2].astype(np.float32)
-    for gap in planes.offset_m - planes.normal_in_world @ center:
+    for gap in planes.offset_m - planes.normal_in_model @ center:
         depth = np.float32(gap) * per_gap
         height = np.float32(center[2]) + depth * rise
         yield depth, (depth > 0) & (height >= lowest) & (height <= highest)
@@ -170,11 +154,11 @@ def _row_range(visible: BoolArray, around_px: int) -> slice:
 
 
 def sweep_result(
-    winner: Winner, normals: NormalMap, offset_m: FloatArray, step_m: FloatArray | Float32Array
+    winner: Winner, camera: ViewPose, normals: NormalMap, offset_m: FloatArray, step_m: FloatArray | Float32Array
 ) -> SweepResult:
     """Return the best hypotheses as a result, given their offsets (H, W) and the steps (H, W) between them."""
-    sharpness = (winner.curvature / step_m**2).astype(np.float32)
-    return SweepResult(normals, offset_m.astype(np.float32), winner.score, step_m.astype(np.float32), sharpness)
+    sharpness, offset, step = winner.curvature / step_m**2, offset_m.astype(np.float32), step_m.astype(np.float32)
+    return SweepResult(camera, normals, offset, winner.score, step, sharpness.astype(np.float32))
 
 
 # Smaller angles give no depth, larger angles another picture of the same place. After Yao et al.,
@@ -192,53 +176,26 @@ _STEP_PX = 1.0  # between two planes in the neighbours
 _LEAST_PLANES, _MOST_PLANES = 16, 256
 
 
-@dataclass(frozen=True)
-class PointVisibility:
-    """Observations of N points in n views.
-
-    Attributes:
-        point_in_world: (N, 3) metres.
-        center_in_world: (n, 3) metres.
-        obs_point, obs_view: (M,) indices.
-    """
-
-    point_in_world: FloatArray
-    center_in_world: FloatArray
-    obs_point: IntArray
-    obs_view: IntArray
-
-    def points_in_view(self, view: int) -> IntArray:
-        """Return ascending indices of the points that a view sees."""
-        return np.unique(self.obs_point[self.obs_view == view])
-
-
-def best_neighbours(visibility: PointVisibility, view: int, among: IntArray, count: int) -> list[int]:
-    """Return at most `count` views that share most points with `view` under good angles, best first.
-
-    Args:
-        visibility: of the SfM points.
-        view: index of the view.
-        among: indices of the views to choose from.
-        count: most views.
-    """
-    seen = visibility.points_in_view(view)
+def best_neighbours(network: Network, view: int, among: IntArray, count: int) -> list[int]:
+    """Return at most `count` views that share most points with `view` under good angles, best first."""
+    seen = np.unique(network.obs_point[network.obs_image == view])
     seen = seen[np.linspace(0, len(seen) - 1, min(len(seen), _MOST_POINTS)).astype(np.int64)]
-    rows = np.isin(visibility.obs_point, seen) & np.isin(visibility.obs_view, among) & (visibility.obs_view != view)
-    point, other = visibility.obs_point[rows], visibility.obs_view[rows]
-    from_view = visibility.point_in_world[point] - visibility.center_in_world[view]
-    from_other = visibility.point_in_world[point] - visibility.center_in_world[other]
+    rows = np.isin(network.obs_point, seen) & np.isin(network.obs_image, among) & (network.obs_image != view)
+    point, other = network.obs_point[rows], network.obs_image[rows]
+    from_view = network.point_in_world[point] - network.cam_center_in_world[view]
+    from_other = network.point_in_world[point] - network.cam_center_in_world[other]
     cosine = (from_view * from_other).sum(axis=1) / np.maximum(
         np.linalg.norm(from_view, axis=1) * np.linalg.norm(from_other, axis=1), 1e-12
     )
     away = np.degrees(np.arccos(np.clip(cosine, -1, 1))) - _BEST_ANGLE_DEG
     sigma = np.where(away < 0, _SIGMA_BELOW_DEG, _SIGMA_ABOVE_DEG)
-    worth = np.bincount(other, np.exp(-0.5 * (away / sigma) ** 2), minlength=len(visibility.center_in_world))
+    worth = np.bincount(other, np.exp(-0.5 * (away / sigma) ** 2), minlength=len(network.cam_center_in_world))
     worth[np.bincount(other, minlength=len(worth)) < _LEAST_SHARED] = 0
     order = np.argsort(-worth, kind="stable")[:count]
     return [int(index) for index in order if worth[index] > 0]
 
 
-def planes_for(view: StereoCamera, neighbours: list[StereoCamera], points: FloatArray) -> list[Planes]:
+def planes_for(view: ViewPose, neighbours: list[ViewPose], points: FloatArray) -> list[SweepPlanes]:
     """Return planes through points (P, 3) that the view sees, by direction; none if the points are too few.
 
     Level planes suit ground and roofs; upright planes across the view suit walls. A view that hardly looks down
@@ -246,7 +203,7 @@ def planes_for(view: StereoCamera, neighbours: list[StereoCamera], points: Float
     """
     if len(points) < _LEAST_SHARED:
         return []
-    axis = view.cam_from_world[2]
+    axis = view.cam_from_model[2]
     ahead = axis * [1.0, 1.0, 0.0]
     forward = float(np.linalg.norm(ahead))
     if -axis[2] <= _LEVEL:
@@ -261,29 +218,29 @@ def planes_for(view: StereoCamera, neighbours: list[StereoCamera], points: Float
     return [planes for planes in candidates if planes is not None]
 
 
-def _level_planes(view: StereoCamera, neighbours: list[StereoCamera], points: FloatArray) -> Planes | None:
+def _level_planes(view: ViewPose, neighbours: list[ViewPose], points: FloatArray) -> SweepPlanes | None:
     low, high = _range(points @ _UP)
     if not high > low:
         return None
-    return Planes(_UP, np.linspace(low, high, _count(view, neighbours, points, _UP, high - low)))
+    return SweepPlanes(_UP, np.linspace(low, high, _count(view, neighbours, points, _UP, high - low)))
 
 
 def _planes_across(
-    view: StereoCamera,
-    neighbours: list[StereoCamera],
+    view: ViewPose,
+    neighbours: list[ViewPose],
     points: FloatArray,
     normal: FloatArray,
     height_m: tuple[float, float] = (-np.inf, np.inf),
-) -> Planes | None:
+) -> SweepPlanes | None:
     """Return planes at distances with evenly spaced inverses, which are evenly spaced in pixels."""
-    away = points @ normal - normal @ view.center_in_world
+    away = points @ normal - normal @ view.center_in_model
     low, high = _range(away)
     low = max(low, _NEAREST * float(np.median(away)))
     if not high > low > 0:
         return None
     count = _count(view, neighbours, points, normal, high - low)
-    offset = normal @ view.center_in_world + 1 / np.linspace(1 / low, 1 / high, count)
-    return Planes(normal, offset, height_m)
+    offset = normal @ view.center_in_model + 1 / np.linspace(1 / low, 1 / high, count)
+    return SweepPlanes(normal, offset, height_m)
 
 
 def _range(along: FloatArray) -> tuple[float, float]:
@@ -293,7 +250,7 @@ def _range(along: FloatArray) -> tuple[float, float]:
 
 
 def _count(
-    view: StereoCamera, neighbours: list[StereoCamera], points: FloatArray, normal: FloatArray, range_m: float
+    view: ViewPose, neighbours: list[ViewPose], points: FloatArray, normal: FloatArray, range_m: float
 ) -> int:
     """Return the number of planes that lie `_STEP_PX` apart in the neighbours."""
     middle = points[np.argsort(points @ normal)[len(points) // 2]]
@@ -301,15 +258,13 @@ def _count(
     return int(np.clip(np.ceil(range_m / step), _LEAST_PLANES, _MOST_PLANES))
 
 
-def _pixels_a_metre(
-    view: StereoCamera, neighbours: list[StereoCamera], point: FloatArray, normal: FloatArray
-) -> float:
+def _pixels_a_metre(view: ViewPose, neighbours: list[ViewPose], point: FloatArray, normal: FloatArray) -> float:
     """Return the pixels by which a point moves in the neighbours (median) if its plane moves by a metre."""
-    ray = point - view.center_in_world
+    ray = point - view.center_in_model
     ray = ray / max(abs(float(normal @ ray)), 1e-9)
     speeds = []
     for other in neighbours:
-        ends = (point + np.outer([-0.05, 0.05], ray) - other.center_in_world) @ other.cam_from_world.T
+        ends = (point + np.outer([-0.05, 0.05], ray) - other.center_in_model) @ other.cam_from_model.T
         if (ends[:, 2] > 0).all():
             on_image = ends[:, :2] / ends[:, 2:] * [other.pinhole.fx, other.pinhole.fy]
             speeds.append(float(np.linalg.norm(on_image[1] - on_image[0])) / 0.1)

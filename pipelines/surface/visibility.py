@@ -7,9 +7,8 @@
 3. The view looks through the point if its surface lies further behind than that, and a nearer surface hides it.
 4. The residual of an agreeing view is the vector along the ray from the point to the view's surface.
 
-Which points of a reference the photographs saw: those that no other point of the reference hides.
-
-The model has no say: a surface that training missed was seen all the same.
+`seen_surface` says which points of a reference the photographs saw: those that no other point of the reference
+hides. The model has no say: a surface that training missed was seen all the same.
 """
 
 from __future__ import annotations
@@ -24,19 +23,28 @@ from scipy.ndimage import minimum_filter
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, Float32Array, FloatArray, IntArray
 from pipelines.geometry.cameras import Pinhole
+from pipelines.geometry.footprints import rows_by_square
 
 # ruff: noqa: PLR0917  (kernels take arrays, not objects)
 
 
-_ONE_SURFACE = (
-    0.04  # of the depth: largest range of four pixels of one surface, as of ground seen under 5° at f = 500 px
-)
+# Largest range of the depths of four pixels of one surface, as a part of them: ground under 5° at f = 500 px.
+_ONE_SURFACE = 0.04
 _BLOCK = 512  # points that share a choice of cameras
 _CELLS = 256  # across the points' extent, to sort them into blocks
 _NEAR = 1e-6  # least depth
 
 _VIEWS, _THROUGH, _UP, _UP2, _HORIZONTAL2, _Z2, _NORMAL, _NORMAL2, _DIRECTION = range(9)
 _SUMS = _DIRECTION + 3
+
+
+@dataclass(frozen=True)
+class Viewpoints:
+    """Cameras of V undistorted photographs: rotations (V, 3, 3), centres (V, 3) in metres, and pinholes."""
+
+    cam_from_world: FloatArray
+    center_in_world: FloatArray
+    pinholes: tuple[Pinhole, ...]
 
 
 @dataclass(frozen=True)
@@ -58,6 +66,14 @@ class DepthViews:
     size_px: IntArray
     start: IntArray
     depth_m: Float32Array
+
+    @classmethod
+    def of(cls, cameras: Viewpoints, depth_m: Float32Array) -> DepthViews:
+        """Return the maps of cameras, which lie one after the other in `depth_m` (P,)."""
+        intrinsics = np.array([[pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy] for pinhole in cameras.pinholes])
+        size = np.array([[pinhole.width, pinhole.height] for pinhole in cameras.pinholes], dtype=np.int64)
+        start = np.concatenate([[0], np.cumsum(size.prod(axis=1))[:-1]])
+        return cls(cameras.cam_from_world, cameras.center_in_world, intrinsics, size, start, depth_m)
 
 
 @dataclass(frozen=True)
@@ -108,7 +124,6 @@ def support(
 
     Args:
         point_in_world: (N, 3) metres, finite.
-        views: depth maps and cameras.
         up_in_world: (3,) unit vector.
         tolerance: largest difference of depths that agree, as a part of the depth.
         normal_in_world: (N, 3) unit normals with an arbitrary sign; NaN where unknown.
@@ -117,22 +132,16 @@ def support(
     normals = np.full_like(points, np.nan) if normal_in_world is None else normal_in_world
     depth = views.depth_m.view()
     depth.flags.writeable = False  # as mapped files are: one type of array, compiled once
+    cameras = [
+        np.ascontiguousarray(values, dtype=np.float64)
+        for values in (views.cam_from_world, views.center_in_world, views.intrinsics_px)
+    ]
+    places = [np.ascontiguousarray(values, dtype=np.int64) for values in (views.size_px, views.start)]
+    up = np.ascontiguousarray(up_in_world, dtype=np.float64)
     sums = np.zeros((len(points), _SUMS))
     if len(points):
-        _sum_support(
-            points,
-            np.ascontiguousarray(normals, dtype=np.float64),
-            _blocks(points),
-            np.ascontiguousarray(views.cam_from_world, dtype=np.float64),
-            np.ascontiguousarray(views.center_in_world, dtype=np.float64),
-            np.ascontiguousarray(views.intrinsics_px, dtype=np.float64),
-            np.ascontiguousarray(views.size_px, dtype=np.int64),
-            np.ascontiguousarray(views.start, dtype=np.int64),
-            depth,
-            np.ascontiguousarray(up_in_world, dtype=np.float64),
-            tolerance,
-            sums,
-        )
+        unit_normals = np.ascontiguousarray(normals, dtype=np.float64)
+        _sum_support(points, unit_normals, _blocks(points), (*cameras, *places, depth), up, tolerance, sums)
     with np.errstate(invalid="ignore"):
         count = np.where(sums[:, _VIEWS] > 0, sums[:, _VIEWS], np.nan)
         resultant = np.linalg.norm(sums[:, _DIRECTION:], axis=1) / count
@@ -159,14 +168,20 @@ def _blocks(points: FloatArray) -> IntArray:
 
 
 @njit(nogil=True, error_model="numpy")
-def _sees(middle: Any, radius: float, rotation: Any, center: Any, intrinsics: Any, size: Any) -> bool:
-    """Return whether a sphere may touch the frustum of a camera."""
+def _in_cam(point: Any, rotation: Any, center: Any) -> tuple[float, float, float]:
     x, y, z = 0.0, 0.0, 0.0
     for k in range(3):
-        d = middle[k] - center[k]
+        d = point[k] - center[k]
         x += rotation[0, k] * d
         y += rotation[1, k] * d
         z += rotation[2, k] * d
+    return x, y, z
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _sees(middle: Any, radius: float, rotation: Any, center: Any, intrinsics: Any, size: Any) -> bool:
+    """Return whether a sphere may touch the frustum of a camera."""
+    x, y, z = _in_cam(middle, rotation, center)
     if z < -radius:
         return False
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
@@ -200,33 +215,18 @@ def _surface(depth: Any, start: int, width: int, height: int, u: float, v: float
 
 
 @njit(nogil=True, error_model="numpy")
-def _add_view(
-    point: Any,
-    normal: Any,
-    rotation: Any,
-    center: Any,
-    intrinsics: Any,
-    size: Any,
-    start: int,
-    depth: Any,
-    up: Any,
-    tolerance: float,
-    total: Any,
-) -> None:
+def _add_view(point: Any, normal: Any, views: Any, view: int, up: Any, tolerance: float, total: Any) -> None:
     """Add one view to the sums of one point."""
-    x, y, z = 0.0, 0.0, 0.0
-    for k in range(3):
-        d = point[k] - center[k]
-        x += rotation[0, k] * d
-        y += rotation[1, k] * d
-        z += rotation[2, k] * d
+    rotations, centers, intrinsics_px, sizes, starts, depth = views
+    center, intrinsics, size = centers[view], intrinsics_px[view], sizes[view]
+    x, y, z = _in_cam(point, rotations[view], center)
     if z <= _NEAR:
         return
     u = intrinsics[0] * x / z + intrinsics[2]
     v = intrinsics[1] * y / z + intrinsics[3]
     if not (u >= 0 and u < size[0] and v >= 0 and v < size[1]):
         return
-    surface = _surface(depth, start, size[0], size[1], u, v)
+    surface = _surface(depth, starts[view], size[0], size[1], u, v)
     if surface <= 0:
         return
     difference = surface - z
@@ -256,20 +256,7 @@ def _add_view(
 
 
 @njit(nogil=True, error_model="numpy")
-def _sum_block(
-    rows: Any,
-    points: Any,
-    normals: Any,
-    rotations: Any,
-    centers: Any,
-    intrinsics: Any,
-    sizes: Any,
-    starts: Any,
-    depth: Any,
-    up: Any,
-    tolerance: float,
-    sums: Any,
-) -> None:
+def _sum_block(rows: Any, points: Any, normals: Any, views: Any, up: Any, tolerance: float, sums: Any) -> None:
     """Add all views to the sums of the points of one block."""
     low, high = points[rows[0]].copy(), points[rows[0]].copy()
     for row in rows:
@@ -278,44 +265,20 @@ def _sum_block(
             high[k] = max(high[k], points[row, k])
     middle = 0.5 * (low + high)
     radius = 0.5 * np.sqrt(((high - low) ** 2).sum())
+    rotations, centers, intrinsics, sizes, starts, _ = views
     for view in range(len(starts)):
         if not _sees(middle, radius, rotations[view], centers[view], intrinsics[view], sizes[view]):
             continue
         for row in rows:
-            _add_view(
-                points[row],
-                normals[row],
-                rotations[view],
-                centers[view],
-                intrinsics[view],
-                sizes[view],
-                starts[view],
-                depth,
-                up,
-                tolerance,
-                sums[row],
-            )
+            _add_view(points[row], normals[row], views, view, up, tolerance, sums[row])
 
 
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy")
-def _sum_support(
-    points: Any,
-    normals: Any,
-    order: Any,
-    rotations: Any,
-    centers: Any,
-    intrinsics: Any,
-    sizes: Any,
-    starts: Any,
-    depth: Any,
-    up: Any,
-    tolerance: float,
-    sums: Any,
-) -> None:
+def _sum_support(points: Any, normals: Any, order: Any, views: Any, up: Any, tolerance: float, sums: Any) -> None:
     """Fill the sums (N, _SUMS) of all points, block by block; `order` puts the points of a block together."""
     for block in prange((len(order) + _BLOCK - 1) // _BLOCK):
         rows = order[block * _BLOCK : min((block + 1) * _BLOCK, len(order))]
-        _sum_block(rows, points, normals, rotations, centers, intrinsics, sizes, starts, depth, up, tolerance, sums)
+        _sum_block(rows, points, normals, views, up, tolerance, sums)
 
 
 LEAST_VIEWS = 3  # as many as must agree on a point of the model's cloud
@@ -327,35 +290,15 @@ _UPWARDS = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
-class Viewpoints:
-    """Cameras of V photographs in `geo`.
-
-    Attributes:
-        cam_from_geo: (V, 3, 3) rotations.
-        center_in_geo: (V, 3) metres.
-        pinholes: V, of undistorted photographs.
-    """
-
-    cam_from_geo: FloatArray
-    center_in_geo: FloatArray
-    pinholes: tuple[Pinhole, ...]
-
-
-@dataclass(frozen=True)
 class SeenSurface:
-    """Depth maps of a reference from the photographs.
-
-    Attributes:
-        views: the maps.
-        tolerance: largest difference of depths of one surface, as a part of the depth.
-    """
+    """Depth maps of a reference from the photographs."""
 
     views: DepthViews
-    tolerance: float
+    tolerance: float  # largest difference of depths of one surface, as a part of the depth
 
     def sees(self, position_in_geo: FloatArray) -> BoolArray:
         """Return whether enough photographs saw points (P, 3)."""
-        return np.asarray(support(position_in_geo, self.views, _UPWARDS, self.tolerance).views >= LEAST_VIEWS)
+        return support(position_in_geo, self.views, _UPWARDS, self.tolerance).views >= LEAST_VIEWS
 
 
 def seen_surface(
@@ -364,88 +307,50 @@ def seen_surface(
     """Return the depth maps of a reference.
 
     Args:
-        viewpoints: cameras.
         position_in_geo: (P, 3) points of the reference, one a voxel.
-        voxel_m: side of the voxels.
-        progress: shows the photographs.
     """
-    blocks = _position_blocks(position_in_geo)
-    maps: list[Float32Array] = []
-    intrinsics, sizes, depths = [], [], []
+    blocks = []
+    for _, rows in rows_by_square(position_in_geo, _BLOCK_M):
+        part = position_in_geo[rows]
+        low, high = part.min(axis=0), part.max(axis=0)
+        blocks.append((part, (low + high) / 2, float(np.linalg.norm(high - low)) / 2))
+    maps: list[tuple[Pinhole, Float32Array]] = []
+    depths = []
     with progress.task("photographs of the reference", len(viewpoints.pinholes)) as task:
         for rotation, center, pinhole in zip(
-            viewpoints.cam_from_geo, viewpoints.center_in_geo, viewpoints.pinholes, strict=True
+            viewpoints.cam_from_world, viewpoints.center_in_world, viewpoints.pinholes, strict=True
         ):
             shown = _in_view(blocks, rotation, center, pinhole)
             depths.append(float(np.median(shown[:, 2])) if len(shown) else np.inf)
             # Never larger than the photograph, and one pixel if nothing is in view.
             shrink = float(np.clip(_CELL_VOXELS * voxel_m * pinhole.fx / depths[-1], 1, pinhole.width))
-            coarse = _coarse(pinhole, shrink if len(shown) else float(pinhole.width))
-            maps.append(_depth_map(shown, coarse, pinhole.fx / coarse.fx))
-            intrinsics.append([coarse.fx, coarse.fy, coarse.cx, coarse.cy])
-            sizes.append([coarse.width, coarse.height])
+            maps.append(_depth_map(shown, pinhole, shrink if len(shown) else float(pinhole.width)))
             task.advance()
-    start = np.concatenate([[0], np.cumsum([depth.size for depth in maps])])[:-1]
-    typical_m = float(np.median(depths))
-    return SeenSurface(
-        DepthViews(
-            viewpoints.cam_from_geo,
-            viewpoints.center_in_geo,
-            np.array(intrinsics),
-            np.array(sizes),
-            start.astype(np.int64),
-            np.concatenate([depth.ravel() for depth in maps]),
-        ),
-        _TOLERANCE_VOXELS * voxel_m / typical_m,
-    )
-
-
-def _position_blocks(position: FloatArray) -> list[tuple[FloatArray, FloatArray, float]]:
-    """Return points by blocks of the plan: the points, the middle and the radius of each block."""
-    cell = np.floor(position[:, :2] / _BLOCK_M).astype(np.int64)
-    order = np.lexsort(cell.T)
-    starts = np.flatnonzero(np.any(np.diff(cell[order], axis=0, prepend=cell[order][:1] - 1), axis=1))
-    parts = [position[rows] for rows in np.split(order, starts[1:])]
-    middles = [(part.min(axis=0) + part.max(axis=0)) / 2 for part in parts]
-    radii = [float(np.linalg.norm(np.ptp(part, axis=0))) / 2 for part in parts]
-    return list(zip(parts, middles, radii, strict=True))
+    coarse = replace(viewpoints, pinholes=tuple(pinhole for pinhole, _ in maps))
+    views = DepthViews.of(coarse, np.concatenate([depth.ravel() for _, depth in maps]))
+    return SeenSurface(views, _TOLERANCE_VOXELS * voxel_m / float(np.median(depths)))
 
 
 def _in_view(
-    blocks: list[tuple[FloatArray, FloatArray, float]],
-    rotation: FloatArray,
-    center: FloatArray,
-    pinhole: Pinhole,
+    blocks: list[tuple[FloatArray, FloatArray, float]], rotation: FloatArray, center: FloatArray, pinhole: Pinhole
 ) -> FloatArray:
-    """Return pixel coordinates and depth (K, 3) of the points in a view."""
-    corner = max(pinhole.cx, pinhole.width - pinhole.cx), max(pinhole.cy, pinhole.height - pinhole.cy)
-    half = np.arctan(np.hypot(corner[0] / pinhole.fx, corner[1] / pinhole.fy))
-    near = []
-    for part, middle, radius in blocks:
-        arm = middle - center
-        distance = float(np.linalg.norm(arm))
-        off = np.arccos(np.clip(rotation[2] @ arm / max(distance, 1e-9), -1, 1))
-        if distance <= radius or off <= half + np.arcsin(min(radius / distance, 1.0)):
-            near.append(part)
+    """Return pixel coordinates and depth (K, 3) of the points in a view, from blocks with middle and radius."""
+    intrinsics = np.array([pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy])
+    size = np.array([pinhole.width, pinhole.height])
+    near = [part for part, middle, radius in blocks if _sees(middle, radius, rotation, center, intrinsics, size)]
     in_cam = (np.concatenate(near) - center) @ rotation.T if near else np.zeros((0, 3))
     in_cam = in_cam[in_cam[:, 2] > _NEAR_M]
     xy = pinhole.project(in_cam)
     return np.column_stack([xy, in_cam[:, 2]])[pinhole.holds(xy)]
 
 
-def _coarse(pinhole: Pinhole, shrink: float) -> Pinhole:
-    """Return the pinhole of an image that is `shrink` times smaller."""
+def _depth_map(shown: FloatArray, pinhole: Pinhole, shrink: float) -> tuple[Pinhole, Float32Array]:
+    """Return the least depth (H, W) of the points in and beside each pixel of an image `shrink` times smaller."""
     width, height = max(int(np.ceil(pinhole.width / shrink)), 1), max(int(np.ceil(pinhole.height / shrink)), 1)
-    return Pinhole(
-        width, height, pinhole.fx / shrink, pinhole.fy / shrink, pinhole.cx / shrink, pinhole.cy / shrink
-    )
-
-
-def _depth_map(shown: FloatArray, coarse: Pinhole, shrink: float) -> Float32Array:
-    """Return the least depth (H, W) of the points in and beside each pixel; 0: none."""
-    depth = np.full((coarse.height, coarse.width), np.inf, dtype=np.float32)
-    column = np.minimum((shown[:, 0] / shrink).astype(np.int64), coarse.width - 1)
-    row = np.minimum((shown[:, 1] / shrink).astype(np.int64), coarse.height - 1)
+    fx, fy, cx, cy = (value / shrink for value in (pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy))
+    depth, step = np.full((height, width), np.inf, dtype=np.float32), pinhole.fx / fx
+    column = np.minimum((shown[:, 0] / step).astype(np.int64), width - 1)
+    row = np.minimum((shown[:, 1] / step).astype(np.int64), height - 1)
     np.minimum.at(depth, (row, column), shown[:, 2].astype(np.float32))
     nearest = minimum_filter(depth, size=3, mode="nearest")
-    return np.where(np.isfinite(nearest), nearest, 0).astype(np.float32)
+    return Pinhole(width, height, fx, fy, cx, cy), np.where(np.isfinite(nearest), nearest, np.float32(0))

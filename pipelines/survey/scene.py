@@ -21,7 +21,7 @@ from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.bundle import BundleInformation, Network, bundle_information
 from pipelines.geometry.cameras import CameraPoses
-from pipelines.geometry.correction_basis import CorrectionBasis, basis_of, correction_basis
+from pipelines.geometry.correction_basis import CorrectionBasis, correction_basis
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.adjustment import InitialSimilarity
@@ -97,12 +97,12 @@ class Scene:
     @cached_property
     def correction_basis(self) -> CorrectionBasis:
         """Whitened corrections of the cameras, which the lens follows. Memory is quadratic in their number."""
-        return basis_of(self.bundle)
+        return correction_basis(self.bundle)
 
     @cached_property
     def correction_basis_through_sfm_lens(self) -> CorrectionBasis:
         """Whitened corrections of the cameras under a lens that stays."""
-        return correction_basis(self.network, lens_follows=False)
+        return correction_basis(bundle_information(self.network), lens_follows=False)
 
 
 def make_scene(sparse: SparseModel, survey: Survey, model_from_local: Similarity, shift: FloatArray) -> Scene:

@@ -33,7 +33,7 @@ from pipelines.splat.losses import FreeSpace
 from pipelines.surface.crossings import crossings
 from pipelines.surface.depth_maps import DepthMaps
 from pipelines.surface.lidar_cloud import LidarCloud, ScannerTrack, read_cloud
-from pipelines.surface.measured_cloud import CloudFiles
+from pipelines.surface.measured_cloud import CloudReader
 from pipelines.surface.registration import Registration, registration
 from pipelines.surface.visibility import DepthViews
 from pipelines.survey.report_parts import LidarArea, LidarRegistration, LidarReport
@@ -195,7 +195,7 @@ class LidarSurface:
 
 def compared_lidar(
     options: LidarOptions,
-    files: CloudFiles,
+    files: CloudReader,
     maps: DepthMaps,
     survey: Survey,
     *,
@@ -228,7 +228,7 @@ def compared_lidar(
 
 
 def lidar_surface(
-    compared: ComparedLidar, files: CloudFiles, survey: Survey, options: LidarOptions, shift_m: FloatArray | None
+    compared: ComparedLidar, files: CloudReader, survey: Survey, options: LidarOptions, shift_m: FloatArray | None
 ) -> LidarSurface:
     """Return the surface of stereo and LiDAR.
 

@@ -25,7 +25,7 @@ from pipelines.splat.memory import free_memory_bytes, require_memory
 from pipelines.splat.rasterizer.backends import device_of, rasterizer
 from pipelines.surface.depth_maps import DepthMaps
 from pipelines.surface.lidar_cloud import ScannerTrack
-from pipelines.surface.measured_cloud import CloudFiles
+from pipelines.surface.measured_cloud import CloudReader
 from pipelines.survey.adjustment import GeolocatedPoints
 from pipelines.survey.calibrated import load_survey
 from pipelines.survey.scene import photographs
@@ -58,7 +58,7 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     # First, so that `--backend cuda` without a GPU fails at once.
     backend = rasterizer(options.backend, stage.progress)
     workspace = stage.workspace
-    clouds = None if options.lidar is None else CloudFiles(options.lidar, options.lidar_stated)
+    clouds = None if options.lidar is None else CloudReader(options.lidar, options.lidar_stated)
     adjusted = AdjustedScene.load(workspace)
     survey, scene = adjusted.survey, adjusted.scene
     track = None

@@ -29,12 +29,12 @@ from pipelines.core.plan import photograph_folder
 from pipelines.core.types import ByteArray, Float32Array, FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.formats.image_file import read_bytes, require_unchanged
-from pipelines.geometry.cameras import Camera, Pinhole, distort, undistort
+from pipelines.geometry.cameras import Camera, Pinhole, ViewPose, distort, undistort
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.similarity import Similarity
 from pipelines.splat.surface import measured_depth
 from pipelines.surface.picking import Sight
-from pipelines.surface.surface_views import ModelRenderer, ViewPose
+from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey.trained_survey import TrainedSurvey
 
 if TYPE_CHECKING:
@@ -208,7 +208,7 @@ class Painter:
             InputError: the photograph cannot be read.
         """
         pose = self._frame.pose(camera, width, height)
-        render = self._renderer.render_from(pose, depth=True)
+        render = self._renderer.render(pose, depth=True)
         assert render.median_depth is not None and render.expected_depth is not None  # of every render with depth
         assert render.depth_variance is not None
         depth = measured_depth(render.median_depth, render.expected_depth, render.depth_variance).cpu().numpy()

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from pipelines.evaluate.photometric import TrainingCoverage
-from pipelines.geometry.cameras import Pinhole
-from pipelines.surface.surface_views import ViewPose
+from pipelines.geometry.cameras import Pinhole, ViewPose
 
 # From 10 m a nadir view shows 10 m across and 8 m along.
 CAMERA = Pinhole(200, 160, 200.0, 200.0, 100.0, 80.0)

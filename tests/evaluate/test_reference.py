@@ -24,7 +24,7 @@ from pipelines.evaluate.reference_distances import (
     kinds_of,
     plane_normals,
 )
-from pipelines.evaluate.reference_figures import CoreTable, DistanceTally, level_of_detection, m3c2_figures
+from pipelines.evaluate.reference_figures import DistanceTally, level_of_detection, m3c2_figures
 from pipelines.geometry.similarity import perturbation
 from pipelines.surface.registration import fit_alignment
 from pipelines.surface.visibility import SeenSurface, Viewpoints, seen_surface
@@ -121,7 +121,7 @@ def test_offset_is_found_on_ground_roof_and_wall(tmp_path: Path) -> None:
     tally, _ = compared(tmp_path, model + offset[:, None] * normal, normal, reference, kind)
     cores = tally.cores()
     lod_m = level_of_detection(cores.noise_m, np.zeros(len(cores.position)))
-    groups = {group.name: group for group in tally.groups(CoreTable(cores, lod_m))}
+    groups = {group.name: group for group in tally.groups(cores, lod_m)}
     for name, expected in (("ground", -0.03), ("roof", 0.02), ("wall", -0.06)):
         inner = apart_from_edges(cores, name)
         assert inner.sum() > 20
@@ -192,7 +192,7 @@ def test_scores_are_those_of_brute_force(tmp_path: Path) -> None:
     assert len(squares) > 3  # points near the borders have their nearest in another square
     between = np.linalg.norm(model[:, None] - reference[None], axis=2)
     to_reference, to_model = between.min(axis=1), between.min(axis=0)
-    (everywhere, *_) = tally.groups(CoreTable(tally.cores(), tally.cores().noise_m))
+    (everywhere, *_) = tally.groups(tally.cores(), tally.cores().noise_m)
     assert everywhere.c2c.count == len(model)
     assert everywhere.seen_points == len(reference)
     for score in everywhere.scores:
@@ -232,9 +232,10 @@ def test_shift_between_clouds_is_found_with_its_sigma() -> None:
         np.concatenate([model, north]) - shift, reference, plane_normals(reference, SPACING_M), SPACING_M, "shift"
     )
     assert fit is not None
+    found = fit[1]
     # A wall's 800 pairs of σ 1 cm each fix their axis to half a millimetre, and the stated σ says so.
-    assert (np.abs(fit.shift.enu_m - shift) < 4 * np.array(fit.shift.sigma_m)).all()
-    assert max(fit.shift.sigma_m) < 1e-3
+    assert (np.abs(found.enu_m - shift) < 4 * np.array(found.sigma_m)).all()
+    assert max(found.sigma_m) < 1e-3
 
 
 def test_a_plane_fixes_no_shift() -> None:
@@ -250,11 +251,12 @@ def test_similarity_between_clouds_is_found() -> None:
     model = true.inverse().apply(hills[::4])
     fit = fit_alignment(model, hills[1::2], plane_normals(hills[1::2], 0.6), 0.6, "similarity")
     assert fit is not None
+    similarity, found = fit
     # Planes through points 0.6 m apart cut the hills' bends by up to 9 cm, crests and troughs alike: 3 cm (RMS) in
     # each of 36 parts of 10 m are 5 mm in their mean. At 30 m, 1 cm is 300 ppm of scale.
-    np.testing.assert_allclose(fit.reference_from_model.apply(model), hills[::4], atol=0.01)
-    assert fit.shift.scale_ppm == pytest.approx(1e6 * np.expm1(0.01), abs=300)
-    np.testing.assert_array_equal(fit.shift.reference_from_model, fit.reference_from_model.matrix()[:3])
+    np.testing.assert_allclose(similarity.apply(model), hills[::4], atol=0.01)
+    assert found.scale_ppm == pytest.approx(1e6 * np.expm1(0.01), abs=300)
+    np.testing.assert_array_equal(found.reference_from_model, similarity.matrix()[:3])
 
 
 def test_classes_are_ground_roof_wall_and_vegetation() -> None:

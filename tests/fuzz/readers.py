@@ -41,7 +41,7 @@ from pipelines.geodesy.enu import Origin
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.similarity import Similarity
 from pipelines.ingest.bag_inspection import inspect_bag
-from pipelines.surface.measured_cloud import CloudFiles
+from pipelines.surface.measured_cloud import CloudReader
 from pipelines.survey.adjustment import GeolocatedPoints, InitialSimilarity
 from pipelines.survey.calibrated import NavigationTrack
 from pipelines.survey.options import CloudCrs
@@ -241,7 +241,7 @@ def _clouds(folder: Path) -> None:
 
 def _read_clouds(folder: Path) -> None:
     origin = Origin(lat_deg=46.05, lon_deg=7.7, alt_m=600.0)
-    for chunk in CloudFiles(folder, CloudCrs(crs="EPSG:32632")).chunks(origin):
+    for chunk in CloudReader(folder, CloudCrs(crs="EPSG:32632")).chunks(origin):
         assert np.isfinite(chunk.position_in_geo).all()
 
 

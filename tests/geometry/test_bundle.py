@@ -8,10 +8,14 @@ import numpy as np
 import pytest
 
 from pipelines.core.errors import DegenerateGeometryError
-from pipelines.geometry.bundle import Network, similarity_modes
-from pipelines.geometry.correction_basis import correction_basis
+from pipelines.geometry.bundle import Network, bundle_information, similarity_modes
+from pipelines.geometry.correction_basis import CorrectionBasis, correction_basis
 from pipelines.geometry.rotations import exp_so3
 from tests.bundle_scenes import SIGMA_PX, adjuster, exact_network, jacobian, noisy, pixels, readjusted, size, units
+
+
+def basis_of(network: Network, *, lens_follows: bool = True) -> CorrectionBasis:
+    return correction_basis(bundle_information(network), lens_follows=lens_follows)
 
 
 def free_covariance(network: Network) -> np.ndarray:
@@ -57,7 +61,7 @@ def test_basis_is_the_root_of_the_full_bundles_covariance() -> None:
     network = exact_network(images=5, points=40)
     # Equal residuals everywhere: the robust weights are all the same, and the two agree but for the hold.
     shifted = replace(network, obs_xy_px=network.obs_xy_px + SIGMA_PX)
-    basis = correction_basis(shifted)
+    basis = basis_of(shifted)
     whitened = basis.matrix.reshape(30, -1) / units(network)[:, None]
     expected = free_covariance(network) / units(network)[:, None] / units(network)
     shape = whitened @ whitened.T
@@ -71,7 +75,7 @@ def test_no_correction_moves_the_points_by_a_similarity(lens_follows: bool) -> N
     network = exact_network()
     # Equal residuals everywhere: the robust weights are all the same, as they are in the design below.
     equal = replace(network, obs_xy_px=network.obs_xy_px + SIGMA_PX)
-    basis = correction_basis(equal, lens_follows=lens_follows).matrix
+    basis = basis_of(equal, lens_follows=lens_follows).matrix
     assert basis.shape == (6, 6, 6 * 6 - 7)
     assert np.linalg.matrix_rank(basis.reshape(36, -1) / units(network)[:, None]) == 29
     flat = basis.reshape(36, -1)
@@ -83,7 +87,7 @@ def test_no_correction_moves_the_points_by_a_similarity(lens_follows: bool) -> N
 
 def test_lens_follows_as_a_readjustment_with_held_cameras_would_have_it() -> None:
     network = exact_network()
-    basis = correction_basis(replace(network, obs_xy_px=network.obs_xy_px + SIGMA_PX))
+    basis = basis_of(replace(network, obs_xy_px=network.obs_xy_px + SIGMA_PX))
     design, flat = jacobian(network), basis.matrix.reshape(36, -1)
     unit = np.linalg.norm(design[:, 36:], axis=0)
     wanted = np.linalg.lstsq(design[:, 36:] / unit, -design[:, :36] @ flat, rcond=None)[0] / unit[:, None]
@@ -93,7 +97,7 @@ def test_lens_follows_as_a_readjustment_with_held_cameras_would_have_it() -> Non
 
 def test_a_wrong_focal_length_moves_the_cameras_and_not_the_points() -> None:
     network = exact_network()
-    basis = correction_basis(replace(network, obs_xy_px=network.obs_xy_px + SIGMA_PX))
+    basis = basis_of(replace(network, obs_xy_px=network.obs_xy_px + SIGMA_PX))
     # The correction that is expected of a focal length one σ off.
     focal = basis.lens_matrix[0] / np.linalg.norm(basis.lens_matrix[0])
     moved = (basis.matrix @ focal)[:, 3:]
@@ -127,7 +131,7 @@ def test_readjusted_cameras_differ_by_unit_variance() -> None:
     for seed in range(30):
         network = noisy(exact, np.random.default_rng(seed))
         change = solve @ (network.obs_xy_px - exact.obs_xy_px).ravel()
-        basis = correction_basis(readjusted(network, change))
+        basis = basis_of(readjusted(network, change))
         white = np.linalg.lstsq(complete(basis.matrix, exact), change[:36] / units(exact), rcond=None)[0][:29]
         squared.append(white @ white)
         sigmas.append(basis.sigma_px)
@@ -149,7 +153,7 @@ def test_outlying_observations_cost_little() -> None:
     wrong = rng.choice(len(network.obs_xy_px), len(network.obs_xy_px) // 20, replace=False)
     spoilt = network.obs_xy_px.copy()
     spoilt[wrong] += rng.normal(0, 30.0, (len(wrong), 2))
-    clean, hit = correction_basis(network), correction_basis(replace(network, obs_xy_px=spoilt))
+    clean, hit = basis_of(network), basis_of(replace(network, obs_xy_px=spoilt))
     # 5 % of the observations at 60 σ: least squares would find 13 times the σ.
     assert hit.sigma_px < 1.4 * clean.sigma_px
     assert np.linalg.norm(hit.matrix) < 1.5 * np.linalg.norm(clean.matrix)
@@ -158,7 +162,7 @@ def test_outlying_observations_cost_little() -> None:
 def test_too_few_observations_are_refused() -> None:
     network = exact_network(images=3, points=5)
     with pytest.raises(DegenerateGeometryError, match="15 observations do not determine 3 cameras and 5 points"):
-        correction_basis(network)
+        basis_of(network)
 
 
 def test_points_behind_a_camera_are_left_out() -> None:
@@ -172,6 +176,4 @@ def test_points_behind_a_camera_are_left_out() -> None:
         obs_xy_px=np.vstack([network.obs_xy_px, [[300.0, 225.0]]]),
     )
     # The lone point has no observation left: it adds three unknowns to the count, and nothing else.
-    np.testing.assert_allclose(
-        correction_basis(spoilt).matrix, correction_basis(network).matrix, rtol=0.02, atol=1e-4
-    )
+    np.testing.assert_allclose(basis_of(spoilt).matrix, basis_of(network).matrix, rtol=0.02, atol=1e-4)

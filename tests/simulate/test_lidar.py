@@ -14,7 +14,7 @@ from pipelines.simulate.lidar import NOISE, LidarFiles, LidarFlight
 from pipelines.simulate.mesh import Raycaster
 from pipelines.simulate.options import LidarFlightOptions
 from pipelines.simulate.scene import SimulatedScene, build_scene
-from pipelines.surface.measured_cloud import CloudFiles
+from pipelines.surface.measured_cloud import CloudReader
 from pipelines.survey.options import CloudCrs
 
 SHIFT = np.array([0.1, -0.2, 0.05])
@@ -44,7 +44,7 @@ def test_files_hold_the_flight(scene: SimulatedScene, tmp_path: Path) -> None:
         strips = list(flight.strips())
         for strip in strips:
             writer.write(strip)
-    files = CloudFiles(tmp_path / "lidar.laz", CloudCrs())
+    files = CloudReader(tmp_path / "lidar.laz", CloudCrs())
     assert not files.assumptions  # the CRS states its heights
     (cloud,) = files.chunks(ORIGIN)
     returns, noise = flight.truth().returns, files.tally.noise

@@ -7,18 +7,17 @@ import numpy as np
 import pytest
 
 from pipelines.core.types import Float32Array
-from pipelines.geometry.cameras import Pinhole
+from pipelines.geometry.cameras import Pinhole, ViewPose
 from pipelines.surface.agreement import (
     AgreementSettings,
-    DepthEstimate,
     SurfacePrior,
     agreed_depth,
     refine,
     surface_prior,
 )
 from pipelines.surface.depth_maps import StereoOptions
-from pipelines.surface.matching import UNSEEN, MatchSettings, StereoCamera, StereoView
-from pipelines.surface.sweep import NormalMap, plane_sweep
+from pipelines.surface.matching import UNSEEN, MatchSettings, StereoView
+from pipelines.surface.sweep import NormalMap, SweepResult, plane_sweep
 from tests.stereo_scenes import (
     CAMERA,
     GROUND_M,
@@ -45,16 +44,16 @@ def fine() -> list[StereoView]:
 
 
 @pytest.fixture(scope="module")
-def coarse() -> list[DepthEstimate]:
+def coarse() -> list[SweepResult]:
     ring = ring_of_views()
     return [depth_estimate(ring, index) for index in range(5)]
 
 
-def height_error(camera: StereoCamera, offset_m: Float32Array) -> np.ndarray:
+def height_error(camera: ViewPose, offset_m: Float32Array) -> np.ndarray:
     return np.asarray(offset_m - level_normals(FINE).offset(camera, true_depth(camera).astype(np.float32)))
 
 
-def shifted_truth(camera: StereoCamera, off_m: float) -> SurfacePrior:
+def shifted_truth(camera: ViewPose, off_m: float) -> SurfacePrior:
     """Return the true surface, raised by `off_m`."""
     offset = level_normals(FINE).offset(camera, true_depth(camera).astype(np.float32)) + off_m
     return SurfacePrior(level_normals(FINE), offset.astype(np.float32), np.full(offset.shape, STEP_M, np.float32))
@@ -88,9 +87,7 @@ def test_a_guess_out_of_reach_has_no_score(fine: list[StereoView]) -> None:
     assert (refined.score[INNER] == UNSEEN).any()
 
 
-def test_the_ground_beside_a_roof_is_not_taken_for_roof(
-    fine: list[StereoView], coarse: list[DepthEstimate]
-) -> None:
+def test_the_ground_beside_a_roof_is_not_taken_for_roof(fine: list[StereoView], coarse: list[SweepResult]) -> None:
     """A sweep of planes on the same fine pixels takes the ground for roof."""
     camera = fine[2].camera
     depth = true_depth(camera)
@@ -115,7 +112,7 @@ WALL = np.array([np.cos(np.radians(20)), np.sin(np.radians(20)), 0.0])  # throug
 def _foot_of_a_wall(azimuth_deg: float) -> tuple[StereoView, np.ndarray, np.ndarray]:
     """Return a view, its true depth, and the mask of the wall, below which the ground begins."""
     rotation, center = looking_at_origin(azimuth_deg, 22.0, 30.0)
-    camera = StereoCamera(FINE, rotation, center)
+    camera = ViewPose(FINE, rotation, center)
     rays = camera.rays()
     wall, ground = -(center @ WALL) / (rays @ WALL), -center[2] / rays[..., 2]
     upright = wall < ground
@@ -129,7 +126,7 @@ def _foot_of_a_wall(azimuth_deg: float) -> tuple[StereoView, np.ndarray, np.ndar
 def test_small_windows_leave_the_foot_of_a_wall_where_it_is() -> None:
     """A wide window lays the surface across the corner, within a reach of a few pixels."""
     (view, depth, upright), *others = [_foot_of_a_wall(azimuth) for azimuth in (0, -24, -12, 12, 24)]
-    normals = NormalMap(np.stack([LEVEL.normal_in_world, WALL]), upright.astype(np.uint8))
+    normals = NormalMap(np.stack([LEVEL.normal_in_model, WALL]), upright.astype(np.uint8))
     offset = normals.offset(view.camera, (depth + 0.3).astype(np.float32)).astype(np.float32)
     prior = SurfacePrior(normals, offset, np.full(offset.shape, STEP_M, np.float32))
     edge = cv2.morphologyEx(upright.astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((9, 9), np.uint8)) > 0
@@ -142,7 +139,7 @@ def test_small_windows_leave_the_foot_of_a_wall_where_it_is() -> None:
     assert wrong[0] < 0.8 * wrong[1]
 
 
-def test_guesses_are_what_views_agree_on(fine: list[StereoView], coarse: list[DepthEstimate]) -> None:
+def test_guesses_are_what_views_agree_on(fine: list[StereoView], coarse: list[SweepResult]) -> None:
     own = coarse[2]
     agreed = np.zeros((CAMERA.height, CAMERA.width), np.float32)
     agreed[10:20, 10:20] = level_normals().depth(own.camera, np.full(agreed.shape, 7.0, np.float32))[10:20, 10:20]
@@ -156,9 +153,9 @@ def test_guesses_are_what_views_agree_on(fine: list[StereoView], coarse: list[De
     np.testing.assert_allclose(prior.step_m, 0.5 / 3, rtol=1e-6)  # a third of that of the sweep
 
 
-def test_pixels_that_nothing_fits_find_nothing(fine: list[StereoView], coarse: list[DepthEstimate]) -> None:
-    empty = DepthEstimate(coarse[2].camera, plane_sweep(*_nothing_to_see(), [LEVEL], MatchSettings()))
-    assert np.isnan(empty.sweep.offset_m).all()
+def test_pixels_that_nothing_fits_find_nothing(fine: list[StereoView], coarse: list[SweepResult]) -> None:
+    empty = plane_sweep(*_nothing_to_see(), [LEVEL], MatchSettings())
+    assert np.isnan(empty.offset_m).all()
     prior = surface_prior(empty, np.zeros((CAMERA.height, CAMERA.width), np.float32), fine[2].camera)
     assert np.isfinite(prior.offset_m).all()
     refined = refine(fine[2], neighbours_of(fine, 2), prior, MatchSettings())

@@ -5,9 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.surface.agreement import AgreementSettings, DepthEstimate, agreed_depth
-from pipelines.surface.matching import MatchSettings, StereoCamera, StereoView
-from pipelines.surface.sweep import Planes, PointVisibility, SweepResult, best_neighbours, plane_sweep, planes_for
+from pipelines.geometry.bundle import Network
+from pipelines.geometry.cameras import ViewPose
+from pipelines.surface.agreement import AgreementSettings, agreed_depth
+from pipelines.surface.matching import MatchSettings, StereoView
+from pipelines.surface.sweep import (
+    SweepPlanes,
+    SweepResult,
+    best_neighbours,
+    plane_sweep,
+    planes_for,
+)
 from tests.stereo_scenes import (
     CAMERA,
     GROUND_M,
@@ -60,12 +68,12 @@ def test_a_place_that_views_look_through_is_no_surface(ring: list[StereoView]) -
     """Two views that err alike, as beside a roof, against two that see the ground behind."""
     raised = (slice(20, 40), slice(20, 40))
 
-    def flat(index: int, height_m: float) -> DepthEstimate:
+    def flat(index: int, height_m: float) -> SweepResult:
         camera = ring[index].camera
         offset = np.zeros((CAMERA.height, CAMERA.width), np.float32)
         offset[raised] = height_m
         ones = np.ones_like(offset)
-        return DepthEstimate(camera, SweepResult(level_normals(), offset, ones, 0.5 * ones, ones))
+        return SweepResult(camera, level_normals(), offset, ones, 0.5 * ones, ones)
 
     own, alike, clear = flat(2, 4.0), [flat(2, 4.0), flat(2, 4.0)], [flat(2, 0.0), flat(2, 0.0)]
     assert (agreed_depth(own, alike, AgreementSettings())[raised] > 0).all()
@@ -78,7 +86,7 @@ def test_a_place_that_views_look_through_is_no_surface(ring: list[StereoView]) -
 
 
 def test_planes_behind_the_camera_are_never_chosen(ring: list[StereoView]) -> None:
-    above = Planes(np.array([0.0, 0.0, 1.0]), np.array([31.0, 32.0, 33.0, 0.0]))
+    above = SweepPlanes(np.array([0.0, 0.0, 1.0]), np.array([31.0, 32.0, 33.0, 0.0]))
     sweep = plane_sweep(ring[2], ring[3:5], [above], MatchSettings())
     assert np.nanmin(np.abs(sweep.offset_m - 33.0)) > 1  # all on the only plane in front, or none at all
 
@@ -87,7 +95,7 @@ def test_a_sweep_needs_neighbours_and_planes(ring: list[StereoView]) -> None:
     with pytest.raises(ValueError, match="0 neighbours"):
         plane_sweep(ring[0], [], [LEVEL], MatchSettings())
     with pytest.raises(ValueError, match="2 planes"):
-        plane_sweep(ring[0], ring[1:2], [Planes(LEVEL.normal_in_world, np.array([0.0, 1.0]))], MatchSettings())
+        plane_sweep(ring[0], ring[1:2], [SweepPlanes(LEVEL.normal_in_model, np.array([0.0, 1.0]))], MatchSettings())
 
 
 def grid_points() -> np.ndarray:
@@ -99,25 +107,29 @@ def grid_points() -> np.ndarray:
 def test_neighbours_are_those_under_good_angles(ring: list[StereoView]) -> None:
     points = grid_points()
     count = len(points)
-    visibility = PointVisibility(
-        points,
-        np.array([view.camera.center_in_world for view in ring]),
-        np.tile(np.arange(count), len(ring)),
-        np.repeat(np.arange(len(ring)), count),
+    network = Network(
+        cameras={},
+        camera_id=np.zeros(len(ring), np.int64),
+        cam_from_world=np.array([view.camera.cam_from_model for view in ring]),
+        cam_center_in_world=np.array([view.camera.center_in_model for view in ring]),
+        point_in_world=points,
+        obs_point=np.tile(np.arange(count), len(ring)),
+        obs_image=np.repeat(np.arange(len(ring)), count),
+        obs_xy_px=np.zeros((len(ring) * count, 2)),
     )
-    neighbours = best_neighbours(visibility, 2, np.arange(len(ring)), 2)
+    neighbours = best_neighbours(network, 2, np.arange(len(ring)), 2)
     assert set(neighbours) == {1, 3}  # 13° and less from the scene; the next ones are at 26°
-    assert 5 not in best_neighbours(visibility, 2, np.array([0, 1, 3, 4]), 9)
+    assert 5 not in best_neighbours(network, 2, np.array([0, 1, 3, 4]), 9)
 
 
 def test_planes_follow_the_view(ring: list[StereoView]) -> None:
     points = grid_points()
     flat, across = planes_for(ring[2].camera, [view.camera for view in ring[3:5]], points)
-    np.testing.assert_allclose(flat.normal_in_world, [0, 0, 1])
+    np.testing.assert_allclose(flat.normal_in_model, [0, 0, 1])
     assert flat.offset_m.min() < GROUND_M < ROOF_M < flat.offset_m.max()
-    ahead = ring[2].camera.cam_from_world[2] * [1, 1, 0]
-    np.testing.assert_allclose(across.normal_in_world, ahead / np.linalg.norm(ahead))
-    along = points @ across.normal_in_world
+    ahead = ring[2].camera.cam_from_model[2] * [1, 1, 0]
+    np.testing.assert_allclose(across.normal_in_model, ahead / np.linalg.norm(ahead))
+    along = points @ across.normal_in_model
     assert across.offset_m.min() < along.min() < along.max() < across.offset_m.max()
     assert across.height_m == pytest.approx((flat.offset_m.min(), flat.offset_m.max()))
 
@@ -125,21 +137,21 @@ def test_planes_follow_the_view(ring: list[StereoView]) -> None:
 def test_a_level_view_needs_planes_across_it_alone() -> None:
     level = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
     rotation = np.stack([level[1], -np.array([0.0, 0, 1]), np.cross(level[1], [0.0, 0, -1])])
-    facade = StereoCamera(CAMERA, rotation, np.array([-40.0, 0.0, 3.0]) * np.sign(rotation[2, 0]))
-    side = StereoCamera(CAMERA, rotation, facade.center_in_world + np.array([0.0, 6.0, 0.0]))
+    facade = ViewPose(CAMERA, rotation, np.array([-40.0, 0.0, 3.0]) * np.sign(rotation[2, 0]))
+    side = ViewPose(CAMERA, rotation, facade.center_in_model + np.array([0.0, 6.0, 0.0]))
     (across,) = planes_for(facade, [side], grid_points())
-    np.testing.assert_allclose(np.abs(across.normal_in_world), [1, 0, 0], atol=1e-12)
-    depth = across.offset_m - across.normal_in_world @ facade.center_in_world
+    np.testing.assert_allclose(np.abs(across.normal_in_model), [1, 0, 0], atol=1e-12)
+    depth = across.offset_m - across.normal_in_model @ facade.center_in_model
     assert 0 < depth.min() < 32  # the points are 32 to 48 m away
     assert depth.max() > 48
 
 
 def test_from_straight_above_there_are_level_planes_alone() -> None:
     rotation = np.diag([1.0, -1.0, -1.0])
-    above = StereoCamera(CAMERA, rotation, np.array([0.0, 0.0, 40.0]))
-    side = StereoCamera(CAMERA, rotation, np.array([8.0, 0.0, 40.0]))
+    above = ViewPose(CAMERA, rotation, np.array([0.0, 0.0, 40.0]))
+    side = ViewPose(CAMERA, rotation, np.array([8.0, 0.0, 40.0]))
     (planes,) = planes_for(above, [side], grid_points())
-    np.testing.assert_allclose(planes.normal_in_world, [0, 0, 1])
+    np.testing.assert_allclose(planes.normal_in_model, [0, 0, 1])
 
 
 @pytest.fixture(scope="module")
@@ -150,27 +162,27 @@ def wall() -> tuple[StereoView, list[StereoView], np.ndarray]:
     views, depths = [], []
     for azimuth in (-24, -12, 0, 12, 24):
         rotation, center = looking_at_origin(azimuth, 18.0, 34.0)
-        camera = StereoCamera(CAMERA, rotation, center)
+        camera = ViewPose(CAMERA, rotation, center)
         depths.append(-(center @ normal) / (camera.rays() @ normal))
         place = center + depths[-1][..., None] * camera.rays()
         views.append(photographed(camera, painted(3, place @ side, place[..., 2])))
     return views[2], [*views[:2], *views[3:]], depths[2]
 
 
-def upright(view: StereoView, height_m: tuple[float, float] = (-np.inf, np.inf)) -> Planes:
+def upright(view: StereoView, height_m: tuple[float, float] = (-np.inf, np.inf)) -> SweepPlanes:
     """Return upright planes across a view."""
-    ahead = view.camera.cam_from_world[2] * [1, 1, 0]
-    return Planes(ahead / np.linalg.norm(ahead), np.arange(-10.0, 10.0, 0.5), height_m)
+    ahead = view.camera.cam_from_model[2] * [1, 1, 0]
+    return SweepPlanes(ahead / np.linalg.norm(ahead), np.arange(-10.0, 10.0, 0.5), height_m)
 
 
 def test_walls_are_found_on_upright_planes(wall: tuple[StereoView, list[StereoView], np.ndarray]) -> None:
     """Level planes cut the wall, and see other texture."""
     reference, others, truth = wall
-    flat = Planes(LEVEL.normal_in_world, np.arange(-12.0, 12.0, 0.5))
+    flat = SweepPlanes(LEVEL.normal_in_model, np.arange(-12.0, 12.0, 0.5))
     inner = np.s_[10:-10, 10:-10]
     wrong = []
     for sweeps in ([flat], [flat, upright(reference)]):
-        estimate = DepthEstimate(reference.camera, plane_sweep(reference, others, sweeps, MatchSettings()))
+        estimate = plane_sweep(reference, others, sweeps, MatchSettings())
         wrong.append((np.abs(estimate.depth() - truth)[inner] > 0.5).mean())
     assert wrong[1] < 0.5 * wrong[0]
     assert wrong[1] < 0.15
@@ -182,12 +194,12 @@ def test_only_the_rows_that_may_show_the_scene_are_compared(
     reference, others, truth = wall
     heights = (-4.0, 3.0)
     whole, part = (
-        DepthEstimate(reference.camera, plane_sweep(reference, others, [planes], MatchSettings()))
+        plane_sweep(reference, others, [planes], MatchSettings())
         for planes in (upright(reference), upright(reference, heights))
     )
 
     def height(depth: np.ndarray) -> np.ndarray:
-        return reference.camera.center_in_world[2] + depth * reference.camera.rays()[..., 2]
+        return reference.camera.center_in_model[2] + depth * reference.camera.rays()[..., 2]
 
     height_m = height(part.depth())
     # Nothing beyond; a parabola goes half a step of 0.5 m from a plane, on rays that fall by 18 m in 34 m.
@@ -197,8 +209,8 @@ def test_only_the_rows_that_may_show_the_scene_are_compared(
     inner = (height(truth) > heights[0] + 1) & (height(truth) < heights[1] - 1)
     inner &= np.abs(whole.depth() - truth) < 0.3
     assert inner.mean() > 0.05
-    np.testing.assert_allclose(part.sweep.offset_m[inner], whole.sweep.offset_m[inner], atol=1e-3)
-    np.testing.assert_allclose(part.sweep.score[inner], whole.sweep.score[inner], atol=1e-3)
+    np.testing.assert_allclose(part.offset_m[inner], whole.offset_m[inner], atol=1e-3)
+    np.testing.assert_allclose(part.score[inner], whole.score[inner], atol=1e-3)
 
 
 def test_too_few_points_give_no_planes(ring: list[StereoView]) -> None:

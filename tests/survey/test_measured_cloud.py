@@ -19,7 +19,7 @@ from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import Origin, lla_from_enu
 from pipelines.geodesy.vertical import parse_vertical
 from pipelines.surface import measured_cloud
-from pipelines.surface.measured_cloud import CloudFiles, Thinning, read_thinned
+from pipelines.surface.measured_cloud import CloudReader, Thinning, read_thinned
 from pipelines.survey.options import CloudCrs
 
 ORIGIN = Origin(lat_deg=46.02, lon_deg=7.75, alt_m=1620.0)
@@ -59,7 +59,7 @@ def cloud_points(position: np.ndarray) -> CloudPoints:
 
 
 def all_points(path: Path, stated: CloudCrs = CloudCrs()) -> np.ndarray:  # noqa: B008
-    return np.concatenate([chunk.position_in_geo for chunk in CloudFiles(path, stated).chunks(ORIGIN)])
+    return np.concatenate([chunk.position_in_geo for chunk in CloudReader(path, stated).chunks(ORIGIN)])
 
 
 @pytest.mark.parametrize("point_format", [1, 6])
@@ -88,7 +88,7 @@ def test_noise_overlap_and_withheld_points_are_dropped(tmp_path: Path) -> None:
     points = town(6)
     write_las(tmp_path / "c.laz", in_crs(points), classification=classes, overlap=overlap, withheld=withheld)
     write_las(tmp_path / "old.las", in_crs(points), point_format=1, classification=np.where(overlap, 12, classes))
-    files = CloudFiles(tmp_path / "c.laz", CloudCrs())
+    files = CloudReader(tmp_path / "c.laz", CloudCrs())
     np.testing.assert_allclose(next(files.chunks(ORIGIN)).position_in_geo, points[[0, 5]], atol=0.6 * STEP_M)
     assert (files.tally.noise, files.tally.overlap, files.tally.withheld) == (2, 1, 1)
     np.testing.assert_allclose(all_points(tmp_path / "old.las"), points[[0, 4, 5]], atol=0.6 * STEP_M)
@@ -112,7 +112,7 @@ def test_each_voxel_keeps_one_measured_point(
     folder, points = tmp_path_factory.mktemp("voxels"), town(300, seed)
     write_las(folder / "c.laz", in_crs(points))
     whole = all_points(folder / "c.laz")
-    cloud = read_thinned(CloudFiles(folder / "c.laz", CloudCrs()), ORIGIN, Thinning(voxel, most))
+    cloud = read_thinned(CloudReader(folder / "c.laz", CloudCrs()), ORIGIN, Thinning(voxel, most))
     assert len(cloud) <= most and cloud.weight.sum() == 300 and cloud.voxel_m >= voxel
     assert {tuple(row) for row in cloud.position_in_geo} <= {tuple(row) for row in whole}
     voxels = np.unique(np.floor(cloud.position_in_geo / cloud.voxel_m), axis=0)
@@ -124,37 +124,37 @@ def test_a_box_limits_the_cloud(tmp_path: Path) -> None:
     points = town(300)
     write_las(tmp_path / "c.laz", in_crs(points))
     low, high = np.array([-50.0, 0.0, -100.0]), np.array([80.0, 90.0, 100.0])
-    cloud = read_thinned(CloudFiles(tmp_path / "c.laz", CloudCrs()), ORIGIN, Thinning(0.01, 1000, low, high))
+    cloud = read_thinned(CloudReader(tmp_path / "c.laz", CloudCrs()), ORIGIN, Thinning(0.01, 1000, low, high))
     assert len(cloud) == ((points >= low) & (points <= high)).all(axis=1).sum()
     with pytest.raises(InputError, match="none of the 300 points"):
-        read_thinned(CloudFiles(tmp_path / "c.laz", CloudCrs()), ORIGIN, Thinning(1, 9, high, high + 1))
+        read_thinned(CloudReader(tmp_path / "c.laz", CloudCrs()), ORIGIN, Thinning(1, 9, high, high + 1))
 
 
 def test_heights_count_from_the_stated_datum(tmp_path: Path) -> None:
     points = town(20)
     write_las(tmp_path / "flat.laz", in_crs(points))
-    assert "ellipsoidal" in CloudFiles(tmp_path / "flat.laz", CloudCrs()).assumptions[0]
-    stated = CloudFiles(tmp_path / "flat.laz", CloudCrs(vertical=parse_vertical("ellipsoidal")))
+    assert "ellipsoidal" in CloudReader(tmp_path / "flat.laz", CloudCrs()).assumptions[0]
+    stated = CloudReader(tmp_path / "flat.laz", CloudCrs(vertical=parse_vertical("ellipsoidal")))
     assert not stated.assumptions
     # The grid of this geoid is not part of PROJ: nothing may be taken in its place.
-    missing = CloudFiles(tmp_path / "flat.laz", CloudCrs(vertical=parse_vertical("EPSG:5728")))
+    missing = CloudReader(tmp_path / "flat.laz", CloudCrs(vertical=parse_vertical("EPSG:5728")))
     with pytest.raises(InputError, match="not installed"):
         next(missing.chunks(ORIGIN))
     write_las(tmp_path / "compound.laz", in_crs(points), crs="EPSG:32632+5728")
     with pytest.raises(InputError, match="not installed"):
-        next(CloudFiles(tmp_path / "compound.laz", CloudCrs()).chunks(ORIGIN))
+        next(CloudReader(tmp_path / "compound.laz", CloudCrs()).chunks(ORIGIN))
 
 
 def test_files_without_crs_need_one(tmp_path: Path) -> None:
     points = town(5)
     write_las(tmp_path / "c.las", in_crs(points), crs=None)
     with pytest.raises(InputError, match="--lidar-crs") as raised:
-        CloudFiles(tmp_path / "c.las", CloudCrs())
+        CloudReader(tmp_path / "c.las", CloudCrs())
     assert raised.value.path == tmp_path / "c.las"
     np.testing.assert_allclose(all_points(tmp_path / "c.las", CloudCrs(crs=UTM)), points, atol=0.6 * STEP_M)
     (tmp_path / "scan.e57").write_bytes(b"ASTM-E57")
     with pytest.raises(InputError, match=r"\.laz"):
-        CloudFiles(tmp_path / "scan.e57", CloudCrs())
+        CloudReader(tmp_path / "scan.e57", CloudCrs())
 
 
 def test_single_precision_of_large_coordinates_is_refused(tmp_path: Path) -> None:
