@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal
 
@@ -43,7 +43,7 @@ class TargetSite:
     @property
     def target_position(self) -> FloatArray:
         """Centre (3,) of the target's face: its board stands a little off the surface behind it."""
-        return np.asarray(self.position + _TARGET_LIFT_M * self.normal)
+        return self.position + _TARGET_LIFT_M * self.normal
 
 
 @dataclass(frozen=True)
@@ -53,9 +53,6 @@ class Building:
     Attributes:
         center: (3,) geo, at ground level.
         axes: (3, 3) rows: along its length, across, up.
-        length_m, width_m: outer size.
-        storeys, floor_m: their number and height.
-        roof: form of the roof.
     """
 
     center: FloatArray
@@ -73,27 +70,32 @@ class Building:
 
     def at(self, x: float, y: float, z: float) -> FloatArray:
         """Return the geo position (3,) of a place in the building's own axes."""
-        return np.asarray(self.center + np.array([x, y, z]) @ self.axes)
+        return self.center + np.array([x, y, z]) @ self.axes
+
+    def rectangle(self, half_l: float, half_w: float, z: float) -> list[FloatArray]:
+        """Return the corners, counter-clockwise from above, of a level rectangle about the building's middle."""
+        return [self.at(x * half_l, y * half_w, z) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
 
 
-def varied_color(rng: np.random.Generator, colors: tuple[Color, ...]) -> Color:
+def _varied(rng: np.random.Generator, colors: tuple[Color, ...]) -> Color:
     """Return one of the colours, varied a little."""
     chosen = np.array(colors[rng.integers(len(colors))])
     varied = np.clip(chosen * rng.uniform(0.85, 1.15) * rng.uniform(0.93, 1.07, 3), 0.02, 0.9)
     return (float(varied[0]), float(varied[1]), float(varied[2]))
 
 
-def random_shift(rng: np.random.Generator) -> tuple[float, float]:
-    """Return a random shift (2,) of a texture in the noise, in metres."""
-    return (float(rng.uniform(0, 400)), float(rng.uniform(0, 400)))
+def _add_shifted(builder: MeshBuilder, texture: TextureParameters, rng: np.random.Generator) -> int:
+    """Register a texture at a random place in the noise, and return its row."""
+    shift_m = (float(rng.uniform(0, 400)), float(rng.uniform(0, 400)))
+    return builder.add_texture(replace(texture, shift_m=shift_m))
 
 
 def add_building(builder: MeshBuilder, building: Building, rng: np.random.Generator) -> list[TargetSite]:
     """Add a building, and return sites for targets on its walls and flat roof."""
     style = int(rng.integers(3))
     wall = TextureParameters(
-        base=varied_color(rng, STONES if style == 1 else PLASTERS),
-        accent=varied_color(rng, FRAMES),
+        base=_varied(rng, STONES if style == 1 else PLASTERS),
+        accent=_varied(rng, FRAMES),
         style=style,
         floor_m=building.floor_m,
         pitch_m=float(rng.uniform(2.3, 3.6)),
@@ -112,19 +114,15 @@ def add_building(builder: MeshBuilder, building: Building, rng: np.random.Genera
 def _add_walls(
     builder: MeshBuilder, building: Building, wall: TextureParameters, rng: np.random.Generator
 ) -> list[TargetSite]:
-    half_l, half_w = building.length_m / 2, building.width_m / 2
     top = building.height_m + (0.8 if building.roof == "flat" else 0.0)
-    ring = [(-half_l, -half_w), (half_l, -half_w), (half_l, half_w), (-half_l, half_w), (-half_l, -half_w)]
+    ring = building.rectangle(building.length_m / 2, building.width_m / 2, 0.0)
     sites = []
-    for (x0, y0), (x1, y1) in pairwise(ring):
-        start, end = building.at(x0, y0, 0.0), building.at(x1, y1, 0.0)
+    for start, end in pairwise([*ring, ring[0]]):
         length = float(np.linalg.norm(end - start))
         along = (end - start) / length
         up = np.array([0.0, 0.0, 1.0])
         count = max(1, round(length / wall.pitch_m))
-        texture = builder.add_texture(
-            TextureParameters(**{**vars(wall), "pitch_m": length / count, "shift_m": random_shift(rng)})
-        )
+        texture = _add_shifted(builder, replace(wall, pitch_m=length / count), rng)
         a, b, c, d = start - _FOOT_M * up, end - _FOOT_M * up, end + top * up, start + top * up
         builder.triangles(np.array([[a, b, c], [a, c, d]]), Material.WALL, texture, (start, along, up))
         normal = np.cross(along, up)
@@ -136,12 +134,9 @@ def _add_walls(
 
 def _add_flat_roof(builder: MeshBuilder, building: Building, rng: np.random.Generator) -> list[TargetSite]:
     half_l, half_w, top = building.length_m / 2, building.width_m / 2, building.height_m
-    ring = [(-half_l, -half_w), (half_l, -half_w), (half_l, half_w), (-half_l, half_w)]
-    sheet = builder.add_texture(
-        TextureParameters(varied_color(rng, SHEETS), varied_color(rng, SHEETS), shift_m=random_shift(rng))
-    )
-    builder.quad([building.at(x, y, top) for x, y in ring], Material.FLAT_ROOF, sheet)
-    metal = builder.add_texture(TextureParameters((0.45, 0.46, 0.47), shift_m=random_shift(rng)))
+    sheet = _add_shifted(builder, TextureParameters(_varied(rng, SHEETS), _varied(rng, SHEETS)), rng)
+    builder.quad(building.rectangle(half_l, half_w, top), Material.FLAT_ROOF, sheet)
+    metal = _add_shifted(builder, TextureParameters((0.45, 0.46, 0.47)), rng)
     free = [(x, y) for x in (-0.6, 0.0, 0.6) for y in (-0.5, 0.5)]
     rng.shuffle(free)
     for x, y in free[: int(rng.integers(1, 4))]:
@@ -162,15 +157,10 @@ def _add_solar(
     builder: MeshBuilder, building: Building, place: tuple[float, float], rng: np.random.Generator
 ) -> None:
     x, y, top = place[0] * building.length_m / 2, place[1] * building.width_m / 2, building.height_m
-    texture = builder.add_texture(TextureParameters((0.02, 0.03, 0.07), shift_m=random_shift(rng)))
-    low, high, reach = top + 0.2, top + 0.9, min(2.5, building.length_m / 8)
-    corners = [
-        (x - reach, y - 0.8, low),
-        (x + reach, y - 0.8, low),
-        (x + reach, y + 0.8, high),
-        (x - reach, y + 0.8, high),
-    ]
-    builder.quad([building.at(*corner) for corner in corners], Material.SOLAR, texture)
+    texture = _add_shifted(builder, TextureParameters((0.02, 0.03, 0.07)), rng)
+    reach = min(2.5, building.length_m / 8)
+    sides = [(-reach, -0.8, 0.2), (reach, -0.8, 0.2), (reach, 0.8, 0.9), (-reach, 0.8, 0.9)]
+    builder.quad([building.at(x + dx, y + dy, top + dz) for dx, dy, dz in sides], Material.SOLAR, texture)
 
 
 def _add_pitched_roof(
@@ -180,25 +170,22 @@ def _add_pitched_roof(
     slope = float(rng.uniform(0.55, 0.95))
     ridge, eave = top + half_w * slope, top - over * slope
     back = half_w if building.roof == "hip" else -over
-    tile = builder.add_texture(TextureParameters(varied_color(rng, TILES), shift_m=random_shift(rng)))
+    tile = _add_shifted(builder, TextureParameters(_varied(rng, TILES)), rng)
     ends = [building.at(-half_l + back, 0.0, ridge), building.at(half_l - back, 0.0, ridge)]
-    out_l, out_w = half_l + over, half_w + over
-    corners = [
-        building.at(x, y, eave) for x, y in [(-out_l, -out_w), (out_l, -out_w), (out_l, out_w), (-out_l, out_w)]
-    ]
+    corners = building.rectangle(half_l + over, half_w + over, eave)
     builder.quad([corners[0], corners[1], ends[1], ends[0]], Material.TILES, tile)
     builder.quad([corners[2], corners[3], ends[0], ends[1]], Material.TILES, tile)
     if building.roof == "hip":
         _add_hip(builder, (corners[1], corners[2], ends[1]), tile)
         _add_hip(builder, (corners[3], corners[0], ends[0]), tile)
     else:
-        gable = builder.add_texture(TextureParameters(**{**vars(wall), "shift_m": random_shift(rng)}))
+        gable = _add_shifted(builder, wall, rng)
         for sign in (-1.0, 1.0):
             low = building.at(sign * half_l, -sign * half_w, top), building.at(sign * half_l, sign * half_w, top)
             peak = building.at(sign * half_l, 0.0, ridge)
             frame = (building.at(sign * half_l, -sign * half_w, 0.0), sign * building.axes[1], building.axes[2])
             builder.triangles(np.array([[*low, peak]]), Material.WALL, gable, frame)
-    brick = builder.add_texture(TextureParameters(varied_color(rng, STONES), shift_m=random_shift(rng)))
+    brick = _add_shifted(builder, TextureParameters(_varied(rng, STONES)), rng)
     x, y = rng.uniform(-0.5, 0.5) * (half_l - 1), rng.uniform(-0.5, 0.5) * half_w
     foot = top + (half_w - abs(y)) * slope - 0.8
     builder.box(building.at(x, y, foot), (0.9, 0.7, 2.2), building.axes, Material.PLAIN, brick)
@@ -236,11 +223,11 @@ _BALL_VERTICES, _BALL_FACES = _ball()
 
 def add_tree(builder: MeshBuilder, foot: FloatArray, height_m: float, rng: np.random.Generator) -> None:
     """Add a tree of a trunk and three lumpy crowns; `foot` (3,) in geo."""
-    bark = builder.add_texture(TextureParameters((0.13, 0.10, 0.07), shift_m=random_shift(rng)))
+    bark = _add_shifted(builder, TextureParameters((0.13, 0.10, 0.07)), rng)
     builder.box(foot - [0, 0, 0.5], (0.35, 0.35, 0.6 * height_m), np.eye(3), Material.PLAIN, bark)
-    red, green, blue = varied_color(rng, CROWNS)
+    red, green, blue = _varied(rng, CROWNS)
     light = (2.1 * red, 2.1 * green, 2.1 * blue)
-    leaf = builder.add_texture(TextureParameters((red, green, blue), light, shift_m=random_shift(rng)))
+    leaf = _add_shifted(builder, TextureParameters((red, green, blue), light), rng)
     for _ in range(3):
         radius = height_m * rng.uniform(0.2, 0.3)
         aside, above = rng.normal(0, 0.12 * height_m, 2), height_m * rng.uniform(0.55, 0.78)
@@ -253,8 +240,8 @@ def add_tree(builder: MeshBuilder, foot: FloatArray, height_m: float, rng: np.ra
 
 def add_car(builder: MeshBuilder, foot: FloatArray, axes: FloatArray, rng: np.random.Generator) -> None:
     """Add a parked car; `foot` (3,) in geo, `axes` (3, 3) rows along, across, up."""
-    color = varied_color(rng, CARS)
-    body = builder.add_texture(TextureParameters(color, shift_m=random_shift(rng)))
-    cabin = builder.add_texture(TextureParameters(color, top_m=1.0, shift_m=random_shift(rng)))
+    color = _varied(rng, CARS)
+    body = _add_shifted(builder, TextureParameters(color), rng)
+    cabin = _add_shifted(builder, TextureParameters(color, top_m=1.0), rng)
     builder.box(foot + 0.25 * axes[2], (4.3, 1.8, 0.7), axes, Material.CAR, body)
     builder.box(foot + 0.95 * axes[2] - 0.2 * axes[0], (2.4, 1.6, 0.55), axes, Material.CAR, cabin)

@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
-from pipelines.core.types import FloatArray
+from pipelines.core.types import FloatArray, IntArray
 from pipelines.geometry.rotations import ENU_FROM_NED, geo_from_cam
 
+START_NS = 1_700_000_000_000_000_000  # 2023-11-14 22:13:20 UTC
 LEAD_S = 1.0  # time that the sensors run before the first and after the last photograph
 _LOOK_AT_M = 6.0
 _SPEED_M_S = 8.0
@@ -24,8 +25,7 @@ class FlightPlan:
 
     Attributes:
         kind: "orbit", "grid" or "facade".
-        images: number of photographs.
-        interval_s: time between them; None for 2 s, or more where the aircraft would be faster than 8 m/s.
+        interval_s: time between photographs; None for 2 s, or more where the aircraft would be faster than 8 m/s.
         heights_m: above the origin, one round each.
         radius_m: radius, half side, or distance from the facade.
     """
@@ -44,20 +44,18 @@ class TrueTrajectory:
     Attributes:
         photo_s: (N,) times of the photographs.
         cam_from_body: (3, 3) nominal mounting: body axes (forward, right, down) → camera.
+        position: camera centres (N, 3) in geo at times (N,); its second derivative is the acceleration in m/s².
     """
 
     photo_s: FloatArray
     cam_from_body: FloatArray
-    _position: CubicSpline
+    position: CubicSpline
     _angles: PchipInterpolator
 
-    def position(self, time_s: ArrayLike) -> FloatArray:
-        """Return camera centres (N, 3) in geo."""
-        return np.asarray(self._position(time_s))
-
-    def acceleration(self, time_s: ArrayLike) -> FloatArray:
-        """Return accelerations (N, 3) in geo, m/s²."""
-        return np.asarray(self._position(time_s, 2))
+    @property
+    def stamp_ns(self) -> IntArray:
+        """Stamps (N,) of the photographs on the camera's clock."""
+        return START_NS + np.round(self.photo_s * 1e9).astype(np.int64)
 
     def geo_from_nominal_cam(self, time_s: ArrayLike) -> FloatArray:
         """Return rotations (N, 3, 3) camera → geo of a camera that is mounted exactly as planned."""
@@ -65,7 +63,7 @@ class TrueTrajectory:
 
     def geo_from_body(self, time_s: ArrayLike) -> FloatArray:
         """Return rotations (N, 3, 3) body → geo of the body (forward, right, down)."""
-        return np.asarray(self.geo_from_nominal_cam(time_s) @ self.cam_from_body)
+        return self.geo_from_nominal_cam(time_s) @ self.cam_from_body
 
 
 def make_trajectory(
@@ -87,11 +85,13 @@ def make_trajectory(
     else:
         positions, angles = _facade(plan, index, complex_m, axes)
     positions = positions + rng.normal(0, 0.008 * plan.radius_m, positions.shape)
-    wobble = rng.normal(0, 1.5, angles.shape)
     pitch = float(np.round(angles[:, 1].mean()))
-    angles = angles + wobble
+    angles = angles + rng.normal(0, 1.5, angles.shape)
     angles[:, 0] = np.degrees(np.unwrap(np.radians(angles[:, 0])))
-    times = index * (plan.interval_s or _unhurried_s(positions))
+    step_m = float(np.median(np.linalg.norm(np.diff(positions, axis=0), axis=1)))
+    # In half seconds: photographs coincide with fixes.
+    unhurried_s = max(2.0, float(np.ceil(2 * step_m / _SPEED_M_S)) / 2)
+    times = index * (plan.interval_s or unhurried_s)
     return TrueTrajectory(
         times[1:-1].astype(np.float64),
         # The mount tilts the camera as the flight needs, so that the body itself flies level.
@@ -99,12 +99,6 @@ def make_trajectory(
         CubicSpline(times, positions),
         PchipInterpolator(times, angles),
     )
-
-
-def _unhurried_s(positions: FloatArray) -> float:
-    """Return the interval for at most 8 m/s, 2 s or more, in half seconds: photographs coincide with fixes."""
-    step_m = float(np.median(np.linalg.norm(np.diff(positions, axis=0), axis=1)))
-    return max(2.0, float(np.ceil(2 * step_m / _SPEED_M_S)) / 2)
 
 
 def _rounds(plan: FlightPlan, index: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:

@@ -54,7 +54,10 @@ def build_scene(name: str, seed: np.random.SeedSequence) -> SimulatedScene:
     layout = make_town_layout(style, rng)
     builder = MeshBuilder()
     add_terrain(builder, terrain, axes, TextureParameters((0.1, 0.15, 0.05)))
-    sites = _ground_sites(terrain, rng)
+    places = rng.uniform(-95, 95, (260, 2))
+    positions = np.concatenate([places, terrain.height(places)[:, None]], axis=1)
+    on_ground = zip(positions, terrain.normal(places), strict=True)
+    sites = [TargetSite(position, normal, "ground") for position, normal in on_ground]
     buildings = tuple(_building(plan, terrain, axes) for plan in layout.buildings)
     for building in buildings:
         sites += add_building(builder, building, rng)
@@ -67,21 +70,13 @@ def build_scene(name: str, seed: np.random.SeedSequence) -> SimulatedScene:
 def _on_ground(xy: tuple[float, float], terrain: Terrain, axes: FloatArray) -> FloatArray:
     place = np.array([*xy, 0.0]) @ axes
     place[2] = terrain.height(place[:2])
-    return np.asarray(place)
+    return place
 
 
 def _building(plan: BuildingPlan, terrain: Terrain, axes: FloatArray) -> Building:
     own = np.stack([axes[1], -axes[0], axes[2]]) if plan.turned else axes
     center = _on_ground(plan.center, terrain, axes)
-    return Building(
-        center,
-        own,
-        plan.length_m,
-        plan.width_m,
-        plan.storeys,
-        plan.floor_m,
-        plan.roof,
-    )
+    return Building(center, own, plan.length_m, plan.width_m, plan.storeys, plan.floor_m, plan.roof)
 
 
 def _add_furniture(
@@ -98,13 +93,6 @@ def _add_furniture(
         add_car(builder, foot, np.stack([along, np.cross(up, along), up]), rng)
 
 
-def _ground_sites(terrain: Terrain, rng: np.random.Generator) -> list[TargetSite]:
-    places = rng.uniform(-95, 95, (260, 2))
-    normals = terrain.normal(places)
-    positions = np.concatenate([places, terrain.height(places)[:, None]], axis=1)
-    return [TargetSite(position, normal, "ground") for position, normal in zip(positions, normals, strict=True)]
-
-
 def with_targets(scene: SimulatedScene, sites: list[TargetSite], width_m: float) -> SimulatedScene:
     """Return the scene with a black and white board of `width_m` at every site."""
     if not sites:
@@ -119,8 +107,7 @@ def with_targets(scene: SimulatedScene, sites: list[TargetSite], width_m: float)
         middle, half = site.target_position, width_m / 2
         a, b, c, d = (middle + half * (i * u_axis + j * v_axis) for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1)))
         builder.triangles(np.array([[a, b, c], [a, c, d]]), Material.TARGET, texture, (middle, u_axis, v_axis))
-    boards = builder.build()
-    return replace(scene, mesh=joined(scene.mesh, boards))
+    return replace(scene, mesh=joined(scene.mesh, builder.build()))
 
 
 def joined(first: Mesh, second: Mesh) -> Mesh:

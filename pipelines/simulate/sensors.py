@@ -10,9 +10,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from pipelines.core.types import FloatArray, IntArray, Vector3
 from pipelines.geodesy.enu import Origin, geo_from_enu_at, lla_from_enu
 from pipelines.geometry.rotations import exp_so3
-from pipelines.simulate.flight import LEAD_S, TrueTrajectory
+from pipelines.simulate.flight import LEAD_S, START_NS, TrueTrajectory
 
-START_NS = 1_700_000_000_000_000_000  # 2023-11-14 22:13:20 UTC
 GNSS_STEP_NS, IMU_STEP_NS = 100_000_000, 10_000_000
 GRAVITY_M_S2 = 9.80665
 
@@ -68,10 +67,7 @@ class GnssLog:
 
     Attributes:
         stamp_ns: (N,) navigation clock.
-        position_in_geo: (N, 3) measured antenna.
-        true_in_geo: (N, 3) true antenna.
-        bias: (N, 3) slow bias of the positions, metres in geo.
-        outlier: (N, 3) errors of wrong fixes, metres in geo; zero for the others.
+        position_in_geo, true_in_geo: (N, 3) measured and true antenna.
         bias_amplitude_m, bias_phase_rad: (3,) bias(t) = amplitude · sin(2πt/period + phase), t from the first
             photograph on the camera's clock.
         wrong_photos: (M,) indices of the photographs with wrong fixes.
@@ -80,8 +76,6 @@ class GnssLog:
     stamp_ns: IntArray
     position_in_geo: FloatArray
     true_in_geo: FloatArray
-    bias: FloatArray
-    outlier: FloatArray
     bias_amplitude_m: FloatArray
     bias_phase_rad: FloatArray
     wrong_photos: IntArray
@@ -103,11 +97,6 @@ class ImuLog:
     specific_force_in_body: FloatArray
 
 
-def photo_stamps(trajectory: TrueTrajectory) -> IntArray:
-    """Return the stamps (N,) of the photographs on the camera's clock."""
-    return np.asarray(START_NS + np.round(trajectory.photo_s * 1e9).astype(np.int64))
-
-
 def record_gnss(
     trajectory: TrueTrajectory, mounting: Mounting, receiver: Receiver, rng: np.random.Generator
 ) -> GnssLog:
@@ -122,16 +111,18 @@ def record_gnss(
     white = rng.normal(size=true.shape) * [receiver.sigma_h_m, receiver.sigma_h_m, receiver.sigma_v_m]
     count = len(trajectory.photo_s)
     wrong = np.sort(rng.permutation(count)[: round(receiver.outlier_share * count)])
+    # Flatter than a sphere, like multipath.
+    direction = rng.normal(size=(len(wrong), 3)) * [1.0, 1.0, 0.6]
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     jumps = np.zeros((count, 3))
-    jumps[wrong] = _jumps(len(wrong), receiver.outlier_m, rng)
+    jumps[wrong] = direction * receiver.outlier_m * rng.uniform(0.7, 1.3, (len(wrong), 1))
     # A reflected signal lasts a while: from halfway before the photograph to halfway after it. Photographs are
     # matched by the navigation clock's stamp, as a user does who does not know the clock offset.
     stamped_s = time_s + mounting.clock_offset_s
     nearest = np.searchsorted((trajectory.photo_s[1:] + trajectory.photo_s[:-1]) / 2, stamped_s)
-    outlier = jumps[nearest]
     stamp_ns = START_NS + since_ns + round(mounting.clock_offset_s * 1e9)
-    measured = true + receiver.common_error_m + bias + white + outlier
-    return GnssLog(stamp_ns, measured, true, bias, outlier, amplitude, phase, wrong)
+    measured = true + receiver.common_error_m + bias + white + jumps[nearest]
+    return GnssLog(stamp_ns, measured, true, amplitude, phase, wrong)
 
 
 def _epochs(trajectory: TrueTrajectory, mounting: Mounting, step_ns: int) -> IntArray:
@@ -139,13 +130,6 @@ def _epochs(trajectory: TrueTrajectory, mounting: Mounting, step_ns: int) -> Int
     lead_ns = round((LEAD_S + abs(mounting.clock_offset_s)) * 1e9)
     last_ns = round(float(trajectory.photo_s[-1]) * 1e9) + lead_ns
     return np.arange(-(-lead_ns // step_ns) * -step_ns, last_ns + step_ns, step_ns, dtype=np.int64)
-
-
-def _jumps(count: int, size_m: float, rng: np.random.Generator) -> FloatArray:
-    """Return errors (N, 3) of 0.7 to 1.3 times `size_m`, flatter than a sphere like multipath."""
-    direction = rng.normal(size=(count, 3)) * [1.0, 1.0, 0.6]
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    return np.asarray(direction * size_m * rng.uniform(0.7, 1.3, (count, 1)))
 
 
 def record_imu(
@@ -158,7 +142,7 @@ def record_imu(
     half_s = 1e-3
     ahead, behind = trajectory.geo_from_body(time_s + half_s), trajectory.geo_from_body(time_s - half_s)
     rate = Rotation.from_matrix(np.swapaxes(behind, 1, 2) @ ahead).as_rotvec() / (2 * half_s)
-    force = trajectory.acceleration(time_s) + np.array([0.0, 0.0, GRAVITY_M_S2])
+    force = trajectory.position(time_s, 2) + np.array([0.0, 0.0, GRAVITY_M_S2])
     noise = exp_so3(np.radians(rng.normal(0, sigma_deg, (len(time_s), 3))))
     return ImuLog(
         START_NS + since_ns + round(mounting.clock_offset_s * 1e9),
@@ -185,4 +169,4 @@ def attitudes_at(log: ImuLog, stamp_ns: IntArray) -> FloatArray:
 def in_local_enu(rotations: FloatArray, positions_in_geo: FloatArray, origin: Origin) -> FloatArray:
     """Return rotations (N, 3, 3) into geo as rotations into East-North-Up at each place (N, 3)."""
     geo_from_enu = geo_from_enu_at(lla_from_enu(positions_in_geo, origin), origin)
-    return np.asarray(np.swapaxes(geo_from_enu, -1, -2) @ rotations)
+    return np.swapaxes(geo_from_enu, -1, -2) @ rotations
