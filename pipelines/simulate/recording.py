@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -71,31 +70,34 @@ def write_trajectory(path: Path, photos: PhotoRecords) -> None:
     _write(path, rows)
 
 
-def write_gnss(path: Path, log: GnssLog, sigma_enu_m: FloatArray, origin: Origin) -> None:
-    """Write every fix, on the navigation clock."""
+def write_tables(folder: Path, recording: Recording, enu_from_body: FloatArray, origin: Origin) -> None:
+    """Write trajectory, raw navigation on the navigation clock, control and check points.
+
+    Args:
+        folder: of the survey.
+        recording: of the instruments and the surveyor.
+        enu_from_body: (K, 3, 3) attitudes of the log, at their places: East-North-Up from forward-right-down.
+        origin: of geo.
+    """
+    photos, gnss, imu = recording.photos, recording.gnss, recording.imu
+    write_trajectory(folder / "trajectory.csv", photos)
+    sigma = ",".join(f"{value:.4g}" for value in photos.sigma_enu_m)
     rows = ["timestamp,latitude,longitude,altitude,sigma_e,sigma_n,sigma_u"]
-    sigma = ",".join(f"{value:.4g}" for value in sigma_enu_m)
-    places = lla_from_enu(log.position_in_geo, origin)
-    rows += [f"{_seconds(stamp)},{_position(lla)},{sigma}" for stamp, lla in zip(log.stamp_ns, places, strict=True)]
-    _write(path, rows)
-
-
-def write_imu(path: Path, log: ImuLog, enu_from_body: FloatArray) -> None:
-    """Write every attitude (N, 3, 3), on the navigation clock: East-North-Up from the body, forward-right-down."""
+    for stamp, lla in zip(gnss.stamp_ns, recording.gnss_lla, strict=True):
+        rows.append(f"{_seconds(stamp)},{_position(lla)},{sigma}")
+    _write(folder / "gnss.csv", rows)
     rows = ["timestamp,qx,qy,qz,qw"]
-    for stamp, quat in zip(log.stamp_ns, quat_xyzw_from_matrix(enu_from_body), strict=True):
+    for stamp, quat in zip(imu.stamp_ns, quat_xyzw_from_matrix(enu_from_body), strict=True):
         rows.append(f"{_seconds(stamp)}," + ",".join(f"{part:.9f}" for part in quat))
-    _write(path, rows)
-
-
-def write_points(path: Path, targets: Sequence[SurveyedTarget], origin: Origin) -> None:
-    """Write control or check points in the form of ODM's gcp_list.txt: x is the longitude."""
-    rows = [POINTS_CRS]
-    for target in targets:
-        lat, lon, alt = lla_from_enu(target.position_in_geo, origin)
-        place = f"{lon:.10f} {lat:.10f} {alt:.5f}"
-        rows += [f"{place} {x:.3f} {y:.3f} {image} {target.name}" for image, x, y in target.marks]
-    _write(path, rows)
+    _write(folder / "imu.csv", rows)
+    for name, targets in (("gcp_list.txt", recording.control), ("checkpoints.txt", recording.check)):
+        # The form of ODM's gcp_list.txt: x is the longitude.
+        rows = [POINTS_CRS]
+        for target in targets:
+            lat, lon, alt = lla_from_enu(target.position_in_geo, origin)
+            place = f"{lon:.10f} {lat:.10f} {alt:.5f}"
+            rows += [f"{place} {x:.3f} {y:.3f} {image} {target.name}" for image, x, y in target.marks]
+        _write(folder / name, rows)
 
 
 def _seconds(stamp_ns: np.int64) -> str:
@@ -106,7 +108,7 @@ def _position(lla: FloatArray) -> str:
     return f"{lla[0]:.9f},{lla[1]:.9f},{lla[2]:.4f}"
 
 
-def _write(path: Path, rows: Sequence[str]) -> None:
+def _write(path: Path, rows: list[str]) -> None:
     path.write_text("\n".join(rows) + "\n", encoding="utf-8", newline="\n")
 
 

@@ -28,15 +28,7 @@ from pipelines.formats.exif_writer import DroneTags, with_tags
 from pipelines.simulate.lens import Renderer, Sensor
 from pipelines.simulate.lidar import LidarFlight, lidar_files
 from pipelines.simulate.options import SimulateOptions
-from pipelines.simulate.recording import (
-    Recording,
-    record,
-    vector,
-    write_gnss,
-    write_imu,
-    write_points,
-    write_trajectory,
-)
+from pipelines.simulate.recording import Recording, record, vector, write_tables
 from pipelines.simulate.sensors import in_local_enu
 from pipelines.simulate.truth import TrueLidar
 from pipelines.simulate.world import WANTED_RAYS, World, check_clearance, make_world
@@ -248,11 +240,7 @@ def _tags(options: SimulateOptions, world: World, recording: Recording, i: int) 
 def _write_records(options: SimulateOptions, world: World, recording: Recording, folder: Path) -> int:
     """Write tables, truth and bag; return the number of messages in the bag."""
     enu_from_body = in_local_enu(recording.imu.geo_from_body, recording.imu_in_geo, world.origin)
-    write_trajectory(folder / "trajectory.csv", recording.photos)
-    write_gnss(folder / "gnss.csv", recording.gnss, recording.photos.sigma_enu_m, world.origin)
-    write_imu(folder / "imu.csv", recording.imu, enu_from_body)
-    write_points(folder / "gcp_list.txt", recording.control, world.origin)
-    write_points(folder / "checkpoints.txt", recording.check, world.origin)
+    write_tables(folder, recording, enu_from_body, world.origin)
     if options.bag == "none":
         return 0
     lens = world.lens
