@@ -34,16 +34,14 @@ class McmcSettings:
     """Settings of `McmcStrategy`; iterations count from 1.
 
     Attributes:
-        start: Gaussians are moved and added after this iteration,
-        stop: and up to this iteration,
-        every: at every such number of iterations.
+        start, stop, every: Gaussians are moved and added after `start` and up to `stop`, at every such number of
+            iterations.
         growth: share of Gaussians to add at each edit.
         dead_opacity: Gaussians up to this opacity are moved.
         noise: standard deviation of the noise, in learning rates of the centres times covariance, all in scene
             extents. The paper's 5e5 is for scenes whose extent is about 5 units, hence the factor 5².
-        opacity_penalty: weight of the mean opacity,
-        scale_penalty: and of the mean standard deviation, in scene extents.
-        max_gaussians: limit of their number.
+        opacity_penalty, scale_penalty: weights of the mean opacity, and of the mean standard deviation in scene
+            extents.
     """
 
     start: int = 500
@@ -70,10 +68,9 @@ class McmcSettings:
 
 
 class McmcStrategy:
-    """Relocation, growth and noise; see the module."""
+    """Relocation, growth and noise in a scene of size `extent_m`; see the module."""
 
     def __init__(self, settings: McmcSettings, extent_m: float, seed: int = 0) -> None:
-        """Start; `extent_m` is the size of the scene."""
         self.settings, self.extent_m, self._seed = settings, extent_m, seed
         self._generator = torch.Generator().manual_seed(seed)
         self._visible: Tensor | None = None
@@ -134,7 +131,6 @@ class McmcStrategy:
 
     @torch.no_grad()
     def _edit(self, optimizer: GaussianAdam) -> DensityEdit:
-        """Move dead Gaussians, add new ones, and put all into spatial order."""
         gaussians, settings = optimizer.gaussians.detached(), self.settings
         opacity = torch.sigmoid(gaussians.logit_opacities)
         dead = (opacity <= settings.dead_opacity).nonzero()[:, 0]

@@ -1,10 +1,6 @@
-"""Gaussians as tensors, a row for each Gaussian, in the form in which they are optimised and stored.
+"""Gaussians as tensors, a row for each Gaussian, in the form in which they are optimised and stored; their files.
 
-Reading and writing of Gaussians as files.
-
-Transformation of Gaussians to another frame.
-
-Detection of values that are not finite, without waiting for the device at every iteration.
+Also their transformation to another frame, and the detection of values that are not finite.
 """
 
 from __future__ import annotations
@@ -63,13 +59,8 @@ class Gaussians:
         """Return the values as numpy arrays by name, for files."""
         return {name: tensor.detach().cpu().numpy() for name, tensor in self.tensors().items()}
 
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, Float32Array]) -> Gaussians:
-        """Make Gaussians from arrays by the names of the attributes; copied."""
-        return cls(**{field.name: torch.tensor(arrays[field.name]) for field in fields(cls)})
-
     def select(self, index: Tensor) -> Gaussians:
-        """Return the rows that `index` (bool mask or integer) picks."""
+        """Return the rows that a mask or integers pick."""
         return Gaussians(**{name: tensor[index] for name, tensor in self.tensors().items()})
 
     def to(self, device: torch.device) -> Gaussians:
@@ -110,18 +101,17 @@ def read_gaussians(path: Path, rows: slice = slice(None)) -> Gaussians:
     Raises:
         InputError: no such file, not a PLY of that form, cut off, or with values that are not finite.
     """
-    return Gaussians.from_arrays(vars(read_splat_ply(path, rows)))
+    return Gaussians(**{name: torch.tensor(values) for name, values in vars(read_splat_ply(path, rows)).items()})
 
 
 def transformed(gaussians: Gaussians, target_from_source: Similarity) -> Gaussians:
     """Return the same Gaussians in another frame: a camera that moves along sees the same image.
 
-    Centres are mapped, scales multiplied, rotations and the direction-dependent bands of the colours turned, in
-    float64. The result has the input's type, so that the target frame's origin must lie near the scene.
-
-    Args:
-        gaussians: N Gaussians.
-        target_from_source: p_target = s R p_source + t.
+    Centres are mapped (p_target = s R p_source + t), scales multiplied, rotations and the direction-dependent bands
+    of
+    the colours turned, in float64. The result has the input's type, so that the target frame's origin must lie near
+    the
+    scene.
     """
     device, kind = gaussians.means.device, gaussians.means.dtype
     turn = torch.as_tensor(target_from_source.rotation, dtype=torch.float64, device=device)
@@ -141,14 +131,7 @@ def transformed(gaussians: Gaussians, target_from_source: Similarity) -> Gaussia
 def _quaternion_product(left_wxyz: Tensor, right_wxyz: Tensor) -> Tensor:
     """Return quaternions (N, 4) of the rotation `left` (4,) after the rotations `right` (N, 4)."""
     w, x, y, z = left_wxyz.unbind(-1)
-    matrix = torch.stack(
-        [
-            torch.stack([w, -x, -y, -z]),
-            torch.stack([x, w, -z, y]),
-            torch.stack([y, z, w, -x]),
-            torch.stack([z, -y, x, w]),
-        ]
-    )
+    matrix = torch.stack([w, -x, -y, -z, x, w, -z, y, y, z, w, -x, z, -y, x, w]).view(4, 4)
     return right_wxyz @ matrix.T
 
 
@@ -156,12 +139,7 @@ _NEVER = 2**62
 
 
 class NonFiniteError(ConvergenceError):
-    """A loss or a gradient is not finite.
-
-    Args:
-        name: of the loss or gradient.
-        iteration: the first with a value that is not finite.
-    """
+    """A loss or a gradient is not finite from an iteration on."""
 
     def __init__(self, name: str, iteration: int) -> None:
         self.name, self.iteration = name, iteration

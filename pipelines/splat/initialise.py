@@ -30,7 +30,7 @@ class InitialisationOptions:
     """Settings of the initial Gaussians.
 
     Attributes:
-        sh_degree: degree of the spherical harmonics; all but the constant start at zero.
+        sh_degree: of the spherical harmonics; all but the constant start at zero.
         opacity: of Gaussians without a normal.
         disc_opacity: of Gaussians with a normal: their place is known, and they need not make room for others.
         thickness: of Gaussians with a normal, relative to their standard deviation across it.
@@ -60,7 +60,7 @@ def gaussians_from_points(
     discs: a ball as wide as the gaps between the points would reach as far before the surface, and behind it.
 
     Args:
-        points_in_model: (N, 3) metres in the model frame.
+        points_in_model: (N, 3) metres.
         colours: (N, 3) uint8, or floats from 0 to 1.
         options: settings of the Gaussians.
         normals_in_model: (N, 3) unit vectors, NaN if unknown; None: all are unknown.
@@ -90,10 +90,7 @@ def gaussians_from_points(
 
 
 def scene_extent(camera_centers: ArrayLike) -> float:
-    """Return the size of a scene in metres: 1.1 times the largest distance of a camera from their mean, as in 3DGS.
-
-    Args:
-        camera_centers: (N, 3) metres.
+    """Return 1.1 times the largest distance in metres of the cameras (N, 3) from their mean, as in 3DGS.
 
     Raises:
         DegenerateGeometryError: all cameras are at one place.

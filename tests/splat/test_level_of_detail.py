@@ -33,7 +33,7 @@ def seen_from(splat: SplatArrays, distance_m: float) -> Render:
     half = np.sqrt(0.5)
     cam_from_model = np.eye(4)
     cam_from_model[:3] = [[1, 0, 0, 0], [0, -half, -half, 0], [0, half, -half, distance_m]]
-    gaussians = Gaussians.from_arrays(vars(splat))
+    gaussians = Gaussians(**{name: torch.tensor(values) for name, values in vars(splat).items()})
     settings = RasterSettings(sh_degree=0)
     return CpuRasterizer().render(gaussians, torch.tensor(cam_from_model).float(), CAMERA, settings)
 
