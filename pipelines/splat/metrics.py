@@ -1,9 +1,9 @@
-"""Image quality as the splatting literature reports it: PSNR and SSIM of images as they are shown.
+"""Image quality as the splatting literature reports it: PSNR, SSIM, and LPIPS (doi 10.1109/CVPR.2018.00068) with
+VGG-16.
 
-LPIPS (doi 10.1109/CVPR.2018.00068) with VGG-16 features, as the splatting literature reports it.
-
-The weights are not part of the package. An NPZ file holds them: a TorchScript or `.pth` file would carry code or
-pickles. The arrays have the names of the published network's state. With the `lpips` package and its weights
+The weights of LPIPS are not part of the package. An NPZ file holds them: a TorchScript or `.pth` file would carry
+code or pickles. The arrays have the names of the published network's state. With the `lpips` package and its
+weights
 installed, these lines write the file:
 
     import lpips, numpy
@@ -48,16 +48,7 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
 
 
 def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-    """Return the mean SSIM with the 11×11 Gaussian window of `pipelines.splat.losses`, 1 for equal images.
-
-    Args:
-        image: (H, W, 3); clamped to 0 … 1, as on a display.
-        target: (H, W, 3).
-        mask: (H, W) bool, True where a pixel counts; None: all do.
-
-    Raises:
-        ValueError: shapes do not agree, or no pixel counts.
-    """
+    """Return the mean SSIM with the window of `pipelines.splat.losses`; arguments and errors as of `psnr`."""
     _check(image, target, mask)
     return image_similarity(image.detach().clamp(0, 1), target, mask).ssim
 
@@ -78,14 +69,13 @@ _SMALLEST_PX = 16  # four poolings
 
 
 class Lpips:
-    """Perceptual distance of images; weights are loaded once."""
+    """Perceptual distance of images; the weights are loaded once.
+
+    Raises:
+        InputError: not an NPZ file of such weights.
+    """
 
     def __init__(self, weights: Path) -> None:
-        """Read the weights.
-
-        Raises:
-            InputError: not an NPZ file of such weights.
-        """
         arrays = load_npz(weights, tuple(_shapes()))
         for name, shape in _shapes().items():
             if arrays[name].shape != shape or not np.isfinite(arrays[name]).all():
@@ -114,7 +104,6 @@ class Lpips:
         return float(torch.stack(distances).sum())
 
     def _features(self, image: Tensor) -> list[Tensor]:
-        """Return unit-length features of the five slices."""
         planes = 2 * image.detach().cpu().float().clamp(0, 1).permute(2, 0, 1)[None] - 1
         x = (planes - torch.tensor(_SHIFT).view(1, 3, 1, 1)) / torch.tensor(_SCALE).view(1, 3, 1, 1)
         features = []

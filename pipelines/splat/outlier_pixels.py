@@ -49,12 +49,7 @@ class OutlierSettings:
 
 
 class OutlierPixels:
-    """Running quantile of the differences, and the pixels beyond it.
-
-    Args:
-        device: of the images.
-        settings: of the rule.
-    """
+    """Running quantile of the differences, and the pixels beyond it."""
 
     def __init__(self, device: torch.device, settings: OutlierSettings | None = None) -> None:
         self.settings = settings or OutlierSettings()

@@ -29,10 +29,10 @@ _C3 = (
 
 
 def coefficient_count(degree: int) -> int:
-    """Return the number of coefficients up to a degree.
+    """Return the number of coefficients up to a degree from 0 to 3.
 
     Raises:
-        ValueError: not a degree from 0 to 3.
+        ValueError: another degree.
     """
     if not 0 <= degree <= MAX_DEGREE:
         raise ValueError(f"spherical harmonics have degree 0 to {MAX_DEGREE}, not {degree}")
@@ -78,7 +78,7 @@ def evaluate_sh(sh: Tensor, directions: Tensor, degree: int | None = None) -> Te
     Args:
         sh: (…, K, 3) coefficients.
         directions: (…, 3) vectors, not necessarily of unit length.
-        degree: highest band to use (default: all).
+        degree: highest band to use; None: all.
     """
     used = round(sh.shape[-2] ** 0.5) - 1 if degree is None else degree
     count = coefficient_count(used)
@@ -89,12 +89,7 @@ def evaluate_sh(sh: Tensor, directions: Tensor, degree: int | None = None) -> Te
 def rotate_sh(sh: Tensor, rotation: ArrayLike | Tensor) -> Tensor:
     """Return coefficients of the turned functions: evaluate_sh(rotate_sh(sh, R), R d) = evaluate_sh(sh, d).
 
-    Args:
-        sh: (…, K, 3) coefficients.
-        rotation: (3, 3) R.
-
-    Returns:
-        (…, K, 3), of the type of `sh`; computed in float64.
+    Coefficients (…, K, 3) keep their type; the rotation (3, 3) is applied in float64.
     """
     turn = torch.as_tensor(rotation, dtype=torch.float64)
     degree = round(sh.shape[-2] ** 0.5) - 1
