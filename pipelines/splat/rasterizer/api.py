@@ -22,7 +22,7 @@ The depth of a Gaussian is the depth of its plane at the pixel, not of its centr
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal, Protocol
 
 from torch import Tensor
@@ -49,7 +49,7 @@ class Window:
     height: int
 
     def of(self, camera: Pinhole) -> Pinhole:
-        """Return the camera whose image is the window of the image of `camera`."""
+        """Return the camera whose image is the window."""
         return Pinhole(self.width, self.height, camera.fx, camera.fy, camera.cx - self.left, camera.cy - self.top)
 
     @property
@@ -59,19 +59,9 @@ class Window:
 
     def cut(self, view: Render) -> Render:
         """Return the part of a render of the whole image; its statistics stay those of the whole."""
-        rows, columns = self.slices
-
-        def part(image: Tensor | None) -> Tensor | None:
-            return None if image is None else image[rows, columns]
-
-        return Render(
-            view.colour[rows, columns],
-            view.alpha[rows, columns],
-            view.stats,
-            part(view.expected_depth),
-            part(view.depth_variance),
-            part(view.median_depth),
-        )
+        depths = (view.expected_depth, view.depth_variance, view.median_depth)
+        parts = (None if image is None else image[self.slices] for image in depths)
+        return Render(view.colour[self.slices], view.alpha[self.slices], view.stats, *parts)
 
 
 @dataclass(frozen=True)
@@ -79,8 +69,7 @@ class RasterSettings:
     """Settings of a render.
 
     Attributes:
-        sh_degree: degree of the spherical harmonics in use (≤ the stored degree).
-        background: colour behind everything.
+        sh_degree: of the spherical harmonics in use (≤ the stored degree).
         near_m: Gaussians with a nearer centre are left out.
         dilation_px2: added to the diagonal of the screen covariance, in px².
         depth: whether to compute depths (colour and alpha always are).
@@ -98,7 +87,7 @@ class RasterSettings:
     window: Window | None = None
 
     def image_of(self, camera: Pinhole) -> Pinhole:
-        """Return the camera of the image that is rendered: `camera`, or its window."""
+        """Return the camera of the image that is rendered."""
         return camera if self.window is None else self.window.of(camera)
 
 
@@ -115,7 +104,7 @@ class ScreenStats:
 
     visible: Tensor
     radius_px: Tensor
-    mean_gradient: Tensor | None = field(default=None)
+    mean_gradient: Tensor | None = None
     counted: Tensor | None = None
 
     def of_first(self, count: int) -> ScreenStats:

@@ -42,14 +42,11 @@ def chosen_backend(name: BackendName) -> api.BackendName:
 
 
 def rasterizer(name: BackendName, progress: Progress = SILENT) -> Rasterizer:
-    """Return the backend that a name stands for.
-
-    Args:
-        name: see `chosen_backend`.
-        progress: shows the compilation of the kernels of cuda, before their first use on a machine.
+    """Return the backend that a name stands for, see `chosen_backend`.
 
     Raises:
-        BackendUnavailableError: `cuda`, and a part that it needs is missing, or its kernels cannot be compiled.
+        BackendUnavailableError: `cuda`, and a part that it needs is missing, or its kernels cannot be compiled;
+            `progress` shows their compilation before their first use on a machine.
     """
     if chosen_backend(name) == "cuda":
         from pipelines.splat.rasterizer.cuda import CudaRasterizer

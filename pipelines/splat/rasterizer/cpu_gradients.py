@@ -1,9 +1,7 @@
-"""Gradients of Gaussians and camera from the gradients of hits, as numba kernels.
+"""Gradients of Gaussians and camera from the gradients of hits, through projection and colour, as numba kernels.
 
 Sums run in a fixed order whatever the number of threads, without atomic additions: the result is the same bit for
 bit on every run.
-
-Derivative of the projection and of the colour of one Gaussian, as numba functions.
 """
 
 from __future__ import annotations

@@ -1,10 +1,8 @@
-"""Numba kernels that find the visible Gaussians and fill the tables for binning and blending.
+"""Numba kernels that find the visible Gaussians, fill the tables for blending, and list the splats of each tile.
 
-Lists of the splats of each tile, nearest first: a parallel counting sort, as numba kernels.
-
-An ellipse is cut into the columns of tiles that it crosses. Its extreme rows within a column have a closed form. A
-tile is therefore listed only if the ellipse enters it, with exactly the rows that the ellipse enters (the idea of
-AccuTile, doi 10.48550/arXiv.2412.00578).
+The lists are a parallel counting sort, nearest first. An ellipse is cut into the columns of tiles that it crosses.
+Its extreme rows within a column have a closed form. A tile is therefore listed only if the ellipse enters it, with
+exactly the rows that the ellipse enters (the idea of AccuTile, doi 10.48550/arXiv.2412.00578).
 """
 
 from __future__ import annotations
@@ -195,8 +193,7 @@ def project_visible(
         degree: of the spherical harmonics in use.
         visible: (M,) rows of the Gaussians, ascending.
         rank: (M,) places of the visible Gaussians in the order of depth.
-        splats: (M, SPLAT_WIDTH) by rank, written.
-        ellipses: (M, ELLIPSE_WIDTH) by rank, written.
+        splats, ellipses: (M, SPLAT_WIDTH), (M, ELLIPSE_WIDTH) by rank, written.
         radius: (M,) three standard deviations along the longer axis in px, in the order of `visible`, written.
         workers: number of threads.
     """

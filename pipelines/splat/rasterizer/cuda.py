@@ -25,11 +25,9 @@ _EVERY_BATCH = 2**31 - 1
 class CudaRasterizer:
     """Backend of gsplat ≥ 1.5.3. The tensors must be on the CUDA device.
 
-    Args:
-        progress: shows the compilation of gsplat's kernels, before their first use on a machine.
-
     Raises:
-        BackendUnavailableError: gsplat is missing, or cannot be compiled.
+        BackendUnavailableError: gsplat is missing, or cannot be compiled; `progress` shows the compilation of its
+            kernels before their first use on a machine.
     """
 
     name: BackendName = "cuda"

@@ -62,9 +62,6 @@ def compile_kernels(progress: Progress = SILENT) -> Path:
 
     They are compiled for the GPUs of this machine, or for those that the variable TORCH_CUDA_ARCH_LIST names.
 
-    Args:
-        progress: shows the files that are compiled.
-
     Raises:
         BackendUnavailableError: a part is missing (names each), or the compiler fails (names its log).
         InputError: neither a GPU nor the variable tells what to compile for, or the cache cannot be written.
@@ -241,7 +238,6 @@ def _link_library(home: Path, draft: Path) -> Path:
 
 
 def _sources() -> int:
-    """Return the number of gsplat's files to compile."""
     patterns = ("cuda/csrc/*.cu", "cuda/csrc/*.cpp", "cuda/*.cpp")
     found = importlib.util.find_spec("gsplat")
     places = (found.submodule_search_locations or ()) if found is not None else ()
@@ -249,7 +245,6 @@ def _sources() -> int:
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """End a process with its compilers."""
     if process.poll() is None:
         if hasattr(os, "killpg"):
             with contextlib.suppress(ProcessLookupError):

@@ -76,10 +76,10 @@ def render_orthographic(
     corner: tuple[float, float] = (0.0, 0.0),
     dilation_px2: float = 0.3,
 ) -> PlanView:
-    """Return the view of a part of the plane from above.
+    """Return the view of a part of the plane from above; Gaussians outside the part do not matter.
 
     Args:
-        splats: the Gaussians; those outside the part do not matter.
+        splats: the Gaussians.
         width, height: of the part in px.
         corner: column and row of its top left corner.
         dilation_px2: added to the diagonal of the screen covariance, in px².

@@ -32,17 +32,7 @@ FRUSTUM_MARGIN = 0.3
 def render_reference(
     gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, settings: RasterSettings
 ) -> Render:
-    """Render as `Rasterizer.render` does, by autograd through dense tensors.
-
-    Args:
-        gaussians: N Gaussians, float32 or float64.
-        cam_from_model: (4, 4) in the same dtype.
-        camera: the image.
-        settings: how to render.
-
-    Returns:
-        The view, in the dtype of the Gaussians.
-    """
+    """Render N Gaussians as `Rasterizer.render` does, in their dtype, by autograd through dense tensors."""
     dtype = gaussians.means.dtype
     pose = cam_from_model.to(dtype)
     mean_in_cam = gaussians.means @ pose[:3, :3].T + pose[:3, 3]
@@ -75,7 +65,9 @@ def render_reference(
         mean = torch.where(opaque, depth_sum / total, 0.0)
         variance = (((depth - mean).square() * weight).sum(dim=0) / total).view(size)
         expected = mean.view(size)
-        median = _median_depth(depth, before, after, counted).view(size) if settings.median else None
+        if settings.median:
+            crossing = counted & (before > 0.5) & (after <= 0.5)
+            median = torch.where(crossing, depth.detach(), 0.0).sum(dim=0).view(size)
     stats = _screen_stats(front, mean_px, cov_px2, sorted_gaussians.logit_opacities, camera)
     view = Render(colour.view(*size, 3), (1 - final).view(size), stats, expected, variance, median)
     return view if settings.window is None else settings.window.cut(view)
@@ -86,10 +78,8 @@ def project_gaussians(
 ) -> tuple[Tensor, Tensor]:
     """Return screen means (N, 2) in px and dilated screen covariances (N, 2, 2) in px²."""
     x, y, z = mean_in_cam.unbind(-1)
-    screen_axes = projected_axes(gaussians.quats_wxyz, gaussians.log_scales, mean_in_cam, cam_from_model, camera)[
-        :, :2
-    ]
-    cov_px2 = screen_axes @ screen_axes.mT + dilation_px2 * torch.eye(2, dtype=z.dtype)
+    axes = projected_axes(gaussians.quats_wxyz, gaussians.log_scales, mean_in_cam, cam_from_model, camera)[:, :2]
+    cov_px2 = axes @ axes.mT + dilation_px2 * torch.eye(2, dtype=z.dtype)
     mean_px = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], dim=-1)
     return mean_px, cov_px2
 
@@ -163,12 +153,6 @@ def _alpha(offset_px: Tensor, cov_px2: Tensor, opacity: Tensor) -> Tensor:
     sigma = 0.5 * (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / (xx * yy - xy * xy)
     alpha = opacity[:, None] * torch.exp(-sigma)
     return torch.where(alpha >= ALPHA_MIN, alpha.clamp(max=ALPHA_MAX), 0.0)
-
-
-def _median_depth(depth: Tensor, before: Tensor, after: Tensor, counted: Tensor) -> Tensor:
-    """Return z (P,), of (N, P), of the Gaussian at which a pixel's transmittance falls to one half, else 0."""
-    crossing = counted & (before > 0.5) & (after <= 0.5)
-    return torch.where(crossing, depth.detach(), 0.0).sum(dim=0)
 
 
 def _screen_stats(
