@@ -31,12 +31,7 @@ _HIGH_ERROR = 0.1
 
 @dataclass(frozen=True)
 class ViewContributions:
-    """Contributions of N Gaussians to one view.
-
-    Attributes:
-        weight_px: (N,) pixels that each Gaussian makes up, Σ w.
-        high_error_px: (N,) those of them whose error is high, Σ w [error is high].
-    """
+    """Pixels (N,) that N Gaussians make up in one view, Σ w, and those with a high error, Σ w [error is high]."""
 
     weight_px: Tensor
     high_error_px: Tensor
@@ -49,14 +44,9 @@ Probe = Callable[[int, torch.Generator], list[ViewContributions]]
 def view_contributions(
     gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, error: Tensor, rasterizer: Rasterizer
 ) -> ViewContributions:
-    """Return the contributions of N Gaussians to one view.
+    """Return the contributions of N Gaussians to a view of H × W pixels from a pose (4, 4).
 
-    Args:
-        gaussians: N of them.
-        cam_from_model: (4, 4).
-        camera: of H × W pixels.
-        error: (H, W) absolute error of the view, 0 where no pixel counts.
-        rasterizer: backend.
+    The absolute error (H, W) of the view is 0 where no pixel counts.
     """
     scaled = error / error.max().clamp_min(1e-9)
     maps = torch.stack([torch.ones_like(error), (scaled > _HIGH_ERROR).to(error), torch.zeros_like(error)], dim=-1)
@@ -193,7 +183,6 @@ class DefaultStrategy:
         self._observations.index_add_(0, stats.visible, counted)
 
     def update(self, iteration: int, optimizer: GaussianAdam, probe: Probe | None = None) -> DensityEdit:
-        """See `Strategy.update`."""
         settings, edit = self.settings, DensityEdit()
         if settings.start < iteration <= settings.stop and iteration % settings.every == 0:
             alive = self._alive(optimizer.gaussians.detached(), iteration)
@@ -208,7 +197,6 @@ class DefaultStrategy:
         return edit
 
     def state(self) -> dict[str, Tensor]:
-        """See `Strategy.state`."""
         return {
             "gradient_sum": self._gradient_sum.clone(),
             "observations": self._observations.clone(),
@@ -216,7 +204,6 @@ class DefaultStrategy:
         }
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """See `Strategy.restore`."""
         self._gradient_sum = state["gradient_sum"].clone()
         self._observations = state["observations"].clone()
         self._generator.set_state(state["generator"])
@@ -272,12 +259,10 @@ class FastSettings:
 
     Attributes:
         views: number of views to sample for an edit.
-        high_error_px: pixels of high error, mean over the views that see a Gaussian, from which it is cloned or
-            split.
+        high_error_px: mean over the views that see a Gaussian from which it is cloned or split.
         least_px: a Gaussian that makes up fewer pixels in each of the views is removed,
         least_views: if at least this number of views sees it.
-        prune_stop: last iteration that removes Gaussians: later than the last that adds them, and early enough that
-            they can settle.
+        prune_stop: last iteration that removes Gaussians, later than the last that adds them.
     """
 
     views: int = 10
@@ -304,11 +289,7 @@ class FastStrategy(DefaultStrategy):
         self.fast = fast
 
     def update(self, iteration: int, optimizer: GaussianAdam, probe: Probe | None = None) -> DensityEdit:
-        """See `Strategy.update`.
-
-        Raises:
-            ValueError: no probe.
-        """
+        """See `Strategy.update`; a ValueError says that there is no probe."""
         settings = self.settings
         adds = settings.start < iteration <= settings.stop and iteration % settings.every == 0
         # Sampling views costs renders, and removal alone changes little: a quarter of the edits is enough.

@@ -34,14 +34,13 @@ class McmcSettings:
     """Settings of `McmcStrategy`; iterations count from 1.
 
     Attributes:
-        start, stop, every: Gaussians are moved and added after `start` and up to `stop`, at every such number of
-            iterations.
+        start, stop, every: Gaussians are moved and added after `start` and up to `stop`, every so many iterations.
         growth: share of Gaussians to add at each edit.
         dead_opacity: Gaussians up to this opacity are moved.
         noise: standard deviation of the noise, in learning rates of the centres times covariance, all in scene
             extents. The paper's 5e5 is for scenes whose extent is about 5 units, hence the factor 5².
-        opacity_penalty, scale_penalty: weights of the mean opacity, and of the mean standard deviation in scene
-            extents.
+        opacity_penalty: weight of the mean opacity.
+        scale_penalty: weight of the mean standard deviation, in scene extents.
     """
 
     start: int = 500
@@ -101,11 +100,9 @@ class McmcStrategy:
         return edit
 
     def state(self) -> dict[str, Tensor]:
-        """See `Strategy.state`."""
         return {"generator": self._generator.get_state()}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """See `Strategy.restore`."""
         self._generator.set_state(state["generator"].cpu())
 
     @torch.no_grad()

@@ -36,16 +36,9 @@ _BETA1, _BETA2, _EPS = 0.9, 0.999, 1e-15
 
 
 class Exposures:
-    """Affine colour corrections of V images, and the Adam that moves those of the training images.
+    """Affine colour corrections (V, 3, 4) of V images, gain matrix and offset, and the Adam that moves them.
 
-    Attributes:
-        affine: (V, 3, 4) gain matrix and offset of each image; the identity for images without a fit.
-
-    Args:
-        count: V.
-        train: (T,) int64, the training images.
-        iterations: length of the training, over which the rate falls.
-        device: of the images.
+    Those of the images `train` (T,) move, with a rate that falls over the iterations; the others are the identity.
     """
 
     def __init__(self, count: int, train: Tensor, iterations: int, device: torch.device) -> None:
@@ -88,7 +81,6 @@ class Exposures:
         }
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Restore a state."""
         self.affine.copy_(state["affine"])
         self._moments.copy_(state["moments"])
         self._steps = [int(count) for count in state["steps"]]
@@ -121,8 +113,7 @@ def with_affine(colour: Tensor, affine: Tensor) -> Tensor:
 
 
 def fitted_affine(rendered: Tensor, photograph: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Return the affine change of colour (3, 4) that maps a render (H, W, 3) to a photograph (H, W, 3) by least
-    squares.
+    """Return the affine change of colour (3, 4) that maps a render to a photograph (H, W, 3) by least squares.
 
     The `mask` (H, W) tells the pixels to use; None: all.
     """
@@ -148,13 +139,7 @@ _SIGMA[:, 3] = _OFFSET
 
 @dataclass(frozen=True)
 class PointColours:
-    """Colours of M observations, sorted by point.
-
-    Attributes:
-        point: (M,) index into the points, ascending.
-        image: (M,) index into the photographs.
-        colour: (M, 3) RGB from 0 to 1.
-    """
+    """RGB (M, 3) from 0 to 1 of M observations of points in photographs, sorted by the index of the point."""
 
     point: IntArray
     image: IntArray
@@ -164,12 +149,9 @@ class PointColours:
 def adjusted_exposures(observed: PointColours, count: int) -> FloatArray:
     """Return the exposures (count, 3, 4) of all photographs: gain matrix and offset (A | b).
 
-    The mean over the photographs with observations is the identity. A photograph without observations has it too.
-    Memory holds the coupled pairs of photographs, and the derivatives of one chunk of observations.
-
-    Args:
-        observed: colours; points with one observation do not count.
-        count: number of photographs.
+    Points with one observation do not count. The mean over the photographs with observations is the identity. A
+    photograph without observations has it too. Memory holds the coupled pairs of photographs, and the derivatives
+    of one chunk of observations.
 
     Raises:
         DegenerateGeometryError: no point has two observations.
@@ -254,8 +236,7 @@ class _Part:
 
 
 def _parts(observed: PointColours, exposure: FloatArray, weight: FloatArray | None) -> Iterator[_Part]:
-    """Yield the normal equations by chunks of points, each point's colour being the best under the exposures (n, 3,
-    4).
+    """Yield the normal equations by chunks of points, whose colours are the best under the exposures.
 
     Without the observations' weights (M,), all weights are equal.
     """

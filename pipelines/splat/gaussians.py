@@ -87,11 +87,7 @@ def rotation_matrices(quats_wxyz: Tensor) -> Tensor:
 
 
 def write_gaussians(path: Path, gaussians: Gaussians) -> None:
-    """Write Gaussians as a 3DGS PLY; the file appears whole or not at all.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """Write Gaussians as a 3DGS PLY; the file appears whole or not at all."""
     write_splat_ply(path, SplatArrays(**gaussians.arrays()))
 
 
@@ -108,10 +104,7 @@ def transformed(gaussians: Gaussians, target_from_source: Similarity) -> Gaussia
     """Return the same Gaussians in another frame: a camera that moves along sees the same image.
 
     Centres are mapped (p_target = s R p_source + t), scales multiplied, rotations and the direction-dependent bands
-    of
-    the colours turned, in float64. The result has the input's type, so that the target frame's origin must lie near
-    the
-    scene.
+    of the colours turned, in float64. The result has the input's type: the target's origin must lie near the scene.
     """
     device, kind = gaussians.means.device, gaussians.means.dtype
     turn = torch.as_tensor(target_from_source.rotation, dtype=torch.float64, device=device)

@@ -34,8 +34,7 @@ class InitialisationOptions:
         opacity: of Gaussians without a normal.
         disc_opacity: of Gaussians with a normal: their place is known, and they need not make room for others.
         thickness: of Gaussians with a normal, relative to their standard deviation across it.
-        far: points farther from the cloud's median centre than this many median distances are left out, as
-            mismatches or sky.
+        far: median distances from the cloud's median centre beyond which points are left out: mismatches, or sky.
         max_gaussians: number to which a larger cloud is thinned evenly; None: no limit.
     """
 
@@ -53,7 +52,7 @@ def gaussians_from_points(
     options: InitialisationOptions | None = None,
     normals_in_model: ArrayLike | None = None,
 ) -> Gaussians:
-    """Return Gaussians at points, as 3D Gaussian Splatting starts (doi 10.1145/3592433, section 5.1).
+    """Return at most N Gaussians, in spatial order, as 3DGS starts (doi 10.1145/3592433, section 5.1).
 
     A Gaussian's standard deviation is the mean distance to the three nearest other points. Points that are not
     finite, repeated or far out are left out. Without a normal, Gaussians are isotropic; with a normal, they are
@@ -64,9 +63,6 @@ def gaussians_from_points(
         colours: (N, 3) uint8, or floats from 0 to 1.
         options: settings of the Gaussians.
         normals_in_model: (N, 3) unit vectors, NaN if unknown; None: all are unknown.
-
-    Returns:
-        At most N Gaussians, float32, in spatial order.
 
     Raises:
         DegenerateGeometryError: fewer than two different points.

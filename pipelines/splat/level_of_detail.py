@@ -46,14 +46,7 @@ _LEAST_SIGMA_CELLS = 0.35
 
 @dataclass(frozen=True)
 class Mixture:
-    """Moments of N groups of Gaussians.
-
-    Attributes:
-        mass: (N,) opacity times area, m².
-        means: (N, 3) metres.
-        covariances: (N, 3, 3) m².
-        sh: (N, K, 3).
-    """
+    """Moments of N groups of Gaussians: mass (opacity times area), means and covariances in metres."""
 
     mass: FloatArray
     means: FloatArray
@@ -66,12 +59,10 @@ class Mixture:
         return np.asarray(np.sqrt(np.einsum("nii->n", self.covariances)))
 
     def select(self, index: IntArray) -> Mixture:
-        """Return copies of the rows (M,)."""
         return Mixture(**{name: values[index] for name, values in vars(self).items()})
 
     @staticmethod
     def concatenate(parts: list[Mixture]) -> Mixture:
-        """Return all rows of `parts`, in order."""
         names = vars(parts[0])
         return Mixture(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
@@ -193,15 +184,11 @@ class DetailTile:
 def build_tiles(parts: Iterable[SplatArrays], box: FloatArray, tiler: Tiler) -> DetailTile:
     """Return the root of the tree of tiles, and write the content of each tile.
 
-    Each part has a tree of its own; as soon as four successive trees stand, they get a common parent. Parts should
-    therefore be neighbours, and in the order of a tree themselves.
+    Each part, of at least one Gaussian, has a tree of its own; as soon as four successive trees stand, they get a
+    common parent. Parts should therefore be neighbours, and in the order of a tree themselves. All values are
+    finite, and the `box` (2, 3) of the scene is that of all parts together, see `scene_box`.
 
     Memory: that of a part, of all Gaussians outside the scene, and of four tiles a level.
-
-    Args:
-        parts: at least one, of at least one Gaussian each, with finite values.
-        box: (2, 3) of the scene, of all parts together, see `scene_box`.
-        tiler: makes the tiles.
     """
     inner, outer = _Forest(tiler), []
     for number, part in enumerate(parts):
@@ -253,12 +240,9 @@ def _codes(points: ArrayLike) -> tuple[IntArray, float]:
 
 @dataclass(frozen=True)
 class _Curve:
-    """Moments of Gaussians, sorted along a Z-order curve: a cell is a range of rows.
+    """Moments of N Gaussians, sorted along a Z-order curve by their codes (N,): a cell is a range of rows.
 
-    Attributes:
-        mixture: N rows.
-        codes: (N,) ascending places along the curve.
-        edge_m: edge of the curve's smallest cells; those of level k are 2^k times as large.
+    The curve's smallest cells have an edge; those of level k are 2^k times as large.
     """
 
     mixture: Mixture
@@ -289,7 +273,6 @@ class _Curve:
         return _Curve(mixture.select(order), codes[order], self.edge_m)
 
     def cell_m(self, level: int) -> float:
-        """Return the edge of the cells of a level."""
         return self.edge_m * 2.0**level
 
     def _cells(self, rows: BoolArray, level: int) -> IntArray:

@@ -46,13 +46,9 @@ def photometric_loss(
     """Return (1 − w) · mean|rendered − target| + w · (1 − mean SSIM), differentiable in `rendered`.
 
     Args:
-        rendered: (H, W, 3) float32 or float64.
-        target: (H, W, 3), same type and device.
+        rendered, target: (H, W, 3) float32 or float64, of one type and on one device.
         mask: (H, W) bool, True where a pixel counts; None: all do.
         ssim_weight: w.
-
-    Returns:
-        A scalar of the images' type; 0 if no pixel counts.
 
     Raises:
         ValueError: shapes, types or devices do not agree.
@@ -66,11 +62,7 @@ def photometric_loss(
 
 
 def image_similarity(image: Tensor, target: Tensor, mask: Tensor | None = None) -> ImageSimilarity:
-    """Return L1 and SSIM of two images (H, W, 3), without gradient; see `photometric_loss`.
-
-    Raises:
-        ValueError: shapes, types or devices do not agree.
-    """
+    """Return L1 and SSIM of two images, without gradient; arguments and errors as of `photometric_loss`."""
     _check(image, target, mask)
     with torch.no_grad():
         if image.device.type == "cpu":
@@ -196,14 +188,9 @@ _AROUND = np.stack(np.meshgrid(*3 * [[-1, 0, 1]], indexing="ij"), axis=-1).resha
 
 @dataclass(frozen=True)
 class MeasuredPlanes:
-    """P planes in `model`.
+    """P planes in `model`: positions (P, 3) in metres, unit normals (P, 3), confidences (P,) 0 … 1.
 
-    Attributes:
-        position: (P, 3) metres.
-        normal: (P, 3) unit vectors.
-        confidence: (P,) 0 … 1.
-        scale_m: distance s at which a Gaussian's confidence is a half.
-        cell_m: reach of the planes; a Gaussian two cells away belongs to none.
+    A Gaussian's confidence is a half at the distance s = `scale_m`; one two cells away belongs to no plane.
     """
 
     position: FloatArray
@@ -235,12 +222,13 @@ class PlaneAttraction:
         """
         means = gaussians.means[visible]
         cell = ((means.detach() - self._corner) / self._cell_m).floor().long()
-        key = _keys(cell)
+        key: Tensor = _keys(cell)
         row = torch.searchsorted(self._key, key).clamp_max(len(self._key) - 1)
         beside = (self._key[row] == key) & (cell >= 0).all(dim=1)
         off = ((means - self._place[row]) * self._normal[row]).sum(dim=1) / self._scale_m
         opacity = torch.sigmoid(gaussians.logit_opacities[visible]).reshape(len(visible)).detach()
-        return (opacity * self._confidence[row] * beside * torch.log1p(off.square())).sum() / max(len(visible), 1)
+        weight = opacity * self._confidence[row] * beside
+        return (weight * torch.log1p(off.square())).sum() / max(len(visible), 1)
 
 
 def _keys(cell: Any) -> Any:

@@ -33,7 +33,7 @@ class TrainingSize:
     Attributes:
         gaussians: largest number.
         camera: of the largest image that is rendered: a photograph, or a window of it.
-        cameras: number of cameras whose poses training refines together.
+        cameras: number of those whose poses training refines together.
         photograph_px: pixels of the largest photograph at its training size; 0: no larger than `camera`.
     """
 
@@ -59,8 +59,7 @@ def predicted_peak_bytes(size: TrainingSize) -> int:
 
 
 def require_memory(size: TrainingSize, free_bytes: int | None) -> None:
-    """Refuse a training that will not fit into the free memory (`free_memory_bytes`; None: unknown, none is
-    refused).
+    """Refuse a training that will not fit into the memory of `free_memory_bytes`; None: none is refused.
 
     Raises:
         ResourceError: states the memory needed, and a number of Gaussians that would fit.
@@ -82,9 +81,7 @@ def require_memory(size: TrainingSize, free_bytes: int | None) -> None:
 
 
 def fitting_gaussians(size: TrainingSize, free_bytes: int) -> int:
-    """Return a number of Gaussians, in thousands, that fits into the free memory at a training of one or more
-    others.
-    """
+    """Return a number of Gaussians, in thousands, that fits into the free memory at a training of others."""
     fixed = predicted_peak_bytes(replace(size, gaussians=0, photograph_px=0))
     each = (predicted_peak_bytes(replace(size, photograph_px=0)) - fixed) / max(size.gaussians, 1)
     return max(int((USABLE * free_bytes - fixed) / each), 0) // 1000 * 1000

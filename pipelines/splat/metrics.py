@@ -1,10 +1,8 @@
-"""Image quality as the splatting literature reports it: PSNR, SSIM, and LPIPS (doi 10.1109/CVPR.2018.00068) with
-VGG-16.
+"""Image quality as the splatting literature reports it: PSNR, SSIM, and LPIPS (doi 10.1109/CVPR.2018.00068).
 
-The weights of LPIPS are not part of the package. An NPZ file holds them: a TorchScript or `.pth` file would carry
-code or pickles. The arrays have the names of the published network's state. With the `lpips` package and its
-weights
-installed, these lines write the file:
+The VGG-16 weights of LPIPS are not part of the package. An NPZ file holds them: a TorchScript or `.pth` file would
+carry code or pickles. The arrays have the names of the published network's state. With the `lpips` package and its
+weights installed, these lines write the file:
 
     import lpips, numpy
     numpy.savez("lpips_vgg.npz", **{k: v.numpy() for k, v in lpips.LPIPS(net="vgg").state_dict().items()})
@@ -31,10 +29,8 @@ MAX_PSNR_DB = 100.0
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     """Return the peak signal-to-noise ratio in dB, of values from 0 to 1 over all channels; at most 100 dB.
 
-    Args:
-        image: (H, W, 3); clamped to 0 … 1, as on a display.
-        target: (H, W, 3).
-        mask: (H, W) bool, True where a pixel counts; None: all do.
+    The image (H, W, 3) is clamped to 0 … 1, as on a display. The `mask` (H, W) tells the pixels that count; None:
+    all.
 
     Raises:
         ValueError: shapes do not agree, or no pixel counts.
@@ -83,13 +79,10 @@ class Lpips:
         self._weights = {name: torch.as_tensor(array, dtype=torch.float32) for name, array in arrays.items()}
 
     def __call__(self, image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-        """Return the distance of two images (H, W, 3) with values from 0 to 1.
+        """Return the distance of two images (H, W, 3) with values from 0 to 1, of 16 px or more.
 
         Features see neighbourhoods, so that pixels cannot be left out. Where the `mask` (H, W) is False, the image
         takes the target's pixels instead.
-
-        Raises:
-            ValueError: other shapes, or smaller than 16 px.
         """
         if image.shape != target.shape or image.ndim != 3 or min(image.shape[:2]) < _SMALLEST_PX:
             raise ValueError(f"expected two images (H, W, 3) of 16 px or more, got {tuple(image.shape)}")

@@ -44,10 +44,8 @@ def adam_rows(
 
     Args:
         rows: (V,) rows to update, each at most once.
-        parameters: tuple of (N, Dᵢ) arrays, float32.
-        gradients: tuple of (N, Dᵢ) arrays, float32.
-        exp_avg: (N, D) first moments, D = Σ Dᵢ.
-        exp_avg_sq: (N, D) second moments.
+        parameters, gradients: tuples of (N, Dᵢ) arrays, float32.
+        exp_avg, exp_avg_sq: (N, D) first and second moments, D = Σ Dᵢ.
         steps: (N,) int32, number of updates of each row so far.
         rates: (D,) learning rates.
         corrections: (T, 2), 1 / (1 − β₁ᵗ) and 1 / √(1 − β₂ᵗ); the last row serves all later steps.
@@ -137,13 +135,10 @@ class GaussianAdam:
 
     Attributes:
         gaussians: leaf tensors that require gradients; replaced by `rearrange`.
-        rate_factor: of all learning rates; lowered after a divergence.
-
-    Args:
-        gaussians: N Gaussians, float32; copied.
         extent_m: size of the scene, the unit of the centres' rate.
         iterations: length of the training, over which that rate falls.
-        rates: learning rates; None: those of 3DGS, raised for trainings shorter than its own.
+        rates: by default those of 3DGS, raised for trainings shorter than its own.
+        rate_factor: of all learning rates; lowered after a divergence.
     """
 
     def __init__(
@@ -166,11 +161,8 @@ class GaussianAdam:
             tensor.grad = None
 
     def step(self, iteration: int, rows: Tensor | None = None) -> None:
-        """Update the Gaussians by the tensors' `.grad`.
-
-        Args:
-            iteration: of the training, for the falling rate.
-            rows: (V,) int64 rows to update, without repetition (a render's visible Gaussians); None: all.
+        """Update the rows (V,) int64 without repetition (a render's visible Gaussians; None: all) by the tensors'
+        `.grad`.
 
         Raises:
             ValueError: a tensor has no gradient.
@@ -194,11 +186,9 @@ class GaussianAdam:
         return self.rate_factor * falling * self.extent_m
 
     def rearrange(self, gaussians: Gaussians, source: Tensor) -> None:
-        """Replace all rows: surviving rows keep their moments, new rows start without.
+        """Replace all rows by N' Gaussians, whose `source` (N',) is their former row, or −1.
 
-        Args:
-            gaussians: N' Gaussians; copied.
-            source: (N',) int64, the former row of each, or −1 for a new row.
+        Surviving rows keep their moments, new rows start without.
         """
         old = source >= 0
         index = source.clamp_min(0)
@@ -220,11 +210,7 @@ class GaussianAdam:
         return {name: tensor.clone() for name, tensor in self._moments().items()}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Restore the moments of `state`.
-
-        Raises:
-            ValueError: they belong to Gaussians of another number or degree.
-        """
+        """Restore the moments of `state`; a ValueError says that their number or degree is another."""
         for name, tensor in self._moments().items():
             if name not in state or state[name].shape != tensor.shape:
                 raise ValueError(f"{name}: expected a tensor of shape {tuple(tensor.shape)}")
@@ -255,12 +241,16 @@ class GaussianAdam:
 
     def _step_by_kernel(self, iteration: int, rows: Tensor) -> None:
         tensors = self.gaussians.tensors().values()
-        both = (tensors, [tensor.grad for tensor in tensors if tensor.grad is not None])
+        parameters, gradients = (
+            tuple(part.detach().contiguous().numpy().reshape(len(part), -1) for part in parts if part is not None)
+            for parts in (tensors, [tensor.grad for tensor in tensors])
+        )
         real, rates = np.float32, self.rates
         betas = np.array([rates.beta1, 1 - rates.beta1, rates.beta2, 1 - rates.beta2], dtype=real)
         adam_rows(
             rows.contiguous().numpy(),
-            *(tuple(part.detach().contiguous().numpy().reshape(len(part), -1) for part in parts) for parts in both),
+            parameters,
+            gradients,
             self._exp_avg.numpy(),
             self._exp_avg_sq.numpy(),
             self._steps.numpy(),

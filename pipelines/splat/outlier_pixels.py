@@ -60,14 +60,8 @@ class OutlierPixels:
     def inliers(self, rendered: Tensor, target: Tensor, mask: Tensor | None, longest_px: int) -> Tensor | None:
         """Return the pixels (H, W) of the mask that are no outliers, and add the view to the running quantile.
 
-        Args:
-            rendered: (H, W, 3).
-            target: (H, W, 3).
-            mask: (H, W) bool, the pixels that count; None: all.
-            longest_px: longer side of the photograph that these pixels are a part of.
-
-        Returns:
-            None if all pixels count.
+        Render and target are (H, W, 3), a part of a photograph whose longer side is `longest_px`. None: all pixels
+        count.
         """
         settings = self.settings
         cell = max(settings.least_px, round(settings.cell * longest_px))
@@ -89,7 +83,6 @@ class OutlierPixels:
         return {"quantile": self._quantile.clone(), "views": torch.tensor(self._views)}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Restore a state."""
         self._quantile.copy_(state["quantile"])
         self._views = int(state["views"])
 

@@ -43,13 +43,7 @@ def repainted(
 ) -> Gaussians:
     """Return the Gaussians, on their own device, with colours and opacities that show the views.
 
-    Args:
-        gaussians: N of them; copied.
-        views: returns a view by its number.
-        order: numbers of the views, one an iteration.
-        rasterizer: backend.
-        settings: degree of the harmonics and background.
-        progress: shows the iterations.
+    The order tells the number of a view for each iteration, the settings degree of the harmonics and background.
     """
     device = device_of(rasterizer)
     adam = GaussianAdam(gaussians.to(device), 1.0, len(order), _RATES)

@@ -29,11 +29,7 @@ _C3 = (
 
 
 def coefficient_count(degree: int) -> int:
-    """Return the number of coefficients up to a degree from 0 to 3.
-
-    Raises:
-        ValueError: another degree.
-    """
+    """Return the number of coefficients up to a degree from 0 to 3; a ValueError refuses others."""
     if not 0 <= degree <= MAX_DEGREE:
         raise ValueError(f"spherical harmonics have degree 0 to {MAX_DEGREE}, not {degree}")
     return (degree + 1) ** 2
@@ -73,12 +69,9 @@ def basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def evaluate_sh(sh: Tensor, directions: Tensor, degree: int | None = None) -> Tensor:
-    """Return Σ c_k Y_k(d) (…, 3), without the 0.5 and the clamp of a colour.
+    """Return Σ c_k Y_k(d) (…, 3) of coefficients (…, K, 3), without the 0.5 and the clamp of a colour.
 
-    Args:
-        sh: (…, K, 3) coefficients.
-        directions: (…, 3) vectors, not necessarily of unit length.
-        degree: highest band to use; None: all.
+    Directions (…, 3) need not be of unit length. The degree is the highest band to use; None: all.
     """
     used = round(sh.shape[-2] ** 0.5) - 1 if degree is None else degree
     count = coefficient_count(used)

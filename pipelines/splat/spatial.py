@@ -76,12 +76,8 @@ class SpatialBlocks:
         self._reach = reaches.max(axis=1, initial=0.0)
 
     def shown(self, cam_from_model: FloatArray, camera: Pinhole, settings: RasterSettings) -> Gaussians:
-        """Return few Gaussians, in their order: all that a render of these settings, with their window, can show.
-
-        Args:
-            cam_from_model: (4, 4).
-            camera: of the whole image.
-            settings: of the render.
+        """Return few Gaussians, in their order: all that a render of the whole image, or of the settings' window,
+        can show.
         """
         image = settings.image_of(camera)
         x, y, z = (self._center @ cam_from_model[:3, :3].T + cam_from_model[:3, 3]).T

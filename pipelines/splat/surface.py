@@ -33,14 +33,9 @@ _OPACITY = 0.9
 def surface_discs(
     point_in_model: FloatArray, normal_in_model: FloatArray, rgb: ByteArray, spacing_m: float, sh_degree: int
 ) -> Gaussians:
-    """Return a disc of one colour at each point of a surface.
+    """Return a disc of one colour (P, 3) at each point (P, 3) of a surface, about `spacing_m` apart.
 
-    Args:
-        point_in_model: (P, 3) metres, about `spacing_m` apart.
-        normal_in_model: (P, 3) unit vectors.
-        rgb: (P, 3) colours.
-        spacing_m: between neighbouring points, in units of `model`.
-        sh_degree: of the harmonics; those above degree 0 are zero.
+    Normals are unit vectors (P, 3); harmonics above degree 0 are zero.
     """
     count = len(point_in_model)
     aside = np.eye(3)[np.abs(normal_in_model).argmin(axis=1)]
@@ -70,8 +65,7 @@ def depth_at(depth_m: Tensor, alpha: Tensor, xy: Tensor, camera: Pinhole) -> tup
     a surface do not count.
 
     Args:
-        depth_m: (H, W) expected depth, along the camera's z axis.
-        alpha: (H, W).
+        depth_m, alpha: (H, W) of a render, the depth along the camera's z axis.
         xy: (K, 2) x/z and y/z of the rays.
         camera: of H × W pixels.
     """

@@ -131,9 +131,7 @@ def _shrinkage(spread2: float, depth: float) -> float:
 
 @jit
 def depth_slope(axes: Any, variance: Any, cov: Any, dilation: float, depth: float) -> Any:
-    """Return ∂z/∂u, ∂z/∂v of a Gaussian in m/px, given V (9), D (3), C (xx, xy, yy), its dilation and the centre's
-    z.
-    """
+    """Return ∂z/∂u, ∂z/∂v of a Gaussian in m/px, given V (9), D (3), C (xx, xy, yy) and its dilation, and z."""
     _, (px, py) = _free_slope(axes, variance, _narrow(cov, dilation))
     wide_x, wide_y = _times(cov, (px, py))
     s = _shrinkage(px * wide_x + py * wide_y, depth)

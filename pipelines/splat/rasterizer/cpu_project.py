@@ -289,13 +289,9 @@ def _count_hits(ellipses: Any, width: int, height: int, per_tile: Any, per_splat
 
 @parallel_jit
 def count_hits(ellipses: Any, width: int, height: int, per_tile: Any, per_splat: Any) -> None:
-    """Count the tiles of each splat.
+    """Count the tiles of M splats, nearest first, in an image of some pixels.
 
-    Args:
-        ellipses: (M, ELLIPSE_WIDTH), nearest first.
-        width, height: of the image in px.
-        per_tile: (RUNS, tiles) hits of each run in each tile, written.
-        per_splat: (M,) hits of each splat, written.
+    Hits of each run in each tile (RUNS, tiles), and hits of each splat (M,), are written.
     """
     for run in prange(RUNS):
         _count_hits(ellipses, width, height, per_tile, per_splat, np.int64(run))
@@ -343,12 +339,10 @@ def list_hits(
     """List the splats of each tile, nearest first, and the places of each splat in those lists.
 
     Args:
-        ellipses: (M, ELLIPSE_WIDTH), nearest first.
-        width, height: of the image in px.
+        ellipses, width, height: as in `count_hits`.
         next_place: (RUNS, tiles) from `starts_from_counts`, overwritten.
         splat_start: (M + 1,) start of each splat in `places`.
-        hits: (H,) packed hits by tile, written.
-        places: (H,) places in `hits` by splat, written.
+        hits, places: (H,) packed hits by tile, and places in `hits` by splat, written.
     """
     for run in prange(RUNS):
         _list_hits(ellipses, width, height, next_place, splat_start, hits, places, np.int64(run))

@@ -145,11 +145,7 @@ def _capabilities() -> list[str]:
 
 
 def _architectures() -> list[str]:
-    """Return the compute capabilities to compile for.
-
-    Raises:
-        InputError: there is no GPU, and the variable TORCH_CUDA_ARCH_LIST names none, or is no list of them.
-    """
+    """Return the compute capabilities to compile for."""
     named = os.environ.get("TORCH_CUDA_ARCH_LIST", "").replace(";", " ").split()
     found = sorted(name.removesuffix("+PTX") for name in named) or _capabilities()
     if not found:
@@ -179,11 +175,7 @@ def _alone_in(folder: Path) -> Iterator[None]:
 
 
 def _compile(draft: Path, log: Path, progress: Progress) -> None:
-    """Compile in a process group of its own, whose end an interrupt brings about.
-
-    Raises:
-        BackendUnavailableError: the compiler failed; cites its first error and names the log.
-    """
+    """Compile in a process group of its own, whose end an interrupt brings about."""
     sources = _sources()
     with log.open("wb") as output, progress.task("compiling CUDA kernels, once", sources + 1) as task:
         process = subprocess.Popen(

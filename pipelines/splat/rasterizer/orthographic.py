@@ -40,7 +40,6 @@ class PlanSplats:
         return len(self.mean)
 
     def select(self, index: FloatArray | BoolArray) -> PlanSplats:
-        """Return the rows that `index` picks."""
         return PlanSplats(self.mean[index], self.cov[index], self.opacity[index], self.colour[index])
 
     def scaled(self, factor: float) -> PlanSplats:
@@ -51,15 +50,7 @@ class PlanSplats:
 
 @dataclass(frozen=True)
 class PlanView:
-    """Orthographic view of H × W pixels, float64.
-
-    Attributes:
-        colour: (H, W, 3) blended over black.
-        alpha: (H, W) 1 − final transmittance.
-        expected_depth: (H, W) Σ w z / Σ w; 0 where alpha is 0.
-        depth_variance: (H, W) Σ w z² / Σ w − expected_depth².
-        median_depth: (H, W) depth at which the transmittance falls to one half; 0 if it stays higher.
-    """
+    """Orthographic view of H × W pixels, float64; the maps are those of a `Render`, with the colour over black."""
 
     colour: FloatArray
     alpha: FloatArray
@@ -76,14 +67,7 @@ def render_orthographic(
     corner: tuple[float, float] = (0.0, 0.0),
     dilation_px2: float = 0.3,
 ) -> PlanView:
-    """Return the view of a part of the plane from above; Gaussians outside the part do not matter.
-
-    Args:
-        splats: the Gaussians.
-        width, height: of the part in px.
-        corner: column and row of its top left corner.
-        dilation_px2: added to the diagonal of the screen covariance, in px².
-    """
+    """Return the view of a part of the plane, `width` × `height` px from a corner (column, row), from above."""
     table, ellipses = _tables(splats, width, height, corner, dilation_px2)
     with KERNEL_LOCK:
         lists = list_tiles(ellipses, width, height)

@@ -85,14 +85,11 @@ def project_gaussians(
 
 
 def depth_slopes(axes: Tensor, depth: Tensor, dilation_px2: float) -> Tensor:
-    """Return ∂z/∂(u, v) of Gaussians (N, 2) in m/px, shortened if z would leave `DEPTH_REACH` of the centre's.
+    """Return ∂z/∂(u, v) of Gaussians (N, 2) in m/px, shortened if z would leave `DEPTH_REACH` of the centre's,
+    `depth`.
 
-    By Cauchy and Schwarz |q · d| ≤ √(q · C q) √(d · C⁻¹ d), with C as the image dilates it.
-
-    Args:
-        axes: (N, 3, 3) of `projected_axes`.
-        depth: (N,) z of the centres.
-        dilation_px2: of the image.
+    By Cauchy and Schwarz |q · d| ≤ √(q · C q) √(d · C⁻¹ d), with C as the image dilates it. The `axes` are those of
+    `projected_axes`.
     """
     u, v, z = axes.unbind(dim=1)
     xx, xy, yy, xz, yz = (u * u).sum(-1), (u * v).sum(-1), (v * v).sum(-1), (u * z).sum(-1), (v * z).sum(-1)
