@@ -13,26 +13,9 @@ from typing import Any
 import numpy as np
 from numba import prange
 
+from pipelines.splat.rasterizer import cpu_gaussian as gaussian
 from pipelines.splat.rasterizer.api import ALPHA_MIN
-from pipelines.splat.rasterizer.cpu_gaussian import (
-    MAX_COEFFICIENTS,
-    WIDEST,
-    View,
-    depth_slope,
-    jacobian,
-    log_sigmoid,
-    point_in_cam,
-    rotation,
-    row3,
-    screen_covariance,
-    screen_from_model,
-    sh_basis,
-    sh_colour,
-    times_rotation,
-    unit_direction,
-    unit_quat,
-    variances,
-)
+from pipelines.splat.rasterizer.cpu_gaussian import MAX_COEFFICIENTS, WIDEST, View
 from pipelines.splat.rasterizer.cpu_lanes import LANES, jit, kernel_jit, parallel_jit, worker_jit
 
 LOG_ALPHA_MIN = math.log(ALPHA_MIN)
@@ -53,12 +36,13 @@ ELLIPSE_WIDTH = 6
 @jit
 def _ellipse(means: Any, quats: Any, log_scales: Any, pose: Any, view: View, i: int) -> Any:
     """Return the point in the camera's frame, screen covariance and slope of the depth of Gaussian i."""
-    point = point_in_cam(pose, row3(means, i))
-    quat, _ = unit_quat(quats, i)
-    axes = times_rotation(screen_from_model(jacobian(view, point), pose), rotation(quat))
-    variance = variances(log_scales, i)
-    cov = screen_covariance(axes, variance, view.dilation)
-    return point, cov, depth_slope(axes, variance, cov, view.dilation, point[2])
+    point = gaussian.point_in_cam(pose, gaussian.row3(means, i))
+    quat, _ = gaussian.unit_quat(quats, i)
+    w = gaussian.screen_from_model(gaussian.jacobian(view, point), pose)
+    axes = gaussian.times_rotation(w, gaussian.rotation(quat))
+    variance = gaussian.variances(log_scales, i)
+    cov = gaussian.screen_covariance(axes, variance, view.dilation)
+    return point, cov, gaussian.depth_slope(axes, variance, cov, view.dilation, point[2])
 
 
 @jit
@@ -89,7 +73,7 @@ def _is_visible(means: Any, quats: Any, log_scales: Any, logit: float, pose: Any
     point, (xx, xy, yy), _ = _ellipse(means, quats, log_scales, pose, view, i)
     if not (xx * yy - xy * xy > 0.0 and xx < math.inf and yy < math.inf):
         return False
-    level = 2.0 * (log_sigmoid(logit) - LOG_ALPHA_MIN)
+    level = 2.0 * (gaussian.log_sigmoid(logit) - LOG_ALPHA_MIN)
     u = view.fx * point[0] / point[2] + view.cx
     v = view.fy * point[1] / point[2] + view.cy
     return _holds_pixel(u, math.sqrt(level * xx), view.width) and _holds_pixel(
@@ -105,11 +89,11 @@ def _find_visible(
     for block in range(worker, (means.shape[0] + BLOCK - 1) // BLOCK, workers):
         for i in range(block * BLOCK, min((block + 1) * BLOCK, means.shape[0])):
             visible[i] = False
-            point = point_in_cam(pose, row3(means, i))
+            point = gaussian.point_in_cam(pose, gaussian.row3(means, i))
             logit = float(logit_opacities[i])
             if not (point[2] >= view.near and logit >= LOGIT_ALPHA_MIN):
                 continue
-            a, b, c = row3(log_scales, i)
+            a, b, c = gaussian.row3(log_scales, i)
             if _may_reach_image(point, max(a, b, c), view):
                 visible[i] = _is_visible(means, quats, log_scales, logit, pose, view, i)
                 depth[i] = point[2]
@@ -167,10 +151,10 @@ def _project_visible(
             i, row = visible[m], rank[m]
             (x, y, z), cov, slope = _ellipse(means, quats, log_scales, pose, view, i)
             on_screen = (view.fx * x / z + view.cx, view.fy * y / z + view.cy)
-            _write_splat(splats, ellipses, row, on_screen, cov, log_sigmoid(float(logit_opacities[i])))
-            direction, _ = unit_direction(row3(means, i), center)
-            sh_basis(direction, degree, basis)
-            red, green, blue = sh_colour(sh, i, basis, (degree + 1) ** 2)
+            _write_splat(splats, ellipses, row, on_screen, cov, gaussian.log_sigmoid(float(logit_opacities[i])))
+            direction, _ = gaussian.unit_direction(gaussian.row3(means, i), center)
+            gaussian.sh_basis(direction, degree, basis)
+            red, green, blue = gaussian.sh_colour(sh, i, basis, (degree + 1) ** 2)
             splats[row, RED] = max(red, 0.0)
             splats[row, GREEN] = max(green, 0.0)
             splats[row, BLUE] = max(blue, 0.0)
