@@ -7,16 +7,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import product
+from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipelines.core.types import ByteArray, FloatArray
-from pipelines.simulate.buildings import Roof
 from pipelines.simulate.mesh import Color
 from pipelines.simulate.textures import GroundPlan, Pyramid
 
+Roof = Literal["flat", "gable", "hip"]
 REACH_M = 128.0  # half side of the painted ground
 SQUARE_M = 38.0  # half side of the central square
 RING_M = 44.0  # middle of the street around it

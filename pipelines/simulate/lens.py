@@ -159,10 +159,8 @@ class Sensor:
 
 
 class Renderer:
-    """Renders one scene through one lens; safe to use from several threads.
-
-    Args:
-        samples: rays for a pixel; a square number.
+    """Renders one scene through one lens, with a square number of rays for a pixel; safe to use from several
+    threads.
     """
 
     def __init__(self, scene: SimulatedScene, lens: BrownLens, samples: int) -> None:

@@ -23,10 +23,9 @@ from pipelines.core.types import BoolArray, ByteArray, FloatArray
 from pipelines.formats.las import LidarReturns, LidarWriter
 from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import Origin, lla_from_enu, lla_of
-from pipelines.simulate.buildings import Building
 from pipelines.simulate.mesh import MISS, Material, Mesh, MeshBuilder, Raycaster, TextureParameters
 from pipelines.simulate.options import LidarFlightOptions
-from pipelines.simulate.scene import SimulatedScene, joined
+from pipelines.simulate.scene import Building, SimulatedScene, joined
 from pipelines.simulate.truth import TrueLidar
 
 GROUND, BUILDING, VEGETATION, UNCLASSIFIED, NOISE = 2, 6, 5, 1, 7

@@ -218,12 +218,9 @@ _INNER_M, _CELL_M = 150.0, 2.5
 
 @dataclass(frozen=True)
 class Terrain:
-    """Terrain whose height is a sum of waves, zero at the origin.
+    """Terrain whose height is a sum of W waves (W, 2) in radians per metre, east and north; zero at the origin.
 
-    Attributes:
-        waves: (W, 2) radians per metre, east and north.
-        phases: (W,) radians.
-        near_m, far_m: (W,) amplitudes in the town and at the horizon.
+    The amplitudes (W,) are those in the town and at the horizon.
     """
 
     waves: FloatArray

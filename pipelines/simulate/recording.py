@@ -11,9 +11,7 @@ import numpy as np
 from pipelines.core.types import FloatArray, IntArray, Matrix3, Vector3
 from pipelines.geodesy.enu import Origin, lla_from_enu
 from pipelines.geometry.rotations import ENU_FROM_NED, geo_from_cam, quat_xyzw_from_matrix, yaw_pitch_roll_deg
-from pipelines.simulate.mesh import Raycaster
-from pipelines.simulate.options import SimulateOptions
-from pipelines.simulate.sensors import (
+from pipelines.simulate.flight import (
     RECEIVERS,
     GnssLog,
     ImuLog,
@@ -24,6 +22,8 @@ from pipelines.simulate.sensors import (
     record_gnss,
     record_imu,
 )
+from pipelines.simulate.mesh import Raycaster
+from pipelines.simulate.options import SimulateOptions
 from pipelines.simulate.truth import TrueLens, TrueMark, TrueNavigation, TrueTarget, Truth
 from pipelines.simulate.world import LEAST_RAYS, World, choose_control, project_targets
 
@@ -73,11 +73,7 @@ def write_trajectory(path: Path, photos: PhotoRecords) -> None:
 def write_tables(folder: Path, recording: Recording, enu_from_body: FloatArray, origin: Origin) -> None:
     """Write trajectory, raw navigation on the navigation clock, control and check points.
 
-    Args:
-        folder: of the survey.
-        recording: of the instruments and the surveyor.
-        enu_from_body: (K, 3, 3) attitudes of the log, at their places: East-North-Up from forward-right-down.
-        origin: of geo.
+    The attitudes (K, 3, 3) are those of the log at their places: East-North-Up from forward-right-down.
     """
     photos, gnss, imu = recording.photos, recording.gnss, recording.imu
     write_trajectory(folder / "trajectory.csv", photos)

@@ -25,11 +25,11 @@ from pipelines.core.products import save_json
 from pipelines.core.progress import SILENT, Progress
 from pipelines.formats.bag_writer import BagCamera, BagFlight, write_bag
 from pipelines.formats.exif_writer import DroneTags, with_tags
+from pipelines.simulate.flight import in_local_enu
 from pipelines.simulate.lens import Renderer, Sensor
 from pipelines.simulate.lidar import LidarFlight, lidar_files
 from pipelines.simulate.options import SimulateOptions
 from pipelines.simulate.recording import Recording, record, vector, write_tables
-from pipelines.simulate.sensors import in_local_enu
 from pipelines.simulate.truth import TrueLidar
 from pipelines.simulate.world import WANTED_RAYS, World, check_clearance, make_world
 
@@ -41,14 +41,7 @@ WANTED_CHECKS = 30
 
 @dataclass(frozen=True)
 class SimulationSummary:
-    """Summary of a simulation.
-
-    Attributes:
-        directory: the survey folder.
-        well_seen: number of check points with at least 6 marks.
-        bag_messages: number of messages in the bag; 0 without a bag.
-        warnings: for the user.
-    """
+    """Summary of a simulation; `well_seen` counts the check points with at least 6 marks."""
 
     directory: Path
     images: int
@@ -96,13 +89,12 @@ def fly_survey(options: SimulateOptions) -> RecordedFlight:
 def simulate(
     options: SimulateOptions, directory: Path, progress: Progress = SILENT, *, overwrite: bool = False
 ) -> SimulationSummary:
-    """Simulate a survey into `directory`, which appears when complete.
+    """Simulate a survey into `directory`, which appears when complete; see `fly_survey` for further errors.
 
     The same options give the same bytes. `overwrite` allows replacing an earlier simulation, and no other folder.
 
     Raises:
-        InputError: the folder is in use, or the options cannot be flown or photographed.
-        BackendUnavailableError: the ray caster is not installed.
+        InputError: the folder is in use.
     """
     _check_folder(directory, overwrite=overwrite)
     flight = fly_survey(options)

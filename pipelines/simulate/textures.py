@@ -127,12 +127,7 @@ def mix(a: Float32Array, b: Float32Array, share: Float32Array) -> Float32Array:
 
 
 class Pyramid:
-    """Image pyramid, for sampling at any distance.
-
-    Args:
-        image: (H, W, 3) uint8.
-        pixel_m: size of its pixels.
-    """
+    """Image pyramid of an image (H, W, 3) uint8 with pixels of `pixel_m`, for sampling at any distance."""
 
     def __init__(self, image: ByteArray, pixel_m: float) -> None:
         self._pixel_m = pixel_m
@@ -185,7 +180,6 @@ class TextureSamples:
         return np.float32(0.75) * np.maximum(self.du, self.dv)
 
     def select(self, chosen: np.ndarray) -> TextureSamples:
-        """Return the chosen points only."""
         return TextureSamples(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
 

@@ -11,19 +11,18 @@ from pipelines.core.errors import InputError
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.geodesy.enu import Origin
 from pipelines.geometry.rotations import exp_so3
-from pipelines.simulate.buildings import SiteKind, TargetSite
 from pipelines.simulate.flight import (
     DEFAULT_HEIGHTS_M,
     DEFAULT_RADIUS_M,
     FlightPlan,
+    Mounting,
     TrueTrajectory,
     make_trajectory,
 )
 from pipelines.simulate.lens import BrownLens, Pose
 from pipelines.simulate.mesh import MISS, Material, Raycaster
 from pipelines.simulate.options import SimulateOptions
-from pipelines.simulate.scene import SimulatedScene, build_scene, with_targets
-from pipelines.simulate.sensors import Mounting
+from pipelines.simulate.scene import SimulatedScene, SiteKind, TargetSite, build_scene, with_targets
 
 WANTED_RAYS = 6
 LEAST_RAYS = 2
@@ -115,14 +114,7 @@ _TARGET_PX = 5.0
 
 @dataclass(frozen=True)
 class World:
-    """Truth from which records and photographs are made.
-
-    Attributes:
-        origin: of geo, on Earth.
-        sites: of the targets in the scene.
-        target_m: width of a target.
-        trajectory: true motion of the camera.
-    """
+    """Truth from which records and photographs are made, with targets of a width at their sites in the scene."""
 
     origin: Origin
     scene: SimulatedScene

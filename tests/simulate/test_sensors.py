@@ -7,13 +7,15 @@ import pytest
 from scipy import stats
 
 from pipelines.geometry.rotations import exp_so3, geo_from_cam, log_so3
-from pipelines.simulate.flight import FlightPlan, TrueTrajectory, make_trajectory
-from pipelines.simulate.sensors import (
+from pipelines.simulate.flight import (
     GRAVITY_M_S2,
+    FlightPlan,
     Mounting,
     Receiver,
+    TrueTrajectory,
     attitudes_at,
     fixes_at,
+    make_trajectory,
     record_gnss,
     record_imu,
 )
