@@ -53,10 +53,6 @@ class GroundPainter:
         """Fill an axis-parallel rectangle."""
         self.polygon(_rectangle(low, high), color, kind)
 
-    def occupy(self, low: tuple[float, float], high: tuple[float, float]) -> None:
-        """Mark a rectangle as built on."""
-        cv2.fillPoly(self.built, [_pixels(_rectangle(low, high))], 255, cv2.LINE_8, _SUBPIXEL)
-
     def is_free(self, x: float, y: float, margin_m: float) -> bool:
         """Return whether the ground within `margin_m` is not built on."""
         r = round(margin_m / _PIXEL_M)
@@ -234,7 +230,8 @@ def make_town_layout(style: TownStyle, rng: np.random.Generator) -> TownLayout:
         half = np.array(size[::-1] if building.turned else size) / 2
         low, high = np.array(building.center) - half, np.array(building.center) + half
         painter.box(tuple(low - 1.0), tuple(high + 1.0), KERB, PAVING)
-        painter.occupy(tuple(low), tuple(high))
+        floor = _pixels(_rectangle(tuple(low), tuple(high)))
+        cv2.fillPoly(painter.built, [floor], 255, cv2.LINE_8, _SUBPIXEL)
     cars = _park(rng)
     trees = _plant(style, painter, rng)
     return TownLayout(painter.ground_plan(), buildings, trees, cars)

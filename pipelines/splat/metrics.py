@@ -89,28 +89,27 @@ class Lpips:
         if mask is not None:
             image = torch.where(mask[:, :, None], image, target)
         with torch.no_grad():
-            layers = zip(self._features(image), self._features(target), strict=True)
+            layers = zip(_features(image, self._weights), _features(target, self._weights), strict=True)
             distances = [
                 functional.conv2d((x - y) ** 2, self._weights[f"lin{i}.model.1.weight"]).mean()
                 for i, (x, y) in enumerate(layers)
             ]
         return float(torch.stack(distances).sum())
 
-    def _features(self, image: Tensor) -> list[Tensor]:
-        planes = 2 * image.detach().cpu().float().clamp(0, 1).permute(2, 0, 1)[None] - 1
-        x = (planes - torch.tensor(_SHIFT).view(1, 3, 1, 1)) / torch.tensor(_SCALE).view(1, 3, 1, 1)
-        features = []
-        for number, layers in enumerate(_SLICES, start=1):
-            if number > 1:
-                x = functional.max_pool2d(x, 2)
-            for layer in layers:
-                name = f"net.slice{number}.{layer}"
-                convolved = functional.conv2d(
-                    x, self._weights[f"{name}.weight"], self._weights[f"{name}.bias"], padding=1
-                )
-                x = convolved.relu()
-            features.append(x / (x.square().sum(dim=1, keepdim=True).sqrt() + 1e-10))
-        return features
+
+def _features(image: Tensor, weights: dict[str, Tensor]) -> list[Tensor]:
+    """Return unit-length features of the five slices."""
+    planes = 2 * image.detach().cpu().float().clamp(0, 1).permute(2, 0, 1)[None] - 1
+    x = (planes - torch.tensor(_SHIFT).view(1, 3, 1, 1)) / torch.tensor(_SCALE).view(1, 3, 1, 1)
+    features = []
+    for number, layers in enumerate(_SLICES, start=1):
+        if number > 1:
+            x = functional.max_pool2d(x, 2)
+        for layer in layers:
+            name = f"net.slice{number}.{layer}"
+            x = functional.conv2d(x, weights[f"{name}.weight"], weights[f"{name}.bias"], padding=1).relu()
+        features.append(x / (x.square().sum(dim=1, keepdim=True).sqrt() + 1e-10))
+    return features
 
 
 def _shapes() -> dict[str, tuple[int, ...]]:

@@ -20,32 +20,25 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+_CELL, _LEAST_CELL_PX = 1 / 40, 8  # side of a cell, as a share of the photograph's longer side, and its lower limit
+_QUANTILE = 0.9  # of the differences of a view's cells
+_TIMES = 8.0  # its multiple from which a cell is an outlier
+_LEAST = 0.05  # lower limit of that, of colours 0 … 1
+_MEMORY = 0.95  # weight of the earlier views in the running quantile
+_AMNESTY = 5  # all pixels count in every view with such a number
+
 
 @dataclass(frozen=True)
 class OutlierSettings:
     """Settings of `OutlierPixels`.
 
     Attributes:
-        cell: side of a cell, as a share of the photograph's longer side,
-        least_px: and its lower limit in pixels.
-        quantile: of the differences of the cells of a view,
-        times: its multiple from which a cell is an outlier,
-        least: and the lower limit of that, of colours 0 … 1.
         most: share of the cells of a view that are outliers at most, before those around them are added.
-        memory: weight of the earlier views in the running quantile.
         views: number of views before the first outlier.
-        amnesty: all pixels count in every view with such a number.
     """
 
-    cell: float = 1 / 40
-    least_px: int = 8
-    quantile: float = 0.9
-    times: float = 8.0
-    least: float = 0.05
     most: float = 0.01
-    memory: float = 0.95
     views: int = 50
-    amnesty: int = 5
 
 
 class OutlierPixels:
@@ -64,15 +57,15 @@ class OutlierPixels:
         count.
         """
         settings = self.settings
-        cell = max(settings.least_px, round(settings.cell * longest_px))
+        cell = max(_LEAST_CELL_PX, round(_CELL * longest_px))
         difference = _cell_differences(rendered - target, mask, cell)
-        kept = settings.memory if self._views else 0.0
-        high, highest = difference.flatten().quantile(difference.new_tensor([settings.quantile, 1 - settings.most]))
+        kept = _MEMORY if self._views else 0.0
+        high, highest = difference.flatten().quantile(difference.new_tensor([_QUANTILE, 1 - settings.most]))
         self._quantile.lerp_(high, 1 - kept)
         self._views += 1
-        if self._views <= settings.views or self._views % settings.amnesty == 0:
+        if self._views <= settings.views or self._views % _AMNESTY == 0:
             return mask
-        limit = torch.maximum(settings.times * self._quantile, highest).clamp_min(settings.least)
+        limit = torch.maximum(_TIMES * self._quantile, highest).clamp_min(_LEAST)
         outlier = functional.max_pool2d((difference > limit).float()[None, None], 3, stride=1, padding=1)
         height, width = target.shape[:2]
         outside = outlier[0, 0].repeat_interleave(cell, 0).repeat_interleave(cell, 1)[:height, :width] > 0

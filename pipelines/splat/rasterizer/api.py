@@ -97,13 +97,11 @@ class ScreenStats:
 
     Attributes:
         visible: (M,) int64 rows of the Gaussians that touched the image.
-        radius_px: (M,) float32, three standard deviations along the longer axis, on the screen.
         mean_gradient: (M, 2) float32, ∂L/∂(projected centre) in 1/pixel; filled by the backward pass.
         counted: (M,) bool, False for Gaussians that other parts of the same image count; None: all are True.
     """
 
     visible: Tensor
-    radius_px: Tensor
     mean_gradient: Tensor | None = None
     counted: Tensor | None = None
 
@@ -112,7 +110,7 @@ class ScreenStats:
         rows = self.visible < count
         gradient = None if self.mean_gradient is None else self.mean_gradient[rows]
         counted = None if self.counted is None else self.counted[rows]
-        return ScreenStats(self.visible[rows], self.radius_px[rows], gradient, counted)
+        return ScreenStats(self.visible[rows], gradient, counted)
 
     def of_part(self, share: float, counted: Tensor | None = None) -> ScreenStats:
         """Return the statistics of a part of an image, as what it adds to those of the whole image.
@@ -122,7 +120,7 @@ class ScreenStats:
             counted: (M,) of the Gaussians that the part counts for the whole; None: all.
         """
         gradient = None if self.mean_gradient is None else share * self.mean_gradient
-        return ScreenStats(self.visible, self.radius_px, gradient, counted)
+        return ScreenStats(self.visible, gradient, counted)
 
 
 @dataclass

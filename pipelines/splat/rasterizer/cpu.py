@@ -204,14 +204,13 @@ def _project(context: _RenderContext, parameters: list[_Array], pose: _Array, ce
     count = len(context.visible)
     context.table = np.empty((count, cpu_project.SPLAT_WIDTH), dtype=dtype)
     ellipses = np.empty((count, cpu_project.ELLIPSE_WIDTH), dtype=dtype)
-    radius = np.empty(count, dtype=np.float32)
     cpu_project.project_visible(
         *(*parameters, pose, center, view, context.settings.sh_degree),
-        *(context.visible, context.rank, context.table, ellipses, radius, context.workers),
+        *(context.visible, context.rank, context.table, ellipses, context.workers),
     )
     image = context.settings.image_of(context.camera)
     context.lists = list_tiles(ellipses, image.width, image.height)
-    context.stats = ScreenStats(visible=torch.from_numpy(context.visible), radius_px=torch.from_numpy(radius))
+    context.stats = ScreenStats(torch.from_numpy(context.visible))
 
 
 def _depth_rank(depth: _Array) -> _Array:

@@ -131,18 +131,10 @@ def _write_splat(splats: Any, ellipses: Any, row: int, center: Any, cov: Any, lo
     ellipses[row, E_LEVEL] = 2.0 * (log_opacity - LOG_ALPHA_MIN)
 
 
-@jit
-def _longer_radius(cov: Any) -> float:
-    """Return three standard deviations along the longer axis of a covariance xx, xy, yy."""
-    xx, xy, yy = cov
-    half_difference = 0.5 * (xx - yy)
-    return 3.0 * math.sqrt(0.5 * (xx + yy) + math.sqrt(half_difference * half_difference + xy * xy))
-
-
 @worker_jit
 def _project_visible(
     means: Any, quats: Any, log_scales: Any, logit_opacities: Any, sh: Any, pose: Any, center: Any, view: View,
-    degree: int, visible: Any, rank: Any, splats: Any, ellipses: Any, radius: Any, worker: int, workers: int,
+    degree: int, visible: Any, rank: Any, splats: Any, ellipses: Any, worker: int, workers: int,
 ) -> None:  # fmt: skip
     basis = np.empty(MAX_COEFFICIENTS)
     count = visible.shape[0]
@@ -160,13 +152,12 @@ def _project_visible(
             splats[row, BLUE] = max(blue, 0.0)
             splats[row, DEPTH] = z
             splats[row, SLOPE_X], splats[row, SLOPE_Y] = slope
-            radius[m] = _longer_radius(cov)
 
 
 @parallel_jit
 def project_visible(
     means: Any, quats: Any, log_scales: Any, logit_opacities: Any, sh: Any, pose: Any, center: Any, view: View,
-    degree: int, visible: Any, rank: Any, splats: Any, ellipses: Any, radius: Any, workers: int,
+    degree: int, visible: Any, rank: Any, splats: Any, ellipses: Any, workers: int,
 ) -> None:  # fmt: skip
     """Fill the tables of the M visible Gaussians.
 
@@ -178,13 +169,12 @@ def project_visible(
         visible: (M,) rows of the Gaussians, ascending.
         rank: (M,) places of the visible Gaussians in the order of depth.
         splats, ellipses: (M, SPLAT_WIDTH), (M, ELLIPSE_WIDTH) by rank, written.
-        radius: (M,) three standard deviations along the longer axis in px, in the order of `visible`, written.
         workers: number of threads.
     """
     for worker in prange(workers):
         _project_visible(
             means, quats, log_scales, logit_opacities, sh, pose, center, view, degree, visible, rank, splats,
-            ellipses, radius, np.int64(worker), workers,
+            ellipses, np.int64(worker), workers,
         )  # fmt: skip
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from pipelines.core.types import BoolArray, FloatArray
+from pipelines.core.types import FloatArray
 from pipelines.splat.rasterizer import cpu_project
 from pipelines.splat.rasterizer.api import ALPHA_MIN
 from pipelines.splat.rasterizer.cpu import KERNEL_LOCK, blend_tiles, list_tiles
@@ -35,12 +35,6 @@ class PlanSplats:
     cov: FloatArray
     opacity: FloatArray
     colour: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.mean)
-
-    def select(self, index: FloatArray | BoolArray) -> PlanSplats:
-        return PlanSplats(self.mean[index], self.cov[index], self.opacity[index], self.colour[index])
 
     def scaled(self, factor: float) -> PlanSplats:
         """Return the same Gaussians over pixels that are smaller by a factor; depths stay."""

@@ -164,8 +164,7 @@ def _screen_stats(
         last = torch.minimum(torch.floor(mean_px + extent - 0.5), size - 1)
         seen = (level >= 0) & (first <= last).all(dim=1)
         order = torch.argsort(rows[seen])
-        radius = 3 * torch.sqrt(torch.linalg.eigvalsh(cov_px2[seen])[:, 1])
-    stats = ScreenStats(visible=rows[seen][order], radius_px=radius[order].float())
+    stats = ScreenStats(rows[seen][order])
     if mean_px.requires_grad:
 
         def keep_gradient(gradient: Tensor) -> None:
