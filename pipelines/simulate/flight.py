@@ -61,7 +61,6 @@ class TrueTrajectory:
 
     @property
     def stamp_ns(self) -> IntArray:
-        """Stamps (N,) of the photographs on the camera's clock."""
         return START_NS + np.round(self.photo_s * 1e9).astype(np.int64)
 
     def geo_from_nominal_cam(self, time_s: ArrayLike) -> FloatArray:
@@ -291,7 +290,6 @@ def _epochs(trajectory: TrueTrajectory, mounting: Mounting, step_ns: int) -> Int
 def record_imu(
     trajectory: TrueTrajectory, mounting: Mounting, sigma_deg: float, rng: np.random.Generator
 ) -> ImuLog:
-    """Return attitude, rate and specific force at 100 Hz, with white noise on the attitude."""
     since_ns = _epochs(trajectory, mounting, IMU_STEP_NS)
     time_s = since_ns / 1e9
     true = trajectory.geo_from_body(time_s)

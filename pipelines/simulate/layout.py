@@ -50,7 +50,6 @@ class GroundPainter:
     def box(
         self, low: tuple[float, float], high: tuple[float, float], color: Color, kind: tuple[int, int, int] | None
     ) -> None:
-        """Fill an axis-parallel rectangle."""
         self.polygon(_rectangle(low, high), color, kind)
 
     def is_free(self, x: float, y: float, margin_m: float) -> bool:
@@ -218,7 +217,6 @@ class TownLayout:
 
 
 def make_town_layout(style: TownStyle, rng: np.random.Generator) -> TownLayout:
-    """Return the layout of a town, with its ground painted."""
     painter = GroundPainter()
     painter.box((-REACH_M, -REACH_M), (REACH_M, REACH_M), (0.11, 0.17, 0.05), GRASS)
     paint_meadows(painter, rng)

@@ -46,12 +46,10 @@ class BrownLens:
 
     @property
     def colmap_model(self) -> str:
-        """COLMAP's name of the model."""
         return COLMAP_MODEL[self.model]
 
     @property
     def colmap_params(self) -> tuple[float, ...]:
-        """COLMAP's parameters of the model."""
         cx, cy = self.center_px
         if self.model == "pinhole":
             return (self.focal_px, cx, cy)
@@ -173,7 +171,6 @@ class Renderer:
         self._kept = [_rays(lens, band, samples).astype(np.float32) for band in self._bands] if keep else []
 
     def photograph(self, pose: Pose, sensor: Sensor, rng: np.random.Generator) -> ByteArray:
-        """Return the photograph (H, W, 3), RGB."""
         light = self.radiance(pose)
         height, width = light.shape[:2]
         across, down = np.linspace(-1, 1, width), np.linspace(-1, 1, height)
@@ -242,7 +239,6 @@ class Renderer:
     def _texture_samples(
         self, points: Float32Array, rays: Float32Array, hits: Hits, normals: Float32Array, rotation: Float32Array
     ) -> TextureSamples:
-        """Return texture coordinates, and the width of a pixel along them."""
         mesh, index = self._scene.mesh, hits.triangle
         u_axis, v_axis, uv_shift = mesh.u_axis[index], mesh.v_axis[index], mesh.uv_shift[index]
         along = np.minimum(_dot(rays, normals), np.float32(-0.04) * np.linalg.norm(rays, axis=1))

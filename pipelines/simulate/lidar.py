@@ -70,8 +70,6 @@ class Strip:
 
 
 class LidarFlight:
-    """Flight over a scene as the photographs show it."""
-
     def __init__(self, options: LidarFlightOptions, scene: SimulatedScene, seed: np.random.SeedSequence) -> None:
         self._options, self._axes = options, scene.axes
         self._rng = np.random.default_rng(seed)
@@ -81,7 +79,6 @@ class LidarFlight:
         self.returns = self.returns_of_change = 0
 
     def strips(self) -> Iterator[Strip]:
-        """Yield the strips of the flight, in order."""
         options = self._options
         half_width_m = options.lidar_height * np.tan(np.radians(options.lidar_fov))
         lines = max(2, int(np.ceil(2 * options.lidar_radius / (_SPACING * half_width_m))) + 1)
@@ -99,7 +96,6 @@ class LidarFlight:
             start_s += duration_s + _TURN_S
 
     def truth(self) -> TrueLidar:
-        """Return the truth of the flight, after its strips."""
         options, changed = self._options, self.changed
         corners = [] if changed is None else changed.rectangle(changed.length_m / 2, changed.width_m / 2, 0.0)
         return TrueLidar(
@@ -186,7 +182,6 @@ def _changed_building(options: LidarFlightOptions, scene: SimulatedScene) -> Bui
 
 
 def _scanned_mesh(options: LidarFlightOptions, scene: SimulatedScene, changed: Building | None) -> Mesh:
-    """Return the scene as it was at the time of the LiDAR flight."""
     if changed is None:
         return scene.mesh
     if options.lidar_change == "removed":

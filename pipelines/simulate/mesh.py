@@ -79,8 +79,6 @@ class Mesh:
 
 
 class MeshBuilder:
-    """Collects surfaces into a `Mesh`."""
-
     def __init__(self) -> None:
         self._parts: list[tuple[FloatArray, FloatArray, FloatArray]] = []
         self._texture_params: list[tuple[float, ...]] = []
@@ -129,7 +127,6 @@ class MeshBuilder:
         self.quad(top, material, texture)
 
     def build(self) -> Mesh:
-        """Return the mesh of all triangles collected so far."""
         corners, normals, shared = (np.concatenate(part) for part in zip(*self._parts, strict=True))
         return Mesh(
             corners=corners,

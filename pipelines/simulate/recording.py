@@ -133,7 +133,6 @@ class Recording:
 
 
 def _receiver(options: SimulateOptions) -> Receiver:
-    """Return the receiver's profile, with the changes that the options make."""
     asked: dict[str, Any] = {
         "sigma_h_m": options.sigma_h,
         "sigma_v_m": options.sigma_v,
@@ -148,7 +147,6 @@ def _receiver(options: SimulateOptions) -> Receiver:
 
 
 def record(options: SimulateOptions, world: World, raycaster: Raycaster, seed: np.random.SeedSequence) -> Recording:
-    """Run the sensors over the flight, and mark the targets in the photographs."""
     gnss_seed, imu_seed, mark_seed = seed.spawn(3)
     receiver = _receiver(options)
     gnss = record_gnss(world.trajectory, world.mounting, receiver, np.random.default_rng(gnss_seed))

@@ -74,7 +74,6 @@ class Building:
 
     @property
     def height_m(self) -> float:
-        """Height of the eaves above ground."""
         return self.storeys * self.floor_m + 0.3
 
     def at(self, x: float, y: float, z: float) -> FloatArray:
@@ -150,7 +149,6 @@ def with_targets(scene: SimulatedScene, sites: list[TargetSite], width_m: float)
 
 
 def joined(first: Mesh, second: Mesh) -> Mesh:
-    """Return the triangles of two meshes in one."""
     shifted = replace(second, texture=second.texture + np.int32(len(first.texture_params)))
     names = vars(first)
     return Mesh(**{name: np.concatenate([getattr(first, name), getattr(shifted, name)]) for name in names})
@@ -189,13 +187,11 @@ def _varied(rng: np.random.Generator, colors: tuple[Color, ...]) -> Color:
 
 
 def _add_shifted(builder: MeshBuilder, texture: TextureParameters, rng: np.random.Generator) -> int:
-    """Register a texture at a random place in the noise, and return its row."""
     shift_m = (float(rng.uniform(0, 400)), float(rng.uniform(0, 400)))
     return builder.add_texture(replace(texture, shift_m=shift_m))
 
 
 def _add_building(builder: MeshBuilder, building: Building, rng: np.random.Generator) -> list[TargetSite]:
-    """Add a building, and return sites for targets on its walls and flat roof."""
     style = int(rng.integers(3))
     wall = TextureParameters(
         base=_varied(rng, STONES if style == 1 else PLASTERS),
@@ -326,7 +322,6 @@ _BALL_VERTICES, _BALL_FACES = _ball()
 
 
 def _add_tree(builder: MeshBuilder, foot: FloatArray, height_m: float, rng: np.random.Generator) -> None:
-    """Add a tree of a trunk and three lumpy crowns; `foot` (3,) in geo."""
     bark = _add_shifted(builder, TextureParameters((0.13, 0.10, 0.07)), rng)
     builder.box(foot - [0, 0, 0.5], (0.35, 0.35, 0.6 * height_m), np.eye(3), Material.PLAIN, bark)
     red, green, blue = _varied(rng, CROWNS)

@@ -53,7 +53,6 @@ class SimulationSummary:
 
     @property
     def key_figure(self) -> str:
-        """Headline of the summary."""
         return f"{self.images} photographs, {self.control_points} control and {self.check_points} check points"
 
 

@@ -86,11 +86,9 @@ class McmcStrategy:
         return share * (self.settings.opacity_penalty * opacity + self.settings.scale_penalty * scale)
 
     def observe(self, stats: ScreenStats, camera: Pinhole) -> None:
-        """Record the Gaussians that this iteration moves."""
         self._visible = stats.visible
 
     def update(self, iteration: int, optimizer: GaussianAdam, probe: Probe | None = None) -> DensityEdit:
-        """See `Strategy.update`; also adds the noise of this iteration."""
         settings, edit = self.settings, DensityEdit()
         if settings.start < iteration <= settings.stop and iteration % settings.every == 0:
             edit = self._edit(optimizer)
@@ -111,20 +109,18 @@ class McmcStrategy:
         moved = optimizer.gaussians
         opacity = torch.sigmoid(moved.logit_opacities[rows])
         free = torch.sigmoid(_SIGMOID_STEEPNESS * (1 - opacity - _SIGMOID_CENTRE))
-        noise = self._noise(len(rows), iteration, opacity.device)
+        if opacity.device.type == "cpu":
+            noise = torch.randn(len(rows), 3, generator=self._generator)
+        else:
+            # Made on the device: copies from the CPU would wait for all its work. The seed follows from the
+            # iteration, so that a resumed training shakes as an uninterrupted one does.
+            generator = torch.Generator(opacity.device).manual_seed(self._seed * _SEEDS_APART + iteration)
+            noise = torch.randn(len(rows), 3, generator=generator, device=opacity.device)
         rotation, variance = rotation_matrices(moved.quats_wxyz[rows]), (2 * moved.log_scales[rows]).exp()
         along = variance * (rotation.transpose(1, 2) @ noise[..., None])[..., 0]
         shaped = (rotation @ along[..., None])[..., 0]
         length = self.settings.noise * optimizer.means_rate(iteration) / self.extent_m
         moved.means[rows] += length * free[:, None] * shaped
-
-    def _noise(self, count: int, iteration: int, device: torch.device) -> Tensor:
-        """Return normal numbers (count, 3), made on the device: copies from the CPU would wait for all its work."""
-        if device.type == "cpu":
-            return torch.randn(count, 3, generator=self._generator)
-        # The seed follows from the iteration, so that a resumed training shakes as an uninterrupted one does.
-        generator = torch.Generator(device).manual_seed(self._seed * _SEEDS_APART + iteration)
-        return torch.randn(count, 3, generator=generator, device=device)
 
     @torch.no_grad()
     def _edit(self, optimizer: GaussianAdam) -> DensityEdit:

@@ -73,7 +73,6 @@ class Exposures:
         self._used = None
 
     def state(self) -> dict[str, Tensor]:
-        """Return copies of exposures and moments, for a checkpoint."""
         return {
             "affine": self.affine.clone(),
             "moments": self._moments.clone(),
@@ -93,7 +92,6 @@ class HeldExposures:
         self.affine = affine
 
     def apply(self, index: int, colour: Tensor) -> Tensor:
-        """See `Exposures.apply`."""
         return with_affine(colour, self.affine[index])
 
     def step(self, iteration: int) -> None:

@@ -44,7 +44,6 @@ class Gaussians:
 
     @property
     def sh_degree(self) -> int:
-        """Degree of the stored spherical harmonics."""
         return math.isqrt(self.sh.shape[1]) - 1
 
     def tensors(self) -> dict[str, Tensor]:
@@ -52,7 +51,6 @@ class Gaussians:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def detached(self) -> Gaussians:
-        """Return the same values without gradient history."""
         return Gaussians(**{name: tensor.detach() for name, tensor in self.tensors().items()})
 
     def arrays(self) -> dict[str, Float32Array]:
@@ -60,16 +58,13 @@ class Gaussians:
         return {name: tensor.detach().cpu().numpy() for name, tensor in self.tensors().items()}
 
     def select(self, index: Tensor) -> Gaussians:
-        """Return the rows that a mask or integers pick."""
         return Gaussians(**{name: tensor[index] for name, tensor in self.tensors().items()})
 
     def to(self, device: torch.device) -> Gaussians:
-        """Return the same Gaussians on a device."""
         return Gaussians(**{name: tensor.to(device) for name, tensor in self.tensors().items()})
 
     @staticmethod
     def concatenate(parts: list[Gaussians]) -> Gaussians:
-        """Return all rows of `parts`, in order."""
         return Gaussians(
             **{name: torch.cat([part.tensors()[name] for part in parts]) for name in parts[0].tensors()}
         )
@@ -132,8 +127,6 @@ _NEVER = 2**62
 
 
 class NonFiniteError(ConvergenceError):
-    """A loss or a gradient is not finite from an iteration on."""
-
     def __init__(self, name: str, iteration: int) -> None:
         self.name, self.iteration = name, iteration
         super().__init__(f"the {name} is not finite at iteration {iteration}")
@@ -163,5 +156,4 @@ class FinitenessMonitor:
             raise NonFiniteError(self._names[place], int(first[place]))
 
     def reset(self) -> None:
-        """Forget all records."""
         self._first.fill_(_NEVER)

@@ -80,7 +80,6 @@ def shadow_areas(sigmas: FloatArray) -> FloatArray:
 
 
 def mixture_of(splat: SplatArrays) -> Mixture:
-    """Return each Gaussian as a group of its own."""
     sigmas = np.exp(np.clip(splat.log_scales.astype(np.float64), *_LOG_SCALES))
     opacities = 0.5 + 0.5 * np.tanh(0.5 * splat.logit_opacities.astype(np.float64))
     axes = matrix_from_quat_xyzw(np.roll(splat.quats_wxyz, -1, axis=1)) * sigmas[:, None]
@@ -175,7 +174,6 @@ class DetailTile:
     children: tuple[DetailTile, ...] = ()
 
     def all(self) -> Iterator[DetailTile]:
-        """Yield the tile and all tiles below it."""
         yield self
         for child in self.children:
             yield from child.all()
@@ -296,7 +294,6 @@ class Tiler:
     write: WriteTile
 
     def leaf(self, name: str, content: SplatArrays, codes: IntArray, edge_m: float) -> _Shown:
-        """Return the leaf of some of the Gaussians."""
         self.write(name, content, is_leaf=True)
         mixture = mixture_of(content)
         tile = DetailTile(name, len(content), 0.0, bounds_of(mixture))
@@ -339,7 +336,6 @@ class _Forest:
         self._joined = 0
 
     def plant(self, tree: _Shown, height: int = 0) -> None:
-        """Add a tree."""
         if height == len(self._waiting):
             self._waiting.append([])
         row = self._waiting[height]
@@ -361,7 +357,6 @@ class _Forest:
 
 
 def _octree(splat: SplatArrays, tiler: Tiler, name: str) -> _Shown:
-    """Return the tile of all Gaussians, with its tree below."""
     codes, edge_m = _codes(splat.means)
     rows = np.argsort(codes, kind="stable")
     codes = codes[rows]

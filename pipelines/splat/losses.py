@@ -32,14 +32,6 @@ from pipelines.splat.gaussians import Gaussians
 SSIM_WEIGHT = 0.2
 
 
-@dataclass(frozen=True)
-class ImageSimilarity:
-    """Mean absolute difference and mean SSIM of two images over the pixels that count (channels averaged)."""
-
-    l1: float
-    ssim: float
-
-
 def photometric_loss(
     rendered: Tensor, target: Tensor, mask: Tensor | None = None, *, ssim_weight: float = SSIM_WEIGHT
 ) -> Tensor:
@@ -61,20 +53,18 @@ def photometric_loss(
     return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim)
 
 
-def image_similarity(image: Tensor, target: Tensor, mask: Tensor | None = None) -> ImageSimilarity:
-    """Return L1 and SSIM of two images, without gradient; arguments and errors as of `photometric_loss`."""
+def image_similarity(image: Tensor, target: Tensor, mask: Tensor | None = None) -> tuple[float, float]:
+    """Return mean L1 and SSIM of two images, without gradient; arguments and errors as of `photometric_loss`."""
     _check(image, target, mask)
     with torch.no_grad():
         if image.device.type == "cpu":
             absolute, similarity, count, _ = _by_kernels(image, target, mask)
-            return ImageSimilarity(absolute / count, similarity / count)
+            return absolute / count, similarity / count
         l1, ssim = _terms_by_convolution(image, target, mask)
-        return ImageSimilarity(float(l1), float(ssim))
+        return float(l1), float(ssim)
 
 
 class _Photometric(torch.autograd.Function):
-    """Value and gradient in one pass: backward only scales the gradient."""
-
     @staticmethod
     def forward(ctx: Any, rendered: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float) -> Tensor:
         wanted = ssim_weight if ctx.needs_input_grad[0] else None
@@ -161,8 +151,6 @@ class FreeSpace:
 
 
 class FreeSpaceLoss:
-    """Loss of Gaussians in free space."""
-
     def __init__(self, space: FreeSpace, device: torch.device) -> None:
         self._low = torch.tensor(space.low_in_model, dtype=torch.float32, device=device)
         self._free = torch.from_numpy(np.ascontiguousarray(space.free)).to(device)

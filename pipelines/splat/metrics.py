@@ -46,7 +46,7 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
 def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     """Return the mean SSIM with the window of `pipelines.splat.losses`; arguments and errors as of `psnr`."""
     _check(image, target, mask)
-    return image_similarity(image.detach().clamp(0, 1), target, mask).ssim
+    return image_similarity(image.detach().clamp(0, 1), target, mask)[1]
 
 
 def _check(image: Tensor, target: Tensor, mask: Tensor | None) -> None:
@@ -98,7 +98,6 @@ class Lpips:
 
 
 def _features(image: Tensor, weights: dict[str, Tensor]) -> list[Tensor]:
-    """Return unit-length features of the five slices."""
     planes = 2 * image.detach().cpu().float().clamp(0, 1).permute(2, 0, 1)[None] - 1
     x = (planes - torch.tensor(_SHIFT).view(1, 3, 1, 1)) / torch.tensor(_SCALE).view(1, 3, 1, 1)
     features = []

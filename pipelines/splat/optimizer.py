@@ -156,7 +156,6 @@ class GaussianAdam:
         self._corrections = _bias_corrections(self.rates).to(gaussians.means.device)
 
     def zero_grad(self) -> None:
-        """Drop the gradients."""
         for tensor in self.gaussians.tensors().values():
             tensor.grad = None
 

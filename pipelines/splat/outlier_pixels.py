@@ -72,7 +72,6 @@ class OutlierPixels:
         return ~outside if mask is None else mask & ~outside
 
     def state(self) -> dict[str, Tensor]:
-        """Return copies of the running state, for a checkpoint."""
         return {"quantile": self._quantile.clone(), "views": torch.tensor(self._views)}
 
     def restore(self, state: dict[str, Tensor]) -> None:

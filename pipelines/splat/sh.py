@@ -36,7 +36,6 @@ def coefficient_count(degree: int) -> int:
 
 
 def sh_from_rgb(rgb: Tensor) -> Tensor:
-    """Return the constant coefficient of a colour."""
     return (rgb - 0.5) / C0
 
 

@@ -54,7 +54,6 @@ class Window:
 
     @property
     def slices(self) -> tuple[slice, slice]:
-        """Rows and columns of the image that lie in the window."""
         return slice(self.top, self.top + self.height), slice(self.left, self.left + self.width)
 
     def cut(self, view: Render) -> Render:
@@ -87,7 +86,6 @@ class RasterSettings:
     window: Window | None = None
 
     def image_of(self, camera: Pinhole) -> Pinhole:
-        """Return the camera of the image that is rendered."""
         return camera if self.window is None else self.window.of(camera)
 
 

@@ -9,16 +9,14 @@ import torch
 
 from pipelines.core.errors import BackendUnavailableError
 from pipelines.core.progress import SILENT, Progress
-from pipelines.splat.rasterizer import api
-from pipelines.splat.rasterizer.api import Rasterizer
+from pipelines.splat.rasterizer.api import BackendName, Rasterizer
 
-BackendName = Literal["auto", "cpu", "cuda"]
-BACKENDS: tuple[api.BackendName, ...] = ("cpu", "cuda")
+BACKENDS: tuple[BackendName, ...] = ("cpu", "cuda")
 
 log = logging.getLogger(__name__)
 
 
-def chosen_backend(name: BackendName) -> api.BackendName:
+def chosen_backend(name: Literal["auto", "cpu", "cuda"]) -> BackendName:
     """Return the backend that a name stands for, without loading it.
 
     `auto` stands for cuda if nothing that it needs is missing. If there is a GPU, the log says what is missing.
@@ -41,7 +39,7 @@ def chosen_backend(name: BackendName) -> api.BackendName:
     return "cpu"
 
 
-def rasterizer(name: BackendName, progress: Progress = SILENT) -> Rasterizer:
+def rasterizer(name: Literal["auto", "cpu", "cuda"], progress: Progress = SILENT) -> Rasterizer:
     """Return the backend that a name stands for, see `chosen_backend`.
 
     Raises:

@@ -178,7 +178,6 @@ class _Rasterize(torch.autograd.Function):
 
 @contextlib.contextmanager
 def _threads_for(image: Pinhole) -> Iterator[None]:
-    """Run the kernels of a small image on one thread."""
     threads = numba.get_num_threads()
     numba.set_num_threads(1 if image.width * image.height <= _SMALL_PX else threads)
     try:

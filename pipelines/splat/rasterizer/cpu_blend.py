@@ -144,7 +144,6 @@ def _blend_tile(table: Any, hits: Any, first: int, last: int, tile_x: int, tile_
 
 @jit
 def _finish_tile(scratch: Any, tile_x: int, tile_y: int, background: Any, images: Any) -> None:
-    """Write a blended tile into the images."""
     colour, alpha, depth, depth2, median = images
     for row in range(min(TILE_HEIGHT, colour.shape[0] - tile_y)):
         for column in range(min(TILE_WIDTH, colour.shape[1] - tile_x)):

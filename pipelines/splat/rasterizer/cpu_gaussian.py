@@ -212,7 +212,6 @@ def make_view(camera: Pinhole, settings: RasterSettings, pose: FloatArray) -> Vi
 
 @jit
 def row3(array: Any, i: int) -> Any:
-    """Return row i of an (N, 3) array."""
     return float(array[i, 0]), float(array[i, 1]), float(array[i, 2])
 
 
@@ -248,7 +247,6 @@ def rotation(quat: Any) -> Any:
 
 @jit
 def variances(log_scales: Any, i: int) -> Any:
-    """Return the variances along the principal axes of Gaussian i."""
     a, b, c = row3(log_scales, i)
     return math.exp(2 * a), math.exp(2 * b), math.exp(2 * c)
 

@@ -185,7 +185,6 @@ RUNS = 32
 
 
 def tile_grid(width: int, height: int) -> tuple[int, int]:
-    """Return the columns and rows of tiles over an image."""
     return -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
 
 
@@ -197,7 +196,6 @@ def pack_hit(splat: int, first_row: int, last_row: int) -> int:
 
 @jit
 def unpack_hit(hit: int) -> Any:
-    """Unpack a hit: inverts `pack_hit`."""
     return hit >> 16, (hit >> 8) & 255, hit & 255
 
 
