@@ -176,7 +176,9 @@ def _write_photographs(options: SimulateOptions, flight: RecordedFlight, folder:
     (folder / "images").mkdir()
     if options.depth:
         (folder / "depth").mkdir()
-    sensors = _sensors(options, rng)
+    gains = 1.1 * np.exp(rng.normal(0, options.exposure, count))
+    tints = np.exp(rng.normal(0, 0.15 * options.exposure, (count, 3)))
+    sensors = [Sensor(float(gain), vector(tint), options.noise) for gain, tint in zip(gains, tints, strict=True)]
     streams = rng.spawn(count)
 
     def write(i: int) -> None:
@@ -199,15 +201,6 @@ def _write_photographs(options: SimulateOptions, flight: RecordedFlight, folder:
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
-
-
-def _sensors(options: SimulateOptions, rng: np.random.Generator) -> list[Sensor]:
-    gains = 1.1 * np.exp(rng.normal(0, options.exposure, options.images))
-    tints = np.exp(rng.normal(0, 0.15 * options.exposure, (options.images, 3)))
-    return [
-        Sensor(float(gain), (float(red), float(green), float(blue)), options.noise)
-        for gain, (red, green, blue) in zip(gains, tints, strict=True)
-    ]
 
 
 def _tags(options: SimulateOptions, world: World, recording: Recording, i: int) -> DroneTags:

@@ -105,22 +105,17 @@ def transformed(gaussians: Gaussians, target_from_source: Similarity) -> Gaussia
     turn = torch.as_tensor(target_from_source.rotation, dtype=torch.float64, device=device)
     shift = torch.as_tensor(target_from_source.translation, dtype=torch.float64, device=device)
     x, y, z, w = quat_xyzw_from_matrix(target_from_source.rotation).tolist()
-    quat_wxyz = torch.tensor([w, x, y, z], dtype=torch.float64, device=device)
+    # Of the product of quaternions with the rotation on the left.
+    product = [w, -x, -y, -z, x, w, -z, y, y, z, w, -x, z, -y, x, w]
+    turn_quat = torch.tensor(product, dtype=torch.float64, device=device).view(4, 4)
     unit = torch.nn.functional.normalize(gaussians.quats_wxyz.double(), dim=1)
     return Gaussians(
         means=(target_from_source.scale * gaussians.means.double() @ turn.T + shift).to(kind),
-        quats_wxyz=_quaternion_product(quat_wxyz, unit).to(kind),
+        quats_wxyz=(unit @ turn_quat.T).to(kind),
         log_scales=(gaussians.log_scales.double() + math.log(target_from_source.scale)).to(kind),
         logit_opacities=gaussians.logit_opacities.clone(),
         sh=sh.rotate_sh(gaussians.sh, turn.cpu()),
     )
-
-
-def _quaternion_product(left_wxyz: Tensor, right_wxyz: Tensor) -> Tensor:
-    """Return quaternions (N, 4) of the rotation `left` (4,) after the rotations `right` (N, 4)."""
-    w, x, y, z = left_wxyz.unbind(-1)
-    matrix = torch.stack([w, -x, -y, -z, x, w, -z, y, y, z, w, -x, z, -y, x, w]).view(4, 4)
-    return right_wxyz @ matrix.T
 
 
 _NEVER = 2**62

@@ -293,12 +293,6 @@ class Tiler:
     largest_tile: int
     write: WriteTile
 
-    def leaf(self, name: str, content: SplatArrays, codes: IntArray, edge_m: float) -> _Shown:
-        self.write(name, content, is_leaf=True)
-        mixture = mixture_of(content)
-        tile = DetailTile(name, len(content), 0.0, bounds_of(mixture))
-        return _Shown(tile, _Curve(mixture, codes, edge_m), 0.0)
-
     def parent(self, name: str, children: list[_Shown], curve: _Curve) -> _Shown:
         """Return the tile above children, with what they show, `curve`, merged in larger cells."""
         most = max(1, min(self.largest_tile, len(curve.codes) // _LEAST_REDUCTION))
@@ -364,7 +358,11 @@ def _octree(splat: SplatArrays, tiler: Tiler, name: str) -> _Shown:
     def cell(name: str, first: int, last: int, height: int) -> _Shown:
         """Return the tile of rows `first` … `last`, which lie in one cell of 2^height cells a side."""
         if last - first <= tiler.largest_tile:
-            return tiler.leaf(name, splat.select(rows[first:last]), codes[first:last], edge_m)
+            content = splat.select(rows[first:last])
+            tiler.write(name, content, is_leaf=True)
+            mixture = mixture_of(content)
+            tile = DetailTile(name, len(content), 0.0, bounds_of(mixture))
+            return _Shown(tile, _Curve(mixture, codes[first:last], edge_m), 0.0)
         ends = octants(first, last, height)
         while len(ends) == 2 and height > 0:  # a single child: look into it
             height -= 1

@@ -211,14 +211,10 @@ def normal_loss(
     assert render.expected_depth is not None
     depth, alpha = render.expected_depth, render.alpha
     blended = (2 * render.colour - alpha[..., None])[:-1, :-1]
-    smooth = _smooth(depth.detach(), alpha.detach(), edge)
+    # Pixels that lie on one surface with their neighbours to the right and below.
+    z, solid = depth.detach(), alpha.detach() > _SOLID
+    step = torch.maximum((z[:-1, 1:] - z[:-1, :-1]).abs(), (z[1:, :-1] - z[:-1, :-1]).abs())
+    on_one = (step < edge * z[:-1, :-1]) & solid[:-1, :-1] & solid[:-1, 1:] & solid[1:, :-1]
+    smooth = on_one.to(depth.dtype)
     agreement = (blended * depth_normals(depth, camera)).sum(dim=-1)
     return ((alpha[:-1, :-1] - agreement) * smooth).sum() / smooth.sum().clamp_min(1)
-
-
-def _smooth(depth: Tensor, alpha: Tensor, edge: float) -> Tensor:
-    """Return 1 for pixels that lie on one surface with their neighbours to the right and below, else 0."""
-    center = depth[:-1, :-1]
-    step = torch.maximum((depth[:-1, 1:] - center).abs(), (depth[1:, :-1] - center).abs())
-    solid = (alpha[:-1, :-1] > 0.5) & (alpha[:-1, 1:] > 0.5) & (alpha[1:, :-1] > 0.5)
-    return ((step < edge * center) & solid).to(depth.dtype)

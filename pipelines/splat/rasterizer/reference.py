@@ -42,7 +42,9 @@ def render_reference(
 
     mean_px, cov_px2 = project_gaussians(sorted_gaussians, mean_in_cam, pose, camera, settings.dilation_px2)
     colours = view_colours(sorted_gaussians, pose, settings.sh_degree)
-    offset_px = _offsets(mean_px, camera)
+    rows, columns = (torch.arange(count, dtype=dtype) + 0.5 for count in (camera.height, camera.width))
+    v, u = torch.meshgrid(rows, columns, indexing="ij")
+    offset_px = torch.stack([u.reshape(-1), v.reshape(-1)], dim=-1) - mean_px[:, None]
     alpha = _alpha(offset_px, cov_px2, torch.sigmoid(sorted_gaussians.logit_opacities))
 
     after = torch.cumprod(1 - alpha, dim=0)
@@ -131,16 +133,6 @@ def view_colours(gaussians: Gaussians, cam_from_model: Tensor, sh_degree: int) -
     """Return colours (N, 3) of the Gaussians seen from the camera's centre, not negative."""
     center_in_model = -torch.linalg.solve(cam_from_model[:3, :3], cam_from_model[:3, 3])
     return (sh.evaluate_sh(gaussians.sh, gaussians.means - center_in_model, sh_degree) + 0.5).clamp_min(0.0)
-
-
-def _offsets(mean_px: Tensor, camera: Pinhole) -> Tensor:
-    """Return offsets (N, H·W, 2) from the screen means to the pixel centres."""
-    v, u = torch.meshgrid(
-        torch.arange(camera.height, dtype=mean_px.dtype) + 0.5,
-        torch.arange(camera.width, dtype=mean_px.dtype) + 0.5,
-        indexing="ij",
-    )
-    return torch.stack([u.reshape(-1), v.reshape(-1)], dim=-1) - mean_px[:, None]
 
 
 def _alpha(offset_px: Tensor, cov_px2: Tensor, opacity: Tensor) -> Tensor:
