@@ -31,15 +31,6 @@ POINTS_CRS = "EPSG:4979"
 
 
 @dataclass(frozen=True)
-class SurveyedTarget:
-    """Target as the surveyor measured it: position (3,) in geo, and (image, x, y) of its marks."""
-
-    name: str
-    position_in_geo: FloatArray
-    marks: tuple[tuple[str, float, float], ...]
-
-
-@dataclass(frozen=True)
 class PhotoRecords:
     """Records of N photographs.
 
@@ -86,13 +77,14 @@ def write_tables(folder: Path, recording: Recording, enu_from_body: FloatArray, 
     for stamp, quat in zip(imu.stamp_ns, quat_xyzw_from_matrix(enu_from_body), strict=True):
         rows.append(f"{_seconds(stamp)}," + ",".join(f"{part:.9f}" for part in quat))
     _write(folder / "imu.csv", rows)
-    for name, targets in (("gcp_list.txt", recording.control), ("checkpoints.txt", recording.check)):
+    for name, role in (("gcp_list.txt", "control"), ("checkpoints.txt", "check")):
         # The form of ODM's gcp_list.txt: x is the longitude.
         rows = [POINTS_CRS]
-        for target in targets:
-            lat, lon, alt = lla_from_enu(target.position_in_geo, origin)
-            place = f"{lon:.10f} {lat:.10f} {alt:.5f}"
-            rows += [f"{place} {x:.3f} {y:.3f} {image} {target.name}" for image, x, y in target.marks]
+        for target, position in zip(recording.truth.targets, recording.target_in_geo, strict=True):
+            lat, lon, alt = lla_from_enu(position, origin)
+            for mark in target.marks if target.role == role else ():
+                place = f"{lon:.10f} {lat:.10f} {alt:.5f} {mark.written_x_px:.3f} {mark.written_y_px:.3f}"
+                rows.append(f"{place} {mark.image} {target.name}")
         _write(folder / name, rows)
 
 
@@ -118,8 +110,8 @@ class Recording:
     Attributes:
         photos: position and attitude of the photographs.
         gnss, imu: the logs; gnss_lla (M, 3) degrees and metres; imu_in_geo (K, 3) places of the attitudes.
-        control, check: surveyed targets.
-        truth: of the whole survey.
+        truth: of the whole survey, with its P targets.
+        target_in_geo: (P, 3) places of the targets, as surveyed.
     """
 
     photos: PhotoRecords
@@ -127,9 +119,8 @@ class Recording:
     gnss_lla: FloatArray
     imu: ImuLog
     imu_in_geo: FloatArray
-    control: tuple[SurveyedTarget, ...]
-    check: tuple[SurveyedTarget, ...]
     truth: Truth
+    target_in_geo: FloatArray
 
 
 def _receiver(options: SimulateOptions) -> Receiver:
@@ -152,7 +143,7 @@ def record(options: SimulateOptions, world: World, raycaster: Raycaster, seed: n
     gnss = record_gnss(world.trajectory, world.mounting, receiver, np.random.default_rng(gnss_seed))
     imu = record_imu(world.trajectory, world.mounting, options.sigma_attitude, np.random.default_rng(imu_seed))
     photos = _photo_records(world, receiver, gnss, imu)
-    targets = _mark(options, world, photos.names, raycaster, np.random.default_rng(mark_seed))
+    targets, target_in_geo = _mark(options, world, photos.names, raycaster, np.random.default_rng(mark_seed))
     imu_time_s = (imu.stamp_ns - photos.stamp_ns[0]) / 1e9 - world.mounting.clock_offset_s
     return Recording(
         photos=photos,
@@ -160,9 +151,8 @@ def record(options: SimulateOptions, world: World, raycaster: Raycaster, seed: n
         gnss_lla=lla_from_enu(gnss.position_in_geo, world.origin),
         imu=imu,
         imu_in_geo=world.trajectory.position(imu_time_s),
-        control=tuple(surveyed for true, surveyed in targets if true.role == "control"),
-        check=tuple(surveyed for true, surveyed in targets if true.role == "check"),
-        truth=_truth(options, world, receiver, gnss, photos, targets=tuple(true for true, _ in targets)),
+        truth=_truth(options, world, receiver, gnss, photos, targets=targets),
+        target_in_geo=target_in_geo,
     )
 
 
@@ -183,12 +173,12 @@ def _photo_records(world: World, receiver: Receiver, gnss: GnssLog, imu: ImuLog)
 
 def _mark(
     options: SimulateOptions, world: World, names: tuple[str, ...], raycaster: Raycaster, rng: np.random.Generator
-) -> list[tuple[TrueTarget, SurveyedTarget]]:
-    """Return the targets that at least two photographs see: the truth, and the surveyor's records."""
+) -> tuple[tuple[TrueTarget, ...], FloatArray]:
+    """Return the P targets that at least two photographs see, and their places (P, 3) as surveyed."""
     seen, pixels = project_targets(world.sites, world.poses, world.lens, raycaster, world.target_m)
     rays = seen.sum(axis=1)
     control = set(choose_control(world.sites, rays, options.control))
-    targets = []
+    targets, surveyed = [], []
     for i in np.nonzero(rays >= LEAST_RAYS)[0]:
         role: Literal["control", "check"] = "control" if i in control else "check"
         name = f"{'G' if role == 'control' else 'C'}{i:02d}"
@@ -201,13 +191,12 @@ def _mark(
                 image=names[j], x_px=x, y_px=y, written_x_px=round(x + dx, 3), written_y_px=round(y + dy, 3)
             ))  # fmt: skip
         position = world.sites[i].target_position
-        measured = position + rng.normal(0, options.sigma_survey, 3)
-        true = TrueTarget(
-            name=name, role=role, surface=world.sites[i].kind, position_in_geo=vector(position), marks=tuple(marks)
+        surveyed.append(position + rng.normal(0, options.sigma_survey, 3))
+        kind, true_in_geo = world.sites[i].kind, vector(position)
+        targets.append(
+            TrueTarget(name=name, role=role, surface=kind, position_in_geo=true_in_geo, marks=tuple(marks))
         )
-        written = tuple((mark.image, mark.written_x_px, mark.written_y_px) for mark in marks)
-        targets.append((true, SurveyedTarget(name, measured, written)))
-    return targets
+    return tuple(targets), np.array(surveyed).reshape(-1, 3)
 
 
 def _truth(

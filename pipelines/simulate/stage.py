@@ -105,15 +105,16 @@ def simulate(
             truth = truth.model_copy(update={"lidar": write_lidar_flight(options, flight, draft, progress)})
         save_json(truth, draft / TRUTH)
         messages = _write_records(options, flight.world, recording, draft)
-    well_seen = sum(len(target.marks) >= WANTED_RAYS for target in recording.check)
+    check = [target for target in recording.truth.targets if target.role == "check"]
+    control, well_seen = len(truth.targets) - len(check), sum(len(target.marks) >= WANTED_RAYS for target in check)
     summary = SimulationSummary(
         directory=directory,
         images=options.images,
-        control_points=len(recording.control),
-        check_points=len(recording.check),
+        control_points=control,
+        check_points=len(check),
         well_seen=well_seen,
         bag_messages=messages,
-        warnings=_warnings(options, well_seen, len(recording.control)),
+        warnings=_warnings(options, well_seen, control),
     )
     for warning in summary.warnings:
         log.warning("simulate: %s", warning)
