@@ -59,6 +59,10 @@ def view_contributions(
     return ViewContributions(sums[:, 0], sums[:, 1])
 
 
+_SPLIT_SCALE = 0.01  # largest standard deviation to clone, in scene extents; larger Gaussians are split
+_LEAST_OPACITY = 0.005  # Gaussians below are removed
+_LARGEST_SCALE = 0.1  # of the scene extent plus the distance from its middle: Gaussians above are removed
+_RESET_OPACITY = 0.01  # largest after a reset
 _CHILDREN = 2
 _SHRINK = 0.8 * _CHILDREN  # 3DGS: a child of a split has 1/1.6 of its parent's standard deviations
 
@@ -105,12 +109,7 @@ class DefaultSettings:
         reset_every: iterations between opacity resets, before `stop` (0: none).
         gradient_threshold: mean length of ∂L/∂(centre in normalised device coordinates) from which a Gaussian is
             cloned or split.
-        split_scale: largest standard deviation to clone, in scene extents; larger Gaussians are split.
-        prune_opacity: Gaussians below this opacity are removed.
-        prune_scale: Gaussians are removed whose standard deviation is above this share of the scene extent plus
-            their distance from the middle of the scene,
-        prune_scale_from: after this iteration.
-        reset_opacity: largest opacity after a reset.
+        prune_scale_from: Gaussians are removed for their size after this iteration.
     """
 
     start: int = 500
@@ -118,11 +117,7 @@ class DefaultSettings:
     every: int = 100
     reset_every: int = 3_000
     gradient_threshold: float = 2e-4
-    split_scale: float = 0.01
-    prune_opacity: float = 0.005
-    prune_scale: float = 0.1
     prune_scale_from: int = 3_000
-    reset_opacity: float = 0.01
     max_gaussians: int = 1_000_000
 
     @classmethod
@@ -190,7 +185,7 @@ class DefaultStrategy:
             chosen = alive & (gradient >= settings.gradient_threshold)
             edit = self._edit(optimizer, alive, self._within_room(alive, chosen, gradient))
         if settings.reset_every and iteration < settings.stop and iteration % settings.reset_every == 0:
-            ceiling = math.log(settings.reset_opacity / (1 - settings.reset_opacity))
+            ceiling = math.log(_RESET_OPACITY / (1 - _RESET_OPACITY))
             capped = optimizer.gaussians.logit_opacities.detach().clamp_max(ceiling)
             optimizer.overwrite("logit_opacities", capped)
             edit = replace(edit, opacity_reset=True)
@@ -211,7 +206,7 @@ class DefaultStrategy:
     def _edit(self, optimizer: GaussianAdam, alive: Tensor, chosen: Tensor) -> DensityEdit:
         """Keep the Gaussians of the mask `alive`, and add one for each of the mask `chosen`."""
         gaussians = optimizer.gaussians.detached()
-        large = gaussians.log_scales.amax(dim=1).exp() > self.settings.split_scale * self.extent_m
+        large = gaussians.log_scales.amax(dim=1).exp() > _SPLIT_SCALE * self.extent_m
         cloned, parents = chosen & ~large, chosen & large
         stay = (alive & ~parents).nonzero()[:, 0]
         parts = [gaussians.select(stay), gaussians.select(cloned), self._children(gaussians.select(parents))]
@@ -225,13 +220,13 @@ class DefaultStrategy:
         return DensityEdit(int(cloned.sum()), int(parents.sum()), int((~alive).sum()))
 
     def _alive(self, gaussians: Gaussians, iteration: int) -> Tensor:
-        alive = torch.sigmoid(gaussians.logit_opacities) >= self.settings.prune_opacity
+        alive = torch.sigmoid(gaussians.logit_opacities) >= _LEAST_OPACITY
         if iteration > self.settings.prune_scale_from:
             # Sky and horizon are far away. 3DGS compares with the extent alone, and so removes them with each edit;
             # the photographs then have a black background until other Gaussians have grown over it.
             distance = (gaussians.means - gaussians.means.median(dim=0).values).norm(dim=1)
             scale = gaussians.log_scales.amax(dim=1).exp()
-            alive &= scale <= self.settings.prune_scale * (self.extent_m + distance)
+            alive &= scale <= _LARGEST_SCALE * (self.extent_m + distance)
         return alive
 
     def _within_room(self, alive: Tensor, chosen: Tensor, score: Tensor) -> Tensor:

@@ -24,6 +24,9 @@ from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.rasterizer.api import ScreenStats
 from pipelines.splat.spatial import morton_order
 
+_DEAD_OPACITY = 0.005  # Gaussians up to this opacity are moved
+# Weights of the mean opacity, and of the mean standard deviation in scene extents.
+_OPACITY_PENALTY, _SCALE_PENALTY = 0.01, 0.01 * 5
 _MOST_COPIES = 51  # of one Gaussian in one edit: the binomials of eq. 9 are tabulated
 _SEEDS_APART = 1_000_003  # more than there are iterations
 _SIGMOID_STEEPNESS, _SIGMOID_CENTRE = 100.0, 0.995
@@ -36,21 +39,15 @@ class McmcSettings:
     Attributes:
         start, stop, every: Gaussians are moved and added after `start` and up to `stop`, every so many iterations.
         growth: share of Gaussians to add at each edit.
-        dead_opacity: Gaussians up to this opacity are moved.
         noise: standard deviation of the noise, in learning rates of the centres times covariance, all in scene
             extents. The paper's 5e5 is for scenes whose extent is about 5 units, hence the factor 5².
-        opacity_penalty: weight of the mean opacity.
-        scale_penalty: weight of the mean standard deviation, in scene extents.
     """
 
     start: int = 500
     stop: int = 25_000
     every: int = 100
     growth: float = 0.05
-    dead_opacity: float = 0.005
     noise: float = 5e5 * 5**2
-    opacity_penalty: float = 0.01
-    scale_penalty: float = 0.01 * 5
     max_gaussians: int = 1_000_000
 
     @classmethod
@@ -83,7 +80,7 @@ class McmcStrategy:
         share = len(rows) / max(len(gaussians), 1)
         opacity = torch.sigmoid(gaussians.logit_opacities[rows]).mean()
         scale = gaussians.log_scales[rows].exp().mean() / self.extent_m
-        return share * (self.settings.opacity_penalty * opacity + self.settings.scale_penalty * scale)
+        return share * (_OPACITY_PENALTY * opacity + _SCALE_PENALTY * scale)
 
     def observe(self, stats: ScreenStats, camera: Pinhole) -> None:
         self._visible = stats.visible
@@ -126,7 +123,7 @@ class McmcStrategy:
     def _edit(self, optimizer: GaussianAdam) -> DensityEdit:
         gaussians, settings = optimizer.gaussians.detached(), self.settings
         opacity = torch.sigmoid(gaussians.logit_opacities)
-        dead = (opacity <= settings.dead_opacity).nonzero()[:, 0]
+        dead = (opacity <= _DEAD_OPACITY).nonzero()[:, 0]
         count = len(gaussians)
         target = min(settings.max_gaussians, math.ceil((1 + settings.growth) * count))
         added = max(target - count, 0) if len(dead) < count else 0
@@ -166,7 +163,9 @@ def _shared_among(gaussians: Gaussians, copies: Tensor) -> Gaussians:
     opacity = torch.sigmoid(gaussians.logit_opacities[rows].double())
     shared_opacity = 1 - (1 - opacity) ** (1 / n)
     # A logit of 1 is infinite, and a copy below the opacity of dead Gaussians would be moved at once.
-    shared.logit_opacities[rows] = torch.logit(shared_opacity.clamp(0.005, 1 - 1e-6)).to(shared.logit_opacities)
+    shared.logit_opacities[rows] = torch.logit(shared_opacity.clamp(_DEAD_OPACITY, 1 - 1e-6)).to(
+        shared.logit_opacities
+    )
     shared.log_scales[rows] += (opacity / _overlap(shared_opacity, n)).log().to(shared.log_scales)[:, None]
     return shared
 
