@@ -19,7 +19,6 @@ from pipelines.formats.georef_sidecar import GeorefSidecar
 from pipelines.formats.splat_ply import SplatArrays
 from pipelines.geodesy.crs import ECEF, parse_crs
 from pipelines.geodesy.vertical import VerticalDatum
-from pipelines.splat.level_of_detail import SceneExtent
 
 
 def landscape(count: int, degree: int, middle_m: float = 0.0) -> SplatArrays:
@@ -50,7 +49,7 @@ def main() -> None:
     )
     # What a lazy reader knows of all parts: here the extent by construction.
     half = np.array([150.0 * args.parts, 150.0, 5.0])
-    tiling = Tiling(SceneExtent(np.array([-half, half])), count)
+    tiling = Tiling(np.array([-half, half]), count)
     sidecar = GeorefSidecar(
         origin=(6378137.0, 0.0, 0.0),
         rotation=(0.5, 0.5, 0.5, 0.5),

@@ -19,6 +19,7 @@ import numpy as np
 from pipelines.core.errors import InputError
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import TILES_GLB
+from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.deliver.options import ExportTilesOptions
 from pipelines.deliver.splat import SplatParts, load_splat_parts
@@ -27,7 +28,7 @@ from pipelines.deliver.tiles_page import ScenePage, ShownScene, scene_page, writ
 from pipelines.formats.georef_sidecar import GeorefSidecar, write_sidecar
 from pipelines.formats.splat_ply import SplatArrays, concatenated
 from pipelines.geodesy.vertical import ELLIPSOIDAL, parse_vertical
-from pipelines.splat.level_of_detail import DetailTile, SceneExtent, Tiler, best_cut, build_tiles
+from pipelines.splat.level_of_detail import DetailTile, Tiler, best_cut, build_tiles, scene_box
 from pipelines.splat.sh import coefficient_count
 from pipelines.survey.calibrated import load_survey
 from pipelines.survey.target_crs import target_crs
@@ -49,7 +50,7 @@ def run(stage: StageRun, options: ExportTilesOptions) -> Summary:
     page = _page(stage.workspace, splat, options)
     count, sidecar = splat.figures.count, splat.placement.sidecar()
     require_space(stage.out, count, coefficient_count(splat.sh_degree))
-    tiling = Tiling(SceneExtent.of(splat.center_in_file), count, options.max_tile_gaussians)
+    tiling = Tiling(scene_box(splat.center_in_file), count, options.max_tile_gaussians)
     root = write_tiles(stage.out, splat, tiling, sidecar, stage.progress)
     in_glb = write_whole(stage.out, splat, root, sidecar, count)
     for name in (TILESET, GLB):
@@ -95,19 +96,19 @@ class Tiling:
     """Division of a splat into tiles.
 
     Attributes:
-        extent: of the scene.
+        extent: (2, 3) box of the scene.
         count: number of all Gaussians.
         largest_tile: largest number of Gaussians in a tile.
     """
 
-    extent: SceneExtent
+    extent: FloatArray
     count: int
     largest_tile: int = 200_000
 
     @staticmethod
     def of(splat: SplatArrays) -> Tiling:
         """Return the division of a splat that is one part."""
-        return Tiling(SceneExtent.of(splat.means), len(splat))
+        return Tiling(scene_box(splat.means), len(splat))
 
 
 def write_tiles(

@@ -1,21 +1,23 @@
 """Layout of a town: a complex on its square, streets around it, buildings between them, gardens, trees, cars.
 
-Painting of the ground: meadows, streets, the square and yards, in metres of the town's axes.
+The ground is painted in metres of the town's axes.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from itertools import product
+from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipelines.core.types import ByteArray, FloatArray
-from pipelines.simulate.buildings import Roof
 from pipelines.simulate.mesh import Color
 from pipelines.simulate.textures import GroundPlan, Pyramid
 
+Roof = Literal["flat", "gable", "hip"]
 REACH_M = 128.0  # half side of the painted ground
 SQUARE_M = 38.0  # half side of the central square
 RING_M = 44.0  # middle of the street around it
@@ -48,14 +50,7 @@ class GroundPainter:
     def box(
         self, low: tuple[float, float], high: tuple[float, float], color: Color, kind: tuple[int, int, int] | None
     ) -> None:
-        """Fill an axis-parallel rectangle."""
-        (x0, y0), (x1, y1) = low, high
-        self.polygon([(x0, y0), (x1, y0), (x1, y1), (x0, y1)], color, kind)
-
-    def occupy(self, low: tuple[float, float], high: tuple[float, float]) -> None:
-        """Mark a rectangle as built on."""
-        (x0, y0), (x1, y1) = low, high
-        cv2.fillPoly(self.built, [_pixels([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])], 255, cv2.LINE_8, _SUBPIXEL)
+        self.polygon(_rectangle(low, high), color, kind)
 
     def is_free(self, x: float, y: float, margin_m: float) -> bool:
         """Return whether the ground within `margin_m` is not built on."""
@@ -81,6 +76,11 @@ def _pixels(corners: ArrayLike) -> NDArray[np.int32]:
     return np.asarray(np.round(scaled * 2**_SUBPIXEL).astype(np.int32))
 
 
+def _rectangle(low: tuple[float, float], high: tuple[float, float]) -> list[tuple[float, float]]:
+    (x0, y0), (x1, y1) = low, high
+    return [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
+
+
 def paint_meadows(painter: GroundPainter, rng: np.random.Generator) -> None:
     """Paint patches of grass and earth of some metres, everywhere."""
     for _ in range(260):
@@ -94,14 +94,14 @@ def paint_meadows(painter: GroundPainter, rng: np.random.Generator) -> None:
 
 def paint_streets(painter: GroundPainter, rng: np.random.Generator) -> None:
     """Paint two square rings of streets and those that join them, with kerbs, wear and markings."""
-    ends = [(OUTER_M + 3.5, -OUTER_M - 3.5)]
+    end = OUTER_M + 3.5
     for walk, color, kind in ((2.2, KERB, PAVING), (0.0, _TAR, ASPHALT)):
         for middle in (RING_M, OUTER_M):
             outer, half = middle + 3.5 + walk, 3.5 + walk
             for side in (-middle, middle):
                 painter.box((side - half, -outer), (side + half, outer), color, kind)
                 painter.box((-outer, side - half), (outer, side + half), color, kind)
-        for a, b in ((RING_M, ends[0][0]), (ends[0][1], -RING_M)):
+        for a, b in ((RING_M, end), (-end, -RING_M)):
             painter.box((a, -3.5 - walk), (b, 3.5 + walk), color, kind)
             painter.box((-3.5 - walk, a), (3.5 + walk, b), color, kind)
     _paint_wear(painter, rng)
@@ -175,11 +175,8 @@ class TownStyle:
 
     Attributes:
         relief_m: variation of the terrain in the town.
-        storeys: fewest and most storeys of a building.
-        flat_share: share of flat roofs.
-        tower_storeys: storeys of the tower in the middle.
-        trees: number of trees.
-        built_share: share of the plots that are built on.
+        storeys: fewest and most of a building.
+        built_share: of the plots.
     """
 
     relief_m: float
@@ -209,18 +206,17 @@ class BuildingPlan:
     turned: bool = False
 
 
-@dataclass
+@dataclass(frozen=True)
 class TownLayout:
     """Places of buildings, trees (x, y, height) and cars (x, y, whether north) in the town's axes."""
 
     plan: GroundPlan
-    buildings: list[BuildingPlan] = field(default_factory=list)
-    trees: list[tuple[float, float, float]] = field(default_factory=list)
-    cars: list[tuple[float, float, bool]] = field(default_factory=list)
+    buildings: list[BuildingPlan]
+    trees: list[tuple[float, float, float]]
+    cars: list[tuple[float, float, bool]]
 
 
 def make_town_layout(style: TownStyle, rng: np.random.Generator) -> TownLayout:
-    """Return the layout of a town, with its ground painted."""
     painter = GroundPainter()
     painter.box((-REACH_M, -REACH_M), (REACH_M, REACH_M), (0.11, 0.17, 0.05), GRASS)
     paint_meadows(painter, rng)
@@ -228,16 +224,13 @@ def make_town_layout(style: TownStyle, rng: np.random.Generator) -> TownLayout:
     paint_square(painter, rng)
     buildings = [*_complex(style), *_town_buildings(style, painter, rng)]
     for building in buildings:
-        half = (
-            np.array(
-                [building.width_m, building.length_m] if building.turned else [building.length_m, building.width_m]
-            )
-            / 2
-        )
+        size = (building.length_m, building.width_m)
+        half = np.array(size[::-1] if building.turned else size) / 2
         low, high = np.array(building.center) - half, np.array(building.center) + half
         painter.box(tuple(low - 1.0), tuple(high + 1.0), KERB, PAVING)
-        painter.occupy(tuple(low), tuple(high))
-    cars = _park(painter, rng)
+        floor = _pixels(_rectangle(tuple(low), tuple(high)))
+        cv2.fillPoly(painter.built, [floor], 255, cv2.LINE_8, _SUBPIXEL)
+    cars = _park(rng)
     trees = _plant(style, painter, rng)
     return TownLayout(painter.ground_plan(), buildings, trees, cars)
 
@@ -258,14 +251,12 @@ def _town_buildings(style: TownStyle, painter: GroundPainter, rng: np.random.Gen
     """Return buildings on the plots between the streets, and scattered outside the town; paint empty plots."""
     buildings = []
     line = (-85.5, -63.0, -40.0, -18.0, 18.0, 40.0, 63.0, 85.5)
-    for x in line:
-        for y in line:
-            if max(abs(x), abs(y)) < 60:
-                continue
-            free = rng.random() > style.built_share
-            if free:
-                paint_yard(painter, x, y, rng)
-                continue
+    for x, y in product(line, line):
+        if max(abs(x), abs(y)) < 60:
+            continue
+        if rng.random() > style.built_share:
+            paint_yard(painter, x, y, rng)
+        else:
             buildings.append(_building_plan(style, x, y, rng))
     for _ in range(40):
         angle, distance = rng.uniform(0, 2 * np.pi), rng.uniform(152, 230)
@@ -286,7 +277,7 @@ def _building_plan(style: TownStyle, x: float, y: float, rng: np.random.Generato
     )
 
 
-def _park(painter: GroundPainter, rng: np.random.Generator) -> list[tuple[float, float, bool]]:
+def _park(rng: np.random.Generator) -> list[tuple[float, float, bool]]:
     """Return cars at the kerbs of the streets: (x, y, whether the car points north)."""
     cars: list[tuple[float, float, bool]] = []
     for middle in (RING_M, OUTER_M):

@@ -1,9 +1,7 @@
-"""Simulated lens: exact projection, and rays by Newton's method.
+"""Simulated camera: exact projection, rays by Newton's method; rendering under sun and sky, with sensor noise.
 
-The code is separate from the pipeline's own camera models on purpose. A mistake in code that both sides shared
-would cancel, and never show at a check point.
-
-Rendering of photographs: rays through the lens, sun and sky, then exposure, vignetting and sensor noise.
+The lens shares no code with the pipeline's camera models on purpose: a mistake that both sides share would cancel,
+and never show at a check point.
 """
 
 from __future__ import annotations
@@ -26,13 +24,12 @@ _TOLERANCE = 1e-12
 
 
 @dataclass(frozen=True)
-class Lens:
+class BrownLens:
     """Lens of COLMAP's RADIAL or OPENCV kind, with one focal length.
 
     Attributes:
         model: determines the coefficients in use.
         width, height: image size in pixels.
-        focal_px: focal length in pixels.
         center_px: principal point; the centre of the top-left pixel is (0.5, 0.5).
         k1, k2, p1, p2: radial and tangential coefficients of Brown's model, as OpenCV orders them.
     """
@@ -49,12 +46,10 @@ class Lens:
 
     @property
     def colmap_model(self) -> str:
-        """COLMAP's name of the model."""
         return COLMAP_MODEL[self.model]
 
     @property
     def colmap_params(self) -> tuple[float, ...]:
-        """COLMAP's parameters of the model."""
         cx, cy = self.center_px
         if self.model == "pinhole":
             return (self.focal_px, cx, cy)
@@ -89,7 +84,7 @@ class Lens:
             residual = self._distort(guess) - target
             if np.abs(residual).max(initial=0.0) < _TOLERANCE:
                 break
-            guess = guess - self._solve(guess, residual)
+            guess = guess - self._newton_step(guess, residual)
         solved = np.abs(self._distort(guess) - target).max(initial=0.0) < 1e-9
         if not solved or np.square(guess).sum(axis=1).max(initial=0.0) >= self._fold_radius() ** 2:
             raise InputError("the distortion is too strong for this field of view: use a smaller one", field="--k1")
@@ -107,8 +102,8 @@ class Lens:
             axis=1,
         )
 
-    def _solve(self, xy: FloatArray, residual: FloatArray) -> FloatArray:
-        """Return the Newton step (N, 2): the 2×2 Jacobian of `_distort` solved by Cramer's rule."""
+    def _newton_step(self, xy: FloatArray, residual: FloatArray) -> FloatArray:
+        """Return the step (N, 2): the 2×2 Jacobian of `_distort` solved by Cramer's rule."""
         x, y = xy[:, 0], xy[:, 1]
         r2 = x * x + y * y
         radial, slope = 1 + r2 * (self.k1 + r2 * self.k2), 2 * (self.k1 + 2 * r2 * self.k2)
@@ -116,7 +111,7 @@ class Lens:
         xy_ = x * y * slope + 2 * self.p1 * x + 2 * self.p2 * y
         yy = radial + y * y * slope + 2 * self.p2 * x + 6 * self.p1 * y
         u, v = residual[:, 0], residual[:, 1]
-        return np.asarray(np.stack([yy * u - xy_ * v, xx * v - xy_ * u], axis=1) / (xx * yy - xy_ * xy_)[:, None])
+        return np.stack([yy * u - xy_ * v, xx * v - xy_ * u], axis=1) / (xx * yy - xy_ * xy_)[:, None]
 
     def _fold_radius(self) -> float:
         """Return the radius (tangent of the angle) at which r (1 + k1 r² + k2 r⁴) stops growing."""
@@ -135,6 +130,7 @@ _ZENITH = np.array([0.24, 0.42, 0.75], dtype=np.float32)
 _BOUNCE = np.array([0.22, 0.20, 0.17], dtype=np.float32)
 _HAZE_M = 1300.0
 _SHADOW_LIFT_M = 0.02
+_VIGNETTING = 0.22  # loss of light in the corners
 
 
 @dataclass(frozen=True)
@@ -153,38 +149,32 @@ class Sensor:
         gain: exposure of this photograph, 1 for a grey of 18 % under the sun at about mid-scale.
         tint: (3,) white balance.
         noise: factor of the noise; 1 is a small sensor at base sensitivity (0.4 % of full scale at mid-scale).
-        vignetting: loss of light in the corners.
     """
 
     gain: float
     tint: tuple[float, float, float]
     noise: float
-    vignetting: float = 0.22
 
 
 class Renderer:
-    """Renders one scene through one lens; safe to use from several threads.
-
-    Args:
-        samples: rays for a pixel; a square number.
+    """Renders one scene through one lens, with a square number of rays for a pixel; safe to use from several
+    threads.
     """
 
-    def __init__(self, scene: SimulatedScene, lens: Lens, samples: int) -> None:
-        self._scene, self._lens = scene, lens
+    def __init__(self, scene: SimulatedScene, lens: BrownLens, samples: int) -> None:
+        self._scene, self._lens, self._samples = scene, lens, samples
         self.raycaster = Raycaster(scene.mesh)
-        self._samples = samples
         rows = max(1, _CHUNK // (lens.width * samples))
         self._bands = [(top, min(top + rows, lens.height)) for top in range(0, lens.height, rows)]
         # Rays are kept for all photographs if they fit; rays of large photographs are made anew for each.
         keep = lens.width * lens.height * samples <= _RAYS_KEPT
-        self._kept = [self._rays(band) for band in self._bands] if keep else []
+        self._kept = [_rays(lens, band, samples).astype(np.float32) for band in self._bands] if keep else []
 
     def photograph(self, pose: Pose, sensor: Sensor, rng: np.random.Generator) -> ByteArray:
-        """Return the photograph (H, W, 3), RGB."""
         light = self.radiance(pose)
         height, width = light.shape[:2]
         across, down = np.linspace(-1, 1, width), np.linspace(-1, 1, height)
-        falloff = (1 - sensor.vignetting / 2 * (across**2 + down[:, None] ** 2)).astype(np.float32)
+        falloff = (1 - _VIGNETTING / 2 * (across**2 + down[:, None] ** 2)).astype(np.float32)
         exposed = light * (falloff[..., None] * np.float32(sensor.gain)) * np.array(sensor.tint, dtype=np.float32)
         # Photon noise grows with the root of the signal; the constant term is read-out noise.
         spread = np.float32(sensor.noise) * np.sqrt(np.float32(6e-5) * np.maximum(exposed, 0) + np.float32(2.5e-6))
@@ -196,7 +186,7 @@ class Renderer:
         rotation = pose.geo_from_cam.astype(np.float32)
         parts = []
         for k, band in enumerate(self._bands):
-            rays = self._kept[k] if self._kept else self._rays(band)
+            rays = self._kept[k] if self._kept else _rays(self._lens, band, self._samples).astype(np.float32)
             light = self._shade(pose, rays @ rotation.T, rotation)
             # Samples are clipped before the mean: a highlight inside a pixel must not outshine its other samples.
             light = np.minimum(light, np.float32(1.5)).reshape(-1, self._lens.width, self._samples, 3)
@@ -208,16 +198,12 @@ class Renderer:
         """Return depth (H, W) in metres along the camera's z axis at the pixel centres; 0 for the sky."""
         parts = []
         for band in self._bands:
-            directions = self._lens.directions(_sample_pixels(self._lens, band, 1)) @ pose.geo_from_cam.T
+            directions = _rays(self._lens, band, 1) @ pose.geo_from_cam.T
             hits = self.raycaster.first_hits(pose.center, directions)
             # The directions have z = 1 in the camera, so that the distance along them is the depth.
             distance = self.raycaster.exact_distance(pose.center, directions, hits)
             parts.append(np.nan_to_num(distance, nan=0.0).astype(np.float32).reshape(-1, self._lens.width))
         return np.concatenate(parts)
-
-    def _rays(self, band: tuple[int, int]) -> Float32Array:
-        """Return directions (rows · W · samples, 3) of depth 1 in the camera."""
-        return self._lens.directions(_sample_pixels(self._lens, band, self._samples)).astype(np.float32)
 
     def _shade(self, pose: Pose, rays: Float32Array, rotation: Float32Array) -> Float32Array:
         """Return the linear light (N, 3) that comes along rays (N, 3) of depth 1."""
@@ -253,12 +239,9 @@ class Renderer:
     def _texture_samples(
         self, points: Float32Array, rays: Float32Array, hits: Hits, normals: Float32Array, rotation: Float32Array
     ) -> TextureSamples:
-        """Return texture coordinates, and the width of a pixel along them."""
         mesh, index = self._scene.mesh, hits.triangle
-        u_axis, v_axis = mesh.u_axis[index], mesh.v_axis[index]
-        uv_shift = mesh.uv_shift[index]
-        along = _dot(rays, normals)
-        along = np.minimum(along, np.float32(-0.04) * np.linalg.norm(rays, axis=1))
+        u_axis, v_axis, uv_shift = mesh.u_axis[index], mesh.v_axis[index], mesh.uv_shift[index]
+        along = np.minimum(_dot(rays, normals), np.float32(-0.04) * np.linalg.norm(rays, axis=1))
         pixel = hits.distance / np.float32(self._lens.focal_px)
         ray_u, ray_v = _dot(rays, u_axis), _dot(rays, v_axis)
         du = dv = np.zeros_like(pixel)
@@ -276,8 +259,8 @@ class Renderer:
         )
 
 
-def _sample_pixels(lens: Lens, band: tuple[int, int], samples: int) -> FloatArray:
-    """Return pixel coordinates (rows · W · samples, 2): a turned grid in each pixel, its centre for one sample."""
+def _rays(lens: BrownLens, band: tuple[int, int], samples: int) -> FloatArray:
+    """Return directions (rows · W · samples, 3), z = 1: a turned grid in each pixel, its centre for one sample."""
     side = round(samples**0.5)
     grid = (np.arange(side) + 0.5) / side - 0.5
     dx, dy = (part.ravel() for part in np.meshgrid(grid, grid))
@@ -285,7 +268,7 @@ def _sample_pixels(lens: Lens, band: tuple[int, int], samples: int) -> FloatArra
     offset = np.stack([dx * np.cos(turn) - dy * np.sin(turn), dx * np.sin(turn) + dy * np.cos(turn)], axis=1)
     y, x = np.mgrid[band[0] : band[1], 0 : lens.width] + 0.5
     centers = np.stack([x.ravel(), y.ravel()], axis=1)
-    return np.asarray((centers[:, None] + offset).reshape(-1, 2))
+    return lens.directions((centers[:, None] + offset).reshape(-1, 2))
 
 
 def _dot(a: Float32Array, b: Float32Array) -> Float32Array:

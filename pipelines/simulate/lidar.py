@@ -7,18 +7,15 @@
    returns from the air, and is classified as noise, as a producer does.
 4. A strip drifts slowly, the whole cloud may be shifted, and a part of the scanner's lever arm may be missing: the
    error that it leaves turns with the heading.
-
-Files of a simulated LiDAR flight: the cloud and the scanner's track.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 
@@ -26,10 +23,9 @@ from pipelines.core.types import BoolArray, ByteArray, FloatArray
 from pipelines.formats.las import LidarReturns, LidarWriter
 from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import Origin, lla_from_enu, lla_of
-from pipelines.simulate.buildings import Building
 from pipelines.simulate.mesh import MISS, Material, Mesh, MeshBuilder, Raycaster, TextureParameters
 from pipelines.simulate.options import LidarFlightOptions
-from pipelines.simulate.scene import SimulatedScene, joined
+from pipelines.simulate.scene import Building, SimulatedScene, joined
 from pipelines.simulate.truth import TrueLidar
 
 GROUND, BUILDING, VEGETATION, UNCLASSIFIED, NOISE = 2, 6, 5, 1, 7
@@ -58,8 +54,6 @@ class Strip:
         number: from 1.
         position_in_geo: (P, 3) metres, as measured.
         classification: (P,) class of LAS.
-        time_s: (P,).
-        scan_angle_deg: (P,).
         of_change: (P,) whether the point lies on what has changed since: on the removed building, or on what lay
             below the added one.
         track_s, track_in_geo: (K,), (K, 3) times and true places of the scanner.
@@ -76,14 +70,6 @@ class Strip:
 
 
 class LidarFlight:
-    """Flight over a scene.
-
-    Args:
-        options: of the flight.
-        scene: as the photographs show it.
-        seed: of noise and drift.
-    """
-
     def __init__(self, options: LidarFlightOptions, scene: SimulatedScene, seed: np.random.SeedSequence) -> None:
         self._options, self._axes = options, scene.axes
         self._rng = np.random.default_rng(seed)
@@ -93,7 +79,6 @@ class LidarFlight:
         self.returns = self.returns_of_change = 0
 
     def strips(self) -> Iterator[Strip]:
-        """Yield the strips of the flight."""
         options = self._options
         half_width_m = options.lidar_height * np.tan(np.radians(options.lidar_fov))
         lines = max(2, int(np.ceil(2 * options.lidar_radius / (_SPACING * half_width_m))) + 1)
@@ -111,8 +96,8 @@ class LidarFlight:
             start_s += duration_s + _TURN_S
 
     def truth(self) -> TrueLidar:
-        """Return the truth of the flight, after its strips."""
         options, changed = self._options, self.changed
+        corners = [] if changed is None else changed.rectangle(changed.length_m / 2, changed.width_m / 2, 0.0)
         return TrueLidar(
             sigma_m=options.lidar_sigma,
             drift_m=options.lidar_drift,
@@ -121,10 +106,8 @@ class LidarFlight:
             change=options.lidar_change,
             returns=self.returns,
             returns_of_change=self.returns_of_change,
-            changed_footprint=() if changed is None else tuple(
-                (float(x), float(y)) for x, y, _ in _corners(changed)
-            ),
-        )  # fmt: skip
+            changed_footprint=tuple((float(x), float(y)) for x, y, _ in corners),
+        )
 
     def _strip(
         self, number: int, begin: FloatArray, along: FloatArray, time_s: FloatArray, start_s: float
@@ -199,7 +182,6 @@ def _changed_building(options: LidarFlightOptions, scene: SimulatedScene) -> Bui
 
 
 def _scanned_mesh(options: LidarFlightOptions, scene: SimulatedScene, changed: Building | None) -> Mesh:
-    """Return the scene as it was at the time of the LiDAR flight."""
     if changed is None:
         return scene.mesh
     if options.lidar_change == "removed":
@@ -222,60 +204,30 @@ def _in_footprint(building: Building, point: FloatArray, margin_m: float) -> Boo
     return np.asarray((np.abs(own[:, :2]) <= half).all(axis=1))
 
 
-def _corners(building: Building) -> list[FloatArray]:
-    half_l, half_w = building.length_m / 2, building.width_m / 2
-    signs = ((-1, -1), (1, -1), (1, 1), (-1, 1))
-    return [building.at(x * half_l, y * half_w, 0.0) for x, y in signs]
-
-
 CLOUD, TRACK = "lidar.laz", "lidar_trajectory.csv"
 _CRS = "EPSG:4979"
 _LON_LAT_ALT = [1, 0, 2]
 _WRITTEN = date(2026, 1, 1)  # the same options give the same bytes
 
 
-class LidarFiles:
-    """Writer of both files; a context manager.
+@contextmanager
+def lidar_files(folder: Path, origin: Origin) -> Iterator[Callable[[Strip], None]]:
+    """Yield a function that appends a strip to the cloud and to the scanner's track, both complete at the end."""
+    near = lla_of(origin)[_LON_LAT_ALT]
+    crs = parse_crs(_CRS)
+    writer = LidarWriter(
+        folder / CLOUD, wkt1=crs.wkt1, angular=True, near=near, software="georef simulate", written=_WRITTEN
+    )
+    with writer as cloud, (folder / TRACK).open("w", encoding="utf-8") as track:
+        track.write("timestamp,latitude,longitude,altitude\n")
 
-    Args:
-        folder: of the files.
-        origin: of geo.
-    """
+        def write(strip: Strip) -> None:
+            position = lla_from_enu(strip.position_in_geo, origin)[:, _LON_LAT_ALT]
+            cloud.write(
+                LidarReturns(position, strip.classification, strip.time_s, strip.scan_angle_deg, strip.number)
+            )
+            places = lla_from_enu(strip.track_in_geo, origin)
+            for time_s, (lat, lon, alt) in zip(strip.track_s, places, strict=True):
+                track.write(f"{time_s:.3f},{lat:.10f},{lon:.10f},{alt:.4f}\n")
 
-    def __init__(self, folder: Path, origin: Origin) -> None:
-        self._folder, self._origin = folder, origin
-        self._open = ExitStack()
-
-    def __enter__(self) -> LidarFiles:
-        """Open the files."""
-        crs = parse_crs(_CRS)
-        near = lla_of(self._origin)[_LON_LAT_ALT]
-        writer = LidarWriter(
-            self._folder / CLOUD,
-            wkt1=crs.wkt1,
-            angular=True,
-            near=near,
-            software="georef simulate",
-            written=_WRITTEN,
-        )
-        self._cloud = self._open.enter_context(writer)
-        self._track = self._open.enter_context((self._folder / TRACK).open("w", encoding="utf-8"))
-        self._track.write("timestamp,latitude,longitude,altitude\n")
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Complete the files."""
-        self._open.close()
-
-    def write(self, strip: Strip) -> None:
-        """Append a strip."""
-        position = lla_from_enu(strip.position_in_geo, self._origin)[:, _LON_LAT_ALT]
-        self._cloud.write(
-            LidarReturns(position, strip.classification, strip.time_s, strip.scan_angle_deg, strip.number)
-        )
-        for time_s, (lat, lon, alt) in zip(
-            strip.track_s, lla_from_enu(strip.track_in_geo, self._origin), strict=True
-        ):
-            self._track.write(f"{time_s:.3f},{lat:.10f},{lon:.10f},{alt:.4f}\n")
+        yield write

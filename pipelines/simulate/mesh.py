@@ -1,9 +1,4 @@
-"""Triangles with the data of their texture: material, a row of parameters, and a plane for its coordinates.
-
-Ray casting against a mesh with Embree (the sole home of embreex).
-
-Terrain: gentle relief in the town, hills towards the horizon.
-"""
+"""Mesh of the scene, its terrain, and ray casting against it with Embree (the sole home of embreex)."""
 
 from __future__ import annotations
 
@@ -58,13 +53,6 @@ class TextureParameters:
     shop: bool = False
     shift_m: tuple[float, float] = (0.0, 0.0)
 
-    def row(self) -> tuple[float, ...]:
-        """Return the row of the table; the file of textures names its columns."""
-        return (
-            *self.base, *self.accent, float(self.style), self.floor_m, self.pitch_m, *self.window_m,
-            self.sill_m, self.top_m, float(self.shop), *self.shift_m,
-        )  # fmt: skip
-
 
 @dataclass(frozen=True)
 class Mesh:
@@ -91,15 +79,16 @@ class Mesh:
 
 
 class MeshBuilder:
-    """Collects surfaces into a `Mesh`."""
-
     def __init__(self) -> None:
         self._parts: list[tuple[FloatArray, FloatArray, FloatArray]] = []
         self._texture_params: list[tuple[float, ...]] = []
 
-    def add_texture(self, add_texture: TextureParameters) -> int:
-        """Register texture parameters, and return their row."""
-        self._texture_params.append(add_texture.row())
+    def add_texture(self, texture: TextureParameters) -> int:
+        """Register texture parameters, and return their row; the file of textures names its columns."""
+        self._texture_params.append((
+            *texture.base, *texture.accent, float(texture.style), texture.floor_m, texture.pitch_m,
+            *texture.window_m, texture.sill_m, texture.top_m, float(texture.shop), *texture.shift_m,
+        ))  # fmt: skip
         return len(self._texture_params) - 1
 
     def triangles(
@@ -123,8 +112,7 @@ class MeshBuilder:
         """Add a quadrilateral (4, 3), counter-clockwise from outside; u runs along its first side from corner 0."""
         a, b, c, d = np.asarray(corners, dtype=np.float64)
         u_axis = (b - a) / np.linalg.norm(b - a)
-        up = d - a
-        v_axis = up - (up @ u_axis) * u_axis
+        v_axis = (d - a) - ((d - a) @ u_axis) * u_axis
         v_axis /= np.linalg.norm(v_axis)
         self.triangles(np.array([[a, b, c], [a, c, d]]), material, texture, (a, u_axis, v_axis))
 
@@ -134,13 +122,11 @@ class MeshBuilder:
         signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
         bottom = np.asarray(low) + (signs * half[:2]) @ axes[:2]
         top = bottom + 2 * half[2] * axes[2]
-        for i in range(4):
-            j = (i + 1) % 4
+        for i, j in ((0, 1), (1, 2), (2, 3), (3, 0)):
             self.quad([bottom[i], bottom[j], top[j], top[i]], material, texture)
         self.quad(top, material, texture)
 
     def build(self) -> Mesh:
-        """Return the mesh of all triangles collected so far."""
         corners, normals, shared = (np.concatenate(part) for part in zip(*self._parts, strict=True))
         return Mesh(
             corners=corners,
@@ -229,12 +215,9 @@ _INNER_M, _CELL_M = 150.0, 2.5
 
 @dataclass(frozen=True)
 class Terrain:
-    """Terrain whose height is a sum of waves, zero at the origin.
+    """Terrain whose height is a sum of W waves (W, 2) in radians per metre, east and north; zero at the origin.
 
-    Attributes:
-        waves: (W, 2) radians per metre, east and north.
-        phases: (W,) radians.
-        near_m, far_m: (W,) amplitudes in the town and at the horizon.
+    The amplitudes (W,) are those in the town and at the horizon.
     """
 
     waves: FloatArray

@@ -1,7 +1,4 @@
-"""Options of `georef simulate`, which belongs to no stage in a workspace.
-
-Options of the simulated flight of a laser scanner.
-"""
+"""Options of `georef simulate`, which belongs to no stage in a workspace."""
 
 from __future__ import annotations
 
@@ -112,7 +109,6 @@ class SimulateOptions(LidarFlightOptions):
 
     @property
     def size_px(self) -> tuple[int, int]:
-        """Width and height."""
         width, height = self.size.split("x")
         return int(width), int(height)
 

@@ -1,11 +1,7 @@
-"""Records of the instruments and the surveyor for a flight, and the truth behind them.
-
-Writing of a survey's tables: trajectory, raw navigation, control and check points.
-"""
+"""Records of the instruments and the surveyor for a flight, the truth behind them, and the survey's tables."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -15,9 +11,7 @@ import numpy as np
 from pipelines.core.types import FloatArray, IntArray, Matrix3, Vector3
 from pipelines.geodesy.enu import Origin, lla_from_enu
 from pipelines.geometry.rotations import ENU_FROM_NED, geo_from_cam, quat_xyzw_from_matrix, yaw_pitch_roll_deg
-from pipelines.simulate.mesh import Raycaster
-from pipelines.simulate.options import SimulateOptions
-from pipelines.simulate.sensors import (
+from pipelines.simulate.flight import (
     RECEIVERS,
     GnssLog,
     ImuLog,
@@ -25,10 +19,11 @@ from pipelines.simulate.sensors import (
     attitudes_at,
     fixes_at,
     in_local_enu,
-    photo_stamps,
     record_gnss,
     record_imu,
 )
+from pipelines.simulate.mesh import Raycaster
+from pipelines.simulate.options import SimulateOptions
 from pipelines.simulate.truth import TrueLens, TrueMark, TrueNavigation, TrueTarget, Truth
 from pipelines.simulate.world import LEAST_RAYS, World, choose_control, project_targets
 
@@ -36,23 +31,13 @@ POINTS_CRS = "EPSG:4979"
 
 
 @dataclass(frozen=True)
-class SurveyedTarget:
-    """Target as the surveyor measured it: position (3,) in geo, and (image, x, y) of its marks."""
-
-    name: str
-    position_in_geo: FloatArray
-    marks: tuple[tuple[str, float, float], ...]
-
-
-@dataclass(frozen=True)
 class PhotoRecords:
     """Records of N photographs.
 
     Attributes:
-        names: file names.
         stamp_ns: (N,) camera clock.
         lla: (N, 3) degrees and ellipsoidal metres of the antenna.
-        yaw_pitch_roll_deg: (N, 3) of the camera.
+        yaw_pitch_roll_deg, body_yaw_pitch_roll_deg: (N, 3) of the camera and of the aircraft.
         sigma_enu_m: (3,) that the receiver states.
     """
 
@@ -60,6 +45,7 @@ class PhotoRecords:
     stamp_ns: IntArray
     lla: FloatArray
     yaw_pitch_roll_deg: FloatArray
+    body_yaw_pitch_roll_deg: FloatArray
     sigma_enu_m: FloatArray
 
 
@@ -75,31 +61,31 @@ def write_trajectory(path: Path, photos: PhotoRecords) -> None:
     _write(path, rows)
 
 
-def write_gnss(path: Path, log: GnssLog, sigma_enu_m: FloatArray, origin: Origin) -> None:
-    """Write every fix, on the navigation clock."""
+def write_tables(folder: Path, recording: Recording, enu_from_body: FloatArray, origin: Origin) -> None:
+    """Write trajectory, raw navigation on the navigation clock, control and check points.
+
+    The attitudes (K, 3, 3) are those of the log at their places: East-North-Up from forward-right-down.
+    """
+    photos, gnss, imu = recording.photos, recording.gnss, recording.imu
+    write_trajectory(folder / "trajectory.csv", photos)
+    sigma = ",".join(f"{value:.4g}" for value in photos.sigma_enu_m)
     rows = ["timestamp,latitude,longitude,altitude,sigma_e,sigma_n,sigma_u"]
-    sigma = ",".join(f"{value:.4g}" for value in sigma_enu_m)
-    places = lla_from_enu(log.position_in_geo, origin)
-    rows += [f"{_seconds(stamp)},{_position(lla)},{sigma}" for stamp, lla in zip(log.stamp_ns, places, strict=True)]
-    _write(path, rows)
-
-
-def write_imu(path: Path, log: ImuLog, enu_from_body: FloatArray) -> None:
-    """Write every attitude (N, 3, 3), on the navigation clock: East-North-Up from the body, forward-right-down."""
+    for stamp, lla in zip(gnss.stamp_ns, recording.gnss_lla, strict=True):
+        rows.append(f"{_seconds(stamp)},{_position(lla)},{sigma}")
+    _write(folder / "gnss.csv", rows)
     rows = ["timestamp,qx,qy,qz,qw"]
-    for stamp, quat in zip(log.stamp_ns, quat_xyzw_from_matrix(enu_from_body), strict=True):
+    for stamp, quat in zip(imu.stamp_ns, quat_xyzw_from_matrix(enu_from_body), strict=True):
         rows.append(f"{_seconds(stamp)}," + ",".join(f"{part:.9f}" for part in quat))
-    _write(path, rows)
-
-
-def write_points(path: Path, targets: Sequence[SurveyedTarget], origin: Origin) -> None:
-    """Write control or check points in the form of ODM's gcp_list.txt: x is the longitude."""
-    rows = [POINTS_CRS]
-    for target in targets:
-        lat, lon, alt = lla_from_enu(target.position_in_geo, origin)
-        place = f"{lon:.10f} {lat:.10f} {alt:.5f}"
-        rows += [f"{place} {x:.3f} {y:.3f} {image} {target.name}" for image, x, y in target.marks]
-    _write(path, rows)
+    _write(folder / "imu.csv", rows)
+    for name, role in (("gcp_list.txt", "control"), ("checkpoints.txt", "check")):
+        # The form of ODM's gcp_list.txt: x is the longitude.
+        rows = [POINTS_CRS]
+        for target, position in zip(recording.truth.targets, recording.target_in_geo, strict=True):
+            lat, lon, alt = lla_from_enu(position, origin)
+            for mark in target.marks if target.role == role else ():
+                place = f"{lon:.10f} {lat:.10f} {alt:.5f} {mark.written_x_px:.3f} {mark.written_y_px:.3f}"
+                rows.append(f"{place} {mark.image} {target.name}")
+        _write(folder / name, rows)
 
 
 def _seconds(stamp_ns: np.int64) -> str:
@@ -110,7 +96,7 @@ def _position(lla: FloatArray) -> str:
     return f"{lla[0]:.9f},{lla[1]:.9f},{lla[2]:.4f}"
 
 
-def _write(path: Path, rows: Sequence[str]) -> None:
+def _write(path: Path, rows: list[str]) -> None:
     path.write_text("\n".join(rows) + "\n", encoding="utf-8", newline="\n")
 
 
@@ -123,25 +109,21 @@ class Recording:
 
     Attributes:
         photos: position and attitude of the photographs.
-        body_yaw_pitch_roll_deg: (N, 3) attitude of the aircraft at the photographs.
         gnss, imu: the logs; gnss_lla (M, 3) degrees and metres; imu_in_geo (K, 3) places of the attitudes.
-        control, check: surveyed targets.
-        truth: of the whole survey.
+        truth: of the whole survey, with its P targets.
+        target_in_geo: (P, 3) places of the targets, as surveyed.
     """
 
     photos: PhotoRecords
-    body_yaw_pitch_roll_deg: FloatArray
     gnss: GnssLog
     gnss_lla: FloatArray
     imu: ImuLog
     imu_in_geo: FloatArray
-    control: tuple[SurveyedTarget, ...]
-    check: tuple[SurveyedTarget, ...]
     truth: Truth
+    target_in_geo: FloatArray
 
 
-def receiver_of(options: SimulateOptions) -> Receiver:
-    """Return the receiver's profile, with the changes that the options make."""
+def _receiver(options: SimulateOptions) -> Receiver:
     asked: dict[str, Any] = {
         "sigma_h_m": options.sigma_h,
         "sigma_v_m": options.sigma_v,
@@ -156,31 +138,27 @@ def receiver_of(options: SimulateOptions) -> Receiver:
 
 
 def record(options: SimulateOptions, world: World, raycaster: Raycaster, seed: np.random.SeedSequence) -> Recording:
-    """Run the sensors over the flight, and mark the targets in the photographs."""
     gnss_seed, imu_seed, mark_seed = seed.spawn(3)
-    receiver = receiver_of(options)
+    receiver = _receiver(options)
     gnss = record_gnss(world.trajectory, world.mounting, receiver, np.random.default_rng(gnss_seed))
     imu = record_imu(world.trajectory, world.mounting, options.sigma_attitude, np.random.default_rng(imu_seed))
-    photos, body_angles = _photo_records(world, receiver, gnss, imu)
-    targets = _mark(options, world, photos.names, raycaster, np.random.default_rng(mark_seed))
-    truth = _truth(options, world, gnss, photos)
+    photos = _photo_records(world, receiver, gnss, imu)
+    targets, target_in_geo = _mark(options, world, photos.names, raycaster, np.random.default_rng(mark_seed))
     imu_time_s = (imu.stamp_ns - photos.stamp_ns[0]) / 1e9 - world.mounting.clock_offset_s
     return Recording(
         photos=photos,
-        body_yaw_pitch_roll_deg=body_angles,
         gnss=gnss,
         gnss_lla=lla_from_enu(gnss.position_in_geo, world.origin),
         imu=imu,
         imu_in_geo=world.trajectory.position(imu_time_s),
-        control=tuple(surveyed for true, surveyed in targets if true.role == "control"),
-        check=tuple(surveyed for true, surveyed in targets if true.role == "check"),
-        truth=truth.model_copy(update={"targets": tuple(true for true, _ in targets)}),
+        truth=_truth(options, world, receiver, gnss, photos, targets=targets),
+        target_in_geo=target_in_geo,
     )
 
 
-def _photo_records(world: World, receiver: Receiver, gnss: GnssLog, imu: ImuLog) -> tuple[PhotoRecords, FloatArray]:
+def _photo_records(world: World, receiver: Receiver, gnss: GnssLog, imu: ImuLog) -> PhotoRecords:
     """Return fix and attitude at each photograph's stamp, as a user reads them off the logs."""
-    stamps = photo_stamps(world.trajectory)
+    stamps = world.trajectory.stamp_ns
     fixes = fixes_at(gnss, stamps)
     enu_from_body = in_local_enu(attitudes_at(imu, stamps), fixes, world.origin)
     angles = yaw_pitch_roll_deg(enu_from_body @ world.trajectory.cam_from_body.T)
@@ -190,41 +168,47 @@ def _photo_records(world: World, receiver: Receiver, gnss: GnssLog, imu: ImuLog)
     # These are the names of the frames of a bag, so that the marks in one gcp_list.txt fit photographs and bag.
     names = tuple(f"frame_{i:06d}.jpg" for i in range(len(stamps)))
     stated = np.maximum([receiver.sigma_h_m, receiver.sigma_h_m, receiver.sigma_v_m], _LEAST_SIGMA_M)
-    return PhotoRecords(names, stamps, lla_from_enu(fixes, world.origin), angles, stated), body_angles
+    return PhotoRecords(names, stamps, lla_from_enu(fixes, world.origin), angles, body_angles, stated)
 
 
 def _mark(
     options: SimulateOptions, world: World, names: tuple[str, ...], raycaster: Raycaster, rng: np.random.Generator
-) -> list[tuple[TrueTarget, SurveyedTarget]]:
-    """Return the targets that at least two photographs see: the truth, and the surveyor's records."""
-    projections = project_targets(world.sites, world.poses, world.lens, raycaster, world.target_m)
-    rays = projections.seen.sum(axis=1)
+) -> tuple[tuple[TrueTarget, ...], FloatArray]:
+    """Return the P targets that at least two photographs see, and their places (P, 3) as surveyed."""
+    seen, pixels = project_targets(world.sites, world.poses, world.lens, raycaster, world.target_m)
+    rays = seen.sum(axis=1)
     control = set(choose_control(world.sites, rays, options.control))
-    targets = []
+    targets, surveyed = [], []
     for i in np.nonzero(rays >= LEAST_RAYS)[0]:
         role: Literal["control", "check"] = "control" if i in control else "check"
         name = f"{'G' if role == 'control' else 'C'}{i:02d}"
         marks = []
-        for j in np.nonzero(projections.seen[i])[0]:
-            x, y = projections.pixels[i, j]
+        for j in np.nonzero(seen[i])[0]:
+            x, y = pixels[i, j]
             dx, dy = rng.normal(0, options.sigma_mark, 2)
             # The files hold three decimals.
             marks.append(TrueMark(
                 image=names[j], x_px=x, y_px=y, written_x_px=round(x + dx, 3), written_y_px=round(y + dy, 3)
             ))  # fmt: skip
         position = world.sites[i].target_position
-        measured = position + rng.normal(0, options.sigma_survey, 3)
-        true = TrueTarget(
-            name=name, role=role, surface=world.sites[i].kind, position_in_geo=_vector(position), marks=tuple(marks)
+        surveyed.append(position + rng.normal(0, options.sigma_survey, 3))
+        kind, true_in_geo = world.sites[i].kind, vector(position)
+        targets.append(
+            TrueTarget(name=name, role=role, surface=kind, position_in_geo=true_in_geo, marks=tuple(marks))
         )
-        written = tuple((mark.image, mark.written_x_px, mark.written_y_px) for mark in marks)
-        targets.append((true, SurveyedTarget(name, measured, written)))
-    return targets
+    return tuple(targets), np.array(surveyed).reshape(-1, 3)
 
 
-def _truth(options: SimulateOptions, world: World, gnss: GnssLog, photos: PhotoRecords) -> Truth:
-    """Return the truth, without the targets."""
-    lens = world.lens
+def _truth(
+    options: SimulateOptions,
+    world: World,
+    receiver: Receiver,
+    gnss: GnssLog,
+    photos: PhotoRecords,
+    *,
+    targets: tuple[TrueTarget, ...],
+) -> Truth:
+    lens, mounting = world.lens, world.mounting
     true_fixes = fixes_at(replace(gnss, position_in_geo=gnss.true_in_geo), photos.stamp_ns)
     errors = fixes_at(gnss, photos.stamp_ns) - true_fixes
     return Truth(
@@ -235,42 +219,38 @@ def _truth(options: SimulateOptions, world: World, gnss: GnssLog, photos: PhotoR
         lens=TrueLens(model=lens.colmap_model, width=lens.width, height=lens.height, params=lens.colmap_params),
         images=photos.names,
         stamp_ns=tuple(int(stamp) for stamp in photos.stamp_ns),
-        centers=tuple(_vector(pose.center) for pose in world.poses),
+        centers=tuple(vector(pose.center) for pose in world.poses),
         cam_from_enu=tuple(_matrix(pose.geo_from_cam.T) for pose in world.poses),
-        fix_errors=tuple(_vector(error) for error in errors),
-        navigation=_navigation(options, world, gnss, photos),
-        targets=(),
+        fix_errors=tuple(vector(error) for error in errors),
+        navigation=TrueNavigation(
+            receiver=options.gnss,
+            sigma_h_m=receiver.sigma_h_m,
+            sigma_v_m=receiver.sigma_v_m,
+            bias_amplitude_m=vector(gnss.bias_amplitude_m),
+            bias_phase_rad=vector(gnss.bias_phase_rad),
+            bias_period_s=receiver.bias_period_s,
+            common_error_m=receiver.common_error_m,
+            outlier_m=receiver.outlier_m,
+            wrong_images=tuple(photos.names[i] for i in gnss.wrong_photos),
+            sigma_attitude_deg=options.sigma_attitude,
+            antenna_in_body_m=vector(mounting.antenna_in_body),
+            nominal_from_cam=_matrix(mounting.nominal_from_cam),
+            cam_from_body=_matrix(world.trajectory.cam_from_body),
+            clock_offset_s=mounting.clock_offset_s,
+        ),
+        targets=targets,
         sigma_mark_px=options.sigma_mark,
         sigma_survey_m=options.sigma_survey,
-        sun_in_geo=_vector(world.scene.sun),
+        sun_in_geo=vector(world.scene.sun),
     )
 
 
-def _navigation(options: SimulateOptions, world: World, gnss: GnssLog, photos: PhotoRecords) -> TrueNavigation:
-    mounting, receiver = world.mounting, receiver_of(options)
-    return TrueNavigation(
-        receiver=options.gnss,
-        sigma_h_m=receiver.sigma_h_m,
-        sigma_v_m=receiver.sigma_v_m,
-        bias_amplitude_m=_vector(gnss.bias_amplitude_m),
-        bias_phase_rad=_vector(gnss.bias_phase_rad),
-        bias_period_s=receiver.bias_period_s,
-        common_error_m=receiver.common_error_m,
-        outlier_m=receiver.outlier_m,
-        wrong_images=tuple(photos.names[i] for i in gnss.wrong_photos),
-        sigma_attitude_deg=options.sigma_attitude,
-        antenna_in_body_m=_vector(mounting.antenna_in_body),
-        nominal_from_cam=_matrix(mounting.nominal_from_cam),
-        cam_from_body=_matrix(world.trajectory.cam_from_body),
-        clock_offset_s=mounting.clock_offset_s,
-    )
-
-
-def _vector(values: FloatArray) -> Vector3:
+def vector(values: FloatArray) -> Vector3:
+    """Return three numbers of numpy as Python's."""
     x, y, z = (float(value) for value in values)
     return x, y, z
 
 
 def _matrix(values: FloatArray) -> Matrix3:
-    a, b, c = (_vector(row) for row in values)
+    a, b, c = (vector(row) for row in values)
     return a, b, c

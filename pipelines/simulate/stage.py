@@ -25,11 +25,11 @@ from pipelines.core.products import save_json
 from pipelines.core.progress import SILENT, Progress
 from pipelines.formats.bag_writer import BagCamera, BagFlight, write_bag
 from pipelines.formats.exif_writer import DroneTags, with_tags
+from pipelines.simulate.flight import in_local_enu
 from pipelines.simulate.lens import Renderer, Sensor
-from pipelines.simulate.lidar import LidarFiles, LidarFlight
+from pipelines.simulate.lidar import LidarFlight, lidar_files
 from pipelines.simulate.options import SimulateOptions
-from pipelines.simulate.recording import Recording, record, write_gnss, write_imu, write_points, write_trajectory
-from pipelines.simulate.sensors import in_local_enu
+from pipelines.simulate.recording import Recording, record, vector, write_tables
 from pipelines.simulate.truth import TrueLidar
 from pipelines.simulate.world import WANTED_RAYS, World, check_clearance, make_world
 
@@ -41,15 +41,7 @@ WANTED_CHECKS = 30
 
 @dataclass(frozen=True)
 class SimulationSummary:
-    """Summary of a simulation.
-
-    Attributes:
-        directory: the survey folder.
-        images, control_points, check_points: their numbers.
-        well_seen: number of check points with at least 6 marks.
-        bag_messages: number of messages in the bag; 0 without a bag.
-        warnings: for the user.
-    """
+    """Summary of a simulation; `well_seen` counts the check points with at least 6 marks."""
 
     directory: Path
     images: int
@@ -61,21 +53,12 @@ class SimulationSummary:
 
     @property
     def key_figure(self) -> str:
-        """Headline of the summary."""
         return f"{self.images} photographs, {self.control_points} control and {self.check_points} check points"
 
 
 @dataclass(frozen=True)
 class RecordedFlight:
-    """Flight over a world with all records, without the photographs.
-
-    Attributes:
-        world: scene, lens, motion and mounting.
-        renderer: of the photographs.
-        recording: of the instruments and the surveyor.
-        photo_seed: of the photographs' noise.
-        lidar_seed: of the LiDAR flight.
-    """
+    """Flight over a world with all records, without the photographs."""
 
     world: World
     renderer: Renderer
@@ -105,32 +88,33 @@ def fly_survey(options: SimulateOptions) -> RecordedFlight:
 def simulate(
     options: SimulateOptions, directory: Path, progress: Progress = SILENT, *, overwrite: bool = False
 ) -> SimulationSummary:
-    """Simulate a survey into `directory`, which appears when complete.
+    """Simulate a survey into `directory`, which appears when complete; see `fly_survey` for further errors.
 
     The same options give the same bytes. `overwrite` allows replacing an earlier simulation, and no other folder.
 
     Raises:
-        InputError: the folder is in use, or the options cannot be flown or photographed.
-        BackendUnavailableError: the ray caster is not installed.
+        InputError: the folder is in use.
     """
-    check_folder(directory, overwrite=overwrite)
+    _check_folder(directory, overwrite=overwrite)
     flight = fly_survey(options)
     recording = flight.recording
     with _draft(directory) as draft:
-        _PhotoWriter(options, flight, draft).run(progress)
+        _write_photographs(options, flight, draft, progress)
         truth = recording.truth
         if options.lidar:
             truth = truth.model_copy(update={"lidar": write_lidar_flight(options, flight, draft, progress)})
         save_json(truth, draft / TRUTH)
         messages = _write_records(options, flight.world, recording, draft)
+    check = [target for target in recording.truth.targets if target.role == "check"]
+    control, well_seen = len(truth.targets) - len(check), sum(len(target.marks) >= WANTED_RAYS for target in check)
     summary = SimulationSummary(
-        directory,
-        options.images,
-        len(recording.control),
-        len(recording.check),
-        sum(len(target.marks) >= WANTED_RAYS for target in recording.check),
-        messages,
-        _warnings(options, recording),
+        directory=directory,
+        images=options.images,
+        control_points=control,
+        check_points=len(check),
+        well_seen=well_seen,
+        bag_messages=messages,
+        warnings=_warnings(options, well_seen, control),
     )
     for warning in summary.warnings:
         log.warning("simulate: %s", warning)
@@ -138,12 +122,8 @@ def simulate(
     return summary
 
 
-def check_folder(directory: Path, *, overwrite: bool) -> None:
-    """Check before the work begins that a survey can be written to `directory`.
-
-    Raises:
-        InputError: the folder exists and may not be replaced.
-    """
+def _check_folder(directory: Path, *, overwrite: bool) -> None:
+    """Raise an InputError before the work begins if `directory` exists and may not be replaced."""
     if not directory.exists():
         return
     if not directory.is_dir():
@@ -159,11 +139,10 @@ def write_lidar_flight(
     options: SimulateOptions, flight: RecordedFlight, folder: Path, progress: Progress = SILENT
 ) -> TrueLidar:
     """Write the cloud of a LiDAR flight over the world of a survey, and the scanner's track; return the truth."""
-    world = flight.world
-    lidar = LidarFlight(options, world.scene, flight.lidar_seed)
-    with LidarFiles(folder, world.origin) as files, progress.task("lidar") as task:
+    lidar = LidarFlight(options, flight.world.scene, flight.lidar_seed)
+    with lidar_files(folder, flight.world.origin) as write, progress.task("lidar") as task:
         for strip in lidar.strips():
-            files.write(strip)
+            write(strip)
             task.advance()
     return lidar.truth()
 
@@ -189,84 +168,64 @@ def _draft(directory: Path) -> Iterator[Path]:
             shutil.rmtree(left, ignore_errors=True)
 
 
-@dataclass(frozen=True)
-class _PhotoWriter:
-    """Renders and writes the photographs, and depth maps on request, into `folder`."""
+def _write_photographs(options: SimulateOptions, flight: RecordedFlight, folder: Path, progress: Progress) -> None:
+    """Write all photographs, and depth maps on request, several at a time.
 
-    options: SimulateOptions
-    flight: RecordedFlight
-    folder: Path
+    Each photograph has its own stream of noise, whatever the order.
+    """
+    count, rng = options.images, np.random.default_rng(flight.photo_seed)
+    (folder / "images").mkdir()
+    if options.depth:
+        (folder / "depth").mkdir()
+    gains = 1.1 * np.exp(rng.normal(0, options.exposure, count))
+    tints = np.exp(rng.normal(0, 0.15 * options.exposure, (count, 3)))
+    sensors = [Sensor(float(gain), vector(tint), options.noise) for gain, tint in zip(gains, tints, strict=True)]
+    streams = rng.spawn(count)
 
-    def run(self, progress: Progress) -> None:
-        """Write all photographs, several at a time; each has its own stream of noise, whatever the order."""
-        count, rng = self.options.images, np.random.default_rng(self.flight.photo_seed)
-        (self.folder / "images").mkdir()
-        if self.options.depth:
-            (self.folder / "depth").mkdir()
-        sensors = _sensors(self.options, rng)
-        streams = rng.spawn(count)
-        threads = chosen_threads(self.options.threads)
-        with progress.task("photographs", count) as task, ThreadPoolExecutor(threads) as pool:
-            jobs = [pool.submit(self._write, i, sensors[i], streams[i]) for i in range(count)]
-            try:
-                for job in jobs:
-                    job.result()
-                    task.advance()
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
-
-    def _write(self, i: int, sensor: Sensor, rng: np.random.Generator) -> None:
-        world, recording = self.flight.world, self.flight.recording
-        pose, name = world.poses[i], recording.photos.names[i]
-        rgb = self.flight.renderer.photograph(pose, sensor, rng)
-        _, encoded = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, self.options.quality])
+    def write(i: int) -> None:
+        pose, name = flight.world.poses[i], flight.recording.photos.names[i]
+        rgb = flight.renderer.photograph(pose, sensors[i], streams[i])
+        _, encoded = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, options.quality])
         jpeg = encoded.tobytes()
-        if self.options.exif:
-            jpeg = with_tags(jpeg, _tags(self.options, world, recording, i))
-        (self.folder / "images" / name).write_bytes(jpeg)
-        if self.options.depth:
-            np.save(self.folder / "depth" / f"{Path(name).stem}.npy", self.flight.renderer.depth(pose))
+        if options.exif:
+            jpeg = with_tags(jpeg, _tags(options, flight.world, flight.recording, i))
+        (folder / "images" / name).write_bytes(jpeg)
+        if options.depth:
+            np.save(folder / "depth" / f"{Path(name).stem}.npy", flight.renderer.depth(pose))
 
-
-def _sensors(options: SimulateOptions, rng: np.random.Generator) -> list[Sensor]:
-    """Return exposure and white balance of each photograph."""
-    gains = 1.1 * np.exp(rng.normal(0, options.exposure, options.images))
-    tints = np.exp(rng.normal(0, 0.15 * options.exposure, (options.images, 3)))
-    return [
-        Sensor(float(gain), (float(red), float(green), float(blue)), options.noise)
-        for gain, (red, green, blue) in zip(gains, tints, strict=True)
-    ]
+    with progress.task("photographs", count) as task, ThreadPoolExecutor(chosen_threads(options.threads)) as pool:
+        jobs = [pool.submit(write, i) for i in range(count)]
+        try:
+            for job in jobs:
+                job.result()
+                task.advance()
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
 
 
 def _tags(options: SimulateOptions, world: World, recording: Recording, i: int) -> DroneTags:
-    lat, lon, alt = (float(value) for value in recording.photos.lla[i])
-    yaw, pitch, roll = (float(value) for value in recording.photos.yaw_pitch_roll_deg[i])
-    body_yaw, body_pitch, body_roll = (float(value) for value in recording.body_yaw_pitch_roll_deg[i])
-    east, north, up = (float(value) for value in recording.photos.sigma_enu_m)
+    photos = recording.photos
+    lat, lon, alt = vector(photos.lla[i])
     return DroneTags(
         width=world.lens.width,
         height=world.lens.height,
         focal_px=world.lens.focal_px,
-        stamp_ns=int(recording.photos.stamp_ns[i]),
+        stamp_ns=int(photos.stamp_ns[i]),
         lat_deg=lat,
         lon_deg=lon,
         alt_m=alt,
         relative_alt_m=alt - world.origin.alt_m,
-        yaw_pitch_roll_deg=(yaw, pitch, roll),
-        body_yaw_pitch_roll_deg=(body_yaw, body_pitch, body_roll),
-        sigma_enu_m=None if options.gnss == "consumer" else (east, north, up),
+        yaw_pitch_roll_deg=vector(photos.yaw_pitch_roll_deg[i]),
+        body_yaw_pitch_roll_deg=vector(photos.body_yaw_pitch_roll_deg[i]),
+        sigma_enu_m=None if options.gnss == "consumer" else vector(photos.sigma_enu_m),
     )
 
 
 def _write_records(options: SimulateOptions, world: World, recording: Recording, folder: Path) -> int:
     """Write tables, truth and bag; return the number of messages in the bag."""
     enu_from_body = in_local_enu(recording.imu.geo_from_body, recording.imu_in_geo, world.origin)
-    write_trajectory(folder / "trajectory.csv", recording.photos)
-    write_gnss(folder / "gnss.csv", recording.gnss, recording.photos.sigma_enu_m, world.origin)
-    write_imu(folder / "imu.csv", recording.imu, enu_from_body)
-    write_points(folder / "gcp_list.txt", recording.control, world.origin)
-    write_points(folder / "checkpoints.txt", recording.check, world.origin)
+    write_tables(folder, recording, enu_from_body, world.origin)
     if options.bag == "none":
         return 0
     lens = world.lens
@@ -292,14 +251,13 @@ def _write_records(options: SimulateOptions, world: World, recording: Recording,
     return write_bag(folder / "bag", options.bag, flight)
 
 
-def _warnings(options: SimulateOptions, recording: Recording) -> tuple[str, ...]:
+def _warnings(options: SimulateOptions, well_seen: int, control: int) -> tuple[str, ...]:
     messages = []
-    good = sum(len(target.marks) >= WANTED_RAYS for target in recording.check)
-    if options.targets and good < WANTED_CHECKS:
+    if options.targets and well_seen < WANTED_CHECKS:
         messages.append(
-            f"only {good} check points are seen in {WANTED_RAYS} photographs or more: "
+            f"only {well_seen} check points are seen in {WANTED_RAYS} photographs or more: "
             "take more --images, larger ones (--size), or more --targets"
         )
-    if len(recording.control) < options.control:
-        messages.append(f"only {len(recording.control)} of {options.control} control points found a place")
+    if control < options.control:
+        messages.append(f"only {control} of {options.control} control points found a place")
     return tuple(messages)

@@ -1,7 +1,5 @@
 """Textures: albedo of every material, such as walls with windows, roofs, ground, leaves, cars, targets.
 
-Building blocks of procedural textures, faded out where they are finer than a pixel.
-
 A texture that aliases gives every photograph other features at the same place. Every pattern therefore takes the
 width of the pixel on the surface, and filters itself: a box filter for stripes, fading for noise and random cells.
 """
@@ -85,8 +83,7 @@ def fbm(
     for i, size in enumerate(sizes):
         shift = np.float32(17.31 * i)
         # Each octave is turned, so that the lattices do not line up.
-        turned_u, turned_v = u * np.float32(0.8) + v * np.float32(0.6), v * np.float32(0.8) - u * np.float32(0.6)
-        u, v = turned_u, turned_v
+        u, v = u * np.float32(0.8) + v * np.float32(0.6), v * np.float32(0.8) - u * np.float32(0.6)
         total += np.float32(strength) * noise(u + shift, v - shift, size, pixel)
         strength *= gain
     return total
@@ -126,16 +123,11 @@ def band(x: Float32Array, low: ArrayLike, high: ArrayLike, pixel: Float32Array) 
 
 def mix(a: Float32Array, b: Float32Array, share: Float32Array) -> Float32Array:
     """Return a (N, 3) and b (N, 3) or (3,), blended by `share` (N,) of b."""
-    return np.asarray(a + (b - a) * share[:, None])
+    return a + (b - a) * share[:, None]
 
 
 class Pyramid:
-    """Image pyramid, for sampling at any distance.
-
-    Args:
-        image: (H, W, 3) uint8.
-        pixel_m: size of its pixels.
-    """
+    """Image pyramid of an image (H, W, 3) uint8 with pixels of `pixel_m`, for sampling at any distance."""
 
     def __init__(self, image: ByteArray, pixel_m: float) -> None:
         self._pixel_m = pixel_m
@@ -185,10 +177,9 @@ class TextureSamples:
     @property
     def pixel(self) -> Float32Array:
         """Width of a pixel for patterns without direction; slightly small, because images are supersampled."""
-        return np.asarray(np.float32(0.75) * np.maximum(self.du, self.dv))
+        return np.float32(0.75) * np.maximum(self.du, self.dv)
 
     def select(self, chosen: np.ndarray) -> TextureSamples:
-        """Return the chosen points only."""
         return TextureSamples(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
 
@@ -202,7 +193,7 @@ class GroundPlan:
 
 
 def _tinted(base: Float32Array, amount: Float32Array) -> Float32Array:
-    return np.asarray(base * np.clip(1 + amount, 0.15, 2.5)[:, None])
+    return base * np.clip(1 + amount, 0.15, 2.5)[:, None]
 
 
 def _grime(s: TextureSamples) -> Float32Array:
@@ -210,7 +201,7 @@ def _grime(s: TextureSamples) -> Float32Array:
     u, v = s.u + s.params[:, SHIFT_U], s.v + s.params[:, SHIFT_V]
     blotches = fbm(u, v, (3.1, 1.3, 0.55, 0.24, 0.1), s.pixel)
     streaks = noise(u, v * np.float32(0.12), 0.45, s.pixel)
-    return np.asarray(np.float32(0.42) * blotches + np.float32(0.22) * streaks)
+    return np.float32(0.42) * blotches + np.float32(0.22) * streaks
 
 
 def _masonry(
@@ -295,7 +286,7 @@ def flat_roof(s: TextureSamples) -> Float32Array:
     return mix(color, color * np.float32(0.5), stripes(s.v, 1.0, 0.05, s.dv))
 
 
-def plain(s: TextureSamples) -> Float32Array:
+def weathered(s: TextureSamples) -> Float32Array:
     """Return weathered concrete, painted metal or bark, with louvres that show up close."""
     louvre = stripes(s.v, 0.25, 0.07, s.dv)
     return mix(_tinted(s.params[:, BASE], _grime(s)), s.params[:, BASE] * np.float32(0.5), louvre * np.float32(0.5))
@@ -389,7 +380,7 @@ _TEXTURES: dict[Material, Callable[[TextureSamples], Float32Array]] = {
     Material.WALL: wall,
     Material.TILES: tiles,
     Material.FLAT_ROOF: flat_roof,
-    Material.PLAIN: plain,
+    Material.PLAIN: weathered,
     Material.LEAVES: leaves,
     Material.CAR: car,
     Material.SOLAR: solar,

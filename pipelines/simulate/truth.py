@@ -74,12 +74,10 @@ class TrueLidar(Product):
     Attributes:
         sigma_m: white noise of the ranges.
         drift_m: RMS of the strips' slow drift per axis.
-        shift_in_geo_m: shift of the whole cloud.
         arm_in_body_m: part of the scanner's lever arm that the cloud lacks.
         change: building removed or added since.
-        returns: number of points.
-        returns_of_change: number of points on what has changed.
-        changed_footprint: corners of the building in geo, east and north.
+        returns_of_change: number of points on it.
+        changed_footprint: its corners in geo, east and north.
     """
 
     sigma_m: float

@@ -1,7 +1,4 @@
-"""Simulated world: scene, lens, true motion, and the arrangement of the sensors.
-
-Survey targets: choice of their sites, and their projections into the photographs.
-"""
+"""World of a simulated survey: scene, lens, true motion, arrangement of the sensors, sites of survey targets."""
 
 from __future__ import annotations
 
@@ -14,19 +11,18 @@ from pipelines.core.errors import InputError
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.geodesy.enu import Origin
 from pipelines.geometry.rotations import exp_so3
-from pipelines.simulate.buildings import SiteKind, TargetSite
 from pipelines.simulate.flight import (
     DEFAULT_HEIGHTS_M,
     DEFAULT_RADIUS_M,
     FlightPlan,
+    Mounting,
     TrueTrajectory,
     make_trajectory,
 )
-from pipelines.simulate.lens import Lens, Pose
+from pipelines.simulate.lens import BrownLens, Pose
 from pipelines.simulate.mesh import MISS, Material, Raycaster
 from pipelines.simulate.options import SimulateOptions
-from pipelines.simulate.scene import SimulatedScene, build_scene, with_targets
-from pipelines.simulate.sensors import Mounting
+from pipelines.simulate.scene import SimulatedScene, SiteKind, TargetSite, build_scene, with_targets
 
 WANTED_RAYS = 6
 LEAST_RAYS = 2
@@ -37,23 +33,15 @@ _LEAST_PX = 3.0
 _LEAST_COSINE = 0.2
 
 
-@dataclass(frozen=True)
-class TargetProjections:
-    """Projections of P targets into N photographs.
-
-    Attributes:
-        seen: (P, N) whether the photograph sees the target.
-        pixels: (P, N, 2) exact projections; meaningless where not seen.
-    """
-
-    seen: BoolArray
-    pixels: FloatArray
-
-
 def project_targets(
-    sites: Sequence[TargetSite], poses: Sequence[Pose], lens: Lens, raycaster: Raycaster, width_m: float
-) -> TargetProjections:
-    """Project targets of `width_m`; targets out of view, too small or hidden (by ray casting) are not seen."""
+    sites: Sequence[TargetSite], poses: Sequence[Pose], lens: BrownLens, raycaster: Raycaster, width_m: float
+) -> tuple[BoolArray, FloatArray]:
+    """Project P targets of `width_m` into N photographs.
+
+    Returns:
+        (P, N) whether the photograph sees the target: not out of view, too small or hidden (by ray casting).
+        (P, N, 2) exact projections in pixels; meaningless where not seen.
+    """
     positions = np.array([site.target_position for site in sites]).reshape(-1, 3)
     normals = np.array([site.normal for site in sites]).reshape(-1, 3)
     seen = np.zeros((len(sites), len(poses)), dtype=bool)
@@ -72,10 +60,10 @@ def project_targets(
         hits = raycaster.first_hits(pose.center, towards[maybe] / distance[maybe, None])
         # The first hit of the ray is the target itself, or the surface close behind it.
         seen[maybe, j] = np.abs(hits.distance - distance[maybe]) < 0.25
-    return TargetProjections(seen, pixels)
+    return seen, pixels
 
 
-def choose_sites(
+def _chosen_sites(
     sites: Sequence[TargetSite], seen: BoolArray, count: int, rng: np.random.Generator
 ) -> list[TargetSite]:
     """Return up to `count` sites on ground, roofs and walls: well seen (P, N), and apart from each other."""
@@ -126,24 +114,13 @@ _TARGET_PX = 5.0
 
 @dataclass(frozen=True)
 class World:
-    """Truth from which records and photographs are made.
-
-    Attributes:
-        origin: of geo, on Earth.
-        scene: with its targets.
-        sites: of the targets.
-        target_m: width of a target.
-        lens: of the camera.
-        trajectory: true motion of the camera.
-        poses: of the photographs.
-        mounting: arrangement of camera, antenna and clocks.
-    """
+    """Truth from which records and photographs are made, with targets of a width at their sites in the scene."""
 
     origin: Origin
     scene: SimulatedScene
     sites: tuple[TargetSite, ...]
     target_m: float
-    lens: Lens
+    lens: BrownLens
     trajectory: TrueTrajectory
     poses: tuple[Pose, ...]
     mounting: Mounting
@@ -179,29 +156,20 @@ def make_world(options: SimulateOptions, seed: np.random.SeedSequence) -> World:
     width_m = options.target_size or max(0.3, _TARGET_PX * distance_m / lens.focal_px)
     sites: list[TargetSite] = []
     if options.targets:
-        projections = project_targets(bare.sites, poses, lens, Raycaster(bare.mesh), width_m)
-        sites = choose_sites(bare.sites, projections.seen, options.targets, np.random.default_rng(target_seed))
+        seen, _ = project_targets(bare.sites, poses, lens, Raycaster(bare.mesh), width_m)
+        sites = _chosen_sites(bare.sites, seen, options.targets, np.random.default_rng(target_seed))
     scene = with_targets(bare, sites, width_m)
     origin = Origin(lat_deg=lat, lon_deg=lon, alt_m=alt)
     return World(origin, scene, tuple(sites), width_m, lens, trajectory, poses, mounting)
 
 
-def _lens(options: SimulateOptions) -> Lens:
+def _lens(options: SimulateOptions) -> BrownLens:
     width, height = options.size_px
     # The principal point of a real camera is never exactly in the middle.
     center = (0.504 * width, 0.497 * height) if options.lens != "pinhole" else (0.5 * width, 0.5 * height)
     bent, skewed = options.lens != "pinhole", options.lens == "opencv"
-    lens = Lens(
-        options.lens,
-        width,
-        height,
-        options.focal * width,
-        center,
-        options.k1 * bent,
-        options.k2 * bent,
-        options.p1 * skewed,
-        options.p2 * skewed,
-    )
+    radial, tangential = (options.k1 * bent, options.k2 * bent), (options.p1 * skewed, options.p2 * skewed)
+    lens = BrownLens(options.lens, width, height, options.focal * width, center, *radial, *tangential)
     lens.directions([(x, y) for x in (0, width / 2, width) for y in (0, height / 2, height)])
     return lens
 

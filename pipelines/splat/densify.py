@@ -1,22 +1,11 @@
 """Density control: strategies that add and remove Gaussians while training, behind one small interface.
 
 A strategy observes every render after its backward pass. Then it may edit the Gaussians through the optimiser,
-which keeps the moments of the rows that stay. Settings are apart from running state. The state can be saved, and
-all random numbers come from the strategy's own generator.
-
-Contribution of every Gaussian to a view: the pixels that it makes up, and those of them with a high error.
+which keeps the moments of the rows that stay. All random numbers come from the strategy's own generator.
 
 The blending weight of Gaussian k at pixel p is w_k(p) = α_k(p) T_k(p), and Σ_p w_k(p) e(p) is the derivative of
 Σ_p e(p) c(p) by the Gaussian's colour. One render of grey Gaussians and its backward pass therefore give the sums
 of all Gaussians at once, on every backend (the auxiliary gradient of doi 10.48550/arXiv.2404.06109, section 3.1).
-
-Density control by several views together: fewer Gaussians for the same image.
-
-After FastGS (doi 10.48550/arXiv.2511.04283, section 3) and Taming 3DGS (doi 10.1145/3680528.3687694):
-
-1. A Gaussian is cloned or split only if it makes up pixels with a high error in several sampled views; a large
-   gradient in one view is not enough.
-2. A Gaussian that makes up hardly any pixel of any view is removed.
 """
 
 from __future__ import annotations
@@ -42,12 +31,7 @@ _HIGH_ERROR = 0.1
 
 @dataclass(frozen=True)
 class ViewContributions:
-    """Contributions of N Gaussians to one view.
-
-    Attributes:
-        weight_px: (N,) pixels that each Gaussian makes up, Σ w.
-        high_error_px: (N,) those of them whose error is high, Σ w [error is high].
-    """
+    """Pixels (N,) that N Gaussians make up in one view, Σ w, and those with a high error, Σ w [error is high]."""
 
     weight_px: Tensor
     high_error_px: Tensor
@@ -60,14 +44,9 @@ Probe = Callable[[int, torch.Generator], list[ViewContributions]]
 def view_contributions(
     gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, error: Tensor, rasterizer: Rasterizer
 ) -> ViewContributions:
-    """Return the contributions of all Gaussians to one view.
+    """Return the contributions of N Gaussians to a view of H × W pixels from a pose (4, 4).
 
-    Args:
-        gaussians: N of them.
-        cam_from_model: (4, 4) pose.
-        camera: of H × W pixels.
-        error: (H, W) absolute error of the view, 0 where no pixel counts.
-        rasterizer: backend.
+    The absolute error (H, W) of the view is 0 where no pixel counts.
     """
     scaled = error / error.max().clamp_min(1e-9)
     maps = torch.stack([torch.ones_like(error), (scaled > _HIGH_ERROR).to(error), torch.zeros_like(error)], dim=-1)
@@ -80,6 +59,10 @@ def view_contributions(
     return ViewContributions(sums[:, 0], sums[:, 1])
 
 
+_SPLIT_SCALE = 0.01  # largest standard deviation to clone, in scene extents; larger Gaussians are split
+_LEAST_OPACITY = 0.005  # Gaussians below are removed
+_LARGEST_SCALE = 0.1  # of the scene extent plus the distance from its middle: Gaussians above are removed
+_RESET_OPACITY = 0.01  # largest after a reset
 _CHILDREN = 2
 _SHRINK = 0.8 * _CHILDREN  # 3DGS: a child of a split has 1/1.6 of its parent's standard deviations
 
@@ -105,12 +88,9 @@ class Strategy(Protocol):
         """Record a render, after its backward pass."""
 
     def update(self, iteration: int, optimizer: GaussianAdam, probe: Probe | None = None) -> DensityEdit:
-        """Edit the Gaussians if the schedule says so; called after the optimiser's step of every iteration.
+        """Edit the Gaussians if the schedule says so; called after the optimiser's step of every iteration, from 1.
 
-        Args:
-            iteration: from 1.
-            optimizer: holds the Gaussians and their moments.
-            probe: returns contributions of the Gaussians to sampled training views, for strategies that need them.
+        The `probe` returns contributions to sampled training views, for strategies that need them.
         """
 
     def state(self) -> dict[str, Tensor]:
@@ -125,19 +105,11 @@ class DefaultSettings:
     """Settings of `DefaultStrategy`; iterations count from 1.
 
     Attributes:
-        start: Gaussians are added after this iteration,
-        stop: and up to this iteration,
-        every: at every such number of iterations.
+        start, stop, every: Gaussians are added after `start` and up to `stop`, at every such number of iterations.
         reset_every: iterations between opacity resets, before `stop` (0: none).
-        gradient_threshold: mean length of ∂L/∂(centre in normalised device coordinates) from which a Gaussian
-            is cloned or split.
-        split_scale: largest standard deviation to clone, in scene extents; larger Gaussians are split.
-        prune_opacity: Gaussians below this opacity are removed.
-        prune_scale: Gaussians are removed whose standard deviation is above this share of the scene extent plus
-            their distance from the middle of the scene,
-        prune_scale_from: after this iteration.
-        reset_opacity: largest opacity after a reset.
-        max_gaussians: limit of their number.
+        gradient_threshold: mean length of ∂L/∂(centre in normalised device coordinates) from which a Gaussian is
+            cloned or split.
+        prune_scale_from: Gaussians are removed for their size after this iteration.
     """
 
     start: int = 500
@@ -145,11 +117,7 @@ class DefaultSettings:
     every: int = 100
     reset_every: int = 3_000
     gradient_threshold: float = 2e-4
-    split_scale: float = 0.01
-    prune_opacity: float = 0.005
-    prune_scale: float = 0.1
     prune_scale_from: int = 3_000
-    reset_opacity: float = 0.01
     max_gaussians: int = 1_000_000
 
     @classmethod
@@ -162,9 +130,9 @@ class DefaultSettings:
         """
         stop, reset_every = iterations // 2, max(iterations // 10, 1_500)
         return cls(
-            start=_between(50, iterations // 20, 500),
+            start=min(max(iterations // 20, 50), 500),
             stop=stop,
-            every=_between(50, iterations // 40, 100),
+            every=min(max(iterations // 40, 50), 100),
             reset_every=reset_every if reset_every < stop else 0,
             prune_scale_from=iterations // 10,
             max_gaussians=max_gaussians,
@@ -182,7 +150,6 @@ class DefaultStrategy:
     """
 
     def __init__(self, settings: DefaultSettings, extent_m: float, count: int, seed: int = 0) -> None:
-        """Start without observations of `count` Gaussians in a scene of size `extent_m`."""
         self.settings = settings
         self.extent_m = extent_m
         self._generator = torch.Generator().manual_seed(seed)
@@ -190,7 +157,7 @@ class DefaultStrategy:
         self._observations = torch.zeros(count)
 
     def penalty(self, gaussians: Gaussians, stats: ScreenStats) -> Tensor | None:
-        """Return None: the photographs alone decide."""
+        """See `Strategy.penalty`; the photographs alone decide."""
         return None
 
     def observe(self, stats: ScreenStats, camera: Pinhole) -> None:
@@ -211,21 +178,20 @@ class DefaultStrategy:
         self._observations.index_add_(0, stats.visible, counted)
 
     def update(self, iteration: int, optimizer: GaussianAdam, probe: Probe | None = None) -> DensityEdit:
-        """See `Strategy.update`."""
         settings, edit = self.settings, DensityEdit()
         if settings.start < iteration <= settings.stop and iteration % settings.every == 0:
-            gaussians = optimizer.gaussians.detached()
-            alive = self._alive(gaussians, iteration)
-            edit = self._edit(optimizer, alive, self._chosen(alive))
+            alive = self._alive(optimizer.gaussians.detached(), iteration)
+            gradient = (self._gradient_sum / self._observations.clamp_min(1)).to(alive.device)
+            chosen = alive & (gradient >= settings.gradient_threshold)
+            edit = self._edit(optimizer, alive, self._within_room(alive, chosen, gradient))
         if settings.reset_every and iteration < settings.stop and iteration % settings.reset_every == 0:
-            ceiling = math.log(settings.reset_opacity / (1 - settings.reset_opacity))
+            ceiling = math.log(_RESET_OPACITY / (1 - _RESET_OPACITY))
             capped = optimizer.gaussians.logit_opacities.detach().clamp_max(ceiling)
             optimizer.overwrite("logit_opacities", capped)
             edit = replace(edit, opacity_reset=True)
         return edit
 
     def state(self) -> dict[str, Tensor]:
-        """See `Strategy.state`."""
         return {
             "gradient_sum": self._gradient_sum.clone(),
             "observations": self._observations.clone(),
@@ -233,7 +199,6 @@ class DefaultStrategy:
         }
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """See `Strategy.restore`."""
         self._gradient_sum = state["gradient_sum"].clone()
         self._observations = state["observations"].clone()
         self._generator.set_state(state["generator"])
@@ -241,7 +206,7 @@ class DefaultStrategy:
     def _edit(self, optimizer: GaussianAdam, alive: Tensor, chosen: Tensor) -> DensityEdit:
         """Keep the Gaussians of the mask `alive`, and add one for each of the mask `chosen`."""
         gaussians = optimizer.gaussians.detached()
-        large = gaussians.log_scales.amax(dim=1).exp() > self.settings.split_scale * self.extent_m
+        large = gaussians.log_scales.amax(dim=1).exp() > _SPLIT_SCALE * self.extent_m
         cloned, parents = chosen & ~large, chosen & large
         stay = (alive & ~parents).nonzero()[:, 0]
         parts = [gaussians.select(stay), gaussians.select(cloned), self._children(gaussians.select(parents))]
@@ -255,23 +220,14 @@ class DefaultStrategy:
         return DensityEdit(int(cloned.sum()), int(parents.sum()), int((~alive).sum()))
 
     def _alive(self, gaussians: Gaussians, iteration: int) -> Tensor:
-        alive = torch.sigmoid(gaussians.logit_opacities) >= self.settings.prune_opacity
+        alive = torch.sigmoid(gaussians.logit_opacities) >= _LEAST_OPACITY
         if iteration > self.settings.prune_scale_from:
             # Sky and horizon are far away. 3DGS compares with the extent alone, and so removes them with each edit;
             # the photographs then have a black background until other Gaussians have grown over it.
             distance = (gaussians.means - gaussians.means.median(dim=0).values).norm(dim=1)
             scale = gaussians.log_scales.amax(dim=1).exp()
-            alive &= scale <= self.settings.prune_scale * (self.extent_m + distance)
+            alive &= scale <= _LARGEST_SCALE * (self.extent_m + distance)
         return alive
-
-    def _chosen(self, alive: Tensor) -> Tensor:
-        """Return the mask of the Gaussians to clone or split: each adds one, within the limit."""
-        gradient = self._mean_gradient(alive.device)
-        chosen = alive & (gradient >= self.settings.gradient_threshold)
-        return self._within_room(alive, chosen, gradient)
-
-    def _mean_gradient(self, device: torch.device) -> Tensor:
-        return (self._gradient_sum / self._observations.clamp_min(1)).to(device)
 
     def _within_room(self, alive: Tensor, chosen: Tensor, score: Tensor) -> Tensor:
         """Reduce the mask `chosen` to the highest scores that the limit leaves room for."""
@@ -292,18 +248,13 @@ class DefaultStrategy:
         return children
 
 
-def _between(low: int, value: int, high: int) -> int:
-    return min(max(value, low), high)
-
-
 @dataclass(frozen=True)
 class FastSettings:
     """Settings of `FastStrategy` beside those of the default one.
 
     Attributes:
         views: number of views to sample for an edit.
-        high_error_px: pixels of high error, mean over the views that see a Gaussian, from which that Gaussian is
-            cloned or split.
+        high_error_px: mean over the views that see a Gaussian from which it is cloned or split.
         least_px: a Gaussian that makes up fewer pixels in each of the views is removed,
         least_views: if at least this number of views sees it.
         prune_stop: last iteration that removes Gaussians, later than the last that adds them.
@@ -315,28 +266,25 @@ class FastSettings:
     least_views: int = 2
     prune_stop: int = 25_000
 
-    @classmethod
-    def for_iterations(cls, iterations: int) -> FastSettings:
-        """Return settings whose removal ends at five sixths of the training, so that Gaussians can settle."""
-        return cls(prune_stop=iterations * 5 // 6)
-
 
 class FastStrategy(DefaultStrategy):
-    """Default density control, with additions and removals that several views agree on."""
+    """Density control by several views together: fewer Gaussians for the same image.
+
+    After FastGS (doi 10.48550/arXiv.2511.04283, section 3) and Taming 3DGS (doi 10.1145/3680528.3687694):
+
+    1. A Gaussian is cloned or split only if it makes up pixels with a high error in several sampled views; a large
+       gradient in one view is not enough. Those with most pixels in error come first, if room is short.
+    2. A Gaussian that makes up hardly any pixel of any view is removed.
+    """
 
     def __init__(
         self, settings: DefaultSettings, fast: FastSettings, extent_m: float, count: int, seed: int = 0
     ) -> None:
-        """Start without observations; see `DefaultStrategy`."""
         super().__init__(settings, extent_m, count, seed)
         self.fast = fast
 
     def update(self, iteration: int, optimizer: GaussianAdam, probe: Probe | None = None) -> DensityEdit:
-        """See `Strategy.update`.
-
-        Raises:
-            ValueError: no probe.
-        """
+        """See `Strategy.update`; a ValueError says that there is no probe."""
         settings = self.settings
         adds = settings.start < iteration <= settings.stop and iteration % settings.every == 0
         # Sampling views costs renders, and removal alone changes little: a quarter of the edits is enough.
@@ -346,20 +294,15 @@ class FastStrategy(DefaultStrategy):
         if probe is None:
             raise ValueError("this strategy asks training views: it needs a probe")
         contributions = probe(self.fast.views, self._generator)
-        alive = self._alive(optimizer.gaussians.detached(), iteration) & ~self._redundant(contributions)
-        chosen = self._agreed(alive, contributions) if adds else torch.zeros_like(alive)
-        return self._edit(optimizer, alive, chosen)
-
-    def _redundant(self, contributions: list[ViewContributions]) -> Tensor:
-        """Return the mask of the Gaussians that views see, but that make up hardly any pixel of them."""
         weight = torch.stack([view.weight_px for view in contributions])
         views = (weight > 0).sum(dim=0)
-        return (views >= self.fast.least_views) & (weight.amax(dim=0) < self.fast.least_px)
-
-    def _agreed(self, alive: Tensor, contributions: list[ViewContributions]) -> Tensor:
-        """Return the mask of the Gaussians to clone or split; those with most pixels in error if room is short."""
-        error = torch.stack([view.high_error_px for view in contributions])
-        views = torch.stack([view.weight_px > 0 for view in contributions]).sum(dim=0)
-        score = error.sum(dim=0) / views.clamp_min(1)
-        pulled = self._mean_gradient(alive.device) >= self.settings.gradient_threshold
-        return self._within_room(alive, alive & pulled & (score >= self.fast.high_error_px), score)
+        redundant = (views >= self.fast.least_views) & (weight.amax(dim=0) < self.fast.least_px)
+        alive = self._alive(optimizer.gaussians.detached(), iteration) & ~redundant
+        chosen = torch.zeros_like(alive)
+        if adds:
+            error = torch.stack([view.high_error_px for view in contributions])
+            score = error.sum(dim=0) / views.clamp_min(1)
+            gradient = (self._gradient_sum / self._observations.clamp_min(1)).to(alive.device)
+            agreed = alive & (gradient >= settings.gradient_threshold) & (score >= self.fast.high_error_px)
+            chosen = self._within_room(alive, agreed, score)
+        return self._edit(optimizer, alive, chosen)

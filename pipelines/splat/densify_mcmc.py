@@ -24,6 +24,9 @@ from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.rasterizer.api import ScreenStats
 from pipelines.splat.spatial import morton_order
 
+_DEAD_OPACITY = 0.005  # Gaussians up to this opacity are moved
+# Weights of the mean opacity, and of the mean standard deviation in scene extents.
+_OPACITY_PENALTY, _SCALE_PENALTY = 0.01, 0.01 * 5
 _MOST_COPIES = 51  # of one Gaussian in one edit: the binomials of eq. 9 are tabulated
 _SEEDS_APART = 1_000_003  # more than there are iterations
 _SIGMOID_STEEPNESS, _SIGMOID_CENTRE = 100.0, 0.995
@@ -34,26 +37,17 @@ class McmcSettings:
     """Settings of `McmcStrategy`; iterations count from 1.
 
     Attributes:
-        start: Gaussians are moved and added after this iteration,
-        stop: and up to this iteration,
-        every: at every such number of iterations.
+        start, stop, every: Gaussians are moved and added after `start` and up to `stop`, every so many iterations.
         growth: share of Gaussians to add at each edit.
-        dead_opacity: Gaussians up to this opacity are moved.
         noise: standard deviation of the noise, in learning rates of the centres times covariance, all in scene
             extents. The paper's 5e5 is for scenes whose extent is about 5 units, hence the factor 5².
-        opacity_penalty: weight of the mean opacity,
-        scale_penalty: and of the mean standard deviation, in scene extents.
-        max_gaussians: limit of their number.
     """
 
     start: int = 500
     stop: int = 25_000
     every: int = 100
     growth: float = 0.05
-    dead_opacity: float = 0.005
     noise: float = 5e5 * 5**2
-    opacity_penalty: float = 0.01
-    scale_penalty: float = 0.01 * 5
     max_gaussians: int = 1_000_000
 
     @classmethod
@@ -70,10 +64,9 @@ class McmcSettings:
 
 
 class McmcStrategy:
-    """Relocation, growth and noise; see the module."""
+    """Relocation, growth and noise in a scene of size `extent_m`; see the module."""
 
     def __init__(self, settings: McmcSettings, extent_m: float, seed: int = 0) -> None:
-        """Start; `extent_m` is the size of the scene."""
         self.settings, self.extent_m, self._seed = settings, extent_m, seed
         self._generator = torch.Generator().manual_seed(seed)
         self._visible: Tensor | None = None
@@ -87,14 +80,12 @@ class McmcStrategy:
         share = len(rows) / max(len(gaussians), 1)
         opacity = torch.sigmoid(gaussians.logit_opacities[rows]).mean()
         scale = gaussians.log_scales[rows].exp().mean() / self.extent_m
-        return share * (self.settings.opacity_penalty * opacity + self.settings.scale_penalty * scale)
+        return share * (_OPACITY_PENALTY * opacity + _SCALE_PENALTY * scale)
 
     def observe(self, stats: ScreenStats, camera: Pinhole) -> None:
-        """Record the Gaussians that this iteration moves."""
         self._visible = stats.visible
 
     def update(self, iteration: int, optimizer: GaussianAdam, probe: Probe | None = None) -> DensityEdit:
-        """See `Strategy.update`; also adds the noise of this iteration."""
         settings, edit = self.settings, DensityEdit()
         if settings.start < iteration <= settings.stop and iteration % settings.every == 0:
             edit = self._edit(optimizer)
@@ -104,11 +95,9 @@ class McmcStrategy:
         return edit
 
     def state(self) -> dict[str, Tensor]:
-        """See `Strategy.state`."""
         return {"generator": self._generator.get_state()}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """See `Strategy.restore`."""
         self._generator.set_state(state["generator"].cpu())
 
     @torch.no_grad()
@@ -117,27 +106,24 @@ class McmcStrategy:
         moved = optimizer.gaussians
         opacity = torch.sigmoid(moved.logit_opacities[rows])
         free = torch.sigmoid(_SIGMOID_STEEPNESS * (1 - opacity - _SIGMOID_CENTRE))
-        noise = self._noise(len(rows), iteration, opacity.device)
+        if opacity.device.type == "cpu":
+            noise = torch.randn(len(rows), 3, generator=self._generator)
+        else:
+            # Made on the device: copies from the CPU would wait for all its work. The seed follows from the
+            # iteration, so that a resumed training shakes as an uninterrupted one does.
+            generator = torch.Generator(opacity.device).manual_seed(self._seed * _SEEDS_APART + iteration)
+            noise = torch.randn(len(rows), 3, generator=generator, device=opacity.device)
         rotation, variance = rotation_matrices(moved.quats_wxyz[rows]), (2 * moved.log_scales[rows]).exp()
         along = variance * (rotation.transpose(1, 2) @ noise[..., None])[..., 0]
         shaped = (rotation @ along[..., None])[..., 0]
         length = self.settings.noise * optimizer.means_rate(iteration) / self.extent_m
         moved.means[rows] += length * free[:, None] * shaped
 
-    def _noise(self, count: int, iteration: int, device: torch.device) -> Tensor:
-        """Return normal numbers (count, 3), made on the device: copies from the CPU would wait for all its work."""
-        if device.type == "cpu":
-            return torch.randn(count, 3, generator=self._generator)
-        # The seed follows from the iteration, so that a resumed training shakes as an uninterrupted one does.
-        generator = torch.Generator(device).manual_seed(self._seed * _SEEDS_APART + iteration)
-        return torch.randn(count, 3, generator=generator, device=device)
-
     @torch.no_grad()
     def _edit(self, optimizer: GaussianAdam) -> DensityEdit:
-        """Move dead Gaussians, add new ones, and put all into spatial order."""
         gaussians, settings = optimizer.gaussians.detached(), self.settings
         opacity = torch.sigmoid(gaussians.logit_opacities)
-        dead = (opacity <= settings.dead_opacity).nonzero()[:, 0]
+        dead = (opacity <= _DEAD_OPACITY).nonzero()[:, 0]
         count = len(gaussians)
         target = min(settings.max_gaussians, math.ceil((1 + settings.growth) * count))
         added = max(target - count, 0) if len(dead) < count else 0
@@ -177,7 +163,9 @@ def _shared_among(gaussians: Gaussians, copies: Tensor) -> Gaussians:
     opacity = torch.sigmoid(gaussians.logit_opacities[rows].double())
     shared_opacity = 1 - (1 - opacity) ** (1 / n)
     # A logit of 1 is infinite, and a copy below the opacity of dead Gaussians would be moved at once.
-    shared.logit_opacities[rows] = torch.logit(shared_opacity.clamp(0.005, 1 - 1e-6)).to(shared.logit_opacities)
+    shared.logit_opacities[rows] = torch.logit(shared_opacity.clamp(_DEAD_OPACITY, 1 - 1e-6)).to(
+        shared.logit_opacities
+    )
     shared.log_scales[rows] += (opacity / _overlap(shared_opacity, n)).log().to(shared.log_scales)[:, None]
     return shared
 

@@ -1,21 +1,19 @@
-"""Exposure of each photograph: an affine change of colour that training fits together with the Gaussians.
+"""Exposure of each photograph: an affine change of colour, fitted in training or adjusted from the points' colours.
 
 Photographs of one flight differ in exposure and white balance. Without exposures, a model bakes these differences
 into the colours of Gaussians that few views see. The images cannot tell a change of all exposures from a change of
 all Gaussians: the mean over the training photographs is therefore held at the identity.
 
-Exposures of all photographs from the colours of points that several photographs show, without Gaussians.
-
-Photograph i shows the colour c of a point as A_i c + b_i (`splat.exposure`). Exposures and the colours of the
-points are unknown. Robust least squares adjusts them together, as a bundle adjustment does with poses and points:
+Without Gaussians, exposures follow from the colours of points that several photographs show: photograph i shows the
+colour c of a point as A_i c + b_i. Robust least squares adjusts exposures and colours together, as a bundle
+adjustment does with poses and points:
 
 1. Linearised normal equations; the points are eliminated (Schur complement).
 2. The reduced matrix couples photographs with common points only, in blocks of 12 × 12. Conjugate gradients solve
    it.
 3. Cauchy's weights follow from the residuals: a point may shine, or move, in one of its photographs.
 
-A weak prior holds each exposure near the identity where a photograph has too few colours to determine it. All
-exposures together can change against all colours: in the end, their mean is made the identity, as in training.
+A weak prior holds each exposure near the identity where a photograph has too few colours to determine it.
 """
 
 from __future__ import annotations
@@ -38,16 +36,9 @@ _BETA1, _BETA2, _EPS = 0.9, 0.999, 1e-15
 
 
 class Exposures:
-    """Affine colour corrections of all images, and the Adam that moves those of the training images.
+    """Affine colour corrections (V, 3, 4) of V images, gain matrix and offset, and the Adam that moves them.
 
-    Attributes:
-        affine: (V, 3, 4) gain matrix and offset of each image; the identity for images without a fit.
-
-    Args:
-        count: V.
-        train: (T,) int64, the training images.
-        iterations: length of the training, over which the rate falls.
-        device: of the images.
+    Those of the images `train` (T,) move, with a rate that falls over the iterations; the others are the identity.
     """
 
     def __init__(self, count: int, train: Tensor, iterations: int, device: torch.device) -> None:
@@ -82,7 +73,6 @@ class Exposures:
         self._used = None
 
     def state(self) -> dict[str, Tensor]:
-        """Return copies of exposures and moments, for a checkpoint."""
         return {
             "affine": self.affine.clone(),
             "moments": self._moments.clone(),
@@ -90,24 +80,18 @@ class Exposures:
         }
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Restore a state."""
         self.affine.copy_(state["affine"])
         self._moments.copy_(state["moments"])
         self._steps = [int(count) for count in state["steps"]]
 
 
 class HeldExposures:
-    """Affine colour corrections of all images that do not move, in the place of `Exposures`.
-
-    Attributes:
-        affine: (V, 3, 4) gain matrix and offset of each image.
-    """
+    """Affine colour corrections (V, 3, 4) of all images that do not move, in the place of `Exposures`."""
 
     def __init__(self, affine: Tensor) -> None:
         self.affine = affine
 
     def apply(self, index: int, colour: Tensor) -> Tensor:
-        """Return the render (H, W, 3) with the exposure of photograph `index`."""
         return with_affine(colour, self.affine[index])
 
     def step(self, iteration: int) -> None:
@@ -127,12 +111,9 @@ def with_affine(colour: Tensor, affine: Tensor) -> Tensor:
 
 
 def fitted_affine(rendered: Tensor, photograph: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Return the affine change of colour (3, 4) that maps a render to a photograph best, by least squares.
+    """Return the affine change of colour (3, 4) that maps a render to a photograph (H, W, 3) by least squares.
 
-    Args:
-        rendered: (H, W, 3).
-        photograph: (H, W, 3).
-        mask: (H, W) bool, the pixels to use; None: all.
+    The `mask` (H, W) tells the pixels to use; None: all.
     """
     x, y = (image.double().reshape(-1, 3) for image in (rendered, photograph))
     if mask is not None:
@@ -156,31 +137,19 @@ _SIGMA[:, 3] = _OFFSET
 
 @dataclass(frozen=True)
 class PointColours:
-    """Colours of M observations, sorted by point.
-
-    Attributes:
-        point: (M,) index into the points, ascending.
-        image: (M,) index into the photographs.
-        colour: (M, 3) RGB from 0 to 1.
-    """
+    """RGB (M, 3) from 0 to 1 of M observations of points in photographs, sorted by the index of the point."""
 
     point: IntArray
     image: IntArray
     colour: Float32Array
 
-    def __len__(self) -> int:
-        return len(self.point)
-
 
 def adjusted_exposures(observed: PointColours, count: int) -> FloatArray:
     """Return the exposures (count, 3, 4) of all photographs: gain matrix and offset (A | b).
 
-    The mean over the photographs with observations is the identity. A photograph without observations has it too.
-    Memory holds the coupled pairs of photographs, and the derivatives of one chunk of observations.
-
-    Args:
-        observed: colours; points with one observation do not count.
-        count: number of photographs.
+    Points with one observation do not count. The mean over the photographs with observations is the identity. A
+    photograph without observations has it too. Memory holds the coupled pairs of photographs, and the derivatives
+    of one chunk of observations.
 
     Raises:
         DegenerateGeometryError: no point has two observations.
@@ -198,23 +167,20 @@ def adjusted_exposures(observed: PointColours, count: int) -> FloatArray:
         exposure = exposure + step
         if np.abs(step).max() < _STILL:
             break
-    exposure[seen] = _about_identity(exposure[seen])
-    return exposure
-
-
-def _about_identity(exposure: FloatArray) -> FloatArray:
-    """Return exposures (n, 3, 4) of other colours of the points, such that their mean is the identity."""
-    mean = exposure.mean(axis=0)
+    # Other colours of the points make the mean of the exposures the identity.
+    mean = exposure[seen].mean(axis=0)
     change = np.linalg.solve(mean[:, :3], np.column_stack([np.eye(3), -mean[:, 3]]))
-    gain = exposure[:, :, :3]
-    return np.concatenate([gain @ change[:, :3], gain @ change[:, 3:] + exposure[:, :, 3:]], axis=2)
+    gain, offset = exposure[seen][:, :, :3], exposure[seen][:, :, 3:]
+    exposure[seen] = np.concatenate([gain @ change[:, :3], gain @ change[:, 3:] + offset], axis=2)
+    return exposure
 
 
 def _step(observed: PointColours, exposure: FloatArray) -> FloatArray:
     """Return the Gauss–Newton step (n, 3, 4) of the exposures."""
-    count, redundancy = len(exposure), 3 * len(observed) - 3 * int(observed.point[-1] + 1) - 12 * len(exposure)
+    count, numbers = len(exposure), 3 * len(observed.point)
+    redundancy = numbers - 3 * int(observed.point[-1] + 1) - 12 * count
     squared = np.concatenate([part.squared for part in _parts(observed, exposure, None)])
-    share = max(redundancy / (3 * len(observed)), 0.1)
+    share = max(redundancy / numbers, 0.1)
     sigma2 = max(float(np.median(squared)) / median_chi2(3) / share, _LEAST_SIGMA**2)
     weight = cauchy_weight(squared / sigma2, 3) / sigma2
     precise = _SIGMA.ravel() ** -2.0
@@ -247,11 +213,9 @@ def _solved(matrix: bsr_matrix, right: FloatArray) -> FloatArray:
     blocks = np.empty((count, 12, 12))
     blocks[row[on_diagonal]] = matrix.data[on_diagonal]
     inverse = np.linalg.inv(blocks)
-
-    def by_blocks(vector: FloatArray) -> FloatArray:
-        return np.asarray((inverse @ vector.reshape(count, 12, 1)).ravel())
-
-    preconditioner = LinearOperator(matrix.shape, matvec=by_blocks, dtype=np.float64)
+    preconditioner = LinearOperator(
+        matrix.shape, matvec=lambda vector: (inverse @ vector.reshape(count, 12, 1)).ravel(), dtype=np.float64
+    )
     return np.asarray(cg(matrix, right, rtol=_ACCURATE, M=preconditioner)[0])
 
 
@@ -270,12 +234,9 @@ class _Part:
 
 
 def _parts(observed: PointColours, exposure: FloatArray, weight: FloatArray | None) -> Iterator[_Part]:
-    """Yield the normal equations by chunks of points, each point's colour being the best under the exposures.
+    """Yield the normal equations by chunks of points, whose colours are the best under the exposures.
 
-    Args:
-        observed: colours of all points.
-        exposure: (n, 3, 4).
-        weight: (M,) of the observations; None: equal weights.
+    Without the observations' weights (M,), all weights are equal.
     """
     last = np.cumsum(np.bincount(observed.point))
     first_point = first = 0

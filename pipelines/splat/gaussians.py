@@ -1,10 +1,6 @@
-"""Gaussians as tensors, a row for each Gaussian, in the form in which they are optimised and stored.
+"""Gaussians as tensors, a row for each Gaussian, in the form in which they are optimised and stored; their files.
 
-Reading and writing of Gaussians as files.
-
-Transformation of Gaussians to another frame.
-
-Detection of values that are not finite, without waiting for the device at every iteration.
+Also their transformation to another frame, and the detection of values that are not finite.
 """
 
 from __future__ import annotations
@@ -48,7 +44,6 @@ class Gaussians:
 
     @property
     def sh_degree(self) -> int:
-        """Degree of the stored spherical harmonics."""
         return math.isqrt(self.sh.shape[1]) - 1
 
     def tensors(self) -> dict[str, Tensor]:
@@ -56,29 +51,20 @@ class Gaussians:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def detached(self) -> Gaussians:
-        """Return the same values without gradient history."""
         return Gaussians(**{name: tensor.detach() for name, tensor in self.tensors().items()})
 
     def arrays(self) -> dict[str, Float32Array]:
         """Return the values as numpy arrays by name, for files."""
         return {name: tensor.detach().cpu().numpy() for name, tensor in self.tensors().items()}
 
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, Float32Array]) -> Gaussians:
-        """Make Gaussians from arrays by the names of the attributes; copied."""
-        return cls(**{field.name: torch.tensor(arrays[field.name]) for field in fields(cls)})
-
     def select(self, index: Tensor) -> Gaussians:
-        """Return the rows that `index` (bool mask or integer) picks."""
         return Gaussians(**{name: tensor[index] for name, tensor in self.tensors().items()})
 
     def to(self, device: torch.device) -> Gaussians:
-        """Return the same Gaussians on a device."""
         return Gaussians(**{name: tensor.to(device) for name, tensor in self.tensors().items()})
 
     @staticmethod
     def concatenate(parts: list[Gaussians]) -> Gaussians:
-        """Return all rows of `parts`, in order."""
         return Gaussians(
             **{name: torch.cat([part.tensors()[name] for part in parts]) for name in parts[0].tensors()}
         )
@@ -96,11 +82,7 @@ def rotation_matrices(quats_wxyz: Tensor) -> Tensor:
 
 
 def write_gaussians(path: Path, gaussians: Gaussians) -> None:
-    """Write Gaussians as a 3DGS PLY; the file appears whole or not at all.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """Write Gaussians as a 3DGS PLY; the file appears whole or not at all."""
     write_splat_ply(path, SplatArrays(**gaussians.arrays()))
 
 
@@ -110,59 +92,36 @@ def read_gaussians(path: Path, rows: slice = slice(None)) -> Gaussians:
     Raises:
         InputError: no such file, not a PLY of that form, cut off, or with values that are not finite.
     """
-    return Gaussians.from_arrays(vars(read_splat_ply(path, rows)))
+    return Gaussians(**{name: torch.tensor(values) for name, values in vars(read_splat_ply(path, rows)).items()})
 
 
 def transformed(gaussians: Gaussians, target_from_source: Similarity) -> Gaussians:
     """Return the same Gaussians in another frame: a camera that moves along sees the same image.
 
-    Centres are mapped, scales multiplied, rotations and the direction-dependent bands of the colours turned, in
-    float64. The result has the input's type, so that the target frame's origin must lie near the scene.
-
-    Args:
-        gaussians: N Gaussians.
-        target_from_source: p_target = s R p_source + t.
+    Centres are mapped (p_target = s R p_source + t), scales multiplied, rotations and the direction-dependent bands
+    of the colours turned, in float64. The result has the input's type: the target's origin must lie near the scene.
     """
     device, kind = gaussians.means.device, gaussians.means.dtype
     turn = torch.as_tensor(target_from_source.rotation, dtype=torch.float64, device=device)
     shift = torch.as_tensor(target_from_source.translation, dtype=torch.float64, device=device)
     x, y, z, w = quat_xyzw_from_matrix(target_from_source.rotation).tolist()
-    quat_wxyz = torch.tensor([w, x, y, z], dtype=torch.float64, device=device)
+    # Of the product of quaternions with the rotation on the left.
+    product = [w, -x, -y, -z, x, w, -z, y, y, z, w, -x, z, -y, x, w]
+    turn_quat = torch.tensor(product, dtype=torch.float64, device=device).view(4, 4)
     unit = torch.nn.functional.normalize(gaussians.quats_wxyz.double(), dim=1)
     return Gaussians(
         means=(target_from_source.scale * gaussians.means.double() @ turn.T + shift).to(kind),
-        quats_wxyz=_quaternion_product(quat_wxyz, unit).to(kind),
+        quats_wxyz=(unit @ turn_quat.T).to(kind),
         log_scales=(gaussians.log_scales.double() + math.log(target_from_source.scale)).to(kind),
         logit_opacities=gaussians.logit_opacities.clone(),
         sh=sh.rotate_sh(gaussians.sh, turn.cpu()),
     )
 
 
-def _quaternion_product(left_wxyz: Tensor, right_wxyz: Tensor) -> Tensor:
-    """Return quaternions (N, 4) of the rotation `left` (4,) after the rotations `right` (N, 4)."""
-    w, x, y, z = left_wxyz.unbind(-1)
-    matrix = torch.stack(
-        [
-            torch.stack([w, -x, -y, -z]),
-            torch.stack([x, w, -z, y]),
-            torch.stack([y, z, w, -x]),
-            torch.stack([z, -y, x, w]),
-        ]
-    )
-    return right_wxyz @ matrix.T
-
-
 _NEVER = 2**62
 
 
 class NonFiniteError(ConvergenceError):
-    """A loss or a gradient is not finite.
-
-    Args:
-        name: of the loss or gradient.
-        iteration: the first with a value that is not finite.
-    """
-
     def __init__(self, name: str, iteration: int) -> None:
         self.name, self.iteration = name, iteration
         super().__init__(f"the {name} is not finite at iteration {iteration}")
@@ -192,5 +151,4 @@ class FinitenessMonitor:
             raise NonFiniteError(self._names[place], int(first[place]))
 
     def reset(self) -> None:
-        """Forget all records."""
         self._first.fill_(_NEVER)

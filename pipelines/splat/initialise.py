@@ -23,6 +23,10 @@ _NEIGHBOURS = 3
 # Two points at almost one place have no gap, and a lone point in the sky has no size. The scales of both are
 # clipped to those of the cloud, which spread over some two orders of magnitude.
 _SCALE_SPREAD = 10.0
+# Of Gaussians with a normal: their place is known, and they need not make room for others.
+_DISC_OPACITY = 0.5
+_DISC_THICKNESS = 0.1  # relative to the standard deviation across it
+_FAR = 50.0  # median distances from the cloud's median centre: points beyond are mismatches, or sky
 
 
 @dataclass(frozen=True)
@@ -30,20 +34,13 @@ class InitialisationOptions:
     """Settings of the initial Gaussians.
 
     Attributes:
-        sh_degree: degree of the spherical harmonics; all but the constant start at zero.
+        sh_degree: of the harmonics, of which all but the constant start at zero.
         opacity: of Gaussians without a normal.
-        disc_opacity: of Gaussians with a normal: their place is known, and they need not make room for others.
-        thickness: of Gaussians with a normal, relative to their standard deviation across it.
-        far: points farther from the cloud's median centre than this many median distances are left out, as
-            mismatches or sky.
         max_gaussians: number to which a larger cloud is thinned evenly; None: no limit.
     """
 
     sh_degree: int = 3
     opacity: float = 0.1
-    disc_opacity: float = 0.5
-    thickness: float = 0.1
-    far: float = 50.0
     max_gaussians: int | None = None
 
 
@@ -53,20 +50,17 @@ def gaussians_from_points(
     options: InitialisationOptions | None = None,
     normals_in_model: ArrayLike | None = None,
 ) -> Gaussians:
-    """Return Gaussians at points, as 3D Gaussian Splatting starts (doi 10.1145/3592433, section 5.1).
+    """Return at most N Gaussians, in spatial order, as 3DGS starts (doi 10.1145/3592433, section 5.1).
 
     A Gaussian's standard deviation is the mean distance to the three nearest other points. Points that are not
     finite, repeated or far out are left out. Without a normal, Gaussians are isotropic; with a normal, they are
     discs: a ball as wide as the gaps between the points would reach as far before the surface, and behind it.
 
     Args:
-        points_in_model: (N, 3) metres in the model frame.
+        points_in_model: (N, 3) metres.
         colours: (N, 3) uint8, or floats from 0 to 1.
         options: settings of the Gaussians.
         normals_in_model: (N, 3) unit vectors, NaN if unknown; None: all are unknown.
-
-    Returns:
-        At most N Gaussians, float32, in spatial order.
 
     Raises:
         DegenerateGeometryError: fewer than two different points.
@@ -74,7 +68,7 @@ def gaussians_from_points(
     """
     options = options or InitialisationOptions()
     points, rgb = _checked(points_in_model, colours)
-    keep = _usable(points, options.far)
+    keep = _usable(points)
     if len(keep) < len(points):
         log.info("left out %d of %d points: repeated, far out or not finite", len(points) - len(keep), len(points))
     if len(keep) < 2:
@@ -85,15 +79,12 @@ def gaussians_from_points(
         log.info("thinned %d SfM points to %d", len(keep), len(order))
     gaussians = gaussians_of_size(points[order], rgb[order], _gap(points[order]), options)
     if normals_in_model is not None:
-        _make_discs(gaussians, np.asarray(normals_in_model, dtype=np.float64)[order], options)
+        _make_discs(gaussians, np.asarray(normals_in_model, dtype=np.float64)[order])
     return gaussians
 
 
 def scene_extent(camera_centers: ArrayLike) -> float:
-    """Return the size of a scene in metres: 1.1 times the largest distance of a camera from their mean, as in 3DGS.
-
-    Args:
-        camera_centers: (N, 3) metres.
+    """Return 1.1 times the largest distance in metres of the cameras (N, 3) from their mean, as in 3DGS.
 
     Raises:
         DegenerateGeometryError: all cameras are at one place.
@@ -123,15 +114,15 @@ def gaussians_of_size(
     )
 
 
-def _make_discs(gaussians: Gaussians, normals: FloatArray, options: InitialisationOptions) -> None:
+def _make_discs(gaussians: Gaussians, normals: FloatArray) -> None:
     """Turn the third axis of Gaussians to their normals (N, 3), if known, and shorten that axis."""
     rows = np.flatnonzero(np.isfinite(normals).all(axis=1))
     normal = torch.as_tensor(normals[rows] * np.where(normals[rows, 2:] < 0, -1.0, 1.0)).float()
     # The shortest turn from z to n is about z × n. The sign that makes n point upwards avoids the opposite of z.
     quats = torch.stack([1 + normal[:, 2], -normal[:, 1], normal[:, 0], torch.zeros(len(rows))], dim=1)
     gaussians.quats_wxyz[rows] = torch.nn.functional.normalize(quats, dim=1)
-    gaussians.log_scales[rows, 2] += math.log(options.thickness)
-    gaussians.logit_opacities[rows] = math.log(options.disc_opacity / (1 - options.disc_opacity))
+    gaussians.log_scales[rows, 2] += math.log(_DISC_THICKNESS)
+    gaussians.logit_opacities[rows] = math.log(_DISC_OPACITY / (1 - _DISC_OPACITY))
 
 
 def _gap(points: FloatArray) -> FloatArray:
@@ -143,7 +134,7 @@ def _gap(points: FloatArray) -> FloatArray:
     return np.asarray(np.clip(gap, median / _SCALE_SPREAD, median * _SCALE_SPREAD))
 
 
-def _usable(points: FloatArray, far: float) -> IntArray:
+def _usable(points: FloatArray) -> IntArray:
     """Return rows of points that are finite, not far, and no repetition (in float32, as Gaussians are kept)."""
     rows = np.flatnonzero(np.isfinite(points).all(axis=1))
     if len(rows) == 0:
@@ -151,7 +142,7 @@ def _usable(points: FloatArray, far: float) -> IntArray:
     _, first = np.unique(points[rows].astype(np.float32), axis=0, return_index=True)
     rows = rows[np.sort(first)]
     distance = np.linalg.norm(points[rows] - np.median(points[rows], axis=0), axis=1)
-    return np.asarray(rows[distance <= far * np.median(distance)])
+    return np.asarray(rows[distance <= _FAR * np.median(distance)])
 
 
 def _checked(points_in_model: ArrayLike, colours: ArrayLike) -> tuple[FloatArray, FloatArray]:

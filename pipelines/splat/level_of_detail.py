@@ -1,21 +1,17 @@
 """Levels of detail: a tree of tiles, each of which shows its part of the splat with few enough Gaussians.
 
 Leaves hold the Gaussians themselves, each in exactly one leaf of an octree. A tile above merges what its children
-show, by the cells of a grid, with moments kept (`merging`). Its cells are at least twice as large as theirs: a
-viewer shows it from afar, and its children from near. Above the octree, further levels become coarser until a few
-hundred Gaussians show the whole.
-
-A scene may be larger than memory: it is handed over in parts, such as the blocks of a training, one after another.
-
-Gaussians far outside the scene, and those as large as it, form a tree of their own: in the scene's tree they would
-make the boxes of its tiles so large that a viewer always stands inside, and never sees a coarse level.
-
-Merging of Gaussians into fewer and larger ones, whose moments are kept.
+show, by the cells of a grid. Its cells are at least twice as large as theirs: a viewer shows it from afar, and its
+children from near. Above the octree, further levels become coarser until a few hundred Gaussians show the whole.
 
 A Gaussian counts with its mass: opacity times the area of its shadow, averaged over all directions. That is the
 light which it takes away from a distant viewer. Merging keeps the sum of the masses, and, weighted by mass, the
 mean, the covariance (that of the mixture, by the law of total covariance) and the harmonics. Moments of moments are
 those of the whole, so that levels of detail can be merged from one another without drift.
+
+A scene may be larger than memory: it is handed over in parts, such as the blocks of a training, one after another.
+Gaussians far outside the scene, and those as large as it, form a tree of their own: in the scene's tree they would
+make the boxes of its tiles so large that a viewer always stands inside, and never sees a coarse level.
 """
 
 from __future__ import annotations
@@ -44,28 +40,18 @@ _MOST_OPACITY = 0.99
 # its variance: an opaque surface in cells of edge h has σ = h / √12 in each, and is closed again at σ = h / √3.
 _MOST_GROWTH = 4.0
 # A viewer shows no Gaussian whose σ is less than about a third of a pixel. In the farthest view of a level, a cell
-# is at least a pixel wide (see `level_of_detail`).
+# is at least a pixel wide.
 _LEAST_SIGMA_CELLS = 0.35
 
 
 @dataclass(frozen=True)
 class Mixture:
-    """Moments of N groups of Gaussians.
-
-    Attributes:
-        mass: (N,) opacity times area, m².
-        means: (N, 3) metres.
-        covariances: (N, 3, 3) m².
-        sh: (N, K, 3).
-    """
+    """Moments of N groups of Gaussians: mass (opacity times area), means and covariances in metres."""
 
     mass: FloatArray
     means: FloatArray
     covariances: FloatArray
     sh: Float32Array
-
-    def __len__(self) -> int:
-        return len(self.mass)
 
     @property
     def sizes_m(self) -> FloatArray:
@@ -73,23 +59,18 @@ class Mixture:
         return np.asarray(np.sqrt(np.einsum("nii->n", self.covariances)))
 
     def select(self, index: IntArray) -> Mixture:
-        """Return copies of the rows (M,)."""
         return Mixture(**{name: values[index] for name, values in vars(self).items()})
 
     @staticmethod
     def concatenate(parts: list[Mixture]) -> Mixture:
-        """Return all rows of `parts`, in order."""
         names = vars(parts[0])
         return Mixture(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
 
 def shadow_areas(sigmas: FloatArray) -> FloatArray:
-    """Return the integrals (N,) of the shadows of Gaussians of opacity 1, averaged over all directions.
+    """Return the shadows (N,) of opaque Gaussians of standard deviations (N, 3), averaged over all directions.
 
     A Gaussian that is σ wide in every direction has the shadow 2π σ².
-
-    Args:
-        sigmas: (N, 3) standard deviations along the principal axes.
     """
     a, b, c = sigmas.T
     products = np.stack([a * b, b * c, c * a])
@@ -99,7 +80,6 @@ def shadow_areas(sigmas: FloatArray) -> FloatArray:
 
 
 def mixture_of(splat: SplatArrays) -> Mixture:
-    """Return each Gaussian as a group of its own."""
     sigmas = np.exp(np.clip(splat.log_scales.astype(np.float64), *_LOG_SCALES))
     opacities = 0.5 + 0.5 * np.tanh(0.5 * splat.logit_opacities.astype(np.float64))
     axes = matrix_from_quat_xyzw(np.roll(splat.quats_wxyz, -1, axis=1)) * sigmas[:, None]
@@ -112,14 +92,9 @@ def mixture_of(splat: SplatArrays) -> Mixture:
 
 
 def merged(mixture: Mixture, starts: IntArray) -> Mixture:
-    """Return the moments of groups of successive rows.
-
-    Args:
-        mixture: N rows.
-        starts: (G,) the first row of each group, ascending from 0.
-    """
+    """Return the moments of groups of successive rows, given each group's first row (G,), ascending from 0."""
     mass = np.add.reduceat(mixture.mass, starts)
-    group = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(mixture)))
+    group = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(mixture.mass)))
     weight = mixture.mass / mass[group]
     means = np.add.reduceat(weight[:, None] * mixture.means, starts)
     arm = mixture.means - means[group]
@@ -133,14 +108,10 @@ def merged(mixture: Mixture, starts: IntArray) -> Mixture:
 
 
 def drawn(mixture: Mixture, cell_m: float) -> SplatArrays:
-    """Return Gaussians that show the groups of a level.
+    """Return Gaussians that show the groups of a level, which were merged in cells of an edge.
 
     The opacity is mass over area. A group with more mass than an opaque Gaussian of its covariance takes, and one
     too small to be shown, is enlarged evenly; where the limit of growth is met, its mass is cut.
-
-    Args:
-        mixture: N groups.
-        cell_m: edge of the cells in which they were merged.
     """
     variances, axes = np.linalg.eigh(mixture.covariances)
     sigmas = np.sqrt(np.maximum(variances, 1e-12 * np.maximum(variances[:, 2:], 1e-30)))
@@ -203,34 +174,29 @@ class DetailTile:
     children: tuple[DetailTile, ...] = ()
 
     def all(self) -> Iterator[DetailTile]:
-        """Yield the tile and all tiles below it."""
         yield self
         for child in self.children:
             yield from child.all()
 
 
-def build_tiles(parts: Iterable[SplatArrays], extent: SceneExtent, tiler: Tiler) -> DetailTile:
+def build_tiles(parts: Iterable[SplatArrays], box: FloatArray, tiler: Tiler) -> DetailTile:
     """Return the root of the tree of tiles, and write the content of each tile.
 
-    Each part has a tree of its own; as soon as four successive trees stand, they get a common parent. Parts should
-    therefore be neighbours, and in the order of a tree themselves.
+    Each part, of at least one Gaussian, has a tree of its own; as soon as four successive trees stand, they get a
+    common parent. Parts should therefore be neighbours, and in the order of a tree themselves. All values are
+    finite, and the `box` (2, 3) of the scene is that of all parts together, see `scene_box`.
 
     Memory: that of a part, of all Gaussians outside the scene, and of four tiles a level.
-
-    Args:
-        parts: at least one, of at least one Gaussian each, with finite values.
-        extent: of the scene, of all parts together.
-        tiler: makes the tiles.
     """
     inner, outer = _Forest(tiler), []
     for number, part in enumerate(parts):
-        outside = extent.leaves_out(part)
+        outside = _outside(part, box)
         if not outside.all():
-            inner.plant(_Tree(part.select(np.flatnonzero(~outside)), tiler).top(f"s{number}p"))
+            inner.plant(_octree(part.select(np.flatnonzero(~outside)), tiler, f"s{number}p"))
         outer.append(part.select(np.flatnonzero(outside)))
     trees = [("s", tree) for tree in inner.grown()]
     if far := [part for part in outer if len(part)]:
-        trees.append(("f", _Tree(concatenated(far), tiler).top("f")))
+        trees.append(("f", _octree(concatenated(far), tiler, "f")))
     tops = [tiler.overview(name, tree) for name, tree in trees]
     return (tops[0] if len(tops) == 1 else tiler.joined("r", tops)).tile
 
@@ -250,25 +216,19 @@ def best_cut(root: DetailTile, most: int) -> list[DetailTile]:
         shown += coarsest.children
 
 
-@dataclass(frozen=True)
-class SceneExtent:
-    """Box (2, 3) of the scene, least and largest coordinates; what lies far around it is not part of the scene."""
+def scene_box(centers: ArrayLike) -> FloatArray:
+    """Return the box (2, 3), least and largest coordinates, of a scene of Gaussians with these centres (N, 3)."""
+    return np.asarray(np.quantile(np.asarray(centers), _INNER, axis=0))
 
-    box: FloatArray
 
-    @staticmethod
-    def of(centers: ArrayLike) -> SceneExtent:
-        """Return the extent of a scene of Gaussians with these centres (N, 3)."""
-        return SceneExtent(np.quantile(np.asarray(centers), _INNER, axis=0))
-
-    def leaves_out(self, splat: SplatArrays) -> BoolArray:
-        """Return which Gaussians (N,) are no part of the scene itself: far away, or as large as it."""
-        low, high = self.box
-        size_m = float((high - low).max())
-        margin = _OUTSKIRTS * size_m
-        away = ((splat.means < low - margin) | (splat.means > high + margin)).any(axis=1)
-        outside: BoolArray = away | (splat.log_scales.max(axis=1) > np.log(max(_GIANT * size_m, _LEAST_EDGE_M)))
-        return outside
+def _outside(splat: SplatArrays, box: FloatArray) -> BoolArray:
+    """Return which Gaussians (N,) are no part of the scene itself: far away, or as large as it."""
+    low, high = box
+    size_m = float((high - low).max())
+    margin = _OUTSKIRTS * size_m
+    away = ((splat.means < low - margin) | (splat.means > high + margin)).any(axis=1)
+    outside: BoolArray = away | (splat.log_scales.max(axis=1) > np.log(max(_GIANT * size_m, _LEAST_EDGE_M)))
+    return outside
 
 
 def _codes(points: ArrayLike) -> tuple[IntArray, float]:
@@ -278,24 +238,14 @@ def _codes(points: ArrayLike) -> tuple[IntArray, float]:
 
 @dataclass(frozen=True)
 class _Curve:
-    """Moments of Gaussians, sorted along a Z-order curve: a cell is a range of rows.
+    """Moments of N Gaussians, sorted along a Z-order curve by their codes (N,): a cell is a range of rows.
 
-    Attributes:
-        mixture: N rows.
-        codes: (N,) ascending places along the curve.
-        edge_m: edge of the curve's smallest cells; those of level k are 2^k times as large.
+    The curve's smallest cells have an edge; those of level k are 2^k times as large.
     """
 
     mixture: Mixture
     codes: IntArray
     edge_m: float
-
-    @staticmethod
-    def through(mixture: Mixture) -> _Curve:
-        """Return rows sorted along a curve through their means."""
-        codes, edge_m = _codes(mixture.means)
-        order = np.argsort(codes, kind="stable")
-        return _Curve(mixture.select(order), codes[order], edge_m)
 
     def level_of(self, cell_m: float, most: int) -> int:
         """Return the level of the least cells, of this edge at least, that leave no more than so many Gaussians."""
@@ -321,7 +271,6 @@ class _Curve:
         return _Curve(mixture.select(order), codes[order], self.edge_m)
 
     def cell_m(self, level: int) -> float:
-        """Return the edge of the cells of a level."""
         return self.edge_m * 2.0**level
 
     def _cells(self, rows: BoolArray, level: int) -> IntArray:
@@ -339,22 +288,10 @@ class _Shown:
 
 @dataclass(frozen=True)
 class Tiler:
-    """Maker of tiles.
-
-    Attributes:
-        largest_tile: largest number of Gaussians in a tile.
-        write: receives the contents.
-    """
+    """Maker of tiles of a largest number of Gaussians."""
 
     largest_tile: int
     write: WriteTile
-
-    def leaf(self, name: str, content: SplatArrays, codes: IntArray, edge_m: float) -> _Shown:
-        """Return the leaf of some of the Gaussians."""
-        self.write(name, content, is_leaf=True)
-        mixture = mixture_of(content)
-        tile = DetailTile(name, len(content), 0.0, bounds_of(mixture))
-        return _Shown(tile, _Curve(mixture, codes, edge_m), 0.0)
 
     def parent(self, name: str, children: list[_Shown], curve: _Curve) -> _Shown:
         """Return the tile above children, with what they show, `curve`, merged in larger cells."""
@@ -371,7 +308,9 @@ class Tiler:
     def joined(self, name: str, children: list[_Shown]) -> _Shown:
         """Return the tile above tops of different trees."""
         both = Mixture.concatenate([child.curve.mixture for child in children])
-        return self.parent(name, children, _Curve.through(both))
+        codes, edge_m = _codes(both.means)
+        order = np.argsort(codes, kind="stable")
+        return self.parent(name, children, _Curve(both.select(order), codes[order], edge_m))
 
     def overview(self, name: str, top: _Shown) -> _Shown:
         """Return the top of the levels above a tree."""
@@ -391,7 +330,6 @@ class _Forest:
         self._joined = 0
 
     def plant(self, tree: _Shown, height: int = 0) -> None:
-        """Add a tree."""
         if height == len(self._waiting):
             self._waiting.append([])
         row = self._waiting[height]
@@ -412,41 +350,37 @@ class _Forest:
         return self._tiler.joined(f"s{self._joined}j", trees)
 
 
-class _Tree:
-    """Octree of Gaussians."""
+def _octree(splat: SplatArrays, tiler: Tiler, name: str) -> _Shown:
+    codes, edge_m = _codes(splat.means)
+    rows = np.argsort(codes, kind="stable")
+    codes = codes[rows]
 
-    def __init__(self, splat: SplatArrays, tiler: Tiler) -> None:
-        codes, self._edge_m = _codes(splat.means)
-        self._rows = np.argsort(codes, kind="stable")
-        self._codes = codes[self._rows]
-        self._splat, self._tiler = splat, tiler
-
-    def top(self, name: str) -> _Shown:
-        """Return the tile of all."""
-        return self._cell(name, 0, len(self._rows), BITS)
-
-    def _cell(self, name: str, first: int, last: int, height: int) -> _Shown:
+    def cell(name: str, first: int, last: int, height: int) -> _Shown:
         """Return the tile of rows `first` … `last`, which lie in one cell of 2^height cells a side."""
-        if last - first <= self._tiler.largest_tile:
-            rows = slice(first, last)
-            content = self._splat.select(self._rows[rows])
-            return self._tiler.leaf(name, content, self._codes[rows], self._edge_m)
-        ends = self._split(first, last, height)
+        if last - first <= tiler.largest_tile:
+            content = splat.select(rows[first:last])
+            tiler.write(name, content, is_leaf=True)
+            mixture = mixture_of(content)
+            tile = DetailTile(name, len(content), 0.0, bounds_of(mixture))
+            return _Shown(tile, _Curve(mixture, codes[first:last], edge_m), 0.0)
+        ends = octants(first, last, height)
         while len(ends) == 2 and height > 0:  # a single child: look into it
             height -= 1
-            ends = self._split(first, last, height)
+            ends = octants(first, last, height)
         children = [
-            self._cell(f"{name}{number}", *span, max(height - 1, 0))
+            cell(f"{name}{number}", *span, max(height - 1, 0))
             for number, span in enumerate(itertools.pairwise(ends))
         ]
         mixture = Mixture.concatenate([child.curve.mixture for child in children])
-        codes = np.concatenate([child.curve.codes for child in children])
-        return self._tiler.parent(name, children, _Curve(mixture, codes, self._edge_m))
+        places = np.concatenate([child.curve.codes for child in children])
+        return tiler.parent(name, children, _Curve(mixture, places, edge_m))
 
-    def _split(self, first: int, last: int, height: int) -> list[int]:
+    def octants(first: int, last: int, height: int) -> list[int]:
         """Return where the octants that are not empty begin, and `last`; equal places are cut into equal parts."""
         if height == 0:
-            parts = math.ceil((last - first) / self._tiler.largest_tile)
+            parts = math.ceil((last - first) / tiler.largest_tile)
             return [first + (last - first) * part // parts for part in range(parts + 1)]
-        octants = self._codes[first:last] >> 3 * (height - 1)
-        return [first, *(first + 1 + np.flatnonzero(np.diff(octants))).tolist(), last]
+        number = codes[first:last] >> 3 * (height - 1)
+        return [first, *(first + 1 + np.flatnonzero(np.diff(number))).tolist(), last]
+
+    return cell(name, 0, len(rows), BITS)

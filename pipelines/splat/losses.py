@@ -1,14 +1,11 @@
-"""The photometric loss of 3D Gaussian Splatting (doi 10.1145/3592433, eq. 7): 0.8 · L1 + 0.2 · (1 − SSIM).
+"""Losses of Gaussians: by photographs, by free space, and by planes that were measured.
 
-SSIM (doi 10.1109/TIP.2003.819861) has the 11×11 Gaussian window, σ = 1.5 px, zeros around the image. On a CPU
-value and gradient come from one pass of fused kernels: torch's convolutions cost more than the rasteriser.
+The photometric loss is that of 3D Gaussian Splatting (doi 10.1145/3592433, eq. 7): 0.8 · L1 + 0.2 · (1 − SSIM).
+SSIM (doi 10.1109/TIP.2003.819861) has the 11×11 Gaussian window, σ = 1.5 px, zeros around the image. On a CPU value
+and gradient come from one pass of fused kernels: torch's convolutions cost more than the rasteriser.
 
 A mask selects the pixels that count. The others are zero in both images, like pixels outside the image: they add
 neither to L1 nor to SSIM's mean, and a window that reaches over them sees the same zeros as at the image's edge.
-
-Free space: cells of the scene in which a scanner's beams met nothing.
-
-Attraction of Gaussians to planes that were measured, with a confidence for each Gaussian.
 
 GeomGS (arXiv 2501.13417) trains a confidence of each Gaussian together with its distance to LiDAR. Here the
 confidence is eliminated: c d²/s² + c − 1 − ln c is least for c = 1/(1 + d²/s²), and is then ln(1 + d²/s²). No
@@ -35,27 +32,15 @@ from pipelines.splat.gaussians import Gaussians
 SSIM_WEIGHT = 0.2
 
 
-@dataclass(frozen=True)
-class ImageSimilarity:
-    """Mean absolute difference and mean SSIM of two images over the pixels that count (channels averaged)."""
-
-    l1: float
-    ssim: float
-
-
 def photometric_loss(
     rendered: Tensor, target: Tensor, mask: Tensor | None = None, *, ssim_weight: float = SSIM_WEIGHT
 ) -> Tensor:
     """Return (1 − w) · mean|rendered − target| + w · (1 − mean SSIM), differentiable in `rendered`.
 
     Args:
-        rendered: (H, W, 3) float32 or float64.
-        target: (H, W, 3), same type and device.
+        rendered, target: (H, W, 3) float32 or float64, of one type and on one device.
         mask: (H, W) bool, True where a pixel counts; None: all do.
         ssim_weight: w.
-
-    Returns:
-        A scalar of the images' type; 0 if no pixel counts.
 
     Raises:
         ValueError: shapes, types or devices do not agree.
@@ -68,31 +53,25 @@ def photometric_loss(
     return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim)
 
 
-def image_similarity(image: Tensor, target: Tensor, mask: Tensor | None = None) -> ImageSimilarity:
-    """Return L1 and SSIM of two images (H, W, 3), without gradient; see `photometric_loss`.
-
-    Raises:
-        ValueError: shapes, types or devices do not agree.
-    """
+def image_similarity(image: Tensor, target: Tensor, mask: Tensor | None = None) -> tuple[float, float]:
+    """Return mean L1 and SSIM of two images, without gradient; arguments and errors as of `photometric_loss`."""
     _check(image, target, mask)
     with torch.no_grad():
         if image.device.type == "cpu":
-            sums, count, _ = _forward(image, target, mask)
-            return ImageSimilarity(sums[0] / count, sums[1] / count)
+            absolute, similarity, count, _ = _by_kernels(image, target, mask)
+            return absolute / count, similarity / count
         l1, ssim = _terms_by_convolution(image, target, mask)
-        return ImageSimilarity(float(l1), float(ssim))
+        return float(l1), float(ssim)
 
 
 class _Photometric(torch.autograd.Function):
-    """Value and gradient in one pass: backward only scales the gradient."""
-
     @staticmethod
     def forward(ctx: Any, rendered: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float) -> Tensor:
-        sums, count, partials = _forward(rendered, target, mask)
-        if ctx.needs_input_grad[0]:
-            scales = ((1 - ssim_weight) / count, ssim_weight / count)
-            ctx.save_for_backward(_gradient(rendered, target, mask, partials, scales))
-        loss = (1 - ssim_weight) * sums[0] / count + ssim_weight * (1 - sums[1] / count)
+        wanted = ssim_weight if ctx.needs_input_grad[0] else None
+        absolute, similarity, count, gradient = _by_kernels(rendered, target, mask, wanted)
+        if gradient is not None:
+            ctx.save_for_backward(gradient)
+        loss = (1 - ssim_weight) * absolute / count + ssim_weight * (1 - similarity / count)
         return rendered.new_tensor(loss)
 
     @staticmethod
@@ -101,50 +80,27 @@ class _Photometric(torch.autograd.Function):
         return gradient * grad_outputs[0], None, None, None
 
 
-def _forward(
-    rendered: Tensor, target: Tensor, mask: Tensor | None
-) -> tuple[tuple[float, float], int, np.ndarray[Any, Any]]:
-    """Return Σ|x − y| and Σ SSIM, the number of values in these sums, and SSIM's derivatives for `_gradient`."""
-    x, y, valid = _rows(rendered), _rows(target), _valid(mask)
-    partials = np.empty((3, *x.shape), dtype=x.dtype)
-    sums = np.empty((len(x), 2))
-    taps, c1, c2 = kernels.gaussian_taps(x.dtype), x.dtype.type(kernels.C1), x.dtype.type(kernels.C2)
-    kernels.ssim_forward(x, y, valid, taps, c1, c2, _bands(len(x)), partials, sums)
-    count = x.size if mask is None else 3 * int(valid.sum())
-    l1, ssim = sums.sum(axis=0)
-    # Without pixels that count, there is no difference: SSIM is 1.
-    return ((float(l1), float(ssim)), count, partials) if count else ((0.0, 1.0), 1, partials)
-
-
-def _gradient(
-    rendered: Tensor,
-    target: Tensor,
-    mask: Tensor | None,
-    partials: np.ndarray[Any, Any],
-    scales: tuple[float, float],
-) -> Tensor:
-    """Return ∂(scales[0] · Σ|x − y| − scales[1] · Σ SSIM)/∂rendered."""
-    x, y = _rows(rendered), _rows(target)
-    gradient = torch.empty_like(rendered, memory_format=torch.contiguous_format)
-    kind = x.dtype.type
-    kernels.ssim_backward(
-        x, y, _valid(mask), partials, kernels.gaussian_taps(x.dtype), kind(scales[0]), kind(scales[1]),
-        _bands(len(x)), gradient.numpy().reshape(x.shape),
-    )  # fmt: skip
-    return gradient
-
-
-def _rows(image: Tensor) -> np.ndarray[Any, Any]:
-    return image.detach().contiguous().numpy().reshape(image.shape[0], -1)
-
-
-def _valid(mask: Tensor | None) -> np.ndarray[Any, Any]:
-    return np.empty((0, 0), dtype=np.bool_) if mask is None else mask.contiguous().numpy()
-
-
-def _bands(height: int) -> int:
+def _by_kernels(
+    rendered: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float | None = None
+) -> tuple[float, float, int, Tensor | None]:
+    """Return Σ|x − y|, Σ SSIM, the number of values in these sums, and the loss's gradient if it has a weight."""
+    x, y = (image.detach().contiguous().numpy().reshape(len(image), -1) for image in (rendered, target))
+    valid = np.empty((0, 0), dtype=np.bool_) if mask is None else mask.contiguous().numpy()
+    kind, taps = x.dtype.type, kernels.gaussian_taps(x.dtype)
     # A band blurs ten rows that its neighbours blur, too: no more bands than threads, and none of a few rows.
-    return max(1, min(numba.get_num_threads(), height // kernels.WINDOW))
+    bands = max(1, min(numba.get_num_threads(), len(x) // kernels.WINDOW))
+    partials, sums = np.empty((3, *x.shape), dtype=x.dtype), np.empty((len(x), 2))
+    kernels.ssim_forward(x, y, valid, taps, kind(kernels.C1), kind(kernels.C2), bands, partials, sums)
+    count = x.size if mask is None else 3 * int(valid.sum())
+    # Without pixels that count, there is no difference: SSIM is 1.
+    absolute, similarity = sums.sum(axis=0).tolist() if count else (0.0, 1.0)
+    count = max(count, 1)
+    if ssim_weight is None:
+        return absolute, similarity, count, None
+    gradient = torch.empty_like(rendered, memory_format=torch.contiguous_format)
+    scales = kind((1 - ssim_weight) / count), kind(ssim_weight / count)
+    kernels.ssim_backward(x, y, valid, partials, taps, *scales, bands, gradient.numpy().reshape(x.shape))
+    return absolute, similarity, count, gradient
 
 
 def _terms_by_convolution(image: Tensor, target: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -181,7 +137,7 @@ def _check(rendered: Tensor, target: Tensor, mask: Tensor | None) -> None:
 
 @dataclass(frozen=True)
 class FreeSpace:
-    """Grid in `model`.
+    """Cells of the scene in which a scanner's beams met nothing, as a grid in `model`.
 
     Attributes:
         low_in_model: (3,) low corner in metres.
@@ -193,19 +149,8 @@ class FreeSpace:
     cell_m: float
     free: BoolArray
 
-    def share(self) -> float:
-        """Return the share of the cells that are free, 0 … 1."""
-        return float(self.free.mean())
-
 
 class FreeSpaceLoss:
-    """Loss of Gaussians in free space.
-
-    Args:
-        space: the grid.
-        device: of the Gaussians.
-    """
-
     def __init__(self, space: FreeSpace, device: torch.device) -> None:
         self._low = torch.tensor(space.low_in_model, dtype=torch.float32, device=device)
         self._free = torch.from_numpy(np.ascontiguousarray(space.free)).to(device)
@@ -231,14 +176,9 @@ _AROUND = np.stack(np.meshgrid(*3 * [[-1, 0, 1]], indexing="ij"), axis=-1).resha
 
 @dataclass(frozen=True)
 class MeasuredPlanes:
-    """P planes in `model`.
+    """P planes in `model`: positions (P, 3) in metres, unit normals (P, 3), confidences (P,) 0 … 1.
 
-    Attributes:
-        position: (P, 3) metres.
-        normal: (P, 3) unit vectors.
-        confidence: (P,) 0 … 1.
-        scale_m: distance s at which a Gaussian's confidence is a half.
-        cell_m: reach of the planes; a Gaussian two cells away belongs to none.
+    A Gaussian's confidence is a half at the distance s = `scale_m`; one two cells away belongs to no plane.
     """
 
     position: FloatArray
@@ -249,12 +189,7 @@ class MeasuredPlanes:
 
 
 class PlaneAttraction:
-    """Loss of Gaussians beside the planes that they lie near.
-
-    Args:
-        planes: at least one.
-        device: of the Gaussians.
-    """
+    """Loss of Gaussians beside the planes, one at least, that they lie near."""
 
     def __init__(self, planes: MeasuredPlanes, device: torch.device) -> None:
         low = planes.position.min(axis=0) - planes.cell_m  # no cell around a plane has a negative number
@@ -275,17 +210,18 @@ class PlaneAttraction:
         """
         means = gaussians.means[visible]
         cell = ((means.detach() - self._corner) / self._cell_m).floor().long()
-        key = (cell[:, 0] << 2 * _SIDE_BITS) + (cell[:, 1] << _SIDE_BITS) + cell[:, 2]
+        key: Tensor = _keys(cell)
         row = torch.searchsorted(self._key, key).clamp_max(len(self._key) - 1)
         beside = (self._key[row] == key) & (cell >= 0).all(dim=1)
         off = ((means - self._place[row]) * self._normal[row]).sum(dim=1) / self._scale_m
         opacity = torch.sigmoid(gaussians.logit_opacities[visible]).reshape(len(visible)).detach()
-        return (opacity * self._confidence[row] * beside * torch.log1p(off.square())).sum() / max(len(visible), 1)
+        weight = opacity * self._confidence[row] * beside
+        return (weight * torch.log1p(off.square())).sum() / max(len(visible), 1)
 
 
-def _keys(cell: IntArray) -> IntArray:
-    """Return the keys of cells (N, 3); sums of keys are those of the sums."""
-    return np.asarray((cell[:, 0] << 2 * _SIDE_BITS) + (cell[:, 1] << _SIDE_BITS) + cell[:, 2])
+def _keys(cell: Any) -> Any:
+    """Return the keys of cells (N, 3), an array or a tensor; sums of keys are those of the sums."""
+    return (cell[:, 0] << 2 * _SIDE_BITS) + (cell[:, 1] << _SIDE_BITS) + cell[:, 2]
 
 
 def _cells(key: IntArray) -> IntArray:

@@ -31,10 +31,9 @@ class TrainingSize:
     """Sizes on which the memory of a training depends.
 
     Attributes:
-        gaussians: largest number of Gaussians.
+        gaussians: largest number.
         camera: of the largest image that is rendered: a photograph, or a window of it.
-        sh_degree: of the stored spherical harmonics.
-        cameras: number of cameras whose poses training refines together.
+        cameras: number of those whose poses training refines together.
         photograph_px: pixels of the largest photograph at its training size; 0: no larger than `camera`.
     """
 
@@ -47,20 +46,20 @@ class TrainingSize:
 
 def predicted_peak_bytes(size: TrainingSize) -> int:
     """Return the bytes that training adds to the process at its peak, assuming that a view sees all Gaussians."""
+    from pipelines.splat.rasterizer.cpu import predicted_bytes
+
     width = 11 + 3 * coefficient_count(size.sh_degree)
     poses = predicted_basis_bytes(size.cameras)
     images = size.camera.width * size.camera.height * _IMAGE_FLOATS * _FLOAT
-    per_gaussian = max(_COPIES * width * _FLOAT, 4 * width * _FLOAT + _raster_bytes()) + _ROW_BYTES
+    # Of the CPU rasteriser, for one visible Gaussian on six tiles; the GPU's needs less.
+    raster = predicted_bytes(1000, Pinhole(1, 1, 1.0, 1.0, 0.5, 0.5), 0) // 1000
+    per_gaussian = max(_COPIES * width * _FLOAT, 4 * width * _FLOAT + raster) + _ROW_BYTES
     training = size.gaussians * per_gaussian + images + poses
     return max(training, size.photograph_px * _UNDISTORTED_BYTES) + _FIXED_BYTES
 
 
 def require_memory(size: TrainingSize, free_bytes: int | None) -> None:
-    """Refuse a training that will not fit.
-
-    Args:
-        size: of the training.
-        free_bytes: from `free_memory_bytes`; None: unknown, no training is refused.
+    """Refuse a training that will not fit into the memory of `free_memory_bytes`; None: none is refused.
 
     Raises:
         ResourceError: states the memory needed, and a number of Gaussians that would fit.
@@ -82,12 +81,7 @@ def require_memory(size: TrainingSize, free_bytes: int | None) -> None:
 
 
 def fitting_gaussians(size: TrainingSize, free_bytes: int) -> int:
-    """Return a number of Gaussians, in thousands, that fits into the free memory at a training of another number.
-
-    Args:
-        size: of the training, with at least one Gaussian.
-        free_bytes: from `free_memory_bytes`.
-    """
+    """Return a number of Gaussians, in thousands, that fits into the free memory at a training of others."""
     fixed = predicted_peak_bytes(replace(size, gaussians=0, photograph_px=0))
     each = (predicted_peak_bytes(replace(size, photograph_px=0)) - fixed) / max(size.gaussians, 1)
     return max(int((USABLE * free_bytes - fixed) / each), 0) // 1000 * 1000
@@ -98,14 +92,6 @@ def free_memory_bytes(device: torch.device) -> int | None:
     if device.type == "cuda":
         return int(torch.cuda.mem_get_info(device)[0])
     return free_main_memory_bytes()
-
-
-def _raster_bytes() -> int:
-    """Return the bytes of the CPU rasteriser for one visible Gaussian on six tiles; the GPU's needs less."""
-    from pipelines.splat.rasterizer.cpu import predicted_bytes
-
-    single_pixel = Pinhole(1, 1, 1.0, 1.0, 0.5, 0.5)
-    return predicted_bytes(1000, single_pixel, 0) // 1000
 
 
 def _gib(size: float) -> str:

@@ -1,10 +1,8 @@
-"""Image quality as the splatting literature reports it: PSNR and SSIM of images as they are shown.
+"""Image quality as the splatting literature reports it: PSNR, SSIM, and LPIPS (doi 10.1109/CVPR.2018.00068).
 
-LPIPS (doi 10.1109/CVPR.2018.00068) with VGG-16 features, as the splatting literature reports it.
-
-The weights are not part of the package. An NPZ file holds them: a TorchScript or `.pth` file would carry code or
-pickles. The arrays have the names of the published network's state. With the `lpips` package and its weights
-installed, these lines write the file:
+The VGG-16 weights of LPIPS are not part of the package. An NPZ file holds them: a TorchScript or `.pth` file would
+carry code or pickles. The arrays have the names of the published network's state. With the `lpips` package and its
+weights installed, these lines write the file:
 
     import lpips, numpy
     numpy.savez("lpips_vgg.npz", **{k: v.numpy() for k, v in lpips.LPIPS(net="vgg").state_dict().items()})
@@ -31,10 +29,8 @@ MAX_PSNR_DB = 100.0
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     """Return the peak signal-to-noise ratio in dB, of values from 0 to 1 over all channels; at most 100 dB.
 
-    Args:
-        image: (H, W, 3); clamped to 0 … 1, as on a display.
-        target: (H, W, 3).
-        mask: (H, W) bool, True where a pixel counts; None: all do.
+    The image (H, W, 3) is clamped to 0 … 1, as on a display. The `mask` (H, W) tells the pixels that count; None:
+    all.
 
     Raises:
         ValueError: shapes do not agree, or no pixel counts.
@@ -48,18 +44,9 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
 
 
 def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-    """Return the mean SSIM with the 11×11 Gaussian window of `pipelines.splat.losses`, 1 for equal images.
-
-    Args:
-        image: (H, W, 3); clamped to 0 … 1, as on a display.
-        target: (H, W, 3).
-        mask: (H, W) bool, True where a pixel counts; None: all do.
-
-    Raises:
-        ValueError: shapes do not agree, or no pixel counts.
-    """
+    """Return the mean SSIM with the window of `pipelines.splat.losses`; arguments and errors as of `psnr`."""
     _check(image, target, mask)
-    return image_similarity(image.detach().clamp(0, 1), target, mask).ssim
+    return image_similarity(image.detach().clamp(0, 1), target, mask)[1]
 
 
 def _check(image: Tensor, target: Tensor, mask: Tensor | None) -> None:
@@ -78,14 +65,13 @@ _SMALLEST_PX = 16  # four poolings
 
 
 class Lpips:
-    """Perceptual distance of images; weights are loaded once."""
+    """Perceptual distance of images; the weights are loaded once.
+
+    Raises:
+        InputError: not an NPZ file of such weights.
+    """
 
     def __init__(self, weights: Path) -> None:
-        """Read the weights.
-
-        Raises:
-            InputError: not an NPZ file of such weights.
-        """
         arrays = read_npz(weights, tuple(_shapes()))
         for name, shape in _shapes().items():
             if arrays[name].shape != shape or not np.isfinite(arrays[name]).all():
@@ -93,42 +79,36 @@ class Lpips:
         self._weights = {name: torch.as_tensor(array, dtype=torch.float32) for name, array in arrays.items()}
 
     def __call__(self, image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-        """Return the distance of two images (H, W, 3) with values from 0 to 1.
+        """Return the distance of two images (H, W, 3) with values from 0 to 1, of 16 px or more.
 
         Features see neighbourhoods, so that pixels cannot be left out. Where the `mask` (H, W) is False, the image
         takes the target's pixels instead.
-
-        Raises:
-            ValueError: other shapes, or smaller than 16 px.
         """
         if image.shape != target.shape or image.ndim != 3 or min(image.shape[:2]) < _SMALLEST_PX:
             raise ValueError(f"expected two images (H, W, 3) of 16 px or more, got {tuple(image.shape)}")
         if mask is not None:
             image = torch.where(mask[:, :, None], image, target)
         with torch.no_grad():
-            layers = zip(self._features(image), self._features(target), strict=True)
+            layers = zip(_features(image, self._weights), _features(target, self._weights), strict=True)
             distances = [
                 functional.conv2d((x - y) ** 2, self._weights[f"lin{i}.model.1.weight"]).mean()
                 for i, (x, y) in enumerate(layers)
             ]
         return float(torch.stack(distances).sum())
 
-    def _features(self, image: Tensor) -> list[Tensor]:
-        """Return unit-length features of the five slices."""
-        planes = 2 * image.detach().cpu().float().clamp(0, 1).permute(2, 0, 1)[None] - 1
-        x = (planes - torch.tensor(_SHIFT).view(1, 3, 1, 1)) / torch.tensor(_SCALE).view(1, 3, 1, 1)
-        features = []
-        for number, layers in enumerate(_SLICES, start=1):
-            if number > 1:
-                x = functional.max_pool2d(x, 2)
-            for layer in layers:
-                name = f"net.slice{number}.{layer}"
-                convolved = functional.conv2d(
-                    x, self._weights[f"{name}.weight"], self._weights[f"{name}.bias"], padding=1
-                )
-                x = convolved.relu()
-            features.append(x / (x.square().sum(dim=1, keepdim=True).sqrt() + 1e-10))
-        return features
+
+def _features(image: Tensor, weights: dict[str, Tensor]) -> list[Tensor]:
+    planes = 2 * image.detach().cpu().float().clamp(0, 1).permute(2, 0, 1)[None] - 1
+    x = (planes - torch.tensor(_SHIFT).view(1, 3, 1, 1)) / torch.tensor(_SCALE).view(1, 3, 1, 1)
+    features = []
+    for number, layers in enumerate(_SLICES, start=1):
+        if number > 1:
+            x = functional.max_pool2d(x, 2)
+        for layer in layers:
+            name = f"net.slice{number}.{layer}"
+            x = functional.conv2d(x, weights[f"{name}.weight"], weights[f"{name}.bias"], padding=1).relu()
+        features.append(x / (x.square().sum(dim=1, keepdim=True).sqrt() + 1e-10))
+    return features
 
 
 def _shapes() -> dict[str, tuple[int, ...]]:

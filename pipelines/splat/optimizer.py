@@ -5,16 +5,15 @@ falls exponentially over the training. Unlike there, the other rates fall too, i
 Gaussians come to rest, instead of moving about the place where the photographs have them.
 
 Rows are added, and seen, at different times. Every row therefore counts its own updates, for the bias correction
-that its moments need. With all rows in every step the result is plain Adam.
-
-Numba kernel of Adam over rows of the Gaussians' tensors: all tensors of a row in one visit.
-
-A single view sees few of the Gaussians. Visiting only the rows that it sees saves the memory traffic that dominates
-Adam, and leaves the moments of the other rows alone.
+that its moments need. With all rows in every step the result is plain Adam. Visiting only the rows that a view
+sees,
+with all tensors of a row in one visit, saves the memory traffic that dominates Adam, and leaves the other moments
+alone.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,10 +44,8 @@ def adam_rows(
 
     Args:
         rows: (V,) rows to update, each at most once.
-        parameters: tuple of (N, Dᵢ) arrays, float32.
-        gradients: tuple of (N, Dᵢ) arrays, float32.
-        exp_avg: (N, D) first moments, D = Σ Dᵢ.
-        exp_avg_sq: (N, D) second moments.
+        parameters, gradients: tuples of (N, Dᵢ) arrays, float32.
+        exp_avg, exp_avg_sq: (N, D) first and second moments, D = Σ Dᵢ.
         steps: (N,) int32, number of updates of each row so far.
         rates: (D,) learning rates.
         corrections: (T, 2), 1 / (1 − β₁ᵗ) and 1 / √(1 − β₂ᵗ); the last row serves all later steps.
@@ -96,17 +93,11 @@ class LearningRates:
     """Learning rates and moments.
 
     Attributes:
-        means: first rate of the centres, in scene extents.
-        means_final: their last rate, in scene extents.
-        quats_wxyz: rate of the rotations.
-        log_scales: rate of the logarithmic scales.
-        logit_opacities: rate of the opacities' logits.
-        sh_dc: rate of the constant colour.
-        sh_rest: rate of the direction-dependent colour.
+        means, means_final: first and last rate of the centres, in scene extents.
+        sh_dc, sh_rest: rates of the constant and of the direction-dependent colour.
         settling_from: fraction of the training from which all rates but the centres' fall exponentially,
         settled: and the share of them that is left at the end.
-        beta1: decay of the first moment.
-        beta2: decay of the second moment.
+        beta1, beta2: decay of the first and of the second moment.
         eps: added to the denominator; tiny, because these gradients are tiny.
     """
 
@@ -138,56 +129,39 @@ class LearningRates:
             **{name: min(ratio**power, most) * getattr(cls(), name) for name, (power, most) in _RAISED.items()}
         )
 
-    def means_at(self, progress: float) -> float:
-        """Return the rate of the centres, in scene extents, after the fraction `progress` of the training."""
-        return float(self.means ** (1 - progress) * self.means_final**progress)
-
-    def settling(self, progress: float) -> float:
-        """Return the factor on all other rates after the fraction `progress` of the training."""
-        return float(self.settled ** (max(progress - self.settling_from, 0.0) / (1 - self.settling_from)))
-
 
 class GaussianAdam:
-    """Gaussians under training and their moments.
+    """Gaussians under training and their moments, of which there are none at first.
 
     Attributes:
         gaussians: leaf tensors that require gradients; replaced by `rearrange`.
+        extent_m: size of the scene, the unit of the centres' rate.
+        iterations: length of the training, over which that rate falls.
+        rates: by default those of 3DGS, raised for trainings shorter than its own.
         rate_factor: of all learning rates; lowered after a divergence.
     """
 
     def __init__(
         self, gaussians: Gaussians, extent_m: float, iterations: int, rates: LearningRates | None = None
     ) -> None:
-        """Start without moments.
-
-        Args:
-            gaussians: N Gaussians, float32; copied.
-            extent_m: size of the scene, the unit of the centres' rate.
-            iterations: length of the training, over which that rate falls.
-            rates: learning rates (default: those of 3DGS, raised for trainings shorter than its own).
-        """
         self.rates = rates or LearningRates.for_iterations(iterations)
         self.extent_m = extent_m
         self.iterations = iterations
         self.rate_factor = 1.0
         self.gaussians = _leaves(gaussians)
-        count, width = len(gaussians), sum(_width(tensor) for tensor in gaussians.tensors().values())
+        count, width = len(gaussians), sum(math.prod(values.shape[1:]) for values in gaussians.tensors().values())
         self._exp_avg = gaussians.means.new_zeros(count, width)
         self._exp_avg_sq = torch.zeros_like(self._exp_avg)
         self._steps = torch.zeros(count, dtype=torch.int32, device=gaussians.means.device)
         self._corrections = _bias_corrections(self.rates).to(gaussians.means.device)
 
     def zero_grad(self) -> None:
-        """Drop the gradients."""
         for tensor in self.gaussians.tensors().values():
             tensor.grad = None
 
     def step(self, iteration: int, rows: Tensor | None = None) -> None:
-        """Update the Gaussians by the tensors' `.grad`.
-
-        Args:
-            iteration: of the training, for the falling rate.
-            rows: (V,) int64 rows to update, without repetition (a render's visible Gaussians); None: all.
+        """Update the rows (V,) int64 without repetition (a render's visible Gaussians; None: all) by the tensors'
+        `.grad`.
 
         Raises:
             ValueError: a tensor has no gradient.
@@ -206,14 +180,14 @@ class GaussianAdam:
 
     def means_rate(self, iteration: int) -> float:
         """Return the learning rate of the centres, in metres."""
-        return self.rate_factor * self.rates.means_at(self._progress(iteration)) * self.extent_m
+        progress = min(iteration / max(self.iterations, 1), 1.0)
+        falling = float(self.rates.means ** (1 - progress) * self.rates.means_final**progress)
+        return self.rate_factor * falling * self.extent_m
 
     def rearrange(self, gaussians: Gaussians, source: Tensor) -> None:
-        """Replace all rows: surviving rows keep their moments, new rows start without.
+        """Replace all rows by N' Gaussians, whose `source` (N',) is their former row, or −1.
 
-        Args:
-            gaussians: N' Gaussians; copied.
-            source: (N',) int64, the former row of each, or −1 for a new row.
+        Surviving rows keep their moments, new rows start without.
         """
         old = source >= 0
         index = source.clamp_min(0)
@@ -235,18 +209,11 @@ class GaussianAdam:
         return {name: tensor.clone() for name, tensor in self._moments().items()}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Restore the moments of `state`.
-
-        Raises:
-            ValueError: they belong to Gaussians of another number or degree.
-        """
+        """Restore the moments of `state`; a ValueError says that their number or degree is another."""
         for name, tensor in self._moments().items():
             if name not in state or state[name].shape != tensor.shape:
                 raise ValueError(f"{name}: expected a tensor of shape {tuple(tensor.shape)}")
             tensor.copy_(state[name])
-
-    def _progress(self, iteration: int) -> float:
-        return min(max(iteration / max(self.iterations, 1), 0.0), 1.0)
 
     def _moments(self) -> dict[str, Tensor]:
         return {"exp_avg": self._exp_avg, "exp_avg_sq": self._exp_avg_sq, "steps": self._steps}
@@ -254,30 +221,35 @@ class GaussianAdam:
     def _columns(self) -> dict[str, slice]:
         columns, first = {}, 0
         for name, tensor in self.gaussians.tensors().items():
-            columns[name] = slice(first, first + _width(tensor))
-            first += _width(tensor)
+            columns[name] = slice(first, first + math.prod(tensor.shape[1:]))
+            first = columns[name].stop
         return columns
 
     def _column_rates(self, iteration: int) -> Tensor:
-        rates, columns = self._exp_avg.new_empty(self._exp_avg.shape[1]), self._columns()
-        rates[columns["quats_wxyz"]] = self.rates.quats_wxyz
-        rates[columns["log_scales"]] = self.rates.log_scales
-        rates[columns["logit_opacities"]] = self.rates.logit_opacities
-        rates[columns["sh"]] = self.rates.sh_rest
-        rates[columns["sh"]][:3] = self.rates.sh_dc
-        rates *= self.rate_factor * self.rates.settling(self._progress(iteration))
+        own, columns = self.rates, self._columns()
+        rates = self._exp_avg.new_empty(self._exp_avg.shape[1])
+        for name in ("quats_wxyz", "log_scales", "logit_opacities"):
+            rates[columns[name]] = getattr(own, name)
+        rates[columns["sh"]] = own.sh_rest
+        rates[columns["sh"]][:3] = own.sh_dc
+        progress = min(iteration / max(self.iterations, 1), 1.0)
+        settling = own.settled ** (max(progress - own.settling_from, 0.0) / (1 - own.settling_from))
+        rates *= self.rate_factor * settling
         rates[columns["means"]] = self.means_rate(iteration)
         return rates
 
     def _step_by_kernel(self, iteration: int, rows: Tensor) -> None:
-
         tensors = self.gaussians.tensors().values()
+        parameters, gradients = (
+            tuple(part.detach().contiguous().numpy().reshape(len(part), -1) for part in parts if part is not None)
+            for parts in (tensors, [tensor.grad for tensor in tensors])
+        )
         real, rates = np.float32, self.rates
         betas = np.array([rates.beta1, 1 - rates.beta1, rates.beta2, 1 - rates.beta2], dtype=real)
         adam_rows(
             rows.contiguous().numpy(),
-            tuple(_matrix(tensor) for tensor in tensors),
-            tuple(_matrix(tensor.grad) for tensor in tensors if tensor.grad is not None),
+            parameters,
+            gradients,
             self._exp_avg.numpy(),
             self._exp_avg_sq.numpy(),
             self._steps.numpy(),
@@ -309,14 +281,6 @@ class GaussianAdam:
 def _leaves(gaussians: Gaussians) -> Gaussians:
     copies = {name: tensor.detach().clone().contiguous() for name, tensor in gaussians.tensors().items()}
     return Gaussians(**{name: tensor.requires_grad_() for name, tensor in copies.items()})
-
-
-def _width(tensor: Tensor) -> int:
-    return int(np.prod(tensor.shape[1:], dtype=np.int64))
-
-
-def _matrix(tensor: Tensor) -> np.ndarray[Any, Any]:
-    return tensor.detach().contiguous().numpy().reshape(len(tensor), -1)
 
 
 def _bias_corrections(rates: LearningRates) -> Tensor:

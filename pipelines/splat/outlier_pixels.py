@@ -20,41 +20,29 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+_CELL, _LEAST_CELL_PX = 1 / 40, 8  # side of a cell, as a share of the photograph's longer side, and its lower limit
+_QUANTILE = 0.9  # of the differences of a view's cells
+_TIMES = 8.0  # its multiple from which a cell is an outlier
+_LEAST = 0.05  # lower limit of that, of colours 0 … 1
+_MEMORY = 0.95  # weight of the earlier views in the running quantile
+_AMNESTY = 5  # all pixels count in every view with such a number
+
 
 @dataclass(frozen=True)
 class OutlierSettings:
     """Settings of `OutlierPixels`.
 
     Attributes:
-        cell: side of a cell, as a share of the photograph's longer side,
-        least_px: and its lower limit in pixels.
-        quantile: of the differences of the cells of a view,
-        times: its multiple from which a cell is an outlier,
-        least: and the lower limit of that, of colours 0 … 1.
         most: share of the cells of a view that are outliers at most, before those around them are added.
-        memory: weight of the earlier views in the running quantile.
         views: number of views before the first outlier.
-        amnesty: all pixels count in every view with such a number.
     """
 
-    cell: float = 1 / 40
-    least_px: int = 8
-    quantile: float = 0.9
-    times: float = 8.0
-    least: float = 0.05
     most: float = 0.01
-    memory: float = 0.95
     views: int = 50
-    amnesty: int = 5
 
 
 class OutlierPixels:
-    """Running quantile of the differences, and the pixels beyond it.
-
-    Args:
-        device: of the images.
-        settings: of the rule.
-    """
+    """Running quantile of the differences, and the pixels beyond it."""
 
     def __init__(self, device: torch.device, settings: OutlierSettings | None = None) -> None:
         self.settings = settings or OutlierSettings()
@@ -65,36 +53,28 @@ class OutlierPixels:
     def inliers(self, rendered: Tensor, target: Tensor, mask: Tensor | None, longest_px: int) -> Tensor | None:
         """Return the pixels (H, W) of the mask that are no outliers, and add the view to the running quantile.
 
-        Args:
-            rendered: (H, W, 3).
-            target: (H, W, 3).
-            mask: (H, W) bool, the pixels that count; None: all.
-            longest_px: longer side of the photograph that these pixels are a part of.
-
-        Returns:
-            None if all pixels count.
+        Render and target are (H, W, 3), a part of a photograph whose longer side is `longest_px`. None: all pixels
+        count.
         """
         settings = self.settings
-        cell = max(settings.least_px, round(settings.cell * longest_px))
+        cell = max(_LEAST_CELL_PX, round(_CELL * longest_px))
         difference = _cell_differences(rendered - target, mask, cell)
-        kept = settings.memory if self._views else 0.0
-        high, highest = difference.flatten().quantile(difference.new_tensor([settings.quantile, 1 - settings.most]))
+        kept = _MEMORY if self._views else 0.0
+        high, highest = difference.flatten().quantile(difference.new_tensor([_QUANTILE, 1 - settings.most]))
         self._quantile.lerp_(high, 1 - kept)
         self._views += 1
-        if self._views <= settings.views or self._views % settings.amnesty == 0:
+        if self._views <= settings.views or self._views % _AMNESTY == 0:
             return mask
-        limit = torch.maximum(settings.times * self._quantile, highest).clamp_min(settings.least)
+        limit = torch.maximum(_TIMES * self._quantile, highest).clamp_min(_LEAST)
         outlier = functional.max_pool2d((difference > limit).float()[None, None], 3, stride=1, padding=1)
         height, width = target.shape[:2]
         outside = outlier[0, 0].repeat_interleave(cell, 0).repeat_interleave(cell, 1)[:height, :width] > 0
         return ~outside if mask is None else mask & ~outside
 
     def state(self) -> dict[str, Tensor]:
-        """Return copies of the running state, for a checkpoint."""
         return {"quantile": self._quantile.clone(), "views": torch.tensor(self._views)}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Restore a state."""
         self._quantile.copy_(state["quantile"])
         self._views = int(state["views"])
 

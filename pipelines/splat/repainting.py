@@ -1,4 +1,4 @@
-"""Repainting: colours and opacities of Gaussians such that they show given images, while their geometry stays."""
+"""Colours and opacities of Gaussians such that they show given images, while their geometry stays."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from pipelines.core.progress import SILENT, Progress
@@ -15,6 +14,7 @@ from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.losses import photometric_loss
 from pipelines.splat.optimizer import GaussianAdam, LearningRates
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings
+from pipelines.splat.rasterizer.backends import device_of
 
 # Rates of a short fit of linear quantities. Gaussians without a rate for their geometry keep it to the last bit.
 _RATES = LearningRates(
@@ -25,13 +25,7 @@ _FALLS = ((0.8, 0.1), (0.5, 0.3), (0.0, 1.0))  # from this part of the work on, 
 
 @dataclass(frozen=True)
 class ShownView:
-    """Image that the Gaussians should show.
-
-    Attributes:
-        cam_from_model: (4, 4) pose.
-        camera: of H × W pixels.
-        colour: (H, W, 3), 0 … 1.
-    """
+    """Image (H, W, 3), 0 … 1, that the Gaussians should show from a pose (4, 4)."""
 
     cam_from_model: Tensor
     camera: Pinhole
@@ -47,17 +41,11 @@ def repainted(
     *,
     progress: Progress = SILENT,
 ) -> Gaussians:
-    """Return the Gaussians with colours and opacities that show the views.
+    """Return the Gaussians, on their own device, with colours and opacities that show the views.
 
-    Args:
-        gaussians: N of them; copied.
-        views: returns a view by its number.
-        order: numbers of the views, one an iteration.
-        rasterizer: backend.
-        settings: degree of the harmonics and background.
-        progress: shows the iterations.
+    The order tells the number of a view for each iteration, the settings degree of the harmonics and background.
     """
-    device = torch.device("cuda" if rasterizer.name == "cuda" else "cpu")
+    device = device_of(rasterizer)
     adam = GaussianAdam(gaussians.to(device), 1.0, len(order), _RATES)
     with progress.task("repainting", len(order)) as task:
         for iteration, number in enumerate(order):

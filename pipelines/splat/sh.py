@@ -29,18 +29,13 @@ _C3 = (
 
 
 def coefficient_count(degree: int) -> int:
-    """Return the number of coefficients up to a degree.
-
-    Raises:
-        ValueError: not a degree from 0 to 3.
-    """
+    """Return the number of coefficients up to a degree from 0 to 3; a ValueError refuses others."""
     if not 0 <= degree <= MAX_DEGREE:
         raise ValueError(f"spherical harmonics have degree 0 to {MAX_DEGREE}, not {degree}")
     return (degree + 1) ** 2
 
 
 def sh_from_rgb(rgb: Tensor) -> Tensor:
-    """Return the constant coefficient of a colour."""
     return (rgb - 0.5) / C0
 
 
@@ -73,12 +68,9 @@ def basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def evaluate_sh(sh: Tensor, directions: Tensor, degree: int | None = None) -> Tensor:
-    """Return Σ c_k Y_k(d) (…, 3), without the 0.5 and the clamp of a colour.
+    """Return Σ c_k Y_k(d) (…, 3) of coefficients (…, K, 3), without the 0.5 and the clamp of a colour.
 
-    Args:
-        sh: (…, K, 3) coefficients.
-        directions: (…, 3) vectors, not necessarily of unit length.
-        degree: highest band to use (default: all).
+    Directions (…, 3) need not be of unit length. The degree is the highest band to use; None: all.
     """
     used = round(sh.shape[-2] ** 0.5) - 1 if degree is None else degree
     count = coefficient_count(used)
@@ -89,12 +81,7 @@ def evaluate_sh(sh: Tensor, directions: Tensor, degree: int | None = None) -> Te
 def rotate_sh(sh: Tensor, rotation: ArrayLike | Tensor) -> Tensor:
     """Return coefficients of the turned functions: evaluate_sh(rotate_sh(sh, R), R d) = evaluate_sh(sh, d).
 
-    Args:
-        sh: (…, K, 3) coefficients.
-        rotation: (3, 3) R.
-
-    Returns:
-        (…, K, 3), of the type of `sh`; computed in float64.
+    Coefficients (…, K, 3) keep their type; the rotation (3, 3) is applied in float64.
     """
     turn = torch.as_tensor(rotation, dtype=torch.float64)
     degree = round(sh.shape[-2] ** 0.5) - 1

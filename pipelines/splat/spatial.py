@@ -1,9 +1,7 @@
-"""Order of the Gaussians in memory: neighbours in space are neighbours in memory.
+"""Order of Gaussians in space: neighbours are neighbours in memory, and blocks of them tell what a window can show.
 
 The Gaussians of one view are then a few long runs of rows. Gathering them takes a third of the time of rows in
 random order.
-
-Blocks of neighbouring Gaussians, to find the few of millions that a small window of an image can show.
 """
 
 from __future__ import annotations
@@ -32,16 +30,10 @@ def morton_order(means: Tensor) -> Tensor:
 
 
 def morton_codes(points: Tensor) -> tuple[Tensor, float]:
-    """Return the places of points along a Z-order curve, and the edge of its cells.
+    """Return the places (N,) int64 of N ≥ 1 points (N, 3) along a Z-order curve, and the edge of its cells.
 
     The curve runs through the cube of 2^21 cells a side at the least corner of the points' bounding box. Codes
     without their lowest 3 k bits are those of cells that are 2^k times as large.
-
-    Args:
-        points: (N, 3), N ≥ 1.
-
-    Returns:
-        (N,) int64 codes, and the edge in the points' unit.
     """
     low, high = points.amin(dim=0), points.amax(dim=0)
     extent = (high - low).max().clamp_min(torch.finfo(points.dtype).tiny)
@@ -66,11 +58,7 @@ _CLASSES = 8  # of size: a few huge Gaussians must not make every block huge
 
 
 class SpatialBlocks:
-    """Gaussians in blocks of neighbours of like size.
-
-    Args:
-        gaussians: N ≥ 0 Gaussians, on a CPU.
-    """
+    """Gaussians, on a CPU, in blocks of neighbours of like size: finds the few that a small window can show."""
 
     def __init__(self, gaussians: Gaussians) -> None:
         means = gaussians.means.detach().double()
@@ -88,12 +76,8 @@ class SpatialBlocks:
         self._reach = reaches.max(axis=1, initial=0.0)
 
     def shown(self, cam_from_model: FloatArray, camera: Pinhole, settings: RasterSettings) -> Gaussians:
-        """Return few Gaussians, in their order: all that a render can show are among them.
-
-        Args:
-            cam_from_model: (4, 4).
-            camera: of the whole image.
-            settings: of the render, with its window.
+        """Return few Gaussians, in their order: all that a render of the whole image, or of the settings' window,
+        can show.
         """
         image = settings.image_of(camera)
         x, y, z = (self._center @ cam_from_model[:3, :3].T + cam_from_model[:3, 3]).T

@@ -144,12 +144,10 @@ def ssim_forward(
     """Write Σ|x − y| and Σ SSIM of each row into sums (H, 2), and SSIM's derivatives into partials (3, H, n).
 
     Args:
-        rendered: (H, n) with n = 3 W.
-        target: (H, n).
+        rendered, target: (H, n) with n = 3 W.
         valid: (H, W) bool of the pixels that count, or (0, 0) for all.
         taps: (6,) from `gaussian_taps`.
-        c1: SSIM's constant, of the images' type.
-        c2: likewise.
+        c1, c2: SSIM's constants, of the images' type.
         bands: number of blocks of rows that share the work.
         partials: (3, H, n) output: ∂SSIM by the blurred x, x² and xy.
         sums: (H, 2) float64 output.

@@ -1,14 +1,10 @@
-"""Surface losses: they make Gaussians lie on surfaces, so that renders have a depth to measure in.
+"""Surfaces in a splat: losses that make Gaussians lie on them, discs that are one, and the depth to measure in.
 
 1. The rendered depth is pulled to the depth of the points that a view observes (as in DS-NeRF,
    doi 10.1109/CVPR52688.2022.01254).
 2. Each Gaussian is flattened towards a disc (as in PGSR, doi 10.1109/TVCG.2024.3494046, eq. 1).
 3. The normals of the discs are pulled to the normals of the rendered depth (2D Gaussian Splatting,
    doi 10.1145/3641519.3657428, eq. 14).
-
-Discs on a surface: flat Gaussians whose centres are points of it.
-
-Depth of a render: choice of the depth map to measure in, and sampling of it at rays.
 """
 
 from __future__ import annotations
@@ -37,14 +33,9 @@ _OPACITY = 0.9
 def surface_discs(
     point_in_model: FloatArray, normal_in_model: FloatArray, rgb: ByteArray, spacing_m: float, sh_degree: int
 ) -> Gaussians:
-    """Return a disc of one colour at each point of a surface.
+    """Return a disc of one colour (P, 3) at each point (P, 3) of a surface, about `spacing_m` apart.
 
-    Args:
-        point_in_model: (P, 3) metres, about `spacing_m` apart.
-        normal_in_model: (P, 3) unit vectors.
-        rgb: (P, 3) colours.
-        spacing_m: between neighbouring points, in units of `model`.
-        sh_degree: of the harmonics; those above degree 0 are zero.
+    Normals are unit vectors (P, 3); harmonics above degree 0 are zero.
     """
     count = len(point_in_model)
     aside = np.eye(3)[np.abs(normal_in_model).argmin(axis=1)]
@@ -74,8 +65,7 @@ def depth_at(depth_m: Tensor, alpha: Tensor, xy: Tensor, camera: Pinhole) -> tup
     a surface do not count.
 
     Args:
-        depth_m: (H, W) expected depth, along the camera's z axis.
-        alpha: (H, W).
+        depth_m, alpha: (H, W) of a render, the depth along the camera's z axis.
         xy: (K, 2) x/z and y/z of the rays.
         camera: of H × W pixels.
     """
@@ -91,14 +81,10 @@ def depth_at(depth_m: Tensor, alpha: Tensor, xy: Tensor, camera: Pinhole) -> tup
 
 
 def measured_depth(median_m: Tensor, expected_m: Tensor, variance_m2: Tensor) -> Tensor:
-    """Return the depth (H, W) to measure in, 0 without a surface.
+    """Return the depth (H, W) to measure in, 0 without a surface, of a render's two depths and variance.
 
     The median selects the surface that a pixel shows, whatever haze lies before and behind it. If all Gaussians of
     the pixel lie on one surface, the mean is less noisy than the median.
-
-    Args:
-        median_m, expected_m: (H, W) depths of a render.
-        variance_m2: (H, W) of its depth.
     """
     one_surface = variance_m2 < (_ONE_SURFACE * median_m).square()
     return torch.where(one_surface, expected_m, median_m)
@@ -120,8 +106,7 @@ class SurfaceSettings:
         normals: of the depth–normal consistency,
         normals_from: fraction of the training from which it counts,
         normals_every: and iterations between two of its renders, by which its weight is multiplied.
-        edge: depth steps between neighbouring pixels that are larger than this fraction of the depth are edges,
-            where the depth has no normal.
+        edge: depth steps between neighbouring pixels above this fraction of the depth are edges, without a normal.
     """
 
     depth: float = 1.0
@@ -135,12 +120,7 @@ class SurfaceSettings:
 
 @dataclass(frozen=True)
 class ObservedPoints:
-    """Points that a view observes.
-
-    Attributes:
-        point_in_model: (K, 3) metres.
-        weight: (K,) of their pull; None: 1.
-    """
+    """Points (K, 3) that a view observes, and the weights (K,) of their pull; None: 1."""
 
     point_in_model: Tensor
     weight: Tensor | None = None
@@ -157,14 +137,7 @@ def depth_loss(
     3. Further away the point is more likely to be wrong, and the photographs prevail.
 
     Points outside the image do not count, nor do points where the render is nearly transparent: there is no surface
-    yet.
-
-    Args:
-        depth_m: (H, W) expected depth.
-        alpha: (H, W).
-        points: that the view observes, with their weights w.
-        cam_from_model: (4, 4) pose; without gradient, because cameras must not follow the surface.
-        camera: of H × W pixels.
+    yet. The pose (4, 4) gets no gradient, because cameras must not follow the surface.
     """
     pose = cam_from_model.detach()
     in_cam = points.point_in_model @ pose[:3, :3].T + pose[:3, 3]
@@ -182,11 +155,6 @@ def compactness_loss(depth_m: Tensor, variance_m2: Tensor, alpha: Tensor) -> Ten
 
     The mean depth can be right in a haze without any surface: the spread cannot. The logarithm bounds the loss of
     pixels at edges, which rightly show surfaces before and behind the edge.
-
-    Args:
-        depth_m: (H, W) expected depth.
-        variance_m2: (H, W) of the depth.
-        alpha: (H, W).
     """
     allowed = (_SPREAD * depth_m.detach()).clamp_min(1e-6)
     return (alpha.detach() * torch.log1p(variance_m2 / allowed.square())).mean()
@@ -243,14 +211,10 @@ def normal_loss(
     assert render.expected_depth is not None
     depth, alpha = render.expected_depth, render.alpha
     blended = (2 * render.colour - alpha[..., None])[:-1, :-1]
-    smooth = _smooth(depth.detach(), alpha.detach(), edge)
+    # Pixels that lie on one surface with their neighbours to the right and below.
+    z, solid = depth.detach(), alpha.detach() > _SOLID
+    step = torch.maximum((z[:-1, 1:] - z[:-1, :-1]).abs(), (z[1:, :-1] - z[:-1, :-1]).abs())
+    on_one = (step < edge * z[:-1, :-1]) & solid[:-1, :-1] & solid[:-1, 1:] & solid[1:, :-1]
+    smooth = on_one.to(depth.dtype)
     agreement = (blended * depth_normals(depth, camera)).sum(dim=-1)
     return ((alpha[:-1, :-1] - agreement) * smooth).sum() / smooth.sum().clamp_min(1)
-
-
-def _smooth(depth: Tensor, alpha: Tensor, edge: float) -> Tensor:
-    """Return 1 for pixels that lie on one surface with their neighbours to the right and below, else 0."""
-    center = depth[:-1, :-1]
-    step = torch.maximum((depth[:-1, 1:] - center).abs(), (depth[1:, :-1] - center).abs())
-    solid = (alpha[:-1, :-1] > 0.5) & (alpha[:-1, 1:] > 0.5) & (alpha[1:, :-1] > 0.5)
-    return ((step < edge * center) & solid).to(depth.dtype)

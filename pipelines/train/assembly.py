@@ -130,6 +130,6 @@ def _strategy(options: TrainOptions, extent_m: float, count: int) -> Strategy:
         return McmcStrategy(McmcSettings.for_iterations(iterations, count, most), extent_m, options.seed)
     settings = DefaultSettings.for_iterations(iterations, most)
     if options.strategy == "fast":
-        fast = FastSettings.for_iterations(iterations)
+        fast = FastSettings(prune_stop=iterations * 5 // 6)
         return FastStrategy(settings, fast, extent_m, count, options.seed)
     return DefaultStrategy(settings, extent_m, count, options.seed)

@@ -19,8 +19,15 @@ from pipelines.core.types import FloatArray
 from pipelines.geometry.rotations import exp_so3, log_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.trajectory import Trajectory, boresight
-from pipelines.simulate.flight import FlightPlan, TrueTrajectory, make_trajectory
-from pipelines.simulate.sensors import RECEIVERS, Mounting, record_gnss, record_imu
+from pipelines.simulate.flight import (
+    RECEIVERS,
+    FlightPlan,
+    Mounting,
+    TrueTrajectory,
+    make_trajectory,
+    record_gnss,
+    record_imu,
+)
 
 OFFSET_S, BORESIGHT_DEG, ARM_M = 0.2, np.array([0.6, -0.5, 0.62]), np.array([0.25, -0.1, -0.15])
 PIXEL_RAD = 1 / 3000  # 3 cm at 100 m

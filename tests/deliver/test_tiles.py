@@ -20,8 +20,7 @@ from pipelines.deliver.options import ExportTilesOptions
 from pipelines.deliver.tiles import run, write_whole
 from pipelines.deliver.tiles_content import read_glb, write_glb
 from pipelines.formats.georef_sidecar import read_sidecar
-from pipelines.formats.splat_ply import SplatArrays
-from pipelines.splat.gaussians import Gaussians, write_gaussians
+from pipelines.formats.splat_ply import SplatArrays, write_splat_ply
 from pipelines.splat.level_of_detail import DetailTile
 from pipelines.survey.block_plan import BlockCell, BlockRecord, MergedBlock
 from tests.delivered_scenes import block_training, splat_arrays, true_ecef, write_trained
@@ -109,9 +108,7 @@ def test_tiles_come_from_blocks(in_blocks: StageRun, scene: SplatArrays) -> None
 
 
 def test_blocks_of_other_gaussians_are_refused(in_blocks: StageRun) -> None:
-    write_gaussians(
-        in_blocks.workspace.root / GAUSSIANS, Gaussians.from_arrays(vars(splat_arrays(COUNT - 1, extent_m=20.0)))
-    )
+    write_splat_ply(in_blocks.workspace.root / GAUSSIANS, splat_arrays(COUNT - 1, extent_m=20.0))
     with pytest.raises(InputError, match=r"blocks\.json.* 2600 Gaussians, and train/gaussians\.ply has 2599"):
         run(in_blocks, ExportTilesOptions())
 

@@ -10,7 +10,7 @@ import pytest
 
 from pipelines.formats.trajectory_csv import read_trajectory
 from pipelines.geodesy.enu import Origin
-from pipelines.simulate.lidar import NOISE, LidarFiles, LidarFlight
+from pipelines.simulate.lidar import NOISE, LidarFlight, lidar_files
 from pipelines.simulate.mesh import Raycaster
 from pipelines.simulate.options import LidarFlightOptions
 from pipelines.simulate.scene import SimulatedScene, build_scene
@@ -40,10 +40,10 @@ def depth_below(scene: SimulatedScene, points: np.ndarray) -> np.ndarray:
 
 def test_files_hold_the_flight(scene: SimulatedScene, tmp_path: Path) -> None:
     flight = flight_over(scene)
-    with LidarFiles(tmp_path, ORIGIN) as writer:
+    with lidar_files(tmp_path, ORIGIN) as write:
         strips = list(flight.strips())
         for strip in strips:
-            writer.write(strip)
+            write(strip)
     files = CloudReader(tmp_path / "lidar.laz", CloudCrs())
     assert not files.assumptions  # the CRS states its heights
     (cloud,) = files.chunks(ORIGIN)

@@ -7,14 +7,15 @@ import pytest
 from scipy import stats
 
 from pipelines.geometry.rotations import exp_so3, geo_from_cam, log_so3
-from pipelines.simulate.flight import FlightPlan, TrueTrajectory, make_trajectory
-from pipelines.simulate.sensors import (
+from pipelines.simulate.flight import (
     GRAVITY_M_S2,
+    FlightPlan,
     Mounting,
     Receiver,
+    TrueTrajectory,
     attitudes_at,
     fixes_at,
-    photo_stamps,
+    make_trajectory,
     record_gnss,
     record_imu,
 )
@@ -37,7 +38,7 @@ def within(sigma: float, errors: np.ndarray) -> bool:
 
 def test_white_noise_has_its_sigma_and_no_memory(trajectory: TrueTrajectory) -> None:
     log = record_gnss(trajectory, STRAIGHT, Receiver(0.02, 0.03), np.random.default_rng(2))
-    error = log.position_in_geo - trajectory.position((log.stamp_ns - photo_stamps(trajectory)[0]) / 1e9)
+    error = log.position_in_geo - trajectory.position((log.stamp_ns - trajectory.stamp_ns[0]) / 1e9)
     assert within(0.02, error[:, :2])
     assert within(0.03, error[:, 2])
     assert abs(np.corrcoef(error[1:, 0], error[:-1, 0])[0, 1]) < 5 / np.sqrt(len(error))
@@ -48,7 +49,7 @@ def test_rates_and_cover(trajectory: TrueTrajectory) -> None:
     imu = record_imu(trajectory, STRAIGHT, 0.5, np.random.default_rng(3))
     assert set(np.diff(gnss.stamp_ns)) == {100_000_000}
     assert set(np.diff(imu.stamp_ns)) == {10_000_000}
-    stamps = photo_stamps(trajectory)
+    stamps = trajectory.stamp_ns
     for log in (gnss, imu):
         assert log.stamp_ns[0] <= stamps[0] - 1_000_000_000
         assert log.stamp_ns[-1] >= stamps[-1] + 1_000_000_000
@@ -58,7 +59,7 @@ def test_bias_is_the_stated_sine_about_the_common_error(trajectory: TrueTrajecto
     common = (0.03, -0.02, 0.05)
     receiver = Receiver(0.0, 0.0, bias_m=0.8, bias_period_s=40.0, common_error_m=common)
     log = record_gnss(trajectory, STRAIGHT, receiver, np.random.default_rng(4))
-    time_s = (log.stamp_ns - photo_stamps(trajectory)[0]) / 1e9
+    time_s = (log.stamp_ns - trajectory.stamp_ns[0]) / 1e9
     stated = log.bias_amplitude_m * np.sin(2 * np.pi * time_s[:, None] / 40.0 + log.bias_phase_rad)
     np.testing.assert_allclose(log.position_in_geo - log.true_in_geo, stated + common, atol=1e-9)
     # Ten whole periods: the RMS is the amplitude over √2.
@@ -68,7 +69,7 @@ def test_bias_is_the_stated_sine_about_the_common_error(trajectory: TrueTrajecto
 def test_outliers_are_as_many_and_as_large_as_asked(trajectory: TrueTrajectory) -> None:
     receiver = Receiver(0.0, 0.0, outlier_share=0.15, outlier_m=15.0)
     log = record_gnss(trajectory, STRAIGHT, receiver, np.random.default_rng(5))
-    stamps = photo_stamps(trajectory)
+    stamps = trajectory.stamp_ns
     true = fixes_at(log, stamps) - trajectory.position(trajectory.photo_s)
     size = np.linalg.norm(true, axis=1)
     assert np.nonzero(size > 1e-6)[0].tolist() == log.wrong_photos.tolist()
@@ -80,7 +81,7 @@ def test_outliers_are_as_many_and_as_large_as_asked(trajectory: TrueTrajectory) 
 def test_lever_arm_puts_the_antenna_above_the_level_body(trajectory: TrueTrajectory) -> None:
     mounting = Mounting(np.array([0.0, 0.0, -0.3]), np.eye(3), 0.0)
     log = record_gnss(trajectory, mounting, Receiver(0.0, 0.0), np.random.default_rng(6))
-    arm = log.true_in_geo - trajectory.position((log.stamp_ns - photo_stamps(trajectory)[0]) / 1e9)
+    arm = log.true_in_geo - trajectory.position((log.stamp_ns - trajectory.stamp_ns[0]) / 1e9)
     np.testing.assert_allclose(np.linalg.norm(arm, axis=1), 0.3, atol=1e-9)
     # The mount carries the camera's tilt, so that the body sways by its few degrees only.
     assert (arm[:, 2] > 0.3 * np.cos(np.radians(12))).all()
@@ -90,16 +91,16 @@ def test_lever_arm_puts_the_antenna_above_the_level_body(trajectory: TrueTraject
 def test_clock_offset_shifts_the_stamps(trajectory: TrueTrajectory, offset_s: float) -> None:
     mounting = Mounting(np.zeros(3), np.eye(3), offset_s)
     log = record_gnss(trajectory, mounting, Receiver(0.0, 0.0), np.random.default_rng(7))
-    read = fixes_at(log, photo_stamps(trajectory))
+    read = fixes_at(log, trajectory.stamp_ns)
     expected = trajectory.position(trajectory.photo_s - offset_s)
     # Linear interpolation between fixes 0.1 s apart misses a·Δt²/8.
-    most = np.abs(trajectory.acceleration(np.arange(0.0, 400.0, 0.1))).max() * 0.1**2 / 8
+    most = np.abs(trajectory.position(np.arange(0.0, 400.0, 0.1), 2)).max() * 0.1**2 / 8
     np.testing.assert_allclose(read, expected, atol=1.05 * most)
 
 
 def test_attitude_noise_has_its_sigma(trajectory: TrueTrajectory) -> None:
     log = record_imu(trajectory, STRAIGHT, 0.5, np.random.default_rng(8))
-    true = trajectory.geo_from_body((log.stamp_ns - photo_stamps(trajectory)[0]) / 1e9)
+    true = trajectory.geo_from_body((log.stamp_ns - trajectory.stamp_ns[0]) / 1e9)
     error = log_so3(np.swapaxes(true, 1, 2) @ log.geo_from_body)
     assert within(np.radians(0.5), error)
 
@@ -110,15 +111,15 @@ def test_rates_and_forces_are_those_of_the_motion(trajectory: TrueTrajectory) ->
     # Euler's step over 10 ms misses half the angular acceleration's share, well below 1e-4 rad.
     assert np.abs(log_so3(np.swapaxes(steps, 1, 2) @ log.geo_from_body[1:])).max() < 1e-4
     force = np.einsum("nij,nj->ni", log.geo_from_body, log.specific_force_in_body)
-    time_s = (log.stamp_ns - photo_stamps(trajectory)[0]) / 1e9
+    time_s = (log.stamp_ns - trajectory.stamp_ns[0]) / 1e9
     np.testing.assert_allclose(
-        force - trajectory.acceleration(time_s), [[0, 0, GRAVITY_M_S2]] * len(force), atol=1e-9
+        force - trajectory.position(time_s, 2), [[0, 0, GRAVITY_M_S2]] * len(force), atol=1e-9
     )
 
 
 def test_attitude_is_read_at_the_photographs(trajectory: TrueTrajectory) -> None:
     log = record_imu(trajectory, STRAIGHT, 0.0, np.random.default_rng(10))
-    read = attitudes_at(log, photo_stamps(trajectory)) @ trajectory.cam_from_body.T
+    read = attitudes_at(log, trajectory.stamp_ns) @ trajectory.cam_from_body.T
     np.testing.assert_allclose(read, trajectory.geo_from_nominal_cam(trajectory.photo_s), atol=1e-9)
 
 

@@ -35,7 +35,7 @@ def gaussians(sigma_m: list[float], opacity: float = 0.5) -> Gaussians:
 
 def pull(gradient_px: Tensor, rows: Tensor | None = None) -> ScreenStats:
     rows = torch.arange(len(gradient_px)) if rows is None else rows
-    return ScreenStats(rows, torch.ones(len(rows)), gradient_px)
+    return ScreenStats(rows, gradient_px)
 
 
 def setup(
@@ -186,4 +186,4 @@ def test_schedule_of_30000_iterations_is_that_of_the_paper() -> None:
 def test_render_without_backward_is_refused() -> None:
     _, strategy = setup(gaussians([SMALL_M]))
     with pytest.raises(ValueError, match="backward"):
-        strategy.observe(ScreenStats(torch.zeros(1, dtype=torch.int64), torch.ones(1)), CAMERA)
+        strategy.observe(ScreenStats(torch.zeros(1, dtype=torch.int64)), CAMERA)

@@ -29,7 +29,7 @@ def setup(count: int = 4) -> tuple[GaussianAdam, FastStrategy]:
     start = tiny.true_gaussians(count)
     start.sh[:, 0] = torch.arange(count)[:, None].float()
     adam, strategy = GaussianAdam(start, 1000.0, 100), FastStrategy(SETTINGS, FAST, 1000.0, count)
-    strategy.observe(ScreenStats(torch.arange(count), torch.ones(count), torch.ones(count, 2)), tiny.PINHOLE)
+    strategy.observe(ScreenStats(torch.arange(count), torch.ones(count, 2)), tiny.PINHOLE)
     return adam, strategy
 
 

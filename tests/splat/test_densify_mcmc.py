@@ -31,7 +31,7 @@ def row(opacities: list[float], sigma_m: float = 0.2) -> Gaussians:
 
 
 def stats(rows: list[int]) -> ScreenStats:
-    return ScreenStats(torch.tensor(rows), torch.ones(len(rows)), torch.zeros(len(rows), 2))
+    return ScreenStats(torch.tensor(rows), torch.zeros(len(rows), 2))
 
 
 def exact_overlap(opacity: float, n: int) -> float:

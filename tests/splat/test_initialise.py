@@ -37,18 +37,17 @@ def test_known_normals_make_discs() -> None:
     normals = rng.normal(size=points.shape)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     normals[0], normals[1], normals[2] = [0, 0, 1], [0, 0, -1], np.nan
-    options = InitialisationOptions(thickness=0.2, disc_opacity=0.6)
-    gaussians = gaussians_from_points(points, np.zeros_like(points), options, normals)
+    gaussians = gaussians_from_points(points, np.zeros_like(points), normals_in_model=normals)
     rows = (gaussians.means.numpy()[:, None] == points.astype(np.float32)).all(axis=2).argmax(axis=1)
     third = rotation_matrices(gaussians.quats_wxyz)[:, :, 2].numpy()
     known = rows != 2
     along = np.abs((third * normals[rows]).sum(axis=1))
     np.testing.assert_allclose(along[known], 1.0, atol=1e-6)
     scales = gaussians.log_scales.exp().numpy()
-    np.testing.assert_allclose(scales[known], np.tile([0.5, 0.5, 0.1], (len(points) - 1, 1)), rtol=1e-5)
+    np.testing.assert_allclose(scales[known], np.tile([0.5, 0.5, 0.05], (len(points) - 1, 1)), rtol=1e-5)
     np.testing.assert_allclose(scales[~known], [[0.5, 0.5, 0.5]], rtol=1e-5)
     opacity = torch.sigmoid(gaussians.logit_opacities).numpy()
-    np.testing.assert_allclose(opacity, np.where(known, 0.6, 0.1), rtol=1e-5)
+    np.testing.assert_allclose(opacity, np.where(known, 0.5, 0.1), rtol=1e-5)
 
 
 def test_float_colours_are_taken_as_they_are() -> None:

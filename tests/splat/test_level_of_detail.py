@@ -9,7 +9,7 @@ from torch.nn.functional import max_pool2d
 from pipelines.formats.splat_ply import SplatArrays
 from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.level_of_detail import SceneExtent, Tiler, build_tiles, shadow_areas
+from pipelines.splat.level_of_detail import Tiler, build_tiles, scene_box, shadow_areas
 from pipelines.splat.rasterizer.api import RasterSettings, Render
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 
@@ -33,7 +33,7 @@ def seen_from(splat: SplatArrays, distance_m: float) -> Render:
     half = np.sqrt(0.5)
     cam_from_model = np.eye(4)
     cam_from_model[:3] = [[1, 0, 0, 0], [0, -half, -half, 0], [0, half, -half, distance_m]]
-    gaussians = Gaussians.from_arrays(vars(splat))
+    gaussians = Gaussians(**{name: torch.tensor(values) for name, values in vars(splat).items()})
     settings = RasterSettings(sh_degree=0)
     return CpuRasterizer().render(gaussians, torch.tensor(cam_from_model).float(), CAMERA, settings)
 
@@ -44,7 +44,7 @@ def test_levels_look_like_what_they_stand_for() -> None:
     def write(name: str, content: SplatArrays, *, is_leaf: bool) -> None:
         contents[name] = content
 
-    root = build_tiles([ground], SceneExtent.of(ground.means), Tiler(10_000, write))
+    root = build_tiles([ground], scene_box(ground.means), Tiler(10_000, write))
     levels = [tile for tile in root.all() if tile.children]
     assert len(levels) == 2
     for tile in levels:

@@ -157,10 +157,10 @@ def test_step_without_gradient_is_refused() -> None:
 
 
 def test_rate_of_the_centres_falls_a_hundredfold() -> None:
-    rates = LearningRates()
-    assert rates.means_at(0.0) == pytest.approx(1.6e-4)
-    assert rates.means_at(0.5) == pytest.approx(1.6e-5)
-    assert rates.means_at(1.0) == pytest.approx(1.6e-6)
+    adam = GaussianAdam(random_gaussians(1), 1.0, ITERATIONS, LearningRates())
+    assert adam.means_rate(0) == pytest.approx(1.6e-4)
+    assert adam.means_rate(ITERATIONS // 2) == pytest.approx(1.6e-5)
+    assert adam.means_rate(ITERATIONS) == pytest.approx(1.6e-6)
 
 
 def test_short_trainings_have_higher_rates() -> None:

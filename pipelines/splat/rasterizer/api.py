@@ -22,7 +22,7 @@ The depth of a Gaussian is the depth of its plane at the pixel, not of its centr
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal, Protocol
 
 from torch import Tensor
@@ -49,29 +49,18 @@ class Window:
     height: int
 
     def of(self, camera: Pinhole) -> Pinhole:
-        """Return the camera whose image is the window of the image of `camera`."""
+        """Return the camera whose image is the window."""
         return Pinhole(self.width, self.height, camera.fx, camera.fy, camera.cx - self.left, camera.cy - self.top)
 
     @property
     def slices(self) -> tuple[slice, slice]:
-        """Rows and columns of the image that lie in the window."""
         return slice(self.top, self.top + self.height), slice(self.left, self.left + self.width)
 
     def cut(self, view: Render) -> Render:
         """Return the part of a render of the whole image; its statistics stay those of the whole."""
-        rows, columns = self.slices
-
-        def part(image: Tensor | None) -> Tensor | None:
-            return None if image is None else image[rows, columns]
-
-        return Render(
-            view.colour[rows, columns],
-            view.alpha[rows, columns],
-            view.stats,
-            part(view.expected_depth),
-            part(view.depth_variance),
-            part(view.median_depth),
-        )
+        depths = (view.expected_depth, view.depth_variance, view.median_depth)
+        parts = (None if image is None else image[self.slices] for image in depths)
+        return Render(view.colour[self.slices], view.alpha[self.slices], view.stats, *parts)
 
 
 @dataclass(frozen=True)
@@ -79,8 +68,7 @@ class RasterSettings:
     """Settings of a render.
 
     Attributes:
-        sh_degree: degree of the spherical harmonics in use (≤ the stored degree).
-        background: colour behind everything.
+        sh_degree: of the spherical harmonics in use (≤ the stored degree).
         near_m: Gaussians with a nearer centre are left out.
         dilation_px2: added to the diagonal of the screen covariance, in px².
         depth: whether to compute depths (colour and alpha always are).
@@ -98,7 +86,6 @@ class RasterSettings:
     window: Window | None = None
 
     def image_of(self, camera: Pinhole) -> Pinhole:
-        """Return the camera of the image that is rendered: `camera`, or its window."""
         return camera if self.window is None else self.window.of(camera)
 
 
@@ -108,14 +95,12 @@ class ScreenStats:
 
     Attributes:
         visible: (M,) int64 rows of the Gaussians that touched the image.
-        radius_px: (M,) float32, three standard deviations along the longer axis, on the screen.
         mean_gradient: (M, 2) float32, ∂L/∂(projected centre) in 1/pixel; filled by the backward pass.
         counted: (M,) bool, False for Gaussians that other parts of the same image count; None: all are True.
     """
 
     visible: Tensor
-    radius_px: Tensor
-    mean_gradient: Tensor | None = field(default=None)
+    mean_gradient: Tensor | None = None
     counted: Tensor | None = None
 
     def of_first(self, count: int) -> ScreenStats:
@@ -123,7 +108,7 @@ class ScreenStats:
         rows = self.visible < count
         gradient = None if self.mean_gradient is None else self.mean_gradient[rows]
         counted = None if self.counted is None else self.counted[rows]
-        return ScreenStats(self.visible[rows], self.radius_px[rows], gradient, counted)
+        return ScreenStats(self.visible[rows], gradient, counted)
 
     def of_part(self, share: float, counted: Tensor | None = None) -> ScreenStats:
         """Return the statistics of a part of an image, as what it adds to those of the whole image.
@@ -133,7 +118,7 @@ class ScreenStats:
             counted: (M,) of the Gaussians that the part counts for the whole; None: all.
         """
         gradient = None if self.mean_gradient is None else share * self.mean_gradient
-        return ScreenStats(self.visible, self.radius_px, gradient, counted)
+        return ScreenStats(self.visible, gradient, counted)
 
 
 @dataclass

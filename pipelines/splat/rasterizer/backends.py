@@ -9,16 +9,14 @@ import torch
 
 from pipelines.core.errors import BackendUnavailableError
 from pipelines.core.progress import SILENT, Progress
-from pipelines.splat.rasterizer import api
-from pipelines.splat.rasterizer.api import Rasterizer
+from pipelines.splat.rasterizer.api import BackendName, Rasterizer
 
-BackendName = Literal["auto", "cpu", "cuda"]
-BACKENDS: tuple[api.BackendName, ...] = ("cpu", "cuda")
+BACKENDS: tuple[BackendName, ...] = ("cpu", "cuda")
 
 log = logging.getLogger(__name__)
 
 
-def chosen_backend(name: BackendName) -> api.BackendName:
+def chosen_backend(name: Literal["auto", "cpu", "cuda"]) -> BackendName:
     """Return the backend that a name stands for, without loading it.
 
     `auto` stands for cuda if nothing that it needs is missing. If there is a GPU, the log says what is missing.
@@ -41,15 +39,12 @@ def chosen_backend(name: BackendName) -> api.BackendName:
     return "cpu"
 
 
-def rasterizer(name: BackendName, progress: Progress = SILENT) -> Rasterizer:
-    """Return the backend that a name stands for.
-
-    Args:
-        name: see `chosen_backend`.
-        progress: shows the compilation of the kernels of cuda, before their first use on a machine.
+def rasterizer(name: Literal["auto", "cpu", "cuda"], progress: Progress = SILENT) -> Rasterizer:
+    """Return the backend that a name stands for, see `chosen_backend`.
 
     Raises:
-        BackendUnavailableError: `cuda`, and a part that it needs is missing, or its kernels cannot be compiled.
+        BackendUnavailableError: `cuda`, and a part that it needs is missing, or its kernels cannot be compiled;
+            `progress` shows their compilation before their first use on a machine.
     """
     if chosen_backend(name) == "cuda":
         from pipelines.splat.rasterizer.cuda import CudaRasterizer

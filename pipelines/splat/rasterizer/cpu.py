@@ -1,7 +1,7 @@
 """Rasteriser on a CPU: numba kernels behind a `torch.autograd.Function`.
 
-Forward: `cpu_project` projects the Gaussians, `cpu_tiles` lists them by tile in order of depth, `cpu_blend` blends
-tile by tile. Backward: `cpu_blend_gradient` walks the same lists, `cpu_gradients` sums up by Gaussian.
+Forward: `cpu_project` projects the Gaussians and lists them by tile in order of depth, `cpu_blend` blends tile by
+tile. Backward: `cpu_blend` walks the same lists, `cpu_gradients` sums up by Gaussian.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def predicted_bytes(
     Args:
         count: number of Gaussians.
         camera: the image.
-        sh_degree: degree of the stored spherical harmonics.
+        sh_degree: of the stored spherical harmonics.
         visible: number of Gaussians in the image; None: all.
         hits_per_visible: tiles (16 × 32 px) that a visible Gaussian touches on average: 3 to 6 in trained models,
             and all tiles of the image if Gaussians are huge.
@@ -95,8 +95,9 @@ class _RenderContext:
 
     Attributes:
         camera, settings: of the render.
-        image: camera of the image that is rendered.
         workers: number of threads.
+        background: (3,) float64.
+        view: camera in the form of the kernels.
         stats: handed out with the render.
         visible: (M,) rows of the visible Gaussians, ascending.
         rank: (M,) places of the visible Gaussians in the order of depth.
@@ -106,25 +107,14 @@ class _RenderContext:
 
     camera: Pinhole
     settings: RasterSettings
-    image: Pinhole = field(init=False)
     workers: int = field(default_factory=numba.get_num_threads)
+    background: _Array = field(init=False)
+    view: cpu_gaussian.View = field(init=False)
     stats: ScreenStats = field(init=False)
     visible: _Array = field(init=False)
     rank: _Array = field(init=False)
     table: _Array = field(init=False)
     lists: TileLists = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.image = self.settings.image_of(self.camera)
-
-    @property
-    def background(self) -> _Array:
-        """Background colour (3,) float64."""
-        return np.array(self.settings.background, dtype=np.float64)
-
-    def view(self, pose: _Array) -> cpu_gaussian.View:
-        """Return the camera in the form of the kernels."""
-        return cpu_gaussian.make_view(self.camera, self.settings, pose)
 
 
 @dataclass
@@ -155,13 +145,10 @@ class _Rasterize(torch.autograd.Function):
         *parameters, pose, center = (_array(tensor) for tensor in tensors)
         with KERNEL_LOCK:
             _project(context, parameters, pose, center)
+            image, depth = context.settings.image_of(context.camera), context.settings.depth
+            size, workers = (image.height, image.width), context.workers
             images = blend_tiles(
-                context.table,
-                context.lists,
-                (context.image.height, context.image.width),
-                context.background,
-                depth=context.settings.depth,
-                workers=context.workers,
+                context.table, context.lists, size, context.background, depth=depth, workers=workers
             )
         outputs = tuple(torch.from_numpy(image) for image in images)
         ctx.context = context
@@ -177,8 +164,13 @@ class _Rasterize(torch.autograd.Function):
         *parameters, pose, center = saved[:7]
         grads = tuple(_array(grad) for grad in grad_outputs[:4])
         outputs = [np.empty_like(parameter) for parameter in parameters]
+        table, lists = context.table, context.lists
+        hit_gradient = np.empty(len(lists.hits) * cpu_blend.HIT_GRADIENT_WIDTH, dtype=table.dtype)
         with KERNEL_LOCK:
-            hit_gradient = _hit_gradient(context, tuple(saved[7:]), grads)
+            cpu_blend.blend_gradient(
+                *(table, lists.hits, lists.tile_start, lists.tile_end, context.background),
+                *(tuple(saved[7:]), grads, hit_gradient, context.workers),
+            )
             camera = _gaussian_gradients(context, [*parameters, pose, center], hit_gradient, outputs)
         gradients = [*outputs, camera[:12].reshape(3, 4), camera[12:]]
         return (*(torch.from_numpy(gradient) for gradient in gradients), None)
@@ -186,7 +178,6 @@ class _Rasterize(torch.autograd.Function):
 
 @contextlib.contextmanager
 def _threads_for(image: Pinhole) -> Iterator[None]:
-    """Run the kernels of a small image on one thread."""
     threads = numba.get_num_threads()
     numba.set_num_threads(1 if image.width * image.height <= _SMALL_PX else threads)
     try:
@@ -202,21 +193,23 @@ def _array(tensor: Tensor) -> _Array:
 
 def _project(context: _RenderContext, parameters: list[_Array], pose: _Array, center: _Array) -> None:
     """Project the visible Gaussians, order them by depth and list them by tile."""
-    view, dtype = context.view(pose), parameters[0].dtype
-    is_visible, depth = np.empty(len(parameters[0]), dtype=np.bool_), np.empty(len(parameters[0]), dtype=dtype)
+    view = context.view = cpu_gaussian.make_view(context.camera, context.settings, pose)
+    context.background = np.array(context.settings.background, dtype=np.float64)
+    every, dtype = len(parameters[0]), parameters[0].dtype
+    is_visible, depth = np.empty(every, dtype=np.bool_), np.empty(every, dtype=dtype)
     cpu_project.find_visible(*parameters[:4], pose, view, is_visible, depth, context.workers)
     context.visible = np.flatnonzero(is_visible)
     context.rank = _depth_rank(depth[context.visible])
     count = len(context.visible)
     context.table = np.empty((count, cpu_project.SPLAT_WIDTH), dtype=dtype)
     ellipses = np.empty((count, cpu_project.ELLIPSE_WIDTH), dtype=dtype)
-    radius = np.empty(count, dtype=np.float32)
     cpu_project.project_visible(
         *(*parameters, pose, center, view, context.settings.sh_degree),
-        *(context.visible, context.rank, context.table, ellipses, radius, context.workers),
+        *(context.visible, context.rank, context.table, ellipses, context.workers),
     )
-    context.lists = list_tiles(ellipses, context.image.width, context.image.height)
-    context.stats = ScreenStats(visible=torch.from_numpy(context.visible), radius_px=torch.from_numpy(radius))
+    image = context.settings.image_of(context.camera)
+    context.lists = list_tiles(ellipses, image.width, image.height)
+    context.stats = ScreenStats(torch.from_numpy(context.visible))
 
 
 def _depth_rank(depth: _Array) -> _Array:
@@ -252,7 +245,7 @@ def list_tiles(ellipses: _Array, width: int, height: int) -> TileLists:
 def blend_tiles(
     table: _Array, lists: TileLists, size: tuple[int, int], background: _Array, *, depth: bool, workers: int
 ) -> tuple[_Array, ...]:
-    """Return colour, alpha, Σ w z, Σ w z² and median depth, the last three of size (0, 0) if not wanted.
+    """Return colour, alpha, Σ w z, Σ w z² and median depth, the last three of size (0, 0) without `depth`.
 
     Args:
         table: (M, SPLAT_WIDTH) splats, nearest first.
@@ -269,16 +262,6 @@ def blend_tiles(
     return images
 
 
-def _hit_gradient(context: _RenderContext, images: tuple[_Array, ...], grads: tuple[_Array, ...]) -> _Array:
-    lists = context.lists
-    gradient = np.empty(len(lists.hits) * cpu_blend.HIT_GRADIENT_WIDTH, dtype=context.table.dtype)
-    cpu_blend.blend_gradient(
-        *(context.table, lists.hits, lists.tile_start, lists.tile_end),
-        *(context.background, images, grads, gradient, context.workers),
-    )
-    return gradient
-
-
 def _gaussian_gradients(
     context: _RenderContext, inputs: list[_Array], hit_gradient: _Array, outputs: list[_Array]
 ) -> _Array:
@@ -289,7 +272,7 @@ def _gaussian_gradients(
     camera = np.empty((blocks, cpu_gradients.CAMERA_WIDTH), dtype=np.float64)
     g_screen = np.empty((len(context.visible), 2), dtype=np.float32)
     cpu_gradients.gaussian_gradients(
-        *(*parameters, pose, center, context.view(pose), context.settings.sh_degree, context.visible, context.rank),
+        *(*parameters, pose, center, context.view, context.settings.sh_degree, context.visible, context.rank),
         *(hit_gradient, context.lists.splat_start, context.lists.places, block_start),
         *(*outputs, camera, g_screen, context.workers),
     )

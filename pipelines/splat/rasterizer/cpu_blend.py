@@ -1,12 +1,8 @@
-"""Blending of the splats of each tile, as numba kernels.
+"""Blending of the splats of each tile and its derivative, as numba kernels.
 
 One row of a tile is one vector (see `cpu_lanes`). Once a pixel is done, its transmittance T is kept as −T: no splat
 adds to the pixel any more, and the final value of T stays known. Forward and backward walk the same lists in the
 same direction with the same arithmetic, so that both take the same decisions at every cut-off.
-
-Derivative of blending, as numba kernels: from the gradients of the images to those of the hits.
-
-The kernels walk the lists of `cpu_blend` in the same direction with the same arithmetic.
 """
 
 from __future__ import annotations
@@ -148,7 +144,6 @@ def _blend_tile(table: Any, hits: Any, first: int, last: int, tile_x: int, tile_
 
 @jit
 def _finish_tile(scratch: Any, tile_x: int, tile_y: int, background: Any, images: Any) -> None:
-    """Write a blended tile into the images."""
     colour, alpha, depth, depth2, median = images
     for row in range(min(TILE_HEIGHT, colour.shape[0] - tile_y)):
         for column in range(min(TILE_WIDTH, colour.shape[1] - tile_x)):

@@ -1,19 +1,13 @@
-"""Projection of one Gaussian to the screen, as numba functions.
+"""Numba functions for one Gaussian: its projection to the screen, slope of its depth, and colour; the camera's
+form.
 
 Arithmetic is float64 whatever the arrays hold: it is scalar code, where float32 is no faster. Small matrices are
-flat tuples, row by row, so that they stay in registers.
-
-Real spherical harmonics of degree 0 to 3 and their derivative, as numba kernels.
-
-Order, signs and polynomials are those of 3DGS (doi 10.1145/3592433).
-
-Slope of the depth of a Gaussian across the screen, and its derivative, as numba functions.
+flat tuples, row by row, so that they stay in registers. Order, signs and polynomials of the spherical harmonics are
+those of 3DGS (doi 10.1145/3592433).
 
 With V the principal axes along (u, v, z), in rows, D their variances, and K the screen covariance with a part of
 the image's dilation, the slope is q = s p, p = K⁻¹ c, c = (V D Vᵀ)_uz,vz. The factor s ≤ 1 keeps z near the depth
 of the centre, see `api`; it depends on C, the screen covariance with all of the dilation.
-
-Camera in the form of the kernels.
 """
 
 from __future__ import annotations
@@ -137,15 +131,7 @@ def _shrinkage(spread2: float, depth: float) -> float:
 
 @jit
 def depth_slope(axes: Any, variance: Any, cov: Any, dilation: float, depth: float) -> Any:
-    """Return ∂z/∂u, ∂z/∂v of a Gaussian in m/px.
-
-    Args:
-        axes: V (9).
-        variance: D (3).
-        cov: C (xx, xy, yy).
-        dilation: of C in px².
-        depth: z of the centre.
-    """
+    """Return ∂z/∂u, ∂z/∂v of a Gaussian in m/px, given V (9), D (3), C (xx, xy, yy) and its dilation, and z."""
     _, (px, py) = _free_slope(axes, variance, _narrow(cov, dilation))
     wide_x, wide_y = _times(cov, (px, py))
     s = _shrinkage(px * wide_x + py * wide_y, depth)
@@ -226,7 +212,6 @@ def make_view(camera: Pinhole, settings: RasterSettings, pose: FloatArray) -> Vi
 
 @jit
 def row3(array: Any, i: int) -> Any:
-    """Return row i of an (N, 3) array."""
     return float(array[i, 0]), float(array[i, 1]), float(array[i, 2])
 
 
@@ -262,7 +247,6 @@ def rotation(quat: Any) -> Any:
 
 @jit
 def variances(log_scales: Any, i: int) -> Any:
-    """Return the variances along the principal axes of Gaussian i."""
     a, b, c = row3(log_scales, i)
     return math.exp(2 * a), math.exp(2 * b), math.exp(2 * c)
 

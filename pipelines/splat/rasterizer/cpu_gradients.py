@@ -1,9 +1,7 @@
-"""Gradients of Gaussians and camera from the gradients of hits, as numba kernels.
+"""Gradients of Gaussians and camera from the gradients of hits, through projection and colour, as numba kernels.
 
 Sums run in a fixed order whatever the number of threads, without atomic additions: the result is the same bit for
 bit on every run.
-
-Derivative of the projection and of the colour of one Gaussian, as numba functions.
 """
 
 from __future__ import annotations
@@ -14,6 +12,7 @@ from typing import Any
 import numpy as np
 from numba import prange
 
+from pipelines.splat.rasterizer import cpu_gaussian as gaussian
 from pipelines.splat.rasterizer.cpu_blend import (
     D_BLUE,
     D_DEPTH,
@@ -29,25 +28,7 @@ from pipelines.splat.rasterizer.cpu_blend import (
     Q_YY,
     Q,
 )
-from pipelines.splat.rasterizer.cpu_gaussian import (
-    MAX_COEFFICIENTS,
-    View,
-    depth_slope_gradient,
-    jacobian,
-    log_sigmoid,
-    point_in_cam,
-    rotation,
-    row3,
-    screen_covariance,
-    screen_from_model,
-    sh_basis,
-    sh_colour,
-    sh_direction_gradient,
-    times_rotation,
-    unit_direction,
-    unit_quat,
-    variances,
-)
+from pipelines.splat.rasterizer.cpu_gaussian import MAX_COEFFICIENTS, View
 from pipelines.splat.rasterizer.cpu_lanes import jit, parallel_jit, worker_jit
 from pipelines.splat.rasterizer.cpu_project import BLOCK
 
@@ -71,13 +52,13 @@ def _conic_gradients(cov: Any, sums: Any) -> Any:
 @jit
 def _covariance_gradients(axes: Any, variance: Any, view: View, depth: float, sums: Any) -> Any:
     """Return ∂L/∂ screen mean (2), depth of the centre, screen covariance (3), covariance with the depth (2)."""
-    cov = screen_covariance(axes, variance, view.dilation)
+    cov = gaussian.screen_covariance(axes, variance, view.dilation)
     (gu, gv), (xx, xy, yy) = _conic_gradients(cov, sums)
     g_depth, g_slope = sums[D_DEPTH], (sums[D_SLOPE_X], sums[D_SLOPE_Y])
     if g_depth == 0.0 and g_slope[0] == 0.0 and g_slope[1] == 0.0:
         # True of every render without depth.
         return (gu, gv), 0.0, (xx, xy, yy), (0.0, 0.0)
-    slope, g_c, (s_xx, s_xy, s_yy), g_reach = depth_slope_gradient(
+    slope, g_c, (s_xx, s_xy, s_yy), g_reach = gaussian.depth_slope_gradient(
         axes, variance, cov, view.dilation, depth, g_slope
     )
     g_mean = (gu - slope[0] * g_depth, gv - slope[1] * g_depth)
@@ -100,22 +81,6 @@ def _axes_gradient(axes: Any, variance: Any, g_cov: Any, g_c: Any) -> Any:
         a * (xz * axes[0] + yz * axes[3]),
         b * (xz * axes[1] + yz * axes[4]),
         c * (xz * axes[2] + yz * axes[5]),
-    )
-
-
-@jit
-def _times_transposed(v: Any, r: Any) -> Any:
-    """Return V Rᵀ (9)."""
-    return (
-        v[0] * r[0] + v[1] * r[1] + v[2] * r[2],
-        v[0] * r[3] + v[1] * r[4] + v[2] * r[5],
-        v[0] * r[6] + v[1] * r[7] + v[2] * r[8],
-        v[3] * r[0] + v[4] * r[1] + v[5] * r[2],
-        v[3] * r[3] + v[4] * r[4] + v[5] * r[5],
-        v[3] * r[6] + v[4] * r[7] + v[5] * r[8],
-        v[6] * r[0] + v[7] * r[1] + v[8] * r[2],
-        v[6] * r[3] + v[7] * r[4] + v[8] * r[5],
-        v[6] * r[6] + v[7] * r[7] + v[8] * r[8],
     )
 
 
@@ -197,15 +162,15 @@ def colour_gradient(
 ) -> Any:
     """Write row i of ∂L/∂ SH, and return ∂L/∂ direction, with the basis as functions of all space."""
     terms = (degree + 1) ** 2
-    sh_basis(direction, degree, basis)
-    red, green, blue = sh_colour(sh, i, basis, terms)
+    gaussian.sh_basis(direction, degree, basis)
+    red, green, blue = gaussian.sh_colour(sh, i, basis, terms)
     g_red = sums[D_RED] if red >= 0.0 else 0.0
     g_green = sums[D_GREEN] if green >= 0.0 else 0.0
     g_blue = sums[D_BLUE] if blue >= 0.0 else 0.0
     for k in range(terms):
         g_sh[i, k, 0], g_sh[i, k, 1], g_sh[i, k, 2] = basis[k] * g_red, basis[k] * g_green, basis[k] * g_blue
         weight[k] = sh[i, k, 0] * g_red + sh[i, k, 1] * g_green + sh[i, k, 2] * g_blue
-    return sh_direction_gradient(direction, degree, weight)
+    return gaussian.sh_direction_gradient(direction, degree, weight)
 
 
 @jit
@@ -221,15 +186,16 @@ def unnormalised(direction: Any, scale: float, gradient: Any) -> Any:
 def geometry_gradient(quats: Any, log_scales: Any, i: int, mean: Any, pose: Any, view: View, sums: Any,
                        camera: Any, g_quats: Any, g_log_scales: Any) -> Any:  # fmt: skip
     """Write row i of ∂L/∂ quaternion and log scales, add to ∂L/∂ pose; return ∂L/∂ point and screen mean."""
-    point = point_in_cam(pose, mean)
-    quat, scale = unit_quat(quats, i)
-    turn = rotation(quat)
-    jac = jacobian(view, point)
-    w = screen_from_model(jac, pose)
-    axes, variance = times_rotation(w, turn), variances(log_scales, i)
+    point = gaussian.point_in_cam(pose, mean)
+    quat, scale = gaussian.unit_quat(quats, i)
+    turn = gaussian.rotation(quat)
+    jac = gaussian.jacobian(view, point)
+    w = gaussian.screen_from_model(jac, pose)
+    axes, variance = gaussian.times_rotation(w, turn), gaussian.variances(log_scales, i)
     g_mean, g_depth, g_cov, g_c = _covariance_gradients(axes, variance, view, point[2], sums)
     g_axes = _axes_gradient(axes, variance, g_cov, g_c)
-    g_w = _times_transposed(g_axes, turn)
+    turn_back = (turn[0], turn[3], turn[6], turn[1], turn[4], turn[7], turn[2], turn[5], turn[8])
+    g_w = gaussian.times_rotation(g_axes, turn_back)
     g_quats[i, 0], g_quats[i, 1], g_quats[i, 2], g_quats[i, 3] = _quat_gradient(quat, scale, w, g_axes)
     # Scaling a principal axis means scaling its column of V.
     g_log_scales[i, 0] = _transposed_times(axes, g_axes, 0, 0)
@@ -287,14 +253,14 @@ def _gaussian_gradients(
         for m in range(block_start[block], block_start[block + 1]):
             i, row = visible[m], rank[m]
             _sum_hits(gradient, places, splat_start[row], splat_start[row + 1], sums)
-            mean = row3(means, i)
+            mean = gaussian.row3(means, i)
             (px, py, pz), (g_screen[m, 0], g_screen[m, 1]) = geometry_gradient(
                 quats, log_scales, i, mean, pose, view, sums, share, g_quats, g_log_scales
             )
             # ln α = ln σ(logit) + exponent, and ∂ ln σ/∂logit = 1 − σ(logit) = σ(−logit).
             logit = float(logit_opacities[i])
-            g_logits[i] = sums[Q] * math.exp(log_sigmoid(logit) - logit)
-            direction, scale = unit_direction(mean, center)
+            g_logits[i] = sums[Q] * math.exp(gaussian.log_sigmoid(logit) - logit)
+            direction, scale = gaussian.unit_direction(mean, center)
             g_direction = colour_gradient(sh, i, direction, degree, sums, basis, weight, g_sh)
             dx, dy, dz = unnormalised(direction, scale, g_direction)
             g_means[i, 0] = pose[0, 0] * px + pose[1, 0] * py + pose[2, 0] * pz + dx

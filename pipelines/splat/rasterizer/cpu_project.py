@@ -1,10 +1,8 @@
-"""Numba kernels that find the visible Gaussians and fill the tables for binning and blending.
+"""Numba kernels that find the visible Gaussians, fill the tables for blending, and list the splats of each tile.
 
-Lists of the splats of each tile, nearest first: a parallel counting sort, as numba kernels.
-
-An ellipse is cut into the columns of tiles that it crosses. Its extreme rows within a column have a closed form. A
-tile is therefore listed only if the ellipse enters it, with exactly the rows that the ellipse enters (the idea of
-AccuTile, doi 10.48550/arXiv.2412.00578).
+The lists are a parallel counting sort, nearest first. An ellipse is cut into the columns of tiles that it crosses.
+Its extreme rows within a column have a closed form. A tile is therefore listed only if the ellipse enters it, with
+exactly the rows that the ellipse enters (the idea of AccuTile, doi 10.48550/arXiv.2412.00578).
 """
 
 from __future__ import annotations
@@ -15,26 +13,9 @@ from typing import Any
 import numpy as np
 from numba import prange
 
+from pipelines.splat.rasterizer import cpu_gaussian as gaussian
 from pipelines.splat.rasterizer.api import ALPHA_MIN
-from pipelines.splat.rasterizer.cpu_gaussian import (
-    MAX_COEFFICIENTS,
-    WIDEST,
-    View,
-    depth_slope,
-    jacobian,
-    log_sigmoid,
-    point_in_cam,
-    rotation,
-    row3,
-    screen_covariance,
-    screen_from_model,
-    sh_basis,
-    sh_colour,
-    times_rotation,
-    unit_direction,
-    unit_quat,
-    variances,
-)
+from pipelines.splat.rasterizer.cpu_gaussian import MAX_COEFFICIENTS, WIDEST, View
 from pipelines.splat.rasterizer.cpu_lanes import LANES, jit, kernel_jit, parallel_jit, worker_jit
 
 LOG_ALPHA_MIN = math.log(ALPHA_MIN)
@@ -55,12 +36,13 @@ ELLIPSE_WIDTH = 6
 @jit
 def _ellipse(means: Any, quats: Any, log_scales: Any, pose: Any, view: View, i: int) -> Any:
     """Return the point in the camera's frame, screen covariance and slope of the depth of Gaussian i."""
-    point = point_in_cam(pose, row3(means, i))
-    quat, _ = unit_quat(quats, i)
-    axes = times_rotation(screen_from_model(jacobian(view, point), pose), rotation(quat))
-    variance = variances(log_scales, i)
-    cov = screen_covariance(axes, variance, view.dilation)
-    return point, cov, depth_slope(axes, variance, cov, view.dilation, point[2])
+    point = gaussian.point_in_cam(pose, gaussian.row3(means, i))
+    quat, _ = gaussian.unit_quat(quats, i)
+    w = gaussian.screen_from_model(gaussian.jacobian(view, point), pose)
+    axes = gaussian.times_rotation(w, gaussian.rotation(quat))
+    variance = gaussian.variances(log_scales, i)
+    cov = gaussian.screen_covariance(axes, variance, view.dilation)
+    return point, cov, gaussian.depth_slope(axes, variance, cov, view.dilation, point[2])
 
 
 @jit
@@ -91,7 +73,7 @@ def _is_visible(means: Any, quats: Any, log_scales: Any, logit: float, pose: Any
     point, (xx, xy, yy), _ = _ellipse(means, quats, log_scales, pose, view, i)
     if not (xx * yy - xy * xy > 0.0 and xx < math.inf and yy < math.inf):
         return False
-    level = 2.0 * (log_sigmoid(logit) - LOG_ALPHA_MIN)
+    level = 2.0 * (gaussian.log_sigmoid(logit) - LOG_ALPHA_MIN)
     u = view.fx * point[0] / point[2] + view.cx
     v = view.fy * point[1] / point[2] + view.cy
     return _holds_pixel(u, math.sqrt(level * xx), view.width) and _holds_pixel(
@@ -107,11 +89,11 @@ def _find_visible(
     for block in range(worker, (means.shape[0] + BLOCK - 1) // BLOCK, workers):
         for i in range(block * BLOCK, min((block + 1) * BLOCK, means.shape[0])):
             visible[i] = False
-            point = point_in_cam(pose, row3(means, i))
+            point = gaussian.point_in_cam(pose, gaussian.row3(means, i))
             logit = float(logit_opacities[i])
             if not (point[2] >= view.near and logit >= LOGIT_ALPHA_MIN):
                 continue
-            a, b, c = row3(log_scales, i)
+            a, b, c = gaussian.row3(log_scales, i)
             if _may_reach_image(point, max(a, b, c), view):
                 visible[i] = _is_visible(means, quats, log_scales, logit, pose, view, i)
                 depth[i] = point[2]
@@ -149,18 +131,10 @@ def _write_splat(splats: Any, ellipses: Any, row: int, center: Any, cov: Any, lo
     ellipses[row, E_LEVEL] = 2.0 * (log_opacity - LOG_ALPHA_MIN)
 
 
-@jit
-def _longer_radius(cov: Any) -> float:
-    """Return three standard deviations along the longer axis of a covariance xx, xy, yy."""
-    xx, xy, yy = cov
-    half_difference = 0.5 * (xx - yy)
-    return 3.0 * math.sqrt(0.5 * (xx + yy) + math.sqrt(half_difference * half_difference + xy * xy))
-
-
 @worker_jit
 def _project_visible(
     means: Any, quats: Any, log_scales: Any, logit_opacities: Any, sh: Any, pose: Any, center: Any, view: View,
-    degree: int, visible: Any, rank: Any, splats: Any, ellipses: Any, radius: Any, worker: int, workers: int,
+    degree: int, visible: Any, rank: Any, splats: Any, ellipses: Any, worker: int, workers: int,
 ) -> None:  # fmt: skip
     basis = np.empty(MAX_COEFFICIENTS)
     count = visible.shape[0]
@@ -169,22 +143,21 @@ def _project_visible(
             i, row = visible[m], rank[m]
             (x, y, z), cov, slope = _ellipse(means, quats, log_scales, pose, view, i)
             on_screen = (view.fx * x / z + view.cx, view.fy * y / z + view.cy)
-            _write_splat(splats, ellipses, row, on_screen, cov, log_sigmoid(float(logit_opacities[i])))
-            direction, _ = unit_direction(row3(means, i), center)
-            sh_basis(direction, degree, basis)
-            red, green, blue = sh_colour(sh, i, basis, (degree + 1) ** 2)
+            _write_splat(splats, ellipses, row, on_screen, cov, gaussian.log_sigmoid(float(logit_opacities[i])))
+            direction, _ = gaussian.unit_direction(gaussian.row3(means, i), center)
+            gaussian.sh_basis(direction, degree, basis)
+            red, green, blue = gaussian.sh_colour(sh, i, basis, (degree + 1) ** 2)
             splats[row, RED] = max(red, 0.0)
             splats[row, GREEN] = max(green, 0.0)
             splats[row, BLUE] = max(blue, 0.0)
             splats[row, DEPTH] = z
             splats[row, SLOPE_X], splats[row, SLOPE_Y] = slope
-            radius[m] = _longer_radius(cov)
 
 
 @parallel_jit
 def project_visible(
     means: Any, quats: Any, log_scales: Any, logit_opacities: Any, sh: Any, pose: Any, center: Any, view: View,
-    degree: int, visible: Any, rank: Any, splats: Any, ellipses: Any, radius: Any, workers: int,
+    degree: int, visible: Any, rank: Any, splats: Any, ellipses: Any, workers: int,
 ) -> None:  # fmt: skip
     """Fill the tables of the M visible Gaussians.
 
@@ -195,15 +168,13 @@ def project_visible(
         degree: of the spherical harmonics in use.
         visible: (M,) rows of the Gaussians, ascending.
         rank: (M,) places of the visible Gaussians in the order of depth.
-        splats: (M, SPLAT_WIDTH) by rank, written.
-        ellipses: (M, ELLIPSE_WIDTH) by rank, written.
-        radius: (M,) three standard deviations along the longer axis in px, in the order of `visible`, written.
+        splats, ellipses: (M, SPLAT_WIDTH), (M, ELLIPSE_WIDTH) by rank, written.
         workers: number of threads.
     """
     for worker in prange(workers):
         _project_visible(
             means, quats, log_scales, logit_opacities, sh, pose, center, view, degree, visible, rank, splats,
-            ellipses, radius, np.int64(worker), workers,
+            ellipses, np.int64(worker), workers,
         )  # fmt: skip
 
 
@@ -214,7 +185,6 @@ RUNS = 32
 
 
 def tile_grid(width: int, height: int) -> tuple[int, int]:
-    """Return the columns and rows of tiles over an image."""
     return -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
 
 
@@ -226,7 +196,6 @@ def pack_hit(splat: int, first_row: int, last_row: int) -> int:
 
 @jit
 def unpack_hit(hit: int) -> Any:
-    """Unpack a hit: inverts `pack_hit`."""
     return hit >> 16, (hit >> 8) & 255, hit & 255
 
 
@@ -292,13 +261,9 @@ def _count_hits(ellipses: Any, width: int, height: int, per_tile: Any, per_splat
 
 @parallel_jit
 def count_hits(ellipses: Any, width: int, height: int, per_tile: Any, per_splat: Any) -> None:
-    """Count the tiles of each splat.
+    """Count the tiles of M splats, nearest first, in an image of some pixels.
 
-    Args:
-        ellipses: (M, ELLIPSE_WIDTH), nearest first.
-        width, height: of the image in px.
-        per_tile: (RUNS, tiles) hits of each run in each tile, written.
-        per_splat: (M,) hits of each splat, written.
+    Hits of each run in each tile (RUNS, tiles), and hits of each splat (M,), are written.
     """
     for run in prange(RUNS):
         _count_hits(ellipses, width, height, per_tile, per_splat, np.int64(run))
@@ -346,12 +311,10 @@ def list_hits(
     """List the splats of each tile, nearest first, and the places of each splat in those lists.
 
     Args:
-        ellipses: (M, ELLIPSE_WIDTH), nearest first.
-        width, height: of the image in px.
+        ellipses, width, height: as in `count_hits`.
         next_place: (RUNS, tiles) from `starts_from_counts`, overwritten.
         splat_start: (M + 1,) start of each splat in `places`.
-        hits: (H,) packed hits by tile, written.
-        places: (H,) places in `hits` by splat, written.
+        hits, places: (H,) packed hits by tile, and places in `hits` by splat, written.
     """
     for run in prange(RUNS):
         _list_hits(ellipses, width, height, next_place, splat_start, hits, places, np.int64(run))

@@ -25,11 +25,9 @@ _EVERY_BATCH = 2**31 - 1
 class CudaRasterizer:
     """Backend of gsplat ≥ 1.5.3. The tensors must be on the CUDA device.
 
-    Args:
-        progress: shows the compilation of gsplat's kernels, before their first use on a machine.
-
     Raises:
-        BackendUnavailableError: gsplat is missing, or cannot be compiled.
+        BackendUnavailableError: gsplat is missing, or cannot be compiled; `progress` shows the compilation of its
+            kernels before their first use on a machine.
     """
 
     name: BackendName = "cuda"
@@ -160,12 +158,7 @@ def _depth_slope(
 
 def _screen_stats(meta: dict[str, Any]) -> ScreenStats:
     means_px = meta["means2d"]
-    with torch.no_grad():
-        xx, xy, yy = meta["conics"].unbind(-1)
-        smallest = 0.5 * (xx + yy) - torch.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
-        # The conic is the inverse covariance: its smaller eigenvalue belongs to the longer axis.
-        radius = 3.0 / torch.sqrt(smallest.clamp(min=1e-12))
-    stats = ScreenStats(visible=meta["gaussian_ids"].long(), radius_px=radius)
+    stats = ScreenStats(meta["gaussian_ids"].long())
     if means_px.requires_grad:
 
         def keep_gradient(gradient: Tensor) -> None:

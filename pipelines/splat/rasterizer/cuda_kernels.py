@@ -62,9 +62,6 @@ def compile_kernels(progress: Progress = SILENT) -> Path:
 
     They are compiled for the GPUs of this machine, or for those that the variable TORCH_CUDA_ARCH_LIST names.
 
-    Args:
-        progress: shows the files that are compiled.
-
     Raises:
         BackendUnavailableError: a part is missing (names each), or the compiler fails (names its log).
         InputError: neither a GPU nor the variable tells what to compile for, or the cache cannot be written.
@@ -148,11 +145,7 @@ def _capabilities() -> list[str]:
 
 
 def _architectures() -> list[str]:
-    """Return the compute capabilities to compile for.
-
-    Raises:
-        InputError: there is no GPU, and the variable TORCH_CUDA_ARCH_LIST names none, or is no list of them.
-    """
+    """Return the compute capabilities to compile for."""
     named = os.environ.get("TORCH_CUDA_ARCH_LIST", "").replace(";", " ").split()
     found = sorted(name.removesuffix("+PTX") for name in named) or _capabilities()
     if not found:
@@ -182,11 +175,7 @@ def _alone_in(folder: Path) -> Iterator[None]:
 
 
 def _compile(draft: Path, log: Path, progress: Progress) -> None:
-    """Compile in a process group of its own, whose end an interrupt brings about.
-
-    Raises:
-        BackendUnavailableError: the compiler failed; cites its first error and names the log.
-    """
+    """Compile in a process group of its own, whose end an interrupt brings about."""
     sources = _sources()
     with log.open("wb") as output, progress.task("compiling CUDA kernels, once", sources + 1) as task:
         process = subprocess.Popen(
@@ -241,7 +230,6 @@ def _link_library(home: Path, draft: Path) -> Path:
 
 
 def _sources() -> int:
-    """Return the number of gsplat's files to compile."""
     patterns = ("cuda/csrc/*.cu", "cuda/csrc/*.cpp", "cuda/*.cpp")
     found = importlib.util.find_spec("gsplat")
     places = (found.submodule_search_locations or ()) if found is not None else ()
@@ -249,7 +237,6 @@ def _sources() -> int:
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """End a process with its compilers."""
     if process.poll() is None:
         if hasattr(os, "killpg"):
             with contextlib.suppress(ProcessLookupError):

@@ -38,13 +38,7 @@ _EXTRA = "pip install 'georefgs[cuda]'"
 
 @dataclass(frozen=True)
 class CudaPart:
-    """Part of what the cuda backend needs.
-
-    Attributes:
-        name: of the part (`C++ compiler`).
-        found: version and place; None: missing.
-        remedy: how to get it; empty if found.
-    """
+    """Part of what the cuda backend needs: version and place, or None if it is missing, and then how to get it."""
 
     name: str
     found: str | None
@@ -69,7 +63,6 @@ def compiling_parts() -> tuple[CudaPart, ...]:
 
 
 def gsplat() -> CudaPart:
-    """Return where gsplat is, whose kernels the backend runs."""
     try:
         return CudaPart("gsplat", f"gsplat {metadata.version('gsplat')}", "")
     except metadata.PackageNotFoundError:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from pipelines.core.types import BoolArray, FloatArray
+from pipelines.core.types import FloatArray
 from pipelines.splat.rasterizer import cpu_project
 from pipelines.splat.rasterizer.api import ALPHA_MIN
 from pipelines.splat.rasterizer.cpu import KERNEL_LOCK, blend_tiles, list_tiles
@@ -36,13 +36,6 @@ class PlanSplats:
     opacity: FloatArray
     colour: FloatArray
 
-    def __len__(self) -> int:
-        return len(self.mean)
-
-    def select(self, index: FloatArray | BoolArray) -> PlanSplats:
-        """Return the rows that `index` picks."""
-        return PlanSplats(self.mean[index], self.cov[index], self.opacity[index], self.colour[index])
-
     def scaled(self, factor: float) -> PlanSplats:
         """Return the same Gaussians over pixels that are smaller by a factor; depths stay."""
         scale = np.array([factor, factor, 1.0])
@@ -51,15 +44,7 @@ class PlanSplats:
 
 @dataclass(frozen=True)
 class PlanView:
-    """Orthographic view of H × W pixels, float64.
-
-    Attributes:
-        colour: (H, W, 3) blended over black.
-        alpha: (H, W) 1 − final transmittance.
-        expected_depth: (H, W) Σ w z / Σ w; 0 where alpha is 0.
-        depth_variance: (H, W) Σ w z² / Σ w − expected_depth².
-        median_depth: (H, W) depth at which the transmittance falls to one half; 0 if it stays higher.
-    """
+    """Orthographic view of H × W pixels, float64; the maps are those of a `Render`, with the colour over black."""
 
     colour: FloatArray
     alpha: FloatArray
@@ -76,14 +61,7 @@ def render_orthographic(
     corner: tuple[float, float] = (0.0, 0.0),
     dilation_px2: float = 0.3,
 ) -> PlanView:
-    """Return the view of a part of the plane from above.
-
-    Args:
-        splats: the Gaussians; those outside the part do not matter.
-        width, height: of the part in px.
-        corner: column and row of its top left corner.
-        dilation_px2: added to the diagonal of the screen covariance, in px².
-    """
+    """Return the view of a part of the plane, `width` × `height` px from a corner (column, row), from above."""
     table, ellipses = _tables(splats, width, height, corner, dilation_px2)
     with KERNEL_LOCK:
         lists = list_tiles(ellipses, width, height)

@@ -32,17 +32,7 @@ FRUSTUM_MARGIN = 0.3
 def render_reference(
     gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, settings: RasterSettings
 ) -> Render:
-    """Render as `Rasterizer.render` does, by autograd through dense tensors.
-
-    Args:
-        gaussians: N Gaussians, float32 or float64.
-        cam_from_model: (4, 4) in the same dtype.
-        camera: the image.
-        settings: how to render.
-
-    Returns:
-        The view, in the dtype of the Gaussians.
-    """
+    """Render N Gaussians as `Rasterizer.render` does, in their dtype, by autograd through dense tensors."""
     dtype = gaussians.means.dtype
     pose = cam_from_model.to(dtype)
     mean_in_cam = gaussians.means @ pose[:3, :3].T + pose[:3, 3]
@@ -52,7 +42,9 @@ def render_reference(
 
     mean_px, cov_px2 = project_gaussians(sorted_gaussians, mean_in_cam, pose, camera, settings.dilation_px2)
     colours = view_colours(sorted_gaussians, pose, settings.sh_degree)
-    offset_px = _offsets(mean_px, camera)
+    rows, columns = (torch.arange(count, dtype=dtype) + 0.5 for count in (camera.height, camera.width))
+    v, u = torch.meshgrid(rows, columns, indexing="ij")
+    offset_px = torch.stack([u.reshape(-1), v.reshape(-1)], dim=-1) - mean_px[:, None]
     alpha = _alpha(offset_px, cov_px2, torch.sigmoid(sorted_gaussians.logit_opacities))
 
     after = torch.cumprod(1 - alpha, dim=0)
@@ -75,7 +67,9 @@ def render_reference(
         mean = torch.where(opaque, depth_sum / total, 0.0)
         variance = (((depth - mean).square() * weight).sum(dim=0) / total).view(size)
         expected = mean.view(size)
-        median = _median_depth(depth, before, after, counted).view(size) if settings.median else None
+        if settings.median:
+            crossing = counted & (before > 0.5) & (after <= 0.5)
+            median = torch.where(crossing, depth.detach(), 0.0).sum(dim=0).view(size)
     stats = _screen_stats(front, mean_px, cov_px2, sorted_gaussians.logit_opacities, camera)
     view = Render(colour.view(*size, 3), (1 - final).view(size), stats, expected, variance, median)
     return view if settings.window is None else settings.window.cut(view)
@@ -86,23 +80,18 @@ def project_gaussians(
 ) -> tuple[Tensor, Tensor]:
     """Return screen means (N, 2) in px and dilated screen covariances (N, 2, 2) in px²."""
     x, y, z = mean_in_cam.unbind(-1)
-    screen_axes = projected_axes(gaussians.quats_wxyz, gaussians.log_scales, mean_in_cam, cam_from_model, camera)[
-        :, :2
-    ]
-    cov_px2 = screen_axes @ screen_axes.mT + dilation_px2 * torch.eye(2, dtype=z.dtype)
+    axes = projected_axes(gaussians.quats_wxyz, gaussians.log_scales, mean_in_cam, cam_from_model, camera)[:, :2]
+    cov_px2 = axes @ axes.mT + dilation_px2 * torch.eye(2, dtype=z.dtype)
     mean_px = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], dim=-1)
     return mean_px, cov_px2
 
 
 def depth_slopes(axes: Tensor, depth: Tensor, dilation_px2: float) -> Tensor:
-    """Return ∂z/∂(u, v) of Gaussians (N, 2) in m/px, shortened if z would leave `DEPTH_REACH` of the centre's.
+    """Return ∂z/∂(u, v) of Gaussians (N, 2) in m/px, shortened if z would leave `DEPTH_REACH` of the centre's,
+    `depth`.
 
-    By Cauchy and Schwarz |q · d| ≤ √(q · C q) √(d · C⁻¹ d), with C as the image dilates it.
-
-    Args:
-        axes: (N, 3, 3) of `projected_axes`.
-        depth: (N,) z of the centres.
-        dilation_px2: of the image.
+    By Cauchy and Schwarz |q · d| ≤ √(q · C q) √(d · C⁻¹ d), with C as the image dilates it. The `axes` are those of
+    `projected_axes`.
     """
     u, v, z = axes.unbind(dim=1)
     xx, xy, yy, xz, yz = (u * u).sum(-1), (u * v).sum(-1), (v * v).sum(-1), (u * z).sum(-1), (v * z).sum(-1)
@@ -146,16 +135,6 @@ def view_colours(gaussians: Gaussians, cam_from_model: Tensor, sh_degree: int) -
     return (sh.evaluate_sh(gaussians.sh, gaussians.means - center_in_model, sh_degree) + 0.5).clamp_min(0.0)
 
 
-def _offsets(mean_px: Tensor, camera: Pinhole) -> Tensor:
-    """Return offsets (N, H·W, 2) from the screen means to the pixel centres."""
-    v, u = torch.meshgrid(
-        torch.arange(camera.height, dtype=mean_px.dtype) + 0.5,
-        torch.arange(camera.width, dtype=mean_px.dtype) + 0.5,
-        indexing="ij",
-    )
-    return torch.stack([u.reshape(-1), v.reshape(-1)], dim=-1) - mean_px[:, None]
-
-
 def _alpha(offset_px: Tensor, cov_px2: Tensor, opacity: Tensor) -> Tensor:
     """Return opacities (N, H·W) at each pixel centre, cut off below ALPHA_MIN and above ALPHA_MAX."""
     dx, dy = offset_px.unbind(-1)
@@ -163,12 +142,6 @@ def _alpha(offset_px: Tensor, cov_px2: Tensor, opacity: Tensor) -> Tensor:
     sigma = 0.5 * (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / (xx * yy - xy * xy)
     alpha = opacity[:, None] * torch.exp(-sigma)
     return torch.where(alpha >= ALPHA_MIN, alpha.clamp(max=ALPHA_MAX), 0.0)
-
-
-def _median_depth(depth: Tensor, before: Tensor, after: Tensor, counted: Tensor) -> Tensor:
-    """Return z (P,), of (N, P), of the Gaussian at which a pixel's transmittance falls to one half, else 0."""
-    crossing = counted & (before > 0.5) & (after <= 0.5)
-    return torch.where(crossing, depth.detach(), 0.0).sum(dim=0)
 
 
 def _screen_stats(
@@ -183,8 +156,7 @@ def _screen_stats(
         last = torch.minimum(torch.floor(mean_px + extent - 0.5), size - 1)
         seen = (level >= 0) & (first <= last).all(dim=1)
         order = torch.argsort(rows[seen])
-        radius = 3 * torch.sqrt(torch.linalg.eigvalsh(cov_px2[seen])[:, 1])
-    stats = ScreenStats(visible=rows[seen][order], radius_px=radius[order].float())
+    stats = ScreenStats(rows[seen][order])
     if mean_px.requires_grad:
 
         def keep_gradient(gradient: Tensor) -> None:
