@@ -166,13 +166,13 @@ def _in_folder(folder: Path) -> Photographs:
 
 def _training(planned: Sequence[PlannedStage], photographs: Photographs | None) -> TrainingForecast | None:
     """Return the forecast of the training; None where none would run, or before a bag is read."""
-    from pipelines.train.forecast import forecast
+    from pipelines.train.forecast import training_forecast
 
     row = _to_run(planned, TrainOptions)
     if row is None or photographs is None:
         return None
     assert isinstance(row.resolved, TrainOptions)
-    return forecast(photographs.count, photographs.size_px, row.resolved)
+    return training_forecast(photographs.count, photographs.size_px, row.resolved)
 
 
 _STYLE = {

@@ -161,7 +161,7 @@ class ViewQuality:
 
     def _psnr(self, index: int, *, exposed: bool) -> float:
         trainer, settings = self.trainer, RasterSettings(sh_degree=self.trainer.options.sh_degree)
-        pose, pinhole = trainer.problem.cameras.cam_from_model(index), trainer.pinhole(index)
+        pose, pinhole = trainer.problem.cameras.cam_from_model(index), trainer.pinholes.of(index)
         colour = trainer.rasterizer.render(trainer.optimizer.gaussians, pose, pinhole, settings).colour
         if exposed and trainer.exposures is not None:
             colour = trainer.exposures.apply(index, colour)

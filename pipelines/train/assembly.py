@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
 from pipelines.splat.densify import DefaultSettings, DefaultStrategy, FastSettings, FastStrategy, Strategy
@@ -13,12 +15,11 @@ from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.outlier_pixels import OutlierPixels, OutlierSettings
 from pipelines.splat.rasterizer.api import Rasterizer
 from pipelines.splat.rasterizer.backends import device_of
-from pipelines.splat.surface import SurfaceSettings
 from pipelines.train.geographic.problem import GeoProblem
 from pipelines.train.initial_gaussians import TrainingScene, initial_gaussians, points_to_hold
+from pipelines.train.lidar_surface import FusedSurface
 from pipelines.train.options import TrainOptions
-from pipelines.train.schedule import COARSE, JointOptions
-from pipelines.train.target_images import Crops
+from pipelines.train.schedule import JointOptions
 from pipelines.train.trainer import JointTrainer, TrainingViews
 
 _OUTLIERS_FROM = 0.5  # of the iterations: before, the model is too coarse to tell what has moved
@@ -45,33 +46,25 @@ def make_trainer(
     Raises:
         DegenerateGeometryError: fewer than two different points to start from.
     """
-    preset, device = options.effort, device_of(backend)
-    scene, images = training.scene, training.images
-    start = InitialisationOptions(sh_degree=options.sh_degree, max_gaussians=preset.max_gaussians)
-    gaussians = initial_gaussians(training, start, preset.max_gaussians, options.seed).to(device)
+    effort, device = options.effort, device_of(backend)
+    scene, images, surface = training.scene, training.images, training.surface
+    start = InitialisationOptions(sh_degree=options.sh_degree, max_gaussians=effort.max_gaussians)
+    gaussians = initial_gaussians(training, start, effort.max_gaussians, options.seed).to(device)
     extent_m = scene_extent(scene.poses.cam_center_in_model)
     train = torch.from_numpy(scene.train)
-    fitted = Exposures(len(images), train, preset.iterations, device) if options.exposure else None
+    fitted = Exposures(len(images), train, effort.iterations, device) if options.exposure else None
     hold = points_to_hold(training, device) if options.faithful_surface else None
-    beside = None if training.surface is None else training.surface.gaussian_loss(device)
+    measured = surface.losses(device) if isinstance(surface, FusedSurface) else ()
+    outliers = OutlierSettings(views=int(_OUTLIERS_FROM * effort.iterations))
     return JointTrainer(
-        GaussianAdam(gaussians, extent_m, preset.iterations),
+        GaussianAdam(gaussians, extent_m, effort.iterations),
         _strategy(options, extent_m, len(gaussians)),
         problem.to(device),
-        TrainingViews(scene.train, images, hold, scene.sparse.lenses, beside),
+        TrainingViews(scene.train, images, hold, scene.sparse.lenses, measured),
         rasterizer=backend,
-        options=JointOptions(
-            preset.iterations,
-            options.sh_degree,
-            geo_weight=options.geo_weight,
-            geo_schedule=options.geo_schedule,
-            seed=options.seed,
-            coarse=COARSE if options.coarse_to_fine else (),
-            crops=Crops(options.crop_size, options.seed),
-            surface=SurfaceSettings() if options.faithful_surface else None,
-        ),
+        options=JointOptions.of(options),
         exposures=exposures or fitted,
-        outliers=_outliers(options, device) if options.robust_photometric else None,
+        outliers=OutlierPixels(device, outliers) if options.robust_photometric else None,
         region=training.region,
     )
 
@@ -95,9 +88,8 @@ def make_finisher(
         options: of the training.
         exposures: of the photographs; None: none.
     """
-    device = device_of(backend)
-    extent_m = scene_extent(training.scene.poses.cam_center_in_model[training.scene.train])
-    iterations = options.effort.iterations
+    device, scene, iterations = device_of(backend), training.scene, options.effort.iterations
+    extent_m = scene_extent(scene.poses.cam_center_in_model[scene.train])
     optimizer = GaussianAdam(gaussians, extent_m, iterations)
     optimizer.rate_factor = _FINISHING_RATE
     hold = points_to_hold(training, device) if options.faithful_surface else None
@@ -105,23 +97,12 @@ def make_finisher(
         optimizer,
         DefaultStrategy(DefaultSettings(stop=0, reset_every=0), extent_m, len(gaussians), options.seed),
         problem.to(device),
-        TrainingViews(training.scene.train, training.images, hold, training.scene.sparse.lenses),
+        TrainingViews(scene.train, training.images, hold, scene.sparse.lenses),
         rasterizer=backend,
-        options=JointOptions(
-            iterations,
-            gaussians.sh_degree,
-            seed=options.seed,
-            crops=Crops(options.crop_size, options.seed),
-            surface=SurfaceSettings() if options.faithful_surface else None,
-            finishing=True,
-        ),
+        options=replace(JointOptions.of(options), sh_degree=gaussians.sh_degree, coarse=(), finishing=True),
         exposures=exposures,
         region=training.region,
     )
-
-
-def _outliers(options: TrainOptions, device: torch.device) -> OutlierPixels:
-    return OutlierPixels(device, OutlierSettings(views=int(_OUTLIERS_FROM * options.effort.iterations)))
 
 
 def _strategy(options: TrainOptions, extent_m: float, count: int) -> Strategy:

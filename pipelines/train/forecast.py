@@ -155,7 +155,7 @@ class TrainingForecast:
         return [effort, size, f"in {many}; one run would take {took.removeprefix('about ')}, {memory}"]
 
 
-def forecast(photographs: int, photo_px: tuple[int, int], options: TrainOptions) -> TrainingForecast:
+def training_forecast(photographs: int, photo_px: tuple[int, int], options: TrainOptions) -> TrainingForecast:
     """Return the forecast of a training.
 
     The time is that of the machine of `MEASURED_ON`, divided by the ratio of the threads.
@@ -168,7 +168,7 @@ def forecast(photographs: int, photo_px: tuple[int, int], options: TrainOptions)
     Raises:
         BackendUnavailableError: `--backend cuda`, and a part that it needs is missing; names each.
     """
-    camera, backend = camera_of(photo_px, options), chosen_backend(options.backend)
+    camera, backend = training_pinhole(photo_px, options), chosen_backend(options.backend)
     device = torch.device(backend)
     free_bytes = free_memory_bytes(device)
     options = with_gaussian_limit(options, photographs, camera, free_bytes)
@@ -197,7 +197,7 @@ def forecast_of(survey: Survey, options: TrainOptions) -> TrainingForecast:
     Raises:
         BackendUnavailableError: `--backend cuda` without a GPU or without gsplat.
     """
-    return forecast(len(survey.images), survey.largest_photograph_px, options)
+    return training_forecast(len(survey.images), survey.largest_photograph_px, options)
 
 
 def block_processor_s(plan: BlockPlan, photo_px: tuple[int, int], options: TrainOptions) -> dict[int, float]:
@@ -208,7 +208,7 @@ def block_processor_s(plan: BlockPlan, photo_px: tuple[int, int], options: Train
         photo_px: width and height of the photographs.
         options: of the training.
     """
-    seconds, camera = {}, camera_of(photo_px, options)
+    seconds, camera = {}, training_pinhole(photo_px, options)
     for block in plan.blocks:
         count = block.gaussians + plan.scaffold_gaussians
         size = _Iteration(camera, block.view_px, block.visible, count, options)
@@ -218,7 +218,7 @@ def block_processor_s(plan: BlockPlan, photo_px: tuple[int, int], options: Train
     return seconds
 
 
-def camera_of(photo_px: tuple[int, int], options: TrainOptions) -> Pinhole:
+def training_pinhole(photo_px: tuple[int, int], options: TrainOptions) -> Pinhole:
     """Return the camera of training photographs, with a lens as wide as many."""
     width, height = photo_px
     whole = Pinhole(width, height, width, width, width / 2, height / 2)

@@ -183,15 +183,15 @@ def guessed_points(
     each = -(-_CANDIDATES * count // max(len(scene.train), 1))
     points, colours, sizes = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)], [np.zeros(0)]
     for index in map(int, scene.train):
-        camera = surface.camera(index)
-        unknown = surface.depth(index) == 0
+        camera = surface.maps.camera(index)
+        unknown = surface.maps.depth(index) == 0
         depth = _ground_depth(scene, index, camera, ground, unknown)
         rows, columns = np.nonzero(unknown & np.isfinite(depth))
         chosen = random.permutation(len(rows))[:each]
         rows, columns = rows[chosen], columns[chosen]
         in_cam = depth[rows, columns, None] * camera.rays(np.stack([columns, rows], axis=1) + 0.5)
         points.append(in_cam @ scene.poses.cam_from_model[index] + scene.poses.cam_center_in_model[index])
-        colours.append(surface.rgb(index)[rows, columns])
+        colours.append(surface.maps.rgb(index)[rows, columns])
         sizes.append(depth[rows, columns] / camera.fx)
     place, rgb, size_m = np.concatenate(points), np.concatenate(colours), np.concatenate(sizes)
     counted = np.flatnonzero(inside(place))
@@ -258,12 +258,12 @@ def hidden(points: FloatArray, scene: Scene, surface: SceneSurface) -> BoolArray
     """
     facing, behind = np.zeros(len(points), dtype=np.int64), np.zeros(len(points), dtype=np.int64)
     for index in map(int, scene.train):
-        camera = surface.camera(index)
+        camera = surface.maps.camera(index)
         in_cam = (points - scene.poses.cam_center_in_model[index]) @ scene.poses.cam_from_model[index].T
         xy = camera.project(in_cam)
         shown = np.flatnonzero(camera.holds(xy))
         column, row = xy[shown].astype(np.int64).T
-        depth = surface.depth(index)[row, column]
+        depth = surface.maps.depth(index)[row, column]
         facing[shown] += 1
         behind[shown] += (depth > 0) & (depth < in_cam[shown, 2])
     return np.asarray(behind >= _HIDDEN_SHARE * facing)

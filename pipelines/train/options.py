@@ -163,7 +163,7 @@ class GeographicOptions(StageOptions):
                 )
 
 
-class SplatOptions(StageOptions):
+class GaussianOptions(StageOptions):
     """Options of the splat: effort, backend, density control, exposure and surface."""
 
     preset: Literal["smoke", "fast", "standard", "high"] = Field("standard", description=f"Effort. {described()}")
@@ -218,7 +218,7 @@ class BlockOptions(StageOptions):
     )
 
 
-class TrainOptions(GeographicOptions, SplatOptions, BlockOptions, LidarOptions):
+class TrainOptions(GeographicOptions, GaussianOptions, BlockOptions, LidarOptions):
     """Options of the joint optimisation of Gaussians, similarity and camera corrections."""
 
     checkpoint_every: int = Field(500, ge=1, description="Iterations between checkpoints.")

@@ -138,7 +138,7 @@ class RegionViews:
             for index in self.indices.tolist():
                 pose, pinhole = self.poses.matrix(index), self.pinholes.of(index)
                 depth = stand_in_depth(stand_in, pose, pinhole, self.rasterizer)
-                known = None if surface is None else surface.depth(index)
+                known = None if surface is None else surface.maps.depth(index)
                 masks[index] = region_mask(pose, pinhole, cell, known, depth)
                 task.advance()
         return RegionMasks(masks)

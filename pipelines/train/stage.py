@@ -32,10 +32,10 @@ from pipelines.survey.scene import photographs
 from pipelines.survey.trained_model import Adjustment, TrainedModel
 from pipelines.train.adjusted_scene import AdjustedScene
 from pipelines.train.assembly import make_trainer
-from pipelines.train.forecast import forecast_of, training_size, with_gaussian_limit
+from pipelines.train.forecast import training_forecast, training_size, with_gaussian_limit
 from pipelines.train.geographic.problem import held_problem, refining_problem
 from pipelines.train.initial_gaussians import TrainingScene
-from pipelines.train.lidar import compared_lidar, draw_changes, lidar_surface
+from pipelines.train.lidar import compared_lidar, draw_changes, lidar_surface, plane_observations
 from pipelines.train.loop import METRICS, train_in_folder
 from pipelines.train.options import TrainOptions
 from pipelines.train.result import summary_of, trained_model
@@ -61,25 +61,26 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     clouds = None if options.lidar is None else CloudFiles(options.lidar, options.lidar_stated)
     adjusted = AdjustedScene.load(workspace)
     survey, scene = adjusted.survey, adjusted.scene
-    track = None
-    if options.lidar_trajectory is not None:
-        track = ScannerTrack.read(options.lidar_trajectory, options.lidar_stated, survey.origin)
+    of_scanner, stated = options.lidar_trajectory, options.lidar_stated
+    track = None if of_scanner is None else ScannerTrack.read(of_scanner, stated, survey.origin)
     options.require_trainable(len(scene.sparse.image_name))
     images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
     free_bytes = free_memory_bytes(device_of(backend))
     options = with_gaussian_limit(options, len(images), images.largest(), free_bytes)
     require_memory(training_size(options, len(images), images.largest()), free_bytes)
     images.build(stage.progress)
-    maps = DepthMaps(workspace.cache / "surface", scene, images) if options.dense else None
-    if maps is not None:
+    surface, compared, planes, lidar = None, None, None, None
+    if options.dense:
+        maps = DepthMaps(workspace.cache / "surface", scene, images)
         maps.build(stage.progress)
-    compared = None
-    if clouds is not None and maps is not None:
-        compared = compared_lidar(
-            options, clouds, maps, survey, track=track,
-            georeference=adjusted.adjustment.geo_from_model, seed=options.seed, progress=stage.progress,
-        )  # fmt: skip
-    planes = compared.planes() if compared is not None and options.lidar_register else None
+        surface = SceneSurface(maps)
+        if clouds is not None:
+            compared = compared_lidar(
+                options, clouds, maps, survey, track=track,
+                georeference=adjusted.adjustment.geo_from_model, seed=options.seed, progress=stage.progress,
+            )  # fmt: skip
+    if compared is not None and options.lidar_register:
+        planes = plane_observations(compared.registration, scene.geo_from_model)
     measured = adjusted.measured(control_points=options.gcp_loss, planes=planes)
     posterior: Posterior | None = None
     if planes is not None:
@@ -93,7 +94,6 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     else:
         log.info("similarity and cameras are held at the adjustment of init-sim3")
         problem = held_problem(adjusted)
-    surface, lidar = None if maps is None else SceneSurface(maps), None
     if compared is not None and clouds is not None:
         shift_m = measured.errors.value(adjusted.error_estimates(measured.errors)[0], "lidar-shift")
         lidar = lidar_surface(compared, clouds, survey, options, shift_m)
@@ -101,7 +101,8 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
         save_json(lidar.report, stage.out / Path(LIDAR).name)
         draw_changes(stage.out / Path(LIDAR_MAP).name, lidar, scene)
     trainer = make_trainer(TrainingScene(scene, images, surface), problem, backend, options)
-    record = train_in_folder(stage, trainer, options, _iterations(stage))
+    done = 0 if stage.extends is None else load_json(TrainedModel, stage.extends / Path(MODEL).name).iterations
+    record = train_in_folder(stage, trainer, options, done)
     if refines:
         posterior = adjusted.posterior(measured, problem.state())
     model = _write_solution(stage, trainer, adjusted.adjustment, posterior)
@@ -138,10 +139,5 @@ def made_in_parts(workspace: Workspace, options: TrainOptions) -> bool:
         BackendUnavailableError: `--backend cuda` without a GPU or without gsplat.
         GeorefError: the survey cannot be read.
     """
-    return forecast_of(load_survey(workspace), options).in_blocks
-
-
-def _iterations(stage: StageRun) -> int:
-    """Return the iterations of the finished training that this one may extend; 0: there is none."""
-    model = None if stage.extends is None else stage.extends / "model.json"
-    return 0 if model is None else load_json(TrainedModel, model).iterations
+    survey = load_survey(workspace)
+    return training_forecast(len(survey.images), survey.largest_photograph_px, options).in_blocks

@@ -100,8 +100,8 @@ _PARTS = 256  # windows kept: density control samples others between an iteratio
 
 
 @dataclass(frozen=True)
-class Look:
-    """Look at a photograph.
+class ImageLook:
+    """ImageLook at a photograph.
 
     Attributes:
         index: of the photograph.
@@ -188,9 +188,9 @@ class TargetImages:
         self._complete: dict[str, bool] = {}
         self._part = lru_cache(_PARTS)(self._find_part)
         self._reader = ThreadPoolExecutor(1, "photographs") if device.type == "cuda" else None
-        self._next: tuple[Look, Future[Tensor]] | None = None
+        self._next: tuple[ImageLook, Future[Tensor]] | None = None
 
-    def get(self, look: Look, upcoming: Look | None = None) -> TargetImage:
+    def get(self, look: ImageLook, upcoming: ImageLook | None = None) -> TargetImage:
         """Return a photograph, or a window of it.
 
         Args:
@@ -208,7 +208,7 @@ class TargetImages:
         on_device = None if mask.all() else torch.from_numpy(mask).to(self._device)
         return TargetImage(colour, on_device, part.window.of(whole), whole, part)
 
-    def _find_part(self, look: Look) -> ImagePart:
+    def _find_part(self, look: ImageLook) -> ImagePart:
         camera = shrunken(self._images.pinhole(look.index), look.shrink)
         image = Window(0, 0, camera.width, camera.height)
         shown = None if self._region is None else self._region.view(look.index, look.shrink)
@@ -225,20 +225,20 @@ class TargetImages:
         weight = len(seen) * counts[windows.index(window)] / max(sum(counts), 1)
         return _part_of(trained, window, len(seen) or 1, weight, share)
 
-    def _count(self, look: Look, window: Window) -> int:
+    def _count(self, look: ImageLook, window: Window) -> int:
         """Return the number of pixels that count in a window."""
         if self._region is None and self._all_count(look):
             return window.width * window.height
         return int(self._counting(look, window).sum())
 
-    def _all_count(self, look: Look) -> bool:
+    def _all_count(self, look: ImageLook) -> bool:
         """Return whether all pixels of a photograph count."""
         key = self._images.mask_key(look.index)
         if key not in self._complete:
             self._complete[key] = bool(self._images.mask(look.index).all())
         return self._complete[key]
 
-    def _counting(self, look: Look, window: Window) -> BoolArray:
+    def _counting(self, look: ImageLook, window: Window) -> BoolArray:
         """Return the pixels (H, W) of a window that count: of the photograph, and of the region if there is one."""
         s = look.shrink
         covered = self._images.mask(look.index)[
@@ -252,17 +252,17 @@ class TargetImages:
         top, left = window.top - shown.window.top, window.left - shown.window.left
         return np.asarray(mask & shown.mask[top : top + window.height, left : left + window.width])
 
-    def _pixels(self, look: Look) -> Tensor:
+    def _pixels(self, look: ImageLook) -> Tensor:
         if self._next is not None and self._next[0] == look:
             return self._next[1].result()
         return self._read(look)
 
-    def _read(self, look: Look) -> Tensor:
+    def _read(self, look: ImageLook) -> Tensor:
         image, window = self._images.shrunken(look.index, look.shrink), self._part(look).window
         pixels = torch.from_numpy(np.array(image if window is None else image[window.slices]))
         return pixels.pin_memory() if self._reader is not None else pixels
 
-    def _whole_mask(self, look: Look) -> Tensor | None:
+    def _whole_mask(self, look: ImageLook) -> Tensor | None:
         key = (self._images.mask_key(look.index), look.shrink)
         if key not in self._masks:
             camera = shrunken(self._images.pinhole(look.index), look.shrink)

@@ -5,9 +5,10 @@ Checkpoints: named tensors in one NPZ file without pickle, replaced in one step.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -16,60 +17,21 @@ from torch import Tensor
 from pipelines.core.errors import InputError
 from pipelines.core.files import read_npz, replacing
 from pipelines.core.types import IntArray
-from pipelines.geometry.cameras import Lenses, Pinhole
+from pipelines.geometry.cameras import Lenses
 from pipelines.jobs.costs import iteration_seconds
 from pipelines.splat.densify import Strategy, ViewContributions, view_contributions
 from pipelines.splat.exposure import Exposures, HeldExposures
 from pipelines.splat.gaussians import FinitenessMonitor, Gaussians
-from pipelines.splat.losses import photometric_loss
 from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.outlier_pixels import OutlierPixels
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Render, ScreenStats
 from pipelines.splat.surface import ObservedPoints
 from pipelines.survey.photographs import ImageCache, Pinholes
 from pipelines.train.geographic.problem import GeographicAdam, GeoProblem
+from pipelines.train.losses import Loss, RenderedView, training_losses, weighted_sum
 from pipelines.train.region import TrainingRegion
 from pipelines.train.schedule import JointOptions, TrainingSchedule
-from pipelines.train.surface import GaussianLoss
-from pipelines.train.surface_losses import RenderedView, SurfaceLosses
-from pipelines.train.target_images import Look, TargetImage, TargetImages
-
-
-def save_checkpoint(path: Path, state: Mapping[str, Tensor]) -> None:
-    """Write tensors to an NPZ file, which replaces an existing file only when complete."""
-    draft = path.with_suffix(".tmp")
-    with replacing(path, draft), draft.open("wb") as handle:
-        arrays = {name: tensor.detach().cpu().numpy() for name, tensor in state.items()}
-        np.savez(handle, **arrays)  # type: ignore[arg-type]
-
-
-def load_checkpoint(path: Path) -> dict[str, Tensor]:
-    """Return the tensors of a checkpoint by name.
-
-    Raises:
-        InputError: the file cannot be read as a checkpoint.
-    """
-    try:
-        return {name: torch.from_numpy(array) for name, array in read_npz(path).items()}
-    except (
-        InputError,
-        TypeError,
-        ValueError,
-    ) as error:  # torch has no complex halves, texts or foreign byte orders
-        raise InputError(f"not a readable checkpoint: {error}; train without --resume") from error
-
-
-def prefixed(prefix: str, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the tensors with `prefix/name` for names."""
-    return {f"{prefix}/{name}": tensor for name, tensor in state.items()}
-
-
-def unprefixed(prefix: str, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the tensors whose names begin with `prefix/`, without that prefix: inverts `prefixed`."""
-    return {
-        name.removeprefix(f"{prefix}/"): tensor for name, tensor in state.items() if name.startswith(f"{prefix}/")
-    }
-
+from pipelines.train.target_images import ImageLook, TargetImage, TargetImages
 
 _LENS_EVERY = 100  # iterations between two reads of the lens: each read waits for the device
 # Each non-finite gradient shows in one of these: colours pass it on to the opacities.
@@ -85,14 +47,14 @@ class TrainingViews:
         images: all undistorted photographs.
         surface: returns the points in `model`, float32, that an image shows; None: no depth loss.
         lenses: lenses with which the images were undistorted; None: the lenses never change.
-        gaussian_loss: further loss of the visible Gaussians; None: none.
+        measured: losses of a surface that was measured.
     """
 
     camera: IntArray
     images: ImageCache
     surface: Callable[[int], ObservedPoints] | None = None
     lenses: Lenses | None = None
-    gaussian_loss: GaussianLoss | None = None
+    measured: Sequence[Loss] = ()
 
 
 @dataclass(frozen=True)
@@ -116,6 +78,12 @@ class StepReport:
     visible: int
     pixels: int
     by_depth: Tensor | None = None
+
+
+class _Stateful(Protocol):
+    def state(self) -> dict[str, Tensor]: ...
+
+    def restore(self, state: dict[str, Tensor]) -> None: ...
 
 
 class JointTrainer:
@@ -156,11 +124,19 @@ class JointTrainer:
         self.iteration = 0
         self.schedule = TrainingSchedule(options, views.camera)
         self.device = optimizer.gaussians.means.device
-        self._pinholes = Pinholes(views.images, views.lenses)
+        self.pinholes = Pinholes(views.images, views.lenses)
         self._lens = np.zeros(len(problem.cameras.lens()))
         masks = None if region is None else region.masks
-        self._targets = TargetImages(views.images, self._pinholes, self.device, masks, options.crops)
-        self._surface_losses = self._made_surface_losses()
+        self._targets = TargetImages(views.images, self.pinholes, self.device, masks, options.crops)
+        self._losses = training_losses(
+            problem,
+            strategy,
+            self.schedule,
+            rasterizer,
+            extent_m=optimizer.extent_m,
+            confined=region is not None,
+            measured=views.measured,
+        )
         self._unknowns = GeographicAdam(problem, options, self.device)
         names = ("photometric loss", "geographic loss", *(f"gradient of {name}" for name in self._watched()))
         self._watch = FinitenessMonitor(names, self.device)
@@ -175,38 +151,28 @@ class JointTrainer:
         self.iteration += 1
         if self.iteration % _LENS_EVERY == 1:
             self._look_through(self.problem.cameras.lens().detach().cpu().numpy())
-        index = self.schedule.view(self.iteration)
-        target = self._targets.get(self._look(self.iteration), self._look(self.iteration + 1))
-        pose = self.problem.cameras.cam_from_model(index)
-        render = self._render(pose, target, depth=self.problem.sees_by_depth(index))
-        colour = render.colour if self.exposures is None else self.exposures.apply(index, render.colour)
-        counting = target.mask
-        if self.outliers is not None:
-            counting = self.outliers.inliers(
-                colour, target.colour, counting, max(target.whole.width, target.whole.height)
-            )
-        photometric = photometric_loss(colour, target.colour, counting)
-        weight, by_depth = self.schedule.geographic_weight(self.iteration), self._by_depth(index, render, target)
-        geographic = self.problem.loss() if by_depth is None else self.problem.loss() + by_depth
+        view = self._rendered(self._targets.get(self._look(self.iteration), self._look(self.iteration + 1)))
         self.optimizer.zero_grad()
         self._unknowns.zero_grad()
-        total = target.part.weight * photometric + weight * geographic
-        penalty = self.strategy.penalty(self.optimizer.gaussians, self._own(render.stats))
-        for term in (penalty, self._surface(render, pose, target, index)):
-            total = total if term is None else total + term
+        total, values = weighted_sum(self._losses, view, self.iteration)
         total.backward()
-        self._note(photometric, geographic)
-        stats = self._of_whole(self._own(render.stats), pose, target)
-        self._apply(stats.visible)
-        self.strategy.observe(stats, target.whole)
+        by_depth = values.get("control_by_depth")
+        geographic = values["geographic"] if by_depth is None else values["geographic"] + by_depth
+        self._note(values["photometric"], geographic)
+        stats = self._of_whole(self._own(view.render.stats), view.pose, view.target)
+        self._unknowns.step(self.optimizer.rate_factor * self.schedule.geographic_rate(self.iteration))
+        self.optimizer.step(self.iteration, stats.visible)
+        if self.exposures is not None:
+            self.exposures.step(self.iteration)
+        self.strategy.observe(stats, view.target.whole)
         self.strategy.update(self.iteration, self.optimizer, self.sample_contributions)
         return StepReport(
-            photometric.detach(),
-            _mean_square(colour, target),
+            values["photometric"].detach(),
+            _mean_square(view.colour, view.target),
             geographic.detach(),
-            weight,
-            len(render.stats.visible),
-            target.camera.width * target.camera.height,
+            self.schedule.geographic_weight(self.iteration),
+            len(view.render.stats.visible),
+            view.target.camera.width * view.target.camera.height,
             None if by_depth is None else by_depth.detach(),
         )
 
@@ -221,11 +187,11 @@ class JointTrainer:
         contributions = []
         for place in torch.randperm(len(self.views.camera), generator=generator)[:count].tolist():
             index = int(self.views.camera[place])
-            shrink, pose = self._shrink_to_whole(index), self.problem.cameras.cam_from_model(index)
-            target = self._targets.get(Look(index, shrink))
-            colour = self._render(pose, target).colour
-            if self.exposures is not None:
-                colour = self.exposures.apply(index, colour)
+            camera = self.views.images.pinhole(index)
+            least = 1 if self.options.crops is None else self.options.crops.shrink(camera.width, camera.height)
+            shrink = max(self.schedule.shrink(self.iteration, camera.width, camera.height), least)
+            target, pose = self._targets.get(ImageLook(index, shrink)), self.problem.cameras.cam_from_model(index)
+            colour = self._exposed(index, self._render(pose, target).colour)
             error = (colour - target.colour).abs().mean(dim=-1)
             error = error if target.mask is None else error * target.mask
             of_view = view_contributions(self.optimizer.gaussians, pose, target.camera, error, self.rasterizer)
@@ -244,10 +210,6 @@ class JointTrainer:
         surface = self.options.surface is not None
         return iteration_seconds(width * height, len(self.optimizer.gaussians), surface=surface, windows=windows)
 
-    def pinhole(self, index: int) -> Pinhole:
-        """Return the camera of an undistorted photograph, with the lens in use."""
-        return self._pinholes.of(index)
-
     def check_finite(self) -> None:
         """Wait for the device, and stop the training if it has diverged.
 
@@ -261,19 +223,30 @@ class JointTrainer:
         self.optimizer.rate_factor *= factor
         self._watch.reset()
 
+    def _look(self, iteration: int) -> ImageLook:
+        index = self.schedule.view(iteration)
+        camera = self.views.images.pinhole(index)
+        shrink = self.schedule.shrink(iteration, camera.width, camera.height)
+        return ImageLook(index, shrink, self.schedule.visit(iteration))
+
     def _look_through(self, lens: np.ndarray) -> None:
         """Render from now on through SfM's lenses with a change (L,) of their parameters."""
         self._lens = lens.copy()
         if self.views.lenses is not None and len(lens):
-            self._pinholes.renew(self.views.lenses.moved(self._lens))
+            self.pinholes.renew(self.views.lenses.moved(self._lens))
 
-    def _by_depth(self, index: int, render: Render, target: TargetImage) -> Tensor | None:
-        """Return the loss of the view's control points by rendered depth, or None if the view has no such marks."""
-        if render.expected_depth is None:
-            return None
-        loss = self.problem.depth_loss(index, render.expected_depth, render.alpha, target.camera)
-        # Marks outside the window do not count: each is seen in one of the windows.
-        return None if loss is None else target.part.windows * loss
+    def _rendered(self, target: TargetImage) -> RenderedView:
+        """Return the view of this iteration, with all that its losses need."""
+        index = self.schedule.view(self.iteration)
+        pose = self.problem.cameras.cam_from_model(index)
+        render = self._render(pose, target, depth=self.problem.sees_by_depth(index))
+        colour, counting = self._exposed(index, render.colour), target.mask
+        if self.outliers is not None:
+            longest_px = max(target.whole.width, target.whole.height)
+            counting = self.outliers.inliers(colour, target.colour, counting, longest_px)
+        points = None if self.views.surface is None else self.views.surface(index)
+        stats, gaussians = self._own(render.stats), self.optimizer.gaussians
+        return RenderedView(index, pose, target, gaussians, render, stats, colour, counting, points)
 
     def _render(self, pose: Tensor, target: TargetImage, *, depth: bool = False) -> Render:
         """Return a render of the Gaussians, and behind their rows those that surround the region."""
@@ -288,6 +261,9 @@ class JointTrainer:
         if self.region is not None:
             gaussians = Gaussians.concatenate([gaussians, self.region.surroundings])
         return self.rasterizer.render(gaussians, pose, target.whole, settings)
+
+    def _exposed(self, index: int, colour: Tensor) -> Tensor:
+        return colour if self.exposures is None else self.exposures.apply(index, colour)
 
     def _own(self, stats: ScreenStats) -> ScreenStats:
         """Return the statistics of the Gaussians in training, without those that surround the region."""
@@ -307,23 +283,6 @@ class JointTrainer:
         here = (x >= part.low[0]) & (x < part.high[0]) & (y >= part.low[1]) & (y < part.high[1])
         return stats.of_part(part.share / part.windows, here)
 
-    def _made_surface_losses(self) -> SurfaceLosses | None:
-        if self.options.surface is None:
-            return None
-        extent_m, confined = self.optimizer.extent_m, self.region is not None
-        return SurfaceLosses(
-            self.options.surface, extent_m, self.rasterizer, self.views.gaussian_loss, confined=confined
-        )
-
-    def _surface(self, render: Render, pose: Tensor, target: TargetImage, index: int) -> Tensor | None:
-        """Return the weighted sum of the surface losses, or None if the options have no surface losses."""
-        if self._surface_losses is None:
-            return None
-        points = None if self.views.surface is None else self.views.surface(index)
-        view = RenderedView(render, target, pose, self._own(render.stats).visible, points)
-        gaussians = self.optimizer.gaussians
-        return self._surface_losses.of(gaussians, view, self.iteration, self.options.iterations)
-
     def _watched(self) -> dict[str, Tensor]:
         tensors = self.optimizer.gaussians.tensors()
         return {name: tensors[name] for name in _WATCHED} | self._unknowns.named()
@@ -336,41 +295,29 @@ class JointTrainer:
         }
         self._watch.note(self.iteration, losses | gradients)
 
-    def _apply(self, visible: Tensor) -> None:
-        self._unknowns.step(self.optimizer.rate_factor * self.schedule.geographic_rate(self.iteration))
-        self.optimizer.step(self.iteration, visible)
-        if self.exposures is not None:
-            self.exposures.step(self.iteration)
-
-    def _look(self, iteration: int) -> Look:
-        """Return the look at a photograph in an iteration."""
-        index = self.schedule.view(iteration)
-        camera = self.views.images.pinhole(index)
-        shrink = self.schedule.shrink(iteration, camera.width, camera.height)
-        return Look(index, shrink, self.schedule.visit(iteration))
-
-    def _shrink_to_whole(self, index: int) -> int:
-        """Return the factor by which a photograph is shrunken at this iteration, to be seen as a whole."""
-        camera = self.views.images.pinhole(index)
-        least = 1 if self.options.crops is None else self.options.crops.shrink(camera.width, camera.height)
-        return max(self.schedule.shrink(self.iteration, camera.width, camera.height), least)
+    def _parts(self) -> dict[str, _Stateful]:
+        """Return what has a state of its own, by the name of that state in a checkpoint."""
+        parts: dict[str, _Stateful | None] = {
+            "optimizer": self.optimizer,
+            "strategy": self.strategy,
+            "geo": self._unknowns,
+            "exposures": self.exposures,
+            "outliers": self.outliers,
+        }
+        return {name: part for name, part in parts.items() if part is not None}
 
     def state(self) -> dict[str, Tensor]:
         """Return all tensors that the next iteration depends on, by name, for a checkpoint."""
-        exposures = {} if self.exposures is None else self.exposures.state()
-        outliers = {} if self.outliers is None else self.outliers.state()
-        return {
+        state = {
             "iteration": torch.tensor(self.iteration),
             "extended_from": torch.tensor(self.schedule.extended_from),
             "rate_factor": torch.tensor(self.optimizer.rate_factor, dtype=torch.float64),
             "lens": torch.from_numpy(self._lens),
             **prefixed("gaussians", self.optimizer.gaussians.tensors()),
-            **prefixed("optimizer", self.optimizer.state()),
-            **prefixed("strategy", self.strategy.state()),
-            **prefixed("geo", self._unknowns.state()),
-            **prefixed("exposures", exposures),
-            **prefixed("outliers", outliers),
         }
+        for name, part in self._parts().items():
+            state |= prefixed(name, part.state())
+        return state
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
         """Restore a state, from which the next iteration continues."""
@@ -384,13 +331,8 @@ class JointTrainer:
         fresh = torch.full((len(gaussians),), -1, dtype=torch.int64, device=self.device)
         fresh[: min(len(gaussians), len(self.optimizer.gaussians))] = 0
         self.optimizer.rearrange(gaussians, fresh)
-        self.optimizer.restore(unprefixed("optimizer", state))
-        self.strategy.restore(unprefixed("strategy", state))
-        if self.exposures is not None:
-            self.exposures.restore(unprefixed("exposures", state))
-        if self.outliers is not None:
-            self.outliers.restore(unprefixed("outliers", state))
-        self._unknowns.restore(unprefixed("geo", state))
+        for name, part in self._parts().items():
+            part.restore(unprefixed(name, state))
 
 
 @torch.no_grad()
@@ -400,3 +342,38 @@ def _mean_square(colour: Tensor, target: TargetImage) -> Tensor:
     if target.mask is None:
         return error.mean()
     return (error * target.mask[..., None]).sum() / (3 * target.mask.sum()).clamp_min(1)
+
+
+def save_checkpoint(path: Path, state: Mapping[str, Tensor]) -> None:
+    """Write tensors to an NPZ file, which replaces an existing file only when complete."""
+    draft = path.with_suffix(".tmp")
+    with replacing(path, draft), draft.open("wb") as handle:
+        arrays = {name: tensor.detach().cpu().numpy() for name, tensor in state.items()}
+        np.savez(handle, **arrays)  # type: ignore[arg-type]
+
+
+def load_checkpoint(path: Path) -> dict[str, Tensor]:
+    """Return the tensors of a checkpoint by name.
+
+    Raises:
+        InputError: the file cannot be read as a checkpoint.
+    """
+    try:
+        return {name: torch.from_numpy(array) for name, array in read_npz(path).items()}
+    except (
+        InputError,
+        TypeError,
+        ValueError,
+    ) as error:  # torch has no complex halves, texts or foreign byte orders
+        raise InputError(f"not a readable checkpoint: {error}; train without --resume") from error
+
+
+def prefixed(prefix: str, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the tensors with `prefix/name` for names."""
+    return {f"{prefix}/{name}": tensor for name, tensor in state.items()}
+
+
+def unprefixed(prefix: str, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the tensors whose names begin with `prefix/`, without that prefix: inverts `prefixed`."""
+    start = f"{prefix}/"
+    return {name.removeprefix(start): tensor for name, tensor in state.items() if name.startswith(start)}

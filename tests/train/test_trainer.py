@@ -117,21 +117,21 @@ def test_state_of_a_run_that_has_not_begun(workspace: Workspace, tmp_path: Path)
 
 def test_views_are_seen_through_the_lens_that_follows(workspace: Workspace) -> None:
     one, two = trainer_of(workspace), trainer_of(workspace)
-    before, basis = one.pinhole(0), one.problem.cameras.lens_basis
+    before, basis = one.pinholes.of(0), one.problem.cameras.lens_basis
     with torch.no_grad():  # toward a focal length two per cent longer
         one.problem.cameras.z.copy_(2 * basis[0] / basis[0].square().sum())
     one.step()
     fx = float(one.problem.cameras.lens()[0].detach()) + before.fx
-    assert one.pinhole(0).fx == pytest.approx(fx, abs=0.1)  # but for the step itself
+    assert one.pinholes.of(0).fx == pytest.approx(fx, abs=0.1)  # but for the step itself
     # It stays for a hundred iterations, whatever the cameras do, also for who goes on from there.
     with torch.no_grad():
         one.problem.cameras.z.zero_()
     two.restore(one.state())
     one.step(), two.step()
-    assert two.pinhole(0) == one.pinhole(0) != before
+    assert two.pinholes.of(0) == one.pinholes.of(0) != before
     one.iteration = 100
     one.step()
-    assert one.pinhole(0).fx == pytest.approx(before.fx, abs=0.2)
+    assert one.pinholes.of(0).fx == pytest.approx(before.fx, abs=0.2)
 
 
 def test_cameras_that_were_solved_once_do_not_move(workspace: Workspace) -> None:

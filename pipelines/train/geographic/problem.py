@@ -31,7 +31,7 @@ from pipelines.train.geographic.terms import (
     ControlByDepth,
     ControlTerm,
     FixTerm,
-    Term,
+    TensorTerm,
     control_by_depth,
     depth_residuals,
     distance_term,
@@ -49,7 +49,7 @@ from pipelines.train.options import GeographicOptions
 from pipelines.train.schedule import JointOptions
 
 Weighting = Literal["whitened", "paper"]
-TermT = TypeVar("TermT", bound=Term)
+TermT = TypeVar("TermT", bound=TensorTerm)
 
 # A learned variance stays within this factor of the stated one, or of 1 m² if residuals are not whitened.
 _BOUND = {"whitened": 100.0, "paper": 1e4}
@@ -120,7 +120,7 @@ class GeoProblem(torch.nn.Module):
         self,
         similarity: LearnableSimilarity,
         cameras: CameraCorrections,
-        terms: Sequence[Term] = (),
+        terms: Sequence[TensorTerm] = (),
         *,
         errors: LearnableErrors | None = None,
         weighting: Weighting = "whitened",
@@ -180,7 +180,7 @@ class GeoProblem(torch.nn.Module):
         """Return L_abs + λ_gcp L_gcp + λ_rel L_rel + λ_att L_att + the losses of cameras and errors; scalar.
 
         - Whitened: every χ² has the same weight. λ is therefore the number of observations of a term over the
-          number of fixes, times `Term.share`, which is below 1 for L_rel only.
+          number of fixes, times `TensorTerm.share`, which is below 1 for L_rel only.
         - Paper: every λ is 1, and cameras and errors have no loss.
         - Control points through the rendered depth are not included: see `depth_loss`.
         """
@@ -234,23 +234,23 @@ class GeoProblem(torch.nn.Module):
         fixes = self.term(FixTerm)
         return len(self.cameras.center) if fixes is None else len(fixes)
 
-    def _factor(self, term: Term) -> float:
+    def _factor(self, term: TensorTerm) -> float:
         """Return λ of a term."""
         return 1.0 if self.weighting == "paper" else term.share * len(term) / self._normaliser()
 
-    def _squared_as(self, term: Term, at: Estimate) -> Tensor:
+    def _squared_as(self, term: TensorTerm, at: Estimate) -> Tensor:
         """Return the residuals (M, d) to be squared: whitened, or lengths in metres with "paper"."""
         in_metres = self.weighting == "paper" and term.in_metres
         return term.residuals(at) if in_metres else term.whitened(at)
 
-    def _rho(self, term: Term, residual: Tensor) -> Tensor:
+    def _rho(self, term: TensorTerm, residual: Tensor) -> Tensor:
         """Return ρ (M,) of residuals (M, d), divided by the learned σ of their term."""
         s = self.weights.log_variance(term.kind)
         scaled = residual if s is None else torch.exp(-0.5 * s) * residual
         chi2 = scaled.square().sum(dim=1)
         return chi2 if self.weighting == "paper" else cauchy(chi2, term.dimension)
 
-    def _priced(self, term: Term, value: Tensor) -> Tensor:
+    def _priced(self, term: TensorTerm, value: Tensor) -> Tensor:
         """Return a term's ρ plus the normalisation of its learned variance."""
         s = self.weights.log_variance(term.kind)
         return value if s is None else value + self.weights.price(term.kind) * s
@@ -278,7 +278,7 @@ def refining_problem(
         InputError: `points` belongs to another model.
     """
     scene, state, record = adjusted.scene, adjusted.state(measured.errors), adjusted.adjustment.geo_from_model
-    terms: list[Term] = []
+    terms: list[TensorTerm] = []
     by_depth = None
     for term in measured.measured:
         if isinstance(term, adjustment.ControlPoints) and options.gcp_mode == "depth":

@@ -22,7 +22,7 @@ from pipelines.core.types import FloatArray, IntArray
 from pipelines.survey.adjustment import GeolocatedPoints
 from pipelines.survey.scene import Scene
 from pipelines.survey.survey import Survey
-from pipelines.train.geographic.unknowns import Estimate, TensorSimilarity, exp_so3, log_so3
+from pipelines.train.geographic.unknowns import Estimate, TensorSimilarity, exp_so3_tensor, log_so3_tensor
 
 RecordT = TypeVar("RecordT")
 
@@ -44,7 +44,7 @@ def moved_tensors(record: RecordT, move: Callable[[Tensor], Tensor]) -> RecordT:
     return replace(record, **tensors)  # type: ignore[type-var]
 
 
-class Term(ABC):
+class TensorTerm(ABC):
     """M observations of one kind.
 
     Attributes:
@@ -75,7 +75,7 @@ class Term(ABC):
 
 
 @dataclass(frozen=True)
-class FixTerm(Term):
+class FixTerm(TensorTerm):
     """L_abs, `adjust.terms.Fixes`.
 
     Attributes:
@@ -101,7 +101,7 @@ class FixTerm(Term):
 
 
 @dataclass(frozen=True)
-class ControlTerm(Term):
+class ControlTerm(TensorTerm):
     """L_gcp, `adjust.terms.ControlPoints`; J points, K marks in all.
 
     Attributes:
@@ -154,7 +154,7 @@ class ControlTerm(Term):
 
 
 @dataclass(frozen=True)
-class AttitudeTerm(Term):
+class AttitudeTerm(TensorTerm):
     """L_att, `adjust.terms.Attitudes`.
 
     Attributes:
@@ -174,14 +174,14 @@ class AttitudeTerm(Term):
         turned, recorded = at.geo_from_cam(self.camera), self.geo_from_cam
         common, boresight = at.error("common"), at.error("boresight")
         if common is not None:
-            turned = exp_so3(common) @ turned
+            turned = exp_so3_tensor(common) @ turned
         if boresight is not None:
-            recorded = recorded @ exp_so3(boresight)
-        return log_so3(turned.transpose(1, 2) @ recorded)
+            recorded = recorded @ exp_so3_tensor(boresight)
+        return log_so3_tensor(turned.transpose(1, 2) @ recorded)
 
 
 @dataclass(frozen=True)
-class PlaneTerm(Term):
+class PlaneTerm(TensorTerm):
     """L_lidar, `adjust.terms.Planes`.
 
     Attributes:
@@ -206,7 +206,7 @@ class PlaneTerm(Term):
         return (self.normal_in_geo * apart).sum(dim=1, keepdim=True)
 
 
-def tensor_term(term: adjustment.Term, errors: SystematicErrors) -> Term:
+def tensor_term(term: adjustment.Term, errors: SystematicErrors) -> TensorTerm:
     """Return a term of the adjustment as tensors.
 
     Args:
@@ -239,7 +239,7 @@ def _of_arrays(kind: Callable[..., RecordT], term: adjustment.Term) -> RecordT:
 
 
 @dataclass(frozen=True)
-class DistanceTerm(Term):
+class DistanceTerm(TensorTerm):
     """Distances between P pairs of geolocated points, or of cameras with fixes: the term L_rel.
 
     The distances are functions of the fixes, not independent measurements.

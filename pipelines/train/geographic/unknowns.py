@@ -16,7 +16,7 @@ from pipelines.geometry.similarity import Similarity, perturbation
 from pipelines.robust.statistics import CAUCHY_SCALE2
 
 
-def exp_so3(rotation_vector: Tensor) -> Tensor:
+def exp_so3_tensor(rotation_vector: Tensor) -> Tensor:
     """Return the rotation matrices (…, 3, 3) of rotation vectors (…, 3), in radians.
 
     Rodrigues' formula is used, because `torch.linalg.matrix_exp` would wait for the device.
@@ -31,7 +31,7 @@ def exp_so3(rotation_vector: Tensor) -> Tensor:
     return identity + linear * cross + quadratic * (cross @ cross)
 
 
-def log_so3(rotation: Tensor) -> Tensor:
+def log_so3_tensor(rotation: Tensor) -> Tensor:
     """Return the rotation vectors (…, 3), in radians, of rotations (…, 3, 3) by less than π."""
     skewed = rotation - rotation.transpose(-1, -2)
     sine_axis = 0.5 * torch.stack([skewed[..., 2, 1], skewed[..., 0, 2], skewed[..., 1, 0]], dim=-1)
@@ -126,7 +126,7 @@ class LearnableSimilarity(torch.nn.Module):
     def forward(self) -> TensorSimilarity:
         """Return the present similarity, differentiable in y."""
         delta = self.root @ self.y
-        turn, grow = exp_so3(delta[1:4]), torch.exp(delta[0])
+        turn, grow = exp_so3_tensor(delta[1:4]), torch.exp(delta[0])
         return TensorSimilarity(
             grow * self.base.scale,
             turn @ self.base_rotation,
@@ -206,12 +206,12 @@ class CameraCorrections(torch.nn.Module):
     def moved(self) -> tuple[Tensor, Tensor]:
         """Return the corrected rotations cam ← model (n, 3, 3) and centres (n, 3) in `model`, metres."""
         correction = self.corrections()
-        return self.rotation @ exp_so3(-correction[:, :3]), self.center + correction[:, 3:]
+        return self.rotation @ exp_so3_tensor(-correction[:, :3]), self.center + correction[:, 3:]
 
     def pose(self, index: int) -> tuple[Tensor, Tensor]:
         """Return the corrected rotation cam ← model (3, 3) and centre (3,) of one camera."""
         correction = self.held_poses[index] + self.basis[index] @ self.z
-        return self.rotation[index] @ exp_so3(-correction[:3]), self.center[index] + correction[3:]
+        return self.rotation[index] @ exp_so3_tensor(-correction[:3]), self.center[index] + correction[3:]
 
     def cam_from_model(self, index: int) -> Tensor:
         """Return the corrected pose of one camera, (4, 4) float32, differentiable in z."""
