@@ -132,7 +132,7 @@ def _run_part(
         parts.plan().block(number)
     elif spec is TRAIN_SCAFFOLD and (values["force"] or parts.why_missing(SOLVE)):
         parts.run(SOLVE, force=values["force"], progress=progress)
-    variant = parts.place(spec, number)
+    variant = parts.place(number)
     with boundary.logged_to_file(variant, spec):
         outcome = parts.run(spec, number, force=values["force"], progress=progress)
     print_outcome(variant, outcome, as_json=values["as_json"], told=is_told(ctx.obj))

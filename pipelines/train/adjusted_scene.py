@@ -57,10 +57,6 @@ class AdjustedScene:
         adjustment = self.adjustment.model_copy(update={"cameras": cameras})
         return replace(self, scene=self.scene.of_images(images), adjustment=adjustment)
 
-    def trained_on(self, train: IntArray) -> AdjustedScene:
-        """Return the scene with other training images (T,), ascending."""
-        return replace(self, scene=replace(self.scene, train=train))
-
     def views(self, images: ImageCache, indices: IntArray, rasterizer: Rasterizer) -> RegionViews:
         """Return views (T,), under the adjusted lenses, in which a region can be looked for."""
         pinholes = Pinholes(images, self.scene.sparse.lenses)

@@ -19,7 +19,6 @@ from pipelines.splat.rasterizer.backends import chosen_backend
 from pipelines.surface.depth_maps import StereoOptions
 from pipelines.survey.block_plan import BlockPlan
 from pipelines.survey.options import NOT_IN_BLOCKS
-from pipelines.survey.survey import Survey
 from pipelines.train.options import PRESETS, TrainOptions
 from pipelines.train.schedule import COARSE, pyramid
 from pipelines.train.target_images import Crops
@@ -33,17 +32,13 @@ def training_size(options: TrainOptions, photographs: int, largest: Pinhole, bes
 
     Args:
         options: of the training.
-        photographs: number of the photographs.
+        photographs: number of photographs.
         largest: camera of the largest photograph at training size.
         beside: number of frozen Gaussians that are rendered too.
     """
-    return TrainingSize(
-        options.effort.max_gaussians + beside,
-        Crops(options.crop_size).largest_of(largest),
-        options.sh_degree,
-        options.refined_cameras(photographs),
-        largest.width * largest.height,
-    )
+    gaussians, cameras = options.effort.max_gaussians + beside, options.refined_cameras(photographs)
+    window, whole_px = Crops(options.crop_size).largest_of(largest), largest.width * largest.height
+    return TrainingSize(gaussians, window, options.sh_degree, cameras, whole_px)
 
 
 def with_gaussian_limit(
@@ -53,13 +48,7 @@ def with_gaussian_limit(
 
     1. Photographs of the preset's size have the preset's limit.
     2. Larger ones have more, in proportion to their pixels, as far as all photographs together have 40 pixels for
-       each, and as far as they fit into memory.
-
-    Args:
-        options: of the training.
-        photographs: number of the photographs.
-        largest: camera of the largest photograph at training size.
-        free_bytes: memory that is free; None: unknown.
+       each, and as far as they fit into `free_bytes` of memory; None: unknown.
     """
     preset = PRESETS[options.preset]
     enlarged = max(largest.width, largest.height) / preset.max_image_size
@@ -87,13 +76,10 @@ class TrainingForecast:
     """Forecast of a training.
 
     Attributes:
-        preset: name of the preset.
         photographs: number of photographs.
         photo_px: width and height of the largest photograph.
         training_px: width and height at which it is trained.
         windows: number of windows in which it is seen, one at an iteration, when it is not shrunken further.
-        iterations: length of the training.
-        max_gaussians: limit of the Gaussians.
         backend: `cpu` or `cuda`.
         threads: that the CPU backend uses.
         seconds: about; None on a GPU, where nothing was measured.
@@ -130,18 +116,14 @@ class TrainingForecast:
         """Reason why the training would be refused; empty: it would not."""
         return NOT_IN_BLOCKS if self.lidar and self.in_blocks else ""
 
-    @property
-    def reduction(self) -> float:
-        """Ratio of the longer sides of photograph and training image."""
-        return max(self.photo_px) / max(self.training_px)
-
     def sentences(self) -> list[str]:
         """Return the forecast for people: effort, size of the images, time and memory."""
         effort = f"{self.preset}: {self.iterations} iterations, at most {self.max_gaussians} Gaussians"
         (width, height), (small_width, small_height) = self.photo_px, self.training_px
         size = f"{self.photographs} photographs of {width}×{height} px are trained at {small_width}×{small_height}"
-        if self.reduction > 1.05:
-            size += f", 1/{self.reduction:.1f} of their side (--max-image-size)"
+        reduction = max(self.photo_px) / max(self.training_px)
+        if reduction > 1.05:
+            size += f", 1/{reduction:.1f} of their side (--max-image-size)"
         if self.windows > 1:
             size += f", each in {self.windows} windows (--crop-size)"
         took = "time not measured on a GPU"
@@ -160,17 +142,11 @@ def training_forecast(photographs: int, photo_px: tuple[int, int], options: Trai
 
     The time is that of the machine of `MEASURED_ON`, divided by the ratio of the threads.
 
-    Args:
-        photographs: number of photographs.
-        photo_px: width and height of the largest.
-        options: of the training.
-
     Raises:
         BackendUnavailableError: `--backend cuda`, and a part that it needs is missing; names each.
     """
     camera, backend = training_pinhole(photo_px, options), chosen_backend(options.backend)
-    device = torch.device(backend)
-    free_bytes = free_memory_bytes(device)
+    free_bytes = free_memory_bytes(torch.device(backend))
     options = with_gaussian_limit(options, photographs, camera, free_bytes)
     effort, size = options.effort, training_size(options, photographs, camera)
     return TrainingForecast(
@@ -183,7 +159,7 @@ def training_forecast(photographs: int, photo_px: tuple[int, int], options: Trai
         max_gaussians=effort.max_gaussians,
         backend=backend,
         threads=thread_count(),
-        seconds=_seconds(photographs, camera, options) if device.type == "cpu" else None,
+        seconds=_seconds(photographs, camera, options) if backend == "cpu" else None,
         peak_bytes=predicted_peak_bytes(size),
         free_bytes=free_bytes,
         blocks=options.blocks,
@@ -191,23 +167,8 @@ def training_forecast(photographs: int, photo_px: tuple[int, int], options: Trai
     )
 
 
-def forecast_of(survey: Survey, options: TrainOptions) -> TrainingForecast:
-    """Return the forecast of a training of a survey.
-
-    Raises:
-        BackendUnavailableError: `--backend cuda` without a GPU or without gsplat.
-    """
-    return training_forecast(len(survey.images), survey.largest_photograph_px, options)
-
-
 def block_processor_s(plan: BlockPlan, photo_px: tuple[int, int], options: TrainOptions) -> dict[int, float]:
-    """Return the processor seconds that the CPU backend needs for each block of a plan, by number, on one core.
-
-    Args:
-        plan: of the blocks.
-        photo_px: width and height of the photographs.
-        options: of the training.
-    """
+    """Return the processor seconds that the CPU backend needs for each block of a plan, by number, on one core."""
     seconds, camera = {}, training_pinhole(photo_px, options)
     for block in plan.blocks:
         count = block.gaussians + plan.scaffold_gaussians
@@ -230,11 +191,9 @@ class _Iteration:
     """Size of an iteration with photographs that are not shrunken.
 
     Attributes:
-        camera: of the photographs.
         pixels: of a photograph that count.
         visible: number of Gaussians in a photograph.
         gaussians: number of all.
-        options: of the training.
     """
 
     camera: Pinhole

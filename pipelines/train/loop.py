@@ -1,9 +1,4 @@
-"""Training loop: iterations, metrics, checkpoints, interruption, and one recovery from a divergence.
-
-Progress of a training: the first iteration, in which kernels compile, and then all iterations.
-
-Files of a training in the folder of its stage, and the training that writes them.
-"""
+"""Training loop: iterations, metrics, checkpoints, progress, interruption, and one recovery from a divergence."""
 
 from __future__ import annotations
 
@@ -30,19 +25,16 @@ from pipelines.train.trainer import JointTrainer, StepReport, load_checkpoint, s
 
 log = logging.getLogger(__name__)
 
+CHECKPOINT, METRICS = "checkpoint.npz", "metrics.jsonl"
 _COMPILING = "compiling kernels (a minute, once)"
+_RECOVERY_RATE = 0.3  # factor on the learning rates after a divergence
 
 
 class TrainingProgress:
-    """Tasks of a training, closed at the end of the context.
+    """Tasks of a training, of which `begun` iterations are of earlier runs; closed at the end of the context.
 
-    The first iteration of a run has a task of its own: its duration is no measure of the others.
-
-    Args:
-        progress: shows the tasks.
-        begun: iterations of earlier runs.
-        iterations: length of the training.
-        time_left: of the training.
+    The first iteration of a run, in which kernels compile, has a task of its own: its duration is no measure of the
+    others.
     """
 
     def __init__(self, progress: Progress, begun: int, iterations: int, time_left: TimeLeft) -> None:
@@ -65,12 +57,7 @@ class TrainingProgress:
         self._first.close()
 
     def iterated(self, iteration: int, note: str | None) -> None:
-        """Note the end of an iteration.
-
-        Args:
-            iteration: that has ended, from 1.
-            note: on the training; None: the display stays as it is.
-        """
+        """Note the end of an iteration, from 1; without a note on the training, the display stays as it is."""
         if self._warming_up is not None:
             self._warming_up.advance(1, " ")
             self._warming_up = None
@@ -83,16 +70,12 @@ class TrainingProgress:
             self._shown = max(iteration, self._shown)
 
 
-_RECOVERY_RATE = 0.3  # factor on the learning rates after a divergence
-
-
 @dataclass(frozen=True)
 class LoopOptions:
     """Files of a training, and intervals of writing them.
 
     Attributes:
-        checkpoint: file of the latest checkpoint.
-        metrics: file of the metrics, one JSON object a line.
+        metrics: one JSON object a line.
         checkpoint_every: iterations between checkpoints.
         log_every: iterations between lines of metrics.
         resume: continue from the checkpoint, if the file exists.
@@ -127,11 +110,6 @@ class TrainingRecord:
 def optimise(trainer: JointTrainer, options: LoopOptions, progress: Progress) -> TrainingRecord:
     """Run all remaining iterations and return the record of the training.
 
-    Args:
-        trainer: state of the optimisation.
-        options: files and intervals.
-        progress: shows iteration, PSNR and number of Gaussians.
-
     Raises:
         KeyboardInterrupt: the user asked to stop; a checkpoint was written.
         ConvergenceError: a loss or gradient was not finite, and again after the return to the last checkpoint and
@@ -147,7 +125,8 @@ def optimise(trainer: JointTrainer, options: LoopOptions, progress: Progress) ->
                 row = loop.iterate()
                 if math.isnan(worked):
                     worked, since = time.process_time(), trainer.iteration
-                display.iterated(trainer.iteration, None if row is None else _note(row))
+                note = None if row is None else f"{row['psnr']:.1f} dB, {row['gaussians'] / 1000:.0f} k Gaussians"
+                display.iterated(trainer.iteration, note)
                 if stop.requested:
                     loop.save()
                     log.warning(
@@ -163,32 +142,28 @@ def optimise(trainer: JointTrainer, options: LoopOptions, progress: Progress) ->
 
 
 class _Loop:
-    """Iterations of a trainer, with their files; begins anew or from the checkpoint."""
+    """Iterations of a trainer, with their files; begins anew or from the checkpoint.
+
+    Raises:
+        DamagedPartialError: the checkpoint is damaged, or is not of this training.
+    """
 
     def __init__(self, trainer: JointTrainer, options: LoopOptions) -> None:
         self.trainer, self.options = trainer, options
         self.recovery: str | None = None
         self._spent, self._clock = 0.0, time.monotonic()
         if options.resume and options.checkpoint.exists():
-            self._spent = self._resumed()
+            try:
+                self._spent = self._go_back()
+            except (InputError, KeyError, ValueError, RuntimeError, TypeError) as error:
+                text = f"the checkpoint is damaged: {error}"
+                raise DamagedPartialError(text, path=options.checkpoint) from error
             if options.extend:
                 trainer.schedule.extended_from = trainer.iteration
             log.info("%s at iteration %d", "extended" if options.extend else "resumed", trainer.iteration)
         else:
             options.metrics.write_text("", encoding="utf-8")
             self.save()
-
-    def _resumed(self) -> float:
-        """Take over the checkpoint of an interrupted run; returns its seconds.
-
-        Raises:
-            DamagedPartialError: the checkpoint is damaged, or is not of this training.
-        """
-        try:
-            return self._go_back()
-        except (InputError, KeyError, ValueError, RuntimeError, TypeError) as error:
-            path = self.options.checkpoint
-            raise DamagedPartialError(f"the checkpoint is damaged: {error}", path=path) from error
 
     def seconds(self) -> float:
         """Return the duration so far, with the runs before a resume."""
@@ -259,10 +234,6 @@ class _Loop:
         return float(state["seconds"])
 
 
-def _note(row: dict[str, float]) -> str:
-    return f"{row['psnr']:.1f} dB, {row['gaussians'] / 1000:.0f} k Gaussians"
-
-
 def _metrics_row(trainer: JointTrainer, report: StepReport, seconds: float) -> dict[str, float]:
     problem = trainer.problem
     with torch.no_grad():
@@ -283,19 +254,10 @@ def _metrics_row(trainer: JointTrainer, report: StepReport, seconds: float) -> d
     return row | {f"variance_{name}": factors[name] for name in factors}
 
 
-CHECKPOINT, METRICS = "checkpoint.npz", "metrics.jsonl"
-
-
 def train_in_folder(stage: StageRun, trainer: JointTrainer, options: TrainOptions, done: int = 0) -> TrainingRecord:
     """Run all remaining iterations of a training, and return its record.
 
-    An interrupted run is resumed. A finished training of fewer iterations is extended from its last state.
-
-    Args:
-        stage: has the folder.
-        trainer: before its first iteration.
-        options: of the training.
-        done: iterations of the finished training that the stage extends.
+    An interrupted run is resumed. A finished training of fewer iterations, `done`, is extended from its last state.
 
     Raises:
         KeyboardInterrupt: the user asked to stop; a checkpoint was written.

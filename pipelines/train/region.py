@@ -33,12 +33,7 @@ _ROOM = 0.2  # of the longest side of their box
 
 @dataclass(frozen=True)
 class RegionView:
-    """Part of an image that shows the region.
-
-    Attributes:
-        window: smallest part of the image that holds all of it.
-        mask: pixels of the window that show the region.
-    """
+    """Smallest part of an image that holds all that shows the region, and its pixels that do."""
 
     window: Window
     mask: BoolArray
@@ -56,22 +51,15 @@ class RegionMasks:
         self._packed: dict[int, ByteArray] = {index: np.packbits(mask) for index, mask in masks.items()}
         self.view = lru_cache(_KEPT)(self._view)
 
-    def share(self, index: int) -> float:
-        """Return the share of a view's pixels that show the region, 0 … 1."""
-        return float(self._whole(index).mean())
-
     def seeing(self) -> IntArray:
         """Return the indices of the views that show the region, ascending."""
         return np.array(sorted(index for index, packed in self._packed.items() if packed.any()), dtype=np.int64)
 
-    def _whole(self, index: int) -> BoolArray:
-        height, width = self._shape[index]
-        return np.unpackbits(self._packed[index], count=height * width).reshape(height, width).astype(bool)
-
     def _view(self, index: int, shrink: int = 1) -> RegionView:
         """Return the part of a view, at 1/`shrink` of its size, that shows the region; at least one pixel."""
-        whole = self._whole(index)
-        height, width = (side // shrink for side in whole.shape)
+        height, width = self._shape[index]
+        whole = np.unpackbits(self._packed[index], count=height * width).reshape(height, width).astype(bool)
+        height, width = height // shrink, width // shrink
         cells = whole[: height * shrink, : width * shrink].reshape(height, shrink, width, shrink)
         mask = whole if shrink == 1 else cells.mean(axis=(1, 3)) >= 0.5
         if not mask.any():
@@ -104,14 +92,7 @@ class SceneBox:
 
 @dataclass(frozen=True)
 class RegionViews:
-    """Views in which a region is looked for.
-
-    Attributes:
-        indices: (T,) of the cameras.
-        poses: of all cameras.
-        pinholes: of their images.
-        rasterizer: renders the stand-in.
-    """
+    """Views in which a region is looked for: indices (T,) of cameras, and the poses and pinholes of all cameras."""
 
     indices: IntArray
     poses: CameraPoses

@@ -22,12 +22,7 @@ _CAUSES = {
 
 
 def trained_model(trainer: JointTrainer, solution: Adjustment) -> TrainedModel:
-    """Return the product of `train` without the Gaussians.
-
-    Args:
-        trainer: at the end of the training.
-        solution: its cameras and similarity.
-    """
+    """Return the product of `train` without the Gaussians, given the solution at the end of the training."""
     if trainer.exposures is not None:
         solution = with_exposures(solution, trainer.exposures.affine.cpu().numpy().astype(float))
     gaussians = trainer.optimizer.gaussians
@@ -45,14 +40,7 @@ def trained_model(trainer: JointTrainer, solution: Adjustment) -> TrainedModel:
 def summary_of(
     model: TrainedModel, metrics: list[dict[str, Any]], record: TrainingRecord, lidar: LidarReport | None = None
 ) -> Summary:
-    """Return headline, values and warnings of a training.
-
-    Args:
-        model: product of the training.
-        metrics: rows of `metrics.jsonl`.
-        record: time and incidents of the training.
-        lidar: LiDAR that the training has used; None: none.
-    """
+    """Return headline, values and warnings of a training, given the rows of `metrics.jsonl`."""
     psnr = float(np.mean([row["psnr"] for row in metrics[-20:]]))
     sigma = np.sqrt(np.diag(np.array(model.geo_from_model.covariance)))
     values = {
@@ -69,35 +57,22 @@ def summary_of(
     if lidar is not None:
         values["lidar"] = lidar.model_dump(mode="json")
     key_figure = f"{model.gaussians} gaussians, train PSNR {psnr:.2f} dB"
-    warnings = [*_warnings(model, record), *(() if lidar is None else _lidar_warnings(lidar))]
-    return Summary(key_figure, values, tuple(warnings), model.cautions)
-
-
-def _warnings(model: TrainedModel, record: TrainingRecord) -> list[str]:
-    # A common error of the fixes is told by the cautions of init-sim3.
-    told = (_warning_of(error) for error in model.estimated_errors if error.name != "bias")
-    warnings = [text for text in told if text is not None]
-    return warnings if record.recovery is None else [*warnings, record.recovery]
-
-
-def _lidar_warnings(lidar: LidarReport) -> list[str]:
-    warnings = list(lidar.assumptions)
-    if lidar.areas:
+    # A common error of the fixes is everyday: init-sim3 has tested it against its prior, and its cautions tell it.
+    told = [_warning_of(error) for error in model.estimated_errors if error.name != "bias"]
+    warnings = [text for text in (*told, record.recovery) if text is not None]
+    if lidar is not None:
+        warnings += lidar.assumptions
+    if lidar is not None and lidar.areas:
         area_m2 = sum(area.area_m2 for area in lidar.areas)
         warnings.append(
             f"LiDAR and photographs contradict each other on {area_m2:.0f} m² in {len(lidar.areas)} places, which "
             "train/lidar.json lists and train/lidar.png shows: the LiDAR is not used there"
         )
-    return warnings
+    return Summary(key_figure, values, tuple(warnings), model.cautions)
 
 
 def _warning_of(error: EstimatedError) -> str | None:
-    """Return a warning if the error exceeds 3 σ or is not observable along every axis; else None.
-
-    The common error of the fixes is everyday: init-sim3 has tested it against its prior.
-    """
-    if error.name == "bias":
-        return None
+    """Return a warning if the error exceeds 3 σ or is not observable along every axis; else None."""
     axes = "east, north, up" if error.name == "lidar-shift" else "right, down, forward"
     values = ", ".join(f"{value:+.3f} ± {sigma:.3f}" for value, sigma in zip(error.value, error.sigma, strict=True))
     evident = [

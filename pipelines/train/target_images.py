@@ -1,6 +1,6 @@
-"""Photographs on the device: shrunken and cut as the schedule demands, and read ahead on a GPU.
+"""Photographs on the device: shrunken as the schedule demands, cut into windows if large, and read ahead on a GPU.
 
-Windows in which large photographs are trained, so that memory and time of an iteration stay bounded.
+Windows bound the memory and time of an iteration.
 """
 
 from __future__ import annotations
@@ -34,7 +34,6 @@ class Crops:
 
     Attributes:
         size_px: a photograph with more pixels than a square of this side is seen in windows of so many pixels.
-        seed: of shifts and orders.
     """
 
     size_px: int
@@ -56,8 +55,12 @@ class Crops:
 
     def largest_of(self, camera: Pinhole) -> Pinhole:
         """Return a camera of the size of the largest window of an image."""
-        columns, rows = self.grid(camera.width, camera.height)
-        return Window(0, 0, _longest(camera.width, columns), _longest(camera.height, rows)).of(camera)
+        sides = zip((camera.width, camera.height), self.grid(camera.width, camera.height), strict=True)
+        width, height = (
+            side if cells == 1 else min(side, int(np.ceil((1 + _SHIFT) * side / cells)) + 1)
+            for side, cells in sides
+        )
+        return Window(0, 0, width, height).of(camera)
 
     def shrink(self, width: int, height: int) -> int:
         """Return the least factor by which an image is to be shrunken, to be seen as a whole."""
@@ -67,18 +70,10 @@ class Crops:
         return shrink
 
     def windows(self, index: int, whole: Window, turn: int) -> list[Window]:
-        """Return the windows of one round, which cover `whole` without overlap.
-
-        Args:
-            index: of the photograph.
-            whole: part of the photograph to cover.
-            turn: number of the round, from 0.
-        """
+        """Return the windows of round `turn`, from 0, which cover `whole` of a photograph without overlap."""
         random = np.random.default_rng([self.seed, index, turn])
         columns, rows = self.grid(whole.width, whole.height)
-        across, down = (
-            _cuts(side, cells, random) for side, cells in ((whole.width, columns), (whole.height, rows))
-        )
+        across, down = _cuts(whole.width, columns, random), _cuts(whole.height, rows, random)
         cells = [
             Window(whole.left + left, whole.top + top, right - left, bottom - top)
             for (top, bottom), (left, right) in product(pairwise(down), pairwise(across))
@@ -91,10 +86,6 @@ def _cuts(side: int, cells: int, random: np.random.Generator) -> list[int]:
     return [0, *(round((cell + shift) * side / cells) for cell in range(1, cells)), side]
 
 
-def _longest(side: int, cells: int) -> int:
-    return side if cells == 1 else min(side, int(np.ceil((1 + _SHIFT) * side / cells)) + 1)
-
-
 _MASKS = 64  # limit on the device; all photographs of a camera share one
 _PARTS = 256  # windows kept: density control samples others between an iteration and the next
 
@@ -104,7 +95,6 @@ class ImageLook:
     """ImageLook at a photograph.
 
     Attributes:
-        index: of the photograph.
         shrink: every pixel is the mean of shrink × shrink pixels.
         visit: number of the visit, from 0, for the choice of a window of a large photograph; None: all of it.
     """
@@ -154,11 +144,6 @@ class TargetImage:
     whole: Pinhole
     part: ImagePart = ImagePart()
 
-    @property
-    def window(self) -> Window | None:
-        """Window of the whole photograph; None: all of it."""
-        return self.part.window
-
 
 class TargetImages:
     """Training photographs on a device.
@@ -191,13 +176,9 @@ class TargetImages:
         self._next: tuple[ImageLook, Future[Tensor]] | None = None
 
     def get(self, look: ImageLook, upcoming: ImageLook | None = None) -> TargetImage:
-        """Return a photograph, or a window of it.
-
-        Args:
-            look: at the photograph.
-            upcoming: next look, to read ahead; None: unknown.
-        """
-        pixels, part = self._pixels(look), self._part(look)
+        """Return a photograph, or a window of it; `upcoming` is the next look, to read ahead, None if unknown."""
+        ahead, part = self._next, self._part(look)
+        pixels = ahead[1].result() if ahead is not None and ahead[0] == look else self._read(look)
         if self._reader is not None and upcoming is not None:
             self._next = (upcoming, self._reader.submit(self._read, upcoming))
         colour = pixels.to(self._device, non_blocking=True).float() / 255.0
@@ -227,16 +208,12 @@ class TargetImages:
 
     def _count(self, look: ImageLook, window: Window) -> int:
         """Return the number of pixels that count in a window."""
-        if self._region is None and self._all_count(look):
-            return window.width * window.height
-        return int(self._counting(look, window).sum())
-
-    def _all_count(self, look: ImageLook) -> bool:
-        """Return whether all pixels of a photograph count."""
         key = self._images.mask_key(look.index)
         if key not in self._complete:
             self._complete[key] = bool(self._images.mask(look.index).all())
-        return self._complete[key]
+        if self._region is None and self._complete[key]:
+            return window.width * window.height
+        return int(self._counting(look, window).sum())
 
     def _counting(self, look: ImageLook, window: Window) -> BoolArray:
         """Return the pixels (H, W) of a window that count: of the photograph, and of the region if there is one."""
@@ -251,11 +228,6 @@ class TargetImages:
         shown = self._region.view(look.index, s)
         top, left = window.top - shown.window.top, window.left - shown.window.left
         return np.asarray(mask & shown.mask[top : top + window.height, left : left + window.width])
-
-    def _pixels(self, look: ImageLook) -> Tensor:
-        if self._next is not None and self._next[0] == look:
-            return self._next[1].result()
-        return self._read(look)
 
     def _read(self, look: ImageLook) -> Tensor:
         image, window = self._images.shrunken(look.index, look.shrink), self._part(look).window
@@ -289,12 +261,6 @@ def _part_of(trained: Window, window: Window, windows: int, weight: float, share
 
 
 def shrunken(camera: Pinhole, shrink: int) -> Pinhole:
-    """Return the camera of an image whose pixels are blocks of shrink × shrink pixels.
-
-    Incomplete blocks at the right and lower edges are cut off.
-    """
-    return Pinhole(
-        camera.width // shrink,
-        camera.height // shrink,
-        *(value / shrink for value in (camera.fx, camera.fy, camera.cx, camera.cy)),
-    )
+    """Return the camera of an image of shrink × shrink blocks; incomplete ones at the edges are cut off."""
+    inner = (value / shrink for value in (camera.fx, camera.fy, camera.cx, camera.cy))
+    return Pinhole(camera.width // shrink, camera.height // shrink, *inner)

@@ -153,7 +153,7 @@ class JointTrainer:
             self._look_through(self.problem.cameras.lens().detach().cpu().numpy())
         view = self._rendered(self._targets.get(self._look(self.iteration), self._look(self.iteration + 1)))
         self.optimizer.zero_grad()
-        self._unknowns.zero_grad()
+        self._unknowns.adam.zero_grad()
         total, values = weighted_sum(self._losses, view, self.iteration)
         total.backward()
         by_depth = values.get("control_by_depth")
@@ -255,7 +255,7 @@ class JointTrainer:
             background=self.options.background,
             depth=depth or self.options.surface is not None,
             median=False,
-            window=target.window,
+            window=target.part.window,
         )
         gaussians = self.optimizer.gaussians
         if self.region is not None:

@@ -64,10 +64,10 @@ def test_each_round_of_visits_shows_each_pixel_once(images: ImageCache) -> None:
         shown = torch.full_like(whole.colour, torch.nan)
         for visit in range(WINDOWS):
             target = targets.get(ImageLook(2, visit=WINDOWS * turn + visit))
-            assert target.window is not None and target.part.windows == WINDOWS
-            assert torch.isnan(shown[target.window.slices]).all()
-            shown[target.window.slices] = target.colour
-            places.append(target.window)
+            assert target.part.window is not None and target.part.windows == WINDOWS
+            assert torch.isnan(shown[target.part.window.slices]).all()
+            shown[target.part.window.slices] = target.colour
+            places.append(target.part.window)
         assert torch.equal(shown, whole.colour)
     assert len(set(places)) > WINDOWS, "cuts move from round to round"
 
@@ -79,7 +79,7 @@ def losses(targets: TargetImages, looks: list[ImageLook], gaussians: Gaussians, 
         pose = torch.eye(4)
         pose[0, 3] = -float(tiny.poses().cam_center_in_model[look.index, 0])
         render = CpuRasterizer().render(
-            gaussians, pose, target.whole, RasterSettings(sh_degree=0, window=target.window)
+            gaussians, pose, target.whole, RasterSettings(sh_degree=0, window=target.part.window)
         )
         loss = photometric_loss(render.colour, target.colour, target.mask, ssim_weight=ssim)
         (target.part.weight * loss / target.part.windows).backward()
@@ -181,7 +181,7 @@ def test_windows_add_up_to_the_surface_losses_of_the_photograph(images: ImageCac
             (parts, [ImageLook(1, visit=visit) for visit in range(WINDOWS)]),
         ):
             for target in map(targets.get, looks):
-                raster = RasterSettings(sh_degree=0, depth=True, median=False, window=target.window)
+                raster = RasterSettings(sh_degree=0, depth=True, median=False, window=target.part.window)
                 render = CpuRasterizer().render(gaussians, pose, target.whole, raster)
                 view = RenderedView(1, pose, target, gaussians, render, render.stats, render.colour, points=points)
                 values.append(float(weighted_sum(losses, view, 1)[0]))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -23,7 +24,6 @@ from pipelines.splat.memory import free_memory_bytes, require_memory
 from pipelines.splat.rasterizer.backends import device_of, rasterizer
 from pipelines.surface.depth_maps import DepthMaps
 from pipelines.survey.block_plan import BlockPlan, BlockTraining, PlannedBlock
-from pipelines.survey.photographs import ImageCache
 from pipelines.survey.scene import photographs
 from pipelines.train.adjusted_scene import AdjustedScene
 from pipelines.train.assembly import make_trainer
@@ -62,12 +62,20 @@ def run(stage: StageRun, options: BlockTrainOptions) -> Summary:
     size = training_size(options, len(images), images.largest(), beside=len(scaffold))
     require_memory(size, free_memory_bytes(device_of(backend)))
     images.build(stage.progress)
-    surface = _surface(stage, solved, images) if options.dense else None
+    surface = None
+    if options.dense:
+        maps = DepthMaps(workspace.cache / "surface", solved.scene, images)
+        maps.build(stage.progress)
+        surface = SceneSurface(maps)
     views = solved.views(images, solved.scene.train, backend)
     masks = views.masks(block.region, scaffold, surface, stage.progress)
-    region = _region(block, box, scaffold, masks)
-    training = TrainingScene(_seeing(solved, masks).scene, images, surface, region)
-    trainer = make_trainer(training, held_problem(solved), backend, options, solved.exposures(device_of(backend)))
+    if len(masks.seeing()) < _LEAST_VIEWS:
+        raise DegenerateGeometryError(
+            f"{len(masks.seeing())} photographs show the surface of a block: give fewer --blocks"
+        )
+    scene, region = replace(solved.scene, train=masks.seeing()), _region(block, box, scaffold, masks)
+    training, exposures = TrainingScene(scene, images, surface, region), solved.exposures(device_of(backend))
+    trainer = make_trainer(training, held_problem(solved), backend, options, exposures)
     record = train_in_folder(stage, trainer, options, _iterations(stage))
     measured = _measured(stage, trainer, block, record)
     write_gaussians(stage.out / "gaussians.ply", trainer.optimizer.gaussians.detached())
@@ -91,30 +99,12 @@ def _indices(whole: AdjustedScene, block: PlannedBlock) -> np.ndarray:
     return rows
 
 
-def _surface(stage: StageRun, solved: AdjustedScene, images: ImageCache) -> SceneSurface:
-    maps = DepthMaps(stage.workspace.cache / "surface", solved.scene, images)
-    maps.build(stage.progress)
-    return SceneSurface(maps)
-
-
 def _region(block: PlannedBlock, box: SceneBox, scaffold: Gaussians, masks: RegionMasks) -> TrainingRegion:
     means = scaffold.means.cpu().double().numpy()
     inside = block.region.contains(means)
     rows = torch.from_numpy(~inside), torch.from_numpy(inside & ~box.contains(means))
     outside, sky = (scaffold.select(mask.to(scaffold.means.device)) for mask in rows)
     return TrainingRegion(block.region, box, outside, sky.to(torch.device("cpu")), masks)
-
-
-def _seeing(solved: AdjustedScene, masks: RegionMasks) -> AdjustedScene:
-    """Return the scene without the training views that do not show the block.
-
-    Raises:
-        DegenerateGeometryError: too few do.
-    """
-    seeing = masks.seeing()
-    if len(seeing) < _LEAST_VIEWS:
-        raise DegenerateGeometryError(f"{len(seeing)} photographs show the surface of a block: give fewer --blocks")
-    return solved.trained_on(seeing)
 
 
 def _iterations(stage: StageRun) -> int:

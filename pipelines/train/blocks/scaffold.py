@@ -50,14 +50,11 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
 
 
 def coarse_options(options: TrainOptions, photographs_count: int) -> TrainOptions:
-    """Return the options of the scaffold's training: fewer iterations, Gaussians and pixels, and no stereo.
+    """Return the options of the scaffold's training, of those of the blocks: less effort, and no stereo.
 
-    Args:
-        options: of the blocks.
-        photographs_count: number of training photographs; each is looked at once, if they are not too many.
+    Each of the training photographs is looked at once, if they are not too many.
     """
-    effort = options.effort
-    looks = min(photographs_count, _MOST_LOOKS)
+    effort, looks = options.effort, min(photographs_count, _MOST_LOOKS)
     return options.model_copy(
         update={
             "iterations": max(min(int(_SHARE * effort.iterations), _MOST_ITERATIONS), looks),

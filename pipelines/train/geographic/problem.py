@@ -1,10 +1,8 @@
-"""Geographic losses of a training: their sum, their weights, and their start at the adjustment.
+"""Geographic losses of a training: their sum, their weights, their start at the adjustment, and their optimiser.
 
 Whitened residuals make each term half of a χ², and the whole a maximum a posteriori estimate: but for L_rel and the
 photographs, the loss is that of the adjustment, so that a training starts at its minimum. `paper` takes plain mean
 squares in metres instead. A Cauchy kernel bounds the effect of one bad fix.
-
-Adam for what all views share: similarity, cameras, constant errors and weights of the losses.
 """
 
 from __future__ import annotations
@@ -169,7 +167,11 @@ class GeoProblem(torch.nn.Module):
     def losses(self) -> dict[str, Tensor]:
         """Return the losses by kind: of each term, a mean of ρ; of the cameras; and of the systematic errors."""
         at = self.estimate()
-        values = {term.kind: self._rho(term, self._squared_as(term, at)).mean() for term in self.terms}
+        values = {}
+        for term in self.terms:
+            in_metres = self.weighting == "paper" and term.in_metres
+            residual = term.residuals(at) if in_metres else term.whitened(at)
+            values[term.kind] = self._rho(term, residual).mean()
         # A problem that holds the cameras has no z, and no loss.
         values["cameras"] = self.cameras.z.square().sum() / self._normaliser()
         if self.errors is not None and len(at.vector):
@@ -237,11 +239,6 @@ class GeoProblem(torch.nn.Module):
     def _factor(self, term: TensorTerm) -> float:
         """Return λ of a term."""
         return 1.0 if self.weighting == "paper" else term.share * len(term) / self._normaliser()
-
-    def _squared_as(self, term: TensorTerm, at: Estimate) -> Tensor:
-        """Return the residuals (M, d) to be squared: whitened, or lengths in metres with "paper"."""
-        in_metres = self.weighting == "paper" and term.in_metres
-        return term.residuals(at) if in_metres else term.whitened(at)
 
     def _rho(self, term: TensorTerm, residual: Tensor) -> Tensor:
         """Return ρ (M,) of residuals (M, d), divided by the learned σ of their term."""
@@ -324,13 +321,7 @@ _MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 
 
 class GeographicAdam:
-    """Moments and rates of the unknowns of a problem.
-
-    Args:
-        problem: has the unknowns.
-        options: have their rates.
-        device: holds them.
-    """
+    """Adam for what all views share: moments and rates of the unknowns of a problem."""
 
     def __init__(self, problem: GeoProblem, options: JointOptions, device: torch.device) -> None:
         self._problem, self._device = problem, device
@@ -342,7 +333,7 @@ class GeographicAdam:
         }
         # One kernel for each of these short vectors on a GPU, in place of a dozen whose launches take longer than
         # their work.
-        self._adam = torch.optim.Adam(
+        self.adam = torch.optim.Adam(
             [{"params": [parameter], "rate": rates[name]} for name, parameter in problem.learned().items()],
             fused=device.type == "cuda",
         )
@@ -351,22 +342,18 @@ class GeographicAdam:
         """Return the unknowns by what they are called in messages."""
         return {_NAMES[name]: parameter for name, parameter in self._problem.learned().items()}
 
-    def zero_grad(self) -> None:
-        """Forget the gradients."""
-        self._adam.zero_grad()
-
     def step(self, factor: float) -> None:
         """Move all unknowns by their gradients, at their rates times `factor`."""
-        for group in self._adam.param_groups:
+        for group in self.adam.param_groups:
             group["lr"] = factor * group["rate"]
-        self._adam.step()
+        self.adam.step()
 
     def state(self) -> dict[str, Tensor]:
         """Return unknowns and moments by name, for a checkpoint."""
         parameters = self._problem.learned()
         state: dict[str, Tensor] = {**parameters}
         for name, parameter in parameters.items():
-            moments = self._adam.state[parameter]
+            moments = self.adam.state[parameter]
             state |= {f"{name}_{key}": torch.as_tensor(value) for key, value in moments.items()}
         return state
 
@@ -376,6 +363,6 @@ class GeographicAdam:
             with torch.no_grad():
                 parameter.copy_(state[name])
             # A fused Adam keeps its count of steps on the device.
-            self._adam.state[parameter] = {
+            self.adam.state[parameter] = {
                 key: state[f"{name}_{key}"].to(self._device) for key in _MOMENTS if f"{name}_{key}" in state
             }

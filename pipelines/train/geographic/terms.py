@@ -207,35 +207,24 @@ class PlaneTerm(TensorTerm):
 
 
 def tensor_term(term: adjustment.Term, errors: SystematicErrors) -> TensorTerm:
-    """Return a term of the adjustment as tensors.
-
-    Args:
-        term: of the adjustment.
-        errors: the systematic errors of its problem.
-    """
+    """Return a term of the adjustment as tensors, given the systematic errors of its problem."""
     match term:
         case adjustment.Fixes():
             blocks = [(block.name, block.session) for block in errors.blocks]
             bias = [[block == ("bias", session) for block in blocks] for session in term.session.tolist()]
-            return FixTerm(
-                torch.from_numpy(term.camera),
-                torch.from_numpy(term.position_in_geo),
-                torch.from_numpy(term.root_information),
-                torch.tensor(bias, dtype=torch.float64).view(len(term), len(blocks)),
-            )
+            of_errors = torch.tensor(bias, dtype=torch.float64).view(len(term), len(blocks))
+            return FixTerm(**_tensors(term, "camera", "position_in_geo", "root_information"), bias=of_errors)
         case adjustment.ControlPoints():
-            return _of_arrays(ControlTerm, term)
+            return ControlTerm(**_tensors(term, *(field.name for field in fields(ControlTerm))))
         case adjustment.Attitudes():
-            return _of_arrays(AttitudeTerm, term)
+            return AttitudeTerm(**_tensors(term, *(field.name for field in fields(AttitudeTerm))))
         case adjustment.Planes():
-            return _of_arrays(PlaneTerm, term)
+            return PlaneTerm(**_tensors(term, *(field.name for field in fields(PlaneTerm))))
     raise TypeError(f"{term.kind} has no tensors")
 
 
-def _of_arrays(kind: Callable[..., RecordT], term: adjustment.Term) -> RecordT:
-    """Return the tensor term whose fields are those of a term of the adjustment."""
-    names = [field.name for field in fields(kind) if field.name != "share"]  # type: ignore[arg-type]
-    return kind(**{name: torch.from_numpy(np.ascontiguousarray(getattr(term, name))) for name in names})
+def _tensors(term: adjustment.Term, *names: str) -> dict[str, Tensor]:
+    return {name: torch.from_numpy(np.ascontiguousarray(getattr(term, name))) for name in names}
 
 
 @dataclass(frozen=True)

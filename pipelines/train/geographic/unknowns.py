@@ -73,9 +73,7 @@ class Estimate:
     Attributes:
         rotation: (n, 3, 3) cam ← model.
         center: (n, 3) projection centres in `model`, metres.
-        geo_from_model: the similarity.
-        errors: the systematic errors.
-        vector: (p,) their values, m and rad.
+        vector: (p,) values of the systematic errors, m and rad.
         lens: (L,) change of the lens parameters; L = 0: none.
     """
 
@@ -114,11 +112,14 @@ class LearnableSimilarity(torch.nn.Module):
         self.pivot_in_geo = np.asarray(pivot, dtype=np.float64)
         self.base = base
         self.y = torch.nn.Parameter(torch.zeros(7, dtype=torch.float64))
+        value, vector = np.linalg.eigh((covariance + covariance.T) / 2)
+        # A floor for directions without uncertainty.
+        root = vector * np.sqrt(np.maximum(value, 1e-12 * max(value.max(), 1e-12)))
         self.root: Tensor
-        self.register_buffer("root", torch.from_numpy(_root(covariance)))
         self.base_rotation: Tensor
         self.base_shift: Tensor
         self.pivot: Tensor
+        self.register_buffer("root", torch.from_numpy(root))
         self.register_buffer("base_rotation", torch.tensor(base.rotation, dtype=torch.float64))
         self.register_buffer("base_shift", torch.tensor(base.translation, dtype=torch.float64))
         self.register_buffer("pivot", torch.tensor(self.pivot_in_geo))
@@ -137,12 +138,6 @@ class LearnableSimilarity(torch.nn.Module):
         """Return the present similarity."""
         delta = (self.root @ self.y).detach().cpu().numpy()
         return perturbation(delta, self.pivot_in_geo) @ self.base
-
-
-def _root(covariance: FloatArray) -> FloatArray:
-    """Return a square root of a positive semi-definite matrix, with a floor for directions without uncertainty."""
-    value, vector = np.linalg.eigh((covariance + covariance.T) / 2)
-    return np.asarray(vector * np.sqrt(np.maximum(value, 1e-12 * max(value.max(), 1e-12))))
 
 
 class CameraCorrections(torch.nn.Module):
@@ -164,12 +159,7 @@ class CameraCorrections(torch.nn.Module):
     """
 
     def __init__(
-        self,
-        base: CameraPoses,
-        basis: FloatArray,
-        lens_basis: FloatArray,
-        start: State,
-        z: FloatArray,
+        self, base: CameraPoses, basis: FloatArray, lens_basis: FloatArray, start: State, z: FloatArray
     ) -> None:
         super().__init__()
         self.z = torch.nn.Parameter(torch.tensor(z, dtype=torch.float64))
