@@ -43,7 +43,7 @@ from pipelines.train.assembly import make_trainer
 from pipelines.train.geographic.problem import held_problem, refining_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import TrainOptions
-from pipelines.train.result import trained_model
+from pipelines.train.stage import trained_model
 from pipelines.train.trainer import load_checkpoint
 
 _POLL_S = 0.1

@@ -20,13 +20,10 @@ from pipelines.core.types import FloatArray, IntArray
 from pipelines.core.workspace import Workspace
 from pipelines.geometry.rotations import log_so3
 from pipelines.splat.exposure import HeldExposures
-from pipelines.splat.rasterizer.api import Rasterizer
 from pipelines.survey.adjustment import InitialSimilarity
-from pipelines.survey.photographs import ImageCache, Pinholes
 from pipelines.survey.scene import Scene, load_adjusted_scene
 from pipelines.survey.survey import Survey
 from pipelines.survey.trained_model import Adjustment
-from pipelines.train.region import RegionViews
 
 
 @dataclass(frozen=True)
@@ -56,12 +53,6 @@ class AdjustedScene:
         cameras = tuple(self.adjustment.cameras[index] for index in sorted(set(images.tolist())))
         adjustment = self.adjustment.model_copy(update={"cameras": cameras})
         return replace(self, scene=self.scene.of_images(images), adjustment=adjustment)
-
-    def views(self, images: ImageCache, indices: IntArray, rasterizer: Rasterizer) -> RegionViews:
-        """Return views (T,), under the adjusted lenses, in which a region can be looked for."""
-        pinholes = Pinholes(images, self.scene.sparse.lenses)
-        pinholes.renew(self.adjustment.with_lenses(self.scene.sparse).lenses)
-        return RegionViews(indices, self.adjustment.poses, pinholes, rasterizer)
 
     def exposures(self, device: torch.device) -> HeldExposures | None:
         """Return the exposures of the adjustment, the identity for cameras without one; None: nobody has one."""

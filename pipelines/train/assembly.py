@@ -38,10 +38,8 @@ def make_trainer(
     Args:
         training: cameras, photographs and surface.
         problem: the geographic losses, moved to the backend's device.
-        backend: the rasteriser.
-        options: of the training.
-        exposures: of the photographs, to be held; None: those of the training photographs are fitted, if the
-            options say so.
+        backend, options: rasteriser and options of the training.
+        exposures: to be held; None: those of the training photographs are fitted, if the options say so.
 
     Raises:
         DegenerateGeometryError: fewer than two different points to start from.
@@ -84,9 +82,8 @@ def make_finisher(
         training: cameras, photographs and region.
         gaussians: on the backend's device.
         problem: holds the cameras.
-        backend: the rasteriser.
-        options: of the training.
-        exposures: of the photographs; None: none.
+        backend, options: rasteriser and options of the training.
+        exposures: to be held; None: none.
     """
     device, scene, iterations = device_of(backend), training.scene, options.effort.iterations
     extent_m = scene_extent(scene.poses.cam_center_in_model[scene.train])

@@ -17,7 +17,7 @@ from pipelines.jobs.costs import BLOCK_SECONDS, MEASURED_CORES, SURFACE_FACTOR, 
 from pipelines.splat.memory import USABLE, TrainingSize, fitting_gaussians, free_memory_bytes, predicted_peak_bytes
 from pipelines.splat.rasterizer.backends import chosen_backend
 from pipelines.surface.depth_maps import StereoOptions
-from pipelines.survey.block_plan import BlockPlan
+from pipelines.survey.block_plan import BlockPlan, PlannedBlock
 from pipelines.survey.options import NOT_IN_BLOCKS
 from pipelines.train.options import PRESETS, TrainOptions
 from pipelines.train.schedule import COARSE, pyramid
@@ -170,10 +170,14 @@ def training_forecast(photographs: int, photo_px: tuple[int, int], options: Trai
 def block_processor_s(plan: BlockPlan, photo_px: tuple[int, int], options: TrainOptions) -> dict[int, float]:
     """Return the processor seconds that the CPU backend needs for each block of a plan, by number, on one core."""
     seconds, camera = {}, training_pinhole(photo_px, options)
+    factor = SURFACE_FACTOR if options.faithful_surface else 1.0
     for block in plan.blocks:
-        count = block.gaussians + plan.scaffold_gaussians
-        size = _Iteration(camera, block.view_px, block.visible, count, options)
-        iterating = size.of_all(size.block_processor_s)
+
+        def one(pixels: float, windows: int, block: PlannedBlock = block) -> float:
+            count = block.gaussians + plan.scaffold_gaussians
+            return factor * BLOCK_SECONDS.of(pixels / windows, block.visible / windows, count)
+
+        iterating = _of_all_iterations(camera, block.view_px, options, one)
         stereo = MEASURED_CORES * _stereo_s(len(block.cameras), camera)
         seconds[block.id] = iterating + (stereo if options.dense else 0.0)
     return seconds
@@ -186,55 +190,35 @@ def training_pinhole(photo_px: tuple[int, int], options: TrainOptions) -> Pinhol
     return whole.limited(options.effort.max_image_size)
 
 
-@dataclass(frozen=True)
-class _Iteration:
-    """Size of an iteration with photographs that are not shrunken.
+def _of_all_iterations(
+    camera: Pinhole, pixels: float, options: TrainOptions, one: Callable[[float, int], float]
+) -> float:
+    """Return the seconds of all iterations.
 
-    Attributes:
+    Args:
+        camera: of the photographs, not shrunken.
         pixels: of a photograph that count.
-        visible: number of Gaussians in a photograph.
-        gaussians: number of all.
+        options: of the training.
+        one: returns the seconds of an iteration, by the pixels of a photograph and the windows in which it is seen.
     """
-
-    camera: Pinhole
-    pixels: float
-    visible: float
-    gaussians: float
-    options: TrainOptions
-
-    def windows(self, shrink: int) -> int:
-        """Return the number of windows of a photograph that is shrunken by a factor."""
-        side = (self.pixels / (self.camera.width * self.camera.height)) ** 0.5 / shrink
-        return Crops(self.options.crop_size).count(
-            max(int(side * self.camera.width), 1), max(int(side * self.camera.height), 1)
-        )
-
-    def seconds(self, shrink: int) -> float:
-        """Return the seconds on the machine of `MEASURED_ON`."""
-        surface, windows = self.options.faithful_surface, self.windows(shrink)
-        return iteration_seconds(self.pixels / shrink**2, self.gaussians, surface=surface, windows=windows)
-
-    def block_processor_s(self, shrink: int) -> float:
-        """Return the processor seconds of an iteration of a block."""
-        windows = self.windows(shrink)
-        plain = BLOCK_SECONDS.of(self.pixels / shrink**2 / windows, self.visible / windows, self.gaussians)
-        return SURFACE_FACTOR * plain if self.options.faithful_surface else plain
-
-    def of_all(self, one: Callable[[int], float]) -> float:
-        """Return the seconds of all iterations; `one`: of one with photographs that are shrunken by a factor."""
-        seconds, begun, options = 0.0, 0.0, self.options
-        coarse, crops = COARSE if options.coarse_to_fine else (), Crops(options.crop_size)
-        for shrink, until in pyramid(self.camera.width, self.camera.height, coarse, crops):
-            seconds += (until - begun) * options.effort.iterations * one(shrink)
-            begun = until
-        return seconds
+    seconds, begun = 0.0, 0.0
+    coarse, crops = COARSE if options.coarse_to_fine else (), Crops(options.crop_size)
+    for shrink, until in pyramid(camera.width, camera.height, coarse, crops):
+        side = (pixels / (camera.width * camera.height)) ** 0.5 / shrink
+        windows = crops.count(max(int(side * camera.width), 1), max(int(side * camera.height), 1))
+        seconds += (until - begun) * options.effort.iterations * one(pixels / shrink**2, windows)
+        begun = until
+    return seconds
 
 
 def _seconds(photographs: int, camera: Pinhole, options: TrainOptions) -> float:
     """Return the seconds of stereo and of all iterations on this machine."""
-    pixels, count = camera.width * camera.height, options.effort.max_gaussians
-    size = _Iteration(camera, pixels, count, count, options)
-    seconds = size.of_all(size.seconds)
+
+    def one(pixels: float, windows: int) -> float:
+        surface, count = options.faithful_surface, options.effort.max_gaussians
+        return iteration_seconds(pixels, count, surface=surface, windows=windows)
+
+    seconds = _of_all_iterations(camera, camera.width * camera.height, options, one)
     if options.dense:
         seconds += _stereo_s(photographs, camera)
     return seconds * MEASURED_CORES / min(thread_count(), _MOST_CORES)

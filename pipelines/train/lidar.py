@@ -100,14 +100,12 @@ def compared_lidar(
     """Return the cloud of the scene, compared with the photographs.
 
     Args:
-        options: of the LiDAR.
-        files: the clouds.
-        maps: depth maps of the training views.
+        options, files: of the LiDAR.
+        maps: of the training views.
         survey: has the origin of `geo`.
         track: of the scanner; None: unknown.
         georeference: initial similarity to `geo`, with covariance.
-        seed: of random choices.
-        progress: shows the points read.
+        seed, progress: of random choices; shows the points read.
 
     Raises:
         InputError: the cloud lies elsewhere, in height or plan, or is shifted beyond 3 σ.

@@ -7,16 +7,15 @@ import logging
 import math
 import shutil
 import time
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 
 import torch
 
 from pipelines.core.errors import ConvergenceError, DamagedPartialError, InputError
-from pipelines.core.progress import Progress, ProgressTask, deferred_interrupts
+from pipelines.core.progress import Progress, deferred_interrupts
 from pipelines.core.workspace import StageRun
 from pipelines.jobs.costs import TimeLeft
 from pipelines.splat.gaussians import NonFiniteError
@@ -26,48 +25,7 @@ from pipelines.train.trainer import JointTrainer, StepReport, load_checkpoint, s
 log = logging.getLogger(__name__)
 
 CHECKPOINT, METRICS = "checkpoint.npz", "metrics.jsonl"
-_COMPILING = "compiling kernels (a minute, once)"
 _RECOVERY_RATE = 0.3  # factor on the learning rates after a divergence
-
-
-class TrainingProgress:
-    """Tasks of a training, of which `begun` iterations are of earlier runs; closed at the end of the context.
-
-    The first iteration of a run, in which kernels compile, has a task of its own: its duration is no measure of the
-    others.
-    """
-
-    def __init__(self, progress: Progress, begun: int, iterations: int, time_left: TimeLeft) -> None:
-        self._progress, self._iterations, self._time_left = progress, iterations, time_left
-        self._shown = begun
-        self._first, self._all = ExitStack(), ExitStack()
-        self._warming_up: ProgressTask | None = None
-        self._training: ProgressTask | None = None
-
-    def __enter__(self) -> TrainingProgress:
-        if self._shown < self._iterations:
-            self._warming_up = self._first.enter_context(self._progress.task("first iteration", 1))
-            self._warming_up.advance(0, _COMPILING)
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self._all.close()
-        self._first.close()
-
-    def iterated(self, iteration: int, note: str | None) -> None:
-        """Note the end of an iteration, from 1; without a note on the training, the display stays as it is."""
-        if self._warming_up is not None:
-            self._warming_up.advance(1, " ")
-            self._warming_up = None
-            self._first.close()
-            self._training = self._all.enter_context(self._progress.task("training", self._iterations))
-            self._training.advance(self._shown)
-            self._time_left.start(iteration)
-        if note is not None and self._training is not None:
-            self._training.advance(max(iteration - self._shown, 0), note, self._time_left.after(iteration))
-            self._shown = max(iteration, self._shown)
 
 
 @dataclass(frozen=True)
@@ -117,16 +75,16 @@ def optimise(trainer: JointTrainer, options: LoopOptions, progress: Progress) ->
         InputError: the checkpoint cannot be read.
     """
     loop, iterations = _Loop(trainer, options), trainer.options.iterations
-    display = TrainingProgress(progress, trainer.iteration, iterations, TimeLeft(trainer.work, iterations))
+    display = _displayed(progress, trainer.iteration, iterations, TimeLeft(trainer.work, iterations))
     worked, since = math.nan, iterations  # the first iteration compiles kernels
-    with deferred_interrupts() as stop, display:
+    with deferred_interrupts() as stop, display as iterated:
         while trainer.iteration < iterations:
             try:
                 row = loop.iterate()
                 if math.isnan(worked):
                     worked, since = time.process_time(), trainer.iteration
                 note = None if row is None else f"{row['psnr']:.1f} dB, {row['gaussians'] / 1000:.0f} k Gaussians"
-                display.iterated(trainer.iteration, note)
+                iterated(trainer.iteration, note)
                 if stop.requested:
                     loop.save()
                     log.warning(
@@ -139,6 +97,41 @@ def optimise(trainer: JointTrainer, options: LoopOptions, progress: Progress) ->
         loop.save()
     each = (time.process_time() - worked) / (iterations - since) if since < iterations else math.nan
     return TrainingRecord(loop.seconds(), loop.recovery, each)
+
+
+@contextmanager
+def _displayed(
+    progress: Progress, begun: int, iterations: int, time_left: TimeLeft
+) -> Iterator[Callable[[int, str | None], None]]:
+    """Show a training of which some iterations were of earlier runs; gives what to call after each iteration.
+
+    The first iteration of a run, in which kernels compile, has a task of its own: its duration is no measure of the
+    others.
+    """
+    first, rest = ExitStack(), ExitStack()
+    shown, training = begun, None
+
+    def iterated(iteration: int, note: str | None) -> None:
+        """Without a note on the training, the display stays as it is."""
+        nonlocal shown, training
+        if training is None:
+            warming_up.advance(1, " ")
+            first.close()
+            training = rest.enter_context(progress.task("training", iterations))
+            training.advance(begun)
+            time_left.start(iteration)
+        if note is not None:
+            training.advance(max(iteration - shown, 0), note, time_left.after(iteration))
+            shown = max(iteration, shown)
+
+    try:
+        if begun < iterations:
+            warming_up = first.enter_context(progress.task("first iteration", 1))
+            warming_up.advance(0, "compiling kernels (a minute, once)")
+        yield iterated
+    finally:
+        rest.close()
+        first.close()
 
 
 class _Loop:

@@ -139,23 +139,26 @@ def training_losses(
     if settings is None:
         return losses
 
-    def flatness(view: RenderedView) -> Tensor:
-        return flatness_loss(view.gaussians, view.stats.visible, extent_m)
-
-    def normals(view: RenderedView) -> Tensor:
-        return normal_loss(view.gaussians, view.pose, view.target.camera, rasterizer, settings.edge)
-
     def weight_of_normals(iteration: int) -> float:
         due = iteration > settings.normals_from * iterations and iteration % settings.normals_every == 0
         return settings.normals_every * settings.normals if due else 0.0
 
     return [
         *losses,
-        Loss("flatness", flatness, lambda _: settings.flatness),
+        Loss(
+            "flatness",
+            lambda view: flatness_loss(view.gaussians, view.stats.visible, extent_m),
+            lambda _: settings.flatness,
+        ),
         Loss("compactness", compactness, lambda _: settings.compactness, _by_pixels),
         Loss("depth", depth, lambda _: settings.depth, _by_points),
         *measured,
-        Loss("normals", normals, weight_of_normals, _by_pixels),
+        Loss(
+            "normals",
+            lambda view: normal_loss(view.gaussians, view.pose, view.target.camera, rasterizer, settings.edge),
+            weight_of_normals,
+            _by_pixels,
+        ),
     ]
 
 

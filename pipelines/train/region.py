@@ -15,12 +15,13 @@ import torch
 
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
-from pipelines.geometry.cameras import CameraPoses, Pinhole
+from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Window
+from pipelines.surface.depth_maps import DepthMaps
 from pipelines.survey.block_plan import BlockCell
-from pipelines.survey.photographs import Pinholes
-from pipelines.train.surface import SceneSurface
+from pipelines.survey.photographs import ImageCache, Pinholes
+from pipelines.train.adjusted_scene import AdjustedScene
 
 _STAND_IN_PX = 160  # longest side of the stand-in's renders
 _LEAST_ALPHA = 0.5  # of a surface: rays that meet less end in the sky
@@ -91,41 +92,6 @@ class SceneBox:
 
 
 @dataclass(frozen=True)
-class RegionViews:
-    """Views in which a region is looked for: indices (T,) of cameras, and the poses and pinholes of all cameras."""
-
-    indices: IntArray
-    poses: CameraPoses
-    pinholes: Pinholes
-    rasterizer: Rasterizer
-
-    def masks(
-        self,
-        cell: BlockCell,
-        stand_in: Gaussians,
-        surface: SceneSurface | None = None,
-        progress: Progress = SILENT,
-    ) -> RegionMasks:
-        """Return the pixels of each view whose surface lies in a region.
-
-        Args:
-            cell: the region.
-            stand_in: whose depth counts where the surface is not known.
-            surface: known depths; None: there are none.
-            progress: counts the views.
-        """
-        masks: dict[int, BoolArray] = {}
-        with progress.task("masks", len(self.indices)) as task:
-            for index in self.indices.tolist():
-                pose, pinhole = self.poses.matrix(index), self.pinholes.of(index)
-                depth = stand_in_depth(stand_in, pose, pinhole, self.rasterizer)
-                known = None if surface is None else surface.maps.depth(index)
-                masks[index] = region_mask(pose, pinhole, cell, known, depth)
-                task.advance()
-        return RegionMasks(masks)
-
-
-@dataclass(frozen=True)
 class TrainingRegion:
     """Region of a training.
 
@@ -142,6 +108,41 @@ class TrainingRegion:
     surroundings: Gaussians
     sky: Gaussians
     masks: RegionMasks
+
+
+def region_masks(
+    solved: AdjustedScene,
+    views: IntArray,
+    images: ImageCache,
+    rasterizer: Rasterizer,
+    cell: BlockCell,
+    *,
+    stand_in: Gaussians,
+    maps: DepthMaps | None = None,
+    progress: Progress = SILENT,
+) -> RegionMasks:
+    """Return the pixels of each view whose surface lies in a region.
+
+    Args:
+        solved: cameras and lenses.
+        views: (T,) indices of the cameras.
+        images: of all cameras.
+        rasterizer: renders the stand-in.
+        cell: the region.
+        stand_in: whose depth counts where the surface is not known.
+        maps: known depths; None: there are none.
+        progress: counts the views.
+    """
+    pinholes = Pinholes(images, solved.scene.sparse.lenses)
+    pinholes.renew(solved.adjustment.with_lenses(solved.scene.sparse).lenses)
+    masks: dict[int, BoolArray] = {}
+    with progress.task("masks", len(views)) as task:
+        for index in views.tolist():
+            pose, pinhole = solved.adjustment.poses.matrix(index), pinholes.of(index)
+            depth = stand_in_depth(stand_in, pose, pinhole, rasterizer)
+            masks[index] = region_mask(pose, pinhole, cell, None if maps is None else maps.depth(index), depth)
+            task.advance()
+    return RegionMasks(masks)
 
 
 def region_mask(

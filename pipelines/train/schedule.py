@@ -18,6 +18,8 @@ _FINAL_RATE = 0.05  # of the geographic unknowns, relative to their first learni
 # would make the Gaussians smaller than a pixel, and push them off the surface that they start on.
 COARSE = ((2, 0.3),)
 _DENSITY_UNTIL = 0.5  # of the training
+_GEO_RISE = 0.1  # τ of eq. 27, as a fraction of the iterations
+BACKGROUND = (0.0, 0.0, 0.0)  # RGB behind the scene
 
 
 @dataclass(frozen=True)
@@ -25,17 +27,13 @@ class JointOptions:
     """Settings of the joint optimisation.
 
     Attributes:
-        iterations: length of the training.
         sh_degree: degree that the spherical harmonics reach.
         geo_weight: w_max of eq. 27.
-        geo_rise: τ of eq. 27, as a fraction of the iterations.
         geo_schedule: "rising" as in eq. 27, or "constant": w_max from the first iteration.
         similarity_rate: first learning rate of the similarity and of constant errors of the measurements, in
             standard deviations an iteration.
         camera_rate: first learning rate of the camera corrections, in standard deviations an iteration.
-        variance_rate: first learning rate of the log-variances of the geographic terms.
-        background: RGB behind the scene, 0 … 1.
-        seed: seed of the order of views.
+        seed: of the order of views.
         coarse: (factor, fraction) pairs: photographs are shrunken by a factor up to a fraction of the training.
         coarse_least_px: lower limit of the longest side of a shrunken photograph.
         crops: windows of large photographs; None: all are trained as wholes.
@@ -46,12 +44,9 @@ class JointOptions:
     iterations: int
     sh_degree: int = 3
     geo_weight: float = 0.05
-    geo_rise: float = 0.1
     geo_schedule: Literal["rising", "constant"] = "rising"
     similarity_rate: float = 0.1
     camera_rate: float = 0.01
-    variance_rate: float = 0.01
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     seed: int = 0
     coarse: tuple[tuple[int, float], ...] = ()
     coarse_least_px: int = 160
@@ -102,7 +97,6 @@ class TrainingSchedule:
     Coarse photographs do not come back, and harmonics that were in use stay so.
 
     Attributes:
-        options: settings of the optimisation.
         views: (V,) indices of the training images.
         extended_from: last iteration of the finished training that this one extends; 0: none.
     """
@@ -148,7 +142,7 @@ class TrainingSchedule:
         options = self.options
         if options.geo_schedule == "constant":
             return options.geo_weight
-        return options.geo_weight * (1.0 - math.exp(-iteration / (options.geo_rise * options.iterations)))
+        return options.geo_weight * (1.0 - math.exp(-iteration / (_GEO_RISE * options.iterations)))
 
     def geographic_rate(self, iteration: int) -> float:
         """Return the factor on the first learning rates of the geographic unknowns."""

@@ -14,6 +14,9 @@ import logging
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from pipelines.adjust.posterior import Posterior, save_posterior
 from pipelines.adjust.system import minimise
@@ -28,21 +31,29 @@ from pipelines.surface.lidar_cloud import ScannerTrack
 from pipelines.surface.measured_cloud import CloudFiles
 from pipelines.survey.adjustment import GeolocatedPoints
 from pipelines.survey.calibrated import load_survey
+from pipelines.survey.report_parts import EstimatedError, LidarReport
 from pipelines.survey.scene import photographs
 from pipelines.survey.trained_model import Adjustment, TrainedModel
-from pipelines.train.adjusted_scene import AdjustedScene
+from pipelines.train.adjusted_scene import AdjustedScene, with_exposures
 from pipelines.train.assembly import make_trainer
 from pipelines.train.forecast import training_forecast, training_size, with_gaussian_limit
 from pipelines.train.geographic.problem import held_problem, refining_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.lidar import compared_lidar, draw_changes, lidar_surface, plane_observations
-from pipelines.train.loop import METRICS, train_in_folder
+from pipelines.train.loop import METRICS, TrainingRecord, train_in_folder
 from pipelines.train.options import TrainOptions
-from pipelines.train.result import summary_of, trained_model
+from pipelines.train.schedule import BACKGROUND
 from pipelines.train.surface import SceneSurface
 from pipelines.train.trainer import JointTrainer
 
 log = logging.getLogger(__name__)
+
+_EVIDENT_SIGMAS = 3.0
+_CAUSES = {
+    "lever-arm": "`georef ingest --lever-arm` can apply it, in the axes of the body",
+    "boresight": "`georef ingest --boresight` can apply it",
+    "lidar-shift": "Check the LiDAR's CRS, datum and flight",
+}
 
 
 def run(stage: StageRun, options: TrainOptions) -> Summary:
@@ -108,20 +119,13 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     model = _write_solution(stage, trainer, adjusted.adjustment, posterior)
     write_gaussians(stage.out / "gaussians.ply", trainer.optimizer.gaussians.detached())
     metrics = [json.loads(row) for row in (stage.out / METRICS).read_text(encoding="utf-8").splitlines()]
-    return summary_of(model, metrics, record, None if lidar is None else lidar.report)
+    return _summary(model, metrics, record, None if lidar is None else lidar.report)
 
 
 def _write_solution(
     stage: StageRun, trainer: JointTrainer, held: Adjustment, posterior: Posterior | None
 ) -> TrainedModel:
-    """Write the adjustment at the end of a training, and return it with the settings of the training.
-
-    Args:
-        stage: has the folder.
-        trainer: at the end of the training.
-        held: the adjustment that the training has held.
-        posterior: that of the training; None: it has held that of `init-sim3`.
-    """
+    """Write and return the product of a training, which has `held` its adjustment if there is no posterior."""
     model = trained_model(trainer, held if posterior is None else posterior.solution)
     save_json(model, stage.out / Path(MODEL).name)
     path = stage.out / Path(TRAIN_POSTERIOR).name
@@ -130,6 +134,72 @@ def _write_solution(
     else:
         save_posterior(posterior, path)
     return model
+
+
+def trained_model(trainer: JointTrainer, solution: Adjustment) -> TrainedModel:
+    """Return the product of `train` without the Gaussians, given the solution at the end of the training."""
+    if trainer.exposures is not None:
+        solution = with_exposures(solution, trainer.exposures.affine.cpu().numpy().astype(float))
+    gaussians = trainer.optimizer.gaussians
+    return TrainedModel(
+        **dict(solution),
+        max_image_size=trainer.views.images.max_size_px,
+        background=BACKGROUND,
+        sh_degree=gaussians.sh_degree,
+        iterations=trainer.iteration,
+        gaussians=len(gaussians),
+        backend=trainer.rasterizer.name,
+    )
+
+
+def _summary(
+    model: TrainedModel, metrics: list[dict[str, Any]], record: TrainingRecord, lidar: LidarReport | None = None
+) -> Summary:
+    """Return headline, values and warnings of a training, given the rows of `metrics.jsonl`."""
+    psnr = float(np.mean([row["psnr"] for row in metrics[-20:]]))
+    sigma = np.sqrt(np.diag(np.array(model.geo_from_model.covariance)))
+    values = {
+        "iterations": model.iterations,
+        "gaussians": model.gaussians,
+        "train_psnr": round(psnr, 3),
+        "seconds": round(record.seconds, 1),
+        "seconds_per_iteration": round(record.seconds / model.iterations, 4),
+        "similarity_sigma_m": [round(float(value), 5) for value in sigma[4:]],
+        "gnss_outliers": list(model.gnss_outliers),
+        "control_outliers": list(model.control_outliers),
+        "estimated_errors": [error.model_dump() for error in model.estimated_errors],
+    }
+    if lidar is not None:
+        values["lidar"] = lidar.model_dump(mode="json")
+    key_figure = f"{model.gaussians} gaussians, train PSNR {psnr:.2f} dB"
+    # A common error of the fixes is everyday: init-sim3 has tested it against its prior, and its cautions tell it.
+    told = [_warning_of(error) for error in model.estimated_errors if error.name != "bias"]
+    warnings = [text for text in (*told, record.recovery) if text is not None]
+    if lidar is not None:
+        warnings += lidar.assumptions
+    if lidar is not None and lidar.areas:
+        area_m2 = sum(area.area_m2 for area in lidar.areas)
+        warnings.append(
+            f"LiDAR and photographs contradict each other on {area_m2:.0f} m² in {len(lidar.areas)} places, which "
+            "train/lidar.json lists and train/lidar.png shows: the LiDAR is not used there"
+        )
+    return Summary(key_figure, values, tuple(warnings), model.cautions)
+
+
+def _warning_of(error: EstimatedError) -> str | None:
+    """Return a warning if the error exceeds 3 σ or is not observable along every axis; else None."""
+    axes = "east, north, up" if error.name == "lidar-shift" else "right, down, forward"
+    values = ", ".join(f"{value:+.3f} ± {sigma:.3f}" for value, sigma in zip(error.value, error.sigma, strict=True))
+    evident = [
+        abs(value) > _EVIDENT_SIGMAS * sigma and observed
+        for value, sigma, observed in zip(error.value, error.sigma, error.observed, strict=True)
+    ]
+    if any(evident):
+        evidence = f"{error.name} of ({values}) {error.unit} {axes}, beyond 3 σ: it is taken out here"
+        return f"{evidence}. {_CAUSES[error.name]}"
+    if not all(error.observed):
+        return f"{error.name} is not observable along every axis: ({values}) {error.unit} {axes}"
+    return None
 
 
 def made_in_parts(workspace: Workspace, options: TrainOptions) -> bool:

@@ -30,7 +30,7 @@ from pipelines.survey.photographs import ImageCache, Pinholes
 from pipelines.train.geographic.problem import GeographicAdam, GeoProblem
 from pipelines.train.losses import Loss, RenderedView, training_losses, weighted_sum
 from pipelines.train.region import TrainingRegion
-from pipelines.train.schedule import JointOptions, TrainingSchedule
+from pipelines.train.schedule import BACKGROUND, JointOptions, TrainingSchedule
 from pipelines.train.target_images import ImageLook, TargetImage, TargetImages
 
 _LENS_EVERY = 100  # iterations between two reads of the lens: each read waits for the device
@@ -44,7 +44,6 @@ class TrainingViews:
 
     Attributes:
         camera: (V,) indices of the training views, into cameras and images.
-        images: all undistorted photographs.
         surface: returns the points in `model`, float32, that an image shows; None: no depth loss.
         lenses: lenses with which the images were undistorted; None: the lenses never change.
         measured: losses of a surface that was measured.
@@ -62,7 +61,6 @@ class StepReport:
     """Figures of one iteration; the scalar tensors are still on the device, because fetching them would wait.
 
     Attributes:
-        photometric: photometric loss.
         mean_square_error: of colours from 0 to 1, over the pixels that count.
         geographic: geographic losses, not yet multiplied by the weight.
         weight: w(t), the weight of the geographic losses.
@@ -96,11 +94,7 @@ class JointTrainer:
         optimizer: the Gaussians and their moments.
         strategy: density control.
         problem: similarity, cameras and constant errors, with the geographic losses.
-        views: training views.
-        rasterizer: backend.
-        options: settings, with the schedule.
-        exposures: exposures of the photographs, optimised as well or held; None: all photographs have the same
-            exposure.
+        exposures: of the photographs, optimised as well or held; None: all photographs have the same exposure.
         outliers: finds pixels that contradict the model, which do not count; None: all do.
         region: part of the scene that the Gaussians are to show; None: all of it.
     """
@@ -252,7 +246,7 @@ class JointTrainer:
         """Return a render of the Gaussians, and behind their rows those that surround the region."""
         settings = RasterSettings(
             sh_degree=self.schedule.sh_degree(self.iteration),
-            background=self.options.background,
+            background=BACKGROUND,
             depth=depth or self.options.surface is not None,
             median=False,
             window=target.part.window,

@@ -32,7 +32,7 @@ from pipelines.train.geographic.problem import held_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.loop import METRICS, TrainingRecord, train_in_folder
 from pipelines.train.options import BlockTrainOptions
-from pipelines.train.region import RegionMasks, SceneBox, TrainingRegion
+from pipelines.train.region import RegionMasks, SceneBox, TrainingRegion, region_masks
 from pipelines.train.surface import SceneSurface
 from pipelines.train.trainer import JointTrainer
 
@@ -62,21 +62,24 @@ def run(stage: StageRun, options: BlockTrainOptions) -> Summary:
     size = training_size(options, len(images), images.largest(), beside=len(scaffold))
     require_memory(size, free_memory_bytes(device_of(backend)))
     images.build(stage.progress)
-    surface = None
+    maps = None
     if options.dense:
         maps = DepthMaps(workspace.cache / "surface", solved.scene, images)
         maps.build(stage.progress)
-        surface = SceneSurface(maps)
-    views = solved.views(images, solved.scene.train, backend)
-    masks = views.masks(block.region, scaffold, surface, stage.progress)
-    if len(masks.seeing()) < _LEAST_VIEWS:
-        raise DegenerateGeometryError(
-            f"{len(masks.seeing())} photographs show the surface of a block: give fewer --blocks"
-        )
-    scene, region = replace(solved.scene, train=masks.seeing()), _region(block, box, scaffold, masks)
+    train = solved.scene.train
+    masks = region_masks(
+        solved, train, images, backend, block.region, stand_in=scaffold, maps=maps, progress=stage.progress
+    )
+    seeing = masks.seeing()
+    if len(seeing) < _LEAST_VIEWS:
+        raise DegenerateGeometryError(f"{len(seeing)} photographs show the surface of a block: give fewer --blocks")
+    surface = None if maps is None else SceneSurface(maps)
+    scene, region = replace(solved.scene, train=seeing), _region(block, box, scaffold, masks)
     training, exposures = TrainingScene(scene, images, surface, region), solved.exposures(device_of(backend))
     trainer = make_trainer(training, held_problem(solved), backend, options, exposures)
-    record = train_in_folder(stage, trainer, options, _iterations(stage))
+    earlier = None if stage.extends is None else stage.extends / "record.json"
+    done = load_json(BlockTraining, earlier).iterations if earlier is not None and earlier.is_file() else 0
+    record = train_in_folder(stage, trainer, options, done)
     measured = _measured(stage, trainer, block, record)
     write_gaussians(stage.out / "gaussians.ply", trainer.optimizer.gaussians.detached())
     save_json(measured, stage.out / "record.json")
@@ -107,16 +110,8 @@ def _region(block: PlannedBlock, box: SceneBox, scaffold: Gaussians, masks: Regi
     return TrainingRegion(block.region, box, outside, sky.to(torch.device("cpu")), masks)
 
 
-def _iterations(stage: StageRun) -> int:
-    """Return the iterations of the finished training that this one may extend; 0: there is none."""
-    if stage.extends is None or not (stage.extends / "record.json").is_file():
-        return 0
-    return load_json(BlockTraining, stage.extends / "record.json").iterations
-
-
 def _measured(stage: StageRun, trainer: JointTrainer, block: PlannedBlock, record: TrainingRecord) -> BlockTraining:
-    lines = (stage.out / METRICS).read_text(encoding="utf-8").splitlines()
-    rows = [json.loads(line) for line in lines]
+    rows = [json.loads(line) for line in (stage.out / METRICS).read_text(encoding="utf-8").splitlines()]
     means = {name: float(np.mean([row[name] for row in rows])) for name in ("gaussians", "visible", "pixels")}
     gaussians, region = trainer.optimizer.gaussians.detached(), trainer.region
     assert region is not None

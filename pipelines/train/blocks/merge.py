@@ -53,6 +53,7 @@ from pipelines.survey.block_plan import (
 from pipelines.survey.photographs import pinhole_of
 from pipelines.survey.trained_model import Adjustment, TrainedModel
 from pipelines.train.blocks.parts import Parts
+from pipelines.train.schedule import BACKGROUND
 
 _VIEWS = 4  # of a seam
 _CANDIDATES = 16  # from which they are chosen, by small renders
@@ -173,7 +174,7 @@ def merge_blocks(parts: Parts, plan: BlockPlan, folder: Path, progress: Progress
     model = TrainedModel(
         **dict(solution),
         max_image_size=parts.options.effort.max_image_size,
-        background=(0.0, 0.0, 0.0),
+        background=BACKGROUND,
         sh_degree=read_gaussians(cells[0], slice(0, 1)).sh_degree,
         iterations=max(training.iterations for training in trainings),
         gaussians=count,

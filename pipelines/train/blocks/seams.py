@@ -35,7 +35,7 @@ from pipelines.train.assembly import make_finisher
 from pipelines.train.geographic.problem import held_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import SeamOptions
-from pipelines.train.region import SceneBox, TrainingRegion
+from pipelines.train.region import SceneBox, TrainingRegion, region_masks
 
 _SHARE = 0.2  # of a block's iterations
 _WIDTH = 0.5  # of the blocks' overlap, on each side of a seam
@@ -147,7 +147,7 @@ class _SeamTrainer:
         index = scene.sparse.image_index()
         train = np.array([index[name] for name in names if name in index], dtype=np.int64)
         everything = Gaussians.concatenate([start, surroundings]).to(device)
-        masks = self.solved.views(self.images, train, self.backend).masks(strip, everything)
+        masks = region_masks(self.solved, train, self.images, self.backend, strip, stand_in=everything)
         seeing = masks.seeing()
         if len(seeing) < _LEAST_VIEWS:
             return None

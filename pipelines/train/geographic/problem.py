@@ -53,6 +53,7 @@ TermT = TypeVar("TermT", bound=TensorTerm)
 _BOUND = {"whitened": 100.0, "paper": 1e4}
 # Uncertainty of the stated variances: σ of the logarithm.
 PRIOR_LOG_VARIANCE = 1.0
+_VARIANCE_RATE = 0.01  # first learning rate of the log-variances
 
 
 class TermWeights(torch.nn.Module):
@@ -267,9 +268,8 @@ def refining_problem(
     Args:
         adjusted: the adjustment, from which the training starts.
         measured: the measurements in use.
-        options: weights, and the terms that training has beside those of the adjustment.
         points: of `geolocate`, for L_rel; None: L_rel uses the cameras and their fixes.
-        seed: of the random pairs for L_rel.
+        options, seed: weights, further terms, and the random pairs of L_rel.
 
     Raises:
         InputError: `points` belongs to another model.
@@ -329,7 +329,7 @@ class GeographicAdam:
             "y": options.similarity_rate,
             "z": options.camera_rate,
             "x": options.similarity_rate,
-            "u": options.variance_rate,
+            "u": _VARIANCE_RATE,
         }
         # One kernel for each of these short vectors on a GPU, in place of a dozen whose launches take longer than
         # their work.

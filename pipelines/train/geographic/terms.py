@@ -76,13 +76,10 @@ class TensorTerm(ABC):
 
 @dataclass(frozen=True)
 class FixTerm(TensorTerm):
-    """L_abs, `adjust.terms.Fixes`.
+    """L_abs, `adjust.terms.Fixes`, in float64.
 
     Attributes:
-        camera: (F,) int64 index into the cameras.
-        position_in_geo: (F, 3) float64 metres.
-        root_information: (F, 3, 3) float64, in 1/m.
-        bias: (F, B) float64, 1 where a block of the systematic errors is the bias of the fix's session.
+        bias: (F, B), 1 where a block of the systematic errors is the bias of the fix's session.
     """
 
     kind: ClassVar[str] = "absolute"
@@ -102,17 +99,9 @@ class FixTerm(TensorTerm):
 
 @dataclass(frozen=True)
 class ControlTerm(TensorTerm):
-    """L_gcp, `adjust.terms.ControlPoints`; J points, K marks in all.
+    """L_gcp, `adjust.terms.ControlPoints`, in float64; J points, K marks in all.
 
-    Attributes:
-        point: (K,) int64 index into the points.
-        camera: (K,) int64 index into the cameras.
-        bearing_in_cam: (K, 3) float64 unit vectors.
-        sigma_rad: (K,) float64 angular σ of a mark.
-        bearing_by_lens: (K, 3, L) float64, derivative of the bearings by the lens parameters.
-        position_in_geo: (J, 3) float64 metres, surveyed.
-        root_information: (J, 3, 3) float64 of survey and intersection together, in 1/m; for control points through
-            the rendered depth, of the surface too.
+    The root information of control points through the rendered depth holds the surface's σ, too.
     """
 
     kind: ClassVar[str] = "control"
@@ -155,13 +144,7 @@ class ControlTerm(TensorTerm):
 
 @dataclass(frozen=True)
 class AttitudeTerm(TensorTerm):
-    """L_att, `adjust.terms.Attitudes`.
-
-    Attributes:
-        camera: (A,) int64 index into the cameras.
-        geo_from_cam: (A, 3, 3) float64, of the nominal camera axes.
-        root_information: (A, 3, 3) float64, in 1/rad.
-    """
+    """L_att, `adjust.terms.Attitudes`, in float64."""
 
     kind: ClassVar[str] = "attitude"
     in_metres: ClassVar[bool] = False
@@ -182,14 +165,7 @@ class AttitudeTerm(TensorTerm):
 
 @dataclass(frozen=True)
 class PlaneTerm(TensorTerm):
-    """L_lidar, `adjust.terms.Planes`.
-
-    Attributes:
-        point_in_model: (M, 3) float64 metres, on the surface of the photographs.
-        position_in_geo: (M, 3) float64 metres, on the plane of the LiDAR.
-        normal_in_geo: (M, 3) float64 unit normals of the planes.
-        root_information: (M, 1, 1) float64, in 1/m, of the distance between both along the normal.
-    """
+    """L_lidar, `adjust.terms.Planes`, in float64."""
 
     kind: ClassVar[str] = "lidar"
     dimension: ClassVar[int] = 1
