@@ -40,12 +40,11 @@ from pipelines.surface.depth_maps import DepthMaps
 from pipelines.survey.photographs import ImageCache
 from pipelines.survey.scene import Scene, photographs
 from pipelines.train.adjusted_scene import AdjustedScene
-from pipelines.train.assembly import make_trainer
 from pipelines.train.geographic.problem import refining_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import TrainOptions
 from pipelines.train.surface import SceneSurface
-from pipelines.train.trainer import JointTrainer
+from pipelines.train.trainer import JointTrainer, make_trainer
 
 
 def iterations(count: int, camera: Pinhole, visible: float, repeats: int, backend_name: str) -> Iterator[float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -65,9 +65,7 @@ class AdjustedScene:
     def measured(self, *, control_points: bool = True, planes: Planes | None = None) -> Problem:
         """Return the measurements in use, with the systematic errors that the adjustment has estimated.
 
-        Args:
-            control_points: whether they are used.
-            planes: of a LiDAR whose shift is a systematic error; None: none.
+        Planes are those of a LiDAR whose shift is a systematic error.
         """
         survey = self.initial.in_use(self.survey)
         if not control_points:
@@ -130,12 +128,21 @@ class AdjustedScene:
         return adjusted(self.scene, problem, state, self.initial, rejected)
 
 
+def figures_of(adjustment: Adjustment) -> dict[str, Any]:
+    """Return what the summary of a training says of its adjustment."""
+    sigma = np.sqrt(np.diag(np.array(adjustment.geo_from_model.covariance)))
+    return {
+        "similarity_sigma_m": [round(float(value), 5) for value in sigma[4:]],
+        "gnss_outliers": list(adjustment.gnss_outliers),
+        "control_outliers": list(adjustment.control_outliers),
+        "estimated_errors": [error.model_dump() for error in adjustment.estimated_errors],
+    }
+
+
 def with_exposures(adjustment: Adjustment, exposure: FloatArray) -> Adjustment:
     """Return an adjustment with the exposures (n, 3, 4) of its training cameras."""
-    cameras = tuple(
-        camera.model_copy(update={"exposure": tuple(map(tuple, affine.tolist()))})
-        if camera.split == "train"
-        else camera
-        for camera, affine in zip(adjustment.cameras, exposure, strict=True)
-    )
-    return adjustment.model_copy(update={"cameras": cameras})
+    cameras = list(adjustment.cameras)
+    for place, (camera, affine) in enumerate(zip(cameras, exposure, strict=True)):
+        if camera.split == "train":
+            cameras[place] = camera.model_copy(update={"exposure": tuple(map(tuple, affine.tolist()))})
+    return adjustment.model_copy(update={"cameras": tuple(cameras)})

@@ -31,8 +31,7 @@ def training_size(options: TrainOptions, photographs: int, largest: Pinhole, bes
     """Return the quantities that determine the memory of a training.
 
     Args:
-        options: of the training.
-        photographs: number of photographs.
+        options, photographs: of the training, and number of photographs.
         largest: camera of the largest photograph at training size.
         beside: number of frozen Gaussians that are rendered too.
     """
@@ -76,17 +75,14 @@ class TrainingForecast:
     """Forecast of a training.
 
     Attributes:
-        photographs: number of photographs.
         photo_px: width and height of the largest photograph.
         training_px: width and height at which it is trained.
         windows: number of windows in which it is seen, one at an iteration, when it is not shrunken further.
         backend: `cpu` or `cuda`.
-        threads: that the CPU backend uses.
         seconds: about; None on a GPU, where nothing was measured.
         peak_bytes: predicted peak of the memory.
         free_bytes: memory that is free; None: unknown.
-        blocks: number of blocks that was asked for; None: as many as fit.
-        lidar: whether LiDAR is to be used.
+        blocks: number that was asked for; None: as many as fit.
     """
 
     preset: str
@@ -193,13 +189,9 @@ def training_pinhole(photo_px: tuple[int, int], options: TrainOptions) -> Pinhol
 def _of_all_iterations(
     camera: Pinhole, pixels: float, options: TrainOptions, one: Callable[[float, int], float]
 ) -> float:
-    """Return the seconds of all iterations.
+    """Return the seconds of all iterations on photographs with so many pixels that count.
 
-    Args:
-        camera: of the photographs, not shrunken.
-        pixels: of a photograph that count.
-        options: of the training.
-        one: returns the seconds of an iteration, by the pixels of a photograph and the windows in which it is seen.
+    `one` returns those of an iteration, by the pixels of a shrunken photograph and its windows.
     """
     seconds, begun = 0.0, 0.0
     coarse, crops = COARSE if options.coarse_to_fine else (), Crops(options.crop_size)

@@ -49,13 +49,7 @@ _SKY_RADIUS = 12.0  # in scene radii
 
 @dataclass(frozen=True)
 class Background:
-    """B points on rays that meet no known point.
-
-    Attributes:
-        point_in_model: (B, 3) metres.
-        rgb: (B, 3) uint8.
-        sigma_m: (B,) half the width of the image cell, at the distance of the point.
-    """
+    """B points on rays that meet no known point; σ (B,) is half the width of an image cell at their distance."""
 
     point_in_model: FloatArray
     rgb: ByteArray
@@ -63,14 +57,9 @@ class Background:
 
 
 def background(scene: Scene, images: ImageCache, points: FloatArray) -> Background:
-    """Return points on the rays of all image cells of the training views that show none of the known points.
+    """Return points on the rays of all image cells of the training views that show none of the known points (N, 3).
 
     The z axis of `model` points up, and the ground is a plane below most of the points.
-
-    Args:
-        scene: cameras.
-        images: undistorted photographs, for the colours.
-        points: (N, 3) known points in `model`, metres.
     """
     middle = np.median(points, axis=0)
     radius = float(np.percentile(np.linalg.norm(points - middle, axis=1), 90))
@@ -157,8 +146,7 @@ def guessed_points(
     Each lies where the ray of its pixel meets the surface through the SfM points, z up. Sky has none.
 
     Args:
-        scene: cameras and SfM points.
-        maps: known depths.
+        scene, maps: cameras and SfM points; known depths.
         count: limit of the points, which are spread as evenly as the photographs resolve them.
         seed: of the choice of pixels.
         inside: returns which of points (N, 3) count, as a mask (N,).
@@ -215,11 +203,7 @@ def underlay(points: SurfacePoints, count: int, seed: int) -> tuple[SurfacePoint
     """Return places on a sheet beneath the points, on a square grid with z up, and the side of its cells in metres.
 
     Each place lies half a side below the lowest ground that points show within 20 m, smoothed but never above them.
-
-    Args:
-        points: of the scene; at least one.
-        count: limit of the places; 0: none.
-        seed: of the choice of points for the colours.
+    There are `count` places at most, and at least one point; the seed is that of the points for the colours.
     """
     place = points.point_in_model
     low, high = np.quantile(place[:, :2], [_STRAY, 1 - _STRAY], axis=0)

@@ -100,10 +100,9 @@ def compared_lidar(
     """Return the cloud of the scene, compared with the photographs.
 
     Args:
-        options, files: of the LiDAR.
+        options, files, track: of the LiDAR; None: the scanner's track is unknown.
         maps: of the training views.
         survey: has the origin of `geo`.
-        track: of the scanner; None: unknown.
         georeference: initial similarity to `geo`, with covariance.
         seed, progress: of random choices; shows the points read.
 
@@ -121,15 +120,7 @@ def compared_lidar(
 def lidar_surface(
     compared: ComparedLidar, files: CloudFiles, survey: Survey, options: LidarOptions, shift_m: FloatArray | None
 ) -> LidarSurface:
-    """Return the surface of stereo and LiDAR.
-
-    Args:
-        compared: the cloud.
-        files: have the numbers of points read and dropped.
-        survey: has the origin of `geo`.
-        options: of the LiDAR.
-        shift_m: (3,) shift of the LiDAR to take out, axes of geo; None: none.
-    """
+    """Return the surface of stereo and LiDAR, without a shift (3,) of the LiDAR, axes of geo; None: none."""
     cloud = compared.cloud if shift_m is None else compared.cloud.moved(-shift_m)
     judged = verdict(cloud, compared.views, compared.shown, sigma_m=options.lidar_sigma, pixel_m=compared.pixel_m)
     tally = files.tally
@@ -276,11 +267,7 @@ def _checked(
     georeference: SimilarityRecord,
     options: LidarOptions,
 ) -> LidarRegistration:
-    """Return the record of a registration.
-
-    Raises:
-        InputError: a shift beyond 3 σ, and no request to take it out.
-    """
+    """Return the record of a registration; a shift beyond 3 σ is an error, unless it is to be taken out."""
     middle = scene.geo_from_model.apply(np.median(cloud.position_in_model, axis=0))[None]
     of_georeference = covariance_at(middle, georeference.covariance, georeference.pivot)[0]
     variance = np.diag(compared.covariance_m2 + of_georeference) + options.lidar_sigma**2

@@ -91,10 +91,9 @@ def verdict(
     sigma_m: float,
     pixel_m: float,
 ) -> CloudVerdict:
-    """Return confidence and contradictions of a cloud's points.
+    """Return confidence and contradictions of the P points of a registered cloud.
 
     Args:
-        cloud: P points, registered.
         views: depth maps of the training photographs.
         surface_in_model: (S, 3) surface that the photographs show together.
         sigma_m: stated σ of the points.
@@ -197,13 +196,7 @@ _SAME = 0.01  # of the depth
 
 
 class LidarPlanes:
-    """Planes of the registered LiDAR that is trusted.
-
-    Args:
-        cloud: P points.
-        confidence: (P,) in its points.
-        pixel_m: size of a pixel of the depth maps on the surface.
-    """
+    """Planes of the registered LiDAR that is trusted, of P points with a confidence (P,)."""
 
     def __init__(self, cloud: LidarCloud, confidence: FloatArray, pixel_m: float) -> None:
         trusted = np.flatnonzero(confidence >= _LEAST_CONFIDENCE)
@@ -230,12 +223,11 @@ class LidarPlanes:
 
 
 class FusedSurface(SceneSurface):
-    """Surface of stereo, corrected by LiDAR, and continued by LiDAR where stereo found none.
+    """Surface of stereo, corrected by registered LiDAR, and continued by it where stereo found none.
 
     Args:
         maps: depth maps, already built.
-        cloud: registered LiDAR.
-        judged: verdict of the photographs on it.
+        judged: verdict of the photographs on the LiDAR.
         pixel_m: size of a pixel of the depth maps on the surface.
         pull: what is held to the LiDAR.
         free: where its beams met nothing; None: unknown.
@@ -305,27 +297,20 @@ class FusedSurface(SceneSurface):
         nearest = ndimage.minimum_filter(np.where(depth > 0, depth, np.inf), size=2 * _RIM_PX + 1)
         unknown = depth[seen.row, seen.column] == 0
         before = seen.depth_m < (1 + _SAME) * nearest[seen.row, seen.column]
-        trusted = self._confidence[seen.rows] >= _LEAST_CONFIDENCE
-        return seen.part(unknown & before & trusted & self._faces(seen.rows, center))
-
-    def _faces(self, rows: IntArray, center: FloatArray) -> BoolArray:
-        """Return whether a camera looks on the side of planes (K,) that the scanner saw; True where unknown."""
-        cloud = self._cloud
-        if cloud.scanner_in_model is None:
-            return np.ones(len(rows), dtype=bool)
-        place, normal = cloud.position_in_model[rows], cloud.normal_in_model[rows]
-        sides = [np.einsum("pi,pi->p", eye - place, normal) for eye in (cloud.scanner_in_model[rows], center)]
-        return np.asarray(~(sides[0] * sides[1] < 0))
+        counts, cloud = unknown & before & (self._confidence[seen.rows] >= _LEAST_CONFIDENCE), self._cloud
+        if cloud.scanner_in_model is not None:
+            place, normal = cloud.position_in_model[seen.rows], cloud.normal_in_model[seen.rows]
+            eyes = cloud.scanner_in_model[seen.rows], center
+            sides = [np.einsum("pi,pi->p", eye - place, normal) for eye in eyes]
+            counts &= ~(sides[0] * sides[1] < 0)  # on the side that the scanner saw, where that is known
+        return seen.part(counts)
 
     def _start_alone(
         self, stereo: FloatArray, most: int, inside: Callable[[FloatArray], BoolArray] | None
     ) -> SurfacePoints:
-        """Return LiDAR points that no point of stereo is near, with the colours of the nearest photograph.
+        """Return LiDAR points, `most` at most, that no point of stereo (S, 3) is near, as `sample` does.
 
-        Args:
-            stereo: (S, 3) points of stereo.
-            most: limit of the points.
-            inside: as of `sample`.
+        They have the colours of the nearest photograph.
         """
         colours = np.zeros((len(self._cloud), 3), dtype=np.uint8)
         size_m = np.full(len(self._cloud), np.inf)  # of a pixel of the nearest view

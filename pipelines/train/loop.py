@@ -163,11 +163,7 @@ class _Loop:
         return self._spent + time.monotonic() - self._clock
 
     def iterate(self) -> dict[str, float] | None:
-        """Run one iteration, check and save where due, and return the row of metrics if one was due.
-
-        Raises:
-            NonFiniteError: a loss or gradient was not finite.
-        """
+        """Run one iteration, check and save where due, and return the row of metrics if one was due."""
         trainer, options = self.trainer, self.options
         report = trainer.step()
         due = trainer.iteration % options.log_every == 0 or trainer.iteration == trainer.options.iterations
@@ -182,11 +178,7 @@ class _Loop:
         return row
 
     def save(self) -> None:
-        """Write a checkpoint, if no loss or gradient has diverged.
-
-        Raises:
-            NonFiniteError: a loss or gradient was not finite.
-        """
+        """Write a checkpoint, if all losses and gradients were finite; else raise `NonFiniteError`."""
         self.trainer.check_finite()
         loop_state = {
             "seconds": torch.tensor(self.seconds(), dtype=torch.float64),
@@ -253,12 +245,15 @@ def train_in_folder(stage: StageRun, trainer: JointTrainer, options: TrainOption
     An interrupted run is resumed. A finished training of fewer iterations, `done`, is extended from its last state.
 
     Raises:
-        KeyboardInterrupt: the user asked to stop; a checkpoint was written.
-        ConvergenceError: the training diverged twice.
-        InputError: the checkpoint cannot be read.
-        StorageError: a file cannot be written or copied.
+        StorageError: a file cannot be written or copied; and the errors of `optimise`.
     """
-    extend = not stage.resumed and _take_over(stage, options.effort.iterations, done)
+    iterations, kept = options.effort.iterations, (CHECKPOINT, METRICS)
+    earlier = None if stage.resumed else stage.extends
+    extend = earlier is not None and done < iterations and all((earlier / name).is_file() for name in kept)
+    if earlier is not None and extend:
+        log.info("the training of %d iterations is extended to %d; --force trains afresh", done, iterations)
+        for name in kept:
+            shutil.copyfile(earlier / name, stage.out / name)
     files = LoopOptions(
         stage.out / CHECKPOINT,
         stage.out / METRICS,
@@ -269,15 +264,3 @@ def train_in_folder(stage: StageRun, trainer: JointTrainer, options: TrainOption
         note=stage.record_progress,
     )
     return optimise(trainer, files, stage.progress)
-
-
-def _take_over(stage: StageRun, iterations: int, done: int) -> bool:
-    """Copy the last state of a finished training of fewer iterations, and return whether there is one."""
-    if stage.extends is None or not all((stage.extends / name).is_file() for name in (CHECKPOINT, METRICS)):
-        return False
-    if done >= iterations:
-        return False
-    log.info("the training of %d iterations is extended to %d; --force trains afresh", done, iterations)
-    for name in (CHECKPOINT, METRICS):
-        shutil.copyfile(stage.extends / name, stage.out / name)
-    return True

@@ -95,8 +95,7 @@ def training_losses(
     """Return the losses of a training.
 
     Args:
-        problem: geographic losses.
-        strategy: may penalise Gaussians.
+        problem, strategy: have losses of their own: geographic ones, and the penalty of density control.
         schedule: has the weights.
         rasterizer: for the render of the normals.
         extent_m: size of the scene.

@@ -235,11 +235,7 @@ class SolutionOptions(StageOptions):
 
 
 class SeamOptions(TrainOptions):
-    """Options of the training across the seams.
-
-    Attributes:
-        trained: SHA-256 of the Gaussians of each block, in the order of their numbers.
-    """
+    """Options of the training across the seams of blocks whose Gaussians have these SHA-256, by their numbers."""
 
     trained: tuple[str, ...] = ()
 

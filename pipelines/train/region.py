@@ -41,11 +41,7 @@ class RegionView:
 
 
 class RegionMasks:
-    """Pixels of each view that show a region; a byte for eight of them.
-
-    Args:
-        masks: (H, W) of each view by index.
-    """
+    """Pixels (H, W) of each view, by index, that show a region; a byte for eight of them."""
 
     def __init__(self, masks: dict[int, BoolArray]) -> None:
         self._shape = {index: mask.shape for index, mask in masks.items()}
@@ -100,7 +96,6 @@ class TrainingRegion:
         box: of the survey; far beyond it lie sky and horizon.
         surroundings: frozen Gaussians outside the cell, on the device of the training.
         sky: Gaussians of the cell beyond the box, to start from.
-        masks: of the training views.
     """
 
     cell: BlockCell
@@ -126,12 +121,10 @@ def region_masks(
     Args:
         solved: cameras and lenses.
         views: (T,) indices of the cameras.
-        images: of all cameras.
-        rasterizer: renders the stand-in.
+        images, rasterizer: photographs of all cameras, and the backend of the stand-in's renders.
         cell: the region.
         stand_in: whose depth counts where the surface is not known.
-        maps: known depths; None: there are none.
-        progress: counts the views.
+        maps, progress: known depths, None: there are none; counts the views.
     """
     pinholes = Pinholes(images, solved.scene.sparse.lenses)
     pinholes.renew(solved.adjustment.with_lenses(solved.scene.sparse).lenses)

@@ -128,10 +128,9 @@ class TrainingSchedule:
         return min(next((shrink for shrink, until in levels if progress <= until), 1), most)
 
     def sh_degree(self, iteration: int) -> int:
-        """Return the degree of the harmonics.
+        """Return the degree of the harmonics, which rises by one after each sixth of the training.
 
-        The degree rises by one after each sixth of the training, and so reaches 3 at half of it (3DGS: after each
-        1 000 of 30 000 iterations).
+        So it reaches 3 at half of the training (3DGS: after each 1 000 of 30 000 iterations).
         """
         every = max(self.options.iterations // 6, 1)
         degree = min(self.options.sh_degree, iteration // every)

@@ -34,8 +34,7 @@ from pipelines.survey.calibrated import load_survey
 from pipelines.survey.report_parts import EstimatedError, LidarReport
 from pipelines.survey.scene import photographs
 from pipelines.survey.trained_model import Adjustment, TrainedModel
-from pipelines.train.adjusted_scene import AdjustedScene, with_exposures
-from pipelines.train.assembly import make_trainer
+from pipelines.train.adjusted_scene import AdjustedScene, figures_of, with_exposures
 from pipelines.train.forecast import training_forecast, training_size, with_gaussian_limit
 from pipelines.train.geographic.problem import held_problem, refining_problem
 from pipelines.train.initial_gaussians import TrainingScene
@@ -44,7 +43,7 @@ from pipelines.train.loop import METRICS, TrainingRecord, train_in_folder
 from pipelines.train.options import TrainOptions
 from pipelines.train.schedule import BACKGROUND
 from pipelines.train.surface import SceneSurface
-from pipelines.train.trainer import JointTrainer
+from pipelines.train.trainer import JointTrainer, make_trainer
 
 log = logging.getLogger(__name__)
 
@@ -157,17 +156,13 @@ def _summary(
 ) -> Summary:
     """Return headline, values and warnings of a training, given the rows of `metrics.jsonl`."""
     psnr = float(np.mean([row["psnr"] for row in metrics[-20:]]))
-    sigma = np.sqrt(np.diag(np.array(model.geo_from_model.covariance)))
     values = {
         "iterations": model.iterations,
         "gaussians": model.gaussians,
         "train_psnr": round(psnr, 3),
         "seconds": round(record.seconds, 1),
         "seconds_per_iteration": round(record.seconds / model.iterations, 4),
-        "similarity_sigma_m": [round(float(value), 5) for value in sigma[4:]],
-        "gnss_outliers": list(model.gnss_outliers),
-        "control_outliers": list(model.control_outliers),
-        "estimated_errors": [error.model_dump() for error in model.estimated_errors],
+        **figures_of(model),
     }
     if lidar is not None:
         values["lidar"] = lidar.model_dump(mode="json")

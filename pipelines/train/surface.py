@@ -131,8 +131,7 @@ class SceneSurface:
         """Return points of the whole surface, as dense as the photographs resolve it.
 
         Args:
-            count: limit of the points.
-            seed: of their choice.
+            count, seed: limit of the points, and of their choice.
             inside: returns which of points (N, 3) count, as a mask (N,); None: all.
         """
         rng = np.random.default_rng(seed)

@@ -10,7 +10,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise, product
-from math import inf
+from math import inf, prod
 
 import numpy as np
 import torch
@@ -50,8 +50,7 @@ class Crops:
 
     def count(self, width: int, height: int) -> int:
         """Return the number of windows in which an image is seen."""
-        columns, rows = self.grid(width, height)
-        return columns * rows
+        return prod(self.grid(width, height))
 
     def largest_of(self, camera: Pinhole) -> Pinhole:
         """Return a camera of the size of the largest window of an image."""
@@ -92,7 +91,7 @@ _PARTS = 256  # windows kept: density control samples others between an iteratio
 
 @dataclass(frozen=True)
 class ImageLook:
-    """ImageLook at a photograph.
+    """Look at a photograph.
 
     Attributes:
         shrink: every pixel is the mean of shrink × shrink pixels.
@@ -152,9 +151,7 @@ class TargetImages:
     iteration waits for disk or transfer. On a CPU reading ahead would only take a core from the kernels.
 
     Args:
-        images: undistorted photographs.
-        pinholes: their cameras, with the lens in use.
-        device: holds the photographs of `get`.
+        pinholes: cameras of the undistorted photographs, with the lens in use.
         region: pixels of each photograph to train on; None: all.
         crops: windows of large photographs; None: all are seen as wholes.
     """
@@ -183,11 +180,15 @@ class TargetImages:
             self._next = (upcoming, self._reader.submit(self._read, upcoming))
         colour = pixels.to(self._device, non_blocking=True).float() / 255.0
         whole = shrunken(self._pinholes.of(look.index), look.shrink)
-        if part.window is None:
-            return TargetImage(colour, self._whole_mask(look), whole, whole, part)
-        mask = self._counting(look, part.window)
-        on_device = None if mask.all() else torch.from_numpy(mask).to(self._device)
-        return TargetImage(colour, on_device, part.window.of(whole), whole, part)
+        if part.window is not None:
+            return TargetImage(colour, self._mask(look, part.window), part.window.of(whole), whole, part)
+        key = (self._images.mask_key(look.index), look.shrink)
+        if key not in self._masks:
+            self._masks[key] = self._mask(look, Window(0, 0, whole.width, whole.height))
+            if len(self._masks) > _MASKS:
+                self._masks.popitem(last=False)
+        self._masks.move_to_end(key)
+        return TargetImage(colour, self._masks[key], whole, whole, part)
 
     def _find_part(self, look: ImageLook) -> ImagePart:
         camera = shrunken(self._images.pinhole(look.index), look.shrink)
@@ -204,7 +205,16 @@ class TargetImages:
         seen = [place for place, count in enumerate(counts) if count]
         window = windows[seen[place % len(seen)]] if seen else windows[0]
         weight = len(seen) * counts[windows.index(window)] / max(sum(counts), 1)
-        return _part_of(trained, window, len(seen) or 1, weight, share)
+        right, bottom = window.left + window.width, window.top + window.height
+        low = (
+            -inf if window.left == trained.left else float(window.left),
+            -inf if window.top == trained.top else float(window.top),
+        )
+        high = (
+            inf if right == trained.left + trained.width else float(right),
+            inf if bottom == trained.top + trained.height else float(bottom),
+        )
+        return ImagePart(window, len(seen) or 1, weight, share, low, high)
 
     def _count(self, look: ImageLook, window: Window) -> int:
         """Return the number of pixels that count in a window."""
@@ -234,30 +244,10 @@ class TargetImages:
         pixels = torch.from_numpy(np.array(image if window is None else image[window.slices]))
         return pixels.pin_memory() if self._reader is not None else pixels
 
-    def _whole_mask(self, look: ImageLook) -> Tensor | None:
-        key = (self._images.mask_key(look.index), look.shrink)
-        if key not in self._masks:
-            camera = shrunken(self._images.pinhole(look.index), look.shrink)
-            mask = self._counting(look, Window(0, 0, camera.width, camera.height))
-            self._masks[key] = None if mask.all() else torch.from_numpy(mask).to(self._device)
-            if len(self._masks) > _MASKS:
-                self._masks.popitem(last=False)
-        self._masks.move_to_end(key)
-        return self._masks[key]
-
-
-def _part_of(trained: Window, window: Window, windows: int, weight: float, share: float) -> ImagePart:
-    """Return a window of all that is trained of a photograph; see `ImagePart`."""
-    right, bottom = window.left + window.width, window.top + window.height
-    low = (
-        -inf if window.left == trained.left else float(window.left),
-        -inf if window.top == trained.top else float(window.top),
-    )
-    high = (
-        inf if right == trained.left + trained.width else float(right),
-        inf if bottom == trained.top + trained.height else float(bottom),
-    )
-    return ImagePart(window, windows, weight, share, low, high)
+    def _mask(self, look: ImageLook, window: Window) -> Tensor | None:
+        """Return the pixels that count on the device; None: all."""
+        mask = self._counting(look, window)
+        return None if mask.all() else torch.from_numpy(mask).to(self._device)
 
 
 def shrunken(camera: Pinhole, shrink: int) -> Pinhole:

@@ -1,12 +1,13 @@
 """Joint optimisation of Gaussians, similarity and cameras, one view an iteration (GeoRefGS, section 2.4).
 
-Checkpoints: named tensors in one NPZ file without pickle, replaced in one step.
+`make_trainer` assembles it from scene, measurements and options. Checkpoints are named tensors in one NPZ file
+without pickle, replaced in one step.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -19,20 +20,36 @@ from pipelines.core.files import read_npz, replacing
 from pipelines.core.types import IntArray
 from pipelines.geometry.cameras import Lenses
 from pipelines.jobs.costs import iteration_seconds
-from pipelines.splat.densify import Strategy, ViewContributions, view_contributions
+from pipelines.splat.densify import (
+    DefaultSettings,
+    DefaultStrategy,
+    FastSettings,
+    FastStrategy,
+    Strategy,
+    ViewContributions,
+    view_contributions,
+)
+from pipelines.splat.densify_mcmc import McmcSettings, McmcStrategy
 from pipelines.splat.exposure import Exposures, HeldExposures
 from pipelines.splat.gaussians import FinitenessMonitor, Gaussians
+from pipelines.splat.initialise import InitialisationOptions, scene_extent
 from pipelines.splat.optimizer import GaussianAdam
-from pipelines.splat.outlier_pixels import OutlierPixels
+from pipelines.splat.outlier_pixels import OutlierPixels, OutlierSettings
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Render, ScreenStats
+from pipelines.splat.rasterizer.backends import device_of
 from pipelines.splat.surface import ObservedPoints
 from pipelines.survey.photographs import ImageCache, Pinholes
 from pipelines.train.geographic.problem import GeographicAdam, GeoProblem
+from pipelines.train.initial_gaussians import TrainingScene, initial_gaussians, points_to_hold
+from pipelines.train.lidar_surface import FusedSurface
 from pipelines.train.losses import Loss, RenderedView, training_losses, weighted_sum
+from pipelines.train.options import TrainOptions
 from pipelines.train.region import TrainingRegion
 from pipelines.train.schedule import BACKGROUND, JointOptions, TrainingSchedule
 from pipelines.train.target_images import ImageLook, TargetImage, TargetImages
 
+_OUTLIERS_FROM = 0.5  # of the iterations: before, the model is too coarse to tell what has moved
+_FINISHING_RATE = 0.3  # of the rates at which a training starts
 _LENS_EVERY = 100  # iterations between two reads of the lens: each read waits for the device
 # Each non-finite gradient shows in one of these: colours pass it on to the opacities.
 _WATCHED = ("means", "quats_wxyz", "log_scales", "logit_opacities")
@@ -132,8 +149,8 @@ class JointTrainer:
             measured=views.measured,
         )
         self._unknowns = GeographicAdam(problem, options, self.device)
-        names = ("photometric loss", "geographic loss", *(f"gradient of {name}" for name in self._watched()))
-        self._watch = FinitenessMonitor(names, self.device)
+        nothing = torch.zeros((), device=self.device)
+        self._watch = FinitenessMonitor(tuple(self._watched(nothing, nothing)), self.device)
 
     def step(self) -> StepReport:
         """Run one iteration and return its figures.
@@ -152,7 +169,7 @@ class JointTrainer:
         total.backward()
         by_depth = values.get("control_by_depth")
         geographic = values["geographic"] if by_depth is None else values["geographic"] + by_depth
-        self._note(values["photometric"], geographic)
+        self._watch.note(self.iteration, self._watched(values["photometric"], geographic))
         stats = self._of_whole(self._own(view.render.stats), view.pose, view.target)
         self._unknowns.step(self.optimizer.rate_factor * self.schedule.geographic_rate(self.iteration))
         self.optimizer.step(self.iteration, stats.visible)
@@ -172,12 +189,7 @@ class JointTrainer:
 
     @torch.no_grad()
     def sample_contributions(self, count: int, generator: torch.Generator) -> list[ViewContributions]:
-        """Return the contributions of all Gaussians to different training views (`splat.densify.Probe`).
-
-        Args:
-            count: number of views; fewer if there are not as many.
-            generator: draws the views.
-        """
+        """Return the contributions of all Gaussians to `count` different training views at most, as a `Probe`."""
         contributions = []
         for place in torch.randperm(len(self.views.camera), generator=generator)[:count].tolist():
             index = int(self.views.camera[place])
@@ -277,17 +289,14 @@ class JointTrainer:
         here = (x >= part.low[0]) & (x < part.high[0]) & (y >= part.low[1]) & (y < part.high[1])
         return stats.of_part(part.share / part.windows, here)
 
-    def _watched(self) -> dict[str, Tensor]:
+    def _watched(self, photometric: Tensor, geographic: Tensor) -> dict[str, Tensor]:
+        """Return the scalars that must stay finite, by what messages call them."""
         tensors = self.optimizer.gaussians.tensors()
-        return {name: tensors[name] for name in _WATCHED} | self._unknowns.named()
-
-    def _note(self, photometric: Tensor, geographic: Tensor) -> None:
-        losses = {"photometric loss": photometric, "geographic loss": geographic}
         gradients = {
             f"gradient of {name}": geographic.new_zeros(()) if tensor.grad is None else tensor.grad.sum()
-            for name, tensor in self._watched().items()
+            for name, tensor in ({name: tensors[name] for name in _WATCHED} | self._unknowns.named()).items()
         }
-        self._watch.note(self.iteration, losses | gradients)
+        return {"photometric loss": photometric, "geographic loss": geographic} | gradients
 
     def _parts(self) -> dict[str, _Stateful]:
         """Return what has a state of its own, by the name of that state in a checkpoint."""
@@ -336,6 +345,91 @@ def _mean_square(colour: Tensor, target: TargetImage) -> Tensor:
     if target.mask is None:
         return error.mean()
     return (error * target.mask[..., None]).sum() / (3 * target.mask.sum()).clamp_min(1)
+
+
+def make_trainer(
+    training: TrainingScene,
+    problem: GeoProblem,
+    backend: Rasterizer,
+    options: TrainOptions,
+    exposures: HeldExposures | None = None,
+) -> JointTrainer:
+    """Return the trainer with its initial Gaussians, before the first iteration.
+
+    Args:
+        training: cameras, photographs and surface.
+        problem: the geographic losses, moved to the backend's device.
+        exposures: to be held; None: those of the training photographs are fitted, if the options say so.
+
+    Raises:
+        DegenerateGeometryError: fewer than two different points to start from.
+    """
+    effort, device = options.effort, device_of(backend)
+    scene, images, surface = training.scene, training.images, training.surface
+    start = InitialisationOptions(sh_degree=options.sh_degree, max_gaussians=effort.max_gaussians)
+    gaussians = initial_gaussians(training, start, effort.max_gaussians, options.seed).to(device)
+    extent_m = scene_extent(scene.poses.cam_center_in_model)
+    train = torch.from_numpy(scene.train)
+    fitted = Exposures(len(images), train, effort.iterations, device) if options.exposure else None
+    hold = points_to_hold(training, device) if options.faithful_surface else None
+    measured = surface.losses(device) if isinstance(surface, FusedSurface) else ()
+    outliers = OutlierSettings(views=int(_OUTLIERS_FROM * effort.iterations))
+    return JointTrainer(
+        GaussianAdam(gaussians, extent_m, effort.iterations),
+        _strategy(options, extent_m, len(gaussians)),
+        problem.to(device),
+        TrainingViews(scene.train, images, hold, scene.sparse.lenses, measured),
+        rasterizer=backend,
+        options=JointOptions.of(options),
+        exposures=exposures or fitted,
+        outliers=OutlierPixels(device, outliers) if options.robust_photometric else None,
+        region=training.region,
+    )
+
+
+def make_finisher(
+    training: TrainingScene,
+    gaussians: Gaussians,
+    problem: GeoProblem,
+    *,
+    backend: Rasterizer,
+    options: TrainOptions,
+    exposures: HeldExposures | None,
+) -> JointTrainer:
+    """Return a trainer that goes on with trained Gaussians, at a low rate, and neither adds nor removes any.
+
+    Args:
+        training: cameras, photographs and region.
+        gaussians: on the backend's device.
+        problem: holds the cameras.
+        exposures: to be held; None: none.
+    """
+    device, scene, iterations = device_of(backend), training.scene, options.effort.iterations
+    extent_m = scene_extent(scene.poses.cam_center_in_model[scene.train])
+    optimizer = GaussianAdam(gaussians, extent_m, iterations)
+    optimizer.rate_factor = _FINISHING_RATE
+    hold = points_to_hold(training, device) if options.faithful_surface else None
+    return JointTrainer(
+        optimizer,
+        DefaultStrategy(DefaultSettings(stop=0, reset_every=0), extent_m, len(gaussians), options.seed),
+        problem.to(device),
+        TrainingViews(scene.train, training.images, hold, scene.sparse.lenses),
+        rasterizer=backend,
+        options=replace(JointOptions.of(options), sh_degree=gaussians.sh_degree, coarse=(), finishing=True),
+        exposures=exposures,
+        region=training.region,
+    )
+
+
+def _strategy(options: TrainOptions, extent_m: float, count: int) -> Strategy:
+    iterations, most = options.effort.iterations, options.effort.max_gaussians
+    if options.strategy == "mcmc":
+        return McmcStrategy(McmcSettings.for_iterations(iterations, count, most), extent_m, options.seed)
+    settings = DefaultSettings.for_iterations(iterations, most)
+    if options.strategy == "fast":
+        fast = FastSettings.for_iterations(iterations)
+        return FastStrategy(settings, fast, extent_m, count, options.seed)
+    return DefaultStrategy(settings, extent_m, count, options.seed)
 
 
 def save_checkpoint(path: Path, state: Mapping[str, Tensor]) -> None:

@@ -15,11 +15,10 @@ from pipelines.core.workspace import Workspace
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.survey.scene import photographs
 from pipelines.train.adjusted_scene import AdjustedScene
-from pipelines.train.assembly import make_trainer
 from pipelines.train.geographic.problem import held_problem, refining_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import TrainOptions
-from pipelines.train.trainer import JointTrainer, load_checkpoint, save_checkpoint
+from pipelines.train.trainer import JointTrainer, load_checkpoint, make_trainer, save_checkpoint
 from tests.splat_scenes import Rendered, make_rendered, write_photographs, write_rendered
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -26,7 +26,6 @@ from pipelines.surface.depth_maps import DepthMaps
 from pipelines.survey.block_plan import BlockPlan, BlockTraining, PlannedBlock
 from pipelines.survey.scene import photographs
 from pipelines.train.adjusted_scene import AdjustedScene
-from pipelines.train.assembly import make_trainer
 from pipelines.train.forecast import training_size
 from pipelines.train.geographic.problem import held_problem
 from pipelines.train.initial_gaussians import TrainingScene
@@ -34,7 +33,7 @@ from pipelines.train.loop import METRICS, TrainingRecord, train_in_folder
 from pipelines.train.options import BlockTrainOptions
 from pipelines.train.region import RegionMasks, SceneBox, TrainingRegion, region_masks
 from pipelines.train.surface import SceneSurface
-from pipelines.train.trainer import JointTrainer
+from pipelines.train.trainer import JointTrainer, make_trainer
 
 _LEAST_VIEWS = 2
 _LAST_ROWS = 20
@@ -44,18 +43,17 @@ def run(stage: StageRun, options: BlockTrainOptions) -> Summary:
     """Train the block, and return its key figures.
 
     Raises:
-        BackendUnavailableError: `--backend cuda` without a GPU or without gsplat.
-        ResourceError: the training would not fit into memory.
-        ConvergenceError: the training diverged twice.
-        DegenerateGeometryError: too few photographs show the block.
-        KeyboardInterrupt: the user asked to stop; a checkpoint was written.
-        GeorefError: a product or a photograph cannot be read.
+        DegenerateGeometryError: too few photographs show the block; and the errors of `train.stage.run`.
     """
     backend, workspace = rasterizer(options.backend), stage.workspace
     block = load_json(BlockPlan, workspace.path(BLOCK_PLAN)).block(options.id)
     whole = AdjustedScene.load(workspace, SOLUTION)
     box = SceneBox.around(whole.scene.point_in_model)
-    solved = whole.of_images(_indices(whole, block))
+    index = whole.scene.sparse.image_index()
+    rows = np.array([index[name] for name in block.cameras if name in index], dtype=np.int64)
+    if len(rows) < _LEAST_VIEWS:
+        raise DegenerateGeometryError(f"{len(rows)} photographs show block {block.id}: give fewer --blocks")
+    solved = whole.of_images(rows)
     options = options.model_copy(update={"max_gaussians": block.gaussians, "optimize_cameras": False})
     images = photographs(solved.scene.sparse, solved.survey, workspace, options.effort.max_image_size)
     scaffold = read_gaussians(workspace.path(SCAFFOLD)).to(device_of(backend))
@@ -87,19 +85,6 @@ def run(stage: StageRun, options: BlockTrainOptions) -> Summary:
         f"block {block.id}: {measured.gaussians_in_cell} Gaussians, train PSNR {measured.train_psnr:.2f} dB",
         measured.model_dump(mode="json"),
     )
-
-
-def _indices(whole: AdjustedScene, block: PlannedBlock) -> np.ndarray:
-    """Return the indices of the block's cameras in the scene of the whole.
-
-    Raises:
-        DegenerateGeometryError: too few photographs show the block.
-    """
-    index = whole.scene.sparse.image_index()
-    rows = np.array([index[name] for name in block.cameras if name in index], dtype=np.int64)
-    if len(rows) < _LEAST_VIEWS:
-        raise DegenerateGeometryError(f"{len(rows)} photographs show block {block.id}: give fewer --blocks")
-    return rows
 
 
 def _region(block: PlannedBlock, box: SceneBox, scaffold: Gaussians, masks: RegionMasks) -> TrainingRegion:

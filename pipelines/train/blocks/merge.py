@@ -42,16 +42,10 @@ from pipelines.splat.gaussians import Gaussians, read_gaussians
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings
 from pipelines.splat.rasterizer.backends import device_of, rasterizer
 from pipelines.splat.surface import measured_depth
-from pipelines.survey.block_plan import (
-    BlockPlan,
-    BlockRecord,
-    BlockTraining,
-    MergedBlock,
-    PlannedBlock,
-    Seam,
-)
+from pipelines.survey.block_plan import BlockPlan, BlockRecord, BlockTraining, MergedBlock, PlannedBlock, Seam
 from pipelines.survey.photographs import pinhole_of
 from pipelines.survey.trained_model import Adjustment, TrainedModel
+from pipelines.train.adjusted_scene import figures_of
 from pipelines.train.blocks.parts import Parts
 from pipelines.train.schedule import BACKGROUND
 
@@ -64,11 +58,7 @@ _LEAST_PIXELS = 200  # of a seam: fewer tell nothing
 
 
 def compare_neighbours(parts: Parts, plan: BlockPlan, solution: Adjustment, progress: Progress) -> tuple[Seam, ...]:
-    """Return the disagreement of all neighbours whose overlap some view shows.
-
-    Raises:
-        InputError: a block or the scaffold cannot be read.
-    """
+    """Return the disagreement of all neighbours whose overlap some view shows."""
     pairs = [pair for pair in combinations(plan.blocks, 2) if pair[0].region.meets(pair[1].region)]
     if not pairs:
         return ()
@@ -109,7 +99,12 @@ class SeamViews:
     def seam(self, first: PlannedBlock, second: PlannedBlock) -> Seam | None:
         """Return the disagreement of two blocks; None if no view shows enough of their overlap."""
         depths, colours, views = [], [], 0
-        for name in self._best_views(first, second):
+        common = sorted(set(first.cameras) & set(second.cameras))
+        common = common[:: max(1, len(common) // _CANDIDATES)]
+        shown = {name: int(self._view(first, name, _CANDIDATE_PX, (first, second)).counts.sum()) for name in common}
+        for name in sorted(common, key=lambda name: -shown[name])[:_VIEWS]:
+            if not shown[name]:
+                break
             one, other = (self._view(block, name, _IMAGE_PX, (first, second)) for block in (first, second))
             both = one.counts & other.counts
             if not both.any():
@@ -128,14 +123,6 @@ class SeamViews:
             depth_nmad_m=float(mad_sigma(differences)),
             colour_rms=float(np.sqrt(np.concatenate(colours).mean())),
         )
-
-    def _best_views(self, first: PlannedBlock, second: PlannedBlock) -> list[str]:
-        """Return the names of the views that show most of an overlap."""
-        common = sorted(set(first.cameras) & set(second.cameras))
-        common = common[:: max(1, len(common) // _CANDIDATES)]
-        shown = {name: int(self._view(first, name, _CANDIDATE_PX, (first, second)).counts.sum()) for name in common}
-        best = sorted(common, key=lambda name: -shown[name])[:_VIEWS]
-        return [name for name in best if shown[name]]
 
     def _view(self, block: PlannedBlock, name: str, size_px: int, pair: tuple[PlannedBlock, PlannedBlock]) -> _View:
         index = self._index[name]
@@ -164,7 +151,7 @@ def merge_blocks(parts: Parts, plan: BlockPlan, folder: Path, progress: Progress
     """Write the product of `train` from the trained blocks of a plan, and return its key figures.
 
     Raises:
-        InputError: a block cannot be read.
+        InputError: a block or the scaffold cannot be read.
     """
     trainings = [parts.training(block) for block in plan.blocks]
     # The Gaussians of each cell, adapted to those of its neighbours.
@@ -185,10 +172,8 @@ def merge_blocks(parts: Parts, plan: BlockPlan, folder: Path, progress: Progress
     shutil.copyfile(parts.workspace.path(SIM3_POSTERIOR), folder / Path(TRAIN_POSTERIOR).name)
     _write_metrics(parts, plan, folder / "metrics.jsonl")
     seams = compare_neighbours(parts, plan, solution, progress)
-    blocks = tuple(
-        MergedBlock(cell=block.cell, training=training)
-        for block, training in zip(plan.blocks, trainings, strict=True)
-    )
+    pairs = zip(plan.blocks, trainings, strict=True)
+    blocks = tuple(MergedBlock(cell=block.cell, training=training) for block, training in pairs)
     save_json(BlockRecord(blocks=blocks, seams=seams), folder / "blocks.json")
     return _summary(model, trainings, seams)
 
@@ -212,17 +197,13 @@ def _write_metrics(parts: Parts, plan: BlockPlan, path: Path) -> None:
 
 def _summary(model: TrainedModel, trainings: Sequence[BlockTraining], seams: Sequence[Seam]) -> Summary:
     psnr = float(np.average([t.train_psnr for t in trainings], weights=[t.photographs for t in trainings]))
-    sigma = np.sqrt(np.diag(np.array(model.geo_from_model.covariance)))
     values = {
         "blocks": len(trainings),
         "iterations": model.iterations,
         "gaussians": model.gaussians,
         "train_psnr": round(psnr, 3),
         "seconds": round(sum(training.seconds for training in trainings), 1),
-        "similarity_sigma_m": [round(float(value), 5) for value in sigma[4:]],
-        "gnss_outliers": list(model.gnss_outliers),
-        "control_outliers": list(model.control_outliers),
-        "estimated_errors": [error.model_dump() for error in model.estimated_errors],
+        **figures_of(model),
     }
     key_figure = f"{model.gaussians} gaussians in {len(trainings)} blocks, train PSNR {psnr:.2f} dB"
     if seams:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,8 +34,7 @@ from pipelines.survey.block_plan import BlockPlan, BlockRecord, BlockTraining, P
 from pipelines.survey.options import NOT_IN_BLOCKS
 from pipelines.train.options import TrainOptions
 
-FOLDER = "blocks"
-_COMMAND = "blocks"
+FOLDER = "blocks"  # and the command
 UPSTREAM = stage_slice(None, "init-sim3")
 # The plan applies these, and a block is stale with the plan.
 _OF_PLAN = ("preset", "blocks", "block_overlap", "block_memory")
@@ -58,11 +58,11 @@ class Parts:
     def place(self, number: int | None = None) -> Workspace:
         """Return the variant of a block, or the one that holds plan, solution, scaffold and seams."""
         lent = {spec.folder: self.workspace.root / spec.folder for spec in UPSTREAM}
-        whole = self.workspace.variant(FOLDER, lent, _COMMAND)
+        whole = self.workspace.variant(FOLDER, lent, FOLDER)
         if number is None:
             return whole
         own = {spec.folder: whole.root / spec.folder for spec in (PLAN_BLOCKS, SOLVE, TRAIN_SCAFFOLD)}
-        return self.workspace.variant(f"{FOLDER}/{number}", lent | own, _COMMAND)
+        return self.workspace.variant(f"{FOLDER}/{number}", lent | own, FOLDER)
 
     @property
     def whole(self) -> Workspace:
@@ -70,11 +70,7 @@ class Parts:
         return self.place()
 
     def on_gpu(self) -> bool:
-        """Return whether a block takes a GPU.
-
-        Raises:
-            BackendUnavailableError: the backend is not available here.
-        """
+        """Return whether a block takes a GPU; a backend that is not available here is an error."""
         return chosen_backend(self.options.backend) == "cuda"
 
     def plan(self) -> BlockPlan:
@@ -90,11 +86,7 @@ class Parts:
         return load_json(BlockPlan, path)
 
     def training(self, block: PlannedBlock) -> BlockTraining:
-        """Return the record of a trained block.
-
-        Raises:
-            InputError: the record cannot be read.
-        """
+        """Return the record of a trained block."""
         return load_json(BlockTraining, self.place(block.id).path(BLOCK_TRAINING))
 
     def flags(self, spec: StageSpec, number: int | None = None) -> dict[str, Any]:
@@ -107,23 +99,20 @@ class Parts:
             "id": number,
         }
         if spec is TRAIN_SEAMS:
-            given["trained"] = [self._hash(block.id) for block in self.plan().blocks]
+            given["trained"] = list(self._hashes())
         if spec is SOLVE:
             given["max_image_size"] = scaffold_image_px(effort.max_image_size)
         left_out = () if spec is PLAN_BLOCKS else _OF_PLAN
         return {name: given[name] for name in spec.options.model_fields if name in given and name not in left_out}
 
-    def _hash(self, number: int) -> str:
-        """Return the hash of a block's Gaussians.
-
-        Raises:
-            MissingProductError: the block is not trained.
-        """
-        manifest = self.place(number).manifest(TRAIN_BLOCK)
-        if manifest is None:
-            command = f"georef blocks train {self.workspace.root} --id {number}"
-            raise MissingProductError(f"{FOLDER}/{number}/{BLOCK_GAUSSIANS}", command)
-        return manifest.files[Path(BLOCK_GAUSSIANS).name].sha256
+    def _hashes(self) -> Iterator[str]:
+        """Yield the hash of each block's Gaussians; a block that is not trained is an error."""
+        for block in self.plan().blocks:
+            manifest = self.place(block.id).manifest(TRAIN_BLOCK)
+            if manifest is None:
+                command = f"georef blocks train {self.workspace.root} --id {block.id}"
+                raise MissingProductError(f"{FOLDER}/{block.id}/{BLOCK_GAUSSIANS}", command)
+            yield manifest.files[Path(BLOCK_GAUSSIANS).name].sha256
 
     def run(
         self, spec: StageSpec, number: int | None = None, *, force: bool = False, progress: Progress = SILENT

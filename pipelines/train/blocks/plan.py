@@ -104,8 +104,6 @@ def cells_of_number(
     Args:
         points: (P, 2 or more) east and north, metres.
         load: (P,) of each point, ≥ 0.
-        count: number of cells.
-        cell: to divide.
 
     Raises:
         DegenerateGeometryError: the points lie at fewer places than cells are wanted.
@@ -123,8 +121,7 @@ def cells_that_fit(
     """Return cells that share the plane out among them, halved until each fits.
 
     Args:
-        points: (P, 2 or more) east and north, metres.
-        load: (P,) of each point, ≥ 0.
+        points, load: as of `cells_of_number`.
         fits: returns whether a cell, with its extent (2,) in metres, is small enough.
 
     Raises:
@@ -184,9 +181,7 @@ def run(stage: StageRun, options: PlanOptions) -> Summary:
     """Write the plan, and return its key figures.
 
     Raises:
-        ResourceError: no number of blocks fits into the memory.
-        DegenerateGeometryError: the survey cannot be cut into so many blocks.
-        GeorefError: a product cannot be read.
+        GeorefError: a product cannot be read, or the survey cannot be divided.
     """
     workspace = stage.workspace
     *_, scene = load_adjusted_scene(workspace)
@@ -240,12 +235,7 @@ class _Planner:
     options: PlanOptions
 
     def cells(self, memory_bytes: int | None) -> list[BlockCell]:
-        """Return the cells: of the number in the options, or such that each block fits into the memory if known.
-
-        Raises:
-            ResourceError: not even a block without Gaussians would fit.
-            DegenerateGeometryError: the survey cannot be cut into so many blocks.
-        """
+        """Return the cells: of the number in the options, or such that each block fits into the memory if known."""
         points, load = self.surface.point_in_model, self.surface.surface
         if self.options.blocks:
             return cells_of_number(points, load, self.options.blocks)

@@ -14,26 +14,19 @@ from pipelines.splat.rasterizer.backends import device_of, rasterizer
 from pipelines.survey.block_plan import scaffold_gaussians, scaffold_image_px
 from pipelines.survey.scene import photographs
 from pipelines.train.adjusted_scene import AdjustedScene
-from pipelines.train.assembly import make_trainer
 from pipelines.train.forecast import training_size
 from pipelines.train.geographic.problem import held_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.loop import train_in_folder
 from pipelines.train.options import TrainOptions
+from pipelines.train.trainer import make_trainer
 
 _SHARE = 0.5  # of a block's iterations
 _MOST_ITERATIONS, _MOST_LOOKS = 3_000, 10_000
 
 
 def run(stage: StageRun, options: TrainOptions) -> Summary:
-    """Train the scaffold, and return its key figures.
-
-    Raises:
-        ResourceError: the training would not fit into memory.
-        ConvergenceError: the training diverged twice.
-        KeyboardInterrupt: the user asked to stop; a checkpoint was written.
-        GeorefError: a product or a photograph cannot be read.
-    """
+    """Train the scaffold, and return its key figures; errors are those of `train.stage.run`."""
     backend, workspace = rasterizer(options.backend), stage.workspace
     solved = AdjustedScene.load(workspace, SOLUTION)
     coarse = coarse_options(options, len(solved.scene.train))

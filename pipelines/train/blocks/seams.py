@@ -31,11 +31,11 @@ from pipelines.survey.block_plan import BlockCell, BlockPlan, PlannedBlock
 from pipelines.survey.photographs import ImageCache
 from pipelines.survey.scene import photographs
 from pipelines.train.adjusted_scene import AdjustedScene
-from pipelines.train.assembly import make_finisher
 from pipelines.train.geographic.problem import held_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import SeamOptions
 from pipelines.train.region import SceneBox, TrainingRegion, region_masks
+from pipelines.train.trainer import make_finisher
 
 _SHARE = 0.2  # of a block's iterations
 _WIDTH = 0.5  # of the blocks' overlap, on each side of a seam

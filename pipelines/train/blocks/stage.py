@@ -27,12 +27,7 @@ log = logging.getLogger(__name__)
 
 
 def run(stage: StageRun, options: TrainOptions) -> Summary:
-    """Train what is not trained, write the merged model, and return its key figures.
-
-    Raises:
-        KeyboardInterrupt: the user asked to stop; the blocks that ran have saved their work.
-        GeorefError: a part fails; the blocks that have ended are kept.
-    """
+    """Train what is not trained, write the merged model, and return its key figures; see `train_blocks`."""
     parts, force, note = Parts(stage.workspace, options), stage.afresh, stage.record_progress
     plan = train_blocks(parts, stage.progress, force=force, note=note)
     if force or parts.why_missing(TRAIN_SEAMS):
@@ -48,8 +43,7 @@ def train_blocks(
     """Bring plan, solution, scaffold and all blocks up to date, and return the plan.
 
     Args:
-        parts: of the training.
-        progress: shows the tasks and jobs.
+        parts, progress: of the training; shows the tasks and jobs.
         force: start all afresh.
         note: receives how far the work has come, after each block (`2 of 4 blocks`).
 
@@ -105,11 +99,7 @@ def _placed(job: Job, parts: Parts, place: str, *, force: bool) -> Job:
 
 
 def _run_jobs(title: str, jobs: Sequence[Job], progress: Progress, note: Callable[[str], None]) -> None:
-    """Run jobs to their ends.
-
-    Raises:
-        GeorefError: jobs have failed; names them.
-    """
+    """Run jobs to their ends; those that have failed are an error, which names them."""
     done = 0
 
     def ended(end: JobEnd) -> None:

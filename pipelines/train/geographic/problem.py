@@ -108,7 +108,7 @@ class GeoProblem(torch.nn.Module):
         similarity: `geo_from_model`.
         cameras: poses in `model`.
         terms: the observations, at most one term of a kind; none: the loss is zero, and nothing moves.
-        errors: systematic errors of the measurements; None: there are none.
+        errors: systematic errors of the measurements; None: none.
         weighting: "whitened" (maximum a posteriori) or "paper" (plain mean squares).
         learned_weights: learn a variance factor of each term.
         control_by_depth: marks of the control points, if training projects them onto the rendered depth. Then
@@ -127,7 +127,8 @@ class GeoProblem(torch.nn.Module):
         control_by_depth: ControlByDepth | None = None,
     ) -> None:
         super().__init__()
-        self.similarity, self.cameras, self.errors = similarity, cameras, errors
+        self.similarity, self.cameras = similarity, cameras
+        self.errors = errors or LearnableErrors(SystematicErrors(), np.zeros(0), np.zeros(0))
         self.terms, self.control_by_depth = tuple(terms), control_by_depth
         self.weighting = weighting
         self.weights = TermWeights({term.kind: term.dimension for term in terms}, weighting, learned_weights)
@@ -146,23 +147,18 @@ class GeoProblem(torch.nn.Module):
 
     def learned(self) -> dict[str, torch.nn.Parameter]:
         """Return the learned parameters by name: similarity y, cameras z, and, if any, errors x and weights u."""
-        more = {"u": self.weights.u} if self.errors is None else {"x": self.errors.x, "u": self.weights.u}
+        more = {"x": self.errors.x, "u": self.weights.u}
         return {"y": self.similarity.y, "z": self.cameras.z} | {k: p for k, p in more.items() if len(p)}
 
     def estimate(self) -> Estimate:
         """Return the present estimate, differentiable in all parameters of `learned`."""
-        rotation, center = self.cameras.moved()
-        if self.errors is None:
-            errors, vector = SystematicErrors(), center.new_zeros(0)
-        else:
-            errors, vector = self.errors.errors, self.errors.vector()
-        return Estimate(rotation, center, self.similarity(), errors, vector, self.cameras.lens())
+        errors, vector = self.errors.errors, self.errors.vector()
+        return Estimate(*self.cameras.moved(), self.similarity(), errors, vector, self.cameras.lens())
 
     def state(self) -> State:
         """Return the present values as a state of the adjustment."""
         with torch.no_grad():
-            tensors = [self.cameras.corrections(), self.cameras.lens()]
-            tensors += [] if self.errors is None else [self.errors.vector()]
+            tensors = self.cameras.corrections(), self.cameras.lens(), self.errors.vector()
             return State(self.similarity.current(), *(tensor.cpu().numpy() for tensor in tensors))
 
     def losses(self) -> dict[str, Tensor]:
@@ -175,7 +171,7 @@ class GeoProblem(torch.nn.Module):
             values[term.kind] = self._rho(term, residual).mean()
         # A problem that holds the cameras has no z, and no loss.
         values["cameras"] = self.cameras.z.square().sum() / self._normaliser()
-        if self.errors is not None and len(at.vector):
+        if len(at.vector):
             values["errors"] = self.errors.prior() / self._normaliser()
         return values
 

@@ -76,11 +76,7 @@ class TensorTerm(ABC):
 
 @dataclass(frozen=True)
 class FixTerm(TensorTerm):
-    """L_abs, `adjust.terms.Fixes`, in float64.
-
-    Attributes:
-        bias: (F, B), 1 where a block of the systematic errors is the bias of the fix's session.
-    """
+    """L_abs, `adjust.terms.Fixes`, in float64; `bias` (F, B) is 1 where a block of errors is that of the session."""
 
     kind: ClassVar[str] = "absolute"
 
@@ -253,39 +249,37 @@ def distance_term(
     Args:
         scene: cameras and points as SfM left them.
         fixes: of the cameras; at least two.
-        points: of `geolocate`; None: take the cameras.
-        seed: of the random pairs.
+        points, seed: of `geolocate`, None: take the cameras; of the random pairs.
 
     Raises:
         InputError: `points` belongs to another model.
     """
-    distances = _pairs_of_points(scene, points, seed) if points is not None else None
-    distances = _pairs_of_cameras(scene, fixes, seed) if distances is None else distances
-    of_pairs = float((distances.distance_in_geo * distances.root_information[:, 0, 0]).square().sum())
-    share = min(1.0, _WORTH * _scale_information(fixes) / of_pairs) if of_pairs > 0 else 0.0
-    return replace(distances, share=share) if share > 0 else None
-
-
-def _pairs_of_points(scene: Scene, points: GeolocatedPoints, seed: int) -> DistanceTerm | None:
-    if not np.array_equal(points.point_id, scene.sparse.point_id):
+    if points is not None and not np.array_equal(points.point_id, scene.sparse.point_id):
         raise InputError("the geolocated points are of another model: run `georef geolocate` again")
-    good = np.flatnonzero(points.inlier)
-    if len(good) < 2:
-        return None
-    first, second = _long_pairs(scene.point_in_model[good], seed)
-    i, j = good[first], good[second]
-    apart = points.position_in_geo[i] - points.position_in_geo[j]
-    inside = np.linalg.norm(scene.point_in_model[i] - scene.point_in_model[j], axis=1)
-    measured = _measured_distance(apart, points.cov_in_geo[i] + points.cov_in_geo[j])
-    return DistanceTerm(torch.from_numpy(inside), None, *measured)
-
-
-def _pairs_of_cameras(scene: Scene, fixes: adjustment.Fixes, seed: int) -> DistanceTerm:
-    camera, place, root = fixes.camera, fixes.position_in_geo, fixes.root_information
-    i, j = _long_pairs(scene.poses.cam_center_in_model[camera], seed)
-    covariance = np.linalg.inv(np.swapaxes(root, 1, 2) @ root)
-    chosen = torch.from_numpy(np.column_stack([camera[i], camera[j]]))
-    return DistanceTerm(None, chosen, *_measured_distance(place[i] - place[j], covariance[i] + covariance[j]))
+    located = np.zeros(0, dtype=np.int64) if points is None else np.flatnonzero(points.inlier)
+    if points is not None and len(located) >= 2:
+        in_model, in_geo, cov_in_geo = scene.point_in_model, points.position_in_geo, points.cov_in_geo
+        in_model, in_geo, cov_in_geo = in_model[located], in_geo[located], cov_in_geo[located]
+        i, j = _long_pairs(in_model, seed)
+        pairs, inside = None, torch.from_numpy(np.linalg.norm(in_model[i] - in_model[j], axis=1))
+    else:
+        in_geo, root = fixes.position_in_geo, fixes.root_information
+        cov_in_geo = np.asarray(np.linalg.inv(np.swapaxes(root, 1, 2) @ root), dtype=np.float64)
+        i, j = _long_pairs(scene.poses.cam_center_in_model[fixes.camera], seed)
+        pairs, inside = torch.from_numpy(np.column_stack([fixes.camera[i], fixes.camera[j]])), None
+    apart = in_geo[i] - in_geo[j]
+    distance = np.linalg.norm(apart, axis=1)
+    along = apart / distance[:, None]
+    variance = np.einsum("pi,pij,pj->p", along, cov_in_geo[i] + cov_in_geo[j], along)
+    root_information = torch.from_numpy(variance**-0.5)[:, None, None]
+    distances = DistanceTerm(inside, pairs, torch.from_numpy(distance), root_information)
+    of_pairs = float((distances.distance_in_geo * distances.root_information[:, 0, 0]).square().sum())
+    root, place = fixes.root_information, fixes.position_in_geo
+    weight = (root**2).sum(axis=(1, 2))
+    arm = place - weight @ place / weight.sum()
+    of_fixes = float(((root @ arm[:, :, None]) ** 2).sum())  # on ln s, about the weighted mean of the fixes
+    share = min(1.0, _WORTH * of_fixes / of_pairs) if of_pairs > 0 else 0.0
+    return replace(distances, share=share) if share > 0 else None
 
 
 def _long_pairs(place: FloatArray, seed: int) -> tuple[IntArray, IntArray]:
@@ -296,22 +290,6 @@ def _long_pairs(place: FloatArray, seed: int) -> tuple[IntArray, IntArray]:
     length = np.linalg.norm(place[first] - place[second], axis=1)
     longest = np.sort(np.argsort(-length, kind="stable")[:_PAIRS])
     return first[longest], second[longest]
-
-
-def _measured_distance(apart: FloatArray, covariance: FloatArray) -> tuple[Tensor, Tensor]:
-    """Return the lengths (P,) of differences (P, 3), and their 1/σ (P, 1, 1)."""
-    distance = np.linalg.norm(apart, axis=1)
-    along = apart / distance[:, None]
-    variance = np.einsum("pi,pij,pj->p", along, covariance, along)
-    return torch.from_numpy(distance), torch.from_numpy(variance**-0.5)[:, None, None]
-
-
-def _scale_information(fixes: adjustment.Fixes) -> float:
-    """Return the information of the fixes on ln s: Σ |W (C − C̄)|² about their weighted mean."""
-    root, place = fixes.root_information, fixes.position_in_geo
-    weight = (root**2).sum(axis=(1, 2))
-    arm = place - weight @ place / weight.sum()
-    return float(((root @ arm[:, :, None]) ** 2).sum())
 
 
 @dataclass(frozen=True)
@@ -349,12 +327,7 @@ def control_by_depth(
     """Return the marks for projection onto the rendered surface, and the control points with the surface's σ added.
 
     The surface's error has a σ of `SURFACE_SIGMA` times the distance, along each axis. All marks of a point share
-    this error, because they show one piece of the surface.
-
-    Args:
-        scene: cameras as SfM left them.
-        survey: has the control points.
-        marks: of the adjustment. Those in test views are not rendered.
+    this error, because they show one piece of the surface. Marks in test views are not rendered.
     """
     order = np.argsort(marks.camera, kind="stable")
     order = order[np.isin(marks.camera[order], scene.train)]

@@ -49,13 +49,7 @@ def cauchy(chi2: Tensor, dimension: int) -> Tensor:
 
 @dataclass(frozen=True)
 class TensorSimilarity:
-    """Similarity geo ← model: p_geo = scale · rotation p_model + translation, in float64.
-
-    Attributes:
-        scale: scalar ().
-        rotation: (3, 3).
-        translation: (3,) metres.
-    """
+    """Similarity in float64: p_geo = scale () · rotation (3, 3) p_model + translation (3,), metres."""
 
     scale: Tensor
     rotation: Tensor
