@@ -214,7 +214,13 @@ def underlay(points: SurfacePoints, count: int, seed: int) -> tuple[SurfacePoint
     cell = np.floor((place[:, :2] - low) / side_m).astype(np.int64)
     inside = np.flatnonzero(((cell >= 0) & (cell < (columns, rows))).all(axis=1))
     lowest = _low_heights(cell[inside, 1] * columns + cell[inside, 0], place[inside, 2], columns * rows)
-    height = _ground(lowest.reshape(rows, columns), side_m) - _DEPTH * side_m
+    lowest = lowest.reshape(rows, columns)
+    # Cells without a point take the height of the nearest that has one.
+    nearest = ndimage.distance_transform_edt(np.isnan(lowest), return_distances=False, return_indices=True)
+    known = lowest[tuple(nearest)]
+    reach = 2 * int(np.ceil(_ROOF_REACH_M / side_m)) + 1
+    smooth = ndimage.uniform_filter(ndimage.minimum_filter(known, size=reach, mode="nearest"), 3, mode="nearest")
+    height = np.minimum(smooth, known) - _DEPTH * side_m
     row, column = np.divmod(np.arange(columns * rows), columns)
     sheet = np.column_stack([low + side_m * (np.stack([column, row], axis=1) + 0.5), height.ravel()])[:count]
     normal = np.broadcast_to([0.0, 0.0, 1.0], sheet.shape)
@@ -248,15 +254,6 @@ def _low_heights(cell: IntArray, height: FloatArray, count: int) -> FloatArray:
     filled = number > 0
     low[filled] = height[order[(first + (_LOW * number).astype(np.int64))[filled]]]
     return low
-
-
-def _ground(lowest: FloatArray, side_m: float) -> FloatArray:
-    """Return the heights (rows, columns) of ground, given the lowest points of cells; NaN: no point lies there."""
-    nearest = ndimage.distance_transform_edt(np.isnan(lowest), return_distances=False, return_indices=True)
-    known = lowest[tuple(nearest)]
-    reach = 2 * int(np.ceil(_ROOF_REACH_M / side_m)) + 1
-    smooth = ndimage.uniform_filter(ndimage.minimum_filter(known, size=reach, mode="nearest"), 3, mode="nearest")
-    return np.asarray(np.minimum(smooth, known))
 
 
 def _colours(points: SurfacePoints, sheet: FloatArray, seed: int) -> ByteArray:

@@ -226,7 +226,7 @@ def _metrics_row(trainer: JointTrainer, report: StepReport, seconds: float) -> d
     row = {
         "iteration": trainer.iteration,
         "seconds": round(seconds, 2),
-        "photometric": float(report.photometric),
+        "photometric": float(report.losses["photometric"]),
         "psnr": -10.0 * math.log10(max(float(report.mean_square_error), 1e-10)),
         "gaussians": len(trainer.optimizer.gaussians),
         "visible": report.visible,
@@ -234,8 +234,8 @@ def _metrics_row(trainer: JointTrainer, report: StepReport, seconds: float) -> d
         "geo_weight": report.weight,
     }
     row |= {name: float(value) for name, value in losses.items()}
-    if report.by_depth is not None:
-        row["control_by_depth"] = float(report.by_depth)
+    if "control_by_depth" in report.losses:
+        row["control_by_depth"] = float(report.losses["control_by_depth"])
     return row | {f"variance_{name}": factors[name] for name in factors}
 
 

@@ -78,21 +78,18 @@ class StepReport:
     """Figures of one iteration; the scalar tensors are still on the device, because fetching them would wait.
 
     Attributes:
+        losses: value of each loss that the view has, by its name, not yet weighted.
         mean_square_error: of colours from 0 to 1, over the pixels that count.
-        geographic: geographic losses, not yet multiplied by the weight.
         weight: w(t), the weight of the geographic losses.
         visible: number of Gaussians in the view, those around a region among them.
         pixels: of the render.
-        by_depth: part of `geographic` from control points by rendered depth; None: the view has no such marks.
     """
 
-    photometric: Tensor
+    losses: dict[str, Tensor]
     mean_square_error: Tensor
-    geographic: Tensor
     weight: float
     visible: int
     pixels: int
-    by_depth: Tensor | None = None
 
 
 class _Stateful(Protocol):
@@ -167,9 +164,9 @@ class JointTrainer:
         self._unknowns.adam.zero_grad()
         total, values = weighted_sum(self._losses, view, self.iteration)
         total.backward()
-        by_depth = values.get("control_by_depth")
-        geographic = values["geographic"] if by_depth is None else values["geographic"] + by_depth
-        self._watch.note(self.iteration, self._watched(values["photometric"], geographic))
+        losses = {name: value.detach() for name, value in values.items()}
+        geographic = losses["geographic"] + losses.get("control_by_depth", 0.0)
+        self._watch.note(self.iteration, self._watched(losses["photometric"], geographic))
         stats = self._of_whole(self._own(view.render.stats), view.pose, view.target)
         self._unknowns.step(self.optimizer.rate_factor * self.schedule.geographic_rate(self.iteration))
         self.optimizer.step(self.iteration, stats.visible)
@@ -178,13 +175,11 @@ class JointTrainer:
         self.strategy.observe(stats, view.target.whole)
         self.strategy.update(self.iteration, self.optimizer, self.sample_contributions)
         return StepReport(
-            values["photometric"].detach(),
+            losses,
             _mean_square(view.colour, view.target),
-            geographic.detach(),
             self.schedule.geographic_weight(self.iteration),
             len(view.render.stats.visible),
             view.target.camera.width * view.target.camera.height,
-            None if by_depth is None else by_depth.detach(),
         )
 
     @torch.no_grad()

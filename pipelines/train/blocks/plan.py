@@ -178,11 +178,7 @@ _SAMPLED_CAMERAS = 24  # of a block, in which its Gaussians are counted
 
 
 def run(stage: StageRun, options: PlanOptions) -> Summary:
-    """Write the plan, and return its key figures.
-
-    Raises:
-        GeorefError: a product cannot be read, or the survey cannot be divided.
-    """
+    """Write the plan, and return its key figures; raises a `GeorefError` if a product cannot be read."""
     workspace = stage.workspace
     *_, scene = load_adjusted_scene(workspace)
     plan = plan_blocks(scene, options, stage.progress)

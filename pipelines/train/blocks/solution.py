@@ -27,11 +27,7 @@ _DARKEST, _BRIGHTEST = 4 / 255, 250 / 255  # a clipped channel does not show its
 
 
 def run(stage: StageRun, options: SolutionOptions) -> Summary:
-    """Write the solution, and return its key figures.
-
-    Raises:
-        GeorefError: a product or a photograph cannot be read.
-    """
+    """Write the solution, and return its key figures; raises a `GeorefError` if something cannot be read."""
     workspace = stage.workspace
     adjusted = AdjustedScene.load(workspace)
     solution, scene = adjusted.adjustment, adjusted.scene

@@ -76,7 +76,7 @@ class TensorTerm(ABC):
 
 @dataclass(frozen=True)
 class FixTerm(TensorTerm):
-    """L_abs, `adjust.terms.Fixes`, in float64; `bias` (F, B) is 1 where a block of errors is that of the session."""
+    """L_abs, `adjust.terms.Fixes`, in float64; `bias` (F, B) is 1 where a block of errors is the session's."""
 
     kind: ClassVar[str] = "absolute"
 
