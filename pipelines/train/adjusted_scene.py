@@ -110,20 +110,15 @@ class AdjustedScene:
         return value, sigma
 
     def require_determined(self, problem: Problem) -> None:
-        """Refuse measurements whose adjustment a training could not state at its end.
+        """Refuse measurements that leave the similarity open, by a `DegenerateGeometryError`.
 
-        Raises:
-            DegenerateGeometryError: they leave the similarity open.
+        A training could not state their adjustment at its end.
         """
         near = linearised(problem, self.state(problem.errors))
         near.normal(posterior_weights(near.residuals))
 
     def posterior(self, problem: Problem, state: State) -> Posterior:
-        """Return a state of the measurements as an adjustment, with its covariances.
-
-        Raises:
-            DegenerateGeometryError: the measurements leave the similarity open.
-        """
+        """Return a state of the measurements, which must be determined, as an adjustment with its covariances."""
         rejected = rejected_of(self.scene, self.survey, self.initial)
         return adjusted(self.scene, problem, state, self.initial, rejected)
 

@@ -28,10 +28,9 @@ _PIXELS_EACH = 40
 
 
 def training_size(options: TrainOptions, photographs: int, largest: Pinhole, beside: int = 0) -> TrainingSize:
-    """Return the quantities that determine the memory of a training.
+    """Return the quantities that determine the memory of a training of so many photographs.
 
     Args:
-        options, photographs: of the training, and number of photographs.
         largest: camera of the largest photograph at training size.
         beside: number of frozen Gaussians that are rendered too.
     """

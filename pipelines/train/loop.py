@@ -135,11 +135,7 @@ def _displayed(
 
 
 class _Loop:
-    """Iterations of a trainer, with their files; begins anew or from the checkpoint.
-
-    Raises:
-        DamagedPartialError: the checkpoint is damaged, or is not of this training.
-    """
+    """Iterations of a trainer, with their files; begins anew, or from a checkpoint of this training."""
 
     def __init__(self, trainer: JointTrainer, options: LoopOptions) -> None:
         self.trainer, self.options = trainer, options
@@ -191,11 +187,7 @@ class _Loop:
             self.options.note(f"{self.trainer.iteration} of {total} iterations, {minutes}")
 
     def recover(self, error: NonFiniteError) -> None:
-        """Return to the last checkpoint and lower the learning rates, once in a training.
-
-        Raises:
-            ConvergenceError: the training has recovered before.
-        """
+        """Return to the last checkpoint and lower the learning rates; a second time is a `ConvergenceError`."""
         advice = "train again with a smaller --geo-weight, another --seed or fewer --max-gaussians"
         if self.recovery is not None:
             raise ConvergenceError(f"{error}, and before that {self.recovery}: {advice}") from error

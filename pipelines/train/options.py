@@ -126,11 +126,7 @@ class GeographicOptions(StageOptions):
         return cameras if self.optimize_cameras and self.geo_loss and not self.solves_once(cameras) else 0
 
     def require_trainable(self, cameras: int) -> None:
-        """Refuse options that change the cameras' solution during a training, if the training holds it.
-
-        Raises:
-            InputError: names the option.
-        """
+        """Refuse options that change the cameras' solution during a training that holds it, by an `InputError`."""
         if not self.solves_once(cameras):
             return
         for value, plain, name in (

@@ -119,12 +119,11 @@ def region_masks(
     """Return the pixels of each view whose surface lies in a region.
 
     Args:
-        solved: cameras and lenses.
+        solved, images: of all cameras.
         views: (T,) indices of the cameras.
-        images, rasterizer: photographs of all cameras, and the backend of the stand-in's renders.
         cell: the region.
         stand_in: whose depth counts where the surface is not known.
-        maps, progress: known depths, None: there are none; counts the views.
+        maps: known depths; None: there are none.
     """
     pinholes = Pinholes(images, solved.scene.sparse.lenses)
     pinholes.renew(solved.adjustment.with_lenses(solved.scene.sparse).lenses)
