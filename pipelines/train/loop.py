@@ -164,7 +164,7 @@ class _Loop:
         report = trainer.step()
         due = trainer.iteration % options.log_every == 0 or trainer.iteration == trainer.options.iterations
         if due or trainer.device.type == "cpu":  # a GPU would have to wait for a check at every iteration
-            trainer.check_finite()
+            trainer.watch.check()
         row = _metrics_row(trainer, report, self.seconds()) if due else None
         if row is not None:
             with options.metrics.open("a", encoding="utf-8") as lines:
@@ -175,7 +175,7 @@ class _Loop:
 
     def save(self) -> None:
         """Write a checkpoint, if all losses and gradients were finite; else raise `NonFiniteError`."""
-        self.trainer.check_finite()
+        self.trainer.watch.check()
         loop_state = {
             "seconds": torch.tensor(self.seconds(), dtype=torch.float64),
             "recovery": torch.tensor(list((self.recovery or "").encode()), dtype=torch.uint8),

@@ -147,7 +147,7 @@ class JointTrainer:
         )
         self._unknowns = GeographicAdam(problem, options, self.device)
         nothing = torch.zeros((), device=self.device)
-        self._watch = FinitenessMonitor(tuple(self._watched(nothing, nothing)), self.device)
+        self.watch = FinitenessMonitor(tuple(self._watched(nothing, nothing)), self.device)
 
     def step(self) -> StepReport:
         """Run one iteration and return its figures.
@@ -166,7 +166,7 @@ class JointTrainer:
         total.backward()
         losses = {name: value.detach() for name, value in values.items()}
         geographic = losses["geographic"] + losses.get("control_by_depth", 0.0)
-        self._watch.note(self.iteration, self._watched(losses["photometric"], geographic))
+        self.watch.note(self.iteration, self._watched(losses["photometric"], geographic))
         stats = self._of_whole(self._own(view.render.stats), view.pose, view.target)
         self._unknowns.step(self.optimizer.rate_factor * self.schedule.geographic_rate(self.iteration))
         self.optimizer.step(self.iteration, stats.visible)
@@ -211,18 +211,10 @@ class JointTrainer:
         surface = self.options.surface is not None
         return iteration_seconds(width * height, len(self.optimizer.gaussians), surface=surface, windows=windows)
 
-    def check_finite(self) -> None:
-        """Wait for the device, and stop the training if it has diverged.
-
-        Raises:
-            NonFiniteError: a loss or gradient was not finite; names the first and its iteration.
-        """
-        self._watch.check()
-
     def slow_down(self, factor: float) -> None:
         """Multiply all learning rates but the exposures' by `factor`, and forget values that were not finite."""
         self.optimizer.rate_factor *= factor
-        self._watch.reset()
+        self.watch.reset()
 
     def _look(self, iteration: int) -> ImageLook:
         index = self.schedule.view(iteration)
@@ -323,7 +315,7 @@ class JointTrainer:
         self.schedule.extended_from = int(state["extended_from"])
         self.optimizer.rate_factor = float(state["rate_factor"])
         self._look_through(state["lens"].cpu().numpy())
-        self._watch.reset()
+        self.watch.reset()
         tensors = {name: tensor.to(self.device) for name, tensor in unprefixed("gaussians", state).items()}
         gaussians = Gaussians(**tensors)
         fresh = torch.full((len(gaussians),), -1, dtype=torch.int64, device=self.device)

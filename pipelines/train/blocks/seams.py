@@ -164,5 +164,5 @@ class _SeamTrainer:
         )
         for _ in range(iterations):
             trainer.step()
-        trainer.check_finite()
+        trainer.watch.check()
         return trainer.optimizer.gaussians.detached().to(torch.device("cpu"))
