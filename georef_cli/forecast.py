@@ -77,7 +77,7 @@ def forecast_run(
         GeorefError: the run would be refused for its options, or for a missing file.
     """
     from pipelines.sfm.forecast import forecast as forecast_reconstruction
-    from pipelines.train.forecast import forecast as forecast_training
+    from pipelines.train.forecast import training_forecast
 
     planned = plan(workspace, stages, flags, force=force)
     photographs = _photographs(workspace, planned)
@@ -87,7 +87,7 @@ def forecast_run(
         if (sfm := _to_run(planned, SfmOptions)) is not None:
             reconstruction = forecast_reconstruction(photographs.count, photo_px, sfm)
         if (train := _to_run(planned, TrainOptions)) is not None:
-            training = forecast_training(photographs.count, photo_px, train)
+            training = training_forecast(photographs.count, photo_px, train)
     seconds: dict[str, float | None] = {}
     for name, forecast in (("sfm", reconstruction), ("train", training)):
         if forecast is not None and forecast.refusal:

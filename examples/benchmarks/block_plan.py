@@ -16,8 +16,8 @@ from pipelines.geometry.cameras import Camera, project
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.scene import Scene
-from pipelines.train.blocks.options import PlanOptions
 from pipelines.train.blocks.plan import plan_blocks
+from pipelines.train.options import PlanOptions
 
 _CAMERA = Camera("OPENCV", 5280, 3956, np.array([3700.0, 3700.0, 2640.0, 1978.0, -0.01, 0.004, 0.0, 0.0]))
 _HEIGHT_M, _ALONG_M, _ACROSS_M = 100.0, 21.0, 43.0

@@ -23,12 +23,12 @@ from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.depth_maps import DepthMaps
 from pipelines.survey.photographs import ImageCache, Photograph
 from pipelines.train.adjusted_scene import AdjustedScene
-from pipelines.train.assembly import make_trainer
 from pipelines.train.forecast import training_size
 from pipelines.train.geographic.problem import held_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import TrainOptions
 from pipelines.train.surface import SceneSurface
+from pipelines.train.trainer import make_trainer
 
 
 def enlarged(

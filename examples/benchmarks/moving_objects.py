@@ -58,7 +58,7 @@ def psnr_at(trainer: JointTrainer, painted: dict[int, tuple[BoolArray, ByteArray
         pose = trainer.problem.cameras.cam_from_model(index)
         settings = RasterSettings(sh_degree=trainer.options.sh_degree)
         colour = trainer.rasterizer.render(
-            trainer.optimizer.gaussians, pose, trainer.pinhole(index), settings
+            trainer.optimizer.gaussians, pose, trainer.pinholes.of(index), settings
         ).colour
         if trainer.exposures is not None:
             colour = trainer.exposures.apply(index, colour)

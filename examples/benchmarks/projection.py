@@ -16,10 +16,9 @@ from pipelines.sfm.forecast import pace
 from pipelines.sfm.options import SfmOptions
 from pipelines.survey.block_plan import BlockPlan
 from pipelines.survey.scene import Scene
-from pipelines.train.blocks.options import PlanOptions
 from pipelines.train.blocks.plan import plan_blocks
 from pipelines.train.forecast import block_processor_s
-from pipelines.train.options import TrainOptions
+from pipelines.train.options import PlanOptions, TrainOptions
 
 PHOTO_PX = (5280, 3956)
 TRAINED_PX = 1600

@@ -39,12 +39,11 @@ from pipelines.survey.adjustment import GeolocatedPoints
 from pipelines.survey.scene import photographs
 from pipelines.survey.trained_survey import TrainedSurvey
 from pipelines.train.adjusted_scene import AdjustedScene
-from pipelines.train.assembly import make_trainer
 from pipelines.train.geographic.problem import held_problem, refining_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import TrainOptions
-from pipelines.train.result import trained_model
-from pipelines.train.trainer import load_checkpoint
+from pipelines.train.stage import trained_model
+from pipelines.train.trainer import load_checkpoint, make_trainer
 
 _POLL_S = 0.1
 _GEOREF = (sys.executable, "-c", "from georef_cli.main import main; main()")

@@ -40,12 +40,11 @@ from pipelines.surface.depth_maps import DepthMaps
 from pipelines.survey.photographs import ImageCache
 from pipelines.survey.scene import Scene, photographs
 from pipelines.train.adjusted_scene import AdjustedScene
-from pipelines.train.assembly import make_trainer
 from pipelines.train.geographic.problem import refining_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import TrainOptions
 from pipelines.train.surface import SceneSurface
-from pipelines.train.trainer import JointTrainer
+from pipelines.train.trainer import JointTrainer, make_trainer
 
 
 def iterations(count: int, camera: Pinhole, visible: float, repeats: int, backend_name: str) -> Iterator[float]:
@@ -161,7 +160,7 @@ class ViewQuality:
 
     def _psnr(self, index: int, *, exposed: bool) -> float:
         trainer, settings = self.trainer, RasterSettings(sh_degree=self.trainer.options.sh_degree)
-        pose, pinhole = trainer.problem.cameras.cam_from_model(index), trainer.pinhole(index)
+        pose, pinhole = trainer.problem.cameras.cam_from_model(index), trainer.pinholes.of(index)
         colour = trainer.rasterizer.render(trainer.optimizer.gaussians, pose, pinhole, settings).colour
         if exposed and trainer.exposures is not None:
             colour = trainer.exposures.apply(index, colour)

@@ -98,7 +98,7 @@ def _run_part(ctx: click.Context, parts: Parts, spec: StageSpec, values: dict[st
         parts.plan().block(number)
     elif spec is TRAIN_SCAFFOLD and (force or parts.why_missing(SOLVE)):
         parts.run(SOLVE, force=force, progress=progress)
-    variant = parts.place(spec, number)
+    variant = parts.place(number)
     with boundary.logged_to_file(variant, spec):
         outcome = parts.run(spec, number, force=force, progress=progress)
     print_outcome(variant, outcome, as_json=values["as_json"], told=is_told(ctx.obj))

@@ -149,7 +149,7 @@ def _median(classes: IntArray) -> float:
 SIGMA_COUNTS = "georeference, disagreement of the training views about the surface, intersection of their rays"
 
 
-class CloudFiles:
+class CloudReader:
     """Files of a cloud: LAZ, and PLY on request.
 
     Args:
@@ -207,7 +207,7 @@ def run(stage: StageRun, options: ExportCloudOptions) -> Summary:
     geo_from_model, box = trained.geo_from_model, corners(scene_points(trained))
     target = target_crs(options, trained.survey.origin, box, trained.survey.vertical)
     frame = cloud_frame(target, box)
-    files = CloudFiles(frame, stage.out, ply=options.ply)
+    files = CloudReader(frame, stage.out, ply=options.ply)
     images = photographs(trained.sfm, trained.survey, stage.workspace, trained.model.max_image_size)
     images.build(stage.progress)
     renderer = ModelRenderer(trained, images, rasterizer("auto", stage.progress))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -20,13 +20,10 @@ from pipelines.core.types import FloatArray, IntArray
 from pipelines.core.workspace import Workspace
 from pipelines.geometry.rotations import log_so3
 from pipelines.splat.exposure import HeldExposures
-from pipelines.splat.rasterizer.api import Rasterizer
 from pipelines.survey.adjustment import InitialSimilarity
-from pipelines.survey.photographs import ImageCache, Pinholes
 from pipelines.survey.scene import Scene, load_adjusted_scene
 from pipelines.survey.survey import Survey
 from pipelines.survey.trained_model import Adjustment
-from pipelines.train.region import RegionViews
 
 
 @dataclass(frozen=True)
@@ -57,16 +54,6 @@ class AdjustedScene:
         adjustment = self.adjustment.model_copy(update={"cameras": cameras})
         return replace(self, scene=self.scene.of_images(images), adjustment=adjustment)
 
-    def trained_on(self, train: IntArray) -> AdjustedScene:
-        """Return the scene with other training images (T,), ascending."""
-        return replace(self, scene=replace(self.scene, train=train))
-
-    def views(self, images: ImageCache, indices: IntArray, rasterizer: Rasterizer) -> RegionViews:
-        """Return views (T,), under the adjusted lenses, in which a region can be looked for."""
-        pinholes = Pinholes(images, self.scene.sparse.lenses)
-        pinholes.renew(self.adjustment.with_lenses(self.scene.sparse).lenses)
-        return RegionViews(indices, self.adjustment.poses, pinholes, rasterizer)
-
     def exposures(self, device: torch.device) -> HeldExposures | None:
         """Return the exposures of the adjustment, the identity for cameras without one; None: nobody has one."""
         exposures = [camera.exposure for camera in self.adjustment.cameras]
@@ -78,9 +65,7 @@ class AdjustedScene:
     def measured(self, *, control_points: bool = True, planes: Planes | None = None) -> Problem:
         """Return the measurements in use, with the systematic errors that the adjustment has estimated.
 
-        Args:
-            control_points: whether they are used.
-            planes: of a LiDAR whose shift is a systematic error; None: none.
+        Planes are those of a LiDAR whose shift is a systematic error.
         """
         survey = self.initial.in_use(self.survey)
         if not control_points:
@@ -125,30 +110,34 @@ class AdjustedScene:
         return value, sigma
 
     def require_determined(self, problem: Problem) -> None:
-        """Refuse measurements whose adjustment a training could not state at its end.
+        """Refuse measurements that leave the similarity open, by a `DegenerateGeometryError`.
 
-        Raises:
-            DegenerateGeometryError: they leave the similarity open.
+        A training could not state their adjustment at its end.
         """
         near = linearised(problem, self.state(problem.errors))
         near.normal(posterior_weights(near.residuals))
 
     def posterior(self, problem: Problem, state: State) -> Posterior:
-        """Return a state of the measurements as an adjustment, with its covariances.
-
-        Raises:
-            DegenerateGeometryError: the measurements leave the similarity open.
-        """
+        """Return a state of the measurements, which must be determined, as an adjustment with its covariances."""
         rejected = rejected_of(self.scene, self.survey, self.initial)
         return adjusted(self.scene, problem, state, self.initial, rejected)
 
 
+def figures_of(adjustment: Adjustment) -> dict[str, Any]:
+    """Return what the summary of a training says of its adjustment."""
+    sigma = np.sqrt(np.diag(np.array(adjustment.geo_from_model.covariance)))
+    return {
+        "similarity_sigma_m": [round(float(value), 5) for value in sigma[4:]],
+        "gnss_outliers": list(adjustment.gnss_outliers),
+        "control_outliers": list(adjustment.control_outliers),
+        "estimated_errors": [error.model_dump() for error in adjustment.estimated_errors],
+    }
+
+
 def with_exposures(adjustment: Adjustment, exposure: FloatArray) -> Adjustment:
     """Return an adjustment with the exposures (n, 3, 4) of its training cameras."""
-    cameras = tuple(
-        camera.model_copy(update={"exposure": tuple(map(tuple, affine.tolist()))})
-        if camera.split == "train"
-        else camera
-        for camera, affine in zip(adjustment.cameras, exposure, strict=True)
-    )
-    return adjustment.model_copy(update={"cameras": cameras})
+    cameras = list(adjustment.cameras)
+    for place, (camera, affine) in enumerate(zip(cameras, exposure, strict=True)):
+        if camera.split == "train":
+            cameras[place] = camera.model_copy(update={"exposure": tuple(map(tuple, affine.tolist()))})
+    return adjustment.model_copy(update={"cameras": tuple(cameras)})

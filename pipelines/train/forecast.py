@@ -17,9 +17,8 @@ from pipelines.jobs.costs import BLOCK_SECONDS, MEASURED_CORES, SURFACE_FACTOR, 
 from pipelines.splat.memory import USABLE, TrainingSize, fitting_gaussians, free_memory_bytes, predicted_peak_bytes
 from pipelines.splat.rasterizer.backends import chosen_backend
 from pipelines.surface.depth_maps import StereoOptions
-from pipelines.survey.block_plan import BlockPlan
+from pipelines.survey.block_plan import BlockPlan, PlannedBlock
 from pipelines.survey.options import NOT_IN_BLOCKS
-from pipelines.survey.survey import Survey
 from pipelines.train.options import PRESETS, TrainOptions
 from pipelines.train.schedule import COARSE, pyramid
 from pipelines.train.target_images import Crops
@@ -29,21 +28,15 @@ _PIXELS_EACH = 40
 
 
 def training_size(options: TrainOptions, photographs: int, largest: Pinhole, beside: int = 0) -> TrainingSize:
-    """Return the quantities that determine the memory of a training.
+    """Return the quantities that determine the memory of a training of so many photographs.
 
     Args:
-        options: of the training.
-        photographs: number of the photographs.
         largest: camera of the largest photograph at training size.
         beside: number of frozen Gaussians that are rendered too.
     """
-    return TrainingSize(
-        options.effort.max_gaussians + beside,
-        Crops(options.crop_size).largest_of(largest),
-        options.sh_degree,
-        options.refined_cameras(photographs),
-        largest.width * largest.height,
-    )
+    gaussians, cameras = options.effort.max_gaussians + beside, options.refined_cameras(photographs)
+    window, whole_px = Crops(options.crop_size).largest_of(largest), largest.width * largest.height
+    return TrainingSize(gaussians, window, options.sh_degree, cameras, whole_px)
 
 
 def with_gaussian_limit(
@@ -53,13 +46,7 @@ def with_gaussian_limit(
 
     1. Photographs of the preset's size have the preset's limit.
     2. Larger ones have more, in proportion to their pixels, as far as all photographs together have 40 pixels for
-       each, and as far as they fit into memory.
-
-    Args:
-        options: of the training.
-        photographs: number of the photographs.
-        largest: camera of the largest photograph at training size.
-        free_bytes: memory that is free; None: unknown.
+       each, and as far as they fit into `free_bytes` of memory; None: unknown.
     """
     preset = PRESETS[options.preset]
     enlarged = max(largest.width, largest.height) / preset.max_image_size
@@ -87,20 +74,14 @@ class TrainingForecast:
     """Forecast of a training.
 
     Attributes:
-        preset: name of the preset.
-        photographs: number of photographs.
         photo_px: width and height of the largest photograph.
         training_px: width and height at which it is trained.
         windows: number of windows in which it is seen, one at an iteration, when it is not shrunken further.
-        iterations: length of the training.
-        max_gaussians: limit of the Gaussians.
         backend: `cpu` or `cuda`.
-        threads: that the CPU backend uses.
         seconds: about; None on a GPU, where nothing was measured.
         peak_bytes: predicted peak of the memory.
         free_bytes: memory that is free; None: unknown.
-        blocks: number of blocks that was asked for; None: as many as fit.
-        lidar: whether LiDAR is to be used.
+        blocks: number that was asked for; None: as many as fit.
     """
 
     preset: str
@@ -130,18 +111,14 @@ class TrainingForecast:
         """Reason why the training would be refused; empty: it would not."""
         return NOT_IN_BLOCKS if self.lidar and self.in_blocks else ""
 
-    @property
-    def reduction(self) -> float:
-        """Ratio of the longer sides of photograph and training image."""
-        return max(self.photo_px) / max(self.training_px)
-
     def sentences(self) -> list[str]:
         """Return the forecast for people: effort, size of the images, time and memory."""
         effort = f"{self.preset}: {self.iterations} iterations, at most {self.max_gaussians} Gaussians"
         (width, height), (small_width, small_height) = self.photo_px, self.training_px
         size = f"{self.photographs} photographs of {width}×{height} px are trained at {small_width}×{small_height}"
-        if self.reduction > 1.05:
-            size += f", 1/{self.reduction:.1f} of their side (--max-image-size)"
+        reduction = max(self.photo_px) / max(self.training_px)
+        if reduction > 1.05:
+            size += f", 1/{reduction:.1f} of their side (--max-image-size)"
         if self.windows > 1:
             size += f", each in {self.windows} windows (--crop-size)"
         took = "time not measured on a GPU"
@@ -155,22 +132,16 @@ class TrainingForecast:
         return [effort, size, f"in {many}; one run would take {took.removeprefix('about ')}, {memory}"]
 
 
-def forecast(photographs: int, photo_px: tuple[int, int], options: TrainOptions) -> TrainingForecast:
+def training_forecast(photographs: int, photo_px: tuple[int, int], options: TrainOptions) -> TrainingForecast:
     """Return the forecast of a training.
 
     The time is that of the machine of `MEASURED_ON`, divided by the ratio of the threads.
 
-    Args:
-        photographs: number of photographs.
-        photo_px: width and height of the largest.
-        options: of the training.
-
     Raises:
         BackendUnavailableError: `--backend cuda`, and a part that it needs is missing; names each.
     """
-    camera, backend = camera_of(photo_px, options), chosen_backend(options.backend)
-    device = torch.device(backend)
-    free_bytes = free_memory_bytes(device)
+    camera, backend = training_pinhole(photo_px, options), chosen_backend(options.backend)
+    free_bytes = free_memory_bytes(torch.device(backend))
     options = with_gaussian_limit(options, photographs, camera, free_bytes)
     effort, size = options.effort, training_size(options, photographs, camera)
     return TrainingForecast(
@@ -183,7 +154,7 @@ def forecast(photographs: int, photo_px: tuple[int, int], options: TrainOptions)
         max_gaussians=effort.max_gaussians,
         backend=backend,
         threads=thread_count(),
-        seconds=_seconds(photographs, camera, options) if device.type == "cpu" else None,
+        seconds=_seconds(photographs, camera, options) if backend == "cpu" else None,
         peak_bytes=predicted_peak_bytes(size),
         free_bytes=free_bytes,
         blocks=options.blocks,
@@ -191,91 +162,54 @@ def forecast(photographs: int, photo_px: tuple[int, int], options: TrainOptions)
     )
 
 
-def forecast_of(survey: Survey, options: TrainOptions) -> TrainingForecast:
-    """Return the forecast of a training of a survey.
-
-    Raises:
-        BackendUnavailableError: `--backend cuda` without a GPU or without gsplat.
-    """
-    return forecast(len(survey.images), survey.largest_photograph_px, options)
-
-
 def block_processor_s(plan: BlockPlan, photo_px: tuple[int, int], options: TrainOptions) -> dict[int, float]:
-    """Return the processor seconds that the CPU backend needs for each block of a plan, by number, on one core.
-
-    Args:
-        plan: of the blocks.
-        photo_px: width and height of the photographs.
-        options: of the training.
-    """
-    seconds, camera = {}, camera_of(photo_px, options)
+    """Return the processor seconds that the CPU backend needs for each block of a plan, by number, on one core."""
+    seconds, camera = {}, training_pinhole(photo_px, options)
+    factor = SURFACE_FACTOR if options.faithful_surface else 1.0
     for block in plan.blocks:
-        count = block.gaussians + plan.scaffold_gaussians
-        size = _Iteration(camera, block.view_px, block.visible, count, options)
-        iterating = size.of_all(size.block_processor_s)
+
+        def one(pixels: float, windows: int, block: PlannedBlock = block) -> float:
+            count = block.gaussians + plan.scaffold_gaussians
+            return factor * BLOCK_SECONDS.of(pixels / windows, block.visible / windows, count)
+
+        iterating = _of_all_iterations(camera, block.view_px, options, one)
         stereo = MEASURED_CORES * _stereo_s(len(block.cameras), camera)
         seconds[block.id] = iterating + (stereo if options.dense else 0.0)
     return seconds
 
 
-def camera_of(photo_px: tuple[int, int], options: TrainOptions) -> Pinhole:
+def training_pinhole(photo_px: tuple[int, int], options: TrainOptions) -> Pinhole:
     """Return the camera of training photographs, with a lens as wide as many."""
     width, height = photo_px
     whole = Pinhole(width, height, width, width, width / 2, height / 2)
     return whole.limited(options.effort.max_image_size)
 
 
-@dataclass(frozen=True)
-class _Iteration:
-    """Size of an iteration with photographs that are not shrunken.
+def _of_all_iterations(
+    camera: Pinhole, pixels: float, options: TrainOptions, one: Callable[[float, int], float]
+) -> float:
+    """Return the seconds of all iterations on photographs with so many pixels that count.
 
-    Attributes:
-        camera: of the photographs.
-        pixels: of a photograph that count.
-        visible: number of Gaussians in a photograph.
-        gaussians: number of all.
-        options: of the training.
+    `one` returns those of an iteration, by the pixels of a shrunken photograph and its windows.
     """
-
-    camera: Pinhole
-    pixels: float
-    visible: float
-    gaussians: float
-    options: TrainOptions
-
-    def windows(self, shrink: int) -> int:
-        """Return the number of windows of a photograph that is shrunken by a factor."""
-        side = (self.pixels / (self.camera.width * self.camera.height)) ** 0.5 / shrink
-        return Crops(self.options.crop_size).count(
-            max(int(side * self.camera.width), 1), max(int(side * self.camera.height), 1)
-        )
-
-    def seconds(self, shrink: int) -> float:
-        """Return the seconds on the machine of `MEASURED_ON`."""
-        surface, windows = self.options.faithful_surface, self.windows(shrink)
-        return iteration_seconds(self.pixels / shrink**2, self.gaussians, surface=surface, windows=windows)
-
-    def block_processor_s(self, shrink: int) -> float:
-        """Return the processor seconds of an iteration of a block."""
-        windows = self.windows(shrink)
-        plain = BLOCK_SECONDS.of(self.pixels / shrink**2 / windows, self.visible / windows, self.gaussians)
-        return SURFACE_FACTOR * plain if self.options.faithful_surface else plain
-
-    def of_all(self, one: Callable[[int], float]) -> float:
-        """Return the seconds of all iterations; `one`: of one with photographs that are shrunken by a factor."""
-        seconds, begun, options = 0.0, 0.0, self.options
-        coarse, crops = COARSE if options.coarse_to_fine else (), Crops(options.crop_size)
-        for shrink, until in pyramid(self.camera.width, self.camera.height, coarse, crops):
-            seconds += (until - begun) * options.effort.iterations * one(shrink)
-            begun = until
-        return seconds
+    seconds, begun = 0.0, 0.0
+    coarse, crops = COARSE if options.coarse_to_fine else (), Crops(options.crop_size)
+    for shrink, until in pyramid(camera.width, camera.height, coarse, crops):
+        side = (pixels / (camera.width * camera.height)) ** 0.5 / shrink
+        windows = crops.count(max(int(side * camera.width), 1), max(int(side * camera.height), 1))
+        seconds += (until - begun) * options.effort.iterations * one(pixels / shrink**2, windows)
+        begun = until
+    return seconds
 
 
 def _seconds(photographs: int, camera: Pinhole, options: TrainOptions) -> float:
     """Return the seconds of stereo and of all iterations on this machine."""
-    pixels, count = camera.width * camera.height, options.effort.max_gaussians
-    size = _Iteration(camera, pixels, count, count, options)
-    seconds = size.of_all(size.seconds)
+
+    def one(pixels: float, windows: int) -> float:
+        surface, count = options.faithful_surface, options.effort.max_gaussians
+        return iteration_seconds(pixels, count, surface=surface, windows=windows)
+
+    seconds = _of_all_iterations(camera, camera.width * camera.height, options, one)
     if options.dense:
         seconds += _stereo_s(photographs, camera)
     return seconds * MEASURED_CORES / min(thread_count(), _MOST_CORES)

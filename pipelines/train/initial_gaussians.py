@@ -1,22 +1,17 @@
 """Initial Gaussians of a training, and the points that its surface losses hold them to.
 
-Background points for parts of the photographs without known points: sky, horizon, bare ground around the scene.
+Beside the surface, three parts of the photographs need Gaussians to start from:
 
-Floaters would fill these parts if they started empty: Gaussians of the scene that grow in mid-air until they cover
-the gap, in front of everything else. Rays through such parts therefore start with a Gaussian of the pixel's colour:
-on the ground, or far away if the ray does not meet the ground.
-
-Points for parts of the photographs whose depth stereo does not know: crowns in wind, water, smooth ground.
-
-Without Gaussians to start from, density control would have to split the few that reach into such a part, again and
-again. Points on the rays of its pixels, at the height of the SfM points around them, start as dense as the surface.
-
-Ground beneath the scene: what a viewer sees through a gap in the model.
-
-No photograph shows the foot of some wall, or what stands in a narrow yard. With nothing behind it, such a gap is
-a black hole, and whatever Gaussian is near grows over it. A sheet of flat Gaussians in the colours of the ground,
-below all points, ends each ray that looks down. It lies only where a known surface hides it from photographs, or
-none looks: elsewhere photographs decide what is there, and the sheet would count as a surface.
+- Sky, horizon and bare ground around the scene (`background`): Gaussians of the scene would grow in mid-air until
+  they cover them. Each ray starts with a Gaussian of the pixel's colour, on the ground, or far away if the ray does
+  not meet the ground.
+- Crowns in wind, water and smooth ground, whose depth stereo does not know (`guessed_points`): density control
+  would have to split the few Gaussians that reach into them, again and again. Points at the height of the SfM
+  points around them start as dense as the surface.
+- Gaps that no photograph shows, such as narrow yards (`underlay`): with nothing behind it, a gap is a black hole,
+  and whatever Gaussian is near grows over it. A sheet of flat Gaussians in the colours of the ground ends each ray
+  that looks down. It lies only where a known surface hides it from photographs, or none looks: elsewhere
+  photographs decide what is there, and the sheet would count as a surface.
 """
 
 from __future__ import annotations
@@ -38,6 +33,7 @@ from pipelines.geometry.footprints import PointSurface, ground_points, thin_to_v
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.initialise import InitialisationOptions, gaussians_from_points, gaussians_of_size
 from pipelines.splat.surface import ObservedPoints
+from pipelines.surface.depth_maps import DepthMaps
 from pipelines.survey.photographs import ImageCache
 from pipelines.survey.scene import Scene
 from pipelines.train.region import TrainingRegion
@@ -53,13 +49,7 @@ _SKY_RADIUS = 12.0  # in scene radii
 
 @dataclass(frozen=True)
 class Background:
-    """B points on rays that meet no known point.
-
-    Attributes:
-        point_in_model: (B, 3) metres.
-        rgb: (B, 3) uint8.
-        sigma_m: (B,) half the width of the image cell, at the distance of the point.
-    """
+    """B points on rays that meet no known point; σ (B,) is half the width of an image cell at their distance."""
 
     point_in_model: FloatArray
     rgb: ByteArray
@@ -67,14 +57,9 @@ class Background:
 
 
 def background(scene: Scene, images: ImageCache, points: FloatArray) -> Background:
-    """Return points on the rays of all image cells of the training views that show none of the known points.
+    """Return points on the rays of all image cells of the training views that show none of the known points (N, 3).
 
     The z axis of `model` points up, and the ground is a plane below most of the points.
-
-    Args:
-        scene: cameras.
-        images: undistorted photographs, for the colours.
-        points: (N, 3) known points in `model`, metres.
     """
     middle = np.median(points, axis=0)
     radius = float(np.percentile(np.linalg.norm(points - middle, axis=1), 90))
@@ -85,12 +70,19 @@ def background(scene: Scene, images: ImageCache, points: FloatArray) -> Backgrou
         camera, center = images.pinhole(index), scene.poses.cam_center_in_model[index]
         cells = _empty_cells(scene, index, camera, points)
         pixel = (cells + 0.5) * (camera.width / _BACKGROUND_COLUMNS)
-        ray = _rays(pixel, camera) @ scene.poses.cam_from_model[index]
+        ray = camera.rays(pixel)
+        ray = ray / np.linalg.norm(ray, axis=1, keepdims=True) @ scene.poses.cam_from_model[index]
         distance = _distance(ray, center, ground, radius)
         points_beyond.append(center + distance[:, None] * ray)
-        colours.append(_image_colours(images.image(index), pixel))
+        image = images.image(index)
+        row = np.clip(pixel[:, 1].astype(int), 0, image.shape[0] - 1)
+        column = np.clip(pixel[:, 0].astype(int), 0, image.shape[1] - 1)
+        colours.append(np.asarray(image[row, column]))
         sigmas.append(0.5 * distance * camera.width / (_BACKGROUND_COLUMNS * camera.fx))
-    return _thinned(Background(np.concatenate(points_beyond), np.concatenate(colours), np.concatenate(sigmas)))
+    place, rgb, sigma_m = np.concatenate(points_beyond), np.concatenate(colours), np.concatenate(sigmas)
+    # One point in each cube of its own size, because neighbouring views see the same places.
+    first = thin_to_voxels(place, 2 * sigma_m)
+    return Background(place[first], rgb[first], sigma_m[first])
 
 
 def _empty_cells(scene: Scene, index: int, camera: Pinhole, points: FloatArray) -> FloatArray:
@@ -106,11 +98,6 @@ def _empty_cells(scene: Scene, index: int, camera: Pinhole, points: FloatArray) 
             occupied[row + shift_row, column + shift_column] = True
     empty_row, empty_column = np.nonzero(~occupied[1:-1, 1:-1])
     return np.stack([empty_column, empty_row], axis=1).astype(np.float64)
-
-
-def _rays(pixel: FloatArray, camera: Pinhole) -> FloatArray:
-    ray = camera.rays(pixel)
-    return np.asarray(ray / np.linalg.norm(ray, axis=1, keepdims=True))
 
 
 def ground_plane(points: FloatArray) -> FloatArray:
@@ -143,25 +130,13 @@ def _distance(ray: FloatArray, center: FloatArray, ground: FloatArray, radius: f
     return np.where(meets, to_ground, _SKY_RADIUS * radius)
 
 
-def _image_colours(image: ByteArray, pixel: FloatArray) -> ByteArray:
-    row = np.clip(pixel[:, 1].astype(int), 0, image.shape[0] - 1)
-    column = np.clip(pixel[:, 0].astype(int), 0, image.shape[1] - 1)
-    return np.asarray(image[row, column])
-
-
-def _thinned(all_points: Background) -> Background:
-    """Return one point in each cube of its own size, because neighbouring views see the same places."""
-    first = thin_to_voxels(all_points.point_in_model, 2 * all_points.sigma_m)
-    return Background(all_points.point_in_model[first], all_points.rgb[first], all_points.sigma_m[first])
-
-
 _CANDIDATES = 4  # drawn for each wanted point
 _RAY_COLUMNS = 64  # along the longer side of a view: neighbouring rays meet neighbouring ground
 
 
 def guessed_points(
     scene: Scene,
-    surface: SceneSurface,
+    maps: DepthMaps,
     count: int,
     seed: int,
     inside: Callable[[FloatArray], BoolArray],
@@ -171,8 +146,7 @@ def guessed_points(
     Each lies where the ray of its pixel meets the surface through the SfM points, z up. Sky has none.
 
     Args:
-        scene: cameras and SfM points.
-        surface: with the known depths.
+        scene, maps: cameras and SfM points; known depths.
         count: limit of the points, which are spread as evenly as the photographs resolve them.
         seed: of the choice of pixels.
         inside: returns which of points (N, 3) count, as a mask (N,).
@@ -183,15 +157,15 @@ def guessed_points(
     each = -(-_CANDIDATES * count // max(len(scene.train), 1))
     points, colours, sizes = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)], [np.zeros(0)]
     for index in map(int, scene.train):
-        camera = surface.camera(index)
-        unknown = surface.depth(index) == 0
+        camera = maps.camera(index)
+        unknown = maps.depth(index) == 0
         depth = _ground_depth(scene, index, camera, ground, unknown)
         rows, columns = np.nonzero(unknown & np.isfinite(depth))
         chosen = random.permutation(len(rows))[:each]
         rows, columns = rows[chosen], columns[chosen]
         in_cam = depth[rows, columns, None] * camera.rays(np.stack([columns, rows], axis=1) + 0.5)
         points.append(in_cam @ scene.poses.cam_from_model[index] + scene.poses.cam_center_in_model[index])
-        colours.append(surface.rgb(index)[rows, columns])
+        colours.append(maps.rgb(index)[rows, columns])
         sizes.append(depth[rows, columns] / camera.fx)
     place, rgb, size_m = np.concatenate(points), np.concatenate(colours), np.concatenate(sizes)
     counted = np.flatnonzero(inside(place))
@@ -229,11 +203,7 @@ def underlay(points: SurfacePoints, count: int, seed: int) -> tuple[SurfacePoint
     """Return places on a sheet beneath the points, on a square grid with z up, and the side of its cells in metres.
 
     Each place lies half a side below the lowest ground that points show within 20 m, smoothed but never above them.
-
-    Args:
-        points: of the scene, in `model`, in metres; at least one.
-        count: limit of the places; 0: none.
-        seed: of the choice of points for the colours.
+    There are `count` places at most, and at least one point; the seed is that of the points for the colours.
     """
     place = points.point_in_model
     low, high = np.quantile(place[:, :2], [_STRAY, 1 - _STRAY], axis=0)
@@ -244,26 +214,32 @@ def underlay(points: SurfacePoints, count: int, seed: int) -> tuple[SurfacePoint
     cell = np.floor((place[:, :2] - low) / side_m).astype(np.int64)
     inside = np.flatnonzero(((cell >= 0) & (cell < (columns, rows))).all(axis=1))
     lowest = _low_heights(cell[inside, 1] * columns + cell[inside, 0], place[inside, 2], columns * rows)
-    height = _ground(lowest.reshape(rows, columns), side_m) - _DEPTH * side_m
+    lowest = lowest.reshape(rows, columns)
+    # Cells without a point take the height of the nearest that has one.
+    nearest = ndimage.distance_transform_edt(np.isnan(lowest), return_distances=False, return_indices=True)
+    known = lowest[tuple(nearest)]
+    reach = 2 * int(np.ceil(_ROOF_REACH_M / side_m)) + 1
+    smooth = ndimage.uniform_filter(ndimage.minimum_filter(known, size=reach, mode="nearest"), 3, mode="nearest")
+    height = np.minimum(smooth, known) - _DEPTH * side_m
     row, column = np.divmod(np.arange(columns * rows), columns)
     sheet = np.column_stack([low + side_m * (np.stack([column, row], axis=1) + 0.5), height.ravel()])[:count]
     normal = np.broadcast_to([0.0, 0.0, 1.0], sheet.shape)
     return SurfacePoints(sheet, _colours(points, sheet, seed), normal), side_m
 
 
-def hidden(points: FloatArray, scene: Scene, surface: SceneSurface) -> BoolArray:
+def hidden(points: FloatArray, scene: Scene, maps: DepthMaps) -> BoolArray:
     """Return which of points (K, 3) in `model` lie behind known depths in most of the training views facing them.
 
     A point that no view faces is hidden, too.
     """
     facing, behind = np.zeros(len(points), dtype=np.int64), np.zeros(len(points), dtype=np.int64)
     for index in map(int, scene.train):
-        camera = surface.camera(index)
+        camera = maps.camera(index)
         in_cam = (points - scene.poses.cam_center_in_model[index]) @ scene.poses.cam_from_model[index].T
         xy = camera.project(in_cam)
         shown = np.flatnonzero(camera.holds(xy))
         column, row = xy[shown].astype(np.int64).T
-        depth = surface.depth(index)[row, column]
+        depth = maps.depth(index)[row, column]
         facing[shown] += 1
         behind[shown] += (depth > 0) & (depth < in_cam[shown, 2])
     return np.asarray(behind >= _HIDDEN_SHARE * facing)
@@ -278,15 +254,6 @@ def _low_heights(cell: IntArray, height: FloatArray, count: int) -> FloatArray:
     filled = number > 0
     low[filled] = height[order[(first + (_LOW * number).astype(np.int64))[filled]]]
     return low
-
-
-def _ground(lowest: FloatArray, side_m: float) -> FloatArray:
-    """Return the heights (rows, columns) of ground, given the lowest points of cells; NaN: no point lies there."""
-    nearest = ndimage.distance_transform_edt(np.isnan(lowest), return_distances=False, return_indices=True)
-    known = lowest[tuple(nearest)]
-    reach = 2 * int(np.ceil(_ROOF_REACH_M / side_m)) + 1
-    smooth = ndimage.uniform_filter(ndimage.minimum_filter(known, size=reach, mode="nearest"), 3, mode="nearest")
-    return np.asarray(np.minimum(smooth, known))
 
 
 def _colours(points: SurfacePoints, sheet: FloatArray, seed: int) -> ByteArray:
@@ -312,14 +279,7 @@ _OFF_SURFACE = 3.0  # gaps between points of the surface: an SfM point nearer th
 
 @dataclass(frozen=True)
 class TrainingScene:
-    """Inputs of a training.
-
-    Attributes:
-        scene: cameras and SfM points.
-        images: undistorted photographs.
-        surface: surface from depth maps; None: the training goes without.
-        region: part of the scene that is trained; None: all of it.
-    """
+    """Cameras and SfM points of a training, its undistorted photographs, and, if any, known surface and region."""
 
     scene: Scene
     images: ImageCache
@@ -332,7 +292,7 @@ class TrainingScene:
 
 
 def initial_gaussians(training: TrainingScene, options: InitialisationOptions, most: int, seed: int) -> Gaussians:
-    """Return the Gaussians that a training starts from.
+    """Return the Gaussians that a training starts from, `most` of them at most.
 
     1. Discs lie on the surface, as dense as the photographs resolve it.
     2. Balls lie at SfM points where no surface is known. On a surface discs are better: an SfM point has no normal,
@@ -341,12 +301,6 @@ def initial_gaussians(training: TrainingScene, options: InitialisationOptions, m
     4. A sheet lies beneath the surface: what photographs do not show is no hole.
     5. Balls lie in the background, as far as the limit leaves room. In a region, the sky is that of the model which
        stands in for the rest: all blocks of a survey then have the same.
-
-    Args:
-        training: cameras, photographs and surface.
-        options: settings of the Gaussians.
-        most: limit of the Gaussians.
-        seed: seed of the choice of surface points.
 
     Raises:
         DegenerateGeometryError: fewer than two different points.
@@ -358,7 +312,7 @@ def initial_gaussians(training: TrainingScene, options: InitialisationOptions, m
         surface = training.surface.sample(int(share * most), seed, training.in_region)
         start = SurfacePoints.concatenate([start.part(_off_surface(start, surface)), surface])
         unknown = int(max(_SURFACE_SHARE - share, _UNKNOWN_SHARE) * most)
-        guessed = guessed_points(scene, training.surface, unknown, seed, training.in_region)
+        guessed = guessed_points(scene, training.surface.maps, unknown, seed, training.in_region)
         start = SurfacePoints.concatenate([start, guessed])
     behind = background(scene, training.images, start.point_in_model)
     beneath = _sheet(training, start, options, int(_BENEATH_SHARE * most), seed)
@@ -383,7 +337,7 @@ def _sheet(
     kept = np.zeros(len(sheet.rgb), dtype=bool)
     if training.surface is not None:
         place = sheet.point_in_model
-        kept = training.in_region(place) & hidden(place, training.scene, training.surface)
+        kept = training.in_region(place) & hidden(place, training.scene, training.surface.maps)
     sheet = sheet.part(np.flatnonzero(kept))
     sigma_m = np.full(len(sheet.rgb), _BENEATH_SIGMA * side_m)
     discs = gaussians_of_size(sheet.point_in_model, sheet.rgb, sigma_m, replace(options, opacity=_BENEATH_OPACITY))
@@ -405,10 +359,6 @@ def points_to_hold(training: TrainingScene, device: torch.device) -> Callable[[i
     """Return a function of an image's index that gives the points in `model`, float32, that the image shows.
 
     These are SfM points and, in training images, points of the surface.
-
-    Args:
-        training: SfM points and surface.
-        device: holds the points.
     """
     scene = training.scene
     shown = set(map(int, scene.train))

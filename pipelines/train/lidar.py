@@ -2,14 +2,8 @@
 
 1. Cloud of the scene, in `model`.
 2. Registration against the depth maps: a shift beyond 3 σ is refused, or taken out on request. It is never taken
-   out unasked.
-3. Confidence, and places that have changed.
-
-Depth maps of the training photographs as one set, against which a LiDAR cloud is compared.
-
-Planes of a LiDAR as observations of the adjustment.
-
-Space that the beams of a LiDAR have crossed, and in which nothing stands.
+   out unasked. Its planes are then observations of the adjustment.
+3. Confidence, places that have changed, and space that beams have crossed and in which nothing stands.
 """
 
 from __future__ import annotations
@@ -24,7 +18,7 @@ from scipy import ndimage
 from pipelines.adjust.terms import Planes
 from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.progress import Progress
-from pipelines.core.types import BoolArray, FloatArray, Vector3
+from pipelines.core.types import BoolArray, FloatArray
 from pipelines.geodesy.enu import lla_from_enu
 from pipelines.geometry.similarity import Similarity, SimilarityRecord, covariance_at
 from pipelines.report.plots.maps import DrawnArea, write_lidar_map
@@ -45,9 +39,132 @@ from pipelines.train.surface import SceneSurface
 
 log = logging.getLogger(__name__)
 
+_GATE_SIGMAS = 3.0
+_ANOTHER_DATUM_M = 1.0
+_HEIGHT_CELL_M = 4.0
+_STRIDE = 3  # of rows and columns of the depth maps, for the surface that they show
+_MOST_LISTED = 50
+# Of the planes that the adjustment takes.
+_CLUSTER_M = 5.0
+_LEAST_POINTS = 5
+_LEAST_SIGMA_M = 1e-3
+# Of the free space.
+_LEAST_CELL_M, _CELL_SPACINGS = 1.0, 3.0  # least sides of a cell
+_MOST_CELLS = 40_000_000
+_GROWTH = 1.3
+_LEAST_BEAMS = 3
 
-def depth_views(maps: DepthMaps) -> DepthViews:
-    """Return the depth maps of all training views, in `model`."""
+
+@dataclass(frozen=True)
+class ComparedLidar:
+    """Cloud of the scene, in `model`, compared with the photographs and not moved.
+
+    Attributes:
+        maps: depth maps of the training views.
+        views: the same as one set.
+        shown: (S, 3) surface that they show.
+        pixel_m: size of their pixels on the surface.
+        registration: shift of the cloud, and its record.
+    """
+
+    cloud: LidarCloud
+    maps: DepthMaps
+    views: DepthViews
+    shown: FloatArray
+    pixel_m: float
+    registration: Registration
+    record: LidarRegistration
+
+
+@dataclass(frozen=True)
+class LidarSurface:
+    """Surface of stereo and LiDAR, the registered cloud in `model`, and the photographs' verdict on it."""
+
+    surface: FusedSurface
+    report: LidarReport
+    verdict: CloudVerdict
+    cloud: LidarCloud
+
+
+def compared_lidar(
+    options: LidarOptions,
+    files: CloudReader,
+    maps: DepthMaps,
+    survey: Survey,
+    *,
+    track: ScannerTrack | None,
+    georeference: SimilarityRecord,
+    seed: int,
+    progress: Progress,
+) -> ComparedLidar:
+    """Return the cloud of the scene, compared with the photographs.
+
+    Args:
+        options, files, track: of the LiDAR; None: the scanner's track is unknown.
+        maps: of the training views.
+        survey: has the origin of `geo`.
+        georeference: initial similarity to `geo`, with covariance.
+        seed, progress: of random choices; shows the points read.
+
+    Raises:
+        InputError: the cloud lies elsewhere, in height or plan, or is shifted beyond 3 σ.
+    """
+    pixel_m, views, surface = _pixel_size_m(maps), _depth_views(maps), SceneSurface(maps)
+    cloud = read_cloud(files, maps.scene, survey, pixel_m, progress=progress, track=track)
+    shown = np.concatenate([surface.points(index, _STRIDE) for index in map(int, maps.scene.train)])
+    found = registration_of(cloud, shown, views, seed)
+    record = _checked(found, cloud, maps.scene, georeference, options)
+    return ComparedLidar(cloud, maps, views, shown, pixel_m, found, record)
+
+
+def lidar_surface(
+    compared: ComparedLidar, files: CloudReader, survey: Survey, options: LidarOptions, shift_m: FloatArray | None
+) -> LidarSurface:
+    """Return the surface of stereo and LiDAR, without a shift (3,) of the LiDAR, axes of geo; None: none."""
+    cloud = compared.cloud if shift_m is None else compared.cloud.moved(-shift_m)
+    judged = verdict(cloud, compared.views, compared.shown, sigma_m=options.lidar_sigma, pixel_m=compared.pixel_m)
+    tally = files.tally
+    report = LidarReport(
+        crs=files.crs_names,
+        read=tally.read,
+        noise=tally.noise,
+        withheld=tally.withheld,
+        overlap=tally.overlap,
+        outside=tally.outside,
+        points=len(cloud),
+        voxel_m=cloud.voxel_m,
+        registration=compared.record,
+        rejected_share=float(judged.rejected.mean()),
+        confidence=float(np.median(judged.confidence)),
+        areas=_listed_areas(judged, compared.maps.scene, survey),
+        assumptions=files.assumptions,
+    )
+    free = free_space(cloud, judged.rejected, compared.shown)
+    surface = FusedSurface(compared.maps, cloud, judged, compared.pixel_m, pull=options.lidar_pull, free=free)
+    return LidarSurface(surface, report, judged, cloud)
+
+
+def draw_changes(path: Path, lidar: LidarSurface, scene: Scene) -> None:
+    """Write the map of the places that have changed as PNG."""
+    shift = scene.geo_from_model.translation  # a pure shift at the start of the training
+    areas = [
+        DrawnArea(area.kind, area.area_m2, area.cells + shift[:2], area.cell_m) for area in lidar.verdict.areas
+    ]
+    write_lidar_map(path, lidar.cloud.position_in_model + shift, areas)
+
+
+def _pixel_size_m(maps: DepthMaps) -> float:
+    """Return the size of a pixel of the depth maps on the surface, the median over all training views."""
+    sizes = []
+    for index in map(int, maps.scene.train):
+        depth = maps.depth(index)[::8, ::8]
+        if (depth > 0).any():
+            sizes.append(float(np.median(depth[depth > 0])) / maps.camera(index).fx)
+    return float(np.median(sizes)) if sizes else 0.1
+
+
+def _depth_views(maps: DepthMaps) -> DepthViews:
+    """Return the depth maps of all training views as one set, in `model`."""
     train, poses = [int(index) for index in maps.scene.train], maps.scene.poses
     cameras = [maps.camera(index) for index in train]
     depths = [np.asarray(maps.depth(index)).ravel() for index in train]
@@ -61,22 +178,29 @@ def depth_views(maps: DepthMaps) -> DepthViews:
     )
 
 
-def pixel_size_m(maps: DepthMaps) -> float:
-    """Return the size of a pixel of the depth maps on the surface, the median over all training views."""
-    sizes = []
-    for index in map(int, maps.scene.train):
-        depth = maps.depth(index)[::8, ::8]
-        if (depth > 0).any():
-            sizes.append(float(np.median(depth[depth > 0])) / maps.camera(index).fx)
-    return float(np.median(sizes)) if sizes else 0.1
+def registration_of(cloud: LidarCloud, shown: FloatArray, views: DepthViews, seed: int) -> Registration:
+    """Return the shift of a cloud against the depth maps.
+
+    Raises:
+        InputError: the cloud lies above or below the surface of the photographs by more than the search reaches,
+            or the two have no surface in common.
+    """
+    height_m, cells = _height_difference(cloud.position_in_model, shown)
+    if cells and abs(height_m) > _ANOTHER_DATUM_M:
+        raise InputError(
+            f"the LiDAR lies {abs(height_m):.2f} m {'above' if height_m > 0 else 'below'} the surface of the "
+            f"photographs (median of {cells} places): the heights of one of them count from another vertical "
+            "datum, or are in another unit. State the LiDAR's by --lidar-vertical or --lidar-crs, and the survey's "
+            "by `georef ingest --vertical`",
+            field="--lidar",
+        )
+    try:
+        return registration(cloud, views, seed)
+    except DegenerateGeometryError as error:
+        raise InputError(f"{error}: another place, another time, or a wrong CRS", field="--lidar") from error
 
 
-_CLUSTER_M = 5.0
-_LEAST_POINTS = 5
-_LEAST_SIGMA_M = 1e-3
-
-
-def planes_of(found: Registration, geo_from_model: Similarity) -> Planes:
+def plane_observations(found: Registration, geo_from_model: Similarity) -> Planes:
     """Return one plane for each cluster of 5 m and each direction that planes face there.
 
     The errors of neighbouring points are not independent: the median of a cluster is one observation. Its σ is the
@@ -105,12 +229,6 @@ def planes_of(found: Registration, geo_from_model: Similarity) -> Planes:
         normal_in_geo=normal,
         root_information=np.full((len(middle), 1, 1), 1.0 / sigma_m),
     )
-
-
-_LEAST_CELL_M, _CELL_SPACINGS = 1.0, 3.0  # least sides of a cell
-_MOST_CELLS = 40_000_000
-_GROWTH = 1.3
-_LEAST_BEAMS = 3
 
 
 def free_space(cloud: LidarCloud, gone: BoolArray, shown: FloatArray) -> FreeSpace | None:
@@ -142,157 +260,6 @@ def free_space(cloud: LidarCloud, gone: BoolArray, shown: FloatArray) -> FreeSpa
     return FreeSpace(low, cell_m, (count >= _LEAST_BEAMS) & ~taken)
 
 
-_GATE_SIGMAS = 3.0
-_ANOTHER_DATUM_M = 1.0
-_CELL_M = 4.0
-_STRIDE = 3
-_MOST_LISTED = 50
-
-
-@dataclass(frozen=True)
-class ComparedLidar:
-    """Cloud of the scene, compared with the photographs and not moved.
-
-    Attributes:
-        cloud: in `model`.
-        maps: depth maps of the training views.
-        views: the same as one set.
-        shown: (S, 3) surface that they show.
-        pixel_m: size of their pixels on the surface.
-        registration: shift of the cloud.
-        record: of the registration.
-    """
-
-    cloud: LidarCloud
-    maps: DepthMaps
-    views: DepthViews
-    shown: FloatArray
-    pixel_m: float
-    registration: Registration
-    record: LidarRegistration
-
-    def planes(self) -> Planes:
-        """Return the planes that the cloud shares with the photographs."""
-        return planes_of(self.registration, self.maps.scene.geo_from_model)
-
-
-@dataclass(frozen=True)
-class LidarSurface:
-    """Surface with LiDAR, and its record.
-
-    Attributes:
-        surface: of stereo and LiDAR.
-        report: for `train/lidar.json`.
-        verdict: of the photographs on the cloud.
-        cloud: registered, in `model`.
-    """
-
-    surface: FusedSurface
-    report: LidarReport
-    verdict: CloudVerdict
-    cloud: LidarCloud
-
-
-def compared_lidar(
-    options: LidarOptions,
-    files: CloudReader,
-    maps: DepthMaps,
-    survey: Survey,
-    *,
-    track: ScannerTrack | None,
-    georeference: SimilarityRecord,
-    seed: int,
-    progress: Progress,
-) -> ComparedLidar:
-    """Return the cloud of the scene, compared with the photographs.
-
-    Args:
-        options: of the LiDAR.
-        files: the clouds.
-        maps: depth maps of the training views.
-        survey: has the origin of `geo`.
-        track: of the scanner; None: not known.
-        georeference: initial similarity to `geo`, with covariance.
-        seed: of random choices.
-        progress: shows the points read.
-
-    Raises:
-        InputError: the cloud lies elsewhere, in height or plan, or is shifted beyond 3 σ.
-    """
-    pixel_m, views = pixel_size_m(maps), depth_views(maps)
-    cloud = read_cloud(files, maps.scene, survey, pixel_m, progress=progress, track=track)
-    shown = SceneSurface(maps).all_points(_STRIDE)
-    found = registration_of(cloud, shown, views, seed)
-    record = _checked(found, cloud, maps.scene, georeference, options)
-    return ComparedLidar(cloud, maps, views, shown, pixel_m, found, record)
-
-
-def lidar_surface(
-    compared: ComparedLidar, files: CloudReader, survey: Survey, options: LidarOptions, shift_m: FloatArray | None
-) -> LidarSurface:
-    """Return the surface of stereo and LiDAR.
-
-    Args:
-        compared: the cloud.
-        files: of the cloud, with the numbers of points read and dropped.
-        survey: has the origin of `geo`.
-        options: of the LiDAR.
-        shift_m: (3,) shift of the LiDAR to take out, axes of geo; None: none.
-    """
-    cloud = compared.cloud if shift_m is None else compared.cloud.moved(-shift_m)
-    judged = verdict(cloud, compared.views, compared.shown, sigma_m=options.lidar_sigma, pixel_m=compared.pixel_m)
-    tally = files.tally
-    report = LidarReport(
-        crs=files.crs_names,
-        read=tally.read,
-        noise=tally.noise,
-        withheld=tally.withheld,
-        overlap=tally.overlap,
-        outside=tally.outside,
-        points=len(cloud),
-        voxel_m=cloud.voxel_m,
-        registration=compared.record,
-        rejected_share=float(judged.rejected.mean()),
-        confidence=float(np.median(judged.confidence)),
-        areas=_areas(judged, compared.maps.scene, survey),
-        assumptions=files.assumptions,
-    )
-    free = free_space(cloud, judged.rejected, compared.shown)
-    surface = FusedSurface(compared.maps, cloud, judged, compared.pixel_m, pull=options.lidar_pull, free=free)
-    return LidarSurface(surface, report, judged, cloud)
-
-
-def draw_changes(path: Path, lidar: LidarSurface, scene: Scene) -> None:
-    """Write the map of the places that have changed as PNG."""
-    shift = scene.geo_from_model.translation  # a pure shift at the start of the training
-    areas = [
-        DrawnArea(area.kind, area.area_m2, area.cells + shift[:2], area.cell_m) for area in lidar.verdict.areas
-    ]
-    write_lidar_map(path, lidar.cloud.position_in_model + shift, areas)
-
-
-def registration_of(cloud: LidarCloud, shown: FloatArray, views: DepthViews, seed: int) -> Registration:
-    """Return the shift of a cloud against the depth maps.
-
-    Raises:
-        InputError: the cloud lies above or below the surface of the photographs by more than the search reaches,
-            or the two have no surface in common.
-    """
-    height_m, cells = _height_difference(cloud.position_in_model, shown)
-    if cells and abs(height_m) > _ANOTHER_DATUM_M:
-        raise InputError(
-            f"the LiDAR lies {abs(height_m):.2f} m {'above' if height_m > 0 else 'below'} the surface of the "
-            f"photographs (median of {cells} places): the heights of one of them count from another vertical "
-            "datum, or are in another unit. State the LiDAR's by --lidar-vertical or --lidar-crs, and the survey's "
-            "by `georef ingest --vertical`",
-            field="--lidar",
-        )
-    try:
-        return registration(cloud, views, seed)
-    except DegenerateGeometryError as error:
-        raise InputError(f"{error}: another place, another time, or a wrong CRS", field="--lidar") from error
-
-
 def _checked(
     compared: Registration,
     cloud: LidarCloud,
@@ -300,19 +267,15 @@ def _checked(
     georeference: SimilarityRecord,
     options: LidarOptions,
 ) -> LidarRegistration:
-    """Return the record of a registration.
-
-    Raises:
-        InputError: a shift beyond 3 σ, and no request to take it out.
-    """
+    """Return the record of a registration; a shift beyond 3 σ is an error, unless it is to be taken out."""
     middle = scene.geo_from_model.apply(np.median(cloud.position_in_model, axis=0))[None]
     of_georeference = covariance_at(middle, georeference.covariance, georeference.pivot)[0]
     variance = np.diag(compared.covariance_m2 + of_georeference) + options.lidar_sigma**2
     sigma = np.sqrt(variance)
     record = LidarRegistration(
-        shift_m=_vector(compared.shift_m),
-        sigma_m=_vector(sigma),
-        sigma_comparison_m=_vector(np.sqrt(np.diag(compared.covariance_m2))),
+        shift_m=compared.shift_m.tolist(),
+        sigma_m=sigma.tolist(),
+        sigma_comparison_m=np.sqrt(np.diag(compared.covariance_m2)).tolist(),
         points=len(compared.matches),
         spread_m=compared.spread_m,
         wall_bias_m=compared.wall_bias_m,
@@ -335,7 +298,7 @@ def _height_difference(cloud: FloatArray, shown: FloatArray) -> tuple[float, int
     low = np.minimum(cloud.min(axis=0), shown.min(axis=0))[:2]
     medians = []
     for points in (cloud, shown):
-        cell = np.floor((points[:, :2] - low) / _CELL_M).astype(np.int64)
+        cell = np.floor((points[:, :2] - low) / _HEIGHT_CELL_M).astype(np.int64)
         key = cell[:, 0] * 10_000_000 + cell[:, 1]
         order = np.lexsort((points[:, 2], key))
         cells, first, count = np.unique(key[order], return_index=True, return_counts=True)
@@ -346,7 +309,7 @@ def _height_difference(cloud: FloatArray, shown: FloatArray) -> tuple[float, int
     return float(np.median(medians[0][1][mine] - medians[1][1][theirs])), len(common)
 
 
-def _areas(judged: CloudVerdict, scene: Scene, survey: Survey) -> tuple[LidarArea, ...]:
+def _listed_areas(judged: CloudVerdict, scene: Scene, survey: Survey) -> tuple[LidarArea, ...]:
     areas = []
     for area in judged.areas[:_MOST_LISTED]:
         center = scene.geo_from_model.apply(area.center_in_model)
@@ -356,14 +319,9 @@ def _areas(judged: CloudVerdict, scene: Scene, survey: Survey) -> tuple[LidarAre
                 kind=area.kind,
                 area_m2=area.area_m2,
                 points=area.points,
-                center_in_geo=_vector(center),
+                center_in_geo=center.tolist(),
                 lat_deg=float(lat),
                 lon_deg=float(lon),
             )
         )
     return tuple(areas)
-
-
-def _vector(values: FloatArray) -> Vector3:
-    x, y, z = np.asarray(values).tolist()
-    return x, y, z

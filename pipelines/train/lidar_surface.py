@@ -1,4 +1,4 @@
-"""Confidence in the points of a LiDAR cloud, and the places that have changed since it was measured.
+"""LiDAR as training uses it: confidence in its points, places that have changed, and its surface with stereo's.
 
 1. A photograph whose depth map lies behind a point looks through it. Where photographs look through a point
    consistently, what the cloud shows there is gone.
@@ -7,8 +7,7 @@
 3. The neighbours of a point decide with it. A single contradiction is noise, of stereo or cloud.
 4. The confidence of the other points is a product of factors from 0 to 1: stated accuracy against that of stereo,
    flatness and density of the neighbours, incidence of the beam, and agreement with the photographs.
-
-Surface of stereo and LiDAR together: points of stereo moved onto the planes of the LiDAR that is trusted.
+5. Points of stereo are moved onto the planes of the LiDAR that is trusted.
 """
 
 from __future__ import annotations
@@ -21,6 +20,7 @@ import numpy as np
 import torch
 from scipy import ndimage
 from scipy.spatial import cKDTree
+from torch import Tensor
 
 from pipelines.core.types import BoolArray, Float32Array, FloatArray, IntArray
 from pipelines.splat.losses import FreeSpace, FreeSpaceLoss, MeasuredPlanes, PlaneAttraction
@@ -29,8 +29,9 @@ from pipelines.surface.depth_maps import DepthMaps
 from pipelines.surface.lidar_cloud import LidarCloud
 from pipelines.surface.registration import UP
 from pipelines.surface.visibility import DepthViews, Support, support
+from pipelines.train.losses import Loss, RenderedView
 from pipelines.train.options import LidarPull
-from pipelines.train.surface import GaussianLoss, SceneSurface, SurfacePoints, spread_evenly
+from pipelines.train.surface import SceneSurface, SurfacePoints, spread_evenly
 
 _TOLERANCE = 0.005  # of the distance: photographs that differ by less agree
 _LEAST_LOOKS = 2  # through a point, that contradict it
@@ -53,10 +54,10 @@ class ChangedArea:
     Attributes:
         kind: `removed`: the photographs look through the cloud; `added`: they show a surface above it.
         area_m2: in plan.
-        points: of the cloud.
-        center_in_model: (3,) mean of these points.
-        cell_m: side of its cells in plan.
-        cells: (C, 2) south-western corners of its cells in `model`, for maps.
+        points: number of points of the cloud.
+        center_in_model: (3,) their mean.
+        cell_m: side of the area's cells in plan.
+        cells: (C, 2) their south-western corners in `model`, for maps.
     """
 
     kind: Literal["removed", "added"]
@@ -72,22 +73,14 @@ class CloudVerdict:
     """What the photographs say of a cloud.
 
     Attributes:
-        removed, added: (P,) whether a point contradicts the photographs.
+        rejected: (P,) whether a point contradicts the photographs.
         confidence: (P,) in the points, 0 … 1; 0 where they contradict the photographs.
-        agreeing: (P,) number of photographs that show a surface at the point.
         areas: that have changed, the largest first.
     """
 
-    removed: BoolArray
-    added: BoolArray
+    rejected: BoolArray
     confidence: FloatArray
-    agreeing: IntArray
     areas: tuple[ChangedArea, ...]
-
-    @property
-    def rejected(self) -> BoolArray:
-        """Points that contradict the photographs (P,)."""
-        return np.asarray(self.removed | self.added)
 
 
 def verdict(
@@ -98,10 +91,9 @@ def verdict(
     sigma_m: float,
     pixel_m: float,
 ) -> CloudVerdict:
-    """Return confidence and contradictions of a cloud's points.
+    """Return confidence and contradictions of the P points of a registered cloud.
 
     Args:
-        cloud: P points, registered.
         views: depth maps of the training photographs.
         surface_in_model: (S, 3) surface that the photographs show together.
         sigma_m: stated σ of the points.
@@ -115,10 +107,10 @@ def verdict(
     below = _below_surface(cloud, surface_in_model, pixel_m) & (found.views == 0)
     added = _majority(below, np.ones_like(votes), nearest) & ~removed
     confidence = _confidence(cloud, found, sigma_m, pixel_m)
-    confidence[removed | added] = 0.0
+    rejected = removed | added
+    confidence[rejected] = 0.0
     areas = (*_areas(cloud, removed, "removed"), *_areas(cloud, added, "added"))
-    ordered = tuple(sorted(areas, key=lambda area: -area.area_m2))
-    return CloudVerdict(removed, added, confidence, found.views, ordered)
+    return CloudVerdict(rejected, confidence, tuple(sorted(areas, key=lambda area: -area.area_m2)))
 
 
 def _majority(mark: BoolArray, votes: BoolArray, nearest: IntArray) -> BoolArray:
@@ -204,13 +196,7 @@ _SAME = 0.01  # of the depth
 
 
 class LidarPlanes:
-    """Planes of the LiDAR that is trusted.
-
-    Args:
-        cloud: registered LiDAR.
-        confidence: (P,) in its points.
-        pixel_m: size of a pixel of the depth maps on the surface.
-    """
+    """Planes of the registered LiDAR that is trusted, of P points with a confidence (P,)."""
 
     def __init__(self, cloud: LidarCloud, confidence: FloatArray, pixel_m: float) -> None:
         trusted = np.flatnonzero(confidence >= _LEAST_CONFIDENCE)
@@ -237,15 +223,14 @@ class LidarPlanes:
 
 
 class FusedSurface(SceneSurface):
-    """Surface of stereo, corrected by LiDAR, and continued by LiDAR where stereo found none.
+    """Surface of stereo, corrected by registered LiDAR, and continued by it where stereo found none.
 
     Args:
         maps: depth maps, already built.
-        cloud: registered LiDAR.
-        judged: verdict of the photographs on it.
+        judged: verdict of the photographs on the LiDAR.
         pixel_m: size of a pixel of the depth maps on the surface.
         pull: what is held to the LiDAR.
-        free: where its beams met nothing; None: not known.
+        free: where its beams met nothing; None: unknown.
     """
 
     def __init__(
@@ -292,59 +277,48 @@ class FusedSurface(SceneSurface):
         normals = np.where((confidence > 0)[:, None], normal, drawn.normal_in_model)
         return SurfacePoints.concatenate([SurfacePoints(points, drawn.rgb, normals), alone])
 
-    def gaussian_loss(self, device: torch.device) -> GaussianLoss | None:
+    def losses(self, device: torch.device) -> list[Loss]:
         """Return the loss of Gaussians in free space, and beside the LiDAR's planes if those are to hold them."""
-        planes = self.planes
-        losses: list[tuple[float, GaussianLoss]] = []
+        losses = []
         if self._free is not None:
-            losses.append((_FREE_SPACE, FreeSpaceLoss(self._free, device)))
-        if self._pull != "depth" and len(planes.confidence):
-            cloud, scale_m = planes.cloud, _SCALE_PX * self._pixel_m
-            measured = MeasuredPlanes(
-                cloud.position_in_model, cloud.normal_in_model, planes.confidence, scale_m, _REACH * cloud.voxel_m
-            )
-            losses.append((_ATTRACTION, PlaneAttraction(measured, device)))
-        if not losses:
-            return None
-        return lambda gaussians, visible: torch.stack([w * loss(gaussians, visible) for w, loss in losses]).sum()
+            losses.append(_loss("free space", _FREE_SPACE, FreeSpaceLoss(self._free, device)))
+        if self._pull != "depth" and len(self.planes.confidence):
+            cloud, scale_m = self.planes.cloud, _SCALE_PX * self._pixel_m
+            place, normal, reach_m = cloud.position_in_model, cloud.normal_in_model, _REACH * cloud.voxel_m
+            measured = MeasuredPlanes(place, normal, self.planes.confidence, scale_m, reach_m)
+            losses.append(_loss("plane attraction", _ATTRACTION, PlaneAttraction(measured, device)))
+        return losses
 
     def _alone_in_view(self, index: int) -> SeenSurfels:
         """Return the trusted LiDAR points that a view sees at pixels without a depth of stereo."""
-        poses, depth = self._poses, np.asarray(self._maps.depth(index))
+        poses, depth = self._poses, np.asarray(self.maps.depth(index))
         rotation, center = poses.cam_from_model[index], poses.cam_center_in_model[index]
-        seen = seen_surfels(self._surfels, rotation, center, self._maps.camera(index))
+        seen = seen_surfels(self._surfels, rotation, center, self.maps.camera(index))
         nearest = ndimage.minimum_filter(np.where(depth > 0, depth, np.inf), size=2 * _RIM_PX + 1)
         unknown = depth[seen.row, seen.column] == 0
         before = seen.depth_m < (1 + _SAME) * nearest[seen.row, seen.column]
-        trusted = self._confidence[seen.rows] >= _LEAST_CONFIDENCE
-        return seen.part(unknown & before & trusted & self._faces(seen.rows, center))
-
-    def _faces(self, rows: IntArray, center: FloatArray) -> BoolArray:
-        """Return whether a camera looks on the side of planes (K,) that the scanner saw; True where unknown."""
-        cloud = self._cloud
-        if cloud.scanner_in_model is None:
-            return np.ones(len(rows), dtype=bool)
-        place, normal = cloud.position_in_model[rows], cloud.normal_in_model[rows]
-        sides = [np.einsum("pi,pi->p", eye - place, normal) for eye in (cloud.scanner_in_model[rows], center)]
-        return np.asarray(~(sides[0] * sides[1] < 0))
+        counts, cloud = unknown & before & (self._confidence[seen.rows] >= _LEAST_CONFIDENCE), self._cloud
+        if cloud.scanner_in_model is not None:
+            place, normal = cloud.position_in_model[seen.rows], cloud.normal_in_model[seen.rows]
+            eyes = cloud.scanner_in_model[seen.rows], center
+            sides = [np.einsum("pi,pi->p", eye - place, normal) for eye in eyes]
+            counts &= ~(sides[0] * sides[1] < 0)  # on the side that the scanner saw, where that is known
+        return seen.part(counts)
 
     def _start_alone(
         self, stereo: FloatArray, most: int, inside: Callable[[FloatArray], BoolArray] | None
     ) -> SurfacePoints:
-        """Return LiDAR points that no point of stereo is near, with the colours of the nearest photograph.
+        """Return LiDAR points, `most` at most, that no point of stereo (S, 3) is near, as `sample` does.
 
-        Args:
-            stereo: (S, 3) points of stereo.
-            most: limit of the points.
-            inside: as of `sample`.
+        They have the colours of the nearest photograph.
         """
         colours = np.zeros((len(self._cloud), 3), dtype=np.uint8)
         size_m = np.full(len(self._cloud), np.inf)  # of a pixel of the nearest view
         for index in map(int, self._train):
-            seen, focal_px = self._alone_in_view(index), self._maps.camera(index).fx
+            seen, focal_px = self._alone_in_view(index), self.maps.camera(index).fx
             seen = seen.part(seen.depth_m < focal_px * size_m[seen.rows])
             size_m[seen.rows] = seen.depth_m / focal_px
-            colours[seen.rows] = self._maps.rgb(index)[seen.row, seen.column]
+            colours[seen.rows] = self.maps.rgb(index)[seen.row, seen.column]
         rows = np.flatnonzero(np.isfinite(size_m))
         if len(stereo) and len(rows):
             gap, _ = cKDTree(stereo).query(self._cloud.position_in_model[rows])
@@ -353,3 +327,10 @@ class FusedSurface(SceneSurface):
             rows = rows[inside(self._cloud.position_in_model[rows])]
         rows = rows[spread_evenly(self._cloud.position_in_model[rows], size_m[rows], most)]
         return SurfacePoints(self._cloud.position_in_model[rows], colours[rows], self._cloud.normal_in_model[rows])
+
+
+def _loss(name: str, weight: float, of: FreeSpaceLoss | PlaneAttraction) -> Loss:
+    def value(view: RenderedView) -> Tensor:
+        return of(view.gaussians, view.stats.visible)
+
+    return Loss(name, value, lambda _iteration: weight)

@@ -1,9 +1,4 @@
-"""Training loop: iterations, metrics, checkpoints, interruption, and one recovery from a divergence.
-
-Progress of a training: the first iteration, in which kernels compile, and then all iterations.
-
-Files of a training in the folder of its stage, and the training that writes them.
-"""
+"""Training loop: iterations, metrics, checkpoints, progress, interruption, and one recovery from a divergence."""
 
 from __future__ import annotations
 
@@ -12,16 +7,15 @@ import logging
 import math
 import shutil
 import time
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 
 import torch
 
 from pipelines.core.errors import ConvergenceError, DamagedPartialError, InputError
-from pipelines.core.progress import Progress, ProgressTask, deferred_interrupts
+from pipelines.core.progress import Progress, deferred_interrupts
 from pipelines.core.workspace import StageRun
 from pipelines.jobs.costs import TimeLeft
 from pipelines.splat.gaussians import NonFiniteError
@@ -30,59 +24,7 @@ from pipelines.train.trainer import JointTrainer, StepReport, load_checkpoint, s
 
 log = logging.getLogger(__name__)
 
-_COMPILING = "compiling kernels (a minute, once)"
-
-
-class TrainingProgress:
-    """Tasks of a training, closed at the end of the context.
-
-    The first iteration of a run has a task of its own: its duration is no measure of the others.
-
-    Args:
-        progress: shows the tasks.
-        begun: iterations of earlier runs.
-        iterations: length of the training.
-        time_left: of the training.
-    """
-
-    def __init__(self, progress: Progress, begun: int, iterations: int, time_left: TimeLeft) -> None:
-        self._progress, self._iterations, self._time_left = progress, iterations, time_left
-        self._shown = begun
-        self._first, self._all = ExitStack(), ExitStack()
-        self._warming_up: ProgressTask | None = None
-        self._training: ProgressTask | None = None
-
-    def __enter__(self) -> TrainingProgress:
-        if self._shown < self._iterations:
-            self._warming_up = self._first.enter_context(self._progress.task("first iteration", 1))
-            self._warming_up.advance(0, _COMPILING)
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self._all.close()
-        self._first.close()
-
-    def iterated(self, iteration: int, note: str | None) -> None:
-        """Note the end of an iteration.
-
-        Args:
-            iteration: that has ended, from 1.
-            note: on the training; None: the display stays as it is.
-        """
-        if self._warming_up is not None:
-            self._warming_up.advance(1, " ")
-            self._warming_up = None
-            self._first.close()
-            self._training = self._all.enter_context(self._progress.task("training", self._iterations))
-            self._training.advance(self._shown)
-            self._time_left.start(iteration)
-        if note is not None and self._training is not None:
-            self._training.advance(max(iteration - self._shown, 0), note, self._time_left.after(iteration))
-            self._shown = max(iteration, self._shown)
-
-
+CHECKPOINT, METRICS = "checkpoint.npz", "metrics.jsonl"
 _RECOVERY_RATE = 0.3  # factor on the learning rates after a divergence
 
 
@@ -91,8 +33,7 @@ class LoopOptions:
     """Files of a training, and intervals of writing them.
 
     Attributes:
-        checkpoint: file of the latest checkpoint.
-        metrics: file of the metrics, one JSON object a line.
+        metrics: one JSON object a line.
         checkpoint_every: iterations between checkpoints.
         log_every: iterations between lines of metrics.
         resume: continue from the checkpoint, if the file exists.
@@ -127,11 +68,6 @@ class TrainingRecord:
 def optimise(trainer: JointTrainer, options: LoopOptions, progress: Progress) -> TrainingRecord:
     """Run all remaining iterations and return the record of the training.
 
-    Args:
-        trainer: state of the optimisation.
-        options: files and intervals.
-        progress: shows iteration, PSNR and number of Gaussians.
-
     Raises:
         KeyboardInterrupt: the user asked to stop; a checkpoint was written.
         ConvergenceError: a loss or gradient was not finite, and again after the return to the last checkpoint and
@@ -139,15 +75,16 @@ def optimise(trainer: JointTrainer, options: LoopOptions, progress: Progress) ->
         InputError: the checkpoint cannot be read.
     """
     loop, iterations = _Loop(trainer, options), trainer.options.iterations
-    display = TrainingProgress(progress, trainer.iteration, iterations, TimeLeft(trainer.work, iterations))
+    display = _displayed(progress, trainer.iteration, iterations, TimeLeft(trainer.work, iterations))
     worked, since = math.nan, iterations  # the first iteration compiles kernels
-    with deferred_interrupts() as stop, display:
+    with deferred_interrupts() as stop, display as iterated:
         while trainer.iteration < iterations:
             try:
                 row = loop.iterate()
                 if math.isnan(worked):
                     worked, since = time.process_time(), trainer.iteration
-                display.iterated(trainer.iteration, None if row is None else _note(row))
+                note = None if row is None else f"{row['psnr']:.1f} dB, {row['gaussians'] / 1000:.0f} k Gaussians"
+                iterated(trainer.iteration, note)
                 if stop.requested:
                     loop.save()
                     log.warning(
@@ -162,15 +99,54 @@ def optimise(trainer: JointTrainer, options: LoopOptions, progress: Progress) ->
     return TrainingRecord(loop.seconds(), loop.recovery, each)
 
 
+@contextmanager
+def _displayed(
+    progress: Progress, begun: int, iterations: int, time_left: TimeLeft
+) -> Iterator[Callable[[int, str | None], None]]:
+    """Show a training of which some iterations were of earlier runs; gives what to call after each iteration.
+
+    The first iteration of a run, in which kernels compile, has a task of its own: its duration is no measure of the
+    others.
+    """
+    first, rest = ExitStack(), ExitStack()
+    shown, training = begun, None
+
+    def iterated(iteration: int, note: str | None) -> None:
+        """Without a note on the training, the display stays as it is."""
+        nonlocal shown, training
+        if training is None:
+            warming_up.advance(1, " ")
+            first.close()
+            training = rest.enter_context(progress.task("training", iterations))
+            training.advance(begun)
+            time_left.start(iteration)
+        if note is not None:
+            training.advance(max(iteration - shown, 0), note, time_left.after(iteration))
+            shown = max(iteration, shown)
+
+    try:
+        if begun < iterations:
+            warming_up = first.enter_context(progress.task("first iteration", 1))
+            warming_up.advance(0, "compiling kernels (a minute, once)")
+        yield iterated
+    finally:
+        rest.close()
+        first.close()
+
+
 class _Loop:
-    """Iterations of a trainer, with their files; begins anew or from the checkpoint."""
+    """Iterations of a trainer, with their files; begins anew, or from a checkpoint of this training."""
 
     def __init__(self, trainer: JointTrainer, options: LoopOptions) -> None:
         self.trainer, self.options = trainer, options
         self.recovery: str | None = None
         self._spent, self._clock = 0.0, time.monotonic()
         if options.resume and options.checkpoint.exists():
-            self._spent = self._resumed()
+            try:
+                self._spent = self._go_back()
+            except (InputError, KeyError, ValueError, RuntimeError, TypeError) as error:
+                text = f"the checkpoint is damaged: {error}"
+                raise DamagedPartialError(text, path=options.checkpoint) from error
             if options.extend:
                 trainer.schedule.extended_from = trainer.iteration
             log.info("%s at iteration %d", "extended" if options.extend else "resumed", trainer.iteration)
@@ -178,33 +154,17 @@ class _Loop:
             options.metrics.write_text("", encoding="utf-8")
             self.save()
 
-    def _resumed(self) -> float:
-        """Take over the checkpoint of an interrupted run; returns its seconds.
-
-        Raises:
-            DamagedPartialError: the checkpoint is damaged, or is not of this training.
-        """
-        try:
-            return self._go_back()
-        except (InputError, KeyError, ValueError, RuntimeError, TypeError) as error:
-            path = self.options.checkpoint
-            raise DamagedPartialError(f"the checkpoint is damaged: {error}", path=path) from error
-
     def seconds(self) -> float:
         """Return the duration so far, with the runs before a resume."""
         return self._spent + time.monotonic() - self._clock
 
     def iterate(self) -> dict[str, float] | None:
-        """Run one iteration, check and save where due, and return the row of metrics if one was due.
-
-        Raises:
-            NonFiniteError: a loss or gradient was not finite.
-        """
+        """Run one iteration, check and save where due, and return the row of metrics if one was due."""
         trainer, options = self.trainer, self.options
         report = trainer.step()
         due = trainer.iteration % options.log_every == 0 or trainer.iteration == trainer.options.iterations
         if due or trainer.device.type == "cpu":  # a GPU would have to wait for a check at every iteration
-            trainer.check_finite()
+            trainer.watch.check()
         row = _metrics_row(trainer, report, self.seconds()) if due else None
         if row is not None:
             with options.metrics.open("a", encoding="utf-8") as lines:
@@ -214,12 +174,8 @@ class _Loop:
         return row
 
     def save(self) -> None:
-        """Write a checkpoint, if no loss or gradient has diverged.
-
-        Raises:
-            NonFiniteError: a loss or gradient was not finite.
-        """
-        self.trainer.check_finite()
+        """Write a checkpoint, if all losses and gradients were finite; else raise `NonFiniteError`."""
+        self.trainer.watch.check()
         loop_state = {
             "seconds": torch.tensor(self.seconds(), dtype=torch.float64),
             "recovery": torch.tensor(list((self.recovery or "").encode()), dtype=torch.uint8),
@@ -231,11 +187,7 @@ class _Loop:
             self.options.note(f"{self.trainer.iteration} of {total} iterations, {minutes}")
 
     def recover(self, error: NonFiniteError) -> None:
-        """Return to the last checkpoint and lower the learning rates, once in a training.
-
-        Raises:
-            ConvergenceError: the training has recovered before.
-        """
+        """Return to the last checkpoint and lower the learning rates; a second time is a `ConvergenceError`."""
         advice = "train again with a smaller --geo-weight, another --seed or fewer --max-gaussians"
         if self.recovery is not None:
             raise ConvergenceError(f"{error}, and before that {self.recovery}: {advice}") from error
@@ -259,10 +211,6 @@ class _Loop:
         return float(state["seconds"])
 
 
-def _note(row: dict[str, float]) -> str:
-    return f"{row['psnr']:.1f} dB, {row['gaussians'] / 1000:.0f} k Gaussians"
-
-
 def _metrics_row(trainer: JointTrainer, report: StepReport, seconds: float) -> dict[str, float]:
     problem = trainer.problem
     with torch.no_grad():
@@ -270,7 +218,7 @@ def _metrics_row(trainer: JointTrainer, report: StepReport, seconds: float) -> d
     row = {
         "iteration": trainer.iteration,
         "seconds": round(seconds, 2),
-        "photometric": float(report.photometric),
+        "photometric": float(report.losses["photometric"]),
         "psnr": -10.0 * math.log10(max(float(report.mean_square_error), 1e-10)),
         "gaussians": len(trainer.optimizer.gaussians),
         "visible": report.visible,
@@ -278,32 +226,26 @@ def _metrics_row(trainer: JointTrainer, report: StepReport, seconds: float) -> d
         "geo_weight": report.weight,
     }
     row |= {name: float(value) for name, value in losses.items()}
-    if report.by_depth is not None:
-        row["control_by_depth"] = float(report.by_depth)
+    if "control_by_depth" in report.losses:
+        row["control_by_depth"] = float(report.losses["control_by_depth"])
     return row | {f"variance_{name}": factors[name] for name in factors}
-
-
-CHECKPOINT, METRICS = "checkpoint.npz", "metrics.jsonl"
 
 
 def train_in_folder(stage: StageRun, trainer: JointTrainer, options: TrainOptions, done: int = 0) -> TrainingRecord:
     """Run all remaining iterations of a training, and return its record.
 
-    An interrupted run is resumed. A finished training of fewer iterations is extended from its last state.
-
-    Args:
-        stage: has the folder.
-        trainer: before its first iteration.
-        options: of the training.
-        done: iterations of the finished training that the stage extends.
+    An interrupted run is resumed. A finished training of fewer iterations, `done`, is extended from its last state.
 
     Raises:
-        KeyboardInterrupt: the user asked to stop; a checkpoint was written.
-        ConvergenceError: the training diverged twice.
-        InputError: the checkpoint cannot be read.
-        StorageError: a file cannot be written or copied.
+        StorageError: a file cannot be written or copied; and the errors of `optimise`.
     """
-    extend = not stage.resumed and _take_over(stage, options.effort.iterations, done)
+    iterations, kept = options.effort.iterations, (CHECKPOINT, METRICS)
+    earlier = None if stage.resumed else stage.extends
+    extend = earlier is not None and done < iterations and all((earlier / name).is_file() for name in kept)
+    if earlier is not None and extend:
+        log.info("the training of %d iterations is extended to %d; --force trains afresh", done, iterations)
+        for name in kept:
+            shutil.copyfile(earlier / name, stage.out / name)
     files = LoopOptions(
         stage.out / CHECKPOINT,
         stage.out / METRICS,
@@ -314,15 +256,3 @@ def train_in_folder(stage: StageRun, trainer: JointTrainer, options: TrainOption
         note=stage.record_progress,
     )
     return optimise(trainer, files, stage.progress)
-
-
-def _take_over(stage: StageRun, iterations: int, done: int) -> bool:
-    """Copy the last state of a finished training of fewer iterations, and return whether there is one."""
-    if stage.extends is None or not all((stage.extends / name).is_file() for name in (CHECKPOINT, METRICS)):
-        return False
-    if done >= iterations:
-        return False
-    log.info("the training of %d iterations is extended to %d; --force trains afresh", done, iterations)
-    for name in (CHECKPOINT, METRICS):
-        shutil.copyfile(stage.extends / name, stage.out / name)
-    return True

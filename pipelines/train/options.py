@@ -1,9 +1,4 @@
-"""Options of `georef train`: of the splat, of the geographic losses, and of the run.
-
-Presets of effort: iterations, size of the photographs and number of Gaussians.
-
-Options of the LiDAR that training takes its surface from.
-"""
+"""Options of `georef train`: of Gaussians, geographic losses, LiDAR, blocks and the run, with presets of effort."""
 
 from __future__ import annotations
 
@@ -20,20 +15,13 @@ from pipelines.survey.options import CloudCrs, CloudPath
 
 @dataclass(frozen=True)
 class Preset:
-    """Effort of a training.
-
-    Attributes:
-        iterations: length of the training.
-        max_image_size: longest side of a photograph in pixels.
-        max_gaussians: limit of the Gaussians.
-    """
+    """Effort of a training; photographs have `max_image_size` pixels on their longest side."""
 
     iterations: int
     max_image_size: int
     max_gaussians: int
 
     def __str__(self) -> str:
-        """Return the effort as `800 iterations, 480 px, 80000 Gaussians`."""
         return f"{self.iterations} iterations, {self.max_image_size} px, {self.max_gaussians} Gaussians"
 
 
@@ -48,12 +36,7 @@ PRESETS = {
 RUN_MINUTES = {"smoke": 1, "fast": 2, "standard": 4, "high": 10}
 
 
-def described() -> str:
-    """Return all presets, each with its effort and the time of a run."""
-    efforts = (f"{name}: {preset}, about {RUN_MINUTES[name]} min" for name, preset in PRESETS.items())
-    return f"{'; '.join(efforts)} (for 48 photographs on 2 cores)."
-
-
+_EFFORTS = "; ".join(f"{name}: {preset}, about {RUN_MINUTES[name]} min" for name, preset in PRESETS.items())
 LidarPull = Literal["depth", "gaussians", "both"]
 
 
@@ -143,11 +126,7 @@ class GeographicOptions(StageOptions):
         return cameras if self.optimize_cameras and self.geo_loss and not self.solves_once(cameras) else 0
 
     def require_trainable(self, cameras: int) -> None:
-        """Refuse options that change the cameras' solution during a training, if the training holds it.
-
-        Raises:
-            InputError: names the option.
-        """
+        """Refuse options that change the cameras' solution during a training that holds it, by an `InputError`."""
         if not self.solves_once(cameras):
             return
         for value, plain, name in (
@@ -163,10 +142,12 @@ class GeographicOptions(StageOptions):
                 )
 
 
-class SplatOptions(StageOptions):
-    """Options of the splat: effort, backend, density control, exposure and surface."""
+class GaussianOptions(StageOptions):
+    """Options of the Gaussians: effort, backend, density control, exposure and surface."""
 
-    preset: Literal["smoke", "fast", "standard", "high"] = Field("standard", description=f"Effort. {described()}")
+    preset: Literal["smoke", "fast", "standard", "high"] = Field(
+        "standard", description=f"Effort. {_EFFORTS} (for 48 photographs on 2 cores)."
+    )
     iterations: int | None = Field(None, ge=1, description="Iterations (default: the preset's).")
     max_image_size: int | None = Field(
         None, ge=32, description="Longest image side for training in pixels (default: the preset's)."
@@ -218,7 +199,15 @@ class BlockOptions(StageOptions):
     )
 
 
-class TrainOptions(GeographicOptions, SplatOptions, BlockOptions, LidarOptions):
+class PlanOptions(BlockOptions):
+    """Options of the plan of the blocks, with the effort that a preset stands for."""
+
+    max_gaussians: int = Field(ge=1)
+    max_image_size: int = Field(ge=1)
+    sh_degree: int = Field(ge=0, le=3)
+
+
+class TrainOptions(GeographicOptions, GaussianOptions, BlockOptions, LidarOptions):
     """Options of the joint optimisation of Gaussians, similarity and camera corrections."""
 
     checkpoint_every: int = Field(500, ge=1, description="Iterations between checkpoints.")
@@ -235,32 +224,19 @@ class TrainOptions(GeographicOptions, SplatOptions, BlockOptions, LidarOptions):
 
 
 class SolutionOptions(StageOptions):
-    """Options of the solution that all blocks share.
-
-    Attributes:
-        max_image_size: longest side in pixels of the photographs whose colours give the exposures.
-        exposure: whether to estimate exposures.
-    """
+    """Options of the solution that all blocks share; photographs of `max_image_size` pixels give the exposures."""
 
     max_image_size: int = Field(ge=1)
     exposure: bool = True
 
 
 class SeamOptions(TrainOptions):
-    """Options of the training across the seams.
-
-    Attributes:
-        trained: SHA-256 of the Gaussians of each block, in the order of their numbers.
-    """
+    """Options of the training across the seams of blocks whose Gaussians have these SHA-256, by their numbers."""
 
     trained: tuple[str, ...] = ()
 
 
 class BlockTrainOptions(TrainOptions):
-    """Options of the training of one block.
-
-    Attributes:
-        id: number of the block in the plan.
-    """
+    """Options of the training of the block with a number in the plan."""
 
     id: int = Field(ge=0)

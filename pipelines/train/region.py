@@ -15,12 +15,13 @@ import torch
 
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
-from pipelines.geometry.cameras import CameraPoses, Pinhole
+from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Window
+from pipelines.surface.depth_maps import DepthMaps
 from pipelines.survey.block_plan import BlockCell
-from pipelines.survey.photographs import Pinholes
-from pipelines.train.surface import SceneSurface
+from pipelines.survey.photographs import ImageCache, Pinholes
+from pipelines.train.adjusted_scene import AdjustedScene
 
 _STAND_IN_PX = 160  # longest side of the stand-in's renders
 _LEAST_ALPHA = 0.5  # of a surface: rays that meet less end in the sky
@@ -33,45 +34,29 @@ _ROOM = 0.2  # of the longest side of their box
 
 @dataclass(frozen=True)
 class RegionView:
-    """Part of an image that shows the region.
-
-    Attributes:
-        window: smallest part of the image that holds all of it.
-        mask: pixels of the window that show the region.
-    """
+    """Smallest part of an image that holds all that shows the region, and its pixels that do."""
 
     window: Window
     mask: BoolArray
 
 
 class RegionMasks:
-    """Pixels of each view that show a region; a byte for eight of them.
-
-    Args:
-        masks: (H, W) of each view by index.
-    """
+    """Pixels (H, W) of each view, by index, that show a region; a byte for eight of them."""
 
     def __init__(self, masks: dict[int, BoolArray]) -> None:
         self._shape = {index: mask.shape for index, mask in masks.items()}
         self._packed: dict[int, ByteArray] = {index: np.packbits(mask) for index, mask in masks.items()}
         self.view = lru_cache(_KEPT)(self._view)
 
-    def share(self, index: int) -> float:
-        """Return the share of a view's pixels that show the region, 0 … 1."""
-        return float(self._whole(index).mean())
-
     def seeing(self) -> IntArray:
         """Return the indices of the views that show the region, ascending."""
         return np.array(sorted(index for index, packed in self._packed.items() if packed.any()), dtype=np.int64)
 
-    def _whole(self, index: int) -> BoolArray:
-        height, width = self._shape[index]
-        return np.unpackbits(self._packed[index], count=height * width).reshape(height, width).astype(bool)
-
     def _view(self, index: int, shrink: int = 1) -> RegionView:
         """Return the part of a view, at 1/`shrink` of its size, that shows the region; at least one pixel."""
-        whole = self._whole(index)
-        height, width = (side // shrink for side in whole.shape)
+        height, width = self._shape[index]
+        whole = np.unpackbits(self._packed[index], count=height * width).reshape(height, width).astype(bool)
+        height, width = height // shrink, width // shrink
         cells = whole[: height * shrink, : width * shrink].reshape(height, shrink, width, shrink)
         mask = whole if shrink == 1 else cells.mean(axis=(1, 3)) >= 0.5
         if not mask.any():
@@ -103,48 +88,6 @@ class SceneBox:
 
 
 @dataclass(frozen=True)
-class RegionViews:
-    """Views in which a region is looked for.
-
-    Attributes:
-        indices: (T,) of the cameras.
-        poses: of all cameras.
-        pinholes: of their images.
-        rasterizer: renders the stand-in.
-    """
-
-    indices: IntArray
-    poses: CameraPoses
-    pinholes: Pinholes
-    rasterizer: Rasterizer
-
-    def masks(
-        self,
-        cell: BlockCell,
-        stand_in: Gaussians,
-        surface: SceneSurface | None = None,
-        progress: Progress = SILENT,
-    ) -> RegionMasks:
-        """Return the pixels of each view whose surface lies in a region.
-
-        Args:
-            cell: the region.
-            stand_in: whose depth counts where the surface is not known.
-            surface: known depths; None: there are none.
-            progress: counts the views.
-        """
-        masks: dict[int, BoolArray] = {}
-        with progress.task("masks", len(self.indices)) as task:
-            for index in self.indices.tolist():
-                pose, pinhole = self.poses.matrix(index), self.pinholes.of(index)
-                depth = stand_in_depth(stand_in, pose, pinhole, self.rasterizer)
-                known = None if surface is None else surface.depth(index)
-                masks[index] = region_mask(pose, pinhole, cell, known, depth)
-                task.advance()
-        return RegionMasks(masks)
-
-
-@dataclass(frozen=True)
 class TrainingRegion:
     """Region of a training.
 
@@ -153,7 +96,6 @@ class TrainingRegion:
         box: of the survey; far beyond it lie sky and horizon.
         surroundings: frozen Gaussians outside the cell, on the device of the training.
         sky: Gaussians of the cell beyond the box, to start from.
-        masks: of the training views.
     """
 
     cell: BlockCell
@@ -161,6 +103,38 @@ class TrainingRegion:
     surroundings: Gaussians
     sky: Gaussians
     masks: RegionMasks
+
+
+def region_masks(
+    solved: AdjustedScene,
+    views: IntArray,
+    images: ImageCache,
+    rasterizer: Rasterizer,
+    cell: BlockCell,
+    *,
+    stand_in: Gaussians,
+    maps: DepthMaps | None = None,
+    progress: Progress = SILENT,
+) -> RegionMasks:
+    """Return the pixels of each view whose surface lies in a region.
+
+    Args:
+        solved, images: of all cameras.
+        views: (T,) indices of the cameras.
+        cell: the region.
+        stand_in: whose depth counts where the surface is not known.
+        maps: known depths; None: there are none.
+    """
+    pinholes = Pinholes(images, solved.scene.sparse.lenses)
+    pinholes.renew(solved.adjustment.with_lenses(solved.scene.sparse).lenses)
+    masks: dict[int, BoolArray] = {}
+    with progress.task("masks", len(views)) as task:
+        for index in views.tolist():
+            pose, pinhole = solved.adjustment.poses.matrix(index), pinholes.of(index)
+            depth = stand_in_depth(stand_in, pose, pinhole, rasterizer)
+            masks[index] = region_mask(pose, pinhole, cell, None if maps is None else maps.depth(index), depth)
+            task.advance()
+    return RegionMasks(masks)
 
 
 def region_mask(

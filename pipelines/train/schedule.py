@@ -10,6 +10,7 @@ import numpy as np
 
 from pipelines.core.types import IntArray
 from pipelines.splat.surface import SurfaceSettings
+from pipelines.train.options import TrainOptions
 from pipelines.train.target_images import Crops
 
 _FINAL_RATE = 0.05  # of the geographic unknowns, relative to their first learning rate
@@ -17,14 +18,8 @@ _FINAL_RATE = 0.05  # of the geographic unknowns, relative to their first learni
 # would make the Gaussians smaller than a pixel, and push them off the surface that they start on.
 COARSE = ((2, 0.3),)
 _DENSITY_UNTIL = 0.5  # of the training
-
-
-WeightSchedule = Literal["rising", "constant"]
-
-
-def rising_weight(iteration: int, w_max: float, tau: float) -> float:
-    """Return w(t) = w_max (1 − exp(−t/τ)), GeoRefGS eq. 27."""
-    return w_max * (1.0 - math.exp(-iteration / tau))
+_GEO_RISE = 0.1  # τ of eq. 27, as a fraction of the iterations
+BACKGROUND = (0.0, 0.0, 0.0)  # RGB behind the scene
 
 
 @dataclass(frozen=True)
@@ -32,17 +27,13 @@ class JointOptions:
     """Settings of the joint optimisation.
 
     Attributes:
-        iterations: length of the training.
         sh_degree: degree that the spherical harmonics reach.
         geo_weight: w_max of eq. 27.
-        geo_rise: τ of eq. 27, as a fraction of the iterations.
         geo_schedule: "rising" as in eq. 27, or "constant": w_max from the first iteration.
         similarity_rate: first learning rate of the similarity and of constant errors of the measurements, in
             standard deviations an iteration.
         camera_rate: first learning rate of the camera corrections, in standard deviations an iteration.
-        variance_rate: first learning rate of the log-variances of the geographic terms.
-        background: RGB behind the scene, 0 … 1.
-        seed: seed of the order of views.
+        seed: of the order of views.
         coarse: (factor, fraction) pairs: photographs are shrunken by a factor up to a fraction of the training.
         coarse_least_px: lower limit of the longest side of a shrunken photograph.
         crops: windows of large photographs; None: all are trained as wholes.
@@ -53,18 +44,29 @@ class JointOptions:
     iterations: int
     sh_degree: int = 3
     geo_weight: float = 0.05
-    geo_rise: float = 0.1
-    geo_schedule: WeightSchedule = "rising"
+    geo_schedule: Literal["rising", "constant"] = "rising"
     similarity_rate: float = 0.1
     camera_rate: float = 0.01
-    variance_rate: float = 0.01
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     seed: int = 0
     coarse: tuple[tuple[int, float], ...] = ()
     coarse_least_px: int = 160
     crops: Crops | None = None
     surface: SurfaceSettings | None = None
     finishing: bool = False
+
+    @classmethod
+    def of(cls, options: TrainOptions) -> JointOptions:
+        """Return the settings of a training with the options of `georef train`."""
+        return cls(
+            options.effort.iterations,
+            options.sh_degree,
+            geo_weight=options.geo_weight,
+            geo_schedule=options.geo_schedule,
+            seed=options.seed,
+            coarse=COARSE if options.coarse_to_fine else (),
+            crops=Crops(options.crop_size, options.seed),
+            surface=SurfaceSettings() if options.faithful_surface else None,
+        )
 
 
 def pyramid(
@@ -95,15 +97,12 @@ class TrainingSchedule:
     Coarse photographs do not come back, and harmonics that were in use stay so.
 
     Attributes:
-        extended_from: last iteration of the finished training that this one extends; 0: none.
-
-    Args:
-        options: settings of the optimisation.
         views: (V,) indices of the training images.
+        extended_from: last iteration of the finished training that this one extends; 0: none.
     """
 
     def __init__(self, options: JointOptions, views: IntArray) -> None:
-        self._options, self._views = options, views
+        self.options, self.views = options, views
         self.extended_from = 0
 
     def view(self, iteration: int) -> int:
@@ -111,39 +110,38 @@ class TrainingSchedule:
 
         Each epoch shows every image once, in an order that depends only on seed and epoch.
         """
-        epoch, place = divmod(iteration - 1, len(self._views))
-        order = np.random.default_rng([self._options.seed, epoch]).permutation(len(self._views))
-        return int(self._views[order[place]])
+        epoch, place = divmod(iteration - 1, len(self.views))
+        order = np.random.default_rng([self.options.seed, epoch]).permutation(len(self.views))
+        return int(self.views[order[place]])
 
     def visit(self, iteration: int) -> int:
         """Return how often the training image of an iteration was seen before."""
-        return (iteration - 1) // len(self._views)
+        return (iteration - 1) // len(self.views)
 
     def shrink(self, iteration: int, width: int, height: int) -> int:
         """Return the factor by which a photograph of that size is shrunken; see `pyramid`."""
         if self.extended_from:
             return 1
-        most = max(max(width, height) // self._options.coarse_least_px, 1)
+        most = max(max(width, height) // self.options.coarse_least_px, 1)
         progress = self.progress(iteration)
-        levels = pyramid(width, height, self._options.coarse, self._options.crops)
+        levels = pyramid(width, height, self.options.coarse, self.options.crops)
         return min(next((shrink for shrink, until in levels if progress <= until), 1), most)
 
     def sh_degree(self, iteration: int) -> int:
-        """Return the degree of the harmonics.
+        """Return the degree of the harmonics, which rises by one after each sixth of the training.
 
-        The degree rises by one after each sixth of the training, and so reaches 3 at half of it (3DGS: after each
-        1 000 of 30 000 iterations).
+        So it reaches 3 at half of the training (3DGS: after each 1 000 of 30 000 iterations).
         """
-        every = max(self._options.iterations // 6, 1)
-        degree = min(self._options.sh_degree, iteration // every)
-        return self._options.sh_degree if self.extended_from or self._options.finishing else degree
+        every = max(self.options.iterations // 6, 1)
+        degree = min(self.options.sh_degree, iteration // every)
+        return self.options.sh_degree if self.extended_from or self.options.finishing else degree
 
     def geographic_weight(self, iteration: int) -> float:
-        """Return w(t) of eq. 27, or w_max if the weight is constant."""
-        options = self._options
+        """Return w(t) = w_max (1 − exp(−t/τ)), GeoRefGS eq. 27, or w_max if the weight is constant."""
+        options = self.options
         if options.geo_schedule == "constant":
             return options.geo_weight
-        return rising_weight(iteration, options.geo_weight, options.geo_rise * options.iterations)
+        return options.geo_weight * (1.0 - math.exp(-iteration / (_GEO_RISE * options.iterations)))
 
     def geographic_rate(self, iteration: int) -> float:
         """Return the factor on the first learning rates of the geographic unknowns."""
@@ -151,4 +149,4 @@ class TrainingSchedule:
 
     def progress(self, iteration: int) -> float:
         """Return the fraction of the training that is done, 0 … 1."""
-        return iteration / self._options.iterations
+        return iteration / self.options.iterations

@@ -14,6 +14,9 @@ import logging
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from pipelines.adjust.posterior import Posterior, save_posterior
 from pipelines.adjust.system import minimise
@@ -28,21 +31,28 @@ from pipelines.surface.lidar_cloud import ScannerTrack
 from pipelines.surface.measured_cloud import CloudReader
 from pipelines.survey.adjustment import GeolocatedPoints
 from pipelines.survey.calibrated import load_survey
+from pipelines.survey.report_parts import EstimatedError, LidarReport
 from pipelines.survey.scene import photographs
 from pipelines.survey.trained_model import Adjustment, TrainedModel
-from pipelines.train.adjusted_scene import AdjustedScene
-from pipelines.train.assembly import make_trainer
-from pipelines.train.forecast import forecast_of, training_size, with_gaussian_limit
+from pipelines.train.adjusted_scene import AdjustedScene, figures_of, with_exposures
+from pipelines.train.forecast import training_forecast, training_size, with_gaussian_limit
 from pipelines.train.geographic.problem import held_problem, refining_problem
 from pipelines.train.initial_gaussians import TrainingScene
-from pipelines.train.lidar import compared_lidar, draw_changes, lidar_surface
-from pipelines.train.loop import METRICS, train_in_folder
+from pipelines.train.lidar import compared_lidar, draw_changes, lidar_surface, plane_observations
+from pipelines.train.loop import METRICS, TrainingRecord, train_in_folder
 from pipelines.train.options import TrainOptions
-from pipelines.train.result import summary_of, trained_model
+from pipelines.train.schedule import BACKGROUND
 from pipelines.train.surface import SceneSurface
-from pipelines.train.trainer import JointTrainer
+from pipelines.train.trainer import JointTrainer, make_trainer
 
 log = logging.getLogger(__name__)
+
+_EVIDENT_SIGMAS = 3.0
+_CAUSES = {
+    "lever-arm": "`georef ingest --lever-arm` can apply it, in the axes of the body",
+    "boresight": "`georef ingest --boresight` can apply it",
+    "lidar-shift": "Check the LiDAR's CRS, datum and flight",
+}
 
 
 def run(stage: StageRun, options: TrainOptions) -> Summary:
@@ -61,25 +71,26 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     clouds = None if options.lidar is None else CloudReader(options.lidar, options.lidar_stated)
     adjusted = AdjustedScene.load(workspace)
     survey, scene = adjusted.survey, adjusted.scene
-    track = None
-    if options.lidar_trajectory is not None:
-        track = ScannerTrack.read(options.lidar_trajectory, options.lidar_stated, survey.origin)
+    of_scanner, stated = options.lidar_trajectory, options.lidar_stated
+    track = None if of_scanner is None else ScannerTrack.read(of_scanner, stated, survey.origin)
     options.require_trainable(len(scene.sparse.image_name))
     images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
     free_bytes = free_memory_bytes(device_of(backend))
     options = with_gaussian_limit(options, len(images), images.largest(), free_bytes)
     require_memory(training_size(options, len(images), images.largest()), free_bytes)
     images.build(stage.progress)
-    maps = DepthMaps(workspace.cache / "surface", scene, images) if options.dense else None
-    if maps is not None:
+    surface, compared, planes, lidar = None, None, None, None
+    if options.dense:
+        maps = DepthMaps(workspace.cache / "surface", scene, images)
         maps.build(stage.progress)
-    compared = None
-    if clouds is not None and maps is not None:
-        compared = compared_lidar(
-            options, clouds, maps, survey, track=track,
-            georeference=adjusted.adjustment.geo_from_model, seed=options.seed, progress=stage.progress,
-        )  # fmt: skip
-    planes = compared.planes() if compared is not None and options.lidar_register else None
+        surface = SceneSurface(maps)
+        if clouds is not None:
+            compared = compared_lidar(
+                options, clouds, maps, survey, track=track,
+                georeference=adjusted.adjustment.geo_from_model, seed=options.seed, progress=stage.progress,
+            )  # fmt: skip
+    if compared is not None and options.lidar_register:
+        planes = plane_observations(compared.registration, scene.geo_from_model)
     measured = adjusted.measured(control_points=options.gcp_loss, planes=planes)
     posterior: Posterior | None = None
     if planes is not None:
@@ -93,7 +104,6 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     else:
         log.info("similarity and cameras are held at the adjustment of init-sim3")
         problem = held_problem(adjusted)
-    surface, lidar = None if maps is None else SceneSurface(maps), None
     if compared is not None and clouds is not None:
         shift_m = measured.errors.value(adjusted.error_estimates(measured.errors)[0], "lidar-shift")
         lidar = lidar_surface(compared, clouds, survey, options, shift_m)
@@ -101,26 +111,20 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
         save_json(lidar.report, stage.out / Path(LIDAR).name)
         draw_changes(stage.out / Path(LIDAR_MAP).name, lidar, scene)
     trainer = make_trainer(TrainingScene(scene, images, surface), problem, backend, options)
-    record = train_in_folder(stage, trainer, options, _iterations(stage))
+    done = 0 if stage.extends is None else load_json(TrainedModel, stage.extends / Path(MODEL).name).iterations
+    record = train_in_folder(stage, trainer, options, done)
     if refines:
         posterior = adjusted.posterior(measured, problem.state())
     model = _write_solution(stage, trainer, adjusted.adjustment, posterior)
     write_gaussians(stage.out / "gaussians.ply", trainer.optimizer.gaussians.detached())
     metrics = [json.loads(row) for row in (stage.out / METRICS).read_text(encoding="utf-8").splitlines()]
-    return summary_of(model, metrics, record, None if lidar is None else lidar.report)
+    return _summary(model, metrics, record, None if lidar is None else lidar.report)
 
 
 def _write_solution(
     stage: StageRun, trainer: JointTrainer, held: Adjustment, posterior: Posterior | None
 ) -> TrainedModel:
-    """Write the adjustment at the end of a training, and return it with the settings of the training.
-
-    Args:
-        stage: has the folder.
-        trainer: at the end of the training.
-        held: the adjustment that the training has held.
-        posterior: that of the training; None: it has held that of `init-sim3`.
-    """
+    """Write and return the product of a training, which has `held` its adjustment if there is no posterior."""
     model = trained_model(trainer, held if posterior is None else posterior.solution)
     save_json(model, stage.out / Path(MODEL).name)
     path = stage.out / Path(TRAIN_POSTERIOR).name
@@ -131,6 +135,68 @@ def _write_solution(
     return model
 
 
+def trained_model(trainer: JointTrainer, solution: Adjustment) -> TrainedModel:
+    """Return the product of `train` without the Gaussians, given the solution at the end of the training."""
+    if trainer.exposures is not None:
+        solution = with_exposures(solution, trainer.exposures.affine.cpu().numpy().astype(float))
+    gaussians = trainer.optimizer.gaussians
+    return TrainedModel(
+        **dict(solution),
+        max_image_size=trainer.views.images.max_size_px,
+        background=BACKGROUND,
+        sh_degree=gaussians.sh_degree,
+        iterations=trainer.iteration,
+        gaussians=len(gaussians),
+        backend=trainer.rasterizer.name,
+    )
+
+
+def _summary(
+    model: TrainedModel, metrics: list[dict[str, Any]], record: TrainingRecord, lidar: LidarReport | None = None
+) -> Summary:
+    """Return headline, values and warnings of a training, given the rows of `metrics.jsonl`."""
+    psnr = float(np.mean([row["psnr"] for row in metrics[-20:]]))
+    values = {
+        "iterations": model.iterations,
+        "gaussians": model.gaussians,
+        "train_psnr": round(psnr, 3),
+        "seconds": round(record.seconds, 1),
+        "seconds_per_iteration": round(record.seconds / model.iterations, 4),
+        **figures_of(model),
+    }
+    if lidar is not None:
+        values["lidar"] = lidar.model_dump(mode="json")
+    key_figure = f"{model.gaussians} gaussians, train PSNR {psnr:.2f} dB"
+    # A common error of the fixes is everyday: init-sim3 has tested it against its prior, and its cautions tell it.
+    told = [_warning_of(error) for error in model.estimated_errors if error.name != "bias"]
+    warnings = [text for text in (*told, record.recovery) if text is not None]
+    if lidar is not None:
+        warnings += lidar.assumptions
+    if lidar is not None and lidar.areas:
+        area_m2 = sum(area.area_m2 for area in lidar.areas)
+        warnings.append(
+            f"LiDAR and photographs contradict each other on {area_m2:.0f} m² in {len(lidar.areas)} places, which "
+            "train/lidar.json lists and train/lidar.png shows: the LiDAR is not used there"
+        )
+    return Summary(key_figure, values, tuple(warnings), model.cautions)
+
+
+def _warning_of(error: EstimatedError) -> str | None:
+    """Return a warning if the error exceeds 3 σ or is not observable along every axis; else None."""
+    axes = "east, north, up" if error.name == "lidar-shift" else "right, down, forward"
+    values = ", ".join(f"{value:+.3f} ± {sigma:.3f}" for value, sigma in zip(error.value, error.sigma, strict=True))
+    evident = [
+        abs(value) > _EVIDENT_SIGMAS * sigma and observed
+        for value, sigma, observed in zip(error.value, error.sigma, error.observed, strict=True)
+    ]
+    if any(evident):
+        evidence = f"{error.name} of ({values}) {error.unit} {axes}, beyond 3 σ: it is taken out here"
+        return f"{evidence}. {_CAUSES[error.name]}"
+    if not all(error.observed):
+        return f"{error.name} is not observable along every axis: ({values}) {error.unit} {axes}"
+    return None
+
+
 def made_in_parts(workspace: Workspace, options: TrainOptions) -> bool:
     """Return whether the survey is trained in blocks: as asked, or because one training would not fit into memory.
 
@@ -138,10 +204,5 @@ def made_in_parts(workspace: Workspace, options: TrainOptions) -> bool:
         BackendUnavailableError: `--backend cuda` without a GPU or without gsplat.
         GeorefError: the survey cannot be read.
     """
-    return forecast_of(load_survey(workspace), options).in_blocks
-
-
-def _iterations(stage: StageRun) -> int:
-    """Return the iterations of the finished training that this one may extend; 0: there is none."""
-    model = None if stage.extends is None else stage.extends / "model.json"
-    return 0 if model is None else load_json(TrainedModel, model).iterations
+    survey = load_survey(workspace)
+    return training_forecast(len(survey.images), survey.largest_photograph_px, options).in_blocks

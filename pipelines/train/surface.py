@@ -1,9 +1,7 @@
-"""Surface of the scene, from the depth maps of its training photographs.
+"""Surface of the scene, from the depth maps of its training photographs, and weights of its points.
 
 Training starts from this surface and holds the Gaussians to it. On ground with little texture, Gaussians would
 otherwise float metres above the ground, and their renders would fit the photographs as well.
-
-Weights of the points that a training view is held to, by the contrast of its photograph.
 """
 
 from __future__ import annotations
@@ -13,13 +11,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import torch
-from torch import Tensor
 
 from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
-from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.footprints import thin_to_voxels
-from pipelines.splat.gaussians import Gaussians
 from pipelines.surface.depth_maps import DepthMaps
 
 _WINDOW_PX = 5  # side of the window that contrast is averaged over
@@ -40,7 +34,7 @@ def pull_weights(rgb: ByteArray, depth_m: Float32Array) -> Float32Array:
     `_REACH_PX`, stereo is least exact, and the weight is smallest.
 
     Args:
-        rgb: (H, W, 3) photograph.
+        rgb: (H, W, 3) the photograph.
         depth_m: (H, W) along the optical axis; 0: unknown.
     """
     contrast = _contrast(rgb)
@@ -96,52 +90,24 @@ class SurfacePoints:
     @staticmethod
     def concatenate(parts: list[SurfacePoints]) -> SurfacePoints:
         """Return the points of all `parts` in their order; at least one part."""
-        return SurfacePoints(
-            np.concatenate([part.point_in_model for part in parts]),
-            np.concatenate([part.rgb for part in parts]),
-            np.concatenate([part.normal_in_model for part in parts]),
-        )
+        columns = zip(*((part.point_in_model, part.rgb, part.normal_in_model) for part in parts), strict=True)
+        return SurfacePoints(*map(np.concatenate, columns))
 
     def part(self, rows: IntArray) -> SurfacePoints:
         """Return the points of the given rows."""
         return SurfacePoints(self.point_in_model[rows], self.rgb[rows], self.normal_in_model[rows])
 
 
-# Returns the loss of Gaussians, of which the visible ones (K,) count.
-GaussianLoss = Callable[[Gaussians, Tensor], Tensor]
-
-
 class SceneSurface:
-    """Surface that the depth maps of all training views show together.
-
-    Args:
-        maps: depth maps, already built.
-    """
+    """Surface that the depth maps of all training views, already built, show together."""
 
     def __init__(self, maps: DepthMaps) -> None:
-        self._maps = maps
+        self.maps = maps
         self._train, self._poses = maps.scene.train, maps.scene.poses
 
-    def depth(self, index: int) -> Float32Array:
-        """Return the depth (H, W) in metres along a training view's optical axis; 0: unknown."""
-        return self._maps.depth(index)
-
-    def camera(self, index: int) -> Pinhole:
-        """Return the camera of a training view's depths."""
-        return self._maps.camera(index)
-
-    def rgb(self, index: int) -> ByteArray:
-        """Return the photograph (H, W, 3) at the pixels of its depths."""
-        return self._maps.rgb(index)
-
     def points(self, index: int, stride: int = 1) -> FloatArray:
-        """Return the surface points (P, 3) in `model` that a training view sees, in metres.
-
-        Args:
-            index: of the view.
-            stride: use every `stride`-th row and column of the depth map.
-        """
-        rows, columns = np.nonzero(self._maps.depth(index)[::stride, ::stride])
+        """Return the points (P, 3) in `model` that a training view sees at every `stride`-th pixel, in metres."""
+        rows, columns = np.nonzero(self.maps.depth(index)[::stride, ::stride])
         return self._points(index, stride * rows, stride * columns)
 
     def held(self, index: int, stride: int) -> tuple[FloatArray, Float32Array]:
@@ -149,22 +115,14 @@ class SceneSurface:
 
         The points are those of `points`, with the weights of `pull_weights`.
         """
-        depth = self._maps.depth(index)
+        depth = self.maps.depth(index)
         rows, columns = np.nonzero(depth[::stride, ::stride])
-        weight = pull_weights(self._maps.rgb(index), depth)[stride * rows, stride * columns]
+        weight = pull_weights(self.maps.rgb(index), depth)[stride * rows, stride * columns]
         return self._points(index, stride * rows, stride * columns), weight
-
-    def all_points(self, stride: int) -> FloatArray:
-        """Return the surface points (P, 3) in `model` of all training views, of every `stride`-th pixel."""
-        return np.concatenate([self.points(index, stride) for index in map(int, self._train)])
-
-    def gaussian_loss(self, device: torch.device) -> GaussianLoss | None:
-        """Return the loss of Gaussians by their places alone, on their device; None: there is none."""
-        return None
 
     def known_share(self) -> float:
         """Return the fraction of the training photographs' pixels whose depth is known, 0 … 1."""
-        depths = (self._maps.depth(index) for index in map(int, self._train))
+        depths = (self.maps.depth(index) for index in map(int, self._train))
         return float(np.mean([np.mean(depth > 0) for depth in depths]))
 
     def sample(
@@ -173,21 +131,20 @@ class SceneSurface:
         """Return points of the whole surface, as dense as the photographs resolve it.
 
         Args:
-            count: limit of the points.
-            seed: seed of their choice.
+            count, seed: limit of the points, and of their choice.
             inside: returns which of points (N, 3) count, as a mask (N,); None: all.
         """
         rng = np.random.default_rng(seed)
         share = -(-_CANDIDATES * count // max(len(self._train), 1))
         views, sizes = [], []
         for index in map(int, self._train):
-            rows, columns = np.nonzero(self._maps.depth(index))
+            rows, columns = np.nonzero(self.maps.depth(index))
             chosen = rng.permutation(len(rows))[:share]
             rows, columns = rows[chosen], columns[chosen]
             normals = self._normals(index, rows, columns)
-            rgb = self._maps.rgb(index)[rows, columns]
+            rgb = self.maps.rgb(index)[rows, columns]
             views.append(SurfacePoints(self._points(index, rows, columns), rgb, normals))
-            sizes.append(self._maps.depth(index)[rows, columns].astype(np.float64) / self._maps.camera(index).fx)
+            sizes.append(self.maps.depth(index)[rows, columns].astype(np.float64) / self.maps.camera(index).fx)
         candidates, size_m = SurfacePoints.concatenate(views), np.concatenate(sizes)
         if inside is not None:
             kept = np.flatnonzero(inside(candidates.point_in_model))
@@ -196,7 +153,7 @@ class SceneSurface:
 
     def _normals(self, index: int, rows: IntArray, columns: IntArray) -> FloatArray:
         """Return unit normals (P, 3) of the surface at pixels of a view; NaN at the edges of surface and image."""
-        depth = self._maps.depth(index)
+        depth = self.maps.depth(index)
         inside = (rows >= _NORMAL_REACH_PX) & (rows < depth.shape[0] - _NORMAL_REACH_PX)
         inside &= (columns >= _NORMAL_REACH_PX) & (columns < depth.shape[1] - _NORMAL_REACH_PX)
         normals = np.full((len(rows), 3), np.nan)
@@ -215,8 +172,8 @@ class SceneSurface:
         return normals
 
     def _points(self, index: int, rows: IntArray, columns: IntArray) -> FloatArray:
-        depth, poses = self._maps.depth(index)[rows, columns].astype(np.float64), self._poses
-        ray = self._maps.camera(index).rays(np.stack([columns, rows], axis=1) + 0.5)
+        depth, poses = self.maps.depth(index)[rows, columns].astype(np.float64), self._poses
+        ray = self.maps.camera(index).rays(np.stack([columns, rows], axis=1) + 0.5)
         turned = (depth[:, None] * ray) @ poses.cam_from_model[index]
         return np.asarray(poses.cam_center_in_model[index] + turned)
 

@@ -1,6 +1,6 @@
-"""Photographs on the device: shrunken and cut as the schedule demands, and read ahead on a GPU.
+"""Photographs on the device: shrunken as the schedule demands, cut into windows if large, and read ahead on a GPU.
 
-Windows in which large photographs are trained, so that memory and time of an iteration stay bounded.
+Windows bound the memory and time of an iteration.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise, product
-from math import inf
+from math import inf, prod
 
 import numpy as np
 import torch
@@ -34,7 +34,6 @@ class Crops:
 
     Attributes:
         size_px: a photograph with more pixels than a square of this side is seen in windows of so many pixels.
-        seed: of shifts and orders.
     """
 
     size_px: int
@@ -51,13 +50,16 @@ class Crops:
 
     def count(self, width: int, height: int) -> int:
         """Return the number of windows in which an image is seen."""
-        columns, rows = self.grid(width, height)
-        return columns * rows
+        return prod(self.grid(width, height))
 
     def largest_of(self, camera: Pinhole) -> Pinhole:
         """Return a camera of the size of the largest window of an image."""
-        columns, rows = self.grid(camera.width, camera.height)
-        return Window(0, 0, _longest(camera.width, columns), _longest(camera.height, rows)).of(camera)
+        sides = zip((camera.width, camera.height), self.grid(camera.width, camera.height), strict=True)
+        width, height = (
+            side if cells == 1 else min(side, int(np.ceil((1 + _SHIFT) * side / cells)) + 1)
+            for side, cells in sides
+        )
+        return Window(0, 0, width, height).of(camera)
 
     def shrink(self, width: int, height: int) -> int:
         """Return the least factor by which an image is to be shrunken, to be seen as a whole."""
@@ -67,18 +69,10 @@ class Crops:
         return shrink
 
     def windows(self, index: int, whole: Window, turn: int) -> list[Window]:
-        """Return the windows of one round, which cover `whole` without overlap.
-
-        Args:
-            index: of the photograph.
-            whole: part of the photograph to cover.
-            turn: number of the round, from 0.
-        """
+        """Return the windows of round `turn`, from 0, which cover `whole` of a photograph without overlap."""
         random = np.random.default_rng([self.seed, index, turn])
         columns, rows = self.grid(whole.width, whole.height)
-        across, down = (
-            _cuts(side, cells, random) for side, cells in ((whole.width, columns), (whole.height, rows))
-        )
+        across, down = _cuts(whole.width, columns, random), _cuts(whole.height, rows, random)
         cells = [
             Window(whole.left + left, whole.top + top, right - left, bottom - top)
             for (top, bottom), (left, right) in product(pairwise(down), pairwise(across))
@@ -91,20 +85,15 @@ def _cuts(side: int, cells: int, random: np.random.Generator) -> list[int]:
     return [0, *(round((cell + shift) * side / cells) for cell in range(1, cells)), side]
 
 
-def _longest(side: int, cells: int) -> int:
-    return side if cells == 1 else min(side, int(np.ceil((1 + _SHIFT) * side / cells)) + 1)
-
-
 _MASKS = 64  # limit on the device; all photographs of a camera share one
 _PARTS = 256  # windows kept: density control samples others between an iteration and the next
 
 
 @dataclass(frozen=True)
-class Look:
+class ImageLook:
     """Look at a photograph.
 
     Attributes:
-        index: of the photograph.
         shrink: every pixel is the mean of shrink × shrink pixels.
         visit: number of the visit, from 0, for the choice of a window of a large photograph; None: all of it.
     """
@@ -154,11 +143,6 @@ class TargetImage:
     whole: Pinhole
     part: ImagePart = ImagePart()
 
-    @property
-    def window(self) -> Window | None:
-        """Window of the whole photograph; None: all of it."""
-        return self.part.window
-
 
 class TargetImages:
     """Training photographs on a device.
@@ -167,9 +151,7 @@ class TargetImages:
     iteration waits for disk or transfer. On a CPU reading ahead would only take a core from the kernels.
 
     Args:
-        images: undistorted photographs.
-        pinholes: their cameras, with the lens in use.
-        device: holds the photographs of `get`.
+        pinholes: cameras of the undistorted photographs, with the lens in use.
         region: pixels of each photograph to train on; None: all.
         crops: windows of large photographs; None: all are seen as wholes.
     """
@@ -188,27 +170,27 @@ class TargetImages:
         self._complete: dict[str, bool] = {}
         self._part = lru_cache(_PARTS)(self._find_part)
         self._reader = ThreadPoolExecutor(1, "photographs") if device.type == "cuda" else None
-        self._next: tuple[Look, Future[Tensor]] | None = None
+        self._next: tuple[ImageLook, Future[Tensor]] | None = None
 
-    def get(self, look: Look, upcoming: Look | None = None) -> TargetImage:
-        """Return a photograph, or a window of it.
-
-        Args:
-            look: at the photograph.
-            upcoming: next look, to read ahead; None: unknown.
-        """
-        pixels, part = self._pixels(look), self._part(look)
+    def get(self, look: ImageLook, upcoming: ImageLook | None = None) -> TargetImage:
+        """Return a photograph, or a window of it; `upcoming` is the next look, to read ahead, None if unknown."""
+        ahead, part = self._next, self._part(look)
+        pixels = ahead[1].result() if ahead is not None and ahead[0] == look else self._read(look)
         if self._reader is not None and upcoming is not None:
             self._next = (upcoming, self._reader.submit(self._read, upcoming))
         colour = pixels.to(self._device, non_blocking=True).float() / 255.0
         whole = shrunken(self._pinholes.of(look.index), look.shrink)
-        if part.window is None:
-            return TargetImage(colour, self._whole_mask(look), whole, whole, part)
-        mask = self._counting(look, part.window)
-        on_device = None if mask.all() else torch.from_numpy(mask).to(self._device)
-        return TargetImage(colour, on_device, part.window.of(whole), whole, part)
+        if part.window is not None:
+            return TargetImage(colour, self._mask(look, part.window), part.window.of(whole), whole, part)
+        key = (self._images.mask_key(look.index), look.shrink)
+        if key not in self._masks:
+            self._masks[key] = self._mask(look, Window(0, 0, whole.width, whole.height))
+            if len(self._masks) > _MASKS:
+                self._masks.popitem(last=False)
+        self._masks.move_to_end(key)
+        return TargetImage(colour, self._masks[key], whole, whole, part)
 
-    def _find_part(self, look: Look) -> ImagePart:
+    def _find_part(self, look: ImageLook) -> ImagePart:
         camera = shrunken(self._images.pinhole(look.index), look.shrink)
         image = Window(0, 0, camera.width, camera.height)
         shown = None if self._region is None else self._region.view(look.index, look.shrink)
@@ -223,22 +205,27 @@ class TargetImages:
         seen = [place for place, count in enumerate(counts) if count]
         window = windows[seen[place % len(seen)]] if seen else windows[0]
         weight = len(seen) * counts[windows.index(window)] / max(sum(counts), 1)
-        return _part_of(trained, window, len(seen) or 1, weight, share)
+        right, bottom = window.left + window.width, window.top + window.height
+        low = (
+            -inf if window.left == trained.left else float(window.left),
+            -inf if window.top == trained.top else float(window.top),
+        )
+        high = (
+            inf if right == trained.left + trained.width else float(right),
+            inf if bottom == trained.top + trained.height else float(bottom),
+        )
+        return ImagePart(window, len(seen) or 1, weight, share, low, high)
 
-    def _count(self, look: Look, window: Window) -> int:
+    def _count(self, look: ImageLook, window: Window) -> int:
         """Return the number of pixels that count in a window."""
-        if self._region is None and self._all_count(look):
-            return window.width * window.height
-        return int(self._counting(look, window).sum())
-
-    def _all_count(self, look: Look) -> bool:
-        """Return whether all pixels of a photograph count."""
         key = self._images.mask_key(look.index)
         if key not in self._complete:
             self._complete[key] = bool(self._images.mask(look.index).all())
-        return self._complete[key]
+        if self._region is None and self._complete[key]:
+            return window.width * window.height
+        return int(self._counting(look, window).sum())
 
-    def _counting(self, look: Look, window: Window) -> BoolArray:
+    def _counting(self, look: ImageLook, window: Window) -> BoolArray:
         """Return the pixels (H, W) of a window that count: of the photograph, and of the region if there is one."""
         s = look.shrink
         covered = self._images.mask(look.index)[
@@ -252,49 +239,18 @@ class TargetImages:
         top, left = window.top - shown.window.top, window.left - shown.window.left
         return np.asarray(mask & shown.mask[top : top + window.height, left : left + window.width])
 
-    def _pixels(self, look: Look) -> Tensor:
-        if self._next is not None and self._next[0] == look:
-            return self._next[1].result()
-        return self._read(look)
-
-    def _read(self, look: Look) -> Tensor:
+    def _read(self, look: ImageLook) -> Tensor:
         image, window = self._images.shrunken(look.index, look.shrink), self._part(look).window
         pixels = torch.from_numpy(np.array(image if window is None else image[window.slices]))
         return pixels.pin_memory() if self._reader is not None else pixels
 
-    def _whole_mask(self, look: Look) -> Tensor | None:
-        key = (self._images.mask_key(look.index), look.shrink)
-        if key not in self._masks:
-            camera = shrunken(self._images.pinhole(look.index), look.shrink)
-            mask = self._counting(look, Window(0, 0, camera.width, camera.height))
-            self._masks[key] = None if mask.all() else torch.from_numpy(mask).to(self._device)
-            if len(self._masks) > _MASKS:
-                self._masks.popitem(last=False)
-        self._masks.move_to_end(key)
-        return self._masks[key]
-
-
-def _part_of(trained: Window, window: Window, windows: int, weight: float, share: float) -> ImagePart:
-    """Return a window of all that is trained of a photograph; see `ImagePart`."""
-    right, bottom = window.left + window.width, window.top + window.height
-    low = (
-        -inf if window.left == trained.left else float(window.left),
-        -inf if window.top == trained.top else float(window.top),
-    )
-    high = (
-        inf if right == trained.left + trained.width else float(right),
-        inf if bottom == trained.top + trained.height else float(bottom),
-    )
-    return ImagePart(window, windows, weight, share, low, high)
+    def _mask(self, look: ImageLook, window: Window) -> Tensor | None:
+        """Return the pixels that count on the device; None: all."""
+        mask = self._counting(look, window)
+        return None if mask.all() else torch.from_numpy(mask).to(self._device)
 
 
 def shrunken(camera: Pinhole, shrink: int) -> Pinhole:
-    """Return the camera of an image whose pixels are blocks of shrink × shrink pixels.
-
-    Incomplete blocks at the right and lower edges are cut off.
-    """
-    return Pinhole(
-        camera.width // shrink,
-        camera.height // shrink,
-        *(value / shrink for value in (camera.fx, camera.fy, camera.cx, camera.cy)),
-    )
+    """Return the camera of an image of shrink × shrink blocks; incomplete ones at the edges are cut off."""
+    inner = (value / shrink for value in (camera.fx, camera.fy, camera.cx, camera.cy))
+    return Pinhole(camera.width // shrink, camera.height // shrink, *inner)

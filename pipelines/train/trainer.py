@@ -1,13 +1,15 @@
 """Joint optimisation of Gaussians, similarity and cameras, one view an iteration (GeoRefGS, section 2.4).
 
-Checkpoints: named tensors in one NPZ file without pickle, replaced in one step.
+`make_trainer` assembles it from scene, measurements and options. Checkpoints are named tensors in one NPZ file
+without pickle, replaced in one step.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -16,23 +18,405 @@ from torch import Tensor
 from pipelines.core.errors import InputError
 from pipelines.core.files import read_npz, replacing
 from pipelines.core.types import IntArray
-from pipelines.geometry.cameras import Lenses, Pinhole
+from pipelines.geometry.cameras import Lenses
 from pipelines.jobs.costs import iteration_seconds
-from pipelines.splat.densify import Strategy, ViewContributions, view_contributions
+from pipelines.splat.densify import (
+    DefaultSettings,
+    DefaultStrategy,
+    FastSettings,
+    FastStrategy,
+    Strategy,
+    ViewContributions,
+    view_contributions,
+)
+from pipelines.splat.densify_mcmc import McmcSettings, McmcStrategy
 from pipelines.splat.exposure import Exposures, HeldExposures
 from pipelines.splat.gaussians import FinitenessMonitor, Gaussians
-from pipelines.splat.losses import photometric_loss
+from pipelines.splat.initialise import InitialisationOptions, scene_extent
 from pipelines.splat.optimizer import GaussianAdam
-from pipelines.splat.outlier_pixels import OutlierPixels
+from pipelines.splat.outlier_pixels import OutlierPixels, OutlierSettings
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Render, ScreenStats
+from pipelines.splat.rasterizer.backends import device_of
 from pipelines.splat.surface import ObservedPoints
 from pipelines.survey.photographs import ImageCache, Pinholes
 from pipelines.train.geographic.problem import GeographicAdam, GeoProblem
+from pipelines.train.initial_gaussians import TrainingScene, initial_gaussians, points_to_hold
+from pipelines.train.lidar_surface import FusedSurface
+from pipelines.train.losses import Loss, RenderedView, training_losses, weighted_sum
+from pipelines.train.options import TrainOptions
 from pipelines.train.region import TrainingRegion
-from pipelines.train.schedule import JointOptions, TrainingSchedule
-from pipelines.train.surface import GaussianLoss
-from pipelines.train.surface_losses import RenderedView, SurfaceLosses
-from pipelines.train.target_images import Look, TargetImage, TargetImages
+from pipelines.train.schedule import BACKGROUND, JointOptions, TrainingSchedule
+from pipelines.train.target_images import ImageLook, TargetImage, TargetImages
+
+_OUTLIERS_FROM = 0.5  # of the iterations: before, the model is too coarse to tell what has moved
+_FINISHING_RATE = 0.3  # of the rates at which a training starts
+_LENS_EVERY = 100  # iterations between two reads of the lens: each read waits for the device
+# Each non-finite gradient shows in one of these: colours pass it on to the opacities.
+_WATCHED = ("means", "quats_wxyz", "log_scales", "logit_opacities")
+
+
+@dataclass(frozen=True)
+class TrainingViews:
+    """Training views, with the data that their renders are compared with.
+
+    Attributes:
+        camera: (V,) indices of the training views, into cameras and images.
+        surface: returns the points in `model`, float32, that an image shows; None: no depth loss.
+        lenses: lenses with which the images were undistorted; None: the lenses never change.
+        measured: losses of a surface that was measured.
+    """
+
+    camera: IntArray
+    images: ImageCache
+    surface: Callable[[int], ObservedPoints] | None = None
+    lenses: Lenses | None = None
+    measured: Sequence[Loss] = ()
+
+
+@dataclass(frozen=True)
+class StepReport:
+    """Figures of one iteration; the scalar tensors are still on the device, because fetching them would wait.
+
+    Attributes:
+        losses: value of each loss that the view has, by its name, not yet weighted.
+        mean_square_error: of colours from 0 to 1, over the pixels that count.
+        weight: w(t), the weight of the geographic losses.
+        visible: number of Gaussians in the view, those around a region among them.
+        pixels: of the render.
+    """
+
+    losses: dict[str, Tensor]
+    mean_square_error: Tensor
+    weight: float
+    visible: int
+    pixels: int
+
+
+class _Stateful(Protocol):
+    def state(self) -> dict[str, Tensor]: ...
+
+    def restore(self, state: dict[str, Tensor]) -> None: ...
+
+
+class JointTrainer:
+    """State of a joint optimisation; every iteration is a pure function of this state.
+
+    An iteration waits for the device only to read the lens. Every hundredth iteration reads the lens that has
+    followed the cameras, and all views are rendered through that lens until the next read.
+
+    Args:
+        optimizer: the Gaussians and their moments.
+        strategy: density control.
+        problem: similarity, cameras and constant errors, with the geographic losses.
+        exposures: of the photographs, optimised as well or held; None: all photographs have the same exposure.
+        outliers: finds pixels that contradict the model, which do not count; None: all do.
+        region: part of the scene that the Gaussians are to show; None: all of it.
+    """
+
+    def __init__(
+        self,
+        optimizer: GaussianAdam,
+        strategy: Strategy,
+        problem: GeoProblem,
+        views: TrainingViews,
+        *,
+        rasterizer: Rasterizer,
+        options: JointOptions,
+        exposures: Exposures | HeldExposures | None = None,
+        outliers: OutlierPixels | None = None,
+        region: TrainingRegion | None = None,
+    ) -> None:
+        self.optimizer, self.strategy, self.problem = optimizer, strategy, problem
+        self.views, self.rasterizer, self.options = views, rasterizer, options
+        self.exposures, self.outliers, self.region = exposures, outliers, region
+        self.iteration = 0
+        self.schedule = TrainingSchedule(options, views.camera)
+        self.device = optimizer.gaussians.means.device
+        self.pinholes = Pinholes(views.images, views.lenses)
+        self._lens = np.zeros(len(problem.cameras.lens()))
+        masks = None if region is None else region.masks
+        self._targets = TargetImages(views.images, self.pinholes, self.device, masks, options.crops)
+        self._losses = training_losses(
+            problem,
+            strategy,
+            self.schedule,
+            rasterizer,
+            extent_m=optimizer.extent_m,
+            confined=region is not None,
+            measured=views.measured,
+        )
+        self._unknowns = GeographicAdam(problem, options, self.device)
+        nothing = torch.zeros((), device=self.device)
+        self.watch = FinitenessMonitor(tuple(self._watched(nothing, nothing)), self.device)
+
+    def step(self) -> StepReport:
+        """Run one iteration and return its figures.
+
+        1. One training view, or a window of it, is rendered and compared with its photograph.
+        2. The gradient of all losses moves Gaussians, similarity, cameras, constant errors, weights and exposures.
+        3. Density control records the render, and edits the Gaussians if its schedule says so.
+        """
+        self.iteration += 1
+        if self.iteration % _LENS_EVERY == 1:
+            self._look_through(self.problem.cameras.lens().detach().cpu().numpy())
+        view = self._rendered(self._targets.get(self._look(self.iteration), self._look(self.iteration + 1)))
+        self.optimizer.zero_grad()
+        self._unknowns.adam.zero_grad()
+        total, values = weighted_sum(self._losses, view, self.iteration)
+        total.backward()
+        losses = {name: value.detach() for name, value in values.items()}
+        geographic = losses["geographic"] + losses.get("control_by_depth", 0.0)
+        self.watch.note(self.iteration, self._watched(losses["photometric"], geographic))
+        stats = self._of_whole(self._own(view.render.stats), view.pose, view.target)
+        self._unknowns.step(self.optimizer.rate_factor * self.schedule.geographic_rate(self.iteration))
+        self.optimizer.step(self.iteration, stats.visible)
+        if self.exposures is not None:
+            self.exposures.step(self.iteration)
+        self.strategy.observe(stats, view.target.whole)
+        self.strategy.update(self.iteration, self.optimizer, self.sample_contributions)
+        return StepReport(
+            losses,
+            _mean_square(view.colour, view.target),
+            self.schedule.geographic_weight(self.iteration),
+            len(view.render.stats.visible),
+            view.target.camera.width * view.target.camera.height,
+        )
+
+    @torch.no_grad()
+    def sample_contributions(self, count: int, generator: torch.Generator) -> list[ViewContributions]:
+        """Return the contributions of all Gaussians to `count` different training views at most, as a `Probe`."""
+        contributions = []
+        for place in torch.randperm(len(self.views.camera), generator=generator)[:count].tolist():
+            index = int(self.views.camera[place])
+            camera = self.views.images.pinhole(index)
+            least = 1 if self.options.crops is None else self.options.crops.shrink(camera.width, camera.height)
+            shrink = max(self.schedule.shrink(self.iteration, camera.width, camera.height), least)
+            target, pose = self._targets.get(ImageLook(index, shrink)), self.problem.cameras.cam_from_model(index)
+            colour = self._exposed(index, self._render(pose, target).colour)
+            error = (colour - target.colour).abs().mean(dim=-1)
+            error = error if target.mask is None else error * target.mask
+            of_view = view_contributions(self.optimizer.gaussians, pose, target.camera, error, self.rasterizer)
+            # Strategies count pixels of the whole photographs, which the schedule may have shrunken.
+            contributions.append(
+                ViewContributions(shrink**2 * of_view.weight_px, shrink**2 * of_view.high_error_px)
+            )
+        return contributions
+
+    def work(self, iteration: int) -> float:
+        """Return the work of an iteration at the present number of Gaussians, relative to others' work."""
+        camera = self.views.images.pinhole(int(self.views.camera[0]))
+        shrink = self.schedule.shrink(iteration, camera.width, camera.height)
+        width, height = camera.width // shrink, camera.height // shrink
+        windows = 1 if self.options.crops is None else self.options.crops.count(width, height)
+        surface = self.options.surface is not None
+        return iteration_seconds(width * height, len(self.optimizer.gaussians), surface=surface, windows=windows)
+
+    def slow_down(self, factor: float) -> None:
+        """Multiply all learning rates but the exposures' by `factor`, and forget values that were not finite."""
+        self.optimizer.rate_factor *= factor
+        self.watch.reset()
+
+    def _look(self, iteration: int) -> ImageLook:
+        index = self.schedule.view(iteration)
+        camera = self.views.images.pinhole(index)
+        shrink = self.schedule.shrink(iteration, camera.width, camera.height)
+        return ImageLook(index, shrink, self.schedule.visit(iteration))
+
+    def _look_through(self, lens: np.ndarray) -> None:
+        """Render from now on through SfM's lenses with a change (L,) of their parameters."""
+        self._lens = lens.copy()
+        if self.views.lenses is not None and len(lens):
+            self.pinholes.renew(self.views.lenses.moved(self._lens))
+
+    def _rendered(self, target: TargetImage) -> RenderedView:
+        """Return the view of this iteration, with all that its losses need."""
+        index = self.schedule.view(self.iteration)
+        pose = self.problem.cameras.cam_from_model(index)
+        render = self._render(pose, target, depth=self.problem.sees_by_depth(index))
+        colour, counting = self._exposed(index, render.colour), target.mask
+        if self.outliers is not None:
+            longest_px = max(target.whole.width, target.whole.height)
+            counting = self.outliers.inliers(colour, target.colour, counting, longest_px)
+        points = None if self.views.surface is None else self.views.surface(index)
+        stats, gaussians = self._own(render.stats), self.optimizer.gaussians
+        return RenderedView(index, pose, target, gaussians, render, stats, colour, counting, points)
+
+    def _render(self, pose: Tensor, target: TargetImage, *, depth: bool = False) -> Render:
+        """Return a render of the Gaussians, and behind their rows those that surround the region."""
+        settings = RasterSettings(
+            sh_degree=self.schedule.sh_degree(self.iteration),
+            background=BACKGROUND,
+            depth=depth or self.options.surface is not None,
+            median=False,
+            window=target.part.window,
+        )
+        gaussians = self.optimizer.gaussians
+        if self.region is not None:
+            gaussians = Gaussians.concatenate([gaussians, self.region.surroundings])
+        return self.rasterizer.render(gaussians, pose, target.whole, settings)
+
+    def _exposed(self, index: int, colour: Tensor) -> Tensor:
+        return colour if self.exposures is None else self.exposures.apply(index, colour)
+
+    def _own(self, stats: ScreenStats) -> ScreenStats:
+        """Return the statistics of the Gaussians in training, without those that surround the region."""
+        # Without a region nothing is left out: to look would make a GPU wait.
+        return stats if self.region is None else stats.of_first(len(self.optimizer.gaussians))
+
+    @torch.no_grad()
+    def _of_whole(self, stats: ScreenStats, pose: Tensor, target: TargetImage) -> ScreenStats:
+        """Return the statistics as a part of those of the whole photograph."""
+        part = target.part
+        if part.windows == 1:
+            return stats if part.share == 1.0 else stats.of_part(part.share)
+        means = self.optimizer.gaussians.means[stats.visible]
+        in_cam, camera = means @ pose[:3, :3].to(means).T + pose[:3, 3].to(means), target.whole
+        x, y, z = in_cam.unbind(dim=1)
+        x, y = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        here = (x >= part.low[0]) & (x < part.high[0]) & (y >= part.low[1]) & (y < part.high[1])
+        return stats.of_part(part.share / part.windows, here)
+
+    def _watched(self, photometric: Tensor, geographic: Tensor) -> dict[str, Tensor]:
+        """Return the scalars that must stay finite, by what messages call them."""
+        tensors = self.optimizer.gaussians.tensors()
+        gradients = {
+            f"gradient of {name}": geographic.new_zeros(()) if tensor.grad is None else tensor.grad.sum()
+            for name, tensor in ({name: tensors[name] for name in _WATCHED} | self._unknowns.named()).items()
+        }
+        return {"photometric loss": photometric, "geographic loss": geographic} | gradients
+
+    def _parts(self) -> dict[str, _Stateful]:
+        """Return what has a state of its own, by the name of that state in a checkpoint."""
+        parts: dict[str, _Stateful | None] = {
+            "optimizer": self.optimizer,
+            "strategy": self.strategy,
+            "geo": self._unknowns,
+            "exposures": self.exposures,
+            "outliers": self.outliers,
+        }
+        return {name: part for name, part in parts.items() if part is not None}
+
+    def state(self) -> dict[str, Tensor]:
+        """Return all tensors that the next iteration depends on, by name, for a checkpoint."""
+        state = {
+            "iteration": torch.tensor(self.iteration),
+            "extended_from": torch.tensor(self.schedule.extended_from),
+            "rate_factor": torch.tensor(self.optimizer.rate_factor, dtype=torch.float64),
+            "lens": torch.from_numpy(self._lens),
+            **prefixed("gaussians", self.optimizer.gaussians.tensors()),
+        }
+        for name, part in self._parts().items():
+            state |= prefixed(name, part.state())
+        return state
+
+    def restore(self, state: Mapping[str, Tensor]) -> None:
+        """Restore a state, from which the next iteration continues."""
+        self.iteration = int(state["iteration"])
+        self.schedule.extended_from = int(state["extended_from"])
+        self.optimizer.rate_factor = float(state["rate_factor"])
+        self._look_through(state["lens"].cpu().numpy())
+        self.watch.reset()
+        tensors = {name: tensor.to(self.device) for name, tensor in unprefixed("gaussians", state).items()}
+        gaussians = Gaussians(**tensors)
+        fresh = torch.full((len(gaussians),), -1, dtype=torch.int64, device=self.device)
+        fresh[: min(len(gaussians), len(self.optimizer.gaussians))] = 0
+        self.optimizer.rearrange(gaussians, fresh)
+        for name, part in self._parts().items():
+            part.restore(unprefixed(name, state))
+
+
+@torch.no_grad()
+def _mean_square(colour: Tensor, target: TargetImage) -> Tensor:
+    """Return the mean square error over the pixels that count, without waiting for the device to count them."""
+    error = (colour - target.colour).square()
+    if target.mask is None:
+        return error.mean()
+    return (error * target.mask[..., None]).sum() / (3 * target.mask.sum()).clamp_min(1)
+
+
+def make_trainer(
+    training: TrainingScene,
+    problem: GeoProblem,
+    backend: Rasterizer,
+    options: TrainOptions,
+    exposures: HeldExposures | None = None,
+) -> JointTrainer:
+    """Return the trainer with its initial Gaussians, before the first iteration.
+
+    Args:
+        training: cameras, photographs and surface.
+        problem: the geographic losses, moved to the backend's device.
+        exposures: to be held; None: those of the training photographs are fitted, if the options say so.
+
+    Raises:
+        DegenerateGeometryError: fewer than two different points to start from.
+    """
+    effort, device = options.effort, device_of(backend)
+    scene, images, surface = training.scene, training.images, training.surface
+    start = InitialisationOptions(sh_degree=options.sh_degree, max_gaussians=effort.max_gaussians)
+    gaussians = initial_gaussians(training, start, effort.max_gaussians, options.seed).to(device)
+    extent_m = scene_extent(scene.poses.cam_center_in_model)
+    train = torch.from_numpy(scene.train)
+    fitted = Exposures(len(images), train, effort.iterations, device) if options.exposure else None
+    hold = points_to_hold(training, device) if options.faithful_surface else None
+    measured = surface.losses(device) if isinstance(surface, FusedSurface) else ()
+    outliers = OutlierSettings(views=int(_OUTLIERS_FROM * effort.iterations))
+    return JointTrainer(
+        GaussianAdam(gaussians, extent_m, effort.iterations),
+        _strategy(options, extent_m, len(gaussians)),
+        problem.to(device),
+        TrainingViews(scene.train, images, hold, scene.sparse.lenses, measured),
+        rasterizer=backend,
+        options=JointOptions.of(options),
+        exposures=exposures or fitted,
+        outliers=OutlierPixels(device, outliers) if options.robust_photometric else None,
+        region=training.region,
+    )
+
+
+def make_finisher(
+    training: TrainingScene,
+    gaussians: Gaussians,
+    problem: GeoProblem,
+    *,
+    backend: Rasterizer,
+    options: TrainOptions,
+    exposures: HeldExposures | None,
+) -> JointTrainer:
+    """Return a trainer that goes on with trained Gaussians, at a low rate, and neither adds nor removes any.
+
+    Args:
+        training: cameras, photographs and region.
+        gaussians: on the backend's device.
+        problem: holds the cameras.
+        exposures: to be held; None: none.
+    """
+    device, scene, iterations = device_of(backend), training.scene, options.effort.iterations
+    extent_m = scene_extent(scene.poses.cam_center_in_model[scene.train])
+    optimizer = GaussianAdam(gaussians, extent_m, iterations)
+    optimizer.rate_factor = _FINISHING_RATE
+    hold = points_to_hold(training, device) if options.faithful_surface else None
+    return JointTrainer(
+        optimizer,
+        DefaultStrategy(DefaultSettings(stop=0, reset_every=0), extent_m, len(gaussians), options.seed),
+        problem.to(device),
+        TrainingViews(scene.train, training.images, hold, scene.sparse.lenses),
+        rasterizer=backend,
+        options=replace(JointOptions.of(options), sh_degree=gaussians.sh_degree, coarse=(), finishing=True),
+        exposures=exposures,
+        region=training.region,
+    )
+
+
+def _strategy(options: TrainOptions, extent_m: float, count: int) -> Strategy:
+    iterations, most = options.effort.iterations, options.effort.max_gaussians
+    if options.strategy == "mcmc":
+        return McmcStrategy(McmcSettings.for_iterations(iterations, count, most), extent_m, options.seed)
+    settings = DefaultSettings.for_iterations(iterations, most)
+    if options.strategy == "fast":
+        fast = FastSettings(prune_stop=iterations * 5 // 6)
+        return FastStrategy(settings, fast, extent_m, count, options.seed)
+    return DefaultStrategy(settings, extent_m, count, options.seed)
 
 
 def save_checkpoint(path: Path, state: Mapping[str, Tensor]) -> None:
@@ -66,337 +450,5 @@ def prefixed(prefix: str, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 def unprefixed(prefix: str, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return the tensors whose names begin with `prefix/`, without that prefix: inverts `prefixed`."""
-    return {
-        name.removeprefix(f"{prefix}/"): tensor for name, tensor in state.items() if name.startswith(f"{prefix}/")
-    }
-
-
-_LENS_EVERY = 100  # iterations between two reads of the lens: each read waits for the device
-# Each non-finite gradient shows in one of these: colours pass it on to the opacities.
-_WATCHED = ("means", "quats_wxyz", "log_scales", "logit_opacities")
-
-
-@dataclass(frozen=True)
-class TrainingViews:
-    """Training views, with the data that their renders are compared with.
-
-    Attributes:
-        camera: (V,) indices of the training views, into cameras and images.
-        images: all undistorted photographs.
-        surface: returns the points in `model`, float32, that an image shows; None: no depth loss.
-        lenses: lenses with which the images were undistorted; None: the lenses never change.
-        gaussian_loss: further loss of the visible Gaussians; None: none.
-    """
-
-    camera: IntArray
-    images: ImageCache
-    surface: Callable[[int], ObservedPoints] | None = None
-    lenses: Lenses | None = None
-    gaussian_loss: GaussianLoss | None = None
-
-
-@dataclass(frozen=True)
-class StepReport:
-    """Figures of one iteration; the scalar tensors are still on the device, because fetching them would wait.
-
-    Attributes:
-        photometric: photometric loss.
-        mean_square_error: of colours from 0 to 1, over the pixels that count.
-        geographic: geographic losses, not yet multiplied by the weight.
-        weight: w(t), the weight of the geographic losses.
-        visible: number of Gaussians in the view, those around a region among them.
-        pixels: of the render.
-        by_depth: part of `geographic` from control points by rendered depth; None: the view has no such marks.
-    """
-
-    photometric: Tensor
-    mean_square_error: Tensor
-    geographic: Tensor
-    weight: float
-    visible: int
-    pixels: int
-    by_depth: Tensor | None = None
-
-
-class JointTrainer:
-    """State of a joint optimisation; every iteration is a pure function of this state.
-
-    An iteration waits for the device only to read the lens. Every hundredth iteration reads the lens that has
-    followed the cameras, and all views are rendered through that lens until the next read.
-
-    Args:
-        optimizer: the Gaussians and their moments.
-        strategy: density control.
-        problem: similarity, cameras and constant errors, with the geographic losses.
-        views: training views.
-        rasterizer: backend.
-        options: settings, with the schedule.
-        exposures: exposures of the photographs, optimised as well or held; None: all photographs have the same
-            exposure.
-        outliers: finds pixels that contradict the model, which do not count; None: all do.
-        region: part of the scene that the Gaussians are to show; None: all of it.
-    """
-
-    def __init__(
-        self,
-        optimizer: GaussianAdam,
-        strategy: Strategy,
-        problem: GeoProblem,
-        views: TrainingViews,
-        *,
-        rasterizer: Rasterizer,
-        options: JointOptions,
-        exposures: Exposures | HeldExposures | None = None,
-        outliers: OutlierPixels | None = None,
-        region: TrainingRegion | None = None,
-    ) -> None:
-        self.optimizer, self.strategy, self.problem = optimizer, strategy, problem
-        self.views, self.rasterizer, self.options = views, rasterizer, options
-        self.exposures, self.outliers, self.region = exposures, outliers, region
-        self.iteration = 0
-        self.schedule = TrainingSchedule(options, views.camera)
-        self.device = optimizer.gaussians.means.device
-        self._pinholes = Pinholes(views.images, views.lenses)
-        self._lens = np.zeros(len(problem.cameras.lens()))
-        masks = None if region is None else region.masks
-        self._targets = TargetImages(views.images, self._pinholes, self.device, masks, options.crops)
-        self._surface_losses = self._made_surface_losses()
-        self._unknowns = GeographicAdam(problem, options, self.device)
-        names = ("photometric loss", "geographic loss", *(f"gradient of {name}" for name in self._watched()))
-        self._watch = FinitenessMonitor(names, self.device)
-
-    def step(self) -> StepReport:
-        """Run one iteration and return its figures.
-
-        1. One training view, or a window of it, is rendered and compared with its photograph.
-        2. The gradient of all losses moves Gaussians, similarity, cameras, constant errors, weights and exposures.
-        3. Density control records the render, and edits the Gaussians if its schedule says so.
-        """
-        self.iteration += 1
-        if self.iteration % _LENS_EVERY == 1:
-            self._look_through(self.problem.cameras.lens().detach().cpu().numpy())
-        index = self.schedule.view(self.iteration)
-        target = self._targets.get(self._look(self.iteration), self._look(self.iteration + 1))
-        pose = self.problem.cameras.cam_from_model(index)
-        render = self._render(pose, target, depth=self.problem.sees_by_depth(index))
-        colour = render.colour if self.exposures is None else self.exposures.apply(index, render.colour)
-        counting = target.mask
-        if self.outliers is not None:
-            counting = self.outliers.inliers(
-                colour, target.colour, counting, max(target.whole.width, target.whole.height)
-            )
-        photometric = photometric_loss(colour, target.colour, counting)
-        weight, by_depth = self.schedule.geographic_weight(self.iteration), self._by_depth(index, render, target)
-        geographic = self.problem.loss() if by_depth is None else self.problem.loss() + by_depth
-        self.optimizer.zero_grad()
-        self._unknowns.zero_grad()
-        total = target.part.weight * photometric + weight * geographic
-        penalty = self.strategy.penalty(self.optimizer.gaussians, self._own(render.stats))
-        for term in (penalty, self._surface(render, pose, target, index)):
-            total = total if term is None else total + term
-        total.backward()
-        self._note(photometric, geographic)
-        stats = self._of_whole(self._own(render.stats), pose, target)
-        self._apply(stats.visible)
-        self.strategy.observe(stats, target.whole)
-        self.strategy.update(self.iteration, self.optimizer, self.sample_contributions)
-        return StepReport(
-            photometric.detach(),
-            _mean_square(colour, target),
-            geographic.detach(),
-            weight,
-            len(render.stats.visible),
-            target.camera.width * target.camera.height,
-            None if by_depth is None else by_depth.detach(),
-        )
-
-    @torch.no_grad()
-    def sample_contributions(self, count: int, generator: torch.Generator) -> list[ViewContributions]:
-        """Return the contributions of all Gaussians to different training views (`splat.densify.Probe`).
-
-        Args:
-            count: number of views; fewer if there are not as many.
-            generator: draws the views.
-        """
-        contributions = []
-        for place in torch.randperm(len(self.views.camera), generator=generator)[:count].tolist():
-            index = int(self.views.camera[place])
-            shrink, pose = self._shrink_to_whole(index), self.problem.cameras.cam_from_model(index)
-            target = self._targets.get(Look(index, shrink))
-            colour = self._render(pose, target).colour
-            if self.exposures is not None:
-                colour = self.exposures.apply(index, colour)
-            error = (colour - target.colour).abs().mean(dim=-1)
-            error = error if target.mask is None else error * target.mask
-            of_view = view_contributions(self.optimizer.gaussians, pose, target.camera, error, self.rasterizer)
-            # Strategies count pixels of the whole photographs, which the schedule may have shrunken.
-            contributions.append(
-                ViewContributions(shrink**2 * of_view.weight_px, shrink**2 * of_view.high_error_px)
-            )
-        return contributions
-
-    def work(self, iteration: int) -> float:
-        """Return the work of an iteration at the present number of Gaussians, relative to others' work."""
-        camera = self.views.images.pinhole(int(self.views.camera[0]))
-        shrink = self.schedule.shrink(iteration, camera.width, camera.height)
-        width, height = camera.width // shrink, camera.height // shrink
-        windows = 1 if self.options.crops is None else self.options.crops.count(width, height)
-        surface = self.options.surface is not None
-        return iteration_seconds(width * height, len(self.optimizer.gaussians), surface=surface, windows=windows)
-
-    def pinhole(self, index: int) -> Pinhole:
-        """Return the camera of an undistorted photograph, with the lens in use."""
-        return self._pinholes.of(index)
-
-    def check_finite(self) -> None:
-        """Wait for the device, and stop the training if it has diverged.
-
-        Raises:
-            NonFiniteError: a loss or gradient was not finite; names the first and its iteration.
-        """
-        self._watch.check()
-
-    def slow_down(self, factor: float) -> None:
-        """Multiply all learning rates but the exposures' by `factor`, and forget values that were not finite."""
-        self.optimizer.rate_factor *= factor
-        self._watch.reset()
-
-    def _look_through(self, lens: np.ndarray) -> None:
-        """Render from now on through SfM's lenses with a change (L,) of their parameters."""
-        self._lens = lens.copy()
-        if self.views.lenses is not None and len(lens):
-            self._pinholes.renew(self.views.lenses.moved(self._lens))
-
-    def _by_depth(self, index: int, render: Render, target: TargetImage) -> Tensor | None:
-        """Return the loss of the view's control points by rendered depth, or None if the view has no such marks."""
-        if render.expected_depth is None:
-            return None
-        loss = self.problem.depth_loss(index, render.expected_depth, render.alpha, target.camera)
-        # Marks outside the window do not count: each is seen in one of the windows.
-        return None if loss is None else target.part.windows * loss
-
-    def _render(self, pose: Tensor, target: TargetImage, *, depth: bool = False) -> Render:
-        """Return a render of the Gaussians, and behind their rows those that surround the region."""
-        settings = RasterSettings(
-            sh_degree=self.schedule.sh_degree(self.iteration),
-            background=self.options.background,
-            depth=depth or self.options.surface is not None,
-            median=False,
-            window=target.window,
-        )
-        gaussians = self.optimizer.gaussians
-        if self.region is not None:
-            gaussians = Gaussians.concatenate([gaussians, self.region.surroundings])
-        return self.rasterizer.render(gaussians, pose, target.whole, settings)
-
-    def _own(self, stats: ScreenStats) -> ScreenStats:
-        """Return the statistics of the Gaussians in training, without those that surround the region."""
-        # Without a region nothing is left out: to look would make a GPU wait.
-        return stats if self.region is None else stats.of_first(len(self.optimizer.gaussians))
-
-    @torch.no_grad()
-    def _of_whole(self, stats: ScreenStats, pose: Tensor, target: TargetImage) -> ScreenStats:
-        """Return the statistics as a part of those of the whole photograph."""
-        part = target.part
-        if part.windows == 1:
-            return stats if part.share == 1.0 else stats.of_part(part.share)
-        means = self.optimizer.gaussians.means[stats.visible]
-        in_cam, camera = means @ pose[:3, :3].to(means).T + pose[:3, 3].to(means), target.whole
-        x, y, z = in_cam.unbind(dim=1)
-        x, y = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-        here = (x >= part.low[0]) & (x < part.high[0]) & (y >= part.low[1]) & (y < part.high[1])
-        return stats.of_part(part.share / part.windows, here)
-
-    def _made_surface_losses(self) -> SurfaceLosses | None:
-        if self.options.surface is None:
-            return None
-        extent_m, confined = self.optimizer.extent_m, self.region is not None
-        return SurfaceLosses(
-            self.options.surface, extent_m, self.rasterizer, self.views.gaussian_loss, confined=confined
-        )
-
-    def _surface(self, render: Render, pose: Tensor, target: TargetImage, index: int) -> Tensor | None:
-        """Return the weighted sum of the surface losses, or None if the options have no surface losses."""
-        if self._surface_losses is None:
-            return None
-        points = None if self.views.surface is None else self.views.surface(index)
-        view = RenderedView(render, target, pose, self._own(render.stats).visible, points)
-        gaussians = self.optimizer.gaussians
-        return self._surface_losses.of(gaussians, view, self.iteration, self.options.iterations)
-
-    def _watched(self) -> dict[str, Tensor]:
-        tensors = self.optimizer.gaussians.tensors()
-        return {name: tensors[name] for name in _WATCHED} | self._unknowns.named()
-
-    def _note(self, photometric: Tensor, geographic: Tensor) -> None:
-        losses = {"photometric loss": photometric, "geographic loss": geographic}
-        gradients = {
-            f"gradient of {name}": geographic.new_zeros(()) if tensor.grad is None else tensor.grad.sum()
-            for name, tensor in self._watched().items()
-        }
-        self._watch.note(self.iteration, losses | gradients)
-
-    def _apply(self, visible: Tensor) -> None:
-        self._unknowns.step(self.optimizer.rate_factor * self.schedule.geographic_rate(self.iteration))
-        self.optimizer.step(self.iteration, visible)
-        if self.exposures is not None:
-            self.exposures.step(self.iteration)
-
-    def _look(self, iteration: int) -> Look:
-        """Return the look at a photograph in an iteration."""
-        index = self.schedule.view(iteration)
-        camera = self.views.images.pinhole(index)
-        shrink = self.schedule.shrink(iteration, camera.width, camera.height)
-        return Look(index, shrink, self.schedule.visit(iteration))
-
-    def _shrink_to_whole(self, index: int) -> int:
-        """Return the factor by which a photograph is shrunken at this iteration, to be seen as a whole."""
-        camera = self.views.images.pinhole(index)
-        least = 1 if self.options.crops is None else self.options.crops.shrink(camera.width, camera.height)
-        return max(self.schedule.shrink(self.iteration, camera.width, camera.height), least)
-
-    def state(self) -> dict[str, Tensor]:
-        """Return all tensors that the next iteration depends on, by name, for a checkpoint."""
-        exposures = {} if self.exposures is None else self.exposures.state()
-        outliers = {} if self.outliers is None else self.outliers.state()
-        return {
-            "iteration": torch.tensor(self.iteration),
-            "extended_from": torch.tensor(self.schedule.extended_from),
-            "rate_factor": torch.tensor(self.optimizer.rate_factor, dtype=torch.float64),
-            "lens": torch.from_numpy(self._lens),
-            **prefixed("gaussians", self.optimizer.gaussians.tensors()),
-            **prefixed("optimizer", self.optimizer.state()),
-            **prefixed("strategy", self.strategy.state()),
-            **prefixed("geo", self._unknowns.state()),
-            **prefixed("exposures", exposures),
-            **prefixed("outliers", outliers),
-        }
-
-    def restore(self, state: Mapping[str, Tensor]) -> None:
-        """Restore a state, from which the next iteration continues."""
-        self.iteration = int(state["iteration"])
-        self.schedule.extended_from = int(state["extended_from"])
-        self.optimizer.rate_factor = float(state["rate_factor"])
-        self._look_through(state["lens"].cpu().numpy())
-        self._watch.reset()
-        tensors = {name: tensor.to(self.device) for name, tensor in unprefixed("gaussians", state).items()}
-        gaussians = Gaussians(**tensors)
-        fresh = torch.full((len(gaussians),), -1, dtype=torch.int64, device=self.device)
-        fresh[: min(len(gaussians), len(self.optimizer.gaussians))] = 0
-        self.optimizer.rearrange(gaussians, fresh)
-        self.optimizer.restore(unprefixed("optimizer", state))
-        self.strategy.restore(unprefixed("strategy", state))
-        if self.exposures is not None:
-            self.exposures.restore(unprefixed("exposures", state))
-        if self.outliers is not None:
-            self.outliers.restore(unprefixed("outliers", state))
-        self._unknowns.restore(unprefixed("geo", state))
-
-
-@torch.no_grad()
-def _mean_square(colour: Tensor, target: TargetImage) -> Tensor:
-    """Return the mean square error over the pixels that count, without waiting for the device to count them."""
-    error = (colour - target.colour).square()
-    if target.mask is None:
-        return error.mean()
-    return (error * target.mask[..., None]).sum() / (3 * target.mask.sum()).clamp_min(1)
+    start = f"{prefix}/"
+    return {name.removeprefix(start): tensor for name, tensor in state.items() if name.startswith(start)}

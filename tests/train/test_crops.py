@@ -17,10 +17,10 @@ from pipelines.splat.rasterizer.api import RasterSettings, Window
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from pipelines.splat.surface import ObservedPoints, SurfaceSettings
 from pipelines.survey.photographs import ImageCache, Pinholes
+from pipelines.train.losses import RenderedView, training_losses, weighted_sum
 from pipelines.train.region import RegionMasks
-from pipelines.train.schedule import JointOptions
-from pipelines.train.surface_losses import RenderedView, SurfaceLosses
-from pipelines.train.target_images import Crops, Look, TargetImages
+from pipelines.train.schedule import JointOptions, TrainingSchedule
+from pipelines.train.target_images import Crops, ImageLook, TargetImages
 from tests import tiny_training as tiny
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -58,28 +58,28 @@ def test_windows_cover_each_pixel_once_and_are_small_enough(size: tuple[int, int
 
 def test_each_round_of_visits_shows_each_pixel_once(images: ImageCache) -> None:
     targets = TargetImages(images, Pinholes(images), torch.device("cpu"), crops=CROPS)
-    whole = TargetImages(images, Pinholes(images), torch.device("cpu")).get(Look(2))
+    whole = TargetImages(images, Pinholes(images), torch.device("cpu")).get(ImageLook(2))
     places = []
     for turn in range(2):
         shown = torch.full_like(whole.colour, torch.nan)
         for visit in range(WINDOWS):
-            target = targets.get(Look(2, visit=WINDOWS * turn + visit))
-            assert target.window is not None and target.part.windows == WINDOWS
-            assert torch.isnan(shown[target.window.slices]).all()
-            shown[target.window.slices] = target.colour
-            places.append(target.window)
+            target = targets.get(ImageLook(2, visit=WINDOWS * turn + visit))
+            assert target.part.window is not None and target.part.windows == WINDOWS
+            assert torch.isnan(shown[target.part.window.slices]).all()
+            shown[target.part.window.slices] = target.colour
+            places.append(target.part.window)
         assert torch.equal(shown, whole.colour)
     assert len(set(places)) > WINDOWS, "cuts move from round to round"
 
 
-def losses(targets: TargetImages, looks: list[Look], gaussians: Gaussians, ssim: float) -> Iterator[tuple]:
+def losses(targets: TargetImages, looks: list[ImageLook], gaussians: Gaussians, ssim: float) -> Iterator[tuple]:
     """Target, weighted loss and statistics of each look, with gradients added to the Gaussians."""
     for look in looks:
         target = targets.get(look)
         pose = torch.eye(4)
         pose[0, 3] = -float(tiny.poses().cam_center_in_model[look.index, 0])
         render = CpuRasterizer().render(
-            gaussians, pose, target.whole, RasterSettings(sh_degree=0, window=target.window)
+            gaussians, pose, target.whole, RasterSettings(sh_degree=0, window=target.part.window)
         )
         loss = photometric_loss(render.colour, target.colour, target.mask, ssim_weight=ssim)
         (target.part.weight * loss / target.part.windows).backward()
@@ -106,13 +106,13 @@ def test_windows_add_up_to_the_loss_of_the_photograph(images: ImageCache, region
     parts, whole = (
         TargetImages(images, Pinholes(images), torch.device("cpu"), masks, crops) for crops in (Crops(30), None)
     )
-    count = parts.get(Look(1, visit=0)).part.windows
+    count = parts.get(ImageLook(1, visit=0)).part.windows
     assert count > 2
     for ssim, tolerance in ((0.0, 1e-5), (0.2, 0.3)):
         one, many = leaves(), leaves()
-        ((_, expected, _),) = losses(whole, [Look(1)], one, ssim)
+        ((_, expected, _),) = losses(whole, [ImageLook(1)], one, ssim)
         values = [
-            loss for _, loss, _ in losses(parts, [Look(1, visit=visit) for visit in range(count)], many, ssim)
+            loss for _, loss, _ in losses(parts, [ImageLook(1, visit=visit) for visit in range(count)], many, ssim)
         ]
         assert sum(values) == pytest.approx(expected, rel=tolerance / 2)
         for name, tensor in one.tensors().items():
@@ -154,7 +154,7 @@ def test_each_place_belongs_to_one_window_of_a_round(images: ImageCache) -> None
     for turn in range(3):
         seen = 0
         for visit in range(WINDOWS):
-            target = targets.get(Look(0, visit=WINDOWS * turn + visit))
+            target = targets.get(ImageLook(0, visit=WINDOWS * turn + visit))
             place = torch.tensor([[20.3, 31.8], [50.1, 7.2], [-9.0, 60.0]])  # the last beyond a corner
             low, high = torch.tensor(target.part.low), torch.tensor(target.part.high)
             seen += int(((place >= low) & (place < high)).all(dim=1).sum())
@@ -169,13 +169,21 @@ def test_windows_add_up_to_the_surface_losses_of_the_photograph(images: ImageCac
     points = ObservedPoints(near)  # most of them in the left half
     gaussians, pose = tiny.true_gaussians(), torch.eye(4)
     for settings in (SurfaceSettings(1.0, 0, 0, 0), SurfaceSettings(0, 1.0, 0, 0)):
-        losses = SurfaceLosses(settings, tiny.EXTENT_M, CpuRasterizer())
+        schedule = TrainingSchedule(JointOptions(10, surface=settings), np.arange(len(images)))
+        trainer = tiny.trainer(images, schedule.options)
+        every = training_losses(
+            trainer.problem, trainer.strategy, schedule, CpuRasterizer(), extent_m=tiny.EXTENT_M
+        )
+        losses = [loss for loss in every if loss.name in ("flatness", "compactness", "depth", "normals")]
         values = []
-        for targets, looks in ((whole, [Look(1)]), (parts, [Look(1, visit=visit) for visit in range(WINDOWS)])):
+        for targets, looks in (
+            (whole, [ImageLook(1)]),
+            (parts, [ImageLook(1, visit=visit) for visit in range(WINDOWS)]),
+        ):
             for target in map(targets.get, looks):
-                raster = RasterSettings(sh_degree=0, depth=True, median=False, window=target.window)
+                raster = RasterSettings(sh_degree=0, depth=True, median=False, window=target.part.window)
                 render = CpuRasterizer().render(gaussians, pose, target.whole, raster)
-                view = RenderedView(render, target, pose, render.stats.visible, points)
-                values.append(float(losses.of(gaussians, view, 1, 10)))
+                view = RenderedView(1, pose, target, gaussians, render, render.stats, render.colour, points=points)
+                values.append(float(weighted_sum(losses, view, 1)[0]))
         assert np.mean(values[1:]) == pytest.approx(values[0], rel=0.02)
         assert max(values[1:]) > 1.1 * values[0], "windows differ"

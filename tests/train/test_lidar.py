@@ -13,8 +13,7 @@ from pipelines.geometry.footprints import voxel_keys
 from pipelines.geometry.similarity import Similarity
 from pipelines.surface.lidar_cloud import planes_of
 from pipelines.surface.registration import registration
-from pipelines.train.lidar import planes_of as observed_planes
-from pipelines.train.lidar import registration_of
+from pipelines.train.lidar import plane_observations, registration_of
 from pipelines.train.lidar_surface import LidarPlanes, _areas, verdict
 from tests.towns import EXTRA, PIXEL_M, SIGMA_M, TOWN, WITH_EXTRA, Town, scanned, surface_of, views_of
 
@@ -103,7 +102,7 @@ def test_another_place_is_refused() -> None:
 def test_planes_agree_with_the_shift_that_was_found() -> None:
     found = registration(scanned(TOWN, (0.06, -0.08, 0.10)), views_of(TOWN), 0)
     similarity = Similarity(translation=np.array([9.0, 5.0, 1.0]))
-    planes = observed_planes(found, similarity)
+    planes = plane_observations(found, similarity)
     errors = SystematicErrors((SystematicError("lidar-shift", (1.0, 1.0, 1.0)),))
     state = State(similarity, np.zeros((1, 6)), np.zeros(0), found.shift_m)
     base = CameraPoses(np.eye(3)[None], np.zeros((1, 3)))

@@ -49,7 +49,7 @@ class TownMaps:
 def fused() -> FusedSurface:
     cloud = scanned(TOWN)
     nothing = np.zeros(len(cloud), dtype=bool)
-    judged = CloudVerdict(nothing, nothing, np.full(len(cloud), 0.9), np.zeros(len(cloud), np.int64), ())
+    judged = CloudVerdict(nothing, np.full(len(cloud), 0.9), ())
     return FusedSurface(cast(Any, TownMaps()), cloud, judged, PIXEL_M)
 
 

@@ -110,13 +110,13 @@ def test_guessed_points_lie_at_the_height_of_the_sfm_points(
     surface: SceneSurface, material: tuple[Rendered, Scene, ImageCache]
 ) -> None:
     scene = material[1]
-    east = guessed_points(scene, surface, 300, 0, lambda points: points[:, 0] > 0)
+    east = guessed_points(scene, surface.maps, 300, 0, lambda points: points[:, 0] > 0)
     assert 150 < len(east.rgb) <= 300 and east.rgb.std() > 20
     assert (east.point_in_model[:, 0] > 0).all() and np.isnan(east.normal_in_model).all()
     near = east.point_in_model[(np.abs(east.point_in_model[:, :2]) < 26).all(axis=1)]
     # Heights are those of the nine nearest of some hundred points, metres apart on slopes of up to a half.
     assert np.median(np.abs(near[:, 2] - ground_height(near[:, 0], near[:, 1]))) < 4 * QUARTER_PX_M
-    nothing = guessed_points(scene, surface, 0, 0, lambda points: points[:, 0] > 0)
+    nothing = guessed_points(scene, surface.maps, 0, 0, lambda points: points[:, 0] > 0)
     assert len(nothing.rgb) == 0
 
 

@@ -11,7 +11,7 @@ import torch
 
 from pipelines.geometry.cameras import Camera, Pinhole
 from pipelines.survey.photographs import ImageCache, Photograph, Pinholes
-from pipelines.train.target_images import Look, TargetImages, shrunken
+from pipelines.train.target_images import ImageLook, TargetImages, shrunken
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -31,7 +31,7 @@ def cache(folder: Path, camera: Camera, count: int = 1) -> ImageCache:
 
 def test_a_shrunken_photograph_is_the_mean_of_its_blocks(tmp_path: Path) -> None:
     images = cache(tmp_path, PINHOLE)
-    target = TargetImages(images, Pinholes(images), torch.device("cpu")).get(Look(0, 4))
+    target = TargetImages(images, Pinholes(images), torch.device("cpu")).get(ImageLook(0, 4))
     full = images.image(0)[:28, :40].astype(np.float64) / 255
     blocks = full.reshape(7, 4, 10, 4, 3).mean(axis=(1, 3))
     assert np.abs(target.colour.numpy() - blocks).max() <= 0.5 / 255 + 1e-6  # stored as bytes
@@ -52,10 +52,10 @@ def test_a_block_counts_only_where_all_of_its_pixels_do(tmp_path: Path) -> None:
     covered = np.array(images.mask(0))
     assert covered.any() and not covered.all()
     targets = TargetImages(images, Pinholes(images), torch.device("cpu"))
-    mask = targets.get(Look(0, 2)).mask
+    mask = targets.get(ImageLook(0, 2)).mask
     assert mask is not None
     assert np.array_equal(mask.numpy(), covered.reshape(15, 2, 21, 2).all(axis=(1, 3)))
-    full = targets.get(Look(0)).mask
+    full = targets.get(ImageLook(0)).mask
     assert full is not None and np.array_equal(full.numpy(), covered)
 
 
@@ -67,4 +67,4 @@ def test_images_of_one_camera_share_a_mask_and_only_one_map_is_kept(tmp_path: Pa
         images.mask(index)
     assert len(list((tmp_path / "cache").glob("*.mask.npy"))) == 1
     targets = TargetImages(images, Pinholes(images), torch.device("cpu"))
-    assert targets.get(Look(0)).mask is targets.get(Look(2)).mask
+    assert targets.get(ImageLook(0)).mask is targets.get(ImageLook(2)).mask

@@ -15,11 +15,10 @@ from pipelines.core.workspace import Workspace
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.survey.scene import photographs
 from pipelines.train.adjusted_scene import AdjustedScene
-from pipelines.train.assembly import make_trainer
 from pipelines.train.geographic.problem import held_problem, refining_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import TrainOptions
-from pipelines.train.trainer import JointTrainer, load_checkpoint, save_checkpoint
+from pipelines.train.trainer import JointTrainer, load_checkpoint, make_trainer, save_checkpoint
 from tests.splat_scenes import Rendered, make_rendered, write_photographs, write_rendered
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -74,7 +73,7 @@ def test_an_iteration_reads_no_value(workspace: Workspace, strategy: str) -> Non
         for _ in range(3):
             report = trainer.step()
         assert [place for place in reads.places if "rasterizer/cpu.py" not in place.replace("\\", "/")] == []
-        float(report.photometric)  # the probe hears this
+        float(report.losses["photometric"])  # the probe hears this
     assert reads.places[-1] == "the test"
 
 
@@ -85,7 +84,7 @@ def test_a_step_moves_everything(workspace: Workspace) -> None:
     report = trainer.step()
     assert trainer.iteration == 1
     assert 0 < report.weight < 0.05
-    assert float(report.photometric) > 0
+    assert float(report.losses["photometric"]) > 0
     after = trainer.optimizer.gaussians.tensors()
     assert any(not torch.equal(before[name], after[name].detach()) for name in before)
     assert float(trainer.problem.similarity.y.detach().abs().max()) > 0
@@ -100,8 +99,8 @@ def test_state_restores_the_next_step_exactly(workspace: Workspace, tmp_path: Pa
     two.restore(load_checkpoint(tmp_path / "c.npz"))
     for _ in range(3):
         first, second = one.step(), two.step()
-        assert float(first.photometric) == float(second.photometric)
-        assert float(first.geographic) == float(second.geographic)
+        assert float(first.losses["photometric"]) == float(second.losses["photometric"])
+        assert float(first.losses["geographic"]) == float(second.losses["geographic"])
     state, again = one.state(), two.state()
     assert state.keys() == again.keys()
     for name in state:
@@ -112,26 +111,26 @@ def test_state_of_a_run_that_has_not_begun(workspace: Workspace, tmp_path: Path)
     one, two = trainer_of(workspace), trainer_of(workspace)
     save_checkpoint(tmp_path / "c.npz", one.state())
     two.restore(load_checkpoint(tmp_path / "c.npz"))
-    assert float(one.step().photometric) == float(two.step().photometric)
+    assert float(one.step().losses["photometric"]) == float(two.step().losses["photometric"])
 
 
 def test_views_are_seen_through_the_lens_that_follows(workspace: Workspace) -> None:
     one, two = trainer_of(workspace), trainer_of(workspace)
-    before, basis = one.pinhole(0), one.problem.cameras.lens_basis
+    before, basis = one.pinholes.of(0), one.problem.cameras.lens_basis
     with torch.no_grad():  # toward a focal length two per cent longer
         one.problem.cameras.z.copy_(2 * basis[0] / basis[0].square().sum())
     one.step()
     fx = float(one.problem.cameras.lens()[0].detach()) + before.fx
-    assert one.pinhole(0).fx == pytest.approx(fx, abs=0.1)  # but for the step itself
+    assert one.pinholes.of(0).fx == pytest.approx(fx, abs=0.1)  # but for the step itself
     # It stays for a hundred iterations, whatever the cameras do, also for who goes on from there.
     with torch.no_grad():
         one.problem.cameras.z.zero_()
     two.restore(one.state())
     one.step(), two.step()
-    assert two.pinhole(0) == one.pinhole(0) != before
+    assert two.pinholes.of(0) == one.pinholes.of(0) != before
     one.iteration = 100
     one.step()
-    assert one.pinhole(0).fx == pytest.approx(before.fx, abs=0.2)
+    assert one.pinholes.of(0).fx == pytest.approx(before.fx, abs=0.2)
 
 
 def test_cameras_that_were_solved_once_do_not_move(workspace: Workspace) -> None:
@@ -142,7 +141,7 @@ def test_cameras_that_were_solved_once_do_not_move(workspace: Workspace) -> None
     sh = trainer.optimizer.gaussians.sh.detach().clone()
     for _ in range(3):
         report = trainer.step()
-    assert float(report.geographic) == 0
+    assert float(report.losses["geographic"]) == 0
     assert torch.equal(problem.cameras.moved()[1], center)
     np.testing.assert_array_equal(problem.similarity.current().translation, similarity.translation)
     assert torch.equal(problem.cameras.lens(), lens)

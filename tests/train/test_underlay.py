@@ -77,9 +77,9 @@ def test_a_place_is_hidden_by_known_depths_or_where_no_view_looks() -> None:
     camera, looking_down = Pinhole(40, 40, 50.0, 50.0, 20.0, 20.0), np.diag([1.0, -1.0, -1.0])
     depth = np.full((40, 40), 50.0, dtype=np.float32)
     depth[:, :20] = 0
-    surface: Any = SimpleNamespace(camera=lambda _index: camera, depth=lambda _index: depth)
+    maps: Any = SimpleNamespace(camera=lambda _index: camera, depth=lambda _index: depth)
     poses = CameraPoses(np.stack([looking_down] * 3), np.array([[0.0, 0.0, 50.0]] * 3))
     scene: Any = SimpleNamespace(train=np.arange(3), poses=poses)
     east, west, above, beside = [10.0, 0.0, -2.0], [-10.0, 0.0, -2.0], [10.0, 0.0, 2.0], [100.0, 0.0, -2.0]
-    found = hidden(np.array([east, west, above, beside]), scene, surface)
+    found = hidden(np.array([east, west, above, beside]), scene, maps)
     np.testing.assert_array_equal(found, [True, False, False, True])

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -23,18 +24,16 @@ from pipelines.splat.memory import free_memory_bytes, require_memory
 from pipelines.splat.rasterizer.backends import device_of, rasterizer
 from pipelines.surface.depth_maps import DepthMaps
 from pipelines.survey.block_plan import BlockPlan, BlockTraining, PlannedBlock
-from pipelines.survey.photographs import ImageCache
 from pipelines.survey.scene import photographs
 from pipelines.train.adjusted_scene import AdjustedScene
-from pipelines.train.assembly import make_trainer
 from pipelines.train.forecast import training_size
 from pipelines.train.geographic.problem import held_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.loop import METRICS, TrainingRecord, train_in_folder
 from pipelines.train.options import BlockTrainOptions
-from pipelines.train.region import RegionMasks, SceneBox, TrainingRegion
+from pipelines.train.region import RegionMasks, SceneBox, TrainingRegion, region_masks
 from pipelines.train.surface import SceneSurface
-from pipelines.train.trainer import JointTrainer
+from pipelines.train.trainer import JointTrainer, make_trainer
 
 _LEAST_VIEWS = 2
 _LAST_ROWS = 20
@@ -44,31 +43,41 @@ def run(stage: StageRun, options: BlockTrainOptions) -> Summary:
     """Train the block, and return its key figures.
 
     Raises:
-        BackendUnavailableError: `--backend cuda` without a GPU or without gsplat.
-        ResourceError: the training would not fit into memory.
-        ConvergenceError: the training diverged twice.
-        DegenerateGeometryError: too few photographs show the block.
-        KeyboardInterrupt: the user asked to stop; a checkpoint was written.
-        GeorefError: a product or a photograph cannot be read.
+        DegenerateGeometryError: too few photographs show the block; and the errors of `train.stage.run`.
     """
     backend, workspace = rasterizer(options.backend), stage.workspace
     block = load_json(BlockPlan, workspace.path(BLOCK_PLAN)).block(options.id)
     whole = AdjustedScene.load(workspace, SOLUTION)
     box = SceneBox.around(whole.scene.point_in_model)
-    solved = whole.of_images(_indices(whole, block))
+    index = whole.scene.sparse.image_index()
+    rows = np.array([index[name] for name in block.cameras if name in index], dtype=np.int64)
+    if len(rows) < _LEAST_VIEWS:
+        raise DegenerateGeometryError(f"{len(rows)} photographs show block {block.id}: give fewer --blocks")
+    solved = whole.of_images(rows)
     options = options.model_copy(update={"max_gaussians": block.gaussians, "optimize_cameras": False})
     images = photographs(solved.scene.sparse, solved.survey, workspace, options.effort.max_image_size)
     scaffold = read_gaussians(workspace.path(SCAFFOLD)).to(device_of(backend))
     size = training_size(options, len(images), images.largest(), beside=len(scaffold))
     require_memory(size, free_memory_bytes(device_of(backend)))
     images.build(stage.progress)
-    surface = _surface(stage, solved, images) if options.dense else None
-    views = solved.views(images, solved.scene.train, backend)
-    masks = views.masks(block.region, scaffold, surface, stage.progress)
-    region = _region(block, box, scaffold, masks)
-    training = TrainingScene(_seeing(solved, masks).scene, images, surface, region)
-    trainer = make_trainer(training, held_problem(solved), backend, options, solved.exposures(device_of(backend)))
-    record = train_in_folder(stage, trainer, options, _iterations(stage))
+    maps = None
+    if options.dense:
+        maps = DepthMaps(workspace.cache / "surface", solved.scene, images)
+        maps.build(stage.progress)
+    train = solved.scene.train
+    masks = region_masks(
+        solved, train, images, backend, block.region, stand_in=scaffold, maps=maps, progress=stage.progress
+    )
+    seeing = masks.seeing()
+    if len(seeing) < _LEAST_VIEWS:
+        raise DegenerateGeometryError(f"{len(seeing)} photographs show the surface of a block: give fewer --blocks")
+    surface = None if maps is None else SceneSurface(maps)
+    scene, region = replace(solved.scene, train=seeing), _region(block, box, scaffold, masks)
+    training, exposures = TrainingScene(scene, images, surface, region), solved.exposures(device_of(backend))
+    trainer = make_trainer(training, held_problem(solved), backend, options, exposures)
+    earlier = None if stage.extends is None else stage.extends / "record.json"
+    done = load_json(BlockTraining, earlier).iterations if earlier is not None and earlier.is_file() else 0
+    record = train_in_folder(stage, trainer, options, done)
     measured = _measured(stage, trainer, block, record)
     write_gaussians(stage.out / "gaussians.ply", trainer.optimizer.gaussians.detached())
     save_json(measured, stage.out / "record.json")
@@ -76,25 +85,6 @@ def run(stage: StageRun, options: BlockTrainOptions) -> Summary:
         f"block {block.id}: {measured.gaussians_in_cell} Gaussians, train PSNR {measured.train_psnr:.2f} dB",
         measured.model_dump(mode="json"),
     )
-
-
-def _indices(whole: AdjustedScene, block: PlannedBlock) -> np.ndarray:
-    """Return the indices of the block's cameras in the scene of the whole.
-
-    Raises:
-        DegenerateGeometryError: too few photographs show the block.
-    """
-    index = whole.scene.sparse.image_index()
-    rows = np.array([index[name] for name in block.cameras if name in index], dtype=np.int64)
-    if len(rows) < _LEAST_VIEWS:
-        raise DegenerateGeometryError(f"{len(rows)} photographs show block {block.id}: give fewer --blocks")
-    return rows
-
-
-def _surface(stage: StageRun, solved: AdjustedScene, images: ImageCache) -> SceneSurface:
-    maps = DepthMaps(stage.workspace.cache / "surface", solved.scene, images)
-    maps.build(stage.progress)
-    return SceneSurface(maps)
 
 
 def _region(block: PlannedBlock, box: SceneBox, scaffold: Gaussians, masks: RegionMasks) -> TrainingRegion:
@@ -105,28 +95,8 @@ def _region(block: PlannedBlock, box: SceneBox, scaffold: Gaussians, masks: Regi
     return TrainingRegion(block.region, box, outside, sky.to(torch.device("cpu")), masks)
 
 
-def _seeing(solved: AdjustedScene, masks: RegionMasks) -> AdjustedScene:
-    """Return the scene without the training views that do not show the block.
-
-    Raises:
-        DegenerateGeometryError: too few do.
-    """
-    seeing = masks.seeing()
-    if len(seeing) < _LEAST_VIEWS:
-        raise DegenerateGeometryError(f"{len(seeing)} photographs show the surface of a block: give fewer --blocks")
-    return solved.trained_on(seeing)
-
-
-def _iterations(stage: StageRun) -> int:
-    """Return the iterations of the finished training that this one may extend; 0: there is none."""
-    if stage.extends is None or not (stage.extends / "record.json").is_file():
-        return 0
-    return load_json(BlockTraining, stage.extends / "record.json").iterations
-
-
 def _measured(stage: StageRun, trainer: JointTrainer, block: PlannedBlock, record: TrainingRecord) -> BlockTraining:
-    lines = (stage.out / METRICS).read_text(encoding="utf-8").splitlines()
-    rows = [json.loads(line) for line in lines]
+    rows = [json.loads(line) for line in (stage.out / METRICS).read_text(encoding="utf-8").splitlines()]
     means = {name: float(np.mean([row[name] for row in rows])) for name in ("gaussians", "visible", "pixels")}
     gaussians, region = trainer.optimizer.gaussians.detached(), trainer.region
     assert region is not None

@@ -1,9 +1,8 @@
 """Merged model: of each block the Gaussians in its cell, and the solution that all blocks have held.
 
-Disagreement of neighbouring blocks where both were trained: the internal precision of the merged model.
-
-A view that shows the overlap of two blocks is rendered twice: with the Gaussians of either block, and the scaffold
-around it. Where both renders show a surface in the overlap, their depths and colours are compared.
+Its internal precision is the disagreement of neighbouring blocks. A view that shows the overlap of two blocks is
+rendered twice: with the Gaussians of either block, and the scaffold around it. Where both renders show a surface in
+the overlap, their depths and colours are compared.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations
@@ -38,24 +37,17 @@ from pipelines.core.types import BoolArray, FloatArray
 from pipelines.core.workspace import Summary
 from pipelines.formats.colmap import read_sparse
 from pipelines.formats.splat_ply import join_splat_plys
-from pipelines.geometry.cameras import Pinhole
 from pipelines.robust.statistics import mad_sigma
 from pipelines.splat.gaussians import Gaussians, read_gaussians
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings
 from pipelines.splat.rasterizer.backends import device_of, rasterizer
 from pipelines.splat.surface import measured_depth
-from pipelines.survey.block_plan import (
-    BlockCell,
-    BlockPlan,
-    BlockRecord,
-    BlockTraining,
-    MergedBlock,
-    PlannedBlock,
-    Seam,
-)
+from pipelines.survey.block_plan import BlockPlan, BlockRecord, BlockTraining, MergedBlock, PlannedBlock, Seam
 from pipelines.survey.photographs import pinhole_of
 from pipelines.survey.trained_model import Adjustment, TrainedModel
+from pipelines.train.adjusted_scene import figures_of
 from pipelines.train.blocks.parts import Parts
+from pipelines.train.schedule import BACKGROUND
 
 _VIEWS = 4  # of a seam
 _CANDIDATES = 16  # from which they are chosen, by small renders
@@ -66,35 +58,17 @@ _LEAST_PIXELS = 200  # of a seam: fewer tell nothing
 
 
 def compare_neighbours(parts: Parts, plan: BlockPlan, solution: Adjustment, progress: Progress) -> tuple[Seam, ...]:
-    """Return the disagreement of all neighbours whose overlap some view shows.
-
-    Args:
-        parts: of the training.
-        plan: of the blocks, all of which are trained.
-        solution: cameras and lenses.
-        progress: counts the seams.
-
-    Raises:
-        InputError: a block or the scaffold cannot be read.
-    """
-    pairs = list(neighbours(plan))
+    """Return the disagreement of all neighbours whose overlap some view shows."""
+    pairs = [pair for pair in combinations(plan.blocks, 2) if pair[0].region.meets(pair[1].region)]
     if not pairs:
         return ()
     views = SeamViews(parts, plan, solution)
     found = []
     with progress.task("seams", len(pairs)) as task:
         for first, second in pairs:
-            seam = views.seam(first, second)
-            found += [] if seam is None else [seam]
+            found.append(views.seam(first, second))
             task.advance()
-    return tuple(found)
-
-
-def neighbours(plan: BlockPlan) -> Iterator[tuple[PlannedBlock, PlannedBlock]]:
-    """Yield the pairs of blocks whose regions have points in common."""
-    for first, second in combinations(plan.blocks, 2):
-        if first.region.meets(second.region):
-            yield first, second
+    return tuple(seam for seam in found if seam is not None)
 
 
 @dataclass(frozen=True)
@@ -110,15 +84,10 @@ class SeamViews:
     """Views of the overlaps of trained blocks, rendered by the models of the blocks.
 
     Memory holds the Gaussians of few blocks at a time.
-
-    Args:
-        parts: of the training.
-        plan: of the blocks.
-        solution: cameras and lenses.
     """
 
     def __init__(self, parts: Parts, plan: BlockPlan, solution: Adjustment) -> None:
-        self._parts, self._plan, self._solution = parts, plan, solution
+        self._parts, self._plan = parts, plan
         self._backend: Rasterizer = rasterizer(parts.options.backend)
         self._device = device_of(self._backend)
         self._poses = solution.poses
@@ -130,7 +99,12 @@ class SeamViews:
     def seam(self, first: PlannedBlock, second: PlannedBlock) -> Seam | None:
         """Return the disagreement of two blocks; None if no view shows enough of their overlap."""
         depths, colours, views = [], [], 0
-        for name in self._best_views(first, second):
+        common = sorted(set(first.cameras) & set(second.cameras))
+        common = common[:: max(1, len(common) // _CANDIDATES)]
+        shown = {name: int(self._view(first, name, _CANDIDATE_PX, (first, second)).counts.sum()) for name in common}
+        for name in sorted(common, key=lambda name: -shown[name])[:_VIEWS]:
+            if not shown[name]:
+                break
             one, other = (self._view(block, name, _IMAGE_PX, (first, second)) for block in (first, second))
             both = one.counts & other.counts
             if not both.any():
@@ -150,14 +124,6 @@ class SeamViews:
             colour_rms=float(np.sqrt(np.concatenate(colours).mean())),
         )
 
-    def _best_views(self, first: PlannedBlock, second: PlannedBlock) -> list[str]:
-        """Return the names of the views that show most of an overlap."""
-        common = sorted(set(first.cameras) & set(second.cameras))
-        common = common[:: max(1, len(common) // _CANDIDATES)]
-        shown = {name: int(self._view(first, name, _CANDIDATE_PX, (first, second)).counts.sum()) for name in common}
-        best = sorted(common, key=lambda name: -shown[name])[:_VIEWS]
-        return [name for name in best if shown[name]]
-
     def _view(self, block: PlannedBlock, name: str, size_px: int, pair: tuple[PlannedBlock, PlannedBlock]) -> _View:
         index = self._index[name]
         pinhole = pinhole_of(self._sfm.camera_of(index), min(size_px, self._parts.options.effort.max_image_size))
@@ -170,53 +136,32 @@ class SeamViews:
         measured = measured_depth(view.median_depth, view.expected_depth, view.depth_variance)
         depth = measured.cpu().double().numpy()
         solid = (view.alpha > _SOLID).cpu().numpy() & (depth > 0)
-        inside = _in_all(depth, matrix, pinhole, [one.region for one in pair])
-        return _View(view.colour.clamp(0, 1), depth, solid & inside)
+        points = (pinhole.points_at(depth) - matrix[:3, 3]) @ matrix[:3, :3]
+        inside = np.all([one.region.contains(points) for one in pair], axis=0)
+        return _View(view.colour.clamp(0, 1), depth, solid & inside.reshape(depth.shape))
 
     def _model_of(self, number: int) -> Gaussians:
         """Return the Gaussians of a block, with the scaffold outside of it, on the device."""
-        own = read_gaussians(self._parts.of_block(number).path(BLOCK_GAUSSIANS))
+        own = read_gaussians(self._parts.place(number).path(BLOCK_GAUSSIANS))
         around = ~self._plan.block(number).region.contains(self._scaffold.means.double().numpy())
         return Gaussians.concatenate([own, self._scaffold.select(torch.from_numpy(around))]).to(self._device)
-
-
-def _in_all(depth_m: FloatArray, pose: FloatArray, pinhole: Pinhole, cells: list[BlockCell]) -> BoolArray:
-    """Return the pixels (H, W) whose surface lies in all cells.
-
-    Args:
-        depth_m: (H, W) along z.
-        pose: (4, 4) cam ← model.
-        pinhole: of H × W pixels.
-        cells: in `model`.
-    """
-    points = (pinhole.points_at(depth_m) - pose[:3, 3]) @ pose[:3, :3]
-    inside = np.all([cell.contains(points) for cell in cells], axis=0)
-    return np.asarray(inside.reshape(depth_m.shape))
-
-
-_BLACK = (0.0, 0.0, 0.0)
 
 
 def merge_blocks(parts: Parts, plan: BlockPlan, folder: Path, progress: Progress) -> Summary:
     """Write the product of `train` from the trained blocks of a plan, and return its key figures.
 
-    Args:
-        parts: of the training.
-        plan: of the blocks, all of which are trained.
-        folder: receives the product.
-        progress: shows the comparison of neighbours.
-
     Raises:
-        InputError: a block cannot be read.
+        InputError: a block or the scaffold cannot be read.
     """
     trainings = [parts.training(block) for block in plan.blocks]
-    cells = [_gaussians_in_cell(parts, block.id) for block in plan.blocks]
+    # The Gaussians of each cell, adapted to those of its neighbours.
+    cells = [parts.whole.root / TRAIN_SEAMS.folder / f"{block.id}.ply" for block in plan.blocks]
     count = join_splat_plys(cells, folder / "gaussians.ply")
     solution = load_json(Adjustment, parts.whole.path(SOLUTION))
     model = TrainedModel(
         **dict(solution),
         max_image_size=parts.options.effort.max_image_size,
-        background=_BLACK,
+        background=BACKGROUND,
         sh_degree=read_gaussians(cells[0], slice(0, 1)).sh_degree,
         iterations=max(training.iterations for training in trainings),
         gaussians=count,
@@ -227,24 +172,17 @@ def merge_blocks(parts: Parts, plan: BlockPlan, folder: Path, progress: Progress
     shutil.copyfile(parts.workspace.path(SIM3_POSTERIOR), folder / Path(TRAIN_POSTERIOR).name)
     _write_metrics(parts, plan, folder / "metrics.jsonl")
     seams = compare_neighbours(parts, plan, solution, progress)
-    blocks = tuple(
-        MergedBlock(cell=block.cell, training=training)
-        for block, training in zip(plan.blocks, trainings, strict=True)
-    )
+    pairs = zip(plan.blocks, trainings, strict=True)
+    blocks = tuple(MergedBlock(cell=block.cell, training=training) for block, training in pairs)
     save_json(BlockRecord(blocks=blocks, seams=seams), folder / "blocks.json")
     return _summary(model, trainings, seams)
-
-
-def _gaussians_in_cell(parts: Parts, number: int) -> Path:
-    """Return the file of the Gaussians of a cell, adapted to those of its neighbours."""
-    return parts.whole.root / TRAIN_SEAMS.folder / f"{number}.ply"
 
 
 def _write_metrics(parts: Parts, plan: BlockPlan, path: Path) -> None:
     """Write metrics of the whole: means over the blocks, and sums of Gaussians and seconds."""
     by_iteration: dict[int, list[dict[str, float]]] = {}
     for block in plan.blocks:
-        source = parts.of_block(block.id).path("block/metrics.jsonl")
+        source = parts.place(block.id).path("block/metrics.jsonl")
         file_size(source)
         for line in source.read_text(encoding="utf-8").splitlines():
             row = json.loads(line)
@@ -252,42 +190,31 @@ def _write_metrics(parts: Parts, plan: BlockPlan, path: Path) -> None:
     with path.open("w", encoding="utf-8") as lines:
         for iteration, rows in sorted(by_iteration.items()):
             if len(rows) == len(plan.blocks):
-                lines.write(json.dumps({"iteration": iteration, **_joined(rows)}) + "\n")
-
-
-def _joined(rows: Sequence[dict[str, float]]) -> dict[str, float]:
-    means = {name: float(np.mean([row[name] for row in rows])) for name in ("photometric", "psnr")}
-    sums = {name: sum(row[name] for row in rows) for name in ("seconds", "gaussians")}
-    return means | sums
+                means = {name: float(np.mean([row[name] for row in rows])) for name in ("photometric", "psnr")}
+                sums = {name: sum(row[name] for row in rows) for name in ("seconds", "gaussians")}
+                lines.write(json.dumps({"iteration": iteration, **means, **sums}) + "\n")
 
 
 def _summary(model: TrainedModel, trainings: Sequence[BlockTraining], seams: Sequence[Seam]) -> Summary:
     psnr = float(np.average([t.train_psnr for t in trainings], weights=[t.photographs for t in trainings]))
-    sigma = np.sqrt(np.diag(np.array(model.geo_from_model.covariance)))
     values = {
         "blocks": len(trainings),
         "iterations": model.iterations,
         "gaussians": model.gaussians,
         "train_psnr": round(psnr, 3),
         "seconds": round(sum(training.seconds for training in trainings), 1),
-        "similarity_sigma_m": [round(float(value), 5) for value in sigma[4:]],
-        "gnss_outliers": list(model.gnss_outliers),
-        "control_outliers": list(model.control_outliers),
-        "estimated_errors": [error.model_dump() for error in model.estimated_errors],
+        **figures_of(model),
     }
     key_figure = f"{model.gaussians} gaussians in {len(trainings)} blocks, train PSNR {psnr:.2f} dB"
     if seams:
-        spread = math.sqrt(_pooled([seam.depth_nmad_m for seam in seams], seams))
+        squares = np.square([[seam.depth_nmad_m for seam in seams], [seam.colour_rms for seam in seams]])
+        pooled = np.average(squares, axis=1, weights=[seam.pixels for seam in seams])
+        spread, colour_rms = map(math.sqrt, pooled.tolist())
         values |= {
             "seams": len(seams),
             "seam_depth_nmad_m": round(spread, 5),
             "seam_depth_shift_m": round(max(abs(seam.depth_median_m) for seam in seams), 5),
-            "seam_colour_rms": round(math.sqrt(_pooled([seam.colour_rms for seam in seams], seams)), 5),
+            "seam_colour_rms": round(colour_rms, 5),
         }
         key_figure += f", neighbours agree to {spread:.3f} m"
     return Summary(key_figure, values, cautions=model.cautions)
-
-
-def _pooled(values: Sequence[float], seams: Sequence[Seam]) -> float:
-    """Return the mean square of values of seams, each weighted by its pixels."""
-    return float(np.average(np.square(values), weights=[seam.pixels for seam in seams]))

@@ -1,10 +1,8 @@
 """Division of a survey into blocks: cells of equal load, the photographs of each, predicted memory.
 
-Reads the survey, the SfM model and the initial similarity; no photographs. Writes `plan.json`.
-
-Load of a survey's parts, predicted from the SfM points before any photograph is read.
-
-The Gaussians that a surface needs grow with the pixels in which photographs show it, and a block's memory and time
+Reads the survey, the SfM model and the initial similarity; no photographs. Writes `plan.json`. The plane is divided
+into cells by a kd-tree (doi 10.1145/361002.361007) that halves the load. The load is predicted from the SfM points:
+the Gaussians that a surface needs grow with the pixels in which photographs show it, and a block's memory and time
 with the Gaussians that its views show (doi 10.48550/arXiv.2510.01767).
 
 1. Each photograph is divided into a grid. The points observed in one of its cells share the pixels of the cell, so
@@ -12,13 +10,11 @@ with the Gaussians that its views show (doi 10.48550/arXiv.2510.01767).
 2. A point's surface is the mean of its pixels over the photographs that observe it: the size of the surface that it
    stands for, in pixels.
 3. The Gaussians of the whole are shared out among the points by their surface.
-
-Division of the plane into cells of equal load: a kd-tree (doi 10.1145/361002.361007) that halves the load.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,12 +25,12 @@ from pipelines.core.products import save_json
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.core.workspace import StageRun, Summary
-from pipelines.geometry.cameras import Pinhole, project
+from pipelines.geometry.cameras import project
 from pipelines.splat.memory import USABLE, TrainingSize, predicted_peak_bytes
 from pipelines.survey.block_plan import BlockCell, BlockPlan, PlannedBlock, scaffold_gaussians
 from pipelines.survey.photographs import pinhole_of
 from pipelines.survey.scene import Scene, load_adjusted_scene
-from pipelines.train.blocks.options import PlanOptions
+from pipelines.train.options import PlanOptions
 
 _COLUMNS, _ROWS = 16, 12
 # Observations beyond this number add nothing to shares of a block, but gigabytes: points are left out evenly.
@@ -64,18 +60,9 @@ class ObservedSurface:
         rows = inside[self.obs_point]
         return np.bincount(self.obs_image[rows], self.obs_share[rows], minlength=images).astype(np.float64)
 
-    def share_of(self, cell: BlockCell) -> float:
-        """Return the share of the survey's surface in a cell, 0 … 1."""
-        return float(self.surface[cell.contains(self.point_in_model)].sum())
-
 
 def observed_surface(scene: Scene, most_observations: int = _MOST_OBSERVATIONS) -> ObservedSurface:
-    """Return the surface that the training images of a scene observe.
-
-    Args:
-        scene: cameras and SfM points.
-        most_observations: number of observations beyond which points are left out evenly.
-    """
+    """Return the surface that the training images of a scene observe; too many observations are thinned evenly."""
     sparse = scene.sparse
     step = -(-len(sparse.obs_point) // most_observations)
     is_train = np.zeros(len(sparse.image_name), dtype=bool)
@@ -106,18 +93,26 @@ _OUTER = 0.01  # of the load lies beyond either end of a cell's extent: a stray 
 MOST_BLOCKS = 4096
 
 
-def cells_of_number(points: FloatArray, load: FloatArray, count: int) -> list[BlockCell]:
-    """Return cells that share the plane out among them, with loads as equal as the points allow.
+def cells_of_number(
+    points: FloatArray,
+    load: FloatArray,
+    count: int,
+    cell: BlockCell = BlockCell(),  # noqa: B008
+) -> list[BlockCell]:
+    """Return cells that share the plane, or `cell`, out among them, with loads as equal as the points allow.
 
     Args:
         points: (P, 2 or more) east and north, metres.
         load: (P,) of each point, ≥ 0.
-        count: number of cells.
 
     Raises:
         DegenerateGeometryError: the points lie at fewer places than cells are wanted.
     """
-    return _divided(BlockCell(), points, load, count)
+    if count == 1:
+        return [cell]
+    inside, first = cell.contains(points), count // 2
+    below, above = _halves(cell, points[inside], load[inside], first / count)
+    return [*cells_of_number(points, load, first, below), *cells_of_number(points, load, count - first, above)]
 
 
 def cells_that_fit(
@@ -126,8 +121,7 @@ def cells_that_fit(
     """Return cells that share the plane out among them, halved until each fits.
 
     Args:
-        points: (P, 2 or more) east and north, metres.
-        load: (P,) of each point, ≥ 0.
+        points, load: as of `cells_of_number`.
         fits: returns whether a cell, with its extent (2,) in metres, is small enough.
 
     Raises:
@@ -157,14 +151,6 @@ def extent_of(points: FloatArray, load: FloatArray) -> FloatArray:
     return np.array([high - low for low, high in ends])
 
 
-def _divided(cell: BlockCell, points: FloatArray, load: FloatArray, count: int) -> list[BlockCell]:
-    if count == 1:
-        return [cell]
-    inside = cell.contains(points)
-    below, above = _halves(cell, points[inside], load[inside], (count // 2) / count)
-    return [*_divided(below, points, load, count // 2), *_divided(above, points, load, count - count // 2)]
-
-
 def _halves(cell: BlockCell, points: FloatArray, load: FloatArray, share: float) -> tuple[BlockCell, BlockCell]:
     """Return the cell cut across its longer axis, with a share of the load in its first part."""
     for axis in np.argsort(-extent_of(points, load), kind="stable"):
@@ -192,13 +178,7 @@ _SAMPLED_CAMERAS = 24  # of a block, in which its Gaussians are counted
 
 
 def run(stage: StageRun, options: PlanOptions) -> Summary:
-    """Write the plan, and return its key figures.
-
-    Raises:
-        ResourceError: no number of blocks fits into the memory.
-        DegenerateGeometryError: the survey cannot be cut into so many blocks.
-        GeorefError: a product cannot be read.
-    """
+    """Write the plan, and return its key figures; raises a `GeorefError` if a product cannot be read."""
     workspace = stage.workspace
     *_, scene = load_adjusted_scene(workspace)
     plan = plan_blocks(scene, options, stage.progress)
@@ -218,17 +198,15 @@ def run(stage: StageRun, options: PlanOptions) -> Summary:
 def plan_blocks(scene: Scene, options: PlanOptions, progress: Progress = SILENT) -> BlockPlan:
     """Return the division of a scene into blocks.
 
-    Args:
-        scene: cameras and SfM points.
-        options: of the plan.
-        progress: counts the blocks.
-
     Raises:
         ResourceError: no number of blocks fits into the memory.
         DegenerateGeometryError: the survey cannot be cut into so many blocks.
     """
-    planner = _Planner(scene, observed_surface(scene), options)
-    memory = None if options.blocks else planner.worker_bytes()
+    planner, memory = _Planner(scene, observed_surface(scene), options), None
+    if not options.blocks and options.block_memory is not None:
+        memory = int(options.block_memory * 2**30)
+    elif not options.blocks:
+        memory = free_main_memory_bytes()
     cells = planner.cells(memory)
     with progress.task("blocks", len(cells)) as task:
         blocks = []
@@ -252,19 +230,8 @@ class _Planner:
     surface: ObservedSurface
     options: PlanOptions
 
-    def worker_bytes(self) -> int | None:
-        """Return the memory that a worker may use; None: unknown."""
-        if self.options.block_memory is not None:
-            return int(self.options.block_memory * 2**30)
-        return free_main_memory_bytes()
-
     def cells(self, memory_bytes: int | None) -> list[BlockCell]:
-        """Return the cells: of the number in the options, or such that each block fits into the memory.
-
-        Raises:
-            ResourceError: not even a block without Gaussians would fit.
-            DegenerateGeometryError: the survey cannot be cut into so many blocks.
-        """
+        """Return the cells: of the number in the options, or such that each block fits into the memory if known."""
         points, load = self.surface.point_in_model, self.surface.surface
         if self.options.blocks:
             return cells_of_number(points, load, self.options.blocks)
@@ -278,7 +245,8 @@ class _Planner:
             )
 
         def fits(cell: BlockCell, extent_m: FloatArray) -> bool:
-            return self._peak_bytes(self._gaussians(self._widened(cell, extent_m))) <= usable
+            region = cell.widened(self.options.block_overlap * extent_m)
+            return self._peak_bytes(self._gaussians(region.contains(points))) <= usable
 
         return cells_that_fit(points, load, fits)
 
@@ -286,13 +254,15 @@ class _Planner:
         """Return the block of a cell."""
         points = self.surface.point_in_model
         inside = cell.contains(points)
-        margin = self._margin(extent_of(points[inside], self.surface.surface[inside]))
-        region = cell.widened(margin)
-        in_region = region.contains(points)
+        margin = self.options.block_overlap * extent_of(points[inside], self.surface.surface[inside])
+        in_region = cell.widened(margin).contains(points)
         share = self.surface.share_in_views(in_region, len(self.scene.sparse.image_name))
         cameras = self._cameras(share)
-        pixels = np.array([camera.width * camera.height for camera in map(self._pinhole, cameras.tolist())])
-        gaussians = self._gaussians(region)
+        pinholes = [
+            pinhole_of(self.scene.sparse.camera_of(i), self.options.max_image_size) for i in cameras.tolist()
+        ]
+        pixels = np.array([camera.width * camera.height for camera in pinholes])
+        gaussians = self._gaussians(in_region)
         return PlannedBlock(
             id=number,
             cell=cell,
@@ -333,28 +303,17 @@ class _Planner:
             seen.append(float(surface[ahead[shown]].sum()))
         return self.options.max_gaussians * float(np.mean(seen)) if seen else 0.0
 
-    def _margin(self, extent_m: FloatArray) -> FloatArray:
-        return np.asarray(self.options.block_overlap * extent_m)
-
-    def _widened(self, cell: BlockCell, extent_m: FloatArray) -> BlockCell:
-        return cell.widened(self._margin(extent_m))
-
-    def _gaussians(self, region: BlockCell) -> int:
-        """Return the limit of the Gaussians in a region."""
-        return max(round(self.options.max_gaussians * self.surface.share_of(region)), 1)
+    def _gaussians(self, inside: BoolArray) -> int:
+        """Return the limit of the Gaussians at the points of a mask (P,)."""
+        share = float(self.surface.surface[inside].sum())
+        return max(round(self.options.max_gaussians * share), 1)
 
     def _peak_bytes(self, gaussians: int) -> int:
         """Return the predicted peak of the memory of a block's process, with the scaffold around the block."""
-        observations = len(self.scene.sparse.obs_point)
-        scene = _PROCESS_BYTES + _OBSERVATION_BYTES * observations
-        count = gaussians + scaffold_gaussians(self.options.max_gaussians)
-        cameras = [self._pinhole(index) for index in self._one_of_each_camera()]
+        sparse, options = self.scene.sparse, self.options
+        scene = _PROCESS_BYTES + _OBSERVATION_BYTES * len(sparse.obs_point)
+        count = gaussians + scaffold_gaussians(options.max_gaussians)
+        _, one_of_each = np.unique(sparse.image_camera_id, return_index=True)
+        cameras = [pinhole_of(sparse.camera_of(int(index)), options.max_image_size) for index in one_of_each]
         largest = max(cameras, key=lambda camera: camera.width * camera.height)
-        return scene + predicted_peak_bytes(TrainingSize(count, largest, self.options.sh_degree, cameras=0))
-
-    def _one_of_each_camera(self) -> Sequence[int]:
-        _, first = np.unique(self.scene.sparse.image_camera_id, return_index=True)
-        return [int(index) for index in first]
-
-    def _pinhole(self, index: int) -> Pinhole:
-        return pinhole_of(self.scene.sparse.camera_of(index), self.options.max_image_size)
+        return scene + predicted_peak_bytes(TrainingSize(count, largest, options.sh_degree, cameras=0))

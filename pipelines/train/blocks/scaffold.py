@@ -14,26 +14,19 @@ from pipelines.splat.rasterizer.backends import device_of, rasterizer
 from pipelines.survey.block_plan import scaffold_gaussians, scaffold_image_px
 from pipelines.survey.scene import photographs
 from pipelines.train.adjusted_scene import AdjustedScene
-from pipelines.train.assembly import make_trainer
 from pipelines.train.forecast import training_size
 from pipelines.train.geographic.problem import held_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.loop import train_in_folder
 from pipelines.train.options import TrainOptions
+from pipelines.train.trainer import make_trainer
 
 _SHARE = 0.5  # of a block's iterations
 _MOST_ITERATIONS, _MOST_LOOKS = 3_000, 10_000
 
 
 def run(stage: StageRun, options: TrainOptions) -> Summary:
-    """Train the scaffold, and return its key figures.
-
-    Raises:
-        ResourceError: the training would not fit into memory.
-        ConvergenceError: the training diverged twice.
-        KeyboardInterrupt: the user asked to stop; a checkpoint was written.
-        GeorefError: a product or a photograph cannot be read.
-    """
+    """Train the scaffold, and return its key figures; errors are those of `train.stage.run`."""
     backend, workspace = rasterizer(options.backend), stage.workspace
     solved = AdjustedScene.load(workspace, SOLUTION)
     coarse = coarse_options(options, len(solved.scene.train))
@@ -50,14 +43,11 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
 
 
 def coarse_options(options: TrainOptions, photographs_count: int) -> TrainOptions:
-    """Return the options of the scaffold's training: fewer iterations, Gaussians and pixels, and no stereo.
+    """Return the options of the scaffold's training, of those of the blocks: less effort, and no stereo.
 
-    Args:
-        options: of the blocks.
-        photographs_count: number of training photographs; each is looked at once, if they are not too many.
+    Each of the training photographs is looked at once, if they are not too many.
     """
-    effort = options.effort
-    looks = min(photographs_count, _MOST_LOOKS)
+    effort, looks = options.effort, min(photographs_count, _MOST_LOOKS)
     return options.model_copy(
         update={
             "iterations": max(min(int(_SHARE * effort.iterations), _MOST_ITERATIONS), looks),

@@ -11,8 +11,8 @@ the blocks. Writes `<number>.ply` with the Gaussians of each cell. An interrupte
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 
@@ -31,11 +31,11 @@ from pipelines.survey.block_plan import BlockCell, BlockPlan, PlannedBlock
 from pipelines.survey.photographs import ImageCache
 from pipelines.survey.scene import photographs
 from pipelines.train.adjusted_scene import AdjustedScene
-from pipelines.train.assembly import make_finisher
 from pipelines.train.geographic.problem import held_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import SeamOptions
-from pipelines.train.region import SceneBox, TrainingRegion
+from pipelines.train.region import SceneBox, TrainingRegion, region_masks
+from pipelines.train.trainer import make_finisher
 
 _SHARE = 0.2  # of a block's iterations
 _WIDTH = 0.5  # of the blocks' overlap, on each side of a seam
@@ -50,44 +50,48 @@ def run(stage: StageRun, options: SeamOptions) -> Summary:
         KeyboardInterrupt: the user asked to stop; the seams that have ended are kept.
         GeorefError: a product or a photograph cannot be read.
     """
-    workspace, backend = stage.workspace, rasterizer(options.backend)
+    workspace, backend, done = stage.workspace, rasterizer(options.backend), stage.out / _DONE
     plan = load_json(BlockPlan, workspace.path(BLOCK_PLAN))
     solved = AdjustedScene.load(workspace, SOLUTION)
     images = photographs(solved.scene.sparse, solved.survey, workspace, options.effort.max_image_size)
-    model = _CellFiles(stage.out, plan)
-    model.begin(workspace.root, afresh=not stage.resumed)
+    if not stage.resumed or not done.is_file():
+        for block in plan.blocks:
+            gaussians = read_gaussians(workspace.root / str(block.id) / BLOCK_GAUSSIANS)
+            inside = block.cell.contains(gaussians.means.double().numpy())
+            write_gaussians(_file(stage.out, block.id), gaussians.select(torch.from_numpy(inside)))
+        replace_text(done, "0")
     scaffold = read_gaussians(workspace.path(SCAFFOLD))
-    strips = _SeamTrainer(solved, images, scaffold, backend, options)
+    trainer = _SeamTrainer(stage.out, plan, solved, images, scaffold, backend, options)
     seams = list(seams_of(plan))
     with stage.progress.task("seams", len(seams)) as task, deferred_interrupts() as stop:
         for number, (first, second, strip) in enumerate(seams):
-            if number >= model.done():
-                strips.train(model, first, second, strip)
-                model.end(number + 1)
+            if number >= int(done.read_text(encoding="utf-8")):
+                trainer.train(first, second, strip)
+                replace_text(done, str(number + 1))
                 stage.record_progress(f"{number + 1} of {len(seams)} seams")
             task.advance()
             if stop.requested:
                 raise KeyboardInterrupt
-    count = sum(len(model.read(block.id)) for block in plan.blocks)
+    count = sum(len(read_gaussians(_file(stage.out, block.id))) for block in plan.blocks)
     values = {"seams": len(seams), "gaussians": count}
     return Summary(f"{len(seams)} seams of {len(plan.blocks)} blocks, {count} Gaussians", values)
 
 
-def seams_of(plan: BlockPlan) -> Iterable[tuple[PlannedBlock, PlannedBlock, BlockCell]]:
-    """Yield the pairs of blocks that have a strip along their common side, and the strip."""
+def _file(folder: Path, block: int) -> Path:
+    return folder / f"{block}.ply"
+
+
+def seams_of(plan: BlockPlan) -> Iterator[tuple[PlannedBlock, PlannedBlock, BlockCell]]:
+    """Yield the pairs of blocks that have a strip along their common side, and the strip.
+
+    Blocks that share a corner only have none.
+    """
     for first, second in combinations(plan.blocks, 2):
-        if (strip := strip_of(first, second)) is not None:
+        half = _WIDTH * np.minimum(first.margin_m, second.margin_m)
+        touching = sum(_touches(first.cell, second.cell, axis) for axis in (0, 1))
+        strip = first.cell.widened(half).common(second.cell.widened(half))
+        if touching == 1 and (half > 0).all() and strip is not None:
             yield first, second, strip
-
-
-def strip_of(first: PlannedBlock, second: PlannedBlock) -> BlockCell | None:
-    """Return the strip along the common side of two blocks; None: they have none, or share a corner only."""
-    half = _WIDTH * np.minimum(first.margin_m, second.margin_m)
-    touching = [axis for axis in (0, 1) if _touches(first.cell, second.cell, axis)]
-    if len(touching) != 1 or not (half > 0).all():
-        return None
-    wide, other = first.cell.widened(half), second.cell.widened(half)
-    return wide.common(other)
 
 
 def _touches(first: BlockCell, second: BlockCell, axis: int) -> bool:
@@ -98,81 +102,40 @@ def _touches(first: BlockCell, second: BlockCell, axis: int) -> bool:
 
 
 @dataclass(frozen=True)
-class _CellFiles:
-    """Gaussians of each cell, in files of the stage's folder, and the number of seams that are done."""
+class _SeamTrainer:
+    """Trainer of strips, with the folder of the cells' Gaussians and what all strips share."""
 
     folder: Path
     plan: BlockPlan
-
-    def begin(self, blocks: Path, *, afresh: bool) -> None:
-        """Write the Gaussians of each cell as its block has trained them, unless an interrupted run has."""
-        if not afresh and (self.folder / _DONE).is_file():
-            return
-        for block in self.plan.blocks:
-            gaussians = read_gaussians(blocks / str(block.id) / BLOCK_GAUSSIANS)
-            inside = block.cell.contains(gaussians.means.double().numpy())
-            write_gaussians(self._path(block.id), gaussians.select(torch.from_numpy(inside)))
-        self.end(0)
-
-    def done(self) -> int:
-        """Return the number of seams that are done."""
-        return int((self.folder / _DONE).read_text(encoding="utf-8"))
-
-    def end(self, number: int) -> None:
-        """Record the number of seams that are done."""
-        replace_text(self.folder / _DONE, str(number))
-
-    def near(self, cell: BlockCell) -> dict[int, Gaussians]:
-        """Return the Gaussians of the blocks that reach into a cell, by number."""
-        return {block.id: self.read(block.id) for block in self.plan.blocks if block.cell.meets(cell)}
-
-    def read(self, number: int) -> Gaussians:
-        """Return the Gaussians of a cell."""
-        return read_gaussians(self._path(number))
-
-    def write(self, parts: dict[int, Gaussians]) -> None:
-        """Replace the Gaussians of cells."""
-        for number, gaussians in parts.items():
-            write_gaussians(self._path(number), gaussians)
-
-    def _path(self, number: int) -> Path:
-        return self.folder / f"{number}.ply"
-
-
-@dataclass(frozen=True)
-class _SeamTrainer:
-    """Trainer of strips, with what all of them share."""
-
     solved: AdjustedScene
     images: ImageCache
     scaffold: Gaussians
     backend: Rasterizer
     options: SeamOptions
 
-    def train(self, model: _CellFiles, first: PlannedBlock, second: PlannedBlock, strip: BlockCell) -> None:
+    def train(self, first: PlannedBlock, second: PlannedBlock, strip: BlockCell) -> None:
         """Train the Gaussians of a strip, and put them back."""
         around = strip.widened(_WIDTH * np.minimum(first.margin_m, second.margin_m))
-        parts = model.near(around)
+        near = [block.id for block in self.plan.blocks if block.cell.meets(around)]
+        parts = {number: read_gaussians(_file(self.folder, number)) for number in near}
         together = Gaussians.concatenate(list(parts.values()))
         means = together.means.double().numpy()
         own = strip.contains(means)
         frozen = together.select(torch.from_numpy(around.contains(means) & ~own))
         beyond = torch.from_numpy(~around.contains(self.scaffold.means.double().numpy()))
         surroundings = Gaussians.concatenate([frozen, self.scaffold.select(beyond)])
-        start = together.select(torch.from_numpy(own))
-        trained = self._trained(sorted({*first.cameras, *second.cameras}), strip, start, surroundings)
+        rows = torch.from_numpy(own)
+        cameras = sorted({*first.cameras, *second.cameras})
+        trained = self._trained(cameras, strip, together.select(rows), surroundings)
         if trained is None:
             return
-        rows = torch.from_numpy(own)
         for name, values in together.tensors().items():
             values[rows] = trained.tensors()[name]
         ends = np.cumsum([len(part) for part in parts.values()])
-        changed = {
-            number: together.select(torch.arange(end - len(part), end))
-            for (number, part), end in zip(parts.items(), ends.tolist(), strict=True)
-            if own[end - len(part) : end].any()
-        }
-        model.write(changed)
+        for (number, part), end in zip(parts.items(), ends.tolist(), strict=True):
+            if own[end - len(part) : end].any():
+                changed = together.select(torch.arange(end - len(part), end))
+                write_gaussians(_file(self.folder, number), changed)
 
     def _trained(
         self, names: list[str], strip: BlockCell, start: Gaussians, surroundings: Gaussians
@@ -180,27 +143,26 @@ class _SeamTrainer:
         """Return the Gaussians of a strip after their training; None if too few views show the strip."""
         if not len(start):
             return None
-        device, index = device_of(self.backend), self.solved.scene.sparse.image_index()
+        scene, device = self.solved.scene, device_of(self.backend)
+        index = scene.sparse.image_index()
         train = np.array([index[name] for name in names if name in index], dtype=np.int64)
         everything = Gaussians.concatenate([start, surroundings]).to(device)
-        masks = self.solved.views(self.images, train, self.backend).masks(strip, everything)
+        masks = region_masks(self.solved, train, self.images, self.backend, strip, stand_in=everything)
         seeing = masks.seeing()
         if len(seeing) < _LEAST_VIEWS:
             return None
-        box = SceneBox.around(self.solved.scene.point_in_model)
+        box = SceneBox.around(scene.point_in_model)
         region = TrainingRegion(strip, box, surroundings.to(device), start.select(torch.zeros(0).long()), masks)
-        solved = self.solved.trained_on(seeing)
-        training = TrainingScene(solved.scene, self.images, None, region)
         iterations = max(int(_SHARE * self.options.effort.iterations), 1)
         trainer = make_finisher(
-            training,
+            TrainingScene(replace(scene, train=seeing), self.images, None, region),
             start.to(device),
-            held_problem(solved),
+            held_problem(self.solved),
             backend=self.backend,
             options=self.options.model_copy(update={"iterations": iterations}),
-            exposures=solved.exposures(device),
+            exposures=self.solved.exposures(device),
         )
         for _ in range(iterations):
             trainer.step()
-        trainer.check_finite()
+        trainer.watch.check()
         return trainer.optimizer.gaussians.detached().to(torch.device("cpu"))

@@ -1,8 +1,7 @@
-"""Solution that all blocks of a survey share: the adjustment, with the exposures of the photographs.
+"""Solution that all blocks of a survey share: the adjustment, with the exposures of the training photographs.
 
-Reads the survey, the SfM model and the adjustment. Writes `solution.json`.
-
-Exposures of the training photographs, from the colours that the photographs show at SfM points.
+The exposures follow from the colours that the photographs show at SfM points. Reads the survey, the SfM model and
+the adjustment. Writes `solution.json`.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from pipelines.core.products import save_json
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, ByteArray, FloatArray, IntArray
 from pipelines.core.workspace import StageRun, Summary
-from pipelines.geometry.cameras import Pinhole, undistort
+from pipelines.geometry.cameras import undistort
 from pipelines.splat.exposure import PointColours, adjusted_exposures
 from pipelines.survey.photographs import ImageCache
 from pipelines.survey.scene import Scene, photographs
@@ -27,15 +26,29 @@ _AROUND_PX = 5  # side of the square whose mean colour counts: a pixel at a corn
 _DARKEST, _BRIGHTEST = 4 / 255, 250 / 255  # a clipped channel does not show its exposure
 
 
+def run(stage: StageRun, options: SolutionOptions) -> Summary:
+    """Write the solution, and return its key figures; raises a `GeorefError` if something cannot be read."""
+    workspace = stage.workspace
+    adjusted = AdjustedScene.load(workspace)
+    solution, scene = adjusted.adjustment, adjusted.scene
+    if options.exposure:
+        images = photographs(scene.sparse, adjusted.survey, workspace, options.max_image_size)
+        images.build(stage.progress)
+        solution = with_exposures(solution, exposures_from_tracks(scene, images, stage.progress))
+    save_json(solution, stage.out / "solution.json")
+    values = {
+        "cameras": len(solution.cameras),
+        "gnss_outliers": list(solution.gnss_outliers),
+        "control_outliers": list(solution.control_outliers),
+        "estimated_errors": [error.model_dump() for error in solution.estimated_errors],
+    }
+    return Summary(f"{len(solution.cameras)} cameras", values, cautions=solution.cautions)
+
+
 def exposures_from_tracks(scene: Scene, images: ImageCache, progress: Progress = SILENT) -> FloatArray:
     """Return the exposures (n, 3, 4) of the training photographs, (A | b) of `splat.exposure`; others the identity.
 
     Each photograph is read once, and memory holds the colours of at most 300 tracks of each.
-
-    Args:
-        scene: tracks of the SfM model, and the training photographs.
-        images: undistorted photographs.
-        progress: shows the photographs that were read.
 
     Raises:
         DegenerateGeometryError: no SfM point is seen in two training photographs.
@@ -48,7 +61,8 @@ def exposures_from_tracks(scene: Scene, images: ImageCache, progress: Progress =
     with progress.task("colours of tracks", len(scene.train)) as task:
         for index in map(int, scene.train):
             mine = by_image[first[index] : first[index + 1]]
-            xy_px = _undistorted_px(scene, images.pinhole(index), index, sparse.obs_xy_px[rows[mine]])
+            pinhole, ray = images.pinhole(index), undistort(sparse.camera_of(index), sparse.obs_xy_px[rows[mine]])
+            xy_px = np.asarray(ray * [pinhole.fx, pinhole.fy] + [pinhole.cx, pinhole.cy])
             colour[mine] = _colours_at(images.image(index), images.mask(index), xy_px)
             task.advance()
     good = np.isfinite(colour).all(axis=1) & (colour > _DARKEST).all(axis=1) & (colour < _BRIGHTEST).all(axis=1)
@@ -56,12 +70,6 @@ def exposures_from_tracks(scene: Scene, images: ImageCache, progress: Progress =
     return adjusted_exposures(
         PointColours(sparse.obs_point[kept], sparse.obs_image[kept], colour[good]), len(images)
     )
-
-
-def _undistorted_px(scene: Scene, pinhole: Pinhole, image: int, xy_px: FloatArray) -> FloatArray:
-    """Return pixels (M, 2) of an undistorted photograph, from those of the original; NaN as in `undistort`."""
-    ray = undistort(scene.sparse.camera_of(image), xy_px)
-    return np.asarray(ray * [pinhole.fx, pinhole.fy] + [pinhole.cx, pinhole.cy])
 
 
 def _observations_in_use(scene: Scene) -> IntArray:
@@ -100,26 +108,3 @@ def _colours_at(photograph: ByteArray, mask: BoolArray, xy_px: FloatArray) -> Fl
     upper = (1 - right) * mean[row, column] + right * mean[row, column + 1]
     lower = (1 - right) * mean[row + 1, column] + right * mean[row + 1, column + 1]
     return np.where(inside[:, None], (1 - down) * upper + down * lower, np.nan)
-
-
-def run(stage: StageRun, options: SolutionOptions) -> Summary:
-    """Write the solution, and return its key figures.
-
-    Raises:
-        GeorefError: a product or a photograph cannot be read.
-    """
-    workspace = stage.workspace
-    adjusted = AdjustedScene.load(workspace)
-    solution, scene = adjusted.adjustment, adjusted.scene
-    if options.exposure:
-        images = photographs(scene.sparse, adjusted.survey, workspace, options.max_image_size)
-        images.build(stage.progress)
-        solution = with_exposures(solution, exposures_from_tracks(scene, images, stage.progress))
-    save_json(solution, stage.out / "solution.json")
-    values = {
-        "cameras": len(solution.cameras),
-        "gnss_outliers": list(solution.gnss_outliers),
-        "control_outliers": list(solution.control_outliers),
-        "estimated_errors": [error.model_dump() for error in solution.estimated_errors],
-    }
-    return Summary(f"{len(solution.cameras)} cameras", values, cautions=solution.cautions)

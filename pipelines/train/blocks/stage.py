@@ -20,21 +20,20 @@ from pipelines.jobs.engine import Job, JobEnd
 from pipelines.jobs.local import failed_of
 from pipelines.survey.block_plan import BlockPlan
 from pipelines.train.blocks.merge import merge_blocks
-from pipelines.train.blocks.parts import UPSTREAM, Parts, TrainingRequest
+from pipelines.train.blocks.parts import UPSTREAM, Parts
+from pipelines.train.options import TrainOptions
 
 log = logging.getLogger(__name__)
 
 
-def run(stage: StageRun, options: TrainingRequest) -> Summary:
-    """Train what is not trained, write the merged model, and return its key figures.
-
-    Raises:
-        KeyboardInterrupt: the user asked to stop; the blocks that ran have saved their work.
-        GeorefError: a part fails; the blocks that have ended are kept.
-    """
-    parts = Parts(stage.workspace, options)
-    plan = train_blocks(parts, stage.progress, force=stage.afresh, note=stage.record_progress)
-    _run_jobs("seams", seam_jobs(parts, plan, force=stage.afresh), stage.progress, stage.record_progress)
+def run(stage: StageRun, options: TrainOptions) -> Summary:
+    """Train what is not trained, write the merged model, and return its key figures; see `train_blocks`."""
+    parts, force, note = Parts(stage.workspace, options), stage.afresh, stage.record_progress
+    plan = train_blocks(parts, stage.progress, force=force, note=note)
+    if force or parts.why_missing(TRAIN_SEAMS):
+        largest = max(block.peak_bytes for block in plan.blocks)
+        job = Job("seams", ("blocks", "seams"), largest)
+        _run_jobs("seams", [_placed(job, parts, "seams", force=force)], stage.progress, note)
     return merge_blocks(parts, plan, stage.out, stage.progress)
 
 
@@ -44,8 +43,7 @@ def train_blocks(
     """Bring plan, solution, scaffold and all blocks up to date, and return the plan.
 
     Args:
-        parts: of the training.
-        progress: shows the tasks and jobs.
+        parts, progress: of the training; shows the tasks and jobs.
         force: start all afresh.
         note: receives how far the work has come, after each block (`2 of 4 blocks`).
 
@@ -57,45 +55,17 @@ def train_blocks(
     parts.run(SOLVE, force=force, progress=progress)
     plan = parts.plan()
     log.info("train: %d blocks", len(plan.blocks))
-    _run_jobs("scaffold", scaffold_jobs(parts, plan, force=force), progress, note)
-    _run_jobs("blocks", block_jobs(parts, plan, force=force), progress, note)
-    return plan
-
-
-def scaffold_jobs(parts: Parts, plan: BlockPlan, *, force: bool = False) -> list[Job]:
-    """Return the job that trains the scaffold; none if it is current."""
-    if not force and not parts.why_missing(TRAIN_SCAFFOLD):
-        return []
-    job = Job("scaffold", ("blocks", "scaffold"), min(block.peak_bytes for block in plan.blocks))
-    return [_placed(job, parts, "scaffold", force=force)]
-
-
-def block_jobs(parts: Parts, plan: BlockPlan, *, force: bool = False) -> list[Job]:
-    """Return the jobs that train the blocks which are not current, the largest first.
-
-    Args:
-        parts: of the training.
-        plan: of the blocks.
-        force: train all afresh.
-    """
-    blocks = plan.blocks if force else tuple(parts.waiting(plan))
-    return [
-        _placed(
-            Job(f"block {b.id}", ("blocks", "train", "--id", str(b.id)), b.peak_bytes),
-            parts,
-            str(b.id),
-            force=force,
-        )
-        for b in sorted(blocks, key=lambda block: -block.gaussians)
+    if force or parts.why_missing(TRAIN_SCAFFOLD):
+        least = min(block.peak_bytes for block in plan.blocks)
+        job = Job("scaffold", ("blocks", "scaffold"), least)
+        _run_jobs("scaffold", [_placed(job, parts, "scaffold", force=force)], progress, note)
+    jobs = [
+        Job(f"block {block.id}", ("blocks", "train", "--id", str(block.id)), block.peak_bytes)
+        for block in sorted(plan.blocks, key=lambda block: -block.gaussians)  # the largest first
+        if force or parts.why_missing(TRAIN_BLOCK, block.id)
     ]
-
-
-def seam_jobs(parts: Parts, plan: BlockPlan, *, force: bool = False) -> list[Job]:
-    """Return the job that trains across the seams; none if that is current."""
-    if not force and not parts.why_missing(TRAIN_SEAMS):
-        return []
-    job = Job("seams", ("blocks", "seams"), max(block.peak_bytes for block in plan.blocks))
-    return [_placed(job, parts, "seams", force=force)]
+    _run_jobs("blocks", [_placed(job, parts, job.arguments[-1], force=force) for job in jobs], progress, note)
+    return plan
 
 
 def require_trained(parts: Parts, plan: BlockPlan) -> None:
@@ -111,14 +81,7 @@ def require_trained(parts: Parts, plan: BlockPlan) -> None:
 
 
 def _placed(job: Job, parts: Parts, place: str, *, force: bool) -> Job:
-    """Return a job with its place in the workspace.
-
-    Args:
-        job: its arguments are those behind `georef`, without the workspace.
-        parts: of the training.
-        place: folder of its product, in `blocks/`.
-        force: start afresh.
-    """
+    """Return a job with the workspace in its arguments, and `place`, the folder of its product in `blocks/`."""
     root, shared = parts.workspace.root.absolute(), parts.whole.root.absolute()
     command, action, *more = job.arguments
     read = [root / name for name in (*(spec.folder for spec in UPSTREAM), REQUESTS, CONFIG_FILE)]
@@ -136,11 +99,7 @@ def _placed(job: Job, parts: Parts, place: str, *, force: bool) -> Job:
 
 
 def _run_jobs(title: str, jobs: Sequence[Job], progress: Progress, note: Callable[[str], None]) -> None:
-    """Run jobs to their ends.
-
-    Raises:
-        GeorefError: jobs have failed; names them.
-    """
+    """Run jobs to their ends; those that have failed are an error, which names them."""
     done = 0
 
     def ended(end: JobEnd) -> None:

@@ -1,10 +1,8 @@
-"""Geographic losses of a training: their sum, their weights, and their start at the adjustment.
+"""Geographic losses of a training: their sum, their weights, their start at the adjustment, and their optimiser.
 
 Whitened residuals make each term half of a χ², and the whole a maximum a posteriori estimate: but for L_rel and the
 photographs, the loss is that of the adjustment, so that a training starts at its minimum. `paper` takes plain mean
 squares in metres instead. A Cauchy kernel bounds the effect of one bad fix.
-
-Adam for what all views share: similarity, cameras, constant errors and weights of the losses.
 """
 
 from __future__ import annotations
@@ -31,7 +29,7 @@ from pipelines.train.geographic.terms import (
     ControlByDepth,
     ControlTerm,
     FixTerm,
-    Term,
+    TensorTerm,
     control_by_depth,
     depth_residuals,
     distance_term,
@@ -49,12 +47,13 @@ from pipelines.train.options import GeographicOptions
 from pipelines.train.schedule import JointOptions
 
 Weighting = Literal["whitened", "paper"]
-TermT = TypeVar("TermT", bound=Term)
+TermT = TypeVar("TermT", bound=TensorTerm)
 
 # A learned variance stays within this factor of the stated one, or of 1 m² if residuals are not whitened.
 _BOUND = {"whitened": 100.0, "paper": 1e4}
 # Uncertainty of the stated variances: σ of the logarithm.
 PRIOR_LOG_VARIANCE = 1.0
+_VARIANCE_RATE = 0.01  # first learning rate of the log-variances
 
 
 class TermWeights(torch.nn.Module):
@@ -109,7 +108,7 @@ class GeoProblem(torch.nn.Module):
         similarity: `geo_from_model`.
         cameras: poses in `model`.
         terms: the observations, at most one term of a kind; none: the loss is zero, and nothing moves.
-        errors: systematic errors of the measurements; None: there are none.
+        errors: systematic errors of the measurements; None: none.
         weighting: "whitened" (maximum a posteriori) or "paper" (plain mean squares).
         learned_weights: learn a variance factor of each term.
         control_by_depth: marks of the control points, if training projects them onto the rendered depth. Then
@@ -120,7 +119,7 @@ class GeoProblem(torch.nn.Module):
         self,
         similarity: LearnableSimilarity,
         cameras: CameraCorrections,
-        terms: Sequence[Term] = (),
+        terms: Sequence[TensorTerm] = (),
         *,
         errors: LearnableErrors | None = None,
         weighting: Weighting = "whitened",
@@ -128,7 +127,8 @@ class GeoProblem(torch.nn.Module):
         control_by_depth: ControlByDepth | None = None,
     ) -> None:
         super().__init__()
-        self.similarity, self.cameras, self.errors = similarity, cameras, errors
+        self.similarity, self.cameras = similarity, cameras
+        self.errors = errors or LearnableErrors(SystematicErrors(), np.zeros(0), np.zeros(0))
         self.terms, self.control_by_depth = tuple(terms), control_by_depth
         self.weighting = weighting
         self.weights = TermWeights({term.kind: term.dimension for term in terms}, weighting, learned_weights)
@@ -147,32 +147,31 @@ class GeoProblem(torch.nn.Module):
 
     def learned(self) -> dict[str, torch.nn.Parameter]:
         """Return the learned parameters by name: similarity y, cameras z, and, if any, errors x and weights u."""
-        more = {"u": self.weights.u} if self.errors is None else {"x": self.errors.x, "u": self.weights.u}
+        more = {"x": self.errors.x, "u": self.weights.u}
         return {"y": self.similarity.y, "z": self.cameras.z} | {k: p for k, p in more.items() if len(p)}
 
     def estimate(self) -> Estimate:
         """Return the present estimate, differentiable in all parameters of `learned`."""
-        rotation, center = self.cameras.moved()
-        if self.errors is None:
-            errors, vector = SystematicErrors(), center.new_zeros(0)
-        else:
-            errors, vector = self.errors.errors, self.errors.vector()
-        return Estimate(rotation, center, self.similarity(), errors, vector, self.cameras.lens())
+        errors, vector = self.errors.errors, self.errors.vector()
+        return Estimate(*self.cameras.moved(), self.similarity(), errors, vector, self.cameras.lens())
 
     def state(self) -> State:
         """Return the present values as a state of the adjustment."""
         with torch.no_grad():
-            tensors = [self.cameras.corrections(), self.cameras.lens()]
-            tensors += [] if self.errors is None else [self.errors.vector()]
+            tensors = self.cameras.corrections(), self.cameras.lens(), self.errors.vector()
             return State(self.similarity.current(), *(tensor.cpu().numpy() for tensor in tensors))
 
     def losses(self) -> dict[str, Tensor]:
         """Return the losses by kind: of each term, a mean of ρ; of the cameras; and of the systematic errors."""
         at = self.estimate()
-        values = {term.kind: self._rho(term, self._squared_as(term, at)).mean() for term in self.terms}
+        values = {}
+        for term in self.terms:
+            in_metres = self.weighting == "paper" and term.in_metres
+            residual = term.residuals(at) if in_metres else term.whitened(at)
+            values[term.kind] = self._rho(term, residual).mean()
         # A problem that holds the cameras has no z, and no loss.
         values["cameras"] = self.cameras.z.square().sum() / self._normaliser()
-        if self.errors is not None and len(at.vector):
+        if len(at.vector):
             values["errors"] = self.errors.prior() / self._normaliser()
         return values
 
@@ -180,7 +179,7 @@ class GeoProblem(torch.nn.Module):
         """Return L_abs + λ_gcp L_gcp + λ_rel L_rel + λ_att L_att + the losses of cameras and errors; scalar.
 
         - Whitened: every χ² has the same weight. λ is therefore the number of observations of a term over the
-          number of fixes, times `Term.share`, which is below 1 for L_rel only.
+          number of fixes, times `TensorTerm.share`, which is below 1 for L_rel only.
         - Paper: every λ is 1, and cameras and errors have no loss.
         - Control points through the rendered depth are not included: see `depth_loss`.
         """
@@ -234,23 +233,18 @@ class GeoProblem(torch.nn.Module):
         fixes = self.term(FixTerm)
         return len(self.cameras.center) if fixes is None else len(fixes)
 
-    def _factor(self, term: Term) -> float:
+    def _factor(self, term: TensorTerm) -> float:
         """Return λ of a term."""
         return 1.0 if self.weighting == "paper" else term.share * len(term) / self._normaliser()
 
-    def _squared_as(self, term: Term, at: Estimate) -> Tensor:
-        """Return the residuals (M, d) to be squared: whitened, or lengths in metres with "paper"."""
-        in_metres = self.weighting == "paper" and term.in_metres
-        return term.residuals(at) if in_metres else term.whitened(at)
-
-    def _rho(self, term: Term, residual: Tensor) -> Tensor:
+    def _rho(self, term: TensorTerm, residual: Tensor) -> Tensor:
         """Return ρ (M,) of residuals (M, d), divided by the learned σ of their term."""
         s = self.weights.log_variance(term.kind)
         scaled = residual if s is None else torch.exp(-0.5 * s) * residual
         chi2 = scaled.square().sum(dim=1)
         return chi2 if self.weighting == "paper" else cauchy(chi2, term.dimension)
 
-    def _priced(self, term: Term, value: Tensor) -> Tensor:
+    def _priced(self, term: TensorTerm, value: Tensor) -> Tensor:
         """Return a term's ρ plus the normalisation of its learned variance."""
         s = self.weights.log_variance(term.kind)
         return value if s is None else value + self.weights.price(term.kind) * s
@@ -270,15 +264,14 @@ def refining_problem(
     Args:
         adjusted: the adjustment, from which the training starts.
         measured: the measurements in use.
-        options: weights, and the terms that training has beside those of the adjustment.
         points: of `geolocate`, for L_rel; None: L_rel uses the cameras and their fixes.
-        seed: of the random pairs for L_rel.
+        options, seed: weights, further terms, and the random pairs of L_rel.
 
     Raises:
         InputError: `points` belongs to another model.
     """
     scene, state, record = adjusted.scene, adjusted.state(measured.errors), adjusted.adjustment.geo_from_model
-    terms: list[Term] = []
+    terms: list[TensorTerm] = []
     by_depth = None
     for term in measured.measured:
         if isinstance(term, adjustment.ControlPoints) and options.gcp_mode == "depth":
@@ -324,13 +317,7 @@ _MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 
 
 class GeographicAdam:
-    """Moments and rates of the unknowns of a problem.
-
-    Args:
-        problem: has the unknowns.
-        options: have their rates.
-        device: holds them.
-    """
+    """Adam for what all views share: moments and rates of the unknowns of a problem."""
 
     def __init__(self, problem: GeoProblem, options: JointOptions, device: torch.device) -> None:
         self._problem, self._device = problem, device
@@ -338,11 +325,11 @@ class GeographicAdam:
             "y": options.similarity_rate,
             "z": options.camera_rate,
             "x": options.similarity_rate,
-            "u": options.variance_rate,
+            "u": _VARIANCE_RATE,
         }
         # One kernel for each of these short vectors on a GPU, in place of a dozen whose launches take longer than
         # their work.
-        self._adam = torch.optim.Adam(
+        self.adam = torch.optim.Adam(
             [{"params": [parameter], "rate": rates[name]} for name, parameter in problem.learned().items()],
             fused=device.type == "cuda",
         )
@@ -351,22 +338,18 @@ class GeographicAdam:
         """Return the unknowns by what they are called in messages."""
         return {_NAMES[name]: parameter for name, parameter in self._problem.learned().items()}
 
-    def zero_grad(self) -> None:
-        """Forget the gradients."""
-        self._adam.zero_grad()
-
     def step(self, factor: float) -> None:
         """Move all unknowns by their gradients, at their rates times `factor`."""
-        for group in self._adam.param_groups:
+        for group in self.adam.param_groups:
             group["lr"] = factor * group["rate"]
-        self._adam.step()
+        self.adam.step()
 
     def state(self) -> dict[str, Tensor]:
         """Return unknowns and moments by name, for a checkpoint."""
         parameters = self._problem.learned()
         state: dict[str, Tensor] = {**parameters}
         for name, parameter in parameters.items():
-            moments = self._adam.state[parameter]
+            moments = self.adam.state[parameter]
             state |= {f"{name}_{key}": torch.as_tensor(value) for key, value in moments.items()}
         return state
 
@@ -376,6 +359,6 @@ class GeographicAdam:
             with torch.no_grad():
                 parameter.copy_(state[name])
             # A fused Adam keeps its count of steps on the device.
-            self._adam.state[parameter] = {
+            self.adam.state[parameter] = {
                 key: state[f"{name}_{key}"].to(self._device) for key in _MOMENTS if f"{name}_{key}" in state
             }

@@ -22,7 +22,7 @@ from pipelines.core.types import FloatArray, IntArray
 from pipelines.survey.adjustment import GeolocatedPoints
 from pipelines.survey.scene import Scene
 from pipelines.survey.survey import Survey
-from pipelines.train.geographic.unknowns import Estimate, TensorSimilarity, exp_so3, log_so3
+from pipelines.train.geographic.unknowns import Estimate, TensorSimilarity, exp_so3_tensor, log_so3_tensor
 
 RecordT = TypeVar("RecordT")
 
@@ -44,7 +44,7 @@ def moved_tensors(record: RecordT, move: Callable[[Tensor], Tensor]) -> RecordT:
     return replace(record, **tensors)  # type: ignore[type-var]
 
 
-class Term(ABC):
+class TensorTerm(ABC):
     """M observations of one kind.
 
     Attributes:
@@ -75,15 +75,8 @@ class Term(ABC):
 
 
 @dataclass(frozen=True)
-class FixTerm(Term):
-    """L_abs, `adjust.terms.Fixes`.
-
-    Attributes:
-        camera: (F,) int64 index into the cameras.
-        position_in_geo: (F, 3) float64 metres.
-        root_information: (F, 3, 3) float64, in 1/m.
-        bias: (F, B) float64, 1 where a block of the systematic errors is the bias of the fix's session.
-    """
+class FixTerm(TensorTerm):
+    """L_abs, `adjust.terms.Fixes`, in float64; `bias` (F, B) is 1 where a block of errors is the session's."""
 
     kind: ClassVar[str] = "absolute"
 
@@ -101,18 +94,10 @@ class FixTerm(Term):
 
 
 @dataclass(frozen=True)
-class ControlTerm(Term):
-    """L_gcp, `adjust.terms.ControlPoints`; J points, K marks in all.
+class ControlTerm(TensorTerm):
+    """L_gcp, `adjust.terms.ControlPoints`, in float64; J points, K marks in all.
 
-    Attributes:
-        point: (K,) int64 index into the points.
-        camera: (K,) int64 index into the cameras.
-        bearing_in_cam: (K, 3) float64 unit vectors.
-        sigma_rad: (K,) float64 angular σ of a mark.
-        bearing_by_lens: (K, 3, L) float64, derivative of the bearings by the lens parameters.
-        position_in_geo: (J, 3) float64 metres, surveyed.
-        root_information: (J, 3, 3) float64 of survey and intersection together, in 1/m; for control points through
-            the rendered depth, of the surface too.
+    The root information of control points through the rendered depth holds the surface's σ, too.
     """
 
     kind: ClassVar[str] = "control"
@@ -154,14 +139,8 @@ class ControlTerm(Term):
 
 
 @dataclass(frozen=True)
-class AttitudeTerm(Term):
-    """L_att, `adjust.terms.Attitudes`.
-
-    Attributes:
-        camera: (A,) int64 index into the cameras.
-        geo_from_cam: (A, 3, 3) float64, of the nominal camera axes.
-        root_information: (A, 3, 3) float64, in 1/rad.
-    """
+class AttitudeTerm(TensorTerm):
+    """L_att, `adjust.terms.Attitudes`, in float64."""
 
     kind: ClassVar[str] = "attitude"
     in_metres: ClassVar[bool] = False
@@ -174,22 +153,15 @@ class AttitudeTerm(Term):
         turned, recorded = at.geo_from_cam(self.camera), self.geo_from_cam
         common, boresight = at.error("common"), at.error("boresight")
         if common is not None:
-            turned = exp_so3(common) @ turned
+            turned = exp_so3_tensor(common) @ turned
         if boresight is not None:
-            recorded = recorded @ exp_so3(boresight)
-        return log_so3(turned.transpose(1, 2) @ recorded)
+            recorded = recorded @ exp_so3_tensor(boresight)
+        return log_so3_tensor(turned.transpose(1, 2) @ recorded)
 
 
 @dataclass(frozen=True)
-class PlaneTerm(Term):
-    """L_lidar, `adjust.terms.Planes`.
-
-    Attributes:
-        point_in_model: (M, 3) float64 metres, on the surface of the photographs.
-        position_in_geo: (M, 3) float64 metres, on the plane of the LiDAR.
-        normal_in_geo: (M, 3) float64 unit normals of the planes.
-        root_information: (M, 1, 1) float64, in 1/m, of the distance between both along the normal.
-    """
+class PlaneTerm(TensorTerm):
+    """L_lidar, `adjust.terms.Planes`, in float64."""
 
     kind: ClassVar[str] = "lidar"
     dimension: ClassVar[int] = 1
@@ -206,40 +178,29 @@ class PlaneTerm(Term):
         return (self.normal_in_geo * apart).sum(dim=1, keepdim=True)
 
 
-def tensor_term(term: adjustment.Term, errors: SystematicErrors) -> Term:
-    """Return a term of the adjustment as tensors.
-
-    Args:
-        term: of the adjustment.
-        errors: the systematic errors of its problem.
-    """
+def tensor_term(term: adjustment.Term, errors: SystematicErrors) -> TensorTerm:
+    """Return a term of the adjustment as tensors, given the systematic errors of its problem."""
     match term:
         case adjustment.Fixes():
             blocks = [(block.name, block.session) for block in errors.blocks]
             bias = [[block == ("bias", session) for block in blocks] for session in term.session.tolist()]
-            return FixTerm(
-                torch.from_numpy(term.camera),
-                torch.from_numpy(term.position_in_geo),
-                torch.from_numpy(term.root_information),
-                torch.tensor(bias, dtype=torch.float64).view(len(term), len(blocks)),
-            )
+            of_errors = torch.tensor(bias, dtype=torch.float64).view(len(term), len(blocks))
+            return FixTerm(**_tensors(term, "camera", "position_in_geo", "root_information"), bias=of_errors)
         case adjustment.ControlPoints():
-            return _of_arrays(ControlTerm, term)
+            return ControlTerm(**_tensors(term, *(field.name for field in fields(ControlTerm))))
         case adjustment.Attitudes():
-            return _of_arrays(AttitudeTerm, term)
+            return AttitudeTerm(**_tensors(term, *(field.name for field in fields(AttitudeTerm))))
         case adjustment.Planes():
-            return _of_arrays(PlaneTerm, term)
+            return PlaneTerm(**_tensors(term, *(field.name for field in fields(PlaneTerm))))
     raise TypeError(f"{term.kind} has no tensors")
 
 
-def _of_arrays(kind: Callable[..., RecordT], term: adjustment.Term) -> RecordT:
-    """Return the tensor term whose fields are those of a term of the adjustment."""
-    names = [field.name for field in fields(kind) if field.name != "share"]  # type: ignore[arg-type]
-    return kind(**{name: torch.from_numpy(np.ascontiguousarray(getattr(term, name))) for name in names})
+def _tensors(term: adjustment.Term, *names: str) -> dict[str, Tensor]:
+    return {name: torch.from_numpy(np.ascontiguousarray(getattr(term, name))) for name in names}
 
 
 @dataclass(frozen=True)
-class DistanceTerm(Term):
+class DistanceTerm(TensorTerm):
     """Distances between P pairs of geolocated points, or of cameras with fixes: the term L_rel.
 
     The distances are functions of the fixes, not independent measurements.
@@ -288,39 +249,37 @@ def distance_term(
     Args:
         scene: cameras and points as SfM left them.
         fixes: of the cameras; at least two.
-        points: of `geolocate`; None: take the cameras.
-        seed: of the random pairs.
+        points, seed: of `geolocate`, None: take the cameras; of the random pairs.
 
     Raises:
         InputError: `points` belongs to another model.
     """
-    distances = _pairs_of_points(scene, points, seed) if points is not None else None
-    distances = _pairs_of_cameras(scene, fixes, seed) if distances is None else distances
-    of_pairs = float((distances.distance_in_geo * distances.root_information[:, 0, 0]).square().sum())
-    share = min(1.0, _WORTH * _scale_information(fixes) / of_pairs) if of_pairs > 0 else 0.0
-    return replace(distances, share=share) if share > 0 else None
-
-
-def _pairs_of_points(scene: Scene, points: GeolocatedPoints, seed: int) -> DistanceTerm | None:
-    if not np.array_equal(points.point_id, scene.sparse.point_id):
+    if points is not None and not np.array_equal(points.point_id, scene.sparse.point_id):
         raise InputError("the geolocated points are of another model: run `georef geolocate` again")
-    good = np.flatnonzero(points.inlier)
-    if len(good) < 2:
-        return None
-    first, second = _long_pairs(scene.point_in_model[good], seed)
-    i, j = good[first], good[second]
-    apart = points.position_in_geo[i] - points.position_in_geo[j]
-    inside = np.linalg.norm(scene.point_in_model[i] - scene.point_in_model[j], axis=1)
-    measured = _measured_distance(apart, points.cov_in_geo[i] + points.cov_in_geo[j])
-    return DistanceTerm(torch.from_numpy(inside), None, *measured)
-
-
-def _pairs_of_cameras(scene: Scene, fixes: adjustment.Fixes, seed: int) -> DistanceTerm:
-    camera, place, root = fixes.camera, fixes.position_in_geo, fixes.root_information
-    i, j = _long_pairs(scene.poses.cam_center_in_model[camera], seed)
-    covariance = np.linalg.inv(np.swapaxes(root, 1, 2) @ root)
-    chosen = torch.from_numpy(np.column_stack([camera[i], camera[j]]))
-    return DistanceTerm(None, chosen, *_measured_distance(place[i] - place[j], covariance[i] + covariance[j]))
+    located = np.zeros(0, dtype=np.int64) if points is None else np.flatnonzero(points.inlier)
+    if points is not None and len(located) >= 2:
+        in_model, in_geo, cov_in_geo = scene.point_in_model, points.position_in_geo, points.cov_in_geo
+        in_model, in_geo, cov_in_geo = in_model[located], in_geo[located], cov_in_geo[located]
+        i, j = _long_pairs(in_model, seed)
+        pairs, inside = None, torch.from_numpy(np.linalg.norm(in_model[i] - in_model[j], axis=1))
+    else:
+        in_geo, root = fixes.position_in_geo, fixes.root_information
+        cov_in_geo = np.asarray(np.linalg.inv(np.swapaxes(root, 1, 2) @ root), dtype=np.float64)
+        i, j = _long_pairs(scene.poses.cam_center_in_model[fixes.camera], seed)
+        pairs, inside = torch.from_numpy(np.column_stack([fixes.camera[i], fixes.camera[j]])), None
+    apart = in_geo[i] - in_geo[j]
+    distance = np.linalg.norm(apart, axis=1)
+    along = apart / distance[:, None]
+    variance = np.einsum("pi,pij,pj->p", along, cov_in_geo[i] + cov_in_geo[j], along)
+    root_information = torch.from_numpy(variance**-0.5)[:, None, None]
+    distances = DistanceTerm(inside, pairs, torch.from_numpy(distance), root_information)
+    of_pairs = float((distances.distance_in_geo * distances.root_information[:, 0, 0]).square().sum())
+    root, place = fixes.root_information, fixes.position_in_geo
+    weight = (root**2).sum(axis=(1, 2))
+    arm = place - weight @ place / weight.sum()
+    of_fixes = float(((root @ arm[:, :, None]) ** 2).sum())  # on ln s, about the weighted mean of the fixes
+    share = min(1.0, _WORTH * of_fixes / of_pairs) if of_pairs > 0 else 0.0
+    return replace(distances, share=share) if share > 0 else None
 
 
 def _long_pairs(place: FloatArray, seed: int) -> tuple[IntArray, IntArray]:
@@ -331,22 +290,6 @@ def _long_pairs(place: FloatArray, seed: int) -> tuple[IntArray, IntArray]:
     length = np.linalg.norm(place[first] - place[second], axis=1)
     longest = np.sort(np.argsort(-length, kind="stable")[:_PAIRS])
     return first[longest], second[longest]
-
-
-def _measured_distance(apart: FloatArray, covariance: FloatArray) -> tuple[Tensor, Tensor]:
-    """Return the lengths (P,) of differences (P, 3), and their 1/σ (P, 1, 1)."""
-    distance = np.linalg.norm(apart, axis=1)
-    along = apart / distance[:, None]
-    variance = np.einsum("pi,pij,pj->p", along, covariance, along)
-    return torch.from_numpy(distance), torch.from_numpy(variance**-0.5)[:, None, None]
-
-
-def _scale_information(fixes: adjustment.Fixes) -> float:
-    """Return the information of the fixes on ln s: Σ |W (C − C̄)|² about their weighted mean."""
-    root, place = fixes.root_information, fixes.position_in_geo
-    weight = (root**2).sum(axis=(1, 2))
-    arm = place - weight @ place / weight.sum()
-    return float(((root @ arm[:, :, None]) ** 2).sum())
 
 
 @dataclass(frozen=True)
@@ -384,12 +327,7 @@ def control_by_depth(
     """Return the marks for projection onto the rendered surface, and the control points with the surface's σ added.
 
     The surface's error has a σ of `SURFACE_SIGMA` times the distance, along each axis. All marks of a point share
-    this error, because they show one piece of the surface.
-
-    Args:
-        scene: cameras as SfM left them.
-        survey: has the control points.
-        marks: of the adjustment. Those in test views are not rendered.
+    this error, because they show one piece of the surface. Marks in test views are not rendered.
     """
     order = np.argsort(marks.camera, kind="stable")
     order = order[np.isin(marks.camera[order], scene.train)]

@@ -16,7 +16,7 @@ from pipelines.geometry.similarity import Similarity, perturbation
 from pipelines.robust.statistics import CAUCHY_SCALE2
 
 
-def exp_so3(rotation_vector: Tensor) -> Tensor:
+def exp_so3_tensor(rotation_vector: Tensor) -> Tensor:
     """Return the rotation matrices (…, 3, 3) of rotation vectors (…, 3), in radians.
 
     Rodrigues' formula is used, because `torch.linalg.matrix_exp` would wait for the device.
@@ -31,7 +31,7 @@ def exp_so3(rotation_vector: Tensor) -> Tensor:
     return identity + linear * cross + quadratic * (cross @ cross)
 
 
-def log_so3(rotation: Tensor) -> Tensor:
+def log_so3_tensor(rotation: Tensor) -> Tensor:
     """Return the rotation vectors (…, 3), in radians, of rotations (…, 3, 3) by less than π."""
     skewed = rotation - rotation.transpose(-1, -2)
     sine_axis = 0.5 * torch.stack([skewed[..., 2, 1], skewed[..., 0, 2], skewed[..., 1, 0]], dim=-1)
@@ -49,13 +49,7 @@ def cauchy(chi2: Tensor, dimension: int) -> Tensor:
 
 @dataclass(frozen=True)
 class TensorSimilarity:
-    """Similarity geo ← model: p_geo = scale · rotation p_model + translation, in float64.
-
-    Attributes:
-        scale: scalar ().
-        rotation: (3, 3).
-        translation: (3,) metres.
-    """
+    """Similarity in float64: p_geo = scale () · rotation (3, 3) p_model + translation (3,), metres."""
 
     scale: Tensor
     rotation: Tensor
@@ -73,9 +67,7 @@ class Estimate:
     Attributes:
         rotation: (n, 3, 3) cam ← model.
         center: (n, 3) projection centres in `model`, metres.
-        geo_from_model: the similarity.
-        errors: the systematic errors.
-        vector: (p,) their values, m and rad.
+        vector: (p,) values of the systematic errors, m and rad.
         lens: (L,) change of the lens parameters; L = 0: none.
     """
 
@@ -114,11 +106,14 @@ class LearnableSimilarity(torch.nn.Module):
         self.pivot_in_geo = np.asarray(pivot, dtype=np.float64)
         self.base = base
         self.y = torch.nn.Parameter(torch.zeros(7, dtype=torch.float64))
+        value, vector = np.linalg.eigh((covariance + covariance.T) / 2)
+        # A floor for directions without uncertainty.
+        root = vector * np.sqrt(np.maximum(value, 1e-12 * max(value.max(), 1e-12)))
         self.root: Tensor
-        self.register_buffer("root", torch.from_numpy(_root(covariance)))
         self.base_rotation: Tensor
         self.base_shift: Tensor
         self.pivot: Tensor
+        self.register_buffer("root", torch.from_numpy(root))
         self.register_buffer("base_rotation", torch.tensor(base.rotation, dtype=torch.float64))
         self.register_buffer("base_shift", torch.tensor(base.translation, dtype=torch.float64))
         self.register_buffer("pivot", torch.tensor(self.pivot_in_geo))
@@ -126,7 +121,7 @@ class LearnableSimilarity(torch.nn.Module):
     def forward(self) -> TensorSimilarity:
         """Return the present similarity, differentiable in y."""
         delta = self.root @ self.y
-        turn, grow = exp_so3(delta[1:4]), torch.exp(delta[0])
+        turn, grow = exp_so3_tensor(delta[1:4]), torch.exp(delta[0])
         return TensorSimilarity(
             grow * self.base.scale,
             turn @ self.base_rotation,
@@ -137,12 +132,6 @@ class LearnableSimilarity(torch.nn.Module):
         """Return the present similarity."""
         delta = (self.root @ self.y).detach().cpu().numpy()
         return perturbation(delta, self.pivot_in_geo) @ self.base
-
-
-def _root(covariance: FloatArray) -> FloatArray:
-    """Return a square root of a positive semi-definite matrix, with a floor for directions without uncertainty."""
-    value, vector = np.linalg.eigh((covariance + covariance.T) / 2)
-    return np.asarray(vector * np.sqrt(np.maximum(value, 1e-12 * max(value.max(), 1e-12))))
 
 
 class CameraCorrections(torch.nn.Module):
@@ -164,12 +153,7 @@ class CameraCorrections(torch.nn.Module):
     """
 
     def __init__(
-        self,
-        base: CameraPoses,
-        basis: FloatArray,
-        lens_basis: FloatArray,
-        start: State,
-        z: FloatArray,
+        self, base: CameraPoses, basis: FloatArray, lens_basis: FloatArray, start: State, z: FloatArray
     ) -> None:
         super().__init__()
         self.z = torch.nn.Parameter(torch.tensor(z, dtype=torch.float64))
@@ -206,12 +190,12 @@ class CameraCorrections(torch.nn.Module):
     def moved(self) -> tuple[Tensor, Tensor]:
         """Return the corrected rotations cam ← model (n, 3, 3) and centres (n, 3) in `model`, metres."""
         correction = self.corrections()
-        return self.rotation @ exp_so3(-correction[:, :3]), self.center + correction[:, 3:]
+        return self.rotation @ exp_so3_tensor(-correction[:, :3]), self.center + correction[:, 3:]
 
     def pose(self, index: int) -> tuple[Tensor, Tensor]:
         """Return the corrected rotation cam ← model (3, 3) and centre (3,) of one camera."""
         correction = self.held_poses[index] + self.basis[index] @ self.z
-        return self.rotation[index] @ exp_so3(-correction[:3]), self.center[index] + correction[3:]
+        return self.rotation[index] @ exp_so3_tensor(-correction[:3]), self.center[index] + correction[3:]
 
     def cam_from_model(self, index: int) -> Tensor:
         """Return the corrected pose of one camera, (4, 4) float32, differentiable in z."""

@@ -1,0 +1,182 @@
+"""Losses of a training: a list of records, of which each iteration differentiates the weighted sum.
+
+A loss is a function of one rendered view. `training_losses` is the list; the functions themselves are in
+`splat.losses`, `splat.surface` and `train.geographic`. The order of the list is the order in which gradients are
+added up: another order gives other last digits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from pipelines.geometry.cameras import Pinhole
+from pipelines.splat.densify import Strategy
+from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.losses import photometric_loss
+from pipelines.splat.rasterizer.api import Rasterizer, Render, ScreenStats
+from pipelines.splat.surface import ObservedPoints, compactness_loss, depth_loss, flatness_loss, normal_loss
+from pipelines.train.geographic.problem import GeoProblem
+from pipelines.train.schedule import TrainingSchedule
+from pipelines.train.target_images import TargetImage
+
+
+@dataclass(frozen=True)
+class RenderedView:
+    """Render of a training view, beside its photograph.
+
+    Attributes:
+        index: of the view.
+        pose: (4, 4) cam ← model.
+        target: the photograph, or a window of it.
+        gaussians: in training.
+        render: of these and of those around a region; with depths if a loss needs them.
+        stats: of the render, for the Gaussians in training alone.
+        colour: (H, W, 3) render with the exposure of the photograph.
+        counting: (H, W) bool, pixels that count; None: all.
+        points: that the photograph shows; None: unknown.
+    """
+
+    index: int
+    pose: Tensor
+    target: TargetImage
+    gaussians: Gaussians
+    render: Render
+    stats: ScreenStats
+    colour: Tensor
+    counting: Tensor | None = None
+    points: ObservedPoints | None = None
+
+
+@dataclass(frozen=True)
+class Loss:
+    """One loss of a training.
+
+    Attributes:
+        name: in reports.
+        of: returns the value for a view, a scalar; None: the view has no such loss.
+        weight: at an iteration, from 1; 0: the loss is not computed.
+        share: factor of a window, such that the mean over all windows of a photograph is its loss.
+    """
+
+    name: str
+    of: Callable[[RenderedView], Tensor | None]
+    weight: Callable[[int], float] = lambda _iteration: 1.0
+    share: Callable[[RenderedView], Tensor | float] = lambda _view: 1.0
+
+
+def weighted_sum(losses: Sequence[Loss], view: RenderedView, iteration: int) -> tuple[Tensor, dict[str, Tensor]]:
+    """Return the weighted sum of the losses of a view, and the value of each that it has, by name; scalars."""
+    terms, values = [], {}
+    for loss in losses:
+        weight = loss.weight(iteration)
+        value = loss.of(view) if weight else None
+        if value is not None:
+            values[loss.name] = value
+            terms.append(loss.share(view) * weight * value)
+    total = terms[0]
+    for term in terms[1:]:
+        total = total + term
+    return total, values
+
+
+def training_losses(
+    problem: GeoProblem,
+    strategy: Strategy,
+    schedule: TrainingSchedule,
+    rasterizer: Rasterizer,
+    *,
+    extent_m: float,
+    confined: bool = False,
+    measured: Sequence[Loss] = (),
+) -> list[Loss]:
+    """Return the losses of a training.
+
+    Args:
+        problem, strategy: have losses of their own: geographic ones, and the penalty of density control.
+        schedule: has the weights.
+        rasterizer: for the render of the normals.
+        extent_m: size of the scene.
+        confined: whether only pixels of the mask show what is trained.
+        measured: losses of a surface that was measured, used if the options have surface losses.
+    """
+
+    def control_by_depth(view: RenderedView) -> Tensor | None:
+        render, camera = view.render, view.target.camera
+        if render.expected_depth is None:
+            return None
+        loss = problem.depth_loss(view.index, render.expected_depth, render.alpha, camera)
+        # Marks outside the window do not count: each is seen in one of the windows.
+        return None if loss is None else view.target.part.windows * loss
+
+    def compactness(view: RenderedView) -> Tensor | None:
+        render, mask = view.render, view.target.mask
+        if render.expected_depth is None or render.depth_variance is None:
+            return None
+        alpha = render.alpha if not confined or mask is None else render.alpha * mask
+        return compactness_loss(render.expected_depth, render.depth_variance, alpha)
+
+    def depth(view: RenderedView) -> Tensor | None:
+        render = view.render
+        if view.points is None or render.expected_depth is None:
+            return None
+        return depth_loss(render.expected_depth, render.alpha, view.points, view.pose, view.target.camera)
+
+    losses = [
+        Loss(
+            "photometric",
+            lambda view: photometric_loss(view.colour, view.target.colour, view.counting),
+            share=_by_pixels,
+        ),
+        Loss("control_by_depth", control_by_depth, schedule.geographic_weight),
+        Loss("geographic", lambda _view: problem.loss(), schedule.geographic_weight),
+        Loss("density control", lambda view: strategy.penalty(view.gaussians, view.stats)),
+    ]
+    settings, iterations = schedule.options.surface, schedule.options.iterations
+    if settings is None:
+        return losses
+
+    def weight_of_normals(iteration: int) -> float:
+        due = iteration > settings.normals_from * iterations and iteration % settings.normals_every == 0
+        return settings.normals_every * settings.normals if due else 0.0
+
+    return [
+        *losses,
+        Loss(
+            "flatness",
+            lambda view: flatness_loss(view.gaussians, view.stats.visible, extent_m),
+            lambda _: settings.flatness,
+        ),
+        Loss("compactness", compactness, lambda _: settings.compactness, _by_pixels),
+        Loss("depth", depth, lambda _: settings.depth, _by_points),
+        *measured,
+        Loss(
+            "normals",
+            lambda view: normal_loss(view.gaussians, view.pose, view.target.camera, rasterizer, settings.edge),
+            weight_of_normals,
+            _by_pixels,
+        ),
+    ]
+
+
+def _by_pixels(view: RenderedView) -> float:
+    return view.target.part.weight
+
+
+def _by_points(view: RenderedView) -> Tensor | float:
+    """Return the number of windows, times the share of the photograph's points that lie in this window."""
+    target, points, pose = view.target, view.points, view.pose
+    if target.part.windows == 1 or points is None:
+        return 1.0
+    in_cam = points.point_in_model @ pose[:3, :3].detach().T.to(points.point_in_model) + pose[:3, 3].detach()
+    here, anywhere = (_inside(in_cam, camera).sum() for camera in (target.camera, target.whole))
+    return target.part.windows * here / anywhere.clamp_min(1)
+
+
+def _inside(in_cam: Tensor, camera: Pinhole) -> Tensor:
+    """Return which of points (K, 3) in the camera frame lie in the image, as a mask (K,)."""
+    z = in_cam[:, 2].clamp_min(1e-3)
+    x, y = camera.fx * in_cam[:, 0] / z + camera.cx, camera.fy * in_cam[:, 1] / z + camera.cy
+    return (in_cam[:, 2] > 1e-3) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
