@@ -50,7 +50,7 @@ _WORST_ROTATION_RAD = np.radians(5.0)  # beyond, the linear covariance is not va
 _FLAT = 0.02  # third extent of the layout over the first
 _GATE_FACTORS = (1.0, 3.0, 10.0, 30.0, 100.0)  # of the stated σ
 
-ADVICE = (
+_ADVICE = (
     "add control points that do not lie on that line (`georef ingest --gcp FILE`, at least 3), or attitudes "
     "(yaw, pitch, roll of the camera) in the trajectory"
 )
@@ -61,7 +61,6 @@ class Alignment:
     """Similarity, with the layout that determines it and the attitude in use.
 
     Attributes:
-        solution: parameters, covariance and residuals.
         layout: extent of the correspondences used: "volume", "plane", or "line" if attitude was needed.
         attitude: mean of the recorded attitudes, if it resolved the rotation.
     """
@@ -72,21 +71,14 @@ class Alignment:
 
     @property
     def attitude_used(self) -> bool:
-        """Whether recorded attitudes resolved the rotation."""
         return self.attitude is not None
 
     @property
     def geo_from_local(self) -> Similarity:
-        """The similarity."""
         return self.solution.state.geo_from_local
 
 
-def align(
-    data: Correspondences,
-    rng: np.random.Generator,
-    *,
-    attitude: RotationPrior | None = None,
-) -> Alignment:
+def align(data: Correspondences, rng: np.random.Generator, *, attitude: RotationPrior | None = None) -> Alignment:
     """Return the similarity that maps local onto geo.
 
     Args:
@@ -101,19 +93,20 @@ def align(
     if len(data) < 2 or (len(data) < 3 and attitude is None):
         raise DegenerateGeometryError(
             f"{len(data)} positions (fixes of registered images and control points) do not determine where the "
-            f"model lies; 3 are needed: {ADVICE}"
+            f"model lies; 3 are needed: {_ADVICE}"
         )
     candidates = _candidates(data, _starts(data, rng), None)
     firm = [candidate for candidate in candidates if candidate.rotation_sigma_rad <= _WORST_ROTATION_RAD]
-    if firm:
-        best = _choose(firm)
-        return Alignment(best, layout_of(data.in_local[best.state.inlier]), None)
-    worst = min((np.degrees(candidate.rotation_sigma_rad) for candidate in candidates), default=np.inf)
-    if attitude is None:
-        size = f"is known to {worst:.0f}° only" if worst < 90 else "is not determined"
-        raise DegenerateGeometryError(f"the positions lie on one line: the rotation about it {size}; {ADVICE}")
-    candidates = _candidates(data, [_start_with_rotation(data, attitude.rotation, rng)], attitude)
-    return Alignment(_choose(candidates), "line", attitude)
+    prior = None
+    if not firm:
+        if attitude is None:
+            worst = min((np.degrees(candidate.rotation_sigma_rad) for candidate in candidates), default=np.inf)
+            size = f"is known to {worst:.0f}° only" if worst < 90 else "is not determined"
+            raise DegenerateGeometryError(f"the positions lie on one line: the rotation about it {size}; {_ADVICE}")
+        prior, firm = attitude, _candidates(data, [_start_with_rotation(data, attitude.rotation, rng)], attitude)
+    # A bias of the fixes costs as much as an outlier.
+    best = min(firm, key=lambda one: one.cost + OUTLIER_GATE * (one.state.fix_bias_in_geo is not None))
+    return Alignment(best, "line" if prior else layout_of(data.in_local[best.state.inlier]), prior)
 
 
 def layout_of(positions: FloatArray) -> Literal["volume", "plane"]:
@@ -123,14 +116,10 @@ def layout_of(positions: FloatArray) -> Literal["volume", "plane"]:
 
 
 def mean_rotation(rotations: FloatArray, sigma_rad: FloatArray) -> RotationPrior:
-    """Return the robust mean of rotations geo ← local, estimated from recorded attitudes.
+    """Return the robust mean of rotations (k, 3, 3) geo ← local of recorded attitudes, with σ (k,) per axis.
 
     Attitude errors of a flight are mostly common to all its images. The covariance is therefore that of one
     rotation, or the scatter if it is larger.
-
-    Args:
-        rotations: (k, 3, 3).
-        sigma_rad: (k,) σ of each rotation per axis, radians.
     """
     mean = rotations[int(np.argmin(_spread(rotations)))]
     weight = np.ones(len(rotations))
@@ -163,16 +152,18 @@ def _starts(data: Correspondences, rng: np.random.Generator) -> list[Similarity]
 
 def _ransac_start(data: Correspondences, rng: np.random.Generator) -> list[Similarity]:
     """Return the similarity of RANSAC at the tightest gate that half of the points pass; none if degenerate."""
-
-    def fit(chosen: np.ndarray) -> Similarity:
-        return umeyama(data.in_local[chosen], data.in_geo[chosen])
-
     starts = []
     for factor in _GATE_FACTORS:
         # The excess scatter of SfM is not known yet: the stated σ may be far too small.
         options = RansacOptions(3, OUTLIER_GATE * factor**2, max_draws=300)
         try:
-            result = ransac(len(data), fit, lambda model: _squared(data, model), options, rng)
+            result = ransac(
+                len(data),
+                lambda chosen: umeyama(data.in_local[chosen], data.in_geo[chosen]),
+                lambda model: _squared(data, model),
+                options,
+                rng,
+            )
         except DegenerateGeometryError:
             return []
         starts = [result.model]
@@ -184,7 +175,6 @@ def _ransac_start(data: Correspondences, rng: np.random.Generator) -> list[Simil
 
 
 def _start_with_rotation(data: Correspondences, rotation: FloatArray, rng: np.random.Generator) -> Similarity:
-    """Return the similarity of a given rotation, with robust scale and translation."""
     turned = data.in_local @ rotation.T
 
     def fit(chosen: np.ndarray) -> Similarity:
@@ -220,8 +210,3 @@ def _with_bias(data: Correspondences, state: SimilarityState) -> SimilarityState
     model = state.geo_from_local
     onto = Similarity(model.scale, model.rotation, model.translation + shift)
     return replace(state, geo_from_local=onto, fix_bias_in_geo=np.median(residual[~data.control], axis=0) - shift)
-
-
-def _choose(candidates: list[AdjustedSimilarity]) -> AdjustedSimilarity:
-    """Return the likeliest candidate; a bias of the fixes costs as much as an outlier."""
-    return min(candidates, key=lambda one: one.cost + OUTLIER_GATE * (one.state.fix_bias_in_geo is not None))

@@ -31,8 +31,7 @@ _EXCHANGED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
 def mistake_in_marks(survey: Survey, model: SparseModel) -> str | None:
     """Return the mistake without which the marks of most control points would meet.
 
-    Returns:
-        None: more than half of the points meet as they are, or no known mistake explains the others.
+    None: more than half of the points meet as they are, or no known mistake explains the others.
     """
     points = survey.control_points
     height_px = {name: model.camera_of(index).height for index, name in enumerate(model.image_name)}

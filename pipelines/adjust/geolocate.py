@@ -47,14 +47,7 @@ _ALIGNMENT_SEED = 0
 
 @dataclass(frozen=True)
 class Geolocation:
-    """Result of `geolocate`.
-
-    Attributes:
-        points: the points on Earth.
-        sigma_m: (N,) σ along the worst axis in metres; NaN without a position.
-        key_figure: one line for tables.
-        warnings: messages that the user should read.
-    """
+    """Result of `geolocate`; sigma_m (N,) is along the worst axis in metres, NaN without a position."""
 
     points: GeolocatedPoints
     sigma_m: FloatArray
@@ -71,11 +64,9 @@ def run(stage: StageRun, options: GeolocateOptions) -> Summary:
     survey = load_survey(stage.workspace)
     model = read_sparse(stage.workspace.path(SPARSE))
     geolocation = geolocate(survey, model, options)
-    points = geolocation.points
+    points, cloud = geolocation.points, stage.out / "points.ply"
     points.save(stage.out / "points.npz")
-    write_point_ply(
-        stage.out / "points.ply", points.position_in_geo, model.point_rgb, geolocation.sigma_m, points.inlier
-    )
+    write_point_ply(cloud, points.position_in_geo, model.point_rgb, geolocation.sigma_m, points.inlier)
     return Summary(geolocation.key_figure, _values(points), geolocation.warnings)
 
 
@@ -110,9 +101,8 @@ def geolocate(survey: Survey, model: SparseModel, options: GeolocateOptions) -> 
         # Control points may place the model nevertheless, or `init-sim3` finds what is wrong with the fixes.
         return _without_positions(model, f"no directions for the SfM points: {problem}")
     warnings = _warnings(model, fixes, recorded, alignment, prior if use_recorded else None)
-    views, usable = _views(
-        model, fixes, fixed, alignment, recorded if use_recorded else None, sigma_px=options.sigma_px
-    )
+    used = recorded if use_recorded else None
+    views, usable = _views(model, fixes, fixed, alignment, used, sigma_px=options.sigma_px)
     rays = _rays(model, usable)
     intersections = intersect_rays(rays, views, len(model.point_id))
     sigma, inlier = _judge(intersections, rays, views, options)

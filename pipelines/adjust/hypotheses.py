@@ -49,9 +49,6 @@ class StatedFixes:
     """Fixes of a survey's n registered photographs as stated, against the SfM model.
 
     Attributes:
-        model: SfM model.
-        origin: of geo.
-        name: (n) of the photographs.
         center_in_local: (n, 3) projection centres.
         position_in_geo: (n, 3) metres.
         time_s: (n,) times of the photographs, NaN where unknown.
@@ -76,7 +73,6 @@ class Hypothesis:
     """A mistake that would explain the measurements.
 
     Attributes:
-        code: stable word.
         sentence: the mistake, and what to do.
         scatter_m: robust scatter per axis of the corrected fixes about the SfM model.
         geo_from_local: similarity of the corrected fixes.
@@ -117,7 +113,6 @@ def fit(center_in_local: FloatArray, position_in_geo: FloatArray) -> tuple[Simil
 
 
 def hangs_upside_down(model: SparseModel, geo_from_local: Similarity) -> bool:
-    """Return whether most cameras hang upside down."""
     up_in_cam = model.rotation_cam_from_local @ geo_from_local.rotation[2]
     return float(np.median(-up_in_cam[:, 1] - up_in_cam[:, 2])) < _UPSIDE_DOWN
 
@@ -159,13 +154,8 @@ def clock_that_turns(fixes: StatedFixes, turn_of: Callable[[Similarity], float])
     """Return the clock offset in s that turns a solution onto its attitudes, and the angle left in rad.
 
     On a circle, or on lines in one direction, a wrong time turns or shifts the whole flight without any scatter.
-
-    Args:
-        fixes: as stated.
-        turn_of: angle in rad between the attitudes and a similarity.
-
-    Returns:
-        None: the times are unknown, or no offset within the search fits the model as well as none.
+    `turn_of` returns the angle in rad between the attitudes and a similarity. None: the times are unknown, or no
+    offset within the search fits the model as well as none.
     """
     track = _Track.of(fixes)
     if track is None:
@@ -231,6 +221,7 @@ def _changed_axes(fixes: StatedFixes) -> Iterator[_Change]:
 
 
 def _latitude_for_longitude(position: FloatArray, origin: Origin) -> FloatArray:
+    """Return the positions (n, 3) with latitude and longitude exchanged, about the median of their places."""
     lla = lla_from_ecef(ecef_from_enu(position, origin))
     middle = np.median(lla, axis=0)[[1, 0, 2]]
     exchanged = lla[:, [1, 0, 2]] - lla[:, [1, 0, 2]].mean(axis=0) + middle
@@ -348,7 +339,6 @@ class _Track:
         return np.asarray(steps[count >= max(2 * _LEAST, len(self.rows) // 2)])
 
     def rows_at(self, offset_s: float) -> IntArray:
-        """Return the rows of the photographs on the curve at a clock offset."""
         time_s = self.fixes.time_s[self.rows]
         return np.asarray(self.rows[(time_s + offset_s >= time_s[0]) & (time_s + offset_s <= time_s[-1])])
 

@@ -8,7 +8,7 @@ autonomous base station, or by what σ of one fix allow. There the control point
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,7 +52,7 @@ _NAMED = 5  # control points in a caution
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Findings:
     """Findings on a solution.
 
     Attributes:
@@ -72,12 +72,8 @@ class _Finding:
     sentence: str
     ends: bool = False
 
-    @property
-    def caution(self) -> Caution:
-        return Caution(code=self.code, sentence=self.sentence)
 
-
-def judge(survey: Survey, model: SparseModel, joint: JointAdjustment) -> Verdict:
+def judge(survey: Survey, model: SparseModel, joint: JointAdjustment) -> Findings:
     """Return the inconsistencies and cautions of the joint adjustment of a survey and its SfM model."""
     fixes = StatedFixes(survey, model)
     findings, of_map = list(_upside_down(fixes, joint.geo_from_local)), list(_map_of_control(survey, model))
@@ -86,23 +82,19 @@ def judge(survey: Survey, model: SparseModel, joint: JointAdjustment) -> Verdict
         findings += _view(model, joint.geo_from_local)
     findings += of_map or [*_shift_of_fixes(joint), *_control_points(joint)]
     findings += [*_attitudes(survey, fixes, joint), *_weak_checks(joint), *_guesses(joint)]
-    return Verdict(
-        tuple(finding.caution for finding in findings if finding.ends),
-        tuple(finding.caution for finding in findings if not finding.ends),
-    )
+    ending, others = ([found for found in findings if found.ends == ends] for ends in (True, False))
+    return Findings(_cautions(ending), _cautions(others))
+
+
+def _cautions(findings: Iterable[_Finding]) -> tuple[Caution, ...]:
+    return tuple(Caution(code=found.code, sentence=found.sentence) for found in findings)
 
 
 def unadjustable(survey: Survey, model: SparseModel, geo_from_local: Similarity | None) -> tuple[Caution, ...]:
-    """Return the inconsistencies of measurements that determine no adjustment.
-
-    Args:
-        survey: as stated.
-        model: SfM model.
-        geo_from_local: alignment of the two; None: not even that.
-    """
+    """Return the inconsistencies of measurements that determine no adjustment, and perhaps no alignment (None)."""
     fixes = StatedFixes(survey, model)
     if geo_from_local is not None and hangs_upside_down(model, geo_from_local):
-        return tuple(finding.caution for finding in _upside_down(fixes, geo_from_local))
+        return _cautions(_upside_down(fixes, geo_from_local))
     if len(fixes.name) < _LEAST_FIXES:
         return ()
     try:
@@ -119,9 +111,7 @@ def unadjustable(survey: Survey, model: SparseModel, geo_from_local: Similarity 
 def marks_that_do_not_meet(unused: Sequence[UnusedControlPoint], mistake: str | None) -> tuple[Caution, ...]:
     """Return the caution that marks of control points do not meet in one point; none if they do.
 
-    Args:
-        unused: control points that their marks do not determine.
-        mistake: without which most of them would meet; then no control point is used.
+    `mistake` is that without which most of them would meet; then no control point is used.
     """
     missed = [point for point in unused if len(point.residual_px) >= 2]
     if not missed:

@@ -18,7 +18,7 @@ from pipelines.adjust.observations import control_correspondences, fix_correspon
 from pipelines.adjust.options import InitSim3Options
 from pipelines.adjust.paper import similarity_by_paper
 from pipelines.adjust.posterior import save_posterior
-from pipelines.adjust.robust import Estimated, Inputs, placed, robust_similarity
+from pipelines.adjust.robust import Estimated, robust_similarity, solved
 from pipelines.core.errors import ConvergenceError, InputError
 from pipelines.core.products import save_json
 from pipelines.core.stages import ADJUSTMENT, POINTS, SIM3, SIM3_POSTERIOR, SPARSE
@@ -51,12 +51,6 @@ def estimate_similarity(
 ) -> Estimated:
     """Return the initial similarity with the adjustment, and warnings for the user.
 
-    Args:
-        survey: has the fixes, attitudes and control points.
-        model: the SfM model.
-        points: the model's points on Earth.
-        options: of the stage.
-
     Raises:
         DegenerateGeometryError: the measurements leave the similarity open; names further measurements.
         ContradictionError: sources contradict each other, and the options do not accept that.
@@ -70,10 +64,10 @@ def estimate_similarity(
     if options.method == "paper":
         control, unused = control_correspondences(survey, model)
         initial = similarity_by_paper(model, points, fix_correspondences(survey, model).joined(control))
-        inputs = Inputs(survey, model, points)
-        estimated = Estimated(initial, placed(inputs, initial, options), tuple(point.sentence for point in unused))
+        posterior = solved(survey, model, initial, options.estimate)
+        estimated = Estimated(initial, posterior, tuple(point.sentence for point in unused))
     else:
-        estimated = robust_similarity(Inputs(survey, model, points), options)
+        estimated = robust_similarity(survey, model, points, options)
     _check_residual(estimated.initial, options.max_residual)
     return estimated
 

@@ -52,10 +52,7 @@ class JointAdjustment:
 
     Attributes:
         survey: with the variance factors in its covariances.
-        scene: of the adjustment.
-        problem: all measurements.
-        state: its minimum.
-        normal: its equations there.
+        normal: equations at `state`, the minimum of `problem`, which has all measurements.
         at_stated: tests of fixes and control points by kind, under the stated σ.
         components: the same under the applied factors.
         factors: tests of all groups.
@@ -81,7 +78,6 @@ class JointAdjustment:
 
     @property
     def geo_from_local(self) -> Similarity:
-        """The similarity."""
         return self.state.geo_from_model @ self.scene.model_from_local
 
     @property
@@ -117,11 +113,7 @@ def adjust_jointly(
 ) -> JointAdjustment:
     """Return the adjustment from the first start, or the likeliest of several where the first finds disagreement.
 
-    Args:
-        survey: the measurements with their stated σ.
-        model: the SfM model.
-        starts: to start from; a layout on a line takes the attitudes into the adjustment.
-        estimate: further systematic errors to estimate.
+    A layout on a line takes the attitudes into the adjustment.
 
     Raises:
         DegenerateGeometryError: the measurements leave the similarity open, from every start.
@@ -146,10 +138,7 @@ def adjust_jointly(
 def in_own_frame(joint: JointAdjustment, survey: Survey, initial: InitialSimilarity) -> tuple[Scene, State]:
     """Return scene and state in the frame `model` of the solution: axes and metre of geo, as training takes them.
 
-    Args:
-        joint: solved in the frame of its start.
-        survey: of the split into training and test images.
-        initial: the solution.
+    The joint adjustment was solved in the frame of its start; `survey` has the split into training and test images.
     """
     before, state = joint.scene, joint.state
     scene = initial_scene(before.sparse, survey, initial)
@@ -167,8 +156,7 @@ def _adjust(
 ) -> JointAdjustment:
     """Alternate between the solution and the variance factors, from the stated σ."""
     fixed = {
-        factor.group: factor
-        for factor in (*_marks(survey, scene), *_attitudes(survey, scene.sparse), *_ties(scene))
+        factor.group: factor for factor in (*_marks(survey, scene), *_attitudes(survey, scene.sparse), _ties(scene))
     }
     applied = applied_factors(tuple(fixed.values()))
 
@@ -180,9 +168,9 @@ def _adjust(
     problem = problem_at(applied)
     if not problem.measured:
         raise DegenerateGeometryError("no position takes part in the adjustment")
-    state = start_of(scene, problem)
     geo_from_local = Similarity.from_record(start.initial.geo_from_local)
-    state = replace(state, geo_from_model=geo_from_local @ scene.model_from_local.inverse())
+    geo_from_model = geo_from_local @ scene.model_from_local.inverse()
+    state = replace(start_of(scene, problem), geo_from_model=geo_from_model)
     if start.at_control:
         state = onto_control(problem, state)
     minimum = minimise(problem, state)
@@ -255,8 +243,7 @@ def _marks(survey: Survey, scene: Scene) -> list[VarianceFactor]:
     squared = (angle / rays.sigma_rad) ** 2
     free = 2.0 - 3.0 / rays.marks_of_point[rays.point]
     good = np.isfinite(squared)
-    component = component_of(squared[good], free[good], 2)
-    return [_independent(survey, "marks", component)]
+    return [_independent(survey, "marks", component_of(squared[good], free[good], 2))]
 
 
 def _attitudes(survey: Survey, model: SparseModel) -> list[VarianceFactor]:
@@ -282,20 +269,18 @@ def _independent(survey: Survey, group: Group, component: VarianceComponent) -> 
     return _factor(survey, group, component, 1.0).model_copy(update={"applied": max(applied, 0.01)})
 
 
-def _ties(scene: Scene) -> list[VarianceFactor]:
+def _ties(scene: Scene) -> VarianceFactor:
     """State the variance of the image observations of tie points, in square pixels: SfM knows no σ beforehand."""
     network = scene.network
     rows = len(network.obs_point)
     free = 2 * rows - 6 * len(network.camera_id) - 3 * len(network.point_in_world)
-    return [
-        VarianceFactor(
-            group="tie points",
-            count=rows,
-            used=rows,
-            redundancy=free,
-            estimated=scene.bundle.sigma_px**2,
-            probability=1.0,
-            applied=1.0,
-            sigma_source="default",
-        )
-    ]
+    return VarianceFactor(
+        group="tie points",
+        count=rows,
+        used=rows,
+        redundancy=free,
+        estimated=scene.bundle.sigma_px**2,
+        probability=1.0,
+        applied=1.0,
+        sigma_source="default",
+    )

@@ -22,7 +22,7 @@ from pipelines.adjust.terms import Attitudes, ControlPoints, Fixes, Planes, Term
 from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray
 from pipelines.survey.adjustment import InitialSimilarity
-from pipelines.survey.marks import mark_rays
+from pipelines.survey.marks import MarkRays, mark_rays
 from pipelines.survey.scene import Scene
 from pipelines.survey.survey import Survey
 
@@ -44,7 +44,7 @@ def problem_of(
         survey: the measurements in use, with the variance factors in their covariances.
         estimate: further systematic errors to estimate, beside the common error of the fixes.
         with_attitudes: whether the attitudes take part, where positions leave the rotation open.
-        planes: of a LiDAR whose shift is a systematic error; None: none.
+        planes: of a LiDAR whose shift is a systematic error.
 
     Raises:
         InputError: an error is to be estimated whose measurements were not recorded.
@@ -52,10 +52,7 @@ def problem_of(
     wanted = tuple(estimate)
     fixes, control = fixes_of(scene, survey), control_of(scene, survey)
     attitudes = attitudes_of(scene, survey) if with_attitudes or "boresight" in wanted else None
-    for name, source, what in (
-        ("lever-arm", fixes, "positions"),
-        ("boresight", attitudes, "attitudes"),
-    ):
+    for name, source, what in (("lever-arm", fixes, "positions"), ("boresight", attitudes, "attitudes")):
         if name in wanted and source is None:
             raise InputError(f"{name} cannot be estimated: no {what} were recorded", field="--estimate")
     blocks = [] if fixes is None else _common_errors(survey, fixes)
@@ -69,12 +66,8 @@ def problem_of(
     if planes is not None:
         blocks.append(SystematicError("lidar-shift", (SIGMA_LIDAR_M,) * 3))
     every: tuple[Term | None, ...] = (fixes, control, attitudes, planes)
-    return Problem(
-        scene.poses,
-        scene.bundle,
-        tuple(term for term in every if term is not None),
-        SystematicErrors(tuple(blocks)),
-    )
+    measured = tuple(term for term in every if term is not None)
+    return Problem(scene.poses, scene.bundle, measured, SystematicErrors(tuple(blocks)))
 
 
 def rejected_of(scene: Scene, survey: Survey, initial: InitialSimilarity) -> Problem | None:
@@ -111,7 +104,8 @@ def control_of(scene: Scene, survey: Survey) -> ControlPoints | None:
     rays = rays.of_points(marked)
     surveyed = [point for point, enough in zip(survey.control_points, marked, strict=True) if enough]
     position = np.array([point.position_in_geo for point in surveyed])
-    control = ControlPoints(
+    of_survey = np.array([point.cov_in_geo for point in surveyed])
+    return ControlPoints(
         name=rays.point_id,
         point=rays.point,
         camera=rays.camera,
@@ -119,10 +113,8 @@ def control_of(scene: Scene, survey: Survey) -> ControlPoints | None:
         sigma_rad=rays.sigma_rad,
         bearing_by_lens=scene.sparse.lenses.bearing_jacobian(rays.camera, rays.xy_px),
         position_in_geo=position,
-        root_information=np.tile(np.eye(3), (len(position), 1, 1)),
+        root_information=root_information(of_survey + _mark_covariance(scene, rays, position)),
     )
-    of_survey = np.array([point.cov_in_geo for point in surveyed])
-    return replace(control, root_information=root_information(of_survey + _mark_covariance(scene, control)))
 
 
 def attitudes_of(scene: Scene, survey: Survey) -> Attitudes | None:
@@ -159,7 +151,6 @@ def onto_control(problem: Problem, state: State) -> State:
 
 
 def _common_errors(survey: Survey, fixes: Fixes) -> list[SystematicError]:
-    """Return the common error of each session that has one."""
     blocks = []
     for session in np.unique(fixes.session) if survey.sessions else ():
         sigma = np.array(survey.sessions[session].sigma_common_m)
@@ -169,9 +160,9 @@ def _common_errors(survey: Survey, fixes: Fixes) -> list[SystematicError]:
     return blocks
 
 
-def _mark_covariance(scene: Scene, marks: ControlPoints) -> FloatArray:
-    """Return the covariance (J, 3, 3) of each intersected point that the σ of its marks causes."""
-    poses, position = scene.poses, marks.position_in_geo
+def _mark_covariance(scene: Scene, marks: MarkRays, position: FloatArray) -> FloatArray:
+    """Return the covariance (J, 3, 3) of each intersected point (J, 3) in geo that the σ of its marks causes."""
+    poses = scene.poses
     center = scene.geo_from_model.apply(poses.cam_center_in_model[marks.camera])
     direction = np.einsum("kji,kj->ki", poses.cam_from_model[marks.camera], marks.bearing_in_cam)
     distance = np.linalg.norm(position[marks.point] - center, axis=1)

@@ -38,7 +38,6 @@ class RecordedRotations:
     contradicting: tuple[str, ...] = ()
 
     def geo_from_local(self, model: SparseModel) -> FloatArray:
-        """Return the rotation geo ← local (k, 3, 3) that each attitude gives to a model."""
         return np.asarray(self.geo_from_cam @ model.rotation_cam_from_local[self.image])
 
 
@@ -47,7 +46,6 @@ class UnusedControlPoint:
     """Control point that its marks do not determine.
 
     Attributes:
-        name: as in the survey.
         unregistered: names of the images with marks that are not in the SfM model.
         registered: names of the images with usable marks.
         residual_px: angles between these marks and the point that most of them agree on, else their least-squares

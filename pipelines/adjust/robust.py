@@ -18,12 +18,12 @@ from pipelines.adjust.observations import (
     fix_correspondences,
     positions_in_use,
 )
-from pipelines.adjust.options import InitSim3Options
+from pipelines.adjust.options import EstimatedErrorName, InitSim3Options
 from pipelines.adjust.paper import agreeing_points, counts_of, residuals_of, residuals_of_points
 from pipelines.adjust.posterior import Posterior
 from pipelines.adjust.similarity_fit import AdjustedSimilarity, Correspondences, RotationPrior
 from pipelines.adjust.solution import adjusted
-from pipelines.adjust.system import Problem, minimise
+from pipelines.adjust.system import minimise
 from pipelines.adjust.terms import ControlPoints, Fixes
 from pipelines.adjust.variance_components import component_of
 from pipelines.core.errors import ContradictionError, DegenerateGeometryError
@@ -34,44 +34,30 @@ from pipelines.geometry.similarity import SimilarityRecord
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.robust.statistics import residual_stats
 from pipelines.survey.adjustment import AttitudeRecord, GeolocatedPoints, InitialSimilarity
-from pipelines.survey.scene import Scene, initial_scene
+from pipelines.survey.scene import initial_scene
 from pipelines.survey.survey import Survey
 
 _LEVEL = 0.01  # of the test that refutes σ where no joint adjustment is possible
 
 
 @dataclass(frozen=True)
-class Inputs:
-    """Products that the similarity is estimated from."""
-
-    survey: Survey
-    model: SparseModel
-    points: GeolocatedPoints
-
-
-@dataclass(frozen=True)
 class Estimated:
-    """Result of init-sim3: the similarity, the adjustment, and warnings for the user.
-
-    Attributes:
-        initial: the similarity, and the verdict on the measurements.
-        posterior: the adjustment.
-        warnings: outliers and measurements without use.
-    """
+    """Result of init-sim3: similarity with the verdict on the measurements, adjustment, warnings for the user."""
 
     initial: InitialSimilarity
     posterior: Posterior
     warnings: tuple[str, ...]
 
 
-def robust_similarity(inputs: Inputs, options: InitSim3Options) -> Estimated:
+def robust_similarity(
+    survey: Survey, model: SparseModel, points: GeolocatedPoints, options: InitSim3Options
+) -> Estimated:
     """Return the similarity by the robust method.
 
     Raises:
         DegenerateGeometryError: the measurements leave the similarity open; names further measurements.
         ContradictionError: sources contradict each other, and the options do not accept that.
     """
-    survey, model = inputs.survey, inputs.model
     control, unused = control_correspondences(survey, model)
     mistake = mistake_in_marks(survey, model) if unused else None
     if mistake is not None:  # What meets all the same meets in a wrong place.
@@ -84,62 +70,58 @@ def robust_similarity(inputs: Inputs, options: InitSim3Options) -> Estimated:
         _refuse(unadjustable(survey, model, None), options)
         reasons = [positions_in_use(survey, model, data, unused), *(caution.sentence for caution in of_marks)]
         raise DegenerateGeometryError(f"{error}. {'; '.join(reasons)}") from error
-    aligned = _aligned_product(inputs, data, alignment).model_copy(
+    aligned = _aligned_product(model, points, data, alignment).model_copy(
         update={"control_outliers": tuple(p.name for p in survey.control_points if p.name not in control.name)}
     )
     warnings = () if mistake else tuple(point.sentence for point in unused)  # else the caution says why
-    used = tuple(point for point in survey.control_points if point.name in control.name)
-    survey = survey.model_copy(update={"control_points": used})
+    meeting = tuple(point for point in survey.control_points if point.name in control.name)
+    meets = survey.model_copy(update={"control_points": meeting})
     try:
-        joint = adjust_jointly(survey, model, _starts(data, aligned, options.seed), estimate=options.estimate)
+        joint = adjust_jointly(meets, model, _starts(data, aligned, options.seed), estimate=options.estimate)
     except DegenerateGeometryError as error:
-        contradictions = unadjustable(survey, model, alignment.geo_from_local)
+        contradictions = unadjustable(meets, model, alignment.geo_from_local)
         _refuse(contradictions, options)
         unchecked = Caution(code=NOT_CHECKED, sentence=f"nothing checks the stated σ: {error}")
         cautions = union(survey.cautions, contradictions, of_marks, (unchecked,))
         initial = _without_joint(aligned, alignment.solution, cautions)
-        return Estimated(initial, placed(inputs, initial, options), warnings)
-    verdict = judge(survey, model, joint)
-    _refuse(verdict.contradictions, options)
-    initial, more = _joint_product(inputs, aligned, joint)
-    cautions = union(survey.cautions, verdict.contradictions, of_marks, verdict.cautions)
+        return Estimated(initial, solved(survey, model, initial, options.estimate), warnings)
+    findings = judge(meets, model, joint)
+    _refuse(findings.contradictions, options)
+    initial, more = _joint_product(model, points, aligned, joint)
+    cautions = union(survey.cautions, findings.contradictions, of_marks, findings.cautions)
     initial = initial.model_copy(update={"cautions": cautions})
-    posterior = _solved(inputs, joint, initial, options)
+    posterior = solved(survey, model, initial, options.estimate, joint)
     record = posterior.solution.similarity_from_local()
     return Estimated(initial.model_copy(update={"geo_from_local": record}), posterior, warnings + more)
 
 
-def placed(inputs: Inputs, initial: InitialSimilarity, options: InitSim3Options) -> Posterior:
-    """Return the cameras of SfM at a similarity, unadjusted, with the covariance that the measurements give there.
-
-    Raises:
-        DegenerateGeometryError: the measurements leave the similarity open.
-    """
-    survey = initial.weighted(inputs.survey)
-    scene = initial_scene(inputs.model, survey, initial)
-    problem = _in_use(scene, survey, initial, options)
-    return adjusted(scene, problem, start_of(scene, problem), initial, rejected_of(scene, survey, initial))
-
-
-def _solved(
-    inputs: Inputs, joint: JointAdjustment, initial: InitialSimilarity, options: InitSim3Options
+def solved(
+    survey: Survey,
+    model: SparseModel,
+    initial: InitialSimilarity,
+    estimate: tuple[EstimatedErrorName, ...] = (),
+    joint: JointAdjustment | None = None,
 ) -> Posterior:
     """Return the solution of a joint adjustment without the measurements that it has rejected.
 
+    Without a joint adjustment, the cameras of SfM stay as they are at the similarity, with the covariance that the
+    measurements give there.
+
     Raises:
         DegenerateGeometryError: the measurements leave the similarity open.
     """
-    survey = initial.weighted(inputs.survey)
-    scene, state = in_own_frame(joint, survey, initial)
-    problem = _in_use(scene, survey, initial, options)
-    state = minimise(problem, problem.start_at(state, joint.problem.errors)).state
-    return adjusted(scene, problem, state, initial, rejected_of(scene, survey, initial))
-
-
-def _in_use(scene: Scene, survey: Survey, initial: InitialSimilarity, options: InitSim3Options) -> Problem:
-    """Return the problem of the measurements that were not rejected."""
+    survey = initial.weighted(survey)
+    if joint is None:
+        scene = initial_scene(model, survey, initial)
+    else:
+        scene, near = in_own_frame(joint, survey, initial)
     with_attitudes = initial.layout == "line"
-    return problem_of(scene, initial.in_use(survey), estimate=options.estimate, with_attitudes=with_attitudes)
+    problem = problem_of(scene, initial.in_use(survey), estimate=estimate, with_attitudes=with_attitudes)
+    if joint is None:
+        state = start_of(scene, problem)
+    else:
+        state = minimise(problem, problem.start_at(near, joint.problem.errors)).state
+    return adjusted(scene, problem, state, initial, rejected_of(scene, survey, initial))
 
 
 def _refuse(contradictions: tuple[Caution, ...], options: InitSim3Options) -> None:
@@ -150,19 +132,21 @@ def _refuse(contradictions: tuple[Caution, ...], options: InitSim3Options) -> No
         )
 
 
-def _aligned_product(inputs: Inputs, data: Correspondences, alignment: Alignment) -> InitialSimilarity:
+def _aligned_product(
+    model: SparseModel, points: GeolocatedPoints, data: Correspondences, alignment: Alignment
+) -> InitialSimilarity:
     solution, similarity = alignment.solution, alignment.geo_from_local
     inlier = solution.state.inlier
-    agreeing = agreeing_points(inputs.model, inputs.points, similarity)
+    agreeing = agreeing_points(model, points, similarity)
     return InitialSimilarity(
         geo_from_local=_record_of(solution),
         method="robust",
-        correspondences=counts_of(data.control, inputs.points.inlier),
+        correspondences=counts_of(data.control, points.inlier),
         inliers=counts_of(data.control[inlier], agreeing),
         gnss_outliers=tuple(name for name, bad in zip(data.name, ~inlier & ~data.control, strict=True) if bad),
         residuals={
             **residuals_of(data.part(inlier), solution.residual[inlier]),
-            "points": residuals_of_points(inputs.model, inputs.points, similarity),
+            "points": residuals_of_points(model, points, similarity),
         },
         condition_number=solution.condition_number,
         layout=alignment.layout,
@@ -220,13 +204,12 @@ def _without_joint(
 
 
 def _joint_product(
-    inputs: Inputs, aligned: InitialSimilarity, joint: JointAdjustment
+    model: SparseModel, points: GeolocatedPoints, aligned: InitialSimilarity, joint: JointAdjustment
 ) -> tuple[InitialSimilarity, tuple[str, ...]]:
     """Return the result of the joint adjustment, and warnings of outliers."""
     similarity = joint.geo_from_local
-    agreeing = agreeing_points(inputs.model, inputs.points, similarity)
-    inliers = aligned.inliers | {"points": int(agreeing.sum())}
-    residuals = dict(aligned.residuals) | {"points": residuals_of_points(inputs.model, inputs.points, similarity)}
+    inliers = aligned.inliers | {"points": int(agreeing_points(model, points, similarity).sum())}
+    residuals = aligned.residuals | {"points": residuals_of_points(model, points, similarity)}
     rejected: dict[str, tuple[str, ...]] = {"gnss": aligned.gnss_outliers, "gcp": ()}
     warnings = []
     for kind, group in (("gnss", Fixes.kind), ("gcp", ControlPoints.kind)):

@@ -28,7 +28,6 @@ class Correspondences:
     """n points known in both frames.
 
     Attributes:
-        name: (n) names of images and control points.
         control: (n,) control point (True) or camera centre (False).
         in_local: (n, 3), in units of local.
         cov_in_local: (n, 3, 3), in squared units of local.
@@ -61,12 +60,7 @@ class Correspondences:
 
 @dataclass(frozen=True)
 class RotationPrior:
-    """Measured rotation geo ← local.
-
-    Attributes:
-        rotation: (3, 3).
-        cov_rad2: (3, 3) covariance in rad², axes of geo.
-    """
+    """Measured rotation (3, 3) geo ← local, with its covariance (3, 3) in rad², axes of geo."""
 
     rotation: FloatArray
     cov_rad2: FloatArray
@@ -77,7 +71,6 @@ class SimilarityState:
     """Unknowns of the adjustment, with the inliers and the excess scatter.
 
     Attributes:
-        geo_from_local: the similarity.
         inlier: (n,) the correspondences in use.
         fix_bias_in_geo: (3,) metres, fix minus truth; None if it is not estimated.
         excess_m: σ per axis beyond the stated one, of fixes and of control points.
@@ -94,9 +87,7 @@ class AdjustedSimilarity:
     """Solution of the adjustment, with its covariance, residuals and cost.
 
     Attributes:
-        state: the solution.
-        covariance: (7, 7) about `pivot`, see `SimilarityRecord`.
-        pivot: (3,) in geo.
+        covariance: (7, 7) about `pivot`, (3,) in geo; see `SimilarityRecord`.
         response: (n, 7, 3) change of the parameters per metre of error of each measured position.
         residual: (n, 3) metres, measured (less bias) minus mapped.
         squared: (n,) whitened squared residuals.
@@ -129,10 +120,7 @@ def adjust(data: Correspondences, start: SimilarityState, prior: RotationPrior |
     3. Estimate the excess scatter of each kind: SfM's own errors, and σ that were stated too small (after Paule
        and Mandel, doi 10.6028/jres.087.022).
 
-    Args:
-        data: n correspondences.
-        start: start of the similarity, and of the bias if it is to be estimated.
-        prior: measured rotation, if the layout needs it.
+    The bias of the fixes is estimated if the start has one.
     """
     state = _rescaled(data, start, robust=True)
     for _ in range(_STEPS):

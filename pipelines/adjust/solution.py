@@ -21,10 +21,8 @@ from pipelines.adjust.system import (
 )
 from pipelines.adjust.terms import Attitudes, ControlPoints, Fixes
 from pipelines.core.products import union
-from pipelines.core.stages import SIM3_POSTERIOR, SPARSE, TRAIN_POSTERIOR
-from pipelines.core.types import FloatArray
+from pipelines.core.stages import SIM3_POSTERIOR, TRAIN_POSTERIOR
 from pipelines.core.workspace import Workspace
-from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.geometry.sparse_model import SparseModel
@@ -37,7 +35,6 @@ from pipelines.survey.trained_model import (
     TrainedCamera,
     TrainedLens,
     TrainedModel,
-    load_solution,
 )
 
 Named = Fixes | ControlPoints | Attitudes
@@ -55,7 +52,7 @@ def adjusted(
         problem: the measurements in use.
         state: values of all unknowns.
         initial: its verdict on each measurement stands; its factors and cautions are carried on.
-        rejected: problem of the measurements that were rejected; None: there are none.
+        rejected: problem of the measurements that were rejected.
 
     Raises:
         DegenerateGeometryError: the measurements leave the similarity open.
@@ -70,11 +67,14 @@ def adjusted(
         geo_from_model=similarity.to_record("model", "geo", pivot=pivot),
         model_from_local=scene.model_from_local.to_record("local", "model"),
         cameras=_cameras(scene, poses),
-        lenses=_lenses(sparse, state.lens),
+        lenses=tuple(
+            TrainedLens(camera_id=key, model=camera.model, params=tuple(camera.params.tolist()))
+            for key, camera in (sparse.lenses.moved(state.lens).cameras.items() if len(state.lens) else ())
+        ),
         gnss_outliers=initial.gnss_outliers,
         control_outliers=initial.control_outliers,
         estimated_errors=problem.errors.estimates(state.errors, covariance),
-        measurements=(*_measurements(near, normal), *_rejected(rejected, state)),
+        measurements=(*_measurements(near, normal), *(() if rejected is None else _rejected(rejected, state))),
         sigma_px=problem.bundle.sigma_px,
         variance_factors=initial.variance_factors,
         cautions=union(initial.cautions),
@@ -87,16 +87,6 @@ def adjusted(
     summary = AccuracySummary(cells=0, reason="the scene has too few points") if grid is None else grid.summary()
     solution = solution.model_copy(update={"geo_from_model": record, "accuracy": summary})
     return replace(posterior, solution=solution, grid=grid)
-
-
-def load_adjustment(workspace: Workspace) -> Posterior:
-    """Return the adjustment of a workspace: that of its training, else that of init-sim3.
-
-    Raises:
-        MissingProductError: neither exists.
-        InputError: a product is damaged.
-    """
-    return posterior_of(workspace, load_solution(workspace), read_sparse(workspace.path(SPARSE)))
 
 
 def posterior_of(workspace: Workspace, solution: Adjustment, sfm: SparseModel) -> Posterior:
@@ -125,16 +115,6 @@ def _cameras(scene: Scene, poses: CameraPoses) -> tuple[TrainedCamera, ...]:
     )
 
 
-def _lenses(sparse: SparseModel, change: FloatArray) -> tuple[TrainedLens, ...]:
-    """Return the lenses after a change (L,); none if the lens was held."""
-    if not len(change):
-        return ()
-    return tuple(
-        TrainedLens(camera_id=key, model=camera.model, params=tuple(camera.params.tolist()))
-        for key, camera in sparse.lenses.moved(change).cameras.items()
-    )
-
-
 _KINDS: dict[str, Literal["fix", "control point", "attitude"]] = {
     Fixes.kind: "fix",
     ControlPoints.kind: "control point",
@@ -158,15 +138,11 @@ def _measurements(near: Linearised, normal: NormalMatrix) -> Iterator[Measuremen
         )
 
 
-def _rejected(problem: Problem | None, state: State) -> Iterator[Measurement]:
-    """Yield the state of the measurements that were rejected."""
-    if problem is None:
-        return
+def _rejected(problem: Problem, state: State) -> Iterator[Measurement]:
+    without_errors = replace(state, errors=np.zeros(len(problem.errors)))
     for term in problem.measured:
         if isinstance(term, Named):
-            yield from _states(
-                problem, term, replace(state, errors=np.zeros(len(problem.errors))), reason=_REJECTED
-            )
+            yield from _states(problem, term, without_errors, reason=_REJECTED)
 
 
 def _states(

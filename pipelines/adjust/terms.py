@@ -44,25 +44,11 @@ class At:
 
     @classmethod
     def of(cls, state: State, base: CameraPoses, errors: SystematicErrors) -> At:
-        """Return the estimate of a state.
-
-        Args:
-            state: values of all unknowns.
-            base: poses that it corrects.
-            errors: its systematic errors.
-        """
         poses, turn = state.poses(base), skew(state.correction[:, :3])
         # Exp(−(ω + δ)) = Exp(−ω) Exp(−J δ) with J = I + ½ [ω] + ⅙ [ω]² + …
         jacobian = np.eye(3) + turn / 2 + turn @ turn / 6
-        return cls(
-            poses.cam_from_model,
-            poses.cam_center_in_model,
-            state.geo_from_model,
-            state.lens,
-            errors,
-            state.errors,
-            jacobian,
-        )
+        cameras, similarity = (poses.cam_from_model, poses.cam_center_in_model), state.geo_from_model
+        return cls(*cameras, similarity, state.lens, errors, state.errors, jacobian)
 
     def geo_from_cam(self, camera: IntArray) -> FloatArray:
         """Return the rotations geo ← cam (K, 3, 3) of cameras (K,)."""
@@ -91,18 +77,6 @@ class Slopes:
     by_errors: FloatArray
     by_similarity: FloatArray | None = None
 
-    def whitened(self, root: FloatArray) -> Slopes:
-        """Return residuals and derivatives in units of σ, from root information (M, d, d)."""
-        return Slopes(
-            (root @ self.residual[:, :, None])[:, :, 0],
-            self.row,
-            self.camera,
-            root[self.row] @ self.by_pose,
-            root @ self.by_lens,
-            root @ self.by_errors,
-            None if self.by_similarity is None else root @ self.by_similarity,
-        )
-
 
 class Term(ABC):
     """M observations of one kind.
@@ -123,7 +97,7 @@ class Term(ABC):
 
     @abstractmethod
     def slopes(self, at: At) -> Slopes:
-        """Return the residuals with their derivatives."""
+        pass
 
     def __len__(self) -> int:
         return len(self.root_information)
@@ -138,7 +112,6 @@ class Fixes(Term):
     """Measured positions of F cameras: the term L_abs.
 
     Attributes:
-        name: (F) images.
         camera: (F,) index into the cameras.
         position_in_geo: (F, 3) metres.
         root_information: (F, 3, 3) of the fixes' own errors, in 1/m.
@@ -189,7 +162,6 @@ class ControlPoints(Term):
     """Control points against the intersections of their image marks: the term L_gcp; J points, K marks in all.
 
     Attributes:
-        name: (J) points.
         point: (K,) index into the points.
         camera: (K,) index into the cameras.
         bearing_in_cam: (K, 3) unit vectors.
@@ -266,7 +238,6 @@ class Attitudes(Term):
     """Recorded rotations of A cameras: the term L_att.
 
     Attributes:
-        name: (A) images.
         camera: (A,) index into the cameras.
         geo_from_cam: (A, 3, 3), of the nominal camera axes.
         root_information: (A, 3, 3), in 1/rad.
@@ -363,7 +334,6 @@ class CommonErrors(Term):
     coordinates. Cauchy's kernel then sets the prior aside, as it does with a bad fix.
 
     Attributes:
-        errors: whose prior it is.
         root_information: (B, 3, 3) by block.
     """
 
@@ -374,11 +344,9 @@ class CommonErrors(Term):
 
     @classmethod
     def of(cls, errors: SystematicErrors) -> CommonErrors:
-        """Return the prior of systematic errors."""
         return cls(errors, np.array([np.diag(1.0 / np.array(block.sigma)) for block in errors.blocks]))
 
     def residuals(self, at: At) -> FloatArray:
-        """Return the values (B, 3)."""
         return at.vector.reshape(-1, 3)
 
     def slopes(self, at: At) -> Slopes:

@@ -66,7 +66,6 @@ def component_of(squared: FloatArray, free: FloatArray, dimension: int) -> Varia
     Args:
         squared: (M,) squared whitened residuals.
         free: (M,) redundancy of each observation, 0 to `dimension`.
-        dimension: of a residual.
     """
     free = np.clip(free, 1e-6, dimension)
     # The σ at which half of the observations agree; never smaller than the stated one.
@@ -79,11 +78,7 @@ def component_of(squared: FloatArray, free: FloatArray, dimension: int) -> Varia
 
 
 def variance_components(linear: Linearised) -> tuple[dict[str, VarianceComponent], NormalMatrix]:
-    """Return the test of each kind of observation of a problem at its minimum, and the equations of its posterior.
-
-    Raises:
-        DegenerateGeometryError: the measurements leave the similarity open.
-    """
+    """Return the test of each kind of observation of a problem at its minimum, and the posterior's equations."""
     residuals = linear.residuals
     weights = posterior_weights(residuals)
     normal, components = linear.normal(weights), {}

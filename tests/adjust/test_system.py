@@ -175,7 +175,13 @@ def test_slopes_are_the_derivatives_of_the_residuals(kind: str, seed: int) -> No
     np.testing.assert_array_equal(slopes.residual, term.residuals(problem.at(state)))
 
     def moved(pose: np.ndarray, lens: np.ndarray, errors: np.ndarray) -> np.ndarray:
-        return term.residuals(problem.at(state.moved(pose.reshape(-1, 6), lens, errors)))
+        moved_state = replace(
+            state,
+            correction=state.correction + pose.reshape(-1, 6),
+            lens=state.lens + lens,
+            errors=state.errors + errors,
+        )
+        return term.residuals(problem.at(moved_state))
 
     no_pose, no_lens, no_errors = np.zeros(6 * IMAGES), np.zeros(LENSES), np.zeros(len(ERRORS))
     by_pose = np.zeros((len(term), term.dimension, 6 * IMAGES))
