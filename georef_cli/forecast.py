@@ -134,13 +134,13 @@ def _reconstruction(
     planned: Sequence[PlannedStage], photographs: Photographs | None
 ) -> ReconstructionForecast | None:
     """Return the forecast of the reconstruction; None where none would run, or before a bag is read."""
-    from pipelines.sfm.forecast import forecast
+    from pipelines.sfm.reconstructor import reconstructor_of
 
     row = _to_run(planned, SfmOptions)
     if row is None or photographs is None:
         return None
     assert isinstance(row.resolved, SfmOptions)
-    return forecast(photographs.count, photographs.size_px, row.resolved)
+    return reconstructor_of(row.resolved).forecast(photographs.count, photographs.size_px, row.resolved)
 
 
 def _photographs(workspace: Workspace, planned: list[PlannedStage]) -> Photographs | None:
