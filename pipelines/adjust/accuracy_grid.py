@@ -31,15 +31,13 @@ _SIGMA = ("sigma_e_m", "sigma_n_m", "sigma_u_m", "sigma_h_m", "sigma_v_m")
 
 @dataclass(frozen=True)
 class AccuracyGrid:
-    """Predicted σ at C cells of a grid over the scene, in metres.
+    """Predicted σ at C cells of a grid over the scene, of `shape` columns and rows and sides of `size_m` metres.
 
     Attributes:
         position_in_geo: (C, 3) middle of each cell, at the height of the scene there.
         cov_m2: (C, 3, 3) covariance in m², east, north, up.
         cell: (C, 2) column from the west and row from the south.
-        size_m: side of a cell.
         corner_in_geo: (2,) east and north of the south-western corner.
-        shape: numbers of columns and rows.
     """
 
     NO_ARRAYS: ClassVar[Mapping[str, FloatArray]] = {

@@ -47,7 +47,6 @@ class AdjustedBundle:
     Attributes:
         residual_px: (M, 2) projected minus observed.
         sigma0: root of the weighted sum of squares over the redundancy; 1 where all σ are true.
-        redundancy: observations minus unknowns.
         points: how the points follow the cameras.
     """
 

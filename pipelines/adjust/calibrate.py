@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from pipelines.adjust.observations import control_correspondences
+from pipelines.adjust.measurements import control_correspondences
 from pipelines.adjust.options import CalibrateOptions
 from pipelines.adjust.rig_fit import (
     ARM,
@@ -41,12 +41,7 @@ _ENDLESS = 1e6
 
 
 def run(stage: StageRun, options: CalibrateOptions) -> Summary:
-    """Estimate the rig of the flight and write the estimates; without any to estimate, write an empty product.
-
-    Raises:
-        MissingProductError: a product does not exist.
-        InputError: a product is damaged, or an error of `calibrate`.
-    """
+    """Estimate the rig of the flight and write the estimates; without any to estimate, write an empty product."""
     workspace = stage.workspace
     survey = load_json(Survey, workspace.path(SURVEY))
     calibration = RigCalibration()

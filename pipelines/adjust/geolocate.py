@@ -15,15 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.adjust.alignment import Alignment, align
-from pipelines.adjust.observations import (
-    RecordedRotations,
-    attitude_prior,
-    fix_correspondences,
-    recorded_rotations,
-)
+from pipelines.adjust.alignment import Alignment, Correspondences, RotationPrior, align, turn_against
+from pipelines.adjust.measurements import RecordedRotations, attitude_prior, fix_correspondences, recorded_rotations
 from pipelines.adjust.options import GeolocateOptions
-from pipelines.adjust.similarity_fit import Correspondences, RotationPrior
 from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.sentences import listed
 from pipelines.core.stages import SPARSE
@@ -33,7 +27,6 @@ from pipelines.formats.cloud_ply import write_point_ply
 from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.cameras import undistort
 from pipelines.geometry.intersection import CommonRotation, Intersections, Rays, UncertainCameras, intersect_rays
-from pipelines.geometry.rotations import log_so3
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.adjustment import GeolocatedPoints
 from pipelines.survey.calibrated import load_survey
@@ -56,11 +49,7 @@ class Geolocation:
 
 
 def run(stage: StageRun, options: GeolocateOptions) -> Summary:
-    """Intersect the points of the workspace's model and write them.
-
-    Raises:
-        GeorefError: unreadable products, or an error of `geolocate`.
-    """
+    """Intersect the points of the workspace's model and write them."""
     survey = load_survey(stage.workspace)
     model = read_sparse(stage.workspace.path(SPARSE))
     geolocation = geolocate(survey, model, options)
@@ -158,7 +147,7 @@ def _warnings(
             f"{listed(sorted(rejected))}"
         )
     if prior is not None and not alignment.attitude_used:
-        turn = float(np.linalg.norm(log_so3(prior.rotation @ alignment.geo_from_local.rotation.T)))
+        turn = turn_against(prior, alignment.geo_from_local)
         sigma = np.hypot(np.sqrt(prior.cov_rad2[0, 0]), alignment.solution.rotation_sigma_rad)
         if turn > 4 * sigma:
             warnings.append(

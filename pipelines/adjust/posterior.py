@@ -57,7 +57,6 @@ def intersection_jacobian(
     points behind their camera do not count.
 
     Args:
-        marks: N points, M marks.
         sigma_px: (M,) σ of the marks.
         surveyed: (N, 3, 3) information on the points beyond their marks, 1/m²; None: there is none.
     """
@@ -120,12 +119,9 @@ class Posterior:
         return np.asarray(self._jointly(point_in_geo, jacobian) + block_diag(*self._cov_of_marks(jacobian)))
 
     def of_scene(self, point_in_geo: FloatArray, point: IntArray, camera: IntArray) -> FloatArray:
-        """Return the covariance (J, 3, 3) in m² of points of the scene, without errors of marks.
+        """Return the covariance (J, 3, 3) in m² of points (J, 3) of the scene, without errors of marks.
 
-        Args:
-            point_in_geo: (J, 3) metres.
-            point: (K,) index into the points, of each ray.
-            camera: (K,) index of the camera that sees the point.
+        Each of K rays sees one point from one camera: `point` and `camera` (K,) are indices.
         """
         jacobian = self._jacobian(point_in_geo, point, camera)
         return self.normal.covariances(*self._derivatives(jacobian), 3)

@@ -22,7 +22,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
-from pipelines.adjust.similarity_fit import Correspondences, covariance_of
+from pipelines.adjust.alignment import Correspondences, covariance_of
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.geometry.rotations import exp_so3, log_so3

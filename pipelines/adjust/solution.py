@@ -11,15 +11,8 @@ import numpy as np
 from pipelines.adjust.accuracy_grid import accuracy_grid
 from pipelines.adjust.posterior import Posterior, camera_covariances, load_posterior
 from pipelines.adjust.state import State
-from pipelines.adjust.system import (
-    Linearised,
-    NormalMatrix,
-    Problem,
-    linearised,
-    posterior_weights,
-    robust_weights,
-)
-from pipelines.adjust.terms import Attitudes, ControlPoints, Fixes
+from pipelines.adjust.system import Linearised, NormalMatrix, Problem, linearised, posterior_weights, robust_weights
+from pipelines.adjust.terms import At, Attitudes, ControlPoints, Fixes
 from pipelines.core.products import union
 from pipelines.core.stages import SIM3_POSTERIOR, TRAIN_POSTERIOR
 from pipelines.core.workspace import Workspace
@@ -29,13 +22,7 @@ from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.adjustment import InitialSimilarity
 from pipelines.survey.report import AccuracySummary
 from pipelines.survey.scene import Scene
-from pipelines.survey.trained_model import (
-    Adjustment,
-    Measurement,
-    TrainedCamera,
-    TrainedLens,
-    TrainedModel,
-)
+from pipelines.survey.trained_model import Adjustment, Measurement, TrainedCamera, TrainedLens, TrainedModel
 
 Named = Fixes | ControlPoints | Attitudes
 _OPEN = 1e-9  # redundancy below which the other observations leave a direction open
@@ -74,7 +61,7 @@ def adjusted(
         gnss_outliers=initial.gnss_outliers,
         control_outliers=initial.control_outliers,
         estimated_errors=problem.errors.estimates(state.errors, covariance),
-        measurements=(*_measurements(near, normal), *(() if rejected is None else _rejected(rejected, state))),
+        measurements=tuple(_measurements(near, normal, rejected)),
         sigma_px=problem.bundle.sigma_px,
         variance_factors=initial.variance_factors,
         cautions=union(initial.cautions),
@@ -122,12 +109,12 @@ _KINDS: dict[str, Literal["fix", "control point", "attitude"]] = {
 }
 
 
-def _measurements(near: Linearised, normal: NormalMatrix) -> Iterator[Measurement]:
-    """Yield the state of every measurement in use, and of every systematic error."""
+def _measurements(near: Linearised, normal: NormalMatrix, rejected: Problem | None) -> Iterator[Measurement]:
+    """Yield the state of every measurement in use, of every systematic error, and of the rejected measurements."""
     for term in near.problem.measured:
         if isinstance(term, Named):
             left_out = _left_out(near, term, normal) if isinstance(term, ControlPoints) else None
-            yield from _states(near.problem, term, near.state, reason="", left_out=left_out)
+            yield from _states(term, near.problem.at(near.state), left_out=left_out)
     for error, row in zip(near.problem.errors.blocks, near.state.errors.reshape(-1, 3), strict=True):
         yield Measurement(
             kind="systematic error",
@@ -136,19 +123,16 @@ def _measurements(near: Linearised, normal: NormalMatrix) -> Iterator[Measuremen
             residual=tuple(row.tolist()),
             normalised=float(np.linalg.norm(row / np.array(error.sigma))),
         )
-
-
-def _rejected(problem: Problem, state: State) -> Iterator[Measurement]:
-    without_errors = replace(state, errors=np.zeros(len(problem.errors)))
-    for term in problem.measured:
-        if isinstance(term, Named):
-            yield from _states(problem, term, without_errors, reason=_REJECTED)
+    if rejected is not None:
+        at = rejected.at(replace(near.state, errors=np.zeros(len(rejected.errors))))
+        for term in rejected.measured:
+            if isinstance(term, Named):
+                yield from _states(term, at, reason=_REJECTED)
 
 
 def _states(
-    problem: Problem, term: Named, state: State, *, reason: str, left_out: list[dict[str, object]] | None = None
+    term: Named, at: At, *, reason: str = "", left_out: list[dict[str, object]] | None = None
 ) -> Iterator[Measurement]:
-    at = problem.at(state)
     residual, white = term.residuals(at), term.whitened(at)
     for row, name in enumerate(term.name):
         yield Measurement(
@@ -182,8 +166,5 @@ def _left_out(near: Linearised, control: ControlPoints, normal: NormalMatrix) ->
         error = unwhiten @ np.linalg.solve(free[row], white[row])
         others = np.linalg.solve(np.eye(3) - expected[kind][row] * spread[row], spread[row])
         cov = unwhiten @ (np.eye(3) + (others + others.T) / 2) @ unwhiten.T
-        rows[row] = {
-            "left_out_error_m": tuple(error.tolist()),
-            "left_out_cov_m2": tuple(map(tuple, cov.tolist())),
-        }
+        rows[row] = {"left_out_error_m": tuple(error.tolist()), "left_out_cov_m2": tuple(map(tuple, cov.tolist()))}
     return rows

@@ -94,7 +94,6 @@ class State:
     """Values of all unknowns.
 
     Attributes:
-        geo_from_model: the similarity.
         correction: (n, 6) corrections (δω, δc) of the cameras in `model`, rad and m: R' = R Exp(−δω), c' = c + δc.
         lens: (L,) change of the lens parameters; L = 0: the lens stays.
         errors: (p,) systematic errors, m and rad.

@@ -55,13 +55,7 @@ Weights = Mapping[str, FloatArray]
 
 @dataclass(frozen=True)
 class Problem:
-    """Cameras, and all that was measured of them.
-
-    Attributes:
-        base: poses as SfM left them, in `model`.
-        bundle: information of the image observations on them.
-        errors: systematic errors of the measurements.
-    """
+    """Cameras with poses as SfM left them, and all that was measured of them; at most one term of a kind."""
 
     base: CameraPoses
     bundle: BundleInformation
@@ -69,10 +63,13 @@ class Problem:
     errors: SystematicErrors = field(default_factory=SystematicErrors)
     lens_held: bool = False
 
-    @property
+    @cached_property
     def terms(self) -> tuple[Term, ...]:
-        prior = (CommonErrors.of(self.errors),) if len(self.errors) else ()
-        return (*self.measured, *prior)
+        """All terms, the prior of the systematic errors among them."""
+        if not self.errors.blocks:
+            return self.measured
+        prior = CommonErrors(np.array([np.diag(1.0 / np.array(block.sigma)) for block in self.errors.blocks]))
+        return (*self.measured, prior)
 
     def term(self, kind: str) -> Term | None:
         return next((term for term in self.terms if term.kind == kind), None)
@@ -149,11 +146,7 @@ class NormalMatrix:
 
     @cached_property
     def factor(self) -> SparseCholesky:
-        """Factor of N.
-
-        Raises:
-            DegenerateGeometryError: the measurements leave the similarity open.
-        """
+        """Factor of N."""
         try:
             return SparseCholesky(self.poses, self.position)
         except DegenerateGeometryError:
@@ -215,12 +208,9 @@ class NormalMatrix:
         return self._of_border(np.eye(count, len(self.corner), lens))
 
     def of_each_camera(self, camera: IntArray, by_pose: FloatArray, by_border: FloatArray) -> FloatArray:
-        """Return the covariances (m, d, d) of quantities that depend on one camera each.
+        """Return the covariances (m, d, d) of quantities that depend on one camera (m,) each.
 
-        Args:
-            camera: (m,) that camera.
-            by_pose: (m, d, 6) derivative by its corrections.
-            by_border: (m, d, b).
+        Their derivatives are (m, d, 6) by its corrections, and (m, d, b) by the border.
         """
         response = self.response.reshape(len(self.position), 6, -1)[camera]
         across = by_border - by_pose @ response

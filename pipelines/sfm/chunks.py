@@ -143,7 +143,7 @@ def work_chunk(workspace: Workspace, name: str, progress: Progress) -> bool:
         GeorefError: a crash of COLMAP, or a full disk.
     """
     partial = workspace.partial(BY_NAME["sfm"])
-    chunk = _planned(workspace, load_plan(workspace), name)
+    chunk = _planned(workspace, name)
     folder = chunk.folder(partial)
     with WriteLock(folder).hold(f"sfm --chunk {name}"):
         if chunk.is_finished(partial):
@@ -156,25 +156,8 @@ def work_chunk(workspace: Workspace, name: str, progress: Progress) -> bool:
     return True
 
 
-def load_plan(workspace: Workspace) -> ChunkPlan:
-    """Return the plan of the chunks of a workspace.
-
-    Raises:
-        InputError: there is none.
-    """
-    path = workspace.partial(BY_NAME["sfm"]) / PLAN
-    if not path.is_file():
-        raise InputError(f"no chunks are planned: `georef sfm {workspace.root}` plans them", path=path)
-    return load_json(ChunkPlan, path)
-
-
 def write_chunk(arguments: Mapping[str, Any], progress: Progress) -> None:
-    """Compute the features or matches of a chunk, in a child process.
-
-    Args:
-        arguments: paths of `survey`, `images` and `partial`, and the `name` of the chunk.
-        progress: shows its photographs or pairs.
-    """
+    """Compute the features or matches of a chunk, in a child process; paths and name are among the arguments."""
     partial = Path(arguments["partial"])
     plan = load_json(ChunkPlan, partial / PLAN)
     chunk = next(chunk for chunk in plan.chunks if chunk.name == arguments["name"])
@@ -220,18 +203,20 @@ def copy_finished(
         raise InputError(f"{error.message}: it was removed; run `georef sfm` again", path=database) from error
 
 
-def _planned(workspace: Workspace, plan: ChunkPlan, name: str) -> Chunk:
-    for chunk in plan.chunks:
-        if chunk.name == name:
-            count = len(load_json(Survey, workspace.path(SURVEY)).images)
-            if max((*chunk.images, *(index for pair in chunk.pairs for index in pair)), default=0) >= count:
-                raise InputError(
-                    f"{name} has more photographs than the survey: `georef sfm {workspace.root}` plans anew",
-                    path=workspace.partial(BY_NAME["sfm"]) / PLAN,
-                )
-            return chunk
-    names = f"{plan.chunks[0].name} … {plan.chunks[-1].name}" if plan.chunks else "none"
-    raise InputError(f"{name!r} is none of the chunks {names}", field="--chunk")
+def _planned(workspace: Workspace, name: str) -> Chunk:
+    path = workspace.partial(BY_NAME["sfm"]) / PLAN
+    if not path.is_file():
+        raise InputError(f"no chunks are planned: `georef sfm {workspace.root}` plans them", path=path)
+    chunks = load_json(ChunkPlan, path).chunks
+    chunk = next((chunk for chunk in chunks if chunk.name == name), None)
+    if chunk is None:
+        names = f"{chunks[0].name} … {chunks[-1].name}" if chunks else "none"
+        raise InputError(f"{name!r} is none of the chunks {names}", field="--chunk")
+    count = len(load_json(Survey, workspace.path(SURVEY)).images)
+    if max((*chunk.images, *(index for pair in chunk.pairs for index in pair)), default=0) >= count:
+        message = f"{name} has more photographs than the survey: `georef sfm {workspace.root}` plans anew"
+        raise InputError(message, path=path)
+    return chunk
 
 
 def work_in_chunks(stage: StageRun, survey: Survey, options: SfmOptions) -> ChunkPlan:
@@ -289,7 +274,7 @@ def _job(stage: StageRun, survey: Survey, plan: ChunkPlan, chunk: Chunk) -> Job:
 
 
 def join_chunks(colmap: Any, job: SfmJob, plan: ChunkPlan, partial: Path, progress: Progress) -> None:
-    """Copy the features and matches of all chunks into the database of the job, which is made anew.
+    """Copy the features and matches of all finished chunks into the database of the job, which is made anew.
 
     Raises:
         InputError: a chunk is damaged; it was removed, and the same command computes it again.

@@ -56,11 +56,10 @@ def rename_images(colmap: Any, path: Path, names: dict[str, str]) -> None:
 
 
 def copy_rows(source: Path, target: Path, tables: Iterable[str], images: Iterable[int] | None = None) -> None:
-    """Copy rows of features or matches from one database of a survey into another; present rows stay.
+    """Copy rows of features or matches from a finished database of a survey into another; present rows stay.
 
     Args:
-        source: finished database, which is not changed.
-        target: database with the same numbers of images.
+        source, target: have the same numbers of images.
         tables: `FEATURES` or `MATCHES`.
         images: indices of the images whose features are copied; None: all rows.
 
@@ -139,11 +138,7 @@ def _write_camera(colmap: Any, database: Any, prior: CameraPrior, options: SfmOp
 
 
 def _copy_shared_params(colmap: Any, prior: CameraPrior, camera: Any) -> None:
-    """Copy the parameters of the prior that both camera models have: focal length, centre, distortion.
-
-    Raises:
-        InputError: COLMAP has no camera of that model with that number of parameters.
-    """
+    """Copy the parameters of the prior that both camera models have: focal length, centre, distortion."""
     try:
         original = colmap.Camera(
             model=prior.model, width=prior.width, height=prior.height, params=list(prior.params)

@@ -74,12 +74,7 @@ def reconstruct(colmap: Any, job: SfmJob, progress: Progress) -> Any:
 
 
 def map_matches(colmap: Any, job: SfmJob, progress: Progress) -> Any:
-    """Return the largest `pycolmap.Reconstruction` of a database with features and matches, robustly adjusted.
-
-    Raises:
-        DegenerateGeometryError: COLMAP found no model.
-        ConvergenceError: the last adjustment found no solution.
-    """
+    """Return the largest model of a database with features and matches, adjusted; raises as `reconstruct`."""
     colmap.set_random_seed(job.options.seed)
     models = map_database(colmap, job, progress)
     if not models:

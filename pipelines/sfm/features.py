@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from pipelines.core.machine import chosen_threads
 from pipelines.core.progress import Progress
-from pipelines.core.types import BoolArray, FloatArray, IntArray
+from pipelines.core.types import FloatArray, IntArray
 from pipelines.formats.image_file import read_bytes, require_unchanged
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.sfm.colmap_database import rename_images, write_frame
@@ -52,15 +52,11 @@ def select_pairs(position: FloatArray, axis: FloatArray, max_neighbors: int) -> 
         reach = min(len(located), max_neighbors * _CANDIDATES_PER_NEIGHBOR + 1)
         for i in map(int, located):
             near = located[tree.query(position[i], k=reach)[1]]
-            near = near[(near != i) & _look_alike(axis, i, near)]
+            looks_away = axis[near] @ axis[i] < np.cos(np.radians(_MAX_ANGLE_DEG))  # unknown (NaN) passes
+            near = near[(near != i) & ~looks_away]
             for j in _spread(position[near] - position[i], max_neighbors):
                 chosen.add((min(i, int(near[j])), max(i, int(near[j]))))
     return np.array(sorted(chosen), dtype=np.int64).reshape(-1, 2)
-
-
-def _look_alike(axis: FloatArray, i: int, others: IntArray) -> BoolArray:
-    cosine = axis[others] @ axis[i]
-    return np.asarray(~(cosine < np.cos(np.radians(_MAX_ANGLE_DEG))))  # unknown (NaN) passes
 
 
 def _spread(offset: FloatArray, limit: int) -> list[int]:
@@ -91,7 +87,6 @@ class SfmJob:
         survey: photographs with priors of their cameras, positions and attitudes.
         images: folder of the photographs.
         database: path of COLMAP's database; an existing one is continued.
-        options: of the stage.
     """
 
     survey: Survey

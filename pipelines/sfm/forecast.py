@@ -22,9 +22,7 @@ class ReconstructionForecast:
     """Forecast of a reconstruction.
 
     Attributes:
-        mapper: that `auto` chooses, or the user.
         chunks: of features; 1: the survey is worked in one process.
-        seconds: about, on this machine.
         peak_bytes: predicted peak of the memory.
         free_bytes: memory that is free; None: unknown.
         refusal: reason why it would not fit; empty: it fits.

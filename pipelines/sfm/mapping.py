@@ -51,12 +51,7 @@ _REGISTERED = 0.95  # of the photographs: if the global mapper has less, the inc
 
 @dataclass(frozen=True)
 class MapperRun:
-    """Files and effort of a mapper.
-
-    Attributes:
-        images: folder of the photographs, for the colours of points.
-        scratch: empty folder for COLMAP's own output.
-    """
+    """Files and effort of a mapper; the folder `scratch` is empty, for COLMAP's own output."""
 
     database: Path
     images: Path
@@ -206,7 +201,12 @@ def _free_principal_point(colmap: Any, model: Any, adjustment: Any) -> bool:
     adjustment.refine_principal_point = True
     before = {key: camera.params.copy() for key, camera in model.cameras.items()}
     _adjust(colmap, model, adjustment)
-    astray = [key for key, camera in model.cameras.items() if _has_left_the_middle(camera)]
+    astray = []
+    for key, camera in model.cameras.items():
+        point = np.asarray(camera.params)[camera.principal_point_idxs()]
+        moved = np.linalg.norm(point - [camera.width / 2, camera.height / 2])
+        if moved > _FURTHEST_PRINCIPAL_POINT * max(camera.width, camera.height):
+            astray.append(key)
     if not astray:
         return True
     log.warning("the principal point of camera %d is not determined and stays where it was", astray[0])
@@ -215,12 +215,6 @@ def _free_principal_point(colmap: Any, model: Any, adjustment: Any) -> bool:
     adjustment.refine_principal_point = False
     _adjust(colmap, model, adjustment)
     return False
-
-
-def _has_left_the_middle(camera: Any) -> bool:
-    point = np.asarray(camera.params)[camera.principal_point_idxs()]
-    moved = np.linalg.norm(point - [camera.width / 2, camera.height / 2])
-    return bool(moved > _FURTHEST_PRINCIPAL_POINT * max(camera.width, camera.height))
 
 
 def _adjust_robustly(colmap: Any, model: Any, adjustment: Any, least_gain: float, task: ProgressTask) -> None:
@@ -270,13 +264,9 @@ def position_adjuster(
     """Return COLMAP's adjuster of all cameras and points, with camera positions as priors under Cauchy's kernel.
 
     Args:
-        colmap: the pycolmap module.
         model: a `pycolmap.Reconstruction`; solving moves it into the frame of the positions.
         positions: a `pycolmap.Image`, its measured centre (3,) in metres, and the covariance (3, 3), of each.
-        iterations: most of them.
         gate_m: limit of an inlier when COLMAP aligns the model with the positions, before it adjusts.
-        threads: of the solver; -1: all.
-        seed: of COLMAP's alignment.
     """
     bundle = colmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():

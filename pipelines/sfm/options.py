@@ -33,9 +33,7 @@ class SfmOptions(StageOptions):
     )
     max_features: int = Field(5000, ge=200, description="Features an image at the most.")
     import_model: InputPath | None = Field(
-        None,
-        description="Use this COLMAP model instead of reconstructing.",
-        json_schema_extra={"flag": "--import"},
+        None, description="Use this COLMAP model instead of reconstructing.", json_schema_extra={"flag": "--import"}
     )
     chunk_size: Annotated[int, EFFORT] = Field(
         200,

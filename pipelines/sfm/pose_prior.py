@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from pipelines.adjust.alignment import Alignment, align
-from pipelines.adjust.observations import attitude_prior, fix_correspondences
+from pipelines.adjust.init_sim3 import solved
+from pipelines.adjust.measurements import attitude_prior, fix_correspondences
 from pipelines.adjust.posterior import save_posterior
-from pipelines.adjust.robust import solved
 from pipelines.core.child import run_in_child
 from pipelines.core.errors import ConvergenceError, DegenerateGeometryError
 from pipelines.core.products import save_json
@@ -50,11 +50,7 @@ _ALIGNMENT_SLACK = 3.0
 
 
 def run(stage: StageRun, options: AdjustOptions) -> Summary:
-    """Adjust the workspace's model and write it.
-
-    Raises:
-        GeorefError: unreadable products, one of `adjust_to_fixes`, or a crash of COLMAP.
-    """
+    """Adjust the workspace's model and write it."""
     arguments = {
         "survey": load_survey(stage.workspace).model_dump(mode="json"),
         "model": str(stage.workspace.path(SPARSE)),
@@ -72,9 +68,6 @@ def write_adjusted(arguments: Mapping[str, Any], progress: Progress) -> dict[str
     Args:
         arguments: the calibrated `survey`, paths of `model` and `out`, and `seed`.
         progress: shows the adjustment.
-
-    Raises:
-        GeorefError: as `run`.
     """
     survey, path = Survey.model_validate(arguments["survey"]), Path(arguments["model"])
     out, seed = Path(arguments["out"]), int(arguments["seed"])

@@ -62,9 +62,6 @@ def write_model(arguments: Mapping[str, Any], progress: Progress) -> dict[str, A
     Args:
         arguments: paths of `survey`, `images` and `out`, and the `options` of the stage.
         progress: shows features, matches and mapping.
-
-    Raises:
-        GeorefError: as `run`.
     """
     survey, database = load_json(Survey, Path(arguments["survey"])), Path(arguments["out"]) / "database.db"
     options = SfmOptions.model_validate(arguments["options"])

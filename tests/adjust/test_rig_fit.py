@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipelines.adjust.alignment import Correspondences
 from pipelines.adjust.rig_fit import (
     LIMIT_ARM_M,
     LIMIT_OFFSET_S,
@@ -14,7 +15,6 @@ from pipelines.adjust.rig_fit import (
     RigData,
     fit_rig,
 )
-from pipelines.adjust.similarity_fit import Correspondences
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import FloatArray
 from pipelines.geometry.rotations import exp_so3, log_so3

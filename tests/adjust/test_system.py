@@ -153,11 +153,10 @@ def at_a_random_state(kind: str, seed: int) -> tuple[Problem, State, Term]:
         rng.normal(0, [5.0, 2.0, 2.0, 0.01]),
         rng.normal(0, 0.3, len(ERRORS)),
     )
-    if kind == CommonErrors.kind:
-        term: Term = CommonErrors.of(ERRORS)
-    else:
-        term = measured(EXACT, GEO_FROM_MODEL, rng, 1.0)[kind]
-    problem = problem_of(EXACT, (term,) if kind != CommonErrors.kind else (), ERRORS)
+    of_kind = measured(EXACT, GEO_FROM_MODEL, rng, 1.0) if kind != CommonErrors.kind else {}
+    problem = problem_of(EXACT, tuple(term for name, term in of_kind.items() if name == kind), ERRORS)
+    term = problem.term(kind)
+    assert term is not None
     if isinstance(term, ControlPoints):  # whose rays meet: the weights of the rays are those of the distances there
         poses = state.poses(problem.base)
         ray = CONTROL[term.point] - poses.cam_center_in_model[term.camera]
