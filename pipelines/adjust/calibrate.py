@@ -42,9 +42,8 @@ _ENDLESS = 1e6
 
 def run(stage: StageRun, options: CalibrateOptions) -> Summary:
     """Estimate the rig of the flight and write the estimates; without any to estimate, write an empty product."""
-    workspace = stage.workspace
+    workspace, calibration = stage.workspace, RigCalibration()
     survey = load_json(Survey, workspace.path(SURVEY))
-    calibration = RigCalibration()
     if _wanted(survey, options):
         calibration = calibrate(survey, read_sparse(workspace.path(SPARSE)), load_track(workspace), options)
     save_json(calibration, stage.out / "rig.json")

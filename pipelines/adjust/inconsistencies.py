@@ -8,7 +8,7 @@ autonomous base station, or by what σ of one fix allow. There the control point
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,14 +70,6 @@ _EXCHANGED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
 
 
 @dataclass(frozen=True)
-class Findings:
-    """Inconsistencies that end the stage, unless the user accepts them, and further limits of the result."""
-
-    contradictions: tuple[Caution, ...]
-    cautions: tuple[Caution, ...]
-
-
-@dataclass(frozen=True)
 class _Finding:
     """Caution, and whether it is an inconsistency that ends the stage."""
 
@@ -86,8 +78,10 @@ class _Finding:
     ends: bool = False
 
 
-def judge(survey: Survey, model: SparseModel, joint: JointAdjustment) -> Findings:
-    """Return the inconsistencies and cautions of the joint adjustment of a survey and its SfM model."""
+def judge(
+    survey: Survey, model: SparseModel, joint: JointAdjustment
+) -> tuple[tuple[Caution, ...], tuple[Caution, ...]]:
+    """Return the inconsistencies, which end the stage unless the user accepts them, and further limits."""
     fixes = StatedFixes(survey, model)
     findings, mistake = list(_upside_down(fixes, joint.geo_from_local)), _mistake_in_map(survey, model)
     of_map = []
@@ -99,19 +93,18 @@ def judge(survey: Survey, model: SparseModel, joint: JointAdjustment) -> Finding
         findings += _view(model, joint.geo_from_local)
     findings += of_map or [*_shift_of_fixes(joint), *_control_points(joint)]
     findings += [*_attitudes(survey, fixes, joint), *_weak_checks(joint), *_guesses(joint)]
-    ending, others = ([found for found in findings if found.ends == ends] for ends in (True, False))
-    return Findings(_cautions(ending), _cautions(others))
-
-
-def _cautions(findings: Iterable[_Finding]) -> tuple[Caution, ...]:
-    return tuple(Caution(code=found.code, sentence=found.sentence) for found in findings)
+    ending, others = (
+        tuple(Caution(code=found.code, sentence=found.sentence) for found in findings if found.ends == ends)
+        for ends in (True, False)
+    )
+    return ending, others
 
 
 def unadjustable(survey: Survey, model: SparseModel, geo_from_local: Similarity | None) -> tuple[Caution, ...]:
     """Return the inconsistencies of measurements that determine no adjustment, and perhaps no alignment (None)."""
     fixes = StatedFixes(survey, model)
     if geo_from_local is not None and hangs_upside_down(model, geo_from_local):
-        return _cautions(_upside_down(fixes, geo_from_local))
+        return tuple(Caution(code=one.code, sentence=one.sentence) for one in _upside_down(fixes, geo_from_local))
     if len(fixes.name) < _LEAST_FIXES:
         return ()
     try:

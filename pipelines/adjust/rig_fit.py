@@ -84,11 +84,6 @@ class RigData:
     def has_attitudes(self) -> bool:
         return len(self.attitudes) > 1
 
-    @property
-    def has_mount(self) -> BoolArray:
-        """Mask (n,) of the images whose mount is known."""
-        return np.asarray(np.isfinite(self.cam_from_body).all(axis=(1, 2)))
-
 
 @dataclass(frozen=True)
 class RigState:
@@ -156,7 +151,7 @@ def fit_rig(data: RigData, start_offset_s: float, start_boresight: FloatArray, o
     data = replace(data, attitudes=_smoothed(data.attitudes))
     free = np.ones(14, dtype=bool)
     free[OFFSET], free[ARM] = options.offset, options.arm
-    free[BORESIGHT] = data.has_attitudes and data.has_mount.any()
+    free[BORESIGHT] = data.has_attitudes and np.isfinite(data.cam_from_body).all(axis=(1, 2)).any()
     start = state = _start(data, start_offset_s, start_boresight, options)
     sigma_m, sigma_rad = 1.0, np.radians(2.0)
     for _ in range(_ROUNDS):
@@ -214,10 +209,10 @@ def _residuals(data: RigData, state: RigState, used: BoolArray) -> tuple[FloatAr
     control = data.control.in_geo - state.geo_from_local.apply(data.control.in_local)
     if not len(bodies):
         return position, np.empty((0, 3)), control
-    mounted = used & data.has_mount
-    from_sfm = data.cam_from_local[mounted] @ state.geo_from_local.rotation.T
-    body_from_cam = np.swapaxes(data.cam_from_body[mounted], 1, 2) @ state.boresight
-    return position, log_so3(from_sfm @ bodies[data.has_mount[used]] @ body_from_cam), control
+    mounted = np.isfinite(data.cam_from_body[used]).all(axis=(1, 2))
+    from_sfm = data.cam_from_local[used][mounted] @ state.geo_from_local.rotation.T
+    body_from_cam = np.swapaxes(data.cam_from_body[used][mounted], 1, 2) @ state.boresight
+    return position, log_so3(from_sfm @ bodies[mounted] @ body_from_cam), control
 
 
 def _cameras_by_navigation(
