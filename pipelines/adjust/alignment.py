@@ -86,7 +86,6 @@ class Correspondences:
         return Correspondences(tuple(compress(self.name, chosen)), *arrays)
 
     def joined(self, other: Correspondences) -> Correspondences:
-        """Return these correspondences, followed by those of `other`."""
         arrays = (
             np.concatenate([getattr(self, each.name), getattr(other, each.name)]) for each in fields(self)[1:]
         )

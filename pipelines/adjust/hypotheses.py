@@ -189,7 +189,6 @@ def _plain(fixes: StatedFixes) -> tuple[Similarity, Hypothesis]:
 
 
 def _blunders(fixes: StatedFixes, plain: Hypothesis) -> Hypothesis | None:
-    """Return the explanation by blunders among good fixes, from the residuals of the plain fit."""
     residual = fixes.position_in_geo - plain.geo_from_local.apply(fixes.center_in_local)
     bad = blunders_among(residual, fixes.sigma_m)
     if bad is None:
@@ -258,7 +257,6 @@ def _drifts(fixes: StatedFixes, price: float) -> Iterator[_Change]:
 
 
 def _groups(fixes: StatedFixes, start: Similarity, price: float) -> Iterator[_Change]:
-    """Shift a part of the fixes back that is shifted against the others, whenever they were recorded."""
     count, similarity = len(fixes.name), start
     second = np.zeros(count, dtype=bool)
     for _ in range(_ROUNDS):

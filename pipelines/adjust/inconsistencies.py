@@ -157,7 +157,6 @@ def _view(model: SparseModel, geo_from_local: Similarity) -> Iterator[_Finding]:
 
 
 def _fixes_against_model(fixes: StatedFixes, joint: JointAdjustment) -> Iterator[_Finding]:
-    """Yield the finding that the fixes do not fit the SfM model, with the mistake that explains it."""
     factor = joint.factors.get("fixes")
     if factor is None or factor.applied <= _QUIET_FACTOR:
         return
@@ -211,7 +210,6 @@ def _shift_of_fixes(joint: JointAdjustment) -> Iterator[_Finding]:
 
 
 def _control_points(joint: JointAdjustment) -> Iterator[_Finding]:
-    """Yield the finding that the control points contradict the fixes, or each other."""
     names, residual, used = joint.residuals(ControlPoints.kind)
     factor = joint.factors.get("control points")
     if factor is None:
@@ -286,7 +284,6 @@ def _attitudes(survey: Survey, fixes: StatedFixes, joint: JointAdjustment) -> It
 
 
 def _weak_checks(joint: JointAdjustment) -> Iterator[_Finding]:
-    """Yield findings of σ that little or nothing checks."""
     tested = [factor for factor in joint.factors.values() if factor.group in ("fixes", "control points")]
     redundancy = sum(factor.redundancy for factor in tested)
     if redundancy < 6.0:
@@ -306,7 +303,6 @@ def _weak_checks(joint: JointAdjustment) -> Iterator[_Finding]:
 
 
 def _guesses(joint: JointAdjustment) -> Iterator[_Finding]:
-    """Yield a finding of the σ that nobody stated, with the variance factors that stand in for them."""
     guessed = [
         f"{factor.group} ({'not checked' if factor.estimated is None else f'factor {factor.estimated:.2g}'})"
         for factor in joint.factors.values()

@@ -305,7 +305,6 @@ class VarianceComponent:
 
     @property
     def factor(self) -> float | None:
-        """Estimate q/r of the variance factor; None without redundancy."""
         return self.squares / self.redundancy if self.redundancy > _NO_REDUNDANCY else None
 
     @property

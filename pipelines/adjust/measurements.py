@@ -141,7 +141,6 @@ def positions_in_use(
 
 
 def _unused(survey: Survey, model: SparseModel, rays: MarkRays) -> tuple[UnusedControlPoint, ...]:
-    """Return the record of each point of `rays`, with the residuals of its marks."""
     position, *_ = _intersect_in_local(model, rays)
     # Where the rays contradict each other, none is left: within a wide σ they meet in the least-squares point.
     wide = RayErrors(_TINY, _TINY, _WIDE_RAD)

@@ -105,6 +105,5 @@ class State:
     errors: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def poses(self, base: CameraPoses) -> CameraPoses:
-        """Return the corrected poses of cameras."""
         turned = base.cam_from_model @ exp_so3(-self.correction[:, :3])
         return CameraPoses(turned, base.cam_center_in_model + self.correction[:, 3:])

@@ -99,7 +99,6 @@ class Problem:
         return At.of(state, self.base, self.errors)
 
     def residuals(self, state: State) -> dict[str, FloatArray]:
-        """Return the whitened residuals (M, d) by kind."""
         at = self.at(state)
         return {term.kind: term.whitened(at) for term in self.terms}
 
@@ -146,7 +145,6 @@ class NormalMatrix:
 
     @cached_property
     def factor(self) -> SparseCholesky:
-        """Factor of N."""
         try:
             return SparseCholesky(self.poses, self.position)
         except DegenerateGeometryError:
@@ -240,7 +238,6 @@ class Linearised:
 
     @property
     def residuals(self) -> Residuals:
-        """Whitened residuals (M, d) by kind."""
         return {kind: rows.residual for kind, rows in self.rows.items()}
 
     def normal(self, weights: Weights) -> NormalMatrix:

@@ -138,7 +138,6 @@ def _write_camera(colmap: Any, database: Any, prior: CameraPrior, options: SfmOp
 
 
 def _copy_shared_params(colmap: Any, prior: CameraPrior, camera: Any) -> None:
-    """Copy the parameters of the prior that both camera models have: focal length, centre, distortion."""
     try:
         original = colmap.Camera(
             model=prior.model, width=prior.width, height=prior.height, params=list(prior.params)

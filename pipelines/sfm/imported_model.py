@@ -82,7 +82,6 @@ def find_model(path: Path) -> Path:
 
 
 def _check_cameras(model: Any, survey: Survey, folder: Path) -> None:
-    """Refuse cameras of other sizes than the photographs; warn of cameras without distortion."""
     priors = {prior.camera_id: prior for prior in survey.cameras}
     size_of = {
         image.name: (priors[image.camera_id].width, priors[image.camera_id].height) for image in survey.images

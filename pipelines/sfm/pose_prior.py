@@ -121,7 +121,6 @@ def adjust_to_fixes(model: Any, survey: Survey, alignment: Alignment, seed: int 
 
 
 def _aligned(model: SparseModel, survey: Survey, seed: int) -> Alignment:
-    """Return the alignment of a model with the fixes."""
     data = fix_correspondences(survey, model)
     return align(data, np.random.default_rng(seed), attitude=attitude_prior(survey, model))
 
@@ -148,7 +147,6 @@ def _identity(alignment: Alignment, names: tuple[str, ...], residual: FloatArray
 
 
 def _located(model: Any, survey: Survey) -> list[tuple[Any, Fix]]:
-    """Return the registered images that have a fix, with their fixes."""
     fixes = {image.name: image.fix for image in survey.images if image.fix is not None}
     images = (model.images[image_id] for image_id in sorted(model.reg_image_ids()))
     return [(image, fixes[image.name]) for image in images if image.name in fixes]
