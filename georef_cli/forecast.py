@@ -134,7 +134,7 @@ def _reconstruction(
     planned: Sequence[PlannedStage], photographs: Photographs | None
 ) -> ReconstructionForecast | None:
     """Return the forecast of the reconstruction; None where none would run, or before a bag is read."""
-    from pipelines.sfm.stage import reconstructor_of
+    from pipelines.sfm.reconstructor import reconstructor_of
 
     row = _to_run(planned, SfmOptions)
     if row is None or photographs is None:
