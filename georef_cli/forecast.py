@@ -76,7 +76,7 @@ def forecast_run(
     Raises:
         GeorefError: the run would be refused for its options, or for a missing file.
     """
-    from pipelines.sfm.forecast import forecast as forecast_reconstruction
+    from pipelines.sfm.reconstructor import reconstructor_of
     from pipelines.train.forecast import training_forecast
 
     planned = plan(workspace, stages, flags, force=force)
@@ -85,7 +85,7 @@ def forecast_run(
     if photographs is not None:
         photo_px = photographs.size_px
         if (sfm := _to_run(planned, SfmOptions)) is not None:
-            reconstruction = forecast_reconstruction(photographs.count, photo_px, sfm)
+            reconstruction = reconstructor_of(sfm).forecast(photographs.count, photo_px, sfm)
         if (train := _to_run(planned, TrainOptions)) is not None:
             training = training_forecast(photographs.count, photo_px, train)
     seconds: dict[str, float | None] = {}

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.adjust.measurements import problem_of, start_of
-from pipelines.adjust.posterior import save_posterior
-from pipelines.adjust.solution import adjusted
+from pipelines.adjust.posterior import Posterior, save_posterior
+from pipelines.adjust.solution import adjusted, posterior_of
 from pipelines.core.products import load_json, save_json
 from pipelines.core.stages import ADJUSTMENT, GAUSSIANS, MODEL, SIM3, SIM3_POSTERIOR, SPARSE, TRAIN_POSTERIOR
 from pipelines.core.workspace import Workspace
@@ -24,7 +24,7 @@ from pipelines.splat.initialise import gaussians_of_size
 from pipelines.survey.adjustment import InitialSimilarity
 from pipelines.survey.calibrated import load_survey
 from pipelines.survey.scene import Scene
-from pipelines.survey.trained_model import Adjustment, TrainedModel
+from pipelines.survey.trained_model import Adjustment, TrainedModel, load_solution
 from tests.scenes import (
     GEO_FROM_LOCAL,
     WITH_GCPS,
@@ -43,6 +43,12 @@ from tests.scenes import (
 GEO_FROM_MODEL = Similarity(translation=np.array([40.0, -30.0, 60.0]))
 NOISE = Noise(pixel_px=0.3)
 IMAGES = 8
+
+
+def load_adjustment(workspace: Workspace) -> Posterior:
+    """Return the adjustment of a workspace: that of its training, else that of init-sim3."""
+    sfm = read_sparse(workspace.path(SPARSE))
+    return posterior_of(workspace, load_solution(workspace), sfm)
 
 
 def trained_workspace(root: Path) -> tuple[TrueScene, Workspace]:

@@ -37,8 +37,8 @@ from pipelines.core.machine import peak_memory_bytes
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.formats.colmap import flatten, quiet_colmap
 from pipelines.geometry.similarity import umeyama
-from pipelines.sfm.features import CameraDirections, select_pairs
-from pipelines.sfm.mapping import LastAdjustment, MapperRun, adjust_finally, remove_drift, run_mapper
+from pipelines.sfm.features import select_pairs
+from pipelines.sfm.mapping import MapperRun, adjust_finally, remove_drift, run_mapper
 
 SIZE_PX, FOCAL_PX, HEIGHT_M = (1200, 900), 1000.0, 100.0
 FORWARD_OVERLAP, SIDE_OVERLAP = 0.8, 0.6
@@ -131,7 +131,7 @@ def write_database(
             database.write_keypoints(index + 1, keypoints.astype(np.float32))
             seen.append(near[inside])
         axis = flown.rotation[:, 2]
-        pairs = select_pairs(CameraDirections(flown.center, axis), NEIGHBOURS)
+        pairs = select_pairs(flown.center, axis, NEIGHBOURS)
         matched = 0
         for i, j in pairs:
             _, a, b = np.intersect1d(seen[i], seen[j], return_indices=True)
@@ -184,12 +184,12 @@ def map_flight(mapper: str, database: Path, count: int, seed: int, threads: int)
         sigma_m = remove_drift(colmap, model, fixes, threads)
         errors["with positions"] = _center_rms_m(model, flown)
         drift_s = time.monotonic() - clock
-        adjust_finally(colmap, model, LastAdjustment(threads=threads))
+        adjust_finally(colmap, model, threads=threads)
         errors["last"] = _center_rms_m(model, flown)
         adjustment_s = time.monotonic() - clock
         peak = _peak_bytes()
         if plain is not None:
-            adjust_finally(colmap, plain, LastAdjustment(threads=threads))
+            adjust_finally(colmap, plain, threads=threads)
             errors["last without positions"] = _center_rms_m(plain, flown)
     return {
         **figures,

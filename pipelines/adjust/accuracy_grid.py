@@ -31,15 +31,13 @@ _SIGMA = ("sigma_e_m", "sigma_n_m", "sigma_u_m", "sigma_h_m", "sigma_v_m")
 
 @dataclass(frozen=True)
 class AccuracyGrid:
-    """Predicted σ at C cells of a grid over the scene, in metres.
+    """Predicted σ at C cells of a grid over the scene, of `shape` columns and rows and sides of `size_m` metres.
 
     Attributes:
         position_in_geo: (C, 3) middle of each cell, at the height of the scene there.
         cov_m2: (C, 3, 3) covariance in m², east, north, up.
         cell: (C, 2) column from the west and row from the south.
-        size_m: side of a cell.
         corner_in_geo: (2,) east and north of the south-western corner.
-        shape: numbers of columns and rows.
     """
 
     NO_ARRAYS: ClassVar[Mapping[str, FloatArray]] = {
@@ -54,7 +52,6 @@ class AccuracyGrid:
     shape: tuple[int, int]
 
     def arrays(self) -> dict[str, FloatArray | IntArray]:
-        """Return the grid as arrays, to be stored."""
         place = np.array([self.size_m, *self.corner_in_geo, *self.shape])
         return dict(zip(self.NO_ARRAYS, (self.position_in_geo, self.cov_m2, self.cell, place), strict=True))
 
@@ -69,8 +66,7 @@ class AccuracyGrid:
 
     @cached_property
     def sigma_m(self) -> FloatArray:
-        """σ (C, 3) east, north, up."""
-        return _sigma(self.cov_m2)
+        return np.asarray(np.sqrt(np.diagonal(self.cov_m2, axis1=1, axis2=2)))
 
     @property
     def sigma_h_m(self) -> FloatArray:
@@ -79,7 +75,6 @@ class AccuracyGrid:
 
     @property
     def sigma_v_m(self) -> FloatArray:
-        """Vertical σ (C,)."""
         return self.sigma_m[:, 2]
 
     def raster(self, values: FloatArray) -> FloatArray:
@@ -91,7 +86,7 @@ class AccuracyGrid:
 
     def sigma_at(self, position_in_geo: FloatArray) -> FloatArray:
         """Return σ (N, 3) east, north, up at points (N, 3) of the scene, in metres."""
-        return _sigma(self.cov_at(position_in_geo))
+        return np.asarray(np.sqrt(np.diagonal(self.cov_at(position_in_geo), axis1=1, axis2=2)))
 
     def cov_at(self, position_in_geo: FloatArray) -> FloatArray:
         """Return the covariance (N, 3, 3) of each of the points (N, 3) of the scene, in m².
@@ -104,7 +99,6 @@ class AccuracyGrid:
         return np.asarray(np.einsum("nk,nkij->nij", weight / weight.sum(axis=1, keepdims=True), self.cov_m2[cell]))
 
     def summary(self) -> AccuracySummary:
-        """Return least, median and largest σ, and their root mean square."""
         horizontal, vertical = self.sigma_h_m, self.sigma_v_m
         return AccuracySummary(
             cells=len(self.cell),
@@ -130,12 +124,7 @@ def accuracy_grid(
 ) -> AccuracyGrid | None:
     """Return the predicted σ on a grid over the scene, at the middle of each cell; None: too few points.
 
-    The cameras that observe the nearest SfM points observe the cell.
-
-    Args:
-        sparse: the SfM model.
-        point_in_geo: (N, 3) its points on Earth.
-        covariance: of points of the scene.
+    The cameras that observe the nearest of the model's points (N, 3) observe the cell.
     """
     rays = np.bincount(sparse.obs_point, minlength=len(sparse.point_id))
     chosen = np.flatnonzero(rays >= _LEAST_RAYS)
@@ -168,11 +157,6 @@ def accuracy_grid(
     return AccuracyGrid(position, cov, cell, size, low, (columns, rows))
 
 
-def _sigma(cov: FloatArray) -> FloatArray:
-    """Return σ (N, 3) of covariances (N, 3, 3)."""
-    return np.asarray(np.sqrt(np.diagonal(cov, axis1=1, axis2=2)))
-
-
 def _seen_by(obs_point: IntArray, obs_image: IntArray, near: IntArray) -> tuple[IntArray, IntArray]:
     """Return unique pairs (cell, camera), ordered by cell: cameras that observe any of the near points (C, k)."""
     order = np.argsort(obs_point, kind="stable")
@@ -185,13 +169,7 @@ def _seen_by(obs_point: IntArray, obs_image: IntArray, near: IntArray) -> tuple[
 
 
 def write_csv(grid: AccuracyGrid, origin: Origin, path: Path) -> None:
-    """Write the grid as a CSV table, one line a cell, with positions in `geo` and on the ellipsoid.
-
-    Args:
-        grid: σ at the cells.
-        origin: of `geo`.
-        path: of the table.
-    """
+    """Write the grid as a CSV table, one line a cell, with positions in `geo` and on the ellipsoid."""
     lla = lla_from_ecef(ecef_from_enu(grid.position_in_geo, origin))
     values = np.column_stack([grid.sigma_m, grid.sigma_h_m, grid.sigma_v_m])
     rows = (

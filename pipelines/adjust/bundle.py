@@ -1,9 +1,8 @@
 """Bundle adjustment of raw image measurements: cameras and points from pixels and surveyed points alone.
 
-SfM delivers a bundle at its minimum, and `adjust.system` takes it from there. Measurements of another program come
-without that minimum. Gauss–Newton steps find it, with the same normal equations: the points are eliminated
-(`geometry.bundle`), the cameras solved (`adjust.system.NormalMatrix`), the points follow
-(`adjust.posterior`). All observations have their stated weight: no kernel, no variance factor.
+SfM delivers a bundle at its minimum. Measurements of another program come without that minimum: Gauss–Newton steps
+find it, with the same normal equations. The points are eliminated (`geometry.bundle`), the cameras solved
+(`adjust.system.NormalMatrix`), the points follow (`adjust.posterior`). All observations have their stated weight.
 """
 
 from __future__ import annotations
@@ -46,11 +45,8 @@ class AdjustedBundle:
     """Minimum of a bundle, with its covariances; the lens is exactly known.
 
     Attributes:
-        network: with adjusted cameras and points.
         residual_px: (M, 2) projected minus observed.
         sigma0: root of the weighted sum of squares over the redundancy; 1 where all σ are true.
-        redundancy: observations minus unknowns.
-        normal: normal equations of the cameras.
         points: how the points follow the cameras.
     """
 
@@ -79,10 +75,7 @@ class AdjustedBundle:
 def adjust_bundle(network: Network, sigma_px: FloatArray, surveyed: SurveyedPoints) -> AdjustedBundle:
     """Return the least-squares adjustment of a network, from its approximate cameras and points.
 
-    Args:
-        network: a lens that is held, approximate cameras and points, and the observations.
-        sigma_px: (M,) σ of the observations.
-        surveyed: control points; a network needs three or more.
+    The lens is held; σ (M,) are of the observations; a network needs three or more control points.
 
     Raises:
         InputError: a point lies behind a camera that observes it.
@@ -112,8 +105,10 @@ def adjust_bundle(network: Network, sigma_px: FloatArray, surveyed: SurveyedPoin
             squares = float(((residual / sigma_px[:, None]) ** 2).sum() + (apart * pull).sum())
             return AdjustedBundle(network, residual, np.sqrt(squares / redundancy), redundancy, normal, points)
         step, _ = normal.solve(-sums.pose_slope[:, None], np.zeros((0, 1)))
-        network = _moved(network, step[:, 0], points, pull + _slope_of_points(network, residual, sigma_px))
-        before = residual
+        slope = np.zeros_like(pull)  # of half the weighted squares of the observations, by the points
+        by_point, weighted = linearise_bundle(network).jacobian_point, residual / sigma_px[:, None] ** 2
+        np.add.at(slope, network.obs_point, np.einsum("mij,mi->mj", by_point, weighted))
+        network, before = _moved(network, step[:, 0], points, pull + slope), residual
     raise ConvergenceError(f"the bundle does not settle in {_ROUNDS} steps: start with better cameras and points")
 
 
@@ -124,13 +119,6 @@ def _refuse_open_layouts(surveyed: SurveyedPoints) -> None:
         raise DegenerateGeometryError(
             f"{len(position)} control points leave the frame open: three are needed that are not on one line"
         )
-
-
-def _slope_of_points(network: Network, residual: FloatArray, sigma_px: FloatArray) -> FloatArray:
-    """Return the gradient (N, 3) of half the weighted squares of the observations by the points."""
-    by_point, slope = linearise_bundle(network).jacobian_point, np.zeros_like(network.point_in_world)
-    np.add.at(slope, network.obs_point, np.einsum("mij,mi->mj", by_point, residual / sigma_px[:, None] ** 2))
-    return slope
 
 
 def _moved(network: Network, step: FloatArray, points: IntersectionJacobian, slope: FloatArray) -> Network:

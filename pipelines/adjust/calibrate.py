@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from pipelines.adjust.observations import control_correspondences
+from pipelines.adjust.measurements import control_correspondences
 from pipelines.adjust.options import CalibrateOptions
 from pipelines.adjust.rig_fit import (
     ARM,
@@ -41,15 +41,9 @@ _ENDLESS = 1e6
 
 
 def run(stage: StageRun, options: CalibrateOptions) -> Summary:
-    """Estimate the rig of the flight and write the estimates; without any to estimate, write an empty product.
-
-    Raises:
-        MissingProductError: a product does not exist.
-        InputError: a product is damaged, or an error of `calibrate`.
-    """
-    workspace = stage.workspace
+    """Estimate the rig of the flight and write the estimates; without any to estimate, write an empty product."""
+    workspace, calibration = stage.workspace, RigCalibration()
     survey = load_json(Survey, workspace.path(SURVEY))
-    calibration = RigCalibration()
     if _wanted(survey, options):
         calibration = calibrate(survey, read_sparse(workspace.path(SPARSE)), load_track(workspace), options)
     save_json(calibration, stage.out / "rig.json")
@@ -87,14 +81,13 @@ def calibrate(
         applied=applied,
         not_applied=tuple(estimate for estimate in estimates if estimate not in applied),
         images=fit.images,
-        control_points=len(data.control_in_local),
+        control_points=len(data.control),
         rms_position_m=fit.rms_position_m,
         rms_attitude_deg=attitude if np.isfinite(attitude) else None,
     )
 
 
 def _wanted(survey: Survey, options: CalibrateOptions) -> tuple[RigParameter, ...]:
-    """Return the parameters to estimate: those of the options, else those of the survey."""
     return survey.estimate if options.estimate is None else options.estimate
 
 
@@ -116,10 +109,7 @@ def _data(survey: Survey, model: SparseModel, track: NavigationTrack) -> RigData
         cam_from_local=model.rotation_cam_from_local[registered],
         cam_from_body=track.cam_from_body[rows],
         antenna_in_body=np.nan_to_num(track.antenna_in_body[rows]),
-        control_in_local=control.in_local,
-        control_in_geo=control.in_geo,
-        control_cov_in_local=control.cov_in_local,
-        control_cov_in_geo=control.cov_in_geo,
+        control=control,
         pixel_rad=float(1.0 / np.median(focal_px)),
         footprint_in_local=float(np.median(distance / focal_px[model.obs_image])),
     )

@@ -15,15 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.adjust.alignment import Alignment, align
-from pipelines.adjust.observations import (
-    RecordedRotations,
-    attitude_prior,
-    fix_correspondences,
-    recorded_rotations,
-)
+from pipelines.adjust.alignment import Alignment, Correspondences, RotationPrior, align, turn_against
+from pipelines.adjust.measurements import RecordedRotations, attitude_prior, fix_correspondences, recorded_rotations
 from pipelines.adjust.options import GeolocateOptions
-from pipelines.adjust.similarity_fit import Correspondences, RotationPrior
 from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.sentences import listed
 from pipelines.core.stages import SPARSE
@@ -33,7 +27,6 @@ from pipelines.formats.cloud_ply import write_point_ply
 from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.cameras import undistort
 from pipelines.geometry.intersection import CommonRotation, Intersections, Rays, UncertainCameras, intersect_rays
-from pipelines.geometry.rotations import log_so3
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.adjustment import GeolocatedPoints
 from pipelines.survey.calibrated import load_survey
@@ -47,14 +40,7 @@ _ALIGNMENT_SEED = 0
 
 @dataclass(frozen=True)
 class Geolocation:
-    """Result of `geolocate`.
-
-    Attributes:
-        points: the points on Earth.
-        sigma_m: (N,) σ along the worst axis in metres; NaN without a position.
-        key_figure: one line for tables.
-        warnings: messages that the user should read.
-    """
+    """Result of `geolocate`; sigma_m (N,) is along the worst axis in metres, NaN without a position."""
 
     points: GeolocatedPoints
     sigma_m: FloatArray
@@ -63,19 +49,13 @@ class Geolocation:
 
 
 def run(stage: StageRun, options: GeolocateOptions) -> Summary:
-    """Intersect the points of the workspace's model and write them.
-
-    Raises:
-        GeorefError: unreadable products, or an error of `geolocate`.
-    """
+    """Intersect the points of the workspace's model and write them."""
     survey = load_survey(stage.workspace)
     model = read_sparse(stage.workspace.path(SPARSE))
     geolocation = geolocate(survey, model, options)
-    points = geolocation.points
+    points, cloud = geolocation.points, stage.out / "points.ply"
     points.save(stage.out / "points.npz")
-    write_point_ply(
-        stage.out / "points.ply", points.position_in_geo, model.point_rgb, geolocation.sigma_m, points.inlier
-    )
+    write_point_ply(cloud, points.position_in_geo, model.point_rgb, geolocation.sigma_m, points.inlier)
     return Summary(geolocation.key_figure, _values(points), geolocation.warnings)
 
 
@@ -110,9 +90,8 @@ def geolocate(survey: Survey, model: SparseModel, options: GeolocateOptions) -> 
         # Control points may place the model nevertheless, or `init-sim3` finds what is wrong with the fixes.
         return _without_positions(model, f"no directions for the SfM points: {problem}")
     warnings = _warnings(model, fixes, recorded, alignment, prior if use_recorded else None)
-    views, usable = _views(
-        model, fixes, fixed, alignment, recorded if use_recorded else None, sigma_px=options.sigma_px
-    )
+    used = recorded if use_recorded else None
+    views, usable = _views(model, fixes, fixed, alignment, used, sigma_px=options.sigma_px)
     rays = _rays(model, usable)
     intersections = intersect_rays(rays, views, len(model.point_id))
     sigma, inlier = _judge(intersections, rays, views, options)
@@ -168,7 +147,7 @@ def _warnings(
             f"{listed(sorted(rejected))}"
         )
     if prior is not None and not alignment.attitude_used:
-        turn = float(np.linalg.norm(log_so3(prior.rotation @ alignment.geo_from_local.rotation.T)))
+        turn = turn_against(prior, alignment.geo_from_local)
         sigma = np.hypot(np.sqrt(prior.cov_rad2[0, 0]), alignment.solution.rotation_sigma_rad)
         if turn > 4 * sigma:
             warnings.append(

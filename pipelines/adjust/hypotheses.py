@@ -17,7 +17,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
 
-from pipelines.adjust.observations import fix_correspondences
+from pipelines.adjust.alignment import RotationPrior, turn_against
+from pipelines.adjust.measurements import fix_correspondences
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.sentences import listed
 from pipelines.core.types import FloatArray, IntArray
@@ -49,9 +50,6 @@ class StatedFixes:
     """Fixes of a survey's n registered photographs as stated, against the SfM model.
 
     Attributes:
-        model: SfM model.
-        origin: of geo.
-        name: (n) of the photographs.
         center_in_local: (n, 3) projection centres.
         position_in_geo: (n, 3) metres.
         time_s: (n,) times of the photographs, NaN where unknown.
@@ -66,18 +64,12 @@ class StatedFixes:
         self.time_s = np.array([times[name] for name in fixes.name], dtype=np.float64)
         self.sigma_m = typical_sigma(fixes.cov_in_geo) if len(fixes) else np.nan
 
-    def distances(self, similarity: Similarity) -> FloatArray:
-        """Return the distances (n,) of the fixes from the centres, in metres."""
-        return np.asarray(np.linalg.norm(self.position_in_geo - similarity.apply(self.center_in_local), axis=1))
-
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A mistake that would explain the measurements.
+    """A mistake that would explain the measurements, and what to do.
 
     Attributes:
-        code: stable word.
-        sentence: the mistake, and what to do.
         scatter_m: robust scatter per axis of the corrected fixes about the SfM model.
         geo_from_local: similarity of the corrected fixes.
         distance_m: (n,) of the corrected fixes from the SfM model; NaN where the hypothesis says nothing.
@@ -90,11 +82,6 @@ class Hypothesis:
     geo_from_local: Similarity
     distance_m: FloatArray
     price: float = 0.0
-
-    def cost(self, sigma_m: float) -> float:
-        """Return −2 ln likelihood at a σ per axis, blunders at the price of the gate."""
-        known = np.nan_to_num(self.distance_m / sigma_m, nan=np.sqrt(_GATE / 2))
-        return float(np.minimum(known**2, _GATE).sum()) + self.price
 
 
 # Code, sentence, fixes (n, 3) without the mistake, and price of its unknowns.
@@ -110,14 +97,17 @@ def fit(center_in_local: FloatArray, position_in_geo: FloatArray) -> tuple[Simil
     weight = np.ones(len(center_in_local))
     for _ in range(_ROUNDS):
         similarity = umeyama(center_in_local, position_in_geo, weight)
-        distance = np.linalg.norm(position_in_geo - similarity.apply(center_in_local), axis=1)
+        distance = _distances(similarity, center_in_local, position_in_geo)
         weight = 1.0 / np.maximum(distance, 1e-3 + 0.1 * float(np.median(distance)))
     redundancy = max(1.0 - 7.0 / (3.0 * len(distance)), 0.05)
     return similarity, float(np.median(distance) / np.sqrt(median_chi2(3) * redundancy))
 
 
+def _distances(similarity: Similarity, center_in_local: FloatArray, position_in_geo: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.norm(position_in_geo - similarity.apply(center_in_local), axis=1))
+
+
 def hangs_upside_down(model: SparseModel, geo_from_local: Similarity) -> bool:
-    """Return whether most cameras hang upside down."""
     up_in_cam = model.rotation_cam_from_local @ geo_from_local.rotation[2]
     return float(np.median(-up_in_cam[:, 1] - up_in_cam[:, 2])) < _UPSIDE_DOWN
 
@@ -142,7 +132,7 @@ def explanation_of(fixes: StatedFixes) -> Hypothesis | None:
     for code, sentence, changed, price in changes:
         with suppress(DegenerateGeometryError):
             similarity, scatter = fit(fixes.center_in_local, changed)
-            distance = np.linalg.norm(changed - similarity.apply(fixes.center_in_local), axis=1)
+            distance = _distances(similarity, fixes.center_in_local, changed)
             tried.append(Hypothesis(code, sentence, scatter, similarity, distance, price))
     tried += _clock(fixes, 3.0 * of_one)
     good = [
@@ -150,22 +140,22 @@ def explanation_of(fixes: StatedFixes) -> Hypothesis | None:
         for one in tried
         if one.scatter_m < plain.scatter_m / _EXPLAINS and not hangs_upside_down(fixes.model, one.geo_from_local)
     ]
-    scale_m = max(fixes.sigma_m, min(one.scatter_m for one in (plain, *good)))
-    best = min((plain, *good), key=lambda one: one.cost(scale_m))
+    sigma_m = max(fixes.sigma_m, min(one.scatter_m for one in (plain, *good)))
+
+    def cost(one: Hypothesis) -> float:
+        """Return −2 ln likelihood at a σ per axis, blunders at the price of the gate."""
+        known = np.nan_to_num(one.distance_m / sigma_m, nan=np.sqrt(_GATE / 2))
+        return float(np.minimum(known**2, _GATE).sum()) + one.price
+
+    best = min((plain, *good), key=cost)
     return _blunders(fixes, plain) if best is plain else best
 
 
-def clock_that_turns(fixes: StatedFixes, turn_of: Callable[[Similarity], float]) -> tuple[float, float] | None:
+def clock_that_turns(fixes: StatedFixes, attitude: RotationPrior) -> tuple[float, float] | None:
     """Return the clock offset in s that turns a solution onto its attitudes, and the angle left in rad.
 
     On a circle, or on lines in one direction, a wrong time turns or shifts the whole flight without any scatter.
-
-    Args:
-        fixes: as stated.
-        turn_of: angle in rad between the attitudes and a similarity.
-
-    Returns:
-        None: the times are unknown, or no offset within the search fits the model as well as none.
+    None: the times are unknown, or no offset within the search fits the model as well as none.
     """
     track = _Track.of(fixes)
     if track is None:
@@ -174,7 +164,7 @@ def clock_that_turns(fixes: StatedFixes, turn_of: Callable[[Similarity], float])
 
     def turn(offset_s: float) -> float:
         similarity, scatter, _ = track.at(offset_s)
-        return turn_of(similarity) + (0.0 if scatter < limit else np.pi)
+        return turn_against(attitude, similarity) + (0.0 if scatter < limit else np.pi)
 
     found = min(_minima(turn, track.offsets(_TURN_S)), key=lambda one: one[1], default=None)
     return None if found is None or found[1] > np.pi else found
@@ -182,23 +172,23 @@ def clock_that_turns(fixes: StatedFixes, turn_of: Callable[[Similarity], float])
 
 def _plain(fixes: StatedFixes) -> tuple[Similarity, Hypothesis]:
     """Return the similarity that the most fixes agree with, and the fit to these, or to all if most disagree."""
+    center, position = fixes.center_in_local, fixes.position_in_geo
     consensus = ransac(
         len(fixes.name),
-        lambda chosen: umeyama(fixes.center_in_local[chosen], fixes.position_in_geo[chosen]),
-        lambda found: fixes.distances(found) ** 2 / fixes.sigma_m**2,
+        lambda chosen: umeyama(center[chosen], position[chosen]),
+        lambda found: _distances(found, center, position) ** 2 / fixes.sigma_m**2,
         RansacOptions(3, _BLUNDER, max_draws=_DRAWS),
         np.random.default_rng(0),
     ).model
-    similarity, scatter = fit(fixes.center_in_local, fixes.position_in_geo)
-    agreeing = fixes.distances(consensus) ** 2 <= _BLUNDER * fixes.sigma_m**2
+    similarity, scatter = fit(center, position)
+    agreeing = _distances(consensus, center, position) ** 2 <= _BLUNDER * fixes.sigma_m**2
     if agreeing.mean() > 0.5:
         with suppress(DegenerateGeometryError):
-            similarity = fit(fixes.center_in_local[agreeing], fixes.position_in_geo[agreeing])[0]
-    return consensus, Hypothesis("", "", scatter, similarity, fixes.distances(similarity))
+            similarity = fit(center[agreeing], position[agreeing])[0]
+    return consensus, Hypothesis("", "", scatter, similarity, _distances(similarity, center, position))
 
 
 def _blunders(fixes: StatedFixes, plain: Hypothesis) -> Hypothesis | None:
-    """Return the explanation by blunders among good fixes, from the residuals of the plain fit."""
     residual = fixes.position_in_geo - plain.geo_from_local.apply(fixes.center_in_local)
     bad = blunders_among(residual, fixes.sigma_m)
     if bad is None:
@@ -231,6 +221,7 @@ def _changed_axes(fixes: StatedFixes) -> Iterator[_Change]:
 
 
 def _latitude_for_longitude(position: FloatArray, origin: Origin) -> FloatArray:
+    """Return the positions (n, 3) with latitude and longitude exchanged, about the median of their places."""
     lla = lla_from_ecef(ecef_from_enu(position, origin))
     middle = np.median(lla, axis=0)[[1, 0, 2]]
     exchanged = lla[:, [1, 0, 2]] - lla[:, [1, 0, 2]].mean(axis=0) + middle
@@ -266,7 +257,6 @@ def _drifts(fixes: StatedFixes, price: float) -> Iterator[_Change]:
 
 
 def _groups(fixes: StatedFixes, start: Similarity, price: float) -> Iterator[_Change]:
-    """Shift a part of the fixes back that is shifted against the others, whenever they were recorded."""
     count, similarity = len(fixes.name), start
     second = np.zeros(count, dtype=bool)
     for _ in range(_ROUNDS):
@@ -312,9 +302,8 @@ def _clock(fixes: StatedFixes, price: float) -> Iterator[Hypothesis]:
         if abs(offset) < _LEAST_CLOCK_S:
             continue
         similarity, _, rows = track.at(offset)
-        distance = np.full(len(fixes.name), np.nan)
-        missed = track.curve(fixes.time_s[rows] + offset) - similarity.apply(fixes.center_in_local[rows])
-        distance[rows] = np.linalg.norm(missed, axis=1)
+        distance, position = np.full(len(fixes.name), np.nan), track.curve(fixes.time_s[rows] + offset)
+        distance[rows] = _distances(similarity, fixes.center_in_local[rows], position)
         leap = ", as GPS time and UTC differ" if abs(abs(offset) - _LEAP_S) < 2.0 * _CLOCK_STEP_S else ""
         sentence = (
             f"the navigation clock is off by about {offset:+.2f} s against the camera's{leap}: correct the times "
@@ -348,16 +337,11 @@ class _Track:
         return np.asarray(steps[count >= max(2 * _LEAST, len(self.rows) // 2)])
 
     def rows_at(self, offset_s: float) -> IntArray:
-        """Return the rows of the photographs on the curve at a clock offset."""
         time_s = self.fixes.time_s[self.rows]
         return np.asarray(self.rows[(time_s + offset_s >= time_s[0]) & (time_s + offset_s <= time_s[-1])])
 
     def at(self, offset_s: float) -> tuple[Similarity, float, IntArray]:
-        """Return similarity, scatter in metres and rows of the photographs on the curve at a clock offset.
-
-        Raises:
-            DegenerateGeometryError: these photographs do not determine a similarity.
-        """
+        """Return similarity, scatter in metres and rows of the photographs on the curve at a clock offset."""
         rows = self.rows_at(offset_s)
         position = self.curve(self.fixes.time_s[rows] + offset_s)
         return *fit(self.fixes.center_in_local[rows], position), rows

@@ -13,27 +13,33 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.adjust.control_mistakes import EVERYDAY_SHIFT_M, mistake_in_map, shift_sentence
+from pipelines.adjust.alignment import Correspondences, turn_against
 from pipelines.adjust.hypotheses import (
     StatedFixes,
     clock_that_turns,
     explanation_of,
     fit,
     hangs_upside_down,
+    mirrored,
 )
 from pipelines.adjust.joint import JointAdjustment
-from pipelines.adjust.observations import UnusedControlPoint, attitude_prior
+from pipelines.adjust.measurements import (
+    UnusedControlPoint,
+    attitude_prior,
+    control_correspondences,
+    fix_correspondences,
+)
 from pipelines.adjust.terms import ControlPoints, Fixes
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.products import Caution
 from pipelines.core.sentences import listed
 from pipelines.core.types import FloatArray
-from pipelines.geometry.rotations import log_so3
+from pipelines.geodesy.vertical import FOOT_M, MOST_GEOID_M
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.robust.patterns import median_spacing
 from pipelines.robust.statistics import outlier_gate, typical_sigma
-from pipelines.survey.report_parts import Group, VarianceFactor
+from pipelines.survey.report_parts import VarianceFactor
 from pipelines.survey.survey import Survey
 
 _SIGMA_REFUTED = "sigma-refuted"
@@ -49,19 +55,18 @@ _ATTITUDE_SIGMAS, _ATTITUDE_RAD = 4.0, np.radians(8.0)
 # A turn is explained by a clock if so little is left of it.
 _CLOCK_SIGMAS, _EXPLAINED_SIGMAS = 3.0, 1.0
 _NAMED = 5  # control points in a caution
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """Findings on a solution.
-
-    Attributes:
-        contradictions: inconsistencies that end the stage, unless the user accepts them.
-        cautions: further limits of the result.
-    """
-
-    contradictions: tuple[Caution, ...]
-    cautions: tuple[Caution, ...]
+# A shift of all fixes up to this is everyday work with an autonomous base station.
+_EVERYDAY_SHIFT_M = 5.0
+_LEAST_FEET_M = 50.0
+_FEET_PART = 0.05  # of a height, by which cameras are higher than control points
+# Size of the photographs in which marks were measured, and the factor of their pixels.
+_SCALES = {"1/2": 2.0, "1/3": 3.0, "1/4": 4.0, "2 times": 0.5, "3 times": 1 / 3, "4 times": 0.25}
+_MIRRORED_M = 0.3  # scatter about the SfM model, below which control points fit as they are
+_LEAST, _SIGMAS, _NEAR_SIGMAS, _LEAST_SCALE = 5, 5.0, 2.0, 0.01
+# From x, y and the height of the photograph to the pixels x, y without a mistake.
+_AS_STATED = np.eye(2, 3)
+_FROM_BELOW = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 1.0]])
+_EXCHANGED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
 
 
 @dataclass(frozen=True)
@@ -72,37 +77,34 @@ class _Finding:
     sentence: str
     ends: bool = False
 
-    @property
-    def caution(self) -> Caution:
-        return Caution(code=self.code, sentence=self.sentence)
 
-
-def judge(survey: Survey, model: SparseModel, joint: JointAdjustment) -> Verdict:
-    """Return the inconsistencies and cautions of the joint adjustment of a survey and its SfM model."""
+def judge(
+    survey: Survey, model: SparseModel, joint: JointAdjustment
+) -> tuple[tuple[Caution, ...], tuple[Caution, ...]]:
+    """Return the inconsistencies, which end the stage unless the user accepts them, and further limits."""
     fixes = StatedFixes(survey, model)
-    findings, of_map = list(_upside_down(fixes, joint.geo_from_local)), list(_map_of_control(survey, model))
+    findings, mistake = list(_upside_down(fixes, joint.geo_from_local)), _mistake_in_map(survey, model)
+    of_map = []
+    if mistake is not None:
+        sentence = f"control points and fixes contradict each other: {mistake}"
+        of_map.append(_Finding("control-map", sentence, ends=True))
     if not findings:
         findings += [] if of_map else _fixes_against_model(fixes, joint)
         findings += _view(model, joint.geo_from_local)
     findings += of_map or [*_shift_of_fixes(joint), *_control_points(joint)]
     findings += [*_attitudes(survey, fixes, joint), *_weak_checks(joint), *_guesses(joint)]
-    return Verdict(
-        tuple(finding.caution for finding in findings if finding.ends),
-        tuple(finding.caution for finding in findings if not finding.ends),
+    ending, others = (
+        tuple(Caution(code=found.code, sentence=found.sentence) for found in findings if found.ends == ends)
+        for ends in (True, False)
     )
+    return ending, others
 
 
 def unadjustable(survey: Survey, model: SparseModel, geo_from_local: Similarity | None) -> tuple[Caution, ...]:
-    """Return the inconsistencies of measurements that determine no adjustment.
-
-    Args:
-        survey: as stated.
-        model: SfM model.
-        geo_from_local: alignment of the two; None: not even that.
-    """
+    """Return the inconsistencies of measurements that determine no adjustment, and perhaps no alignment (None)."""
     fixes = StatedFixes(survey, model)
     if geo_from_local is not None and hangs_upside_down(model, geo_from_local):
-        return tuple(finding.caution for finding in _upside_down(fixes, geo_from_local))
+        return tuple(Caution(code=one.code, sentence=one.sentence) for one in _upside_down(fixes, geo_from_local))
     if len(fixes.name) < _LEAST_FIXES:
         return ()
     try:
@@ -119,9 +121,7 @@ def unadjustable(survey: Survey, model: SparseModel, geo_from_local: Similarity 
 def marks_that_do_not_meet(unused: Sequence[UnusedControlPoint], mistake: str | None) -> tuple[Caution, ...]:
     """Return the caution that marks of control points do not meet in one point; none if they do.
 
-    Args:
-        unused: control points that their marks do not determine.
-        mistake: without which most of them would meet; then no control point is used.
+    `mistake` is that without which most of them would meet; then no control point is used.
     """
     missed = [point for point in unused if len(point.residual_px) >= 2]
     if not missed:
@@ -132,10 +132,6 @@ def marks_that_do_not_meet(unused: Sequence[UnusedControlPoint], mistake: str | 
     sentence = f"the marks of {len(missed)} control points do not meet in one point: {named}{more}; "
     sentence += "these are not used" if mistake is None else f"no control point is used. Probably {mistake}"
     return (Caution(code="control-marks", sentence=sentence),)
-
-
-def _factor(joint: JointAdjustment, group: Group) -> VarianceFactor | None:
-    return next((factor for factor in joint.factors if factor.group == group), None)
 
 
 def _is_wrong(factor: VarianceFactor) -> bool:
@@ -161,8 +157,7 @@ def _view(model: SparseModel, geo_from_local: Similarity) -> Iterator[_Finding]:
 
 
 def _fixes_against_model(fixes: StatedFixes, joint: JointAdjustment) -> Iterator[_Finding]:
-    """Yield the finding that the fixes do not fit the SfM model, with the mistake that explains it."""
-    factor = _factor(joint, "fixes")
+    factor = joint.factors.get("fixes")
     if factor is None or factor.applied <= _QUIET_FACTOR:
         return
     is_wrong = _is_wrong(factor)
@@ -189,13 +184,6 @@ def _fixes_against_model(fixes: StatedFixes, joint: JointAdjustment) -> Iterator
     yield _Finding(_SIGMA_REFUTED, f"{sides}: {remedy}", ends=is_wrong and scatter_m > _WRONG_SCATTER_M)
 
 
-def _map_of_control(survey: Survey, model: SparseModel) -> Iterator[_Finding]:
-    """Yield the finding that the control points' map has another size or other axes than the fixes."""
-    mistake = mistake_in_map(survey, model)
-    if mistake is not None:
-        yield _Finding("control-map", f"control points and fixes contradict each other: {mistake}", ends=True)
-
-
 def _shift_of_fixes(joint: JointAdjustment) -> Iterator[_Finding]:
     """Yield the finding that the fixes of a session are shifted against the control points, beyond their σ."""
     fixes = joint.problem.term(Fixes.kind)
@@ -214,17 +202,16 @@ def _shift_of_fixes(joint: JointAdjustment) -> Iterator[_Finding]:
         sentence = (
             f"all fixes are shifted by ({values}) m east, north, up against the control points, which decide the "
             f"position; the σ of their common error is ({stated}) m. Either side may be wrong: "
-            f"{shift_sentence(shift_m, joint.survey)}"
+            f"{_cause_of_shift(shift_m, joint.survey)}"
         )
         within_one_fix = bool(shift_m @ information @ shift_m <= outlier_gate(3))
-        is_everyday = bool(np.linalg.norm(shift_m) <= EVERYDAY_SHIFT_M)
+        is_everyday = bool(np.linalg.norm(shift_m) <= _EVERYDAY_SHIFT_M)
         yield _Finding("fixes-shifted", sentence, ends=not (within_one_fix or is_everyday))
 
 
 def _control_points(joint: JointAdjustment) -> Iterator[_Finding]:
-    """Yield the finding that the control points contradict the fixes, or each other."""
     names, residual, used = joint.residuals(ControlPoints.kind)
-    factor = _factor(joint, "control points")
+    factor = joint.factors.get("control points")
     if factor is None:
         return
     shift = _constant_shift(residual)
@@ -262,7 +249,7 @@ def _apart(shift_m: FloatArray, survey: Survey, *, ends: bool) -> _Finding:
     values = ", ".join(f"{value:+.2f}" for value in shift_m)
     sentence = (
         f"control points and fixes are apart by one constant shift of ({values}) m east, north, up: "
-        f"{shift_sentence(shift_m, survey)}"
+        f"{_cause_of_shift(shift_m, survey)}"
     )
     return _Finding("control-shifted", sentence, ends)
 
@@ -276,15 +263,10 @@ def _attitudes(survey: Survey, fixes: StatedFixes, joint: JointAdjustment) -> It
     prior = attitude_prior(survey, fixes.model)
     if prior is None:
         return
-    attitude = prior.rotation
-
-    def turn_of(similarity: Similarity) -> float:
-        return float(np.linalg.norm(log_so3(attitude @ similarity.rotation.T)))
-
-    sigma, angle = float(np.sqrt(prior.cov_rad2[0, 0])), turn_of(joint.geo_from_local)
+    sigma, angle = float(np.sqrt(prior.cov_rad2[0, 0])), turn_against(prior, joint.geo_from_local)
     if angle <= _CLOCK_SIGMAS * sigma:
         return
-    clock = clock_that_turns(fixes, turn_of)
+    clock = clock_that_turns(fixes, prior)
     if clock is not None and clock[1] < _EXPLAINED_SIGMAS * sigma:
         cause = (
             f"a clock offset of {clock[0]:+.2f} s between positions and photographs would explain it, and the "
@@ -302,8 +284,7 @@ def _attitudes(survey: Survey, fixes: StatedFixes, joint: JointAdjustment) -> It
 
 
 def _weak_checks(joint: JointAdjustment) -> Iterator[_Finding]:
-    """Yield findings of σ that little or nothing checks."""
-    tested = [factor for factor in joint.factors if factor.group in ("fixes", "control points")]
+    tested = [factor for factor in joint.factors.values() if factor.group in ("fixes", "control points")]
     redundancy = sum(factor.redundancy for factor in tested)
     if redundancy < 6.0:
         sentence = (
@@ -311,7 +292,7 @@ def _weak_checks(joint: JointAdjustment) -> Iterator[_Finding]:
             "unnoticed; add fixes or control points"
         )
         yield _Finding("hardly-checked", sentence)
-    if joint.problem.term(Fixes.kind) is not None and _factor(joint, "control points") is None:
+    if joint.problem.term(Fixes.kind) is not None and joint.factors.get("control points") is None:
         fixes = [image.fix for image in joint.survey.images if image.fix is not None]
         sigma = typical_sigma(np.array([fix.cov_in_geo for fix in fixes]))
         sentence = (
@@ -322,10 +303,9 @@ def _weak_checks(joint: JointAdjustment) -> Iterator[_Finding]:
 
 
 def _guesses(joint: JointAdjustment) -> Iterator[_Finding]:
-    """Yield a finding of the σ that nobody stated, with the variance factors that stand in for them."""
     guessed = [
         f"{factor.group} ({'not checked' if factor.estimated is None else f'factor {factor.estimated:.2g}'})"
-        for factor in joint.factors
+        for factor in joint.factors.values()
         if factor.sigma_source == "default" and factor.group in ("fixes", "control points", "marks")
     ]
     if guessed:
@@ -334,3 +314,102 @@ def _guesses(joint: JointAdjustment) -> Iterator[_Finding]:
             "them"
         )
         yield _Finding("default-sigma", sentence)
+
+
+def mistake_in_marks(survey: Survey, model: SparseModel) -> str | None:
+    """Return the mistake without which the marks of most control points would meet.
+
+    None: more than half of the points meet as they are, or no known mistake explains the others.
+    """
+    points = survey.control_points
+    height_px = {name: model.camera_of(index).height for index, name in enumerate(model.image_name)}
+
+    def meeting(change: FloatArray) -> int:
+        """Return how many points meet after a change (2, 3) of x, y, height; a missing image has no height."""
+        changed = []
+        for point in points:
+            marks = []
+            for mark in point.marks:
+                x_px, y_px = (change @ [mark.x_px, mark.y_px, height_px.get(mark.image, 0)]).tolist()
+                marks.append(mark.model_copy(update={"x_px": x_px, "y_px": y_px}))
+            changed.append(point.model_copy(update={"marks": tuple(marks)}))
+        return len(control_correspondences(survey.model_copy(update={"control_points": tuple(changed)}), model)[0])
+
+    changes = {
+        "their y counts from the lower edge of the photograph: count it from the upper one": _FROM_BELOW,
+        "their x and y are exchanged": _EXCHANGED,
+    }
+    for size, scale in _SCALES.items():
+        sentence = f"they were measured in photographs of {size} the size: measure in these, or scale the marks"
+        changes[sentence] = scale * _AS_STATED
+    stated = meeting(_AS_STATED)
+    most, sentence = max(((meeting(change), name) for name, change in changes.items()), key=lambda one: one[0])
+    explains = most >= max(2, 2 * stated) and most > len(points) / 2
+    return f"{sentence}; then {most} of {len(points)} meet" if explains else None
+
+
+def _mistake_in_map(survey: Survey, model: SparseModel) -> str | None:
+    """Return the mistake of a map of control points that has another size or other axes than the fixes, or None.
+
+    At least five fixes and five control points are needed: the scatter of fewer shows too little.
+    """
+    fixes, control = fix_correspondences(survey, model), control_correspondences(survey, model)[0]
+    if min(len(fixes), len(control)) < _LEAST:
+        return None
+    try:
+        (by_fixes, fix_m), (by_control, control_m) = (fit(one.in_local, one.in_geo) for one in (fixes, control))
+        mirrored_m = fit(control.in_local, mirrored(control.in_geo))[1]
+    except DegenerateGeometryError:
+        return None
+    if control_m > _MIRRORED_M and mirrored_m < control_m / 10.0:
+        return "their map is mirrored: east and north are exchanged; check the order of the columns and the CRS"
+    ratio = by_control.scale / by_fixes.scale
+    sigma = float(np.hypot(_sigma_of_scale(fixes, fix_m), _sigma_of_scale(control, control_m)))
+    causes = {
+        1.0 / np.cos(np.radians(survey.origin.lat_deg)): "Web Mercator (EPSG:3857) has this scale at this latitude",
+        FOOT_M: "the coordinates are in metres, although their CRS has feet",
+        1.0 / FOOT_M: "the coordinates are in feet, although their CRS has metres",
+    }
+    near = min(causes, key=lambda scale: abs(np.log(ratio / scale)))
+    is_known = abs(np.log(ratio / near)) < _NEAR_SIGMAS * sigma + _LEAST_SCALE
+    # Poor coordinates have any scale: one without a known cause has to be twice as evident.
+    if abs(np.log(ratio)) < (_SIGMAS if is_known else 2.0 * _SIGMAS) * sigma + _LEAST_SCALE:
+        return None
+    cause = causes[near] if is_known else "another unit or map projection"
+    return f"their map is {ratio:.4g} times as large as that of the fixes: {cause}"
+
+
+def _sigma_of_scale(positions: Correspondences, scatter_m: float) -> float:
+    """Return the σ of ln(scale): of the scatter, or of errors as large as stated that drift over the flight."""
+    size_m = float(np.sqrt(((positions.in_geo - positions.in_geo.mean(axis=0)) ** 2).sum(axis=1).mean()))
+    return float(max(scatter_m / len(positions) ** 0.5, typical_sigma(positions.cov_in_geo)) / size_m)
+
+
+def _cause_of_shift(shift_m: FloatArray, survey: Survey) -> str:
+    """Return the likely cause of a constant shift (3,) between fixes and control points: east, north, up.
+
+    Of which of the two it is, is of no account. The survey has control points.
+    """
+    height_m = survey.origin.alt_m + np.median([point.position_in_geo[2] for point in survey.control_points])
+    horizontal, vertical = float(np.hypot(shift_m[0], shift_m[1])), abs(float(shift_m[2]))
+    for sign in (-1.0, 1.0):
+        other_m = height_m + sign * float(shift_m[2])
+        for high, low, side in ((height_m, other_m, "control points"), (other_m, height_m, "fixes")):
+            if vertical > _LEAST_FEET_M and abs(high * FOOT_M - low) < _FEET_PART * abs(low):
+                return f"the heights of the {side} are in feet, and taken for metres"
+    if horizontal < 0.2 * vertical and 5.0 < vertical < MOST_GEOID_M:
+        return (
+            f"heights apart by {vertical:.1f} m: one above the ellipsoid, the other above a geoid or the take-off"
+        )
+    if horizontal < 0.2 * vertical and vertical >= MOST_GEOID_M:
+        return "heights above another zero: the take-off, or another unit"
+    if horizontal > 100_000.0:
+        return "another zone, or exchanged axes"
+    if horizontal > 20.0:
+        return "another datum, or another realisation of it"
+    if horizontal > _EVERYDAY_SHIFT_M:
+        return (
+            "the position of the base station, the datum, or US survey feet taken for international ones (10 m in "
+            "5 000 km)"
+        )
+    return "the position of the base station, the datum, or the antenna offset"

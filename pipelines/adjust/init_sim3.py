@@ -9,33 +9,66 @@ stated σ. `pipelines.adjust.alignment` explains why the geolocated points are n
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from pipelines.adjust.observations import control_correspondences, fix_correspondences
-from pipelines.adjust.options import InitSim3Options
-from pipelines.adjust.paper import similarity_by_paper
-from pipelines.adjust.posterior import save_posterior
-from pipelines.adjust.robust import Estimated, Inputs, placed, robust_similarity
-from pipelines.core.errors import ConvergenceError, InputError
-from pipelines.core.products import save_json
+from pipelines.adjust.alignment import AdjustedSimilarity, Alignment, Correspondences, RotationPrior, align
+from pipelines.adjust.inconsistencies import judge, marks_that_do_not_meet, mistake_in_marks, unadjustable
+from pipelines.adjust.joint import JointAdjustment, Start, adjust_jointly, component_of, in_own_frame
+from pipelines.adjust.measurements import (
+    attitude_prior,
+    control_correspondences,
+    fix_correspondences,
+    positions_in_use,
+    problem_of,
+    rejected_of,
+    start_of,
+)
+from pipelines.adjust.options import EstimatedErrorName, InitSim3Options
+from pipelines.adjust.paper import (
+    agreeing_points,
+    counts_of,
+    residuals_of,
+    residuals_of_points,
+    similarity_by_paper,
+)
+from pipelines.adjust.posterior import Posterior, save_posterior
+from pipelines.adjust.solution import adjusted
+from pipelines.adjust.system import minimise
+from pipelines.adjust.terms import ControlPoints, Fixes
+from pipelines.core.errors import ContradictionError, ConvergenceError, DegenerateGeometryError, InputError
+from pipelines.core.products import NOT_CHECKED, Caution, save_json, union
+from pipelines.core.sentences import listed
 from pipelines.core.stages import ADJUSTMENT, POINTS, SIM3, SIM3_POSTERIOR, SPARSE
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.formats.colmap import read_sparse
+from pipelines.geometry.rotations import quat_xyzw_from_matrix
+from pipelines.geometry.similarity import SimilarityRecord
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.survey.adjustment import GeolocatedPoints, InitialSimilarity
+from pipelines.robust.statistics import residual_stats
+from pipelines.survey.adjustment import AttitudeRecord, GeolocatedPoints, InitialSimilarity
 from pipelines.survey.calibrated import load_survey
+from pipelines.survey.scene import initial_scene
 from pipelines.survey.survey import Survey
+
+_LEVEL = 0.01  # of the test that refutes σ where no joint adjustment is possible
+
+
+@dataclass(frozen=True)
+class Estimated:
+    """Result of init-sim3: similarity with the verdict on the measurements, adjustment, warnings for the user."""
+
+    initial: InitialSimilarity
+    posterior: Posterior
+    warnings: tuple[str, ...]
 
 
 def run(stage: StageRun, options: InitSim3Options) -> Summary:
-    """Estimate the similarity of the workspace and write it.
-
-    Raises:
-        GeorefError: unreadable products, or an error of `estimate_similarity`.
-    """
+    """Estimate the similarity of the workspace and write it."""
     survey = load_survey(stage.workspace)
     model = read_sparse(stage.workspace.path(SPARSE))
     points = GeolocatedPoints.load(stage.workspace.path(POINTS))
@@ -51,12 +84,6 @@ def estimate_similarity(
 ) -> Estimated:
     """Return the initial similarity with the adjustment, and warnings for the user.
 
-    Args:
-        survey: has the fixes, attitudes and control points.
-        model: the SfM model.
-        points: the model's points on Earth.
-        options: of the stage.
-
     Raises:
         DegenerateGeometryError: the measurements leave the similarity open; names further measurements.
         ContradictionError: sources contradict each other, and the options do not accept that.
@@ -70,10 +97,10 @@ def estimate_similarity(
     if options.method == "paper":
         control, unused = control_correspondences(survey, model)
         initial = similarity_by_paper(model, points, fix_correspondences(survey, model).joined(control))
-        inputs = Inputs(survey, model, points)
-        estimated = Estimated(initial, placed(inputs, initial, options), tuple(point.sentence for point in unused))
+        posterior = solved(survey, model, initial, options.estimate)
+        estimated = Estimated(initial, posterior, tuple(point.sentence for point in unused))
     else:
-        estimated = robust_similarity(Inputs(survey, model, points), options)
+        estimated = robust_similarity(survey, model, points, options)
     _check_residual(estimated.initial, options.max_residual)
     return estimated
 
@@ -119,3 +146,183 @@ def _summary(estimated: Estimated) -> Summary:
         estimated.warnings,
         initial.cautions,
     )
+
+
+def robust_similarity(
+    survey: Survey, model: SparseModel, points: GeolocatedPoints, options: InitSim3Options
+) -> Estimated:
+    """Return the similarity by the robust method; raises as `estimate_similarity`."""
+    control, unused = control_correspondences(survey, model)
+    mistake = mistake_in_marks(survey, model) if unused else None
+    if mistake is not None:  # What meets all the same meets in a wrong place.
+        control = control.part(np.zeros(len(control), dtype=bool))
+    of_marks = marks_that_do_not_meet(unused, mistake)
+    data = fix_correspondences(survey, model).joined(control)
+    try:
+        alignment = align(data, np.random.default_rng(options.seed), attitude=attitude_prior(survey, model))
+    except DegenerateGeometryError as error:
+        _refuse(unadjustable(survey, model, None), options)
+        reasons = [positions_in_use(survey, model, data, unused), *(caution.sentence for caution in of_marks)]
+        raise DegenerateGeometryError(f"{error}. {'; '.join(reasons)}") from error
+    aligned = _aligned_product(model, points, data, alignment).model_copy(
+        update={"control_outliers": tuple(p.name for p in survey.control_points if p.name not in control.name)}
+    )
+    warnings = () if mistake else tuple(point.sentence for point in unused)  # else the caution says why
+    meeting = tuple(point for point in survey.control_points if point.name in control.name)
+    meets = survey.model_copy(update={"control_points": meeting})
+    try:
+        joint = adjust_jointly(meets, model, _starts(data, aligned, options.seed), estimate=options.estimate)
+    except DegenerateGeometryError as error:
+        contradictions = unadjustable(meets, model, alignment.geo_from_local)
+        _refuse(contradictions, options)
+        unchecked = Caution(code=NOT_CHECKED, sentence=f"nothing checks the stated σ: {error}")
+        cautions = union(survey.cautions, contradictions, of_marks, (unchecked,))
+        initial = _without_joint(aligned, alignment.solution, cautions)
+        return Estimated(initial, solved(survey, model, initial, options.estimate), warnings)
+    contradictions, limits = judge(meets, model, joint)
+    _refuse(contradictions, options)
+    initial, more = _joint_product(model, points, aligned, joint)
+    cautions = union(survey.cautions, contradictions, of_marks, limits)
+    initial = initial.model_copy(update={"cautions": cautions})
+    posterior = solved(survey, model, initial, options.estimate, joint)
+    initial = initial.model_copy(update={"geo_from_local": posterior.solution.similarity_from_local()})
+    return Estimated(initial, posterior, warnings + more)
+
+
+def solved(
+    survey: Survey,
+    model: SparseModel,
+    initial: InitialSimilarity,
+    estimate: tuple[EstimatedErrorName, ...] = (),
+    joint: JointAdjustment | None = None,
+) -> Posterior:
+    """Return the solution of a joint adjustment without the measurements that it has rejected.
+
+    Without a joint adjustment, the cameras of SfM stay as they are at the similarity, with the covariance that the
+    measurements give there.
+
+    Raises:
+        DegenerateGeometryError: the measurements leave the similarity open.
+    """
+    survey, with_attitudes = initial.weighted(survey), initial.layout == "line"
+    if joint is None:
+        scene = initial_scene(model, survey, initial)
+    else:
+        scene, near = in_own_frame(joint, survey, initial)
+    problem = problem_of(scene, initial.in_use(survey), estimate=estimate, with_attitudes=with_attitudes)
+    if joint is None:
+        state = start_of(scene, problem)
+    else:
+        state = minimise(problem, problem.start_at(near, joint.problem.errors)).state
+    return adjusted(scene, problem, state, initial, rejected_of(scene, survey, initial))
+
+
+def _refuse(contradictions: tuple[Caution, ...], options: InitSim3Options) -> None:
+    if contradictions and not options.accept_contradiction:
+        raise ContradictionError(
+            "; ".join(caution.sentence for caution in contradictions)
+            + ". Correct what is wrong, or go on with --accept-contradiction, which widens every σ"
+        )
+
+
+def _aligned_product(
+    model: SparseModel, points: GeolocatedPoints, data: Correspondences, alignment: Alignment
+) -> InitialSimilarity:
+    solution, similarity = alignment.solution, alignment.geo_from_local
+    inlier = solution.state.inlier
+    agreeing = agreeing_points(model, points, similarity)
+    return InitialSimilarity(
+        geo_from_local=_record_of(solution),
+        method="robust",
+        correspondences=counts_of(data.control, points.inlier),
+        inliers=counts_of(data.control[inlier], agreeing),
+        gnss_outliers=tuple(name for name, bad in zip(data.name, ~inlier & ~data.control, strict=True) if bad),
+        residuals={
+            **residuals_of(data.part(inlier), solution.residual[inlier]),
+            "points": residuals_of_points(model, points, similarity),
+        },
+        condition_number=solution.condition_number,
+        layout=alignment.layout,
+        attitude_used=alignment.attitude_used,
+        attitude=_attitude(alignment.attitude),
+    )
+
+
+def _attitude(prior: RotationPrior | None) -> AttitudeRecord | None:
+    if prior is None:
+        return None
+    x, y, z, w = quat_xyzw_from_matrix(prior.rotation).tolist()
+    first, second, third = (tuple(row) for row in prior.cov_rad2.tolist())
+    return AttitudeRecord(quat_xyzw=(x, y, z, w), cov_rad2=(first, second, third))
+
+
+def _starts(data: Correspondences, aligned: InitialSimilarity, seed: int) -> Iterator[Start]:
+    """Yield the alignment, then, if they are needed, those of the fixes and of the control points alone.
+
+    Which fixes are outliers is for the joint adjustment to find.
+    """
+    aligned = aligned.model_copy(update={"gnss_outliers": ()})
+    yield Start(aligned)
+    if data.control.any():
+        yield Start(aligned, at_control=True)
+    for members in (~data.control, data.control):
+        if not 3 <= members.sum() < len(data):
+            continue
+        try:
+            solution = align(data.part(members), np.random.default_rng(seed)).solution
+        except DegenerateGeometryError:
+            continue
+        alone = aligned.model_copy(update={"geo_from_local": _record_of(solution), "layout": "volume"})
+        yield Start(alone, at_control=bool(data.control[members].all()))
+
+
+def _record_of(solution: AdjustedSimilarity) -> SimilarityRecord:
+    similarity = solution.state.geo_from_local
+    return similarity.to_record("local", "geo", covariance=solution.covariance, pivot=solution.pivot)
+
+
+def _without_joint(
+    aligned: InitialSimilarity, solution: AdjustedSimilarity, cautions: tuple[Caution, ...]
+) -> InitialSimilarity:
+    """Return the alignment with σ widened by what its few residuals show."""
+    count = len(solution.squared)
+    free = 3.0 - 7.0 / count
+    component = component_of(solution.squared, np.full(count, free), 3)
+    factor = component.cautious_factor if component.probability() < _LEVEL else 1.0
+    record = aligned.geo_from_local
+    covariance = tuple(tuple(max(factor, 1.0) * value for value in row) for row in record.covariance)
+    return aligned.model_copy(
+        update={"geo_from_local": record.model_copy(update={"covariance": covariance}), "cautions": cautions}
+    )
+
+
+def _joint_product(
+    model: SparseModel, points: GeolocatedPoints, aligned: InitialSimilarity, joint: JointAdjustment
+) -> tuple[InitialSimilarity, tuple[str, ...]]:
+    """Return the result of the joint adjustment, and warnings of outliers."""
+    similarity = joint.geo_from_local
+    inliers = aligned.inliers | {"points": int(agreeing_points(model, points, similarity).sum())}
+    residuals = aligned.residuals | {"points": residuals_of_points(model, points, similarity)}
+    rejected: dict[str, tuple[str, ...]] = {"gnss": aligned.gnss_outliers, "gcp": ()}
+    warnings = []
+    for kind, group in (("gnss", Fixes.kind), ("gcp", ControlPoints.kind)):
+        names, missed, used = joint.residuals(group)
+        if not names:
+            continue
+        residuals[kind], inliers[kind] = residual_stats(missed[used]), int(used.sum())
+        bad = [(name, miss) for name, miss, good in zip(names, missed, used, strict=True) if not good]
+        if bad:
+            sizes = [f"{name} ({np.linalg.norm(miss):.2f} m)" for name, miss in bad]
+            warnings.append(f"{len(bad)} of {len(names)} {group} are outliers: {listed(sizes)}")
+        rejected[kind] = tuple(name for name, _ in bad)
+    pivot = np.array(aligned.geo_from_local.pivot)
+    return aligned.model_copy(
+        update={
+            "geo_from_local": similarity.to_record("local", "geo", pivot=pivot),
+            "inliers": inliers,
+            "gnss_outliers": rejected["gnss"],
+            "control_outliers": aligned.control_outliers + rejected["gcp"],
+            "residuals": residuals,
+            "variance_factors": tuple(joint.factors.values()),
+        }
+    ), tuple(warnings)

@@ -2,6 +2,12 @@
 
 The lens and SfM's own errors have their part in the result and in its covariance, and the factors are those with
 which training and evaluation go on.
+
+At the minimum, each kind of observation has a sum of whitened squares q and a redundancy r: the number of its
+observations less the part that the unknowns absorb. q/r estimates the factor between true and stated variance, and
+q is χ² with r degrees of freedom where the stated σ are right (Förstner 1979; Niemeier, Ausgleichungsrechnung,
+2008, section 9.4). Outliers take no part if most observations agree with each other, at whatever σ. Where they do
+not agree, nothing shows which of them are wrong, and all of them count.
 """
 
 from __future__ import annotations
@@ -12,18 +18,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipelines.adjust.alignment import mean_rotation
-from pipelines.adjust.measurements import onto_control, problem_of, start_of
-from pipelines.adjust.observations import recorded_rotations
+from pipelines.adjust.measurements import onto_control, problem_of, recorded_rotations, start_of
 from pipelines.adjust.options import EstimatedErrorName
 from pipelines.adjust.state import State
-from pipelines.adjust.system import NormalMatrix, Problem, linearised, minimise
+from pipelines.adjust.system import Linearised, NormalMatrix, Problem, linearised, minimise, posterior_weights
 from pipelines.adjust.terms import ControlPoints, Fixes
-from pipelines.adjust.variance_components import VarianceComponent, component_of, variance_components
 from pipelines.core.errors import ConvergenceError, DegenerateGeometryError
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.geometry.rotations import log_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
+from pipelines.robust.statistics import chi2_probability_above, median_chi2, outlier_gate
 from pipelines.survey.adjustment import InitialSimilarity
 from pipelines.survey.marks import RayErrors, intersect_marks, mark_angles, mark_rays
 from pipelines.survey.report_parts import (
@@ -44,6 +49,9 @@ _LEVEL: dict[SigmaSource, float] = {"stated": 0.001, "default": 0.01}
 _TESTED: tuple[Group, ...] = ("fixes", "control points")
 _EXACT = 1e-9
 _FEW_OUTLIERS = 0.02  # of the fixes: noise alone puts one in a thousand beyond the gate
+# Observations agree if so large a part of them is within the gate, and so many degrees of freedom check them.
+_CONSENSUS, _LEAST_REDUNDANCY = 2 / 3, 3.0
+_NO_REDUNDANCY = 0.5
 
 
 @dataclass(frozen=True)
@@ -52,13 +60,9 @@ class JointAdjustment:
 
     Attributes:
         survey: with the variance factors in its covariances.
-        scene: of the adjustment.
-        problem: all measurements.
-        state: its minimum.
-        normal: its equations there.
+        normal: equations at `state`, the minimum of `problem`, which has all measurements.
         at_stated: tests of fixes and control points by kind, under the stated σ.
         components: the same under the applied factors.
-        factors: tests of all groups.
         cost: −2 ln likelihood at the stated σ; compares solutions from different starts.
     """
 
@@ -69,7 +73,7 @@ class JointAdjustment:
     normal: NormalMatrix
     at_stated: dict[str, VarianceComponent]
     components: dict[str, VarianceComponent]
-    factors: tuple[VarianceFactor, ...]
+    factors: dict[Group, VarianceFactor]
     cost: float
 
     @property
@@ -81,7 +85,6 @@ class JointAdjustment:
 
     @property
     def geo_from_local(self) -> Similarity:
-        """The similarity."""
         return self.state.geo_from_model @ self.scene.model_from_local
 
     @property
@@ -109,19 +112,11 @@ class Start:
 
 
 def adjust_jointly(
-    survey: Survey,
-    model: SparseModel,
-    starts: Iterable[Start],
-    *,
-    estimate: tuple[EstimatedErrorName, ...] = (),
+    survey: Survey, model: SparseModel, starts: Iterable[Start], *, estimate: tuple[EstimatedErrorName, ...] = ()
 ) -> JointAdjustment:
     """Return the adjustment from the first start, or the likeliest of several where the first finds disagreement.
 
-    Args:
-        survey: the measurements with their stated σ.
-        model: the SfM model.
-        starts: to start from; a layout on a line takes the attitudes into the adjustment.
-        estimate: further systematic errors to estimate.
+    A layout on a line takes the attitudes into the adjustment.
 
     Raises:
         DegenerateGeometryError: the measurements leave the similarity open, from every start.
@@ -146,10 +141,7 @@ def adjust_jointly(
 def in_own_frame(joint: JointAdjustment, survey: Survey, initial: InitialSimilarity) -> tuple[Scene, State]:
     """Return scene and state in the frame `model` of the solution: axes and metre of geo, as training takes them.
 
-    Args:
-        joint: solved in the frame of its start.
-        survey: of the split into training and test images.
-        initial: the solution.
+    The joint adjustment was solved in the frame of its start; `survey` has the split into training and test images.
     """
     before, state = joint.scene, joint.state
     scene = initial_scene(before.sparse, survey, initial)
@@ -167,8 +159,7 @@ def _adjust(
 ) -> JointAdjustment:
     """Alternate between the solution and the variance factors, from the stated σ."""
     fixed = {
-        factor.group: factor
-        for factor in (*_marks(survey, scene), *_attitudes(survey, scene.sparse), *_ties(scene))
+        factor.group: factor for factor in (*_marks(survey, scene), *_attitudes(survey, scene.sparse), _ties(scene))
     }
     applied = applied_factors(tuple(fixed.values()))
 
@@ -180,9 +171,9 @@ def _adjust(
     problem = problem_at(applied)
     if not problem.measured:
         raise DegenerateGeometryError("no position takes part in the adjustment")
-    state = start_of(scene, problem)
     geo_from_local = Similarity.from_record(start.initial.geo_from_local)
-    state = replace(state, geo_from_model=geo_from_local @ scene.model_from_local.inverse())
+    geo_from_model = geo_from_local @ scene.model_from_local.inverse()
+    state = replace(start_of(scene, problem), geo_from_model=geo_from_model)
     if start.at_control:
         state = onto_control(problem, state)
     minimum = minimise(problem, state)
@@ -197,14 +188,13 @@ def _adjust(
         problem = problem_at(applied)
         minimum = minimise(problem, minimum.state, None if max(changes) > _NEAR else normal)
         components, normal = variance_components(linearised(problem, minimum.state))
-    factors = [
-        _factor(survey, group, components[group], applied.get(group, 1.0))
+    factors = {
+        group: _factor(survey, group, components[group], applied.get(group, 1.0))
         for group in _TESTED
         if group in components
-    ]
+    } | fixed
     weighted = with_variance_factors(survey, applied)
-    every = (*factors, *fixed.values())
-    return JointAdjustment(weighted, scene, problem, minimum.state, normal, at_stated, components, every, cost)
+    return JointAdjustment(weighted, scene, problem, minimum.state, normal, at_stated, components, factors, cost)
 
 
 def _next_factors(
@@ -255,8 +245,7 @@ def _marks(survey: Survey, scene: Scene) -> list[VarianceFactor]:
     squared = (angle / rays.sigma_rad) ** 2
     free = 2.0 - 3.0 / rays.marks_of_point[rays.point]
     good = np.isfinite(squared)
-    component = component_of(squared[good], free[good], 2)
-    return [_independent(survey, "marks", component)]
+    return [_independent(survey, "marks", component_of(squared[good], free[good], 2))]
 
 
 def _attitudes(survey: Survey, model: SparseModel) -> list[VarianceFactor]:
@@ -265,7 +254,7 @@ def _attitudes(survey: Survey, model: SparseModel) -> list[VarianceFactor]:
     count = len(recorded.image)
     if count < 2:
         return []
-    geo_from_local = recorded.geo_from_local(model)
+    geo_from_local = recorded.geo_from_cam @ model.rotation_cam_from_local[recorded.image]
     mean = mean_rotation(geo_from_local, recorded.sigma_rad).rotation
     squared = (log_so3(geo_from_local @ mean.T) ** 2).sum(axis=1) / recorded.sigma_rad**2
     component = component_of(squared, np.full(count, 3.0 * (count - 1) / count), 3)
@@ -282,20 +271,76 @@ def _independent(survey: Survey, group: Group, component: VarianceComponent) -> 
     return _factor(survey, group, component, 1.0).model_copy(update={"applied": max(applied, 0.01)})
 
 
-def _ties(scene: Scene) -> list[VarianceFactor]:
+def _ties(scene: Scene) -> VarianceFactor:
     """State the variance of the image observations of tie points, in square pixels: SfM knows no σ beforehand."""
     network = scene.network
     rows = len(network.obs_point)
     free = 2 * rows - 6 * len(network.camera_id) - 3 * len(network.point_in_world)
-    return [
-        VarianceFactor(
-            group="tie points",
-            count=rows,
-            used=rows,
-            redundancy=free,
-            estimated=scene.bundle.sigma_px**2,
-            probability=1.0,
-            applied=1.0,
-            sigma_source="default",
-        )
-    ]
+    return VarianceFactor(
+        group="tie points",
+        count=rows,
+        used=rows,
+        redundancy=free,
+        estimated=scene.bundle.sigma_px**2,
+        probability=1.0,
+        applied=1.0,
+        sigma_source="default",
+    )
+
+
+@dataclass(frozen=True)
+class VarianceComponent:
+    """Test of the σ of M observations of one kind.
+
+    Attributes:
+        used: (M,) mask of the observations that count.
+        agree: whether most agree with each other, so that the others are outliers.
+        squares, redundancy: q and r of those that count.
+    """
+
+    used: BoolArray
+    agree: bool
+    squares: float
+    redundancy: float
+
+    @property
+    def factor(self) -> float | None:
+        return self.squares / self.redundancy if self.redundancy > _NO_REDUNDANCY else None
+
+    @property
+    def cautious_factor(self) -> float:
+        """Mean q/(r − 2) of the factor given q: larger where few degrees of freedom show little."""
+        return self.squares / max(self.redundancy - 2.0, 1.0)
+
+    def probability(self, scale: float = 1.0) -> float:
+        """Return the probability that right σ, `scale` times smaller in variance, give a larger q.
+
+        Without redundancy, the probability is 1.
+        """
+        if self.redundancy <= _NO_REDUNDANCY:
+            return 1.0
+        return chi2_probability_above(scale * self.squares, self.redundancy)
+
+
+def component_of(squared: FloatArray, free: FloatArray, dimension: int) -> VarianceComponent:
+    """Return the test of M observations, from squared whitened residuals (M,) and the redundancy (M,) of each."""
+    free = np.clip(free, 1e-6, dimension)
+    # The σ at which half of the observations agree; never smaller than the stated one.
+    scale = max(float(np.median(squared / free)) * dimension / median_chi2(dimension), 1.0) if len(squared) else 1.0
+    used = squared <= outlier_gate(dimension) * scale
+    agree = len(used) > 0 and bool(used.mean() >= _CONSENSUS) and float(free[used].sum()) >= _LEAST_REDUNDANCY
+    if not agree:
+        used = np.ones(len(squared), dtype=bool)
+    return VarianceComponent(used, agree, float(squared[used].sum()), float(free[used].sum()))
+
+
+def variance_components(linear: Linearised) -> tuple[dict[str, VarianceComponent], NormalMatrix]:
+    """Return the test of each kind of observation of a problem at its minimum, and the posterior's equations."""
+    residuals = linear.residuals
+    weights = posterior_weights(residuals)
+    normal, components = linear.normal(weights), {}
+    for kind, rows in residuals.items():
+        dimension = rows.shape[1]
+        absorbed = np.trace(linear.spread(weights, kind, normal), axis1=1, axis2=2) * weights[kind]
+        components[kind] = component_of((rows**2).sum(axis=1), dimension - absorbed, dimension)
+    return components, normal

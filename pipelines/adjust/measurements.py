@@ -1,13 +1,13 @@
-"""Terms of the adjustment, built from the survey's measurements of the registered images."""
+"""The survey's measurements of the registered images: as arrays, and as terms of the adjustment."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipelines.adjust.observations import recorded_rotations
+from pipelines.adjust.alignment import Correspondences, RotationPrior, mean_rotation
 from pipelines.adjust.options import EstimatedErrorName
 from pipelines.adjust.state import (
     SIGMA_ARM_M,
@@ -20,13 +20,193 @@ from pipelines.adjust.state import (
 from pipelines.adjust.system import Problem
 from pipelines.adjust.terms import Attitudes, ControlPoints, Fixes, Planes, Term, root_information
 from pipelines.core.errors import InputError
-from pipelines.core.types import FloatArray
+from pipelines.core.sentences import listed
+from pipelines.core.types import BoolArray, FloatArray, IntArray
+from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
+from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.adjustment import InitialSimilarity
-from pipelines.survey.marks import mark_rays
+from pipelines.survey.marks import MarkRays, RayErrors, intersect_marks, mark_angles, mark_rays
 from pipelines.survey.scene import Scene
 from pipelines.survey.survey import Survey
 
+_CONTRADICTION_SIGMAS = 6.0
+_CONTRADICTION_RAD = np.radians(15.0)  # lower limit, because the σ of attitudes are often optimistic
+_WIDE_RAD = 1.0
+_TINY = 1e-9  # σ of exact values, where a covariance must be regular
 _LEAST_SIGMA_COMMON_M = 1e-4  # of an axis without a common error, where another axis has one
+
+
+@dataclass(frozen=True)
+class RecordedRotations:
+    """Recorded attitudes of k registered images, without the images that contradict the SfM model.
+
+    Attributes:
+        image: (k,) index into the model's images.
+        geo_from_cam: (k, 3, 3).
+        sigma_rad: (k,) per axis.
+        contradicting: names of the images left out.
+    """
+
+    image: IntArray
+    geo_from_cam: FloatArray
+    sigma_rad: FloatArray
+    contradicting: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class UnusedControlPoint:
+    """Control point that its marks do not determine.
+
+    Attributes:
+        unregistered: names of the images with marks that are not in the SfM model.
+        registered: names of the images with usable marks.
+        residual_px: angles between these marks and the point that most of them agree on, else their least-squares
+            point, in pixels; infinite: the rays are parallel.
+    """
+
+    name: str
+    unregistered: tuple[str, ...]
+    registered: tuple[str, ...]
+    residual_px: tuple[float, ...] = ()
+
+    @property
+    def sentence(self) -> str:
+        """Reason for people: images that are missing, or marks that do not meet."""
+        missing = f" ({listed(self.unregistered)} not registered)" if self.unregistered else ""
+        if len(self.registered) < 2:
+            return f"control point {self.name}: marked in fewer than 2 registered images{missing}, not used"
+        marks = sorted(zip(self.residual_px, self.registered, strict=True), reverse=True)
+        rays = f"control point {self.name}: its {len(marks)} marks do not meet in one point"
+        if not np.isfinite(self.residual_px).all():
+            return f"{rays}: their rays are parallel ({listed(self.registered)}), not used; check the marks"
+        rms = float(np.sqrt(np.mean(np.square(self.residual_px))))
+        worst = listed(tuple(f"{image} {residual:.1f} px" for residual, image in marks))
+        return f"{rays}: up to {marks[0][0]:.1f} px off, RMS {rms:.1f} px ({worst}), not used; check the marks"
+
+
+def fix_correspondences(survey: Survey, model: SparseModel) -> Correspondences:
+    """Return the camera centres of registered images with their fixes.
+
+    SfM's own error of a centre is not known at this point (zero covariance). The adjustment measures it as excess
+    scatter.
+    """
+    fixes = {image.name: image.fix for image in survey.images if image.fix is not None}
+    fixed = [(index, name) for index, name in enumerate(model.image_name) if name in fixes]
+    return Correspondences(
+        name=tuple(name for _, name in fixed),
+        control=np.zeros(len(fixed), dtype=bool),
+        in_local=model.cam_center_in_local[[index for index, _ in fixed]].reshape(-1, 3),
+        cov_in_local=np.zeros((len(fixed), 3, 3)),
+        in_geo=np.array([fixes[name].position_in_geo for _, name in fixed]).reshape(-1, 3),
+        cov_in_geo=np.array([fixes[name].cov_in_geo for _, name in fixed]).reshape(-1, 3, 3),
+    )
+
+
+def control_correspondences(
+    survey: Survey, model: SparseModel
+) -> tuple[Correspondences, tuple[UnusedControlPoint, ...]]:
+    """Return the control points, intersected in local from their marks, with their survey; and those left out.
+
+    A point that its marks do not determine is left out. The covariance in local is that of the marks
+    alone. The model's own error is not known at this point: the adjustment measures it as excess scatter.
+    """
+    points = survey.control_points
+    rays = mark_rays(points, model)
+    marked = rays.marks_of_point >= 2
+    position, cov, meets = _intersect_in_local(model, rays.of_points(marked))
+    used = marked.copy()
+    used[marked] = meets
+    meeting = [point for point, is_used in zip(points, used, strict=True) if is_used]
+    return Correspondences(
+        name=tuple(point.name for point in meeting),
+        control=np.ones(len(meeting), dtype=bool),
+        in_local=position[meets],
+        cov_in_local=cov[meets],
+        in_geo=np.array([point.position_in_geo for point in meeting]).reshape(-1, 3),
+        cov_in_geo=np.array([point.cov_in_geo for point in meeting]).reshape(-1, 3, 3),
+    ), _unused(survey, model, rays.of_points(~used))
+
+
+def positions_in_use(
+    survey: Survey, model: SparseModel, data: Correspondences, unused: tuple[UnusedControlPoint, ...]
+) -> str:
+    """Return how many fixes and control points there are, how many are used, and why the others are not."""
+    fixes, control = int((~data.control).sum()), int(data.control.sum())
+    counts = (
+        f"{len(model.image_name)} of {len(survey.images)} images are registered; in use are {fixes} of "
+        f"{sum(image.fix is not None for image in survey.images)} fixes and {control} of "
+        f"{len(survey.control_points)} control points"
+    )
+    return "; ".join([counts, *(point.sentence for point in unused)])
+
+
+def _unused(survey: Survey, model: SparseModel, rays: MarkRays) -> tuple[UnusedControlPoint, ...]:
+    position, *_ = _intersect_in_local(model, rays)
+    # Where the rays contradict each other, none is left: within a wide σ they meet in the least-squares point.
+    wide = RayErrors(_TINY, _TINY, _WIDE_RAD)
+    compromise = intersect_marks(rays, model.rotation_cam_from_local, model.cam_center_in_local, wide)
+    position = np.where(np.isfinite(position), position, compromise.position_in_geo)
+    angle = mark_angles(rays, position, model.rotation_cam_from_local, model.cam_center_in_local)
+    residual_px = np.nan_to_num(angle * rays.sigma_px / rays.sigma_rad, nan=np.inf)
+    marks = {point.name: point.marks for point in survey.control_points}
+    registered = model.image_index()
+    return tuple(
+        UnusedControlPoint(
+            name=name,
+            unregistered=tuple(mark.image for mark in marks[name] if mark.image not in registered),
+            registered=tuple(model.image_name[camera] for camera in rays.camera[rays.point == index]),
+            residual_px=tuple(residual_px[rays.point == index].tolist()),
+        )
+        for index, name in enumerate(rays.point_id)
+    )
+
+
+def _intersect_in_local(model: SparseModel, rays: MarkRays) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Return the position (J, 3), covariance (J, 3, 3) and success (J,) of points in local from their marks."""
+    # The test of the marks' agreement includes the model's own error, because no lens is modelled to 0.1 px.
+    own_px = float(np.nanmedian(model.point_error_px)) if np.isfinite(model.point_error_px).any() else 0.0
+    own_rad = own_px * rays.sigma_rad / rays.sigma_px
+    center = model.cam_center_in_local
+    errors = RayErrors(_TINY * float(np.ptp(center, axis=0).max()), _TINY, own_rad)
+    solved = intersect_marks(rays, model.rotation_cam_from_local, center, errors)
+    of_marks, of_all = (
+        np.bincount(rays.point, squared, len(rays.point_id))
+        for squared in (rays.sigma_rad**2, rays.sigma_rad**2 + own_rad**2)
+    )
+    return solved.position_in_geo, solved.cov_in_geo * (of_marks / of_all)[:, None, None], solved.consistent
+
+
+def recorded_rotations(survey: Survey, model: SparseModel) -> RecordedRotations:
+    """Return the recorded attitudes of the registered images, without those that the SfM model contradicts.
+
+    For example, a photograph that was turned in an image viewer keeps the attitude that the drone wrote. That
+    attitude differs from the others by far more than its σ.
+    """
+    attitudes = {image.name: image.attitude for image in survey.images if image.attitude is not None}
+    image = np.array([index for index, name in enumerate(model.image_name) if name in attitudes], dtype=np.int64)
+    of_images = [attitudes[model.image_name[index]] for index in image]
+    rotation = matrix_from_quat_xyzw(np.array([attitude.quat_xyzw for attitude in of_images]).reshape(-1, 4))
+    sigma_rad = np.radians([attitude.sigma_deg for attitude in of_images])
+    agrees = np.ones(len(image), dtype=bool)
+    if len(image) > 2:
+        geo_from_local = rotation @ model.rotation_cam_from_local[image]
+        mean = mean_rotation(geo_from_local, sigma_rad).rotation
+        turn = np.linalg.norm(log_so3(geo_from_local @ mean.T), axis=1)
+        agrees = turn < np.maximum(_CONTRADICTION_SIGMAS * sigma_rad, _CONTRADICTION_RAD)
+    return RecordedRotations(
+        image=image[agrees],
+        geo_from_cam=rotation[agrees],
+        sigma_rad=sigma_rad[agrees],
+        contradicting=tuple(model.image_name[index] for index in image[~agrees]),
+    )
+
+
+def attitude_prior(survey: Survey, model: SparseModel) -> RotationPrior | None:
+    """Return the mean rotation geo ← local of the recorded attitudes, or None without any."""
+    recorded = recorded_rotations(survey, model)
+    if len(recorded.image) == 0:
+        return None
+    return mean_rotation(recorded.geo_from_cam @ model.rotation_cam_from_local[recorded.image], recorded.sigma_rad)
 
 
 def problem_of(
@@ -44,7 +224,7 @@ def problem_of(
         survey: the measurements in use, with the variance factors in their covariances.
         estimate: further systematic errors to estimate, beside the common error of the fixes.
         with_attitudes: whether the attitudes take part, where positions leave the rotation open.
-        planes: of a LiDAR whose shift is a systematic error; None: none.
+        planes: of a LiDAR whose shift is a systematic error.
 
     Raises:
         InputError: an error is to be estimated whose measurements were not recorded.
@@ -52,10 +232,7 @@ def problem_of(
     wanted = tuple(estimate)
     fixes, control = fixes_of(scene, survey), control_of(scene, survey)
     attitudes = attitudes_of(scene, survey) if with_attitudes or "boresight" in wanted else None
-    for name, source, what in (
-        ("lever-arm", fixes, "positions"),
-        ("boresight", attitudes, "attitudes"),
-    ):
+    for name, source, what in (("lever-arm", fixes, "positions"), ("boresight", attitudes, "attitudes")):
         if name in wanted and source is None:
             raise InputError(f"{name} cannot be estimated: no {what} were recorded", field="--estimate")
     blocks = [] if fixes is None else _common_errors(survey, fixes)
@@ -69,12 +246,8 @@ def problem_of(
     if planes is not None:
         blocks.append(SystematicError("lidar-shift", (SIGMA_LIDAR_M,) * 3))
     every: tuple[Term | None, ...] = (fixes, control, attitudes, planes)
-    return Problem(
-        scene.poses,
-        scene.bundle,
-        tuple(term for term in every if term is not None),
-        SystematicErrors(tuple(blocks)),
-    )
+    measured = tuple(term for term in every if term is not None)
+    return Problem(scene.poses, scene.bundle, measured, SystematicErrors(tuple(blocks)))
 
 
 def rejected_of(scene: Scene, survey: Survey, initial: InitialSimilarity) -> Problem | None:
@@ -85,20 +258,16 @@ def rejected_of(scene: Scene, survey: Survey, initial: InitialSimilarity) -> Pro
 
 def fixes_of(scene: Scene, survey: Survey) -> Fixes | None:
     """Return the fixes of the registered images, or None without any."""
-    by_name = {image.name: image.fix for image in survey.images}
-    fixed = [
-        (index, name, fix)
-        for index, name in enumerate(scene.sparse.image_name)
-        if (fix := by_name.get(name)) is not None
-    ]
-    if not fixed:
+    fixes, index = fix_correspondences(survey, scene.sparse), scene.sparse.image_index()
+    if not len(fixes):
         return None
+    session = {image.name: image.fix.session for image in survey.images if image.fix is not None}
     return Fixes(
-        name=tuple(name for _, name, _ in fixed),
-        camera=np.array([index for index, _, _ in fixed]),
-        position_in_geo=np.array([fix.position_in_geo for _, _, fix in fixed]),
-        root_information=root_information(np.array([fix.cov_in_geo for _, _, fix in fixed])),
-        session=np.array([fix.session for _, _, fix in fixed]),
+        name=fixes.name,
+        camera=np.array([index[name] for name in fixes.name]),
+        position_in_geo=fixes.in_geo,
+        root_information=root_information(fixes.cov_in_geo),
+        session=np.array([session[name] for name in fixes.name]),
     )
 
 
@@ -111,7 +280,8 @@ def control_of(scene: Scene, survey: Survey) -> ControlPoints | None:
     rays = rays.of_points(marked)
     surveyed = [point for point, enough in zip(survey.control_points, marked, strict=True) if enough]
     position = np.array([point.position_in_geo for point in surveyed])
-    control = ControlPoints(
+    of_survey = np.array([point.cov_in_geo for point in surveyed])
+    return ControlPoints(
         name=rays.point_id,
         point=rays.point,
         camera=rays.camera,
@@ -119,10 +289,8 @@ def control_of(scene: Scene, survey: Survey) -> ControlPoints | None:
         sigma_rad=rays.sigma_rad,
         bearing_by_lens=scene.sparse.lenses.bearing_jacobian(rays.camera, rays.xy_px),
         position_in_geo=position,
-        root_information=np.tile(np.eye(3), (len(position), 1, 1)),
+        root_information=root_information(of_survey + _mark_covariance(scene, rays, position)),
     )
-    of_survey = np.array([point.cov_in_geo for point in surveyed])
-    return replace(control, root_information=root_information(of_survey + _mark_covariance(scene, control)))
 
 
 def attitudes_of(scene: Scene, survey: Survey) -> Attitudes | None:
@@ -159,7 +327,6 @@ def onto_control(problem: Problem, state: State) -> State:
 
 
 def _common_errors(survey: Survey, fixes: Fixes) -> list[SystematicError]:
-    """Return the common error of each session that has one."""
     blocks = []
     for session in np.unique(fixes.session) if survey.sessions else ():
         sigma = np.array(survey.sessions[session].sigma_common_m)
@@ -169,9 +336,9 @@ def _common_errors(survey: Survey, fixes: Fixes) -> list[SystematicError]:
     return blocks
 
 
-def _mark_covariance(scene: Scene, marks: ControlPoints) -> FloatArray:
-    """Return the covariance (J, 3, 3) of each intersected point that the σ of its marks causes."""
-    poses, position = scene.poses, marks.position_in_geo
+def _mark_covariance(scene: Scene, marks: MarkRays, position: FloatArray) -> FloatArray:
+    """Return the covariance (J, 3, 3) of each intersected point (J, 3) in geo that the σ of its marks causes."""
+    poses = scene.poses
     center = scene.geo_from_model.apply(poses.cam_center_in_model[marks.camera])
     direction = np.einsum("kji,kj->ki", poses.cam_from_model[marks.camera], marks.bearing_in_cam)
     distance = np.linalg.norm(position[marks.point] - center, axis=1)

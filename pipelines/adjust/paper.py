@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipelines.adjust.alignment import layout_of
-from pipelines.adjust.similarity_fit import OUTLIER_GATE, Correspondences, covariance_of
+from pipelines.adjust.alignment import OUTLIER_GATE, Correspondences, covariance_of, layout_of
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.geometry.similarity import Similarity, jacobian_at, spread_ratio_similarity

@@ -2,8 +2,6 @@
 
 The matrix is stored with the solution: whoever asks for a σ factorises it once, and solves nothing again. A wanted
 quantity is described by its derivatives by cameras and lens; points follow from the rays that intersect in them.
-
-Derivatives of intersected points by poses and lens of the cameras that see them.
 """
 
 from __future__ import annotations
@@ -29,7 +27,6 @@ from pipelines.geometry.bundle import (
     linearise_bundle,
     with_positive_depths,
 )
-from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.similarity import jacobian_at, second_moment_at
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.marks import MarkRays
@@ -61,7 +58,6 @@ def intersection_jacobian(
     points behind their camera do not count.
 
     Args:
-        marks: N points, M marks.
         sigma_px: (M,) σ of the marks.
         surveyed: (N, 3, 3) information on the points beyond their marks, 1/m²; None: there is none.
     """
@@ -91,7 +87,6 @@ class Posterior:
     """Covariances of a solved survey.
 
     Attributes:
-        solution: similarity, cameras and lenses.
         sparse: the SfM model with the solved lenses.
         normal: matrix of the normal equations, in `model`.
         followed: (7, 6 n + L) mean similarity of the SfM points by corrections of cameras and lens.
@@ -109,63 +104,40 @@ class Posterior:
     grid: AccuracyGrid | None = None
 
     def of_marked_points(self, point_in_geo: FloatArray, rays: MarkRays) -> FloatArray:
-        """Return covariances (J, 3, 3) in m² of points intersected from their marks, errors of the marks included.
+        """Return covariances (J, 3, 3) in m² of points (J, 3) intersected from their marks, with the marks' errors.
 
         NaN for a point that is NaN, or that its marks do not determine.
-
-        Args:
-            point_in_geo: (J, 3) metres.
-            rays: of the marks.
         """
         rays = rays.part(np.flatnonzero(np.isfinite(point_in_geo[rays.point]).all(axis=1)))
-        position = np.nan_to_num(point_in_geo)
-        jacobian = self._jacobian(position, rays.point, rays.camera, rays.sigma_px)
-        cov = self.normal.covariances(*self._derivatives(jacobian), 3) + self._cov_of_marks(jacobian)
-        cov[rays.marks_of_point < 2] = np.nan
-        return cov
+        return self._intersected(np.nan_to_num(point_in_geo), rays.point, rays.camera, rays.sigma_px)
 
     def jointly_of_marked_points(self, point_in_geo: FloatArray, rays: MarkRays) -> FloatArray:
-        """Return the joint covariance (3 J, 3 J) in m² of points intersected from their marks.
+        """Return the joint covariance (3 J, 3 J) in m² of points (J, 3) that are all determined by their marks.
 
         The points share the errors of similarity, cameras and lens. Those of the marks are independent.
-
-        Args:
-            point_in_geo: (J, 3) metres; all are determined by their marks.
-            rays: of the marks.
         """
         jacobian = self._jacobian(point_in_geo, rays.point, rays.camera, rays.sigma_px)
         return np.asarray(self._jointly(point_in_geo, jacobian) + block_diag(*self._cov_of_marks(jacobian)))
 
     def of_scene(self, point_in_geo: FloatArray, point: IntArray, camera: IntArray) -> FloatArray:
-        """Return the covariance (J, 3, 3) in m² of points of the scene, without errors of marks.
+        """Return the covariance (J, 3, 3) in m² of points (J, 3) of the scene, without errors of marks.
 
-        Args:
-            point_in_geo: (J, 3) metres.
-            point: (K,) index into the points, of each ray.
-            camera: (K,) index of the camera that sees the point.
+        Each of K rays sees one point from one camera: `point` and `camera` (K,) are indices.
         """
-        jacobian = self._jacobian_of_scene(point_in_geo, point, camera)
+        jacobian = self._jacobian(point_in_geo, point, camera)
         return self.normal.covariances(*self._derivatives(jacobian), 3)
 
     def jointly_of_scene(self, point_in_geo: FloatArray, point: IntArray, camera: IntArray) -> FloatArray:
         """Return the joint covariance (3 J, 3 J) in m² of points of the scene; arguments as of `of_scene`."""
-        return self._jointly(point_in_geo, self._jacobian_of_scene(point_in_geo, point, camera))
+        return self._jointly(point_in_geo, self._jacobian(point_in_geo, point, camera))
 
     def of_tie_points(self, point_in_geo: FloatArray, point: IntArray, camera: IntArray) -> FloatArray:
         """Return the covariance (J, 3, 3) in m² of tie points, errors of their own image observations included.
 
-        NaN for a point that fewer than two rays see.
-
-        Args:
-            point_in_geo: (J, 3) metres.
-            point: (K,) index into the points, of each observation.
-            camera: (K,) index of its camera.
+        NaN for a point that fewer than two rays see; arguments as of `of_scene`.
         """
         sigma_px = np.full(len(point), np.nan if self.solution.sigma_px is None else self.solution.sigma_px)
-        jacobian = self._jacobian(point_in_geo, point, camera, sigma_px)
-        cov = self.normal.covariances(*self._derivatives(jacobian), 3) + self._cov_of_marks(jacobian)
-        cov[np.bincount(point, minlength=len(cov)) < 2] = np.nan
-        return cov
+        return self._intersected(point_in_geo, point, camera, sigma_px)
 
     def of_lens(self) -> FloatArray | None:
         """Return the covariance (L, L) of the lens parameters, in the order of `geometry.cameras.Lenses`.
@@ -174,7 +146,8 @@ class Posterior:
         """
         if not len(self.lens):
             return None
-        covariance = np.zeros((self._lenses, self._lenses))
+        every = self.followed.shape[1] - self.normal.poses.shape[0]
+        covariance = np.zeros((every, every))
         by_border = np.eye(len(self.lens), len(self.normal.corner))
         no_poses = csr_matrix((len(self.lens), self.normal.poses.shape[0]))
         covariance[np.ix_(self.lens, self.lens)] = self.normal.covariance(no_poses, by_border)
@@ -191,7 +164,7 @@ class Posterior:
         by_border[:, : len(self.lens)] = self.followed[:, n + self.lens]
         in_model = self.normal.covariance(csr_matrix(self.followed[:, :n]), by_border)
         similarity = self.solution.similarity
-        center = similarity.apply(self._poses.cam_center_in_model.mean(axis=0))
+        center = similarity.apply(self.solution.poses.cam_center_in_model.mean(axis=0))
         turn = block_diag(1.0, similarity.rotation, similarity.scale * similarity.rotation)
         about = jacobian_at(np.array(self.solution.geo_from_model.pivot)[None], center)[0]
         to_pivot = np.eye(7)
@@ -199,13 +172,13 @@ class Posterior:
         by_model = to_pivot @ turn
         return np.asarray(by_model @ in_model @ by_model.T)
 
-    @cached_property
-    def _poses(self) -> CameraPoses:
-        return self.solution.poses
-
-    @property
-    def _lenses(self) -> int:
-        return int(self.followed.shape[1] - self.normal.poses.shape[0])
+    def _intersected(
+        self, point_in_geo: FloatArray, point: IntArray, camera: IntArray, sigma_px: FloatArray
+    ) -> FloatArray:
+        jacobian = self._jacobian(point_in_geo, point, camera, sigma_px)
+        cov = self.normal.covariances(*self._derivatives(jacobian), 3) + self._cov_of_marks(jacobian)
+        cov[np.bincount(point, minlength=len(cov)) < 2] = np.nan
+        return cov
 
     def _jointly(self, point_in_geo: FloatArray, jacobian: IntersectionJacobian) -> FloatArray:
         """Return the joint covariance of points, with the second-order error of the similarity.
@@ -213,22 +186,21 @@ class Posterior:
         Relative positions are known far better than the similarity, so that the square of a rotation can exceed
         their σ.
         """
-        of_similarity = second_moment_at(
-            point_in_geo, self.of_similarity, np.array(self.solution.geo_from_model.pivot)
-        )
+        pivot = np.array(self.solution.geo_from_model.pivot)
+        of_similarity = second_moment_at(point_in_geo, self.of_similarity, pivot)
         return self.normal.covariance(*self._derivatives(jacobian)) + of_similarity
 
-    def _jacobian_of_scene(
-        self, point_in_geo: FloatArray, point: IntArray, camera: IntArray
-    ) -> IntersectionJacobian:
-        focal_px = np.array([self.sparse.camera_of(i).mean_focal_px for i in range(len(self.sparse.image_name))])
-        return self._jacobian(point_in_geo, point, camera, focal_px[camera])  # all rays have the same angular σ
-
     def _jacobian(
-        self, point_in_geo: FloatArray, point: IntArray, camera: IntArray, sigma_px: FloatArray
+        self, point_in_geo: FloatArray, point: IntArray, camera: IntArray, sigma_px: FloatArray | None = None
     ) -> IntersectionJacobian:
-        """Return the derivatives, in metres of `model`, of points (J, 3) by the cameras and lens that see them."""
-        sparse, poses = self.sparse, self._poses
+        """Return the derivatives, in metres of `model`, of points (J, 3) by the cameras and lens that see them.
+
+        Without the σ of the rays, all of them have the same angular σ.
+        """
+        sparse, poses = self.sparse, self.solution.poses
+        if sigma_px is None:
+            focal_px = np.array([sparse.camera_of(index).mean_focal_px for index in range(len(sparse.image_name))])
+            sigma_px = focal_px[camera]
         rays = Network(
             sparse.cameras,
             sparse.image_camera_id,
@@ -250,23 +222,19 @@ class Posterior:
         return csr_matrix(turned @ jacobian.by_poses), by_border
 
     def _cov_of_marks(self, jacobian: IntersectionJacobian) -> FloatArray:
-        return np.asarray(self._geo_by_model @ jacobian.cov_of_marks @ self._geo_by_model.T)
+        return self._geo_by_model @ jacobian.cov_of_marks @ self._geo_by_model.T
 
     @property
     def _geo_by_model(self) -> FloatArray:
         """Derivative (3, 3) of positions in `geo` by positions in `model`."""
-        return np.asarray(self.solution.similarity.scale * self.solution.similarity.rotation)
+        return self.solution.similarity.scale * self.solution.similarity.rotation
 
 
 def camera_covariances(normal: NormalMatrix, turn: FloatArray, scale: float) -> FloatArray:
     """Return the covariance (n, 6, 6) of (δθ [rad], δc [m]) of all cameras, along the axes of `geo`.
 
-    δθ turns a camera about its centre, R_geo_from_cam' = Exp(δθ) R_geo_from_cam, and δc moves its centre.
-
-    Args:
-        normal: of cameras in `model`.
-        turn: rotation (3, 3) geo ← model.
-        scale: of geo ← model.
+    δθ turns a camera about its centre, R_geo_from_cam' = Exp(δθ) R_geo_from_cam, and δc moves its centre. `turn`
+    (3, 3) and `scale` are those of geo ← model.
     """
     count = len(normal.position)
     by_pose = np.broadcast_to(block_diag(turn, scale * turn), (count, 6, 6))
@@ -287,12 +255,7 @@ def save_posterior(posterior: Posterior, path: Path) -> None:
 
 
 def load_posterior(path: Path, solution: Adjustment, sfm: SparseModel) -> Posterior:
-    """Read what `save_posterior` has written.
-
-    Args:
-        path: of the NPZ file.
-        solution: the document beside it.
-        sfm: the SfM model with SfM's lenses.
+    """Read what `save_posterior` has written; `sfm` has SfM's lenses.
 
     Raises:
         InputError: the file is damaged, or of another solution.

@@ -22,7 +22,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
-from pipelines.adjust.similarity_fit import covariance_of
+from pipelines.adjust.alignment import Correspondences, covariance_of
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.geometry.rotations import exp_so3, log_so3
@@ -64,10 +64,7 @@ class RigData:
         cam_from_local: (n, 3, 3) rotations of SfM.
         cam_from_body: (n, 3, 3) mount, NaN where unknown.
         antenna_in_body: (n, 3) lever arm to start from, metres.
-        control_in_local: (c, 3) control points, intersected from their marks.
-        control_in_geo: (c, 3) control points as surveyed, metres.
-        control_cov_in_local: (c, 3, 3) covariances of the intersections.
-        control_cov_in_geo: (c, 3, 3) covariances of the survey, m².
+        control: control points, intersected from their marks and as surveyed.
         pixel_rad: angle of a pixel.
         footprint_in_local: width of a pixel at the distance of the scene.
     """
@@ -79,22 +76,13 @@ class RigData:
     cam_from_local: FloatArray
     cam_from_body: FloatArray
     antenna_in_body: FloatArray
-    control_in_local: FloatArray
-    control_in_geo: FloatArray
-    control_cov_in_local: FloatArray
-    control_cov_in_geo: FloatArray
+    control: Correspondences
     pixel_rad: float
     footprint_in_local: float
 
     @property
     def has_attitudes(self) -> bool:
-        """Whether attitudes were recorded."""
         return len(self.attitudes) > 1
-
-    @property
-    def has_mount(self) -> BoolArray:
-        """Mask (n,) of the images whose mount is known."""
-        return np.asarray(np.isfinite(self.cam_from_body).all(axis=(1, 2)))
 
 
 @dataclass(frozen=True)
@@ -125,13 +113,7 @@ class RigState:
 
 @dataclass(frozen=True)
 class FitOptions:
-    """Options of the adjustment.
-
-    Attributes:
-        offset: estimate the time offset.
-        arm: estimate the lever arm.
-        max_offset_s: the offset is searched so far on either side of its start.
-    """
+    """Options of the adjustment; the offset is searched so far on either side of its start."""
 
     offset: bool = True
     arm: bool = False
@@ -143,11 +125,9 @@ class RigFit:
     """Result of the adjustment.
 
     Attributes:
-        state: values of the unknowns.
         sigma: (14,) σ: of the similarity (7), offset in s, boresight in rad (3), lever arm in m (3). A small error
             of SfM's lens tilts all cameras alike, or shifts them along their view, without any residual. The σ of
             boresight and lever arm therefore include one pixel: its angle, and its width at the scene.
-        images: number of images in the adjustment.
         rms_position_m, rms_attitude_deg: robust σ of the residuals per axis; attitude NaN without any.
     """
 
@@ -161,14 +141,8 @@ class RigFit:
 def fit_rig(data: RigData, start_offset_s: float, start_boresight: FloatArray, options: FitOptions) -> RigFit:
     """Return the parameters of the rig that make SfM cameras and navigation agree.
 
-    The boresight is free if attitudes and a mount are known, so that its error does not affect the other
-    parameters.
-
-    Args:
-        data: cameras, navigation and control points.
-        start_offset_s: time offset to start from.
-        start_boresight: (3, 3) nominal ← true camera, to start from.
-        options: free parameters.
+    The boresight (3, 3), nominal ← true camera, is free if attitudes and a mount are known, so that its error does
+    not affect the other parameters.
 
     Raises:
         DegenerateGeometryError: fewer than six images within the track, or all on one line or in one place; or the
@@ -177,7 +151,7 @@ def fit_rig(data: RigData, start_offset_s: float, start_boresight: FloatArray, o
     data = replace(data, attitudes=_smoothed(data.attitudes))
     free = np.ones(14, dtype=bool)
     free[OFFSET], free[ARM] = options.offset, options.arm
-    free[BORESIGHT] = data.has_attitudes and data.has_mount.any()
+    free[BORESIGHT] = data.has_attitudes and np.isfinite(data.cam_from_body).all(axis=(1, 2)).any()
     start = state = _start(data, start_offset_s, start_boresight, options)
     sigma_m, sigma_rad = 1.0, np.radians(2.0)
     for _ in range(_ROUNDS):
@@ -188,9 +162,10 @@ def fit_rig(data: RigData, start_offset_s: float, start_boresight: FloatArray, o
             if np.abs(step[7:]).max() < 1e-7:
                 break
         position, attitude, _ = _residuals(data, state, _usable_images(data, state.offset_s))
-        sigma_m = max(_sigma_about_zero(position), _LEAST_SIGMA_M)
+        # σ about zero: a mean that the residuals share counts as scatter.
+        sigma_m = max(mad_sigma(np.concatenate([position, -position]).ravel()), _LEAST_SIGMA_M)
         if len(attitude):
-            sigma_rad = max(_sigma_about_zero(attitude), _LEAST_SIGMA_RAD)
+            sigma_rad = max(mad_sigma(np.concatenate([attitude, -attitude]).ravel()), _LEAST_SIGMA_RAD)
     if options.offset and abs(state.offset_s - start_offset_s) > _INNER * options.max_offset_s:
         raise DegenerateGeometryError(
             f"the time offset that fits best lies at the end of the search, {options.max_offset_s:g} s from the "
@@ -225,25 +200,19 @@ def _usable_images(data: RigData, offset_s: float) -> BoolArray:
 
 
 def _residuals(data: RigData, state: RigState, used: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the residuals of positions, attitudes and control points.
+    """Return the residuals of a mask (n,) of k images, of which j have a mount, and of c control points.
 
-    Args:
-        data: cameras, navigation and control points.
-        state: values of the unknowns.
-        used: (n,) mask of k images; j of them have a mount.
-
-    Returns:
-        Positions (k, 3) in metres, attitudes (j, 3) in radians, axes of the camera, and control points (c, 3).
+    Positions (k, 3) in metres, attitudes (j, 3) in radians, axes of the camera, and control points (c, 3).
     """
     center, bodies = _cameras_by_navigation(data, state.offset_s, state.arm, used)
     position = center - state.geo_from_local.apply(data.center_in_local[used])
-    control = data.control_in_geo - state.geo_from_local.apply(data.control_in_local)
+    control = data.control.in_geo - state.geo_from_local.apply(data.control.in_local)
     if not len(bodies):
         return position, np.empty((0, 3)), control
-    mounted = used & data.has_mount
-    from_sfm = data.cam_from_local[mounted] @ state.geo_from_local.rotation.T
-    body_from_cam = np.swapaxes(data.cam_from_body[mounted], 1, 2) @ state.boresight
-    return position, log_so3(from_sfm @ bodies[data.has_mount[used]] @ body_from_cam), control
+    mounted = np.isfinite(data.cam_from_body[used]).all(axis=(1, 2))
+    from_sfm = data.cam_from_local[used][mounted] @ state.geo_from_local.rotation.T
+    body_from_cam = np.swapaxes(data.cam_from_body[used][mounted], 1, 2) @ state.boresight
+    return position, log_so3(from_sfm @ bodies[mounted] @ body_from_cam), control
 
 
 def _cameras_by_navigation(
@@ -311,11 +280,6 @@ def _smoothed(attitudes: Trajectory) -> Trajectory:
     return replace(attitudes, rotation=rotation)
 
 
-def _sigma_about_zero(residuals: FloatArray) -> float:
-    """Return the robust σ per axis of residuals (n, 3); a mean that they share counts as scatter."""
-    return mad_sigma(np.concatenate([residuals, -residuals]).ravel())
-
-
 def _linearised(
     data: RigData, state: RigState, sigmas: tuple[float, float], start: RigState, options: FitOptions
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -360,7 +324,7 @@ def _control_whitener(data: RigData, state: RigState, missed: FloatArray) -> Flo
     covariances are scaled up to the scatter.
     """
     turn = state.geo_from_local.scale * state.geo_from_local.rotation
-    cov = data.control_cov_in_geo + turn @ data.control_cov_in_local @ turn.T
+    cov = data.control.cov_in_geo + turn @ data.control.cov_in_local @ turn.T
     squared = squared_mahalanobis(missed, cov)
     excess = max(1.0, float(np.median(squared)) / median_chi2(3)) if len(squared) else 1.0
     return np.asarray(np.linalg.inv(np.linalg.cholesky(excess * cov)))

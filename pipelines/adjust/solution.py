@@ -11,34 +11,18 @@ import numpy as np
 from pipelines.adjust.accuracy_grid import accuracy_grid
 from pipelines.adjust.posterior import Posterior, camera_covariances, load_posterior
 from pipelines.adjust.state import State
-from pipelines.adjust.system import (
-    Linearised,
-    NormalMatrix,
-    Problem,
-    linearised,
-    posterior_weights,
-    robust_weights,
-)
-from pipelines.adjust.terms import Attitudes, ControlPoints, Fixes
+from pipelines.adjust.system import Linearised, NormalMatrix, Problem, linearised, posterior_weights, robust_weights
+from pipelines.adjust.terms import At, Attitudes, ControlPoints, Fixes
 from pipelines.core.products import union
-from pipelines.core.stages import SIM3_POSTERIOR, SPARSE, TRAIN_POSTERIOR
-from pipelines.core.types import FloatArray
+from pipelines.core.stages import SIM3_POSTERIOR, TRAIN_POSTERIOR
 from pipelines.core.workspace import Workspace
-from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.adjustment import InitialSimilarity
 from pipelines.survey.report import AccuracySummary
 from pipelines.survey.scene import Scene
-from pipelines.survey.trained_model import (
-    Adjustment,
-    Measurement,
-    TrainedCamera,
-    TrainedLens,
-    TrainedModel,
-    load_solution,
-)
+from pipelines.survey.trained_model import Adjustment, Measurement, TrainedCamera, TrainedLens, TrainedModel
 
 Named = Fixes | ControlPoints | Attitudes
 _OPEN = 1e-9  # redundancy below which the other observations leave a direction open
@@ -55,7 +39,7 @@ def adjusted(
         problem: the measurements in use.
         state: values of all unknowns.
         initial: its verdict on each measurement stands; its factors and cautions are carried on.
-        rejected: problem of the measurements that were rejected; None: there are none.
+        rejected: problem of the measurements that were rejected.
 
     Raises:
         DegenerateGeometryError: the measurements leave the similarity open.
@@ -70,11 +54,14 @@ def adjusted(
         geo_from_model=similarity.to_record("model", "geo", pivot=pivot),
         model_from_local=scene.model_from_local.to_record("local", "model"),
         cameras=_cameras(scene, poses),
-        lenses=_lenses(sparse, state.lens),
+        lenses=tuple(
+            TrainedLens(camera_id=key, model=camera.model, params=tuple(camera.params.tolist()))
+            for key, camera in (sparse.lenses.moved(state.lens).cameras.items() if len(state.lens) else ())
+        ),
         gnss_outliers=initial.gnss_outliers,
         control_outliers=initial.control_outliers,
         estimated_errors=problem.errors.estimates(state.errors, covariance),
-        measurements=(*_measurements(near, normal), *_rejected(rejected, state)),
+        measurements=tuple(_measurements(near, normal, rejected)),
         sigma_px=problem.bundle.sigma_px,
         variance_factors=initial.variance_factors,
         cautions=union(initial.cautions),
@@ -87,16 +74,6 @@ def adjusted(
     summary = AccuracySummary(cells=0, reason="the scene has too few points") if grid is None else grid.summary()
     solution = solution.model_copy(update={"geo_from_model": record, "accuracy": summary})
     return replace(posterior, solution=solution, grid=grid)
-
-
-def load_adjustment(workspace: Workspace) -> Posterior:
-    """Return the adjustment of a workspace: that of its training, else that of init-sim3.
-
-    Raises:
-        MissingProductError: neither exists.
-        InputError: a product is damaged.
-    """
-    return posterior_of(workspace, load_solution(workspace), read_sparse(workspace.path(SPARSE)))
 
 
 def posterior_of(workspace: Workspace, solution: Adjustment, sfm: SparseModel) -> Posterior:
@@ -125,16 +102,6 @@ def _cameras(scene: Scene, poses: CameraPoses) -> tuple[TrainedCamera, ...]:
     )
 
 
-def _lenses(sparse: SparseModel, change: FloatArray) -> tuple[TrainedLens, ...]:
-    """Return the lenses after a change (L,); none if the lens was held."""
-    if not len(change):
-        return ()
-    return tuple(
-        TrainedLens(camera_id=key, model=camera.model, params=tuple(camera.params.tolist()))
-        for key, camera in sparse.lenses.moved(change).cameras.items()
-    )
-
-
 _KINDS: dict[str, Literal["fix", "control point", "attitude"]] = {
     Fixes.kind: "fix",
     ControlPoints.kind: "control point",
@@ -142,12 +109,12 @@ _KINDS: dict[str, Literal["fix", "control point", "attitude"]] = {
 }
 
 
-def _measurements(near: Linearised, normal: NormalMatrix) -> Iterator[Measurement]:
-    """Yield the state of every measurement in use, and of every systematic error."""
+def _measurements(near: Linearised, normal: NormalMatrix, rejected: Problem | None) -> Iterator[Measurement]:
+    """Yield the state of every measurement in use, of every systematic error, and of the rejected measurements."""
     for term in near.problem.measured:
         if isinstance(term, Named):
             left_out = _left_out(near, term, normal) if isinstance(term, ControlPoints) else None
-            yield from _states(near.problem, term, near.state, reason="", left_out=left_out)
+            yield from _states(term, near.problem.at(near.state), left_out=left_out)
     for error, row in zip(near.problem.errors.blocks, near.state.errors.reshape(-1, 3), strict=True):
         yield Measurement(
             kind="systematic error",
@@ -156,23 +123,16 @@ def _measurements(near: Linearised, normal: NormalMatrix) -> Iterator[Measuremen
             residual=tuple(row.tolist()),
             normalised=float(np.linalg.norm(row / np.array(error.sigma))),
         )
-
-
-def _rejected(problem: Problem | None, state: State) -> Iterator[Measurement]:
-    """Yield the state of the measurements that were rejected."""
-    if problem is None:
-        return
-    for term in problem.measured:
-        if isinstance(term, Named):
-            yield from _states(
-                problem, term, replace(state, errors=np.zeros(len(problem.errors))), reason=_REJECTED
-            )
+    if rejected is not None:
+        at = rejected.at(replace(near.state, errors=np.zeros(len(rejected.errors))))
+        for term in rejected.measured:
+            if isinstance(term, Named):
+                yield from _states(term, at, reason=_REJECTED)
 
 
 def _states(
-    problem: Problem, term: Named, state: State, *, reason: str, left_out: list[dict[str, object]] | None = None
+    term: Named, at: At, *, reason: str = "", left_out: list[dict[str, object]] | None = None
 ) -> Iterator[Measurement]:
-    at = problem.at(state)
     residual, white = term.residuals(at), term.whitened(at)
     for row, name in enumerate(term.name):
         yield Measurement(
@@ -206,8 +166,5 @@ def _left_out(near: Linearised, control: ControlPoints, normal: NormalMatrix) ->
         error = unwhiten @ np.linalg.solve(free[row], white[row])
         others = np.linalg.solve(np.eye(3) - expected[kind][row] * spread[row], spread[row])
         cov = unwhiten @ (np.eye(3) + (others + others.T) / 2) @ unwhiten.T
-        rows[row] = {
-            "left_out_error_m": tuple(error.tolist()),
-            "left_out_cov_m2": tuple(map(tuple, cov.tolist())),
-        }
+        rows[row] = {"left_out_error_m": tuple(error.tolist()), "left_out_cov_m2": tuple(map(tuple, cov.tolist()))}
     return rows

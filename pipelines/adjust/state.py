@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -10,21 +10,21 @@ import numpy as np
 from pipelines.core.types import FloatArray
 from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.rotations import exp_so3
-from pipelines.geometry.similarity import Similarity, perturbation
+from pipelines.geometry.similarity import Similarity
 from pipelines.survey.report_parts import EstimatedError
 
 SIGMA_ARM_M = 1.0  # wider than any error of a mounting, and finite, so that unobservable errors show by their σ
 SIGMA_LIDAR_M = 1.0
 SIGMA_BORESIGHT_RAD = np.radians(5.0)
 # A component counts as observed if its σ is at most this part of the prior's.
-OBSERVED_PART = 0.5
+_OBSERVED_PART = 0.5
 
 ErrorName = Literal["bias", "lever-arm", "boresight", "common", "lidar-shift"]
 
 
 @dataclass(frozen=True)
 class SystematicError:
-    """Three components that many measurements share, with a prior N(0, σ²).
+    """Three components that many measurements share, with a prior N(0, σ²) per axis, metres or radians.
 
     - bias: fix minus true position of the antenna, axes of geo, common to a session.
     - lever-arm: the antenna seen from the camera beyond the arm that the survey has applied, camera axes.
@@ -32,11 +32,6 @@ class SystematicError:
     - common: rotation vector that all recorded attitudes share, axes of geo (compass, tilt of a gimbal). Its prior
       has the σ of one attitude: hundreds of attitudes have no more information on the rotation than one.
     - lidar-shift: LiDAR minus its true place, axes of geo.
-
-    Attributes:
-        name: which.
-        sigma: (3) of the prior, metres or radians.
-        session: of a bias; None: of all measurements.
     """
 
     name: ErrorName
@@ -55,7 +50,6 @@ class SystematicErrors:
 
     @property
     def sigma(self) -> FloatArray:
-        """σ (p,) of the prior."""
         return np.array([block.sigma for block in self.blocks], dtype=np.float64).reshape(-1)
 
     def columns(self, name: ErrorName, session: int | None = None) -> slice | None:
@@ -74,21 +68,22 @@ class SystematicErrors:
 
         The rotation that all attitudes share is not included.
         """
-        sigma, prior, estimates = np.sqrt(np.diag(covariance)), self.sigma, []
-        for index, block in enumerate(self.blocks):
+        values, sigmas = vector.reshape(-1, 3), np.sqrt(np.diag(covariance)).reshape(-1, 3)
+        estimates = []
+        for block, value, sigma in zip(self.blocks, values, sigmas, strict=True):
             if block.name == "common":
                 continue
-            axes, unit = slice(3 * index, 3 * index + 3), "deg" if block.name == "boresight" else "m"
-            factor = float(np.degrees(1.0)) if unit == "deg" else 1.0
+            is_angle, prior = block.name == "boresight", np.array(block.sigma)
+            factor = float(np.degrees(1.0)) if is_angle else 1.0
             estimates.append(
                 EstimatedError(
                     name=block.name,
                     session=block.session,
-                    unit="deg" if unit == "deg" else "m",
-                    value=tuple((factor * vector[axes]).tolist()),
-                    sigma=tuple((factor * sigma[axes]).tolist()),
-                    prior=tuple((factor * prior[axes]).tolist()),
-                    observed=tuple((sigma[axes] <= OBSERVED_PART * prior[axes]).tolist()),
+                    unit="deg" if is_angle else "m",
+                    value=tuple((factor * value).tolist()),
+                    sigma=tuple((factor * sigma).tolist()),
+                    prior=tuple((factor * prior).tolist()),
+                    observed=tuple((sigma <= _OBSERVED_PART * prior).tolist()),
                 )
             )
         return tuple(estimates)
@@ -99,7 +94,6 @@ class State:
     """Values of all unknowns.
 
     Attributes:
-        geo_from_model: the similarity.
         correction: (n, 6) corrections (δω, δc) of the cameras in `model`, rad and m: R' = R Exp(−δω), c' = c + δc.
         lens: (L,) change of the lens parameters; L = 0: the lens stays.
         errors: (p,) systematic errors, m and rad.
@@ -111,29 +105,5 @@ class State:
     errors: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def poses(self, base: CameraPoses) -> CameraPoses:
-        """Return the corrected poses of cameras."""
         turned = base.cam_from_model @ exp_so3(-self.correction[:, :3])
         return CameraPoses(turned, base.cam_center_in_model + self.correction[:, 3:])
-
-    def moved(self, correction: FloatArray, lens: FloatArray, errors: FloatArray) -> State:
-        """Return the state after a step of corrections (n, 6), lens (L,) and errors (p,)."""
-        return replace(
-            self,
-            correction=self.correction + correction,
-            lens=self.lens + lens,
-            errors=self.errors + errors,
-        )
-
-    def without_common_motion(self, mean: FloatArray, modes: FloatArray, center: FloatArray) -> State:
-        """Return the same cameras on Earth, with a similarity of the whole moved from the corrections to it.
-
-        Args:
-            mean: (7,) similarity (ln s, rotation, translation) about `center` that the corrections contain.
-            modes: (6 n, 7) its movements of the cameras.
-            center: (3,) mean projection centre in `model`.
-        """
-        return replace(
-            self,
-            geo_from_model=self.geo_from_model @ perturbation(mean, center),
-            correction=self.correction - (modes @ mean).reshape(-1, 6),
-        )

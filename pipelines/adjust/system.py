@@ -9,8 +9,8 @@ systematic errors v. Image observations enter as the information of the bundle a
 
 N is sparse and is factorised by nested dissection (`geometry.sparse_cholesky`); the border is dense and small. A
 similarity of the whole costs the bundle nothing, so that fixes and control points alone determine it. After each
-step, it is moved from the corrections into the similarity (`State.without_common_motion`): the information about
-SfM's minimum then holds, wherever on Earth the cameras have gone.
+step, it is moved from the corrections into the similarity: the information about SfM's minimum then holds, wherever
+on Earth the cameras have gone.
 
 Terms that depend on the mean similarity g of the SfM points (planes of a LiDAR) add g to the border, with the
 constraint g = F (x, ℓ) and its multipliers: F is dense, but has seven rows.
@@ -18,7 +18,7 @@ constraint g = F (x, ℓ) and its multipliers: F is dense, but has seven rows.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -32,6 +32,7 @@ from pipelines.core.errors import ConvergenceError, DegenerateGeometryError
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.geometry.bundle import BundleInformation
 from pipelines.geometry.cameras import CameraPoses
+from pipelines.geometry.similarity import perturbation
 from pipelines.geometry.sparse_cholesky import SparseCholesky
 from pipelines.robust.statistics import NOISE_WEIGHT, cauchy_loss, cauchy_weight
 
@@ -54,15 +55,7 @@ Weights = Mapping[str, FloatArray]
 
 @dataclass(frozen=True)
 class Problem:
-    """Cameras, and all that was measured of them.
-
-    Attributes:
-        base: poses as SfM left them, in `model`.
-        bundle: information of the image observations on them.
-        measured: terms of the survey, at most one of a kind.
-        errors: systematic errors of the measurements.
-        lens_held: whether the lens stays as it is, exactly known.
-    """
+    """Cameras with poses as SfM left them, and all that was measured of them; at most one term of a kind."""
 
     base: CameraPoses
     bundle: BundleInformation
@@ -70,14 +63,15 @@ class Problem:
     errors: SystematicErrors = field(default_factory=SystematicErrors)
     lens_held: bool = False
 
-    @property
+    @cached_property
     def terms(self) -> tuple[Term, ...]:
         """All terms, the prior of the systematic errors among them."""
-        prior = (CommonErrors.of(self.errors),) if len(self.errors) else ()
-        return (*self.measured, *prior)
+        if not self.errors.blocks:
+            return self.measured
+        prior = CommonErrors(np.array([np.diag(1.0 / np.array(block.sigma)) for block in self.errors.blocks]))
+        return (*self.measured, prior)
 
     def term(self, kind: str) -> Term | None:
-        """Return the term of a kind; None if there is none."""
         return next((term for term in self.terms if term.kind == kind), None)
 
     @cached_property
@@ -102,11 +96,9 @@ class Problem:
         return np.asarray(modes.T @ (self.bundle.sums.poses @ modes))
 
     def at(self, state: State) -> At:
-        """Return the estimate of a state, as terms need it."""
         return At.of(state, self.base, self.errors)
 
     def residuals(self, state: State) -> dict[str, FloatArray]:
-        """Return the whitened residuals (M, d) by kind."""
         at = self.at(state)
         return {term.kind: term.whitened(at) for term in self.terms}
 
@@ -153,11 +145,6 @@ class NormalMatrix:
 
     @cached_property
     def factor(self) -> SparseCholesky:
-        """Factor of N.
-
-        Raises:
-            DegenerateGeometryError: the measurements leave the similarity open.
-        """
         try:
             return SparseCholesky(self.poses, self.position)
         except DegenerateGeometryError:
@@ -170,13 +157,29 @@ class NormalMatrix:
         return self.factor.solve(right) if right.size else right
 
     @cached_property
-    def _schur(self) -> _EquilibratedLU:
-        return _EquilibratedLU(self.corner - self.border @ self.response)
+    def _schur_solve(self) -> Callable[[FloatArray], FloatArray]:
+        """Return the solver S⁻¹ of right sides (b, m), by S scaled to a largest entry of 1 in rows and columns.
+
+        S is symmetric, and indefinite where there are multipliers.
+        """
+        schur = self.corner - self.border @ self.response
+        if not len(schur):
+            return lambda right: right
+        scale = np.ones(len(schur))
+        for _ in range(_EQUILIBRATIONS):
+            largest = np.abs(schur * scale[:, None] * scale).max(axis=1)
+            scale /= np.sqrt(np.where(largest > 0, largest, 1.0))
+        scaled = schur * scale[:, None] * scale
+        size = np.linalg.svd(scaled, compute_uv=False)
+        if size[-1] <= _OPEN * size[0]:
+            raise DegenerateGeometryError(_ADVICE)
+        factors = lu_factor(scaled)
+        return lambda right: np.asarray(lu_solve(factors, right * scale[:, None]) * scale[:, None])
 
     def solve(self, poses: FloatArray, border: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the unknowns (6 n, m) and (b, m) for right sides of the same shapes."""
         inner = self.factor.solve(poses)
-        outer = self._schur.solve(border - self.border @ inner)
+        outer = self._schur_solve(border - self.border @ inner)
         return inner - self.response @ outer, outer
 
     def covariance(self, by_poses: csr_matrix, by_border: FloatArray) -> FloatArray:
@@ -203,12 +206,9 @@ class NormalMatrix:
         return self._of_border(np.eye(count, len(self.corner), lens))
 
     def of_each_camera(self, camera: IntArray, by_pose: FloatArray, by_border: FloatArray) -> FloatArray:
-        """Return the covariances (m, d, d) of quantities that depend on one camera each.
+        """Return the covariances (m, d, d) of quantities that depend on one camera (m,) each.
 
-        Args:
-            camera: (m,) that camera.
-            by_pose: (m, d, 6) derivative by its corrections.
-            by_border: (m, d, b).
+        Their derivatives are (m, d, 6) by its corrections, and (m, d, b) by the border.
         """
         response = self.response.reshape(len(self.position), 6, -1)[camera]
         across = by_border - by_pose @ response
@@ -223,21 +223,21 @@ class NormalMatrix:
         """Return the products left S⁻¹ leftᵀ (…, m, m) of border vectors (…, m, b)."""
         if not len(self.corner):
             return np.zeros((*left.shape[:-1], left.shape[-2]))
-        solved = self._schur.solve(left.reshape(-1, left.shape[-1]).T).T.reshape(left.shape)
+        solved = self._schur_solve(left.reshape(-1, left.shape[-1]).T).T.reshape(left.shape)
         return np.asarray(left @ np.swapaxes(solved, -1, -2))
 
 
 @dataclass(frozen=True)
 class Linearised:
-    """Problem near a state: the whitened observations by kind, and the state's own pull."""
+    """Problem near a state: whitened observations by kind, and whether any depends on the SfM points' mean."""
 
     problem: Problem
     state: State
     rows: dict[str, Rows]
+    has_points: bool
 
     @property
     def residuals(self) -> Residuals:
-        """Whitened residuals (M, d) by kind."""
         return {kind: rows.residual for kind, rows in self.rows.items()}
 
     def normal(self, weights: Weights) -> NormalMatrix:
@@ -259,7 +259,7 @@ class Linearised:
                 matrix = matrix + (weighted @ rows.by_poses).tobsr((6, 6))
             border += (weighted @ rows.by_border).T
             corner += rows.by_border.T @ (weight[:, None] * rows.by_border)
-        if self._has_points:  # g = F (x, ℓ), with multipliers
+        if self.has_points:  # g = F (x, ℓ), with multipliers
             followed, n = problem.bundle.followed, matrix.shape[0]
             known = np.zeros((7, width))
             known[:, : len(lens)], known[:, -7:] = -followed[:, n + lens], np.eye(7)
@@ -305,7 +305,7 @@ class Linearised:
         known = np.zeros((7 + count, 7 + count))
         for rows in self.rows.values():
             whole = rows.by_poses @ problem.bundle.similarity_modes
-            if self._has_points:
+            if self.has_points:
                 whole = whole + rows.by_border[:, lenses + count :]
             by_unknowns = np.hstack([whole, rows.by_border[:, lenses : lenses + count]])
             known += by_unknowns.T @ by_unknowns
@@ -318,11 +318,7 @@ class Linearised:
     @property
     def _width(self) -> int:
         """Number of unknowns of the border, without multipliers."""
-        return len(self.problem.lens) + len(self.problem.errors) + 7 * self._has_points
-
-    @property
-    def _has_points(self) -> bool:
-        return any(term.kind == "lidar" for term in self.problem.terms)
+        return len(self.problem.lens) + len(self.problem.errors) + 7 * self.has_points
 
 
 @dataclass(frozen=True)
@@ -335,38 +331,35 @@ class Minimum:
 
 
 def linearised(problem: Problem, state: State) -> Linearised:
-    """Return the observations of a problem near a state."""
-    at, columns = problem.at(state), 6 * len(problem.base.cam_center_in_model)
-    slopes = {term.kind: term.slopes(at).whitened(term.root_information) for term in problem.terms}
-    has_points = any(slope.by_similarity is not None for slope in slopes.values())
-    rows = {kind: _rows(problem, slope, columns, has_points=has_points) for kind, slope in slopes.items()}
-    return Linearised(problem, state, rows)
+    at = problem.at(state)
+    slopes = {term.kind: (term.root_information, term.slopes(at)) for term in problem.terms}
+    has_points = any(slope.by_similarity is not None for _, slope in slopes.values())
+    rows = {kind: _rows(problem, *of_kind, has_points=has_points) for kind, of_kind in slopes.items()}
+    return Linearised(problem, state, rows, has_points)
 
 
-def _rows(problem: Problem, slopes: Slopes, columns: int, *, has_points: bool) -> Rows:
+def _rows(problem: Problem, root: FloatArray, slopes: Slopes, *, has_points: bool) -> Rows:
+    """Return the observations of a term in units of σ, from its root information (M, d, d)."""
     count, d = slopes.residual.shape
-    parts = [slopes.by_lens[:, :, problem.lens], slopes.by_errors]
+    by_pose = root[slopes.row] @ slopes.by_pose
+    parts = [(root @ slopes.by_lens)[:, :, problem.lens], root @ slopes.by_errors]
     if has_points:
-        none = np.zeros((count, d, 7))
-        parts.append(none if slopes.by_similarity is None else slopes.by_similarity)
+        parts.append(np.zeros((count, d, 7)) if slopes.by_similarity is None else root @ slopes.by_similarity)
     by_border = np.concatenate(parts, axis=2).reshape(count * d, -1)
-    row = np.broadcast_to((d * slopes.row)[:, None, None] + np.arange(d)[:, None], slopes.by_pose.shape)
-    column = np.broadcast_to((6 * slopes.camera)[:, None, None] + np.arange(6), slopes.by_pose.shape)
-    entries = (slopes.by_pose.ravel(), (row.ravel(), column.ravel()))
-    return Rows(slopes.residual, csr_matrix(entries, shape=(count * d, columns)), by_border)
+    row = np.broadcast_to((d * slopes.row)[:, None, None] + np.arange(d)[:, None], by_pose.shape)
+    column = np.broadcast_to((6 * slopes.camera)[:, None, None] + np.arange(6), by_pose.shape)
+    shape = (count * d, 6 * len(problem.base.cam_center_in_model))
+    by_poses = csr_matrix((by_pose.ravel(), (row.ravel(), column.ravel())), shape=shape)
+    return Rows((root @ slopes.residual[:, :, None])[:, :, 0], by_poses, by_border)
 
 
 def minimise(problem: Problem, start: State, normal: NormalMatrix | None = None) -> Minimum:
     """Return the minimum of Cauchy's cost of all terms, with the information of the bundle.
 
     A quasi-Newton step takes the slope at the present state and a factor that may be older: the minimum is exact,
-    and few factorisations are needed. A step that raises the cost is halved. Where steps shrink slowly, because the
-    weights of a redescending kernel are stiff, the next one is stretched.
-
-    Args:
-        problem: the measurements.
-        start: state to start from.
-        normal: equations of a state near by, whose factor the first steps take; None: there are none.
+    and few factorisations are needed. The first steps take that of `normal`, if there is one. A step that raises
+    the cost is halved. Where steps shrink slowly, because the weights of a redescending kernel are stiff, the next
+    one is stretched.
 
     Raises:
         ConvergenceError: the steps do not end.
@@ -383,7 +376,8 @@ def minimise(problem: Problem, start: State, normal: NormalMatrix | None = None)
         for halving in range(_HALVINGS + 1):
             moved = _moved(problem, state, step, stretch * 0.5**halving)
             new = problem.residuals(moved)
-            change, reached = _largest_change(residuals, new), cost_at(problem, moved, new)
+            differences = (float(np.abs(new[kind] - residuals[kind]).max(initial=0.0)) for kind in new)
+            change, reached = max(differences, default=0.0), cost_at(problem, moved, new)
             if reached <= cost + _NOISE * (1 + abs(cost)) or change < _STILL:
                 break
         else:
@@ -400,13 +394,14 @@ def minimise(problem: Problem, start: State, normal: NormalMatrix | None = None)
 
 
 def _moved(problem: Problem, state: State, step: tuple[FloatArray, FloatArray], part: float) -> State:
-    """Return the state after a part of a step, without a similarity of the whole among the corrections."""
+    """Return the state after a part of a step, with a similarity of the whole moved from the corrections to it."""
     poses, border = step
-    lenses = len(state.lens)
-    moved = state.moved(part * poses, part * border[:lenses], part * border[lenses:])
-    mean = problem.bundle.followed @ np.concatenate([moved.correction.ravel(), moved.lens])
-    center = problem.base.cam_center_in_model.mean(axis=0)
-    return moved.without_common_motion(mean, problem.bundle.similarity_modes, center)
+    lenses, modes = len(state.lens), problem.bundle.similarity_modes
+    correction, lens = state.correction + part * poses, state.lens + part * border[:lenses]
+    errors = state.errors + part * border[lenses:]
+    mean = problem.bundle.followed @ np.concatenate([correction.ravel(), lens])
+    about = perturbation(mean, problem.base.cam_center_in_model.mean(axis=0))
+    return State(state.geo_from_model @ about, correction - (modes @ mean).reshape(-1, 6), lens, errors)
 
 
 def _slope_of_bundle(problem: Problem, state: State) -> tuple[FloatArray, FloatArray]:
@@ -442,30 +437,3 @@ def posterior_weights(residuals: Residuals) -> dict[str, FloatArray]:
         if kind == CommonErrors.kind:
             weights[kind] = np.minimum(weights[kind], 1.0)
     return weights
-
-
-def _largest_change(before: Residuals, after: Residuals) -> float:
-    return max((float(np.abs(after[kind] - before[kind]).max(initial=0.0)) for kind in after), default=0.0)
-
-
-class _EquilibratedLU:
-    """LU factors of a symmetric, perhaps indefinite matrix, scaled to a largest entry of 1 in rows and columns."""
-
-    def __init__(self, matrix: FloatArray) -> None:
-        self._scale = np.ones(len(matrix))
-        if not len(matrix):
-            return
-        for _ in range(_EQUILIBRATIONS):
-            largest = np.abs(matrix * self._scale[:, None] * self._scale).max(axis=1)
-            self._scale /= np.sqrt(np.where(largest > 0, largest, 1.0))
-        scaled = matrix * self._scale[:, None] * self._scale
-        size = np.linalg.svd(scaled, compute_uv=False)
-        if size[-1] <= _OPEN * size[0]:
-            raise DegenerateGeometryError(_ADVICE)
-        self._factors = lu_factor(scaled)
-
-    def solve(self, right: FloatArray) -> FloatArray:
-        """Return the solution (b, m) for right sides (b, m)."""
-        if not len(self._scale):
-            return right
-        return np.asarray(lu_solve(self._factors, right * self._scale[:, None]) * self._scale[:, None])

@@ -27,10 +27,8 @@ class At:
     Attributes:
         cam_from_model: (n, 3, 3) corrected rotations.
         center: (n, 3) corrected projection centres in `model`.
-        geo_from_model: the similarity.
         lens: (L,) change of the lens.
-        errors: the systematic errors.
-        vector: (p,) their values.
+        vector: (p,) values of the systematic errors.
         turn_by_correction: (n, 3, 3) change of the rotation Exp(δω) by δω: its right Jacobian.
     """
 
@@ -44,29 +42,15 @@ class At:
 
     @classmethod
     def of(cls, state: State, base: CameraPoses, errors: SystematicErrors) -> At:
-        """Return the estimate of a state.
-
-        Args:
-            state: values of all unknowns.
-            base: poses that it corrects.
-            errors: its systematic errors.
-        """
         poses, turn = state.poses(base), skew(state.correction[:, :3])
         # Exp(−(ω + δ)) = Exp(−ω) Exp(−J δ) with J = I + ½ [ω] + ⅙ [ω]² + …
         jacobian = np.eye(3) + turn / 2 + turn @ turn / 6
-        return cls(
-            poses.cam_from_model,
-            poses.cam_center_in_model,
-            state.geo_from_model,
-            state.lens,
-            errors,
-            state.errors,
-            jacobian,
-        )
+        rotation, center = poses.cam_from_model, poses.cam_center_in_model
+        return cls(rotation, center, state.geo_from_model, state.lens, errors, state.errors, jacobian)
 
     def geo_from_cam(self, camera: IntArray) -> FloatArray:
         """Return the rotations geo ← cam (K, 3, 3) of cameras (K,)."""
-        return np.asarray(self.geo_from_model.rotation @ np.swapaxes(self.cam_from_model[camera], 1, 2))
+        return self.geo_from_model.rotation @ np.swapaxes(self.cam_from_model[camera], 1, 2)
 
 
 @dataclass(frozen=True)
@@ -90,18 +74,6 @@ class Slopes:
     by_lens: FloatArray
     by_errors: FloatArray
     by_similarity: FloatArray | None = None
-
-    def whitened(self, root: FloatArray) -> Slopes:
-        """Return residuals and derivatives in units of σ, from root information (M, d, d)."""
-        return Slopes(
-            (root @ self.residual[:, :, None])[:, :, 0],
-            self.row,
-            self.camera,
-            root[self.row] @ self.by_pose,
-            root @ self.by_lens,
-            root @ self.by_errors,
-            None if self.by_similarity is None else root @ self.by_similarity,
-        )
 
 
 class Term(ABC):
@@ -130,7 +102,7 @@ class Term(ABC):
 
     def whitened(self, at: At) -> FloatArray:
         """Return the residuals (M, d) in units of their σ."""
-        return np.asarray((self.root_information @ self.residuals(at)[:, :, None])[:, :, 0])
+        return (self.root_information @ self.residuals(at)[:, :, None])[:, :, 0]
 
 
 @dataclass(frozen=True)
@@ -138,7 +110,6 @@ class Fixes(Term):
     """Measured positions of F cameras: the term L_abs.
 
     Attributes:
-        name: (F) images.
         camera: (F,) index into the cameras.
         position_in_geo: (F, 3) metres.
         root_information: (F, 3, 3) of the fixes' own errors, in 1/m.
@@ -189,7 +160,6 @@ class ControlPoints(Term):
     """Control points against the intersections of their image marks: the term L_gcp; J points, K marks in all.
 
     Attributes:
-        name: (J) points.
         point: (K,) index into the points.
         camera: (K,) index into the cameras.
         bearing_in_cam: (K, 3) unit vectors.
@@ -266,7 +236,6 @@ class Attitudes(Term):
     """Recorded rotations of A cameras: the term L_att.
 
     Attributes:
-        name: (A) images.
         camera: (A,) index into the cameras.
         geo_from_cam: (A, 3, 3), of the nominal camera axes.
         root_information: (A, 3, 3), in 1/rad.
@@ -292,10 +261,12 @@ class Attitudes(Term):
         by_pose = np.zeros((len(self), 3, 6))
         by_pose[:, :, :3] = -by_left @ at.cam_from_model[self.camera] @ at.turn_by_correction[self.camera]
         by_errors = np.zeros((len(self), 3, len(at.vector)))
+        vectors = np.stack([-common, boresight])
+        of_common, of_boresight = np.linalg.inv(right_jacobian_inverse_so3(vectors))  # right Jacobians of Exp
         if (columns := at.errors.columns("common")) is not None:
-            by_errors[:, :, columns] = -by_left @ np.swapaxes(turned, 1, 2) @ _right_jacobian(-common)
+            by_errors[:, :, columns] = -by_left @ np.swapaxes(turned, 1, 2) @ of_common
         if (columns := at.errors.columns("boresight")) is not None:
-            by_errors[:, :, columns] = by_right @ _right_jacobian(boresight)
+            by_errors[:, :, columns] = by_right @ of_boresight
         no_lens = np.zeros((len(self), 3, len(at.lens)))
         return Slopes(residual, np.arange(len(self)), self.camera, by_pose, no_lens, by_errors)
 
@@ -360,25 +331,15 @@ class CommonErrors(Term):
     """Prior of the systematic errors as measurements of the value zero: the surplus of a wrong one is rejected.
 
     One error that every fix of a session shares may be far larger than its σ says: a base station on wrong
-    coordinates. Cauchy's kernel then sets the prior aside, as it does with a bad fix.
-
-    Attributes:
-        errors: whose prior it is.
-        root_information: (B, 3, 3) by block.
+    coordinates. Cauchy's kernel then sets the prior aside, as it does with a bad fix. The root information is
+    (B, 3, 3), by block.
     """
 
     kind: ClassVar[str] = "systematic errors"
 
-    errors: SystematicErrors
     root_information: FloatArray
 
-    @classmethod
-    def of(cls, errors: SystematicErrors) -> CommonErrors:
-        """Return the prior of systematic errors."""
-        return cls(errors, np.array([np.diag(1.0 / np.array(block.sigma)) for block in errors.blocks]))
-
     def residuals(self, at: At) -> FloatArray:
-        """Return the values (B, 3)."""
         return at.vector.reshape(-1, 3)
 
     def slopes(self, at: At) -> Slopes:
@@ -395,8 +356,3 @@ def root_information(covariance: FloatArray) -> FloatArray:
 
 def _projector(direction: FloatArray) -> FloatArray:
     return np.eye(3) - direction[:, :, None] * direction[:, None, :]
-
-
-def _right_jacobian(vector: FloatArray) -> FloatArray:
-    """Return the right Jacobian (3, 3) of Exp at a rotation vector (3,)."""
-    return np.asarray(np.linalg.inv(right_jacobian_inverse_so3(vector[None])[0]))

@@ -59,6 +59,33 @@ def reconstruction_pace(
     )
 
 
+_FIXED_BYTES = 300 << 20  # interpreter, libraries, reserves of the allocator
+# Bytes a pixel of the photograph, and of the image that features are detected in, by thread: measured with
+# photographs of 2.3 and 20.9 megapixels at 600, 1200 and 2400 px, where they are 1.04 to 1.28 times the growth.
+# Photographs that are not doubled: 79 to 91 bytes at 1200, 1600 and 3200 px.
+_PHOTO_BYTES_PX, _DETECTION_BYTES_PX, _OWN_SIZE_DETECTION_BYTES_PX = 4.0, 310.0, 95.0
+# Mapping and the adjustments after it, of the global mapper, which needs more than the incremental one
+# (`examples/benchmarks/many_photographs.py`; docs/benchmarks.md has the runs).
+_FEATURE_BYTES = 133.0
+_OBSERVATION_BYTES = 2500.0
+# Features that COLMAP finds and observations of points, as multiples of `--max-features`: eight surveys had up to
+# 1.5 and, with real photographs, 0.14 to 0.32.
+_FOUND, _OBSERVED = 1.5, 0.35
+
+
+def features_peak_bytes(pixels: int, shrink: float, *, doubled: bool, threads: int) -> int:
+    """Return the peak of a process that detects or matches features in photographs, shrunken by a factor ≥ 1."""
+    detection = _DETECTION_BYTES_PX if doubled else _OWN_SIZE_DETECTION_BYTES_PX
+    a_thread = _PHOTO_BYTES_PX * pixels + detection * pixels / shrink**2
+    return int(_FIXED_BYTES + threads * a_thread)
+
+
+def mapping_peak_bytes(photographs: int, max_features: int) -> int:
+    """Return the peak of mapping and the adjustments after it."""
+    a_photograph = (_FEATURE_BYTES * _FOUND + _OBSERVATION_BYTES * _OBSERVED) * max_features
+    return int(_FIXED_BYTES + photographs * a_photograph)
+
+
 # Fitted to one whole iteration of docs/benchmarks.md: 10 000 … 1 000 000 Gaussians, 0.25 … 1.2 megapixels, a third
 # of the Gaussians in view. 2 cores of an AMD EPYC (AVX-512), CPU backend, 2026-11-21.
 MEASURED_ON = "2 cores of an AMD EPYC"

@@ -1,15 +1,10 @@
-"""Chunks of a reconstruction: parts of features and of matches that processes work on independently.
+"""Features and matches of a large survey in chunks, which are jobs of an engine, and their way into one database.
 
 The plan lies in the partial product of the stage, and a folder for each chunk beside it. A chunk is finished when
 its folder holds `database.db`. The folder's name has a hash of all that the chunk is made from: a finished chunk is
-used again exactly as long as it is right.
-
-Work on one chunk of a reconstruction: a process of its own, which needs no other that runs at the same time.
-
-Reads `ingest/survey.json`, the photographs, the plan in `sfm.partial/`, and for matches the finished features.
-Writes the chunk's folder only, whose lock it holds. The same command again continues a chunk that was interrupted.
-
-Features and matches of a large survey in chunks, as jobs of an engine, and their way into one database.
+reused while photographs, options and COLMAP's version are unchanged. A process that works on a chunk needs no other
+that runs at the same time; it writes the chunk's folder only, whose lock it holds. The same command again continues
+a chunk that was interrupted.
 """
 
 from __future__ import annotations
@@ -50,7 +45,7 @@ from pipelines.sfm.colmap_database import (
     write_frame,
 )
 from pipelines.sfm.features import SfmJob, candidate_pairs, extract_features, match_features
-from pipelines.sfm.memory import chunk_peak_bytes
+from pipelines.sfm.forecast import chunk_peak_bytes
 from pipelines.sfm.options import SfmOptions
 from pipelines.survey.survey import Survey
 
@@ -64,6 +59,9 @@ Kind = Literal["features", "matches"]
 Index = Annotated[int, Field(ge=0)]
 # Matches of an image with its neighbours take about as long as its features: both kinds of chunks take as long.
 _PAIRS_PER_PHOTOGRAPH = 8
+_DRAFT = "unfinished.db"
+_RUN_AGAIN = "run the same command again (finished features and matches are kept)"
+_TITLES: dict[Kind, str] = {"features": "chunks of features", "matches": "chunks of matches"}
 
 
 class Chunk(Product):
@@ -71,7 +69,6 @@ class Chunk(Product):
 
     Attributes:
         name: unique in the plan, for people and for the command line.
-        kind: what is computed.
         key: hash of all that the chunk is made from.
         images: indices of the photographs, ascending.
         pairs: indices of the photographs to match, for a chunk of matches.
@@ -84,54 +81,35 @@ class Chunk(Product):
     pairs: tuple[tuple[Index, Index], ...] = ()
 
     def folder(self, partial: Path) -> Path:
-        """Return the folder of the chunk in the partial product of the stage."""
         return partial / FOLDER / f"{self.name}-{self.key}"
 
     def database(self, partial: Path) -> Path:
-        """Return the database of the chunk, which exists when the chunk is finished."""
         return self.folder(partial) / DATABASE
 
     def is_finished(self, partial: Path) -> bool:
-        """Return whether the chunk is finished."""
         return self.database(partial).is_file()
 
 
 class ChunkPlan(Product):
-    """Chunks of a reconstruction.
-
-    Attributes:
-        format_version: version of the format.
-        options: of the stage.
-        chunks: those of features before those of matches.
-    """
+    """Chunks of a reconstruction, those of features before those of matches."""
 
     format_version: Literal[1] = 1
     options: SfmOptions
     chunks: tuple[Chunk, ...]
 
     def of_kind(self, kind: Kind) -> tuple[Chunk, ...]:
-        """Return the chunks of a kind."""
         return tuple(chunk for chunk in self.chunks if chunk.kind == kind)
-
-
-def is_chunked(photographs: int, options: SfmOptions) -> bool:
-    """Return whether a survey of so many photographs is worked in chunks."""
-    return options.import_model is None and photographs > options.chunk_size
 
 
 def plan_chunks(survey: Survey, pairs: IntArray, options: SfmOptions) -> ChunkPlan:
     """Return the chunks of a survey, of about equal size and about `options.chunk_size` photographs.
 
     Photographs and pairs are cut in their order, which for photographs is that of the flight as a rule: a chunk of
-    matches needs the features of few chunks.
-
-    Args:
-        survey: has the photographs.
-        pairs: (P, 2) indices of the photographs to match, sorted.
-        options: of the stage.
+    matches needs the features of few chunks. The pairs to match (P, 2) are sorted.
     """
-    features = _cut(np.arange(len(survey.images)), options.chunk_size)
-    matches = _cut(pairs, options.chunk_size * _PAIRS_PER_PHOTOGRAPH)
+    count, size = len(survey.images), options.chunk_size
+    features = np.array_split(np.arange(count), max(-(-count // size), 1))
+    matches = np.array_split(pairs, max(-(-len(pairs) // (size * _PAIRS_PER_PHOTOGRAPH)), 1))
     common = _digest(
         [prior.model_dump(mode="json") for prior in survey.cameras],
         options.model_dump(include={"camera_model", "max_image_size", "max_features", "doubled"}),
@@ -152,25 +130,12 @@ def plan_chunks(survey: Survey, pairs: IntArray, options: SfmOptions) -> ChunkPl
     return ChunkPlan(options=options.model_copy(update={"threads": -1}), chunks=tuple(chunks))
 
 
-def _cut(rows: IntArray, size: int) -> list[IntArray]:
-    return np.array_split(rows, max(-(-len(rows) // size), 1))
-
-
 def _digest(*content: object) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
-_DRAFT = "unfinished.db"
-_RUN_AGAIN = "run the same command again (finished features and matches are kept)"
-
-
 def work_chunk(workspace: Workspace, name: str, progress: Progress) -> bool:
     """Work on a chunk until it is finished, and return whether there was anything to do.
-
-    Args:
-        workspace: in which `georef sfm` has planned the chunks.
-        name: of the chunk.
-        progress: shows its photographs or pairs.
 
     Raises:
         InputError: no such chunk is planned, or a photograph has changed.
@@ -178,7 +143,7 @@ def work_chunk(workspace: Workspace, name: str, progress: Progress) -> bool:
         GeorefError: a crash of COLMAP, or a full disk.
     """
     partial = workspace.partial(BY_NAME["sfm"])
-    chunk = _planned(workspace, load_plan(workspace), name)
+    chunk = _planned(workspace, name)
     folder = chunk.folder(partial)
     with WriteLock(folder).hold(f"sfm --chunk {name}"):
         if chunk.is_finished(partial):
@@ -191,28 +156,8 @@ def work_chunk(workspace: Workspace, name: str, progress: Progress) -> bool:
     return True
 
 
-def load_plan(workspace: Workspace) -> ChunkPlan:
-    """Return the plan of the chunks of a workspace.
-
-    Raises:
-        InputError: there is none.
-    """
-    path = workspace.partial(BY_NAME["sfm"]) / PLAN
-    if not path.is_file():
-        raise InputError(f"no chunks are planned: `georef sfm {workspace.root}` plans them", path=path)
-    return load_json(ChunkPlan, path)
-
-
 def write_chunk(arguments: Mapping[str, Any], progress: Progress) -> None:
-    """Compute the features or matches of a chunk, in a child process.
-
-    Args:
-        arguments: paths of `survey`, `images` and `partial`, and the `name` of the chunk.
-        progress: shows its photographs or pairs.
-
-    Raises:
-        GeorefError: as `work_chunk`.
-    """
+    """Compute the features or matches of a chunk, in a child process; paths and name are among the arguments."""
     partial = Path(arguments["partial"])
     plan = load_json(ChunkPlan, partial / PLAN)
     chunk = next(chunk for chunk in plan.chunks if chunk.name == arguments["name"])
@@ -258,35 +203,26 @@ def copy_finished(
         raise InputError(f"{error.message}: it was removed; run `georef sfm` again", path=database) from error
 
 
-def _planned(workspace: Workspace, plan: ChunkPlan, name: str) -> Chunk:
-    for chunk in plan.chunks:
-        if chunk.name == name:
-            count = len(load_json(Survey, workspace.path(SURVEY)).images)
-            if max((*chunk.images, *(index for pair in chunk.pairs for index in pair)), default=0) >= count:
-                raise InputError(
-                    f"{name} has more photographs than the survey: `georef sfm {workspace.root}` plans anew",
-                    path=workspace.partial(BY_NAME["sfm"]) / PLAN,
-                )
-            return chunk
-    names = f"{plan.chunks[0].name} … {plan.chunks[-1].name}" if plan.chunks else "none"
-    raise InputError(f"{name!r} is none of the chunks {names}", field="--chunk")
-
-
-_TITLES: dict[Kind, str] = {
-    "features": "chunks of features",
-    "matches": "chunks of matches",
-}
+def _planned(workspace: Workspace, name: str) -> Chunk:
+    path = workspace.partial(BY_NAME["sfm"]) / PLAN
+    if not path.is_file():
+        raise InputError(f"no chunks are planned: `georef sfm {workspace.root}` plans them", path=path)
+    chunks = load_json(ChunkPlan, path).chunks
+    chunk = next((chunk for chunk in chunks if chunk.name == name), None)
+    if chunk is None:
+        names = f"{chunks[0].name} … {chunks[-1].name}" if chunks else "none"
+        raise InputError(f"{name!r} is none of the chunks {names}", field="--chunk")
+    count = len(load_json(Survey, workspace.path(SURVEY)).images)
+    if max((*chunk.images, *(index for pair in chunk.pairs for index in pair)), default=0) >= count:
+        message = f"{name} has more photographs than the survey: `georef sfm {workspace.root}` plans anew"
+        raise InputError(message, path=path)
+    return chunk
 
 
 def work_in_chunks(stage: StageRun, survey: Survey, options: SfmOptions) -> ChunkPlan:
     """Compute features and matches in chunks that the engine in use shares out, and return their plan.
 
-    Chunks that an earlier run has finished are kept.
-
-    Args:
-        stage: run of `sfm`; its partial product receives plan and chunks.
-        survey: the photographs.
-        options: of the stage.
+    The partial product of the stage receives plan and chunks. Chunks that an earlier run has finished are kept.
 
     Raises:
         GeorefError: chunks have failed; the others are finished and kept.
@@ -300,12 +236,6 @@ def work_in_chunks(stage: StageRun, survey: Survey, options: SfmOptions) -> Chun
 
 
 def _work(stage: StageRun, survey: Survey, plan: ChunkPlan, kind: Kind) -> None:
-    """Run those chunks of a kind that are not finished.
-
-    Raises:
-        GeorefError: at least one has failed.
-    """
-
     def ended(_: JobEnd) -> None:
         finished = sum(chunk.is_finished(stage.out) for chunk in plan.chunks)
         stage.record_progress(f"{finished} of {len(plan.chunks)} chunks")
@@ -322,7 +252,6 @@ def _work(stage: StageRun, survey: Survey, plan: ChunkPlan, kind: Kind) -> None:
 
 
 def _job(stage: StageRun, survey: Survey, plan: ChunkPlan, chunk: Chunk) -> Job:
-    """Return the command that works on a chunk, with all that it reads and writes."""
     root = stage.workspace.root.absolute()
     if chunk.kind == "features":
         images = photograph_folder(stage.workspace, survey.image_dir)
@@ -345,14 +274,7 @@ def _job(stage: StageRun, survey: Survey, plan: ChunkPlan, chunk: Chunk) -> Job:
 
 
 def join_chunks(colmap: Any, job: SfmJob, plan: ChunkPlan, partial: Path, progress: Progress) -> None:
-    """Copy the features and matches of all chunks into the database of the job, which is made anew.
-
-    Args:
-        colmap: the pycolmap module.
-        job: inputs of the reconstruction.
-        plan: its chunks, all of them finished.
-        partial: the partial product of the stage.
-        progress: shows the chunks.
+    """Copy the features and matches of all finished chunks into the database of the job, which is made anew.
 
     Raises:
         InputError: a chunk is damaged; it was removed, and the same command computes it again.

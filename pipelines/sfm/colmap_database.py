@@ -3,26 +3,19 @@
 An image has the same number in every database of a survey: its place in the survey, counted from 1. Rows of
 features and matches are therefore copied as they are. COLMAP's own `Database.merge` renumbers images and refuses
 databases that share one, as those of matches do.
-
-COLMAP's bundle adjustment with measured camera positions as priors, under Cauchy's kernel.
 """
 
 from __future__ import annotations
 
-import math
 import sqlite3
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-from numpy.typing import ArrayLike
 
 from pipelines.core.errors import DamagedPartialError, InputError, storage_error
 from pipelines.core.files import remove, replace_file
 from pipelines.core.stages import SURVEY
-from pipelines.robust.statistics import CAUCHY_SCALE2
 from pipelines.sfm.options import SfmOptions
 from pipelines.survey.survey import CameraPrior, Survey
 
@@ -31,14 +24,7 @@ MATCHES = ("matches", "two_view_geometries")
 
 
 def write_frame(colmap: Any, database: Path, survey: Survey, images: Iterable[int], options: SfmOptions) -> None:
-    """Write cameras and images into a database, unless an interrupted run has already done so.
-
-    Args:
-        colmap: the pycolmap module.
-        database: path; made if missing.
-        survey: has the images and the priors of their cameras.
-        images: indices into the images of the survey.
-        options: have the camera model.
+    """Write cameras and images (indices) into a database, made if missing, unless they are in it already.
 
     Raises:
         InputError: a camera prior is none of COLMAP's cameras.
@@ -70,11 +56,10 @@ def rename_images(colmap: Any, path: Path, names: dict[str, str]) -> None:
 
 
 def copy_rows(source: Path, target: Path, tables: Iterable[str], images: Iterable[int] | None = None) -> None:
-    """Copy rows of features or matches from one database of a survey into another; present rows stay.
+    """Copy rows of features or matches from a finished database of a survey into another; present rows stay.
 
     Args:
-        source: finished database, which is not changed.
-        target: database with the same numbers of images.
+        source, target: have the same numbers of images.
         tables: `FEATURES` or `MATCHES`.
         images: indices of the images whose features are copied; None: all rows.
 
@@ -104,13 +89,7 @@ def copy_rows(source: Path, target: Path, tables: Iterable[str], images: Iterabl
 
 
 def finish_database(draft: Path, final: Path, *, without: Iterable[str] = ()) -> None:
-    """Make a draft the final database: one whole file, on the disk.
-
-    Args:
-        draft: path of a database that is no longer written.
-        final: its new path.
-        without: tables whose rows are dropped.
-    """
+    """Make a draft the final database, without the rows of some tables: one whole file, on the disk."""
     with closing(sqlite3.connect(draft, isolation_level=None)) as connection:
         for table in without:
             connection.execute(f"delete from {table}")
@@ -120,7 +99,6 @@ def finish_database(draft: Path, final: Path, *, without: Iterable[str] = ()) ->
 
 
 def remove_database(path: Path) -> None:
-    """Remove a database and its journals."""
     for suffix in ("", "-wal", "-shm", "-journal"):
         remove(path.with_name(path.name + suffix))
 
@@ -160,11 +138,6 @@ def _write_camera(colmap: Any, database: Any, prior: CameraPrior, options: SfmOp
 
 
 def _copy_shared_params(colmap: Any, prior: CameraPrior, camera: Any) -> None:
-    """Copy the parameters of the prior that both camera models have: focal length, centre, distortion.
-
-    Raises:
-        InputError: COLMAP has no camera of that model with that number of parameters.
-    """
     try:
         original = colmap.Camera(
             model=prior.model, width=prior.width, height=prior.height, params=list(prior.params)
@@ -181,60 +154,3 @@ def _copy_shared_params(colmap: Any, prior: CameraPrior, camera: Any) -> None:
     for index, name in enumerate(part.strip() for part in camera.params_info.split(",")):
         params[index] = by_name.get(name, params[index])
     camera.params = params
-
-
-@dataclass(frozen=True)
-class PriorAdjustment:
-    """Settings of an adjustment with position priors.
-
-    Attributes:
-        iterations: most of them.
-        gate_m: limit of an inlier when COLMAP aligns the model with the priors, before it adjusts.
-        threads: of the solver; -1: all.
-        seed: of COLMAP's alignment.
-    """
-
-    iterations: int
-    gate_m: float
-    threads: int = -1
-    seed: int = 0
-
-    def adjuster(self, colmap: Any, model: Any, priors: Sequence[Any]) -> Any:
-        """Return the adjuster of all cameras and points of a `pycolmap.Reconstruction`.
-
-        Args:
-            colmap: the pycolmap module.
-            model: the reconstruction; solving moves it into the frame of the priors.
-            priors: from `position_prior`.
-        """
-        bundle = colmap.BundleAdjustmentConfig()
-        for image_id in model.reg_image_ids():
-            bundle.add_image(image_id)
-        return colmap.create_pose_prior_bundle_adjuster(
-            self._image_options(colmap), self._prior_options(colmap), bundle, priors, model
-        )
-
-    def _image_options(self, colmap: Any) -> Any:
-        options = colmap.BundleAdjustmentOptions()
-        options.print_summary = False
-        options.ceres.solver_options.max_num_iterations = self.iterations
-        options.ceres.solver_options.num_threads = self.threads
-        return options
-
-    def _prior_options(self, colmap: Any) -> Any:
-        options = colmap.PosePriorBundleAdjustmentOptions()
-        options.ceres.prior_position_loss_function_type = colmap.LossFunctionType.CAUCHY
-        options.ceres.prior_position_loss_scale = math.sqrt(CAUCHY_SCALE2[3])
-        options.alignment_ransac.max_error = self.gate_m
-        options.alignment_ransac.random_seed = self.seed
-        return options
-
-
-def position_prior(colmap: Any, image: Any, position: ArrayLike, covariance: ArrayLike) -> Any:
-    """Return the prior of a `pycolmap.Image`: its centre (3,) in metres with a covariance (3, 3)."""
-    return colmap.PosePrior(
-        corr_data_id=image.data_id,
-        position=position,
-        position_covariance=covariance,
-        coordinate_system=colmap.PosePriorCoordinateSystem.CARTESIAN,
-    )

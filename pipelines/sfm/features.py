@@ -1,14 +1,13 @@
-"""Features of photographs, and matches of pairs, in a database of COLMAP: for a whole survey, or for a chunk of it.
+"""Pairs of photographs to match, and their features and matches in a database of COLMAP: of a survey, or a chunk.
 
-Both work in small steps, which survive an interruption.
-
-Choice of the image pairs to match, from camera positions and viewing directions.
+Pairs are chosen by positions and viewing directions. COLMAP works in small steps, which survive an interruption.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from pipelines.core.machine import chosen_threads
 from pipelines.core.progress import Progress
-from pipelines.core.types import BoolArray, FloatArray, IntArray
+from pipelines.core.types import FloatArray, IntArray
 from pipelines.formats.image_file import read_bytes, require_unchanged
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.sfm.colmap_database import rename_images, write_frame
@@ -30,25 +29,7 @@ _SECTORS = 8
 _CANDIDATES_PER_NEIGHBOR = 8
 
 
-@dataclass(frozen=True)
-class CameraDirections:
-    """Positions and viewing directions of N images.
-
-    Attributes:
-        position_in_geo: (N, 3) metres, NaN where unknown.
-        axis_in_geo: (N, 3) unit vectors of the optical axes, NaN where unknown.
-    """
-
-    position_in_geo: FloatArray
-    axis_in_geo: FloatArray
-
-
-def all_pairs(count: int) -> IntArray:
-    """Return every pair (P, 2), i < j, of `count` images."""
-    return np.stack(np.triu_indices(count, k=1), axis=1)
-
-
-def select_pairs(cameras: CameraDirections, max_neighbors: int) -> IntArray:
+def select_pairs(position: FloatArray, axis: FloatArray, max_neighbors: int) -> IntArray:
     """Return the pairs (P, 2), i < j, of images that may show the same place; sorted, unique.
 
     1. Half of an image's neighbours are the nearest with a similar viewing direction.
@@ -57,10 +38,10 @@ def select_pairs(cameras: CameraDirections, max_neighbors: int) -> IntArray:
     3. Images without a position are paired with all others, and each image with its successor in the list.
 
     Args:
-        cameras: of N images.
+        position: (N, 3) metres in geo, NaN where unknown.
+        axis: (N, 3) unit vectors of the optical axes in geo, NaN where unknown.
         max_neighbors: limit of the neighbours in steps 1 and 2.
     """
-    position = cameras.position_in_geo
     count = len(position)
     located = np.flatnonzero(np.isfinite(position).all(axis=1))
     chosen = {(i, i + 1) for i in range(count - 1)}
@@ -71,15 +52,11 @@ def select_pairs(cameras: CameraDirections, max_neighbors: int) -> IntArray:
         reach = min(len(located), max_neighbors * _CANDIDATES_PER_NEIGHBOR + 1)
         for i in map(int, located):
             near = located[tree.query(position[i], k=reach)[1]]
-            near = near[(near != i) & _look_alike(cameras.axis_in_geo, i, near)]
+            looks_away = axis[near] @ axis[i] < np.cos(np.radians(_MAX_ANGLE_DEG))  # unknown (NaN) passes
+            near = near[(near != i) & ~looks_away]
             for j in _spread(position[near] - position[i], max_neighbors):
                 chosen.add((min(i, int(near[j])), max(i, int(near[j]))))
     return np.array(sorted(chosen), dtype=np.int64).reshape(-1, 2)
-
-
-def _look_alike(axis: FloatArray, i: int, others: IntArray) -> BoolArray:
-    cosine = axis[others] @ axis[i]
-    return np.asarray(~(cosine < np.cos(np.radians(_MAX_ANGLE_DEG))))  # unknown (NaN) passes
 
 
 def _spread(offset: FloatArray, limit: int) -> list[int]:
@@ -110,13 +87,22 @@ class SfmJob:
         survey: photographs with priors of their cameras, positions and attitudes.
         images: folder of the photographs.
         database: path of COLMAP's database; an existing one is continued.
-        options: of the stage.
     """
 
     survey: Survey
     images: Path
     database: Path
     options: SfmOptions
+
+    @property
+    def sparse(self) -> Path:
+        """Folder of the model."""
+        return self.database.parent / "sparse"
+
+    @cached_property
+    def pairs(self) -> IntArray:
+        """Pairs to match, as indices (P, 2) into the images of the survey."""
+        return candidate_pairs(self.survey, self.options)
 
 
 def candidate_pairs(survey: Survey, options: SfmOptions) -> IntArray:
@@ -128,7 +114,7 @@ def candidate_pairs(survey: Survey, options: SfmOptions) -> IntArray:
     count = len(survey.images)
     located = any(image.fix for image in survey.images)
     if options.pairs == "exhaustive" or count <= _EXHAUSTIVE_UP_TO or not located:
-        return all_pairs(count)
+        return np.stack(np.triu_indices(count, k=1), axis=1)
     unknown = (np.nan, np.nan, np.nan)
     position = np.array([image.fix.position_in_geo if image.fix else unknown for image in survey.images])
     axis = np.array(
@@ -137,17 +123,11 @@ def candidate_pairs(survey: Survey, options: SfmOptions) -> IntArray:
             for image in survey.images
         ]
     )
-    return select_pairs(CameraDirections(position, axis), options.max_neighbors)
+    return select_pairs(position, axis, options.max_neighbors)
 
 
 def extract_features(colmap: Any, job: SfmJob, images: Sequence[int], progress: Progress) -> None:
-    """Detect the features of photographs, and write them into the database.
-
-    Args:
-        colmap: the pycolmap module.
-        job: inputs.
-        images: indices into the images of the survey.
-        progress: shows the photographs.
+    """Detect the features of photographs, given as indices, and write them into the database.
 
     Raises:
         InputError: a photograph is not that of the survey, or a camera prior is none of COLMAP's cameras.
@@ -181,14 +161,7 @@ def extract_features(colmap: Any, job: SfmJob, images: Sequence[int], progress: 
 
 
 def match_features(colmap: Any, job: SfmJob, pairs: IntArray, progress: Progress) -> None:
-    """Match pairs of photographs whose features are in the database, and verify the matches.
-
-    Args:
-        colmap: the pycolmap module.
-        job: inputs.
-        pairs: (P, 2) indices into the images of the survey.
-        progress: shows the pairs.
-    """
+    """Match pairs (P, 2) of photographs whose features are in the database, and verify the matches."""
     matching, pairing = colmap.FeatureMatchingOptions(), colmap.ImportedPairingOptions()
     matching.num_threads = chosen_threads(job.options.threads)
     verification = colmap.TwoViewGeometryOptions()

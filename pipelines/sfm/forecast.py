@@ -1,17 +1,20 @@
-"""Forecast of a reconstruction: mapper, chunks, time and memory for the photographs of a survey."""
+"""Forecast of a reconstruction by COLMAP: mapper, chunks, time and memory for the photographs of a survey.
+
+`jobs.costs` has the constants. The largest photographs of a survey have `photo_px` pixels, width and height.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 
-from pipelines.core.machine import free_main_memory_bytes, thread_count
+from pipelines.core.machine import chosen_threads, free_main_memory_bytes, thread_count
 from pipelines.core.sentences import about
-from pipelines.jobs.costs import ReconstructionPace, reconstruction_pace
-from pipelines.sfm.chunks import is_chunked
+from pipelines.jobs.costs import ReconstructionPace, features_peak_bytes, mapping_peak_bytes, reconstruction_pace
 from pipelines.sfm.mapping import MapperName, chosen_mapper
-from pipelines.sfm.memory import peak_bytes, why_too_large
 from pipelines.sfm.options import SfmOptions
+
+_USABLE = 0.9  # of the free memory: other programs grow, too
 
 
 @dataclass(frozen=True)
@@ -19,10 +22,7 @@ class ReconstructionForecast:
     """Forecast of a reconstruction.
 
     Attributes:
-        photographs: number of photographs.
-        mapper: that `auto` chooses, or the user.
         chunks: of features; 1: the survey is worked in one process.
-        seconds: about, on this machine.
         peak_bytes: predicted peak of the memory.
         free_bytes: memory that is free; None: unknown.
         refusal: reason why it would not fit; empty: it fits.
@@ -46,21 +46,15 @@ class ReconstructionForecast:
         ]
 
 
-def forecast(photographs: int, photo_px: tuple[int, int], options: SfmOptions) -> ReconstructionForecast | None:
-    """Return the forecast of a reconstruction; None for an imported model.
-
-    Args:
-        photographs: number of photographs.
-        photo_px: width and height of the largest.
-        options: of the reconstruction.
-    """
-    if options.import_model is not None:
-        return None
+def forecast_reconstruction(
+    photographs: int, photo_px: tuple[int, int], options: SfmOptions
+) -> ReconstructionForecast:
+    """Return the forecast of a reconstruction on this machine."""
     free_bytes = free_main_memory_bytes()
     return ReconstructionForecast(
         photographs=photographs,
         mapper=chosen_mapper(photographs, options),
-        chunks=math.ceil(photographs / options.chunk_size) if is_chunked(photographs, options) else 1,
+        chunks=max(math.ceil(photographs / options.chunk_size), 1),
         seconds=pace(photographs, photo_px, options).total_s / thread_count(),
         peak_bytes=peak_bytes(photographs, photo_px, options),
         free_bytes=free_bytes,
@@ -69,15 +63,53 @@ def forecast(photographs: int, photo_px: tuple[int, int], options: SfmOptions) -
 
 
 def pace(photographs: int, photo_px: tuple[int, int], options: SfmOptions) -> ReconstructionPace:
-    """Return about how many seconds one core needs for each step; arguments as for `forecast`."""
-    shrink = max(max(photo_px) / options.max_image_size, 1.0)
+    """Return about how many seconds one core needs for each step."""
     every = photographs * (photographs - 1) / 2
     # Half of the largest number of neighbours: most pairs are chosen by both of their images.
     pairs = every if options.pairs == "exhaustive" else min(every, photographs * options.max_neighbors / 2)
     return reconstruction_pace(
         photographs,
-        photo_px[0] * photo_px[1] / shrink**2 / 1e6,
+        photo_px[0] * photo_px[1] / options.shrink(photo_px) ** 2 / 1e6,
         pairs,
         doubled=options.doubles(photo_px),
         max_features=options.max_features,
+    )
+
+
+def chunk_peak_bytes(photo_px: tuple[int, int], options: SfmOptions, threads: int = 1) -> int:
+    """Return the peak of a process that detects or matches features in so many threads."""
+    pixels, doubled = photo_px[0] * photo_px[1], options.doubles(photo_px)
+    return features_peak_bytes(pixels, options.shrink(photo_px), doubled=doubled, threads=threads)
+
+
+def peak_bytes(photographs: int, photo_px: tuple[int, int], options: SfmOptions) -> int:
+    """Return the peak of the memory of a reconstruction on this machine."""
+    features = chunk_peak_bytes(photo_px, options, chosen_threads(options.threads))
+    return max(features, mapping_peak_bytes(photographs, options.max_features))
+
+
+def why_too_large(
+    photographs: int, photo_px: tuple[int, int], options: SfmOptions, free_bytes: int | None
+) -> str | None:
+    """Return why a reconstruction would not fit into the free memory, and what would; None: it fits.
+
+    Into an unknown memory (None) everything fits.
+    """
+    needed = peak_bytes(photographs, photo_px, options)
+    if free_bytes is None or needed <= _USABLE * free_bytes:
+        return None
+
+    def fits(max_features: int) -> bool:
+        smaller = options.model_copy(update={"max_features": max_features})
+        return peak_bytes(photographs, photo_px, smaller) <= _USABLE * free_bytes
+
+    fewer = options.max_features
+    while fewer > 1000 and not fits(fewer):
+        fewer -= 500
+    advice = f"use --max-features {fewer}" if fits(fewer) else "reconstruct elsewhere and use --import"
+    mapper = chosen_mapper(photographs, options)
+    return (
+        f"SfM of {photographs} photographs needs about {needed / 2**30:.1f} GiB at its peak ({mapper} mapper, "
+        f"{options.max_features} features a photograph) and {free_bytes / 2**30:.1f} GiB are free: {advice}, or a "
+        "machine with more memory"
     )

@@ -1,17 +1,14 @@
-"""Mapping by COLMAP: cameras and points from features and matches in a database.
-
-Last adjustment of a reconstruction: the principal point is free, and image observations are weighted robustly.
+"""Mapping by COLMAP: cameras and points from features and matches in a database, and their adjustments.
 
 COLMAP adjusts by plain least squares. Wrong matches that pass its filter of 4 px give the residuals longer tails
-than noise has, and cause larger errors of lens and poses than noise does. This adjustment weights the observations
-by Cauchy's kernel. Later computations from the model (`geometry/bundle.py`) assume these weights.
-
-Adjustment with the measured positions, which removes the drift of a large reconstruction.
+than noise has, and cause larger errors of lens and poses than noise does. The last adjustment frees the principal
+point and weights the observations by Cauchy's kernel. Later computations from the model (`geometry/bundle.py`)
+assume these weights.
 
 The errors of neighbouring photographs add up over a large flight: a model bends at hardly any cost, and the steps
-of a plain adjustment along such a bend are tiny. An adjustment with the positions as priors straightens it at once.
-This is a start only. The last adjustment follows, by the photographs alone: otherwise the fixes would count twice,
-here and where the model is placed on Earth.
+of a plain adjustment along such a bend are tiny. An adjustment with the measured positions as priors straightens it
+at once. This is a start only. The last adjustment follows, by the photographs alone: otherwise the fixes would
+count twice, here and where the model is placed on Earth.
 """
 
 from __future__ import annotations
@@ -19,13 +16,14 @@ from __future__ import annotations
 import logging
 import math
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pipelines.core.errors import ConvergenceError
 from pipelines.core.machine import chosen_threads
@@ -34,8 +32,7 @@ from pipelines.core.types import FloatArray, Vector3
 from pipelines.formats.colmap import flatten
 from pipelines.geometry.cameras import project_each
 from pipelines.geometry.similarity import umeyama
-from pipelines.robust.statistics import CAUCHY_95, cauchy_weight, median_chi2, rayleigh_sigma
-from pipelines.sfm.colmap_database import PriorAdjustment, position_prior
+from pipelines.robust.statistics import CAUCHY_95, CAUCHY_SCALE2, cauchy_weight, median_chi2, rayleigh_sigma
 from pipelines.sfm.features import SfmJob
 from pipelines.sfm.options import SfmOptions
 
@@ -54,15 +51,7 @@ _REGISTERED = 0.95  # of the photographs: if the global mapper has less, the inc
 
 @dataclass(frozen=True)
 class MapperRun:
-    """Files and effort of a mapper.
-
-    Attributes:
-        database: path of COLMAP's database.
-        images: folder of the photographs, for the colours of points.
-        scratch: empty folder for COLMAP's own output.
-        threads: number of threads.
-        seed: of every random choice.
-    """
+    """Files and effort of a mapper; the folder `scratch` is empty, for COLMAP's own output."""
 
     database: Path
     images: Path
@@ -83,11 +72,6 @@ def map_database(colmap: Any, job: SfmJob, progress: Progress) -> list[Any]:
 
     With `--mapper auto`, a global mapper that leaves out more than one photograph of twenty is followed by the
     incremental one, and the larger model counts.
-
-    Args:
-        colmap: the pycolmap module.
-        job: inputs of the reconstruction.
-        progress: shows the photographs.
     """
     count = len(job.survey.images)
     mapper = chosen_mapper(count, job.options)
@@ -106,11 +90,7 @@ def map_database(colmap: Any, job: SfmJob, progress: Progress) -> list[Any]:
 def run_mapper(colmap: Any, mapper: MapperName, run: MapperRun, registered: Callable[[], None]) -> list[Any]:
     """Return the models of a mapper, the largest first.
 
-    Args:
-        colmap: the pycolmap module.
-        mapper: its name.
-        run: files and effort.
-        registered: called when the incremental mapper has registered a photograph.
+    The incremental mapper calls `registered` when it has registered a photograph.
     """
     if mapper == "global":
         options = colmap.GlobalPipelineOptions()
@@ -128,10 +108,10 @@ def run_mapper(colmap: Any, mapper: MapperName, run: MapperRun, registered: Call
 
 
 def _models(colmap: Any, mapper: MapperName, job: SfmJob, progress: Progress) -> list[Any]:
-    threads, seed = chosen_threads(job.options.threads), job.options.seed
     title = "global mapping" if mapper == "global" else "mapping"
     with progress.task(title, len(job.survey.images)) as task, _scratch(job.database.parent) as scratch:
-        run = MapperRun(job.database, job.images, scratch, threads, seed)
+        threads = chosen_threads(job.options.threads)
+        run = MapperRun(job.database, job.images, scratch, threads, job.options.seed)
         models = run_mapper(colmap, mapper, run, lambda: task.advance(1))
         if mapper == "global":
             task.advance(len(job.survey.images))
@@ -171,46 +151,29 @@ _LEAST_GAIN_OF_FEW = 1e-6
 _COARSE = 10.0  # factor on the least gain while the scale of the kernel still changes
 
 
-@dataclass(frozen=True)
-class LastAdjustment:
-    """Options of the last adjustment.
+def adjust_finally(
+    colmap: Any, model: Any, *, principal_point: bool = True, threads: int = -1, progress: Progress = SILENT
+) -> None:
+    """Adjust a `pycolmap.Reconstruction` in place; one without points is left as it is.
 
-    Attributes:
-        principal_point: free the principal point, if there are ten images or more. The mapper holds it at the
-            image's centre.
-        threads: of the solver; -1: all cores.
-    """
-
-    principal_point: bool = True
-    threads: int = -1
-
-
-def adjust_finally(colmap: Any, model: Any, options: LastAdjustment, progress: Progress = SILENT) -> None:
-    """Adjust a `pycolmap.Reconstruction` in place.
-
-    1. The principal point is adjusted with all other parameters. For most lenses it lies a few pixels from the
-       image's centre; without it, points move by decimetres when the cameras are aligned with GNSS. Fewer than ten
-       images do not determine it. A result far from the image's centre is refused with a warning.
+    1. The principal point, if it is free, is adjusted with all other parameters. For most lenses it lies a few
+       pixels from the image's centre, where the mapper holds it; without it, points move by decimetres when the
+       cameras are aligned with GNSS. Fewer than ten images do not determine it. A result far from the image's
+       centre is refused with a warning.
     2. Up to three adjustments with Cauchy's kernel follow. The scale of the kernel comes from the residuals of the
        adjustment before, until that scale converges. No observation is removed: an outlier has nearly no weight.
-
-    Args:
-        colmap: the pycolmap module.
-        model: the reconstruction; one without points is left as is.
-        options: of the adjustment.
-        progress: shows the rounds.
 
     Raises:
         ConvergenceError: COLMAP found no solution.
     """
     if model.num_points3D() == 0:
         return
-    free = options.principal_point and model.num_reg_images() >= _FEWEST_FOR_PRINCIPAL_POINT
+    free = principal_point and model.num_reg_images() >= _FEWEST_FOR_PRINCIPAL_POINT
     adjustment = colmap.BundleAdjustmentOptions()
     adjustment.print_summary = False
     least_gain = min(_LEAST_GAIN / model.compute_num_observations(), _LEAST_GAIN_OF_FEW)
     adjustment.ceres.solver_options.function_tolerance = _COARSE * least_gain
-    adjustment.ceres.solver_options.num_threads = options.threads
+    adjustment.ceres.solver_options.num_threads = threads
     adjustment.ceres.solver_options.max_num_iterations = _MOST_STEPS
     with progress.task("last adjustment", _ROBUST_ROUNDS + int(free)) as task:
         if free:
@@ -238,7 +201,12 @@ def _free_principal_point(colmap: Any, model: Any, adjustment: Any) -> bool:
     adjustment.refine_principal_point = True
     before = {key: camera.params.copy() for key, camera in model.cameras.items()}
     _adjust(colmap, model, adjustment)
-    astray = [key for key, camera in model.cameras.items() if _has_left_the_middle(camera)]
+    astray = []
+    for key, camera in model.cameras.items():
+        point = np.asarray(camera.params)[camera.principal_point_idxs()]
+        moved = np.linalg.norm(point - [camera.width / 2, camera.height / 2])
+        if moved > _FURTHEST_PRINCIPAL_POINT * max(camera.width, camera.height):
+            astray.append(key)
     if not astray:
         return True
     log.warning("the principal point of camera %d is not determined and stays where it was", astray[0])
@@ -247,12 +215,6 @@ def _free_principal_point(colmap: Any, model: Any, adjustment: Any) -> bool:
     adjustment.refine_principal_point = False
     _adjust(colmap, model, adjustment)
     return False
-
-
-def _has_left_the_middle(camera: Any) -> bool:
-    point = np.asarray(camera.params)[camera.principal_point_idxs()]
-    moved = np.linalg.norm(point - [camera.width / 2, camera.height / 2])
-    return bool(moved > _FURTHEST_PRINCIPAL_POINT * max(camera.width, camera.height))
 
 
 def _adjust_robustly(colmap: Any, model: Any, adjustment: Any, least_gain: float, task: ProgressTask) -> None:
@@ -289,6 +251,47 @@ _LEAST_SIGMA = 1e-6  # of the extent, for positions without noise
 _MOST_ITERATIONS = 50
 
 
+def position_adjuster(
+    colmap: Any,
+    model: Any,
+    positions: Sequence[tuple[Any, ArrayLike, ArrayLike]],
+    *,
+    iterations: int,
+    gate_m: float,
+    threads: int = -1,
+    seed: int = 0,
+) -> Any:
+    """Return COLMAP's adjuster of all cameras and points, with camera positions as priors under Cauchy's kernel.
+
+    Args:
+        model: a `pycolmap.Reconstruction`; solving moves it into the frame of the positions.
+        positions: a `pycolmap.Image`, its measured centre (3,) in metres, and the covariance (3, 3), of each.
+        gate_m: limit of an inlier when COLMAP aligns the model with the positions, before it adjusts.
+    """
+    bundle = colmap.BundleAdjustmentConfig()
+    for image_id in model.reg_image_ids():
+        bundle.add_image(image_id)
+    of_images = colmap.BundleAdjustmentOptions()
+    of_images.print_summary = False
+    of_images.ceres.solver_options.max_num_iterations = iterations
+    of_images.ceres.solver_options.num_threads = threads
+    of_priors = colmap.PosePriorBundleAdjustmentOptions()
+    of_priors.ceres.prior_position_loss_function_type = colmap.LossFunctionType.CAUCHY
+    of_priors.ceres.prior_position_loss_scale = math.sqrt(CAUCHY_SCALE2[3])
+    of_priors.alignment_ransac.max_error = gate_m
+    of_priors.alignment_ransac.random_seed = seed
+    priors = [
+        colmap.PosePrior(
+            corr_data_id=image.data_id,
+            position=position,
+            position_covariance=covariance,
+            coordinate_system=colmap.PosePriorCoordinateSystem.CARTESIAN,
+        )
+        for image, position, covariance in positions
+    ]
+    return colmap.create_pose_prior_bundle_adjuster(of_images, of_priors, bundle, priors, model)
+
+
 def remove_drift(
     colmap: Any, model: Any, fixes: Mapping[str, Vector3], threads: int, progress: Progress = SILENT
 ) -> float | None:
@@ -297,12 +300,7 @@ def remove_drift(
     All priors have one σ: that of the model's positions against the fixes, after a robust alignment. The fixes' own
     σ are not used, since this is a start only, and a change of σ does not make the model stale.
 
-    Args:
-        colmap: the pycolmap module.
-        model: the reconstruction; its frame becomes `geo`.
-        fixes: measured camera centres in geo by name of the image, metres.
-        threads: of the solver.
-        progress: shows the adjustment.
+    The frame of the model becomes `geo`; `fixes` are measured camera centres there by name of the image, metres.
 
     Returns:
         σ of the positions along one axis in metres; None: too few positions, or on one line, and nothing was done.
@@ -318,12 +316,12 @@ def remove_drift(
     center = np.array([image.projection_center() for image in images])
     sigma_m = max(_sigma_m(center, position), _LEAST_SIGMA * float(extent[0]))
     covariance = sigma_m**2 * np.eye(3)
-    priors = [
-        position_prior(colmap, image, place, covariance) for image, place in zip(images, position, strict=True)
-    ]
-    adjustment = PriorAdjustment(_MOST_ITERATIONS, _ALIGNMENT_GATE * sigma_m, threads)
+    positions = [(image, place, covariance) for image, place in zip(images, position, strict=True)]
+    gate_m = _ALIGNMENT_GATE * sigma_m
     with progress.task("adjustment with positions", 1) as task:
-        adjuster = adjustment.adjuster(colmap, model, priors)
+        adjuster = position_adjuster(
+            colmap, model, positions, iterations=_MOST_ITERATIONS, gate_m=gate_m, threads=threads
+        )
         if not adjuster.solve().is_solution_usable():
             log.warning("the adjustment with the measured positions found no solution: the model may have drifted")
         task.advance(note=f"σ {sigma_m:.2f} m")

@@ -33,9 +33,7 @@ class SfmOptions(StageOptions):
     )
     max_features: int = Field(5000, ge=200, description="Features an image at the most.")
     import_model: InputPath | None = Field(
-        None,
-        description="Use this COLMAP model instead of reconstructing.",
-        json_schema_extra={"flag": "--import"},
+        None, description="Use this COLMAP model instead of reconstructing.", json_schema_extra={"flag": "--import"}
     )
     chunk_size: Annotated[int, EFFORT] = Field(
         200,
@@ -45,6 +43,10 @@ class SfmOptions(StageOptions):
     )
     threads: Annotated[int, EFFORT] = Field(-1, ge=-1, description="Threads (-1: all).")
     seed: int = Field(0, ge=0, description="Seed of every random choice.")
+
+    def shrink(self, photo_px: tuple[int, int]) -> float:
+        """Return the factor ≥ 1 by which photographs of this size are larger than where features are detected."""
+        return max(max(photo_px) / self.max_image_size, 1.0)
 
     def doubles(self, photo_px: tuple[int, int]) -> bool:
         """Return whether features are detected on photographs of this size doubled.

@@ -16,10 +16,9 @@ from typing import Any
 import numpy as np
 
 from pipelines.adjust.alignment import Alignment, align
-from pipelines.adjust.measurements import problem_of, start_of
-from pipelines.adjust.observations import attitude_prior, fix_correspondences
-from pipelines.adjust.posterior import Posterior, save_posterior
-from pipelines.adjust.solution import adjusted
+from pipelines.adjust.init_sim3 import solved
+from pipelines.adjust.measurements import attitude_prior, fix_correspondences
+from pipelines.adjust.posterior import save_posterior
 from pipelines.core.child import run_in_child
 from pipelines.core.errors import ConvergenceError, DegenerateGeometryError
 from pipelines.core.products import save_json
@@ -37,11 +36,10 @@ from pipelines.formats.colmap import (
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.robust.statistics import residual_stats
-from pipelines.sfm.colmap_database import PriorAdjustment, position_prior
+from pipelines.sfm.mapping import position_adjuster
 from pipelines.sfm.options import AdjustOptions
 from pipelines.survey.adjustment import InitialSimilarity
 from pipelines.survey.calibrated import load_survey
-from pipelines.survey.scene import initial_scene
 from pipelines.survey.survey import Fix, Survey
 
 _MOST_ITERATIONS = 100
@@ -52,11 +50,7 @@ _ALIGNMENT_SLACK = 3.0
 
 
 def run(stage: StageRun, options: AdjustOptions) -> Summary:
-    """Adjust the workspace's model and write it.
-
-    Raises:
-        GeorefError: unreadable products, one of `adjust_to_fixes`, or a crash of COLMAP.
-    """
+    """Adjust the workspace's model and write it."""
     arguments = {
         "survey": load_survey(stage.workspace).model_dump(mode="json"),
         "model": str(stage.workspace.path(SPARSE)),
@@ -74,9 +68,6 @@ def write_adjusted(arguments: Mapping[str, Any], progress: Progress) -> dict[str
     Args:
         arguments: the calibrated `survey`, paths of `model` and `out`, and `seed`.
         progress: shows the adjustment.
-
-    Raises:
-        GeorefError: as `run`.
     """
     survey, path = Survey.model_validate(arguments["survey"]), Path(arguments["model"])
     out, seed = Path(arguments["out"]), int(arguments["seed"])
@@ -91,7 +82,7 @@ def write_adjusted(arguments: Mapping[str, Any], progress: Progress) -> dict[str
     adjusted_model = read_sparse(sparse)
     similarity = _identity(_aligned(adjusted_model, survey, seed), names, _residuals(model, survey))
     save_json(similarity, out / Path(SIM3).name)
-    posterior = _posterior(adjusted_model, survey.model_copy(update={"control_points": ()}), similarity)
+    posterior = solved(survey.model_copy(update={"control_points": ()}), adjusted_model, similarity)
     save_json(posterior.solution, out / Path(ADJUSTMENT).name)
     save_posterior(posterior, out / Path(SIM3_POSTERIOR).name)
     fixes = similarity.residuals["gnss"]
@@ -102,11 +93,7 @@ def write_adjusted(arguments: Mapping[str, Any], progress: Progress) -> dict[str
 def adjust_to_fixes(model: Any, survey: Survey, alignment: Alignment, seed: int = 0) -> None:
     """Adjust cameras, lenses and points of a `pycolmap.Reconstruction` in place; its frame becomes `geo`.
 
-    Args:
-        model: the reconstruction, in `local`.
-        survey: has the fixes.
-        alignment: of the model with the fixes; its residuals limit those of COLMAP's inliers.
-        seed: of COLMAP's alignment.
+    The residuals of its alignment with the fixes limit those of COLMAP's inliers.
 
     Raises:
         DegenerateGeometryError: the fixes lie on one line, and leave the rotation about that line open.
@@ -117,14 +104,13 @@ def adjust_to_fixes(model: Any, survey: Survey, alignment: Alignment, seed: int 
             "the fixes lie on one line: a bundle adjustment that knows positions only can turn the model about it"
         )
     colmap = pycolmap_module()
-    priors = [
-        position_prior(colmap, image, np.array(fix.position_in_geo), np.array(fix.cov_in_geo))
-        for image, fix in _located(model, survey)
+    fixes = [
+        (image, np.array(fix.position_in_geo), np.array(fix.cov_in_geo)) for image, fix in _located(model, survey)
     ]
     solution = alignment.solution
     furthest = np.linalg.norm(solution.residual[solution.state.inlier], axis=1).max()
     limit_m = float(_ALIGNMENT_SLACK * max(furthest, 1e-3))
-    adjuster = PriorAdjustment(_MOST_ITERATIONS, limit_m, seed=seed).adjuster(colmap, model, priors)
+    adjuster = position_adjuster(colmap, model, fixes, iterations=_MOST_ITERATIONS, gate_m=limit_m, seed=seed)
     summary = adjuster.solve()
     if not summary.is_solution_usable():
         raise ConvergenceError(f"the bundle adjustment found no solution: {summary.brief_report()}")
@@ -135,7 +121,6 @@ def adjust_to_fixes(model: Any, survey: Survey, alignment: Alignment, seed: int 
 
 
 def _aligned(model: SparseModel, survey: Survey, seed: int) -> Alignment:
-    """Return the alignment of a model with the fixes."""
     data = fix_correspondences(survey, model)
     return align(data, np.random.default_rng(seed), attitude=attitude_prior(survey, model))
 
@@ -143,10 +128,8 @@ def _aligned(model: SparseModel, survey: Survey, seed: int) -> Alignment:
 def _identity(alignment: Alignment, names: tuple[str, ...], residual: FloatArray) -> InitialSimilarity:
     """Return the identity as initial similarity: at its minimum the adjustment cannot improve the similarity.
 
-    Args:
-        alignment: of the adjusted model with the fixes; has the covariance.
-        names: of the F images with a fix.
-        residual: (F, 3) of their cameras.
+    The alignment of the adjusted model with the fixes has the covariance; F images with a fix have `names` and
+    `residual` (F, 3).
     """
     solution = alignment.solution
     inlier = solution.state.inlier
@@ -163,16 +146,7 @@ def _identity(alignment: Alignment, names: tuple[str, ...], residual: FloatArray
     )
 
 
-def _posterior(model: SparseModel, survey: Survey, similarity: InitialSimilarity) -> Posterior:
-    """Return the adjusted model as it is, with the covariances that the fixes give its cameras."""
-    scene, rejected = initial_scene(model, survey, similarity), similarity.rejected(survey)
-    problem = problem_of(scene, similarity.in_use(survey))
-    of_rejected = None if rejected is None else problem_of(scene, rejected)
-    return adjusted(scene, problem, start_of(scene, problem), similarity, of_rejected)
-
-
 def _located(model: Any, survey: Survey) -> list[tuple[Any, Fix]]:
-    """Return the registered images that have a fix, with their fixes."""
     fixes = {image.name: image.fix for image in survey.images if image.fix is not None}
     images = (model.images[image_id] for image_id in sorted(model.reg_image_ids()))
     return [(image, fixes[image.name]) for image in images if image.name in fixes]

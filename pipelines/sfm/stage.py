@@ -1,14 +1,13 @@
-"""Stage `sfm`: structure from motion with COLMAP.
+"""Stage `sfm`: structure from motion by an engine (`reconstructor.py`): COLMAP, or the import of a model.
 
 Reads `ingest/survey.json` and the photographs. Writes `sfm/sparse/` (a COLMAP model that COLMAP itself opens) and
 `sfm/database.db` (features and matches). The model's frame is `local`: similar to the scene, with an arbitrary
 place, rotation and scale. The positions measured by GNSS select the pairs to match, and remove the drift of a large
-model before its last adjustment. Features and matches of a large survey are computed in chunks (`chunked.py`).
+model before its last adjustment.
 """
 
 from __future__ import annotations
 
-import logging
 import shutil
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -17,52 +16,40 @@ from typing import Any
 
 from pipelines.core.child import run_in_child
 from pipelines.core.errors import CrashError, DamagedPartialError, DegenerateGeometryError
-from pipelines.core.machine import free_main_memory_bytes
 from pipelines.core.plan import photograph_folder
 from pipelines.core.products import load_json
 from pipelines.core.progress import Progress
 from pipelines.core.stages import SURVEY
 from pipelines.core.workspace import StageRun, Summary
-from pipelines.formats.colmap import quiet_colmap, write_reconstruction
-from pipelines.sfm.chunks import ChunkPlan, is_chunked, join_chunks, remove_chunks, work_in_chunks
-from pipelines.sfm.colmap_database import require_sound
 from pipelines.sfm.features import SfmJob
-from pipelines.sfm.memory import require_memory
 from pipelines.sfm.options import SfmOptions
-from pipelines.sfm.reconstruction import import_model, map_matches, reconstruct
+from pipelines.sfm.reconstructor import reconstructor_of
 from pipelines.survey.survey import Survey
 
-log = logging.getLogger(__name__)
-
 _FEW_REGISTERED = 0.8
-_RUN_AGAIN = "run it again (finished features and matches are kept), or with a smaller `--max-image-size`"
-_EXPORT_AGAIN = "COLMAP cannot read the imported model: export it again"
 
 
 def run(stage: StageRun, options: SfmOptions) -> Summary:
     """Reconstruct the cameras and points, or import a model, and write the model.
 
     Raises:
-        GeorefError: unreadable products, an error of `reconstruct` or `import_model`, or a crash of COLMAP.
+        GeorefError: unreadable products, an error of the engine, or a crash of COLMAP.
         DegenerateGeometryError: fewer than three photographs are registered.
     """
     path = stage.workspace.path(SURVEY)
-    survey = load_json(Survey, path)
-    require_memory(len(survey.images), survey.largest_photograph_px, options, free_main_memory_bytes())
-    plan = work_in_chunks(stage, survey, options) if is_chunked(len(survey.images), options) else None
+    survey, engine = load_json(Survey, path), reconstructor_of(options)
+    continues = engine.prepare(stage, survey, options)
     arguments = {
         "survey": str(path),
         "images": str(photograph_folder(stage.workspace, survey.image_dir)),
         "out": str(stage.out),
         "options": options.model_dump(mode="json"),
-        "chunks": None if plan is None else plan.model_dump(mode="json"),
     }
-    remedy = _EXPORT_AGAIN if options.import_model is not None else _RUN_AGAIN
     task = "pipelines.sfm.stage:write_model"
     try:
-        document = run_in_child(task, arguments, remedy, stage.progress, writes=stage.out)
+        document = run_in_child(task, arguments, engine.remedy, stage.progress, writes=stage.out)
     except (CrashError, RuntimeError) as error:
-        if stage.resumed and plan is None:
+        if stage.resumed and continues:
             cause = str(error).strip().splitlines()[-1]
             raise DamagedPartialError(f"COLMAP cannot continue it: {cause}", path=stage.out) from error
         raise
@@ -73,33 +60,15 @@ def write_model(arguments: Mapping[str, Any], progress: Progress) -> dict[str, A
     """Reconstruct or import the model and write it; return the summary as a document.
 
     Args:
-        arguments: paths of `survey`, `images` and `out`, the `options` of the stage, and the plan of its `chunks`,
-            which are finished; None: there are none.
+        arguments: paths of `survey`, `images` and `out`, and the `options` of the stage.
         progress: shows features, matches and mapping.
-
-    Raises:
-        GeorefError: as `run`.
     """
-    survey, out = load_json(Survey, Path(arguments["survey"])), Path(arguments["out"])
+    survey, database = load_json(Survey, Path(arguments["survey"])), Path(arguments["out"]) / "database.db"
     options = SfmOptions.model_validate(arguments["options"])
-    sparse = out / "sparse"
-    if sparse.exists():
-        shutil.rmtree(sparse)
-    with quiet_colmap() as colmap:
-        if options.import_model is not None:
-            model = import_model(options.import_model, survey)
-        else:
-            job = SfmJob(survey, Path(arguments["images"]), out / "database.db", options)
-            plan = arguments["chunks"]
-            if plan is None:
-                require_sound(job.database)
-                model = reconstruct(colmap, job, progress)
-            else:
-                join_chunks(colmap, job, ChunkPlan.model_validate(plan), out, progress)
-                model = map_matches(colmap, job, progress)
-        write_reconstruction(model, sparse)
-    remove_chunks(out)
-    return asdict(_summarise(model, survey))
+    job = SfmJob(survey, Path(arguments["images"]), database, options)
+    if job.sparse.exists():
+        shutil.rmtree(job.sparse)
+    return asdict(_summarise(reconstructor_of(options).reconstruct(job, progress), survey))
 
 
 def _summarise(model: Any, survey: Survey) -> Summary:

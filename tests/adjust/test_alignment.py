@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.adjust.alignment import Alignment, align, mean_rotation
-from pipelines.adjust.similarity_fit import Correspondences, covariance_of
+from pipelines.adjust.alignment import Alignment, Correspondences, align, covariance_of, mean_rotation
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.geometry.rotations import exp_so3, log_so3
 from pipelines.geometry.similarity import moved_pivot

@@ -11,7 +11,7 @@ import pytest
 
 from pipelines.adjust.geolocate import geolocate
 from pipelines.adjust.init_sim3 import estimate_similarity
-from pipelines.adjust.observations import control_correspondences
+from pipelines.adjust.measurements import control_correspondences
 from pipelines.adjust.options import GeolocateOptions, InitSim3Options
 from pipelines.core.errors import ConvergenceError, DegenerateGeometryError, InputError
 from pipelines.core.products import load_json

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipelines.adjust.alignment import Correspondences
 from pipelines.adjust.rig_fit import (
     LIMIT_ARM_M,
     LIMIT_OFFSET_S,
@@ -62,10 +63,14 @@ def _data(track: TrueTrajectory, seed: int = 1, control: int = 0, *, arm_m: np.n
         cam_from_local=noise @ np.swapaxes(true_geo_from_cam, 1, 2) @ GEO_FROM_LOCAL.rotation,
         cam_from_body=np.tile(track.cam_from_body, (count, 1, 1)),
         antenna_in_body=np.tile(arm_m, (count, 1)),
-        control_in_local=local_from_geo.apply(points),
-        control_in_geo=points,
-        control_cov_in_local=np.zeros((control, 3, 3)),
-        control_cov_in_geo=np.tile(1e-4 * np.eye(3), (control, 1, 1)),
+        control=Correspondences(
+            name=tuple(map(str, range(control))),
+            control=np.ones(control, dtype=bool),
+            in_local=local_from_geo.apply(points),
+            cov_in_local=np.zeros((control, 3, 3)),
+            in_geo=points,
+            cov_in_geo=np.tile(1e-4 * np.eye(3), (control, 1, 1)),
+        ),
         pixel_rad=PIXEL_RAD,
         footprint_in_local=100.0 * PIXEL_RAD / GEO_FROM_LOCAL.scale,
     )
@@ -113,13 +118,14 @@ def _tilted(data: RigData, pixels: float) -> RigData:
     tilt = exp_so3([pixels * data.pixel_rad, 0.0, 0.0])
     before, after = (np.swapaxes(one, 1, 2) for one in (data.cam_from_local, tilt @ data.cam_from_local))
     control = []
-    for point in data.control_in_local:
+    for point in data.control.in_local:
         ray = point - data.center_in_local
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
         ray = np.einsum("nij,nkj,nk->ni", after, before, ray)
         across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
         control.append(np.linalg.solve(across.sum(axis=0), np.einsum("nij,nj->i", across, data.center_in_local)))
-    return replace(data, cam_from_local=tilt @ data.cam_from_local, control_in_local=np.array(control))
+    moved = replace(data.control, in_local=np.array(control))
+    return replace(data, cam_from_local=tilt @ data.cam_from_local, control=moved)
 
 
 def test_sigma_counts_a_lens_that_sfm_has_not_quite_found() -> None:

@@ -153,11 +153,10 @@ def at_a_random_state(kind: str, seed: int) -> tuple[Problem, State, Term]:
         rng.normal(0, [5.0, 2.0, 2.0, 0.01]),
         rng.normal(0, 0.3, len(ERRORS)),
     )
-    if kind == CommonErrors.kind:
-        term: Term = CommonErrors.of(ERRORS)
-    else:
-        term = measured(EXACT, GEO_FROM_MODEL, rng, 1.0)[kind]
-    problem = problem_of(EXACT, (term,) if kind != CommonErrors.kind else (), ERRORS)
+    of_kind = measured(EXACT, GEO_FROM_MODEL, rng, 1.0) if kind != CommonErrors.kind else {}
+    problem = problem_of(EXACT, tuple(term for name, term in of_kind.items() if name == kind), ERRORS)
+    term = problem.term(kind)
+    assert term is not None
     if isinstance(term, ControlPoints):  # whose rays meet: the weights of the rays are those of the distances there
         poses = state.poses(problem.base)
         ray = CONTROL[term.point] - poses.cam_center_in_model[term.camera]
@@ -175,7 +174,13 @@ def test_slopes_are_the_derivatives_of_the_residuals(kind: str, seed: int) -> No
     np.testing.assert_array_equal(slopes.residual, term.residuals(problem.at(state)))
 
     def moved(pose: np.ndarray, lens: np.ndarray, errors: np.ndarray) -> np.ndarray:
-        return term.residuals(problem.at(state.moved(pose.reshape(-1, 6), lens, errors)))
+        moved_state = replace(
+            state,
+            correction=state.correction + pose.reshape(-1, 6),
+            lens=state.lens + lens,
+            errors=state.errors + errors,
+        )
+        return term.residuals(problem.at(moved_state))
 
     no_pose, no_lens, no_errors = np.zeros(6 * IMAGES), np.zeros(LENSES), np.zeros(len(ERRORS))
     by_pose = np.zeros((len(term), term.dimension, 6 * IMAGES))

@@ -12,7 +12,6 @@ import pytest
 
 from georef_cli import job_tables
 from georef_cli.output import print_outcomes, print_rich
-from pipelines.adjust.solution import load_adjustment
 from pipelines.core.figures import Headline
 from pipelines.core.fingerprints import fingerprints
 from pipelines.core.products import NOT_CHECKED, Caution, load_json, save_json
@@ -32,7 +31,7 @@ from tests.cli_runs import Georef
 from tests.evaluated_workspaces import CHECK_POINTS, ERROR_M, evaluated_workspace
 from tests.reports import check_points_with
 from tests.scenes import WITH_GCPS, Noise, make_scene, sparse_model, survey_of, write_workspace
-from tests.trained_workspaces import untrained
+from tests.trained_workspaces import load_adjustment, untrained
 
 UNCHECKED = (Caution(code=NOT_CHECKED, sentence="Nothing checks the positions."),)
 

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from pyproj import Proj, Transformer
 
-from pipelines.adjust.solution import load_adjustment
 from pipelines.core.errors import InputError
 from pipelines.core.products import NOT_CHECKED, Caution, load_json, save_json
 from pipelines.core.stages import MODEL, SPARSE, SURVEY
@@ -28,7 +27,7 @@ from pipelines.geometry.rotations import map_from_cam, matrix_from_quat_xyzw
 from pipelines.survey.survey import Survey
 from pipelines.survey.trained_model import TrainedModel
 from tests.scenes import TrueScene
-from tests.trained_workspaces import IMAGES, scene_of, trained_workspace, untrained
+from tests.trained_workspaces import IMAGES, load_adjustment, scene_of, trained_workspace, untrained
 
 pycolmap = pytest.importorskip("pycolmap")
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -14,7 +14,7 @@ from pipelines.core.errors import InputError
 from pipelines.formats.colmap import load_reconstruction, write_sparse
 from pipelines.geometry.cameras import Camera
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.sfm.reconstruction import find_model, import_model
+from pipelines.sfm.imported_model import find_model, import_model
 from pipelines.survey.survey import Survey
 from tests.scenes import Measured, Noise, make_scene, sparse_model, survey_of
 

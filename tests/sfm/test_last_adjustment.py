@@ -12,7 +12,7 @@ import pytest
 
 from pipelines.formats.colmap import quiet_colmap
 from pipelines.geometry.similarity import umeyama
-from pipelines.sfm.mapping import LastAdjustment, adjust_finally
+from pipelines.sfm.mapping import adjust_finally
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -74,7 +74,7 @@ def least_squares(model: Any, *, principal_point: bool) -> Any:
 
 def adjust(model: Any, *, principal_point: bool = True) -> Any:
     with quiet_colmap() as colmap:
-        adjust_finally(colmap, model, LastAdjustment(principal_point, threads=1))
+        adjust_finally(colmap, model, principal_point=principal_point, threads=1)
     return model
 
 
@@ -186,5 +186,5 @@ class Bars:
 def test_progress_comes_to_its_end(noise_px: float) -> None:
     bars, model = Bars(), mapped(OFF_PX, noise_px)
     with quiet_colmap() as colmap:
-        adjust_finally(colmap, model, LastAdjustment(threads=1), bars)
+        adjust_finally(colmap, model, threads=1, progress=bars)
     assert bars.steps == bars.total == 4

@@ -15,11 +15,12 @@ from pipelines.core.products import save_json
 from pipelines.core.progress import SILENT
 from pipelines.core.stages import BY_NAME, SURVEY
 from pipelines.core.workspace import StageRun, Workspace
-from pipelines.sfm import mapping, stage
+from pipelines.sfm import colmap_reconstruction, mapping, stage
 from pipelines.sfm.features import SfmJob
+from pipelines.sfm.forecast import chunk_peak_bytes, peak_bytes, why_too_large
 from pipelines.sfm.mapping import chosen_mapper, map_database
-from pipelines.sfm.memory import chunk_peak_bytes, peak_bytes, require_memory, why_too_large
 from pipelines.sfm.options import SfmOptions
+from pipelines.sfm.reconstructor import reconstructor_of
 from tests.sfm_scenes import CONFIG, HEIGHT, WIDTH, survey_of
 
 GIB = 1 << 30
@@ -86,7 +87,8 @@ def test_memory_follows_size_and_options() -> None:
     assert 1.5 < sizes[1] / sizes[0] < 2.1 and 1.5 < sizes[2] / sizes[1] < 2.1
     fewer = options.model_copy(update={"max_features": 1000})
     assert peak_bytes(4000, PHOTO_PX, fewer) < 0.3 * sizes[2]
-    assert peak_bytes(4000, PHOTO_PX, SfmOptions(import_model=Path("sparse"))) == 0
+    imported = SfmOptions(import_model=Path("sparse"))
+    assert reconstructor_of(imported).forecast(4000, PHOTO_PX, imported) is None  # needs no memory
     small = SfmOptions(max_image_size=600)
     assert chunk_peak_bytes(PHOTO_PX, small) < chunk_peak_bytes(PHOTO_PX, options) < 2 * GIB
 
@@ -94,9 +96,7 @@ def test_memory_follows_size_and_options() -> None:
 def test_the_advice_fits() -> None:
     options = SfmOptions()
     free_bytes = peak_bytes(10_000, PHOTO_PX, options) // 2
-    with pytest.raises(ResourceError) as refused:
-        require_memory(10_000, PHOTO_PX, options, free_bytes)
-    advised = re.search(r"--max-features (\d+)", str(refused.value))
+    advised = re.search(r"--max-features (\d+)", why_too_large(10_000, PHOTO_PX, options, free_bytes) or "")
     assert advised is not None
     followed = options.model_copy(update={"max_features": int(advised[1])})
     assert why_too_large(10_000, PHOTO_PX, followed, free_bytes) is None
@@ -114,7 +114,7 @@ def test_a_survey_that_does_not_fit_is_refused_before_work(monkeypatch: pytest.M
     partial = workspace.partial(BY_NAME["sfm"])
     partial.mkdir()
     needed = peak_bytes(900, (WIDTH, HEIGHT), SfmOptions())
-    monkeypatch.setattr(stage, "free_main_memory_bytes", lambda: needed // 2)
+    monkeypatch.setattr(colmap_reconstruction, "free_main_memory_bytes", lambda: needed // 2)
     with pytest.raises(ResourceError, match="SfM of 900 photographs needs about"):
         stage.run(StageRun(workspace, partial), SfmOptions())
     assert list(partial.iterdir()) == []

@@ -20,9 +20,10 @@ from pipelines.core.staleness import status
 from pipelines.core.workspace import StageRun, Workspace
 from pipelines.formats.colmap import quiet_colmap, read_sparse
 from pipelines.geometry.similarity import umeyama
+from pipelines.sfm.colmap_reconstruction import reconstruct
 from pipelines.sfm.features import SfmJob, candidate_pairs, extract_features
+from pipelines.sfm.imported_model import import_model
 from pipelines.sfm.options import SfmOptions
-from pipelines.sfm.reconstruction import import_model, reconstruct
 from pipelines.sfm.stage import _summarise, run
 from pipelines.survey.survey import Fix, Survey, SurveyedPoint
 from tests.sfm_scenes import CONFIG, HEIGHT, IMAGES, WIDTH, Photographs, survey_of
@@ -156,7 +157,7 @@ def test_file_names_with_blanks(photographs: Photographs, tmp_path: Path, monkey
         shutil.copy(photographs.folder / name, photos / f"# flight 1 {name}")
     survey = survey_of(sorted(path.name for path in photos.iterdir()))
     asked = np.array([(0, 1), (1, 2), (2, 3), (3, 4), (0, 2), (1, 3), (2, 4)])
-    monkeypatch.setattr("pipelines.sfm.reconstruction.candidate_pairs", lambda *_: asked)
+    monkeypatch.setattr("pipelines.sfm.features.candidate_pairs", lambda *_: asked)
     job = SfmJob(survey, photos, tmp_path / "database.db", CONFIG)
     with quiet_colmap() as colmap:
         model = reconstruct(colmap, job, SILENT)

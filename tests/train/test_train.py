@@ -15,7 +15,6 @@ import torch
 from scipy.stats import chi2
 
 from pipelines.adjust.options import InitSim3Options
-from pipelines.adjust.solution import load_adjustment
 from pipelines.core.errors import BackendUnavailableError, DegenerateGeometryError, MissingProductError
 from pipelines.core.products import load_json, save_json
 from pipelines.core.runner import run_stage
@@ -34,6 +33,7 @@ from pipelines.train.options import PRESETS, RUN_MINUTES, Preset, TrainOptions
 from tests.scenes import GEO_FROM_LOCAL
 from tests.splat_scenes import TRAINING, RenderedFlight, adjust_workspace
 from tests.threads import single_thread
+from tests.trained_workspaces import load_adjustment
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 TRAIN = BY_NAME["train"]

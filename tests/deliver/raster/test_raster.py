@@ -18,7 +18,6 @@ from rio_cogeo.cogeo import cog_validate
 
 from pipelines.adjust.geolocate import geolocate
 from pipelines.adjust.options import GeolocateOptions
-from pipelines.adjust.solution import load_adjustment
 from pipelines.core.errors import InputError
 from pipelines.core.products import load_json, save_json
 from pipelines.core.runner import run_stage
@@ -45,7 +44,7 @@ from tests.scenes import (
     trained_model,
     write_workspace,
 )
-from tests.trained_workspaces import write_adjustment
+from tests.trained_workspaces import load_adjustment, write_adjustment
 
 CAMERA = Camera("PINHOLE", 192, 144, np.array([220.0, 220.0, 96.0, 72.0]))
 GEO_FROM_MODEL = Similarity(1.7, exp_so3(np.array([0.3, -0.2, 1.0])), np.array([12.0, -7.0, 4.0]))

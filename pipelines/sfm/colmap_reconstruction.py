@@ -1,0 +1,93 @@
+"""Engine `colmap`: features, matches, mapping, and a last, robust adjustment; a large survey in chunks."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+from pipelines.core.errors import DegenerateGeometryError, InputError, ResourceError
+from pipelines.core.machine import chosen_threads, free_main_memory_bytes
+from pipelines.core.products import load_json
+from pipelines.core.progress import Progress
+from pipelines.core.workspace import StageRun
+from pipelines.formats.colmap import quiet_colmap, write_reconstruction
+from pipelines.sfm.chunks import PLAN, ChunkPlan, join_chunks, remove_chunks, work_in_chunks
+from pipelines.sfm.colmap_database import require_sound
+from pipelines.sfm.features import SfmJob, extract_features, match_features
+from pipelines.sfm.forecast import forecast_reconstruction, why_too_large
+from pipelines.sfm.mapping import adjust_finally, map_database, remove_drift
+from pipelines.sfm.options import SfmOptions
+from pipelines.survey.survey import Survey
+
+log = logging.getLogger(__name__)
+
+# Over so few photographs a model bends by less than the last adjustment removes.
+_DRIFTLESS_UP_TO = 200
+
+
+class ColmapReconstructor:
+    """Reconstruction by COLMAP, which hears no interrupts while it works."""
+
+    remedy = "run it again (finished features and matches are kept), or with a smaller `--max-image-size`"
+
+    forecast = staticmethod(forecast_reconstruction)
+
+    def prepare(self, stage: StageRun, survey: Survey, options: SfmOptions) -> bool:
+        count = len(survey.images)
+        reason = why_too_large(count, survey.largest_photograph_px, options, free_main_memory_bytes())
+        if reason is not None:
+            raise ResourceError(reason)
+        if count > options.chunk_size:
+            work_in_chunks(stage, survey, options)
+        return count <= options.chunk_size
+
+    def reconstruct(self, job: SfmJob, progress: Progress) -> Any:
+        out = job.database.parent
+        with quiet_colmap() as colmap:
+            if len(job.survey.images) > job.options.chunk_size:
+                join_chunks(colmap, job, load_json(ChunkPlan, out / PLAN), out, progress)
+                model = map_matches(colmap, job, progress)
+            else:
+                require_sound(job.database)
+                model = reconstruct(colmap, job, progress)
+            write_reconstruction(model, job.sparse)
+        remove_chunks(out)
+        return model
+
+
+def reconstruct(colmap: Any, job: SfmJob, progress: Progress) -> Any:
+    """Return the largest `pycolmap.Reconstruction` of the photographs, robustly adjusted.
+
+    Raises:
+        InputError: a photograph does not exist or is not that of the survey, or a camera prior is none of COLMAP's
+            cameras.
+        DegenerateGeometryError: COLMAP found no model.
+        ConvergenceError: the last adjustment found no solution.
+    """
+    missing = [image.name for image in job.survey.images if not (job.images / image.name).is_file()]
+    if missing:
+        raise InputError(f"{len(missing)} photographs of the survey are gone", path=job.images / missing[0])
+    colmap.set_random_seed(job.options.seed)
+    extract_features(colmap, job, range(len(job.survey.images)), progress)
+    match_features(colmap, job, job.pairs, progress)
+    return map_matches(colmap, job, progress)
+
+
+def map_matches(colmap: Any, job: SfmJob, progress: Progress) -> Any:
+    """Return the largest model of a database with features and matches, adjusted; raises as `reconstruct`."""
+    colmap.set_random_seed(job.options.seed)
+    models = map_database(colmap, job, progress)
+    if not models:
+        raise DegenerateGeometryError(
+            "no two photographs could be tied together: is there enough overlap and texture? "
+            "`--max-features` and `--pairs exhaustive` may help"
+        )
+    if len(models) > 1:
+        sizes = [model.num_reg_images() for model in models]
+        log.warning("the survey fell apart into %d models of %s images; the largest is used", len(models), sizes)
+    model, threads = models[0], chosen_threads(job.options.threads)
+    if len(job.survey.images) > _DRIFTLESS_UP_TO:
+        fixes = {image.name: image.fix.position_in_geo for image in job.survey.images if image.fix is not None}
+        remove_drift(colmap, model, fixes, threads, progress)
+    adjust_finally(colmap, model, principal_point=job.options.principal_point, threads=threads, progress=progress)
+    return model
