@@ -366,7 +366,7 @@ def _table(lines: Sequence[PointLine], *, with_way: bool) -> Table:
     if with_way:
         table.columns[1].justify = "left"
     for line in lines:
-        error, sigma = line.error_m, line.sigma_m
+        error, sigma = line.row.error_m, line.sigma_m
         lengths = ["–"] * 4 if error is None else [*(f"{value:+.3f}" for value in error), _length(error[:2])]
         predicted = ["–"] * 2 if sigma is None else [_length(sigma[:2]), f"{sigma[2]:.3f}"]
         table.add_row(

@@ -112,7 +112,7 @@ def control_of(scene: Scene, survey: Survey) -> ControlPoints | None:
     surveyed = [point for point, enough in zip(survey.control_points, marked, strict=True) if enough]
     position = np.array([point.position_in_geo for point in surveyed])
     control = ControlPoints(
-        name=rays.point_id,
+        name=rays.point_name,
         point=rays.point,
         camera=rays.camera,
         bearing_in_cam=rays.bearing_in_cam,

@@ -113,11 +113,7 @@ def ninety_percent(way: str, errors: CheckPointErrors) -> NinetyPercent:
         way: in which the errors were measured.
         errors: the errors.
     """
-    rows = [
-        (row.de_m, row.dn_m, row.du_m)
-        for row in errors.points
-        if row.de_m is not None and row.dn_m is not None and row.du_m is not None
-    ]
+    rows = [row.error_m for row in errors.points if row.error_m is not None]
     table = np.array(rows, dtype=np.float64).reshape(-1, 3)
     has_quantile = len(table) >= _LEAST_FOR_QUANTILE
     ce90 = le90 = None
@@ -152,12 +148,9 @@ def _compared(errors: CheckPointErrors, points: tuple[SurveyedPoint, ...]) -> tu
     for row in errors.points:
         if not isinstance(row, PredictedPointError) or row.name not in surveyed:
             continue
-        predicted = (row.sigma_e_m, row.sigma_n_m, row.sigma_u_m)
-        measured = (row.de_m, row.dn_m, row.du_m)
-        if None in predicted or None in measured:
+        if row.sigma_m is None or row.error_m is None:
             continue
-        variance = np.square(np.array(predicted, dtype=np.float64)) + surveyed[row.name]
-        off = np.array(measured, dtype=np.float64)
+        variance, off = np.square(row.sigma_m) + surveyed[row.name], row.error_m
         sigma.append([np.sqrt(variance[0] + variance[1]), np.sqrt(variance[2])])
         error.append([np.hypot(off[0], off[1]), abs(off[2])])
     return np.array(sigma).reshape(-1, 2), np.array(error).reshape(-1, 2)

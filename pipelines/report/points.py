@@ -17,12 +17,12 @@ from pipelines.core.errors import InputError
 from pipelines.core.plan import photograph_folder
 from pipelines.core.progress import Progress
 from pipelines.core.types import ByteArray, FloatArray
-from pipelines.formats.image_file import read_bytes, require_unchanged
 from pipelines.geometry.cameras import project
 from pipelines.report.page import Picture, picture_of
 from pipelines.report.place import Texts, heads_of, texts_of
 from pipelines.report.views import EvaluatedSurvey
 from pipelines.survey.marks import mark_rays
+from pipelines.survey.photographs import decoded_photograph
 from pipelines.survey.report import PointResidual, PredictedPointError
 from pipelines.survey.survey import SurveyedPoint
 
@@ -83,7 +83,9 @@ def cut_chips(
     Raises:
         InputError: a photograph cannot be read, or has changed since `ingest`.
     """
-    sparse = evaluated.solved.sparse
+    sparse, survey = evaluated.solved.sparse, evaluated.solved.survey
+    folder = photograph_folder(evaluated.workspace, survey.image_dir)
+    sha256 = {image.name: image.sha256 for image in survey.images}
     longest = max((max(camera.width, camera.height) for camera in sparse.cameras.values()), default=0)
     side = max(_LEAST_SIDE_PX, 2 * round(_SIDE_SHARE * longest / 2))
     by_image: dict[int, list[WantedChip]] = defaultdict(list)
@@ -93,23 +95,13 @@ def cut_chips(
     with progress.task("image chips", len(by_image)) as task:
         for image, of_image in by_image.items():
             name = sparse.image_name[image]
-            photograph = _photograph(evaluated, name)
+            pixels = decoded_photograph(folder / name, sha256.get(name, ""))
+            if pixels is None:
+                raise InputError("does not decode: put the photograph back", path=folder / name)
             for chip in of_image:
-                chips[chip.owner].append(_cut(photograph, name, chip, side))
+                chips[chip.owner].append(_cut(pixels[..., ::-1], name, chip, side))
             task.advance()
     return {owner: tuple(mine) for owner, mine in chips.items()}, side
-
-
-def _photograph(evaluated: EvaluatedSurvey, name: str) -> ByteArray:
-    survey = evaluated.solved.survey
-    path = photograph_folder(evaluated.workspace, survey.image_dir) / name
-    image = survey.image(name)
-    data = read_bytes(path)
-    require_unchanged(data, "" if image is None else image.sha256, path)
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if pixels is None:
-        raise InputError("does not decode: put the photograph back", path=path)
-    return np.asarray(pixels[..., ::-1])
 
 
 def _cut(photograph: ByteArray, name: str, wanted: WantedChip, side: int) -> Chip:
@@ -232,8 +224,8 @@ class _Group:
         position = np.full((len(self.points), 3), np.nan)
         for index, point in enumerate(self.points):
             row = by_name.get(point.name)
-            if row is not None and row.de_m is not None and row.dn_m is not None and row.du_m is not None:
-                position[index] = np.add(point.position_in_geo, (row.de_m, row.dn_m, row.du_m))
+            if row is not None and row.error_m is not None:
+                position[index] = np.add(point.position_in_geo, row.error_m)
         return position
 
 

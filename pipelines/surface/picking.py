@@ -169,7 +169,7 @@ def points_by_model(trained: TrainedSurvey, rays: MarkRays, maps: Sequence[Depth
         maps: K, the depth around each mark in its view.
     """
     hits = surface_hits(trained, rays, maps)
-    middle = np.full((len(rays.point_id), 3), np.nan)
+    middle = np.full((len(rays.point_name), 3), np.nan)
     for point in range(len(middle)):
         counted = hits.counted(np.flatnonzero(rays.point == point))
         if len(counted) >= LEAST_VIEWS:

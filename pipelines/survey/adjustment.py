@@ -1,19 +1,14 @@
-"""Product of `init-sim3`: the similarity from the SfM model to the Earth, with its covariance.
-
-Product of `geolocate`: SfM points on Earth, each with its covariance.
-"""
+"""Products of `init-sim3` and `geolocate`: similarity from the SfM model to the Earth, and SfM points on Earth."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from pathlib import Path
-from typing import Literal
+from dataclasses import dataclass
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.core.errors import InputError
-from pipelines.core.products import Caution, Covariance3, Product, Rotation, load_npz, save_npz
+from pipelines.core.products import ArrayProduct, Caution, Covariance3, Product, Rotation
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.geometry.similarity import SimilarityRecord
 from pipelines.robust.statistics import ResidualStats
@@ -22,12 +17,7 @@ from pipelines.survey.survey import Survey
 
 
 class AttitudeRecord(Product):
-    """Rotation geo ← local that the recorded attitudes give.
-
-    Attributes:
-        quat_xyzw: rotation geo ← local.
-        cov_rad2: 3×3 covariance in rad², axes of geo.
-    """
+    """Rotation geo ← local that the recorded attitudes give, with its covariance in rad², axes of geo."""
 
     quat_xyzw: Rotation
     cov_rad2: Covariance3
@@ -37,8 +27,6 @@ class InitialSimilarity(Product):
     """Product of `init-sim3`: `geo_from_local`, its estimation and its precision.
 
     Attributes:
-        format_version: version of the format.
-        geo_from_local: the similarity with its covariance.
         method: `robust` or `paper`, the option of `init-sim3`; `adjusted` by the bundle adjustment of the baseline.
         correspondences: number by kind: `gnss` (camera centres with fixes), `gcp` (control points), `points`
             (geolocated points).
@@ -46,13 +34,10 @@ class InitialSimilarity(Product):
         gnss_outliers: names of the images whose fixes were rejected: they enter no later solution.
         control_outliers: names of the control points that were rejected, or that their marks do not determine:
             they enter no later solution.
-        residuals: figures by kind.
         condition_number: of the normal matrix, with angles and ln s scaled by the size of the layout.
         layout: extent of the correspondences: they fill a volume, lie in a plane, or on a line.
         attitude_used: whether recorded attitudes contributed to the rotation.
-        attitude: rotation of the recorded attitudes, if the robust method needed it.
         variance_factors: tests of the stated σ, with the factors that apply to all later stages.
-        cautions: limits of the result.
     """
 
     format_version: Literal[1] = 1
@@ -93,7 +78,7 @@ class InitialSimilarity(Product):
 
 
 @dataclass(frozen=True)
-class GeolocatedPoints:
+class GeolocatedPoints(ArrayProduct):
     """Product of `geolocate`: N SfM points intersected in the geo frame.
 
     Attributes:
@@ -107,6 +92,17 @@ class GeolocatedPoints:
         rotation_source: source of the rays' rotations: "recorded" attitudes or "sfm".
     """
 
+    FORMS: ClassVar = {
+        "point_id": ("i", "N"),
+        "position_in_geo": ("f", "N", 3),
+        "cov_in_geo": ("f", "N", 3, 3),
+        "ray_count": ("i", "N"),
+        "max_angle_deg": ("f", "N"),
+        "condition": ("f", "N"),
+        "inlier": ("b", "N"),
+        "rotation_source": None,
+    }
+
     point_id: IntArray
     position_in_geo: FloatArray
     cov_in_geo: FloatArray
@@ -115,34 +111,3 @@ class GeolocatedPoints:
     condition: FloatArray
     inlier: BoolArray
     rotation_source: str
-
-    def save(self, path: Path) -> None:
-        """Write the points as NPZ."""
-        save_npz(path, {field.name: getattr(self, field.name) for field in fields(self)})
-
-    @classmethod
-    def load(cls, path: Path) -> GeolocatedPoints:
-        """Read points from NPZ.
-
-        Raises:
-            InputError: the file is no NPZ file with these arrays.
-        """
-        arrays = load_npz(path, tuple(field.name for field in fields(cls)))
-        for name, (kind, shape) in _POINT_ARRAYS.items():
-            array = arrays[name]
-            if array.dtype.kind not in kind or array.shape != (len(arrays["point_id"].ravel()), *shape):
-                raise InputError(f"has the form {array.shape} {array.dtype}", path=path, field=name)
-        source = str(arrays.pop("rotation_source"))
-        return cls(**arrays, rotation_source=source)
-
-
-# Kind of number, and shape of one point's entry.
-_POINT_ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
-    "point_id": ("i", ()),
-    "position_in_geo": ("f", (3,)),
-    "cov_in_geo": ("f", (3, 3)),
-    "ray_count": ("i", ()),
-    "max_angle_deg": ("f", ()),
-    "condition": ("f", ()),
-    "inlier": ("b", ()),
-}

@@ -13,6 +13,7 @@ from pipelines.core.errors import GeorefError
 from pipelines.core.figures import Headline
 from pipelines.core.products import Caution, is_checked
 from pipelines.core.stages import REPORT
+from pipelines.core.types import Vector3
 from pipelines.core.workspace import Workspace
 from pipelines.survey.report import (
     AccuracySummary,
@@ -28,13 +29,7 @@ _NOT_CHECKED = "nothing checks the σ of the positions"
 
 
 def headline(triangulated: CheckPointErrors, scene: AccuracySummary, cautions: tuple[Caution, ...]) -> Headline:
-    """Return the accuracy as the check points measure it, else as the σ of the scene predict it.
-
-    Args:
-        triangulated: errors of the triangulated check points; those under vegetation do not count.
-        scene: predicted σ.
-        cautions: of the result; one says whether anything checks the σ.
-    """
+    """Return the accuracy as the triangulated check points outside vegetation measure it, else as σ predict it."""
     total = triangulated.with_survey
     if total is None:
         return predicted(scene, cautions)
@@ -88,7 +83,6 @@ class PointLine:
         use: whether the point is a check point or entered the solution.
         way: triangulated, on the rendered surface, by a solution that left the point out, or as the residual of
             the fit.
-        row: of the report.
     """
 
     use: Literal["check", "control"]
@@ -96,19 +90,9 @@ class PointLine:
     row: PointResidual
 
     @property
-    def error_m(self) -> tuple[float, float, float] | None:
-        """Error east, north, up; None: the point was not measured."""
-        east, north, up = self.row.de_m, self.row.dn_m, self.row.du_m
-        return None if east is None or north is None or up is None else (east, north, up)
-
-    @property
-    def sigma_m(self) -> tuple[float, float, float] | None:
+    def sigma_m(self) -> Vector3 | None:
         """Predicted σ east, north, up; None: there is no prediction."""
-        row = self.row
-        if not isinstance(row, PredictedPointError):
-            return None
-        east, north, up = row.sigma_e_m, row.sigma_n_m, row.sigma_u_m
-        return None if east is None or north is None or up is None else (east, north, up)
+        return self.row.sigma_m if isinstance(self.row, PredictedPointError) else None
 
     @property
     def is_blunder(self) -> bool:
