@@ -30,7 +30,7 @@ from pipelines.core.staleness import cautions_by_stage
 from pipelines.core.workspace import now
 from pipelines.jobs.engine import Engine, Job, JobEnd
 from pipelines.jobs.missions import Mission, MissionList
-from pipelines.report.page import Page, Section, moment, write_page
+from pipelines.report.page import Page, Section, moment, render_page
 from pipelines.survey.headline import headline_of
 from pipelines.survey.report import read_report
 
@@ -177,7 +177,7 @@ def write_batch(folder: Path, table: BatchTable) -> None:
     Raises:
         OSError: a file cannot be written; the existing one stays.
     """
-    write_page(batch_page(table), _ROOM, page_file(folder, table.batch))
+    replace_text(page_file(folder, table.batch), render_page(batch_page(table), _ROOM))
     replace_text(json_file(folder, table.batch), table.model_dump_json(indent=1) + "\n")
 
 

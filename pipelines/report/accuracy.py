@@ -29,10 +29,8 @@ class NinetyPercent:
     """Radii within which 90 % of the errors are expected, and within which 90 % of those measured are.
 
     Attributes:
-        way: `camera` or `model`.
         ce90_m, le90_m: from the RMSE; None without check points.
         measured_h_m, measured_v_m: empirical 90 % quantile; None with fewer than ten points.
-        count: number of check points.
     """
 
     way: str
@@ -53,13 +51,11 @@ class AccuracyFacts:
         ways: words of the ways that have measured points.
         surface: whether points were measured on the rendered surface.
         chart: predicted against measured σ; None: fewer than three points have both.
-        within: share of the points within 1 σ and 2 σ of the prediction, horizontal and vertical; None likewise.
+        within: share of the points within 1 σ and 2 σ of the prediction, horizontal and vertical; empty likewise.
         cells: what is told of the predicted σ over the scene, by the beginning of its fields.
         map: of the predicted σ; None: there is none.
         crossed: whether control points were cross-validated with a result.
         crossed_reason: why not; empty: they were not to be.
-        check_points: number in the survey.
-        ce90_factor, le90_factor: of the formulas.
         quantile_points: fewest points with an empirical quantile.
     """
 
@@ -80,7 +76,6 @@ class AccuracyFacts:
 
 
 def accuracy_facts(evaluated: EvaluatedSurvey) -> AccuracyFacts:
-    """Return the accuracy of an evaluated survey."""
     report = evaluated.report
     by_way = report.checkpoints.by_way
     sigma, error = _compared(report.checkpoints.camera, evaluated.solved.survey.check_points)
@@ -108,10 +103,6 @@ def ninety_percent(way: str, errors: CheckPointErrors) -> NinetyPercent:
     """Return CE90 and LE90 of check points.
 
     CE90 = 2.1460 · (RMSE_E + RMSE_N) / 2 and LE90 = 1.6449 · RMSE_V, for normal errors without bias.
-
-    Args:
-        way: in which the errors were measured.
-        errors: the errors.
     """
     rows = [row.error_m for row in errors.points if row.error_m is not None]
     table = np.array(rows, dtype=np.float64).reshape(-1, 3)

@@ -1,7 +1,4 @@
-"""Positions of the photographs: measured and adjusted, with error ellipses, residuals of the fixes in time.
-
-Lenses of a survey: reprojection residuals by image region, parameters with σ, and their correlations.
-"""
+"""Photographs of a survey: adjusted positions with error ellipses, residuals of fixes in time; and its lenses."""
 
 from __future__ import annotations
 
@@ -9,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipelines.core.products import is_checked
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.geometry.cameras import LENGTHS, Camera, parameter_names, parameters_in
 from pipelines.report.page import Picture, picture_of_png
@@ -16,7 +14,7 @@ from pipelines.report.place import Texts, heads_of, texts_of
 from pipelines.report.plots.observations import FixSeries, correlation_matrix, fix_series, residual_field
 from pipelines.report.plots.plans import movement_plan
 from pipelines.report.views import EvaluatedSurvey
-from pipelines.survey.survey import CameraPrior, FixSession, Survey
+from pipelines.survey.survey import FixSession, Survey
 from pipelines.survey.trained_survey import FixDifferences, fix_differences
 
 
@@ -42,7 +40,6 @@ class CameraRow:
     """Row of the table of photographs: texts of coordinates in the CRS of the report, differences in metres.
 
     Attributes:
-        name: of the photograph.
         use: `train`, `test`, or `outlier` for a fix that was left out.
         measured: coordinates of the fix; None: there is none.
         adjusted: coordinates of the adjusted camera.
@@ -65,9 +62,7 @@ class CamerasFacts:
     """Positions of the photographs.
 
     Attributes:
-        photographs: number in the survey.
-        registered: number of those in the SfM model.
-        unregistered: names of the others.
+        photographs, registered: numbers in the survey, and in the SfM model; the others are `unregistered`.
         fixes: number of registered photographs with a fix.
         sessions: of the fixes, without repeats, each with the σ of their common error.
         map: adjusted positions, with arrows and ellipses.
@@ -78,7 +73,6 @@ class CamerasFacts:
         bias: of the used fixes; empty without fixes.
         outliers: fixes that were left out.
         median_sigma_h_m, median_sigma_v_m: of the cameras; None: not known.
-        rows: of the table of photographs.
         axes: names of the coordinates with their units.
     """
 
@@ -102,14 +96,13 @@ class CamerasFacts:
 
 
 def cameras_facts(evaluated: EvaluatedSurvey) -> CamerasFacts:
-    """Return the positions of the photographs of an evaluated survey."""
-    solved, sigma = evaluated.solved, evaluated.camera_sigma
+    solved, checked = evaluated.solved, is_checked(evaluated.solved.model.cautions)
     fixes = fix_differences(solved)
     names, registered = solved.sparse.image_name, set(solved.sparse.image_name)
     moved = np.full((len(names), 3), np.nan)
     is_outlier: BoolArray = np.zeros(len(names), dtype=bool)
     moved[fixes.camera], is_outlier[fixes.camera] = fixes.difference_in_geo, fixes.is_outlier
-    covariance = None if sigma.covariance is None else sigma.covariance[:, 3:, 3:]
+    covariance = evaluated.posterior.camera_cov[:, 3:, 3:] if checked else None
     drawn = movement_plan(
         evaluated.center_in_geo[:, :2],
         moved[:, :2],
@@ -127,7 +120,7 @@ def cameras_facts(evaluated: EvaluatedSurvey) -> CamerasFacts:
         map=picture_of_png(drawn.png),
         arrow_factor=drawn.arrow_factor,
         ellipse_factor=drawn.ellipse_factor,
-        no_sigma=sigma.reason,
+        no_sigma="" if checked else "nothing checks the σ of the positions",
         series=series,
         by_time=by_time,
         bias=bias_of(fixes),
@@ -220,8 +213,7 @@ class LensParameter:
         name: after COLMAP.
         unit: `px`, or empty.
         start: before SfM; None: not known.
-        value: after the adjustment.
-        sigma: of `value`; None: not known.
+        value, sigma: after the adjustment; None: not known.
     """
 
     name: str
@@ -236,12 +228,9 @@ class LensFacts:
     """Lens of a camera.
 
     Attributes:
-        camera_id: of the SfM model.
+        camera_id, model: of the SfM model.
         make_model: as recorded in the photographs; may be empty.
-        model: COLMAP's name of the camera model.
-        width_px, height_px: of the photographs.
-        photographs: number of registered ones.
-        observations: number of image observations of SfM points.
+        photographs, observations: numbers of registered ones, and of their image observations of SfM points.
         rmse_px: root mean square length of their residuals; None: no observations.
         parameters: in COLMAP's order.
         correlation: picture; None: not known.
@@ -270,8 +259,6 @@ class LensesFacts:
     Attributes:
         rmse_px: root mean square length of all residuals; None: no observations.
         sigma_px: σ of an image coordinate that follows from the residuals of the SfM model; None: not known.
-        observations, points, photographs: numbers.
-        lenses: one for each camera.
         drawn: number of lenses with pictures.
         no_sigma: reason why σ is not known; empty if known.
     """
@@ -287,7 +274,6 @@ class LensesFacts:
 
 
 def lenses_facts(evaluated: EvaluatedSurvey) -> LensesFacts:
-    """Return the lenses of an evaluated survey, and the residuals of its image observations."""
     sparse, residual = evaluated.solved.sparse, evaluated.residual_px
     covariance = evaluated.posterior.of_lens()
     longest = sparse.lenses.longest
@@ -356,7 +342,10 @@ def _lens(
     drawn: bool,
 ) -> LensFacts:
     prior = next((prior for prior in survey.cameras if prior.camera_id == key), None)
-    start = None if prior is None else parameters_in(_camera_of(prior), camera.model)
+    start = None
+    if prior is not None:
+        before = Camera(prior.model, prior.width, prior.height, np.array(prior.params))
+        start = parameters_in(before, camera.model)
     names = parameter_names(camera)
     sigma = None if covariance is None else np.sqrt(np.maximum(np.diag(covariance), 0.0))
     size = (camera.width, camera.height)
@@ -390,10 +379,6 @@ def _lens(
         residuals=None if field is None else picture_of_png(field.png),
         factor=None if field is None else field.factor,
     )
-
-
-def _camera_of(prior: CameraPrior) -> Camera:
-    return Camera(prior.model, prior.width, prior.height, np.array(prior.params))
 
 
 def _rmse(residual_px: FloatArray) -> float | None:

@@ -1,9 +1,4 @@
-"""Place of the survey on Earth: plan, origin, extent, CRS.
-
-Coordinates in the CRS of the report, as text.
-
-Overlap of the photographs: how many see each cell of the ground, and which are tied to each other.
-"""
+"""Place of the survey on Earth, with coordinates as text; and the overlap of its photographs."""
 
 from __future__ import annotations
 
@@ -36,15 +31,14 @@ def units_of(crs: TargetCrs) -> Texts:
     return first, second, third
 
 
-def axes_of(crs: TargetCrs) -> Texts:
+def axis_names(crs: TargetCrs) -> Texts:
     """Return the names of the three coordinates, easting or longitude first."""
     first, second = ("longitude", "latitude") if crs.crs.is_geographic else ("easting", "northing")
     return first, second, f"height ({crs.crs.vertical.name})"
 
 
 def heads_of(crs: TargetCrs) -> Texts:
-    """Return the heads of the columns of a table of coordinates: name and unit."""
-    first, second, third = (f"{axis} in {unit}" for axis, unit in zip(axes_of(crs), units_of(crs), strict=True))
+    first, second, third = (f"{axis} in {unit}" for axis, unit in zip(axis_names(crs), units_of(crs), strict=True))
     return first, second, third
 
 
@@ -72,7 +66,7 @@ _MOST_DOTS = 12_000
 
 
 @dataclass(frozen=True)
-class Axis:
+class AxisExtent:
     """Extent of the survey along one axis of a CRS."""
 
     name: str
@@ -88,11 +82,8 @@ class PlaceFacts:
     Attributes:
         plan: of photographs and surveyed points.
         origin: latitude and longitude in degrees, ellipsoidal height in metres, of the frame `geo`.
-        geographic: extent of scene and cameras on the WGS84 ellipsoid.
-        projected: the same in the CRS of the report.
-        crs, heights: names of CRS and vertical datum.
+        geographic, projected: extent of scene and cameras on the WGS84 ellipsoid, and in the CRS of the report.
         operation: between WGS84 and the CRS, with its accuracy where that is published.
-        operation_accuracy_m: None: not known.
         recorded_crs, recorded_heights: of the survey's input.
         heights_stated: whether the input stated its datum.
         assumed: what nobody stated of the CRS of the report.
@@ -101,8 +92,8 @@ class PlaceFacts:
 
     plan: Picture
     origin: Vector3
-    geographic: tuple[Axis, ...]
-    projected: tuple[Axis, ...]
+    geographic: tuple[AxisExtent, ...]
+    projected: tuple[AxisExtent, ...]
     crs: str
     heights: str
     operation: str
@@ -131,7 +122,7 @@ def place_facts(evaluated: EvaluatedSurvey) -> PlaceFacts:
         plan=_plan(evaluated),
         origin=(survey.origin.lat_deg, survey.origin.lon_deg, survey.origin.alt_m),
         geographic=_axes(("longitude", "latitude", "ellipsoidal height"), ("°", "°", "m"), lla[:, [1, 0, 2]]),
-        projected=_axes(axes_of(crs), units_of(crs), xyz),
+        projected=_axes(axis_names(crs), units_of(crs), xyz),
         crs=crs.crs.name,
         heights=crs.crs.vertical.name,
         operation=operation.name,
@@ -159,15 +150,14 @@ def _plan(evaluated: EvaluatedSurvey) -> Picture:
 
 
 def named_places(points: tuple[SurveyedPoint, ...]) -> NamedPlaces:
-    """Return names and plan coordinates of surveyed points."""
     place = np.array([point.position_in_geo for point in points]).reshape(-1, 3)[:, :2]
-    return NamedPlaces([point.name for point in points], place)
+    return NamedPlaces(place, [point.name for point in points])
 
 
-def _axes(names: tuple[str, ...], units: tuple[str, ...], values: FloatArray) -> tuple[Axis, ...]:
+def _axes(names: tuple[str, ...], units: tuple[str, ...], values: FloatArray) -> tuple[AxisExtent, ...]:
     low, high = values.min(axis=0).tolist(), values.max(axis=0).tolist()
     return tuple(
-        Axis(name, coordinate(first, unit), coordinate(last, unit), unit)
+        AxisExtent(name, coordinate(first, unit), coordinate(last, unit), unit)
         for name, unit, first, last in zip(names, units, low, high, strict=True)
     )
 
@@ -200,18 +190,13 @@ class OverlapFacts:
     """Overlap of a survey; the map and its figures are None without a scene.
 
     Attributes:
-        overlap: map.
-        cell_m: side of its cells.
         median: number of photographs that see half of the cells or more.
         enough_share: share of the cells that at least `enough` photographs see.
-        enough: that number.
         matches: graph of the photographs that share points.
-        links: number of pairs that share points, and of those that are drawn.
-        drawn_links: the strongest ones.
+        links, drawn_links: numbers of pairs that share points, and of the strongest ones, which are drawn.
         tied_points: points that a pair must share to count as tied.
         median_tied: median number of photographs that a photograph is tied to.
-        least_tied: name of the photograph with fewest of them.
-        least_tied_count: its number.
+        least_tied, least_tied_count: name of the photograph with fewest of them, and their number.
         parts: groups of photographs that no tie connects; 1: all hang together.
     """
 
@@ -231,7 +216,6 @@ class OverlapFacts:
 
 
 def overlap_facts(evaluated: EvaluatedSurvey) -> OverlapFacts:
-    """Return the overlap of an evaluated survey."""
     center = evaluated.center_in_geo[:, :2]
     raster = overlap_of(evaluated)
     inside = raster.count[raster.count >= 0] if raster is not None else np.zeros(0)

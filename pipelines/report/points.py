@@ -1,7 +1,4 @@
-"""Control and check points: coordinates, errors, and image chips around their marks.
-
-Image chips: small pieces of the photographs around the marks of surveyed points.
-"""
+"""Control and check points: coordinates, errors, and chips: small pieces of the photographs around their marks."""
 
 from __future__ import annotations
 
@@ -35,12 +32,11 @@ Pixel = tuple[float, float]
 
 @dataclass(frozen=True)
 class WantedChip:
-    """Mark to be shown.
+    """Mark to be shown, in pixels of a photograph.
 
     Attributes:
         owner: kind and name of the point.
         image: index of the photograph.
-        mark: pixel of the mark.
         adjusted: where the measured point projects; None: not measured.
         surveyed: where the surveyed point projects; None: behind the camera.
     """
@@ -57,9 +53,7 @@ class Chip:
     """Chip with its symbols, in pixels of the photograph from the chip's upper left corner.
 
     Attributes:
-        image: name of the photograph.
-        picture: the piece of the photograph.
-        side_px: of the piece, in pixels of the photograph.
+        side_px: of the piece of the photograph.
         mark, adjusted, surveyed: symbols; None: there is none, or it is outside.
         distance_px: from the mark to the adjusted point; None: not measured.
     """
@@ -143,14 +137,12 @@ class PointRow:
     """Surveyed point.
 
     Attributes:
-        name: as in the survey.
         coordinates: surveyed, in the CRS of the report.
-        field: path of its row in the report of `evaluate`; None: it has none.
+        field, model_field: paths of its rows in the report of `evaluate`, triangulated and on the rendered surface;
+            None: it has none.
         blunder: whether it is a blunder, triangulated.
         predicted: whether the row has predicted σ.
-        model_field: path of its row on the rendered surface; None: it has none.
         rmse_px: root mean square distance of its marks from the adjusted point; None: it is not measured.
-        chips: of its marks.
     """
 
     name: str
@@ -168,11 +160,8 @@ class PointsFacts:
     """Control or check points of a survey.
 
     Attributes:
-        kind: which of the two.
         heads: of the columns of the coordinates.
-        rows: one for each point.
-        chips: number of image chips that are shown.
-        marks: number of marks in registered photographs.
+        chips, marks: numbers of chips that are shown, and of marks in registered photographs.
         side_px: side of a chip in pixels of the photographs.
         surface: whether points were measured on the rendered surface.
     """
@@ -191,10 +180,7 @@ def points_facts(
 ) -> tuple[PointsFacts, PointsFacts]:
     """Return the control points and the check points of an evaluated survey.
 
-    Args:
-        evaluated: the survey.
-        chips_a_point: most image chips for each point; all points together have 240 at most.
-        progress: shows the photographs that chips are cut from.
+    All points together have 240 chips at most, whatever `chips_a_point` allows.
 
     Raises:
         InputError: a photograph cannot be read, or has changed since `ingest`.

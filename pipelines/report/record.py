@@ -1,8 +1,6 @@
 """Record of the processing: stages with options, inputs, versions and times; assumptions, warnings, cautions.
 
-LiDAR that the training has used: its registration, and the places that have changed since.
-
-Comparison of the surface with a reference cloud: map, histogram, and the figures by class and slope.
+Also what two stages have left for the page: LiDAR that the training has used, and the comparison with a reference.
 """
 
 from __future__ import annotations
@@ -18,7 +16,7 @@ from pipelines.core.products import Caution, load_json
 from pipelines.core.stages import BY_NAME, LIDAR, LIDAR_MAP, REFERENCE_HISTOGRAM, REFERENCE_MAP, StageSpec
 from pipelines.core.staleness import cautions_by_stage, status
 from pipelines.core.workspace import Workspace
-from pipelines.report.page import Picture, limited, picture_of, png_file, read_picture
+from pipelines.report.page import Picture, png_file, preview
 from pipelines.report.views import EvaluatedSurvey
 from pipelines.survey.report_parts import LidarReport
 from pipelines.survey.survey import Survey
@@ -31,15 +29,11 @@ class StageRecord:
     """Stage as it was run.
 
     Attributes:
-        name: of the stage.
-        state: as in `georef status`, when the report was made.
-        reason: of the state.
-        made: time at which it ended; None: not recorded.
-        duration_s: None: not recorded.
+        state, reason: as in `georef status`, when the report was made.
+        made, duration_s: end and duration; None: not recorded.
         key_figure: one line.
         options: every option by flag, with its value.
         inputs: SHA-256 by product or flag.
-        warnings: messages that the user should read.
     """
 
     name: str
@@ -75,7 +69,6 @@ class RecordFacts:
 
 
 def record_facts(workspace: Workspace, survey: Survey) -> RecordFacts:
-    """Return the record of the processing of a workspace."""
     states = [row for row in status(workspace) if row.stage != _REPORT]
     stages = []
     versions: dict[str, dict[str, list[str]]] = {}
@@ -158,14 +151,7 @@ class ShiftRow:
 
 @dataclass(frozen=True)
 class LidarFacts:
-    """LiDAR of a training.
-
-    Attributes:
-        report: the record of the training.
-        shift: by axis.
-        listed: number of areas in the table.
-        map: picture; None: not kept.
-    """
+    """LiDAR of a training: the shift by axis, the number of areas in the table, and their map if it was kept."""
 
     report: LidarReport
     shift: tuple[ShiftRow, ...]
@@ -181,25 +167,20 @@ def lidar_facts(workspace: Workspace) -> LidarFacts | None:
     """
     if not (workspace.root / LIDAR).is_file():
         return None
-    report, drawn = load_json(LidarReport, workspace.root / LIDAR), workspace.root / LIDAR_MAP
+    report = load_json(LidarReport, workspace.root / LIDAR)
     registration = report.registration
     rows = zip(("east", "north", "up"), registration.shift_m, registration.sigma_m, strict=True)
     return LidarFacts(
         report,
         tuple(ShiftRow(axis, shift, sigma, abs(shift) > 3 * sigma) for axis, shift, sigma in rows),
         min(len(report.areas), _LISTED),
-        picture_of(limited(read_picture(drawn), _MAP_PX)) if drawn.is_file() else None,
+        preview(workspace.root / LIDAR_MAP, _MAP_PX),
     )
 
 
 @dataclass(frozen=True)
 class ReferenceFacts:
-    """Pictures of a comparison.
-
-    Attributes:
-        is_compared: whether `evaluate` had a reference.
-        map, histogram: None: nothing was measured.
-    """
+    """Pictures of a comparison, if `evaluate` had a reference; None: nothing was measured."""
 
     is_compared: bool
     map: Picture | None

@@ -3,8 +3,6 @@
 Reads survey, SfM model, adjustment and the report of `evaluate`; trained model, test views, accuracy map, metrics
 and LiDAR of the training, and previews of the rasters where there are any. Writes `report/report.html` and, on
 request, `report/report.pdf`.
-
-Summary of the report: key figures, traffic lights, cautions.
 """
 
 from __future__ import annotations
@@ -14,6 +12,7 @@ from datetime import UTC, datetime
 
 from pipelines import __version__
 from pipelines.core.figures import Headline
+from pipelines.core.files import replace_text
 from pipelines.core.products import Caution, union
 from pipelines.core.stages import REPORT_PAGE
 from pipelines.core.workspace import StageRun, Summary
@@ -21,7 +20,7 @@ from pipelines.report.accuracy import accuracy_facts
 from pipelines.report.cameras import LensesFacts, cameras_facts, lenses_facts
 from pipelines.report.chromium import chromium_path, print_pdf
 from pipelines.report.options import ReportOptions
-from pipelines.report.page import Page, Section, write_page
+from pipelines.report.page import Page, Section, render_page
 from pipelines.report.place import OverlapFacts, overlap_facts, place_facts
 from pipelines.report.points import points_facts
 from pipelines.report.record import RecordFacts, lidar_facts, record_facts, reference_facts
@@ -38,14 +37,9 @@ _NOTES = {
 
 @dataclass(frozen=True)
 class SummaryFacts:
-    """Summary of an evaluated survey.
+    """Summary of an evaluated survey: traffic lights, cautions, headline.
 
-    Attributes:
-        verdicts: traffic lights.
-        cautions: limits of the result.
-        headline: accuracy of the result.
-        accuracy_note: what its figures are.
-        statement: ASPRS statement of the triangulated check points; None without any.
+    `accuracy_note` says what the headline's figures are; `statement` is that of ASPRS, None without check points.
     """
 
     verdicts: tuple[Verdict, ...]
@@ -56,20 +50,11 @@ class SummaryFacts:
 
 
 def summary_facts(
-    evaluated: EvaluatedSurvey,
-    cautions: tuple[Caution, ...],
-    overlap: OverlapFacts,
-    lenses: LensesFacts,
-    record: RecordFacts,
+    evaluated: EvaluatedSurvey, overlap: OverlapFacts, lenses: LensesFacts, record: RecordFacts
 ) -> SummaryFacts:
-    """Return the summary of an evaluated survey.
-
-    Args:
-        evaluated: the survey.
-        cautions: of its products.
-        overlap, lenses, record: facts of those sections.
-    """
+    """Return the summary of an evaluated survey, of which it needs the facts of three sections."""
     survey, report = evaluated.solved.survey, evaluated.report
+    cautions = union(evaluated.solved.model.cautions, report.cautions)
     measured = Measured(
         photographs=len(survey.images),
         registered=lenses.photographs,
@@ -113,7 +98,7 @@ def run(stage: StageRun, options: ReportOptions) -> Summary:
         task.advance()
     page, summary = report_page(evaluated, options, stage)
     html = stage.out / REPORT_PAGE.rpartition("/")[2]
-    write_page(page, _ROOM, html)
+    replace_text(html, render_page(page, _ROOM))
     if options.pdf:
         with stage.progress.task("PDF") as task:
             print_pdf(html, html.with_suffix(".pdf"))
@@ -124,17 +109,12 @@ def run(stage: StageRun, options: ReportOptions) -> Summary:
     return Summary(
         f"{', '.join(f'{count} {level}' for level, count in counts.items() if count)}; {size_mb:.1f} MB",
         {**counts, "bytes": html.stat().st_size, "pdf": options.pdf, "crs": evaluated.crs.crs.name},
-        cautions=_cautions(evaluated),
+        cautions=summary.cautions,
     )
 
 
 def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: StageRun) -> tuple[Page, SummaryFacts]:
     """Return the content of the report, and its summary.
-
-    Args:
-        evaluated: the survey.
-        options: of the report.
-        stage: shows the progress; names the workspace.
 
     Raises:
         InputError: a photograph or a picture of the workspace cannot be read.
@@ -157,7 +137,7 @@ def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: Stage
         task.advance(note="views")
         record = record_facts(workspace, survey)
         task.advance(note="record")
-    summary = summary_facts(evaluated, _cautions(evaluated), overlap, lenses, record)
+    summary = summary_facts(evaluated, overlap, lenses, record)
     page = Page(
         title=f"Survey report: {workspace.root.name}",
         subtitle="Georeferenced 3D Gaussian splat, with its measured and predicted accuracy"
@@ -200,7 +180,3 @@ def _sections_of_gaussians(evaluated: EvaluatedSurvey, options: ReportOptions) -
         Section("lidar", "LiDAR in the training", "lidar.html", lidar_facts(workspace)),
         Section("rasters", "Orthophoto and surface model", "rasters.html", previews_facts(workspace)),
     )
-
-
-def _cautions(evaluated: EvaluatedSurvey) -> tuple[Caution, ...]:
-    return union(evaluated.solved.model.cautions, evaluated.report.cautions)

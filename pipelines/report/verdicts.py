@@ -11,7 +11,7 @@ from typing import Literal
 
 from pipelines.core.products import NOT_CHECKED, Caution
 from pipelines.core.sentences import listed
-from pipelines.report.page import decibel, number, share
+from pipelines.report.page import decibel, number_text, share
 from pipelines.survey.report import ByAxis, CheckPointErrors, EvaluationReport
 from pipelines.survey.report_parts import VarianceFactor
 
@@ -29,15 +29,7 @@ TEST_PSNR_DB = (22.0, 18.0)
 
 @dataclass(frozen=True)
 class Verdict:
-    """Verdict on one quality of the survey.
-
-    Attributes:
-        subject: the quality.
-        level: the verdict.
-        reading: what was measured.
-        reason: what follows, or what to do.
-        rule: limits of good and fair.
-    """
+    """Verdict on one quality of the survey: what was measured, what follows, and the limits of good and fair."""
 
     subject: str
     level: Level
@@ -51,9 +43,7 @@ class Measured:
     """Measurements that the verdicts need beside the report of `evaluate`.
 
     Attributes:
-        photographs, registered: numbers.
         enough_share: share of the ground that at least `enough` photographs see; None: no scene.
-        enough: that number.
         parts: groups of photographs that nothing ties to each other.
         rmse_px: of the reprojection residuals; None: no observations.
         fixes, fix_outliers: numbers, of the training photographs.
@@ -79,13 +69,7 @@ class Measured:
 
 
 def verdicts(report: EvaluationReport, measured: Measured, cautions: Sequence[Caution]) -> tuple[Verdict, ...]:
-    """Return the verdicts on a survey, in the order of the work.
-
-    Args:
-        report: of `evaluate`.
-        measured: what the report does not hold.
-        cautions: of all products.
-    """
+    """Return the verdicts on a survey, in the order of the work."""
     return (
         _registered(measured),
         _overlap(measured),
@@ -151,7 +135,7 @@ def _reprojection(measured: Measured) -> Verdict:
         if level == "good"
         else "look at the residuals by image region: a pattern is a fault of the lens model"
     )
-    return Verdict("Reprojection", level, f"{number(measured.rmse_px)} px RMSE", reason, rule)
+    return Verdict("Reprojection", level, f"{number_text(measured.rmse_px)} px RMSE", reason, rule)
 
 
 def _fixes(measured: Measured) -> Verdict:
@@ -195,7 +179,7 @@ def _stated_sigma(factors: tuple[VarianceFactor, ...]) -> Verdict:
         )
     changed = [factor for factor in tested if factor.applied != 1.0]
     if changed:
-        reading = ", ".join(f"{factor.group}: variance × {number(factor.applied)}" for factor in changed)
+        reading = ", ".join(f"{factor.group}: variance × {number_text(factor.applied)}" for factor in changed)
         refuted = any(factor.sigma_source == "stated" for factor in changed)
         reason = "the data refute a stated σ" if refuted else "nobody stated these σ: the data gave them"
         return Verdict("σ of the measurements", "fair", reading, reason, rule)
@@ -249,7 +233,7 @@ def _prediction(errors: CheckPointErrors) -> Verdict:
     return Verdict(
         "Predicted against measured",
         level,
-        f"{number(worst)} on the worst axis",
+        f"{number_text(worst)} on the worst axis",
         reason,
         rule,
     )

@@ -1,7 +1,4 @@
-"""Test views as pictures, the curves of the training, and previews of the rasters.
-
-Evaluated survey: what the sections of the report take their facts from, loaded and computed once.
-"""
+"""Evaluated survey, which all sections show; test views, curves of the training, previews of the rasters."""
 
 from __future__ import annotations
 
@@ -18,7 +15,6 @@ from pipelines.adjust.posterior import Posterior
 from pipelines.adjust.solution import posterior_of
 from pipelines.core.errors import InputError, MissingProductError
 from pipelines.core.files import file_size
-from pipelines.core.products import is_checked
 from pipelines.core.stages import BY_NAME, HILLSHADE, METRICS, ORTHOPHOTO_PREVIEW, RENDERS, REPORT
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
@@ -27,11 +23,12 @@ from pipelines.geometry.cameras import project_each
 from pipelines.geometry.footprints import PointSurface
 from pipelines.geometry.intersection import refined_points
 from pipelines.report.options import ReportOptions
-from pipelines.report.page import Picture, limited, picture_of, picture_of_png, read_picture
+from pipelines.report.page import Picture, limited, picture_of, picture_of_png, preview, read_picture
 from pipelines.report.plots.charts import without_labels
 from pipelines.report.plots.observations import curves
 from pipelines.survey.photographs import DIFFERENCE_GAIN, render_name
 from pipelines.survey.report import EvaluationReport, PhotometricFigures, read_report
+from pipelines.survey.scene import network_of
 from pipelines.survey.target_crs import TargetCrs, usable_crs
 from pipelines.survey.trained_model import TrainedModel
 from pipelines.survey.trained_survey import SolvedSurvey, load_solved
@@ -88,12 +85,8 @@ class TrainingFacts:
 
     Attributes:
         curves: picture; None: no metrics were kept.
-        iterations, gaussians: of the result.
         max_image_size: longer side of the training photographs in pixels.
-        backend: rasteriser.
         duration_s: None: not recorded.
-        last_psnr: of the last batch, dB; None: no metrics.
-        sh_degree: of the spherical harmonics.
     """
 
     curves: Picture | None
@@ -102,7 +95,6 @@ class TrainingFacts:
     max_image_size: int
     backend: str
     duration_s: float | None
-    last_psnr: float | None
     sh_degree: int
 
 
@@ -165,7 +157,6 @@ def training_facts(workspace: Workspace, model: TrainedModel) -> TrainingFacts:
         max_image_size=model.max_image_size,
         backend=model.backend,
         duration_s=None if manifest is None else manifest.duration_s,
-        last_psnr=rows[-1].get("psnr") if rows else None,
         sh_degree=model.sh_degree,
     )
 
@@ -213,11 +204,8 @@ def previews_facts(workspace: Workspace) -> PreviewsFacts:
     Raises:
         InputError: a preview cannot be read.
     """
-    pictures = []
-    for product in (ORTHOPHOTO_PREVIEW, HILLSHADE):
-        path = workspace.root / product
-        pictures.append(picture_of(limited(read_picture(path), _PREVIEW_PX)) if path.is_file() else None)
-    return PreviewsFacts(*pictures)
+    products = (ORTHOPHOTO_PREVIEW, HILLSHADE)
+    return PreviewsFacts(*(preview(workspace.root / product, _PREVIEW_PX) for product in products))
 
 
 _LEAST_RAYS = 3  # of a point that counts as a part of the surface
@@ -225,29 +213,8 @@ _RIM = 0.005  # fraction of the points that are taken for errors above, and belo
 
 
 @dataclass(frozen=True)
-class CameraSigma:
-    """Covariance of the n cameras, or the reason why it is not known.
-
-    Attributes:
-        covariance: (n, 6, 6) of (δθ [rad], δc [m]) along the axes of `geo`; None: not known.
-        reason: why not; empty if known.
-    """
-
-    covariance: FloatArray | None
-    reason: str
-
-
-@dataclass(frozen=True)
 class EvaluatedSurvey:
-    """Solved survey with its evaluation.
-
-    Attributes:
-        workspace: it was read from.
-        solved: survey, cameras, and the Gaussians if there are any.
-        report: of `evaluate`.
-        posterior: covariances of the solution.
-        crs: of the coordinates in the report.
-    """
+    """Solved survey with the report of `evaluate`, the covariances of the solution, and the CRS of the page."""
 
     workspace: Workspace
     solved: SolvedSurvey
@@ -257,7 +224,6 @@ class EvaluatedSurvey:
 
     @cached_property
     def document(self) -> dict[str, Any]:
-        """The report of `evaluate` as JSON."""
         return self.report.model_dump(mode="json")
 
     @cached_property
@@ -268,17 +234,7 @@ class EvaluatedSurvey:
     @cached_property
     def network(self) -> Network:
         """The image observations with adjusted cameras and lenses, and points where these see them, in `model`."""
-        sparse, poses = self.solved.sparse, self.solved.poses
-        network = Network(
-            sparse.cameras,
-            sparse.image_camera_id,
-            poses.cam_from_model,
-            poses.cam_center_in_model,
-            self.solved.point_in_model,
-            sparse.obs_point,
-            sparse.obs_image,
-            sparse.obs_xy_px,
-        )
+        network = network_of(self.solved.sparse, self.solved.poses, self.solved.point_in_model)
         return replace(network, point_in_world=refined_points(network).point_in_world)
 
     @cached_property
@@ -305,13 +261,6 @@ class EvaluatedSurvey:
     def surface(self) -> PointSurface | None:
         """Surface through the points of the scene; None: there are none."""
         return PointSurface(self.scene_in_geo) if len(self.scene_in_geo) else None
-
-    @cached_property
-    def camera_sigma(self) -> CameraSigma:
-        """Covariance of the cameras."""
-        if not is_checked(self.solved.model.cautions):
-            return CameraSigma(None, "nothing checks the σ of the positions")
-        return CameraSigma(self.posterior.camera_cov, "")
 
 
 def load_evaluated(workspace: Workspace, options: ReportOptions) -> EvaluatedSurvey:

@@ -166,17 +166,18 @@ class PointResidual(Product):
     @property
     def error_m(self) -> Vector3 | None:
         """Error east, north, up; None: the point was not measured."""
-        return _vector(self.de_m, self.dn_m, self.du_m)
+        east, north, up = self.de_m, self.dn_m, self.du_m
+        return None if east is None or north is None or up is None else (east, north, up)
 
 
 class PointError(PointResidual):
-    """Error of a point that entered no solution; a blunder exceeds three times the class that the other points meet."""
+    """Error of a point that entered no solution; that of a blunder is thrice the class that the others meet."""
 
     blunder: bool
 
 
 class PredictedPointError(PointError):
-    """Error of a point that entered no solution, with its predicted σ; None: the rays do not determine the point."""
+    """Error of a point that entered no solution, with its σ; None: the rays do not determine the point."""
 
     sigma_e_m: float | None
     sigma_n_m: float | None
@@ -185,11 +186,8 @@ class PredictedPointError(PointError):
     @property
     def sigma_m(self) -> Vector3 | None:
         """σ east, north, up; None: there is no prediction."""
-        return _vector(self.sigma_e_m, self.sigma_n_m, self.sigma_u_m)
-
-
-def _vector(east: float | None, north: float | None, up: float | None) -> Vector3 | None:
-    return None if east is None or north is None or up is None else (east, north, up)
+        east, north, up = self.sigma_e_m, self.sigma_n_m, self.sigma_u_m
+        return None if east is None or north is None or up is None else (east, north, up)
 
 
 PointRows = tuple[PredictedPointError | PointError, ...]
@@ -234,7 +232,7 @@ class CheckPoints(Product):
 
 
 class CrossValidation(StatedErrors):
-    """Errors of the control points, each measured by a solution without that point; or the reason why there are none."""
+    """Errors of the control points, each measured by a solution without it; or the reason why there are none."""
 
     without_blunders: ErrorStats | None
     blunders: tuple[str, ...]

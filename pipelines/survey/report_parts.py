@@ -129,10 +129,6 @@ class ReferenceComparison(Product):
     cylinder_m: float
     groups: tuple[ReferenceGroup, ...]
 
-    def group(self, name: str) -> ReferenceGroup:
-        """Return the figures of a part of the surface."""
-        return next(group for group in self.groups if group.name == name)
-
 
 class LidarArea(Product):
     """Area where the LiDAR and the photographs contradict each other.

@@ -40,8 +40,8 @@ _WIDE_RANGE = 20.0  # between the largest and the smallest bar: beyond, only a l
 
 
 @dataclass(frozen=True)
-class Panel:
-    """One chart: a group of bars for each member, a bar for each series.
+class BarChart:
+    """Group of bars for each member, a bar for each series.
 
     Attributes:
         title: above it.
@@ -60,7 +60,7 @@ class Panel:
     least: float = 0.0
 
 
-def write_bars(path: Path, panels: Sequence[Panel]) -> None:
+def write_bars(path: Path, panels: Sequence[BarChart]) -> None:
     """Draw the panels side by side; a file that is there is replaced when the new one is complete."""
     width, height = _PANEL_INCHES
     figure = new_figure((width * len(panels), height), "constrained")
@@ -69,7 +69,7 @@ def write_bars(path: Path, panels: Sequence[Panel]) -> None:
     write_png(figure, path)
 
 
-def _draw(axes: Axes, panel: Panel) -> None:
+def _draw(axes: Axes, panel: BarChart) -> None:
     _scale(axes, panel)
     width = 0.8 / len(panel.series)
     for position, (name, values) in enumerate(panel.series.items()):
@@ -90,7 +90,7 @@ def _draw(axes: Axes, panel: Panel) -> None:
         )
 
 
-def _scale(axes: Axes, panel: Panel) -> None:
+def _scale(axes: Axes, panel: BarChart) -> None:
     """A logarithmic axis where bars of unlike size would vanish on a linear one."""
     heights = [value for values in panel.series.values() for value in values if value is not None]
     if heights and min(heights) > 0 and max(heights) > _WIDE_RANGE * min(heights):

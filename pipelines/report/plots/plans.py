@@ -6,7 +6,7 @@ Plans of a survey: where it is, how the cameras moved, how often the ground is s
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from math import floor, log10
 from typing import TYPE_CHECKING, Any
@@ -46,7 +46,7 @@ _BOX = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85}
 
 
 @dataclass(frozen=True)
-class Frame:
+class PlanFrame:
     """South-western and north-eastern corner (2,) of a plan, in metres."""
 
     low: FloatArray
@@ -58,19 +58,30 @@ class Frame:
         return float((self.high - self.low).max())
 
 
-def frame_around(*places: FloatArray) -> Frame:
-    """Return the frame around groups of places (N, 2) in metres; a margin is added, and no side is too narrow."""
+def frame_around(
+    *places: FloatArray, narrowest: float = _NARROWEST, margin: float = _MARGIN, least_m: float = 1.0
+) -> PlanFrame:
+    """Return the frame around groups of places (N, 2) in metres.
+
+    Args:
+        places: the groups; NaN rows do not count.
+        narrowest: shorter side over the longer one, at least.
+        margin: around all places, as a part of the longer side.
+        least_m: longer side, at least.
+    """
     everything = np.concatenate([np.zeros((0, 2)), *(np.asarray(group)[:, :2] for group in places)])
     everything = everything[np.isfinite(everything).all(axis=1)]
     if not len(everything):
         everything = np.zeros((1, 2))
     low, high = everything.min(axis=0), everything.max(axis=0)
-    longer = max(float((high - low).max()), 1.0)
-    half = np.maximum(high - low, _NARROWEST * longer) / 2 + _MARGIN * longer
-    return Frame((low + high) / 2 - half, (low + high) / 2 + half)
+    longer = max(float((high - low).max()), least_m)
+    half = np.maximum(high - low, narrowest * longer) / 2 + margin * longer
+    return PlanFrame((low + high) / 2 - half, (low + high) / 2 + half)
 
 
-def new_plan(frame: Frame, title: str, *, right_inches: float = 0.0, legend_rows: int = 0) -> tuple[Figure, Axes]:
+def new_plan(
+    frame: PlanFrame, title: str, *, right_inches: float = 0.0, legend_rows: int = 0
+) -> tuple[Figure, Axes]:
     """Return a figure with the axes of a plan.
 
     Args:
@@ -209,10 +220,20 @@ _OVERLAP_STEPS = (1, 2, 3, 4, 5, 7, 10, 15, 20)
 
 @dataclass(frozen=True)
 class NamedPlaces:
-    """Names and places (N, 2), east and north in metres, of surveyed points."""
+    """Surveyed points to mark on a map.
 
-    names: Sequence[str]
-    place_m: FloatArray
+    Attributes:
+        place_m: (K, 2) east and north.
+        names: of the points; empty: none is written.
+        error_m: (K, 3) east, north, up, to be drawn as arrows; NaN: not measured; None: no arrows.
+    """
+
+    place_m: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    names: Sequence[str] = ()
+    error_m: FloatArray | None = None
+
+
+NO_PLACES = NamedPlaces()
 
 
 @dataclass(frozen=True)
