@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -21,6 +22,9 @@ CE90_OF_AXIS_RMSE = 2.1460
 LE90_OF_RMSE = 1.6449
 _LEAST_FOR_QUANTILE = 10
 _LEAST_FOR_CHART = 3
+# Line of a table of errors: name, key in the report, form and unit.
+FigureLine = tuple[str, str, str, str]
+_CROSSED = ("count", "rmse_h_m", "rmse_v_m", "mean_u_m")
 _SURVEYED = ("rmse_h_m", "rmse_v_m", "rmse_3d_m")
 
 
@@ -46,7 +50,7 @@ class AccuracyFacts:
     """Accuracy of an evaluated survey.
 
     Attributes:
-        figures: of the check points: name, key in the report, form and unit.
+        figures, crossed_figures: of the check points, and of the control points that were left out.
         ninety: CE90 and LE90, triangulated and on the rendered surface.
         ways: words of the ways that have measured points.
         surface: whether points were measured on the rendered surface.
@@ -59,20 +63,21 @@ class AccuracyFacts:
         quantile_points: fewest points with an empirical quantile.
     """
 
-    figures: tuple[tuple[str, str, str, str], ...]
+    figures: tuple[FigureLine, ...]
     ninety: tuple[NinetyPercent, ...]
     ways: dict[str, str]
     surface: bool
     chart: Picture | None
     within: tuple[tuple[str, float, float], ...]
-    cells: dict[str, Figure]
     map: Picture | None
     crossed: bool
     crossed_reason: str
+    crossed_figures: tuple[FigureLine, ...]
     check_points: int
-    ce90_factor: float
-    le90_factor: float
-    quantile_points: int
+    cells: Mapping[str, Figure] = field(default_factory=lambda: CELLS)
+    ce90_factor: float = CE90_OF_AXIS_RMSE
+    le90_factor: float = LE90_OF_RMSE
+    quantile_points: int = _LEAST_FOR_QUANTILE
 
 
 def accuracy_facts(evaluated: EvaluatedSurvey) -> AccuracyFacts:
@@ -82,20 +87,21 @@ def accuracy_facts(evaluated: EvaluatedSurvey) -> AccuracyFacts:
     enough = len(sigma) >= _LEAST_FOR_CHART
     crossed = report.cross_validation
     return AccuracyFacts(
-        figures=_figures(),
+        figures=(
+            *_lines("", tuple(ERRORS)),
+            *_lines("with_survey.", _SURVEYED, " with the points' own survey"),
+            *_lines("without_blunders.", ("count", "rmse_h_m", "rmse_v_m"), " without blunders"),
+        ),
         ninety=tuple(ninety_percent(way, errors) for way, errors in by_way.items()),
         ways={way: WAYS[way] for way, errors in by_way.items() if errors.count},
         chart=picture_of_png(predicted_against_measured(sigma, error)) if enough else None,
         within=_within(sigma, error) if enough else (),
-        cells=CELLS,
         map=_map(evaluated),
         surface="model" in by_way,
         crossed=crossed is not None and crossed.count > 0,
         crossed_reason="" if crossed is None or crossed.reason is None else crossed.reason,
+        crossed_figures=_lines("cross_validation.", _CROSSED),
         check_points=len(evaluated.solved.survey.check_points),
-        ce90_factor=CE90_OF_AXIS_RMSE,
-        le90_factor=LE90_OF_RMSE,
-        quantile_points=_LEAST_FOR_QUANTILE,
     )
 
 
@@ -121,14 +127,12 @@ def ninety_percent(way: str, errors: CheckPointErrors) -> NinetyPercent:
     )
 
 
-def _figures() -> tuple[tuple[str, str, str, str], ...]:
-    """Return the lines of the table of errors: all errors, then with the points' survey, then without blunders."""
-    groups = {"": ("", tuple(ERRORS)), "with_survey.": (" with the points' own survey", _SURVEYED)}
-    groups["without_blunders."] = (" without blunders", ("count", "rmse_h_m", "rmse_v_m"))
-    lines = [(group, ending, name, ERRORS[name]) for group, (ending, names) in groups.items() for name in names]
+def _lines(group: str, names: tuple[str, ...], ending: str = "") -> tuple[FigureLine, ...]:
+    """Return the lines of a table of errors: all errors, or those of a group."""
+    figures = [(name, ERRORS[name]) for name in names]
     return tuple(
         (figure.meaning + ending, group + name, "metres" if figure.unit else "whole", figure.unit)
-        for group, ending, name, figure in lines
+        for name, figure in figures
     )
 
 

@@ -228,7 +228,7 @@ class LensFacts:
     """Lens of a camera.
 
     Attributes:
-        camera_id, model: of the SfM model.
+        camera_id: of the SfM model.
         make_model: as recorded in the photographs; may be empty.
         photographs, observations: numbers of registered ones, and of their image observations of SfM points.
         rmse_px: root mean square length of their residuals; None: no observations.
@@ -240,9 +240,7 @@ class LensFacts:
 
     camera_id: int
     make_model: str
-    model: str
-    width_px: int
-    height_px: int
+    camera: Camera
     photographs: int
     observations: int
     rmse_px: float | None
@@ -359,9 +357,7 @@ def _lens(
     return LensFacts(
         camera_id=key,
         make_model="" if prior is None else prior.make_model,
-        model=camera.model,
-        width_px=camera.width,
-        height_px=camera.height,
+        camera=camera,
         photographs=photographs,
         observations=len(residual_px),
         rmse_px=_rmse(residual_px),

@@ -9,15 +9,16 @@ from scipy.sparse import csr_matrix, triu
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from pipelines.core.types import FloatArray, IntArray, Vector3
+from pipelines.core.types import FloatArray, IntArray
 from pipelines.geodesy.enu import ecef_from_enu, lla_from_ecef
+from pipelines.geodesy.operations import Operation
 from pipelines.geometry.bundle import Network
 from pipelines.geometry.cameras import Camera, project
 from pipelines.geometry.footprints import border_rays
 from pipelines.report.page import Picture, picture_of_png
 from pipelines.report.plots.plans import NamedPlaces, match_plan, overlap_plan, site_plan
 from pipelines.report.views import EvaluatedSurvey
-from pipelines.survey.survey import SurveyedPoint
+from pipelines.survey.survey import Survey, SurveyedPoint
 from pipelines.survey.target_crs import TargetCrs
 
 _SHORT_UNIT = {"metre": "m", "degree": "°"}
@@ -80,28 +81,20 @@ class PlaceFacts:
     """Place of a survey.
 
     Attributes:
-        plan: of photographs and surveyed points.
-        origin: latitude and longitude in degrees, ellipsoidal height in metres, of the frame `geo`.
-        geographic, projected: extent of scene and cameras on the WGS84 ellipsoid, and in the CRS of the report.
+        survey: has the origin, and CRS and datum as recorded.
+        crs: of the report.
         operation: between WGS84 and the CRS, with its accuracy where that is published.
-        recorded_crs, recorded_heights: of the survey's input.
-        heights_stated: whether the input stated its datum.
-        assumed: what nobody stated of the CRS of the report.
+        plan: of photographs and surveyed points.
+        geographic, projected: extent of scene and cameras on the WGS84 ellipsoid, and in the CRS of the report.
         ground_size_m: extent of the scene along east and north.
     """
 
+    survey: Survey
+    crs: TargetCrs
+    operation: Operation
     plan: Picture
-    origin: Vector3
     geographic: tuple[AxisExtent, ...]
     projected: tuple[AxisExtent, ...]
-    crs: str
-    heights: str
-    operation: str
-    operation_accuracy_m: float | None
-    recorded_crs: str
-    recorded_heights: str
-    heights_stated: bool
-    assumed: tuple[str, ...]
     ground_size_m: tuple[float, float]
 
 
@@ -116,21 +109,14 @@ def place_facts(evaluated: EvaluatedSurvey) -> PlaceFacts:
     lla = lla_from_ecef(ecef_from_enu(everything, survey.origin))
     lla[:, 1] -= 360.0 * np.round((lla[:, 1] - lla[0, 1]) / 360.0)
     xyz = crs.xyz_from_geo(everything)
-    operation = crs.crs.operation(crs.lla)
     size = np.ptp(evaluated.scene_in_geo, axis=0).tolist() if len(evaluated.scene_in_geo) else [0.0, 0.0, 0.0]
     return PlaceFacts(
+        survey=survey,
+        crs=crs,
+        operation=crs.crs.operation(crs.lla),
         plan=_plan(evaluated),
-        origin=(survey.origin.lat_deg, survey.origin.lon_deg, survey.origin.alt_m),
         geographic=_axes(("longitude", "latitude", "ellipsoidal height"), ("°", "°", "m"), lla[:, [1, 0, 2]]),
         projected=_axes(axis_names(crs), units_of(crs), xyz),
-        crs=crs.crs.name,
-        heights=crs.crs.vertical.name,
-        operation=operation.name,
-        operation_accuracy_m=operation.accuracy_m,
-        recorded_crs=survey.source_crs,
-        recorded_heights=survey.vertical.name,
-        heights_stated=survey.vertical.stated,
-        assumed=crs.assumed,
         ground_size_m=(size[0], size[1]),
     )
 

@@ -18,7 +18,7 @@ from pipelines.geometry.cameras import project
 from pipelines.report.page import Picture, picture_of
 from pipelines.report.place import Texts, heads_of, texts_of
 from pipelines.report.views import EvaluatedSurvey
-from pipelines.survey.marks import mark_rays
+from pipelines.survey.marks import MarkRays, mark_rays
 from pipelines.survey.photographs import decoded_photograph
 from pipelines.survey.report import PointResidual, PredictedPointError
 from pipelines.survey.survey import SurveyedPoint
@@ -186,55 +186,63 @@ def points_facts(
         InputError: a photograph cannot be read, or has changed since `ingest`.
     """
     survey, report = evaluated.solved.survey, evaluated.report
-    control = _Group("control", survey.control_points, report.fit.gcp.points, "fit.gcp.points")
-    check = _Group("check", survey.check_points, report.checkpoints.camera.points, "checkpoints.camera.points")
-    groups = (control, check)
+    groups = (
+        _group(evaluated, "control", survey.control_points, report.fit.gcp.points, "fit.gcp.points"),
+        _group(
+            evaluated, "check", survey.check_points, report.checkpoints.camera.points, "checkpoints.camera.points"
+        ),
+    )
     total = sum(len(group.points) for group in groups)
     each = min(chips_a_point, max(1, _MOST_CHIPS // total)) if total else 0
-    wanted = [chip for group in groups for chip in _wanted(evaluated, group, each)]
+    images = len(evaluated.solved.sparse.image_name)
+    wanted = [chip for group in groups for chip in _wanted(group, each, images)]
     chips, side_px = cut_chips(evaluated, wanted[:_MOST_CHIPS], progress)
-    facts = [_facts(evaluated, group, chips, side_px) for group in groups]
-    return facts[0], facts[1]
+    control, check = (_facts(evaluated, group, chips, side_px) for group in groups)
+    return control, check
 
 
 @dataclass(frozen=True)
 class _Group:
+    """Control or check points, with the rays of their K marks and the pixels where points project; NaN: nowhere."""
+
     kind: Kind
     points: tuple[SurveyedPoint, ...]
     errors: Sequence[PointResidual]
     field: str
-
-    def adjusted(self) -> FloatArray:
-        """Return the measured positions (J, 3) in `geo`; NaN: not measured."""
-        by_name = {row.name: row for row in self.errors}
-        position = np.full((len(self.points), 3), np.nan)
-        for index, point in enumerate(self.points):
-            row = by_name.get(point.name)
-            if row is not None and row.error_m is not None:
-                position[index] = np.add(point.position_in_geo, row.error_m)
-        return position
+    surveyed_in_geo: FloatArray
+    rays: MarkRays
+    surveyed_px: FloatArray
+    adjusted_px: FloatArray
 
 
-def _wanted(evaluated: EvaluatedSurvey, group: _Group, each: int) -> list[WantedChip]:
+def _group(
+    evaluated: EvaluatedSurvey,
+    kind: Kind,
+    points: tuple[SurveyedPoint, ...],
+    errors: Sequence[PointResidual],
+    field: str,
+) -> _Group:
+    by_name = {row.name: row.error_m for row in errors}
+    surveyed = np.array([point.position_in_geo for point in points]).reshape(-1, 3)
+    error = np.array([by_name.get(point.name) or (np.nan,) * 3 for point in points]).reshape(-1, 3)
+    rays = mark_rays(points, evaluated.solved.sparse)
+    surveyed_px, adjusted_px = (
+        _projected(evaluated, place[rays.point], rays.camera) for place in (surveyed, surveyed + error)
+    )
+    return _Group(kind, points, errors, field, surveyed, rays, surveyed_px, adjusted_px)
+
+
+def _wanted(group: _Group, each: int, images: int) -> list[WantedChip]:
     """Return the chips of a group: for each point those photographs that show most marked points."""
-    rays = mark_rays(group.points, evaluated.solved.sparse)
-    adjusted = _projected(evaluated, group.adjusted()[rays.point], rays.camera)
-    surveyed = np.array([point.position_in_geo for point in group.points]).reshape(-1, 3)
-    on_survey = _projected(evaluated, surveyed[rays.point], rays.camera)
-    popular = np.bincount(rays.camera, minlength=len(evaluated.solved.sparse.image_name))
-    chips: list[WantedChip] = []
+    rays, chips = group.rays, []
+    popular = np.bincount(rays.camera, minlength=images)
     for index, point in enumerate(group.points):
         marks = np.flatnonzero(rays.point == index)
         for mark in marks[np.argsort(-popular[rays.camera[marks]], kind="stable")][:each]:
             x_px, y_px = rays.xy_px[mark].tolist()
+            adjusted, surveyed = _pair(group.adjusted_px[mark]), _pair(group.surveyed_px[mark])
             chips.append(
-                WantedChip(
-                    (group.kind, point.name),
-                    int(rays.camera[mark]),
-                    (x_px, y_px),
-                    _pair(adjusted[mark]),
-                    _pair(on_survey[mark]),
-                )
+                WantedChip((group.kind, point.name), int(rays.camera[mark]), (x_px, y_px), adjusted, surveyed)
             )
     return chips
 
@@ -242,18 +250,17 @@ def _wanted(evaluated: EvaluatedSurvey, group: _Group, each: int) -> list[Wanted
 def _facts(
     evaluated: EvaluatedSurvey, group: _Group, chips: dict[tuple[str, str], tuple[Chip, ...]], side_px: int
 ) -> PointsFacts:
-    rays = mark_rays(group.points, evaluated.solved.sparse)
-    distance = rays.xy_px - _projected(evaluated, group.adjusted()[rays.point], rays.camera)
-    surveyed = np.array([point.position_in_geo for point in group.points]).reshape(-1, 3)
+    distance = group.rays.xy_px - group.adjusted_px
     place = {row.name: index for index, row in enumerate(group.errors)}
     surface = evaluated.report.checkpoints.model
     by_model = {} if surface is None else {row.name: index for index, row in enumerate(surface.points)}
     rows = []
-    for index, (point, coordinates) in enumerate(zip(group.points, texts_of(evaluated.crs, surveyed), strict=True)):
+    texts = texts_of(evaluated.crs, group.surveyed_in_geo)
+    for index, (point, coordinates) in enumerate(zip(group.points, texts, strict=True)):
         at = place.get(point.name)
         row = None if at is None else group.errors[at]
         model_at = by_model.get(point.name) if group.kind == "check" else None
-        squares = (distance[rays.point == index] ** 2).sum(axis=1)
+        squares = (distance[group.rays.point == index] ** 2).sum(axis=1)
         rows.append(
             PointRow(
                 name=point.name,
@@ -271,7 +278,7 @@ def _facts(
         heads=heads_of(evaluated.crs),
         rows=tuple(rows),
         chips=sum(len(row.chips) for row in rows),
-        marks=len(rays),
+        marks=len(group.rays),
         side_px=side_px,
         surface=surface is not None,
     )

@@ -140,21 +140,11 @@ _LISTED = 12
 
 
 @dataclass(frozen=True)
-class ShiftRow:
-    """Shift along one axis, and its σ, in metres; whether it is beyond 3 σ."""
-
-    axis: str
-    shift_m: float
-    sigma_m: float
-    beyond: bool
-
-
-@dataclass(frozen=True)
 class LidarFacts:
-    """LiDAR of a training: the shift by axis, the number of areas in the table, and their map if it was kept."""
+    """LiDAR of a training: axis, shift and σ in metres; number of areas in the table; their map if it was kept."""
 
     report: LidarReport
-    shift: tuple[ShiftRow, ...]
+    shift: tuple[tuple[str, float, float], ...]
     listed: int
     map: Picture | None
 
@@ -169,10 +159,9 @@ def lidar_facts(workspace: Workspace) -> LidarFacts | None:
         return None
     report = load_json(LidarReport, workspace.root / LIDAR)
     registration = report.registration
-    rows = zip(("east", "north", "up"), registration.shift_m, registration.sigma_m, strict=True)
     return LidarFacts(
         report,
-        tuple(ShiftRow(axis, shift, sigma, abs(shift) > 3 * sigma) for axis, shift, sigma in rows),
+        tuple(zip(("east", "north", "up"), registration.shift_m, registration.sigma_m, strict=True)),
         min(len(report.areas), _LISTED),
         preview(workspace.root / LIDAR_MAP, _MAP_PX),
     )
@@ -180,9 +169,8 @@ def lidar_facts(workspace: Workspace) -> LidarFacts | None:
 
 @dataclass(frozen=True)
 class ReferenceFacts:
-    """Pictures of a comparison, if `evaluate` had a reference; None: nothing was measured."""
+    """Pictures of a comparison; None: nothing was measured."""
 
-    is_compared: bool
     map: Picture | None
     histogram: Picture | None
 
@@ -194,6 +182,6 @@ def reference_facts(evaluated: EvaluatedSurvey) -> ReferenceFacts:
         InputError: a picture is damaged.
     """
     if evaluated.report.reference is None:
-        return ReferenceFacts(False, None, None)
+        return ReferenceFacts(None, None)
     paths = (evaluated.workspace.root / product for product in (REFERENCE_MAP, REFERENCE_HISTOGRAM))
-    return ReferenceFacts(True, *(png_file(path) if path.is_file() else None for path in paths))
+    return ReferenceFacts(*(png_file(path) if path.is_file() else None for path in paths))

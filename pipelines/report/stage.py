@@ -37,16 +37,12 @@ _NOTES = {
 
 @dataclass(frozen=True)
 class SummaryFacts:
-    """Summary of an evaluated survey: traffic lights, cautions, headline.
-
-    `accuracy_note` says what the headline's figures are; `statement` is that of ASPRS, None without check points.
-    """
+    """Summary of an evaluated survey: traffic lights, cautions, headline, and what the headline's figures are."""
 
     verdicts: tuple[Verdict, ...]
     cautions: tuple[Caution, ...]
     headline: Headline
     accuracy_note: str
-    statement: str | None
 
 
 def summary_facts(
@@ -75,7 +71,6 @@ def summary_facts(
         cautions=cautions,
         headline=report.headline,
         accuracy_note=_NOTES[report.headline.kind],
-        statement=report.checkpoints.camera.asprs.statement,
     )
 
 
@@ -147,7 +142,7 @@ def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: Stage
             "Made": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
             "Program": f"GeoRefGS {__version__}",
             "Photographs": f"{cameras.registered} of {cameras.photographs} registered",
-            "Reference system": f"{place.crs}, heights {place.heights}",
+            "Reference system": f"{place.crs.crs.name}, heights {place.crs.crs.vertical.name}",
         },
         sections=(
             Section("summary", "Summary", "summary.html", summary),

@@ -81,21 +81,11 @@ class ViewsFacts:
 
 @dataclass(frozen=True)
 class TrainingFacts:
-    """Training of the model.
+    """Training of the model, with its curves; None: no metrics were kept, or the duration was not recorded."""
 
-    Attributes:
-        curves: picture; None: no metrics were kept.
-        max_image_size: longer side of the training photographs in pixels.
-        duration_s: None: not recorded.
-    """
-
+    model: TrainedModel
     curves: Picture | None
-    iterations: int
-    gaussians: int
-    max_image_size: int
-    backend: str
     duration_s: float | None
-    sh_degree: int
 
 
 @dataclass(frozen=True)
@@ -151,13 +141,9 @@ def training_facts(workspace: Workspace, model: TrainedModel) -> TrainingFacts:
         rows = []
     panels = _panels(rows)
     return TrainingFacts(
+        model=model,
         curves=picture_of_png(curves("iteration", panels)) if panels else None,
-        iterations=model.iterations,
-        gaussians=model.gaussians,
-        max_image_size=model.max_image_size,
-        backend=model.backend,
         duration_s=None if manifest is None else manifest.duration_s,
-        sh_degree=model.sh_degree,
     )
 
 

@@ -22,10 +22,10 @@ from pipelines.report.plots.style import (
     EMPTY_COLOUR,
     FIGURE_POINTS,
     GREY,
-    LABEL_POINTS,
     ORANGE,
     SERIES_COLOURS,
     TICK_POINTS,
+    add_scale,
     label,
     new_figure,
     pixels_of,
@@ -135,9 +135,8 @@ def write_distance_map(path: Path, place_m: FloatArray, distance_m: FloatArray, 
     )
     axes.set_xlim(frame.low[0], frame.high[0])
     axes.set_ylim(frame.low[1], frame.high[1])
-    bar = figure.colorbar(image, cax=bar_axes(figure, axes), extend="both")
-    bar.set_label("m; above 0: the model lies before the reference", fontsize=LABEL_POINTS)
-    bar.ax.tick_params(labelsize=TICK_POINTS)
+    text = "m; above 0: the model lies before the reference"
+    add_scale(figure, image, text, cax=bar_axes(figure, axes), extend="both")
     add_bearings(axes)
     write_png(figure, path)
 

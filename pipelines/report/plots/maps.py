@@ -36,7 +36,9 @@ from pipelines.report.plots.style import (
     HEADING_POINTS,
     LABEL_POINTS,
     ORANGE,
-    TICK_POINTS,
+    add_arrows,
+    add_key,
+    add_scale,
     label,
     new_figure,
     write_png,
@@ -127,12 +129,9 @@ def draw_errors(axes: Axes, places: FloatArray, errors_m: FloatArray, factor: fl
     known = np.isfinite(errors_m).all(axis=1)
     if not known.any():
         return
-    (east, north), (right, up) = places[known].T, factor * errors_m[known].T
-    axes.quiver(
-        east, north, right, up,
-        angles="xy", scale_units="xy", scale=1.0, width=0.006, zorder=5,
-        color=ORANGE if of_control else DARK, edgecolor="white", linewidth=0.4,
-    )  # fmt: skip
+    colour = ORANGE if of_control else DARK
+    style = {"color": colour, "edgecolor": "white", "linewidth": 0.4, "width": 0.006, "zorder": 5}
+    add_arrows(axes, places[known], factor * errors_m[known], **style)
 
 
 def draw_north(figure: Figure, axes: Axes) -> None:
@@ -258,20 +257,9 @@ def write_accuracy_map(
         draw_north(figure, axes)
         axes.locator_params("x", nbins=max(round(_MOST_TICKS * width / _MAP), 2))
         axes.locator_params("y", nbins=max(round(_MOST_TICKS * height / _MAP), 2))
-        figure.colorbar(image, cax=bar).set_label(f"{symbol} in m", fontsize=LABEL_POINTS)
-        bar.tick_params(labelsize=TICK_POINTS)
+        add_scale(figure, image, f"{symbol} in m", cax=bar)
         bar.ticklabel_format(useOffset=False, style="plain")
-    handles, names = figure.axes[0].get_legend_handles_labels()
-    if names:
-        figure.legend(
-            handles,
-            names,
-            loc="center",
-            bbox_to_anchor=(0.5, _LEGEND_HEIGHT / figure.get_figheight()),
-            ncols=len(names),
-            fontsize=TICK_POINTS,
-            frameon=False,
-        )
+    add_key(figure, 3, loc="center", bbox_to_anchor=(0.5, _LEGEND_HEIGHT / figure.get_figheight()))
     write_png(figure, path)
 
 
@@ -372,5 +360,5 @@ def write_lidar_map(path: Path, points_in_geo: FloatArray, areas: Sequence[Drawn
         names = [f"{area.area_m2:.0f} m²" for area in areas[:_NAMED]]
         add_names(figure, axes, np.array(middles), names, np.zeros((0, 2)))
     add_bearings(axes)
-    add_legend(figure, axes)
+    add_legend(figure)
     write_png(figure, path)

@@ -19,6 +19,9 @@ from pipelines.report.plots.style import (
     LABEL_POINTS,
     ORANGE,
     TICK_POINTS,
+    add_arrows,
+    add_key,
+    add_scale,
     label,
     new_figure,
     png_of,
@@ -77,9 +80,7 @@ def residual_field(size_px: tuple[int, int], mean_px: FloatArray, rms_px: FloatA
     image = axes.imshow(
         np.ma.masked_invalid(rms_px), cmap=COLOUR_MAP, extent=(0, width, height, 0), interpolation="nearest"
     )
-    bar = figure.colorbar(image, ax=axes, fraction=0.04, pad=0.02)
-    bar.set_label("RMS of the residuals in px", fontsize=LABEL_POINTS)
-    bar.ax.tick_params(labelsize=TICK_POINTS)
+    add_scale(figure, image, "RMS of the residuals in px", ax=axes, fraction=0.04, pad=0.02)
     x = (np.arange(columns) + 0.5) * width / columns
     y = (np.arange(rows) + 0.5) * height / rows
     grid = np.stack(np.meshgrid(x, y), axis=-1)
@@ -88,19 +89,9 @@ def residual_field(size_px: tuple[int, int], mean_px: FloatArray, rms_px: FloatA
     factor = None
     if longest > 0:
         factor = nice_number(_ARROW_SHARE * min(width / columns, height / rows) / longest)
-        arrow = factor * mean_px[known]
-        axes.quiver(
-            *grid[known].T,
-            *arrow.T,
-            angles="xy",
-            scale_units="xy",
-            scale=1,
-            color="white",
-            edgecolor="black",  # readable on every colour
-            linewidth=0.5,
-            width=0.004,
-            pivot="mid",
-        )
+        # white on black: readable on every colour
+        style = {"color": "white", "edgecolor": "black", "linewidth": 0.5}
+        add_arrows(axes, grid[known], factor * mean_px[known], width=0.004, pivot="mid", **style)
     return DrawnField(png_of(figure), factor)
 
 
@@ -110,15 +101,8 @@ def fix_series(series: FixSeries) -> bytes:
     order = np.argsort(series.abscissa, kind="stable")
     for axis, axes in enumerate(figure.subplots(3, 1, sharex=True)):
         values, sigma = series.residual_m[:, axis], series.sigma_m[:, axis]
-        axes.fill_between(
-            series.abscissa[order],
-            -2 * sigma[order],
-            2 * sigma[order],
-            color=GREY,
-            alpha=0.3,
-            linewidth=0,
-            label="stated 2 σ",
-        )
+        band = {"color": GREY, "alpha": 0.3, "linewidth": 0, "label": "stated 2 σ"}
+        axes.fill_between(series.abscissa[order], -2 * sigma[order], 2 * sigma[order], **band)
         axes.axhline(0, color=DARK, linewidth=0.6)
         used = ~series.is_outlier
         if used.any():
@@ -132,8 +116,7 @@ def fix_series(series: FixSeries) -> bytes:
         label(axes, "", y=f"{_AXES[axis]} in m")
         axes.spines[["top", "right"]].set_visible(False)
     axes.set_xlabel(series.abscissa_title, fontsize=LABEL_POINTS)
-    handles, names = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside upper center", ncols=len(names), fontsize=TICK_POINTS, frameon=False)
+    add_key(figure, 4, loc="outside upper center")
     return png_of(figure)
 
 
@@ -183,8 +166,7 @@ def predicted_against_measured(sigma_m: FloatArray, error_m: FloatArray) -> byte
         axes.set_ylim(0, 1.1 * max(float(error.max()), 2 * most))
         label(axes, name, x="predicted σ with survey in m", y="measured error in m")
         axes.spines[["top", "right"]].set_visible(False)
-    handles, names = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside lower center", ncols=3, fontsize=TICK_POINTS, frameon=False)
+    add_key(figure, 3, loc="outside lower center")
     return png_of(figure)
 
 

@@ -21,9 +21,11 @@ from pipelines.report.plots.style import (
     EMPTY_COLOUR,
     FIGURE_POINTS,
     GREY,
-    LABEL_POINTS,
     ORANGE,
     TICK_POINTS,
+    add_arrows,
+    add_key,
+    add_scale,
     label,
     new_figure,
     png_of,
@@ -146,19 +148,9 @@ def add_bearings(axes: Axes) -> None:
     )
 
 
-def add_legend(figure: Figure, axes: Axes, columns: int = 4) -> None:
+def add_legend(figure: Figure, columns: int = 4) -> None:
     """Add the legend of a plan below it."""
-    handles, names = axes.get_legend_handles_labels()
-    if names:
-        figure.legend(
-            handles,
-            names,
-            loc="lower center",
-            bbox_to_anchor=(0.5, 0.04 / figure.get_figheight()),
-            ncols=min(columns, len(names)),
-            fontsize=TICK_POINTS,
-            frameon=False,
-        )
+    add_key(figure, columns, loc="lower center", bbox_to_anchor=(0.5, 0.04 / figure.get_figheight()))
 
 
 def add_names(figure: Figure, axes: Axes, places: FloatArray, names: Sequence[str], others: FloatArray) -> int:
@@ -283,7 +275,7 @@ def site_plan(
     add_bearings(axes)
     marked = np.concatenate([control.place_m, check.place_m])
     add_names(figure, axes, marked, [*control.names, *check.names], np.concatenate([training_m, test_m]))
-    add_legend(figure, axes)
+    add_legend(figure)
     return png_of(figure)
 
 
@@ -316,17 +308,8 @@ def movement_plan(
         ):
             if chosen.any():
                 start, arrow = center_m[chosen] - arrow_factor * moved_m[chosen], arrow_factor * moved_m[chosen]
-                axes.quiver(
-                    *start.T,
-                    *arrow.T,
-                    angles="xy",
-                    scale_units="xy",
-                    scale=1,
-                    color=colour,
-                    width=0.003,
-                    zorder=4,
-                    label=f"{name} (× {arrow_factor:g})",
-                )
+                text = f"{name} (× {arrow_factor:g})"
+                add_arrows(axes, start, arrow, color=colour, width=0.003, zorder=4, label=text)
     if covariance is not None and np.isfinite(covariance).all():
         variance, axis = np.linalg.eigh(covariance)
         semi = np.sqrt(np.maximum(variance, 0.0))
@@ -349,7 +332,7 @@ def movement_plan(
             )
             axes.plot([], [], "o", mfc="none", mec=DARK, label=f"1 σ ellipse (× {ellipse_factor:g})")
     add_bearings(axes)
-    add_legend(figure, axes, columns=2)
+    add_legend(figure, columns=2)
     return DrawnMovement(png_of(figure), arrow_factor, ellipse_factor)
 
 
@@ -382,13 +365,11 @@ def overlap_plan(count: IntArray, corner_m: FloatArray, cell_m: float, camera_m:
     axes.scatter(camera_m[:, 0], camera_m[:, 1], s=6, color="white", edgecolors=DARK, linewidths=0.5)
     axes.set_xlim(west, east)
     axes.set_ylim(south, north)
-    bar = figure.colorbar(image, cax=bar_axes(figure, axes))
+    bar = add_scale(figure, image, "photographs that see the cell", cax=bar_axes(figure, axes))
     bar.set_ticks(
         ticks=[(low + high) / 2 for low, high in pairwise(edges)],
         labels=[str(low) if high == low + 1 else f"{low}–{high - 1}" for low, high in pairwise(edges)],
     )
-    bar.set_label("photographs that see the cell", fontsize=LABEL_POINTS)
-    bar.ax.tick_params(labelsize=TICK_POINTS)
     add_bearings(axes)
     return png_of(figure)
 
@@ -420,9 +401,7 @@ def match_plan(camera_m: FloatArray, pairs: IntArray, shared: IntArray) -> bytes
     lines.set_array(shared[order])
     axes.add_collection(lines)
     axes.scatter(camera_m[:, 0], camera_m[:, 1], s=10, color="white", edgecolors=DARK, linewidths=0.7, zorder=3)
-    bar = figure.colorbar(lines, cax=bar_axes(figure, axes))
-    bar.set_label("points that two photographs share", fontsize=LABEL_POINTS)
-    bar.ax.tick_params(labelsize=TICK_POINTS)
+    bar = add_scale(figure, lines, "points that two photographs share", cax=bar_axes(figure, axes))
     bar.ax.yaxis.set_major_formatter("{x:g}")
     add_bearings(axes)
     return png_of(figure)
