@@ -34,12 +34,7 @@ class PointAccuracy(Product):
 
 
 class SurfaceAccuracy(Product):
-    """Surface against the reference cloud of `evaluate`.
-
-    Attributes:
-        median_m, nmad_m: of the distances along the normals (M3C2); None: not measured.
-        f1: by threshold in metres, in the order of the report; None: no points.
-    """
+    """Surface against the reference cloud of `evaluate`: M3C2 distances, and F1 by threshold in metres."""
 
     median_m: float | None
     nmad_m: float | None

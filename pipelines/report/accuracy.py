@@ -52,14 +52,11 @@ class AccuracyFacts:
     Attributes:
         figures, crossed_figures: of the check points, and of the control points that were left out.
         ninety: CE90 and LE90, triangulated and on the rendered surface.
-        ways: words of the ways that have measured points.
-        surface: whether points were measured on the rendered surface.
+        ways: words of the ways that have measured points; `surface`: the rendered surface may be one.
         chart: predicted against measured σ; None: fewer than three points have both.
         within: share of the points within 1 σ and 2 σ of the prediction, horizontal and vertical; empty likewise.
-        cells: what is told of the predicted σ over the scene, by the beginning of its fields.
-        map: of the predicted σ; None: there is none.
-        crossed: whether control points were cross-validated with a result.
-        crossed_reason: why not; empty: they were not to be.
+        map, cells: of the predicted σ; None: there is none; and what is told of it, by the beginning of its fields.
+        crossed, crossed_reason: whether control points were cross-validated; why not; empty: they were not to be.
         quantile_points: fewest points with an empirical quantile.
     """
 

@@ -37,15 +37,9 @@ class Outlier:
 
 @dataclass(frozen=True)
 class CameraRow:
-    """Row of the table of photographs: texts of coordinates in the CRS of the report, differences in metres.
+    """Row of the table of photographs: coordinates in the CRS of the report; east, north, up in metres; None: not known.
 
-    Attributes:
-        use: `train`, `test`, or `outlier` for a fix that was left out.
-        measured: coordinates of the fix; None: there is none.
-        adjusted: coordinates of the adjusted camera.
-        difference_m: adjusted minus measured, east, north, up; None: no fix.
-        sigma_m: of the adjusted position, east, north, up; None: not known.
-        sha256: of the file; empty: not recorded.
+    `use` is `train`, `test`, or `outlier` for a fix that was left out.
     """
 
     name: str
@@ -59,20 +53,17 @@ class CameraRow:
 
 @dataclass(frozen=True)
 class CamerasFacts:
-    """Positions of the photographs.
+    """Positions of the photographs; a picture, factor or σ is None where there is none.
 
     Attributes:
         photographs, registered: numbers in the survey, and in the SfM model; the others are `unregistered`.
         fixes: number of registered photographs with a fix.
         sessions: of the fixes, without repeats, each with the σ of their common error.
-        map: adjusted positions, with arrows and ellipses.
-        arrow_factor, ellipse_factor: magnifications; None: none are drawn.
+        map: adjusted positions, with arrows and ellipses, magnified.
         no_sigma: reason why there are no ellipses; empty: there are.
-        series: residuals in time; None: no fixes.
-        by_time: whether the series runs in time; otherwise, in the order of the photographs.
+        series: residuals in time if `by_time`; otherwise, in the order of the photographs.
         bias: of the used fixes; empty without fixes.
         outliers: fixes that were left out.
-        median_sigma_h_m, median_sigma_v_m: of the cameras; None: not known.
         axes: names of the coordinates with their units.
     """
 
@@ -207,14 +198,7 @@ _MOST_LENSES = 8  # that are shown with pictures
 
 @dataclass(frozen=True)
 class LensParameter:
-    """Parameter of a lens.
-
-    Attributes:
-        name: after COLMAP.
-        unit: `px`, or empty.
-        start: before SfM; None: not known.
-        value, sigma: after the adjustment; None: not known.
-    """
+    """Parameter of a lens, after COLMAP; `start` before SfM, value and σ after the adjustment; None: not known."""
 
     name: str
     unit: str
@@ -228,12 +212,10 @@ class LensFacts:
     """Lens of a camera.
 
     Attributes:
-        camera_id: of the SfM model.
         make_model: as recorded in the photographs; may be empty.
         photographs, observations: numbers of registered ones, and of their image observations of SfM points.
         rmse_px: root mean square length of their residuals; None: no observations.
-        parameters: in COLMAP's order.
-        correlation: picture; None: not known.
+        correlation: of the parameters; None: not known.
         residuals: mean residual by image region; None beyond the first lenses, or without observations.
         factor: magnification of its arrows; None: no arrows.
     """
@@ -252,12 +234,11 @@ class LensFacts:
 
 @dataclass(frozen=True)
 class LensesFacts:
-    """Lenses of a survey.
+    """Lenses of a survey, of which the first `drawn` have pictures.
 
     Attributes:
         rmse_px: root mean square length of all residuals; None: no observations.
         sigma_px: σ of an image coordinate that follows from the residuals of the SfM model; None: not known.
-        drawn: number of lenses with pictures.
         no_sigma: reason why σ is not known; empty if known.
     """
 
@@ -309,10 +290,7 @@ def mean_by_region(
 ) -> tuple[FloatArray, FloatArray]:
     """Return mean (R, C, 2) and RMS (R, C) of residuals by image region, rows from the top; NaN: too few.
 
-    Args:
-        xy_px: (M, 2) places in the image.
-        residual_px: (M, 2); NaN rows do not count.
-        size_px: width and height of the image.
+    Residuals (M, 2) that are NaN do not count; `xy_px` (M, 2) are their places in an image of a width and height.
     """
     width, height = size_px
     side = max(width, height) / _REGIONS

@@ -140,11 +140,9 @@ class Section:
 
 @dataclass(frozen=True)
 class Page:
-    """Content of a page.
+    """Content of a page: name and value of each line of its head, such as the time, then its sections.
 
-    Attributes:
-        about: name and value of each line of the head, such as the time at which the page was made.
-        document: JSON document that figures of the page are taken from by their path (`figure` in `macros.html`).
+    Figures are taken from the JSON document by their path (`figure` in `macros.html`).
     """
 
     title: str
@@ -256,11 +254,7 @@ def read_picture(path: Path) -> ByteArray:
 
 
 def preview(path: Path, longest_px: int) -> Picture | None:
-    """Return a picture of the workspace, made smaller if it is larger; None: there is none.
-
-    Raises:
-        InputError: as `read_picture`.
-    """
+    """Return a picture of the workspace, as `read_picture`, made smaller if it is larger; None: there is none."""
     return picture_of(limited(read_picture(path), longest_px)) if path.is_file() else None
 
 

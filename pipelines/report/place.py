@@ -78,15 +78,9 @@ class AxisExtent:
 
 @dataclass(frozen=True)
 class PlaceFacts:
-    """Place of a survey.
+    """Place of a survey; its extent is that of scene and cameras, on the WGS84 ellipsoid and in the CRS.
 
-    Attributes:
-        survey: has the origin, and CRS and datum as recorded.
-        crs: of the report.
-        operation: between WGS84 and the CRS, with its accuracy where that is published.
-        plan: of photographs and surveyed points.
-        geographic, projected: extent of scene and cameras on the WGS84 ellipsoid, and in the CRS of the report.
-        ground_size_m: extent of the scene along east and north.
+    The operation is that between WGS84 and the CRS; the ground size is that of the scene along east and north.
     """
 
     survey: Survey
@@ -99,11 +93,6 @@ class PlaceFacts:
 
 
 def place_facts(evaluated: EvaluatedSurvey) -> PlaceFacts:
-    """Return the place of an evaluated survey.
-
-    Raises:
-        InputError: the survey lies outside the domain of the CRS.
-    """
     survey, crs = evaluated.solved.survey, evaluated.crs
     everything = np.concatenate([evaluated.scene_in_geo, evaluated.center_in_geo])
     lla = lla_from_ecef(ecef_from_enu(everything, survey.origin))
@@ -163,7 +152,6 @@ class OverlapRaster:
     Attributes:
         count: (R, C) rows from the south, columns from the west; −1: no scene.
         corner_m: (2,) east and north of the south-western corner.
-        cell_m: side of a cell.
     """
 
     count: IntArray
@@ -178,11 +166,9 @@ class OverlapFacts:
     Attributes:
         median: number of photographs that see half of the cells or more.
         enough_share: share of the cells that at least `enough` photographs see.
-        matches: graph of the photographs that share points.
-        links, drawn_links: numbers of pairs that share points, and of the strongest ones, which are drawn.
+        matches: graph of the photographs that share points, with the strongest `drawn_links` of the `links`.
         tied_points: points that a pair must share to count as tied.
-        median_tied: median number of photographs that a photograph is tied to.
-        least_tied, least_tied_count: name of the photograph with fewest of them, and their number.
+        median_tied: median number of photographs that a photograph is tied to; `least_tied` has fewest.
         parts: groups of photographs that no tie connects; 1: all hang together.
     """
 

@@ -32,13 +32,9 @@ Pixel = tuple[float, float]
 
 @dataclass(frozen=True)
 class WantedChip:
-    """Mark to be shown, in pixels of a photograph.
+    """Mark to be shown, in pixels of a photograph; `owner` is kind and name of the point.
 
-    Attributes:
-        owner: kind and name of the point.
-        image: index of the photograph.
-        adjusted: where the measured point projects; None: not measured.
-        surveyed: where the surveyed point projects; None: behind the camera.
+    `adjusted` and `surveyed` are where the measured and the surveyed point project; None: nowhere.
     """
 
     owner: tuple[str, str]
@@ -50,12 +46,9 @@ class WantedChip:
 
 @dataclass(frozen=True)
 class Chip:
-    """Chip with its symbols, in pixels of the photograph from the chip's upper left corner.
+    """Chip with its symbols, in pixels of the photograph from the chip's upper left corner; None: there is none.
 
-    Attributes:
-        side_px: of the piece of the photograph.
-        mark, adjusted, surveyed: symbols; None: there is none, or it is outside.
-        distance_px: from the mark to the adjusted point; None: not measured.
+    `distance_px` leads from the mark to the adjusted point.
     """
 
     image: str
@@ -134,14 +127,12 @@ Kind = Literal["control", "check"]
 
 @dataclass(frozen=True)
 class PointRow:
-    """Surveyed point.
+    """Surveyed point, with its coordinates in the CRS of the report.
 
     Attributes:
-        coordinates: surveyed, in the CRS of the report.
         field, model_field: paths of its rows in the report of `evaluate`, triangulated and on the rendered surface;
             None: it has none.
-        blunder: whether it is a blunder, triangulated.
-        predicted: whether the row has predicted σ.
+        blunder, predicted: whether it is a blunder, triangulated; whether the row has predicted σ.
         rmse_px: root mean square distance of its marks from the adjusted point; None: it is not measured.
     """
 
@@ -157,10 +148,9 @@ class PointRow:
 
 @dataclass(frozen=True)
 class PointsFacts:
-    """Control or check points of a survey.
+    """Control or check points of a survey, with the heads of their coordinates' columns.
 
     Attributes:
-        heads: of the columns of the coordinates.
         chips, marks: numbers of chips that are shown, and of marks in registered photographs.
         side_px: side of a chip in pixels of the photographs.
         surface: whether points were measured on the rendered surface.
@@ -178,13 +168,7 @@ class PointsFacts:
 def points_facts(
     evaluated: EvaluatedSurvey, chips_a_point: int, progress: Progress
 ) -> tuple[PointsFacts, PointsFacts]:
-    """Return the control points and the check points of an evaluated survey.
-
-    All points together have 240 chips at most, whatever `chips_a_point` allows.
-
-    Raises:
-        InputError: a photograph cannot be read, or has changed since `ingest`.
-    """
+    """Return the control and check points of an evaluated survey, with 240 chips at most."""
     survey, report = evaluated.solved.survey, evaluated.report
     groups = (
         _group(evaluated, "control", survey.control_points, report.fit.gcp.points, "fit.gcp.points"),

@@ -26,12 +26,10 @@ _REPORT = "report"
 
 @dataclass(frozen=True)
 class StageRecord:
-    """Stage as it was run.
+    """Stage as it was run; None: not recorded.
 
     Attributes:
         state, reason: as in `georef status`, when the report was made.
-        made, duration_s: end and duration; None: not recorded.
-        key_figure: one line.
         options: every option by flag, with its value.
         inputs: SHA-256 by product or flag.
     """
@@ -49,14 +47,11 @@ class StageRecord:
 
 @dataclass(frozen=True)
 class RecordFacts:
-    """Processing of a survey.
+    """Processing of a survey: its stages in the order of the work, assumptions of `ingest`, cautions by stage.
 
     Attributes:
-        stages: in the order of the work.
         total_s: sum of the recorded durations.
         versions: of this package and its libraries, by name, with the stages that ran with them if not all did.
-        assumptions: of `ingest`.
-        cautions: by stage.
         by_hand: stages whose product was put there by hand.
     """
 
@@ -150,11 +145,7 @@ class LidarFacts:
 
 
 def lidar_facts(workspace: Workspace) -> LidarFacts | None:
-    """Return the LiDAR of a training; None: it has used none.
-
-    Raises:
-        InputError: record or map cannot be read.
-    """
+    """Return the LiDAR of a training; None: it has used none."""
     if not (workspace.root / LIDAR).is_file():
         return None
     report = load_json(LidarReport, workspace.root / LIDAR)
@@ -176,11 +167,6 @@ class ReferenceFacts:
 
 
 def reference_facts(evaluated: EvaluatedSurvey) -> ReferenceFacts:
-    """Return the pictures of the comparison with a reference.
-
-    Raises:
-        InputError: a picture is damaged.
-    """
     if evaluated.report.reference is None:
         return ReferenceFacts(None, None)
     paths = (evaluated.workspace.root / product for product in (REFERENCE_MAP, REFERENCE_HISTOGRAM))

@@ -46,9 +46,8 @@ class Measured:
         enough_share: share of the ground that at least `enough` photographs see; None: no scene.
         parts: groups of photographs that nothing ties to each other.
         rmse_px: of the reprojection residuals; None: no observations.
-        fixes, fix_outliers: numbers, of the training photographs.
-        control_points, control_outliers: numbers of used and of rejected ones.
-        check_points: number in the survey.
+        fixes: number, of the training photographs.
+        control_points: number of used ones; the rejected are `control_outliers`.
         stale: stages whose product is not current.
         workspace: path, for commands.
     """

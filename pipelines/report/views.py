@@ -64,13 +64,9 @@ class TestView:
 
 @dataclass(frozen=True)
 class ViewsFacts:
-    """Test views of an evaluated survey.
+    """Test views: those with pictures, the worst first; name, and path of the figures, of all.
 
-    Attributes:
-        shown: views with pictures, the worst first.
-        rows: name, and path of the figures, of every view.
-        gain: of the difference.
-        renders: number of renders that `evaluate` has saved.
+    `renders` is the number of renders that `evaluate` has saved, `gain` that of the difference.
     """
 
     shown: tuple[TestView, ...]
@@ -97,11 +93,7 @@ class PreviewsFacts:
 
 
 def views_facts(workspace: Workspace, test: PhotometricFigures, most: int) -> ViewsFacts:
-    """Return the test views of a workspace, with pictures of at most `most` of them.
-
-    Raises:
-        InputError: a render cannot be read.
-    """
+    """Return the test views of a workspace, with pictures of at most `most` of them."""
     views = test.per_view
     fields = {view.image: f"photometric.test.per_view.{index}" for index, view in enumerate(views)}
     worst_first = sorted(views, key=lambda view: view.psnr)
@@ -129,11 +121,6 @@ def _view(name: str, field: str, file: Path) -> TestView:
 
 
 def training_facts(workspace: Workspace, model: TrainedModel) -> TrainingFacts:
-    """Return the training of a workspace.
-
-    Raises:
-        InputError: the metrics are damaged.
-    """
     manifest = workspace.manifest(BY_NAME["train"])
     try:
         rows = read_metrics(workspace.path(METRICS))
@@ -185,11 +172,6 @@ def _panels(rows: list[dict[str, float]]) -> dict[str, Mapping[str, tuple[FloatA
 
 
 def previews_facts(workspace: Workspace) -> PreviewsFacts:
-    """Return the previews of the rasters of a workspace.
-
-    Raises:
-        InputError: a preview cannot be read.
-    """
     products = (ORTHOPHOTO_PREVIEW, HILLSHADE)
     return PreviewsFacts(*(preview(workspace.root / product, _PREVIEW_PX) for product in products))
 

@@ -28,15 +28,12 @@ class InitialSimilarity(Product):
 
     Attributes:
         method: `robust` or `paper`, the option of `init-sim3`; `adjusted` by the bundle adjustment of the baseline.
-        correspondences: number by kind: `gnss` (camera centres with fixes), `gcp` (control points), `points`
-            (geolocated points).
-        inliers: number by kind that agrees with the similarity.
-        gnss_outliers: names of the images whose fixes were rejected: they enter no later solution.
-        control_outliers: names of the control points that were rejected, or that their marks do not determine:
-            they enter no later solution.
+        correspondences, inliers: numbers by kind, of all and of those that agree with the similarity: `gnss`
+            (camera centres with fixes), `gcp` (control points), `points` (geolocated points).
+        gnss_outliers, control_outliers: names of the images whose fixes, and of the control points that were
+            rejected, or that their marks do not determine: they enter no later solution.
         condition_number: of the normal matrix, with angles and ln s scaled by the size of the layout.
         layout: extent of the correspondences: they fill a volume, lie in a plane, or on a line.
-        attitude_used: whether recorded attitudes contributed to the rotation.
         variance_factors: tests of the stated σ, with the factors that apply to all later stages.
     """
 
@@ -82,13 +79,11 @@ class GeolocatedPoints(ArrayProduct):
     """Product of `geolocate`: N SfM points intersected in the geo frame.
 
     Attributes:
-        point_id: (N,) int64, ids in the COLMAP model.
-        position_in_geo: (N, 3) float64, metres; NaN where rays did not intersect.
-        cov_in_geo: (N, 3, 3) float64, m².
-        ray_count: (N,) int32, rays in use.
-        max_angle_deg: (N,) float64, largest angle between two of its rays.
-        condition: (N,) float64, condition number of the normal matrix.
-        inlier: (N,) bool.
+        point_id: of the COLMAP model.
+        position_in_geo, cov_in_geo: metres, m²; NaN where rays did not intersect.
+        ray_count: int32, rays in use.
+        max_angle_deg: largest angle between two of its rays.
+        condition: condition number of the normal matrix.
         rotation_source: source of the rays' rotations: "recorded" attitudes or "sfm".
     """
 

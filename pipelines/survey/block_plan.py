@@ -22,9 +22,7 @@ Bound = tuple[float | None, float | None]
 class BlockCell(Product):
     """Vertical prism in `model`, half-open: a point on its western or southern side is inside.
 
-    Attributes:
-        low: east and north of the sides in the west and south, metres; None: without end.
-        high: of the sides in the east and north.
+    `low` and `high` are the sides, east and north in metres; None: without end.
     """
 
     low: Bound = (None, None)
@@ -148,8 +146,7 @@ class BlockTraining(Product):
         gaussians_in_cell: those that the merged model takes.
         seconds: of the iterations.
         processor_s: of all processors together, for one iteration; None: unknown.
-        mean_gaussians: mean number during the training.
-        mean_visible: mean number in a view, those that stood in for the rest among them.
+        mean_gaussians, mean_visible: mean numbers during the training, and in a view, surroundings among these.
         mean_px: mean number of the pixels of a view that were rendered.
         surroundings: Gaussians that stood in for the rest.
         peak_bytes: peak of the process's memory; None: not measured on this system.

@@ -28,22 +28,16 @@ class NavigationTrack(ArrayProduct):
 
     `calibrate` fits the SfM cameras to this navigation. Positions are those of the antenna, attitudes those of the
     body (forward-right-down), both on the navigation's clock, without any correction by the rig. The rig is the one
-    given to `ingest`.
+    given to `ingest`. Lengths are metres, times seconds.
 
     Attributes:
-        position_time_s: (K,) float64, seconds.
-        antenna_in_geo: (K, 3) float64, metres.
-        sigma_m: (K, 3) float64, σ east, north, up; NaN where the receiver states none.
-        attitude_time_s: (M,) float64, seconds.
-        geo_from_body: (M, 3, 3) float64.
-        image: (n,) names of images.
-        image_time_s: (n,) float64, camera clock.
-        cam_from_body: (n, 3, 3) float64, mount; NaN where unknown.
-        antenna_in_body: (n, 3) float64, lever arm; NaN where unknown.
-        nominal_from_cam: (3, 3) float64, boresight.
-        time_offset_s: () float64, navigation clock minus camera clock.
-        max_gap_s: () float64, longest gap to interpolate over.
-        body_known: () bool; if false, the body's axes are set to the camera's nominal axes.
+        sigma_m: σ east, north, up; NaN where the receiver states none.
+        image, image_time_s: names of images, and their times on the camera clock.
+        cam_from_body, antenna_in_body: mount and lever arm; NaN where unknown.
+        nominal_from_cam: boresight.
+        time_offset_s: navigation clock minus camera clock.
+        max_gap_s: longest gap to interpolate over.
+        body_known: if false, the body's axes are set to the camera's nominal axes.
     """
 
     FORMS: ClassVar = {
@@ -225,7 +219,6 @@ def _images(
 
 
 def _filled(values: list[ValueT | None], time_s: FloatArray) -> list[ValueT | None]:
-    """Return the values; None is replaced by the value nearest in time, if there is any."""
     known = np.array([row for row, value in enumerate(values) if value is not None], dtype=np.int64)
     if not len(known):
         return values

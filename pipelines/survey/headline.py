@@ -77,12 +77,9 @@ Way = Literal["camera", "model", "left out", "fit"]
 
 @dataclass(frozen=True)
 class PointLine:
-    """Error of one point, measured in one way.
+    """Error of one point, of a check point or of one that entered the solution.
 
-    Attributes:
-        use: whether the point is a check point or entered the solution.
-        way: triangulated, on the rendered surface, by a solution that left the point out, or as the residual of
-            the fit.
+    It is triangulated, on the rendered surface, by a solution that left the point out, or the residual of the fit.
     """
 
     use: Literal["check", "control"]

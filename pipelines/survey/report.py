@@ -47,10 +47,8 @@ class ViewFigures(Product):
 class PhotometricFigures(_OptionalKeys):
     """Photometric figures of all test views: means, and the figures of each view.
 
-    Attributes:
-        psnr_compensated: after an affine change of colour that is fitted to each photograph.
-        psnr_covered: mean over the views that have covered pixels.
-        lpips: None without weights of the network; `lpips_reason` says so.
+    `psnr_compensated` follows an affine change of colour that is fitted to each photograph; `psnr_covered` is the
+    mean over the views that have covered pixels. LPIPS is None without weights of its network, as its reason says.
     """
 
     views: int
@@ -116,8 +114,7 @@ class AsprsStatement(Product):
         points: number of check points outside vegetation: horizontal, vertical (NVA) and 3-D accuracy are theirs.
         horizontal_class, vertical_class, class_3d: smallest classes of whole centimetres that the errors meet
             ("5 cm"); None without these points.
-        area_km2: of the scene, by which the standard counts.
-        least_points: number of check points that the standard demands for this area.
+        area_km2, least_points: of the scene, and the number of check points that the standard demands for it.
         statement: sentence to quote.
     """
 
@@ -194,11 +191,7 @@ PointRows = tuple[PredictedPointError | PointError, ...]
 
 
 class StatedErrors(ErrorStats):
-    """Figures of errors, with those of the survey.
-
-    Attributes:
-        survey: σ of the points' own survey.
-        with_survey: errors and survey in quadrature.
+    """Figures of errors; with σ of the points' own survey, and both in quadrature.
 
     Points under vegetation count in the errors alone, and neither in `survey` nor in `with_survey`.
     """
@@ -299,10 +292,7 @@ class PointCoordinates(Product):
 class Coordinates(Product):
     """Check points and origin of `geo` in a CRS: easting or longitude first, height last.
 
-    Attributes:
-        heights: surface that the heights count from.
-        operation: published operation between WGS84 and the CRS.
-        operation_accuracy_m: None: not known.
+    `heights` is the surface that these count from, `operation` the published one between WGS84 and the CRS.
     """
 
     crs: str
@@ -330,11 +320,8 @@ class EvaluationReport(_OptionalKeys):
     Attributes:
         headline: accuracy of the result, as every table and file states it.
         photometric: None: nothing is trained yet.
-        cross_validation: None without `--cross-validate`.
-        accuracy: predicted σ over the scene.
-        fit: residuals of the solution.
+        cross_validation, coordinates, reference: None without their options.
         cameras: predicted σ of the camera positions; None: nothing checks it.
-        coordinates, reference: absent without `--crs`, and without `--reference`.
         cautions: limits of the result: those of the model, then those that `evaluate` found.
     """
 
@@ -354,7 +341,6 @@ class EvaluationReport(_OptionalKeys):
 
     @property
     def test_views(self) -> PhotometricFigures | None:
-        """Figures of the test views; None: nothing is trained yet."""
         return None if self.photometric is None else self.photometric.test
 
     @model_validator(mode="before")

@@ -19,10 +19,8 @@ Alignment = Literal["none", "shift", "similarity"]
 class SurfaceScore(Product):
     """Shares of points that lie within a distance of the other cloud; None: there are no points.
 
-    Attributes:
-        precision: of the model's points, where the reference covers the plan.
-        recall: of the reference's points that photographs saw.
-        f1: their harmonic mean.
+    Precision is that of the model's points, where the reference covers the plan; recall that of the reference's
+    points that photographs saw; F1 their harmonic mean.
     """
 
     threshold_m: float
@@ -35,12 +33,11 @@ class M3c2Figures(Product):
     """Distances model minus reference along the reference's normals (M3C2), positive on the cameras' side.
 
     Attributes:
-        core_points: places on the reference that photographs saw.
-        measured: places at which both clouds have points within the cylinder.
+        core_points, measured: places on the reference that photographs saw, and those of them at which both clouds
+            have points within the cylinder.
         nmad_m: 1.4826 times the median absolute deviation from the median.
         abs_95_m: 95 % of the distances are shorter.
-        median_lod_m: median level of detection, 95 %.
-        significant: share of the distances beyond their level of detection.
+        median_lod_m: median level of detection, 95 %; beyond it lies the share `significant` of the distances.
     """
 
     core_points: int
@@ -67,11 +64,9 @@ class CloudDistances(Product):
 
 
 class ReferenceGroup(Product):
-    """Figures of one part of the surface.
+    """Figures of one part of the surface, of which photographs saw `seen_points` of the reference.
 
-    Attributes:
-        name: `all`; a class (`ground`, `roof`, `wall`, `vegetation`, `other`); or a range of slopes.
-        seen_points: points of the reference that photographs saw.
+    Its name is `all`; a class (`ground`, `roof`, `wall`, `vegetation`, `other`); or a range of slopes.
     """
 
     name: str
@@ -86,8 +81,7 @@ class ReferenceShift(Product):
     """Translation that moves the model onto the reference best, by points and planes.
 
     Attributes:
-        enu_m: east, north, up.
-        sigma_m: their σ, from the spread between parts of the scene.
+        enu_m, sigma_m: east, north, up; σ from the spread between parts of the scene.
         scale_ppm, turn_deg: of the similarity; 0 for a shift.
         reference_from_model: rows of the matrix [sR | t] in geo.
     """
@@ -104,8 +98,7 @@ class ReferenceComparison(Product):
     """Comparison of the surface with a reference cloud.
 
     Attributes:
-        points: of the reference within the scene, after thinning.
-        seen: share of them that photographs saw.
+        points, seen: of the reference within the scene, after thinning; share of them that photographs saw.
         spacing_m: median distance between neighbours in the reference.
         model_spacing_m: side of the voxels of the model's cloud.
         sigma_m: stated σ of the reference.

@@ -103,13 +103,7 @@ def network_of(sparse: SparseModel, poses: CameraPoses, point_in_model: FloatArr
 
 
 def make_scene(sparse: SparseModel, survey: Survey, model_from_local: Similarity, shift: FloatArray) -> Scene:
-    """Return the scene of a sparse model.
-
-    Args:
-        sparse: the SfM model.
-        survey: has the split into training and test images.
-        model_from_local: similarity from the SfM frame.
-        shift: (3,) origin of the frame `model` in `geo`.
+    """Return the scene of a sparse model, whose origin lies at a `shift` (3,) in `geo`.
 
     Raises:
         DegenerateGeometryError: fewer than two registered training images.

@@ -107,13 +107,7 @@ _NotNegative = Annotated[float, Field(ge=0)]
 
 
 class CameraPrior(Product):
-    """Intrinsics of a camera before SfM.
-
-    Attributes:
-        camera_id: number from 1.
-        model, params: of COLMAP; lengths in pixels of the full image.
-        make_model: of the camera, as recorded in the photographs.
-    """
+    """Intrinsics of a camera before SfM: COLMAP's model and parameters, in pixels of the full image."""
 
     camera_id: int = Field(ge=1)
     model: str
@@ -125,13 +119,7 @@ class CameraPrior(Product):
 
 
 class Fix(Product):
-    """Measured position of a camera centre.
-
-    Attributes:
-        position_in_geo: metres.
-        cov_in_geo: 3×3, m².
-        session: index into the survey's `sessions`.
-    """
+    """Measured position of a camera centre in metres and m²; `session` is an index into the survey's `sessions`."""
 
     position_in_geo: Vector3
     cov_in_geo: Covariance3
@@ -143,9 +131,8 @@ class Fix(Product):
 class FixSession(Product):
     """Fixes that share one error beside their own: of the base station, the receiver, or the day.
 
-    Attributes:
-        receiver: kind of receiver, of `ingest.image_poses.RECEIVERS`.
-        sigma_common_m: σ of the common error east, north, up in metres; 0: none along that axis.
+    `sigma_common_m` is its σ east, north, up, 0 for none along that axis; `receiver` is one of
+    `ingest.image_poses.RECEIVERS`.
     """
 
     receiver: str
@@ -154,11 +141,7 @@ class FixSession(Product):
 
 
 class Attitude(Product):
-    """Measured rotation of a camera: `p_geo = R(quat_xyzw) p_cam + centre`.
-
-    Attributes:
-        sigma_deg: σ per axis.
-    """
+    """Measured rotation of a camera, with σ per axis: `p_geo = R(quat_xyzw) p_cam + centre`."""
 
     quat_xyzw: Rotation
     sigma_deg: float = Field(gt=0)
@@ -166,12 +149,9 @@ class Attitude(Product):
 
 
 class SurveyImage(Product):
-    """Photograph of the survey.
+    """Photograph, named by its path relative to the survey's `image_dir`; its time is the camera clock's.
 
-    Attributes:
-        name: path relative to the survey's `image_dir`.
-        sha256: hash of the file; empty in a survey written by hand: the photograph is not checked then.
-        timestamp_s: time of exposure, camera clock.
+    `sha256` is empty in a survey written by hand: the photograph is not checked then.
     """
 
     name: ImageName
@@ -222,8 +202,6 @@ class Survey(Product):
     replaces that rig by the estimates of `calibrate`.
 
     Attributes:
-        source_crs: CRS in which the positions were recorded.
-        vertical: vertical datum of the recorded heights.
         image_dir: folder of photographs, absolute or inside the workspace.
         sessions: groups of fixes with one common error each; empty: no common error is modelled.
         check_points: points that enter no solution.

@@ -71,8 +71,8 @@ class Adjustment(Product):
 
     Attributes:
         model_from_local: fixed similarity from the SfM frame.
-        cameras: corrected cameras, in the order of the SfM model's images.
-        lenses: corrected lenses; a camera of the SfM model without one keeps SfM's lens.
+        cameras: in the order of the SfM model's images.
+        lenses: a camera of the SfM model without one keeps SfM's lens.
         gnss_outliers, control_outliers: names of the images whose fixes, and of the control points that `init-sim3`
             has rejected: they entered no solution.
         sigma_px: σ of an image coordinate of a tie point.

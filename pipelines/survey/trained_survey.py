@@ -36,12 +36,7 @@ Solution = TypeVar("Solution", bound=Adjustment)
 
 @dataclass(frozen=True)
 class SolvedSurvey:
-    """Survey with the solution of its adjustment.
-
-    Attributes:
-        sfm: the SfM model with SfM's lenses; its images have the order of `poses`.
-        model: similarity, cameras, lenses.
-    """
+    """Survey with the solution of its adjustment; `sfm` has SfM's lenses, its images the order of `poses`."""
 
     survey: Survey
     sfm: SparseModel
@@ -158,12 +153,9 @@ def points_by_camera(solved: SolvedSurvey, rays: MarkRays) -> FloatArray:
 
 @dataclass(frozen=True)
 class FixDifferences:
-    """Adjusted minus measured position of the F registered cameras that have a fix.
+    """Adjusted minus measured position (F, 3) in metres of the F registered cameras that have a fix.
 
-    Attributes:
-        camera: (F,) index into the images of the SfM model.
-        difference_in_geo: (F, 3) metres.
-        is_outlier: (F,) whether the solution has left the fix out.
+    `is_outlier` says whether the solution has left the fix out.
     """
 
     camera: IntArray

@@ -1,9 +1,4 @@
-"""Bar charts as PNG files.
-
-Distances between two surfaces: as a map and as histograms.
-
-Pictures side by side, each with its label above.
-"""
+"""Bar charts, distances between two surfaces as map and histogram, and labelled pictures side by side."""
 
 from __future__ import annotations
 
@@ -44,10 +39,8 @@ class BarChart:
     """Group of bars for each member, a bar for each series.
 
     Attributes:
-        title: above it.
         axis: what the bars measure, with its unit.
-        members: names of the G groups.
-        series: by name, G heights; None leaves a gap.
+        series: by name, heights of the members; None leaves a gap.
         digits: decimals of the figures on the bars.
         least: where a linear axis begins.
     """
@@ -108,13 +101,9 @@ _COLOURS = (BLUE, ORANGE, DARK, "#3a9d6e", GREY)
 
 
 def write_distance_map(path: Path, place_m: FloatArray, distance_m: FloatArray, size_m: float) -> None:
-    """Write the map of signed distances: blue below zero, red above.
+    """Write the map of signed distances (C,) at places (C, 2), east and north, C ≥ 1: blue below zero, red above.
 
-    Args:
-        path: of the PNG.
-        place_m: (C, 2) east and north, C ≥ 1.
-        distance_m: (C,).
-        size_m: least side of a cell, which shows the median of its distances.
+    A cell, whose least side is `size_m`, shows the median of its distances.
     """
     frame = frame_around(place_m)
     cell_m = max(size_m, frame.longer_m / _MOST_CELLS)
@@ -142,13 +131,7 @@ def write_distance_map(path: Path, place_m: FloatArray, distance_m: FloatArray, 
 
 
 def write_distance_histogram(path: Path, groups: Mapping[str, FloatArray], lod_m: float) -> None:
-    """Write the densities of signed distances by group, and the band of the level of detection.
-
-    Args:
-        path: of the PNG.
-        groups: distances (C,) by name, none empty.
-        lod_m: median level of detection, 95 %.
-    """
+    """Write the densities of signed distances by group, none empty, and the median level of detection."""
     everything = np.concatenate(list(groups.values()))
     limit_m = _round_up(max(float(np.quantile(np.abs(everything), 0.98)), 1.5 * lod_m))
     edges = np.linspace(-limit_m, limit_m, _BINS + 1)

@@ -1,8 +1,6 @@
-"""What a surveyor looks for on a map beside its colours: names, errors as arrows, coordinates, and north.
+"""Maps with what a surveyor looks for beside the colours: names, errors as arrows, coordinates, and north.
 
-The predicted accuracy over a scene as a pair of maps, horizontal and vertical σ.
-
-Map of the places where LiDAR and photographs contradict each other.
+They show the predicted accuracy over a scene, and the places where LiDAR and photographs contradict each other.
 """
 
 from __future__ import annotations
@@ -58,14 +56,7 @@ _NORTH_LENGTH, _NORTH_LEFT, _NORTH_GAP = 0.28, 0.45, 0.04  # inches: the arrow, 
 
 @dataclass(frozen=True)
 class MapCoordinates:
-    """Coordinates to write beside the metres of a map.
-
-    Attributes:
-        crs: name of the CRS.
-        names: of the first and second coordinate: `longitude`, `latitude`.
-        unit: of both.
-        of: returns coordinates (N, 2) of places east and north (N, 2).
-    """
+    """Coordinates beside the metres of a map: their names, and those of places (N, 2) east and north."""
 
     crs: str
     names: tuple[str, str]
@@ -112,10 +103,7 @@ def exaggeration(lengths_m: FloatArray, side_m: float) -> float | None:
     """Return the factor 1, 2 or 5 times a power of ten by which errors are drawn; None: none is to be drawn.
 
     The longest arrow takes a seventh of the map's longer side, where it is not four times as long as the median.
-
-    Args:
-        lengths_m: (K,) of the errors; NaN: not measured.
-        side_m: of the map.
+    Lengths (K,) are NaN where errors were not measured.
     """
     known = lengths_m[np.isfinite(lengths_m)]
     longest = 0.0 if not len(known) else min(float(known.max()), _OUTLIER * float(np.median(known)))
@@ -176,13 +164,9 @@ _LARGEST_SIGN, _SMALLEST_SIGN, _LARGE_SIGNS = 26.0, 9.0, 100
 
 @dataclass(frozen=True)
 class SigmaRaster:
-    """Standard deviations over a scene, as R rows from the south and C columns from the west.
+    """Standard deviations (R, C) over a scene, rows from the south, columns from the west; NaN: there is no scene.
 
-    Attributes:
-        sigma_h_m: (R, C) horizontal; NaN where there is no scene.
-        sigma_v_m: (R, C) vertical.
-        corner_m: (2,) east and north of the south-western corner.
-        cell_m: side of a cell.
+    `corner_m` (2,) is the south-western corner, east and north, and `cell_m` the side of a cell.
     """
 
     sigma_h_m: FloatArray
@@ -206,12 +190,7 @@ def write_accuracy_map(
     """Draw horizontal and vertical σ side by side, north up, with cameras, control and check points.
 
     Errors of the points are arrows: horizontal ones on the left, vertical ones, up and down, on the right.
-
-    Args:
-        path: of the picture.
-        raster: σ.
-        points: to mark.
-        coordinates: to write below the metres of the axes; None: none.
+    Coordinates are written below the metres of the axes.
     """
     rows, columns = raster.sigma_h_m.shape
     corners = np.stack([raster.corner_m, raster.corner_m + raster.cell_m * np.array([columns, rows])])
@@ -309,13 +288,9 @@ _NAMED = 12
 
 @dataclass(frozen=True)
 class DrawnArea:
-    """Changed area.
+    """Changed area, which only the LiDAR has (`removed`) or only the photographs have (`added`).
 
-    Attributes:
-        kind: `removed`: only the LiDAR has it; `added`: only the photographs have it.
-        area_m2: in plan.
-        corner_in_geo: (C, 2) south-western corners of its cells, east and north in metres.
-        cell_m: side of these cells.
+    `corner_in_geo` (C, 2) are the south-western corners of its cells, east and north in metres.
     """
 
     kind: Literal["removed", "added"]
@@ -325,12 +300,7 @@ class DrawnArea:
 
 
 def write_lidar_map(path: Path, points_in_geo: FloatArray, areas: Sequence[DrawnArea]) -> None:
-    """Write the map as PNG.
-
-    Args:
-        path: of the picture.
-        points_in_geo: (P, 3) cloud, drawn by its height.
-        areas: that have changed, the largest first.
+    """Write the map of a cloud (P, 3), drawn by its height, with the areas that have changed, the largest first.
 
     Raises:
         OSError: the picture cannot be written.

@@ -45,14 +45,9 @@ class DrawnField:
 
 @dataclass(frozen=True)
 class FixSeries:
-    """Residuals of F fixes in time.
+    """Residuals (F, 3) of F fixes in time, east, north, up, with their stated σ; an outlier was left out.
 
-    Attributes:
-        abscissa: (F,) seconds since the first, or the number of the photograph.
-        abscissa_title: what it is, with its unit.
-        residual_m: (F, 3) east, north, up.
-        sigma_m: (F, 3) stated σ.
-        is_outlier: (F,) whether the solution has left it out.
+    The abscissa (F,) is seconds since the first, or the number of the photograph.
     """
 
     abscissa: FloatArray
@@ -148,12 +143,7 @@ def correlation_matrix(names: Sequence[str], correlation: FloatArray) -> bytes:
 
 
 def predicted_against_measured(sigma_m: FloatArray, error_m: FloatArray) -> bytes:
-    """Return predicted σ against measured errors of check points as PNG.
-
-    Args:
-        sigma_m: (J, 2) horizontal and vertical, of error and survey together.
-        error_m: (J, 2) lengths, horizontal and vertical.
-    """
+    """Return predicted σ (J, 2) against measured errors (J, 2) of check points, horizontal and vertical, as PNG."""
     figure = new_figure((7.6, 3.9), "constrained")
     for axis, (axes, name) in enumerate(zip(figure.subplots(1, 2), ("horizontal", "vertical"), strict=True)):
         sigma, error = sigma_m[:, axis], error_m[:, axis]
@@ -171,12 +161,7 @@ def predicted_against_measured(sigma_m: FloatArray, error_m: FloatArray) -> byte
 
 
 def curves(abscissa_title: str, panels: Mapping[str, Mapping[str, tuple[FloatArray, FloatArray]]]) -> bytes:
-    """Return curves below each other as PNG.
-
-    Args:
-        abscissa_title: what runs to the right.
-        panels: by the quantity on the ordinate, with its unit: the curves by name, abscissa (N,) and ordinate (N,).
-    """
+    """Return curves below each other as PNG: by quantity, lines by name, abscissa (N,) and ordinate (N,)."""
     width, height = _CHART_INCHES
     figure = new_figure((width, 0.62 * height * len(panels) + 0.5), "constrained")
     all_axes = np.atleast_1d(figure.subplots(len(panels), 1, sharex=True))

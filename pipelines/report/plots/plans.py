@@ -1,6 +1,6 @@
-"""Plans: axes with east to the right and north up, with north arrow, scale bar and names that do not overlap.
+"""Plans of a survey: where it is, how the cameras moved, how often the ground is seen, how photographs are tied.
 
-Plans of a survey: where it is, how the cameras moved, how often the ground is seen, how photographs are tied.
+East is to the right and north up, with north arrow, scale bar and names that do not overlap.
 """
 
 from __future__ import annotations
@@ -84,14 +84,7 @@ def frame_around(
 def new_plan(
     frame: PlanFrame, title: str, *, right_inches: float = 0.0, legend_rows: int = 0
 ) -> tuple[Figure, Axes]:
-    """Return a figure with the axes of a plan.
-
-    Args:
-        frame: that the axes show.
-        title: above them.
-        right_inches: room beside the map, for a colour bar.
-        legend_rows: rows of the legend below the map.
-    """
+    """Return a figure with the axes of a plan, room for a colour bar beside it, and rows of the legend below."""
     width, height = (LONGER_INCHES * (frame.high - frame.low) / frame.longer_m).tolist()
     below = _BELOW + _LEGEND_ROW * (legend_rows + 0.4 * bool(legend_rows))
     size = (_LEFT + width + _RIGHT + right_inches, below + height + _ABOVE)
@@ -156,12 +149,7 @@ def add_legend(figure: Figure, columns: int = 4) -> None:
 def add_names(figure: Figure, axes: Axes, places: FloatArray, names: Sequence[str], others: FloatArray) -> int:
     """Write names beside places (N, 2), as many as cover no sign and no other name, and return their number.
 
-    Args:
-        figure: of the axes.
-        axes: of the plan, with its limits.
-        places: (N, 2) metres.
-        names: N.
-        others: (M, 2) places of further signs, in metres.
+    `others` (M, 2) are places of further signs.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
@@ -240,13 +228,7 @@ class DrawnMovement:
 def site_plan(
     training_m: FloatArray, test_m: FloatArray, control: NamedPlaces, check: NamedPlaces, scene_m: FloatArray
 ) -> bytes:
-    """Return the plan of a survey as PNG.
-
-    Args:
-        training_m, test_m: (n, 2) cameras of the photographs.
-        control, check: surveyed points.
-        scene_m: (N, 2) points of the scene, drawn as its ground.
-    """
+    """Return the plan of a survey with cameras (n, 2) and points as PNG; the scene (N, 2) is its ground."""
     frame = frame_around(training_m, test_m, control.place_m, check.place_m)
     figure, axes = new_plan(frame, "Photographs and surveyed points", legend_rows=1)
     axes.scatter(scene_m[:, 0], scene_m[:, 1], s=1.5, color=GREY, alpha=0.6, linewidths=0, rasterized=True)
@@ -377,10 +359,7 @@ def overlap_plan(count: IntArray, corner_m: FloatArray, cell_m: float, camera_m:
 def match_plan(camera_m: FloatArray, pairs: IntArray, shared: IntArray) -> bytes:
     """Return the graph of the photographs that share points, as PNG: strong links last, dark and thick.
 
-    Args:
-        camera_m: (n, 2) cameras.
-        pairs: (P, 2) indices of cameras.
-        shared: (P,) number of points that both see, at least 1.
+    Pairs (P, 2) index the cameras (n, 2); `shared` (P,) is the number of points that both see, at least 1.
     """
     from matplotlib import colormaps
     from matplotlib.collections import LineCollection

@@ -36,13 +36,7 @@ def new_figure(
     *,
     dots_per_inch: int = _DOTS_PER_INCH,
 ) -> Figure:
-    """Return an empty figure of a width and height.
-
-    Args:
-        size_inches: width and height.
-        layout: `constrained` makes room for labels; None leaves the axes where they are put.
-        dots_per_inch: resolution.
-    """
+    """Return an empty figure; `constrained` makes room for labels, None leaves the axes where they are put."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=size_inches, dpi=dots_per_inch, facecolor="white", layout=layout)
