@@ -11,7 +11,7 @@ from pipelines.core.types import BoolArray, FloatArray
 from pipelines.geometry.cameras import LENGTHS, Camera, parameter_names, parameters_in
 from pipelines.report.page import Picture, picture_of_png
 from pipelines.report.place import Texts, heads_of, texts_of
-from pipelines.report.plots.observations import FixSeries, correlation_matrix, fix_series, residual_field
+from pipelines.report.plots.observations import correlation_matrix, fix_series, residual_field
 from pipelines.report.plots.plans import movement_plan
 from pipelines.report.views import EvaluatedSurvey
 from pipelines.survey.survey import FixSession, Survey
@@ -37,7 +37,7 @@ class Outlier:
 
 @dataclass(frozen=True)
 class CameraRow:
-    """Row of the table of photographs: coordinates in the CRS of the report; east, north, up in metres; None: not known.
+    """Row of the table of photographs: coordinates in the CRS; east, north, up in metres; None: not known.
 
     `use` is `train`, `test`, or `outlier` for a fix that was left out.
     """
@@ -152,16 +152,9 @@ def _series(evaluated: EvaluatedSurvey, fixes: FixDifferences) -> tuple[Picture 
     by_time = len(known) == len(images) and len(set(known)) > 1
     abscissa = np.array(known) - min(known) if by_time else 1.0 + np.arange(len(images), dtype=np.float64)
     covariance = np.array([image.fix.cov_in_geo for image in images if image.fix is not None])
-    png = fix_series(
-        FixSeries(
-            abscissa=abscissa,
-            abscissa_title="time since the first photograph in s" if by_time else "photograph, in order of names",
-            residual_m=fixes.difference_in_geo,
-            sigma_m=np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)),
-            is_outlier=fixes.is_outlier,
-        )
-    )
-    return picture_of_png(png), by_time
+    sigma_m = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    title = "time since the first photograph in s" if by_time else "photograph, in order of names"
+    return picture_of_png(fix_series(abscissa, title, fixes.difference_in_geo, sigma_m, fixes.is_outlier)), by_time
 
 
 def _rows(
@@ -325,10 +318,11 @@ def _lens(
     names = parameter_names(camera)
     sigma = None if covariance is None else np.sqrt(np.maximum(np.diag(covariance), 0.0))
     size = (camera.width, camera.height)
-    field = None
+    field = factor = None
     if drawn and len(residual_px):
         mean, rms = mean_by_region(xy_px, residual_px, size)
-        field = residual_field(size, mean, rms, f"Camera {key}: residuals by image region")
+        png, factor = residual_field(size, mean, rms, f"Camera {key}: residuals by image region")
+        field = picture_of_png(png)
     correlation = None
     if drawn and covariance is not None and sigma is not None and (sigma > 0).all():
         correlation = picture_of_png(correlation_matrix(names, covariance / np.outer(sigma, sigma)))
@@ -350,8 +344,8 @@ def _lens(
             for index, name in enumerate(names)
         ),
         correlation=correlation,
-        residuals=None if field is None else picture_of_png(field.png),
-        factor=None if field is None else field.factor,
+        residuals=field,
+        factor=factor,
     )
 
 

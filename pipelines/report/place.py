@@ -13,7 +13,7 @@ from pipelines.core.types import FloatArray, IntArray
 from pipelines.geodesy.enu import ecef_from_enu, lla_from_ecef
 from pipelines.geodesy.operations import Operation
 from pipelines.geometry.bundle import Network
-from pipelines.geometry.cameras import Camera, project
+from pipelines.geometry.cameras import project
 from pipelines.geometry.footprints import border_rays
 from pipelines.report.page import Picture, picture_of_png
 from pipelines.report.plots.plans import NamedPlaces, match_plan, overlap_plan, site_plan
@@ -146,20 +146,6 @@ _MOST_LINKS = 4000  # that are drawn
 
 
 @dataclass(frozen=True)
-class OverlapRaster:
-    """Number of photographs that see each cell of the ground.
-
-    Attributes:
-        count: (R, C) rows from the south, columns from the west; −1: no scene.
-        corner_m: (2,) east and north of the south-western corner.
-    """
-
-    count: IntArray
-    corner_m: FloatArray
-    cell_m: float
-
-
-@dataclass(frozen=True)
 class OverlapFacts:
     """Overlap of a survey; the map and its figures are None without a scene.
 
@@ -189,17 +175,15 @@ class OverlapFacts:
 
 def overlap_facts(evaluated: EvaluatedSurvey) -> OverlapFacts:
     center = evaluated.center_in_geo[:, :2]
-    raster = overlap_of(evaluated)
-    inside = raster.count[raster.count >= 0] if raster is not None else np.zeros(0)
+    raster = _overlap_of(evaluated)
+    inside = np.zeros(0) if raster is None else raster[0][raster[0] >= 0]
     pairs, shared = links_of(evaluated.network)
     strongest = np.argsort(-shared, kind="stable")[:_MOST_LINKS]
     tied, parts = ties_of(len(center), pairs, shared)
     least = int(tied.argmin())
     return OverlapFacts(
-        overlap=None
-        if raster is None
-        else picture_of_png(overlap_plan(raster.count, raster.corner_m, raster.cell_m, center)),
-        cell_m=None if raster is None else raster.cell_m,
+        overlap=None if raster is None else picture_of_png(overlap_plan(*raster, center)),
+        cell_m=None if raster is None else raster[2],
         median=float(np.median(inside)) if len(inside) else None,
         enough_share=float((inside >= ENOUGH_PHOTOGRAPHS).mean()) if len(inside) else None,
         enough=ENOUGH_PHOTOGRAPHS,
@@ -214,10 +198,11 @@ def overlap_facts(evaluated: EvaluatedSurvey) -> OverlapFacts:
     )
 
 
-def overlap_of(evaluated: EvaluatedSurvey) -> OverlapRaster | None:
-    """Return how many photographs see each cell of the scene; None without a scene.
+def _overlap_of(evaluated: EvaluatedSurvey) -> tuple[IntArray, FloatArray, float] | None:
+    """Return how many photographs see each cell (R, C) of the scene, the south-western corner, and a cell's side.
 
-    A cell is a point on the surface through the SfM points. What stands before it is not asked for.
+    Rows run from the south, columns from the west; −1 is no scene, None a survey without one. A cell is a point on
+    the surface through the SfM points. What stands before it is not asked for.
     """
     scene, surface = evaluated.scene_in_geo, evaluated.surface
     if surface is None:
@@ -234,14 +219,18 @@ def overlap_of(evaluated: EvaluatedSurvey) -> OverlapRaster | None:
     points = np.column_stack([place[known], surface.heights(place[known])])
     count = np.full(rows * columns, -1, dtype=np.int64)
     count[known] = photographs_that_see(evaluated, points)
-    return OverlapRaster(count.reshape(rows, columns), low, cell)
+    return count.reshape(rows, columns), low, cell
 
 
 def photographs_that_see(evaluated: EvaluatedSurvey, point_in_geo: FloatArray) -> IntArray:
     """Return the number (K,) of registered photographs whose frame holds points (K, 3); nothing hides a point."""
     solved = evaluated.solved
     in_model = solved.geo_from_model.inverse().apply(point_in_geo)
-    widest = {key: _widest(camera) for key, camera in solved.sparse.cameras.items()}
+    # Tangent of the widest angle from the axis that a camera's frame shows.
+    widest = {
+        key: float(np.linalg.norm(border_rays(camera)[:, :2], axis=1).max(initial=0.0)) * (1 + 1e-9)
+        for key, camera in solved.sparse.cameras.items()
+    }
     count = np.zeros(len(point_in_geo), dtype=np.int64)
     for index, (rotation, center) in enumerate(
         zip(solved.poses.cam_from_model, solved.poses.cam_center_in_model, strict=True)
@@ -256,12 +245,6 @@ def photographs_that_see(evaluated: EvaluatedSurvey, point_in_geo: FloatArray) -
         seen = ((pixel >= 0) & (pixel <= [camera.width, camera.height])).all(axis=1)
         count[ahead[seen]] += 1
     return count
-
-
-def _widest(camera: Camera) -> float:
-    """Return the tangent of the widest angle from the axis that a camera's frame shows."""
-    rays = border_rays(camera)
-    return float(np.linalg.norm(rays[:, :2], axis=1).max(initial=0.0)) * (1 + 1e-9)
 
 
 def links_of(network: Network) -> tuple[IntArray, IntArray]:

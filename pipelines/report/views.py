@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -239,14 +239,10 @@ def load_evaluated(workspace: Workspace, options: ReportOptions) -> EvaluatedSur
         InputError: a product is damaged, or the CRS cannot be used here.
     """
     report = read_report(workspace.path(REPORT))
-    solved = load_solved(workspace, _evaluated_similarity(workspace))
+    manifest = workspace.manifest(BY_NAME["evaluate"])  # None: a report put there by hand
+    initial = manifest is not None and manifest.config.get("similarity") == "initial"
+    solved = load_solved(workspace, "initial" if initial else "trained")
     center_in_geo = solved.geo_from_model.apply(solved.poses.cam_center_in_model)
     crs = usable_crs(options, solved.survey.origin, center_in_geo, solved.survey.vertical)
     posterior = posterior_of(workspace, solved.model, solved.sfm)
     return EvaluatedSurvey(workspace, solved, report, posterior, crs)
-
-
-def _evaluated_similarity(workspace: Workspace) -> Literal["trained", "initial"]:
-    """Return the similarity that was evaluated; the trained one for a report put there by hand."""
-    manifest = workspace.manifest(BY_NAME["evaluate"])
-    return "initial" if manifest is not None and manifest.config.get("similarity") == "initial" else "trained"

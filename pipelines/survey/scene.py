@@ -21,7 +21,6 @@ from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.bundle import BundleInformation, Network, bundle_information
 from pipelines.geometry.cameras import CameraPoses
-from pipelines.geometry.correction_basis import CorrectionBasis, basis_of
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.adjustment import InitialSimilarity
@@ -81,11 +80,6 @@ class Scene:
         same = replace(self)
         same.__dict__["bundle"] = bundle
         return same
-
-    @cached_property
-    def correction_basis(self) -> CorrectionBasis:
-        """Whitened corrections of the cameras, which the lens follows. Memory is quadratic in their number."""
-        return basis_of(self.bundle)
 
 
 def network_of(sparse: SparseModel, poses: CameraPoses, point_in_model: FloatArray) -> Network:

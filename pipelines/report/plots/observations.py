@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -35,30 +34,10 @@ _ARROW_SHARE, _ARROW_QUANTILE = 0.9, 0.95  # of a region, that an arrow of this 
 _CHART_INCHES = (6.4, 3.2)
 
 
-@dataclass(frozen=True)
-class DrawnField:
-    """Field of residuals, with its magnification; None: there are no arrows."""
-
-    png: bytes
-    factor: float | None
-
-
-@dataclass(frozen=True)
-class FixSeries:
-    """Residuals (F, 3) of F fixes in time, east, north, up, with their stated σ; an outlier was left out.
-
-    The abscissa (F,) is seconds since the first, or the number of the photograph.
-    """
-
-    abscissa: FloatArray
-    abscissa_title: str
-    residual_m: FloatArray
-    sigma_m: FloatArray
-    is_outlier: BoolArray
-
-
-def residual_field(size_px: tuple[int, int], mean_px: FloatArray, rms_px: FloatArray, title: str) -> DrawnField:
-    """Return mean reprojection residuals by image region as arrows on their RMS.
+def residual_field(
+    size_px: tuple[int, int], mean_px: FloatArray, rms_px: FloatArray, title: str
+) -> tuple[bytes, float | None]:
+    """Return mean reprojection residuals by image region as arrows on their RMS, and the arrows' magnification.
 
     Args:
         size_px: width and height of the photographs.
@@ -87,30 +66,35 @@ def residual_field(size_px: tuple[int, int], mean_px: FloatArray, rms_px: FloatA
         # white on black: readable on every colour
         style = {"color": "white", "edgecolor": "black", "linewidth": 0.5}
         add_arrows(axes, grid[known], factor * mean_px[known], width=0.004, pivot="mid", **style)
-    return DrawnField(png_of(figure), factor)
+    return png_of(figure), factor
 
 
-def fix_series(series: FixSeries) -> bytes:
-    """Return the residuals of fixes, east, north and up, with the stated 2 σ and the mean, as PNG."""
+def fix_series(
+    abscissa: FloatArray, title: str, residual_m: FloatArray, sigma_m: FloatArray, is_outlier: BoolArray
+) -> bytes:
+    """Return the residuals (F, 3) of fixes, east, north and up, with the stated 2 σ and the mean, as PNG.
+
+    The abscissa (F,), of that title, is seconds since the first, or the number of the photograph.
+    """
     figure = new_figure((7.6, 6.0), "constrained")
-    order = np.argsort(series.abscissa, kind="stable")
+    order = np.argsort(abscissa, kind="stable")
     for axis, axes in enumerate(figure.subplots(3, 1, sharex=True)):
-        values, sigma = series.residual_m[:, axis], series.sigma_m[:, axis]
+        values, sigma = residual_m[:, axis], sigma_m[:, axis]
         band = {"color": GREY, "alpha": 0.3, "linewidth": 0, "label": "stated 2 σ"}
-        axes.fill_between(series.abscissa[order], -2 * sigma[order], 2 * sigma[order], **band)
+        axes.fill_between(abscissa[order], -2 * sigma[order], 2 * sigma[order], **band)
         axes.axhline(0, color=DARK, linewidth=0.6)
-        used = ~series.is_outlier
+        used = ~is_outlier
         if used.any():
             axes.axhline(float(values[used].mean()), color=BLUE, linewidth=1.2, linestyle="--", label="mean (bias)")
         for chosen, style, name in (
             (used, {"marker": "o", "color": BLUE, "s": 11}, "used"),
-            (series.is_outlier, {"marker": "X", "color": ORANGE, "edgecolors": "black", "s": 34}, "outlier"),
+            (is_outlier, {"marker": "X", "color": ORANGE, "edgecolors": "black", "s": 34}, "outlier"),
         ):
             if chosen.any():
-                axes.scatter(series.abscissa[chosen], values[chosen], label=name, linewidths=0.7, zorder=3, **style)
+                axes.scatter(abscissa[chosen], values[chosen], label=name, linewidths=0.7, zorder=3, **style)
         label(axes, "", y=f"{_AXES[axis]} in m")
         axes.spines[["top", "right"]].set_visible(False)
-    axes.set_xlabel(series.abscissa_title, fontsize=LABEL_POINTS)
+    axes.set_xlabel(title, fontsize=LABEL_POINTS)
     add_key(figure, 4, loc="outside upper center")
     return png_of(figure)
 

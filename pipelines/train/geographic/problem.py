@@ -22,7 +22,7 @@ from pipelines.adjust import terms as adjustment
 from pipelines.adjust.state import State, SystematicErrors
 from pipelines.adjust.system import Problem
 from pipelines.geometry.cameras import Pinhole
-from pipelines.geometry.correction_basis import coordinates_of, correction_basis
+from pipelines.geometry.correction_basis import basis_of, coordinates_of, correction_basis
 from pipelines.robust.statistics import MEAN_WEIGHTED_CHI2
 from pipelines.splat.surface import depth_at
 from pipelines.survey.adjustment import GeolocatedPoints
@@ -290,7 +290,7 @@ def refining_problem(
             distances = distance_term(scene, term, points, seed)
             terms += [] if distances is None else [distances]
     lens_follows = options.weighting == "whitened"
-    basis = scene.correction_basis if lens_follows else correction_basis(scene.network, lens_follows=False)
+    basis = basis_of(scene.bundle) if lens_follows else correction_basis(scene.network, lens_follows=False)
     z = coordinates_of(scene.bundle, state.correction)
     lens = basis.lens_matrix if lens_follows else np.zeros((len(state.lens), len(z)))
     return GeoProblem(
