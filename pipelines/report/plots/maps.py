@@ -112,16 +112,6 @@ def exaggeration(lengths_m: FloatArray, side_m: float) -> float | None:
     return nice_number(_LONGEST_ARROW * side_m / longest)
 
 
-def draw_errors(axes: Axes, places: FloatArray, errors_m: FloatArray, factor: float, *, of_control: bool) -> None:
-    """Draw errors (K, 2) east and north, times a factor, as arrows at their places (K, 2); NaN: none."""
-    known = np.isfinite(errors_m).all(axis=1)
-    if not known.any():
-        return
-    colour = ORANGE if of_control else DARK
-    style = {"color": colour, "edgecolor": "white", "linewidth": 0.4, "width": 0.006, "zorder": 5}
-    add_arrows(axes, places[known], factor * errors_m[known], **style)
-
-
 def draw_north(figure: Figure, axes: Axes) -> None:
     """Draw an arrow to the north left of a map, at its upper edge: up, as the axes of the map are."""
     width, height = figure.get_size_inches()
@@ -194,7 +184,6 @@ def write_accuracy_map(
     """
     rows, columns = raster.sigma_h_m.shape
     corners = np.stack([raster.corner_m, raster.corner_m + raster.cell_m * np.array([columns, rows])])
-    west, east, south, north = corners.T.ravel().tolist()
     places = (corners, points.cameras, points.control.place_m, points.check.place_m)
     frame = frame_around(*places, narrowest=_NARROWEST, margin=_MARGIN, least_m=0.0)
     low, high = frame.low, frame.high
@@ -210,16 +199,7 @@ def write_accuracy_map(
         left = _LEFT + number * size[0] / 2
         axes = figure.add_axes(_share(size, left, width, height))
         bar = figure.add_axes(_share(size, left + width + _BAR_GAP, _BAR_WIDTH, height))
-        axes.set_facecolor(EMPTY_COLOUR)
-        image = axes.imshow(
-            np.ma.masked_invalid(sigma_m),
-            cmap=COLOUR_MAP,
-            origin="lower",
-            extent=(west, east, south, north),
-            interpolation="nearest",
-            aspect="equal",
-        )
-        axes.ticklabel_format(useOffset=False, style="plain")
+        _draw_sigma(figure, axes, bar, corners, sigma_m, text=f"{symbol} in m")
         _mark(axes, points)
         axes.set_xlim(low[0], high[0])
         axes.set_ylim(low[1], high[1])
@@ -236,8 +216,6 @@ def write_accuracy_map(
         draw_north(figure, axes)
         axes.locator_params("x", nbins=max(round(_MOST_TICKS * width / _MAP), 2))
         axes.locator_params("y", nbins=max(round(_MOST_TICKS * height / _MAP), 2))
-        add_scale(figure, image, f"{symbol} in m", cax=bar)
-        bar.ticklabel_format(useOffset=False, style="plain")
     add_key(figure, 3, loc="center", bbox_to_anchor=(0.5, _LEGEND_HEIGHT / figure.get_figheight()))
     write_png(figure, path)
 
@@ -247,6 +225,25 @@ def _share(
 ) -> tuple[float, float, float, float]:
     """Left, lower edge, width and height in parts of the picture, of axes above the room for labels."""
     return left / size[0], _BELOW / size[1], width / size[0], height / size[1]
+
+
+def _draw_sigma(
+    figure: Figure, axes: Axes, bar: Axes, corners: FloatArray, sigma_m: FloatArray, *, text: str
+) -> None:
+    """Draw σ (R, C) between two corners (2, 2), with its scale."""
+    west, east, south, north = corners.T.ravel().tolist()
+    axes.set_facecolor(EMPTY_COLOUR)
+    image = axes.imshow(
+        np.ma.masked_invalid(sigma_m),
+        cmap=COLOUR_MAP,
+        origin="lower",
+        extent=(west, east, south, north),
+        interpolation="nearest",
+        aspect="equal",
+    )
+    add_scale(figure, image, text, cax=bar)
+    for each in (axes, bar):
+        each.ticklabel_format(useOffset=False, style="plain")
 
 
 def _mark(axes: Axes, points: MapPoints) -> None:
@@ -275,8 +272,12 @@ def _draw_errors(axes: Axes, points: MapPoints, along: tuple[int, ...], side_m: 
         groups.append((group, none if group.error_m is None else group.error_m[:, along]))
     factor = exaggeration(np.concatenate([np.linalg.norm(errors_m, axis=1) for _, errors_m in groups]), side_m)
     for group, errors_m in groups if factor is not None else ():
+        known = np.isfinite(errors_m).all(axis=1)
         plan_m = errors_m if len(along) == 2 else np.column_stack([np.zeros(len(errors_m)), errors_m])
-        draw_errors(axes, group.place_m, plan_m, factor or 1.0, of_control=group is points.control)
+        style = {"edgecolor": "white", "linewidth": 0.4, "width": 0.006, "zorder": 5}
+        colour = ORANGE if group is points.control else DARK
+        if known.any():
+            add_arrows(axes, group.place_m[known], (factor or 1.0) * plan_m[known], color=colour, **style)
     return factor
 
 
