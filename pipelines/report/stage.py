@@ -33,47 +33,6 @@ _NOTES = {
     "predicted": "no check points: root mean square of the predicted σ over the scene",
     "unknown": "neither measured nor predicted",
 }
-
-
-@dataclass(frozen=True)
-class SummaryFacts:
-    """Summary of an evaluated survey: traffic lights, cautions, headline, and what the headline's figures are."""
-
-    verdicts: tuple[Verdict, ...]
-    cautions: tuple[Caution, ...]
-    headline: Headline
-    accuracy_note: str
-
-
-def summary_facts(
-    evaluated: EvaluatedSurvey, overlap: OverlapFacts, lenses: LensesFacts, record: RecordFacts
-) -> SummaryFacts:
-    """Return the summary of an evaluated survey, of which it needs the facts of three sections."""
-    survey, report = evaluated.solved.survey, evaluated.report
-    cautions = union(evaluated.solved.model.cautions, report.cautions)
-    measured = Measured(
-        photographs=len(survey.images),
-        registered=lenses.photographs,
-        enough_share=overlap.enough_share,
-        enough=overlap.enough,
-        parts=overlap.parts,
-        rmse_px=lenses.rmse_px,
-        fixes=report.fit.gnss.count + report.fit.gnss.outliers,
-        fix_outliers=report.fit.gnss.outliers,
-        control_points=len(survey.control_points) - report.fit.gcp.outliers,
-        control_outliers=report.fit.gcp.outliers,
-        check_points=len(survey.check_points),
-        stale=tuple(stage.name for stage in record.stages if stage.state in ("stale", "damaged")),
-        workspace=str(evaluated.workspace.root),
-    )
-    return SummaryFacts(
-        verdicts=verdicts(report, measured, cautions),
-        cautions=cautions,
-        headline=report.headline,
-        accuracy_note=_NOTES[report.headline.kind],
-    )
-
-
 _ROOM = __name__.rpartition(".")[0]
 _STEPS = 8
 
@@ -170,4 +129,43 @@ def _sections_of_gaussians(evaluated: EvaluatedSurvey, options: ReportOptions) -
         Section("training", "Training", "training.html", training),
         Section("lidar", "LiDAR in the training", "lidar.html", lidar_facts(workspace)),
         Section("rasters", "Orthophoto and surface model", "rasters.html", previews_facts(workspace)),
+    )
+
+
+@dataclass(frozen=True)
+class SummaryFacts:
+    """Summary of an evaluated survey: traffic lights, cautions, headline, and what the headline's figures are."""
+
+    verdicts: tuple[Verdict, ...]
+    cautions: tuple[Caution, ...]
+    headline: Headline
+    accuracy_note: str
+
+
+def summary_facts(
+    evaluated: EvaluatedSurvey, overlap: OverlapFacts, lenses: LensesFacts, record: RecordFacts
+) -> SummaryFacts:
+    """Return the summary of an evaluated survey, of which it needs the facts of three sections."""
+    survey, report = evaluated.solved.survey, evaluated.report
+    cautions = union(evaluated.solved.model.cautions, report.cautions)
+    measured = Measured(
+        photographs=len(survey.images),
+        registered=lenses.photographs,
+        enough_share=overlap.enough_share,
+        enough=overlap.enough,
+        parts=overlap.parts,
+        rmse_px=lenses.rmse_px,
+        fixes=report.fit.gnss.count + report.fit.gnss.outliers,
+        fix_outliers=report.fit.gnss.outliers,
+        control_points=len(survey.control_points) - report.fit.gcp.outliers,
+        control_outliers=report.fit.gcp.outliers,
+        check_points=len(survey.check_points),
+        stale=tuple(stage.name for stage in record.stages if stage.state in ("stale", "damaged")),
+        workspace=str(evaluated.workspace.root),
+    )
+    return SummaryFacts(
+        verdicts=verdicts(report, measured, cautions),
+        cautions=cautions,
+        headline=report.headline,
+        accuracy_note=_NOTES[report.headline.kind],
     )

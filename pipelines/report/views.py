@@ -33,6 +33,78 @@ from pipelines.survey.target_crs import TargetCrs, usable_crs
 from pipelines.survey.trained_model import TrainedModel
 from pipelines.survey.trained_survey import SolvedSurvey, load_solved
 
+_LEAST_RAYS = 3  # of a point that counts as a part of the surface
+_RIM = 0.005  # fraction of the points that are taken for errors above, and below
+
+
+@dataclass(frozen=True)
+class EvaluatedSurvey:
+    """Solved survey with the report of `evaluate`, the covariances of the solution, and the CRS of the page."""
+
+    workspace: Workspace
+    solved: SolvedSurvey
+    report: EvaluationReport
+    posterior: Posterior
+    crs: TargetCrs
+
+    @cached_property
+    def document(self) -> dict[str, Any]:
+        return self.report.model_dump(mode="json")
+
+    @cached_property
+    def center_in_geo(self) -> FloatArray:
+        """Adjusted projection centres (n, 3), metres."""
+        return self.solved.geo_from_model.apply(self.solved.poses.cam_center_in_model)
+
+    @cached_property
+    def network(self) -> Network:
+        """The image observations with adjusted cameras and lenses, and points where these see them, in `model`."""
+        network = network_of(self.solved.sparse, self.solved.poses, self.solved.point_in_model)
+        return replace(network, point_in_world=refined_points(network).point_in_world)
+
+    @cached_property
+    def residual_px(self) -> FloatArray:
+        """Reprojection residuals (M, 2), projected minus observed; NaN where a point lies behind its camera."""
+        network = self.network
+        ray = network.point_in_world[network.obs_point] - network.cam_center_in_world[network.obs_image]
+        in_cam = np.einsum("mij,mj->mi", network.cam_from_world[network.obs_image], ray)
+        projected = project_each(network.cameras, network.camera_id[network.obs_image], in_cam)
+        return np.asarray(np.where(has_positive_depth(network)[:, None], projected - network.obs_xy_px, np.nan))
+
+    @cached_property
+    def scene_in_geo(self) -> FloatArray:
+        """SfM points (N, 3) in `geo` that three photographs show, without the highest and lowest."""
+        network = self.network
+        points = self.solved.geo_from_model.apply(network.point_in_world)
+        points = points[np.bincount(network.obs_point, minlength=len(points)) >= _LEAST_RAYS]
+        if not len(points):
+            return points
+        low, high = np.quantile(points[:, 2], [_RIM, 1 - _RIM])
+        return np.asarray(points[(points[:, 2] >= low) & (points[:, 2] <= high)])
+
+    @cached_property
+    def surface(self) -> PointSurface | None:
+        """Surface through the points of the scene; None: there are none."""
+        return PointSurface(self.scene_in_geo) if len(self.scene_in_geo) else None
+
+
+def load_evaluated(workspace: Workspace, options: ReportOptions) -> EvaluatedSurvey:
+    """Return the evaluated survey of a workspace.
+
+    Raises:
+        MissingProductError: a stage up to evaluate has not been run; names the command.
+        InputError: a product is damaged, or the CRS cannot be used here.
+    """
+    report = read_report(workspace.path(REPORT))
+    manifest = workspace.manifest(BY_NAME["evaluate"])  # None: a report put there by hand
+    initial = manifest is not None and manifest.config.get("similarity") == "initial"
+    solved = load_solved(workspace, "initial" if initial else "trained")
+    center_in_geo = solved.geo_from_model.apply(solved.poses.cam_center_in_model)
+    crs = usable_crs(options, solved.survey.origin, center_in_geo, solved.survey.vertical)
+    posterior = posterior_of(workspace, solved.model, solved.sfm)
+    return EvaluatedSurvey(workspace, solved, report, posterior, crs)
+
+
 _VIEW_PX, _PREVIEW_PX = 720, 1100
 _MOST_METRICS_BYTES = 256 * 1024 * 1024
 _MOST_ROWS = 2000  # of the metrics that are drawn
@@ -174,75 +246,3 @@ def _panels(rows: list[dict[str, float]]) -> dict[str, Mapping[str, tuple[FloatA
 def previews_facts(workspace: Workspace) -> PreviewsFacts:
     products = (ORTHOPHOTO_PREVIEW, HILLSHADE)
     return PreviewsFacts(*(preview(workspace.root / product, _PREVIEW_PX) for product in products))
-
-
-_LEAST_RAYS = 3  # of a point that counts as a part of the surface
-_RIM = 0.005  # fraction of the points that are taken for errors above, and below
-
-
-@dataclass(frozen=True)
-class EvaluatedSurvey:
-    """Solved survey with the report of `evaluate`, the covariances of the solution, and the CRS of the page."""
-
-    workspace: Workspace
-    solved: SolvedSurvey
-    report: EvaluationReport
-    posterior: Posterior
-    crs: TargetCrs
-
-    @cached_property
-    def document(self) -> dict[str, Any]:
-        return self.report.model_dump(mode="json")
-
-    @cached_property
-    def center_in_geo(self) -> FloatArray:
-        """Adjusted projection centres (n, 3), metres."""
-        return self.solved.geo_from_model.apply(self.solved.poses.cam_center_in_model)
-
-    @cached_property
-    def network(self) -> Network:
-        """The image observations with adjusted cameras and lenses, and points where these see them, in `model`."""
-        network = network_of(self.solved.sparse, self.solved.poses, self.solved.point_in_model)
-        return replace(network, point_in_world=refined_points(network).point_in_world)
-
-    @cached_property
-    def residual_px(self) -> FloatArray:
-        """Reprojection residuals (M, 2), projected minus observed; NaN where a point lies behind its camera."""
-        network = self.network
-        ray = network.point_in_world[network.obs_point] - network.cam_center_in_world[network.obs_image]
-        in_cam = np.einsum("mij,mj->mi", network.cam_from_world[network.obs_image], ray)
-        projected = project_each(network.cameras, network.camera_id[network.obs_image], in_cam)
-        return np.asarray(np.where(has_positive_depth(network)[:, None], projected - network.obs_xy_px, np.nan))
-
-    @cached_property
-    def scene_in_geo(self) -> FloatArray:
-        """SfM points (N, 3) in `geo` that three photographs show, without the highest and lowest."""
-        network = self.network
-        points = self.solved.geo_from_model.apply(network.point_in_world)
-        points = points[np.bincount(network.obs_point, minlength=len(points)) >= _LEAST_RAYS]
-        if not len(points):
-            return points
-        low, high = np.quantile(points[:, 2], [_RIM, 1 - _RIM])
-        return np.asarray(points[(points[:, 2] >= low) & (points[:, 2] <= high)])
-
-    @cached_property
-    def surface(self) -> PointSurface | None:
-        """Surface through the points of the scene; None: there are none."""
-        return PointSurface(self.scene_in_geo) if len(self.scene_in_geo) else None
-
-
-def load_evaluated(workspace: Workspace, options: ReportOptions) -> EvaluatedSurvey:
-    """Return the evaluated survey of a workspace.
-
-    Raises:
-        MissingProductError: a stage up to evaluate has not been run; names the command.
-        InputError: a product is damaged, or the CRS cannot be used here.
-    """
-    report = read_report(workspace.path(REPORT))
-    manifest = workspace.manifest(BY_NAME["evaluate"])  # None: a report put there by hand
-    initial = manifest is not None and manifest.config.get("similarity") == "initial"
-    solved = load_solved(workspace, "initial" if initial else "trained")
-    center_in_geo = solved.geo_from_model.apply(solved.poses.cam_center_in_model)
-    crs = usable_crs(options, solved.survey.origin, center_in_geo, solved.survey.vertical)
-    posterior = posterior_of(workspace, solved.model, solved.sfm)
-    return EvaluatedSurvey(workspace, solved, report, posterior, crs)
