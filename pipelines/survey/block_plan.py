@@ -127,11 +127,10 @@ class BlockPlan(Product):
         raise InputError(f"there is no block {number}: the plan has 0 … {len(self.blocks) - 1}", field="--id")
 
 
-def _outermost(one: float | None, other: float | None, choose: Callable[[float, float], float]) -> float | None:
+def _outermost(one: float | None, other: float | None, choose: Callable[[list[float]], float]) -> float | None:
     """Return one of two bounds; None has no end."""
-    if one is None or other is None:
-        return other if one is None else one
-    return choose(one, other)
+    known = [bound for bound in (one, other) if bound is not None]
+    return choose(known) if known else None
 
 
 def _moved(bound: Bound, by: FloatArray) -> Bound:
@@ -202,12 +201,11 @@ class BlockRecord(Product):
     seams: tuple[Seam, ...]
 
 
-_SHARE = 0.1
-_MOST = 200_000
-_LEAST = 2_000
+# Gaussians of the scaffold: part of those of the whole, and limits.
+_SCAFFOLD_SHARE, _LEAST_SCAFFOLD, _MOST_SCAFFOLD = 0.1, 2_000, 200_000
 SCAFFOLD_IMAGE_PX = 320  # longest side of the photographs that it is trained on, at most
 
 
 def scaffold_gaussians(most: int) -> int:
     """Return the limit of the scaffold's Gaussians for a survey with a limit of `most`."""
-    return min(max(int(_SHARE * most), _LEAST), _MOST, most)
+    return min(max(int(_SCAFFOLD_SHARE * most), _LEAST_SCAFFOLD), _MOST_SCAFFOLD, most)

@@ -230,12 +230,12 @@ def _distortion_of_rows(camera: Camera, pinhole: Pinhole, rows: slice) -> tuple[
 class Pinholes:
     """Pinhole of each image, which maps the rays of the present lens to pixels of the undistorted photograph.
 
-    Photographs are undistorted once, with the lenses `sfm`. A change of the lens is expressed as another pinhole
-    (`geometry.cameras`); without `sfm`, the lenses never change.
+    Photographs are undistorted once, with the lenses `sfm`. A change of the lens, at first to `now`, is expressed
+    as another pinhole (`geometry.cameras`); without `sfm`, the lenses never change.
     """
 
-    def __init__(self, images: ImageCache, sfm: Lenses | None = None) -> None:
-        self._images, self._sfm, self._now = images, sfm, sfm
+    def __init__(self, images: ImageCache, sfm: Lenses | None = None, now: Lenses | None = None) -> None:
+        self._images, self._sfm, self._now = images, sfm, sfm if now is None else now
         self._fitted: dict[int, Pinhole] = {}
 
     def renew(self, now: Lenses) -> None:

@@ -27,7 +27,6 @@ from pipelines.splat.gaussians import Gaussians, read_gaussians
 from pipelines.survey.adjustment import InitialSimilarity
 from pipelines.survey.calibrated import load_survey
 from pipelines.survey.marks import MarkRays, RayErrors, intersect_marks
-from pipelines.survey.photographs import ImageCache, Pinholes
 from pipelines.survey.survey import Survey
 from pipelines.survey.trained_model import Adjustment, TrainedModel
 
@@ -118,13 +117,6 @@ def _require_same_cameras(model: Adjustment, sparse: SparseModel, path: Path, ad
         camera = sparse.cameras.get(lens.camera_id)
         if camera is None or (camera.model, len(camera.params)) != (lens.model, len(lens.params)):
             raise InputError(f"its lenses are not those of sfm/sparse: {advice}", path=path, field="lenses")
-
-
-def trained_pinholes(trained: TrainedSurvey, images: ImageCache) -> Pinholes:
-    """Return the pinholes of the photographs, undistorted with SfM's lenses, under the trained lenses."""
-    pinholes = Pinholes(images, trained.sfm.lenses)
-    pinholes.renew(trained.sparse.lenses)
-    return pinholes
 
 
 def _initially_placed(model: Solution, workspace: Workspace) -> Solution:

@@ -63,8 +63,8 @@ class AdjustedScene:
 
     def views(self, images: ImageCache, indices: IntArray, rasterizer: Rasterizer) -> RegionViews:
         """Return views (T,), under the adjusted lenses, in which a region can be looked for."""
-        pinholes = Pinholes(images, self.scene.sparse.lenses)
-        pinholes.renew(self.adjustment.with_lenses(self.scene.sparse).lenses)
+        sparse = self.scene.sparse
+        pinholes = Pinholes(images, sparse.lenses, self.adjustment.with_lenses(sparse).lenses)
         return RegionViews(indices, self.adjustment.poses, pinholes, rasterizer)
 
     def exposures(self, device: torch.device) -> HeldExposures | None:
