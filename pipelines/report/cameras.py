@@ -14,6 +14,7 @@ from pipelines.report.place import Texts, heads_of, texts_of
 from pipelines.report.plots.observations import correlation_matrix, fix_series, residual_field
 from pipelines.report.plots.plans import movement_plan
 from pipelines.report.views import EvaluatedSurvey
+from pipelines.survey.headline import NOTHING_CHECKS
 from pipelines.survey.survey import FixSession, Survey
 from pipelines.survey.trained_survey import FixDifferences, fix_differences
 
@@ -111,7 +112,7 @@ def cameras_facts(evaluated: EvaluatedSurvey) -> CamerasFacts:
         map=picture_of_png(drawn.png),
         arrow_factor=drawn.arrow_factor,
         ellipse_factor=drawn.ellipse_factor,
-        no_sigma="" if checked else "nothing checks the σ of the positions",
+        no_sigma="" if checked else NOTHING_CHECKS,
         series=series,
         by_time=by_time,
         bias=bias_of(fixes),

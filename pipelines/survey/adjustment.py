@@ -56,15 +56,12 @@ class InitialSimilarity(Product):
         """Return a survey with the applied variance factors in its covariances."""
         return with_variance_factors(survey, applied_factors(self.variance_factors))
 
-    def in_use(self, survey: Survey) -> Survey:
-        """Return a survey without the measurements that were rejected."""
-        return self._part(survey, used=True)
-
     def rejected(self, survey: Survey) -> Survey | None:
         """Return a survey with the rejected measurements alone; None: there are none."""
-        return self._part(survey, used=False) if self.gnss_outliers or self.control_outliers else None
+        return self.in_use(survey, used=False) if self.gnss_outliers or self.control_outliers else None
 
-    def _part(self, survey: Survey, *, used: bool) -> Survey:
+    def in_use(self, survey: Survey, *, used: bool = True) -> Survey:
+        """Return a survey without the measurements that were rejected, or else with these alone."""
         bad_fixes, bad_points = set(self.gnss_outliers), set(self.control_outliers)
         images = tuple(
             image if (image.name not in bad_fixes) == used else image.model_copy(update={"fix": None})

@@ -25,7 +25,7 @@ from pipelines.survey.report import (
     read_report,
 )
 
-_NOT_CHECKED = "nothing checks the σ of the positions"
+NOTHING_CHECKS = "nothing checks the σ of the positions"
 
 
 def headline(triangulated: CheckPointErrors, scene: AccuracySummary, cautions: tuple[Caution, ...]) -> Headline:
@@ -43,7 +43,7 @@ def predicted(scene: AccuracySummary, cautions: tuple[Caution, ...]) -> Headline
     Without anything that checks the σ of the positions, the accuracy is not known.
     """
     if not is_checked(cautions):
-        return Headline(kind="unknown", reason=_NOT_CHECKED)
+        return Headline(kind="unknown", reason=NOTHING_CHECKS)
     if scene.rms_sigma_h_m is None or scene.rms_sigma_v_m is None:
         return Headline(kind="unknown", reason=scene.reason or "no σ is predicted")
     return Headline(kind="predicted", rmse_h_m=scene.rms_sigma_h_m, rmse_v_m=scene.rms_sigma_v_m)
