@@ -24,9 +24,10 @@ from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.splat.gaussians import read_gaussians
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.survey.photographs import Pinholes
 from pipelines.survey.scene import photographs
 from pipelines.survey.survey import Fix, SurveyImage
-from pipelines.survey.trained_survey import TrainedSurvey, load_trained, trained_pinholes
+from pipelines.survey.trained_survey import TrainedSurvey, load_trained
 
 
 def geo_from_cam(image: SurveyImage, trained: TrainedSurvey, recorded: bool) -> FloatArray:
@@ -69,7 +70,7 @@ def main() -> None:
     ]
     chosen = registered[:: max(1, len(registered) // options.images)][: options.images]
     images = photographs(trained.sfm, trained.survey, workspace, options.size)
-    pinholes = trained_pinholes(trained, images)
+    pinholes = Pinholes(images, trained.sfm.lenses, trained.sparse.lenses)
     gaussians, backend = read_gaussians(options.splat), rasterizer("auto")
     options.output.mkdir(parents=True, exist_ok=True)
     for image, fix in chosen:

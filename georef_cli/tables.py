@@ -332,7 +332,7 @@ def _table(lines: Sequence[PointLine], *, with_way: bool) -> Table:
     heads = [*first, "rays", "E", "N", "U", "H", *(["σ H", "σ U"] if has_sigma else [])]
     table = plain_table(*heads, "", right=range(len(first), len(heads)), no_wrap=range(1, len(heads)))
     for line in lines:
-        error, sigma = line.error_m, line.sigma_m
+        error, sigma = line.row.error_m, line.sigma_m
         lengths = [MISSING] * 4 if error is None else [*(f"{value:+.3f}" for value in error), _length(error[:2])]
         predicted = [MISSING] * 2 if sigma is None else [_length(sigma[:2]), f"{sigma[2]:.3f}"]
         table.add_row(

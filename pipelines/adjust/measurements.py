@@ -157,7 +157,7 @@ def _unused(survey: Survey, model: SparseModel, rays: MarkRays) -> tuple[UnusedC
             registered=tuple(model.image_name[camera] for camera in rays.camera[rays.point == index]),
             residual_px=tuple(residual_px[rays.point == index].tolist()),
         )
-        for index, name in enumerate(rays.point_id)
+        for index, name in enumerate(rays.point_name)
     )
 
 
@@ -170,7 +170,7 @@ def _intersect_in_local(model: SparseModel, rays: MarkRays) -> tuple[FloatArray,
     errors = RayErrors(_TINY * float(np.ptp(center, axis=0).max()), _TINY, own_rad)
     solved = intersect_marks(rays, model.rotation_cam_from_local, center, errors)
     of_marks, of_all = (
-        np.bincount(rays.point, squared, len(rays.point_id))
+        np.bincount(rays.point, squared, len(rays.point_name))
         for squared in (rays.sigma_rad**2, rays.sigma_rad**2 + own_rad**2)
     )
     return solved.position_in_geo, solved.cov_in_geo * (of_marks / of_all)[:, None, None], solved.consistent
@@ -282,7 +282,7 @@ def control_of(scene: Scene, survey: Survey) -> ControlPoints | None:
     position = np.array([point.position_in_geo for point in surveyed])
     of_survey = np.array([point.cov_in_geo for point in surveyed])
     return ControlPoints(
-        name=rays.point_id,
+        name=rays.point_name,
         point=rays.point,
         camera=rays.camera,
         bearing_in_cam=rays.bearing_in_cam,

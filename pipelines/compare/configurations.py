@@ -1,6 +1,6 @@
-"""Table of the ablation's configurations, which the command line reads without loading a stage.
+"""Configurations of the ablation, and the files of `georef compare`: table as JSON and Markdown, bars, page.
 
-Files of `georef compare`: the table as JSON and as Markdown, its bars, and the page of both.
+The command line reads the configurations without loading a stage.
 """
 
 from __future__ import annotations
@@ -10,8 +10,16 @@ from pathlib import Path
 from typing import Any
 
 from pipelines import __version__
-from pipelines.compare.table import ComparedRow, Comparison, markdown, panels, remarks_on
+from pipelines.compare.table import (
+    POINT_FIGURES,
+    Comparison,
+    bar_charts,
+    markdown,
+    point_heads,
+    remarks_on,
+)
 from pipelines.core.errors import InputError
+from pipelines.core.figures import ERRORS, WAYS
 from pipelines.core.files import replace_text
 from pipelines.core.stages import BY_NAME
 from pipelines.core.staleness import Flags
@@ -33,9 +41,7 @@ class Configuration:
     """Configuration of the ablation: options of the stages.
 
     Attributes:
-        name: as in `--configs`.
-        title: the method in a few words.
-        note: difference from the other configurations, in one line.
+        title, note: the method in a few words; what differs from the other configurations, in one line.
         sim3: its options of `init-sim3`; None: a bundle adjustment with the fixes places the model.
         train: its options of `train`; without effect if `trained_by` is set.
         trained_by: name of the configuration whose training it uses; None: its own.
@@ -109,31 +115,25 @@ _ROOM = __name__.rpartition(".")[0]
 def write_comparison(folder: Path, table: Comparison, survey: str) -> None:
     """Write `table.json`, `table.md`, `plot.png` and `comparison.html`, unless the files already hold this table.
 
-    Args:
-        folder: to write into.
-        table: of the configurations.
-        survey: name of the workspace, for the page.
+    `survey` is the name of the workspace, for the page.
     """
     json_path, markdown_path, page_path = folder / JSON, folder / MARKDOWN, folder / PAGE
     json_text, markdown_text = table.model_dump_json(indent=1) + "\n", markdown(table)
     is_held = _holds(json_path, json_text) and _holds(markdown_path, markdown_text)
     if is_held and (folder / PLOT).exists() and page_path.exists():
         return
-    write_bars(folder / PLOT, panels(table.rows))
+    write_bars(folder / PLOT, bar_charts(table.rows))
     replace_text(page_path, render_page(comparison_page(table, folder / PLOT, survey), _ROOM))
     replace_text(markdown_path, markdown_text)
     replace_text(json_path, json_text)
 
 
 def comparison_page(table: Comparison, plot: Path, survey: str) -> Page:
-    """Return the page of a comparison.
-
-    Args:
-        table: of the configurations.
-        plot: PNG of its bars.
-        survey: name of the workspace.
-    """
+    """Return the page of a comparison, with the PNG of its bars and the name of the workspace."""
+    names = ", ".join(row.configuration for row in table.rows)
+    heads = zip(POINT_FIGURES, point_heads(WAYS, ": "), strict=True)
     facts: dict[str, Any] = {
+        "points": {f"{way}.{name}": f"{head} in {ERRORS[name].unit}" for (way, name), head in heads},
         "rows": table.rows,
         "bars": png_file(plot),
         "remarks": [(row, remarks_on(row)) for row in table.rows if remarks_on(row)],
@@ -142,17 +142,13 @@ def comparison_page(table: Comparison, plot: Path, survey: str) -> Page:
     return Page(
         title=f"Comparison: {survey}",
         subtitle="One survey, trained and measured in several configurations",
-        about={"Program": f"GeoRefGS {__version__}", "Configurations": _names(table.rows)},
+        about={"Program": f"GeoRefGS {__version__}", "Configurations": names},
         sections=(
             Section("figures", "Figures", "figures.html", facts),
             Section("configurations", "Configurations", "configurations.html", facts),
         ),
         document=table.model_dump(mode="json"),
     )
-
-
-def _names(rows: tuple[ComparedRow, ...]) -> str:
-    return ", ".join(row.configuration for row in rows)
 
 
 def _holds(path: Path, text: str) -> bool:

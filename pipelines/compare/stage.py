@@ -13,7 +13,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 
 from pipelines.compare.configurations import BY_CONFIGURATION, COMMON_TRAIN_OPTIONS, Configuration, write_comparison
-from pipelines.compare.table import ComparedRow, Comparison, JsonScalar, point_accuracy, surface_accuracy
+from pipelines.compare.table import ComparedRow, Comparison, point_accuracy, surface_accuracy
 from pipelines.core.errors import ConvergenceError, DegenerateGeometryError, GeorefError
 from pipelines.core.products import union
 from pipelines.core.progress import SILENT, Progress
@@ -35,7 +35,7 @@ StageContext = Callable[[Workspace, StageSpec], AbstractContextManager[None]]
 
 
 @dataclass(frozen=True)
-class PlannedStage:
+class VariantStage:
     """Stage to run in a variant, with its options."""
 
     variant: Workspace
@@ -94,24 +94,22 @@ def compare(
     with workspace.lock(FOLDER):
         runner = _PlanRunner([ComparedStage(None, outcome) for outcome in shared], force, progress, around)
         rows = tuple(_row(configuration, plan, runner) for configuration, plan in plans)
-        table = Comparison(options=_json_scalars(asked), rows=rows)
+        scalars = {
+            name: value if isinstance(value, bool | int | float) else str(value) for name, value in asked.items()
+        }
+        table = Comparison(options=scalars, rows=rows)
         write_comparison(workspace.root / FOLDER, table, workspace.root.name)
     return table, runner.finished
 
 
-def _json_scalars(options: Flags) -> dict[str, JsonScalar]:
-    """Return the options as values of JSON."""
-    return {name: value if isinstance(value, bool | int | float) else str(value) for name, value in options.items()}
-
-
-def _plan(workspace: Workspace, configuration: Configuration, asked: Flags) -> Iterator[PlannedStage]:
+def _plan(workspace: Workspace, configuration: Configuration, asked: Flags) -> Iterator[VariantStage]:
     """Yield the stages of a configuration in order, with those of the configuration whose training it uses."""
     place, root = f"{FOLDER}/{configuration.name}", workspace.root
     shared = {spec.folder: root / spec.folder for spec in _SHARED}
     seed = {"seed": asked["seed"]} if "seed" in asked else {}
     lent = dict(shared)
     if configuration.sim3 is None:
-        yield PlannedStage(workspace.variant(place, shared, FOLDER), ADJUST, seed)
+        yield VariantStage(workspace.variant(place, shared, FOLDER), ADJUST, seed)
         lent |= dict.fromkeys(("sfm", _INIT.folder), root / place / ADJUST.folder)
     if configuration.trained_by is not None:
         trainer = BY_CONFIGURATION[configuration.trained_by]
@@ -120,22 +118,18 @@ def _plan(workspace: Workspace, configuration: Configuration, asked: Flags) -> I
         lent[_TRAIN.folder] = root / FOLDER / trainer.name / _TRAIN.folder
     variant = workspace.variant(place, lent, FOLDER)
     if configuration.sim3 is not None:
-        yield PlannedStage(variant, _INIT, {**configuration.sim3, "max_residual": None, **seed})
+        yield VariantStage(variant, _INIT, {**configuration.sim3, "max_residual": None, **seed})
     if configuration.trained_by is None:
-        yield PlannedStage(variant, _TRAIN, {**asked, **configuration.train})
+        yield VariantStage(variant, _TRAIN, {**asked, **configuration.train})
     similarity = "trained" if configuration.trained_by is None else "initial"
     backend = {"backend": asked["backend"]} if "backend" in asked else {}
     evaluated = workspace.requests().get(_EVALUATE.name, {})
-    yield PlannedStage(variant, _EVALUATE, {**evaluated, **backend, "similarity": similarity})
+    yield VariantStage(variant, _EVALUATE, {**evaluated, **backend, "similarity": similarity})
 
 
 @dataclass
 class _PlanRunner:
-    """Runner that runs each planned stage once, even if several configurations plan it.
-
-    Attributes:
-        finished: finished stages, in the order of their runs.
-    """
+    """Runner that runs each planned stage once, even if several configurations plan it."""
 
     finished: list[ComparedStage]
     force: bool
@@ -143,7 +137,7 @@ class _PlanRunner:
     around: StageContext
     _by_place: dict[tuple[str, str], Outcome | GeorefError] = field(default_factory=dict)
 
-    def run(self, configuration: Configuration, planned: PlannedStage) -> Outcome:
+    def run(self, configuration: Configuration, planned: VariantStage) -> Outcome:
         """Return the outcome of a stage, run now or before.
 
         Raises:
@@ -151,8 +145,17 @@ class _PlanRunner:
         """
         key = (str(planned.variant.root), planned.spec.name)
         if key not in self._by_place:
+            planned.variant.root.mkdir(parents=True, exist_ok=True)
             try:
-                self._by_place[key] = self._run(planned)
+                with self.around(planned.variant, planned.spec):
+                    self._by_place[key] = run_stage(
+                        planned.variant,
+                        planned.spec,
+                        planned.flags,
+                        force=self.force,
+                        resume="if-same",
+                        progress=self.progress,
+                    )
             except _RESULTS as error:
                 self._by_place[key] = error
         outcome = self._by_place[key]
@@ -162,38 +165,24 @@ class _PlanRunner:
             self.finished.append(ComparedStage(configuration.name, outcome))
         return outcome
 
-    def _run(self, planned: PlannedStage) -> Outcome:
-        variant, spec = planned.variant, planned.spec
-        variant.root.mkdir(parents=True, exist_ok=True)
-        with self.around(variant, spec):
-            return run_stage(
-                variant, spec, planned.flags, force=self.force, resume="if-same", progress=self.progress
-            )
 
-
-def _row(configuration: Configuration, plan: Sequence[PlannedStage], runner: _PlanRunner) -> ComparedRow:
+def _row(configuration: Configuration, plan: Sequence[VariantStage], runner: _PlanRunner) -> ComparedRow:
     """Run a configuration and return the row of its figures."""
     log.info("configuration %s: %s", configuration.name, configuration.title)
+    told = {"configuration": configuration.name, "title": configuration.title, "note": configuration.note}
     try:
         # Of two runs of init-sim3 the later is the configuration's own.
         manifests = {planned.spec.name: runner.run(configuration, planned).manifest for planned in plan}
     except _RESULTS as error:
         log.warning("configuration %s failed: %s", configuration.name, error)
-        return ComparedRow(
-            configuration=configuration.name,
-            title=configuration.title,
-            note=configuration.note,
-            failure=str(error),
-        )
+        return ComparedRow(**told, failure=str(error))
     del manifests[_EVALUATE.name]  # Its warnings concern the survey, which all rows share.
     training = manifests[_TRAIN.name].values
     report = read_report(plan[-1].variant.path(REPORT))
     test = report.test_views
     assert test is not None and report.checkpoints.model is not None  # every configuration trains
     return ComparedRow(
-        configuration=configuration.name,
-        title=configuration.title,
-        note=configuration.note,
+        **told,
         test_psnr=test.psnr,
         test_psnr_covered=test.psnr_covered,
         test_covered_share=test.covered_share,

@@ -1,16 +1,24 @@
-"""Table of `georef compare`: the figures of each configuration, as JSON, as Markdown and as bars."""
+"""Table of `georef compare`: the figures of each configuration, as Markdown and as bars."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Literal
 
-from pipelines.core.figures import WAYS
+from pipelines.core.figures import ERRORS, MISSING, SHORT_WAYS, WAYS
 from pipelines.core.products import Caution, Product
-from pipelines.report.plots.charts import Panel
+from pipelines.report.plots.charts import BarChart
 from pipelines.survey.report import CheckPointErrors
 from pipelines.survey.report_parts import ReferenceComparison
 
+# Errors of the check points that the table shows: how they were measured, and the field of `PointAccuracy`.
+POINT_FIGURES = (
+    ("camera", "rmse_h_m"),
+    ("camera", "rmse_v_m"),
+    ("model", "median_h_m"),
+    ("model", "rmse_h_m"),
+    ("model", "rmse_v_m"),
+)
 REFERENCE_HEADS = ("M3C2 median", "NMAD", "F1 0.05 m", "F1 0.1 m", "F1 0.3 m")
 JsonScalar = bool | int | float | str
 
@@ -26,12 +34,7 @@ class PointAccuracy(Product):
 
 
 class SurfaceAccuracy(Product):
-    """Surface against the reference cloud of `evaluate`.
-
-    Attributes:
-        median_m, nmad_m: of the distances along the normals (M3C2); None: not measured.
-        f1: by threshold in metres, in the order of the report; None: no points.
-    """
+    """Surface against the reference cloud of `evaluate`: M3C2 distances, and F1 by threshold in metres."""
 
     median_m: float | None
     nmad_m: float | None
@@ -42,17 +45,14 @@ class ComparedRow(Product):
     """Row of the table: the figures of one configuration.
 
     Attributes:
-        configuration, title, note: as in `Configuration`.
         failure: reason why there are no figures.
         test_psnr, test_ssim: means over the test views, in dB and from 0 to 1.
         test_psnr_covered: as test_psnr, over the pixels whose ground at least two training views show.
         test_covered_share: share of these pixels; the same for all configurations of one SfM model.
         camera, model: errors of the check points, triangulated and on the rendered surface.
         reference: the surface against a reference cloud; None: there is none.
-        iterations, gaussians: of the training.
         training_s: duration; None if the training is that of another configuration.
-        warnings: of its stages.
-        cautions: of its stages, each once.
+        warnings, cautions: of its stages; a caution once.
     """
 
     configuration: str
@@ -74,13 +74,7 @@ class ComparedRow(Product):
 
 
 class Comparison(Product):
-    """Table of the configurations.
-
-    Attributes:
-        format_version: version of the format.
-        options: options that all trainings share.
-        rows: one row for each configuration.
-    """
+    """Table of the configurations, with the options that all trainings share."""
 
     format_version: Literal[1] = 1
     options: dict[str, JsonScalar]
@@ -88,21 +82,13 @@ class Comparison(Product):
 
 
 def point_accuracy(errors: CheckPointErrors) -> PointAccuracy:
-    """Return the figures of the check points that the table shows."""
-    return PointAccuracy(
-        count=errors.count,
-        mean_h_m=errors.mean_h_m,
-        median_h_m=errors.median_h_m,
-        rmse_h_m=errors.rmse_h_m,
-        rmse_v_m=errors.rmse_v_m,
-    )
+    return PointAccuracy(**{name: getattr(errors, name) for name in PointAccuracy.model_fields})
 
 
 def surface_accuracy(reference: ReferenceComparison | None) -> SurfaceAccuracy | None:
-    """Return the figures of a comparison with a reference that the table shows."""
     if reference is None:
         return None
-    everywhere = reference.group("all")
+    everywhere = next(group for group in reference.groups if group.name == "all")
     return SurfaceAccuracy(
         median_m=everywhere.m3c2.median_m,
         nmad_m=everywhere.m3c2.nmad_m,
@@ -110,31 +96,38 @@ def surface_accuracy(reference: ReferenceComparison | None) -> SurfaceAccuracy |
     )
 
 
-def panels(rows: Sequence[ComparedRow]) -> tuple[Panel, ...]:
-    """Return the bar charts of the table's figures."""
+def point_heads(ways: Mapping[str, str], between: str) -> tuple[str, ...]:
+    """Return the heads of the columns of `POINT_FIGURES`, of which the first of each way names it."""
+    first = dict(reversed(POINT_FIGURES))
+    return tuple(
+        (f"{ways[way]}{between}" if first[way] == name else "") + ERRORS[name].label for way, name in POINT_FIGURES
+    )
+
+
+def bar_charts(rows: Sequence[ComparedRow]) -> tuple[BarChart, ...]:
     members = tuple(row.configuration for row in rows)
-    ways = {"camera": [row.camera for row in rows], "model": [row.model for row in rows]}
     geometry = (
-        Panel(
-            f"Check points, {WAYS[way]}",
+        BarChart(
+            f"Check points, {words}",
             "RMSE in m",
             members,
             {
-                "horizontal": [accuracy.rmse_h_m for accuracy in accuracies],
-                "vertical": [accuracy.rmse_v_m for accuracy in accuracies],
+                direction: [getattr(getattr(row, way), name) for row in rows]
+                for direction, name in (("horizontal", "rmse_h_m"), ("vertical", "rmse_v_m"))
             },
         )
-        for way, accuracies in ways.items()
+        for way, words in WAYS.items()
     )
-    images = Panel("Test views", "PSNR in dB", members, {"PSNR": [row.test_psnr for row in rows]}, digits=2)
+    images = BarChart("Test views", "PSNR in dB", members, {"PSNR": [row.test_psnr for row in rows]}, digits=2)
     return (*geometry, images)
 
 
 def markdown(table: Comparison) -> str:
     """Return the table as Markdown, with notes and remarks below."""
     heads = (
-        *("", "test PSNR dB", "PSNR covered", "SSIM", "triangulated RMSE H", "RMSE V"),
-        *("surface median H", "RMSE H", "RMSE V", "check points", "training"),
+        *("", "test PSNR dB", "PSNR covered", "SSIM"),
+        *point_heads(SHORT_WAYS, " "),
+        *("check points", "training"),
     )
     lines = [
         "# Comparison\n",
@@ -163,16 +156,14 @@ def cells(row: ComparedRow) -> tuple[str, ...]:
 
     PSNR, that of covered pixels, SSIM; check points triangulated and on the surface, and their number; time.
     """
-    camera, model = row.camera, row.model
-    counts = str(camera.count) if camera.count == model.count else f"{camera.count}, {model.count}"
+    points, on_surface = row.camera.count, row.model.count
     return (
-        _number(row.test_psnr, 2),
-        _number(row.test_psnr_covered, 2),
-        _number(row.test_ssim, 4),
-        *(_metres(value) for value in (camera.rmse_h_m, camera.rmse_v_m)),
-        *(_metres(value) for value in (model.median_h_m, model.rmse_h_m, model.rmse_v_m)),
-        counts,
-        "–" if row.training_s is None else f"{row.training_s:.0f} s",
+        _text(row.test_psnr, 2),
+        _text(row.test_psnr_covered, 2),
+        _text(row.test_ssim, 4),
+        *(_text(getattr(getattr(row, way), name)) for way, name in POINT_FIGURES),
+        str(points) if points == on_surface else f"{points}, {on_surface}",
+        MISSING if row.training_s is None else f"{row.training_s:.0f} s",
     )
 
 
@@ -180,8 +171,8 @@ def reference_cells(row: ComparedRow) -> tuple[str, ...]:
     """Return the figures of a row against the reference as text, in the order of `REFERENCE_HEADS`."""
     found = row.reference
     if found is None:
-        return ("–",) * len(REFERENCE_HEADS)
-    return (_metres(found.median_m), _metres(found.nmad_m), *(_number(value, 3) for _, value in found.f1))
+        return (MISSING,) * len(REFERENCE_HEADS)
+    return (_text(found.median_m), _text(found.nmad_m), *(_text(value, 3) for _, value in found.f1))
 
 
 def remarks_on(row: ComparedRow) -> tuple[str, ...]:
@@ -194,10 +185,8 @@ def _line(parts: Iterable[str]) -> str:
     return "| " + " | ".join(parts) + " |"
 
 
-def _number(value: float | None, digits: int) -> str:
-    return "–" if value is None else f"{value:.{digits}f}"
-
-
-def _metres(value: float | None) -> str:
-    """Return metres as text, with tenths of a millimetre below one metre."""
-    return _number(value, 4 if value is not None and value < 1 else 2)
+def _text(value: float | None, decimals: int | None = None) -> str:
+    """Return a number as text; without decimals, metres, with tenths of a millimetre below one metre."""
+    if value is None:
+        return MISSING
+    return f"{value:.{decimals or (4 if value < 1 else 2)}f}"

@@ -9,14 +9,15 @@ Gaussians.
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, ClassVar, Self, TypeVar
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, StringConstraints, ValidationError
 
 from pipelines.core.errors import InputError
-from pipelines.core.files import file_size
+from pipelines.core.files import file_size, read_npz
 from pipelines.core.types import Matrix3, Quaternion
 from pipelines.core.validators import covariance, image_name, unit_quaternion
 
@@ -73,6 +74,44 @@ def save_npz(path: Path, arrays: dict[str, Any]) -> None:
     """Write arrays as an NPZ file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     np.savez(path, **{name: np.asarray(array) for name, array in arrays.items()})  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class ArrayProduct:
+    """Base of the NPZ products: a field is an array or a text.
+
+    `FORMS` states kind of number and shape by field, in which a letter stands for a length that arrays share;
+    None: a text.
+    """
+
+    FORMS: ClassVar[dict[str, tuple[Any, ...] | None]]
+
+    def save(self, path: Path) -> None:
+        """Write the product as NPZ."""
+        save_npz(path, vars(self))
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read the product from NPZ.
+
+        Raises:
+            InputError: the file is no NPZ file with these arrays, or an array has another form.
+        """
+        arrays: dict[str, Any] = {**read_npz(path, tuple(cls.FORMS))}
+        lengths: dict[str, int] = {}
+        for name, form in cls.FORMS.items():
+            array = arrays[name]
+            if form is None:
+                arrays[name] = str(array)
+                continue
+            kind, *shape = form
+            matches = array.dtype.kind in kind and array.ndim == len(shape)
+            for length, wanted in zip(array.shape, shape, strict=False):
+                expected = lengths.setdefault(wanted, length) if isinstance(wanted, str) else wanted
+                matches = matches and length == expected
+            if not matches:
+                raise InputError(f"has the form {array.shape} {array.dtype}", path=path, field=name)
+        return cls(**arrays)
 
 
 # Code of the caution that nothing checks the σ of the positions: no accuracy is stated then.

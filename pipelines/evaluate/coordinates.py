@@ -130,7 +130,7 @@ def _places(survey: Survey) -> dict[str, list[str]]:
 
 
 def _error(line: PointLine) -> list[str]:
-    error, sigma = line.error_m, line.sigma_m
+    error, sigma = line.row.error_m, line.sigma_m
     lengths = () if error is None else (*error, math.hypot(*error[:2]), math.hypot(*error))
     cells = [f"{value:.4f}" for value in lengths] or [""] * 5
     cells += [""] * 3 if sigma is None else [f"{value:.4f}" for value in sigma]

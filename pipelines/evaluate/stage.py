@@ -49,7 +49,8 @@ from pipelines.evaluate.reference import (
 )
 from pipelines.geodesy.crs import PointCrs
 from pipelines.geodesy.enu import Origin, ecef_from_enu, lla_from_ecef
-from pipelines.report.plots.maps import MapCoordinates, MapPoints, NamedPlaces, SigmaRaster, write_accuracy_map
+from pipelines.report.plots.maps import MapCoordinates, MapPoints, SigmaRaster, write_accuracy_map
+from pipelines.report.plots.plans import NamedPlaces
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey.headline import headline

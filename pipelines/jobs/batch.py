@@ -25,7 +25,7 @@ from pipelines.core.staleness import cautions_by_stage
 from pipelines.core.workspace import now
 from pipelines.jobs.engine import Engine, Job, JobEnd
 from pipelines.jobs.missions import Mission, MissionList
-from pipelines.report.page import Page, Section, moment, write_page
+from pipelines.report.page import Page, Section, moment, render_page
 from pipelines.survey.headline import headline_of
 from pipelines.survey.report import read_report
 
@@ -133,7 +133,7 @@ def page_file(folder: Path, batch: str) -> Path:
 
 def write_batch(folder: Path, table: BatchTable) -> None:
     """Write the table as JSON and as a page; existing files are replaced when the new ones are complete."""
-    write_page(batch_page(table), __package__, page_file(folder, table.batch))
+    replace_text(page_file(folder, table.batch), render_page(batch_page(table), __package__))
     replace_text(folder / f"{table.batch}.batch.json", table.model_dump_json(indent=1) + "\n")
 
 

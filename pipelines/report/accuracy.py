@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -21,6 +22,9 @@ CE90_OF_AXIS_RMSE = 2.1460
 LE90_OF_RMSE = 1.6449
 _LEAST_FOR_QUANTILE = 10
 _LEAST_FOR_CHART = 3
+# Line of a table of errors: name, key in the report, form and unit.
+FigureLine = tuple[str, str, str, str]
+_CROSSED = ("count", "rmse_h_m", "rmse_v_m", "mean_u_m")
 _SURVEYED = ("rmse_h_m", "rmse_v_m", "rmse_3d_m")
 
 
@@ -29,10 +33,8 @@ class NinetyPercent:
     """Radii within which 90 % of the errors are expected, and within which 90 % of those measured are.
 
     Attributes:
-        way: `camera` or `model`.
         ce90_m, le90_m: from the RMSE; None without check points.
         measured_h_m, measured_v_m: empirical 90 % quantile; None with fewer than ten points.
-        count: number of check points.
     """
 
     way: str
@@ -48,59 +50,55 @@ class AccuracyFacts:
     """Accuracy of an evaluated survey.
 
     Attributes:
-        figures: of the check points: name, key in the report, form and unit.
+        figures, crossed_figures: of the check points, and of the control points that were left out.
         ninety: CE90 and LE90, triangulated and on the rendered surface.
-        ways: words of the ways that have measured points.
-        surface: whether points were measured on the rendered surface.
+        ways: words of the ways that have measured points; `surface`: the rendered surface may be one.
         chart: predicted against measured σ; None: fewer than three points have both.
-        within: share of the points within 1 σ and 2 σ of the prediction, horizontal and vertical; None likewise.
-        cells: what is told of the predicted σ over the scene, by the beginning of its fields.
-        map: of the predicted σ; None: there is none.
-        crossed: whether control points were cross-validated with a result.
-        crossed_reason: why not; empty: they were not to be.
-        check_points: number in the survey.
-        ce90_factor, le90_factor: of the formulas.
+        within: share of the points within 1 σ and 2 σ of the prediction, horizontal and vertical; empty likewise.
+        map, cells: of the predicted σ; None: there is none; and what is told of it, by the beginning of its fields.
+        crossed, crossed_reason: whether control points were cross-validated; why not; empty: they were not to be.
         quantile_points: fewest points with an empirical quantile.
     """
 
-    figures: tuple[tuple[str, str, str, str], ...]
+    figures: tuple[FigureLine, ...]
     ninety: tuple[NinetyPercent, ...]
     ways: dict[str, str]
     surface: bool
     chart: Picture | None
     within: tuple[tuple[str, float, float], ...]
-    cells: dict[str, Figure]
     map: Picture | None
     crossed: bool
     crossed_reason: str
+    crossed_figures: tuple[FigureLine, ...]
     check_points: int
-    ce90_factor: float
-    le90_factor: float
-    quantile_points: int
+    cells: Mapping[str, Figure] = field(default_factory=lambda: CELLS)
+    ce90_factor: float = CE90_OF_AXIS_RMSE
+    le90_factor: float = LE90_OF_RMSE
+    quantile_points: int = _LEAST_FOR_QUANTILE
 
 
 def accuracy_facts(evaluated: EvaluatedSurvey) -> AccuracyFacts:
-    """Return the accuracy of an evaluated survey."""
     report = evaluated.report
     by_way = report.checkpoints.by_way
     sigma, error = _compared(report.checkpoints.camera, evaluated.solved.survey.check_points)
     enough = len(sigma) >= _LEAST_FOR_CHART
     crossed = report.cross_validation
     return AccuracyFacts(
-        figures=_figures(),
+        figures=(
+            *_lines("", tuple(ERRORS)),
+            *_lines("with_survey.", _SURVEYED, " with the points' own survey"),
+            *_lines("without_blunders.", ("count", "rmse_h_m", "rmse_v_m"), " without blunders"),
+        ),
         ninety=tuple(ninety_percent(way, errors) for way, errors in by_way.items()),
         ways={way: WAYS[way] for way, errors in by_way.items() if errors.count},
         chart=picture_of_png(predicted_against_measured(sigma, error)) if enough else None,
         within=_within(sigma, error) if enough else (),
-        cells=CELLS,
         map=_map(evaluated),
         surface="model" in by_way,
         crossed=crossed is not None and crossed.count > 0,
         crossed_reason="" if crossed is None or crossed.reason is None else crossed.reason,
+        crossed_figures=_lines("cross_validation.", _CROSSED),
         check_points=len(evaluated.solved.survey.check_points),
-        ce90_factor=CE90_OF_AXIS_RMSE,
-        le90_factor=LE90_OF_RMSE,
-        quantile_points=_LEAST_FOR_QUANTILE,
     )
 
 
@@ -108,16 +106,8 @@ def ninety_percent(way: str, errors: CheckPointErrors) -> NinetyPercent:
     """Return CE90 and LE90 of check points.
 
     CE90 = 2.1460 · (RMSE_E + RMSE_N) / 2 and LE90 = 1.6449 · RMSE_V, for normal errors without bias.
-
-    Args:
-        way: in which the errors were measured.
-        errors: the errors.
     """
-    rows = [
-        (row.de_m, row.dn_m, row.du_m)
-        for row in errors.points
-        if row.de_m is not None and row.dn_m is not None and row.du_m is not None
-    ]
+    rows = [row.error_m for row in errors.points if row.error_m is not None]
     table = np.array(rows, dtype=np.float64).reshape(-1, 3)
     has_quantile = len(table) >= _LEAST_FOR_QUANTILE
     ce90 = le90 = None
@@ -134,14 +124,12 @@ def ninety_percent(way: str, errors: CheckPointErrors) -> NinetyPercent:
     )
 
 
-def _figures() -> tuple[tuple[str, str, str, str], ...]:
-    """Return the lines of the table of errors: all errors, then with the points' survey, then without blunders."""
-    groups = {"": ("", tuple(ERRORS)), "with_survey.": (" with the points' own survey", _SURVEYED)}
-    groups["without_blunders."] = (" without blunders", ("count", "rmse_h_m", "rmse_v_m"))
-    lines = [(group, ending, name, ERRORS[name]) for group, (ending, names) in groups.items() for name in names]
+def _lines(group: str, names: tuple[str, ...], ending: str = "") -> tuple[FigureLine, ...]:
+    """Return the lines of a table of errors: all errors, or those of a group."""
+    figures = [(name, ERRORS[name]) for name in names]
     return tuple(
         (figure.meaning + ending, group + name, "metres" if figure.unit else "whole", figure.unit)
-        for group, ending, name, figure in lines
+        for name, figure in figures
     )
 
 
@@ -152,12 +140,9 @@ def _compared(errors: CheckPointErrors, points: tuple[SurveyedPoint, ...]) -> tu
     for row in errors.points:
         if not isinstance(row, PredictedPointError) or row.name not in surveyed:
             continue
-        predicted = (row.sigma_e_m, row.sigma_n_m, row.sigma_u_m)
-        measured = (row.de_m, row.dn_m, row.du_m)
-        if None in predicted or None in measured:
+        if row.sigma_m is None or row.error_m is None:
             continue
-        variance = np.square(np.array(predicted, dtype=np.float64)) + surveyed[row.name]
-        off = np.array(measured, dtype=np.float64)
+        variance, off = np.square(row.sigma_m) + surveyed[row.name], row.error_m
         sigma.append([np.sqrt(variance[0] + variance[1]), np.sqrt(variance[2])])
         error.append([np.hypot(off[0], off[1]), abs(off[2])])
     return np.array(sigma).reshape(-1, 2), np.array(error).reshape(-1, 2)

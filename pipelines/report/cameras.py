@@ -1,7 +1,4 @@
-"""Positions of the photographs: measured and adjusted, with error ellipses, residuals of the fixes in time.
-
-Lenses of a survey: reprojection residuals by image region, parameters with σ, and their correlations.
-"""
+"""Photographs of a survey: adjusted positions with error ellipses, residuals of fixes in time; and its lenses."""
 
 from __future__ import annotations
 
@@ -9,14 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipelines.core.products import is_checked
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.geometry.cameras import LENGTHS, Camera, parameter_names, parameters_in
 from pipelines.report.page import Picture, picture_of_png
 from pipelines.report.place import Texts, heads_of, texts_of
-from pipelines.report.plots.observations import FixSeries, correlation_matrix, fix_series, residual_field
+from pipelines.report.plots.observations import correlation_matrix, fix_series, residual_field
 from pipelines.report.plots.plans import movement_plan
 from pipelines.report.views import EvaluatedSurvey
-from pipelines.survey.survey import CameraPrior, FixSession, Survey
+from pipelines.survey.headline import NOTHING_CHECKS
+from pipelines.survey.survey import FixSession, Survey
 from pipelines.survey.trained_survey import FixDifferences, fix_differences
 
 
@@ -39,16 +38,9 @@ class Outlier:
 
 @dataclass(frozen=True)
 class CameraRow:
-    """Row of the table of photographs: texts of coordinates in the CRS of the report, differences in metres.
+    """Row of the table of photographs: coordinates in the CRS; east, north, up in metres; None: not known.
 
-    Attributes:
-        name: of the photograph.
-        use: `train`, `test`, or `outlier` for a fix that was left out.
-        measured: coordinates of the fix; None: there is none.
-        adjusted: coordinates of the adjusted camera.
-        difference_m: adjusted minus measured, east, north, up; None: no fix.
-        sigma_m: of the adjusted position, east, north, up; None: not known.
-        sha256: of the file; empty: not recorded.
+    `use` is `train`, `test`, or `outlier` for a fix that was left out.
     """
 
     name: str
@@ -62,23 +54,17 @@ class CameraRow:
 
 @dataclass(frozen=True)
 class CamerasFacts:
-    """Positions of the photographs.
+    """Positions of the photographs; a picture, factor or σ is None where there is none.
 
     Attributes:
-        photographs: number in the survey.
-        registered: number of those in the SfM model.
-        unregistered: names of the others.
+        photographs, registered: numbers in the survey, and in the SfM model; the others are `unregistered`.
         fixes: number of registered photographs with a fix.
         sessions: of the fixes, without repeats, each with the σ of their common error.
-        map: adjusted positions, with arrows and ellipses.
-        arrow_factor, ellipse_factor: magnifications; None: none are drawn.
+        map: adjusted positions, with arrows and ellipses, magnified.
         no_sigma: reason why there are no ellipses; empty: there are.
-        series: residuals in time; None: no fixes.
-        by_time: whether the series runs in time; otherwise, in the order of the photographs.
+        series: residuals in time if `by_time`; otherwise, in the order of the photographs.
         bias: of the used fixes; empty without fixes.
         outliers: fixes that were left out.
-        median_sigma_h_m, median_sigma_v_m: of the cameras; None: not known.
-        rows: of the table of photographs.
         axes: names of the coordinates with their units.
     """
 
@@ -102,14 +88,13 @@ class CamerasFacts:
 
 
 def cameras_facts(evaluated: EvaluatedSurvey) -> CamerasFacts:
-    """Return the positions of the photographs of an evaluated survey."""
-    solved, sigma = evaluated.solved, evaluated.camera_sigma
+    solved, checked = evaluated.solved, is_checked(evaluated.solved.model.cautions)
     fixes = fix_differences(solved)
     names, registered = solved.sparse.image_name, set(solved.sparse.image_name)
     moved = np.full((len(names), 3), np.nan)
     is_outlier: BoolArray = np.zeros(len(names), dtype=bool)
     moved[fixes.camera], is_outlier[fixes.camera] = fixes.difference_in_geo, fixes.is_outlier
-    covariance = None if sigma.covariance is None else sigma.covariance[:, 3:, 3:]
+    covariance = evaluated.posterior.camera_cov[:, 3:, 3:] if checked else None
     drawn = movement_plan(
         evaluated.center_in_geo[:, :2],
         moved[:, :2],
@@ -127,7 +112,7 @@ def cameras_facts(evaluated: EvaluatedSurvey) -> CamerasFacts:
         map=picture_of_png(drawn.png),
         arrow_factor=drawn.arrow_factor,
         ellipse_factor=drawn.ellipse_factor,
-        no_sigma=sigma.reason,
+        no_sigma="" if checked else NOTHING_CHECKS,
         series=series,
         by_time=by_time,
         bias=bias_of(fixes),
@@ -168,16 +153,9 @@ def _series(evaluated: EvaluatedSurvey, fixes: FixDifferences) -> tuple[Picture 
     by_time = len(known) == len(images) and len(set(known)) > 1
     abscissa = np.array(known) - min(known) if by_time else 1.0 + np.arange(len(images), dtype=np.float64)
     covariance = np.array([image.fix.cov_in_geo for image in images if image.fix is not None])
-    png = fix_series(
-        FixSeries(
-            abscissa=abscissa,
-            abscissa_title="time since the first photograph in s" if by_time else "photograph, in order of names",
-            residual_m=fixes.difference_in_geo,
-            sigma_m=np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)),
-            is_outlier=fixes.is_outlier,
-        )
-    )
-    return picture_of_png(png), by_time
+    sigma_m = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    title = "time since the first photograph in s" if by_time else "photograph, in order of names"
+    return picture_of_png(fix_series(abscissa, title, fixes.difference_in_geo, sigma_m, fixes.is_outlier)), by_time
 
 
 def _rows(
@@ -214,15 +192,7 @@ _MOST_LENSES = 8  # that are shown with pictures
 
 @dataclass(frozen=True)
 class LensParameter:
-    """Parameter of a lens.
-
-    Attributes:
-        name: after COLMAP.
-        unit: `px`, or empty.
-        start: before SfM; None: not known.
-        value: after the adjustment.
-        sigma: of `value`; None: not known.
-    """
+    """Parameter of a lens, after COLMAP; `start` before SfM, value and σ after the adjustment; None: not known."""
 
     name: str
     unit: str
@@ -236,24 +206,17 @@ class LensFacts:
     """Lens of a camera.
 
     Attributes:
-        camera_id: of the SfM model.
         make_model: as recorded in the photographs; may be empty.
-        model: COLMAP's name of the camera model.
-        width_px, height_px: of the photographs.
-        photographs: number of registered ones.
-        observations: number of image observations of SfM points.
+        photographs, observations: numbers of registered ones, and of their image observations of SfM points.
         rmse_px: root mean square length of their residuals; None: no observations.
-        parameters: in COLMAP's order.
-        correlation: picture; None: not known.
+        correlation: of the parameters; None: not known.
         residuals: mean residual by image region; None beyond the first lenses, or without observations.
         factor: magnification of its arrows; None: no arrows.
     """
 
     camera_id: int
     make_model: str
-    model: str
-    width_px: int
-    height_px: int
+    camera: Camera
     photographs: int
     observations: int
     rmse_px: float | None
@@ -265,14 +228,11 @@ class LensFacts:
 
 @dataclass(frozen=True)
 class LensesFacts:
-    """Lenses of a survey.
+    """Lenses of a survey, of which the first `drawn` have pictures.
 
     Attributes:
         rmse_px: root mean square length of all residuals; None: no observations.
         sigma_px: σ of an image coordinate that follows from the residuals of the SfM model; None: not known.
-        observations, points, photographs: numbers.
-        lenses: one for each camera.
-        drawn: number of lenses with pictures.
         no_sigma: reason why σ is not known; empty if known.
     """
 
@@ -287,7 +247,6 @@ class LensesFacts:
 
 
 def lenses_facts(evaluated: EvaluatedSurvey) -> LensesFacts:
-    """Return the lenses of an evaluated survey, and the residuals of its image observations."""
     sparse, residual = evaluated.solved.sparse, evaluated.residual_px
     covariance = evaluated.posterior.of_lens()
     longest = sparse.lenses.longest
@@ -325,10 +284,7 @@ def mean_by_region(
 ) -> tuple[FloatArray, FloatArray]:
     """Return mean (R, C, 2) and RMS (R, C) of residuals by image region, rows from the top; NaN: too few.
 
-    Args:
-        xy_px: (M, 2) places in the image.
-        residual_px: (M, 2); NaN rows do not count.
-        size_px: width and height of the image.
+    Residuals (M, 2) that are NaN do not count; `xy_px` (M, 2) are their places in an image of a width and height.
     """
     width, height = size_px
     side = max(width, height) / _REGIONS
@@ -356,23 +312,25 @@ def _lens(
     drawn: bool,
 ) -> LensFacts:
     prior = next((prior for prior in survey.cameras if prior.camera_id == key), None)
-    start = None if prior is None else parameters_in(_camera_of(prior), camera.model)
+    start = None
+    if prior is not None:
+        before = Camera(prior.model, prior.width, prior.height, np.array(prior.params))
+        start = parameters_in(before, camera.model)
     names = parameter_names(camera)
     sigma = None if covariance is None else np.sqrt(np.maximum(np.diag(covariance), 0.0))
     size = (camera.width, camera.height)
-    field = None
+    field = factor = None
     if drawn and len(residual_px):
         mean, rms = mean_by_region(xy_px, residual_px, size)
-        field = residual_field(size, mean, rms, f"Camera {key}: residuals by image region")
+        png, factor = residual_field(size, mean, rms, f"Camera {key}: residuals by image region")
+        field = picture_of_png(png)
     correlation = None
     if drawn and covariance is not None and sigma is not None and (sigma > 0).all():
         correlation = picture_of_png(correlation_matrix(names, covariance / np.outer(sigma, sigma)))
     return LensFacts(
         camera_id=key,
         make_model="" if prior is None else prior.make_model,
-        model=camera.model,
-        width_px=camera.width,
-        height_px=camera.height,
+        camera=camera,
         photographs=photographs,
         observations=len(residual_px),
         rmse_px=_rmse(residual_px),
@@ -387,13 +345,9 @@ def _lens(
             for index, name in enumerate(names)
         ),
         correlation=correlation,
-        residuals=None if field is None else picture_of_png(field.png),
-        factor=None if field is None else field.factor,
+        residuals=field,
+        factor=factor,
     )
-
-
-def _camera_of(prior: CameraPrior) -> Camera:
-    return Camera(prior.model, prior.width, prior.height, np.array(prior.params))
 
 
 def _rmse(residual_px: FloatArray) -> float | None:

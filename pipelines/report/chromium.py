@@ -25,7 +25,7 @@ _LONGEST_MESSAGE = 300
 
 
 def named_or_installed() -> str | None:
-    """Return Chromium or Chrome as the variable CHROMIUM names it, else where it is installed; None: nowhere."""
+    """Return Chromium or Chrome as the variable CHROMIUM names it, else where it is; None: nowhere."""
     on_path = (shutil.which(name) for name in _ON_PATH)
     installed = (place for place in _INSTALLED if Path(place).is_file())
     return os.environ.get("CHROMIUM") or next(filter(None, [*on_path, *installed]), None)
@@ -49,11 +49,7 @@ def chromium_path() -> str:
 
 
 def print_pdf(page: Path, pdf: Path) -> None:
-    """Print a page as PDF; the file appears when it is complete.
-
-    Args:
-        page: HTML file.
-        pdf: file to write.
+    """Print a page, an HTML file, as PDF, which appears when it is complete.
 
     Raises:
         BackendUnavailableError: there is no Chromium.

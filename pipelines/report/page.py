@@ -5,11 +5,8 @@ both. Texts of users (names of points, of photographs, of workspaces) enter thro
 their control characters are written as escapes.
 
 A room that makes a page has a folder `templates/` with one template a section. The templates hold all HTML; Python
-gives them typed facts.
-
-Figures as text: decimals that fit their size, a true minus, a dash for what does not exist.
-
-Pictures inside a page: as data, at a size that the page needs.
+gives them typed facts, figures as text (decimals that fit their size, a true minus, a dash for what does not
+exist), and pictures as data, at a size that the page needs.
 """
 
 from __future__ import annotations
@@ -19,24 +16,21 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
+from functools import partial
 from math import isnan
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from pipelines.core.errors import InputError
 from pipelines.core.figures import ACCURACY_H, MISSING
-from pipelines.core.files import replace_text
 from pipelines.core.sentences import printable_lines
 from pipelines.core.types import ByteArray
 from pipelines.formats.image_file import MAX_PIXELS, header_size, read_bytes
 
-if TYPE_CHECKING:
-    from jinja2 import Environment
 
-
-def number(value: float | None, decimals: int = 2) -> str:
+def number_text(value: float | None, decimals: int = 2) -> str:
     """Return a number with fixed decimals: `−0.12`; a dash for None and NaN."""
     if value is None or isnan(value):
         return MISSING
@@ -50,7 +44,7 @@ def metres(value: float | None) -> str:
     """Return metres without their unit: millimetres below 10 m, tenths of them below 1 cm, else centimetres."""
     if value is None or isnan(value):
         return MISSING
-    return "0" if value == 0 else number(value, 4 if abs(value) < 0.00995 else 3 if abs(value) < 9.9995 else 2)
+    return "0" if value == 0 else number_text(value, 4 if abs(value) < 0.00995 else 3 if abs(value) < 9.9995 else 2)
 
 
 def in_metres(value: float | None) -> str:
@@ -58,60 +52,45 @@ def in_metres(value: float | None) -> str:
     return MISSING if value is None or isnan(value) else f"{metres(value)} m"
 
 
-def accuracy(value: float | None) -> str:
-    """Return a figure of the headline, given in metres, with its unit."""
-    return ACCURACY_H.with_unit(value)
-
-
 def signed(value: float | None) -> str:
     """Return millimetre-fine metres without their unit, with a sign: a column of errors."""
-    text = number(value, 3)
+    text = number_text(value, 3)
     return text if text == MISSING or text.startswith("−") else f"+{text}"
 
 
 def share(value: float | None) -> str:
     """Return a share of one as per cent: `97.5 %`."""
-    return MISSING if value is None or isnan(value) else f"{number(100 * value, 1).removesuffix('.0')} %"
-
-
-def ratio(value: float | None) -> str:
-    """Return a ratio with two decimals."""
-    return number(value, 2)
+    return MISSING if value is None or isnan(value) else f"{number_text(100 * value, 1).removesuffix('.0')} %"
 
 
 def square_km(value: float | None) -> str:
     """Return an area in square kilometres, with its unit."""
-    return MISSING if value is None else f"{number(value, 3)} km²"
+    return MISSING if value is None else f"{number_text(value, 3)} km²"
 
 
 def decibel(value: float | None) -> str:
     """Return decibels with their unit."""
-    return MISSING if value is None else f"{number(value, 2)} dB"
-
-
-def similarity(value: float | None) -> str:
-    """Return a figure between 0 and 1 with four decimals (SSIM, LPIPS)."""
-    return number(value, 4)
+    return MISSING if value is None else f"{number_text(value, 2)} dB"
 
 
 def parts_per_million(value: float | None) -> str:
     """Return a relative quantity in parts per million, or per cent from one per mille on: `96.4 ppm`, `1.86 %`."""
     if value is None:
         return MISSING
-    return f"{number(1e6 * value, 1)} ppm" if abs(value) < 1e-3 else f"{number(100 * value, 2)} %"
+    return f"{number_text(1e6 * value, 1)} ppm" if abs(value) < 1e-3 else f"{number_text(100 * value, 2)} %"
 
 
-def whole(value: int | None) -> str:
+def count_text(value: int | None) -> str:
     """Return a whole number with thin spaces between thousands."""
     return MISSING if value is None else f"{value:,}".replace(",", "\u2009").replace("-", "−")
 
 
-def plain(value: object) -> str:
+def any_text(value: object) -> str:
     """Return any value as text; a dash for None."""
     return MISSING if value is None else str(value)
 
 
-def duration(seconds: float | None) -> str:
+def duration_text(seconds: float | None) -> str:
     """Return a duration: `48 s`, `12 min 3 s`, `2 h 5 min`."""
     if seconds is None:
         return MISSING
@@ -128,49 +107,30 @@ def moment(value: datetime | None) -> str:
     return MISSING if value is None else f"{value:%Y-%m-%d %H:%M} UTC"
 
 
-def as_json(value: object) -> str:
-    """Return a value of a JSON document in full, for programs that read the page."""
-    return json.dumps(value, allow_nan=False)
-
-
+# Filters of the templates, and the forms in which they ask for a figure of the document.
 FORMS: dict[str, Callable[..., str]] = {
-    "accuracy": accuracy,
-    "as_json": as_json,
-    "whole": whole,
+    "accuracy": ACCURACY_H.with_unit,
+    "as_json": partial(json.dumps, allow_nan=False),  # in full, for programs that read the page
+    "whole": count_text,
     "decibel": decibel,
-    "duration": duration,
+    "duration": duration_text,
     "in_metres": in_metres,
     "metres": metres,
     "moment": moment,
-    "number": number,
+    "number": number_text,
     "parts_per_million": parts_per_million,
-    "plain": plain,
-    "ratio": ratio,
+    "plain": any_text,
+    "ratio": number_text,
     "share": share,
     "signed": signed,
-    "similarity": similarity,
+    "similarity": partial(number_text, decimals=4),
     "square_km": square_km,
 }
 
 
-def formatted(value: Any, form: str) -> str:
-    """Return a value in one of the forms."""
-    return FORMS[form](value)
-
-
-_FRAME = "frame.html"
-
-
 @dataclass(frozen=True)
 class Section:
-    """Section of a page.
-
-    Attributes:
-        anchor: name that links lead to: lower-case letters and hyphens.
-        title: its heading.
-        template: file in the `templates/` of the page's room.
-        facts: what the template shows, under the name `facts`.
-    """
+    """Section of a page: `template`, of the `templates/` of the page's room, shows `facts`."""
 
     anchor: str
     title: str
@@ -180,14 +140,9 @@ class Section:
 
 @dataclass(frozen=True)
 class Page:
-    """Content of a page.
+    """Content of a page: name and value of each line of its head, such as the time, then its sections.
 
-    Attributes:
-        title: heading.
-        subtitle: line below it.
-        about: name and value of each line of the head, such as the time at which the page was made.
-        sections: in order.
-        document: JSON document that figures of the page are taken from by their path (`figure` in `macros.html`).
+    Figures are taken from the JSON document by their path (`figure` in `macros.html`).
     """
 
     title: str
@@ -198,25 +153,24 @@ class Page:
 
 
 def render_page(page: Page, room: str) -> str:
-    """Return the HTML of a page.
-
-    Args:
-        page: its content.
-        room: package with the folder `templates/` of its sections, such as `pipelines.report`.
+    """Return the HTML of a page, whose room is the package with the `templates/` of its sections.
 
     Raises:
         jinja2.UndefinedError: a template names a fact that does not exist.
     """
-    return _environment(room).get_template(_FRAME).render(page=page, document=page.document)
+    from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
-
-def write_page(page: Page, room: str, path: Path) -> None:
-    """Write the HTML of a page; an existing file is replaced when the new one is complete.
-
-    Raises:
-        OSError: the file cannot be written; the existing one stays.
-    """
-    replace_text(path, render_page(page, room))
+    environment = Environment(
+        loader=ChoiceLoader([PackageLoader(room), PackageLoader("pipelines.report")]),
+        autoescape=True,
+        finalize=lambda value: printable_lines(value) if type(value) is str else value,  # not of markup
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= FORMS
+    environment.globals |= {"value_at": value_at, "forms": FORMS}
+    return environment.get_template("frame.html").render(page=page, document=page.document)
 
 
 def value_at(document: Any, path: str) -> Any:
@@ -234,22 +188,6 @@ def value_at(document: Any, path: str) -> Any:
     return document
 
 
-def _environment(room: str) -> Environment:
-    from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
-
-    environment = Environment(
-        loader=ChoiceLoader([PackageLoader(room), PackageLoader("pipelines.report")]),
-        autoescape=True,
-        finalize=lambda value: printable_lines(value) if type(value) is str else value,  # not of markup
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters |= FORMS
-    environment.globals |= {"value_at": value_at, "formatted": formatted}
-    return environment
-
-
 _PNG = b"\x89PNG"
 _QUALITY = 82
 _PAPER = 255  # behind transparent pixels
@@ -257,12 +195,7 @@ _PAPER = 255  # behind transparent pixels
 
 @dataclass(frozen=True)
 class Picture:
-    """Picture as the address of an `img` element.
-
-    Attributes:
-        address: `data:` with the whole picture.
-        width_px, height_px: of its pixels.
-    """
+    """Picture as the address of an `img` element: `data:` with the whole picture."""
 
     address: str
     width_px: int
@@ -288,12 +221,12 @@ def png_file(path: Path) -> Picture:
     return picture_of_png(data)
 
 
-def picture_of(rgb: ByteArray, *, quality: int = _QUALITY) -> Picture:
+def picture_of(rgb: ByteArray) -> Picture:
     """Return a photograph (H, W, 3) RGB as JPEG."""
     import cv2
 
     height, width = rgb.shape[:2]
-    _, data = cv2.imencode(".jpg", np.ascontiguousarray(rgb[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality])
+    _, data = cv2.imencode(".jpg", np.ascontiguousarray(rgb[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
     return Picture(_address("jpeg", data.tobytes()), width, height)
 
 
@@ -318,6 +251,11 @@ def read_picture(path: Path) -> ByteArray:
         alpha = pixels[..., 3:] / np.float32(255)
         pixels = (pixels[..., :3] * alpha + _PAPER * (1 - alpha)).round().astype(np.uint8)
     return np.asarray(pixels[..., ::-1])
+
+
+def preview(path: Path, longest_px: int) -> Picture | None:
+    """Return a picture of the workspace, as `read_picture`, made smaller if it is larger; None: there is none."""
+    return picture_of(limited(read_picture(path), longest_px)) if path.is_file() else None
 
 
 def limited(rgb: ByteArray, longest_px: int) -> ByteArray:

@@ -1,9 +1,4 @@
-"""Place of the survey on Earth: plan, origin, extent, CRS.
-
-Coordinates in the CRS of the report, as text.
-
-Overlap of the photographs: how many see each cell of the ground, and which are tied to each other.
-"""
+"""Place of the survey on Earth, with coordinates as text; and the overlap of its photographs."""
 
 from __future__ import annotations
 
@@ -14,15 +9,16 @@ from scipy.sparse import csr_matrix, triu
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from pipelines.core.types import FloatArray, IntArray, Vector3
+from pipelines.core.types import FloatArray, IntArray
 from pipelines.geodesy.enu import ecef_from_enu, lla_from_ecef
+from pipelines.geodesy.operations import Operation
 from pipelines.geometry.bundle import Network
-from pipelines.geometry.cameras import Camera, project
+from pipelines.geometry.cameras import project
 from pipelines.geometry.footprints import border_rays
 from pipelines.report.page import Picture, picture_of_png
 from pipelines.report.plots.plans import NamedPlaces, match_plan, overlap_plan, site_plan
 from pipelines.report.views import EvaluatedSurvey
-from pipelines.survey.survey import SurveyedPoint
+from pipelines.survey.survey import Survey, SurveyedPoint
 from pipelines.survey.target_crs import TargetCrs
 
 _SHORT_UNIT = {"metre": "m", "degree": "°"}
@@ -36,15 +32,14 @@ def units_of(crs: TargetCrs) -> Texts:
     return first, second, third
 
 
-def axes_of(crs: TargetCrs) -> Texts:
+def axis_names(crs: TargetCrs) -> Texts:
     """Return the names of the three coordinates, easting or longitude first."""
     first, second = ("longitude", "latitude") if crs.crs.is_geographic else ("easting", "northing")
     return first, second, f"height ({crs.crs.vertical.name})"
 
 
 def heads_of(crs: TargetCrs) -> Texts:
-    """Return the heads of the columns of a table of coordinates: name and unit."""
-    first, second, third = (f"{axis} in {unit}" for axis, unit in zip(axes_of(crs), units_of(crs), strict=True))
+    first, second, third = (f"{axis} in {unit}" for axis, unit in zip(axis_names(crs), units_of(crs), strict=True))
     return first, second, third
 
 
@@ -72,7 +67,7 @@ _MOST_DOTS = 12_000
 
 
 @dataclass(frozen=True)
-class Axis:
+class AxisExtent:
     """Extent of the survey along one axis of a CRS."""
 
     name: str
@@ -83,63 +78,34 @@ class Axis:
 
 @dataclass(frozen=True)
 class PlaceFacts:
-    """Place of a survey.
+    """Place of a survey; its extent is that of scene and cameras, on the WGS84 ellipsoid and in the CRS.
 
-    Attributes:
-        plan: of photographs and surveyed points.
-        origin: latitude and longitude in degrees, ellipsoidal height in metres, of the frame `geo`.
-        geographic: extent of scene and cameras on the WGS84 ellipsoid.
-        projected: the same in the CRS of the report.
-        crs, heights: names of CRS and vertical datum.
-        operation: between WGS84 and the CRS, with its accuracy where that is published.
-        operation_accuracy_m: None: not known.
-        recorded_crs, recorded_heights: of the survey's input.
-        heights_stated: whether the input stated its datum.
-        assumed: what nobody stated of the CRS of the report.
-        ground_size_m: extent of the scene along east and north.
+    The operation is that between WGS84 and the CRS; the ground size is that of the scene along east and north.
     """
 
+    survey: Survey
+    crs: TargetCrs
+    operation: Operation
     plan: Picture
-    origin: Vector3
-    geographic: tuple[Axis, ...]
-    projected: tuple[Axis, ...]
-    crs: str
-    heights: str
-    operation: str
-    operation_accuracy_m: float | None
-    recorded_crs: str
-    recorded_heights: str
-    heights_stated: bool
-    assumed: tuple[str, ...]
+    geographic: tuple[AxisExtent, ...]
+    projected: tuple[AxisExtent, ...]
     ground_size_m: tuple[float, float]
 
 
 def place_facts(evaluated: EvaluatedSurvey) -> PlaceFacts:
-    """Return the place of an evaluated survey.
-
-    Raises:
-        InputError: the survey lies outside the domain of the CRS.
-    """
     survey, crs = evaluated.solved.survey, evaluated.crs
     everything = np.concatenate([evaluated.scene_in_geo, evaluated.center_in_geo])
     lla = lla_from_ecef(ecef_from_enu(everything, survey.origin))
     lla[:, 1] -= 360.0 * np.round((lla[:, 1] - lla[0, 1]) / 360.0)
     xyz = crs.xyz_from_geo(everything)
-    operation = crs.crs.operation(crs.lla)
     size = np.ptp(evaluated.scene_in_geo, axis=0).tolist() if len(evaluated.scene_in_geo) else [0.0, 0.0, 0.0]
     return PlaceFacts(
+        survey=survey,
+        crs=crs,
+        operation=crs.crs.operation(crs.lla),
         plan=_plan(evaluated),
-        origin=(survey.origin.lat_deg, survey.origin.lon_deg, survey.origin.alt_m),
         geographic=_axes(("longitude", "latitude", "ellipsoidal height"), ("°", "°", "m"), lla[:, [1, 0, 2]]),
-        projected=_axes(axes_of(crs), units_of(crs), xyz),
-        crs=crs.crs.name,
-        heights=crs.crs.vertical.name,
-        operation=operation.name,
-        operation_accuracy_m=operation.accuracy_m,
-        recorded_crs=survey.source_crs,
-        recorded_heights=survey.vertical.name,
-        heights_stated=survey.vertical.stated,
-        assumed=crs.assumed,
+        projected=_axes(axis_names(crs), units_of(crs), xyz),
         ground_size_m=(size[0], size[1]),
     )
 
@@ -159,15 +125,14 @@ def _plan(evaluated: EvaluatedSurvey) -> Picture:
 
 
 def named_places(points: tuple[SurveyedPoint, ...]) -> NamedPlaces:
-    """Return names and plan coordinates of surveyed points."""
     place = np.array([point.position_in_geo for point in points]).reshape(-1, 3)[:, :2]
-    return NamedPlaces([point.name for point in points], place)
+    return NamedPlaces(place, [point.name for point in points])
 
 
-def _axes(names: tuple[str, ...], units: tuple[str, ...], values: FloatArray) -> tuple[Axis, ...]:
+def _axes(names: tuple[str, ...], units: tuple[str, ...], values: FloatArray) -> tuple[AxisExtent, ...]:
     low, high = values.min(axis=0).tolist(), values.max(axis=0).tolist()
     return tuple(
-        Axis(name, coordinate(first, unit), coordinate(last, unit), unit)
+        AxisExtent(name, coordinate(first, unit), coordinate(last, unit), unit)
         for name, unit, first, last in zip(names, units, low, high, strict=True)
     )
 
@@ -181,37 +146,15 @@ _MOST_LINKS = 4000  # that are drawn
 
 
 @dataclass(frozen=True)
-class OverlapRaster:
-    """Number of photographs that see each cell of the ground.
-
-    Attributes:
-        count: (R, C) rows from the south, columns from the west; −1: no scene.
-        corner_m: (2,) east and north of the south-western corner.
-        cell_m: side of a cell.
-    """
-
-    count: IntArray
-    corner_m: FloatArray
-    cell_m: float
-
-
-@dataclass(frozen=True)
 class OverlapFacts:
     """Overlap of a survey; the map and its figures are None without a scene.
 
     Attributes:
-        overlap: map.
-        cell_m: side of its cells.
         median: number of photographs that see half of the cells or more.
         enough_share: share of the cells that at least `enough` photographs see.
-        enough: that number.
-        matches: graph of the photographs that share points.
-        links: number of pairs that share points, and of those that are drawn.
-        drawn_links: the strongest ones.
+        matches: graph of the photographs that share points, with the strongest `drawn_links` of the `links`.
         tied_points: points that a pair must share to count as tied.
-        median_tied: median number of photographs that a photograph is tied to.
-        least_tied: name of the photograph with fewest of them.
-        least_tied_count: its number.
+        median_tied: median number of photographs that a photograph is tied to; `least_tied` has fewest.
         parts: groups of photographs that no tie connects; 1: all hang together.
     """
 
@@ -231,19 +174,16 @@ class OverlapFacts:
 
 
 def overlap_facts(evaluated: EvaluatedSurvey) -> OverlapFacts:
-    """Return the overlap of an evaluated survey."""
     center = evaluated.center_in_geo[:, :2]
-    raster = overlap_of(evaluated)
-    inside = raster.count[raster.count >= 0] if raster is not None else np.zeros(0)
+    raster = _overlap_of(evaluated)
+    inside = np.zeros(0) if raster is None else raster[0][raster[0] >= 0]
     pairs, shared = links_of(evaluated.network)
     strongest = np.argsort(-shared, kind="stable")[:_MOST_LINKS]
     tied, parts = ties_of(len(center), pairs, shared)
     least = int(tied.argmin())
     return OverlapFacts(
-        overlap=None
-        if raster is None
-        else picture_of_png(overlap_plan(raster.count, raster.corner_m, raster.cell_m, center)),
-        cell_m=None if raster is None else raster.cell_m,
+        overlap=None if raster is None else picture_of_png(overlap_plan(*raster, center)),
+        cell_m=None if raster is None else raster[2],
         median=float(np.median(inside)) if len(inside) else None,
         enough_share=float((inside >= ENOUGH_PHOTOGRAPHS).mean()) if len(inside) else None,
         enough=ENOUGH_PHOTOGRAPHS,
@@ -258,10 +198,11 @@ def overlap_facts(evaluated: EvaluatedSurvey) -> OverlapFacts:
     )
 
 
-def overlap_of(evaluated: EvaluatedSurvey) -> OverlapRaster | None:
-    """Return how many photographs see each cell of the scene; None without a scene.
+def _overlap_of(evaluated: EvaluatedSurvey) -> tuple[IntArray, FloatArray, float] | None:
+    """Return how many photographs see each cell (R, C) of the scene, the south-western corner, and a cell's side.
 
-    A cell is a point on the surface through the SfM points. What stands before it is not asked for.
+    Rows run from the south, columns from the west; −1 is no scene, None a survey without one. A cell is a point on
+    the surface through the SfM points. What stands before it is not asked for.
     """
     scene, surface = evaluated.scene_in_geo, evaluated.surface
     if surface is None:
@@ -278,14 +219,18 @@ def overlap_of(evaluated: EvaluatedSurvey) -> OverlapRaster | None:
     points = np.column_stack([place[known], surface.heights(place[known])])
     count = np.full(rows * columns, -1, dtype=np.int64)
     count[known] = photographs_that_see(evaluated, points)
-    return OverlapRaster(count.reshape(rows, columns), low, cell)
+    return count.reshape(rows, columns), low, cell
 
 
 def photographs_that_see(evaluated: EvaluatedSurvey, point_in_geo: FloatArray) -> IntArray:
     """Return the number (K,) of registered photographs whose frame holds points (K, 3); nothing hides a point."""
     solved = evaluated.solved
     in_model = solved.geo_from_model.inverse().apply(point_in_geo)
-    widest = {key: _widest(camera) for key, camera in solved.sparse.cameras.items()}
+    # Tangent of the widest angle from the axis that a camera's frame shows.
+    widest = {
+        key: float(np.linalg.norm(border_rays(camera)[:, :2], axis=1).max(initial=0.0)) * (1 + 1e-9)
+        for key, camera in solved.sparse.cameras.items()
+    }
     count = np.zeros(len(point_in_geo), dtype=np.int64)
     for index, (rotation, center) in enumerate(
         zip(solved.poses.cam_from_model, solved.poses.cam_center_in_model, strict=True)
@@ -300,12 +245,6 @@ def photographs_that_see(evaluated: EvaluatedSurvey, point_in_geo: FloatArray) -
         seen = ((pixel >= 0) & (pixel <= [camera.width, camera.height])).all(axis=1)
         count[ahead[seen]] += 1
     return count
-
-
-def _widest(camera: Camera) -> float:
-    """Return the tangent of the widest angle from the axis that a camera's frame shows."""
-    rays = border_rays(camera)
-    return float(np.linalg.norm(rays[:, :2], axis=1).max(initial=0.0)) * (1 + 1e-9)
 
 
 def links_of(network: Network) -> tuple[IntArray, IntArray]:

@@ -1,7 +1,4 @@
-"""Control and check points: coordinates, errors, and image chips around their marks.
-
-Image chips: small pieces of the photographs around the marks of surveyed points.
-"""
+"""Control and check points: coordinates, errors, and chips: small pieces of the photographs around their marks."""
 
 from __future__ import annotations
 
@@ -17,12 +14,12 @@ from pipelines.core.errors import InputError
 from pipelines.core.plan import photograph_folder
 from pipelines.core.progress import Progress
 from pipelines.core.types import ByteArray, FloatArray
-from pipelines.formats.image_file import read_bytes, require_unchanged
 from pipelines.geometry.cameras import project
 from pipelines.report.page import Picture, picture_of
 from pipelines.report.place import Texts, heads_of, texts_of
 from pipelines.report.views import EvaluatedSurvey
-from pipelines.survey.marks import mark_rays
+from pipelines.survey.marks import MarkRays, mark_rays
+from pipelines.survey.photographs import decoded_photograph
 from pipelines.survey.report import PointResidual, PredictedPointError
 from pipelines.survey.survey import SurveyedPoint
 
@@ -35,14 +32,9 @@ Pixel = tuple[float, float]
 
 @dataclass(frozen=True)
 class WantedChip:
-    """Mark to be shown.
+    """Mark to be shown, in pixels of a photograph; `owner` is kind and name of the point.
 
-    Attributes:
-        owner: kind and name of the point.
-        image: index of the photograph.
-        mark: pixel of the mark.
-        adjusted: where the measured point projects; None: not measured.
-        surveyed: where the surveyed point projects; None: behind the camera.
+    `adjusted` and `surveyed` are where the measured and the surveyed point project; None: nowhere.
     """
 
     owner: tuple[str, str]
@@ -54,14 +46,9 @@ class WantedChip:
 
 @dataclass(frozen=True)
 class Chip:
-    """Chip with its symbols, in pixels of the photograph from the chip's upper left corner.
+    """Chip with its symbols, in pixels of the photograph from the chip's upper left corner; None: there is none.
 
-    Attributes:
-        image: name of the photograph.
-        picture: the piece of the photograph.
-        side_px: of the piece, in pixels of the photograph.
-        mark, adjusted, surveyed: symbols; None: there is none, or it is outside.
-        distance_px: from the mark to the adjusted point; None: not measured.
+    `distance_px` leads from the mark to the adjusted point.
     """
 
     image: str
@@ -83,7 +70,9 @@ def cut_chips(
     Raises:
         InputError: a photograph cannot be read, or has changed since `ingest`.
     """
-    sparse = evaluated.solved.sparse
+    sparse, survey = evaluated.solved.sparse, evaluated.solved.survey
+    folder = photograph_folder(evaluated.workspace, survey.image_dir)
+    sha256 = {image.name: image.sha256 for image in survey.images}
     longest = max((max(camera.width, camera.height) for camera in sparse.cameras.values()), default=0)
     side = max(_LEAST_SIDE_PX, 2 * round(_SIDE_SHARE * longest / 2))
     by_image: dict[int, list[WantedChip]] = defaultdict(list)
@@ -93,23 +82,13 @@ def cut_chips(
     with progress.task("image chips", len(by_image)) as task:
         for image, of_image in by_image.items():
             name = sparse.image_name[image]
-            photograph = _photograph(evaluated, name)
+            pixels = decoded_photograph(folder / name, sha256.get(name, ""))
+            if pixels is None:
+                raise InputError("does not decode: put the photograph back", path=folder / name)
             for chip in of_image:
-                chips[chip.owner].append(_cut(photograph, name, chip, side))
+                chips[chip.owner].append(_cut(pixels[..., ::-1], name, chip, side))
             task.advance()
     return {owner: tuple(mine) for owner, mine in chips.items()}, side
-
-
-def _photograph(evaluated: EvaluatedSurvey, name: str) -> ByteArray:
-    survey = evaluated.solved.survey
-    path = photograph_folder(evaluated.workspace, survey.image_dir) / name
-    image = survey.image(name)
-    data = read_bytes(path)
-    require_unchanged(data, "" if image is None else image.sha256, path)
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if pixels is None:
-        raise InputError("does not decode: put the photograph back", path=path)
-    return np.asarray(pixels[..., ::-1])
 
 
 def _cut(photograph: ByteArray, name: str, wanted: WantedChip, side: int) -> Chip:
@@ -148,17 +127,13 @@ Kind = Literal["control", "check"]
 
 @dataclass(frozen=True)
 class PointRow:
-    """Surveyed point.
+    """Surveyed point, with its coordinates in the CRS of the report.
 
     Attributes:
-        name: as in the survey.
-        coordinates: surveyed, in the CRS of the report.
-        field: path of its row in the report of `evaluate`; None: it has none.
-        blunder: whether it is a blunder, triangulated.
-        predicted: whether the row has predicted σ.
-        model_field: path of its row on the rendered surface; None: it has none.
+        field, model_field: paths of its rows in the report of `evaluate`, triangulated and on the rendered surface;
+            None: it has none.
+        blunder, predicted: whether it is a blunder, triangulated; whether the row has predicted σ.
         rmse_px: root mean square distance of its marks from the adjusted point; None: it is not measured.
-        chips: of its marks.
     """
 
     name: str
@@ -173,14 +148,10 @@ class PointRow:
 
 @dataclass(frozen=True)
 class PointsFacts:
-    """Control or check points of a survey.
+    """Control or check points of a survey, with the heads of their coordinates' columns.
 
     Attributes:
-        kind: which of the two.
-        heads: of the columns of the coordinates.
-        rows: one for each point.
-        chips: number of image chips that are shown.
-        marks: number of marks in registered photographs.
+        chips, marks: numbers of chips that are shown, and of marks in registered photographs.
         side_px: side of a chip in pixels of the photographs.
         surface: whether points were measured on the rendered surface.
     """
@@ -197,66 +168,65 @@ class PointsFacts:
 def points_facts(
     evaluated: EvaluatedSurvey, chips_a_point: int, progress: Progress
 ) -> tuple[PointsFacts, PointsFacts]:
-    """Return the control points and the check points of an evaluated survey.
-
-    Args:
-        evaluated: the survey.
-        chips_a_point: most image chips for each point; all points together have 240 at most.
-        progress: shows the photographs that chips are cut from.
-
-    Raises:
-        InputError: a photograph cannot be read, or has changed since `ingest`.
-    """
+    """Return the control and check points of an evaluated survey, with 240 chips at most."""
     survey, report = evaluated.solved.survey, evaluated.report
-    control = _Group("control", survey.control_points, report.fit.gcp.points, "fit.gcp.points")
-    check = _Group("check", survey.check_points, report.checkpoints.camera.points, "checkpoints.camera.points")
-    groups = (control, check)
+    groups = (
+        _group(evaluated, "control", survey.control_points, report.fit.gcp.points, "fit.gcp.points"),
+        _group(
+            evaluated, "check", survey.check_points, report.checkpoints.camera.points, "checkpoints.camera.points"
+        ),
+    )
     total = sum(len(group.points) for group in groups)
     each = min(chips_a_point, max(1, _MOST_CHIPS // total)) if total else 0
-    wanted = [chip for group in groups for chip in _wanted(evaluated, group, each)]
+    images = len(evaluated.solved.sparse.image_name)
+    wanted = [chip for group in groups for chip in _wanted(group, each, images)]
     chips, side_px = cut_chips(evaluated, wanted[:_MOST_CHIPS], progress)
-    facts = [_facts(evaluated, group, chips, side_px) for group in groups]
-    return facts[0], facts[1]
+    control, check = (_facts(evaluated, group, chips, side_px) for group in groups)
+    return control, check
 
 
 @dataclass(frozen=True)
 class _Group:
+    """Control or check points, with the rays of their K marks and the pixels where points project; NaN: nowhere."""
+
     kind: Kind
     points: tuple[SurveyedPoint, ...]
     errors: Sequence[PointResidual]
     field: str
-
-    def adjusted(self) -> FloatArray:
-        """Return the measured positions (J, 3) in `geo`; NaN: not measured."""
-        by_name = {row.name: row for row in self.errors}
-        position = np.full((len(self.points), 3), np.nan)
-        for index, point in enumerate(self.points):
-            row = by_name.get(point.name)
-            if row is not None and row.de_m is not None and row.dn_m is not None and row.du_m is not None:
-                position[index] = np.add(point.position_in_geo, (row.de_m, row.dn_m, row.du_m))
-        return position
+    surveyed_in_geo: FloatArray
+    rays: MarkRays
+    surveyed_px: FloatArray
+    adjusted_px: FloatArray
 
 
-def _wanted(evaluated: EvaluatedSurvey, group: _Group, each: int) -> list[WantedChip]:
+def _group(
+    evaluated: EvaluatedSurvey,
+    kind: Kind,
+    points: tuple[SurveyedPoint, ...],
+    errors: Sequence[PointResidual],
+    field: str,
+) -> _Group:
+    by_name = {row.name: row.error_m for row in errors}
+    surveyed = np.array([point.position_in_geo for point in points]).reshape(-1, 3)
+    error = np.array([by_name.get(point.name) or (np.nan,) * 3 for point in points]).reshape(-1, 3)
+    rays = mark_rays(points, evaluated.solved.sparse)
+    surveyed_px, adjusted_px = (
+        _projected(evaluated, place[rays.point], rays.camera) for place in (surveyed, surveyed + error)
+    )
+    return _Group(kind, points, errors, field, surveyed, rays, surveyed_px, adjusted_px)
+
+
+def _wanted(group: _Group, each: int, images: int) -> list[WantedChip]:
     """Return the chips of a group: for each point those photographs that show most marked points."""
-    rays = mark_rays(group.points, evaluated.solved.sparse)
-    adjusted = _projected(evaluated, group.adjusted()[rays.point], rays.camera)
-    surveyed = np.array([point.position_in_geo for point in group.points]).reshape(-1, 3)
-    on_survey = _projected(evaluated, surveyed[rays.point], rays.camera)
-    popular = np.bincount(rays.camera, minlength=len(evaluated.solved.sparse.image_name))
-    chips: list[WantedChip] = []
+    rays, chips = group.rays, []
+    popular = np.bincount(rays.camera, minlength=images)
     for index, point in enumerate(group.points):
         marks = np.flatnonzero(rays.point == index)
         for mark in marks[np.argsort(-popular[rays.camera[marks]], kind="stable")][:each]:
             x_px, y_px = rays.xy_px[mark].tolist()
+            adjusted, surveyed = _pair(group.adjusted_px[mark]), _pair(group.surveyed_px[mark])
             chips.append(
-                WantedChip(
-                    (group.kind, point.name),
-                    int(rays.camera[mark]),
-                    (x_px, y_px),
-                    _pair(adjusted[mark]),
-                    _pair(on_survey[mark]),
-                )
+                WantedChip((group.kind, point.name), int(rays.camera[mark]), (x_px, y_px), adjusted, surveyed)
             )
     return chips
 
@@ -264,18 +234,17 @@ def _wanted(evaluated: EvaluatedSurvey, group: _Group, each: int) -> list[Wanted
 def _facts(
     evaluated: EvaluatedSurvey, group: _Group, chips: dict[tuple[str, str], tuple[Chip, ...]], side_px: int
 ) -> PointsFacts:
-    rays = mark_rays(group.points, evaluated.solved.sparse)
-    distance = rays.xy_px - _projected(evaluated, group.adjusted()[rays.point], rays.camera)
-    surveyed = np.array([point.position_in_geo for point in group.points]).reshape(-1, 3)
+    distance = group.rays.xy_px - group.adjusted_px
     place = {row.name: index for index, row in enumerate(group.errors)}
     surface = evaluated.report.checkpoints.model
     by_model = {} if surface is None else {row.name: index for index, row in enumerate(surface.points)}
     rows = []
-    for index, (point, coordinates) in enumerate(zip(group.points, texts_of(evaluated.crs, surveyed), strict=True)):
+    texts = texts_of(evaluated.crs, group.surveyed_in_geo)
+    for index, (point, coordinates) in enumerate(zip(group.points, texts, strict=True)):
         at = place.get(point.name)
         row = None if at is None else group.errors[at]
         model_at = by_model.get(point.name) if group.kind == "check" else None
-        squares = (distance[rays.point == index] ** 2).sum(axis=1)
+        squares = (distance[group.rays.point == index] ** 2).sum(axis=1)
         rows.append(
             PointRow(
                 name=point.name,
@@ -293,7 +262,7 @@ def _facts(
         heads=heads_of(evaluated.crs),
         rows=tuple(rows),
         chips=sum(len(row.chips) for row in rows),
-        marks=len(rays),
+        marks=len(group.rays),
         side_px=side_px,
         surface=surface is not None,
     )

@@ -1,8 +1,6 @@
 """Record of the processing: stages with options, inputs, versions and times; assumptions, warnings, cautions.
 
-LiDAR that the training has used: its registration, and the places that have changed since.
-
-Comparison of the surface with a reference cloud: map, histogram, and the figures by class and slope.
+Also what two stages have left for the page: LiDAR that the training has used, and the comparison with a reference.
 """
 
 from __future__ import annotations
@@ -18,7 +16,7 @@ from pipelines.core.products import Caution, load_json
 from pipelines.core.stages import BY_NAME, LIDAR, LIDAR_MAP, REFERENCE_HISTOGRAM, REFERENCE_MAP, StageSpec
 from pipelines.core.staleness import cautions_by_stage, status
 from pipelines.core.workspace import Workspace
-from pipelines.report.page import Picture, limited, picture_of, png_file, read_picture
+from pipelines.report.page import Picture, png_file, preview
 from pipelines.report.views import EvaluatedSurvey
 from pipelines.survey.report_parts import LidarReport
 from pipelines.survey.survey import Survey
@@ -28,18 +26,12 @@ _REPORT = "report"
 
 @dataclass(frozen=True)
 class StageRecord:
-    """Stage as it was run.
+    """Stage as it was run; None: not recorded.
 
     Attributes:
-        name: of the stage.
-        state: as in `georef status`, when the report was made.
-        reason: of the state.
-        made: time at which it ended; None: not recorded.
-        duration_s: None: not recorded.
-        key_figure: one line.
+        state, reason: as in `georef status`, when the report was made.
         options: every option by flag, with its value.
         inputs: SHA-256 by product or flag.
-        warnings: messages that the user should read.
     """
 
     name: str
@@ -55,14 +47,11 @@ class StageRecord:
 
 @dataclass(frozen=True)
 class RecordFacts:
-    """Processing of a survey.
+    """Processing of a survey: its stages in the order of the work, assumptions of `ingest`, cautions by stage.
 
     Attributes:
-        stages: in the order of the work.
         total_s: sum of the recorded durations.
         versions: of this package and its libraries, by name, with the stages that ran with them if not all did.
-        assumptions: of `ingest`.
-        cautions: by stage.
         by_hand: stages whose product was put there by hand.
     """
 
@@ -75,7 +64,6 @@ class RecordFacts:
 
 
 def record_facts(workspace: Workspace, survey: Survey) -> RecordFacts:
-    """Return the record of the processing of a workspace."""
     states = [row for row in status(workspace) if row.stage != _REPORT]
     stages = []
     versions: dict[str, dict[str, list[str]]] = {}
@@ -147,72 +135,39 @@ _LISTED = 12
 
 
 @dataclass(frozen=True)
-class ShiftRow:
-    """Shift along one axis, and its σ, in metres; whether it is beyond 3 σ."""
-
-    axis: str
-    shift_m: float
-    sigma_m: float
-    beyond: bool
-
-
-@dataclass(frozen=True)
 class LidarFacts:
-    """LiDAR of a training.
-
-    Attributes:
-        report: the record of the training.
-        shift: by axis.
-        listed: number of areas in the table.
-        map: picture; None: not kept.
-    """
+    """LiDAR of a training: axis, shift and σ in metres; number of areas in the table; their map if it was kept."""
 
     report: LidarReport
-    shift: tuple[ShiftRow, ...]
+    shift: tuple[tuple[str, float, float], ...]
     listed: int
     map: Picture | None
 
 
 def lidar_facts(workspace: Workspace) -> LidarFacts | None:
-    """Return the LiDAR of a training; None: it has used none.
-
-    Raises:
-        InputError: record or map cannot be read.
-    """
+    """Return the LiDAR of a training; None: it has used none."""
     if not (workspace.root / LIDAR).is_file():
         return None
-    report, drawn = load_json(LidarReport, workspace.root / LIDAR), workspace.root / LIDAR_MAP
+    report = load_json(LidarReport, workspace.root / LIDAR)
     registration = report.registration
-    rows = zip(("east", "north", "up"), registration.shift_m, registration.sigma_m, strict=True)
     return LidarFacts(
         report,
-        tuple(ShiftRow(axis, shift, sigma, abs(shift) > 3 * sigma) for axis, shift, sigma in rows),
+        tuple(zip(("east", "north", "up"), registration.shift_m, registration.sigma_m, strict=True)),
         min(len(report.areas), _LISTED),
-        picture_of(limited(read_picture(drawn), _MAP_PX)) if drawn.is_file() else None,
+        preview(workspace.root / LIDAR_MAP, _MAP_PX),
     )
 
 
 @dataclass(frozen=True)
 class ReferenceFacts:
-    """Pictures of a comparison.
+    """Pictures of a comparison; None: nothing was measured."""
 
-    Attributes:
-        is_compared: whether `evaluate` had a reference.
-        map, histogram: None: nothing was measured.
-    """
-
-    is_compared: bool
     map: Picture | None
     histogram: Picture | None
 
 
 def reference_facts(evaluated: EvaluatedSurvey) -> ReferenceFacts:
-    """Return the pictures of the comparison with a reference.
-
-    Raises:
-        InputError: a picture is damaged.
-    """
     if evaluated.report.reference is None:
-        return ReferenceFacts(False, None, None)
+        return ReferenceFacts(None, None)
     paths = (evaluated.workspace.root / product for product in (REFERENCE_MAP, REFERENCE_HISTOGRAM))
-    return ReferenceFacts(True, *(png_file(path) if path.is_file() else None for path in paths))
+    return ReferenceFacts(*(png_file(path) if path.is_file() else None for path in paths))

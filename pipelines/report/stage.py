@@ -3,8 +3,6 @@
 Reads survey, SfM model, adjustment and the report of `evaluate`; trained model, test views, accuracy map, metrics
 and LiDAR of the training, and previews of the rasters where there are any. Writes `report/report.html` and, on
 request, `report/report.pdf`.
-
-Summary of the report: key figures, traffic lights, cautions.
 """
 
 from __future__ import annotations
@@ -14,6 +12,7 @@ from datetime import UTC, datetime
 
 from pipelines import __version__
 from pipelines.core.figures import Headline
+from pipelines.core.files import replace_text
 from pipelines.core.products import Caution, union
 from pipelines.core.stages import REPORT_PAGE
 from pipelines.core.workspace import StageRun, Summary
@@ -21,7 +20,7 @@ from pipelines.report.accuracy import accuracy_facts
 from pipelines.report.cameras import LensesFacts, cameras_facts, lenses_facts
 from pipelines.report.chromium import chromium_path, print_pdf
 from pipelines.report.options import ReportOptions
-from pipelines.report.page import Page, Section, write_page
+from pipelines.report.page import Page, Section, render_page
 from pipelines.report.place import OverlapFacts, overlap_facts, place_facts
 from pipelines.report.points import points_facts
 from pipelines.report.record import RecordFacts, lidar_facts, record_facts, reference_facts
@@ -34,66 +33,6 @@ _NOTES = {
     "predicted": "no check points: root mean square of the predicted σ over the scene",
     "unknown": "neither measured nor predicted",
 }
-
-
-@dataclass(frozen=True)
-class SummaryFacts:
-    """Summary of an evaluated survey.
-
-    Attributes:
-        verdicts: traffic lights.
-        cautions: limits of the result.
-        headline: accuracy of the result.
-        accuracy_note: what its figures are.
-        statement: ASPRS statement of the triangulated check points; None without any.
-    """
-
-    verdicts: tuple[Verdict, ...]
-    cautions: tuple[Caution, ...]
-    headline: Headline
-    accuracy_note: str
-    statement: str | None
-
-
-def summary_facts(
-    evaluated: EvaluatedSurvey,
-    cautions: tuple[Caution, ...],
-    overlap: OverlapFacts,
-    lenses: LensesFacts,
-    record: RecordFacts,
-) -> SummaryFacts:
-    """Return the summary of an evaluated survey.
-
-    Args:
-        evaluated: the survey.
-        cautions: of its products.
-        overlap, lenses, record: facts of those sections.
-    """
-    survey, report = evaluated.solved.survey, evaluated.report
-    measured = Measured(
-        photographs=len(survey.images),
-        registered=lenses.photographs,
-        enough_share=overlap.enough_share,
-        enough=overlap.enough,
-        parts=overlap.parts,
-        rmse_px=lenses.rmse_px,
-        fixes=report.fit.gnss.count + report.fit.gnss.outliers,
-        fix_outliers=report.fit.gnss.outliers,
-        control_points=len(survey.control_points) - report.fit.gcp.outliers,
-        control_outliers=report.fit.gcp.outliers,
-        check_points=len(survey.check_points),
-        stale=tuple(stage.name for stage in record.stages if stage.state in ("stale", "damaged")),
-        workspace=str(evaluated.workspace.root),
-    )
-    return SummaryFacts(
-        verdicts=verdicts(report, measured, cautions),
-        cautions=cautions,
-        headline=report.headline,
-        accuracy_note=_NOTES[report.headline.kind],
-        statement=report.checkpoints.camera.asprs.statement,
-    )
-
-
 _ROOM = __name__.rpartition(".")[0]
 _STEPS = 8
 
@@ -113,7 +52,7 @@ def run(stage: StageRun, options: ReportOptions) -> Summary:
         task.advance()
     page, summary = report_page(evaluated, options, stage)
     html = stage.out / REPORT_PAGE.rpartition("/")[2]
-    write_page(page, _ROOM, html)
+    replace_text(html, render_page(page, _ROOM))
     if options.pdf:
         with stage.progress.task("PDF") as task:
             print_pdf(html, html.with_suffix(".pdf"))
@@ -124,21 +63,12 @@ def run(stage: StageRun, options: ReportOptions) -> Summary:
     return Summary(
         f"{', '.join(f'{count} {level}' for level, count in counts.items() if count)}; {size_mb:.1f} MB",
         {**counts, "bytes": html.stat().st_size, "pdf": options.pdf, "crs": evaluated.crs.crs.name},
-        cautions=_cautions(evaluated),
+        cautions=summary.cautions,
     )
 
 
 def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: StageRun) -> tuple[Page, SummaryFacts]:
-    """Return the content of the report, and its summary.
-
-    Args:
-        evaluated: the survey.
-        options: of the report.
-        stage: shows the progress; names the workspace.
-
-    Raises:
-        InputError: a photograph or a picture of the workspace cannot be read.
-    """
+    """Return the content of the report, and its summary."""
     workspace, survey = stage.workspace, evaluated.solved.survey
     with stage.progress.task("sections", _STEPS) as task:
         place = place_facts(evaluated)
@@ -157,7 +87,7 @@ def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: Stage
         task.advance(note="views")
         record = record_facts(workspace, survey)
         task.advance(note="record")
-    summary = summary_facts(evaluated, _cautions(evaluated), overlap, lenses, record)
+    summary = summary_facts(evaluated, overlap, lenses, record)
     page = Page(
         title=f"Survey report: {workspace.root.name}",
         subtitle="Georeferenced 3D Gaussian splat, with its measured and predicted accuracy"
@@ -167,7 +97,7 @@ def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: Stage
             "Made": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
             "Program": f"GeoRefGS {__version__}",
             "Photographs": f"{cameras.registered} of {cameras.photographs} registered",
-            "Reference system": f"{place.crs}, heights {place.heights}",
+            "Reference system": f"{place.crs.crs.name}, heights {place.crs.crs.vertical.name}",
         },
         sections=(
             Section("summary", "Summary", "summary.html", summary),
@@ -202,5 +132,40 @@ def _sections_of_gaussians(evaluated: EvaluatedSurvey, options: ReportOptions) -
     )
 
 
-def _cautions(evaluated: EvaluatedSurvey) -> tuple[Caution, ...]:
-    return union(evaluated.solved.model.cautions, evaluated.report.cautions)
+@dataclass(frozen=True)
+class SummaryFacts:
+    """Summary of an evaluated survey: traffic lights, cautions, headline, and what the headline's figures are."""
+
+    verdicts: tuple[Verdict, ...]
+    cautions: tuple[Caution, ...]
+    headline: Headline
+    accuracy_note: str
+
+
+def summary_facts(
+    evaluated: EvaluatedSurvey, overlap: OverlapFacts, lenses: LensesFacts, record: RecordFacts
+) -> SummaryFacts:
+    """Return the summary of an evaluated survey, of which it needs the facts of three sections."""
+    survey, report = evaluated.solved.survey, evaluated.report
+    cautions = union(evaluated.solved.model.cautions, report.cautions)
+    measured = Measured(
+        photographs=len(survey.images),
+        registered=lenses.photographs,
+        enough_share=overlap.enough_share,
+        enough=overlap.enough,
+        parts=overlap.parts,
+        rmse_px=lenses.rmse_px,
+        fixes=report.fit.gnss.count + report.fit.gnss.outliers,
+        fix_outliers=report.fit.gnss.outliers,
+        control_points=len(survey.control_points) - report.fit.gcp.outliers,
+        control_outliers=report.fit.gcp.outliers,
+        check_points=len(survey.check_points),
+        stale=tuple(stage.name for stage in record.stages if stage.state in ("stale", "damaged")),
+        workspace=str(evaluated.workspace.root),
+    )
+    return SummaryFacts(
+        verdicts=verdicts(report, measured, cautions),
+        cautions=cautions,
+        headline=report.headline,
+        accuracy_note=_NOTES[report.headline.kind],
+    )

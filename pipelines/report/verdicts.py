@@ -11,7 +11,7 @@ from typing import Literal
 
 from pipelines.core.products import NOT_CHECKED, Caution
 from pipelines.core.sentences import listed
-from pipelines.report.page import decibel, number, share
+from pipelines.report.page import decibel, number_text, share
 from pipelines.survey.report import ByAxis, CheckPointErrors, EvaluationReport
 from pipelines.survey.report_parts import VarianceFactor
 
@@ -29,15 +29,7 @@ TEST_PSNR_DB = (22.0, 18.0)
 
 @dataclass(frozen=True)
 class Verdict:
-    """Verdict on one quality of the survey.
-
-    Attributes:
-        subject: the quality.
-        level: the verdict.
-        reading: what was measured.
-        reason: what follows, or what to do.
-        rule: limits of good and fair.
-    """
+    """Verdict on one quality of the survey: what was measured, what follows, and the limits of good and fair."""
 
     subject: str
     level: Level
@@ -51,14 +43,11 @@ class Measured:
     """Measurements that the verdicts need beside the report of `evaluate`.
 
     Attributes:
-        photographs, registered: numbers.
         enough_share: share of the ground that at least `enough` photographs see; None: no scene.
-        enough: that number.
         parts: groups of photographs that nothing ties to each other.
         rmse_px: of the reprojection residuals; None: no observations.
-        fixes, fix_outliers: numbers, of the training photographs.
-        control_points, control_outliers: numbers of used and of rejected ones.
-        check_points: number in the survey.
+        fixes: number, of the training photographs.
+        control_points: number of used ones; the rejected are `control_outliers`.
         stale: stages whose product is not current.
         workspace: path, for commands.
     """
@@ -78,29 +67,29 @@ class Measured:
     workspace: str
 
 
-def verdicts(report: EvaluationReport, measured: Measured, cautions: Sequence[Caution]) -> tuple[Verdict, ...]:
-    """Return the verdicts on a survey, in the order of the work.
+# Of a verdict: level, reading, reason, rule.
+_Told = tuple[Level, str, str, str]
 
-    Args:
-        report: of `evaluate`.
-        measured: what the report does not hold.
-        cautions: of all products.
-    """
-    return (
-        _registered(measured),
-        _overlap(measured),
-        _reprojection(measured),
-        _fixes(measured),
-        _control(measured),
-        _stated_sigma(report.variance_factors),
-        _check_points(measured, report.checkpoints.camera),
-        _prediction(report.checkpoints.camera),
-        _blunders(report.checkpoints.camera),
-        *(() if report.checkpoints.model is None else (_surface(report.checkpoints.model),)),
-        *(() if report.test_views is None else (_views(report.test_views.psnr, report.test_views.views),)),
-        _cautions(cautions),
-        _current(measured),
-    )
+
+def verdicts(report: EvaluationReport, measured: Measured, cautions: Sequence[Caution]) -> tuple[Verdict, ...]:
+    """Return the verdicts on a survey, in the order of the work."""
+    by_camera, by_model, test = report.checkpoints.camera, report.checkpoints.model, report.test_views
+    told: dict[str, _Told] = {
+        "Registered photographs": _registered(measured),
+        "Overlap": _overlap(measured),
+        "Reprojection": _reprojection(measured),
+        "Recorded positions": _fixes(measured),
+        "Control points": _control(measured),
+        "σ of the measurements": _stated_sigma(report.variance_factors),
+        "Check points": _check_points(measured, by_camera),
+        "Predicted against measured": _prediction(by_camera),
+        "Blunders": _blunders(by_camera),
+        **({} if by_model is None else {"Surface at the points": _surface(by_model)}),
+        **({} if test is None else {"Test views": _views(test.psnr, test.views)}),
+        "Cautions": _cautions(cautions),
+        "State of the products": _current(measured),
+    }
+    return tuple(Verdict(subject, *verdict) for subject, verdict in told.items())
 
 
 def level_of(value: float, limits: tuple[float, float], *, more_is_better: bool) -> Level:
@@ -111,67 +100,57 @@ def level_of(value: float, limits: tuple[float, float], *, more_is_better: bool)
     return "good" if value <= good else "fair" if value <= fair else "poor"
 
 
-def _registered(measured: Measured) -> Verdict:
+def _registered(measured: Measured) -> _Told:
     part = measured.registered / measured.photographs if measured.photographs else 0.0
     level = level_of(part, REGISTERED, more_is_better=True)
     lost = measured.photographs - measured.registered
     reason = "all photographs contribute" if not lost else f"{lost} not used: blurred, or without overlap"
-    return Verdict(
-        "Registered photographs",
-        level,
-        f"{measured.registered} of {measured.photographs} ({share(part)})",
-        reason,
-        f"good from {share(REGISTERED[0])}, fair from {share(REGISTERED[1])}",
-    )
+    rule = f"good from {share(REGISTERED[0])}, fair from {share(REGISTERED[1])}"
+    return level, f"{measured.registered} of {measured.photographs} ({share(part)})", reason, rule
 
 
-def _overlap(measured: Measured) -> Verdict:
+def _overlap(measured: Measured) -> _Told:
     rule = (
         f"good if {share(OVERLAP[0])} of the ground is seen by {measured.enough} photographs or more and all hang "
         f"together, fair from {share(OVERLAP[1])}"
     )
     if measured.enough_share is None:
-        return Verdict("Overlap", "unknown", "no scene", "too few SfM points to map the ground", rule)
+        return "unknown", "no scene", "too few SfM points to map the ground", rule
     level = level_of(measured.enough_share, OVERLAP, more_is_better=True)
     reason = "enough rays everywhere" if level == "good" else "the rim of the scene is less accurate: fly beyond it"
     if measured.parts > 1:
         level = "fair" if level == "good" else level
         reason = f"{measured.parts} groups of photographs that few points tie together: add photographs"
     reading = f"{share(measured.enough_share)} of the ground in {measured.enough} photographs or more"
-    return Verdict("Overlap", level, reading, reason, rule)
+    return level, reading, reason, rule
 
 
-def _reprojection(measured: Measured) -> Verdict:
+def _reprojection(measured: Measured) -> _Told:
     rule = f"good up to {REPROJECTION_PX[0]:g} px, fair up to {REPROJECTION_PX[1]:g} px"
     if measured.rmse_px is None:
-        return Verdict("Reprojection", "unknown", "no observations", "the SfM model has none", rule)
+        return "unknown", "no observations", "the SfM model has none", rule
     level = level_of(measured.rmse_px, REPROJECTION_PX, more_is_better=False)
     reason = (
         "cameras, lens and points fit together"
         if level == "good"
         else "look at the residuals by image region: a pattern is a fault of the lens model"
     )
-    return Verdict("Reprojection", level, f"{number(measured.rmse_px)} px RMSE", reason, rule)
+    return level, f"{number_text(measured.rmse_px)} px RMSE", reason, rule
 
 
-def _fixes(measured: Measured) -> Verdict:
+def _fixes(measured: Measured) -> _Told:
     rule = f"good up to {share(FIX_OUTLIERS[0])} outliers, fair up to {share(FIX_OUTLIERS[1])}"
     if not measured.fixes:
-        return Verdict(
-            "Recorded positions",
-            "fair" if measured.control_points >= CONTROL_POINTS[1] else "unknown",
-            "none",
-            "the control points alone place the survey",
-            rule,
-        )
+        level: Level = "fair" if measured.control_points >= CONTROL_POINTS[1] else "unknown"
+        return level, "none", "the control points alone place the survey", rule
     part = measured.fix_outliers / measured.fixes
     level = level_of(part, FIX_OUTLIERS, more_is_better=False)
     reason = "the section on positions names them" if measured.fix_outliers else "none contradicts the others"
     reading = f"{measured.fixes} used or tested, {measured.fix_outliers} outliers"
-    return Verdict("Recorded positions", level, reading, reason, rule)
+    return level, reading, reason, rule
 
 
-def _control(measured: Measured) -> Verdict:
+def _control(measured: Measured) -> _Told:
     count = measured.control_points
     level: Level = level_of(count, CONTROL_POINTS, more_is_better=True) if count else "fair"
     reason = (
@@ -183,27 +162,25 @@ def _control(measured: Measured) -> Verdict:
     )
     rule = f"good from {CONTROL_POINTS[0]}, fair from {CONTROL_POINTS[1]} or with none (positions only)"
     reading = f"{count} used, {measured.control_outliers} rejected" if measured.control_outliers else str(count)
-    return Verdict("Control points", level, reading, reason, rule)
+    return level, reading, reason, rule
 
 
-def _stated_sigma(factors: tuple[VarianceFactor, ...]) -> Verdict:
+def _stated_sigma(factors: tuple[VarianceFactor, ...]) -> _Told:
     rule = "good if the σ of every tested group passed, fair if the data changed one"
     tested = [factor for factor in factors if factor.estimated is not None]
     if not tested:
-        return Verdict(
-            "σ of the measurements", "unknown", "not tested", "there is no redundancy to test them with", rule
-        )
+        return "unknown", "not tested", "there is no redundancy to test them with", rule
     changed = [factor for factor in tested if factor.applied != 1.0]
     if changed:
-        reading = ", ".join(f"{factor.group}: variance × {number(factor.applied)}" for factor in changed)
+        reading = ", ".join(f"{factor.group}: variance × {number_text(factor.applied)}" for factor in changed)
         refuted = any(factor.sigma_source == "stated" for factor in changed)
         reason = "the data refute a stated σ" if refuted else "nobody stated these σ: the data gave them"
-        return Verdict("σ of the measurements", "fair", reading, reason, rule)
+        return "fair", reading, reason, rule
     passed = ", ".join(factor.group for factor in tested)
-    return Verdict("σ of the measurements", "good", f"passed: {passed}", "residuals agree with the σ", rule)
+    return "good", f"passed: {passed}", "residuals agree with the σ", rule
 
 
-def _check_points(measured: Measured, errors: CheckPointErrors) -> Verdict:
+def _check_points(measured: Measured, errors: CheckPointErrors) -> _Told:
     least = errors.asprs.least_points
     rule = f"good from {least} measured check points (ASPRS), fair from 1, poor with none"
     if not errors.count:
@@ -213,19 +190,13 @@ def _check_points(measured: Measured, errors: CheckPointErrors) -> Verdict:
             else f"nothing measures the accuracy: `georef ingest {measured.workspace} --checkpoints FILE`, then "
             f"`georef run {measured.workspace}`"
         )
-        return Verdict("Check points", "poor", f"{errors.count} of {measured.check_points} measured", reason, rule)
+        return "poor", f"{errors.count} of {measured.check_points} measured", reason, rule
     enough = errors.asprs.enough_points
     reason = "an accuracy class may be stated" if enough else f"the standard demands {least} for an accuracy class"
-    return Verdict(
-        "Check points",
-        "good" if enough else "fair",
-        f"{errors.count} of {measured.check_points} measured",
-        reason,
-        rule,
-    )
+    return "good" if enough else "fair", f"{errors.count} of {measured.check_points} measured", reason, rule
 
 
-def _prediction(errors: CheckPointErrors) -> Verdict:
+def _prediction(errors: CheckPointErrors) -> _Told:
     rule = (
         f"good up to {NORMALISED[0]:g}, fair up to {NORMALISED[1]:g}: mean of "
         "error² / (predicted + survey variance), 1 if both are right"
@@ -234,9 +205,7 @@ def _prediction(errors: CheckPointErrors) -> Verdict:
     axes = ByAxis(e=None, n=None, u=None) if predicted is None else predicted.normalised_error_squared
     known = [value for value in (axes.e, axes.n, axes.u) if value is not None]
     if not known:
-        return Verdict(
-            "Predicted against measured", "unknown", "not compared", "needs check points with predicted σ", rule
-        )
+        return "unknown", "not compared", "needs check points with predicted σ", rule
     worst = max(known)
     level = level_of(worst, NORMALISED, more_is_better=False)
     reason = (
@@ -246,29 +215,23 @@ def _prediction(errors: CheckPointErrors) -> Verdict:
         if level == "good"
         else "errors are larger than predicted: control points, marks or the datum may be at fault"
     )
-    return Verdict(
-        "Predicted against measured",
-        level,
-        f"{number(worst)} on the worst axis",
-        reason,
-        rule,
-    )
+    return level, f"{number_text(worst)} on the worst axis", reason, rule
 
 
-def _blunders(errors: CheckPointErrors) -> Verdict:
+def _blunders(errors: CheckPointErrors) -> _Told:
     rule = "good with none, fair otherwise: beyond three times the class that the others meet"
     if not errors.count:
-        return Verdict("Blunders", "unknown", "no check points measured", "nothing to look for", rule)
+        return "unknown", "no check points measured", "nothing to look for", rule
     if errors.blunders:
         reason = "look at their image chips: a mark or a coordinate may be wrong"
-        return Verdict("Blunders", "fair", listed(errors.blunders), reason, rule)
-    return Verdict("Blunders", "good", "none", "no check point stands out", rule)
+        return "fair", listed(errors.blunders), reason, rule
+    return "good", "none", "no check point stands out", rule
 
 
-def _surface(errors: CheckPointErrors) -> Verdict:
+def _surface(errors: CheckPointErrors) -> _Told:
     rule = "good if no check point is a blunder on the rendered surface, fair up to a fifth of them, poor beyond"
     if not errors.count:
-        return Verdict("Surface at the points", "unknown", "no check points", "nothing to compare with", rule)
+        return "unknown", "no check points", "nothing to compare with", rule
     count = len(errors.blunders)
     level: Level = "good" if not count else "fair" if count <= errors.count / 5 else "poor"
     reason = (
@@ -276,29 +239,29 @@ def _surface(errors: CheckPointErrors) -> Verdict:
         if not count
         else "there the splat shows another surface: thin or moving things, or too little training"
     )
-    return Verdict("Surface at the points", level, f"{count} of {errors.count} off", reason, rule)
+    return level, f"{count} of {errors.count} off", reason, rule
 
 
-def _views(psnr_db: float | None, count: int) -> Verdict:
+def _views(psnr_db: float | None, count: int) -> _Told:
     rule = f"good from {TEST_PSNR_DB[0]:g} dB, fair from {TEST_PSNR_DB[1]:g} dB (mean PSNR)"
     if psnr_db is None:
-        return Verdict("Test views", "unknown", "none", "no photograph was left out of the training", rule)
+        return "unknown", "none", "no photograph was left out of the training", rule
     level = level_of(psnr_db, TEST_PSNR_DB, more_is_better=True)
     reason = "renders look like the photographs" if level == "good" else "train longer, or at a larger image size"
-    return Verdict("Test views", level, f"{decibel(psnr_db)} over {count}", reason, rule)
+    return level, f"{decibel(psnr_db)} over {count}", reason, rule
 
 
-def _cautions(cautions: Sequence[Caution]) -> Verdict:
+def _cautions(cautions: Sequence[Caution]) -> _Told:
     rule = "good with none, poor if nothing checks the positions, fair otherwise"
     if not cautions:
-        return Verdict("Cautions", "good", "none", "no limit of the result is known", rule)
+        return "good", "none", "no limit of the result is known", rule
     unchecked = any(caution.code == NOT_CHECKED for caution in cautions)
-    return Verdict("Cautions", "poor" if unchecked else "fair", str(len(cautions)), "listed below the table", rule)
+    return "poor" if unchecked else "fair", str(len(cautions)), "listed below the table", rule
 
 
-def _current(measured: Measured) -> Verdict:
+def _current(measured: Measured) -> _Told:
     rule = "good if every product is current"
     if not measured.stale:
-        return Verdict("State of the products", "good", "current", "all stages belong together", rule)
+        return "good", "current", "all stages belong together", rule
     reason = f"`georef run {measured.workspace}` brings them up to date; then make this report again"
-    return Verdict("State of the products", "poor", f"not current: {', '.join(measured.stale)}", reason, rule)
+    return "poor", f"not current: {', '.join(measured.stale)}", reason, rule

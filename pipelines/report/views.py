@@ -1,7 +1,4 @@
-"""Test views as pictures, the curves of the training, and previews of the rasters.
-
-Evaluated survey: what the sections of the report take their facts from, loaded and computed once.
-"""
+"""Evaluated survey, which all sections show; test views, curves of the training, previews of the rasters."""
 
 from __future__ import annotations
 
@@ -10,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +15,6 @@ from pipelines.adjust.posterior import Posterior
 from pipelines.adjust.solution import posterior_of
 from pipelines.core.errors import InputError, MissingProductError
 from pipelines.core.files import file_size
-from pipelines.core.products import is_checked
 from pipelines.core.stages import BY_NAME, HILLSHADE, METRICS, ORTHOPHOTO_PREVIEW, RENDERS, REPORT
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
@@ -27,14 +23,87 @@ from pipelines.geometry.cameras import project_each
 from pipelines.geometry.footprints import PointSurface
 from pipelines.geometry.intersection import refined_points
 from pipelines.report.options import ReportOptions
-from pipelines.report.page import Picture, limited, picture_of, picture_of_png, read_picture
+from pipelines.report.page import Picture, limited, picture_of, picture_of_png, preview, read_picture
 from pipelines.report.plots.charts import without_labels
 from pipelines.report.plots.observations import curves
 from pipelines.survey.photographs import DIFFERENCE_GAIN, render_name
 from pipelines.survey.report import EvaluationReport, PhotometricFigures, read_report
+from pipelines.survey.scene import network_of
 from pipelines.survey.target_crs import TargetCrs, usable_crs
 from pipelines.survey.trained_model import TrainedModel
 from pipelines.survey.trained_survey import SolvedSurvey, load_solved
+
+_LEAST_RAYS = 3  # of a point that counts as a part of the surface
+_RIM = 0.005  # fraction of the points that are taken for errors above, and below
+
+
+@dataclass(frozen=True)
+class EvaluatedSurvey:
+    """Solved survey with the report of `evaluate`, the covariances of the solution, and the CRS of the page."""
+
+    workspace: Workspace
+    solved: SolvedSurvey
+    report: EvaluationReport
+    posterior: Posterior
+    crs: TargetCrs
+
+    @cached_property
+    def document(self) -> dict[str, Any]:
+        return self.report.model_dump(mode="json")
+
+    @cached_property
+    def center_in_geo(self) -> FloatArray:
+        """Adjusted projection centres (n, 3), metres."""
+        return self.solved.geo_from_model.apply(self.solved.poses.cam_center_in_model)
+
+    @cached_property
+    def network(self) -> Network:
+        """The image observations with adjusted cameras and lenses, and points where these see them, in `model`."""
+        network = network_of(self.solved.sparse, self.solved.poses, self.solved.point_in_model)
+        return replace(network, point_in_world=refined_points(network).point_in_world)
+
+    @cached_property
+    def residual_px(self) -> FloatArray:
+        """Reprojection residuals (M, 2), projected minus observed; NaN where a point lies behind its camera."""
+        network = self.network
+        ray = network.point_in_world[network.obs_point] - network.cam_center_in_world[network.obs_image]
+        in_cam = np.einsum("mij,mj->mi", network.cam_from_world[network.obs_image], ray)
+        projected = project_each(network.cameras, network.camera_id[network.obs_image], in_cam)
+        return np.asarray(np.where(has_positive_depth(network)[:, None], projected - network.obs_xy_px, np.nan))
+
+    @cached_property
+    def scene_in_geo(self) -> FloatArray:
+        """SfM points (N, 3) in `geo` that three photographs show, without the highest and lowest."""
+        network = self.network
+        points = self.solved.geo_from_model.apply(network.point_in_world)
+        points = points[np.bincount(network.obs_point, minlength=len(points)) >= _LEAST_RAYS]
+        if not len(points):
+            return points
+        low, high = np.quantile(points[:, 2], [_RIM, 1 - _RIM])
+        return np.asarray(points[(points[:, 2] >= low) & (points[:, 2] <= high)])
+
+    @cached_property
+    def surface(self) -> PointSurface | None:
+        """Surface through the points of the scene; None: there are none."""
+        return PointSurface(self.scene_in_geo) if len(self.scene_in_geo) else None
+
+
+def load_evaluated(workspace: Workspace, options: ReportOptions) -> EvaluatedSurvey:
+    """Return the evaluated survey of a workspace.
+
+    Raises:
+        MissingProductError: a stage up to evaluate has not been run; names the command.
+        InputError: a product is damaged, or the CRS cannot be used here.
+    """
+    report = read_report(workspace.path(REPORT))
+    manifest = workspace.manifest(BY_NAME["evaluate"])  # None: a report put there by hand
+    initial = manifest is not None and manifest.config.get("similarity") == "initial"
+    solved = load_solved(workspace, "initial" if initial else "trained")
+    center_in_geo = solved.geo_from_model.apply(solved.poses.cam_center_in_model)
+    crs = usable_crs(options, solved.survey.origin, center_in_geo, solved.survey.vertical)
+    posterior = posterior_of(workspace, solved.model, solved.sfm)
+    return EvaluatedSurvey(workspace, solved, report, posterior, crs)
+
 
 _VIEW_PX, _PREVIEW_PX = 720, 1100
 _MOST_METRICS_BYTES = 256 * 1024 * 1024
@@ -67,13 +136,9 @@ class TestView:
 
 @dataclass(frozen=True)
 class ViewsFacts:
-    """Test views of an evaluated survey.
+    """Test views: those with pictures, the worst first; name, and path of the figures, of all.
 
-    Attributes:
-        shown: views with pictures, the worst first.
-        rows: name, and path of the figures, of every view.
-        gain: of the difference.
-        renders: number of renders that `evaluate` has saved.
+    `renders` is the number of renders that `evaluate` has saved, `gain` that of the difference.
     """
 
     shown: tuple[TestView, ...]
@@ -84,26 +149,11 @@ class ViewsFacts:
 
 @dataclass(frozen=True)
 class TrainingFacts:
-    """Training of the model.
+    """Training of the model, with its curves; None: no metrics were kept, or the duration was not recorded."""
 
-    Attributes:
-        curves: picture; None: no metrics were kept.
-        iterations, gaussians: of the result.
-        max_image_size: longer side of the training photographs in pixels.
-        backend: rasteriser.
-        duration_s: None: not recorded.
-        last_psnr: of the last batch, dB; None: no metrics.
-        sh_degree: of the spherical harmonics.
-    """
-
+    model: TrainedModel
     curves: Picture | None
-    iterations: int
-    gaussians: int
-    max_image_size: int
-    backend: str
     duration_s: float | None
-    last_psnr: float | None
-    sh_degree: int
 
 
 @dataclass(frozen=True)
@@ -115,11 +165,7 @@ class PreviewsFacts:
 
 
 def views_facts(workspace: Workspace, test: PhotometricFigures, most: int) -> ViewsFacts:
-    """Return the test views of a workspace, with pictures of at most `most` of them.
-
-    Raises:
-        InputError: a render cannot be read.
-    """
+    """Return the test views of a workspace, with pictures of at most `most` of them."""
     views = test.per_view
     fields = {view.image: f"photometric.test.per_view.{index}" for index, view in enumerate(views)}
     worst_first = sorted(views, key=lambda view: view.psnr)
@@ -147,11 +193,6 @@ def _view(name: str, field: str, file: Path) -> TestView:
 
 
 def training_facts(workspace: Workspace, model: TrainedModel) -> TrainingFacts:
-    """Return the training of a workspace.
-
-    Raises:
-        InputError: the metrics are damaged.
-    """
     manifest = workspace.manifest(BY_NAME["train"])
     try:
         rows = read_metrics(workspace.path(METRICS))
@@ -159,14 +200,9 @@ def training_facts(workspace: Workspace, model: TrainedModel) -> TrainingFacts:
         rows = []
     panels = _panels(rows)
     return TrainingFacts(
+        model=model,
         curves=picture_of_png(curves("iteration", panels)) if panels else None,
-        iterations=model.iterations,
-        gaussians=model.gaussians,
-        max_image_size=model.max_image_size,
-        backend=model.backend,
         duration_s=None if manifest is None else manifest.duration_s,
-        last_psnr=rows[-1].get("psnr") if rows else None,
-        sh_degree=model.sh_degree,
     )
 
 
@@ -208,128 +244,5 @@ def _panels(rows: list[dict[str, float]]) -> dict[str, Mapping[str, tuple[FloatA
 
 
 def previews_facts(workspace: Workspace) -> PreviewsFacts:
-    """Return the previews of the rasters of a workspace.
-
-    Raises:
-        InputError: a preview cannot be read.
-    """
-    pictures = []
-    for product in (ORTHOPHOTO_PREVIEW, HILLSHADE):
-        path = workspace.root / product
-        pictures.append(picture_of(limited(read_picture(path), _PREVIEW_PX)) if path.is_file() else None)
-    return PreviewsFacts(*pictures)
-
-
-_LEAST_RAYS = 3  # of a point that counts as a part of the surface
-_RIM = 0.005  # fraction of the points that are taken for errors above, and below
-
-
-@dataclass(frozen=True)
-class CameraSigma:
-    """Covariance of the n cameras, or the reason why it is not known.
-
-    Attributes:
-        covariance: (n, 6, 6) of (δθ [rad], δc [m]) along the axes of `geo`; None: not known.
-        reason: why not; empty if known.
-    """
-
-    covariance: FloatArray | None
-    reason: str
-
-
-@dataclass(frozen=True)
-class EvaluatedSurvey:
-    """Solved survey with its evaluation.
-
-    Attributes:
-        workspace: it was read from.
-        solved: survey, cameras, and the Gaussians if there are any.
-        report: of `evaluate`.
-        posterior: covariances of the solution.
-        crs: of the coordinates in the report.
-    """
-
-    workspace: Workspace
-    solved: SolvedSurvey
-    report: EvaluationReport
-    posterior: Posterior
-    crs: TargetCrs
-
-    @cached_property
-    def document(self) -> dict[str, Any]:
-        """The report of `evaluate` as JSON."""
-        return self.report.model_dump(mode="json")
-
-    @cached_property
-    def center_in_geo(self) -> FloatArray:
-        """Adjusted projection centres (n, 3), metres."""
-        return self.solved.geo_from_model.apply(self.solved.poses.cam_center_in_model)
-
-    @cached_property
-    def network(self) -> Network:
-        """The image observations with adjusted cameras and lenses, and points where these see them, in `model`."""
-        sparse, poses = self.solved.sparse, self.solved.poses
-        network = Network(
-            sparse.cameras,
-            sparse.image_camera_id,
-            poses.cam_from_model,
-            poses.cam_center_in_model,
-            self.solved.point_in_model,
-            sparse.obs_point,
-            sparse.obs_image,
-            sparse.obs_xy_px,
-        )
-        return replace(network, point_in_world=refined_points(network).point_in_world)
-
-    @cached_property
-    def residual_px(self) -> FloatArray:
-        """Reprojection residuals (M, 2), projected minus observed; NaN where a point lies behind its camera."""
-        network = self.network
-        ray = network.point_in_world[network.obs_point] - network.cam_center_in_world[network.obs_image]
-        in_cam = np.einsum("mij,mj->mi", network.cam_from_world[network.obs_image], ray)
-        projected = project_each(network.cameras, network.camera_id[network.obs_image], in_cam)
-        return np.asarray(np.where(has_positive_depth(network)[:, None], projected - network.obs_xy_px, np.nan))
-
-    @cached_property
-    def scene_in_geo(self) -> FloatArray:
-        """SfM points (N, 3) in `geo` that three photographs show, without the highest and lowest."""
-        network = self.network
-        points = self.solved.geo_from_model.apply(network.point_in_world)
-        points = points[np.bincount(network.obs_point, minlength=len(points)) >= _LEAST_RAYS]
-        if not len(points):
-            return points
-        low, high = np.quantile(points[:, 2], [_RIM, 1 - _RIM])
-        return np.asarray(points[(points[:, 2] >= low) & (points[:, 2] <= high)])
-
-    @cached_property
-    def surface(self) -> PointSurface | None:
-        """Surface through the points of the scene; None: there are none."""
-        return PointSurface(self.scene_in_geo) if len(self.scene_in_geo) else None
-
-    @cached_property
-    def camera_sigma(self) -> CameraSigma:
-        """Covariance of the cameras."""
-        if not is_checked(self.solved.model.cautions):
-            return CameraSigma(None, "nothing checks the σ of the positions")
-        return CameraSigma(self.posterior.camera_cov, "")
-
-
-def load_evaluated(workspace: Workspace, options: ReportOptions) -> EvaluatedSurvey:
-    """Return the evaluated survey of a workspace.
-
-    Raises:
-        MissingProductError: a stage up to evaluate has not been run; names the command.
-        InputError: a product is damaged, or the CRS cannot be used here.
-    """
-    report = read_report(workspace.path(REPORT))
-    solved = load_solved(workspace, _evaluated_similarity(workspace))
-    center_in_geo = solved.geo_from_model.apply(solved.poses.cam_center_in_model)
-    crs = usable_crs(options, solved.survey.origin, center_in_geo, solved.survey.vertical)
-    posterior = posterior_of(workspace, solved.model, solved.sfm)
-    return EvaluatedSurvey(workspace, solved, report, posterior, crs)
-
-
-def _evaluated_similarity(workspace: Workspace) -> Literal["trained", "initial"]:
-    """Return the similarity that was evaluated; the trained one for a report put there by hand."""
-    manifest = workspace.manifest(BY_NAME["evaluate"])
-    return "initial" if manifest is not None and manifest.config.get("similarity") == "initial" else "trained"
+    products = (ORTHOPHOTO_PREVIEW, HILLSHADE)
+    return PreviewsFacts(*(preview(workspace.root / product, _PREVIEW_PX) for product in products))

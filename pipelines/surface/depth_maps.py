@@ -138,7 +138,7 @@ class DepthMaps:
         # A view is read by all of its neighbours: large photographs are shrunken once. Nothing must be cut off.
         most = max(max(whole.width, whole.height) // (2 * self._options.fine_px), 1)
         shrink = max(s for s in range(1, most + 1) if whole.width % s == 0 == whole.height % s)
-        image = np.array(self.images.shrunken(index, shrink))
+        image = np.array(self.images.image(index, shrink))
         small = cv2.resize(image, (pinhole.width, pinhole.height), interpolation=cv2.INTER_AREA)
         return np.asarray(small, np.uint8)
 

@@ -111,7 +111,7 @@ def points_by_model(trained: TrainedSurvey, rays: MarkRays, maps: Sequence[Depth
         rays: K marks of J points.
         maps: K, the depth around each mark in its view.
     """
-    middle = np.full((len(rays.point_id), 3), np.nan)
+    middle = np.full((len(rays.point_name), 3), np.nan)
     for point in range(len(middle)):
         _, place = _counted_hits(trained, rays, maps, np.flatnonzero(rays.point == point))
         if len(place) >= LEAST_VIEWS:

@@ -29,8 +29,8 @@ from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Render, W
 from pipelines.splat.spatial import SpatialBlocks
 from pipelines.splat.surface import measured_depth
 from pipelines.surface.visibility import DepthViews, Support, Viewpoints, support
-from pipelines.survey.photographs import ImageCache
-from pipelines.survey.trained_survey import TrainedSurvey, trained_pinholes
+from pipelines.survey.photographs import ImageCache, Pinholes
+from pipelines.survey.trained_survey import TrainedSurvey
 
 _WINDOW_PX = 15
 _LEAST_SHARE = 0.5  # of the photograph's contrast, which the render must show
@@ -66,7 +66,7 @@ class ModelRenderer:
     def __init__(self, trained: TrainedSurvey, images: ImageCache, backend: Rasterizer) -> None:
         self.trained, self.images = trained, images
         self._backend = backend
-        self._pinholes = trained_pinholes(trained, images)
+        self._pinholes = Pinholes(images, trained.sfm.lenses, trained.sparse.lenses)
         device = torch.device("cuda" if backend.name == "cuda" else "cpu")
         self._gaussians = trained.gaussians.to(device)
 

@@ -1,8 +1,6 @@
-"""Product of the division of a survey into blocks: cells in `model`, and what each block trains.
+"""Division of a survey into blocks: cells in `model`, what each block trains, and the records of what was trained.
 
-Records of a training in blocks: of one block, and of the merged model with the disagreement of neighbours.
-
-Effort of the scaffold: the coarse model of the whole survey that stands in for the world around a block.
+The scaffold is the coarse model of the whole survey that stands in for the world around a block.
 """
 
 from __future__ import annotations
@@ -24,9 +22,7 @@ Bound = tuple[float | None, float | None]
 class BlockCell(Product):
     """Vertical prism in `model`, half-open: a point on its western or southern side is inside.
 
-    Attributes:
-        low: east and north of the sides in the west and south, metres; None: without end.
-        high: of the sides in the east and north.
+    `low` and `high` are the sides, east and north in metres; None: without end.
     """
 
     low: Bound = (None, None)
@@ -78,14 +74,12 @@ class PlannedBlock(Product):
     """Block of the plan.
 
     Attributes:
-        id: number, from 0.
         cell: of the Gaussians that the merged model takes from this block.
         margin_m: width of the overlap beyond the cell, east and north.
         cameras: training images that see the block.
         share: of the survey's load that lies in the cell.
-        gaussians: limit of the Gaussians in training, those of the overlap among them.
-        visible: predicted number of the block's Gaussians in a view.
-        view_px: predicted number of the block's pixels in a view.
+        gaussians: limit in training, those of the overlap among them.
+        visible, view_px: predicted numbers of the block's Gaussians and pixels in a view.
         peak_bytes: predicted peak of the memory of the process that trains it.
     """
 
@@ -109,10 +103,7 @@ class BlockPlan(Product):
     """Division of a survey into blocks, whose cells share the plane out among them.
 
     Attributes:
-        format_version: version of the format.
-        blocks: in the order of their numbers.
-        gaussians: limit of the Gaussians of the whole.
-        scaffold_gaussians: limit of the Gaussians of the coarse model of the whole.
+        gaussians, scaffold_gaussians: limits for the whole, and for the coarse model of the whole.
         photographs: number of training images.
         memory_bytes: of a worker, for which the plan was made; None: the number of blocks was given.
     """
@@ -136,11 +127,10 @@ class BlockPlan(Product):
         raise InputError(f"there is no block {number}: the plan has 0 … {len(self.blocks) - 1}", field="--id")
 
 
-def _outermost(one: float | None, other: float | None, choose: Callable[[float, float], float]) -> float | None:
+def _outermost(one: float | None, other: float | None, choose: Callable[[list[float]], float]) -> float | None:
     """Return one of two bounds; None has no end."""
-    if one is None or other is None:
-        return other if one is None else one
-    return choose(one, other)
+    known = [bound for bound in (one, other) if bound is not None]
+    return choose(known) if known else None
 
 
 def _moved(bound: Bound, by: FloatArray) -> Bound:
@@ -152,20 +142,13 @@ class BlockTraining(Product):
     """Training of one block, as measured: for the merged product, and to fit the model of time and memory.
 
     Attributes:
-        id: number of the block.
-        iterations: of the training.
-        gaussians: at its end, those of the overlap among them.
         gaussians_in_cell: those that the merged model takes.
-        photographs: trained on.
         seconds: of the iterations.
         processor_s: of all processors together, for one iteration; None: unknown.
-        mean_gaussians: mean number during the training.
-        mean_visible: mean number in a view, those that stood in for the rest among them.
+        mean_gaussians, mean_visible: mean numbers during the training, and in a view, surroundings among these.
         mean_px: mean number of the pixels of a view that were rendered.
         surroundings: Gaussians that stood in for the rest.
         peak_bytes: peak of the process's memory; None: not measured on this system.
-        threads: that the training computed with.
-        backend: rasteriser of the training.
         train_psnr: mean of the last iterations, decibels.
     """
 
@@ -190,9 +173,6 @@ class Seam(Product):
     """Disagreement of two neighbouring blocks in their overlap, which both have trained.
 
     Attributes:
-        blocks: their numbers.
-        views: number of the views that were rendered by both.
-        pixels: number of pixels compared.
         depth_median_m: median of the difference in depth, second less first.
         depth_nmad_m: 1.4826 × the median absolute deviation of the differences in depth.
         colour_rms: root mean square of the differences in colour, of colours from 0 to 1.
@@ -214,30 +194,18 @@ class MergedBlock(Product):
 
 
 class BlockRecord(Product):
-    """Record of a model that was trained in blocks.
-
-    Attributes:
-        format_version: version of the format.
-        blocks: in the order of their numbers.
-        seams: of neighbours whose overlap some view shows.
-    """
+    """Record of a model that was trained in blocks, with the seams whose overlap some view shows."""
 
     format_version: Literal[1] = 1
     blocks: tuple[MergedBlock, ...]
     seams: tuple[Seam, ...]
 
 
-_SHARE = 0.1
-_MOST = 200_000
-_LEAST = 2_000
-_MOST_IMAGE_PX = 320
+# Gaussians of the scaffold: part of those of the whole, and limits.
+_SCAFFOLD_SHARE, _LEAST_SCAFFOLD, _MOST_SCAFFOLD = 0.1, 2_000, 200_000
+SCAFFOLD_IMAGE_PX = 320  # longest side of the photographs that it is trained on, at most
 
 
 def scaffold_gaussians(most: int) -> int:
     """Return the limit of the scaffold's Gaussians for a survey with a limit of `most`."""
-    return min(max(int(_SHARE * most), _LEAST), _MOST, most)
-
-
-def scaffold_image_px(max_image_size: int) -> int:
-    """Return the longest side in pixels of the photographs that the scaffold is trained on."""
-    return min(max_image_size, _MOST_IMAGE_PX)
+    return min(max(int(_SCAFFOLD_SHARE * most), _LEAST_SCAFFOLD), _MOST_SCAFFOLD, most)

@@ -1,22 +1,17 @@
-"""Survey with its calibrated rig: positions and attitudes computed anew from the navigation.
-
-Navigation as recorded, with the times and the rig of the photographs.
-"""
+"""Survey with its calibrated rig: positions and attitudes computed anew from the navigation as recorded."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from pathlib import Path
-from typing import Any, TypeVar
+from dataclasses import dataclass, replace
+from typing import ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.core.errors import InputError, MissingProductError
-from pipelines.core.files import read_npz
-from pipelines.core.products import load_json, save_npz
+from pipelines.core.products import ArrayProduct, load_json
 from pipelines.core.stages import RIG, SURVEY, TRACK
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.core.workspace import Workspace
@@ -28,28 +23,38 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class NavigationTrack:
+class NavigationTrack(ArrayProduct):
     """Second product of `ingest`: the navigation as recorded, with the times and the rig of n photographs.
 
     `calibrate` fits the SfM cameras to this navigation. Positions are those of the antenna, attitudes those of the
     body (forward-right-down), both on the navigation's clock, without any correction by the rig. The rig is the one
-    given to `ingest`.
+    given to `ingest`. Lengths are metres, times seconds.
 
     Attributes:
-        position_time_s: (K,) float64, seconds.
-        antenna_in_geo: (K, 3) float64, metres.
-        sigma_m: (K, 3) float64, σ east, north, up; NaN where the receiver states none.
-        attitude_time_s: (M,) float64, seconds.
-        geo_from_body: (M, 3, 3) float64.
-        image: (n,) names of images.
-        image_time_s: (n,) float64, camera clock.
-        cam_from_body: (n, 3, 3) float64, mount; NaN where unknown.
-        antenna_in_body: (n, 3) float64, lever arm; NaN where unknown.
-        nominal_from_cam: (3, 3) float64, boresight.
-        time_offset_s: () float64, navigation clock minus camera clock.
-        max_gap_s: () float64, longest gap to interpolate over.
-        body_known: () bool; if false, the body's axes are set to the camera's nominal axes.
+        sigma_m: σ east, north, up; NaN where the receiver states none.
+        image, image_time_s: names of images, and their times on the camera clock.
+        cam_from_body, antenna_in_body: mount and lever arm; NaN where unknown.
+        nominal_from_cam: boresight.
+        time_offset_s: navigation clock minus camera clock.
+        max_gap_s: longest gap to interpolate over.
+        body_known: if false, the body's axes are set to the camera's nominal axes.
     """
+
+    FORMS: ClassVar = {
+        "position_time_s": ("f", "K"),
+        "antenna_in_geo": ("f", "K", 3),
+        "sigma_m": ("f", "K", 3),
+        "attitude_time_s": ("f", "M"),
+        "geo_from_body": ("f", "M", 3, 3),
+        "image": ("U", "n"),
+        "image_time_s": ("f", "n"),
+        "cam_from_body": ("f", "n", 3, 3),
+        "antenna_in_body": ("f", "n", 3),
+        "nominal_from_cam": ("f", 3, 3),
+        "time_offset_s": ("fi",),
+        "max_gap_s": ("fi",),
+        "body_known": ("b",),
+    }
 
     position_time_s: FloatArray
     antenna_in_geo: FloatArray
@@ -67,7 +72,6 @@ class NavigationTrack:
 
     @property
     def positions(self) -> Trajectory:
-        """Trajectory of the antenna in geo, on the navigation's clock."""
         return Trajectory.from_samples(
             self.position_time_s,
             position=self.antenna_in_geo,
@@ -77,56 +81,9 @@ class NavigationTrack:
 
     @property
     def attitudes(self) -> Trajectory:
-        """Rotations of the body in geo, on the navigation's clock."""
         return Trajectory.from_samples(
             self.attitude_time_s, rotation=self.geo_from_body, max_gap_s=float(self.max_gap_s)
         )
-
-    @property
-    def rig(self) -> Rig:
-        """Rig of the n images, as given to `ingest`."""
-        return Rig(self.cam_from_body, self.antenna_in_body, self.nominal_from_cam)
-
-    def save(self, path: Path) -> None:
-        """Write the navigation as NPZ."""
-        save_npz(path, {field.name: getattr(self, field.name) for field in fields(self)})
-
-    @classmethod
-    def load(cls, path: Path) -> NavigationTrack:
-        """Read the navigation from NPZ.
-
-        Raises:
-            InputError: the file is no NPZ file with these arrays, or an array has another form.
-        """
-        arrays = read_npz(path, tuple(field.name for field in fields(cls)))
-        lengths: dict[str, int] = {}
-        for name, (kind, *shape) in _TRACK_ARRAYS.items():
-            array = arrays[name]
-            matches = array.dtype.kind in kind and array.ndim == len(shape)
-            for length, wanted in zip(array.shape, shape, strict=False):
-                expected = lengths.setdefault(wanted, length) if isinstance(wanted, str) else wanted
-                matches = matches and length == expected
-            if not matches:
-                raise InputError(f"has the form {array.shape} {array.dtype}", path=path, field=name)
-        return cls(**arrays)
-
-
-# Kind of number, and shape, in which a letter stands for a length that several arrays share.
-_TRACK_ARRAYS: dict[str, tuple[Any, ...]] = {
-    "position_time_s": ("f", "K"),
-    "antenna_in_geo": ("f", "K", 3),
-    "sigma_m": ("f", "K", 3),
-    "attitude_time_s": ("f", "M"),
-    "geo_from_body": ("f", "M", 3, 3),
-    "image": ("U", "n"),
-    "image_time_s": ("f", "n"),
-    "cam_from_body": ("f", "n", 3, 3),
-    "antenna_in_body": ("f", "n", 3),
-    "nominal_from_cam": ("f", 3, 3),
-    "time_offset_s": ("fi",),
-    "max_gap_s": ("fi",),
-    "body_known": ("b",),
-}
 
 
 def load_track(workspace: Workspace) -> NavigationTrack:
@@ -149,10 +106,7 @@ def load_track(workspace: Workspace) -> NavigationTrack:
 def require_estimable(track: NavigationTrack | None, wanted: Sequence[RigParameter], field: str) -> None:
     """Refuse parameters of the rig that the navigation cannot determine.
 
-    Args:
-        track: the navigation; None: not recorded by time.
-        wanted: parameters to be estimated.
-        field: option that names them.
+    `field` is the option that names them; without a track, the navigation was not recorded by time.
 
     Raises:
         InputError: the navigation was not recorded by time; or attitudes, the body's axes or the mount are needed
@@ -205,16 +159,11 @@ def apply_calibration(survey: Survey, track: NavigationTrack, calibration: RigCa
 
     The other parameters of the rig keep the values of `ingest`. A new time offset can bring further images into the
     span of the navigation. Their fixes and attitudes take σ from the image nearest in time.
-
-    Args:
-        survey: as recorded.
-        track: its navigation.
-        calibration: estimates of the rig; only `applied` counts.
     """
     values = {estimate.name: np.array(estimate.value) for estimate in calibration.applied}
     starts = {estimate.name: np.array(estimate.start) for estimate in calibration.applied}
     offset_s = float(values["time-offset"][0]) if "time-offset" in values else float(track.time_offset_s)
-    rig = track.rig
+    rig = Rig(track.cam_from_body, track.antenna_in_body, track.nominal_from_cam)
     if "boresight" in values:
         rig = replace(rig, nominal_from_cam=boresight(values["boresight"]))
     if "lever-arm" in values:
@@ -227,7 +176,7 @@ def apply_calibration(survey: Survey, track: NavigationTrack, calibration: RigCa
 
 
 def _bodies(survey: Survey, track: NavigationTrack, time_s: FloatArray) -> FloatArray:
-    """Return attitudes geo ← body (n, 3, 3) of the track's images at times (n,), NaN where unknown."""
+    """Return attitudes geo ← body (n, 3, 3) of the track's images, NaN where unknown."""
     if len(track.attitude_time_s) > 1:
         return track.attitudes.at(time_s).rotation
     # The attitudes were recorded with the photographs: mount and boresight of `ingest` give those of the body.
@@ -270,7 +219,6 @@ def _images(
 
 
 def _filled(values: list[ValueT | None], time_s: FloatArray) -> list[ValueT | None]:
-    """Return the values; None is replaced by the value nearest in time, if there is any."""
     known = np.array([row for row, value in enumerate(values) if value is not None], dtype=np.int64)
     if not len(known):
         return values

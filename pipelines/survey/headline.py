@@ -13,6 +13,7 @@ from pipelines.core.errors import GeorefError
 from pipelines.core.figures import Headline
 from pipelines.core.products import Caution, is_checked
 from pipelines.core.stages import REPORT
+from pipelines.core.types import Vector3
 from pipelines.core.workspace import Workspace
 from pipelines.survey.report import (
     AccuracySummary,
@@ -24,17 +25,11 @@ from pipelines.survey.report import (
     read_report,
 )
 
-_NOT_CHECKED = "nothing checks the σ of the positions"
+NOTHING_CHECKS = "nothing checks the σ of the positions"
 
 
 def headline(triangulated: CheckPointErrors, scene: AccuracySummary, cautions: tuple[Caution, ...]) -> Headline:
-    """Return the accuracy as the check points measure it, else as the σ of the scene predict it.
-
-    Args:
-        triangulated: errors of the triangulated check points; those under vegetation do not count.
-        scene: predicted σ.
-        cautions: of the result; one says whether anything checks the σ.
-    """
+    """Return the accuracy as the triangulated check points outside vegetation measure it, else as σ predict it."""
     total = triangulated.with_survey
     if total is None:
         return predicted(scene, cautions)
@@ -48,7 +43,7 @@ def predicted(scene: AccuracySummary, cautions: tuple[Caution, ...]) -> Headline
     Without anything that checks the σ of the positions, the accuracy is not known.
     """
     if not is_checked(cautions):
-        return Headline(kind="unknown", reason=_NOT_CHECKED)
+        return Headline(kind="unknown", reason=NOTHING_CHECKS)
     if scene.rms_sigma_h_m is None or scene.rms_sigma_v_m is None:
         return Headline(kind="unknown", reason=scene.reason or "no σ is predicted")
     return Headline(kind="predicted", rmse_h_m=scene.rms_sigma_h_m, rmse_v_m=scene.rms_sigma_v_m)
@@ -82,13 +77,9 @@ Way = Literal["camera", "model", "left out", "fit"]
 
 @dataclass(frozen=True)
 class PointLine:
-    """Error of one point, measured in one way.
+    """Error of one point, of a check point or of one that entered the solution.
 
-    Attributes:
-        use: whether the point is a check point or entered the solution.
-        way: triangulated, on the rendered surface, by a solution that left the point out, or as the residual of
-            the fit.
-        row: of the report.
+    It is triangulated, on the rendered surface, by a solution that left the point out, or the residual of the fit.
     """
 
     use: Literal["check", "control"]
@@ -96,19 +87,9 @@ class PointLine:
     row: PointResidual
 
     @property
-    def error_m(self) -> tuple[float, float, float] | None:
-        """Error east, north, up; None: the point was not measured."""
-        east, north, up = self.row.de_m, self.row.dn_m, self.row.du_m
-        return None if east is None or north is None or up is None else (east, north, up)
-
-    @property
-    def sigma_m(self) -> tuple[float, float, float] | None:
+    def sigma_m(self) -> Vector3 | None:
         """Predicted σ east, north, up; None: there is no prediction."""
-        row = self.row
-        if not isinstance(row, PredictedPointError):
-            return None
-        east, north, up = row.sigma_e_m, row.sigma_n_m, row.sigma_u_m
-        return None if east is None or north is None or up is None else (east, north, up)
+        return self.row.sigma_m if isinstance(self.row, PredictedPointError) else None
 
     @property
     def is_blunder(self) -> bool:

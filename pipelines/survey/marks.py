@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,7 +19,7 @@ class MarkRays:
     """K image marks of J surveyed points, in registered images.
 
     Attributes:
-        point_id: (J,) names of the points, as in the survey.
+        point_name: (J,) as in the survey.
         point: (K,) index into the points, ascending.
         camera: (K,) index into the images of the SfM model.
         xy_px: (K, 2) pixels of the photograph.
@@ -28,7 +28,7 @@ class MarkRays:
         sigma_rad: (K,) σ of a mark as an angle: `sigma_px` over the mean focal length.
     """
 
-    point_id: tuple[str, ...]
+    point_name: tuple[str, ...]
     point: IntArray
     camera: IntArray
     xy_px: FloatArray
@@ -47,42 +47,18 @@ class MarkRays:
     @property
     def marks_of_point(self) -> IntArray:
         """Number of marks (J,) of each point; no two are in one image."""
-        return np.bincount(self.point, minlength=len(self.point_id)).astype(np.int64)
+        return np.bincount(self.point, minlength=len(self.point_name)).astype(np.int64)
 
     def part(self, chosen: BoolArray | IntArray) -> MarkRays:
-        """Return the chosen marks; the points stay the same.
-
-        Args:
-            chosen: (K,) mask, or indices.
-        """
-        return MarkRays(
-            self.point_id,
-            self.point[chosen],
-            self.camera[chosen],
-            self.xy_px[chosen],
-            self.bearing_in_cam[chosen],
-            self.sigma_px[chosen],
-            self.sigma_rad[chosen],
-        )
+        """Return the marks chosen by a mask (K,) or indices; the points stay the same."""
+        arrays = ("point", "camera", "xy_px", "bearing_in_cam", "sigma_px", "sigma_rad")
+        return replace(self, **{name: getattr(self, name)[chosen] for name in arrays})
 
     def of_points(self, chosen: BoolArray) -> MarkRays:
-        """Return the marks of the chosen points, which are numbered anew.
-
-        Args:
-            chosen: (J,) mask.
-        """
+        """Return the marks of the points chosen by a mask (J,); the points are numbered anew."""
         rays = self.part(chosen[self.point])
-        number = np.cumsum(chosen) - 1
-        point_id = tuple(name for name, keep in zip(self.point_id, chosen, strict=True) if keep)
-        return MarkRays(
-            point_id,
-            number[rays.point],
-            rays.camera,
-            rays.xy_px,
-            rays.bearing_in_cam,
-            rays.sigma_px,
-            rays.sigma_rad,
-        )
+        names = tuple(name for name, keep in zip(self.point_name, chosen, strict=True) if keep)
+        return replace(rays, point_name=names, point=(np.cumsum(chosen) - 1)[rays.point])
 
 
 def mark_rays(
@@ -145,9 +121,8 @@ def intersect_marks(
     """Intersect the rays of each of the J points, in the frame of the cameras.
 
     Args:
-        rays: rays of the marks.
-        cam_from_frame: (n, 3, 3) rotations of all images.
-        center_in_frame: (n, 3) projection centres of all images.
+        rays: of the marks.
+        cam_from_frame, center_in_frame: (n, 3, 3) and (n, 3), of all images.
         errors: of cameras and lenses.
     """
     count = len(rays)
@@ -159,7 +134,7 @@ def intersect_marks(
         sigma_attitude_rad=np.full(count, errors.sigma_attitude_rad),
         sigma_ray=np.hypot(rays.sigma_rad, errors.sigma_lens_rad),
     )
-    return intersect_rays(Rays(rays.point, np.arange(count), rays.xy), views, len(rays.point_id))
+    return intersect_rays(Rays(rays.point, np.arange(count), rays.xy), views, len(rays.point_name))
 
 
 def mark_angles(
@@ -168,10 +143,9 @@ def mark_angles(
     """Return the angles (K,) in radians between the marks and their points; NaN for a point without position.
 
     Args:
-        rays: rays of the marks.
+        rays: of the marks.
         position_in_frame: (J, 3) points.
-        cam_from_frame: (n, 3, 3) rotations of all images.
-        center_in_frame: (n, 3) projection centres of all images.
+        cam_from_frame, center_in_frame: (n, 3, 3) and (n, 3), of all images.
     """
     arm = position_in_frame[rays.point] - center_in_frame[rays.camera]
     in_cam = np.einsum("kij,kj->ki", cam_from_frame[rays.camera], arm)

@@ -1,7 +1,4 @@
-"""Options of clouds of other instruments: path, CRS and datum of the heights.
-
-Options of everything whose coordinates are in a CRS.
-"""
+"""Options of clouds of other instruments, and of everything whose coordinates are in a CRS."""
 
 from __future__ import annotations
 

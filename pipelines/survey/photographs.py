@@ -1,15 +1,13 @@
 """Undistorted photographs at training size, cached as plain arrays on disk and mapped into memory.
 
-Cameras of the undistorted photographs under a lens that has changed since.
-
-Files of the test views: photograph, render and their difference side by side in one PNG.
+Also their pinholes under a lens that has changed since, and the files of the test views: photograph, render and
+their difference side by side in one PNG.
 """
 
 from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -49,13 +47,10 @@ def pinhole_of(camera: Camera, max_size_px: int) -> Pinhole:
 
     The focal length is scaled with the size. Distortion parameters are dropped.
     """
-    return Pinhole(camera.width, camera.height, *_focal_and_centre(camera)).limited(max_size_px)
-
-
-def _focal_and_centre(camera: Camera) -> tuple[float, float, float, float]:
     p = camera.params
-    one_focal = camera.model.startswith("SIMPLE") or camera.model.startswith("RADIAL")
-    return (p[0], p[0], p[1], p[2]) if one_focal else (p[0], p[1], p[2], p[3])
+    one_focal = camera.model.startswith(("SIMPLE", "RADIAL"))
+    fx, fy, cx, cy = (p[0], p[0], p[1], p[2]) if one_focal else p[:4]
+    return Pinhole(camera.width, camera.height, fx, fy, cx, cy).limited(max_size_px)
 
 
 class ImageCache:
@@ -63,11 +58,6 @@ class ImageCache:
 
     Memory does not grow with their number. Only the last distortion map stays in memory, until all images are
     built. Masks, one for each camera, and shrunken images are stored beside the images.
-
-    Args:
-        folder: folder of the arrays.
-        photographs: photographs to undistort, in the order of the indices.
-        max_size_px: limit of the longer side.
     """
 
     def __init__(self, folder: Path, photographs: list[Photograph], max_size_px: int) -> None:
@@ -80,11 +70,9 @@ class ImageCache:
         return len(self._photographs)
 
     def pinhole(self, index: int) -> Pinhole:
-        """Return the camera of an undistorted image."""
         return pinhole_of(self._photographs[index].camera, self.max_size_px)
 
     def largest(self) -> Pinhole:
-        """Return the camera of the image with the most pixels."""
         cameras = (self.pinhole(index) for index in range(len(self)))
         return max(cameras, key=lambda camera: camera.width * camera.height)
 
@@ -101,64 +89,46 @@ class ImageCache:
                 task.advance()
         self._last_map = None
 
-    def image(self, index: int) -> ByteArray:
-        """Return the RGB values (H, W, 3) of an image, mapped from disk; a missing or damaged file is made again.
+    def image(self, index: int, shrink: int = 1) -> ByteArray:
+        """Return the RGB values (H // s, W // s, 3) of an image, mapped from disk.
+
+        Each pixel is the mean of s × s pixels, s being `shrink`. A missing or damaged file is made again.
 
         Raises:
             InputError: the photograph cannot be read, or has another size than its camera.
         """
-        return self._mapped(self._path(index), lambda: self._write(index))
-
-    def shrunken(self, index: int, shrink: int) -> ByteArray:
-        """Return the RGB values (H // s, W // s, 3) of a shrunken image, mapped from disk; each is made once.
-
-        Args:
-            index: of the image.
-            shrink: s: each pixel is the mean of s × s pixels.
-
-        Raises:
-            InputError: the photograph cannot be read, or has another size than its camera.
-        """
-        if shrink == 1:
-            return self.image(index)
+        path = self._path(index) if shrink == 1 else self._folder / f"{self.key(index)}.{shrink}.npy"
 
         def write() -> None:
+            if shrink == 1:
+                self._write(index)
+                return
             image = self.image(index)
             height, width = (side // shrink for side in image.shape[:2])
             blocks = image[: height * shrink, : width * shrink]
             save_array(path, cv2.resize(blocks, (width, height), interpolation=cv2.INTER_AREA))
 
-        path = self._folder / f"{self.key(index)}.{shrink}.npy"
-        return self._mapped(path, write)
-
-    def _mapped(self, path: Path, write: Callable[[], None]) -> ByteArray:
         if not path.exists():
             write()
         try:
-            return self._open(path)
+            return _mapped(path)
         except (ValueError, EOFError):  # truncated by a full disk or a power failure
             log.warning("%s is damaged and made again", path)
             write()
-            return self._open(path)
+            return _mapped(path)
 
     def mask(self, index: int) -> BoolArray:
         """Return the mask (H, W) of the pixels that the photograph covers, mapped from disk."""
         path = self._folder / f"{self.mask_key(index)}.mask.npy"
         if not path.exists():
             save_array(path, self._map(index)[1])
-        array: BoolArray = np.load(path, mmap_mode="r", allow_pickle=False)
-        return array
+        return _mapped(path)
 
     def mask_key(self, index: int) -> str:
-        """Return the key of an image's mask, which all photographs of one camera share."""
+        """Return the key of a mask, which all photographs of one camera share."""
         camera = self._photographs[index].camera
         key = f"{camera.model}|{camera.width}x{camera.height}|{camera.params.tobytes().hex()}|{self.max_size_px}"
         return hashlib.sha256(key.encode()).hexdigest()[:32]
-
-    @staticmethod
-    def _open(path: Path) -> ByteArray:
-        array: ByteArray = np.load(path, mmap_mode="r", allow_pickle=False)
-        return array
 
     def _path(self, index: int) -> Path:
         return self._folder / f"{self.key(index)}.npy"
@@ -184,11 +154,7 @@ class ImageCache:
 
     def _write(self, index: int) -> None:
         photograph, pinhole = self._photographs[index], self.pinhole(index)
-        # COLMAP ignores the EXIF orientation of images, and so must this cache.
-        data = read_bytes(photograph.file)
-        require_unchanged(data, photograph.sha256, photograph.file)
-        flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-        full = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        full = decoded_photograph(photograph.file, photograph.sha256)
         if full is None:
             raise InputError("the photograph cannot be read", path=photograph.file)
         if (full.shape[1], full.shape[0]) != (photograph.camera.width, photograph.camera.height):
@@ -210,12 +176,30 @@ class ImageCache:
         return self._last_map[1:]
 
 
+def decoded_photograph(file: Path, sha256: str) -> ByteArray | None:
+    """Return a photograph (H, W, 3) BGR, its EXIF orientation ignored as by COLMAP; None: it does not decode.
+
+    Raises:
+        InputError: it cannot be read, or is not that of the survey.
+    """
+    data = read_bytes(file)
+    require_unchanged(data, sha256, file)
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    return None if pixels is None else np.asarray(pixels, dtype=np.uint8)
+
+
 def save_array(path: Path, array: NDArray[Any]) -> None:
     """Write an array to a temporary file, and rename that: the file at `path` is always complete."""
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(f"{path.stem}.{uuid4().hex}.tmp")  # Several processes may make the same file at once.
     with replacing(path, draft), draft.open("wb") as handle:
         np.save(handle, array, allow_pickle=False)
+
+
+def _mapped(path: Path) -> NDArray[Any]:
+    array: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
+    return array
 
 
 def _distortion_map(camera: Camera, pinhole: Pinhole) -> tuple[Float32Array, BoolArray]:
@@ -246,20 +230,15 @@ def _distortion_of_rows(camera: Camera, pinhole: Pinhole, rows: slice) -> tuple[
 class Pinholes:
     """Pinhole of each image, which maps the rays of the present lens to pixels of the undistorted photograph.
 
-    Photographs are undistorted once, with SfM's lens. A change of the lens is expressed as another pinhole
-    (`geometry.cameras`).
-
-    Args:
-        images: the undistorted photographs.
-        sfm: the lenses with which they were undistorted; None: the lenses never change.
+    Photographs are undistorted once, with the lenses `sfm`. A change of the lens, at first to `now`, is expressed
+    as another pinhole (`geometry.cameras`); without `sfm`, the lenses never change.
     """
 
-    def __init__(self, images: ImageCache, sfm: Lenses | None = None) -> None:
-        self._images, self._sfm, self._now = images, sfm, sfm
+    def __init__(self, images: ImageCache, sfm: Lenses | None = None, now: Lenses | None = None) -> None:
+        self._images, self._sfm, self._now = images, sfm, sfm if now is None else now
         self._fitted: dict[int, Pinhole] = {}
 
     def renew(self, now: Lenses) -> None:
-        """Set the present lenses of the images."""
         self._now = now
         self._fitted.clear()
 
@@ -279,13 +258,7 @@ _LONGEST_NAME_BYTES = 255
 
 
 def write_render(folder: Path, image: str, strip: ByteArray) -> None:
-    """Write a photograph beside its render as PNG.
-
-    Args:
-        folder: of the PNG.
-        image: name of the photograph.
-        strip: (H, W, 3) RGB: the photograph, its render, their difference, with labels above.
-    """
+    """Write a strip (H, W, 3) RGB as PNG: photograph of that name, render and difference, with labels above."""
     _, png = cv2.imencode(".png", np.ascontiguousarray(strip[..., ::-1]))  # `imwrite` reports no full disk
     (folder / render_name(image)).write_bytes(png.tobytes())
 

@@ -2,8 +2,6 @@
 
 Lengths are metres, axes those of `geo` (east, north, up). An error is the measured minus the surveyed position. A
 figure that does not exist, such as a mean over no points, is None. docs/formats.md explains every field.
-
-Errors of a report point by point, in one list for tables, files and pictures.
 """
 
 from __future__ import annotations
@@ -34,9 +32,7 @@ class _OptionalKeys(Product):
 class ViewFigures(Product):
     """Photometric figures of one test view: PSNR in dB, SSIM, LPIPS.
 
-    Attributes:
-        covered_share: share of the pixels whose ground at least two training views show; None: not known.
-        psnr_covered: PSNR over these pixels; None: there are none.
+    `psnr_covered` is taken over the `covered_share` of the pixels whose ground at least two training views show.
     """
 
     image: ImageName
@@ -51,17 +47,8 @@ class ViewFigures(Product):
 class PhotometricFigures(_OptionalKeys):
     """Photometric figures of all test views: means, and the figures of each view.
 
-    Attributes:
-        views: number of test views.
-        psnr: dB.
-        psnr_compensated: dB, after an affine change of colour that is fitted to each photograph.
-        psnr_covered: dB, over the pixels whose ground at least two training views show, mean over the views that
-            have any.
-        covered_share: share of these pixels, mean over the views.
-        ssim: structural similarity.
-        lpips: perceptual distance; None without weights of the network.
-        lpips_reason: reason why there is no LPIPS.
-        per_view: figures of each view.
+    `psnr_compensated` follows an affine change of colour that is fitted to each photograph; `psnr_covered` is the
+    mean over the views that have covered pixels. LPIPS is None without weights of its network, as its reason says.
     """
 
     views: int
@@ -127,11 +114,8 @@ class AsprsStatement(Product):
         points: number of check points outside vegetation: horizontal, vertical (NVA) and 3-D accuracy are theirs.
         horizontal_class, vertical_class, class_3d: smallest classes of whole centimetres that the errors meet
             ("5 cm"); None without these points.
-        vegetated: vertical accuracy under vegetation; None: no such point.
-        area_km2: of the scene, by which the standard counts; None: not known.
-        least_points: number of check points that the standard demands for this area.
-        enough_points: whether there are that many.
-        statement: sentence to quote; None without check points.
+        area_km2, least_points: of the scene, and the number of check points that the standard demands for it.
+        statement: sentence to quote.
     """
 
     points: int
@@ -162,23 +146,13 @@ class RmsSigma(Product):
 
 
 class PredictedSigma(RmsSigma):
-    """Predicted σ, and its test against the errors.
-
-    Attributes:
-        normalised_error_squared: mean of error² / (predicted + survey variance); 1 if both variances are true.
-    """
+    """Predicted σ, and the mean of error² / (predicted + survey variance): 1 if both variances are true."""
 
     normalised_error_squared: ByAxis
 
 
 class PointResidual(Product):
-    """Error of a surveyed point.
-
-    Attributes:
-        name: as in the survey.
-        rays: number of marks in registered images.
-        de_m, dn_m, du_m: error; None: not measured.
-    """
+    """Error of a surveyed point with marks in `rays` registered images; None: not measured."""
 
     name: str
     rays: int
@@ -186,38 +160,38 @@ class PointResidual(Product):
     dn_m: float | None
     du_m: float | None
 
+    @property
+    def error_m(self) -> Vector3 | None:
+        """Error east, north, up; None: the point was not measured."""
+        east, north, up = self.de_m, self.dn_m, self.du_m
+        return None if east is None or north is None or up is None else (east, north, up)
+
 
 class PointError(PointResidual):
-    """Error of a point that entered no solution.
-
-    Attributes:
-        blunder: whether the error exceeds three times the class that the other points meet.
-    """
+    """Error of a point that entered no solution; that of a blunder is thrice the class that the others meet."""
 
     blunder: bool
 
 
 class PredictedPointError(PointError):
-    """Error of a point that entered no solution, with its predicted σ.
-
-    Attributes:
-        sigma_e_m, sigma_n_m, sigma_u_m: None: the rays do not determine the point.
-    """
+    """Error of a point that entered no solution, with its σ; None: the rays do not determine the point."""
 
     sigma_e_m: float | None
     sigma_n_m: float | None
     sigma_u_m: float | None
+
+    @property
+    def sigma_m(self) -> Vector3 | None:
+        """σ east, north, up; None: there is no prediction."""
+        east, north, up = self.sigma_e_m, self.sigma_n_m, self.sigma_u_m
+        return None if east is None or north is None or up is None else (east, north, up)
 
 
 PointRows = tuple[PredictedPointError | PointError, ...]
 
 
 class StatedErrors(ErrorStats):
-    """Figures of errors, with those of the survey.
-
-    Attributes:
-        survey: σ of the points' own survey.
-        with_survey: errors and survey in quadrature.
+    """Figures of errors; with σ of the points' own survey, and both in quadrature.
 
     Points under vegetation count in the errors alone, and neither in `survey` nor in `with_survey`.
     """
@@ -227,15 +201,7 @@ class StatedErrors(ErrorStats):
 
 
 class CheckPointErrors(StatedErrors):
-    """Errors of the check points, measured in one way.
-
-    Attributes:
-        asprs: accuracy classes.
-        without_blunders: figures without the blunders; None: there are none.
-        blunders: names of the points that are blunders.
-        predicted: predicted σ; None where no prediction exists.
-        points: one row for each point.
-    """
+    """Errors of the check points, measured in one way; None: there are no blunders, or there is no prediction."""
 
     asprs: AsprsStatement
     without_blunders: ErrorStats | None
@@ -255,20 +221,11 @@ class CheckPoints(Product):
 
     @property
     def by_way(self) -> dict[Literal["camera", "model"], CheckPointErrors]:
-        """Errors by the way in which the points were measured."""
         return {"camera": self.camera} if self.model is None else {"camera": self.camera, "model": self.model}
 
 
 class CrossValidation(StatedErrors):
-    """Errors of the control points, each measured by a solution without that point.
-
-    Attributes:
-        without_blunders: figures without the blunders; None: there are none.
-        blunders: names of the points that are blunders.
-        predicted: predicted σ.
-        points: one row for each point.
-        reason: reason why there are no errors, else None.
-    """
+    """Errors of the control points, each measured by a solution without it; or the reason why there are none."""
 
     without_blunders: ErrorStats | None
     blunders: tuple[str, ...]
@@ -278,15 +235,9 @@ class CrossValidation(StatedErrors):
 
 
 class AccuracySummary(_OptionalKeys):
-    """Predicted σ over the cells of the scene.
+    """Predicted σ over the cells of the scene, or the reason why there are no cells.
 
-    Attributes:
-        cells: number of cells.
-        cell_m: side of a cell.
-        least_sigma_h_m, median_sigma_h_m, largest_sigma_h_m: horizontal.
-        least_sigma_v_m, median_sigma_v_m, largest_sigma_v_m: vertical.
-        rms_sigma_h_m, rms_sigma_v_m: root mean square, the RMSE that the prediction lets expect.
-        reason: reason why there are no cells, else None.
+    The root mean square of σ is the RMSE that the prediction lets expect.
     """
 
     cells: int
@@ -341,14 +292,7 @@ class PointCoordinates(Product):
 class Coordinates(Product):
     """Check points and origin of `geo` in a CRS: easting or longitude first, height last.
 
-    Attributes:
-        crs: name of the CRS.
-        units: of the three coordinates.
-        heights: surface that the heights count from.
-        operation: published operation between WGS84 and the CRS.
-        operation_accuracy_m: its accuracy; None: not known.
-        origin: origin of `geo`.
-        points: the check points.
+    `heights` is the surface that these count from, `operation` the published one between WGS84 and the CRS.
     """
 
     crs: str
@@ -374,18 +318,10 @@ class EvaluationReport(_OptionalKeys):
     """Product of `evaluate`.
 
     Attributes:
-        format_version: version of the format.
         headline: accuracy of the result, as every table and file states it.
-        photometric: figures of the test views; None: nothing is trained yet.
-        checkpoints: errors of the check points.
-        cross_validation: errors of the control points; None without `--cross-validate`.
-        accuracy: predicted σ over the scene.
-        fit: residuals of the solution.
+        photometric: None: nothing is trained yet.
+        cross_validation, coordinates, reference: None without their options.
         cameras: predicted σ of the camera positions; None: nothing checks it.
-        similarity: σ of the similarity.
-        coordinates: check points in the CRS of `--crs`; absent without it.
-        reference: comparison of the surface with a reference cloud; absent without `--reference`.
-        variance_factors: tests of the stated σ.
         cautions: limits of the result: those of the model, then those that `evaluate` found.
     """
 
@@ -405,7 +341,6 @@ class EvaluationReport(_OptionalKeys):
 
     @property
     def test_views(self) -> PhotometricFigures | None:
-        """Figures of the test views; None: nothing is trained yet."""
         return None if self.photometric is None else self.photometric.test
 
     @model_validator(mode="before")

@@ -1,10 +1,6 @@
-"""Comparison of the model's surface with a reference cloud: part of `evaluate/report.json`. Lengths are metres.
+"""Parts of reports: comparison with a reference cloud, LiDAR of a training, variance factors, systematic errors.
 
-Record of the LiDAR that a training has used: `train/lidar.json`.
-
-Variance factors of a survey's measurements: tests of the stated σ, and the survey with σ that passed them.
-
-Estimated systematic error of the measurements: part of the adjustment.
+Lengths are metres.
 """
 
 from __future__ import annotations
@@ -23,11 +19,8 @@ Alignment = Literal["none", "shift", "similarity"]
 class SurfaceScore(Product):
     """Shares of points that lie within a distance of the other cloud; None: there are no points.
 
-    Attributes:
-        threshold_m: the distance.
-        precision: of the model's points, where the reference covers the plan.
-        recall: of the reference's points that photographs saw.
-        f1: their harmonic mean.
+    Precision is that of the model's points, where the reference covers the plan; recall that of the reference's
+    points that photographs saw; F1 their harmonic mean.
     """
 
     threshold_m: float
@@ -40,14 +33,11 @@ class M3c2Figures(Product):
     """Distances model minus reference along the reference's normals (M3C2), positive on the cameras' side.
 
     Attributes:
-        core_points: places on the reference that photographs saw.
-        measured: places at which both clouds have points within the cylinder.
-        median_m, mean_m: signed.
+        core_points, measured: places on the reference that photographs saw, and those of them at which both clouds
+            have points within the cylinder.
         nmad_m: 1.4826 times the median absolute deviation from the median.
-        rmse_m: root mean square.
         abs_95_m: 95 % of the distances are shorter.
-        median_lod_m: median level of detection, 95 %.
-        significant: share of the distances beyond their level of detection.
+        median_lod_m: median level of detection, 95 %; beyond it lies the share `significant` of the distances.
     """
 
     core_points: int
@@ -64,9 +54,7 @@ class M3c2Figures(Product):
 class CloudDistances(Product):
     """Distances of the model's points from the nearest point of the reference (C2C), to the millimetre.
 
-    Attributes:
-        count: points of the model where the reference covers the plan.
-        median_m, mean_m, abs_95_m: of the distances; those beyond 2 m count as 2 m.
+    They are taken where the reference covers the plan; those beyond 2 m count as 2 m.
     """
 
     count: int
@@ -76,13 +64,9 @@ class CloudDistances(Product):
 
 
 class ReferenceGroup(Product):
-    """Figures of one part of the surface.
+    """Figures of one part of the surface, of which photographs saw `seen_points` of the reference.
 
-    Attributes:
-        name: `all`; a class (`ground`, `roof`, `wall`, `vegetation`, `other`); or a range of slopes.
-        kind: of the name.
-        seen_points: points of the reference that photographs saw.
-        m3c2, c2c, scores: distances and shares.
+    Its name is `all`; a class (`ground`, `roof`, `wall`, `vegetation`, `other`); or a range of slopes.
     """
 
     name: str
@@ -97,11 +81,9 @@ class ReferenceShift(Product):
     """Translation that moves the model onto the reference best, by points and planes.
 
     Attributes:
-        enu_m: east, north, up.
-        sigma_m: their σ, from the spread between parts of the scene.
+        enu_m, sigma_m: east, north, up; σ from the spread between parts of the scene.
         scale_ppm, turn_deg: of the similarity; 0 for a shift.
         reference_from_model: rows of the matrix [sR | t] in geo.
-        points: that decide.
     """
 
     enu_m: Vector3
@@ -116,20 +98,14 @@ class ReferenceComparison(Product):
     """Comparison of the surface with a reference cloud.
 
     Attributes:
-        name: of the file or folder.
-        crs: of the reference.
-        points: of the reference within the scene, after thinning.
-        seen: share of them that photographs saw.
+        points, seen: of the reference within the scene, after thinning; share of them that photographs saw.
         spacing_m: median distance between neighbours in the reference.
-        model_points: of the model's cloud.
-        model_spacing_m: side of its voxels.
+        model_spacing_m: side of the voxels of the model's cloud.
         sigma_m: stated σ of the reference.
         georeference_sigma_m: median predicted σ of the georeference along the normals; None: not known, and the
             level of detection does not hold it.
-        shift: of the model against the reference.
-        aligned: whether that was removed before the comparison.
+        shift: of the model against the reference; `aligned` says whether it was removed before the comparison.
         cylinder_m: radius of the cylinders of M3C2.
-        groups: figures of the whole, of classes and of slopes.
     """
 
     name: str
@@ -146,10 +122,6 @@ class ReferenceComparison(Product):
     cylinder_m: float
     groups: tuple[ReferenceGroup, ...]
 
-    def group(self, name: str) -> ReferenceGroup:
-        """Return the figures of a part of the surface."""
-        return next(group for group in self.groups if group.name == name)
-
 
 class LidarArea(Product):
     """Area where the LiDAR and the photographs contradict each other.
@@ -157,9 +129,7 @@ class LidarArea(Product):
     Attributes:
         kind: `removed`: the photographs look through the LiDAR's points; `added`: they show a surface above them.
         area_m2: in plan.
-        points: of the thinned cloud.
-        center_in_geo: mean of these points.
-        lat_deg, lon_deg: of that mean.
+        points: of the thinned cloud; their mean is `center_in_geo`, `lat_deg`, `lon_deg`.
     """
 
     kind: Literal["removed", "added"]
@@ -196,11 +166,8 @@ class LidarReport(Product):
     """LiDAR of a training.
 
     Attributes:
-        crs: names of the files' CRSs.
         read, noise, withheld, overlap, outside: numbers of points read, and dropped by reason.
-        points: that remain after thinning.
-        voxel_m: distance between them, about.
-        registration: check against the photographs.
+        points: that remain after thinning, about `voxel_m` apart.
         rejected_share: of the points, which contradict the photographs.
         confidence: median over the points.
         areas: that have changed, the largest first.
@@ -231,12 +198,10 @@ class VarianceFactor(Product):
     """Test of the stated σ of one group of measurements, after a least-squares adjustment.
 
     Attributes:
-        group: kind of measurement.
-        count: number of measurements in the group.
-        used: number of them in the test; the others are outliers.
+        count, used: numbers of measurements in the group, and in the test; the others are outliers.
         redundancy: degrees of freedom of the test.
         estimated: estimated factor of the stated variance; None without redundancy.
-        probability: probability of a larger factor if the stated σ are right; 1 without redundancy.
+        probability: of a larger factor if the stated σ are right; 1 without redundancy.
         applied: factor by which the variance was multiplied.
         sigma_source: whether σ was stated, or is a default that nobody stated.
     """
@@ -303,11 +268,6 @@ class EstimatedError(Product):
         name: `bias`: fix minus truth, east, north, up, in m. `lever-arm`: antenna seen from the camera beyond the
             arm that the survey has applied, camera axes, in m. `boresight`: rotation vector from the true to the
             nominal camera axes, in degrees. `lidar-shift`: LiDAR minus its true place, east, north, up, in m.
-        session: of a bias: index into the survey's sessions.
-        unit: of `value` and `sigma`.
-        value: the estimate.
-        sigma: its σ.
-        prior: σ of its prior.
         observed: σ is at most half of that of the prior.
     """
 

@@ -21,7 +21,6 @@ from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.bundle import BundleInformation, Network, bundle_information
 from pipelines.geometry.cameras import CameraPoses
-from pipelines.geometry.correction_basis import CorrectionBasis, correction_basis
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.adjustment import InitialSimilarity
@@ -50,7 +49,6 @@ class Scene:
 
     @cached_property
     def poses(self) -> CameraPoses:
-        """Cameras of the SfM model, in `model`."""
         turn = self.model_from_local.rotation
         return CameraPoses(
             self.sparse.rotation_cam_from_local @ turn.T,
@@ -71,17 +69,7 @@ class Scene:
     @cached_property
     def network(self) -> Network:
         """Cameras, points and image observations of the SfM model, in `model`."""
-        sparse, poses = self.sparse, self.poses
-        return Network(
-            sparse.cameras,
-            sparse.image_camera_id,
-            poses.cam_from_model,
-            poses.cam_center_in_model,
-            self.point_in_model,
-            sparse.obs_point,
-            sparse.obs_image,
-            sparse.obs_xy_px,
-        )
+        return network_of(self.sparse, self.poses, self.point_in_model)
 
     @cached_property
     def bundle(self) -> BundleInformation:
@@ -89,30 +77,27 @@ class Scene:
         return bundle_information(self.network)
 
     def with_bundle(self, bundle: BundleInformation) -> Scene:
-        """Return the same scene, whose bundle is known already."""
         same = replace(self)
         same.__dict__["bundle"] = bundle
         return same
 
-    @cached_property
-    def correction_basis(self) -> CorrectionBasis:
-        """Whitened corrections of the cameras, which the lens follows. Memory is quadratic in their number."""
-        return correction_basis(self.bundle)
 
-    @cached_property
-    def correction_basis_through_sfm_lens(self) -> CorrectionBasis:
-        """Whitened corrections of the cameras under a lens that stays."""
-        return correction_basis(bundle_information(self.network), lens_follows=False)
+def network_of(sparse: SparseModel, poses: CameraPoses, point_in_model: FloatArray) -> Network:
+    """Return the image observations of an SfM model with its cameras and points (N, 3) in `model`."""
+    return Network(
+        sparse.cameras,
+        sparse.image_camera_id,
+        poses.cam_from_model,
+        poses.cam_center_in_model,
+        point_in_model,
+        sparse.obs_point,
+        sparse.obs_image,
+        sparse.obs_xy_px,
+    )
 
 
 def make_scene(sparse: SparseModel, survey: Survey, model_from_local: Similarity, shift: FloatArray) -> Scene:
-    """Return the scene of a sparse model.
-
-    Args:
-        sparse: the SfM model.
-        survey: has the split into training and test images.
-        model_from_local: similarity from the SfM frame.
-        shift: (3,) origin of the frame `model` in `geo`.
+    """Return the scene of a sparse model, whose origin lies at a `shift` (3,) in `geo`.
 
     Raises:
         DegenerateGeometryError: fewer than two registered training images.
@@ -153,9 +138,7 @@ def load_adjusted_scene(
 ) -> tuple[InitialSimilarity, Adjustment, Survey, Scene]:
     """Read the initial similarity, the adjustment, the survey with its variance factors, and the scene.
 
-    Args:
-        workspace: of the survey.
-        product: the adjustment: that of `init-sim3`, or the solution that blocks share.
+    `product` is the adjustment: that of `init-sim3`, or the solution that blocks share.
 
     Raises:
         GeorefError: a product does not exist, is damaged, or has too few images.

@@ -1,8 +1,6 @@
-"""Product of `ingest`: the survey, with its images, cameras, fixes, attitudes and marks.
+"""Measurements of a survey, product of `ingest`; estimates of its rig, product of `calibrate`.
 
 All positions are in the frame `geo`: East-North-Up metres at the survey's origin.
-
-Product of `calibrate`: estimates of time offset, boresight and lever arm with their σ.
 """
 
 from __future__ import annotations
@@ -39,17 +37,13 @@ RigParameters = Annotated[
 
 
 class RigEstimate(Product):
-    """Parameter of the rig, estimated from the SfM cameras.
+    """Parameter of the rig, estimated from the SfM cameras, by component.
 
     Sign and unit are those of the option of `ingest` with the same name.
 
     Attributes:
-        name: the parameter.
-        unit: of value, σ and start.
-        value: estimate, by component.
-        sigma: σ, by component.
-        start: value given to `ingest`, by component.
-        observable: by component, whether σ is small enough for the estimate to be used.
+        start: value given to `ingest`.
+        observable: whether σ is small enough for the estimate to be used.
     """
 
     name: RigParameter
@@ -78,12 +72,9 @@ class RigCalibration(Product):
     """Product of `calibrate`: estimates of the rig, divided into those applied to the survey and the others.
 
     Attributes:
-        format_version: version of the format.
         wanted: parameters that were to be estimated.
         applied: estimates that `load_survey` applies.
-        not_applied: all other estimates.
-        images: number of images in the fit.
-        control_points: number of control points in the fit.
+        images, control_points: numbers in the fit.
         rms_position_m, rms_attitude_deg: robust σ of the residuals per axis.
         problem: reason why nothing was estimated; else empty.
     """
@@ -116,16 +107,7 @@ _NotNegative = Annotated[float, Field(ge=0)]
 
 
 class CameraPrior(Product):
-    """Intrinsics of a camera before SfM.
-
-    Attributes:
-        camera_id: number from 1.
-        model: COLMAP's name of the camera model.
-        width, height: of the full image in pixels.
-        params: COLMAP's parameters of the model, in pixels of the full image.
-        focal_source: source of the focal length.
-        make_model: of the camera, as recorded in the photographs.
-    """
+    """Intrinsics of a camera before SfM: COLMAP's model and parameters, in pixels of the full image."""
 
     camera_id: int = Field(ge=1)
     model: str
@@ -137,15 +119,7 @@ class CameraPrior(Product):
 
 
 class Fix(Product):
-    """Measured position of a camera centre.
-
-    Attributes:
-        position_in_geo: metres.
-        cov_in_geo: 3×3, m².
-        source: kind of record that the position comes from.
-        sigma_source: source of σ: the recording, an option, or the default.
-        session: index into the survey's `sessions`.
-    """
+    """Measured position of a camera centre in metres and m²; `session` is an index into the survey's `sessions`."""
 
     position_in_geo: Vector3
     cov_in_geo: Covariance3
@@ -157,10 +131,8 @@ class Fix(Product):
 class FixSession(Product):
     """Fixes that share one error beside their own: of the base station, the receiver, or the day.
 
-    Attributes:
-        receiver: kind of receiver, of `ingest.flight_record.RECEIVERS`.
-        sigma_common_m: σ of the common error east, north, up in metres; 0: none along that axis.
-        sigma_source: source of that σ: the recording, an option, or the default by receiver.
+    `sigma_common_m` is its σ east, north, up, 0 for none along that axis; `receiver` is one of
+    `ingest.flight_record.RECEIVERS`.
     """
 
     receiver: str
@@ -169,13 +141,7 @@ class FixSession(Product):
 
 
 class Attitude(Product):
-    """Measured rotation of a camera: `p_geo = R(quat_xyzw) p_cam + centre`.
-
-    Attributes:
-        quat_xyzw: rotation geo ← cam.
-        sigma_deg: σ per axis in degrees.
-        source: kind of record that the rotation comes from.
-    """
+    """Measured rotation of a camera, with σ per axis: `p_geo = R(quat_xyzw) p_cam + centre`."""
 
     quat_xyzw: Rotation
     sigma_deg: float = Field(gt=0)
@@ -183,16 +149,9 @@ class Attitude(Product):
 
 
 class SurveyImage(Product):
-    """Photograph of the survey.
+    """Photograph, named by its path relative to the survey's `image_dir`; its time is the camera clock's.
 
-    Attributes:
-        name: path relative to the survey's `image_dir`.
-        camera_id: of the survey's `cameras`.
-        sha256: hash of the file; empty in a survey written by hand: the photograph is not checked then.
-        timestamp_s: time of exposure, camera clock.
-        fix: measured position of its centre.
-        attitude: measured rotation.
-        split: use of the photograph, for training or as a test view.
+    `sha256` is empty in a survey written by hand: the photograph is not checked then.
     """
 
     name: ImageName
@@ -231,11 +190,7 @@ class SurveyedPoint(Product):
 
 
 class UnmarkedPoint(SurveyedPoint):
-    """Surveyed point with marks in fewer than two images: it enters nothing until it is marked.
-
-    Attributes:
-        use: what the point is surveyed for.
-    """
+    """Surveyed point with marks in fewer than two images: it enters nothing until it is marked."""
 
     use: Literal["control", "check"]
 
@@ -247,19 +202,10 @@ class Survey(Product):
     replaces that rig by the estimates of `calibrate`.
 
     Attributes:
-        format_version: version of the format.
-        origin: of the frame `geo`.
-        source_crs: CRS in which the positions were recorded.
-        vertical: vertical datum of the recorded heights.
         image_dir: folder of photographs, absolute or inside the workspace.
-        cameras: intrinsics before SfM.
-        images: the photographs.
         sessions: groups of fixes with one common error each; empty: no common error is modelled.
-        control_points: points that enter the solution.
         check_points: points that enter no solution.
-        unmarked_points: points with too few marks to be measured, which enter nothing.
         assumptions: decisions that `ingest` made where the input states nothing.
-        warnings: messages that the user should read.
         cautions: limits of every result of the survey.
         estimate: parameters of the rig to be estimated after sfm.
         default_sigmas: groups of measurements whose σ nobody stated.
@@ -317,13 +263,8 @@ class Survey(Product):
 
     @property
     def largest_photograph_px(self) -> tuple[int, int]:
-        """Width and height of the largest photographs."""
         largest = max(self.cameras, key=lambda camera: camera.width * camera.height)
         return largest.width, largest.height
-
-    def image(self, name: str) -> SurveyImage | None:
-        """Return the image of that name, or None."""
-        return next((image for image in self.images if image.name == name), None)
 
     def names(self, split: Literal["train", "test"]) -> tuple[str, ...]:
         """Return the names of the images in a split, in order."""

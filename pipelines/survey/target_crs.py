@@ -31,7 +31,6 @@ class TargetCrs:
     """CRS of a file, with one operation for the whole scene.
 
     Attributes:
-        crs: the CRS.
         origin: of the frame `geo`.
         lla: (M, 3) places that span the scene.
         assumed: what the user did not state, for the user and the file; empty: nothing.
@@ -51,7 +50,6 @@ class TargetCrs:
 
     @property
     def height_unit_m(self) -> float:
-        """Unit of the heights in metres."""
         return self.crs.height_unit_m
 
     def xyz_from_geo(self, points: ArrayLike) -> FloatArray:
@@ -132,9 +130,6 @@ def usable_crs(options: CrsOptions, origin: Origin, scene_in_geo: ArrayLike, hei
 
     Only the default gives way, where the survey's datum needs a grid that is not installed: a user who names a CRS
     or a datum learns what is missing.
-
-    Args:
-        options, origin, scene_in_geo, heights: as for `target_crs`.
 
     Raises:
         InputError: as `target_crs`, for a CRS or a datum that the user named.

@@ -1,6 +1,4 @@
-"""Product of `train` beside the Gaussians: frames, cameras, lenses, constant errors; and the part of it without
-Gaussians.
-"""
+"""Solution of a survey: frames, cameras, lenses, systematic errors; with the settings of `train`, its product."""
 
 from __future__ import annotations
 
@@ -26,10 +24,7 @@ class TrainedCamera(Product):
     """Pose `cam_from_model` of a camera after training. A test camera has moved only with its neighbours.
 
     Attributes:
-        name: of the image.
-        split: use of the image.
-        quat_xyzw: rotation cam ← model.
-        translation: metres, p_cam = R p_model + translation.
+        quat_xyzw, translation: p_cam = R p_model + translation, metres.
         exposure: gain matrix and offset (A | b): the photograph shows a colour c as A c + b. None: not estimated.
     """
 
@@ -52,8 +47,6 @@ class Measurement(Product):
     """State of one measurement in the adjustment.
 
     Attributes:
-        kind: of the measurement.
-        name: of the image, or of the control point.
         used: whether it takes part; what was rejected stays rejected in every later stage.
         reason: why it was rejected; empty: it is used.
         residual: predicted minus measured, metres or radians.
@@ -77,15 +70,11 @@ class Adjustment(Product):
     """Solution of all that does not depend on Gaussians: similarity, cameras, lenses, systematic errors.
 
     Attributes:
-        format_version: version of the format.
-        geo_from_model: similarity with its covariance.
         model_from_local: fixed similarity from the SfM frame.
-        cameras: corrected cameras, in the order of the SfM model's images.
-        lenses: corrected lenses; a camera of the SfM model without one keeps SfM's lens.
+        cameras: in the order of the SfM model's images.
+        lenses: a camera of the SfM model without one keeps SfM's lens.
         gnss_outliers, control_outliers: names of the images whose fixes, and of the control points that `init-sim3`
             has rejected: they entered no solution.
-        estimated_errors: systematic errors of the measurements.
-        measurements: state of every measurement.
         sigma_px: σ of an image coordinate of a tie point.
         accuracy: predicted σ over the scene; None: a solution that states none.
         variance_factors: tests of the stated σ, of the initial similarity.
@@ -108,7 +97,6 @@ class Adjustment(Product):
 
     @property
     def similarity(self) -> Similarity:
-        """Similarity geo ← model."""
         return Similarity.from_record(self.geo_from_model)
 
     def similarity_from_local(self) -> SimilarityRecord:
@@ -119,7 +107,6 @@ class Adjustment(Product):
 
     @property
     def poses(self) -> CameraPoses:
-        """Cameras in `model`."""
         rotation = matrix_from_quat_xyzw([camera.quat_xyzw for camera in self.cameras])
         translation = np.array([camera.translation for camera in self.cameras])
         return CameraPoses(rotation, -np.einsum("nji,nj->ni", rotation, translation))
@@ -134,16 +121,7 @@ class Adjustment(Product):
 
 
 class TrainedModel(Adjustment):
-    """Product of `train` beside the Gaussians: the solution of the training, and its settings.
-
-    Attributes:
-        max_image_size: limit of the longer side of the training photographs, in pixels.
-        background: colour behind the Gaussians, RGB.
-        sh_degree: degree of the spherical harmonics.
-        iterations: iterations of the training.
-        gaussians: number of Gaussians.
-        backend: rasteriser of the training.
-    """
+    """Product of `train` beside the Gaussians: the solution of the training, and its settings."""
 
     max_image_size: int = Field(gt=0)
     background: Vector3

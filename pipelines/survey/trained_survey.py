@@ -1,10 +1,7 @@
 """Solved survey, read from the workspace: cameras in `model`, the similarity, and any Gaussians.
 
-Surveyed points, triangulated: intersections of the rays of their marks.
-
-Differences between the adjusted cameras and their measured positions.
-
-Extent of the scene that files cover: that of the SfM points, without those at its rim.
+Also its surveyed points, intersected from their marks; the differences between adjusted cameras and their fixes;
+and the extent of the scene that files cover: that of the SfM points, without those at its rim.
 """
 
 from __future__ import annotations
@@ -30,7 +27,6 @@ from pipelines.splat.gaussians import Gaussians, read_gaussians
 from pipelines.survey.adjustment import InitialSimilarity
 from pipelines.survey.calibrated import load_survey
 from pipelines.survey.marks import MarkRays, RayErrors, intersect_marks
-from pipelines.survey.photographs import ImageCache, Pinholes
 from pipelines.survey.survey import Survey
 from pipelines.survey.trained_model import Adjustment, TrainedModel
 
@@ -39,13 +35,7 @@ Solution = TypeVar("Solution", bound=Adjustment)
 
 @dataclass(frozen=True)
 class SolvedSurvey:
-    """Survey with the solution of its adjustment.
-
-    Attributes:
-        survey: the measurements.
-        sfm: the SfM model with SfM's lenses; its images have the order of `poses`.
-        model: similarity, cameras, lenses.
-    """
+    """Survey with the solution of its adjustment; `sfm` has SfM's lenses, its images the order of `poses`."""
 
     survey: Survey
     sfm: SparseModel
@@ -53,7 +43,6 @@ class SolvedSurvey:
 
     @cached_property
     def poses(self) -> CameraPoses:
-        """Adjusted cameras in `model`."""
         return self.model.poses
 
     @cached_property
@@ -63,7 +52,6 @@ class SolvedSurvey:
 
     @property
     def geo_from_model(self) -> Similarity:
-        """Similarity of `model`."""
         return self.model.similarity
 
     @property
@@ -78,12 +66,7 @@ class SolvedSurvey:
 
 @dataclass(frozen=True)
 class TrainedSurvey(SolvedSurvey):
-    """Survey with its trained model.
-
-    Attributes:
-        model: similarity, cameras, settings.
-        gaussians: Gaussians in `model`.
-    """
+    """Survey with its trained model, and the Gaussians in `model`."""
 
     model: TrainedModel
     gaussians: Gaussians
@@ -92,9 +75,7 @@ class TrainedSurvey(SolvedSurvey):
 def load_solved(workspace: Workspace, similarity: Literal["trained", "initial"] = "trained") -> SolvedSurvey:
     """Read the survey with its solution: with the trained model if there is one, else as init-sim3 has solved it.
 
-    Args:
-        workspace: holds the products.
-        similarity: choice of `geo_from_model`: the solution's, or the one that follows from `geo_from_local`.
+    `similarity` chooses `geo_from_model`: the solution's, or the one that follows from `geo_from_local`.
 
     Raises:
         MissingProductError: a product does not exist.
@@ -102,57 +83,40 @@ def load_solved(workspace: Workspace, similarity: Literal["trained", "initial"] 
     """
     if workspace.has(MODEL):
         return load_trained(workspace, similarity)
-    model, sparse = load_json(Adjustment, workspace.path(ADJUSTMENT)), read_sparse(workspace.path(SPARSE))
-    _require_same_cameras(model, sparse, workspace.path(ADJUSTMENT), "run `georef init-sim3` again")
-    model = _initially_placed(model, workspace) if similarity == "initial" else model
-    return SolvedSurvey(_weighted_survey(workspace), sparse, model)
+    advice = "run `georef init-sim3` again"
+    return SolvedSurvey(*_loaded(workspace, Adjustment, ADJUSTMENT, similarity, advice))
 
 
 def load_trained(workspace: Workspace, similarity: Literal["trained", "initial"] = "trained") -> TrainedSurvey:
-    """Read the products of ingest, sfm and train.
+    """As `load_solved`, of a survey that must be trained."""
+    survey, sparse, model = _loaded(workspace, TrainedModel, MODEL, similarity, "train again")
+    return TrainedSurvey(survey, sparse, model, read_gaussians(workspace.path(GAUSSIANS)))
 
-    Args:
-        workspace: holds the products.
-        similarity: choice of `geo_from_model`: the trained one, or the one that follows from init-sim3.
 
-    Raises:
-        MissingProductError: a product does not exist.
-        InputError: a product is damaged, or the cameras or lenses of `train` are not those of `sfm`.
-    """
-    model, sparse = load_json(TrainedModel, workspace.path(MODEL)), read_sparse(workspace.path(SPARSE))
-    _require_same_cameras(model, sparse, workspace.path(MODEL), "train again")
-    model = _initially_placed(model, workspace) if similarity == "initial" else model
-    return TrainedSurvey(_weighted_survey(workspace), sparse, model, read_gaussians(workspace.path(GAUSSIANS)))
+def _loaded(
+    workspace: Workspace, kind: type[Solution], product: str, similarity: Literal["trained", "initial"], advice: str
+) -> tuple[Survey, SparseModel, Solution]:
+    """Read a solution with its SfM model, and the survey with the variance factors of `init-sim3`."""
+    path = workspace.path(product)
+    model, sparse = load_json(kind, path), read_sparse(workspace.path(SPARSE))
+    _require_same_cameras(model, sparse, path, advice)
+    if similarity == "initial":
+        model = _initially_placed(model, workspace)
+    survey = load_survey(workspace)
+    try:
+        return load_json(InitialSimilarity, workspace.path(SIM3)).weighted(survey), sparse, model
+    except MissingProductError:  # a model that was put there by hand: σ are as stated
+        return survey, sparse, model
 
 
 def _require_same_cameras(model: Adjustment, sparse: SparseModel, path: Path, advice: str) -> None:
-    """Refuse a solution of another SfM model.
-
-    Raises:
-        InputError: its cameras or lenses are not those of `sfm`.
-    """
+    """Refuse a solution of another SfM model."""
     if tuple(camera.name for camera in model.cameras) != sparse.image_name:
         raise InputError(f"its cameras are not those of sfm/sparse: {advice}", path=path, field="cameras")
     for lens in model.lenses:
         camera = sparse.cameras.get(lens.camera_id)
         if camera is None or (camera.model, len(camera.params)) != (lens.model, len(lens.params)):
             raise InputError(f"its lenses are not those of sfm/sparse: {advice}", path=path, field="lenses")
-
-
-def _weighted_survey(workspace: Workspace) -> Survey:
-    """Return the survey with the variance factors of `init-sim3`; as stated for a model put there by hand."""
-    survey = load_survey(workspace)
-    try:
-        return load_json(InitialSimilarity, workspace.path(SIM3)).weighted(survey)
-    except MissingProductError:
-        return survey
-
-
-def trained_pinholes(trained: TrainedSurvey, images: ImageCache) -> Pinholes:
-    """Return the pinholes of the photographs, undistorted with SfM's lenses, under the trained lenses."""
-    pinholes = Pinholes(images, trained.sfm.lenses)
-    pinholes.renew(trained.sparse.lenses)
-    return pinholes
 
 
 def _initially_placed(model: Solution, workspace: Workspace) -> Solution:
@@ -171,12 +135,7 @@ _CAMERA_ERRORS = RayErrors(sigma_center=0.02, sigma_attitude_rad=2e-4)
 
 
 def points_by_camera(solved: SolvedSurvey, rays: MarkRays) -> FloatArray:
-    """Return the intersections (J, 3) in `geo` of the rays of each point; NaN: marks in fewer than two images.
-
-    Args:
-        solved: cameras and similarity.
-        rays: of the marks of J points.
-    """
+    """Return the intersections (J, 3) in `geo` of the rays of each point; NaN: marks in fewer than two images."""
     poses = solved.poses
     met = intersect_marks(rays, poses.cam_from_model, poses.cam_center_in_model, _CAMERA_ERRORS)
     position = met.position_in_geo.copy()  # in the frame of the cameras, `model`
@@ -186,12 +145,9 @@ def points_by_camera(solved: SolvedSurvey, rays: MarkRays) -> FloatArray:
 
 @dataclass(frozen=True)
 class FixDifferences:
-    """Adjusted minus measured position of the F registered cameras that have a fix.
+    """Adjusted minus measured position (F, 3) in metres of the F registered cameras that have a fix.
 
-    Attributes:
-        camera: (F,) index into the images of the SfM model.
-        difference_in_geo: (F, 3) metres.
-        is_outlier: (F,) whether the solution has left the fix out.
+    `is_outlier` says whether the solution has left the fix out.
     """
 
     camera: IntArray

@@ -125,8 +125,8 @@ def region_masks(
         stand_in: whose depth counts where the surface is not known.
         maps: known depths; None: there are none.
     """
-    pinholes = Pinholes(images, solved.scene.sparse.lenses)
-    pinholes.renew(solved.adjustment.with_lenses(solved.scene.sparse).lenses)
+    sparse = solved.scene.sparse
+    pinholes = Pinholes(images, sparse.lenses, solved.adjustment.with_lenses(sparse).lenses)
     masks: dict[int, BoolArray] = {}
     with progress.task("masks", len(views)) as task:
         for index in views.tolist():

@@ -240,7 +240,7 @@ class TargetImages:
         return np.asarray(mask & shown.mask[top : top + window.height, left : left + window.width])
 
     def _read(self, look: ImageLook) -> Tensor:
-        image, window = self._images.shrunken(look.index, look.shrink), self._part(look).window
+        image, window = self._images.image(look.index, look.shrink), self._part(look).window
         pixels = torch.from_numpy(np.array(image if window is None else image[window.slices]))
         return pixels.pin_memory() if self._reader is not None else pixels
 

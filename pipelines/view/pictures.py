@@ -28,13 +28,13 @@ from pipelines.core.errors import GeorefError, InputError
 from pipelines.core.plan import photograph_folder
 from pipelines.core.types import ByteArray, Float32Array, FloatArray
 from pipelines.core.workspace import Workspace
-from pipelines.formats.image_file import read_bytes, require_unchanged
 from pipelines.geometry.cameras import Camera, Pinhole, ViewPose, distort, undistort
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.similarity import Similarity
 from pipelines.splat.surface import measured_depth
 from pipelines.surface.picking import Sight
 from pipelines.surface.surface_views import ModelRenderer
+from pipelines.survey.photographs import decoded_photograph
 from pipelines.survey.trained_survey import TrainedSurvey
 
 if TYPE_CHECKING:
@@ -165,11 +165,9 @@ class Photographs:
 
     def _decoded(self, camera: int) -> ByteArray:
         name = self._trained.sparse.image_name[camera]
-        image, file = self._trained.survey.image(name), self._folder / name
-        data = read_bytes(file)
-        require_unchanged(data, "" if image is None else image.sha256, file)
-        flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        file = self._folder / name
+        sha256 = {image.name: image.sha256 for image in self._trained.survey.images}
+        pixels = decoded_photograph(file, sha256.get(name, ""))
         lens = self._trained.sparse.camera_of(camera)
         if pixels is None or pixels.shape[:2] != (lens.height, lens.width):
             raise InputError("the photograph cannot be read, or has another size than its camera", path=file)

@@ -15,6 +15,7 @@ from pipelines.core.errors import InputError
 from pipelines.core.products import load_json
 from pipelines.core.progress import SILENT
 from pipelines.core.stages import SURVEY
+from pipelines.geometry.correction_basis import correction_basis
 from pipelines.report.accuracy import ninety_percent
 from pipelines.report.cameras import bias_of, cameras_facts, lenses_facts, mean_by_region
 from pipelines.report.place import links_of, overlap_facts, photographs_that_see, ties_of
@@ -83,7 +84,7 @@ def test_mean_residuals_by_region_show_a_planted_pattern() -> None:
 
 def test_lens_covariance_lies_between_its_free_part_and_that_of_the_photographs(reported: Reported) -> None:
     covariance = reported.survey.posterior.of_lens()
-    basis = scene_of(reported.survey.solved.model, reported.survey.solved.sfm).correction_basis
+    basis = correction_basis(scene_of(reported.survey.solved.model, reported.survey.solved.sfm).bundle)
     assert covariance is not None
     from_photographs = basis.lens_matrix @ basis.lens_matrix.T + basis.lens_cov
     scale = 1 / np.sqrt(np.diag(from_photographs))

@@ -10,7 +10,7 @@ import numpy as np
 from pipelines.core.products import save_json
 from pipelines.core.stages import LIDAR, LIDAR_MAP
 from pipelines.core.workspace import Workspace
-from pipelines.report.page import Page, Section, write_page
+from pipelines.report.page import Page, Section, render_page
 from pipelines.report.plots.maps import DrawnArea, write_lidar_map
 from pipelines.report.record import lidar_facts
 from pipelines.survey.report_parts import LidarArea, LidarRegistration, LidarReport
@@ -45,9 +45,8 @@ def test_the_page_says_what_the_training_has_recorded(tmp_path: Path) -> None:
     write_lidar_map(tmp_path / LIDAR_MAP, points, [DrawnArea("removed", 4.0, np.array([[9.0, 9.0]]), 2.0)])
     facts = lidar_facts(workspace)
     assert facts is not None
-    file = tmp_path / "page.html"
-    write_page(Page("", "", {}, (Section("lidar", "LiDAR", "lidar.html", facts),), {}), "pipelines.report", file)
-    html = file.read_text("utf-8")
+    page = Page("", "", {}, (Section("lidar", "LiDAR", "lidar.html", facts),), {})
+    html = render_page(page, "pipelines.report")
     text = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", html))
     for words in (
         "126 255 points", "of 1 295 739", "ETRS89 / UTM 32N", "taken as ellipsoidal",

@@ -10,15 +10,15 @@ from hypothesis import strategies as st
 
 from pipelines.report.page import (
     Page,
-    duration,
+    count_text,
+    duration_text,
     metres,
-    number,
+    number_text,
     parts_per_million,
     render_page,
     share,
     signed,
     value_at,
-    whole,
 )
 
 
@@ -32,14 +32,19 @@ def test_text_of_metres_is_the_value_to_what_it_is_worth(value: float) -> None:
 
 @given(st.one_of(st.none(), st.just(math.nan)))
 def test_what_does_not_exist_is_a_dash(value: float | None) -> None:
-    assert {number(value), metres(value), share(value), signed(value)} == {"–"}
+    assert {number_text(value), metres(value), share(value), signed(value)} == {"–"}
 
 
 def test_forms() -> None:
-    assert (number(-0.001), number(-1.25), signed(0.0004), signed(-0.2)) == ("0.00", "−1.25", "+0.000", "−0.200")
+    assert (number_text(-0.001), number_text(-1.25), signed(0.0004), signed(-0.2)) == (
+        "0.00",
+        "−1.25",
+        "+0.000",
+        "−0.200",
+    )
     assert (share(0.95), share(0.9754), share(1.0)) == ("95 %", "97.5 %", "100 %")
-    assert (whole(1234567), whole(None)) == ("1\u2009234\u2009567", "–")
-    assert [duration(s) for s in (0.34, 48, 723, 7500)] == ["0.3 s", "48 s", "12 min 3 s", "2 h 5 min"]
+    assert (count_text(1234567), count_text(None)) == ("1\u2009234\u2009567", "–")
+    assert [duration_text(s) for s in (0.34, 48, 723, 7500)] == ["0.3 s", "48 s", "12 min 3 s", "2 h 5 min"]
     assert (parts_per_million(9.64e-5), parts_per_million(0.01858)) == ("96.4 ppm", "1.86 %")
 
 

@@ -1,9 +1,4 @@
-"""Bar charts as PNG files.
-
-Distances between two surfaces: as a map and as histograms.
-
-Pictures side by side, each with its label above.
-"""
+"""Bar charts, distances between two surfaces as map and histogram, and labelled pictures side by side."""
 
 from __future__ import annotations
 
@@ -22,10 +17,10 @@ from pipelines.report.plots.style import (
     EMPTY_COLOUR,
     FIGURE_POINTS,
     GREY,
-    LABEL_POINTS,
     ORANGE,
     SERIES_COLOURS,
     TICK_POINTS,
+    add_scale,
     label,
     new_figure,
     pixels_of,
@@ -40,14 +35,12 @@ _WIDE_RANGE = 20.0  # between the largest and the smallest bar: beyond, only a l
 
 
 @dataclass(frozen=True)
-class Panel:
-    """One chart: a group of bars for each member, a bar for each series.
+class BarChart:
+    """Group of bars for each member, a bar for each series.
 
     Attributes:
-        title: above it.
         axis: what the bars measure, with its unit.
-        members: names of the G groups.
-        series: by name, G heights; None leaves a gap.
+        series: by name, heights of the members; None leaves a gap.
         digits: decimals of the figures on the bars.
         least: where a linear axis begins.
     """
@@ -60,7 +53,7 @@ class Panel:
     least: float = 0.0
 
 
-def write_bars(path: Path, panels: Sequence[Panel]) -> None:
+def write_bars(path: Path, panels: Sequence[BarChart]) -> None:
     """Draw the panels side by side; a file that is there is replaced when the new one is complete."""
     width, height = _PANEL_INCHES
     figure = new_figure((width * len(panels), height), "constrained")
@@ -69,7 +62,7 @@ def write_bars(path: Path, panels: Sequence[Panel]) -> None:
     write_png(figure, path)
 
 
-def _draw(axes: Axes, panel: Panel) -> None:
+def _draw(axes: Axes, panel: BarChart) -> None:
     _scale(axes, panel)
     width = 0.8 / len(panel.series)
     for position, (name, values) in enumerate(panel.series.items()):
@@ -90,7 +83,7 @@ def _draw(axes: Axes, panel: Panel) -> None:
         )
 
 
-def _scale(axes: Axes, panel: Panel) -> None:
+def _scale(axes: Axes, panel: BarChart) -> None:
     """A logarithmic axis where bars of unlike size would vanish on a linear one."""
     heights = [value for values in panel.series.values() for value in values if value is not None]
     if heights and min(heights) > 0 and max(heights) > _WIDE_RANGE * min(heights):
@@ -108,13 +101,9 @@ _COLOURS = (BLUE, ORANGE, DARK, "#3a9d6e", GREY)
 
 
 def write_distance_map(path: Path, place_m: FloatArray, distance_m: FloatArray, size_m: float) -> None:
-    """Write the map of signed distances: blue below zero, red above.
+    """Write the map of signed distances (C,) at places (C, 2), east and north, C ≥ 1: blue below zero, red above.
 
-    Args:
-        path: of the PNG.
-        place_m: (C, 2) east and north, C ≥ 1.
-        distance_m: (C,).
-        size_m: least side of a cell, which shows the median of its distances.
+    A cell, whose least side is `size_m`, shows the median of its distances.
     """
     frame = frame_around(place_m)
     cell_m = max(size_m, frame.longer_m / _MOST_CELLS)
@@ -135,21 +124,14 @@ def write_distance_map(path: Path, place_m: FloatArray, distance_m: FloatArray, 
     )
     axes.set_xlim(frame.low[0], frame.high[0])
     axes.set_ylim(frame.low[1], frame.high[1])
-    bar = figure.colorbar(image, cax=bar_axes(figure, axes), extend="both")
-    bar.set_label("m; above 0: the model lies before the reference", fontsize=LABEL_POINTS)
-    bar.ax.tick_params(labelsize=TICK_POINTS)
+    text = "m; above 0: the model lies before the reference"
+    add_scale(figure, image, text, cax=bar_axes(figure, axes), extend="both")
     add_bearings(axes)
     write_png(figure, path)
 
 
 def write_distance_histogram(path: Path, groups: Mapping[str, FloatArray], lod_m: float) -> None:
-    """Write the densities of signed distances by group, and the band of the level of detection.
-
-    Args:
-        path: of the PNG.
-        groups: distances (C,) by name, none empty.
-        lod_m: median level of detection, 95 %.
-    """
+    """Write the densities of signed distances by group, none empty, and the median level of detection."""
     everything = np.concatenate(list(groups.values()))
     limit_m = _round_up(max(float(np.quantile(np.abs(everything), 0.98)), 1.5 * lod_m))
     edges = np.linspace(-limit_m, limit_m, _BINS + 1)

@@ -1,8 +1,6 @@
-"""What a surveyor looks for on a map beside its colours: names, errors as arrows, coordinates, and north.
+"""Maps with what a surveyor looks for beside the colours: names, errors as arrows, coordinates, and north.
 
-The predicted accuracy over a scene as a pair of maps, horizontal and vertical σ.
-
-Map of the places where LiDAR and photographs contradict each other.
+They show the predicted accuracy over a scene, and the places where LiDAR and photographs contradict each other.
 """
 
 from __future__ import annotations
@@ -16,7 +14,16 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from pipelines.core.types import FloatArray
-from pipelines.report.plots.plans import add_bearings, add_legend, add_names, frame_around, new_plan
+from pipelines.report.plots.plans import (
+    NO_PLACES,
+    NamedPlaces,
+    add_bearings,
+    add_legend,
+    add_names,
+    frame_around,
+    new_plan,
+    nice_number,
+)
 from pipelines.report.plots.style import (
     BLUE,
     COLOUR_MAP,
@@ -27,7 +34,9 @@ from pipelines.report.plots.style import (
     HEADING_POINTS,
     LABEL_POINTS,
     ORANGE,
-    TICK_POINTS,
+    add_arrows,
+    add_key,
+    add_scale,
     label,
     new_figure,
     write_png,
@@ -36,7 +45,6 @@ from pipelines.report.plots.style import (
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.image import AxesImage
 
 _MOST_NAMES = 100  # more would hide the map
 _NAME_OFFSET_POINTS = (4, 3)
@@ -48,23 +56,12 @@ _NORTH_LENGTH, _NORTH_LEFT, _NORTH_GAP = 0.28, 0.45, 0.04  # inches: the arrow, 
 
 @dataclass(frozen=True)
 class MapCoordinates:
-    """Coordinates to write beside the metres of a map.
-
-    Attributes:
-        crs: name of the CRS.
-        names: of the first and second coordinate: `longitude`, `latitude`.
-        unit: of both.
-        of: returns coordinates (N, 2) of places east and north (N, 2).
-    """
+    """Coordinates beside the metres of a map: their names, and those of places (N, 2) east and north."""
 
     crs: str
     names: tuple[str, str]
     unit: str
     of: Callable[[FloatArray], FloatArray]
-
-    def label(self, axis: int) -> str:
-        """Return the second line of the label of an axis."""
-        return f"{self.names[axis]} in {self.unit} ({self.crs})"
 
 
 def write_ticks(axes: Axes, coordinates: MapCoordinates) -> None:
@@ -106,31 +103,13 @@ def exaggeration(lengths_m: FloatArray, side_m: float) -> float | None:
     """Return the factor 1, 2 or 5 times a power of ten by which errors are drawn; None: none is to be drawn.
 
     The longest arrow takes a seventh of the map's longer side, where it is not four times as long as the median.
-
-    Args:
-        lengths_m: (K,) of the errors; NaN: not measured.
-        side_m: of the map.
+    Lengths (K,) are NaN where errors were not measured.
     """
     known = lengths_m[np.isfinite(lengths_m)]
     longest = 0.0 if not len(known) else min(float(known.max()), _OUTLIER * float(np.median(known)))
     if longest <= 0:
         return None
-    factor = _LONGEST_ARROW * side_m / longest
-    power = 10.0 ** math.floor(math.log10(factor))
-    return next(step * power for step in (5.0, 2.0, 1.0) if step * power <= factor * (1 + 1e-9))
-
-
-def draw_errors(axes: Axes, places: FloatArray, errors_m: FloatArray, factor: float, *, of_control: bool) -> None:
-    """Draw errors (K, 2) east and north, times a factor, as arrows at their places (K, 2); NaN: none."""
-    known = np.isfinite(errors_m).all(axis=1)
-    if not known.any():
-        return
-    (east, north), (right, up) = places[known].T, factor * errors_m[known].T
-    axes.quiver(
-        east, north, right, up,
-        angles="xy", scale_units="xy", scale=1.0, width=0.006, zorder=5,
-        color=ORANGE if of_control else DARK, edgecolor="white", linewidth=0.4,
-    )  # fmt: skip
+    return nice_number(_LONGEST_ARROW * side_m / longest)
 
 
 def draw_north(figure: Figure, axes: Axes) -> None:
@@ -175,13 +154,9 @@ _LARGEST_SIGN, _SMALLEST_SIGN, _LARGE_SIGNS = 26.0, 9.0, 100
 
 @dataclass(frozen=True)
 class SigmaRaster:
-    """Standard deviations over a scene, as R rows from the south and C columns from the west.
+    """Standard deviations (R, C) over a scene, rows from the south, columns from the west; NaN: there is no scene.
 
-    Attributes:
-        sigma_h_m: (R, C) horizontal; NaN where there is no scene.
-        sigma_v_m: (R, C) vertical.
-        corner_m: (2,) east and north of the south-western corner.
-        cell_m: side of a cell.
+    `corner_m` (2,) is the south-western corner, east and north, and `cell_m` the side of a cell.
     """
 
     sigma_h_m: FloatArray
@@ -189,44 +164,14 @@ class SigmaRaster:
     corner_m: FloatArray
     cell_m: float
 
-    @property
-    def bounds_m(self) -> tuple[FloatArray, FloatArray]:
-        """East and north (2,) of the south-western and of the north-eastern corner."""
-        rows, columns = self.sigma_h_m.shape
-        return self.corner_m, self.corner_m + self.cell_m * np.array([columns, rows])
-
-
-def _nowhere() -> FloatArray:
-    return np.empty((0, 2))
-
-
-@dataclass(frozen=True)
-class NamedPlaces:
-    """Surveyed points to mark on a map.
-
-    Attributes:
-        place: (K, 2) east and north in metres.
-        names: of the points; empty: none is written.
-        error_m: (K, 3) east, north, up, to be drawn as arrows; NaN: not measured; None: no arrows.
-    """
-
-    place: FloatArray = field(default_factory=_nowhere)
-    names: tuple[str, ...] = ()
-    error_m: FloatArray | None = None
-
-    def error_of(self, axes: tuple[int, ...]) -> FloatArray:
-        """Return the errors (K, len(axes)) along some axes; NaN where there is none."""
-        none = np.full((len(self.place), len(axes)), np.nan)
-        return none if self.error_m is None else self.error_m[:, axes]
-
 
 @dataclass(frozen=True)
 class MapPoints:
     """Points to mark on a map: cameras (K, 2) in metres east and north, control and check points."""
 
-    cameras: FloatArray = field(default_factory=_nowhere)
-    control: NamedPlaces = NamedPlaces()
-    check: NamedPlaces = NamedPlaces()
+    cameras: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    control: NamedPlaces = NO_PLACES
+    check: NamedPlaces = NO_PLACES
 
 
 def write_accuracy_map(
@@ -235,30 +180,31 @@ def write_accuracy_map(
     """Draw horizontal and vertical σ side by side, north up, with cameras, control and check points.
 
     Errors of the points are arrows: horizontal ones on the left, vertical ones, up and down, on the right.
-
-    Args:
-        path: of the picture.
-        raster: σ.
-        points: to mark.
-        coordinates: to write below the metres of the axes; None: none.
+    Coordinates are written below the metres of the axes.
     """
-    low, high = _limits(raster, points)
-    width, height = (_MAP * (high - low) / (high - low).max()).tolist()
+    rows, columns = raster.sigma_h_m.shape
+    corners = np.stack([raster.corner_m, raster.corner_m + raster.cell_m * np.array([columns, rows])])
+    places = (corners, points.cameras, points.control.place_m, points.check.place_m)
+    frame = frame_around(*places, narrowest=_NARROWEST, margin=_MARGIN, least_m=0.0)
+    low, high = frame.low, frame.high
+    width, height = (_MAP * (high - low) / frame.longer_m).tolist()
     size = (2 * (_LEFT + width + _RIGHT), _BELOW + height + _ABOVE)
     figure = new_figure(size, None)
     figure.suptitle("Predicted accuracy, 1 σ", fontsize=HEADING_POINTS, y=1 - _HEADING_DEPTH / size[1])
+    below = ["", ""]
+    if coordinates is not None:
+        below = [f"\n{name} in {coordinates.unit} ({coordinates.crs})" for name in coordinates.names]
     maps = (("σ H", "horizontal", raster.sigma_h_m, (0, 1)), ("σ V", "vertical", raster.sigma_v_m, (2,)))
     for number, (symbol, direction, sigma_m, errors_along) in enumerate(maps):
         left = _LEFT + number * size[0] / 2
         axes = figure.add_axes(_share(size, left, width, height))
         bar = figure.add_axes(_share(size, left + width + _BAR_GAP, _BAR_WIDTH, height))
-        image = _draw(axes, raster, sigma_m)
+        _draw_sigma(figure, axes, bar, corners, sigma_m, text=f"{symbol} in m")
         _mark(axes, points)
         axes.set_xlim(low[0], high[0])
         axes.set_ylim(low[1], high[1])
-        factor = _draw_errors(axes, points, errors_along, float((high - low).max()))
+        factor = _draw_errors(axes, points, errors_along, frame.longer_m)
         arrows = "" if factor is None else f"; arrows: errors × {factor:,g}"
-        below = ("", "") if coordinates is None else (f"\n{coordinates.label(0)}", f"\n{coordinates.label(1)}")
         label(
             axes,
             f"{symbol}, {direction}{arrows}",
@@ -270,8 +216,7 @@ def write_accuracy_map(
         draw_north(figure, axes)
         axes.locator_params("x", nbins=max(round(_MOST_TICKS * width / _MAP), 2))
         axes.locator_params("y", nbins=max(round(_MOST_TICKS * height / _MAP), 2))
-        _scale(figure, image, bar, f"{symbol} in m")
-    _add_legend(figure)
+    add_key(figure, 3, loc="center", bbox_to_anchor=(0.5, _LEGEND_HEIGHT / figure.get_figheight()))
     write_png(figure, path)
 
 
@@ -282,18 +227,11 @@ def _share(
     return left / size[0], _BELOW / size[1], width / size[0], height / size[1]
 
 
-def _limits(raster: SigmaRaster, points: MapPoints) -> tuple[FloatArray, FloatArray]:
-    """South-western and north-eastern corner (2,) of the maps: all is inside, and neither side is too narrow."""
-    corners = np.array(raster.bounds_m)
-    places = np.concatenate([corners, points.cameras, points.control.place, points.check.place])
-    low, high = places.min(axis=0), places.max(axis=0)
-    longer = float((high - low).max())
-    half = np.maximum(high - low, _NARROWEST * longer) / 2 + _MARGIN * longer
-    return (low + high) / 2 - half, (low + high) / 2 + half
-
-
-def _draw(axes: Axes, raster: SigmaRaster, sigma_m: FloatArray) -> AxesImage:
-    (west, south), (east, north) = (corner.tolist() for corner in raster.bounds_m)
+def _draw_sigma(
+    figure: Figure, axes: Axes, bar: Axes, corners: FloatArray, sigma_m: FloatArray, *, text: str
+) -> None:
+    """Draw σ (R, C) between two corners (2, 2), with its scale."""
+    west, east, south, north = corners.T.ravel().tolist()
     axes.set_facecolor(EMPTY_COLOUR)
     image = axes.imshow(
         np.ma.masked_invalid(sigma_m),
@@ -303,29 +241,23 @@ def _draw(axes: Axes, raster: SigmaRaster, sigma_m: FloatArray) -> AxesImage:
         interpolation="nearest",
         aspect="equal",
     )
-    axes.ticklabel_format(useOffset=False, style="plain")
-    return image
-
-
-def _scale(figure: Figure, image: AxesImage, axes: Axes, text: str) -> None:
-    bar = figure.colorbar(image, cax=axes)
-    bar.set_label(text, fontsize=LABEL_POINTS)
-    axes.tick_params(labelsize=TICK_POINTS)
-    axes.ticklabel_format(useOffset=False, style="plain")
+    add_scale(figure, image, text, cax=bar)
+    for each in (axes, bar):
+        each.ticklabel_format(useOffset=False, style="plain")
 
 
 def _mark(axes: Axes, points: MapPoints) -> None:
     size = min(max(_LARGEST_SIGN * _LARGE_SIGNS / max(len(points.cameras), 1), _SMALLEST_SIGN), _LARGEST_SIGN)
     kinds: tuple[tuple[str, FloatArray, Mapping[str, Any]], ...] = (
         ("camera", points.cameras, {**_CAMERAS, "s": size}),
-        (_named("check point", points.check, "its triangulated error"), points.check.place, _CHECK),
-        (_named("control point", points.control, "its residual"), points.control.place, _CONTROL),
+        (_named("check point", points.check, "its triangulated error"), points.check.place_m, _CHECK),
+        (_named("control point", points.control, "its residual"), points.control.place_m, _CONTROL),
     )
     for name, places, style in kinds:
         if len(places):
             axes.scatter(places[:, 0], places[:, 1], label=name, zorder=4, **style)
     for group in (points.check, points.control):
-        write_names(axes, group.place[: len(group.names)], group.names)
+        write_names(axes, group.place_m[: len(group.names)], group.names)
 
 
 def _named(name: str, points: NamedPlaces, arrow: str) -> str:
@@ -334,28 +266,19 @@ def _named(name: str, points: NamedPlaces, arrow: str) -> str:
 
 def _draw_errors(axes: Axes, points: MapPoints, along: tuple[int, ...], side_m: float) -> float | None:
     """Draw the errors along the map's axes, or up and down; return their exaggeration, None without errors."""
-    groups = [(points.control, points.control.error_of(along)), (points.check, points.check.error_of(along))]
-    lengths_m = np.concatenate([np.linalg.norm(errors_m, axis=1) for _, errors_m in groups])
-    factor = exaggeration(lengths_m, side_m)
+    groups = []
+    for group in (points.control, points.check):
+        none = np.full((len(group.place_m), len(along)), np.nan)
+        groups.append((group, none if group.error_m is None else group.error_m[:, along]))
+    factor = exaggeration(np.concatenate([np.linalg.norm(errors_m, axis=1) for _, errors_m in groups]), side_m)
     for group, errors_m in groups if factor is not None else ():
+        known = np.isfinite(errors_m).all(axis=1)
         plan_m = errors_m if len(along) == 2 else np.column_stack([np.zeros(len(errors_m)), errors_m])
-        draw_errors(axes, group.place, plan_m, factor or 1.0, of_control=group is points.control)
+        style = {"edgecolor": "white", "linewidth": 0.4, "width": 0.006, "zorder": 5}
+        colour = ORANGE if group is points.control else DARK
+        if known.any():
+            add_arrows(axes, group.place_m[known], (factor or 1.0) * plan_m[known], color=colour, **style)
     return factor
-
-
-def _add_legend(figure: Figure) -> None:
-    handles, names = figure.axes[0].get_legend_handles_labels()
-    if names:
-        place = (0.5, _LEGEND_HEIGHT / figure.get_figheight())
-        figure.legend(
-            handles,
-            names,
-            loc="center",
-            bbox_to_anchor=place,
-            ncols=len(names),
-            fontsize=TICK_POINTS,
-            frameon=False,
-        )
 
 
 _COLOUR = {"removed": ORANGE, "added": BLUE}
@@ -366,13 +289,9 @@ _NAMED = 12
 
 @dataclass(frozen=True)
 class DrawnArea:
-    """Changed area.
+    """Changed area, which only the LiDAR has (`removed`) or only the photographs have (`added`).
 
-    Attributes:
-        kind: `removed`: only the LiDAR has it; `added`: only the photographs have it.
-        area_m2: in plan.
-        corner_in_geo: (C, 2) south-western corners of its cells, east and north in metres.
-        cell_m: side of these cells.
+    `corner_in_geo` (C, 2) are the south-western corners of its cells, east and north in metres.
     """
 
     kind: Literal["removed", "added"]
@@ -382,12 +301,7 @@ class DrawnArea:
 
 
 def write_lidar_map(path: Path, points_in_geo: FloatArray, areas: Sequence[DrawnArea]) -> None:
-    """Write the map as PNG.
-
-    Args:
-        path: of the picture.
-        points_in_geo: (P, 3) cloud, drawn by its height.
-        areas: that have changed, the largest first.
+    """Write the map of a cloud (P, 3), drawn by its height, with the areas that have changed, the largest first.
 
     Raises:
         OSError: the picture cannot be written.
@@ -417,5 +331,5 @@ def write_lidar_map(path: Path, points_in_geo: FloatArray, areas: Sequence[Drawn
         names = [f"{area.area_m2:.0f} m²" for area in areas[:_NAMED]]
         add_names(figure, axes, np.array(middles), names, np.zeros((0, 2)))
     add_bearings(axes)
-    add_legend(figure, axes)
+    add_legend(figure)
     write_png(figure, path)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,6 +18,9 @@ from pipelines.report.plots.style import (
     LABEL_POINTS,
     ORANGE,
     TICK_POINTS,
+    add_arrows,
+    add_key,
+    add_scale,
     label,
     new_figure,
     png_of,
@@ -32,35 +34,10 @@ _ARROW_SHARE, _ARROW_QUANTILE = 0.9, 0.95  # of a region, that an arrow of this 
 _CHART_INCHES = (6.4, 3.2)
 
 
-@dataclass(frozen=True)
-class DrawnField:
-    """Field of residuals, with its magnification; None: there are no arrows."""
-
-    png: bytes
-    factor: float | None
-
-
-@dataclass(frozen=True)
-class FixSeries:
-    """Residuals of F fixes in time.
-
-    Attributes:
-        abscissa: (F,) seconds since the first, or the number of the photograph.
-        abscissa_title: what it is, with its unit.
-        residual_m: (F, 3) east, north, up.
-        sigma_m: (F, 3) stated σ.
-        is_outlier: (F,) whether the solution has left it out.
-    """
-
-    abscissa: FloatArray
-    abscissa_title: str
-    residual_m: FloatArray
-    sigma_m: FloatArray
-    is_outlier: BoolArray
-
-
-def residual_field(size_px: tuple[int, int], mean_px: FloatArray, rms_px: FloatArray, title: str) -> DrawnField:
-    """Return mean reprojection residuals by image region as arrows on their RMS.
+def residual_field(
+    size_px: tuple[int, int], mean_px: FloatArray, rms_px: FloatArray, title: str
+) -> tuple[bytes, float | None]:
+    """Return mean reprojection residuals by image region as arrows on their RMS, and the arrows' magnification.
 
     Args:
         size_px: width and height of the photographs.
@@ -77,9 +54,7 @@ def residual_field(size_px: tuple[int, int], mean_px: FloatArray, rms_px: FloatA
     image = axes.imshow(
         np.ma.masked_invalid(rms_px), cmap=COLOUR_MAP, extent=(0, width, height, 0), interpolation="nearest"
     )
-    bar = figure.colorbar(image, ax=axes, fraction=0.04, pad=0.02)
-    bar.set_label("RMS of the residuals in px", fontsize=LABEL_POINTS)
-    bar.ax.tick_params(labelsize=TICK_POINTS)
+    add_scale(figure, image, "RMS of the residuals in px", ax=axes, fraction=0.04, pad=0.02)
     x = (np.arange(columns) + 0.5) * width / columns
     y = (np.arange(rows) + 0.5) * height / rows
     grid = np.stack(np.meshgrid(x, y), axis=-1)
@@ -88,52 +63,39 @@ def residual_field(size_px: tuple[int, int], mean_px: FloatArray, rms_px: FloatA
     factor = None
     if longest > 0:
         factor = nice_number(_ARROW_SHARE * min(width / columns, height / rows) / longest)
-        arrow = factor * mean_px[known]
-        axes.quiver(
-            *grid[known].T,
-            *arrow.T,
-            angles="xy",
-            scale_units="xy",
-            scale=1,
-            color="white",
-            edgecolor="black",  # readable on every colour
-            linewidth=0.5,
-            width=0.004,
-            pivot="mid",
-        )
-    return DrawnField(png_of(figure), factor)
+        # white on black: readable on every colour
+        style = {"color": "white", "edgecolor": "black", "linewidth": 0.5}
+        add_arrows(axes, grid[known], factor * mean_px[known], width=0.004, pivot="mid", **style)
+    return png_of(figure), factor
 
 
-def fix_series(series: FixSeries) -> bytes:
-    """Return the residuals of fixes, east, north and up, with the stated 2 σ and the mean, as PNG."""
+def fix_series(
+    abscissa: FloatArray, title: str, residual_m: FloatArray, sigma_m: FloatArray, is_outlier: BoolArray
+) -> bytes:
+    """Return the residuals (F, 3) of fixes, east, north and up, with the stated 2 σ and the mean, as PNG.
+
+    The abscissa (F,), of that title, is seconds since the first, or the number of the photograph.
+    """
     figure = new_figure((7.6, 6.0), "constrained")
-    order = np.argsort(series.abscissa, kind="stable")
+    order = np.argsort(abscissa, kind="stable")
     for axis, axes in enumerate(figure.subplots(3, 1, sharex=True)):
-        values, sigma = series.residual_m[:, axis], series.sigma_m[:, axis]
-        axes.fill_between(
-            series.abscissa[order],
-            -2 * sigma[order],
-            2 * sigma[order],
-            color=GREY,
-            alpha=0.3,
-            linewidth=0,
-            label="stated 2 σ",
-        )
+        values, sigma = residual_m[:, axis], sigma_m[:, axis]
+        band = {"color": GREY, "alpha": 0.3, "linewidth": 0, "label": "stated 2 σ"}
+        axes.fill_between(abscissa[order], -2 * sigma[order], 2 * sigma[order], **band)
         axes.axhline(0, color=DARK, linewidth=0.6)
-        used = ~series.is_outlier
+        used = ~is_outlier
         if used.any():
             axes.axhline(float(values[used].mean()), color=BLUE, linewidth=1.2, linestyle="--", label="mean (bias)")
         for chosen, style, name in (
             (used, {"marker": "o", "color": BLUE, "s": 11}, "used"),
-            (series.is_outlier, {"marker": "X", "color": ORANGE, "edgecolors": "black", "s": 34}, "outlier"),
+            (is_outlier, {"marker": "X", "color": ORANGE, "edgecolors": "black", "s": 34}, "outlier"),
         ):
             if chosen.any():
-                axes.scatter(series.abscissa[chosen], values[chosen], label=name, linewidths=0.7, zorder=3, **style)
+                axes.scatter(abscissa[chosen], values[chosen], label=name, linewidths=0.7, zorder=3, **style)
         label(axes, "", y=f"{_AXES[axis]} in m")
         axes.spines[["top", "right"]].set_visible(False)
-    axes.set_xlabel(series.abscissa_title, fontsize=LABEL_POINTS)
-    handles, names = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside upper center", ncols=len(names), fontsize=TICK_POINTS, frameon=False)
+    axes.set_xlabel(title, fontsize=LABEL_POINTS)
+    add_key(figure, 4, loc="outside upper center")
     return png_of(figure)
 
 
@@ -165,12 +127,7 @@ def correlation_matrix(names: Sequence[str], correlation: FloatArray) -> bytes:
 
 
 def predicted_against_measured(sigma_m: FloatArray, error_m: FloatArray) -> bytes:
-    """Return predicted σ against measured errors of check points as PNG.
-
-    Args:
-        sigma_m: (J, 2) horizontal and vertical, of error and survey together.
-        error_m: (J, 2) lengths, horizontal and vertical.
-    """
+    """Return predicted σ (J, 2) against measured errors (J, 2) of check points, horizontal and vertical, as PNG."""
     figure = new_figure((7.6, 3.9), "constrained")
     for axis, (axes, name) in enumerate(zip(figure.subplots(1, 2), ("horizontal", "vertical"), strict=True)):
         sigma, error = sigma_m[:, axis], error_m[:, axis]
@@ -183,18 +140,12 @@ def predicted_against_measured(sigma_m: FloatArray, error_m: FloatArray) -> byte
         axes.set_ylim(0, 1.1 * max(float(error.max()), 2 * most))
         label(axes, name, x="predicted σ with survey in m", y="measured error in m")
         axes.spines[["top", "right"]].set_visible(False)
-    handles, names = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside lower center", ncols=3, fontsize=TICK_POINTS, frameon=False)
+    add_key(figure, 3, loc="outside lower center")
     return png_of(figure)
 
 
 def curves(abscissa_title: str, panels: Mapping[str, Mapping[str, tuple[FloatArray, FloatArray]]]) -> bytes:
-    """Return curves below each other as PNG.
-
-    Args:
-        abscissa_title: what runs to the right.
-        panels: by the quantity on the ordinate, with its unit: the curves by name, abscissa (N,) and ordinate (N,).
-    """
+    """Return curves below each other as PNG: by quantity, lines by name, abscissa (N,) and ordinate (N,)."""
     width, height = _CHART_INCHES
     figure = new_figure((width, 0.62 * height * len(panels) + 0.5), "constrained")
     all_axes = np.atleast_1d(figure.subplots(len(panels), 1, sharex=True))

@@ -1,12 +1,12 @@
-"""Plans: axes with east to the right and north up, with north arrow, scale bar and names that do not overlap.
+"""Plans of a survey: where it is, how the cameras moved, how often the ground is seen, how photographs are tied.
 
-Plans of a survey: where it is, how the cameras moved, how often the ground is seen, how photographs are tied.
+East is to the right and north up, with north arrow, scale bar and names that do not overlap.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from math import floor, log10
 from typing import TYPE_CHECKING, Any
@@ -21,9 +21,11 @@ from pipelines.report.plots.style import (
     EMPTY_COLOUR,
     FIGURE_POINTS,
     GREY,
-    LABEL_POINTS,
     ORANGE,
     TICK_POINTS,
+    add_arrows,
+    add_key,
+    add_scale,
     label,
     new_figure,
     png_of,
@@ -46,7 +48,7 @@ _BOX = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85}
 
 
 @dataclass(frozen=True)
-class Frame:
+class PlanFrame:
     """South-western and north-eastern corner (2,) of a plan, in metres."""
 
     low: FloatArray
@@ -58,27 +60,31 @@ class Frame:
         return float((self.high - self.low).max())
 
 
-def frame_around(*places: FloatArray) -> Frame:
-    """Return the frame around groups of places (N, 2) in metres; a margin is added, and no side is too narrow."""
+def frame_around(
+    *places: FloatArray, narrowest: float = _NARROWEST, margin: float = _MARGIN, least_m: float = 1.0
+) -> PlanFrame:
+    """Return the frame around groups of places (N, 2) in metres.
+
+    Args:
+        places: the groups; NaN rows do not count.
+        narrowest: shorter side over the longer one, at least.
+        margin: around all places, as a part of the longer side.
+        least_m: longer side, at least.
+    """
     everything = np.concatenate([np.zeros((0, 2)), *(np.asarray(group)[:, :2] for group in places)])
     everything = everything[np.isfinite(everything).all(axis=1)]
     if not len(everything):
         everything = np.zeros((1, 2))
     low, high = everything.min(axis=0), everything.max(axis=0)
-    longer = max(float((high - low).max()), 1.0)
-    half = np.maximum(high - low, _NARROWEST * longer) / 2 + _MARGIN * longer
-    return Frame((low + high) / 2 - half, (low + high) / 2 + half)
+    longer = max(float((high - low).max()), least_m)
+    half = np.maximum(high - low, narrowest * longer) / 2 + margin * longer
+    return PlanFrame((low + high) / 2 - half, (low + high) / 2 + half)
 
 
-def new_plan(frame: Frame, title: str, *, right_inches: float = 0.0, legend_rows: int = 0) -> tuple[Figure, Axes]:
-    """Return a figure with the axes of a plan.
-
-    Args:
-        frame: that the axes show.
-        title: above them.
-        right_inches: room beside the map, for a colour bar.
-        legend_rows: rows of the legend below the map.
-    """
+def new_plan(
+    frame: PlanFrame, title: str, *, right_inches: float = 0.0, legend_rows: int = 0
+) -> tuple[Figure, Axes]:
+    """Return a figure with the axes of a plan, room for a colour bar beside it, and rows of the legend below."""
     width, height = (LONGER_INCHES * (frame.high - frame.low) / frame.longer_m).tolist()
     below = _BELOW + _LEGEND_ROW * (legend_rows + 0.4 * bool(legend_rows))
     size = (_LEFT + width + _RIGHT + right_inches, below + height + _ABOVE)
@@ -135,30 +141,15 @@ def add_bearings(axes: Axes) -> None:
     )
 
 
-def add_legend(figure: Figure, axes: Axes, columns: int = 4) -> None:
+def add_legend(figure: Figure, columns: int = 4) -> None:
     """Add the legend of a plan below it."""
-    handles, names = axes.get_legend_handles_labels()
-    if names:
-        figure.legend(
-            handles,
-            names,
-            loc="lower center",
-            bbox_to_anchor=(0.5, 0.04 / figure.get_figheight()),
-            ncols=min(columns, len(names)),
-            fontsize=TICK_POINTS,
-            frameon=False,
-        )
+    add_key(figure, columns, loc="lower center", bbox_to_anchor=(0.5, 0.04 / figure.get_figheight()))
 
 
 def add_names(figure: Figure, axes: Axes, places: FloatArray, names: Sequence[str], others: FloatArray) -> int:
     """Write names beside places (N, 2), as many as cover no sign and no other name, and return their number.
 
-    Args:
-        figure: of the axes.
-        axes: of the plan, with its limits.
-        places: (N, 2) metres.
-        names: N.
-        others: (M, 2) places of further signs, in metres.
+    `others` (M, 2) are places of further signs.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
@@ -209,10 +200,20 @@ _OVERLAP_STEPS = (1, 2, 3, 4, 5, 7, 10, 15, 20)
 
 @dataclass(frozen=True)
 class NamedPlaces:
-    """Names and places (N, 2), east and north in metres, of surveyed points."""
+    """Surveyed points to mark on a map.
 
-    names: Sequence[str]
-    place_m: FloatArray
+    Attributes:
+        place_m: (K, 2) east and north.
+        names: of the points; empty: none is written.
+        error_m: (K, 3) east, north, up, to be drawn as arrows; NaN: not measured; None: no arrows.
+    """
+
+    place_m: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    names: Sequence[str] = ()
+    error_m: FloatArray | None = None
+
+
+NO_PLACES = NamedPlaces()
 
 
 @dataclass(frozen=True)
@@ -227,13 +228,7 @@ class DrawnMovement:
 def site_plan(
     training_m: FloatArray, test_m: FloatArray, control: NamedPlaces, check: NamedPlaces, scene_m: FloatArray
 ) -> bytes:
-    """Return the plan of a survey as PNG.
-
-    Args:
-        training_m, test_m: (n, 2) cameras of the photographs.
-        control, check: surveyed points.
-        scene_m: (N, 2) points of the scene, drawn as its ground.
-    """
+    """Return the plan of a survey with cameras (n, 2) and points as PNG; the scene (N, 2) is its ground."""
     frame = frame_around(training_m, test_m, control.place_m, check.place_m)
     figure, axes = new_plan(frame, "Photographs and surveyed points", legend_rows=1)
     axes.scatter(scene_m[:, 0], scene_m[:, 1], s=1.5, color=GREY, alpha=0.6, linewidths=0, rasterized=True)
@@ -262,7 +257,7 @@ def site_plan(
     add_bearings(axes)
     marked = np.concatenate([control.place_m, check.place_m])
     add_names(figure, axes, marked, [*control.names, *check.names], np.concatenate([training_m, test_m]))
-    add_legend(figure, axes)
+    add_legend(figure)
     return png_of(figure)
 
 
@@ -295,17 +290,8 @@ def movement_plan(
         ):
             if chosen.any():
                 start, arrow = center_m[chosen] - arrow_factor * moved_m[chosen], arrow_factor * moved_m[chosen]
-                axes.quiver(
-                    *start.T,
-                    *arrow.T,
-                    angles="xy",
-                    scale_units="xy",
-                    scale=1,
-                    color=colour,
-                    width=0.003,
-                    zorder=4,
-                    label=f"{name} (× {arrow_factor:g})",
-                )
+                text = f"{name} (× {arrow_factor:g})"
+                add_arrows(axes, start, arrow, color=colour, width=0.003, zorder=4, label=text)
     if covariance is not None and np.isfinite(covariance).all():
         variance, axis = np.linalg.eigh(covariance)
         semi = np.sqrt(np.maximum(variance, 0.0))
@@ -328,7 +314,7 @@ def movement_plan(
             )
             axes.plot([], [], "o", mfc="none", mec=DARK, label=f"1 σ ellipse (× {ellipse_factor:g})")
     add_bearings(axes)
-    add_legend(figure, axes, columns=2)
+    add_legend(figure, columns=2)
     return DrawnMovement(png_of(figure), arrow_factor, ellipse_factor)
 
 
@@ -361,13 +347,11 @@ def overlap_plan(count: IntArray, corner_m: FloatArray, cell_m: float, camera_m:
     axes.scatter(camera_m[:, 0], camera_m[:, 1], s=6, color="white", edgecolors=DARK, linewidths=0.5)
     axes.set_xlim(west, east)
     axes.set_ylim(south, north)
-    bar = figure.colorbar(image, cax=bar_axes(figure, axes))
+    bar = add_scale(figure, image, "photographs that see the cell", cax=bar_axes(figure, axes))
     bar.set_ticks(
         ticks=[(low + high) / 2 for low, high in pairwise(edges)],
         labels=[str(low) if high == low + 1 else f"{low}–{high - 1}" for low, high in pairwise(edges)],
     )
-    bar.set_label("photographs that see the cell", fontsize=LABEL_POINTS)
-    bar.ax.tick_params(labelsize=TICK_POINTS)
     add_bearings(axes)
     return png_of(figure)
 
@@ -375,10 +359,7 @@ def overlap_plan(count: IntArray, corner_m: FloatArray, cell_m: float, camera_m:
 def match_plan(camera_m: FloatArray, pairs: IntArray, shared: IntArray) -> bytes:
     """Return the graph of the photographs that share points, as PNG: strong links last, dark and thick.
 
-    Args:
-        camera_m: (n, 2) cameras.
-        pairs: (P, 2) indices of cameras.
-        shared: (P,) number of points that both see, at least 1.
+    Pairs (P, 2) index the cameras (n, 2); `shared` (P,) is the number of points that both see, at least 1.
     """
     from matplotlib import colormaps
     from matplotlib.collections import LineCollection
@@ -399,9 +380,7 @@ def match_plan(camera_m: FloatArray, pairs: IntArray, shared: IntArray) -> bytes
     lines.set_array(shared[order])
     axes.add_collection(lines)
     axes.scatter(camera_m[:, 0], camera_m[:, 1], s=10, color="white", edgecolors=DARK, linewidths=0.7, zorder=3)
-    bar = figure.colorbar(lines, cax=bar_axes(figure, axes))
-    bar.set_label("points that two photographs share", fontsize=LABEL_POINTS)
-    bar.ax.tick_params(labelsize=TICK_POINTS)
+    bar = add_scale(figure, lines, "points that two photographs share", cax=bar_axes(figure, axes))
     bar.ax.yaxis.set_major_formatter("{x:g}")
     add_bearings(axes)
     return png_of(figure)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -16,6 +16,8 @@ from pipelines.core.types import ByteArray, FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colorbar import Colorbar
     from matplotlib.figure import Figure
 
 # Blue and orange stay apart with every kind of colour blindness, and the third by its lightness.
@@ -34,13 +36,7 @@ def new_figure(
     *,
     dots_per_inch: int = _DOTS_PER_INCH,
 ) -> Figure:
-    """Return an empty figure of a width and height.
-
-    Args:
-        size_inches: width and height.
-        layout: `constrained` makes room for labels; None leaves the axes where they are put.
-        dots_per_inch: resolution.
-    """
+    """Return an empty figure; `constrained` makes room for labels, None leaves the axes where they are put."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=size_inches, dpi=dots_per_inch, facecolor="white", layout=layout)
@@ -52,6 +48,27 @@ def label(axes: Axes, title: str, *, x: str | None = None, y: str | None = None)
     axes.set_xlabel(x or "", fontsize=LABEL_POINTS)
     axes.set_ylabel(y or "", fontsize=LABEL_POINTS)
     axes.tick_params(labelsize=TICK_POINTS)
+
+
+def add_scale(figure: Figure, image: ScalarMappable, text: str, **place: Any) -> Colorbar:
+    """Add a colour bar with what it measures; `place` is where matplotlib puts it."""
+    bar = figure.colorbar(image, **place)
+    bar.set_label(text, fontsize=LABEL_POINTS)
+    bar.ax.tick_params(labelsize=TICK_POINTS)
+    return bar
+
+
+def add_key(figure: Figure, columns: int, **place: Any) -> None:
+    """Add the legend of the first axes, if they have one, to the figure."""
+    handles, names = figure.axes[0].get_legend_handles_labels()
+    if names:
+        columns = min(columns, len(names))
+        figure.legend(handles, names, ncols=columns, fontsize=TICK_POINTS, frameon=False, **place)
+
+
+def add_arrows(axes: Axes, start: FloatArray, arrow: FloatArray, **style: Any) -> None:
+    """Draw arrows (N, 2) in the units of the axes at their places (N, 2)."""
+    axes.quiver(*start.T, *arrow.T, angles="xy", scale_units="xy", scale=1, **style)
 
 
 def pixels_of(figure: Figure) -> ByteArray:

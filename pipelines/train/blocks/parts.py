@@ -30,7 +30,7 @@ from pipelines.core.stages import (
 from pipelines.core.staleness import request, why_damaged, why_stale
 from pipelines.core.workspace import Workspace
 from pipelines.splat.rasterizer.backends import chosen_backend
-from pipelines.survey.block_plan import BlockPlan, BlockRecord, BlockTraining, PlannedBlock, scaffold_image_px
+from pipelines.survey.block_plan import SCAFFOLD_IMAGE_PX, BlockPlan, BlockRecord, BlockTraining, PlannedBlock
 from pipelines.survey.options import NOT_IN_BLOCKS
 from pipelines.train.options import TrainOptions
 
@@ -101,7 +101,7 @@ class Parts:
         if spec is TRAIN_SEAMS:
             given["trained"] = list(self._hashes())
         if spec is SOLVE:
-            given["max_image_size"] = scaffold_image_px(effort.max_image_size)
+            given["max_image_size"] = min(effort.max_image_size, SCAFFOLD_IMAGE_PX)
         left_out = () if spec is PLAN_BLOCKS else _OF_PLAN
         return {name: given[name] for name in spec.options.model_fields if name in given and name not in left_out}
 

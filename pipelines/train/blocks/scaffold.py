@@ -11,7 +11,7 @@ from pipelines.core.workspace import StageRun, Summary
 from pipelines.splat.gaussians import write_gaussians
 from pipelines.splat.memory import free_memory_bytes, require_memory
 from pipelines.splat.rasterizer.backends import device_of, rasterizer
-from pipelines.survey.block_plan import scaffold_gaussians, scaffold_image_px
+from pipelines.survey.block_plan import SCAFFOLD_IMAGE_PX, scaffold_gaussians
 from pipelines.survey.scene import photographs
 from pipelines.train.adjusted_scene import AdjustedScene
 from pipelines.train.forecast import training_size
@@ -52,7 +52,7 @@ def coarse_options(options: TrainOptions, photographs_count: int) -> TrainOption
         update={
             "iterations": max(min(int(_SHARE * effort.iterations), _MOST_ITERATIONS), looks),
             "max_gaussians": scaffold_gaussians(effort.max_gaussians),
-            "max_image_size": scaffold_image_px(effort.max_image_size),
+            "max_image_size": min(effort.max_image_size, SCAFFOLD_IMAGE_PX),
             "optimize_cameras": False,
             "dense": False,
         }

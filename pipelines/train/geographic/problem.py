@@ -19,8 +19,9 @@ from torch import Tensor
 from pipelines.adjust import terms as adjustment
 from pipelines.adjust.state import State, SystematicErrors
 from pipelines.adjust.system import Problem
+from pipelines.geometry.bundle import bundle_information
 from pipelines.geometry.cameras import Pinhole
-from pipelines.geometry.correction_basis import coordinates_of
+from pipelines.geometry.correction_basis import coordinates_of, correction_basis
 from pipelines.robust.statistics import MEAN_WEIGHTED_CHI2
 from pipelines.splat.surface import depth_at
 from pipelines.survey.adjustment import GeolocatedPoints
@@ -283,7 +284,8 @@ def refining_problem(
             distances = distance_term(scene, term, points, seed)
             terms += [] if distances is None else [distances]
     lens_follows = options.weighting == "whitened"
-    basis = scene.correction_basis if lens_follows else scene.correction_basis_through_sfm_lens
+    bundle = scene.bundle if lens_follows else bundle_information(scene.network)
+    basis = correction_basis(bundle, lens_follows=lens_follows)
     z = coordinates_of(scene.bundle, state.correction)
     lens = basis.lens_matrix if lens_follows else np.zeros((len(state.lens), len(z)))
     return GeoProblem(

@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from pipelines.report.plots.maps import (
     MapCoordinates,
     MapPoints,
-    NamedPlaces,
     SigmaRaster,
     exaggeration,
     write_accuracy_map,
     write_ticks,
 )
+from pipelines.report.plots.plans import NamedPlaces
 from pipelines.report.plots.style import new_figure
 
 LEAST, LARGEST, EMPTY = (0x44, 0x01, 0x54), (0xFD, 0xE7, 0x25), (0xE8, 0xE8, 0xE8)  # ends of viridis; no scene

@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
-from pipelines.report.plots.charts import Panel, write_bars
+from pipelines.report.plots.charts import BarChart, write_bars
 
 BLUE, ORANGE = (0x2B, 0x6C, 0xB0), (0xDD, 0x8A, 0x3B)
 
 
-def picture(path: Path, *panels: Panel) -> np.ndarray:
+def picture(path: Path, *panels: BarChart) -> np.ndarray:
     """What is drawn, RGB."""
     write_bars(path, panels)
     image = cv2.imread(str(path))
@@ -28,8 +28,8 @@ def columns(image: np.ndarray, colour: tuple[int, int, int]) -> list[int]:
     return [int(np.median(height[a:b])) for a, b in edges.reshape(-1, 2) if b - a > 10]
 
 
-def panel(*heights: float | None) -> Panel:
-    return Panel("title", "metres", tuple("ABCD"[: len(heights)]), {"horizontal": heights})
+def panel(*heights: float | None) -> BarChart:
+    return BarChart("title", "metres", tuple("ABCD"[: len(heights)]), {"horizontal": heights})
 
 
 def test_bars_are_as_high_as_their_figures(tmp_path: Path) -> None:
@@ -44,7 +44,7 @@ def test_figures_of_other_orders_of_magnitude_show_too(tmp_path: Path) -> None:
 
 
 def test_series_stand_side_by_side_and_gaps_stay_gaps(tmp_path: Path) -> None:
-    two = Panel("title", "m", ("A", "B"), {"horizontal": (1.0, None), "vertical": (0.5, 0.7)})
+    two = BarChart("title", "m", ("A", "B"), {"horizontal": (1.0, None), "vertical": (0.5, 0.7)})
     image = picture(tmp_path / "bars.png", two)
     legend = 1  # a patch of each colour under the axis, over which its column counts
     assert len(columns(image[: int(0.85 * len(image))], BLUE)) == 1

@@ -17,7 +17,7 @@ from pipelines.report.plots.plans import (
     site_plan,
 )
 
-NOTHING = NamedPlaces([], np.zeros((0, 2)))
+NOTHING = NamedPlaces()
 
 
 @given(st.floats(1e-6, 1e9))
