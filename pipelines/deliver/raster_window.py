@@ -17,7 +17,7 @@ from pipelines.deliver.surface import predicted_sigma, surface_views
 from pipelines.formats.geotiff import RasterFrame
 from pipelines.geometry.similarity import Similarity
 from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.rasterizer.orthographic import PlanSplats, PlanView, render_orthographic
+from pipelines.splat.rasterizer.orthographic import PlanSplats, render_orthographic
 from pipelines.surface.surface_views import SurfaceViews
 from pipelines.survey.target_crs import TargetCrs
 from pipelines.survey.trained_survey import TrainedSurvey, scene_points
@@ -44,8 +44,6 @@ class RasterSource:
     Attributes:
         splats, level: Gaussians over the plane, and the height above them that their depths count from.
         views: depth maps of the training views.
-        geo_from_model: similarity.
-        target: the CRS.
         sigma: predicted σ of the georeference over the scene; None: not known.
         training_px: size of a training pixel on the ground, in cells.
         training_gsd_m: size of a training pixel on the ground.
@@ -83,7 +81,7 @@ def raster_source(
     views = surface_views(stage, trained)
     training_px = training_gsd_m / (frame.step_x * target.horizontal_unit_m)
     splats, level = plan_splats(
-        _without_haze(_within(trained), views),
+        _seen_gaussians(trained, views),
         trained.geo_from_model,
         target,
         frame,
@@ -105,8 +103,11 @@ def raster_source(
     return source, no_sigma
 
 
-def _within(trained: TrainedSurvey) -> Gaussians:
-    """Return the Gaussians that reach into the scene; far ones may lie outside the domain of the CRS."""
+def _seen_gaussians(trained: TrainedSurvey, views: SurfaceViews) -> Gaussians:
+    """Return the Gaussians that reach into the scene; far ones may lie outside the domain of the CRS.
+
+    Left out are those in the air, through which the training views look at the surface.
+    """
     points, gaussians = scene_points(trained), trained.gaussians
     low, high = points.min(axis=0), points.max(axis=0)
     around = float(np.linalg.norm(high - low)) * np.array([_AROUND, _AROUND, 1.0])  # masts stand above all points
@@ -116,14 +117,9 @@ def _within(trained: TrainedSurvey) -> Gaussians:
     chosen = gaussians.select(solid & torch.from_numpy(inside))
     if len(chosen) == 0:
         raise DegenerateGeometryError("no Gaussian lies within the scene of the SfM points: train again")
-    return chosen
-
-
-def _without_haze(gaussians: Gaussians, views: SurfaceViews) -> Gaussians:
-    """Return the Gaussians without those in the air, through which the training views look at the surface."""
-    support = views.support(gaussians.means.double().numpy())
+    support = views.support(chosen.means.double().numpy())
     haze = (support.views == 0) & (support.seen_through >= _HAZE_VIEWS)
-    return gaussians.select(torch.from_numpy(~haze))
+    return chosen.select(torch.from_numpy(~haze))
 
 
 @dataclass(frozen=True)
@@ -153,13 +149,22 @@ def render_window(source: RasterSource, frame: RasterFrame, column: int, row: in
        views from it: their errors correlate, and more views do not make them smaller.
 
     Args:
-        source: the scene.
+        source: what it is made from.
         frame: of the window.
         column, row: of its first cell in the raster.
     """
     inner = samples_per_cell(source.training_px)
-    view = _render(source, frame, column, row, inner)
-    depth = _depth(view, source)
+    view = render_orthographic(
+        source.splats.scaled(float(inner)) if inner > 1 else source.splats,
+        frame.columns * inner,
+        frame.rows * inner,
+        corner=(float(column * inner), float(row * inner)),
+        dilation_px2=dilation_cells2(source.training_px) * inner**2,
+    )
+    # The mean of one surface is less noisy than the median.
+    limit = _ONE_SURFACE_GSD * source.training_gsd_m / source.target.height_unit_m
+    one_surface = (view.depth_variance < limit**2) & (view.median_depth > 0)
+    depth = np.where(one_surface, view.expected_depth, view.median_depth)
     middle = inner // 2
     height = np.where(view.alpha > _SOLID, source.level - depth, np.nan)[middle::inner, middle::inner]
     colour, alpha = _reduced(view.colour, inner), _reduced(view.alpha, inner)
@@ -174,28 +179,6 @@ def render_window(source: RasterSource, frame: RasterFrame, column: int, row: in
     sigma_h, sigma_v = _georeference_sigma(source, frame, height)
     sigma_h, sigma_v = np.hypot(sigma_h, noise_h_m), np.hypot(sigma_v, noise_up_m)
     return WindowCells(rgba, height, np.where(solid, sigma_h, np.nan), np.where(solid, sigma_v, np.nan))
-
-
-def _render(source: RasterSource, frame: RasterFrame, column: int, row: int, inner: int) -> PlanView:
-    """Return the view with `inner` × `inner` samples a cell, blurred as the training was."""
-    splats = source.splats
-    dilation = dilation_cells2(source.training_px) * inner**2
-    if inner > 1:
-        splats = splats.scaled(float(inner))
-    return render_orthographic(
-        splats,
-        frame.columns * inner,
-        frame.rows * inner,
-        corner=(float(column * inner), float(row * inner)),
-        dilation_px2=dilation,
-    )
-
-
-def _depth(view: PlanView, source: RasterSource) -> FloatArray:
-    """Return the depth of the surface: the mean of one surface is less noisy than the median."""
-    limit = _ONE_SURFACE_GSD * source.training_gsd_m / source.target.height_unit_m
-    one_surface = view.depth_variance < limit**2
-    return np.where(one_surface & (view.median_depth > 0), view.expected_depth, view.median_depth)
 
 
 def _reduced(values: FloatArray, inner: int) -> FloatArray:

@@ -27,7 +27,7 @@ from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.deliver.options import ExportTilesOptions
 from pipelines.deliver.placement import require_space
 from pipelines.deliver.splat import SplatParts, load_splat_parts, splat_values
-from pipelines.deliver.tiles_page import TILESET, ScenePage, ShownScene, scene_page, write_scene_page
+from pipelines.deliver.tiles_page import TILESET, ScenePage, scene_page, write_scene_page
 from pipelines.formats.georef_sidecar import GeorefSidecar, write_sidecar
 from pipelines.formats.gltf import SPLATS, SPZ_IN_GLTF, encode_glb, spz_in_glb
 from pipelines.formats.splat_ply import SplatArrays, concatenated
@@ -100,8 +100,14 @@ def _page(workspace: Workspace, splat: SplatParts, options: ExportTilesOptions) 
         without_grid = options.model_copy(update={"vertical": parse_vertical(ELLIPSOIDAL)})
         target = target_crs(without_grid, survey.origin, middle_in_geo, survey.vertical)
         target = replace(target, assumed=(*target.assumed, f"heights are ellipsoidal, because {error}"))
-    scene = ShownScene(workspace.root.resolve().name, splat.placement, splat.center_in_file)
-    return scene_page(scene, survey, target, options.cesium)
+    return scene_page(
+        workspace.root.resolve().name,
+        splat.placement,
+        splat.center_in_file,
+        survey=survey,
+        target=target,
+        cesium=options.cesium,
+    )
 
 
 @dataclass(frozen=True)

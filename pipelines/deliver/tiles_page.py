@@ -13,7 +13,6 @@ import html
 import itertools
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Literal
@@ -130,26 +129,21 @@ class ScenePage(Product):
     crs: LocalCrs | None = None
 
 
-@dataclass(frozen=True)
-class ShownScene:
-    """Scene to show.
-
-    Attributes:
-        title: name of the scene.
-        placement: place on Earth of its frame `file`.
-        center_in_file: (N, 3) centres of its Gaussians, metres.
-    """
-
-    title: str
-    placement: Placement
-    center_in_file: Float32Array
-
-
-def scene_page(scene: ShownScene, survey: Survey, target: TargetCrs, cesium: str) -> ScenePage:
+def scene_page(
+    title: str,
+    placement: Placement,
+    center_in_file: Float32Array,
+    *,
+    survey: Survey,
+    target: TargetCrs,
+    cesium: str,
+) -> ScenePage:
     """Return the content of the page of a splat.
 
     Args:
-        scene: the splat.
+        title: name of the scene.
+        placement: of its frame `file`.
+        center_in_file: (N, 3) centres of its Gaussians, metres.
         survey: has the control and check points.
         target: CRS in which coordinates are shown.
         cesium: address of the folder of CesiumJS.
@@ -157,12 +151,11 @@ def scene_page(scene: ShownScene, survey: Survey, target: TargetCrs, cesium: str
     Raises:
         InputError: the scene is outside the domain of the CRS, or a grid is missing.
     """
-    placement = scene.placement
-    distance_m = np.linalg.norm(scene.center_in_file, axis=1)
+    distance_m = np.linalg.norm(center_in_file, axis=1)
     radius = max(float(np.quantile(distance_m, _SHOWN)), _LEAST_RADIUS_M)
     box = float(np.clip(_CRS_BOX * radius, _LEAST_CRS_BOX_M, _MOST_CRS_BOX_M))
     return ScenePage(
-        title=scene.title,
+        title=title,
         tileset=TILESET,
         cesium=cesium,
         origin_lla=vector3(placement.origin_lla),
@@ -243,7 +236,7 @@ def fit_local_crs(crs: PointCrs, origin_lla: ArrayLike, half_extent_m: Vector3) 
     """Return the polynomials of a CRS in a box around a place.
 
     Args:
-        crs: the CRS.
+        crs: to be shown.
         origin_lla: (3,) latitude, longitude in degrees, ellipsoidal height: middle of the box.
         half_extent_m: half of its sides east, north and up.
 
@@ -252,7 +245,10 @@ def fit_local_crs(crs: PointCrs, origin_lla: ArrayLike, half_extent_m: Vector3) 
     """
     chebyshev = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
     between = np.linspace(-1.0, 1.0, _NODES + 1)
-    nodes, checks = _cube(chebyshev), _cube(between)
+    nodes, checks = (
+        np.stack(np.meshgrid(along, along, along, indexing="ij"), axis=-1).reshape(-1, 3)
+        for along in (chebyshev, between)
+    )
     plan_m = crs.horizontal_unit * (SEMI_MAJOR_M if crs.is_geographic else 1.0)
     unit_m = np.array([plan_m, plan_m, crs.height_unit_m])
     values = _coordinates(crs, origin_lla, np.vstack([nodes, checks]) * half_extent_m)
@@ -270,10 +266,6 @@ def fit_local_crs(crs: PointCrs, origin_lla: ArrayLike, half_extent_m: Vector3) 
         coefficients=tuple((x, y, z) for x, y, z in solved.tolist()),
         error_m=float((errors * unit_m).max()),
     )
-
-
-def _cube(along: FloatArray) -> FloatArray:
-    return np.stack(np.meshgrid(along, along, along, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def _powers(unit: FloatArray) -> FloatArray:

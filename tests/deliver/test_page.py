@@ -23,7 +23,6 @@ from pipelines.deliver.splat import placed_splat
 from pipelines.deliver.tiles_page import (
     LocalCrs,
     ScenePage,
-    ShownScene,
     fit_local_crs,
     scene_page,
     write_scene_page,
@@ -76,10 +75,10 @@ def page_of(survey: Survey, cautions: tuple[Caution, ...] = (), accuracy: Headli
         sh=torch.zeros(500, 1, 3),
     )
     splat = placed_splat(gaussians, place(model, survey, means, accuracy), SplatOptions())
-    scene = ShownScene(HOSTILE, splat.placement, splat.gaussians.means.numpy())
     middle_in_geo = splat.placement.file_from_geo.inverse().apply(np.zeros((1, 3)))
     target = target_crs(PageOptions(), survey.origin, middle_in_geo, survey.vertical)
-    return scene_page(scene, survey, target, "Cesium/")
+    in_file = splat.gaussians.means.numpy()
+    return scene_page(HOSTILE, splat.placement, in_file, survey=survey, target=target, cesium="Cesium/")
 
 
 def test_names_cannot_leave_the_document_that_holds_them(tmp_path: Path) -> None:
