@@ -78,11 +78,7 @@ def _middle_and_axes(target: TargetCrs, scene_in_geo: FloatArray) -> tuple[Float
     """Return the middle (3,) of the scene in the CRS, and the rotation (3, 3) of directions CRS ← `geo`.
 
     Grid north is not true north. Where coordinates are angles, which have no directions of their own, the rotation
-    is the identity: normals are East-North-Up then.
-
-    Args:
-        target: the CRS.
-        scene_in_geo: (M, 3) places that span the scene.
+    is the identity: normals are East-North-Up then. The scene is given by places (M, 3) that span it.
     """
     middle = scene_in_geo.mean(axis=0)
     at = target.xyz_from_geo(middle + _STEP_M * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]))
@@ -97,11 +93,7 @@ def _points_in_crs(
 ) -> CloudPoints:
     """Return points in the CRS, with the covariance of the georeference and of the surface together.
 
-    Args:
-        cloud: in `geo`.
-        target: the CRS.
-        crs_from_geo: (3, 3) rotation of directions.
-        grid: predicted covariance of the georeference; None: unknown, and so is the sum.
+    Without a grid, the covariance of the georeference is unknown, and so is the sum.
     """
     georeference = np.full((len(cloud), 3, 3), np.nan) if grid is None else grid.cov_at(cloud.position)
     # The surface is uncertain along its normal. Along itself, a surface has no place.

@@ -176,13 +176,7 @@ def median_values(sigma: SceneSigma | None, of: str) -> dict[str, float | None]:
 
 
 def require_space(folder: Path, needed_bytes: int, files: str, advice: str) -> None:
-    """Refuse files that the disk of a folder would not hold, before the work begins.
-
-    Args:
-        folder: on the disk.
-        needed_bytes: that the files may need.
-        files: subject of the sentence, such as "rasters of 100 × 100 cells".
-        advice: what makes them smaller.
+    """Refuse files that the disk would not hold: a sentence names them, and advises what makes them smaller.
 
     Raises:
         InputError: too little space is free.

@@ -24,7 +24,7 @@ from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import ExportRasterOptions
 from pipelines.deliver.placement import median_values, require_space, scene_sigma
 from pipelines.deliver.raster_mosaic import Mosaic
-from pipelines.deliver.raster_plan import ground_sampling, make_frame
+from pipelines.deliver.raster_plan import ground_sampling_m, make_frame
 from pipelines.deliver.raster_window import raster_source
 from pipelines.deliver.surface import without_sigma
 from pipelines.formats.georef_sidecar import median_sigma, write_sidecar
@@ -56,13 +56,13 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
         DegenerateGeometryError: no cell of the scene was seen.
     """
     trained = load_trained(stage.workspace)
-    points, sampling = scene_points(trained), ground_sampling(trained)
+    points, (photographs_m, training_m) = scene_points(trained), ground_sampling_m(trained)
     target = target_crs(options, trained.survey.origin, corners(points), trained.survey.vertical)
-    frame = make_frame(target.xyz_from_geo(points)[:, :2], target, sampling.photographs_m, options)
+    frame = make_frame(target.xyz_from_geo(points)[:, :2], target, photographs_m, options)
     size = f"{frame.columns} × {frame.rows} cells"
     needed_bytes = _BYTES_PER_CELL * frame.columns * frame.rows
     require_space(stage.out, needed_bytes, f"rasters of {size}", "give a larger --gsd")
-    source, reason = raster_source(stage, trained, target, frame, sampling.training_m, min_views=options.min_views)
+    source, reason = raster_source(stage, trained, target, frame, training_m, min_views=options.min_views)
     mosaic = Mosaic(stage.out / "parts", frame, target)
     mosaic.render(source, stage.progress)
     mosaic.drop_islands()
@@ -77,7 +77,7 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
         sigma = scene_sigma(counts, mosaic.sample("sigma_h"), mosaic.sample("sigma_v"))
     west, south, east, north = frame.bounds
     bounds = [[west, south, height.min()], [east, north, height.max()]]
-    coarse = _detail_of_training(sampling.training_m) if source.training_px > _DETAIL else ()
+    coarse = _detail_of_training(training_m) if source.training_px > _DETAIL else ()
     empty = "The rasters state no σ, and sigma_h.tif and sigma_v.tif are empty"
     cautions = union(trained.model.cautions, (*coarse, *without_sigma(empty, reason)))
     sidecar = target.sidecar(bounds, headline_of(stage.workspace), sigma, cautions)
@@ -96,8 +96,8 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
             "columns": frame.columns,
             "rows": frame.rows,
             "gsd": frame.step_x,
-            "gsd_photographs_m": sampling.photographs_m,
-            "gsd_training_m": sampling.training_m,
+            "gsd_photographs_m": photographs_m,
+            "gsd_training_m": training_m,
             "crs": target.crs.name,
             "heights": target.crs.vertical.name,
             "units": target.crs.units,

@@ -8,7 +8,6 @@ which varies so slowly that it is taken from a few nodes over the scene.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -19,7 +18,6 @@ from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.types import FloatArray
 from pipelines.deliver.options import ExportRasterOptions
 from pipelines.formats.geotiff import RasterFrame
-from pipelines.geometry.similarity import Similarity
 from pipelines.splat.gaussians import Gaussians, rotation_matrices
 from pipelines.splat.rasterizer.orthographic import PlanSplats
 from pipelines.splat.sh import basis
@@ -37,20 +35,11 @@ _MARGIN = 0.02  # of the extent, on each side
 _LARGEST_DEG = 0.01  # about a kilometre
 
 
-@dataclass(frozen=True)
-class GroundSampling:
-    """Ground sample distances in metres, medians over the SfM points' observations: depth over focal length.
+def ground_sampling_m(trained: TrainedSurvey) -> tuple[float, float]:
+    """Return the ground sample distances of the photographs, and at the size at which the model was trained.
 
-    Attributes:
-        photographs_m: of the photographs as they are.
-        training_m: at the size at which the model was trained.
+    They are medians over the SfM points' observations: depth over focal length.
     """
-
-    photographs_m: float
-    training_m: float
-
-
-def ground_sampling(trained: TrainedSurvey) -> GroundSampling:
     sfm, poses = trained.sfm, trained.poses
     cameras = [trained.sparse.camera_of(index) for index in range(len(sfm.image_name))]
     focal_px = np.array([camera.mean_focal_px for camera in cameras])
@@ -59,7 +48,7 @@ def ground_sampling(trained: TrainedSurvey) -> GroundSampling:
     depth = np.einsum("kj,kj->k", poses.cam_from_model[sfm.obs_image][:, 2], arm)
     gsd_m = trained.geo_from_model.scale * depth / focal_px[sfm.obs_image]
     reduced = np.maximum(longest_px / trained.model.max_image_size, 1.0)[sfm.obs_image]
-    return GroundSampling(float(np.median(gsd_m)), float(np.median(gsd_m * reduced)))
+    return float(np.median(gsd_m)), float(np.median(gsd_m * reduced))
 
 
 def make_frame(
@@ -71,7 +60,7 @@ def make_frame(
         xy: (P, 2) points in the CRS, easting or longitude first.
         target: the CRS.
         default_gsd_m: size of a cell in metres without `--gsd`.
-        options: size of a cell, and the largest number of cells.
+        options: others' size, and the largest number of cells.
 
     Raises:
         InputError: a geocentric CRS, a geographic CRS without a size in degrees, or too many cells.
@@ -131,26 +120,20 @@ def dilation_cells2(training_px: float) -> float:
 
 
 def plan_splats(
-    gaussians: Gaussians,
-    geo_from_model: Similarity,
-    target: TargetCrs,
-    frame: RasterFrame,
-    *,
-    centers_in_model: FloatArray,
-    training_px: float,
+    gaussians: Gaussians, trained: TrainedSurvey, target: TargetCrs, frame: RasterFrame, training_px: float
 ) -> tuple[PlanSplats, float]:
     """Return Gaussians in columns and rows of a raster's cells and depths, and the level that depths count from.
 
     The level is a height in the CRS's unit, above all Gaussians.
 
     Args:
-        gaussians: in `model`.
-        geo_from_model: similarity.
+        gaussians: those of the trained model that count, in `model`.
+        trained: the trained model.
         target: the CRS.
         frame: of the raster.
-        centers_in_model: (V, 3) centres of the training cameras, V ≥ 1.
         training_px: size of a training pixel on the ground, in cells.
     """
+    geo_from_model = trained.geo_from_model
     mean_in_geo = geo_from_model.apply(gaussians.means.numpy())
     xyz = np.concatenate(
         [target.xyz_from_geo(mean_in_geo[i : i + _CHUNK]) for i in range(0, len(mean_in_geo), _CHUNK)]
@@ -175,7 +158,7 @@ def plan_splats(
         cov,
         torch.sigmoid(gaussians.logit_opacities.double()).numpy()
         * _edge_on(cov * np.outer(metric, metric), dilation_cells2(training_px)),
-        _colours_from_above(gaussians, geo_from_model, centers_in_model),
+        _colours_from_above(gaussians, trained),
     )
     return splats, level
 
@@ -212,18 +195,13 @@ def _edge_on(cov: FloatArray, dilation: float) -> FloatArray:
     return np.asarray(np.sqrt(np.clip(area / np.maximum(face, 1e-300), 0.0, 1.0)))
 
 
-def _colours_from_above(
-    gaussians: Gaussians, geo_from_model: Similarity, centers_in_model: FloatArray
-) -> FloatArray:
+def _colours_from_above(gaussians: Gaussians, trained: TrainedSurvey) -> FloatArray:
     """Return colours (N, 3) as the training cameras nearest in plan see the Gaussians, averaged over these cameras.
 
     Straight down would be a direction from which an oblique flight has never looked: harmonics say nothing there.
-
-    Args:
-        gaussians: N Gaussians in `model`.
-        geo_from_model: similarity.
-        centers_in_model: (V, 3) centres of the training cameras.
     """
+    geo_from_model = trained.geo_from_model
+    centers_in_model = trained.poses.cam_center_in_model[trained.indices("train")]
     tree = cKDTree(geo_from_model.apply(centers_in_model)[:, :2])
     nearest = min(_VIEWS_OF_COLOUR, len(centers_in_model))
     centers = torch.from_numpy(np.ascontiguousarray(centers_in_model))

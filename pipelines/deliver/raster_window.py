@@ -31,7 +31,6 @@ _OPENED, _CLOSED = 2, 3
 _SIGMA_PX = 0.15  # of a ray through a photograph, in training pixels: by simulated flights
 _NODE_PX = 64  # cells between two nodes at which the georeference's σ is taken
 _NODES = 4  # nodes along each side, at which the way from the CRS to `geo` is fitted
-
 _LEAST_OPACITY = 1 / 255
 _AROUND = 0.1  # of the scene's extent: Gaussians further outside it, in plan, reach into no cell
 _HAZE_VIEWS = 2  # training views that look through a Gaussian, and none that shows a surface there
@@ -80,14 +79,7 @@ def raster_source(
     """
     views = surface_views(stage, trained)
     training_px = training_gsd_m / (frame.step_x * target.horizontal_unit_m)
-    splats, level = plan_splats(
-        _seen_gaussians(trained, views),
-        trained.geo_from_model,
-        target,
-        frame,
-        centers_in_model=trained.poses.cam_center_in_model[trained.indices("train")],
-        training_px=training_px,
-    )
+    splats, level = plan_splats(_seen_gaussians(trained, views), trained, target, frame, training_px)
     sigma, no_sigma = predicted_sigma(stage.workspace, trained)
     source = RasterSource(
         splats=splats,

@@ -29,13 +29,7 @@ from pipelines.survey.trained_model import TrainedModel
 
 @dataclass(frozen=True)
 class PlacedSplat:
-    """Splat in the frame `file` of its placement.
-
-    Attributes:
-        gaussians: in `file`, metres.
-        placement: place of that frame on Earth.
-        left_out: number of Gaussians that were too transparent.
-    """
+    """Splat in the frame `file` of its placement, and the number of Gaussians that were too transparent."""
 
     gaussians: Gaussians
     placement: Placement
@@ -47,13 +41,10 @@ class SplatParts:
     """Splat in the frame `file` of its placement, read part by part: each block of a training in blocks is one.
 
     Attributes:
-        path: of the trained Gaussians.
-        rows: of the file, one range for each part.
-        placement: place of the frame on Earth.
+        path, rows: file of the trained Gaussians, and a range of its rows for each part.
         center_in_file: (N, 3) metres, of all opaque Gaussians.
         left_out: number of Gaussians that were too transparent.
         sh_degree: of the harmonics to deliver.
-        options: least opacity.
     """
 
     path: Path
@@ -139,12 +130,7 @@ def _rows_of_blocks(workspace: Workspace, count: int) -> tuple[slice, ...]:
 
 
 def placed_splat(gaussians: Gaussians, placement: Placement, options: SplatOptions) -> PlacedSplat:
-    """Return the opaque ones of Gaussians in an East-North-Up frame at the scene.
-
-    Args:
-        gaussians: to deliver, in the frame `model`.
-        placement: that of the model, whatever part of it is delivered.
-        options: the least opacity.
+    """Return the opaque ones of Gaussians in `model`, in the frame of the placement.
 
     Raises:
         DegenerateGeometryError: no Gaussian is opaque enough.

@@ -112,13 +112,7 @@ def _page(workspace: Workspace, splat: SplatParts, options: ExportTilesOptions) 
 
 @dataclass(frozen=True)
 class Tiling:
-    """Division of a splat into tiles.
-
-    Attributes:
-        extent: of the scene.
-        count: number of all Gaussians.
-        largest_tile: largest number of Gaussians in a tile.
-    """
+    """Division of a splat into tiles: extent of the scene, and numbers of all Gaussians and of a tile's at most."""
 
     extent: SceneExtent
     count: int
@@ -135,7 +129,7 @@ def write_tiles(
         parts: at least one Gaussian each, in the frame of the sidecar; one after another is in memory.
         tiling: of all parts together.
         sidecar: place of the frame on Earth.
-        progress: shows how many of the Gaussians are in tiles.
+        progress: counts the Gaussians in leaves.
 
     Raises:
         OSError: a file cannot be written.
@@ -163,15 +157,8 @@ def write_whole(
 ) -> int:
     """Write the whole splat as one glb, and return the number of its Gaussians.
 
-    A splat of more Gaussians than a viewer can load is shown by the most detailed tiles that it can.
-
-    Args:
-        folder: holds the contents of the tiles.
-        parts: of the Gaussians.
-        root: of their tiles.
-        sidecar: place of the frame on Earth; it is in `asset.extras`, too.
-        count: number of all Gaussians.
-        most: largest number of Gaussians.
+    A splat of more than `most` Gaussians, which viewers cannot load, is shown by the most detailed tiles that they
+    can. The folder holds the tiles' contents.
     """
     if count > most:
         parts = [read_glb(folder / _content_uri(tile.name)) for tile in best_cut(root, most)]
@@ -188,7 +175,7 @@ def write_glb(path: Path, splat: SplatArrays, extras: dict[str, Any] | None = No
     Args:
         path: of the glb.
         splat: N ≥ 1 Gaussians.
-        extras: metadata for `asset.extras`.
+        extras: for `asset.extras`.
 
     Raises:
         InputError: values that are not finite.

@@ -107,14 +107,11 @@ class ScenePage(Product):
     """Content of the page.
 
     Attributes:
-        title: name of the scene.
         tileset: address of the tileset, relative to the page.
         cesium: address of the folder of CesiumJS, relative to the page or absolute; ends in a slash.
         origin_lla: latitude, longitude in degrees, ellipsoidal height: middle of the scene.
         radius_m: of the scene, for the first view.
         facts: what the reader must know of the coordinates.
-        cautions: limits of the model, one sentence each.
-        points: surveyed points to label.
         crs: coordinates to show beside longitude, latitude and ellipsoidal height; None: no others.
     """
 
@@ -146,7 +143,7 @@ def scene_page(
         center_in_file: (N, 3) centres of its Gaussians, metres.
         survey: has the control and check points.
         target: CRS in which coordinates are shown.
-        cesium: address of the folder of CesiumJS.
+        cesium: folder of CesiumJS.
 
     Raises:
         InputError: the scene is outside the domain of the CRS, or a grid is missing.

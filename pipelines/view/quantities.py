@@ -78,10 +78,8 @@ def length(points: MeasuredPoints) -> tuple[Quantity, ...]:
 
 def plan_area(points: MeasuredPoints) -> Quantity:
     """Return the horizontal area of the polygon of the points, in either direction."""
-    x, y = points.position_in_geo[:, 0], points.position_in_geo[:, 1]
-    east, north = x - x.mean(), y - y.mean()
-    area = abs(float(east @ np.roll(north, -1) - north @ np.roll(east, -1))) / 2
-    return Quantity("horizontal area", area, propagated(_area_gradient(points), points.cov_in_geo), "m²")
+    area, gradient = _area(points)
+    return Quantity("horizontal area", area, propagated(gradient, points.cov_in_geo), "m²")
 
 
 def propagated(gradient: FloatArray, cov: FloatArray | None) -> float | None:
@@ -153,13 +151,13 @@ def volumes(surface: SampledSurface, base: BasePlane) -> tuple[Quantity, ...]:
     σ is that of the difference: of corners and samples jointly, and of the sampling, which is half the difference
     between the volumes of the white and of the black samples of the grid, if that is a chequerboard.
     """
-    area = plan_area(surface.corners).value
+    area, area_gradient = _area(surface.corners)
     weights = _base_weights(base, surface.corners.position_in_geo[:, :2], surface.samples[:, :2])
     above = surface.samples[:, 2] - weights @ surface.corners.position_in_geo[:, 2]
     count = len(above)
     gradient = np.zeros((len(surface.corners) + len(surface.chosen), 3))
     gradient[: len(surface.corners), 2] = -area * weights.mean(axis=0)
-    gradient[: len(surface.corners)] += _area_gradient(surface.corners) * float(above.mean())
+    gradient[: len(surface.corners)] += area_gradient * float(above.mean())
     gradient[len(surface.corners) :, 2] = area / len(surface.chosen)
     of_points = propagated(gradient, surface.cov_in_geo)
     sigma = None
@@ -223,11 +221,11 @@ def _mean_stretch(samples: FloatArray) -> float:
     return float(np.linalg.norm(normal, axis=1).sum() / np.abs(normal[:, 2]).sum())
 
 
-def _area_gradient(points: MeasuredPoints) -> FloatArray:
-    """Return the derivative (J, 3) of the horizontal area of a polygon."""
+def _area(points: MeasuredPoints) -> tuple[float, FloatArray]:
+    """Return the horizontal area of a polygon, and its derivative (J, 3) by the points."""
     east, north = (points.position_in_geo[:, axis] - points.position_in_geo[:, axis].mean() for axis in (0, 1))
     twice = float(east @ np.roll(north, -1) - north @ np.roll(east, -1))
     gradient = np.zeros((len(east), 3))
     gradient[:, 0] = (np.roll(north, -1) - np.roll(north, 1)) / 2
     gradient[:, 1] = (np.roll(east, 1) - np.roll(east, -1)) / 2
-    return np.asarray(gradient * np.sign(twice))
+    return abs(twice) / 2, np.asarray(gradient * np.sign(twice))

@@ -40,6 +40,9 @@ MEASUREMENTS, TABLE = "measurements.geojson", "measurements.csv"
 Kind = Literal["point", "distance", "polyline", "area", "volume"]
 _MOST_BYTES = 64 << 20
 _COLUMNS = ("name", "kind", "vertex", "x", "y", "z", "crs", "sigma_e_m", "sigma_n_m", "sigma_u_m")
+_TEXT = "font-size:0.85em;margin:0.4em 0.8em"
+_ALARM = "padding:0.4em 0.6em;border-left:0.3em solid #d33;background:rgba(221,51,51,0.12);font-weight:600"
+_TABLE = "width:100%;font-size:0.8em;border-spacing:0.3em 0.1em;font-variant-numeric:tabular-nums;text-align:right"
 
 
 @contextmanager
@@ -67,12 +70,7 @@ class History:
         self._steps: deque[tuple[str, Callable[[], object]]] = deque(maxlen=_MOST_STEPS)
 
     def add(self, step: str, undo: Callable[[], object]) -> None:
-        """Add a step that was taken.
-
-        Args:
-            step: in words, for the user.
-            undo: undoes it; a step whose undoing fails can be undone again.
-        """
+        """Add a step that was taken, in words, with its undoing; one that fails can be repeated."""
         self._steps.append((step, undo))
 
     def undo(self) -> str | None:
@@ -243,11 +241,6 @@ def _anticlockwise(ring: list[list[float]]) -> list[list[float]]:
     return [*turned, turned[0]]
 
 
-_TEXT = "font-size:0.85em;margin:0.4em 0.8em"
-_ALARM = "padding:0.4em 0.6em;border-left:0.3em solid #d33;background:rgba(221,51,51,0.12);font-weight:600"
-_TABLE = "width:100%;font-size:0.8em;border-spacing:0.3em 0.1em;font-variant-numeric:tabular-nums;text-align:right"
-
-
 @dataclass(frozen=True)
 class PlaceRow:
     """Place (3,) in `geo` with σ (3,) east, north, up in metres, or None."""
@@ -268,13 +261,7 @@ def failure(text: str) -> str:
 
 
 def place_table(target: TargetCrs, rows: Sequence[PlaceRow], marked: str = "place") -> str:
-    """Return places with their coordinates in the CRS.
-
-    Args:
-        target: the CRS.
-        rows: the places.
-        marked: name of the attribute `data-…` that holds a row's metres in `geo`, for scripts.
-    """
+    """Return places with their coordinates in the CRS; `data-…` of the name `marked` has metres in `geo`."""
     crs = target.crs
     names = ("longitude", "latitude", "height") if crs.is_geographic else ("easting", "northing", "height")
     heads = "".join(f"<th>{name} ({html.escape(unit)})</th>" for name, unit in zip(names, crs.units, strict=True))
