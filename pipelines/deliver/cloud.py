@@ -52,7 +52,7 @@ def run(stage: StageRun, options: ExportCloudOptions) -> Summary:
     target = target_crs(options, trained.survey.origin, box, trained.survey.vertical)
     middle, crs_from_geo = _middle_and_axes(target, box)
     wkt1 = target.crs.wkt1  # a CRS that LAZ cannot state is refused before the work begins
-    laz = stage.out / CLOUD.rpartition("/")[2]
+    laz = stage.out / Path(CLOUD).name
     paths = (laz, laz.with_suffix(".ply")) if options.ply else (laz,)
     views = surface_views(stage, trained, colours=True)
     settings = fusion_settings(views, geo_from_model, options.min_views, options.spacing)

@@ -9,6 +9,8 @@ east, up and south, so that every reader sees the scene upright. The rotation of
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 from pipelines.core.errors import InputError
@@ -35,7 +37,7 @@ def run(stage: StageRun, options: ExportSpzOptions) -> Summary:
     """
     splat = load_splat(stage.workspace, options)
     upright = transformed(splat.gaussians, Similarity(1.0, ENU_FROM_RUB.T))
-    path = stage.out / SPZ.rpartition("/")[2]
+    path = stage.out / Path(SPZ).name
     version: SpzVersion = 3 if options.spz_version == "3" else 4
     try:
         write_spz(path, codec_arrays(upright, options.sh_degree), version)

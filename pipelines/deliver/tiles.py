@@ -43,7 +43,7 @@ _COPIES, _BYTES = 3, 17  # bytes of a Gaussian in SPZ before its compression, wi
 # A viewer draws nothing of a tileset whose own error is below its limit (16 pixels by default): with this factor,
 # the scene is shown until it is a pixel wide.
 _UNSEEN_FACTOR = 16.0
-GLB = TILES_GLB.rpartition("/")[2]
+GLB = Path(TILES_GLB).name
 # CesiumJS refuses to decode more at degree 3 (its decoder has 2 GB of memory).
 _LARGEST_GLB = 3_400_000
 

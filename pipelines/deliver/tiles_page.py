@@ -25,6 +25,7 @@ from pydantic import AfterValidator, Field
 from pipelines.core.files import replace_file
 from pipelines.core.products import Product
 from pipelines.core.sentences import printable
+from pipelines.core.stages import TILES
 from pipelines.core.types import Float32Array, FloatArray, Vector3
 from pipelines.deliver.placement import Placement, vector3
 from pipelines.geodesy.crs import PointCrs
@@ -40,7 +41,7 @@ from pipelines.geodesy.vertical import ELLIPSOIDAL
 from pipelines.survey.survey import Survey, SurveyedPoint
 from pipelines.survey.target_crs import TargetCrs
 
-PAGE, TILESET = "index.html", "tileset.json"
+PAGE, TILESET = "index.html", Path(TILES).name
 _PLACEHOLDER, _POLICY = '{"to be filled": "page.py"}', "to be filled: page.py"
 _SCRIPT = re.compile(r"<script>(.*?)</script>", re.DOTALL)
 # The first view shows these of the Gaussians: single ones of the sky or of a far background lie kilometres away.
