@@ -90,7 +90,7 @@ def _headline(result: Overview) -> list[str]:
 
 def _place(result: Overview, *, brief: bool = False) -> Table:
     """Return the lines on the place on Earth and its accuracy."""
-    bounds, quality = result.bounds, result.quality
+    bounds, accuracy = result.bounds, result.accuracy
     lines = {
         "longitude": f"{bounds.west:.6f} … {bounds.east:.6f}°",
         "latitude": f"{bounds.south:.6f} … {bounds.north:.6f}°",
@@ -103,12 +103,11 @@ def _place(result: Overview, *, brief: bool = False) -> Table:
     }
     if not brief:
         lines[""] = f"heights {bounds.heights}" + "".join(f"; {text}" for text in bounds.assumed)
-    accuracy = quality.accuracy
     lines["accuracy"] = "not known yet: georef evaluate states it" if accuracy is None else accuracy.text
     if accuracy is not None and accuracy.kind != "measured":
         lines["accuracy"] += "; check points measure it (--checkpoints, --check)"
-    if quality.psnr is not None:
-        lines["test views"] = f"PSNR {quality.psnr:.2f} dB"
+    if result.psnr is not None:
+        lines["test views"] = f"PSNR {result.psnr:.2f} dB"
     table = plain_table("", "", header=False)
     for name, text in lines.items():
         table.add_row(shown(name), shown(text))

@@ -71,7 +71,7 @@ def main() -> None:
 
     rows = []
     for sight in sights(model, args.clicks):
-        point = model.under(sight)
+        point = model.reader.under(sight)
         if not isinstance(point, SurfacePoint):
             continue
         start = in_world(trained.geo_from_model.apply(sight.start_in_model[None]))

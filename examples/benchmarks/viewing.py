@@ -89,7 +89,7 @@ def time_server(workspace: Workspace, clicks: int) -> None:
         times.append(time.perf_counter())
     made, coarse, full = (each - began for each in times)
     print(f"without a browser: read after {made:.1f} s, coarse picture {coarse:.1f} s, full picture {full:.1f} s")
-    viewer.click_mode = "measures"
+    viewer.click_mode.value = "measures"  # type: ignore[misc]
     taken = []
     pinhole = camera.pinhole(camera.width, camera.height)
     for x, y in np.random.default_rng(0).uniform([400, 250], [900, 600], (clicks, 2)):

@@ -1,27 +1,20 @@
 """Export of the adjusted cameras and lenses, placed on Earth, in the forms that other programs read.
 
-Reads survey, SfM model, initial similarity, and the adjustment: of the training, or
-before it of init-sim3. Writes into `cameras/` (docs/deliverables.md):
+Reads survey, SfM model, initial similarity, and the adjustment: of the training, or before it of init-sim3. Writes
+into `cameras/` (docs/deliverables.md):
 
 - `colmap/`: cameras, images and points as a COLMAP model, in the frame of `splat.ply`;
 - `transforms.json`: the same cameras for nerfstudio, in the same frame;
 - `cameras.csv`: positions in the CRS of the contract, angles in both conventions, σ;
 - `footprints.geojson`: the ground that each photograph shows;
-- `covariances.npz` and `camera_covariances.csv`: full covariances of cameras and tie points, in the same frame.
-
-Full covariances of cameras and tie points, for who weights them in a solution of his own.
-
-Both files are in the frame of `splat.ply`, as the COLMAP model beside them: metres, along east, north and up.
-
-Footprints of the photographs as GeoJSON features.
-
-Adjusted cameras on Earth: positions, angles and σ in the terms of a survey.
+- `covariances.npz` and `camera_covariances.csv`: full covariances of cameras and tie points, in the same frame, for
+  who weights them in a solution of his own.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -30,13 +23,13 @@ import numpy as np
 from pipelines.adjust.posterior import Posterior
 from pipelines.adjust.solution import posterior_of
 from pipelines.core.products import Caution, is_checked, save_npz, union
-from pipelines.core.types import FloatArray, IntArray
+from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import ExportCamerasOptions
-from pipelines.deliver.placement import Placement, place
+from pipelines.deliver.placement import Placement, median_values, place, scene_sigma
 from pipelines.formats.camera_files import CameraTable, Frame, lens_of, write_camera_table, write_transforms
 from pipelines.formats.colmap import write_sparse
-from pipelines.formats.georef_sidecar import CrsSidecar, SceneSigma, median_sigma, write_sidecar
+from pipelines.formats.georef_sidecar import CrsSidecar, median_sigma, write_sidecar
 from pipelines.formats.tables import write_table
 from pipelines.formats.vector_files import Json, feature, polygon, write_features
 from pipelines.geodesy.crs import grid_from_enu, parse_crs
@@ -45,7 +38,6 @@ from pipelines.geometry.bundle import Network
 from pipelines.geometry.footprints import PointSurface, border_rays, footprint
 from pipelines.geometry.intersection import refined_points
 from pipelines.geometry.rotations import omega_phi_kappa_deg, omega_phi_kappa_jacobian, yaw_pitch_roll_deg
-from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.headline import headline_of
 from pipelines.survey.survey import Survey
@@ -54,213 +46,13 @@ from pipelines.survey.trained_survey import SolvedSurvey, TrainedSurvey, load_so
 
 # Components of a camera: rotation about its centre by the axes, rad, then position of the centre, m.
 _COMPONENTS = ("rotation_e", "rotation_n", "rotation_u", "e", "n", "u")
-_MOST_POINTS = 100_000
-
-
-@dataclass(frozen=True)
-class Covariances:
-    """Covariances of n cameras and N tie points; NaN: not known.
-
-    Attributes:
-        camera_name: n names.
-        camera_cov: (n, 6, 6) of (δθ [rad], δc [m]): R_file_from_cam' = Exp(δθ) R_file_from_cam.
-        point_id: (N,) ids of the SfM model.
-        position: (N, 3) metres.
-        point_cov_m2: (N, 3, 3), errors of the points' own image observations included.
-    """
-
-    camera_name: tuple[str, ...]
-    camera_cov: FloatArray
-    point_id: IntArray
-    position: FloatArray
-    point_cov_m2: FloatArray
-
-
-def covariances_in_file(model: SparseModel, posterior: Posterior | None, file_from_geo: Similarity) -> Covariances:
-    """Return the covariances of the cameras, and of at most 100 000 tie points that lie evenly among all.
-
-    Args:
-        model: cameras and points in the frame of the file.
-        posterior: of the cameras; None: no covariance is known.
-        file_from_geo: rigid.
-    """
-    rays = np.bincount(model.obs_point, minlength=len(model.point_id))
-    known = np.flatnonzero((rays >= 2) & np.isfinite(model.point_in_local).all(axis=1))
-    chosen = known[:: max(1, -(-len(known) // _MOST_POINTS))]
-    position = model.point_in_local[chosen]
-    of_cameras, of_points = np.full((len(model.image_name), 6, 6), np.nan), np.full((len(chosen), 3, 3), np.nan)
-    if posterior is not None:
-        turn, both = file_from_geo.rotation, np.kron(np.eye(2), file_from_geo.rotation)
-        place = np.full(len(rays), -1)
-        place[chosen] = np.arange(len(chosen))
-        seen = np.flatnonzero(place[model.obs_point] >= 0)
-        in_geo = file_from_geo.inverse().apply(position)
-        of_points = posterior.of_tie_points(in_geo, place[model.obs_point[seen]], model.obs_image[seen])
-        of_cameras, of_points = both @ posterior.camera_cov @ both.T, turn @ of_points @ turn.T
-    return Covariances(model.image_name, of_cameras, model.point_id[chosen], position, of_points)
-
-
-def write_covariances(found: Covariances, npz: Path, table: Path) -> None:
-    """Write all covariances as NPZ, and those of the cameras as a table of their upper triangles.
-
-    Args:
-        found: the covariances.
-        npz: path of the arrays.
-        table: path of the CSV file.
-    """
-    save_npz(npz, vars(found))
-    rows, columns = np.triu_indices(6)
-    header = [f"cov_{_COMPONENTS[row]}_{_COMPONENTS[column]}" for row, column in zip(rows, columns, strict=True)]
-    cells = (
-        (name, *(f"{value:.9e}" if np.isfinite(value) else "" for value in values))
-        for name, values in zip(found.camera_name, found.camera_cov[:, rows, columns].tolist(), strict=True)
-    )
-    write_table(table, (("name", *header), *cells))
-
-
+_MOST_POINTS = 100_000  # with a covariance
 _LEAST_RAYS = 3  # of a point that counts as a part of the surface
 _RIM = 0.005  # fraction of the points that are taken for errors above, and below
-
-
-@dataclass(frozen=True)
-class Footprints:
-    """Footprints of n photographs.
-
-    Attributes:
-        features: n, the outline of the ground that each photograph shows, with its properties.
-        corner_lla: (M, 3) corners of all outlines; the centres of the cameras if none shows ground.
-    """
-
-    features: list[Json]
-    corner_lla: FloatArray
-
-
-def footprints_of(survey: Survey, model: SparseModel, table: CameraTable, placement: Placement) -> Footprints:
-    """Return the footprints of the photographs.
-
-    The geometry is null for a photograph that shows no ground. `clipped` says that part of the photograph lies
-    above the horizon, or so near below it that the outline ends at ten times the height above ground.
-
-    Args:
-        survey: has the times of exposure.
-        model: cameras and points in the frame of the placement, z up.
-        table: the same cameras, with split and σ.
-        placement: of that frame.
-    """
-    surface = PointSurface(_surface_points(model))
-    times = {image.name: image.timestamp_s for image in survey.images}
-    rays = {key: border_rays(camera) for key, camera in model.cameras.items()}
-    features, corners = [], []
-    for index, (name, center) in enumerate(zip(model.image_name, model.cam_center_in_local, strict=True)):
-        in_file = rays[int(model.image_camera_id[index])] @ model.rotation_cam_from_local[index]
-        found = footprint(in_file, center, surface)
-        lla = lla_from_ecef(placement.ecef_from_file.apply(found.outline))
-        east, north, up = table.sigma_enu_m[index].tolist()
-        properties = {
-            "name": name,
-            "split": table.split[index],
-            "time": _iso(times.get(name)),
-            "sigma_e_m": east,
-            "sigma_n_m": north,
-            "sigma_u_m": up,
-            "clipped": found.clipped,
-        }
-        features.append(feature(polygon(lla[:, [1, 0]]), properties))
-        corners.append(lla)
-    seen = np.concatenate(corners)
-    if not len(seen):
-        seen = lla_from_ecef(placement.ecef_from_file.apply(model.cam_center_in_local))
-    return Footprints(features, seen)
-
-
-def _surface_points(model: SparseModel) -> FloatArray:
-    """Return the points that three photographs show, without the highest and lowest; all if none are left."""
-    rays = np.bincount(model.obs_point, minlength=len(model.point_id))
-    good = rays >= _LEAST_RAYS
-    points = model.point_in_local[good if good.any() else slice(None)]
-    low, high = np.quantile(points[:, 2], [_RIM, 1 - _RIM])
-    kept = points[(points[:, 2] >= low) & (points[:, 2] <= high)]
-    return kept if len(kept) else points
-
-
-def _iso(seconds: float | None) -> str | None:
-    try:
-        return None if seconds is None else datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds")
-    except (OverflowError, ValueError, OSError):  # a clock beyond the calendar
-        return None
-
-
-@dataclass(frozen=True)
-class CamerasOnEarth:
-    """n adjusted cameras in the frame `geo`.
-
-    Attributes:
-        name, split: n each.
-        geo_from_cam: (n, 3, 3) rotations.
-        center_in_geo: (n, 3) metres.
-        covariance: (n, 6, 6) of (δθ [rad], δc [m]) along the axes of `geo`; NaN: not known.
-    """
-
-    name: tuple[str, ...]
-    split: tuple[str, ...]
-    geo_from_cam: FloatArray
-    center_in_geo: FloatArray
-    covariance: FloatArray
-
-
-def cameras_on_earth(solved: SolvedSurvey, covariance: FloatArray | None) -> CamerasOnEarth:
-    """Return the adjusted cameras on Earth.
-
-    Args:
-        solved: the survey.
-        covariance: (n, 6, 6) as in `CamerasOnEarth`; None: not known.
-    """
-    cameras, poses, similarity = solved.model.cameras, solved.poses, solved.geo_from_model
-    return CamerasOnEarth(
-        name=tuple(camera.name for camera in cameras),
-        split=tuple(camera.split for camera in cameras),
-        geo_from_cam=similarity.rotation @ np.swapaxes(poses.cam_from_model, 1, 2),
-        center_in_geo=similarity.apply(poses.cam_center_in_model),
-        covariance=np.full((len(cameras), 6, 6), np.nan) if covariance is None else covariance,
-    )
-
-
-def camera_table(cameras: CamerasOnEarth, crs: TargetCrs) -> CameraTable:
-    """Return the table of cameras in a CRS.
-
-    ω, φ, κ count from the axes of the CRS at each camera: grid east, grid north, up along the ellipsoid's normal.
-    In a CRS without a grid they count from true east and north, as do yaw, pitch, roll and the σ of the position.
-
-    Raises:
-        InputError: a camera lies outside the domain of the CRS, or its axes are left-handed.
-    """
-    lla = lla_from_enu(cameras.center_in_geo, crs.origin)
-    enu_from_geo = np.swapaxes(geo_from_enu_at(lla, crs.origin), 1, 2)
-    map_from_geo = grid_from_enu(crs.crs, lla) @ enu_from_geo
-    angles = omega_phi_kappa_deg(map_from_geo @ cameras.geo_from_cam)
-    by_turn = omega_phi_kappa_jacobian(angles) @ map_from_geo
-    return CameraTable(
-        name=cameras.name,
-        split=cameras.split,
-        position=crs.xyz_from_geo(cameras.center_in_geo),
-        geographic=crs.crs.is_geographic,
-        omega_phi_kappa_deg=angles,
-        yaw_pitch_roll_deg=yaw_pitch_roll_deg(enu_from_geo @ cameras.geo_from_cam),
-        sigma_enu_m=_sigma(enu_from_geo, cameras.covariance[:, 3:, 3:]),
-        sigma_angles_deg=np.degrees(_sigma(by_turn, cameras.covariance[:, :3, :3])),
-    )
-
-
-def _sigma(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return σ (n, 3) of quantities with derivatives (n, 3, 3) by others that have covariances (n, 3, 3)."""
-    propagated = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
-    return np.asarray(np.sqrt(np.diagonal(propagated, axis1=1, axis2=2)))
-
-
+_LENS_TOLERANCE_PX = 0.01  # of a lens that nerfstudio's model replaces: below, nobody need know
 _UNKNOWN = (
     Caution(code="cameras-without-sigma", sentence="The cameras have no σ: nothing checks the σ of the positions."),
 )
-_LENS_TOLERANCE_PX = 0.01  # of a lens that nerfstudio's model replaces: below, nobody need know
 
 
 def run(stage: StageRun, options: ExportCamerasOptions) -> Summary:
@@ -274,59 +66,96 @@ def run(stage: StageRun, options: ExportCamerasOptions) -> Summary:
     accuracy = headline_of(stage.workspace)
     points = solved.gaussians.means.numpy() if isinstance(solved, TrainedSurvey) else solved.point_in_model
     placement = place(solved.model, solved.survey, points, accuracy)
-    on_earth = cameras_on_earth(solved, None)
-    crs = target_crs(options, solved.survey.origin, on_earth.center_in_geo, solved.survey.vertical)
-    camera_table(on_earth, crs)  # a CRS that cannot hold the cameras is refused before the work begins
+    centers = solved.geo_from_model.apply(solved.poses.cam_center_in_model)
+    crs = target_crs(options, solved.survey.origin, centers, solved.survey.vertical)
+    _camera_table(solved, None, crs)  # a CRS that cannot hold the cameras is refused before the work begins
     with stage.progress.task("cameras", 5) as task:
         posterior = None
         if is_checked(solved.model.cautions):
             posterior = posterior_of(stage.workspace, solved.model, solved.sfm)
-        cameras = cameras_on_earth(solved, None if posterior is None else posterior.camera_cov)
-        table = camera_table(cameras, crs)
+        table = _camera_table(solved, posterior, crs)
         task.advance(note="σ")
-        model = model_in_file(solved, placement)
-        found = covariances_in_file(model, posterior, placement.file_from_geo)
-        npz, csv = stage.out / "covariances.npz", stage.out / "camera_covariances.csv"
-        write_covariances(found, npz, csv)
-        for path in (npz, csv):
-            write_sidecar(placement.sidecar(), path)
+        model = _model_in_file(solved, placement)
+        _write_covariances(stage.out, model, posterior, placement)
         task.advance(note="covariances")
         write_sparse(model, stage.out / "colmap")
         write_sidecar(placement.sidecar(), stage.out / "colmap")
         task.advance(note="COLMAP")
         lens_limits = _write_nerfstudio(stage.out / "transforms.json", model, placement)
         task.advance(note="nerfstudio")
-        footprints = footprints_of(solved.survey, model, table, placement)
-        write_features(stage.out / "footprints.geojson", footprints.features)
+        features, corner_lla = _footprints(solved.survey, model, table, placement)
+        write_features(stage.out / "footprints.geojson", features)
         task.advance(note="footprints")
-    cautions, sigma = union(solved.model.cautions, _UNKNOWN if posterior is None else ()), _scene_sigma(table)
-    on_ellipsoid = TargetCrs(parse_crs("EPSG:4979"), crs.origin, footprints.corner_lla)
-    bounds = _bounds(footprints.corner_lla[:, [1, 0, 2]])
-    write_sidecar(on_ellipsoid.sidecar(bounds, accuracy, sigma, cautions), stage.out / "footprints.geojson")
+    cautions, sigma = union(solved.model.cautions, _UNKNOWN if posterior is None else ()), None
+    if np.isfinite(table.sigma_enu_m).all():
+        east, north, up = table.sigma_enu_m.T
+        sigma = scene_sigma("positions of the cameras: similarity, cameras and lens", np.hypot(east, north), up)
+
+    def stated(target: TargetCrs, places: FloatArray) -> CrsSidecar:
+        return target.sidecar([places.min(axis=0), places.max(axis=0)], accuracy, sigma, cautions)
+
+    on_ellipsoid = TargetCrs(parse_crs("EPSG:4979"), crs.origin, corner_lla)
+    write_sidecar(stated(on_ellipsoid, corner_lla[:, [1, 0, 2]]), stage.out / "footprints.geojson")
     write_camera_table(stage.out / "cameras.csv", table)
-    sidecar = crs.sidecar(_bounds(table.position), accuracy, sigma, cautions)
+    sidecar = stated(crs, table.position)
     write_sidecar(sidecar, stage.out / "cameras.csv")
     return _summary(table, model, sidecar, union(cautions, lens_limits))
 
 
-def model_in_file(solved: SolvedSurvey, placement: Placement) -> SparseModel:
+def _camera_table(solved: SolvedSurvey, posterior: Posterior | None, crs: TargetCrs) -> CameraTable:
+    """Return the table of the adjusted cameras in a CRS; σ are NaN without a posterior.
+
+    ω, φ, κ count from the axes of the CRS at each camera: grid east, grid north, up along the ellipsoid's normal.
+    In a CRS without a grid they count from true east and north, as do yaw, pitch, roll and the σ of the position.
+
+    Raises:
+        InputError: a camera lies outside the domain of the CRS, or its axes are left-handed.
+    """
+    cameras, poses, similarity = solved.model.cameras, solved.poses, solved.geo_from_model
+    geo_from_cam = similarity.rotation @ np.swapaxes(poses.cam_from_model, 1, 2)
+    center_in_geo = similarity.apply(poses.cam_center_in_model)
+    # Of (δθ [rad], δc [m]) along the axes of `geo`.
+    covariance = np.full((len(cameras), 6, 6), np.nan) if posterior is None else posterior.camera_cov
+    lla = lla_from_enu(center_in_geo, crs.origin)
+    enu_from_geo = np.swapaxes(geo_from_enu_at(lla, crs.origin), 1, 2)
+    map_from_geo = grid_from_enu(crs.crs, lla) @ enu_from_geo
+    angles = omega_phi_kappa_deg(map_from_geo @ geo_from_cam)
+    by_turn = omega_phi_kappa_jacobian(angles) @ map_from_geo
+    return CameraTable(
+        name=tuple(camera.name for camera in cameras),
+        split=tuple(camera.split for camera in cameras),
+        position=crs.xyz_from_geo(center_in_geo),
+        geographic=crs.crs.is_geographic,
+        omega_phi_kappa_deg=angles,
+        yaw_pitch_roll_deg=yaw_pitch_roll_deg(enu_from_geo @ geo_from_cam),
+        sigma_enu_m=_sigma(enu_from_geo, covariance[:, 3:, 3:]),
+        sigma_angles_deg=np.degrees(_sigma(by_turn, covariance[:, :3, :3])),
+    )
+
+
+def _sigma(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return σ (n, 3) of quantities with derivatives (n, 3, 3) by others that have covariances (n, 3, 3)."""
+    propagated = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
+    return np.asarray(np.sqrt(np.diagonal(propagated, axis1=1, axis2=2)))
+
+
+def _model_in_file(solved: SolvedSurvey, placement: Placement) -> SparseModel:
     """Return the adjusted cameras and lenses in the frame of the placement, with the points as these see them."""
     file_from_model = placement.file_from_model
     rotation = solved.poses.cam_from_model @ file_from_model.rotation.T
     center = file_from_model.apply(solved.poses.cam_center_in_model)
     sparse = solved.sparse
-    refined = refined_points(
-        Network(
-            sparse.cameras,
-            sparse.image_camera_id,
-            rotation,
-            center,
-            file_from_model.apply(solved.point_in_model),
-            sparse.obs_point,
-            sparse.obs_image,
-            sparse.obs_xy_px,
-        )
+    network = Network(
+        sparse.cameras,
+        sparse.image_camera_id,
+        rotation,
+        center,
+        file_from_model.apply(solved.point_in_model),
+        sparse.obs_point,
+        sparse.obs_image,
+        sparse.obs_xy_px,
     )
+    refined = refined_points(network)
     return replace(
         sparse,
         rotation_cam_from_local=rotation,
@@ -334,6 +163,46 @@ def model_in_file(solved: SolvedSurvey, placement: Placement) -> SparseModel:
         point_in_local=refined.point_in_world,
         point_error_px=refined.error_px,
     )
+
+
+def _write_covariances(folder: Path, model: SparseModel, posterior: Posterior | None, placement: Placement) -> None:
+    """Write the covariances of cameras and tie points as NPZ, those of the cameras as a table of upper triangles.
+
+    Both are NaN, or empty, where no covariance is known. Tie points are at most 100 000, evenly among all; their
+    covariances include the errors of their own image observations. Those of the cameras are of (δθ [rad], δc [m]):
+    R_file_from_cam' = Exp(δθ) R_file_from_cam.
+    """
+    file_from_geo = placement.file_from_geo
+    rays = np.bincount(model.obs_point, minlength=len(model.point_id))
+    known = np.flatnonzero((rays >= 2) & np.isfinite(model.point_in_local).all(axis=1))
+    chosen = known[:: max(1, -(-len(known) // _MOST_POINTS))]
+    position = model.point_in_local[chosen]
+    of_cameras, of_points = np.full((len(model.image_name), 6, 6), np.nan), np.full((len(chosen), 3, 3), np.nan)
+    if posterior is not None:
+        turn, both = file_from_geo.rotation, np.kron(np.eye(2), file_from_geo.rotation)
+        place = np.full(len(rays), -1)
+        place[chosen] = np.arange(len(chosen))
+        seen = np.flatnonzero(place[model.obs_point] >= 0)
+        in_geo = file_from_geo.inverse().apply(position)
+        of_points = posterior.of_tie_points(in_geo, place[model.obs_point[seen]], model.obs_image[seen])
+        of_cameras, of_points = both @ posterior.camera_cov @ both.T, turn @ of_points @ turn.T
+    arrays = {
+        "camera_name": model.image_name,
+        "camera_cov": of_cameras,
+        "point_id": model.point_id[chosen],
+        "position": position,
+        "point_cov_m2": of_points,
+    }
+    save_npz(folder / "covariances.npz", arrays)
+    rows, columns = np.triu_indices(6)
+    header = [f"cov_{_COMPONENTS[row]}_{_COMPONENTS[column]}" for row, column in zip(rows, columns, strict=True)]
+    cells = (
+        (name, *(f"{value:.9e}" if np.isfinite(value) else "" for value in values))
+        for name, values in zip(model.image_name, of_cameras[:, rows, columns].tolist(), strict=True)
+    )
+    write_table(folder / "camera_covariances.csv", (("name", *header), *cells))
+    for file in ("covariances.npz", "camera_covariances.csv"):
+        write_sidecar(placement.sidecar(), folder / file)
 
 
 def _write_nerfstudio(path: Path, model: SparseModel, placement: Placement) -> tuple[Caution, ...]:
@@ -371,28 +240,67 @@ def _write_nerfstudio(path: Path, model: SparseModel, placement: Placement) -> t
     return cautions
 
 
-def _bounds(points: FloatArray) -> FloatArray:
-    return np.stack([points.min(axis=0), points.max(axis=0)])
+def _footprints(
+    survey: Survey, model: SparseModel, table: CameraTable, placement: Placement
+) -> tuple[list[Json], FloatArray]:
+    """Return the outline of the ground that each photograph shows, with its properties, and all corners (M, 3).
+
+    The geometry is null for a photograph that shows no ground. `clipped` says that part of the photograph lies
+    above the horizon, or so near below it that the outline ends at ten times the height above ground. The corners
+    are latitude, longitude, height; those of the cameras' centres if no photograph shows ground.
+
+    Args:
+        survey: has the times of exposure.
+        model: cameras and points in the frame of the placement, z up.
+        table: the same cameras, with split and σ.
+        placement: of that frame.
+    """
+    surface = PointSurface(_surface_points(model))
+    times = {image.name: image.timestamp_s for image in survey.images}
+    rays = {key: border_rays(camera) for key, camera in model.cameras.items()}
+    features, corners = [], []
+    for index, (name, center) in enumerate(zip(model.image_name, model.cam_center_in_local, strict=True)):
+        in_file = rays[int(model.image_camera_id[index])] @ model.rotation_cam_from_local[index]
+        found = footprint(in_file, center, surface)
+        lla = lla_from_ecef(placement.ecef_from_file.apply(found.outline))
+        east, north, up = table.sigma_enu_m[index].tolist()
+        properties = {
+            "name": name,
+            "split": table.split[index],
+            "time": _iso(times.get(name)),
+            "sigma_e_m": east,
+            "sigma_n_m": north,
+            "sigma_u_m": up,
+            "clipped": found.clipped,
+        }
+        features.append(feature(polygon(lla[:, [1, 0]]), properties))
+        corners.append(lla)
+    seen = np.concatenate(corners)
+    if not len(seen):
+        seen = lla_from_ecef(placement.ecef_from_file.apply(model.cam_center_in_local))
+    return features, seen
 
 
-def _scene_sigma(table: CameraTable) -> SceneSigma | None:
-    """Return the predicted σ of the positions; None if they are not known."""
-    if not np.isfinite(table.sigma_enu_m).all():
+def _surface_points(model: SparseModel) -> FloatArray:
+    """Return the points that three photographs show, without the highest and lowest; all if none are left."""
+    rays = np.bincount(model.obs_point, minlength=len(model.point_id))
+    good = rays >= _LEAST_RAYS
+    points = model.point_in_local[good if good.any() else slice(None)]
+    low, high = np.quantile(points[:, 2], [_RIM, 1 - _RIM])
+    kept = points[(points[:, 2] >= low) & (points[:, 2] <= high)]
+    return kept if len(kept) else points
+
+
+def _iso(seconds: float | None) -> str | None:
+    try:
+        return None if seconds is None else datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds")
+    except (OverflowError, ValueError, OSError):  # a clock beyond the calendar
         return None
-    horizontal: FloatArray = np.hypot(table.sigma_enu_m[:, 0], table.sigma_enu_m[:, 1])
-    vertical = table.sigma_enu_m[:, 2]
-    return SceneSigma(
-        counts="positions of the cameras: similarity, cameras and lens",
-        median_sigma_h_m=float(np.median(horizontal)),
-        median_sigma_v_m=float(np.median(vertical)),
-        largest_sigma_h_m=float(horizontal.max()),
-        largest_sigma_v_m=float(vertical.max()),
-    )
 
 
 def _summary(table: CameraTable, model: SparseModel, sidecar: CrsSidecar, cautions: tuple[Caution, ...]) -> Summary:
-    sigma, count = sidecar.sigma, len(table.name)
-    figure = f"{count} cameras, {sidecar.crs}{median_sigma(sigma, 'camera positions')}"
+    count = len(table.name)
+    figure = f"{count} cameras, {sidecar.crs}{median_sigma(sidecar.sigma, 'camera positions')}"
     seen = model.point_error_px[np.isfinite(model.point_error_px)]
     values = {
         "cameras": count,
@@ -402,7 +310,6 @@ def _summary(table: CameraTable, model: SparseModel, sidecar: CrsSidecar, cautio
         "crs": sidecar.crs,
         "heights": sidecar.vertical_datum.name,
         "assumed": "; ".join(sidecar.assumed) or None,
-        "median_camera_sigma_h_m": None if sigma is None else sigma.median_sigma_h_m,
-        "median_camera_sigma_v_m": None if sigma is None else sigma.median_sigma_v_m,
+        **median_values(sidecar.sigma, "camera"),
     }
     return Summary(figure, values, cautions=cautions)

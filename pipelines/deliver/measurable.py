@@ -11,15 +11,13 @@ surface is wrong by a part of the Gaussian's size. So:
 
 Reads `ingest/survey.json`, the photographs, `sfm/sparse`, `train/model.json` and `train/gaussians.ply`. Writes
 `measurable/splat.measurable.ply` and its sidecar, beside `export/splat.ply` of `export-ply`.
-
-Predicted σ of the georeference over the scene, for files that state it.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,18 +25,15 @@ import torch
 from scipy.spatial import ConvexHull, KDTree
 from torch import Tensor
 
-from pipelines.adjust.accuracy_grid import AccuracyGrid
-from pipelines.adjust.solution import posterior_of
 from pipelines.core.errors import DegenerateGeometryError, ResourceError
-from pipelines.core.products import is_checked
 from pipelines.core.progress import Progress
 from pipelines.core.sentences import about
 from pipelines.core.stages import MEASURABLE_SPLAT
-from pipelines.core.workspace import StageRun, Summary, Workspace
+from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import MeasurableOptions
 from pipelines.deliver.placement import place
 from pipelines.deliver.ply import write_ply
-from pipelines.deliver.splat import SplatFigures, placed_splat
+from pipelines.deliver.splat import placed_splat, splat_values
 from pipelines.geometry.cameras import pose_matrix
 from pipelines.geometry.similarity import Similarity
 from pipelines.splat.densify import view_contributions
@@ -54,7 +49,7 @@ from pipelines.surface.fusion import SurfaceCloud, fused_squares, fusion_setting
 from pipelines.surface.surface_views import ModelRenderer, SurfaceView, SurfaceViews
 from pipelines.survey.headline import headline_of
 from pipelines.survey.scene import photographs
-from pipelines.survey.trained_survey import SolvedSurvey, TrainedSurvey, load_trained
+from pipelines.survey.trained_survey import TrainedSurvey, load_trained
 
 log = logging.getLogger(__name__)
 
@@ -70,77 +65,58 @@ _OTHER_PASSES = 5  # depth maps, their comparison and the choice of the Gaussian
 _BESIDE = 1.0  # spacings between the centre of a Gaussian and the disc that replaces it
 
 
-@dataclass(frozen=True)
-class MeasurableSplat:
-    """Trained splat for measuring by centres.
-
-    Attributes:
-        gaussians: in `model`: those of the trained model that stay, then the discs.
-        trained: the trained model, with its own Gaussians.
-        discs: number of discs.
-        spacing_m: between neighbouring discs.
-        psnr_change_db: mean over the test views, against the trained model; None without test views.
-    """
-
-    gaussians: Gaussians
-    trained: TrainedSurvey
-    discs: int
-    spacing_m: float
-    psnr_change_db: float | None
-
-    def figures(self, splat: SplatFigures) -> tuple[str, dict[str, object]]:
-        """Return the key figure and the values of the deliverable, from those of every deliverable of the splat."""
-        psnr_text = "" if self.psnr_change_db is None else f", PSNR {self.psnr_change_db:+.2f} dB"
-        values = {
-            **splat.values(),
-            "discs": self.discs,
-            "spacing_m": self.spacing_m,
-            "psnr_change_db": self.psnr_change_db,
-        }
-        return f"{splat.key_figure()}; {self.discs} discs {self.spacing_m:.3f} m apart{psnr_text}", values
-
-
 def run(stage: StageRun, options: MeasurableOptions) -> Summary:
     """Write the PLY and its sidecar, and return their key figures.
 
     Raises:
-        GeorefError: as `measurable_splat`; or no Gaussian is opaque enough.
+        MissingProductError: a stage has not been run.
+        InputError: a product or photograph cannot be read, or the disk is too small for the depth maps.
+        ResourceError: the discs do not fit into the memory.
+        DegenerateGeometryError: the views agree on no point, or no Gaussian is opaque enough.
     """
-    made = measurable_splat(stage, options)
-    trained = made.trained
+    trained, progress = load_trained(stage.workspace), stage.progress
+    geo_from_model = trained.geo_from_model
+    images = photographs(trained.sfm, trained.survey, stage.workspace, trained.model.max_image_size)
+    backend = rasterizer("auto", progress)
+    renderer = ModelRenderer(trained, images, backend)
+    log.info("export-ply --measurable: %s", _estimate(renderer, options) or "time and size cannot be estimated")
+    images.build(progress)
+    views = SurfaceViews(renderer, stage.out / "depth_maps", colours=True, confirmed=True, progress=progress)
+    pixel_m = pixel_on_surface_m(views, geo_from_model)
+    spacing_m = options.disc_spacing or _SPACING_PX * pixel_m
+    settings = fusion_settings(views, geo_from_model, _MIN_VIEWS, spacing_m)
+    surface = _collected(fused_squares(views, geo_from_model, settings, progress), views, trained)
+    shown = trained.gaussians.select(_in_views(trained.gaussians, views, backend, progress).nonzero()[:, 0])
+    replaced, discs = with_discs(shown, surface, geo_from_model, spacing_m)
+    painted = repainted(
+        replaced,
+        lambda number: _shown(views.view(number)),
+        shuffled_passes(len(views), options.repaint_passes, np.random.default_rng(0)),
+        backend,
+        RasterSettings(trained.model.sh_degree, trained.model.background),
+        progress=progress,
+    )
+    views.close()
+    change = _psnr_change_db(
+        renderer, ModelRenderer(replace(trained, gaussians=painted), images, backend), progress
+    )
+    # The place is that of the trained model, whatever the discs have replaced.
     means, accuracy = trained.gaussians.means.numpy(), headline_of(stage.workspace)
-    splat = placed_splat(made.gaussians, place(trained.model, trained.survey, means, accuracy), options)
+    splat = placed_splat(painted, place(trained.model, trained.survey, means, accuracy), options)
     write_ply(splat, stage.out / Path(MEASURABLE_SPLAT).name)
-    key_figure, values = made.figures(splat.figures)
-    return Summary(key_figure, values, cautions=splat.placement.cautions)
+    psnr_text = "" if change is None else f", PSNR {change:+.2f} dB"
+    return Summary(
+        f"{len(splat.gaussians)} Gaussians; {discs} discs {spacing_m:.3f} m apart{psnr_text}",
+        {**splat_values(splat), "discs": discs, "spacing_m": spacing_m, "psnr_change_db": change},
+        cautions=splat.placement.cautions,
+    )
 
 
-@dataclass(frozen=True)
-class MeasurableEstimate:
-    """Estimate of the file and of the time that it takes, from SfM points and cameras, before anything is rendered.
+def _estimate(renderer: ModelRenderer, options: MeasurableOptions) -> str | None:
+    """Return an estimate of file and time from SfM points and cameras, before anything is rendered.
 
-    Attributes:
-        discs: number of discs.
-        spacing_m: between them.
-        bytes: of the PLY.
-        seconds: on the machine of docs/benchmarks.md.
+    The time is that of the machine of docs/benchmarks.md. None: too few SfM points tell the extent of the surface.
     """
-
-    discs: int
-    spacing_m: float
-    bytes: int
-    seconds: float
-
-    def __str__(self) -> str:
-        """Return the estimate as a sentence."""
-        return (
-            f"about {self.discs} discs {self.spacing_m:.3f} m apart, {self.bytes / 1e6:.3g} MB and "
-            f"{about(self.seconds)}; a larger --disc-spacing makes it smaller"
-        )
-
-
-def estimate(renderer: ModelRenderer, options: MeasurableOptions) -> MeasurableEstimate | None:
-    """Return the estimate for a trained model; None where too few SfM points tell the extent of the surface."""
     trained = renderer.trained
     points = trained.point_in_model[:: max(1, len(trained.point_in_model) // _LOOKED_AT)]
     cameras, shown, pixels_m = trained.indices("train"), np.zeros(len(points), int), []
@@ -158,57 +134,15 @@ def estimate(renderer: ModelRenderer, options: MeasurableOptions) -> MeasurableE
     spacing_m = options.disc_spacing or _SPACING_PX * trained.geo_from_model.scale * float(np.median(pixels_m))
     discs = round(ConvexHull(ground).volume / spacing_m**2)
     gaussians = discs + round(_KEPT * len(trained.gaussians))
-    megapixels = (
-        float(np.mean([pinhole.width * pinhole.height for pinhole in map(renderer.pinhole, cameras)])) / 1e6
-    )
+    size_bytes = gaussians * 4 * (_PLY_VALUES + 3 * coefficient_count(trained.gaussians.sh_degree))
+    pixels = [pinhole.width * pinhole.height for pinhole in map(renderer.pinhole, cameras)]
+    megapixels = float(np.mean(pixels)) / 1e6
     pass_s = _FIXED_S + _MEGAPIXEL_S * megapixels + _MILLION_GAUSSIANS_S * gaussians / 1e6
-    return MeasurableEstimate(
-        discs,
-        spacing_m,
-        gaussians * 4 * (_PLY_VALUES + 3 * coefficient_count(trained.gaussians.sh_degree)),
-        (options.repaint_passes + _OTHER_PASSES) * len(cameras) * pass_s,
+    seconds = (options.repaint_passes + _OTHER_PASSES) * len(cameras) * pass_s
+    return (
+        f"about {discs} discs {spacing_m:.3f} m apart, {size_bytes / 1e6:.3g} MB and {about(seconds)}; a larger "
+        "--disc-spacing makes it smaller"
     )
-
-
-def measurable_splat(stage: StageRun, options: MeasurableOptions) -> MeasurableSplat:
-    """Return the trained splat with discs on its surface.
-
-    Args:
-        stage: the run; its folder holds the depth maps meanwhile.
-        options: spacing and passes.
-
-    Raises:
-        MissingProductError: a stage has not been run.
-        InputError: a product or photograph cannot be read, or the disk is too small for the depth maps.
-        ResourceError: the discs do not fit into the memory.
-        DegenerateGeometryError: the views agree on no point.
-    """
-    trained, progress = load_trained(stage.workspace), stage.progress
-    images = photographs(trained.sfm, trained.survey, stage.workspace, trained.model.max_image_size)
-    backend = rasterizer("auto", progress)
-    renderer = ModelRenderer(trained, images, backend)
-    log.info("export-ply --measurable: %s", estimate(renderer, options) or "time and size cannot be estimated")
-    images.build(progress)
-    views = SurfaceViews(renderer, stage.out / "depth_maps", colours=True, confirmed=True, progress=progress)
-    pixel_m = pixel_on_surface_m(views, trained.geo_from_model)
-    spacing_m = options.disc_spacing or _SPACING_PX * pixel_m
-    settings = fusion_settings(views, trained.geo_from_model, _MIN_VIEWS, spacing_m)
-    surface = _collected(fused_squares(views, trained.geo_from_model, settings, progress), views, trained)
-    shown = trained.gaussians.select(_in_views(trained.gaussians, views, backend, progress).nonzero()[:, 0])
-    replaced, discs = with_discs(shown, surface, trained.geo_from_model, spacing_m)
-    painted = repainted(
-        replaced,
-        lambda number: _shown(views.view(number)),
-        shuffled_passes(len(views), options.repaint_passes, np.random.default_rng(0)),
-        backend,
-        RasterSettings(trained.model.sh_degree, trained.model.background),
-        progress=progress,
-    )
-    views.close()
-    change = _psnr_change_db(
-        renderer, ModelRenderer(replace(trained, gaussians=painted), images, backend), progress
-    )
-    return MeasurableSplat(painted, trained, discs, spacing_m, change)
 
 
 def with_discs(
@@ -282,7 +216,6 @@ def _shown(view: SurfaceView) -> ShownView:
 
 
 def _pose(view: SurfaceView) -> Tensor:
-    """Return the pose (4, 4) of a view, float32."""
     return torch.as_tensor(pose_matrix(view.cam_from_model, view.cam_center_in_model), dtype=torch.float32)
 
 
@@ -299,18 +232,3 @@ def _psnr_change_db(before: ModelRenderer, after: ModelRenderer, progress: Progr
             changes.append(now - was)
             task.advance()
     return float(np.mean(changes)) if changes else None
-
-
-def predicted_sigma(workspace: Workspace, solved: SolvedSurvey) -> tuple[AccuracyGrid | None, str]:
-    """Return the predicted σ over the scene; None, with the reason as the end of a sentence, if it is not known.
-
-    Nothing is stated where nothing checks it.
-
-    Raises:
-        MissingProductError: the solution was stored without its covariances.
-        InputError: a product is damaged.
-    """
-    if not is_checked(solved.model.cautions):
-        return None, "nothing checks the σ of the positions"
-    grid = posterior_of(workspace, solved.model, solved.sfm).grid
-    return grid, "" if grid is not None else "the scene has too few points"

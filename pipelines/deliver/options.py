@@ -1,7 +1,4 @@
-"""Options of the deliverables.
-
-What each file of a workspace is for, in the words of those who take it away.
-"""
+"""Options of the deliverables, and what each file of a workspace is for, in the words of those who take it away."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from pipelines.core.staleness import StageState, cautions_by_stage, status
 from pipelines.core.types import FloatArray, Vector3
 from pipelines.core.workspace import Workspace
 from pipelines.deliver.options import PURPOSES
-from pipelines.deliver.placement import place
+from pipelines.deliver.placement import place, vector3
 from pipelines.formats.splat_ply import read_centres
 from pipelines.formats.vector_files import Json, feature, polygon
 from pipelines.geodesy.enu import ecef_from_enu, lla_from_ecef
@@ -31,7 +31,7 @@ from pipelines.survey.survey import Survey
 from pipelines.survey.target_crs import usable_crs
 from pipelines.survey.trained_model import TrainedModel
 
-_RIM = 0.01  # fraction of the Gaussians outside the bounds at either end: sky, and floaters
+_WITHIN = (0.01, 1 - 0.01)  # quantiles of the Gaussians at the bounds: beyond lie sky, and floaters
 _MOST = 100_000  # Gaussians that the bounds are taken from
 
 
@@ -42,9 +42,7 @@ class Bounds:
     Attributes:
         west, south, east, north: WGS84 degrees; west > east across the date line.
         height_m: least and largest ellipsoidal height.
-        crs: name of a CRS.
-        units: of its three coordinates.
-        heights: datum of its heights.
+        crs, units, heights: name of a CRS, units of its three coordinates, and datum of its heights.
         low, high: least and largest coordinates in it, easting or longitude first.
         assumed: what the user did not state of it.
     """
@@ -61,33 +59,12 @@ class Bounds:
     high: Vector3
     assumed: tuple[str, ...]
 
-    def geometry(self) -> Json | None:
-        """Return the rectangle in longitude and latitude as GeoJSON."""
-        east = self.east if self.east >= self.west else self.east + 360.0
-        corners = [(self.west, self.south), (east, self.south), (east, self.north), (self.west, self.north)]
-        return polygon(corners)
-
-
-@dataclass(frozen=True)
-class Quality:
-    """Quality of the result.
-
-    Attributes:
-        accuracy: its headline; None: nothing states it yet.
-        psnr: of the test views, dB; None: not known.
-    """
-
-    accuracy: Headline | None
-    psnr: float | None
-
 
 @dataclass(frozen=True)
 class MadeFile:
-    """File or folder that was made.
+    """File or folder that was made, by its path in the workspace.
 
     Attributes:
-        path: in the workspace.
-        purpose: use of it.
         bytes: size, that of all its files for a folder.
         made: time; None: not recorded.
         state: state of its stage, as in `georef status`.
@@ -105,11 +82,10 @@ class Overview:
     """Result of a workspace.
 
     Attributes:
-        workspace: its root.
         gaussians: number of Gaussians.
         center_lla: latitude, longitude and ellipsoidal height of the middle of the scene.
-        bounds: of the scene.
-        quality: accuracy, and likeness to the photographs.
+        accuracy: headline of the result; None: nothing states it yet.
+        psnr: of the test views, dB; None: not known.
         files: those that there are, with their use.
         outdated: stages whose product is stale or damaged, in the order of the work.
         interrupted: by stage, what an interrupted run has left beside the product.
@@ -121,7 +97,8 @@ class Overview:
     gaussians: int
     center_lla: Vector3
     bounds: Bounds
-    quality: Quality
+    accuracy: Headline | None
+    psnr: float | None
     files: tuple[MadeFile, ...]
     outdated: tuple[StageState, ...]
     interrupted: dict[str, str]
@@ -147,10 +124,7 @@ class Overview:
                 "high": bounds.high,
                 "assumed": bounds.assumed,
             },
-            "quality": {
-                "accuracy": self.quality.accuracy and self.quality.accuracy.model_dump(),
-                "psnr": self.quality.psnr,
-            },
+            "quality": {"accuracy": self.accuracy and self.accuracy.model_dump(), "psnr": self.psnr},
             "files": [{**asdict(file), "made": file.made and file.made.isoformat()} for file in self.files],
             "further": {spec.command(self.workspace): spec.title for spec in self.further},
             "cautions": [
@@ -159,15 +133,14 @@ class Overview:
                 for caution in cautions
             ],
         }
-        return feature(bounds.geometry(), properties, (bounds.west, bounds.south, bounds.east, bounds.north))
+        west, south, north = bounds.west, bounds.south, bounds.north
+        east = bounds.east if bounds.east >= west else bounds.east + 360.0
+        rectangle = polygon([(west, south), (east, south), (east, north), (west, north)])
+        return feature(rectangle, properties, (west, south, bounds.east, north))
 
 
 def overview(workspace: Workspace, options: CrsOptions) -> Overview:
-    """Return the overview of a trained workspace.
-
-    Args:
-        workspace: has at least the products of ingest and train.
-        options: CRS of the bounds.
+    """Return the overview of a trained workspace, its bounds in the CRS of the options.
 
     Raises:
         MissingProductError: nothing has been trained; names the command.
@@ -179,13 +152,13 @@ def overview(workspace: Workspace, options: CrsOptions) -> Overview:
     placement = place(model, survey, means, headline_of(workspace))
     rows = status(workspace)
     states = {BY_NAME[row.stage].folder: row for row in rows}
-    x, y, z = placement.origin_lla.tolist()
     return Overview(
         workspace=workspace.root,
         gaussians=len(means),
-        center_lla=(x, y, z),
+        center_lla=vector3(placement.origin_lla),
         bounds=_bounds(placement.geo_from_model.apply(means[:: max(1, len(means) // _MOST)]), survey, options),
-        quality=Quality(placement.accuracy, _psnr(workspace)),
+        accuracy=placement.accuracy,
+        psnr=_psnr(workspace),
         files=_files(workspace, states),
         outdated=tuple(row for row in rows if row.state in ("stale", "damaged")),
         interrupted={row.stage: row.interrupted for row in rows if row.interrupted},
@@ -197,21 +170,20 @@ def overview(workspace: Workspace, options: CrsOptions) -> Overview:
 def _bounds(points_in_geo: FloatArray, survey: Survey, options: CrsOptions) -> Bounds:
     lla = lla_from_ecef(ecef_from_enu(points_in_geo, survey.origin))
     lla[:, 1] -= 360.0 * np.round((lla[:, 1] - lla[0, 1]) / 360.0)
-    (south, west, low_m), (north, east, high_m) = (row.tolist() for row in _robust(lla))
-    spanning = _robust(points_in_geo)
-    crs = usable_crs(options, survey.origin, spanning, survey.vertical)
-    low, high = _robust(crs.xyz_from_geo(points_in_geo))
+    (south, west, low_m), (north, east, high_m) = (row.tolist() for row in np.quantile(lla, _WITHIN, axis=0))
+    crs = usable_crs(options, survey.origin, np.quantile(points_in_geo, _WITHIN, axis=0), survey.vertical)
+    low, high = np.quantile(crs.xyz_from_geo(points_in_geo), _WITHIN, axis=0)
     return Bounds(
-        west=_wrapped(west),
+        west=west - 360.0 * round(west / 360.0),
         south=south,
-        east=_wrapped(east),
+        east=east - 360.0 * round(east / 360.0),
         north=north,
         height_m=(low_m, high_m),
         crs=crs.crs.name,
         units=crs.crs.units,
         heights=crs.crs.vertical.name,
-        low=_vector(low),
-        high=_vector(high),
+        low=vector3(low),
+        high=vector3(high),
         assumed=crs.assumed,
     )
 
@@ -226,28 +198,11 @@ def _psnr(workspace: Workspace) -> float | None:
 
 def _files(workspace: Workspace, states: dict[str, StageState]) -> tuple[MadeFile, ...]:
     """Return the files that there are, with the state of the stage of their folder."""
-    files = []
+    made = []
     for name, purpose in PURPOSES.items():
         path, row = workspace.root / name, states.get(name.partition("/")[0])
         if row is not None and path.exists():
-            files.append(MadeFile(name, purpose, _size(path), row.finished, row.state))
-    return tuple(files)
-
-
-def _size(path: Path) -> int:
-    files = path.rglob("*") if path.is_dir() else (path,)
-    return sum(file.stat().st_size for file in files if file.is_file())
-
-
-def _robust(points: FloatArray) -> FloatArray:
-    """Return the bounds (2, d) of points (N, d) without the rim."""
-    return np.asarray(np.quantile(points, [_RIM, 1 - _RIM], axis=0))
-
-
-def _wrapped(lon: float) -> float:
-    return lon - 360.0 * round(lon / 360.0)
-
-
-def _vector(values: FloatArray) -> Vector3:
-    x, y, z = values.tolist()
-    return x, y, z
+            inside = path.rglob("*") if path.is_dir() else (path,)
+            size = sum(file.stat().st_size for file in inside if file.is_file())
+            made.append(MadeFile(name, purpose, size, row.finished, row.state))
+    return tuple(made)

@@ -1,4 +1,4 @@
-"""The one placement of a trained model on Earth, which all deliverables of a survey share.
+"""The one placement of a trained model on Earth, which all deliverables of a survey share, and their common words.
 
 Frame-based files (PLY, SPZ, tiles) are East-North-Up at their own origin in the middle of the scene. There, float32
 coordinates stay small, and "up" is the vertical at the splat, not at the start of the survey. The similarity maps
@@ -7,18 +7,20 @@ the model to Earth (GeoRefGS section 2.4).
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from pipelines.core.errors import InputError
 from pipelines.core.figures import Headline
 from pipelines.core.products import Caution, is_checked
 from pipelines.core.types import FloatArray, Quaternion, Row7, Vector3
-from pipelines.formats.georef_sidecar import GeoreferenceSigma, GeorefSidecar, georeference_sigma
+from pipelines.formats.georef_sidecar import GeoreferenceSigma, GeorefSidecar, SceneSigma, georeference_sigma
 from pipelines.geodesy.crs import ECEF, parse_crs
 from pipelines.geodesy.enu import (
-    Origin,
     ecef_from_enu,
     ecef_from_enu_rotation,
     ecef_from_lla,
@@ -42,6 +44,7 @@ class Placement:
     Attributes:
         origin_lla: (3,) latitude, longitude in degrees and ellipsoidal height of the origin of `file`, rounded:
             these numbers define the frame exactly.
+        ecef_from_file: rigid, to the Earth-centred frame EPSG:4978.
         file_from_geo: rigid.
         geo_from_model: the trained similarity.
         covariance: (7, 7) of the similarity about the origin of `file`, along its axes; None if unknown.
@@ -51,6 +54,7 @@ class Placement:
     """
 
     origin_lla: FloatArray
+    ecef_from_file: Similarity
     file_from_geo: Similarity
     geo_from_model: Similarity
     covariance: FloatArray | None
@@ -62,11 +66,6 @@ class Placement:
     def file_from_model(self) -> Similarity:
         """Similarity from the model's frame."""
         return self.file_from_geo @ self.geo_from_model
-
-    @property
-    def ecef_from_file(self) -> Similarity:
-        """Rigid transformation to the Earth-centred frame EPSG:4978."""
-        return _enu_at(self.origin_lla)
 
     @property
     def georeference_sigma(self) -> GeoreferenceSigma | None:
@@ -87,10 +86,10 @@ class Placement:
         quaternion: Quaternion = (x, y, z, w)
         covariance = None if self.covariance is None else _turned(self.covariance, axes.T)
         return GeorefSidecar(
-            origin=_vector(self.ecef_from_file.translation),
+            origin=vector3(self.ecef_from_file.translation),
             rotation=quaternion,
             scale=1.0,
-            origin_lla=_vector(self.origin_lla),
+            origin_lla=vector3(self.origin_lla),
             vertical_datum=self.vertical,
             crs_wkt=parse_crs(ECEF).wkt,
             covariance=None if covariance is None else tuple(map(_row, covariance)),
@@ -112,10 +111,16 @@ def place(model: Adjustment, survey: Survey, points_in_model: ArrayLike, accurac
     """
     geo_from_model = Similarity.from_record(model.geo_from_model)
     scene_in_geo = np.median(geo_from_model.apply(points_in_model), axis=0)
-    origin_lla = _rounded_origin(scene_in_geo, survey.origin)
-    file_from_geo = _enu_at(origin_lla).inverse() @ _enu_at(lla_of(survey.origin))
+    lla = lla_from_ecef(ecef_from_enu(scene_in_geo, survey.origin))
+    origin_lla = np.array([*np.round(lla[:2], _ORIGIN_DECIMALS_DEG), np.round(lla[2], _ORIGIN_DECIMALS_M)])
+    ecef_from_file, ecef_from_geo = (
+        Similarity(1.0, ecef_from_enu_rotation(origin), ecef_from_lla(origin))
+        for origin in (origin_lla, lla_of(survey.origin))
+    )
+    file_from_geo = ecef_from_file.inverse() @ ecef_from_geo
     return Placement(
         origin_lla=origin_lla,
+        ecef_from_file=ecef_from_file,
         file_from_geo=file_from_geo,
         geo_from_model=geo_from_model,
         covariance=_covariance_in_file(model.geo_from_model, file_from_geo),
@@ -123,16 +128,6 @@ def place(model: Adjustment, survey: Survey, points_in_model: ArrayLike, accurac
         cautions=model.cautions,
         accuracy=accuracy,
     )
-
-
-def _rounded_origin(point_in_geo: FloatArray, origin: Origin) -> FloatArray:
-    lla = lla_from_ecef(ecef_from_enu(point_in_geo, origin))
-    return np.array([*np.round(lla[:2], _ORIGIN_DECIMALS_DEG), np.round(lla[2], _ORIGIN_DECIMALS_M)])
-
-
-def _enu_at(lla: FloatArray) -> Similarity:
-    """Return the similarity ecef ← enu of the East-North-Up frame at latitude, longitude and height (3,)."""
-    return Similarity(1.0, ecef_from_enu_rotation(lla), ecef_from_lla(lla))
 
 
 def _covariance_in_file(geo_from_model: SimilarityRecord, file_from_geo: Similarity) -> FloatArray | None:
@@ -155,6 +150,39 @@ def _row(values: FloatArray) -> Row7:
     return s, rx, ry, rz, x, y, z
 
 
-def _vector(values: FloatArray) -> Vector3:
+def vector3(values: FloatArray) -> Vector3:
+    """Return an array (3,) as numbers for a file."""
     x, y, z = values.tolist()
     return x, y, z
+
+
+def scene_sigma(counts: str, horizontal_m: FloatArray, vertical_m: FloatArray) -> SceneSigma:
+    """Return medians and largest of predicted σ (K,), for a sidecar that says which errors they count."""
+    return SceneSigma(
+        counts=counts,
+        median_sigma_h_m=float(np.median(horizontal_m)),
+        median_sigma_v_m=float(np.median(vertical_m)),
+        largest_sigma_h_m=float(horizontal_m.max()),
+        largest_sigma_v_m=float(vertical_m.max()),
+    )
+
+
+def median_values(sigma: SceneSigma | None, of: str) -> dict[str, float | None]:
+    """Return the median σ of points or cells for `--json`; None where they are not known."""
+    return {
+        f"median_{of}_sigma_h_m": None if sigma is None else sigma.median_sigma_h_m,
+        f"median_{of}_sigma_v_m": None if sigma is None else sigma.median_sigma_v_m,
+    }
+
+
+def require_space(folder: Path, needed_bytes: int, files: str, advice: str) -> None:
+    """Refuse files that the disk would not hold: a sentence names them, and advises what makes them smaller.
+
+    Raises:
+        InputError: too little space is free.
+    """
+    free_bytes = shutil.disk_usage(folder).free
+    if needed_bytes > free_bytes:
+        needed, free = f"{needed_bytes / 2**30:.1f} GiB", f"{free_bytes / 2**30:.1f} GiB"
+        advice = f"{advice}, or make room on this disk"
+        raise InputError(f"{files} may need {needed}, and {free} are free: {advice}", path=folder)

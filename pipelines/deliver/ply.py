@@ -11,7 +11,7 @@ from pathlib import Path
 from pipelines.core.stages import SPLAT
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import ExportPlyOptions
-from pipelines.deliver.splat import PlacedSplat, load_splat
+from pipelines.deliver.splat import PlacedSplat, load_splat, splat_values
 from pipelines.formats.georef_sidecar import write_sidecar
 from pipelines.splat.gaussians import write_gaussians
 
@@ -26,8 +26,7 @@ def run(stage: StageRun, options: ExportPlyOptions) -> Summary:
     """
     splat = load_splat(stage.workspace, options)
     write_ply(splat, stage.out / Path(SPLAT).name)
-    figures = splat.figures
-    return Summary(figures.key_figure(), figures.values(), cautions=splat.placement.cautions)
+    return Summary(f"{len(splat.gaussians)} Gaussians", splat_values(splat), cautions=splat.placement.cautions)
 
 
 def write_ply(splat: PlacedSplat, path: Path) -> None:

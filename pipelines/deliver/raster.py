@@ -4,10 +4,6 @@ Reads the survey, the trained model and the initial similarity. Writes `raster/o
 `sigma_h.tif`, `sigma_v.tif` as Cloud Optimized GeoTIFF, each with its sidecar, `hillshade.png` and `preview.png`;
 with `--contours` also `contours.gpkg` and `contours.dxf`. The Gaussians are rendered orthographically, window by
 window: finished windows survive an interruption.
-
-Pictures of the rasters for people: the orthophoto made small, and the surface model as hillshade.
-
-Contour lines of the surface model.
 """
 
 from __future__ import annotations
@@ -18,7 +14,6 @@ from pathlib import Path
 import contourpy
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from pipelines.core.errors import DegenerateGeometryError, InputError
@@ -27,60 +22,24 @@ from pipelines.core.products import Caution, union
 from pipelines.core.types import BoolArray, ByteArray, FloatArray
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import ExportRasterOptions
+from pipelines.deliver.placement import median_values, require_space, scene_sigma
 from pipelines.deliver.raster_mosaic import Mosaic
-from pipelines.deliver.raster_plan import GroundSampling, ground_sampling, make_frame, require_space
-from pipelines.deliver.raster_window import Request, raster_source
-from pipelines.formats.georef_sidecar import SceneSigma, median_sigma, write_sidecar
+from pipelines.deliver.raster_plan import ground_sampling_m, make_frame
+from pipelines.deliver.raster_window import raster_source
+from pipelines.deliver.surface import without_sigma
+from pipelines.formats.georef_sidecar import median_sigma, write_sidecar
 from pipelines.formats.geotiff import RasterFrame, read_reduced
 from pipelines.formats.vector_files import ContourLine, write_contours_dxf, write_contours_gpkg
 from pipelines.survey.headline import headline_of
-from pipelines.survey.target_crs import TargetCrs, target_crs
+from pipelines.survey.target_crs import target_crs
 from pipelines.survey.trained_survey import corners, load_trained, scene_points
 
+_DETAIL = 1.5  # training pixels over cells, beyond which a raster shows less than its cells promise
+# Bytes of a cell on the disk at most: colours, height and two σ, as parts and as final rasters.
+_BYTES_PER_CELL = 32
 _PICTURE_PX = 2000
 _SUN_AZIMUTH_DEG, _SUN_ELEVATION_DEG = 315.0, 45.0
-
-
-def write_pictures(folder: Path, heights_by_plan: float) -> None:
-    """Write `preview.png` and `hillshade.png` of the rasters in a folder.
-
-    Args:
-        folder: has `orthophoto.tif` and `dsm.tif`.
-        heights_by_plan: horizontal unit over the unit of the heights.
-    """
-    rgba, _ = read_reduced(folder / "orthophoto.tif", _PICTURE_PX)
-    _write_preview(folder / "preview.png", rgba)
-    height, cell = read_reduced(folder / "dsm.tif", _PICTURE_PX)
-    _write_hillshade(folder / "hillshade.png", height[0], cell * heights_by_plan)
-
-
-def _write_preview(path: Path, rgba: NDArray[np.uint8]) -> None:
-    """Write red, green, blue and alpha (4, H, W) as a PNG."""
-    cv2.imwrite(str(path), np.ascontiguousarray(np.moveaxis(rgba, 0, 2)[..., [2, 1, 0, 3]]))
-
-
-def _write_hillshade(path: Path, height: FloatArray, cell: float) -> None:
-    """Write the hillshade of heights (H, W) as a PNG; transparent where there is no surface.
-
-    Args:
-        path: of the PNG.
-        height: (H, W) rows from the north; NaN: no surface.
-        cell: size of a cell, in the unit of the heights.
-    """
-    grey = hillshade(height, cell)
-    alpha = np.where(np.isfinite(height), 255, 0).astype(np.uint8)
-    cv2.imwrite(str(path), np.dstack([grey, grey, grey, alpha]))
-
-
-def hillshade(height: FloatArray, cell: float) -> ByteArray:
-    """Return the light (H, W) of a sun in the north-west on a surface, 0 … 255; the sun stands at 45°."""
-    south, east = np.gradient(np.where(np.isfinite(height), height, np.nanmedian(height)), cell)
-    azimuth, elevation = np.radians(_SUN_AZIMUTH_DEG), np.radians(_SUN_ELEVATION_DEG)
-    sun = np.array([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)])
-    light = (sun[2] - sun[0] * east + sun[1] * south) / np.sqrt(1.0 + east**2 + south**2)
-    return np.asarray(np.round(255 * np.clip(light, 0.0, 1.0)), dtype=np.uint8)
-
-
+# Of the contour lines.
 _EVERY_MAJOR = 5
 _LEAST_CELLS = 12.0  # length of the shortest line
 _SMOOTHED = 1.5  # cells: σ of the smoothing, without which every stone has its own line
@@ -88,25 +47,117 @@ _MOST_LEVELS = 2_000
 _CONTOUR_PX = 6000  # of the surface that lines are drawn of
 
 
-def write_contours(folder: Path, frame: RasterFrame, interval: float) -> int:
-    """Write `contours.gpkg` and `contours.dxf` of the surface model in a folder, and return the number of lines.
-
-    Args:
-        folder: has `dsm.tif`.
-        frame: of the rasters.
-        interval: between two lines, in the unit of the heights.
+def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
+    """Write the rasters, their pictures and contours, and return their key figures.
 
     Raises:
-        InputError: the interval is too small for the scene.
+        MissingProductError: a stage has not been run.
+        InputError: a product is damaged, the CRS cannot be used, the cells are too many, or the disk is too small.
+        DegenerateGeometryError: no cell of the scene was seen.
     """
+    trained = load_trained(stage.workspace)
+    points, (photographs_m, training_m) = scene_points(trained), ground_sampling_m(trained)
+    target = target_crs(options, trained.survey.origin, corners(points), trained.survey.vertical)
+    frame = make_frame(target.xyz_from_geo(points)[:, :2], target, photographs_m, options)
+    size = f"{frame.columns} × {frame.rows} cells"
+    needed_bytes = _BYTES_PER_CELL * frame.columns * frame.rows
+    require_space(stage.out, needed_bytes, f"rasters of {size}", "give a larger --gsd")
+    source, reason = raster_source(stage, trained, target, frame, training_m, min_views=options.min_views)
+    mosaic = Mosaic(stage.out / "parts", frame, target)
+    mosaic.render(source, stage.progress)
+    mosaic.drop_islands()
+    height = mosaic.sample("dsm")
+    if not len(height):
+        raise DegenerateGeometryError(
+            f"no cell is shown by {options.min_views} training views or more: lower --min-views"
+        )
+    sigma = None
+    if not reason:
+        counts = "georeference, cameras and lens; the surface's own noise between training views"
+        sigma = scene_sigma(counts, mosaic.sample("sigma_h"), mosaic.sample("sigma_v"))
+    west, south, east, north = frame.bounds
+    bounds = [[west, south, height.min()], [east, north, height.max()]]
+    coarse = _detail_of_training(training_m) if source.training_px > _DETAIL else ()
+    empty = "The rasters state no σ, and sigma_h.tif and sigma_v.tif are empty"
+    cautions = union(trained.model.cautions, (*coarse, *without_sigma(empty, reason)))
+    sidecar = target.sidecar(bounds, headline_of(stage.workspace), sigma, cautions)
+    for path in mosaic.write(stage.out, sidecar, stage.progress):
+        write_sidecar(sidecar, path)
+    if options.hillshade:
+        _write_pictures(stage.out, target.horizontal_unit_m / target.height_unit_m)
+    lines = _write_contours(stage.out, frame, options.contours) if options.contours else 0
+    covered = mosaic.covered()
+    source.views.close()
+    remove(mosaic.folder)
+    figure = f"{size} of {frame.step_x:g} {target.crs.units[0]} in {target.crs.name}"
+    return Summary(
+        figure + median_sigma(sigma, "cells"),
+        {
+            "columns": frame.columns,
+            "rows": frame.rows,
+            "gsd": frame.step_x,
+            "gsd_photographs_m": photographs_m,
+            "gsd_training_m": training_m,
+            "crs": target.crs.name,
+            "heights": target.crs.vertical.name,
+            "units": target.crs.units,
+            "bounds": bounds,
+            "covered": covered,
+            **median_values(sigma, "cell"),
+            "contour_lines": lines,
+            "assumed": "; ".join(target.assumed),
+        },
+        cautions=cautions,
+    )
+
+
+def _detail_of_training(training_m: float) -> tuple[Caution, ...]:
+    sentence = (
+        f"The model was trained at {training_m:.3f} m a pixel on the ground, and shows no finer detail, whatever "
+        "the size of a raster's cells."
+    )
+    return (Caution(code="detail-of-training", sentence=sentence),)
+
+
+def _write_pictures(folder: Path, heights_by_plan: float) -> None:
+    """Write `preview.png` and `hillshade.png` of the rasters in a folder, transparent where there is no surface.
+
+    Args:
+        folder: has `orthophoto.tif` and `dsm.tif`.
+        heights_by_plan: horizontal unit over the unit of the heights.
+    """
+    rgba, _ = read_reduced(folder / "orthophoto.tif", _PICTURE_PX)
+    cv2.imwrite(str(folder / "preview.png"), np.ascontiguousarray(np.moveaxis(rgba, 0, 2)[..., [2, 1, 0, 3]]))
+    height, cell = read_reduced(folder / "dsm.tif", _PICTURE_PX)
+    grey = _hillshade(height[0], cell * heights_by_plan)
+    alpha = np.where(np.isfinite(height[0]), 255, 0).astype(np.uint8)
+    cv2.imwrite(str(folder / "hillshade.png"), np.dstack([grey, grey, grey, alpha]))
+
+
+def _hillshade(height: FloatArray, cell: float) -> ByteArray:
+    """Return the light (H, W), 0 … 255, of a sun in the north-west at 45° on heights (H, W), rows from the north.
+
+    Args:
+        height: NaN: no surface.
+        cell: size of a cell, in the unit of the heights.
+    """
+    south, east = np.gradient(np.where(np.isfinite(height), height, np.nanmedian(height)), cell)
+    azimuth, elevation = np.radians(_SUN_AZIMUTH_DEG), np.radians(_SUN_ELEVATION_DEG)
+    sun = np.array([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)])
+    light = (sun[2] - sun[0] * east + sun[1] * south) / np.sqrt(1.0 + east**2 + south**2)
+    return np.asarray(np.round(255 * np.clip(light, 0.0, 1.0)), dtype=np.uint8)
+
+
+def _write_contours(folder: Path, frame: RasterFrame, interval: float) -> int:
+    """Write `contours.gpkg` and `contours.dxf` of a folder's `dsm.tif`, and return the number of lines."""
     height, _ = read_reduced(folder / "dsm.tif", _CONTOUR_PX)
-    lines = contour_lines(height[0].astype(np.float64), frame, interval)
+    lines = _contour_lines(height[0].astype(np.float64), frame, interval)
     write_contours_gpkg(folder / "contours.gpkg", lines, frame.wkt)
     write_contours_dxf(folder / "contours.dxf", lines)
     return len(lines)
 
 
-def contour_lines(height: FloatArray, frame: RasterFrame, interval: float) -> list[ContourLine]:
+def _contour_lines(height: FloatArray, frame: RasterFrame, interval: float) -> list[ContourLine]:
     """Return the contour lines of a surface, lowest first; short ones are left out.
 
     Args:
@@ -146,99 +197,3 @@ def _smoothed(height: FloatArray, known: BoolArray) -> FloatArray:
     weight = gaussian_filter(known.astype(np.float64), _SMOOTHED, mode="constant")
     total = gaussian_filter(np.where(known, height, 0.0), _SMOOTHED, mode="constant")
     return np.where(known, total / np.maximum(weight, 1e-9), np.nan)
-
-
-_DETAIL = 1.5  # training pixels over cells, beyond which a raster shows less than its cells promise
-
-
-def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
-    """Write the rasters, their pictures and contours, and return their key figures.
-
-    Raises:
-        MissingProductError: a stage has not been run.
-        InputError: a product is damaged, the CRS cannot be used, the cells are too many, or the disk is too small.
-        DegenerateGeometryError: no cell of the scene was seen.
-    """
-    trained = load_trained(stage.workspace)
-    points, sampling = scene_points(trained), ground_sampling(trained)
-    target = target_crs(options, trained.survey.origin, corners(points), trained.survey.vertical)
-    frame = make_frame(target.xyz_from_geo(points)[:, :2], target, sampling.photographs_m, options)
-    require_space(stage.out, frame)
-    source, reason = raster_source(stage, Request(trained, target, frame, sampling, options))
-    mosaic = Mosaic(stage.out / "parts", frame, target)
-    mosaic.render(source, stage.progress)
-    mosaic.drop_islands()
-    height = mosaic.sample("dsm")
-    if not len(height):
-        raise DegenerateGeometryError(
-            f"no cell is shown by {options.min_views} training views or more: lower --min-views"
-        )
-    accuracy, sigma = headline_of(stage.workspace), None if reason else _sigma(mosaic)
-    west, south, east, north = frame.bounds
-    bounds = [[west, south, height.min()], [east, north, height.max()]]
-    cautions = union(trained.model.cautions, _cautions(sampling, source.training_px, reason))
-    sidecar = target.sidecar(bounds, accuracy, sigma, cautions)
-    for path in mosaic.write(stage.out, sidecar, stage.progress):
-        write_sidecar(sidecar, path)
-    if options.hillshade:
-        write_pictures(stage.out, target.horizontal_unit_m / target.height_unit_m)
-    lines = write_contours(stage.out, frame, options.contours) if options.contours else 0
-    covered = mosaic.covered()
-    source.views.close()
-    remove(mosaic.folder)
-    return Summary(
-        _key_figure(frame, target, sigma),
-        {
-            "columns": frame.columns,
-            "rows": frame.rows,
-            "gsd": frame.step_x,
-            "gsd_photographs_m": sampling.photographs_m,
-            "gsd_training_m": sampling.training_m,
-            "crs": target.crs.name,
-            "heights": target.crs.vertical.name,
-            "units": target.crs.units,
-            "bounds": bounds,
-            "covered": covered,
-            "median_cell_sigma_h_m": None if sigma is None else sigma.median_sigma_h_m,
-            "median_cell_sigma_v_m": None if sigma is None else sigma.median_sigma_v_m,
-            "contour_lines": lines,
-            "assumed": "; ".join(target.assumed),
-        },
-        cautions=cautions,
-    )
-
-
-def _sigma(mosaic: Mosaic) -> SceneSigma:
-    horizontal, vertical = mosaic.sample("sigma_h"), mosaic.sample("sigma_v")
-    return SceneSigma(
-        counts="georeference, cameras and lens; the surface's own noise between training views",
-        median_sigma_h_m=float(np.median(horizontal)),
-        median_sigma_v_m=float(np.median(vertical)),
-        largest_sigma_h_m=float(horizontal.max()),
-        largest_sigma_v_m=float(vertical.max()),
-    )
-
-
-def _cautions(sampling: GroundSampling, training_px: float, reason: str) -> tuple[Caution, ...]:
-    cautions = []
-    if training_px > _DETAIL:
-        cautions.append(
-            Caution(
-                code="detail-of-training",
-                sentence=f"The model was trained at {sampling.training_m:.3f} m a pixel on the ground, and shows "
-                "no finer detail, whatever the size of a raster's cells.",
-            )
-        )
-    if reason:
-        cautions.append(
-            Caution(
-                code="no-sigma",
-                sentence=f"The rasters state no σ, and sigma_h.tif and sigma_v.tif are empty: {reason}.",
-            )
-        )
-    return tuple(cautions)
-
-
-def _key_figure(frame: RasterFrame, target: TargetCrs, sigma: SceneSigma | None) -> str:
-    cells = f"{frame.columns} × {frame.rows} cells of {frame.step_x:g} {target.crs.units[0]} in {target.crs.name}"
-    return cells + median_sigma(sigma, "cells")

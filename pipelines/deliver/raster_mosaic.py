@@ -13,7 +13,7 @@ from scipy.ndimage import label
 
 from pipelines import __version__
 from pipelines.core.progress import Progress
-from pipelines.core.types import BoolArray, FloatArray, IntArray
+from pipelines.core.types import FloatArray, IntArray
 from pipelines.deliver.raster_window import RasterSource, WindowCells, render_window
 from pipelines.formats.georef_sidecar import CrsSidecar
 from pipelines.formats.geotiff import (
@@ -43,18 +43,11 @@ _COLOURS = (
 
 @dataclass(frozen=True)
 class _Window:
-    """First cell and size of a window."""
+    """Window by its first cell, and the frame of its cells."""
 
     column: int
     row: int
-    columns: int
-    rows: int
-
-    def coarse(self, step: int) -> tuple[IntArray, IntArray]:
-        """Return its rows (H, 1) and columns (1, W) in a raster with one cell for `step` × `step`."""
-        rows = (self.row + np.arange(self.rows, dtype=np.int64)) // step
-        columns = (self.column + np.arange(self.columns, dtype=np.int64)) // step
-        return rows[:, None], columns[None, :]
+    frame: RasterFrame
 
 
 class Mosaic:
@@ -62,12 +55,10 @@ class Mosaic:
 
     Args:
         folder: for the parts; those that are there are kept.
-        frame: of the rasters.
-        target: the CRS.
     """
 
     def __init__(self, folder: Path, frame: RasterFrame, target: TargetCrs) -> None:
-        self.folder, self.frame, self._target = folder, frame, target
+        self.folder, self.frame = folder, frame
         height = f"height above {target.crs.vertical.name}"
         self._kinds = {
             "orthophoto": RasterKind("uint8", _COLOURS),
@@ -83,7 +74,9 @@ class Mosaic:
         with progress.task("windows", len(windows)) as task:
             for window in windows:
                 if not all(self._part(name, window).exists() for name in self._kinds):
-                    self._render(source, window)
+                    cells = render_window(source, window.frame, window.column, window.row)
+                    for name in self._kinds:
+                        write_part(self._part(name, window), _bands(name, cells), window.frame)
                 task.advance()
 
     def drop_islands(self) -> None:
@@ -91,7 +84,7 @@ class Mosaic:
         step = -(-max(self.frame.columns, self.frame.rows) // _ISLANDS_PX)
         seen = np.zeros((-(-self.frame.rows // step), -(-self.frame.columns // step)), dtype=bool)
         for window in self._windows():
-            np.logical_or.at(seen, window.coarse(step), read_all(self._part("orthophoto", window))[3] > 0)
+            np.logical_or.at(seen, _coarse(window, step), read_all(self._part("orthophoto", window))[3] > 0)
         number, _ = label(seen, structure=np.ones((3, 3)))
         sizes = np.bincount(number.ravel())
         if len(sizes) < 3:
@@ -99,16 +92,13 @@ class Mosaic:
         island = sizes < _LEAST_ISLAND * sizes[1:].max()
         island[0] = False
         for window in self._windows():
-            dropped = island[number[window.coarse(step)]]
-            if dropped.any():
-                self._empty(window, dropped)
-
-    def _empty(self, window: _Window, dropped: BoolArray) -> None:
-        part = self.frame.part(window.column, window.row, window.columns, window.rows)
-        for name, kind in self._kinds.items():
-            values = read_all(self._part(name, window))
-            values[:, dropped] = 0 if kind.dtype == "uint8" else NODATA
-            write_part(self._part(name, window), values, part)
+            dropped = island[number[_coarse(window, step)]]
+            if not dropped.any():
+                continue
+            for name, kind in self._kinds.items():
+                values = read_all(self._part(name, window))
+                values[:, dropped] = 0 if kind.dtype == "uint8" else NODATA
+                write_part(self._part(name, window), values, window.frame)
 
     def sample(self, name: str) -> FloatArray:
         """Return values (K,) of cells all over a raster that have one; enough for medians and bounds."""
@@ -122,49 +112,46 @@ class Mosaic:
         return float(np.concatenate([part.ravel() for part in alpha]).mean() / 255)
 
     def write(self, folder: Path, sidecar: CrsSidecar, progress: Progress) -> Iterator[Path]:
-        """Write each raster into a folder, and yield its path.
-
-        Args:
-            folder: of the rasters.
-            sidecar: of the rasters: accuracy and σ for the metadata.
-            progress: shows the rasters.
-        """
+        """Write each raster into a folder, with accuracy and σ of the sidecar as metadata, and yield its path."""
         with progress.task("rasters", len(self._kinds)) as task:
             for name, kind in self._kinds.items():
                 parts = [(self._part(name, window), window.column, window.row) for window in self._windows()]
                 path = folder / f"{name}.tif"
-                write_mosaic(path, parts, self.frame, kind, self._tags(sidecar))
+                write_mosaic(path, parts, self.frame, kind, _tags(sidecar))
                 yield path
                 task.advance(note=path.name)
-
-    def _render(self, source: RasterSource, window: _Window) -> None:
-        part = self.frame.part(window.column, window.row, window.columns, window.rows)
-        cells = render_window(source, part, window.column, window.row)
-        for name in self._kinds:
-            write_part(self._part(name, window), _bands(name, cells), part)
 
     def _windows(self) -> Iterator[_Window]:
         for row in range(0, self.frame.rows, _WINDOW_PX):
             for column in range(0, self.frame.columns, _WINDOW_PX):
                 columns = min(_WINDOW_PX, self.frame.columns - column)
-                yield _Window(column, row, columns, min(_WINDOW_PX, self.frame.rows - row))
+                rows = min(_WINDOW_PX, self.frame.rows - row)
+                yield _Window(column, row, self.frame.part(column, row, columns, rows))
 
     def _part(self, name: str, window: _Window) -> Path:
         return self.folder / f"{name}_{window.row}_{window.column}.tif"
 
-    def _tags(self, sidecar: CrsSidecar) -> dict[str, str]:
-        tags = {
-            "TIFFTAG_SOFTWARE": f"GeoRefGS {__version__}",
-            "GEOREF_CRS": self._target.crs.name,
-            "GEOREF_VERTICAL_DATUM": self._target.crs.vertical.name,
-            "GEOREF_EPOCH": "not stated",
-        }
-        if sidecar.accuracy is not None:
-            tags["GEOREF_ACCURACY"] = sidecar.accuracy.text
-        if sidecar.sigma is not None:
-            tags["GEOREF_MEDIAN_CELL_SIGMA_H_M"] = f"{sidecar.sigma.median_sigma_h_m:.4f}"
-            tags["GEOREF_MEDIAN_CELL_SIGMA_V_M"] = f"{sidecar.sigma.median_sigma_v_m:.4f}"
-        return tags
+
+def _tags(sidecar: CrsSidecar) -> dict[str, str]:
+    tags = {
+        "TIFFTAG_SOFTWARE": f"GeoRefGS {__version__}",
+        "GEOREF_CRS": sidecar.crs,
+        "GEOREF_VERTICAL_DATUM": sidecar.vertical_datum.name,
+        "GEOREF_EPOCH": "not stated",
+    }
+    if sidecar.accuracy is not None:
+        tags["GEOREF_ACCURACY"] = sidecar.accuracy.text
+    if sidecar.sigma is not None:
+        tags["GEOREF_MEDIAN_CELL_SIGMA_H_M"] = f"{sidecar.sigma.median_sigma_h_m:.4f}"
+        tags["GEOREF_MEDIAN_CELL_SIGMA_V_M"] = f"{sidecar.sigma.median_sigma_v_m:.4f}"
+    return tags
+
+
+def _coarse(window: _Window, step: int) -> tuple[IntArray, IntArray]:
+    """Return the rows (H, 1) and columns (1, W) of a window in a raster with one cell for `step` × `step`."""
+    rows = (window.row + np.arange(window.frame.rows, dtype=np.int64)) // step
+    columns = (window.column + np.arange(window.frame.columns, dtype=np.int64)) // step
+    return rows[:, None], columns[None, :]
 
 
 def _bands(name: str, cells: WindowCells) -> NDArray[Any]:

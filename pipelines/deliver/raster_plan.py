@@ -1,17 +1,13 @@
-"""Gaussians over the map plane: every one through ENU → ECEF → CRS by itself.
+"""Plan of the rasters: their frame of cells, and the Gaussians over the map plane.
 
-A centre is transformed exactly. Its covariance is carried by the derivative of that way, which varies so slowly
-that it is taken from a few nodes over the scene.
-
-Frame of the rasters: cells on whole multiples of their size, over the scene, checked before the work begins.
+The frame has cells on whole multiples of their size, over the scene; it is checked before the work begins. Every
+Gaussian goes through ENU → ECEF → CRS by itself: its centre exactly, its covariance by the derivative of that way,
+which varies so slowly that it is taken from a few nodes over the scene.
 """
 
 from __future__ import annotations
 
 import math
-import shutil
-from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -22,7 +18,6 @@ from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.types import FloatArray
 from pipelines.deliver.options import ExportRasterOptions
 from pipelines.formats.geotiff import RasterFrame
-from pipelines.geometry.similarity import Similarity
 from pipelines.splat.gaussians import Gaussians, rotation_matrices
 from pipelines.splat.rasterizer.orthographic import PlanSplats
 from pipelines.splat.sh import basis
@@ -36,169 +31,15 @@ _ABOVE = 1.0  # unit of the heights, between the level from which depths count a
 _MOST_REACH = 3.34  # standard deviations at which an opaque Gaussian falls below 1/255
 _VIEWS_OF_COLOUR = 4
 _DILATION_PX2 = 0.3  # of the training, in its pixels
-
-
-def samples_per_cell(training_px: float) -> int:
-    """Return the number of samples along a side of a cell: odd, so that one lies in the middle.
-
-    Args:
-        training_px: size of a training pixel on the ground, in cells.
-    """
-    return max(round(1.0 / training_px) | 1, 1)
-
-
-def dilation_cells2(training_px: float) -> float:
-    """Return the variance that rendering adds on the screen, in squared cells: that of the training.
-
-    What the training saw was blurred by its own pixels. A finer raster must not let holes show between Gaussians.
-    """
-    return _DILATION_PX2 * max(training_px, 1.0 / samples_per_cell(training_px)) ** 2
-
-
-class PlanScene:
-    """Gaussians over the plane of a raster.
-
-    Args:
-        gaussians: in `model`.
-        geo_from_model: similarity.
-        target: the CRS.
-        frame: of the raster.
-        centers_in_model: (V, 3) centres of the training cameras, V ≥ 1.
-        training_px: size of a training pixel on the ground, in cells.
-
-    Attributes:
-        splats: columns and rows of the raster's cells, depths below `level`.
-        level: height in the CRS's unit, above all Gaussians.
-    """
-
-    def __init__(
-        self,
-        gaussians: Gaussians,
-        geo_from_model: Similarity,
-        target: TargetCrs,
-        frame: RasterFrame,
-        *,
-        centers_in_model: FloatArray,
-        training_px: float,
-    ) -> None:
-        mean_in_geo = geo_from_model.apply(gaussians.means.numpy())
-        xyz = np.concatenate(
-            [target.xyz_from_geo(mean_in_geo[i : i + _CHUNK]) for i in range(0, len(mean_in_geo), _CHUNK)]
-        )
-        derivative = _Derivative(mean_in_geo, target, frame)
-        cov = np.empty((len(xyz), 3, 3))
-        for start in range(0, len(xyz), _CHUNK):
-            part = slice(start, start + _CHUNK)
-            axes = geo_from_model.scale * geo_from_model.rotation @ _principal_axes(gaussians, part)
-            axes = derivative.at(mean_in_geo[part]) @ axes
-            cov[part] = axes @ np.swapaxes(axes, 1, 2)
-        metric = np.array([1.0, 1.0, target.height_unit_m / (frame.step_x * target.horizontal_unit_m)])
-        reach = _MOST_REACH * np.sqrt(cov[:, 2, 2])
-        self.level = float((xyz[:, 2] + reach).max()) + _ABOVE
-        column = (xyz[:, 0] - frame.west) / frame.step_x
-        row = (frame.north - xyz[:, 1]) / frame.step_y
-        self.splats = PlanSplats(
-            np.column_stack([column, row, self.level - xyz[:, 2]]),
-            cov,
-            torch.sigmoid(gaussians.logit_opacities.double()).numpy()
-            * _edge_on(cov * np.outer(metric, metric), dilation_cells2(training_px)),
-            colours_from_above(gaussians, geo_from_model, centers_in_model),
-        )
-
-
-class _Derivative:
-    """Derivative (3, 3) of column, row and depth by a place in `geo`, interpolated between nodes."""
-
-    def __init__(self, points: FloatArray, target: TargetCrs, frame: RasterFrame) -> None:
-        low, high = points.min(axis=0), points.max(axis=0)
-        high = np.maximum(high, low + _STEP_M)
-        axes = [np.linspace(a, b, _NODES) for a, b in zip(low, high, strict=True)]
-        nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-        ends = [target.xyz_from_geo(nodes + _STEP_M / 2 * sign * axis) for axis in np.eye(3) for sign in (1, -1)]
-        by_geo = np.stack([ends[0] - ends[1], ends[2] - ends[3], ends[4] - ends[5]], axis=-1) / _STEP_M
-        by_geo = by_geo / np.array([frame.step_x, -frame.step_y, -1.0])[:, None]
-        if not np.isfinite(by_geo).all():
-            raise DegenerateGeometryError(f"{target.crs.name} has no derivative over the scene")
-        self._at = RegularGridInterpolator(tuple(axes), by_geo.reshape(*3 * (_NODES,), 9))
-
-    def at(self, points: FloatArray) -> FloatArray:
-        return np.asarray(self._at(points)).reshape(-1, 3, 3)
-
-
-def _edge_on(cov: FloatArray, dilation: float) -> FloatArray:
-    """Return factors (N,) of the opacity that take from discs seen edge-on the area that dilation gives them.
-
-    A wall is a stack of discs. Each would be widened to a pixel without getting fainter, and a hundred of them
-    would paint the wall pixels wide beside its roof. A disc seen face-on keeps the opacity of the training.
-
-    Args:
-        cov: (N, 3, 3) of columns, rows and depth, all in cells.
-        dilation: variance that rendering adds on the screen, in squared cells.
-    """
-    seen = cov[:, :2, :2]
-    squared = np.linalg.eigvalsh(cov)[:, 1:]
-    face = np.prod(squared / (squared + dilation), axis=1)
-    dilated = (seen[:, 0, 0] + dilation) * (seen[:, 1, 1] + dilation) - seen[:, 0, 1] ** 2
-    area = np.maximum(np.linalg.det(seen), 0.0) / dilated
-    return np.asarray(np.sqrt(np.clip(area / np.maximum(face, 1e-300), 0.0, 1.0)))
-
-
-def _principal_axes(gaussians: Gaussians, part: slice) -> FloatArray:
-    """Return the principal axes (N, 3, 3) in columns, one standard deviation long, in `model`."""
-    rotation = rotation_matrices(gaussians.quats_wxyz[part].double())
-    return np.asarray((rotation * gaussians.log_scales[part].double().exp()[:, None]).numpy())
-
-
-def colours_from_above(
-    gaussians: Gaussians, geo_from_model: Similarity, centers_in_model: FloatArray
-) -> FloatArray:
-    """Return colours (N, 3) as the training cameras nearest in plan see the Gaussians, averaged over these cameras.
-
-    Straight down would be a direction from which an oblique flight has never looked: harmonics say nothing there.
-
-    Args:
-        gaussians: N Gaussians in `model`.
-        geo_from_model: similarity.
-        centers_in_model: (V, 3) centres of the training cameras.
-    """
-    tree = cKDTree(geo_from_model.apply(centers_in_model)[:, :2])
-    nearest = min(_VIEWS_OF_COLOUR, len(centers_in_model))
-    centers = torch.from_numpy(np.ascontiguousarray(centers_in_model))
-    colours = np.empty((len(gaussians), 3))
-    for start in range(0, len(gaussians), _CHUNK):
-        part = gaussians.select(torch.arange(start, min(start + _CHUNK, len(gaussians))))
-        means = part.means.double()
-        _, camera = tree.query(geo_from_model.apply(means.numpy())[:, :2], k=[*range(1, nearest + 1)])
-        total = torch.zeros(len(part), 3, dtype=torch.float64)
-        for rank in range(nearest):
-            direction = torch.nn.functional.normalize(means - centers[camera[:, rank]], dim=1)
-            values = torch.einsum("nk,nkc->nc", basis(direction, part.sh_degree), part.sh.double())
-            total += (0.5 + values).clamp_min(0.0)
-        colours[start : start + len(part)] = (total / nearest).numpy()
-    return colours
-
-
 _MARGIN = 0.02  # of the extent, on each side
 _LARGEST_DEG = 0.01  # about a kilometre
-# Bytes of a cell on the disk at most: colours, height and two σ, as parts and as final rasters.
-_BYTES_PER_CELL = 32
 
 
-@dataclass(frozen=True)
-class GroundSampling:
-    """Ground sample distances in metres, medians over the SfM points' observations: depth over focal length.
+def ground_sampling_m(trained: TrainedSurvey) -> tuple[float, float]:
+    """Return the ground sample distances of the photographs, and at the size at which the model was trained.
 
-    Attributes:
-        photographs_m: of the photographs as they are.
-        training_m: at the size at which the model was trained.
+    They are medians over the SfM points' observations: depth over focal length.
     """
-
-    photographs_m: float
-    training_m: float
-
-
-def ground_sampling(trained: TrainedSurvey) -> GroundSampling:
-    """Return the ground sample distances of a trained survey."""
     sfm, poses = trained.sfm, trained.poses
     cameras = [trained.sparse.camera_of(index) for index in range(len(sfm.image_name))]
     focal_px = np.array([camera.mean_focal_px for camera in cameras])
@@ -207,7 +48,7 @@ def ground_sampling(trained: TrainedSurvey) -> GroundSampling:
     depth = np.einsum("kj,kj->k", poses.cam_from_model[sfm.obs_image][:, 2], arm)
     gsd_m = trained.geo_from_model.scale * depth / focal_px[sfm.obs_image]
     reduced = np.maximum(longest_px / trained.model.max_image_size, 1.0)[sfm.obs_image]
-    return GroundSampling(float(np.median(gsd_m)), float(np.median(gsd_m * reduced)))
+    return float(np.median(gsd_m)), float(np.median(gsd_m * reduced))
 
 
 def make_frame(
@@ -219,7 +60,7 @@ def make_frame(
         xy: (P, 2) points in the CRS, easting or longitude first.
         target: the CRS.
         default_gsd_m: size of a cell in metres without `--gsd`.
-        options: size of a cell, and the largest number of cells.
+        options: others' size, and the largest number of cells.
 
     Raises:
         InputError: a geocentric CRS, a geographic CRS without a size in degrees, or too many cells.
@@ -255,22 +96,124 @@ def make_frame(
     return RasterFrame(crs.wkt1, west * step, north * step, step, step, columns, rows)
 
 
-def require_space(folder: Path, frame: RasterFrame) -> None:
-    """Refuse rasters that the disk would not hold.
-
-    Raises:
-        InputError: too little space is free.
-    """
-    needed, free = _BYTES_PER_CELL * frame.columns * frame.rows, shutil.disk_usage(folder).free
-    if needed > free:
-        raise InputError(
-            f"rasters of {frame.columns} × {frame.rows} cells may need {needed / 2**30:.1f} GiB, and "
-            f"{free / 2**30:.1f} GiB are free: give a larger --gsd, or make room on this disk",
-            path=folder,
-        )
-
-
 def _readable(gsd: float) -> float:
     """Return a size rounded up to two digits, which people can copy."""
     digit = 10.0 ** (math.floor(math.log10(gsd)) - 1)
     return round(math.ceil(gsd / digit - 1e-9) * digit, 12)
+
+
+def samples_per_cell(training_px: float) -> int:
+    """Return the number of samples along a side of a cell: odd, so that one lies in the middle.
+
+    Args:
+        training_px: size of a training pixel on the ground, in cells.
+    """
+    return max(round(1.0 / training_px) | 1, 1)
+
+
+def dilation_cells2(training_px: float) -> float:
+    """Return the variance that rendering adds on the screen, in squared cells: that of the training.
+
+    What the training saw was blurred by its own pixels. A finer raster must not let holes show between Gaussians.
+    """
+    return _DILATION_PX2 * max(training_px, 1.0 / samples_per_cell(training_px)) ** 2
+
+
+def plan_splats(
+    gaussians: Gaussians, trained: TrainedSurvey, target: TargetCrs, frame: RasterFrame, training_px: float
+) -> tuple[PlanSplats, float]:
+    """Return Gaussians in columns and rows of a raster's cells and depths, and the level that depths count from.
+
+    The level is a height in the CRS's unit, above all Gaussians.
+
+    Args:
+        gaussians: those of the trained model that count, in `model`.
+        trained: the trained model.
+        target: the CRS.
+        frame: of the raster.
+        training_px: size of a training pixel on the ground, in cells.
+    """
+    geo_from_model = trained.geo_from_model
+    mean_in_geo = geo_from_model.apply(gaussians.means.numpy())
+    xyz = np.concatenate(
+        [target.xyz_from_geo(mean_in_geo[i : i + _CHUNK]) for i in range(0, len(mean_in_geo), _CHUNK)]
+    )
+    derivative_at = _derivative(mean_in_geo, target, frame)
+    cov = np.empty((len(xyz), 3, 3))
+    for start in range(0, len(xyz), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        # Principal axes in columns, one standard deviation long.
+        rotation = rotation_matrices(gaussians.quats_wxyz[part].double())
+        axes = np.asarray((rotation * gaussians.log_scales[part].double().exp()[:, None]).numpy())
+        axes = geo_from_model.scale * geo_from_model.rotation @ axes
+        axes = np.asarray(derivative_at(mean_in_geo[part])).reshape(-1, 3, 3) @ axes
+        cov[part] = axes @ np.swapaxes(axes, 1, 2)
+    metric = np.array([1.0, 1.0, target.height_unit_m / (frame.step_x * target.horizontal_unit_m)])
+    reach = _MOST_REACH * np.sqrt(cov[:, 2, 2])
+    level = float((xyz[:, 2] + reach).max()) + _ABOVE
+    column = (xyz[:, 0] - frame.west) / frame.step_x
+    row = (frame.north - xyz[:, 1]) / frame.step_y
+    splats = PlanSplats(
+        np.column_stack([column, row, level - xyz[:, 2]]),
+        cov,
+        torch.sigmoid(gaussians.logit_opacities.double()).numpy()
+        * _edge_on(cov * np.outer(metric, metric), dilation_cells2(training_px)),
+        _colours_from_above(gaussians, trained),
+    )
+    return splats, level
+
+
+def _derivative(points: FloatArray, target: TargetCrs, frame: RasterFrame) -> RegularGridInterpolator:
+    """Return the derivative (9,) of column, row and depth by a place in `geo`, interpolated between nodes."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    high = np.maximum(high, low + _STEP_M)
+    axes = [np.linspace(a, b, _NODES) for a, b in zip(low, high, strict=True)]
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    ends = [target.xyz_from_geo(nodes + _STEP_M / 2 * sign * axis) for axis in np.eye(3) for sign in (1, -1)]
+    by_geo = np.stack([ends[0] - ends[1], ends[2] - ends[3], ends[4] - ends[5]], axis=-1) / _STEP_M
+    by_geo = by_geo / np.array([frame.step_x, -frame.step_y, -1.0])[:, None]
+    if not np.isfinite(by_geo).all():
+        raise DegenerateGeometryError(f"{target.crs.name} has no derivative over the scene")
+    return RegularGridInterpolator(tuple(axes), by_geo.reshape(*3 * (_NODES,), 9))
+
+
+def _edge_on(cov: FloatArray, dilation: float) -> FloatArray:
+    """Return factors (N,) of the opacity that take from discs seen edge-on the area that dilation gives them.
+
+    A wall is a stack of discs. Each would be widened to a pixel without getting fainter, and a hundred of them
+    would paint the wall pixels wide beside its roof. A disc seen face-on keeps the opacity of the training.
+
+    Args:
+        cov: (N, 3, 3) of columns, rows and depth, all in cells.
+        dilation: variance that rendering adds on the screen, in squared cells.
+    """
+    seen = cov[:, :2, :2]
+    squared = np.linalg.eigvalsh(cov)[:, 1:]
+    face = np.prod(squared / (squared + dilation), axis=1)
+    dilated = (seen[:, 0, 0] + dilation) * (seen[:, 1, 1] + dilation) - seen[:, 0, 1] ** 2
+    area = np.maximum(np.linalg.det(seen), 0.0) / dilated
+    return np.asarray(np.sqrt(np.clip(area / np.maximum(face, 1e-300), 0.0, 1.0)))
+
+
+def _colours_from_above(gaussians: Gaussians, trained: TrainedSurvey) -> FloatArray:
+    """Return colours (N, 3) as the training cameras nearest in plan see the Gaussians, averaged over these cameras.
+
+    Straight down would be a direction from which an oblique flight has never looked: harmonics say nothing there.
+    """
+    geo_from_model = trained.geo_from_model
+    centers_in_model = trained.poses.cam_center_in_model[trained.indices("train")]
+    tree = cKDTree(geo_from_model.apply(centers_in_model)[:, :2])
+    nearest = min(_VIEWS_OF_COLOUR, len(centers_in_model))
+    centers = torch.from_numpy(np.ascontiguousarray(centers_in_model))
+    colours = np.empty((len(gaussians), 3))
+    for start in range(0, len(gaussians), _CHUNK):
+        part = gaussians.select(torch.arange(start, min(start + _CHUNK, len(gaussians))))
+        means = part.means.double()
+        _, camera = tree.query(geo_from_model.apply(means.numpy())[:, :2], k=[*range(1, nearest + 1)])
+        total = torch.zeros(len(part), 3, dtype=torch.float64)
+        for rank in range(nearest):
+            direction = torch.nn.functional.normalize(means - centers[camera[:, rank]], dim=1)
+            values = torch.einsum("nk,nkc->nc", basis(direction, part.sh_degree), part.sh.double())
+            total += (0.5 + values).clamp_min(0.0)
+        colours[start : start + len(part)] = (total / nearest).numpy()
+    return colours

@@ -1,7 +1,4 @@
-"""Cells of one window: colour, height and σ, from the view from above and from what the training views show.
-
-What the rasters are made from, read from the workspace.
-"""
+"""Cells of one window: colour, height and σ, from the view from above and from what the training views show."""
 
 from __future__ import annotations
 
@@ -13,18 +10,15 @@ from scipy.ndimage import binary_closing, binary_opening, uniform_filter
 
 from pipelines.adjust.accuracy_grid import AccuracyGrid
 from pipelines.core.errors import DegenerateGeometryError
-from pipelines.core.types import BoolArray, ByteArray, FloatArray, IntArray
+from pipelines.core.types import BoolArray, ByteArray, FloatArray
 from pipelines.core.workspace import StageRun
-from pipelines.deliver.measurable import predicted_sigma
-from pipelines.deliver.options import ExportRasterOptions
-from pipelines.deliver.raster_plan import GroundSampling, PlanScene, dilation_cells2, samples_per_cell
+from pipelines.deliver.raster_plan import dilation_cells2, plan_splats, samples_per_cell
+from pipelines.deliver.surface import predicted_sigma, surface_views
 from pipelines.formats.geotiff import RasterFrame
 from pipelines.geometry.similarity import Similarity
 from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.rasterizer.backends import rasterizer
-from pipelines.splat.rasterizer.orthographic import PlanView, render_orthographic
-from pipelines.surface.surface_views import ModelRenderer, SurfaceViews
-from pipelines.survey.scene import photographs
+from pipelines.splat.rasterizer.orthographic import PlanSplats, render_orthographic
+from pipelines.surface.surface_views import SurfaceViews
 from pipelines.survey.target_crs import TargetCrs
 from pipelines.survey.trained_survey import TrainedSurvey, scene_points
 
@@ -37,6 +31,9 @@ _OPENED, _CLOSED = 2, 3
 _SIGMA_PX = 0.15  # of a ray through a photograph, in training pixels: by simulated flights
 _NODE_PX = 64  # cells between two nodes at which the georeference's σ is taken
 _NODES = 4  # nodes along each side, at which the way from the CRS to `geo` is fitted
+_LEAST_OPACITY = 1 / 255
+_AROUND = 0.1  # of the scene's extent: Gaussians further outside it, in plan, reach into no cell
+_HAZE_VIEWS = 2  # training views that look through a Gaussian, and none that shows a surface there
 
 
 @dataclass(frozen=True)
@@ -44,26 +41,77 @@ class RasterSource:
     """What the windows of the rasters are made from.
 
     Attributes:
-        scene: Gaussians over the plane.
+        splats, level: Gaussians over the plane, and the height above them that their depths count from.
         views: depth maps of the training views.
-        geo_from_model: similarity.
-        target: the CRS.
         sigma: predicted σ of the georeference over the scene; None: not known.
         training_px: size of a training pixel on the ground, in cells.
-        height_unit_m: unit of the heights.
         training_gsd_m: size of a training pixel on the ground.
         min_views: least number of training views that show a cell's surface.
     """
 
-    scene: PlanScene
+    splats: PlanSplats
+    level: float
     views: SurfaceViews
     geo_from_model: Similarity
     target: TargetCrs
     sigma: AccuracyGrid | None
     training_px: float
-    height_unit_m: float
     training_gsd_m: float
     min_views: int
+
+
+def raster_source(
+    stage: StageRun,
+    trained: TrainedSurvey,
+    target: TargetCrs,
+    frame: RasterFrame,
+    training_gsd_m: float,
+    *,
+    min_views: int,
+) -> tuple[RasterSource, str]:
+    """Return what the windows are made from, and the reason why σ is not known, or an empty text.
+
+    The folder of the stage holds the depth maps until the stage ends.
+
+    Raises:
+        InputError: a photograph cannot be read, or the depth maps do not fit on the disk.
+        DegenerateGeometryError: no Gaussian lies within the scene.
+    """
+    views = surface_views(stage, trained)
+    training_px = training_gsd_m / (frame.step_x * target.horizontal_unit_m)
+    splats, level = plan_splats(_seen_gaussians(trained, views), trained, target, frame, training_px)
+    sigma, no_sigma = predicted_sigma(stage.workspace, trained)
+    source = RasterSource(
+        splats=splats,
+        level=level,
+        views=views,
+        geo_from_model=trained.geo_from_model,
+        target=target,
+        sigma=sigma,
+        training_px=training_px,
+        training_gsd_m=training_gsd_m,
+        min_views=min_views,
+    )
+    return source, no_sigma
+
+
+def _seen_gaussians(trained: TrainedSurvey, views: SurfaceViews) -> Gaussians:
+    """Return the Gaussians that reach into the scene; far ones may lie outside the domain of the CRS.
+
+    Left out are those in the air, through which the training views look at the surface.
+    """
+    points, gaussians = scene_points(trained), trained.gaussians
+    low, high = points.min(axis=0), points.max(axis=0)
+    around = float(np.linalg.norm(high - low)) * np.array([_AROUND, _AROUND, 1.0])  # masts stand above all points
+    in_geo = trained.geo_from_model.apply(gaussians.means.numpy())
+    inside = ((in_geo >= low - around) & (in_geo <= high + around)).all(axis=1)
+    solid = torch.sigmoid(gaussians.logit_opacities) >= _LEAST_OPACITY
+    chosen = gaussians.select(solid & torch.from_numpy(inside))
+    if len(chosen) == 0:
+        raise DegenerateGeometryError("no Gaussian lies within the scene of the SfM points: train again")
+    support = views.support(chosen.means.double().numpy())
+    haze = (support.views == 0) & (support.seen_through >= _HAZE_VIEWS)
+    return chosen.select(torch.from_numpy(~haze))
 
 
 @dataclass(frozen=True)
@@ -93,15 +141,24 @@ def render_window(source: RasterSource, frame: RasterFrame, column: int, row: in
        views from it: their errors correlate, and more views do not make them smaller.
 
     Args:
-        source: the scene.
+        source: what it is made from.
         frame: of the window.
         column, row: of its first cell in the raster.
     """
     inner = samples_per_cell(source.training_px)
-    view = _render(source, frame, column, row, inner)
-    depth = _depth(view, source)
+    view = render_orthographic(
+        source.splats.scaled(float(inner)) if inner > 1 else source.splats,
+        frame.columns * inner,
+        frame.rows * inner,
+        corner=(float(column * inner), float(row * inner)),
+        dilation_px2=dilation_cells2(source.training_px) * inner**2,
+    )
+    # The mean of one surface is less noisy than the median.
+    limit = _ONE_SURFACE_GSD * source.training_gsd_m / source.target.height_unit_m
+    one_surface = (view.depth_variance < limit**2) & (view.median_depth > 0)
+    depth = np.where(one_surface, view.expected_depth, view.median_depth)
     middle = inner // 2
-    height = np.where(view.alpha > _SOLID, source.scene.level - depth, np.nan)[middle::inner, middle::inner]
+    height = np.where(view.alpha > _SOLID, source.level - depth, np.nan)[middle::inner, middle::inner]
     colour, alpha = _reduced(view.colour, inner), _reduced(view.alpha, inner)
     seen, noise_up_m, noise_h_m = _support(source, frame, height)
     height = np.where(seen, height, np.nan)
@@ -114,28 +171,6 @@ def render_window(source: RasterSource, frame: RasterFrame, column: int, row: in
     sigma_h, sigma_v = _georeference_sigma(source, frame, height)
     sigma_h, sigma_v = np.hypot(sigma_h, noise_h_m), np.hypot(sigma_v, noise_up_m)
     return WindowCells(rgba, height, np.where(solid, sigma_h, np.nan), np.where(solid, sigma_v, np.nan))
-
-
-def _render(source: RasterSource, frame: RasterFrame, column: int, row: int, inner: int) -> PlanView:
-    """Return the view with `inner` × `inner` samples a cell, blurred as the training was."""
-    splats = source.scene.splats
-    dilation = dilation_cells2(source.training_px) * inner**2
-    if inner > 1:
-        splats = splats.scaled(float(inner))
-    return render_orthographic(
-        splats,
-        frame.columns * inner,
-        frame.rows * inner,
-        corner=(float(column * inner), float(row * inner)),
-        dilation_px2=dilation,
-    )
-
-
-def _depth(view: PlanView, source: RasterSource) -> FloatArray:
-    """Return the depth of the surface: the mean of one surface is less noisy than the median."""
-    limit = _ONE_SURFACE_GSD * source.training_gsd_m / source.height_unit_m
-    one_surface = view.depth_variance < limit**2
-    return np.where(one_surface & (view.median_depth > 0), view.expected_depth, view.median_depth)
 
 
 def _reduced(values: FloatArray, inner: int) -> FloatArray:
@@ -200,11 +235,6 @@ def _tidied(seen: BoolArray) -> BoolArray:
     return np.asarray(wider[margin:-margin, margin:-margin])
 
 
-def _every(stride: int, size: int) -> IntArray:
-    """Return the middle cell of each run of `stride` cells."""
-    return np.minimum(np.arange(stride // 2, size + stride // 2, stride), size - 1)
-
-
 def _in_geo(source: RasterSource, frame: RasterFrame, cell: FloatArray, height: FloatArray) -> FloatArray:
     """Return places (K, 3) in `geo` of cells (K, 2) and heights (K,), to a fraction of a millimetre.
 
@@ -246,81 +276,3 @@ def _spread(nodes: FloatArray, cells: int) -> FloatArray:
     """Return the weights (cells, nodes) that interpolate linearly from nodes to the middles of cells."""
     middle = np.arange(cells) + 0.5
     return np.stack([np.interp(middle, nodes, unit) for unit in np.eye(len(nodes))], axis=1)
-
-
-_LEAST_OPACITY = 1 / 255
-_AROUND = 0.1  # of the scene's extent: Gaussians further outside it, in plan, reach into no cell
-_HAZE_VIEWS = 2  # training views that look through a Gaussian, and none that shows a surface there
-
-
-@dataclass(frozen=True)
-class Request:
-    """What rasters are wanted of what survey."""
-
-    trained: TrainedSurvey
-    target: TargetCrs
-    frame: RasterFrame
-    sampling: GroundSampling
-    options: ExportRasterOptions
-
-
-def raster_source(stage: StageRun, wanted: Request) -> tuple[RasterSource, str]:
-    """Return what the windows are made from, and the reason why σ is not known, or an empty text.
-
-    Args:
-        stage: the run; its folder holds the depth maps until the stage ends.
-        wanted: the rasters.
-
-    Raises:
-        InputError: a photograph cannot be read, or the depth maps do not fit on the disk.
-        DegenerateGeometryError: no Gaussian lies within the scene.
-    """
-    trained, target, frame = wanted.trained, wanted.target, wanted.frame
-    images = photographs(trained.sfm, trained.survey, stage.workspace, trained.model.max_image_size)
-    images.build(stage.progress)
-    renderer = ModelRenderer(trained, images, rasterizer("auto", stage.progress))
-    views = SurfaceViews(renderer, stage.out / "depth_maps", confirmed=True, progress=stage.progress)
-    training_px = wanted.sampling.training_m / (frame.step_x * target.horizontal_unit_m)
-    gaussians = _within(trained, trained.gaussians)
-    scene = PlanScene(
-        _without_haze(gaussians, views),
-        trained.geo_from_model,
-        target,
-        frame,
-        centers_in_model=trained.poses.cam_center_in_model[trained.indices("train")],
-        training_px=training_px,
-    )
-    sigma, no_sigma = predicted_sigma(stage.workspace, trained)
-    source = RasterSource(
-        scene=scene,
-        views=views,
-        geo_from_model=trained.geo_from_model,
-        target=target,
-        sigma=sigma,
-        training_px=training_px,
-        height_unit_m=target.height_unit_m,
-        training_gsd_m=wanted.sampling.training_m,
-        min_views=wanted.options.min_views,
-    )
-    return source, no_sigma
-
-
-def _within(trained: TrainedSurvey, gaussians: Gaussians) -> Gaussians:
-    """Return the Gaussians that reach into the scene; far ones may lie outside the domain of the CRS."""
-    points = scene_points(trained)
-    low, high = points.min(axis=0), points.max(axis=0)
-    around = float(np.linalg.norm(high - low)) * np.array([_AROUND, _AROUND, 1.0])  # masts stand above all points
-    in_geo = trained.geo_from_model.apply(gaussians.means.numpy())
-    inside = ((in_geo >= low - around) & (in_geo <= high + around)).all(axis=1)
-    solid = torch.sigmoid(gaussians.logit_opacities) >= _LEAST_OPACITY
-    chosen = gaussians.select(solid & torch.from_numpy(inside))
-    if len(chosen) == 0:
-        raise DegenerateGeometryError("no Gaussian lies within the scene of the SfM points: train again")
-    return chosen
-
-
-def _without_haze(gaussians: Gaussians, views: SurfaceViews) -> Gaussians:
-    """Return the Gaussians without those in the air, through which the training views look at the surface."""
-    support = views.support(gaussians.means.double().numpy())
-    haze = (support.views == 0) & (support.seen_through >= _HAZE_VIEWS)
-    return gaussians.select(torch.from_numpy(~haze))

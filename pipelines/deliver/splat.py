@@ -17,7 +17,7 @@ from pipelines.core.stages import BLOCK_RECORD, GAUSSIANS, MODEL
 from pipelines.core.types import BoolArray, Float32Array
 from pipelines.core.workspace import Workspace
 from pipelines.deliver.options import SplatOptions, WebSplatOptions
-from pipelines.deliver.placement import Placement, place
+from pipelines.deliver.placement import Placement, place, vector3
 from pipelines.formats.splat_ply import SplatArrays, read_centres, read_logit_opacities
 from pipelines.splat.gaussians import Gaussians, read_gaussians, transformed
 from pipelines.splat.sh import coefficient_count
@@ -28,54 +28,12 @@ from pipelines.survey.trained_model import TrainedModel
 
 
 @dataclass(frozen=True)
-class SplatFigures:
-    """What every deliverable of the splat tells.
-
-    Attributes:
-        placement: place of its frame on Earth.
-        count: number of the opaque Gaussians.
-        left_out: number of Gaussians that were too transparent.
-    """
-
-    placement: Placement
-    count: int
-    left_out: int
-
-    def values(self) -> dict[str, object]:
-        """Return counts, origin, accuracy and the predicted σ of the georeference."""
-        accuracy, sigma = self.placement.accuracy, self.placement.georeference_sigma
-        return {
-            "gaussians": self.count,
-            "left_out": self.left_out,
-            "origin_lla": tuple(self.placement.origin_lla.tolist()),
-            "stated_accuracy": None if accuracy is None else accuracy.text,
-            "georeference_sigma_h_m": None if sigma is None else sigma.sigma_h_m,
-            "georeference_sigma_v_m": None if sigma is None else sigma.sigma_v_m,
-        }
-
-    def key_figure(self) -> str:
-        """Return the number of Gaussians."""
-        return f"{self.count} Gaussians"
-
-
-@dataclass(frozen=True)
 class PlacedSplat:
-    """Splat in the frame `file` of its placement.
-
-    Attributes:
-        gaussians: in `file`, metres.
-        placement: place of that frame on Earth.
-        left_out: number of Gaussians that were too transparent.
-    """
+    """Splat in the frame `file` of its placement, and the number of Gaussians that were too transparent."""
 
     gaussians: Gaussians
     placement: Placement
     left_out: int
-
-    @property
-    def figures(self) -> SplatFigures:
-        """Counts, origin, accuracy."""
-        return SplatFigures(self.placement, len(self.gaussians), self.left_out)
 
 
 @dataclass(frozen=True)
@@ -83,13 +41,10 @@ class SplatParts:
     """Splat in the frame `file` of its placement, read part by part: each block of a training in blocks is one.
 
     Attributes:
-        path: of the trained Gaussians.
-        rows: of the file, one range for each part.
-        placement: place of the frame on Earth.
+        path, rows: file of the trained Gaussians, and a range of its rows for each part.
         center_in_file: (N, 3) metres, of all opaque Gaussians.
         left_out: number of Gaussians that were too transparent.
         sh_degree: of the harmonics to deliver.
-        options: least opacity.
     """
 
     path: Path
@@ -109,10 +64,20 @@ class SplatParts:
                 kept = gaussians.select(torch.from_numpy(opaque))
                 yield codec_arrays(transformed(kept, self.placement.file_from_model), self.sh_degree)
 
-    @property
-    def figures(self) -> SplatFigures:
-        """Counts, origin, accuracy."""
-        return SplatFigures(self.placement, len(self.center_in_file), self.left_out)
+
+def splat_values(splat: PlacedSplat | SplatParts) -> dict[str, object]:
+    """Return what every deliverable of the splat tells: counts, origin, accuracy, σ of the georeference."""
+    placement = splat.placement
+    count = len(splat.gaussians if isinstance(splat, PlacedSplat) else splat.center_in_file)
+    accuracy, sigma = placement.accuracy, placement.georeference_sigma
+    return {
+        "gaussians": count,
+        "left_out": splat.left_out,
+        "origin_lla": vector3(placement.origin_lla),
+        "stated_accuracy": None if accuracy is None else accuracy.text,
+        "georeference_sigma_h_m": None if sigma is None else sigma.sigma_h_m,
+        "georeference_sigma_v_m": None if sigma is None else sigma.sigma_v_m,
+    }
 
 
 def load_splat(workspace: Workspace, options: SplatOptions) -> PlacedSplat:
@@ -133,9 +98,7 @@ def load_splat_parts(workspace: Workspace, options: WebSplatOptions) -> SplatPar
     """Return the splat of a workspace, placed on Earth, to be read part by part.
 
     Raises:
-        MissingProductError: ingest or train has not been run.
-        InputError: a product is damaged.
-        DegenerateGeometryError: no Gaussian is opaque enough.
+        GeorefError: as `load_splat`.
     """
     survey = load_survey(workspace)
     model = load_json(TrainedModel, workspace.path(MODEL))
@@ -166,17 +129,8 @@ def _rows_of_blocks(workspace: Workspace, count: int) -> tuple[slice, ...]:
     return tuple(slice(first, last) for first, last in itertools.pairwise(ends))
 
 
-def placed_splat(
-    gaussians: Gaussians,
-    placement: Placement,
-    options: SplatOptions,
-) -> PlacedSplat:
-    """Return the opaque ones of Gaussians in an East-North-Up frame at the scene.
-
-    Args:
-        gaussians: to deliver, in the frame `model`.
-        placement: that of the model, whatever part of it is delivered.
-        options: the least opacity.
+def placed_splat(gaussians: Gaussians, placement: Placement, options: SplatOptions) -> PlacedSplat:
+    """Return the opaque ones of Gaussians in `model`, in the frame of the placement.
 
     Raises:
         DegenerateGeometryError: no Gaussian is opaque enough.

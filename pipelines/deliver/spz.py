@@ -9,13 +9,15 @@ east, up and south, so that every reader sees the scene upright. The rotation of
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 from pipelines.core.errors import InputError
 from pipelines.core.stages import SPZ
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import ExportSpzOptions
-from pipelines.deliver.splat import codec_arrays, load_splat
+from pipelines.deliver.splat import codec_arrays, load_splat, splat_values
 from pipelines.formats.georef_sidecar import write_sidecar
 from pipelines.formats.spz import SpzVersion, write_spz
 from pipelines.geometry.similarity import Similarity
@@ -35,13 +37,16 @@ def run(stage: StageRun, options: ExportSpzOptions) -> Summary:
     """
     splat = load_splat(stage.workspace, options)
     upright = transformed(splat.gaussians, Similarity(1.0, ENU_FROM_RUB.T))
-    path = stage.out / SPZ.rpartition("/")[2]
+    path = stage.out / Path(SPZ).name
     version: SpzVersion = 3 if options.spz_version == "3" else 4
     try:
         write_spz(path, codec_arrays(upright, options.sh_degree), version)
     except InputError as error:
         raise InputError(f"{error}: georef export-tiles writes scenes of any size") from error
     write_sidecar(splat.placement.sidecar(ENU_FROM_RUB), path)
-    values = {**splat.figures.values(), "spz_version": version, "bytes": path.stat().st_size}
-    size = f"{path.stat().st_size / 2**20:.1f} MiB"
-    return Summary(f"{splat.figures.key_figure()}, {size}", values, cautions=splat.placement.cautions)
+    size = path.stat().st_size
+    return Summary(
+        f"{len(splat.gaussians)} Gaussians, {size / 2**20:.1f} MiB",
+        {**splat_values(splat), "spz_version": version, "bytes": size},
+        cautions=splat.placement.cautions,
+    )

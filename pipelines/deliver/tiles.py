@@ -10,30 +10,41 @@ All files are in the frame of the placement, East-North-Up; the tileset's root p
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from pipelines.core.errors import InputError
+from pipelines.core.files import file_size, replace_text
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import TILES_GLB
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.deliver.options import ExportTilesOptions
-from pipelines.deliver.splat import SplatParts, load_splat_parts
-from pipelines.deliver.tiles_content import TILESET, content_uri, read_glb, require_space, write_glb, write_tileset
-from pipelines.deliver.tiles_page import ScenePage, ShownScene, scene_page, write_page
+from pipelines.deliver.placement import require_space
+from pipelines.deliver.splat import SplatParts, load_splat_parts, splat_values
+from pipelines.deliver.tiles_page import TILESET, ScenePage, scene_page, write_scene_page
 from pipelines.formats.georef_sidecar import GeorefSidecar, write_sidecar
+from pipelines.formats.gltf import SPLATS, SPZ_IN_GLTF, encode_glb, spz_in_glb
 from pipelines.formats.splat_ply import SplatArrays, concatenated
+from pipelines.formats.spz import FRACTIONAL_BITS, decode_spz, encode_spz
 from pipelines.geodesy.vertical import ELLIPSOIDAL, parse_vertical
 from pipelines.splat.level_of_detail import DetailTile, Tiler, best_cut, build_tiles, scene_box
 from pipelines.splat.sh import coefficient_count
 from pipelines.survey.calibrated import load_survey
 from pipelines.survey.target_crs import target_crs
 
-GLB = TILES_GLB.rpartition("/")[2]
+_REACH_M = 2.0 ** (23 - FRACTIONAL_BITS)
+_COPIES, _BYTES = 3, 17  # bytes of a Gaussian in SPZ before its compression, without harmonics above the constant
+# A viewer draws nothing of a tileset whose own error is below its limit (16 pixels by default): with this factor,
+# the scene is shown until it is a pixel wide.
+_UNSEEN_FACTOR = 16.0
+GLB = Path(TILES_GLB).name
 # CesiumJS refuses to decode more at degree 3 (its decoder has 2 GB of memory).
 _LARGEST_GLB = 3_400_000
 
@@ -48,18 +59,21 @@ def run(stage: StageRun, options: ExportTilesOptions) -> Summary:
     """
     splat = load_splat_parts(stage.workspace, options)
     page = _page(stage.workspace, splat, options)
-    count, sidecar = splat.figures.count, splat.placement.sidecar()
-    require_space(stage.out, count, coefficient_count(splat.sh_degree))
+    count, sidecar = len(splat.center_in_file), splat.placement.sidecar()
+    # Each Gaussian is in a leaf, in splat.glb, and merged in levels.
+    needed_bytes = _COPIES * count * (_BYTES + 3 * coefficient_count(splat.sh_degree))
+    advice = "give a lower --sh-degree or a larger --min-opacity"
+    require_space(stage.out, needed_bytes, f"tiles of {count} Gaussians", advice)
     tiling = Tiling(scene_box(splat.center_in_file), count, options.max_tile_gaussians)
     root = write_tiles(stage.out, splat, tiling, sidecar, stage.progress)
     in_glb = write_whole(stage.out, splat, root, sidecar, count)
     for name in (TILESET, GLB):
         write_sidecar(sidecar, stage.out / name)
-    write_page(page, stage.out)
+    write_scene_page(page, stage.out)
     tiles = list(root.all())
     size = sum(path.stat().st_size for path in stage.out.rglob("*") if path.is_file())
     values = {
-        **splat.figures.values(),
+        **splat_values(splat),
         "tiles": len(tiles),
         "leaves": sum(not tile.children for tile in tiles),
         "coarsest": root.count,
@@ -68,7 +82,7 @@ def run(stage: StageRun, options: ExportTilesOptions) -> Summary:
     }
     merged = (f"{GLB} holds {in_glb} merged Gaussians: viewers cannot load all {count} from one file",)
     return Summary(
-        f"{splat.figures.key_figure()}, {len(tiles)} tiles, {size / 2**20:.0f} MiB",
+        f"{count} Gaussians, {len(tiles)} tiles, {size / 2**20:.0f} MiB",
         values,
         warnings=merged if in_glb < count else (),
         cautions=splat.placement.cautions,
@@ -87,28 +101,23 @@ def _page(workspace: Workspace, splat: SplatParts, options: ExportTilesOptions) 
         without_grid = options.model_copy(update={"vertical": parse_vertical(ELLIPSOIDAL)})
         target = target_crs(without_grid, survey.origin, middle_in_geo, survey.vertical)
         target = replace(target, assumed=(*target.assumed, f"heights are ellipsoidal, because {error}"))
-    scene = ShownScene(workspace.root.resolve().name, splat.placement, splat.center_in_file)
-    return scene_page(scene, survey, target, options.cesium)
+    return scene_page(
+        workspace.root.resolve().name,
+        splat.placement,
+        splat.center_in_file,
+        survey=survey,
+        target=target,
+        cesium=options.cesium,
+    )
 
 
 @dataclass(frozen=True)
 class Tiling:
-    """Division of a splat into tiles.
-
-    Attributes:
-        extent: (2, 3) box of the scene.
-        count: number of all Gaussians.
-        largest_tile: largest number of Gaussians in a tile.
-    """
+    """Division of a splat into tiles: box (2, 3) of the scene, numbers of all Gaussians and of a tile's at most."""
 
     extent: FloatArray
     count: int
     largest_tile: int = 200_000
-
-    @staticmethod
-    def of(splat: SplatArrays) -> Tiling:
-        """Return the division of a splat that is one part."""
-        return Tiling(scene_box(splat.means), len(splat))
 
 
 def write_tiles(
@@ -121,7 +130,7 @@ def write_tiles(
         parts: at least one Gaussian each, in the frame of the sidecar; one after another is in memory.
         tiling: of all parts together.
         sidecar: place of the frame on Earth.
-        progress: shows how many of the Gaussians are in tiles.
+        progress: counts the Gaussians in leaves.
 
     Raises:
         OSError: a file cannot be written.
@@ -129,11 +138,12 @@ def write_tiles(
     with progress.task("tiles", total=tiling.count) as task:
 
         def write(name: str, content: SplatArrays, *, is_leaf: bool) -> None:
-            write_glb(folder / content_uri(name), content)
+            write_glb(folder / _content_uri(name), content)
             task.advance(len(content) if is_leaf else 0, note=f"tile {name}")
 
         root = build_tiles(parts, tiling.extent, Tiler(tiling.largest_tile, write))
-    write_tileset(folder, root, sidecar)
+    text = json.dumps(_tileset(root, sidecar), separators=(",", ":"), ensure_ascii=False)
+    replace_text(folder / TILESET, text + "\n")
     return root
 
 
@@ -148,18 +158,73 @@ def write_whole(
 ) -> int:
     """Write the whole splat as one glb, and return the number of its Gaussians.
 
-    A splat of more Gaussians than a viewer can load is shown by the most detailed tiles that it can.
-
-    Args:
-        folder: holds the contents of the tiles.
-        parts: of the Gaussians.
-        root: of their tiles.
-        sidecar: place of the frame on Earth; it is in `asset.extras`, too.
-        count: number of all Gaussians.
-        most: largest number of Gaussians.
+    A splat of more than `most` Gaussians, which viewers cannot load, is shown by the most detailed tiles that they
+    can. The folder holds the tiles' contents.
     """
     if count > most:
-        parts = [read_glb(folder / content_uri(tile.name)) for tile in best_cut(root, most)]
+        parts = [read_glb(folder / _content_uri(tile.name)) for tile in best_cut(root, most)]
     splat = concatenated(list(parts))
     write_glb(folder / GLB, splat, {"georef": sidecar.model_dump(mode="json", by_alias=True)})
     return len(splat)
+
+
+def write_glb(path: Path, splat: SplatArrays, extras: dict[str, Any] | None = None) -> None:
+    """Write Gaussians of an East-North-Up frame as a glb.
+
+    A scene that reaches further than ±2048 m gets coarser steps of position: 0.24 mm up to ±4096 m, and so on.
+
+    Args:
+        path: of the glb.
+        splat: N ≥ 1 Gaussians.
+        extras: for `asset.extras`.
+
+    Raises:
+        InputError: values that are not finite.
+        OSError: the file cannot be written.
+    """
+    furthest = float(np.abs(splat.means).max())
+    coarser = max(0, math.ceil(math.log2((furthest + 1) / _REACH_M))) if math.isfinite(furthest) else 0
+    spz = encode_spz(splat, 3, FRACTIONAL_BITS - coarser)
+    low, high = splat.means.min(axis=0).tolist(), splat.means.max(axis=0).tolist()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(encode_glb(spz, len(splat), math.isqrt(splat.sh.shape[1]) - 1, (low, high), extras))
+
+
+def read_glb(path: Path) -> SplatArrays:
+    """Return the Gaussians of a glb that `write_glb` wrote.
+
+    Raises:
+        InputError: the file cannot be read, or is damaged.
+    """
+    file_size(path)
+    return decode_spz(spz_in_glb(path.read_bytes()), path)
+
+
+def _tileset(root: DetailTile, sidecar: GeorefSidecar) -> dict[str, Any]:
+    """Return the content of `tileset.json`. Only the root has a transform: that of the frame to EPSG:4978."""
+    in_contents = [SPLATS, SPZ_IN_GLTF]
+    diagonal = float(np.linalg.norm(root.bounds[1] - root.bounds[0]))
+    return {
+        "asset": {"version": "1.1", "extras": {"georef": sidecar.model_dump(mode="json", by_alias=True)}},
+        "extensionsUsed": ["3DTILES_content_gltf"],
+        "extensions": {"3DTILES_content_gltf": {"extensionsUsed": in_contents, "extensionsRequired": in_contents}},
+        "geometricError": max(_UNSEEN_FACTOR * diagonal, 2 * root.error_m),
+        "root": {"transform": sidecar.ecef_from_file().matrix().T.ravel().tolist(), **_tile(root)},
+    }
+
+
+def _content_uri(name: str) -> str:
+    return f"content/{name}.glb"
+
+
+def _tile(tile: DetailTile) -> dict[str, Any]:
+    middle, half = tile.bounds.mean(axis=0), (tile.bounds[1] - tile.bounds[0]) / 2
+    document: dict[str, Any] = {
+        "boundingVolume": {"box": [*middle.tolist(), *np.diag(half).ravel().tolist()]},
+        "geometricError": tile.error_m,
+        "refine": "REPLACE",
+        "content": {"uri": _content_uri(tile.name)},
+    }
+    if tile.children:
+        document["children"] = [_tile(child) for child in tile.children]
+    return document

@@ -10,27 +10,38 @@ from __future__ import annotations
 import base64
 import hashlib
 import html
+import itertools
 import re
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Literal
 from urllib.parse import quote, urlsplit
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import AfterValidator, Field
 
 from pipelines.core.files import replace_file
 from pipelines.core.products import Product
 from pipelines.core.sentences import printable
-from pipelines.core.types import Float32Array, Vector3
-from pipelines.deliver.placement import Placement
-from pipelines.deliver.tiles_content import TILESET, LocalCrs, fit_local_crs
-from pipelines.geodesy.enu import ecef_from_enu
+from pipelines.core.stages import TILES
+from pipelines.core.types import Float32Array, FloatArray, Vector3
+from pipelines.deliver.placement import Placement, vector3
+from pipelines.geodesy.crs import PointCrs
+from pipelines.geodesy.enu import (
+    SEMI_MAJOR_M,
+    Origin,
+    ecef_from_enu,
+    ecef_from_enu_rotation,
+    ecef_from_lla,
+    lla_from_ecef,
+)
+from pipelines.geodesy.vertical import ELLIPSOIDAL
 from pipelines.survey.survey import Survey, SurveyedPoint
 from pipelines.survey.target_crs import TargetCrs
 
-PAGE = "index.html"
+PAGE, TILESET = "index.html", Path(TILES).name
 _PLACEHOLDER, _POLICY = '{"to be filled": "page.py"}', "to be filled: page.py"
 _SCRIPT = re.compile(r"<script>(.*?)</script>", re.DOTALL)
 # The first view shows these of the Gaussians: single ones of the sky or of a far background lie kilometres away.
@@ -39,7 +50,12 @@ _LEAST_RADIUS_M = 1.0
 _CRS_BOX = 4.0  # of the radius, to each side: cameras of the usual views lie inside
 _LEAST_CRS_BOX_M = 300.0
 _MOST_CRS_BOX_M = 10_000.0
-
+# Polynomials of the coordinates of a CRS.
+_DEGREE = 3
+_EXPONENTS = tuple(powers for powers in itertools.product(range(_DEGREE + 1), repeat=3) if sum(powers) <= _DEGREE)
+_NODES = 7  # of each axis: more than the polynomial has coefficients along it
+_MOST_DECIMALS = 3
+_SHORT_UNIT = {"metre": "m", "degree": "°"}
 
 # Names come from files of other people: control characters are shown, and none turns the direction of writing.
 ShownText = Annotated[str, AfterValidator(printable)]
@@ -60,18 +76,43 @@ class PagePoint(Product):
     ecef: Vector3
 
 
+class Axis(Product):
+    """Axis of a CRS: its short name, its unit, and the decimals of which the polynomial is sure."""
+
+    name: str
+    unit: str
+    decimals: int
+
+
+class LocalCrs(Product):
+    """Polynomials of the coordinates of a CRS, in a box around a scene.
+
+    A coordinate is Σ coefficient · (e / a)^i (n / b)^j (u / c)^k; e, n, u are East-North-Up metres at the scene.
+
+    Attributes:
+        axes: of the coordinates, easting or longitude first.
+        half_extent_m: (a, b, c), half of the box's sides; the polynomials are not to be used outside.
+        exponents: (i, j, k) of each coefficient.
+        coefficients: of the three axes, for each row of exponents.
+        error_m: largest departure from the CRS that was found in the box.
+    """
+
+    axes: tuple[Axis, Axis, Axis]
+    half_extent_m: Vector3
+    exponents: tuple[tuple[int, int, int], ...]
+    coefficients: tuple[Vector3, ...]
+    error_m: float
+
+
 class ScenePage(Product):
     """Content of the page.
 
     Attributes:
-        title: name of the scene.
         tileset: address of the tileset, relative to the page.
         cesium: address of the folder of CesiumJS, relative to the page or absolute; ends in a slash.
         origin_lla: latitude, longitude in degrees, ellipsoidal height: middle of the scene.
         radius_m: of the scene, for the first view.
         facts: what the reader must know of the coordinates.
-        cautions: limits of the model, one sentence each.
-        points: surveyed points to label.
         crs: coordinates to show beside longitude, latitude and ellipsoidal height; None: no others.
     """
 
@@ -86,55 +127,48 @@ class ScenePage(Product):
     crs: LocalCrs | None = None
 
 
-@dataclass(frozen=True)
-class ShownScene:
-    """Scene to show.
-
-    Attributes:
-        title: name of the scene.
-        placement: place on Earth of its frame `file`.
-        center_in_file: (N, 3) centres of its Gaussians, metres.
-    """
-
-    title: str
-    placement: Placement
-    center_in_file: Float32Array
-
-
-def scene_page(scene: ShownScene, survey: Survey, target: TargetCrs, cesium: str) -> ScenePage:
+def scene_page(
+    title: str,
+    placement: Placement,
+    center_in_file: Float32Array,
+    *,
+    survey: Survey,
+    target: TargetCrs,
+    cesium: str,
+) -> ScenePage:
     """Return the content of the page of a splat.
 
     Args:
-        scene: the splat.
+        title: name of the scene.
+        placement: of its frame `file`.
+        center_in_file: (N, 3) centres of its Gaussians, metres.
         survey: has the control and check points.
         target: CRS in which coordinates are shown.
-        cesium: address of the folder of CesiumJS.
+        cesium: folder of CesiumJS.
 
     Raises:
         InputError: the scene is outside the domain of the CRS, or a grid is missing.
     """
-    placement = scene.placement
-    distance_m = np.linalg.norm(scene.center_in_file, axis=1)
+    distance_m = np.linalg.norm(center_in_file, axis=1)
     radius = max(float(np.quantile(distance_m, _SHOWN)), _LEAST_RADIUS_M)
     box = float(np.clip(_CRS_BOX * radius, _LEAST_CRS_BOX_M, _MOST_CRS_BOX_M))
-    lat, lon, height = placement.origin_lla.tolist()
     return ScenePage(
-        title=scene.title,
+        title=title,
         tileset=TILESET,
         cesium=cesium,
-        origin_lla=(lat, lon, height),
+        origin_lla=vector3(placement.origin_lla),
         radius_m=radius,
         facts=_facts(placement, target),
         cautions=tuple(caution.sentence for caution in placement.cautions),
         points=(
-            *(_page_point(point, "control", survey) for point in survey.control_points),
-            *(_page_point(point, "check", survey) for point in survey.check_points),
+            *_points("control", survey.control_points, survey.origin),
+            *_points("check", survey.check_points, survey.origin),
         ),
         crs=fit_local_crs(target.crs, placement.origin_lla, (box, box, box)),
     )
 
 
-def write_page(page: ScenePage, folder: Path) -> None:
+def write_scene_page(page: ScenePage, folder: Path) -> None:
     """Write the page into a folder; the file appears whole or not at all.
 
     Raises:
@@ -143,7 +177,9 @@ def write_page(page: ScenePage, folder: Path) -> None:
     program = resources.files(__package__).joinpath("templates", "tiles.html").read_text(encoding="utf-8")
     draft = folder / f"{PAGE}.tmp"
     program = program.replace(_POLICY, html.escape(_policy(program, page.cesium)), 1)
-    draft.write_text(program.replace(_PLACEHOLDER, _script_json(page), 1), encoding="utf-8")
+    # No name in the JSON can break out of an HTML script element: `<` only occurs escaped.
+    scene = re.sub("[<>&\u2028\u2029]", lambda found: f"\\u{ord(found[0]):04x}", page.model_dump_json())
+    draft.write_text(program.replace(_PLACEHOLDER, scene, 1), encoding="utf-8")
     replace_file(draft, folder / PAGE)
 
 
@@ -172,14 +208,12 @@ def _policy(program: str, cesium: str) -> str:
     )
 
 
-def _script_json(page: ScenePage) -> str:
-    """Return JSON that no name in it can break out of an HTML script element: `<` only occurs escaped."""
-    return re.sub("[<>&\u2028\u2029]", lambda found: f"\\u{ord(found[0]):04x}", page.model_dump_json())
-
-
-def _page_point(point: SurveyedPoint, kind: Literal["control", "check"], survey: Survey) -> PagePoint:
-    x, y, z = ecef_from_enu(point.position_in_geo, survey.origin).tolist()
-    return PagePoint(name=point.name, kind=kind, ecef=(x, y, z))
+def _points(
+    kind: Literal["control", "check"], points: Sequence[SurveyedPoint], origin: Origin
+) -> Iterator[PagePoint]:
+    for point in points:
+        ecef = ecef_from_enu(point.position_in_geo, origin)
+        yield PagePoint(name=point.name, kind=kind, ecef=vector3(ecef))
 
 
 def _facts(placement: Placement, target: TargetCrs) -> tuple[Fact, ...]:
@@ -194,3 +228,58 @@ def _facts(placement: Placement, target: TargetCrs) -> tuple[Fact, ...]:
         Fact(name="Accuracy", value=accuracy),
     )
     return facts + tuple(Fact(name="Assumed", value=sentence) for sentence in target.assumed)
+
+
+def fit_local_crs(crs: PointCrs, origin_lla: ArrayLike, half_extent_m: Vector3) -> LocalCrs:
+    """Return the polynomials of a CRS in a box around a place.
+
+    Args:
+        crs: to be shown.
+        origin_lla: (3,) latitude, longitude in degrees, ellipsoidal height: middle of the box.
+        half_extent_m: half of its sides east, north and up.
+
+    Raises:
+        InputError: the box leaves the domain of the CRS, or a grid is missing.
+    """
+    chebyshev = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
+    between = np.linspace(-1.0, 1.0, _NODES + 1)
+    nodes, checks = (
+        np.stack(np.meshgrid(along, along, along, indexing="ij"), axis=-1).reshape(-1, 3)
+        for along in (chebyshev, between)
+    )
+    plan_m = crs.horizontal_unit * (SEMI_MAJOR_M if crs.is_geographic else 1.0)
+    unit_m = np.array([plan_m, plan_m, crs.height_unit_m])
+    values = _coordinates(crs, origin_lla, np.vstack([nodes, checks]) * half_extent_m)
+    solved = np.linalg.lstsq(_powers(nodes), values[: len(nodes)], rcond=None)[0]
+    errors = np.abs(_powers(checks) @ solved - values[len(nodes) :]).max(axis=0)
+    decimals = np.clip(np.floor(-np.log10(2 * errors + 1e-12)), 0, _MOST_DECIMALS + np.round(np.log10(unit_m)))
+    axes = [
+        Axis(name=name, unit=_SHORT_UNIT.get(unit, unit), decimals=int(count))
+        for name, unit, count in zip(_axis_names(crs), crs.units, decimals, strict=True)
+    ]
+    return LocalCrs(
+        axes=(axes[0], axes[1], axes[2]),
+        half_extent_m=half_extent_m,
+        exponents=tuple((i, j, k) for i, j, k in _EXPONENTS),
+        coefficients=tuple((x, y, z) for x, y, z in solved.tolist()),
+        error_m=float((errors * unit_m).max()),
+    )
+
+
+def _powers(unit: FloatArray) -> FloatArray:
+    return np.stack([np.prod(unit ** np.array(powers), axis=1) for powers in _EXPONENTS], axis=1)
+
+
+def _coordinates(crs: PointCrs, origin_lla: ArrayLike, enu: FloatArray) -> FloatArray:
+    lla = lla_from_ecef(ecef_from_lla(origin_lla) + enu @ ecef_from_enu_rotation(origin_lla).T)
+    xyz = crs.serving(lla).xyz_from_lla(lla)
+    if crs.is_geographic:  # a polynomial cannot jump at the date line
+        xyz[:, 0] -= 360.0 * np.round((xyz[:, 0] - xyz[0, 0]) / 360.0)
+    return xyz
+
+
+def _axis_names(crs: PointCrs) -> tuple[str, str, str]:
+    if crs.is_geocentric:
+        return "X", "Y", "Z"
+    height = "h" if crs.vertical.name == ELLIPSOIDAL else "H"
+    return ("lon", "lat", height) if crs.is_geographic else ("E", "N", height)

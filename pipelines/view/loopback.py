@@ -5,10 +5,8 @@ browser could speak with it as well, unless its Origin is looked at, and could p
 that resolves to 127.0.0.1, unless Host is looked at. Another program of this machine could send both, and lacks the
 key that is the path of the address; viser's page hands it on to its websocket. viser looks at none of the three.
 
-Messages that a page may send: their form, and the connection that lets no other through.
-
-viser sets any property of an element that a message names, and casts what does not fit. A forged message could so
-remove an element or its callback for all pages, or leave a traceback a message.
+viser also sets any property of an element that a message names, and casts what does not fit. A forged message could
+so remove an element or its callback for all pages, or leave a traceback a message. Known messages alone pass.
 """
 
 from __future__ import annotations
@@ -38,6 +36,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+HOST = "127.0.0.1"
+_FOREIGN = "georef.invalid"
+_TIMEOUT_S = 5.0
 MOST_BYTES = 1 << 16  # of a message; the longest text of an element takes two thirds of it
 _MOST_CHARACTERS = 10_000
 _SHOWN_CHARACTERS = 120
@@ -100,13 +101,17 @@ class RefusedError(Exception):
         super().__init__(reason)
 
 
-def check_message(raw: object, elements: Mapping[str, Any], commands: Mapping[str, Any]) -> None:
-    """Check a message of a page.
+@dataclass
+class Doorkeeper:
+    """What the server admits: addresses that begin with the key, values of viser's elements and commands, by id."""
 
-    Args:
-        raw: the message as it arrived.
-        elements: handles of viser's elements with a value, by id.
-        commands: handles of the keyboard's commands, by id.
+    key: str = field(default_factory=lambda: secrets.token_urlsafe(16), repr=False)
+    elements: Mapping[str, Any] = field(default_factory=dict)
+    commands: Mapping[str, Any] = field(default_factory=dict)
+
+
+def check_message(raw: object, keeper: Doorkeeper) -> None:
+    """Check a message as a page sent it.
 
     Raises:
         RefusedError: the page may not send it.
@@ -122,12 +127,12 @@ def check_message(raw: object, elements: Mapping[str, Any], commands: Mapping[st
             if not 0.5 < math.hypot(*direction) < 2.0:  # of length one but for rounding
                 raise RefusedError("direction", f"{direction} is no direction")
         case _Update(uuid=uuid, updates=updates):
-            if uuid not in elements:
+            if uuid not in keeper.elements:
                 raise RefusedError("element", f"there is no element {uuid!r}")
-            if not _takes(elements[uuid], updates.value):
-                raise RefusedError("value", f"{updates.value!r} is no value of {elements[uuid].label!r}")
+            if not _takes(keeper.elements[uuid], updates.value):
+                raise RefusedError("value", f"{updates.value!r} is no value of {keeper.elements[uuid].label!r}")
         case _Command(uuid=uuid):
-            if uuid not in commands:
+            if uuid not in keeper.commands:
                 raise RefusedError("element", f"there is no command {uuid!r}")
 
 
@@ -150,18 +155,10 @@ def _takes(element: Any, value: bool | float | str) -> bool:
 
 
 class CheckedConnection:
-    """Connection of a page that viser reads from: refused messages never reach it.
+    """Connection of a page that viser reads from: refused messages never reach it."""
 
-    Args:
-        connection: of the page.
-        elements: handles of viser's elements with a value, by id.
-        commands: handles of the keyboard's commands, by id.
-    """
-
-    def __init__(
-        self, connection: ServerConnection, elements: Mapping[str, Any], commands: Mapping[str, Any]
-    ) -> None:
-        self._connection, self._elements, self._commands = connection, elements, commands
+    def __init__(self, connection: ServerConnection, keeper: Doorkeeper) -> None:
+        self._connection, self._keeper = connection, keeper
         self._told: set[str] = set()
 
     def __getattr__(self, name: str) -> Any:
@@ -172,7 +169,7 @@ class CheckedConnection:
         while True:
             try:
                 raw = await self._connection.recv()
-                check_message(raw, self._elements, self._commands)
+                check_message(raw, self._keeper)
             except RefusedError as error:
                 self._tell(error)
             except ConnectionClosedError as error:
@@ -190,40 +187,8 @@ class CheckedConnection:
             log.warning("a message of a page is refused: %s (more of this kind are not logged)", reason)
 
 
-HOST = "127.0.0.1"
-_FOREIGN = "georef.invalid"
-_TIMEOUT_S = 5.0
-
-
-@dataclass
-class Doorkeeper:
-    """Whom the server answers, and what it hears from them.
-
-    Attributes:
-        key: first part of the path of every address.
-        elements: handles of viser's elements with a value, by id.
-        commands: handles of the keyboard's commands, by id.
-    """
-
-    key: str = field(default_factory=lambda: secrets.token_urlsafe(16), repr=False)
-    elements: Mapping[str, Any] = field(default_factory=dict)
-    commands: Mapping[str, Any] = field(default_factory=dict)
-
-    def path_of(self, request: Any, port: int) -> str | None:
-        """Return the path of a request behind the key; None: the server must not answer it."""
-        bare = request.path.partition("?")[0]
-        given, _, path = bare.removeprefix("/").partition("/")
-        has_key = hmac.compare_digest(given.encode(errors="replace"), self.key.encode())
-        return f"/{path}" if has_key and _is_from_here(request.headers, port) else None
-
-
 def start_server(port: int, title: str, *, dark: bool = False) -> tuple[viser.ViserServer, str]:
     """Start a server on loopback, at a port or, if that is taken, the next free one; return it with its address.
-
-    Args:
-        port: the wanted port.
-        title: of the page.
-        dark: whether its panel is light on dark.
 
     Raises:
         BackendUnavailableError: viser is not installed.
@@ -279,14 +244,15 @@ def _checked_connections(keeper: Doorkeeper) -> Iterator[None]:
     @functools.wraps(original)
     def serve(handler: Any, host: str, port: int, *, process_request: Any, **settings: Any) -> Any:
         def admitted(connection: Any, request: Any) -> Any:
-            path = keeper.path_of(request, port)
-            if path is None:
-                return connection.respond(HTTPStatus.FORBIDDEN, "open the address that georef view printed\n")
-            return process_request(connection, replace(request, path=path))
+            given, _, path = request.path.partition("?")[0].removeprefix("/").partition("/")
+            has_key = hmac.compare_digest(given.encode(errors="replace"), keeper.key.encode())
+            if has_key and _is_from_here(request.headers, port):
+                return process_request(connection, replace(request, path=f"/{path}"))
+            return connection.respond(HTTPStatus.FORBIDDEN, "open the address that georef view printed\n")
 
         async def heard(connection: Any) -> None:
             if connection.subprotocol == protocol:  # viser prints a line about every other one
-                await handler(CheckedConnection(connection, keeper.elements, keeper.commands))
+                await handler(CheckedConnection(connection, keeper))
 
         limited = {**settings, "max_size": MOST_BYTES}
         return original(heard, host, port, process_request=admitted, **limited)
@@ -313,9 +279,8 @@ def _refuses_strangers(port: int, key: str) -> bool:
         (page, {"Host": own, "Origin": f"http://{_FOREIGN}"}),
         ("/", {"Host": own}),
     )
-    return all(_status(port, path, headers) == HTTPStatus.FORBIDDEN for path, headers in strangers) and (
-        _status(port, page, {"Host": own}) == HTTPStatus.OK
-    )
+    refused = all(_status(port, path, headers) == HTTPStatus.FORBIDDEN for path, headers in strangers)
+    return refused and _status(port, page, {"Host": own}) == HTTPStatus.OK
 
 
 def _status(port: int, path: str, headers: dict[str, str]) -> int:

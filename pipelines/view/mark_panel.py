@@ -1,7 +1,4 @@
-"""Panel of the viewer in which points are marked in photographs, and the marks written for `--gcp`.
-
-Base of the viewer's panels: buttons, one place for results, and one for what failed.
-"""
+"""Panel of the viewer in which points are marked in photographs, and the marks written for `--gcp`."""
 
 from __future__ import annotations
 
@@ -21,10 +18,13 @@ from pipelines.view.marking import KeptMarks, MarkedPoint, appears_in, points_to
 from pipelines.view.measuring import MeasuringModel
 from pipelines.view.photo_view import PhotoView
 from pipelines.view.saved import PlaceRow, failure, mark_table, paragraph, place_table
-from pipelines.view.signs import Signs
 
 if TYPE_CHECKING:
     import viser
+
+
+_NONE = "—"
+_NO_POINT = "Make a point first: its name, and its coordinates if it was surveyed."
 
 
 class Panel:
@@ -52,24 +52,11 @@ class Panel:
         self._result.content = paragraph(sentence)
 
 
-_NONE = "—"
-
-
 class MarkPanel(Panel):
-    """Panel of the marks.
+    """Panel of the marks, whose files lie in a folder."""
 
-    Args:
-        server: of the viewer.
-        model: to measure in.
-        signs: of the scene.
-        photo: shows photographs in the page.
-        folder: for the files of marks.
-    """
-
-    def __init__(
-        self, server: viser.ViserServer, model: MeasuringModel, signs: Signs, photo: PhotoView, folder: Path
-    ) -> None:
-        self._model, self._signs, self._photo = model, signs, photo
+    def __init__(self, server: viser.ViserServer, model: MeasuringModel, photo: PhotoView, folder: Path) -> None:
+        self._model, self._photo = model, photo
         survey, crs = model.trained.survey, model.target.crs
         self.names = model.trained.sparse.image_name
         self._kept = KeptMarks(folder, points_to_mark(survey, self._xyz), crs.lla_from_xyz, crs.xyz_from_lla)
@@ -119,7 +106,7 @@ class MarkPanel(Panel):
         with self._lock:
             point = self.point
             if point is None:
-                self._tell("Make a point first: its name, and its coordinates if it was surveyed.")
+                self._tell(_NO_POINT)
                 return
             place = self._expected(point)
             shown = [camera for camera, _ in appears_in(place, self._model.trained)] if place is not None else []
@@ -130,16 +117,11 @@ class MarkPanel(Panel):
             self._show()
 
     def add(self, camera: int, direction_in_cam: FloatArray) -> None:
-        """Mark the chosen point where a line of sight leaves a camera; a failure is told.
-
-        Args:
-            camera: whose photograph is shown.
-            direction_in_cam: (3,) in the camera.
-        """
+        """Mark the chosen point where a line of sight (3,) leaves the camera that is shown; a failure is told."""
         with self._lock:
             point = self.point
             if point is None:
-                self._tell("Make a point first: its name, and its coordinates if it was surveyed.")
+                self._tell(_NO_POINT)
                 return
             lens = self._model.trained.sparse.camera_of(camera)
             x_px, y_px = distort(lens, direction_in_cam[:2] / direction_in_cam[2]).tolist()
@@ -182,7 +164,7 @@ class MarkPanel(Panel):
             GeorefError: the change could not be kept, and why.
         """
         with self._lock:
-            step = self._kept.undo()
+            step = self._kept.history.undo()
             self._show_points(note=f"Undone: {step}." if step else "Nothing to undo.")
 
     def _show_points(self, name: str | None = None, note: str = "") -> None:
@@ -248,17 +230,14 @@ class MarkPanel(Panel):
                 rows.append(PlaceRow("triangulated", place, None if cov is None else np.sqrt(np.diag(cov))))
                 errors = residuals_px(place, rays, self._model.trained)
                 residuals = {self.names[camera]: error for camera, error in zip(rays.camera, errors, strict=True)}
-            shown = "".join(map(paragraph, self._state(note)))
+            lines = [note] if note else []
+            if self._photo.camera is not None:
+                lines.append(f"Shown: {self.names[self._photo.camera]}")
+            if not self._kept.is_written:
+                lines.append("Changes of marks are kept; gcp_list.txt is not written yet.")
+            shown = "".join(map(paragraph, lines))
             places = place_table(self._model.target, rows, marked="marked") if rows else ""
             self._result.content = shown + places + mark_table(point.marks, residuals)
-
-    def _state(self, note: str) -> list[str]:
-        camera = self._photo.camera
-        return [
-            *([note] if note else []),
-            *([] if camera is None else [f"Shown: {self.names[camera]}"]),
-            *([] if self._kept.is_written else ["Changes of marks are kept; gcp_list.txt is not written yet."]),
-        ]
 
     def _crosses(self, point: MarkedPoint | None) -> tuple[FloatArray | None, FloatArray | None, list[FloatArray]]:
         """Return, in the shown camera: the direction of the mark, that of the expected place, and epipolar lines.

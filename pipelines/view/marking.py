@@ -1,9 +1,8 @@
 """Marking of points in photographs: where a point must appear, what its marks give, and the files for `--gcp`.
 
-Marks kept on disk as they are set: what the viewers of a workspace change in the marks of its survey.
-
-The file has one record for each changed mark and point. A record that the survey has taken over, because what was
-written was ingested, is dropped; until then it stays, so that no viewer writes marks without those of another.
+Marks are kept on disk as they are set. The file has one record for each changed mark and point. A record that the
+survey has taken over, because what was written was ingested, is dropped; until then it stays, so that no viewer
+writes marks without those of another.
 """
 
 from __future__ import annotations
@@ -26,9 +25,11 @@ from pipelines.survey.survey import Mark, Survey, SurveyedPoint
 from pipelines.survey.trained_survey import TrainedSurvey
 from pipelines.view.saved import History, changing
 
-CONTROL, CHECK = "gcp_list.txt", "checkpoints.txt"
+CONTROL, CHECK, MARKS = "gcp_list.txt", "checkpoints.txt", "marks.json"
 SIGMA_PX = 0.5  # of a mark that somebody sets with care; the survey's own marks keep theirs
-_UNKNOWN = np.full(3, np.nan)
+_SAME_PX = 1e-3  # files of marks have three decimals
+_SAME_LLA = (1e-8, 1e-8, 1e-3)  # degrees, degrees, metres: a millimetre
+_IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 @dataclass(frozen=True)
@@ -36,9 +37,7 @@ class MarkedPoint:
     """Point with its marks.
 
     Attributes:
-        name: of the point.
         xyz: surveyed coordinates in the CRS; None: not surveyed.
-        is_check: whether it is a check point.
         marks: place in pixels of the full image, by image.
     """
 
@@ -60,26 +59,13 @@ def points_to_mark(survey: Survey, xyz_of: Callable[[tuple[SurveyedPoint, ...]],
         survey: has the points.
         xyz_of: returns the coordinates (J, 3) of J points in the CRS.
     """
-    control, check = (
-        (*points, *(point for point in survey.unmarked_points if point.use == use))
-        for use, points in (("control", survey.control_points), ("check", survey.check_points))
-    )
-    return [
-        *_marked(control, xyz_of(control), is_check=False),
-        *_marked(check, xyz_of(check), is_check=True),
-    ]
-
-
-def _marked(points: Sequence[SurveyedPoint], xyz: FloatArray, *, is_check: bool) -> list[MarkedPoint]:
-    return [
-        MarkedPoint(
-            point.name,
-            (float(row[0]), float(row[1]), float(row[2])),
-            is_check,
-            {mark.image: (mark.x_px, mark.y_px) for mark in point.marks},
-        )
-        for point, row in zip(points, xyz, strict=True)
-    ]
+    to_mark = []
+    for use, marked in (("control", survey.control_points), ("check", survey.check_points)):
+        points = (*marked, *(point for point in survey.unmarked_points if point.use == use))
+        for point, (x, y, z) in zip(points, xyz_of(points).tolist(), strict=True):
+            marks = {mark.image: (mark.x_px, mark.y_px) for mark in point.marks}
+            to_mark.append(MarkedPoint(point.name, (x, y, z), use == "check", marks))
+    return to_mark
 
 
 def rays_of(point: MarkedPoint, trained: TrainedSurvey) -> MarkRays:
@@ -137,65 +123,32 @@ def mark_texts(crs: str, points: Sequence[MarkedPoint]) -> dict[str, str]:
     return texts
 
 
-_IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-
-
-MARKS = "marks.json"
-_SAME_PX = 1e-3  # files of marks have three decimals
-_SAME_LLA = (1e-8, 1e-8, 1e-3)  # degrees, degrees, metres: a millimetre
-
-Name = str
-Key = tuple[Name, ImageName | None]
-
-
 class KeptPoint(Product):
-    """Changed point.
+    """Changed point, by its name.
 
     Attributes:
-        point: its name.
         lla: latitude and longitude in degrees, ellipsoidal height in metres; None: as surveyed, or not surveyed.
-        is_check: whether it is a check point.
     """
 
-    point: Name = Field(min_length=1)
+    point: str = Field(min_length=1)
     lla: Vector3 | None
     is_check: bool
 
-    @property
-    def key(self) -> Key:
-        """What the record is about."""
-        return self.point, None
-
 
 class KeptMark(Product):
-    """Changed mark.
+    """Changed mark of a point in an image; its place in pixels of the full image is None where it was removed."""
 
-    Attributes:
-        point: its name.
-        image: that shows it.
-        place_px: in pixels of the full image; None: removed.
-    """
-
-    point: Name = Field(min_length=1)
+    point: str = Field(min_length=1)
     image: ImageName
     place_px: tuple[float, float] | None
 
-    @property
-    def key(self) -> Key:
-        """What the record is about."""
-        return self.point, self.image
-
 
 Record = KeptPoint | KeptMark
+Key = tuple[str, ImageName | None]  # what a record is about: a point, or its mark in an image
 
 
 class KeptRecords(Product):
-    """Content of the file.
-
-    Attributes:
-        is_written: whether the files for `--gcp` have all of it.
-        points, marks: the records.
-    """
+    """Content of the file, and whether the files for `--gcp` have all of it."""
 
     format_version: Literal[1] = 1
     is_written: bool = True
@@ -212,7 +165,9 @@ class KeptMarks:
         lla_of, xyz_of: convert points (N, 3) from the viewer's CRS to latitude, longitude, height, and back.
 
     Attributes:
+        points: all points, those of the survey first.
         is_written: whether the files for `--gcp` have all changes.
+        history: steps of this viewer that can be undone.
 
     Raises:
         InputError: the file cannot be read, or holds no marks of the viewer.
@@ -227,24 +182,19 @@ class KeptMarks:
     ) -> None:
         self._folder, self._lla_of, self._xyz_of = folder, lla_of, xyz_of
         self._surveyed = {point.name: point for point in surveyed}
-        self._history = History()
+        self.history = History()
         self._take(*self._read())
 
-    @property
-    def points(self) -> Sequence[MarkedPoint]:
-        """All points, those of the survey first."""
-        return self._points
-
-    def set_mark(self, point: Name, image: str, place_px: tuple[float, float] | None) -> None:
+    def set_mark(self, point: str, image: str, place_px: tuple[float, float] | None) -> None:
         """Set the mark of a point in an image, or remove it (None).
 
         Raises:
             GeorefError: nothing was changed, and why.
         """
         step = f"{'removal of the mark' if place_px is None else 'mark'} of {point} in {image}"
-        self._put(KeptMark(point=point, image=image, place_px=place_px), step)
+        self._step({(point, image): KeptMark(point=point, image=image, place_px=place_px)}, step)
 
-    def set_point(self, name: Name, xyz: tuple[float, float, float] | None, *, is_check: bool) -> None:
+    def set_point(self, name: str, xyz: tuple[float, float, float] | None, *, is_check: bool) -> None:
         """Make a point, or change its coordinates in the CRS (None: leave them) and its use.
 
         Raises:
@@ -257,9 +207,9 @@ class KeptMarks:
         if xyz is not None:
             lat, lon, height = self._lla_of(np.array([xyz]))[0].tolist()
             lla = (lat, lon, height)
-        self._put(KeptPoint(point=name, lla=lla, is_check=is_check), f"point {name}")
+        self._step({(name, None): KeptPoint(point=name, lla=lla, is_check=is_check)}, f"point {name}")
 
-    def remove_point(self, name: Name) -> None:
+    def remove_point(self, name: str) -> None:
         """Remove a point that was made here, with its marks.
 
         Raises:
@@ -269,36 +219,22 @@ class KeptMarks:
             raise InputError(f"{name} is a point of the survey: remove its marks, or ingest the survey without it")
         self._step(dict.fromkeys(key for key in self._records if key[0] == name), f"removal of {name}")
 
-    def undo(self) -> str | None:
-        """Undo the last change of this viewer and return it in words; None: there is none.
-
-        Raises:
-            GeorefError: nothing was changed, and why.
-        """
-        return self._history.undo()
-
     def write(self, crs: str) -> list[Path]:
         """Write the surveyed points with their marks for `--gcp` and `--checkpoints`; return the files written.
-
-        Args:
-            crs: name of the CRS.
 
         Raises:
             GeorefError: nothing was written, and why.
         """
         with changing(self._folder):
             self._take(*self._read())
-            texts = {self._folder / name: text for name, text in mark_texts(crs, self._points).items()}
+            texts = {self._folder / name: text for name, text in mark_texts(crs, self.points).items()}
             if texts:
                 self._save(self._records, is_written=True, others=texts)
         return list(texts)
 
-    def _put(self, record: Record, step: str) -> None:
-        self._step({record.key: record}, step)
-
     def _step(self, wanted: Mapping[Key, Record | None], step: str) -> None:
         former = self._change(wanted)
-        self._history.add(step, lambda: self._change(former))
+        self.history.add(step, lambda: self._change(former))
 
     def _change(self, wanted: Mapping[Key, Record | None]) -> Mapping[Key, Record | None]:
         """Set records of the file or drop them (None), and return the former ones."""
@@ -324,8 +260,12 @@ class KeptMarks:
         """Return the records of the file that the survey has not taken over, and whether all are written."""
         path = self._folder / MARKS
         content = load_json(KeptRecords, path) if path.exists() else KeptRecords()
-        records: Sequence[Record] = (*content.points, *content.marks)
-        return {each.key: each for each in records if not self._is_surveyed(each)}, content.is_written
+        stored: Sequence[Record] = (*content.points, *content.marks)
+        records: dict[Key, Record] = {}
+        for record in stored:
+            if not self._is_surveyed(record):
+                records[record.point, record.image if isinstance(record, KeptMark) else None] = record
+        return records, content.is_written
 
     def _is_surveyed(self, record: Record) -> bool:
         """Return whether the survey says what a record says."""
@@ -351,4 +291,4 @@ class KeptMarks:
             else:
                 xyz = point.xyz if record.lla is None else tuple(self._xyz_of(np.array([record.lla]))[0].tolist())
                 points[record.point] = replace(point, xyz=xyz, is_check=record.is_check)
-        self._records, self._points, self.is_written = records, tuple(points.values()), is_written
+        self._records, self.points, self.is_written = records, tuple(points.values()), is_written

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
@@ -15,15 +14,14 @@ from pipelines.survey.marks import mark_rays
 from pipelines.survey.survey import SurveyedPoint
 from pipelines.view.mark_panel import Panel
 from pipelines.view.measuring import MeasuringModel
-from pipelines.view.quantities import BaseKind, BasePlane, Quantity
+from pipelines.view.quantities import BaseKind, BasePlane, Quantity, distances, length
 from pipelines.view.saved import (
     History,
     Kind,
-    Measurement,
+    NamedMeasurement,
     PlaceRow,
     SavedMeasurements,
     SavedPoint,
-    SavedQuantity,
     new_id,
     paragraph,
     place_table,
@@ -43,14 +41,11 @@ _BASES: tuple[BaseKind, ...] = get_args(BaseKind)
 
 
 class MeasurePanel(Panel):
-    """Panel of the measurements.
+    """Panel of the measurements; those that are saved lie in a folder.
 
-    Args:
-        server: of the viewer.
-        model: to measure in.
-        signs: of the scene.
-        folder: of the saved measurements.
-        model_hash: of the trained model.
+    Attributes:
+        kind: chosen in the page.
+        points: of the present measurement.
     """
 
     def __init__(
@@ -58,33 +53,17 @@ class MeasurePanel(Panel):
     ) -> None:
         self._model, self._signs, self._hash = model, signs, model_hash
         self._names = model.trained.sparse.image_name
-        self._index = model.trained.sparse.image_index()
         survey = model.trained.survey
         self._surveyed = {point.name: point for point in (*survey.control_points, *survey.check_points)}
-        self._points: tuple[SurfacePoint, ...] = ()
+        self.points: tuple[SurfacePoint, ...] = ()
         self._kind: Kind = "point"
         self._quantities: tuple[Quantity, ...] = ()
         self._id = new_id()
         self._lock = threading.RLock()
-        self._saved, self._drawn = SavedMeasurements(folder), 0
+        self.saved, self._drawn = SavedMeasurements(folder), 0
         self._history = History()
         self._build(server)
         self._show_saved()
-
-    @property
-    def points(self) -> Sequence[SurfacePoint]:
-        """Points of the present measurement."""
-        return self._points
-
-    @property
-    def quantities(self) -> Sequence[Quantity]:
-        """Quantities of the present measurement."""
-        return self._quantities
-
-    @property
-    def saved(self) -> Sequence[Measurement]:
-        """Saved measurements."""
-        return self._saved.all
 
     def choose(self, kind: Kind) -> None:
         """Begin a measurement of a kind."""
@@ -112,14 +91,14 @@ class MeasurePanel(Panel):
     def add_sight(self, sight: Sight) -> None:
         """Measure the surface under a line of sight."""
         with self._lock:
-            self._add(self._model.under(sight), "")
+            self._add(self._model.reader.under(sight), "")
 
     def add_surveyed(self, name: str) -> None:
         """Measure a surveyed point behind its marks, as `evaluate` does on the rendered surface."""
         with self._lock:
             point = self._surveyed[name]
             rays = mark_rays((point,), self._model.trained.sparse)
-            self._add(self._model.behind_marks(rays), self._against_survey(point))
+            self._add(self._model.reader.behind_marks(rays), self._against_survey(point))
 
     def add_point(self, point: SurfacePoint) -> None:
         """Add a point that was measured elsewhere, such as in marked photographs."""
@@ -130,21 +109,19 @@ class MeasurePanel(Panel):
         if isinstance(point, NoSurface):
             self._tell(f"Nothing measured: {point.reason}.")
             return
-        kept = () if len(self._points) >= _MOST.get(self._kind, 10_000) else self._points
+        kept = () if len(self.points) >= _MOST.get(self._kind, 10_000) else self.points
         self._replace("point", self._kind, (*kept, point), note)
 
     def _replace(self, step: str, kind: Kind, points: tuple[SurfacePoint, ...], note: str = "") -> None:
         """Measure with other points, as a step that can be undone."""
-        former_kind, former = self._kind, self._points
+        former_kind, former = self._kind, self.points
         if points or former:
             self._history.add(step, lambda: self._show(former_kind, former))
         self._show(kind, points, note)
 
     def _show(self, kind: Kind, points: tuple[SurfacePoint, ...], note: str = "") -> None:
-        self._kind, self._points = kind, points
+        self._kind, self.points = kind, points
         self.kind.value = kind  # type: ignore[misc]
-        if not points:
-            self._signs.remove_measured("now")
         self._compute(note)
 
     def _change_kind(self) -> None:
@@ -155,28 +132,25 @@ class MeasurePanel(Panel):
     def _compute(self, note: str = "") -> None:
         kind = self._kind
         self._quantities = ()
-        if len(self._points) >= _LEAST[kind]:
+        if len(self.points) >= _LEAST[kind]:
             if kind in _CLOSED:
                 self._tell("Reading the surface …")
             self._quantities = self._measured(kind)
-        if self._points:
-            self._signs.add_measured("now", self._positions(), closed=kind in _CLOSED and len(self._points) > 2)
+        places = np.array([point.position_in_geo for point in self.points])
+        self._signs.show_measured("now", places, closed=kind in _CLOSED and len(self.points) > 2)
         self._result.content = self._described(note)
 
     def _measured(self, kind: Kind) -> tuple[Quantity, ...]:
         if kind == "distance":
-            return self._model.distance(self._points)
+            return distances(self._model.jointly(self.points))
         if kind == "polyline":
-            return self._model.polyline(self._points)
+            return length(self._model.jointly(self.points))
         if kind == "area":
-            return self._model.area(self._points)
+            return self._model.area(self.points)
         if kind == "volume":
             base: BaseKind = self._base.value
-            return self._model.volume(self._points, BasePlane(base))
+            return self._model.volume(self.points, BasePlane(base))
         return ()
-
-    def _positions(self) -> np.ndarray:
-        return np.array([point.position_in_geo for point in self._points])
 
     def _against_survey(self, point: SurveyedPoint) -> str:
         """Return the coordinates of a surveyed point as surveyed and as triangulated, as HTML."""
@@ -190,20 +164,20 @@ class MeasurePanel(Panel):
 
     def _described(self, note: str) -> str:
         """Return the present measurement as HTML."""
-        if not self._points:
+        if not self.points:
             return note + self._hint()
-        placed = [self._model.place(point) for point in self._points]
         rows = [
-            PlaceRow(str(number), point.surface.position_in_geo, point.sigma_m)
-            for number, point in enumerate(placed, start=1)
+            PlaceRow(str(number), point.position_in_geo, self._model.place(point)[1])
+            for number, point in enumerate(self.points, start=1)
         ]
-        views = ", ".join(str(len(point.surface.cameras)) for point in placed)
+        views = ", ".join(str(len(point.cameras)) for point in self.points)
+        reason = self._model.without_sigma
         return (
             note
             + place_table(self._model.target, rows, marked="measured")
             + paragraph(f"photographs that agree: {views}")
             + quantity_table(self._quantities)
-            + self._without_sigma()
+            + (paragraph(f"No σ is stated: {reason}.") if reason else "")
         )
 
     def _hint(self) -> str:
@@ -215,14 +189,10 @@ class MeasurePanel(Panel):
         ]
         return "".join(map(paragraph, lines))
 
-    def _without_sigma(self) -> str:
-        reason = self._model.without_sigma
-        return paragraph(f"No σ is stated: {reason}.") if reason else ""
-
     def take_back(self) -> None:
         """Take the last point of the measurement back."""
         with self._lock:
-            self._replace("removal of a point", self._kind, self._points[:-1])
+            self._replace("removal of a point", self._kind, self.points[:-1])
 
     def clear(self) -> None:
         """Begin a new measurement."""
@@ -246,78 +216,75 @@ class MeasurePanel(Panel):
             GeorefError: it was not saved, and why.
         """
         with self._lock:
-            kind, points = self._kind, self._points
+            kind, points = self._kind, self.points
             if len(points) < _LEAST[kind]:
                 self._tell(f"A {kind} needs {_LEAST[kind]} points before it can be saved.")
                 return
-            measurement = Measurement(
+            measurement = NamedMeasurement(
                 id=self._id,
-                name=self._name.value.strip()[:200] or f"{kind} {len(self._saved.all) + 1}",
+                name=self._name.value.strip()[:200] or f"{kind} {len(self.saved.all) + 1}",
                 kind=kind,
                 crs=self._model.target.crs.name,
                 model=self._hash,
                 points=tuple(self._saved_point(point) for point in points),
-                quantities=tuple(SavedQuantity(**vars(each)) for each in self._quantities),
+                quantities=self._quantities,
             )
-            self._saved.put(measurement)
+            self.saved.put(measurement)
             self._history.add(f"saving of {measurement.name}", lambda: self._unsave(measurement, points))
             self._id = new_id()
             self._name.value = ""  # type: ignore[misc]
             self._show(kind, ())
             self._show_saved()
 
-    def _unsave(self, measurement: Measurement, points: tuple[SurfacePoint, ...]) -> None:
-        self._saved.remove(measurement)
+    def _unsave(self, measurement: NamedMeasurement, points: tuple[SurfacePoint, ...]) -> None:
+        self.saved.remove(measurement)
         self._show_saved()
         self._show(measurement.kind, points)
 
     def _saved_point(self, point: SurfacePoint) -> SavedPoint:
-        placed, origin = self._model.place(point), self._model.trained.survey.origin
-        lla = lla_from_enu(point.position_in_geo[None], origin)[0]
+        xyz, sigma_m = self._model.place(point)
+        lla = lla_from_enu(point.position_in_geo[None], self._model.trained.survey.origin)[0]
         rows = [tuple(map(float, row)) for row in point.cov_of_surface]
         return SavedPoint.model_validate(
             {
                 "position_in_geo": point.position_in_geo.tolist(),
                 "cov_of_surface": rows,
                 "images": [self._names[camera] for camera in point.cameras],
-                "xyz": placed.xyz.tolist(),
-                "sigma_m": None if placed.sigma_m is None else placed.sigma_m.tolist(),
+                "xyz": xyz.tolist(),
+                "sigma_m": None if sigma_m is None else sigma_m.tolist(),
                 "lla": lla.tolist(),
             }
         )
 
     def _delete(self) -> None:
         with self._lock:
-            titles = [_title(number, each) for number, each in enumerate(self._saved.all)]
+            titles = [_title(number, each) for number, each in enumerate(self.saved.all)]
             if self._chosen.value not in titles:
                 return
             row = titles.index(self._chosen.value)
-            measurement = self._saved.all[row]
-            self._saved.remove(measurement)
+            measurement = self.saved.all[row]
+            self.saved.remove(measurement)
             self._history.add(f"deletion of {measurement.name}", lambda: self._put_back(measurement, row))
             self._show_saved()
 
-    def _put_back(self, measurement: Measurement, row: int) -> None:
-        self._saved.put(measurement, row)
+    def _put_back(self, measurement: NamedMeasurement, row: int) -> None:
+        self.saved.put(measurement, row)
         self._show_saved()
-
-    def _draw_saved(self, number: int, measurement: Measurement) -> None:
-        points = [point.surface_point(self._index).position_in_geo for point in measurement.points]
-        self._signs.add_measured(f"saved{number}", np.array(points), closed=measurement.kind in _CLOSED)
 
     def _show_saved(self) -> None:
         for number in range(self._drawn):
-            self._signs.remove_measured(f"saved{number}")
+            self._signs.show_measured(f"saved{number}", np.zeros((0, 3)))
         rows = []
-        for number, measurement in enumerate(self._saved.all):
-            self._draw_saved(number, measurement)
-            values = "; ".join(quantity_text(Quantity(**each.model_dump())) for each in measurement.quantities[:3])
+        for number, measurement in enumerate(self.saved.all):
+            places = np.array([point.position_in_geo for point in measurement.points])
+            self._signs.show_measured(f"saved{number}", places, closed=measurement.kind in _CLOSED)
+            values = "; ".join(quantity_text(each) for each in measurement.quantities[:3])
             older = "" if measurement.model == self._hash else " (measured in an earlier model)"
             rows.append((measurement.name, measurement.name + older, values))
         self._drawn = len(rows)
         self._list.content = saved_table(rows)
-        self._chosen.options = tuple(_title(number, each) for number, each in enumerate(self._saved.all)) or ("—",)
+        self._chosen.options = tuple(_title(number, each) for number, each in enumerate(self.saved.all)) or ("—",)
 
 
-def _title(number: int, measurement: Measurement) -> str:
+def _title(number: int, measurement: NamedMeasurement) -> str:
     return f"{number + 1}: {measurement.name}"

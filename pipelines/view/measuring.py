@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.linalg import block_diag
 
 from pipelines.adjust.solution import posterior_of
 from pipelines.core.products import is_checked
-from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
-from pipelines.surface.picking import NoSurface, Sight, SurfacePoint, SurfaceReader
+from pipelines.surface.picking import Sight, SurfacePoint, SurfaceReader
 from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey.marks import MarkRays
 from pipelines.survey.options import CrsOptions
@@ -24,9 +23,7 @@ from pipelines.view.quantities import (
     MeasuredPoints,
     Quantity,
     SampledSurface,
-    distances,
     grid_in_polygon,
-    length,
     plan_area,
     surface_area,
     volumes,
@@ -39,33 +36,15 @@ _ABOVE_M = 30.0  # of the start of a plumb line above the highest corner, at lea
 _PLUMB_PX_RAD = 1e-3
 
 
-@dataclass(frozen=True)
-class PlacedPoint:
-    """Measured point in the CRS.
-
-    Attributes:
-        surface: the point.
-        xyz: (3,) in the CRS, easting or longitude first.
-        sigma_m: (3,) east, north, up; None: not known.
-    """
-
-    surface: SurfacePoint
-    xyz: FloatArray
-    sigma_m: FloatArray | None
-
-
 class MeasuringModel:
     """Trained model of a workspace, to measure in.
 
-    Args:
-        workspace: has a trained model.
-        renderer: of the model.
-        crs: the CRS of coordinates.
-
     Attributes:
         trained: the trained survey.
-        target: the CRS.
+        reader: of its surface.
+        target: the CRS of coordinates.
         posterior: covariances of the model; None: none are stated.
+        without_sigma: why no σ is stated; empty: it is.
 
     Raises:
         MissingProductError: the model was stored without its covariances.
@@ -79,19 +58,7 @@ class MeasuringModel:
         self.target: TargetCrs = usable_crs(crs, survey.origin, centers, survey.vertical)
         is_stated = is_checked(self.trained.model.cautions)
         self.posterior = posterior_of(workspace, self.trained.model, self.trained.sfm) if is_stated else None
-
-    @property
-    def without_sigma(self) -> str:
-        """Why no σ is stated; empty: it is."""
-        return "" if self.posterior is not None else "nothing checks the σ of the positions"
-
-    def under(self, sight: Sight) -> SurfacePoint | NoSurface:
-        """Return the point of the surface under a line of sight."""
-        return self.reader.under(sight)
-
-    def behind_marks(self, rays: MarkRays) -> SurfacePoint | NoSurface:
-        """Return the surface behind the marks of one point, as `evaluate` measures it on the rendered surface."""
-        return self.reader.behind_marks(rays)
+        self.without_sigma = "" if self.posterior is not None else "nothing checks the σ of the positions"
 
     def by_camera(self, rays: MarkRays) -> tuple[FloatArray, FloatArray | None]:
         """Return the intersection (3,) in `geo` of the marks of one point, and its covariance (3, 3) in m².
@@ -103,44 +70,39 @@ class MeasuringModel:
             return position[0], None
         return position[0], self.posterior.of_marked_points(position, rays)[0]
 
-    def place(self, point: SurfacePoint) -> PlacedPoint:
-        """Return a point in the CRS, with σ of georeference, cameras, lens and surface."""
+    def place(self, point: SurfacePoint) -> tuple[FloatArray, FloatArray | None]:
+        """Return a point (3,) in the CRS, easting or longitude first, and its σ (3,) east, north, up in metres.
+
+        σ is that of georeference, cameras, lens and surface; None: not known.
+        """
         joint = self.jointly([point])
-        sigma = None if joint.cov_in_geo is None else np.sqrt(np.diag(joint.cov_in_geo))
-        return PlacedPoint(point, self.target.xyz_from_geo(point.position_in_geo[None])[0], sigma)
+        sigma_m = None if joint.cov_in_geo is None else np.sqrt(np.diag(joint.cov_in_geo))
+        return self.target.xyz_from_geo(point.position_in_geo[None])[0], sigma_m
 
     def jointly(self, points: Sequence[SurfacePoint]) -> MeasuredPoints:
         """Return points with their joint covariance."""
         position = np.array([point.position_in_geo for point in points]).reshape(-1, 3)
-        own = [point.cov_of_surface for point in points]
         cov = self._joint_covariance(points)
-        cov = None if cov is None else cov + block_diag(*own)
-        return MeasuredPoints(position, cov, self._heights_m(position))
+        cov = None if cov is None else cov + block_diag(*(point.cov_of_surface for point in points))
+        height_m = np.asarray(self.target.xyz_from_geo(position)[:, 2] * self.target.height_unit_m)
+        return MeasuredPoints(position, cov, height_m)
 
-    def distance(self, points: Sequence[SurfacePoint]) -> tuple[Quantity, ...]:
-        """Return distance, horizontal distance and height difference of two points."""
-        return distances(self.jointly(points))
-
-    def polyline(self, points: Sequence[SurfacePoint]) -> tuple[Quantity, ...]:
-        """Return the length of the line through points, in space and in plan."""
-        return length(self.jointly(points))
-
-    def area(self, corners: Sequence[SurfacePoint], progress: Progress = SILENT) -> tuple[Quantity, ...]:
+    def area(self, corners: Sequence[SurfacePoint]) -> tuple[Quantity, ...]:
         """Return the area of a polygon, in plan and on the surface."""
-        surface = self._sampled(corners, progress)
-        if surface is None:
+        sampled = self._sampled(corners)
+        if sampled is None:
             return (plan_area(self.jointly(corners)),)
-        return plan_area(surface.corners), surface_area(surface), _coverage(surface)
+        surface, coverage = sampled
+        return plan_area(surface.corners), surface_area(surface), coverage
 
-    def volume(
-        self, corners: Sequence[SurfacePoint], base: BasePlane, progress: Progress = SILENT
-    ) -> tuple[Quantity, ...]:
+    def volume(self, corners: Sequence[SurfacePoint], base: BasePlane) -> tuple[Quantity, ...]:
         """Return the volume between the surface within a polygon and a base; nothing where there is no surface."""
-        surface = self._sampled(corners, progress)
-        if surface is None:
+        sampled = self._sampled(corners)
+        if sampled is None:
             return ()
+        surface, coverage = sampled
         lowest = int(np.argmin(surface.corners.height_m))
-        return (*volumes(surface, replace(base, lowest=lowest)), _coverage(surface))
+        return (*volumes(surface, replace(base, lowest=lowest)), coverage)
 
     def _joint_covariance(self, points: Sequence[SurfacePoint]) -> FloatArray | None:
         """Return the joint covariance (3 J, 3 J) of points without the surface's own."""
@@ -152,23 +114,21 @@ class MeasuringModel:
         cov = self.posterior.jointly_of_scene(position, number, cameras)
         return cov if np.isfinite(cov).all() else None
 
-    def _heights_m(self, position_in_geo: FloatArray) -> FloatArray:
-        return np.asarray(self.target.xyz_from_geo(position_in_geo)[:, 2] * self.target.height_unit_m)
-
-    def _sampled(self, corners: Sequence[SurfacePoint], progress: Progress) -> SampledSurface | None:
-        """Return the surface in a polygon, read along plumb lines; None: the polygon shows none."""
+    def _sampled(self, corners: Sequence[SurfacePoint]) -> tuple[SampledSurface, Quantity] | None:
+        """Return the surface in a polygon, read along plumb lines, and how densely; None: there is none."""
         joint = self.jointly(corners)
         area, pixel_m = plan_area(joint).value, self._pixel_m(corners)
         spacing = max(float(np.sqrt(area / _MOST_SAMPLES)), _LEAST_SPACING_PX * pixel_m)
         grid = grid_in_polygon(joint.position_in_geo[:, :2], spacing)
         top = float(joint.position_in_geo[:, 2].max()) + _ABOVE_M + float(np.sqrt(area))
+        model_from_geo = self.trained.geo_from_model.inverse()
+        down = model_from_geo.rotation @ np.array([0.0, 0.0, -1.0])
         samples = []
-        with progress.task("surface", len(grid)) as task:
-            for east, north in grid:
-                point = self.under(self._plumb_line(np.array([east, north, top])))
-                if isinstance(point, SurfacePoint):
-                    samples.append(point)
-                task.advance()
+        for east, north in grid:
+            start = model_from_geo.apply(np.array([[east, north, top]]))[0]
+            point = self.reader.under(Sight(start, down, _PLUMB_PX_RAD))
+            if isinstance(point, SurfacePoint):
+                samples.append(point)
         if not samples:
             return None
         chosen = np.unique(np.linspace(0, len(samples) - 1, _JOINT_SAMPLES).astype(np.int64))
@@ -176,20 +136,15 @@ class MeasuringModel:
         if shared is not None:
             own = [point.cov_of_surface for point in corners]
             shared = shared + block_diag(*own, *[np.zeros((3, 3))] * len(chosen))
-        return SampledSurface(
+        surface = SampledSurface(
             corners=joint,
             samples=np.array([point.position_in_geo for point in samples]),
             sigma_up_m=np.sqrt([point.cov_of_surface[2, 2] for point in samples]),
             cov_in_geo=shared,
             chosen=chosen,
-            spacing_m=spacing,
-            coverage=len(samples) / len(grid),
         )
-
-    def _plumb_line(self, start_in_geo: FloatArray) -> Sight:
-        model_from_geo = self.trained.geo_from_model.inverse()
-        down = model_from_geo.rotation @ np.array([0.0, 0.0, -1.0])
-        return Sight(model_from_geo.apply(start_in_geo[None])[0], down, _PLUMB_PX_RAD)
+        share = 100 * (len(samples) / len(grid))
+        return surface, Quantity(f"measured every {spacing:.2f} m, on", share, None, "% of the area")
 
     def _pixel_m(self, points: Sequence[SurfacePoint]) -> float:
         """Return the mean width of a training pixel at points."""
@@ -200,7 +155,3 @@ class MeasuringModel:
             for camera in point.cameras
         ]
         return float(np.mean(widths))
-
-
-def _coverage(surface: SampledSurface) -> Quantity:
-    return Quantity(f"measured every {surface.spacing_m:.2f} m, on", 100 * surface.coverage, None, "% of the area")

@@ -27,15 +27,13 @@ class PhotoView:
     """Photograph that the pages show.
 
     Args:
-        server: of the viewer.
-        trained: the trained survey.
-        frame: of the viewer.
         signs: of the scene, hidden while a photograph is shown.
         changed: called when the pictures of the pages must be drawn anew.
 
     Attributes:
         camera: whose photograph is shown; None: none.
         share: of the photograph in the picture, 0 … 1.
+        reach_m: length of the lines of sight that are drawn.
     """
 
     def __init__(
@@ -48,14 +46,10 @@ class PhotoView:
     ) -> None:
         self._server, self._trained, self._frame, self._signs = server, trained, frame, signs
         self._changed = changed
+        self.reach_m = 20 * frame.radius_m
         self.camera: int | None = None
         self.share = 1.0
         self._is_close = False
-
-    @property
-    def reach_m(self) -> float:
-        """Length of the lines of sight that are drawn."""
-        return 20 * self._frame.radius_m
 
     @property
     def blend(self) -> Blend | None:
@@ -127,10 +121,9 @@ class PhotoView:
         middle = _NEAR * direction / np.linalg.norm(direction)
         lens = self._trained.sparse.camera_of(self.camera)
         arm = _NEAR * _CROSS * (_CLOSER if self._is_close else 1.0) * lens.height / lens.mean_focal_px
-        first, second = (np.array([arm, arm, 0.0]), np.array([arm, -arm, 0.0]))
-        if not diagonal:
-            first, second = np.array([arm * 1.4, 0.0, 0.0]), np.array([0.0, arm * 1.4, 0.0])
-        in_cam = np.array([[middle - each, middle + each] for each in (first, second)])
+        upright = ((arm * 1.4, 0.0, 0.0), (0.0, arm * 1.4, 0.0))
+        arms = np.array(((arm, arm, 0.0), (arm, -arm, 0.0)) if diagonal else upright)
+        in_cam = np.stack([middle - arms, middle + arms], axis=1)
         turn = self._frame.view_from_model.rotation @ self._trained.poses.cam_from_model[self.camera].T
         segments = in_cam @ turn.T + self._center(self.camera)
         self._server.scene.add_line_segments(name, segments, rgb, thickness=2.0, thickness_units="screen")

@@ -3,12 +3,9 @@
 The machine that holds the model draws them, with the rasteriser that trained it: what is seen is what is measured,
 colours that depend on the direction included, and a page without a graphics card shows millions of Gaussians.
 
-Frame of the viewer, and cameras in it.
-
 The viewer's depth images end at 167 units. Its frame is therefore a small copy of the scene around its middle, with
-the axes of `geo`: east, north, up.
-
-Loop that draws the picture of one page: small while its camera moves, at full size when it stands.
+the axes of `geo`: east, north, up. Each page has a loop, which draws small pictures
+while its camera moves, and a full one when it stands.
 """
 
 from __future__ import annotations
@@ -44,6 +41,15 @@ log = logging.getLogger(__name__)
 
 _RADIUS = 10.0  # of the scene, in units of the viewer
 _RIM = 0.02  # share of the SfM points outside the scene, on each side
+_KEPT_PHOTOGRAPHS = 3  # at full size, in memory
+_SAME_PLACE = 1e-4  # of the scene's radius: a camera this near to a photograph's sees what it saw
+_EDGE_POINTS = 9  # on each side of a photograph
+_FARTHEST = 150.0  # units of the viewer, for what has no surface
+_MOVING_S = 0.12  # of drawing one picture while the camera moves
+_STILL_S = 0.2  # without movement until the full picture is drawn
+_LEAST_PX, _MOST_PX = 160, 1920  # of the longer side
+_DEPTH_PX = 480  # of the longer side of the depth: it only decides which signs are hidden
+_QUALITY_MOVING, _QUALITY_STILL = 70, 95  # of the JPEG
 
 
 @dataclass(frozen=True)
@@ -77,30 +83,20 @@ class ViewerCamera:
 
 @dataclass(frozen=True)
 class ViewFrame:
-    """Frame of the viewer.
-
-    Attributes:
-        view_from_model: similarity.
-        radius_m: of the scene.
-    """
+    """Frame of the viewer, and the radius of the scene."""
 
     view_from_model: Similarity
     radius_m: float
 
-    @property
-    def model_from_view(self) -> Similarity:
-        """Similarity back."""
-        return self.view_from_model.inverse()
-
     def pose(self, camera: ViewerCamera, width: int, height: int) -> ViewPose:
         """Return a page's camera in `model`, with its own number of pixels."""
         cam_from_model = camera.rotation.T @ self.view_from_model.rotation
-        center = self.model_from_view.apply(camera.position[None])[0]
+        center = self.view_from_model.inverse().apply(camera.position[None])[0]
         return ViewPose(camera.pinhole(width, height), cam_from_model, center)
 
     def sight(self, camera: ViewerCamera, start: FloatArray, direction: FloatArray) -> Sight:
         """Return a line of sight in `model` of one in the viewer's frame: start (3,) and direction (3,)."""
-        model_from_view = self.model_from_view
+        model_from_view = self.view_from_model.inverse()
         turned = model_from_view.rotation @ direction
         pixel_rad = 1.0 / camera.pinhole(camera.width, camera.height).fx
         return Sight(model_from_view.apply(start[None])[0], turned / np.linalg.norm(turned), pixel_rad)
@@ -116,14 +112,8 @@ def frame_of(trained: TrainedSurvey) -> ViewFrame:
     return ViewFrame(view_from_geo @ trained.geo_from_model, radius_m)
 
 
-_KEPT_PHOTOGRAPHS = 3  # at full size, in memory
-_SAME_PLACE = 1e-4  # of the scene's radius: a camera this near to a photograph's sees what it saw
-_EDGE_POINTS = 9  # on each side of a photograph
-_FARTHEST = 150.0  # units of the viewer, for what has no surface
-
-
 @dataclass(frozen=True)
-class Picture:
+class PageView:
     """Picture of a page.
 
     Attributes:
@@ -136,16 +126,11 @@ class Picture:
 
 
 class Photographs:
-    """Photographs of the survey at full size, decoded on demand.
+    """Photographs of the survey at full size, decoded on demand."""
 
-    Args:
-        workspace: names their folder.
-        renderer: of the trained model.
-    """
-
-    def __init__(self, workspace: Workspace, renderer: ModelRenderer) -> None:
-        self._folder = photograph_folder(workspace, renderer.trained.survey.image_dir)
-        self._trained = renderer.trained
+    def __init__(self, workspace: Workspace, trained: TrainedSurvey) -> None:
+        self._folder = photograph_folder(workspace, trained.survey.image_dir)
+        self._trained = trained
         self._kept: OrderedDict[int, ByteArray] = OrderedDict()
         self._lock = threading.Lock()
 
@@ -183,24 +168,13 @@ class Blend:
 
 
 class Painter:
-    """Painter of the pictures of pages.
-
-    Args:
-        renderer: of the trained model.
-        photographs: of the survey.
-        frame: of the viewer.
-    """
+    """Painter of the pictures of pages."""
 
     def __init__(self, renderer: ModelRenderer, photographs: Photographs, frame: ViewFrame) -> None:
         self._renderer, self._photographs, self._frame = renderer, photographs, frame
 
-    def paint(self, camera: ViewerCamera, width: int, height: int, blend: Blend | None = None) -> Picture:
-        """Return the picture of a page's camera.
-
-        Args:
-            camera: of the page.
-            width, height: of the picture in pixels.
-            blend: photograph to blend over it, which shows only from its own place.
+    def paint(self, camera: ViewerCamera, width: int, height: int, blend: Blend | None = None) -> PageView:
+        """Return the picture of a page's camera; a photograph blended over it shows only from its own place.
 
         Raises:
             InputError: the photograph cannot be read.
@@ -212,18 +186,19 @@ class Painter:
         depth = measured_depth(render.median_depth, render.expected_depth, render.depth_variance).cpu().numpy()
         rgb = (255 * render.colour.clamp(0, 1)).round().byte().cpu().numpy()
         scaled = depth * self._frame.view_from_model.scale
-        if blend is not None and blend.share > 0 and self._is_at(blend.camera, pose.center_in_model):
-            rgb = self._blended(rgb, blend, pose.pinhole.rays(_pixels(width, height)), pose.cam_from_model)
-        return Picture(rgb, np.where(scaled > 0, np.minimum(scaled, _FARTHEST), _FARTHEST).astype(np.float32))
+        if blend is not None and blend.share > 0:
+            apart = self._renderer.trained.poses.cam_center_in_model[blend.camera] - pose.center_in_model
+            if float(np.linalg.norm(apart)) < _SAME_PLACE * self._frame.radius_m:
+                rgb = self._blended(rgb, blend, pose)
+        return PageView(rgb, np.where(scaled > 0, np.minimum(scaled, _FARTHEST), _FARTHEST).astype(np.float32))
 
-    def _is_at(self, camera: int, center_in_model: FloatArray) -> bool:
-        own = self._renderer.trained.poses.cam_center_in_model[camera]
-        return float(np.linalg.norm(own - center_in_model)) < _SAME_PLACE * self._frame.radius_m
-
-    def _blended(self, rgb: ByteArray, blend: Blend, rays: FloatArray, cam_from_model: FloatArray) -> ByteArray:
-        """Return a picture with the photograph over it, as the photograph's lens shows the rays (H, W, 3)."""
+    def _blended(self, rgb: ByteArray, blend: Blend, pose: ViewPose) -> ByteArray:
+        """Return a picture with the photograph over it, as the photograph's lens shows the picture's rays."""
         trained = self._renderer.trained
-        own = rays @ (trained.poses.cam_from_model[blend.camera] @ cam_from_model.T).T
+        height, width = rgb.shape[:2]
+        pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
+        turn = trained.poses.cam_from_model[blend.camera] @ pose.cam_from_model.T
+        own = pose.pinhole.rays(pixels) @ turn.T
         ahead = own[..., 2] > 0
         slope = own[..., :2] / np.where(ahead, own[..., 2], 1.0)[..., None]
         lens = trained.sparse.camera_of(blend.camera)
@@ -245,24 +220,11 @@ def _widest_slope(lens: Camera) -> float:
     return float(np.nanmax(np.linalg.norm(undistort(lens, edge), axis=-1))) * (1 + 1e-3)
 
 
-def _pixels(width: int, height: int) -> FloatArray:
-    """Return the centres (H, W, 2) of the pixels of a picture."""
-    return np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
-
-
-_MOVING_S = 0.12  # of drawing one picture while the camera moves
-_STILL_S = 0.2  # without movement until the full picture is drawn
-_LEAST_PX, _MOST_PX = 160, 1920  # of the longer side
-_DEPTH_PX = 480  # of the longer side of the depth: it only decides which signs are hidden
-_QUALITY_MOVING, _QUALITY_STILL = 70, 95  # of the JPEG
-
-
 class PictureLoop:
     """Loop of one page, on a thread of its own.
 
     Args:
         client: the page.
-        painter: of the pictures.
         blend: returns the photograph to blend over the picture, or None.
         drawn: called after each picture at full size.
     """
@@ -299,7 +261,10 @@ class PictureLoop:
                 return
             self._changed.clear()
             try:
-                self._draw_moving()
+                began = time.monotonic()
+                self._draw(int(self._moving_px), _QUALITY_MOVING)
+                factor = np.clip(np.sqrt(_MOVING_S / max(time.monotonic() - began, 1e-3)), 0.5, 1.3)
+                self._moving_px = float(np.clip(self._moving_px * factor, _LEAST_PX, _MOST_PX))
                 if not self._changed.wait(_STILL_S):
                     self._draw(_MOST_PX, _QUALITY_STILL)
                     self.drawn += 1
@@ -311,22 +276,14 @@ class PictureLoop:
                     return
                 log.exception("the picture could not be drawn")
 
-    def _draw_moving(self) -> None:
-        began = time.monotonic()
-        self._draw(int(self._moving_px), _QUALITY_MOVING)
-        factor = np.sqrt(_MOVING_S / max(time.monotonic() - began, 1e-3))
-        self._moving_px = float(np.clip(self._moving_px * np.clip(factor, 0.5, 1.3), _LEAST_PX, _MOST_PX))
-
     def _draw(self, longer_px: int, quality: int) -> None:
         camera = camera_of(self._client)
         if camera is None:
             return
-        scale = min(1.0, longer_px / max(camera.width, camera.height))
-        width, height = max(round(camera.width * scale), 1), max(round(camera.height * scale), 1)
+        width, height = _shrunk(camera.width, camera.height, longer_px)
         picture = self._painter.paint(camera, width, height, self._blend())
-        self._client.scene.set_background_image(
-            picture.rgb, format="jpeg", jpeg_quality=quality, depth=_small_depth(picture)
-        )
+        depth = cv2.resize(picture.depth, _shrunk(width, height, _DEPTH_PX), interpolation=cv2.INTER_NEAREST)
+        self._client.scene.set_background_image(picture.rgb, format="jpeg", jpeg_quality=quality, depth=depth)
         self._client.flush()
 
 
@@ -340,8 +297,7 @@ def camera_of(client: viser.ClientHandle) -> ViewerCamera | None:
     )
 
 
-def _small_depth(picture: Picture) -> np.ndarray:
-    height, width = picture.depth.shape
-    scale = min(1.0, _DEPTH_PX / max(width, height))
-    size = max(round(width * scale), 1), max(round(height * scale), 1)
-    return cv2.resize(picture.depth, size, interpolation=cv2.INTER_NEAREST)
+def _shrunk(width: int, height: int, longer_px: int) -> tuple[int, int]:
+    """Return the size of a picture whose longer side is at most `longer_px`."""
+    scale = min(1.0, longer_px / max(width, height))
+    return max(round(width * scale), 1), max(round(height * scale), 1)

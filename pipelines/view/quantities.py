@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from pydantic import ConfigDict
 from scipy.spatial import Delaunay
 
 from pipelines.core.types import BoolArray, FloatArray, IntArray
@@ -19,14 +20,9 @@ BaseKind = Literal["plane through the corners", "level of the lowest corner"]
 
 @dataclass(frozen=True)
 class Quantity:
-    """Measured quantity.
+    """Measured quantity with its standard deviation in the same unit; None: not known. Saved with measurements."""
 
-    Attributes:
-        name: of the quantity.
-        value: of it.
-        sigma: its standard deviation; None: not known.
-        unit: of both.
-    """
+    __pydantic_config__ = ConfigDict(extra="forbid", allow_inf_nan=False)
 
     name: str
     value: float
@@ -57,48 +53,33 @@ def distances(points: MeasuredPoints) -> tuple[Quantity, ...]:
     """Return distance in space, horizontal distance and height difference from the first point to the second."""
     line = points.position_in_geo[1] - points.position_in_geo[0]
     rise = float(points.height_m[1] - points.height_m[0])
-    plan = np.array([*line[:2], 0.0])
-    up = np.array([0.0, 0.0, 1.0])
-    return (
-        _linear("distance", float(np.linalg.norm(line)), _ends(_unit(line)), points),
-        _linear("horizontal distance", float(np.linalg.norm(plan)), _ends(_unit(plan)), points),
-        _linear("height difference", rise, _ends(up), points),
+    plan, up = np.array([*line[:2], 0.0]), np.array([0.0, 0.0, 1.0])
+    found = (
+        ("distance", float(np.linalg.norm(line)), _unit(line)),
+        ("horizontal distance", float(np.linalg.norm(plan)), _unit(plan)),
+        ("height difference", rise, up),
+    )
+    return tuple(
+        Quantity(name, value, propagated(np.stack([-along, along]), points.cov_in_geo), "m")
+        for name, value, along in found
     )
 
 
 def length(points: MeasuredPoints) -> tuple[Quantity, ...]:
     """Return the length of the line through the points, in space and in plan."""
-    legs = np.diff(points.position_in_geo, axis=0)
+    legs, cov = np.diff(points.position_in_geo, axis=0), points.cov_in_geo
+    in_plan = legs * [1.0, 1.0, 0.0]
+    whole, plan = (float(np.linalg.norm(each, axis=1).sum()) for each in (legs, legs[:, :2]))
     return (
-        _linear("length", float(np.linalg.norm(legs, axis=1).sum()), _along(legs), points),
-        _linear(
-            "horizontal length",
-            float(np.linalg.norm(legs[:, :2], axis=1).sum()),
-            _along(legs * [1.0, 1.0, 0.0]),
-            points,
-        ),
+        Quantity("length", whole, propagated(_along(legs), cov), "m"),
+        Quantity("horizontal length", plan, propagated(_along(in_plan), cov), "m"),
     )
 
 
 def plan_area(points: MeasuredPoints) -> Quantity:
     """Return the horizontal area of the polygon of the points, in either direction."""
-    x, y = points.position_in_geo[:, 0], points.position_in_geo[:, 1]
-    east, north = x - x.mean(), y - y.mean()
-    area = abs(float(east @ np.roll(north, -1) - north @ np.roll(east, -1))) / 2
-    return _linear("horizontal area", area, _area_gradient(points), points, unit="m²")
-
-
-def _linear(name: str, value: float, gradient: FloatArray, points: MeasuredPoints, unit: str = "m") -> Quantity:
-    """Return a quantity with the σ of its linear part.
-
-    Args:
-        name: of the quantity.
-        value: of it.
-        gradient: (J, 3) derivative by the points.
-        points: with their covariance.
-        unit: of the value.
-    """
-    return Quantity(name, value, propagated(gradient, points.cov_in_geo), unit)
+    area, gradient = _area(points)
+    return Quantity("horizontal area", area, propagated(gradient, points.cov_in_geo), "m²")
 
 
 def propagated(gradient: FloatArray, cov: FloatArray | None) -> float | None:
@@ -107,10 +88,6 @@ def propagated(gradient: FloatArray, cov: FloatArray | None) -> float | None:
         return None
     flat = gradient.ravel()
     return float(np.sqrt(max(float(flat @ cov @ flat), 0.0)))
-
-
-def _ends(direction: FloatArray) -> FloatArray:
-    return np.stack([-direction, direction])
 
 
 def _along(legs: FloatArray) -> FloatArray:
@@ -139,8 +116,6 @@ class SampledSurface:
         cov_in_geo: (3 (J + M), 3 (J + M)) m², joint, of the corners and of those M samples that `chosen` names,
             without the samples' own errors; None: nothing states it.
         chosen: (M,) rows of the samples in that covariance.
-        spacing_m: of the grid.
-        coverage: share of the grid's points with a surface.
     """
 
     corners: MeasuredPoints
@@ -148,8 +123,6 @@ class SampledSurface:
     sigma_up_m: FloatArray
     cov_in_geo: FloatArray | None
     chosen: IntArray
-    spacing_m: float
-    coverage: float
 
 
 def surface_area(surface: SampledSurface) -> Quantity:
@@ -164,23 +137,27 @@ def surface_area(surface: SampledSurface) -> Quantity:
     return Quantity("area on the surface", plan.value * stretch, sigma, "m²")
 
 
+@dataclass(frozen=True)
+class BasePlane:
+    """Base of a volume: the plane that fits the corners best, or the level of the lowest one."""
+
+    kind: BaseKind = "plane through the corners"
+    lowest: int = 0
+
+
 def volumes(surface: SampledSurface, base: BasePlane) -> tuple[Quantity, ...]:
     """Return the volume between surface and base plane: above, below, and their difference.
 
     σ is that of the difference: of corners and samples jointly, and of the sampling, which is half the difference
     between the volumes of the white and of the black samples of the grid, if that is a chequerboard.
-
-    Args:
-        surface: the surface.
-        base: the plane.
     """
-    area = plan_area(surface.corners).value
-    weights = base.weights(surface.corners.position_in_geo[:, :2], surface.samples[:, :2])
+    area, area_gradient = _area(surface.corners)
+    weights = _base_weights(base, surface.corners.position_in_geo[:, :2], surface.samples[:, :2])
     above = surface.samples[:, 2] - weights @ surface.corners.position_in_geo[:, 2]
     count = len(above)
     gradient = np.zeros((len(surface.corners) + len(surface.chosen), 3))
     gradient[: len(surface.corners), 2] = -area * weights.mean(axis=0)
-    gradient[: len(surface.corners)] += _area_gradient(surface.corners) * float(above.mean())
+    gradient[: len(surface.corners)] += area_gradient * float(above.mean())
     gradient[len(surface.corners) :, 2] = area / len(surface.chosen)
     of_points = propagated(gradient, surface.cov_in_geo)
     sigma = None
@@ -199,36 +176,19 @@ def volumes(surface: SampledSurface, base: BasePlane) -> tuple[Quantity, ...]:
     )
 
 
-@dataclass(frozen=True)
-class BasePlane:
-    """Base of a volume: the plane that fits the corners best, or the level of the lowest one."""
-
-    kind: BaseKind = "plane through the corners"
-    lowest: int = 0
-
-    def weights(self, corners: FloatArray, places: FloatArray) -> FloatArray:
-        """Return the weights (N, J) of the corners' heights in the base at places.
-
-        Args:
-            corners: (J, 2) east and north.
-            places: (N, 2) likewise.
-        """
-        if self.kind == "level of the lowest corner":
-            weights = np.zeros((len(places), len(corners)))
-            weights[:, self.lowest] = 1.0
-            return weights
-        middle = corners.mean(axis=0)
-        design = np.column_stack([np.ones(len(corners)), corners - middle])
-        return np.asarray(np.column_stack([np.ones(len(places)), places - middle]) @ np.linalg.pinv(design))
+def _base_weights(base: BasePlane, corners: FloatArray, places: FloatArray) -> FloatArray:
+    """Return the weights (N, J) of the heights of corners (J, 2) in the base at places (N, 2), east and north."""
+    if base.kind == "level of the lowest corner":
+        weights = np.zeros((len(places), len(corners)))
+        weights[:, base.lowest] = 1.0
+        return weights
+    middle = corners.mean(axis=0)
+    design = np.column_stack([np.ones(len(corners)), corners - middle])
+    return np.asarray(np.column_stack([np.ones(len(places)), places - middle]) @ np.linalg.pinv(design))
 
 
 def grid_in_polygon(corners: FloatArray, spacing: float) -> FloatArray:
-    """Return the points (N, 2) of a grid that lie in a polygon.
-
-    Args:
-        corners: (J, 2), in either direction.
-        spacing: of the grid.
-    """
+    """Return the points (N, 2) of a grid that lie in a polygon (J, 2), which has either direction."""
     low, high = corners.min(axis=0), corners.max(axis=0)
     count = np.maximum(np.ceil((high - low) / spacing).astype(int), 1)
     axes = [low[k] + (np.arange(count[k]) + 0.5) * (high[k] - low[k]) / count[k] for k in (0, 1)]
@@ -261,11 +221,11 @@ def _mean_stretch(samples: FloatArray) -> float:
     return float(np.linalg.norm(normal, axis=1).sum() / np.abs(normal[:, 2]).sum())
 
 
-def _area_gradient(points: MeasuredPoints) -> FloatArray:
-    """Return the derivative (J, 3) of the horizontal area of a polygon."""
+def _area(points: MeasuredPoints) -> tuple[float, FloatArray]:
+    """Return the horizontal area of a polygon, and its derivative (J, 3) by the points."""
     east, north = (points.position_in_geo[:, axis] - points.position_in_geo[:, axis].mean() for axis in (0, 1))
     twice = float(east @ np.roll(north, -1) - north @ np.roll(east, -1))
     gradient = np.zeros((len(east), 3))
     gradient[:, 0] = (np.roll(north, -1) - np.roll(north, 1)) / 2
     gradient[:, 1] = (np.roll(east, 1) - np.roll(east, -1)) / 2
-    return np.asarray(gradient * np.sign(twice))
+    return abs(twice) / 2, np.asarray(gradient * np.sign(twice))

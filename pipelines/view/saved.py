@@ -1,14 +1,11 @@
-"""Saved measurements: a GeoJSON file that is read again, and the same as CSV for tables.
-
-The points are stored in `geo` with the covariance of the surface and the photographs that show them, so that σ of
-what is made of several measurements is again the joint one.
-
-What the viewer's files have in common: one writer at a time, clear failures, and steps that can be undone.
+"""What the user saves in the viewer: its files, its measurements as GeoJSON and CSV, and the panels' tables.
 
 Several viewers may show one workspace. Each change reads the file again, changes the records that it is about, and
-writes the file whole: nothing is lost of what another viewer has saved meanwhile.
+writes the file whole: nothing is lost of what another viewer has saved meanwhile. One writer at a time.
 
-Tables of the viewer's panels, as HTML; all texts of the survey are escaped.
+The points of a measurement are stored in `geo` with the covariance of the surface and the photographs that show
+them, so that σ of what is made of several measurements is again the joint one. All texts of the survey are escaped
+in the tables.
 """
 
 from __future__ import annotations
@@ -33,13 +30,19 @@ from pipelines.core.products import ImageName, Product
 from pipelines.core.types import FloatArray, Matrix3, Vector3
 from pipelines.formats.tables import table_text
 from pipelines.formats.vector_files import Json, feature, features_text
-from pipelines.surface.picking import SurfacePoint
 from pipelines.survey.target_crs import TargetCrs
 from pipelines.view.quantities import Quantity
 
 FOLDER = "view"  # of the workspace: what the user saves in the viewer
 _PATIENCE_S = 5.0  # for another viewer, which holds the folder for the time of one write
 _MOST_STEPS = 100
+MEASUREMENTS, TABLE = "measurements.geojson", "measurements.csv"
+Kind = Literal["point", "distance", "polyline", "area", "volume"]
+_MOST_BYTES = 64 << 20
+_COLUMNS = ("name", "kind", "vertex", "x", "y", "z", "crs", "sigma_e_m", "sigma_n_m", "sigma_u_m")
+_TEXT = "font-size:0.85em;margin:0.4em 0.8em"
+_ALARM = "padding:0.4em 0.6em;border-left:0.3em solid #d33;background:rgba(221,51,51,0.12);font-weight:600"
+_TABLE = "width:100%;font-size:0.8em;border-spacing:0.3em 0.1em;font-variant-numeric:tabular-nums;text-align:right"
 
 
 @contextmanager
@@ -67,12 +70,7 @@ class History:
         self._steps: deque[tuple[str, Callable[[], object]]] = deque(maxlen=_MOST_STEPS)
 
     def add(self, step: str, undo: Callable[[], object]) -> None:
-        """Add a step that was taken.
-
-        Args:
-            step: in words, for the user.
-            undo: undoes it; a step whose undoing fails can be undone again.
-        """
+        """Add a step that was taken, in words, with its undoing; one that fails can be repeated."""
         self._steps.append((step, undo))
 
     def undo(self) -> str | None:
@@ -85,24 +83,9 @@ class History:
         return step
 
 
-MEASUREMENTS, TABLE = "measurements.geojson", "measurements.csv"
-Kind = Literal["point", "distance", "polyline", "area", "volume"]
-_MOST_BYTES = 64 << 20
-_COLUMNS = ("name", "kind", "vertex", "x", "y", "z", "crs", "sigma_e_m", "sigma_n_m", "sigma_u_m")
-
-
 def new_id() -> str:
     """Return the id of a new measurement."""
     return uuid.uuid4().hex
-
-
-class SavedQuantity(Product):
-    """Quantity of a measurement; σ is None where it is not known."""
-
-    name: str
-    value: float
-    sigma: float | None
-    unit: str
 
 
 class SavedPoint(Product):
@@ -124,23 +107,14 @@ class SavedPoint(Product):
     sigma_m: Vector3 | None
     lla: Vector3
 
-    def surface_point(self, index: dict[str, int]) -> SurfacePoint:
-        """Return the point, for a model whose images have these indices; unknown ones are left out."""
-        cameras = np.array([index[name] for name in self.images if name in index], dtype=np.int64)
-        return SurfacePoint(np.array(self.position_in_geo), np.array(self.cov_of_surface), cameras)
 
-
-class Measurement(Product):
+class NamedMeasurement(Product):
     """Saved measurement.
 
     Attributes:
         id: by which viewers know it, whatever its name.
-        name: given by the user.
-        kind: of the measurement.
         crs: name of the CRS of `xyz`.
         model: hash of the trained model in which it was measured.
-        points: in order.
-        quantities: values with their σ.
     """
 
     format_version: Literal[1] = 1
@@ -150,14 +124,11 @@ class Measurement(Product):
     crs: str
     model: str
     points: tuple[SavedPoint, ...] = Field(min_length=1, max_length=10_000)
-    quantities: tuple[SavedQuantity, ...] = ()
+    quantities: tuple[Quantity, ...] = ()
 
 
 class SavedMeasurements:
     """Measurements that the viewers of a workspace have saved, in the order of the file.
-
-    Args:
-        folder: of the files.
 
     Raises:
         InputError: the file cannot be read, or holds no measurements of the viewer.
@@ -165,16 +136,16 @@ class SavedMeasurements:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self.all: tuple[Measurement, ...] = tuple(read_measurements(folder))
+        self.all: tuple[NamedMeasurement, ...] = tuple(read_measurements(folder))
 
-    def put(self, measurement: Measurement, row: int | None = None) -> None:
+    def put(self, measurement: NamedMeasurement, row: int | None = None) -> None:
         """Save a measurement: in the place of the one with its id, else in a row, else as the last one.
 
         Raises:
             GeorefError: nothing was saved, and why.
         """
 
-        def with_it(found: list[Measurement]) -> list[Measurement]:
+        def with_it(found: list[NamedMeasurement]) -> list[NamedMeasurement]:
             ids = [each.id for each in found]
             if measurement.id in ids:
                 found[ids.index(measurement.id)] = measurement
@@ -184,7 +155,7 @@ class SavedMeasurements:
 
         self._change(with_it)
 
-    def remove(self, measurement: Measurement) -> None:
+    def remove(self, measurement: NamedMeasurement) -> None:
         """Remove a measurement.
 
         Raises:
@@ -192,7 +163,7 @@ class SavedMeasurements:
         """
         self._change(lambda found: [each for each in found if each.id != measurement.id])
 
-    def _change(self, changed: Callable[[list[Measurement]], list[Measurement]]) -> None:
+    def _change(self, changed: Callable[[list[NamedMeasurement]], list[NamedMeasurement]]) -> None:
         with changing(self._folder):
             measurements = changed(read_measurements(self._folder))
             replace_texts(
@@ -204,7 +175,7 @@ class SavedMeasurements:
         self.all = tuple(measurements)
 
 
-def _table(measurements: Sequence[Measurement]) -> str:
+def _table(measurements: Sequence[NamedMeasurement]) -> str:
     points = (
         (each.name, each.kind, vertex, *point.xyz, each.crs, *(point.sigma_m or ("", "", "")))
         for each in measurements
@@ -219,7 +190,7 @@ def _table(measurements: Sequence[Measurement]) -> str:
     return table_text((_COLUMNS, *points, (), named, *quantities))
 
 
-def read_measurements(folder: Path) -> list[Measurement]:
+def read_measurements(folder: Path) -> list[NamedMeasurement]:
     """Return the saved measurements of a folder; none without a file.
 
     Raises:
@@ -239,7 +210,7 @@ def read_measurements(folder: Path) -> list[Measurement]:
     read = []
     for number, each in enumerate(measurements):
         try:
-            read.append(Measurement.model_validate(each))
+            read.append(NamedMeasurement.model_validate(each))
         except ValidationError as error:
             first = error.errors()[0]
             field = f"features[{number}].properties.georef." + ".".join(map(str, first["loc"]))
@@ -247,7 +218,7 @@ def read_measurements(folder: Path) -> list[Measurement]:
     return read
 
 
-def _feature(measurement: Measurement) -> Json:
+def _feature(measurement: NamedMeasurement) -> Json:
     """Return the feature: a Point, a LineString or a Polygon in longitude, latitude and ellipsoidal height."""
     lon_lat_h = [[point.lla[1], point.lla[0], point.lla[2]] for point in measurement.points]
     geometry: dict[str, Any]
@@ -270,11 +241,6 @@ def _anticlockwise(ring: list[list[float]]) -> list[list[float]]:
     return [*turned, turned[0]]
 
 
-_TEXT = "font-size:0.85em;margin:0.4em 0.8em"
-_ALARM = "padding:0.4em 0.6em;border-left:0.3em solid #d33;background:rgba(221,51,51,0.12);font-weight:600"
-_TABLE = "width:100%;font-size:0.8em;border-spacing:0.3em 0.1em;font-variant-numeric:tabular-nums;text-align:right"
-
-
 @dataclass(frozen=True)
 class PlaceRow:
     """Place (3,) in `geo` with σ (3,) east, north, up in metres, or None."""
@@ -295,13 +261,7 @@ def failure(text: str) -> str:
 
 
 def place_table(target: TargetCrs, rows: Sequence[PlaceRow], marked: str = "place") -> str:
-    """Return places with their coordinates in the CRS.
-
-    Args:
-        target: the CRS.
-        rows: the places.
-        marked: name of the attribute `data-…` that holds a row's metres in `geo`, for scripts.
-    """
+    """Return places with their coordinates in the CRS; `data-…` of the name `marked` has metres in `geo`."""
     crs = target.crs
     names = ("longitude", "latitude", "height") if crs.is_geographic else ("easting", "northing", "height")
     heads = "".join(f"<th>{name} ({html.escape(unit)})</th>" for name, unit in zip(names, crs.units, strict=True))

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
@@ -20,54 +19,26 @@ if TYPE_CHECKING:
     import viser
 
 PointColour = Literal["of the photographs", "by σ horizontal", "by σ vertical"]
-Kind = Literal["cameras", "points", "errors", "tie points", "measured"]
-KINDS: tuple[Kind, ...] = ("cameras", "points", "errors", "tie points", "measured")
-MEASURED_RGB = (220, 30, 30)
+SignKind = Literal["cameras", "points", "errors", "tie points", "measured"]
+_KINDS: tuple[SignKind, ...] = get_args(SignKind)
+_MEASURED_RGB = (220, 30, 30)
 _MOST_POINTS = 200_000  # SfM points that are drawn
 _MOST_FRUSTUMS = 400  # cameras with a frustum to click on; of more, only the places are drawn
 # In units of the viewer; the scene's radius is 10.
-CAMERA_SIZE, SIGN_RADIUS, _POINT_SIZE = 0.15, 0.06, 0.012
+_CAMERA_SIZE, _SIGN_RADIUS, _POINT_SIZE = 0.15, 0.06, 0.012
 _SNAP_PX = 6.0  # of a click, around a sign
 _LENGTH = 0.7  # of the longest error arrow, in units of the viewer
 
 
-def rgb(colour: str) -> tuple[int, int, int]:
-    """Return the numbers of a colour `#rrggbb`."""
-    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
-
-
-@dataclass(frozen=True)
-class PointError:
-    """Surveyed place (3,) and measured place (3,) of a point, in `geo`."""
-
-    surveyed: FloatArray
-    measured: FloatArray
-
-
-@dataclass(frozen=True)
-class Hit:
-    """Sign under a click: a camera by its index, or a surveyed point by its name."""
-
-    kind: Literal["camera", "point"]
-    camera: int = -1
-    name: str = ""
-
-
 class Signs:
-    """Signs in the scene of a server.
-
-    Args:
-        server: of the viewer.
-        trained: the trained survey.
-        frame: of the viewer.
-    """
+    """Signs in the scene of a server, in the viewer's frame."""
 
     def __init__(self, server: viser.ViserServer, trained: TrainedSurvey, frame: ViewFrame) -> None:
         self._scene, self._trained, self._frame = server.scene, trained, frame
         self._centers = frame.view_from_model.apply(trained.poses.cam_center_in_model)
         self._named: dict[str, FloatArray] = {}
-        self._groups = {kind: self._scene.add_frame(f"/{kind}", show_axes=False) for kind in KINDS}
-        self._wanted = dict.fromkeys(KINDS, True)
+        self._groups = {kind: self._scene.add_frame(f"/{kind}", show_axes=False) for kind in _KINDS}
+        self._wanted = dict.fromkeys(_KINDS, True)
         self._hidden = False
 
     def place(self, point_in_geo: FloatArray) -> FloatArray:
@@ -75,7 +46,7 @@ class Signs:
         model_from_geo = self._trained.geo_from_model.inverse()
         return (self._frame.view_from_model @ model_from_geo).apply(point_in_geo)
 
-    def show(self, kind: Kind, visible: bool) -> None:
+    def show(self, kind: SignKind, visible: bool) -> None:
         """Show or hide the signs of a kind."""
         self._wanted[kind] = visible
         self._groups[kind].visible = visible and not self._hidden
@@ -86,19 +57,21 @@ class Signs:
         for kind, wanted in self._wanted.items():
             self.show(kind, wanted)
 
-    def hit(self, start: FloatArray, direction: FloatArray, pixel_rad: float) -> Hit | None:
+    def hit(self, start: FloatArray, direction: FloatArray, pixel_rad: float) -> int | str | None:
         """Return the sign that a line of sight meets, the nearest to its start; None: it meets none.
+
+        The sign is a camera by its index, or a surveyed point by its name.
 
         Args:
             start: (3,) in the viewer's frame.
             direction: (3,) unit vector.
             pixel_rad: width of a pixel of the page.
         """
-        signs: list[tuple[FloatArray, float, Hit]] = []
+        signs: list[tuple[FloatArray, float, int | str]] = []
         if self._groups["points"].visible:
-            signs += [(place, SIGN_RADIUS, Hit("point", name=name)) for name, place in self._named.items()]
+            signs += [(place, _SIGN_RADIUS, name) for name, place in self._named.items()]
         if self._groups["cameras"].visible:
-            signs += [(place, CAMERA_SIZE, Hit("camera", camera=k)) for k, place in enumerate(self._centers)]
+            signs += [(place, _CAMERA_SIZE, camera) for camera, place in enumerate(self._centers)]
         met = []
         for place, radius, sign in signs:
             along = float((place - start) @ direction)
@@ -112,7 +85,7 @@ class Signs:
         poses, frame = self._trained.poses, self._frame
         if len(self._centers) > _MOST_FRUSTUMS:
             self._scene.add_point_cloud(
-                "/cameras/all", self._centers, rgb(BLUE), point_size=CAMERA_SIZE / 2, precision="float32"
+                "/cameras/all", self._centers, _rgb(BLUE), point_size=_CAMERA_SIZE / 2, precision="float32"
             )
             return
         for index, center in enumerate(self._centers):
@@ -122,10 +95,10 @@ class Signs:
                 f"/cameras/{index}",
                 fov=2 * float(np.arctan(lens.height / 2 / lens.mean_focal_px)),
                 aspect=lens.width / lens.height,
-                scale=CAMERA_SIZE,
+                scale=_CAMERA_SIZE,
                 thickness=1.5,
                 thickness_units="screen",
-                color=rgb(BLUE if split == "train" else ORANGE),
+                color=_rgb(BLUE if split == "train" else ORANGE),
                 wxyz=wxyz_of(frame.view_from_model.rotation @ poses.cam_from_model[index].T),
                 position=center,
             )
@@ -135,20 +108,21 @@ class Signs:
         for number, point in enumerate(points):
             place = self._named[point.name] = self.place(np.array(point.position_in_geo))
             name = f"/points/{kind}{number}"
-            colour = rgb(ORANGE if kind == "control" else DARK)
-            self._scene.add_icosphere(name, radius=SIGN_RADIUS, color=colour, position=place, subdivisions=2)
-            self._scene.add_label(f"{name}/name", point.name, position=(0.0, 0.0, SIGN_RADIUS))
+            colour = _rgb(ORANGE if kind == "control" else DARK)
+            self._scene.add_icosphere(name, radius=_SIGN_RADIUS, color=colour, position=place, subdivisions=2)
+            self._scene.add_label(f"{name}/name", point.name, position=(0.0, 0.0, _SIGN_RADIUS))
 
-    def add_errors(self, errors: Sequence[PointError]) -> float:
-        """Draw at least one error arrow, enlarged so that they are seen; return by how much."""
-        longest = max(float(np.linalg.norm(error.measured - error.surveyed)) for error in errors)
+    def add_errors(self, ends_in_geo: Sequence[tuple[FloatArray, FloatArray]]) -> float:
+        """Draw arrows from surveyed to measured places (3,), enlarged so that they are seen; return by how much."""
+        longest = max(float(np.linalg.norm(measured - surveyed)) for surveyed, measured in ends_in_geo)
         scale = self._frame.view_from_model.scale
         enlarged = _round_factor(_LENGTH / max(longest * scale, 1e-12))
         ends = [
-            (self.place(e.surveyed), self.place(e.surveyed + enlarged * (e.measured - e.surveyed))) for e in errors
+            (self.place(surveyed), self.place(surveyed + enlarged * (measured - surveyed)))
+            for surveyed, measured in ends_in_geo
         ]
         self._scene.add_arrows(
-            "/errors/all", np.array(ends), rgb(ORANGE), shaft_radius=0.015, head_radius=0.04, head_length=0.1
+            "/errors/all", np.array(ends), _rgb(ORANGE), shaft_radius=0.015, head_radius=0.04, head_length=0.1
         )
         return enlarged
 
@@ -172,14 +146,17 @@ class Signs:
         )
         return limits
 
-    def add_measured(self, name: str, points_in_geo: FloatArray, *, closed: bool = False) -> None:
-        """Draw measured points, and the line through them."""
+    def show_measured(self, name: str, points_in_geo: FloatArray, *, closed: bool = False) -> None:
+        """Draw measured points, and the line through them; without points, remove those of that name."""
+        if not len(points_in_geo):
+            self._scene.remove_by_name(f"/measured/{name}")
+            return
         places = self.place(points_in_geo)
         self._scene.add_point_cloud(
             f"/measured/{name}/points",
             places,
-            MEASURED_RGB,
-            point_size=SIGN_RADIUS,
+            _MEASURED_RGB,
+            point_size=_SIGN_RADIUS,
             point_shape="circle",
             precision="float32",
         )
@@ -187,18 +164,19 @@ class Signs:
         if len(places) > 1:
             segments = np.stack([places[: len(ends)], ends], axis=1)
             self._scene.add_line_segments(
-                f"/measured/{name}/line", segments, MEASURED_RGB, thickness=3.0, thickness_units="screen"
+                f"/measured/{name}/line", segments, _MEASURED_RGB, thickness=3.0, thickness_units="screen"
             )
-
-    def remove_measured(self, name: str) -> None:
-        """Remove measured points and their line."""
-        self._scene.remove_by_name(f"/measured/{name}")
 
 
 def wxyz_of(rotation: FloatArray) -> FloatArray:
     """Return the quaternion (4,) of a rotation (3, 3), real part first."""
     x, y, z, w = quat_xyzw_from_matrix(rotation)
     return np.array([w, x, y, z])
+
+
+def _rgb(colour: str) -> tuple[int, int, int]:
+    """Return the numbers of a colour `#rrggbb`."""
+    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
 
 
 def _round_factor(value: float) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 from collections.abc import Callable
@@ -15,6 +16,7 @@ from pipelines.core.errors import GeorefError
 from pipelines.core.manifest import hash_file
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import GAUSSIANS, MODEL, REPORT
+from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.surface_views import ModelRenderer
@@ -30,7 +32,7 @@ from pipelines.view.options import ViewOptions
 from pipelines.view.photo_view import PhotoView
 from pipelines.view.pictures import Painter, Photographs, PictureLoop, ViewFrame, camera_of, frame_of
 from pipelines.view.saved import FOLDER, paragraph
-from pipelines.view.signs import Kind, PointColour, PointError, Signs
+from pipelines.view.signs import PointColour, SignKind, Signs
 
 if TYPE_CHECKING:
     import viser
@@ -46,11 +48,9 @@ ClickMode = Literal["looks", "measures", "marks in the photograph"]
 class Viewer:
     """Viewer of a workspace, until the model changes.
 
-    Args:
-        server: of the pages.
-        workspace: has a trained model.
-        options: of the viewer.
-        progress: shows the reading.
+    Attributes:
+        click_mode: what a click in the scene does.
+        loops: of the open pages, by the number of the page.
 
     Raises:
         MissingProductError: there is no trained model; names the command that makes it.
@@ -70,29 +70,30 @@ class Viewer:
             self.model = MeasuringModel(workspace, self._renderer, options)
             task.advance()
         self.frame: ViewFrame = frame_of(trained)
-        self.painter = Painter(self._renderer, Photographs(workspace, self._renderer), self.frame)
-        self._loops: dict[int, PictureLoop] = {}
+        self.painter = Painter(self._renderer, Photographs(workspace, trained), self.frame)
+        self.loops: dict[int, PictureLoop] = {}
         self._lock, self._first_drawn = threading.Lock(), threading.Event()
         self.signs = Signs(server, trained, self.frame)
         self.photo = PhotoView(server, trained, self.frame, self.signs, self.wake)
         self._build(workspace, workspace.root / FOLDER)
         server.scene.on_click()(self._clicked)
-        threading.Thread(target=self._prepare_clicks, daemon=True).start()
+
+        def prepare_clicks() -> None:
+            """Sort the Gaussians after the first picture, so that neither it nor the first click waits."""
+            self._first_drawn.wait(_FIRST_S)
+            self._renderer.prepare_windows()
+
+        threading.Thread(target=prepare_clicks, daemon=True).start()
         server.on_client_connect(self._connected)
         server.on_client_disconnect(self._left)
         for client in server.get_clients().values():
             self._connected(client)
 
-    def _prepare_clicks(self) -> None:
-        """Sort the Gaussians after the first picture, so that neither it nor the first click waits."""
-        self._first_drawn.wait(_FIRST_S)
-        self._renderer.prepare_windows()
-
     def _build(self, workspace: Workspace, folder: Path) -> None:
         gui, trained = self._server.gui, self.model.trained
         self._notice = gui.add_html("")
         gui.add_html(accuracy_line(workspace))
-        self._mode = gui.add_dropdown("A click", get_args(ClickMode), hint="What a click in the scene does")
+        self.click_mode = gui.add_dropdown("A click", get_args(ClickMode), hint="What a click in the scene does")
         tabs = gui.add_tab_group()
         with tabs.add_tab("See"):
             self._build_look(workspace)
@@ -101,7 +102,7 @@ class Viewer:
                 self._server, self.model, self.signs, folder, hash_file(workspace.path(MODEL), {})
             )
         with tabs.add_tab("Mark"):
-            self.marking = MarkPanel(self._server, self.model, self.signs, self.photo, folder)
+            self.marking = MarkPanel(self._server, self.model, self.photo, folder)
             gui.add_button("Measure with the marked point").on_click(lambda _: self._take_marked())
         survey = trained.survey
         self.signs.add_cameras()
@@ -116,20 +117,25 @@ class Viewer:
         gui.add_button("Fly there").on_click(lambda _: self.photo.show(names.index(self._photo.value)))
         share = gui.add_slider("Photograph over splat", 0.0, 1.0, 0.05, 1.0)
         gui.add_button("Leave the photograph").on_click(lambda _: self._leave())
-        shown: tuple[tuple[str, Kind, bool], ...] = (
+        switches: tuple[tuple[str, SignKind, bool], ...] = (
             ("Cameras", "cameras", True),
             ("Control and check points", "points", True),
             ("Errors of the points", "errors", True),
             ("SfM points", "tie points", False),
         )
-        for label, kind, visible in shown:
+        for label, kind, visible in switches:
             self._add_switch(label, kind, visible)
         self._colour = gui.add_dropdown("Colour of the SfM points", get_args(PointColour))
         self._legend = gui.add_html(self._errors(workspace))
         self._colour.on_update(lambda _: self._colour_points())
-        share.on_update(lambda _: self._blend(share.value))
 
-    def _add_switch(self, label: str, kind: Kind, visible: bool) -> None:
+        def blend() -> None:
+            self.photo.share = float(share.value)
+            self.wake()
+
+        share.on_update(lambda _: blend())
+
+    def _add_switch(self, label: str, kind: SignKind, visible: bool) -> None:
         box = self._server.gui.add_checkbox(label, visible)
         box.on_update(lambda _: self.signs.show(kind, box.value))
         self.signs.show(kind, visible)
@@ -140,7 +146,7 @@ class Viewer:
             report = read_report(workspace.path(REPORT))
         except GeorefError:
             return paragraph("No errors are shown: `georef evaluate` measures them.")
-        errors = point_errors(self.model, report)
+        errors = _point_errors(self.model, report)
         if not errors:
             return paragraph("No control or check point has an error to show.")
         enlarged = self.signs.add_errors(errors)
@@ -157,10 +163,6 @@ class Viewer:
                 f"predicted σ of the SfM points: dark {low:.3f} m, bright {high:.3f} m"
             )
 
-    def _blend(self, share: float) -> None:
-        self.photo.share = float(share)
-        self.wake()
-
     def _leave(self) -> None:
         self.photo.leave()
         for client in self._server.get_clients().values():
@@ -171,43 +173,23 @@ class Viewer:
         if point is not None:
             self.measuring.add_point(point)
 
-    @property
-    def click_mode(self) -> ClickMode:
-        """What a click in the scene does."""
-        mode: ClickMode = self._mode.value
-        return mode
-
-    @click_mode.setter
-    def click_mode(self, mode: ClickMode) -> None:
-        self._mode.value = mode  # type: ignore[misc]
-
-    @property
-    def loops(self) -> tuple[PictureLoop, ...]:
-        """Loops of the open pages."""
-        return tuple(self._loops.values())
-
-    @property
-    def drawn(self) -> int:
-        """Number of pictures at full size that were drawn for the open pages."""
-        return sum(loop.drawn for loop in self.loops)
-
     def wake(self) -> None:
         """Draw the pictures of all pages anew."""
-        for loop in self.loops:
+        for loop in tuple(self.loops.values()):
             loop.wake()
 
     def _connected(self, client: viser.ClientHandle) -> None:
         with self._lock:
-            if client.client_id in self._loops:
+            if client.client_id in self.loops:
                 return
             self._stand_above(client)
-            self._loops[client.client_id] = PictureLoop(
+            self.loops[client.client_id] = PictureLoop(
                 client, self.painter, lambda: self.photo.blend, self._first_drawn.set
             )
 
     def _left(self, client: viser.ClientHandle) -> None:
         with self._lock:
-            loop = self._loops.pop(client.client_id, None)
+            loop = self.loops.pop(client.client_id, None)
         if loop is not None:
             loop.end()
 
@@ -225,17 +207,17 @@ class Viewer:
             return
         start, direction = np.array(event.ray_origin), np.array(event.ray_direction)
         direction /= np.linalg.norm(direction)
-        if self.click_mode == "marks in the photograph":
+        if self.click_mode.value == "marks in the photograph":
             self._mark(event.client, direction)
             return
         sight = self.frame.sight(camera, start, direction)
         hit = self.signs.hit(start, direction, sight.pixel_rad)
-        if hit is not None and hit.kind == "camera" and self.click_mode == "looks":
-            self._photo.value = self.model.trained.sparse.image_name[hit.camera]  # type: ignore[misc]
-            self.photo.show(hit.camera)
-        elif hit is not None and hit.kind == "point":
-            self.measuring.add_surveyed(hit.name)
-        elif self.click_mode == "measures":
+        if isinstance(hit, int) and self.click_mode.value == "looks":
+            self._photo.value = self.model.trained.sparse.image_name[hit]  # type: ignore[misc]
+            self.photo.show(hit)
+        elif isinstance(hit, str):
+            self.measuring.add_surveyed(hit)
+        elif self.click_mode.value == "measures":
             self.measuring.add_sight(sight)
 
     def _mark(self, client: viser.ClientHandle, direction: np.ndarray) -> None:
@@ -245,17 +227,15 @@ class Viewer:
         elif not self.photo.come_closer(client, direction):
             self.marking.add(self.photo.camera, self.photo.in_cam(direction))
 
-    def tell(self, sentence: str) -> None:
-        """Show a sentence above the panels of all pages."""
+    def tell_change(self, read_again: Callable[[], None]) -> None:
+        """Tell all pages that the model has changed, and offer to read it again."""
+        sentence = "The model has changed since it was read: measurements are those of the old one."
         self._notice.content = paragraph(sentence, mark="notice")
-
-    def add_reload(self, act: Callable[[], None]) -> None:
-        """Offer to read the model again."""
-        self._server.gui.add_button("Read the model again").on_click(lambda _: act())
+        self._server.gui.add_button("Read the model again").on_click(lambda _: read_again())
 
     def close(self) -> None:
         """End the pictures, and empty the pages."""
-        for loop in self.loops:
+        for loop in tuple(self.loops.values()):
             loop.end()
         self._server.scene.remove_click_callback("all")
         self._server.scene.reset()
@@ -268,13 +248,13 @@ def accuracy_line(workspace: Workspace) -> str:
     return "" if headline is None else paragraph(f"The {headline.sentence}.", mark="accuracy")
 
 
-def point_errors(model: MeasuringModel, report: EvaluationReport) -> list[PointError]:
-    """Return the triangulated errors of control and check points."""
+def _point_errors(model: MeasuringModel, report: EvaluationReport) -> list[tuple[FloatArray, FloatArray]]:
+    """Return the surveyed and the triangulated place (3,) in `geo` of control and check points."""
     survey = model.trained.survey
     place = {p.name: np.array(p.position_in_geo) for p in (*survey.control_points, *survey.check_points)}
     rows = [*report.checkpoints.camera.points, *report.fit.gcp.points]
     return [
-        PointError(place[row.name], place[row.name] + np.array([row.de_m, row.dn_m, row.du_m]))
+        (place[row.name], place[row.name] + np.array([row.de_m, row.dn_m, row.du_m]))
         for row in rows
         if row.name in place and row.de_m is not None and row.dn_m is not None and row.du_m is not None
     ]
@@ -303,7 +283,6 @@ def serve(
         options: of the viewer.
         ready: called with the address, its key included, when the pages can be opened.
         ended: ends the viewer.
-        progress: shows the reading.
 
     Raises:
         MissingProductError: there is no trained model; names the command that makes it.
@@ -321,17 +300,12 @@ def serve(
                 again.clear()
                 viewer.close()
                 viewer, told = Viewer(server, workspace, options, progress), False
-            if not told and _has_changed(workspace, viewer.stamp):
+            changed = False
+            with contextlib.suppress(GeorefError, OSError):  # between the old model and the new one
+                changed = model_stamp(workspace) != viewer.stamp
+            if changed and not told:
                 told = True
                 log.warning("the model has changed since the viewer read it")
-                viewer.tell("The model has changed since it was read: measurements are those of the old one.")
-                viewer.add_reload(again.set)
+                viewer.tell_change(again.set)
     finally:
         stop_server(server)
-
-
-def _has_changed(workspace: Workspace, stamp: tuple[int, ...]) -> bool:
-    try:
-        return model_stamp(workspace) != stamp
-    except (GeorefError, OSError):  # between the old model and the new one
-        return False

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,9 +10,9 @@ from playwright.sync_api import Browser
 
 from pipelines.deliver.splat import codec_arrays
 from pipelines.deliver.tiles import Tiling, write_tiles
-from pipelines.deliver.tiles_page import write_page
+from pipelines.deliver.tiles_page import write_scene_page
 from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.level_of_detail import DetailTile
+from pipelines.splat.level_of_detail import DetailTile, scene_box
 from tests.browser import hill
 from tests.browser.chromium import Viewer, chromium, served
 
@@ -38,9 +37,9 @@ def write_scene(folder: Path, gaussians: Gaussians, largest_tile: int = 200_000)
     """Write tiles and page of Gaussians of the hill; return the root of the tiles."""
     splat = hill.placed(gaussians)
     arrays = codec_arrays(splat.gaussians)
-    tiling = replace(Tiling.of(arrays), largest_tile=largest_tile)
+    tiling = Tiling(scene_box(arrays.means), len(arrays), largest_tile)
     root = write_tiles(folder, [arrays], tiling, splat.placement.sidecar())
-    write_page(hill.page(splat, "Cesium/"), folder)
+    write_scene_page(hill.page(splat, "Cesium/"), folder)
     return root
 
 

@@ -13,7 +13,7 @@ import torch
 from pipelines.deliver.options import PageOptions, SplatOptions
 from pipelines.deliver.placement import place
 from pipelines.deliver.splat import PlacedSplat, placed_splat
-from pipelines.deliver.tiles_page import ScenePage, ShownScene, scene_page
+from pipelines.deliver.tiles_page import ScenePage, scene_page
 from pipelines.geodesy.enu import (
     Origin,
     ecef_from_enu,
@@ -147,8 +147,8 @@ def placed(gaussians: Gaussians) -> PlacedSplat:
 def page(splat: PlacedSplat, cesium: str) -> ScenePage:
     """Return the page of a splat, with coordinates in the Swiss CRS."""
     target = target_crs(PageOptions(crs=SWISS), ORIGIN, GEO_FROM_SCENE.translation[None], survey().vertical)
-    scene = ShownScene(HOSTILE, splat.placement, splat.gaussians.means.numpy())
-    return scene_page(scene, survey(), target, cesium)
+    means = splat.gaussians.means.numpy()
+    return scene_page(HOSTILE, splat.placement, means, survey=survey(), target=target, cesium=cesium)
 
 
 _COVARIANCE = ((1e-4, 0.0, 0.0), (0.0, 1e-4, 0.0), (0.0, 0.0, 1e-4))

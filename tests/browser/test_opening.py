@@ -10,7 +10,7 @@ import pytest
 from playwright.sync_api import Browser
 
 from pipelines.deliver.options import CESIUM
-from pipelines.deliver.tiles_page import write_page
+from pipelines.deliver.tiles_page import write_scene_page
 from tests.browser import hill
 from tests.browser.chromium import served
 from tests.browser.conftest import new_viewer, write_scene
@@ -32,7 +32,7 @@ def test_link_opens_the_view_that_it_names(browser: Browser, address: str) -> No
 
 @pytest.mark.parametrize("cesium", [CESIUM, "nowhere/"], ids=["no network", "no such folder"])
 def test_page_says_that_the_library_is_missing(browser: Browser, tmp_path: Path, cesium: str) -> None:
-    write_page(hill.page(hill.placed(hill.make_gaussians()), cesium), tmp_path)
+    write_scene_page(hill.page(hill.placed(hill.make_gaussians()), cesium), tmp_path)
     viewer = new_viewer(browser)
     with served(tmp_path) as root:
         viewer.show(root)

@@ -83,7 +83,7 @@ class Opened:
 
     def measure(self, point_in_geo: np.ndarray) -> None:
         """Measure a point with a click."""
-        self.viewer.click_mode = "measures"
+        self.viewer.click_mode.value = "measures"
         self.viewer.measuring.choose("point")
         self.tab("Measure")
         wait(lambda: self.page.locator("[data-measured]").count() == 0)
@@ -92,7 +92,7 @@ class Opened:
 
     def come_to_mark(self, point: SurveyedPoint) -> str:
         """Look closely at a point in the next photograph that shows it; return the photograph's name."""
-        self.viewer.click_mode = "marks in the photograph"
+        self.viewer.click_mode.value = "marks in the photograph"
         self.tab("Mark")
         self.viewer.marking.choose(point.name)
         self.press("Next photograph (N)")
@@ -144,9 +144,11 @@ def opened(workspace: Workspace, browser: Browser) -> Opened:
 
     page.route("**/*", loopback_only)
     page.goto(address)
-    wait(lambda: bool(server.get_clients()) and any(loop.drawn for loop in viewer.loops))
+    wait(lambda: bool(server.get_clients()) and any(loop.drawn for loop in viewer.loops.values()))
     before = 0
-    while before != (before := viewer.drawn):  # the panel takes a part of the page when it is laid out
+    while before != (
+        before := sum(loop.drawn for loop in viewer.loops.values())
+    ):  # the panel takes a part of the page when it is laid out
         time.sleep(1.5)
     return Opened(viewer, server, page, outside)
 
@@ -186,7 +188,7 @@ def test_picture_is_the_render(hill: Opened) -> None:
 
 
 def test_clicks_on_check_points_give_what_evaluate_states(hill: Opened, workspace: Workspace) -> None:
-    hill.viewer.click_mode = "measures"
+    hill.viewer.click_mode.value = "measures"
     hill.tab("Measure")
     rows = {row.name: row for row in read_report(workspace.path(REPORT)).checkpoints.model.points}
     points = hill.viewer.model.trained.survey.check_points[:5]
@@ -203,7 +205,7 @@ def test_clicks_on_check_points_give_what_evaluate_states(hill: Opened, workspac
 
 
 def test_a_click_on_the_ground_measures_what_lies_under_it(hill: Opened) -> None:
-    hill.viewer.click_mode = "measures"
+    hill.viewer.click_mode.value = "measures"
     hill.tab("Measure")
     hill.viewer.measuring.clear()
     wait(lambda: hill.page.locator("[data-measured]").count() == 0)
@@ -215,7 +217,7 @@ def test_a_click_on_the_ground_measures_what_lies_under_it(hill: Opened) -> None
 
 
 def test_a_distance_states_its_sigma(hill: Opened) -> None:
-    hill.viewer.click_mode = "measures"
+    hill.viewer.click_mode.value = "measures"
     hill.tab("Measure")
     hill.viewer.measuring.choose("distance")
     first, second = (np.array(point.position_in_geo) for point in hill.viewer.model.trained.survey.check_points[:2])
@@ -244,7 +246,7 @@ def test_two_viewers_save_beside_each_other(hill: Opened, workspace: Workspace, 
         wait(lambda: again.page.locator("[data-saved]").count() == 1)
         assert name in str(again.page.locator("[data-saved]").text_content())
         assert again.page.title() != "run"
-        saved = again.viewer.measuring.saved[0]
+        saved = again.viewer.measuring.saved.all[0]
         np.testing.assert_allclose(saved.points[0].position_in_geo, place, atol=1e-6)
         assert saved.points[0].sigma_m is not None
         for view, count in ((again, 2), (hill, 3)):
@@ -300,7 +302,7 @@ def test_marks_are_set_in_photographs(hill: Opened, workspace: Workspace, browse
     finally:
         again.close()
     hill.viewer.photo.leave()
-    hill.viewer.click_mode = "looks"
+    hill.viewer.click_mode.value = "looks"
 
 
 def test_a_full_disk_is_told_and_nothing_is_stored_twice(

@@ -14,7 +14,7 @@ from pipelines.core.products import NOT_CHECKED, Caution, load_json, save_json
 from pipelines.core.stages import DELIVERABLES, MODEL, SPLAT, SURVEY
 from pipelines.core.workspace import Workspace
 from pipelines.deliver.options import PURPOSES
-from pipelines.deliver.overview import Bounds, overview
+from pipelines.deliver.overview import overview
 from pipelines.geodesy.enu import ecef_from_enu
 from pipelines.geodesy.vertical import VerticalDatum, parse_vertical
 from pipelines.survey.options import CrsOptions
@@ -76,13 +76,13 @@ def test_geoid_without_its_grid_gives_way_only_where_nobody_asked_for_it(copied:
 
 
 def test_accuracy_is_that_of_the_evaluation_and_unknown_where_nothing_checks_it(copied: Workspace) -> None:
-    before = overview(copied, CrsOptions()).quality.accuracy
+    before = overview(copied, CrsOptions()).accuracy
     assert before is not None and before.kind == "predicted"  # by the adjustment: not evaluated
     scene = AccuracySummary(cells=4, rms_sigma_h_m=0.03, rms_sigma_v_m=0.04, reason=None)
     unchecked = Caution(code=NOT_CHECKED, sentence="Nothing checks the positions.")
     for cautions, kind in (((), "predicted"), ((unchecked,), "unknown")):
         save_json(report_with(scene=scene, cautions=cautions), copied.root / "evaluate/report.json")
-        accuracy = overview(copied, CrsOptions()).quality.accuracy
+        accuracy = overview(copied, CrsOptions()).accuracy
         assert accuracy is not None
         assert accuracy.kind == kind
         assert (accuracy.rmse_h_m is None) == (kind == "unknown")
@@ -114,7 +114,8 @@ def test_feature_is_the_rectangle_with_all_the_rest(copied: Workspace) -> None:
 
 
 def test_rectangle_across_the_date_line_has_two_parts(made: tuple[TrueScene, Workspace]) -> None:
-    bounds: Bounds = replace(overview(made[1], CrsOptions()).bounds, west=179.9, east=-179.8)
-    geometry = bounds.geometry()
+    result = overview(made[1], CrsOptions())
+    across = replace(result, bounds=replace(result.bounds, west=179.9, east=-179.8))
+    geometry = across.feature()["geometry"]
     assert geometry is not None
     assert geometry["type"] == "MultiPolygon"

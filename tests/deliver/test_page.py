@@ -20,8 +20,13 @@ from pipelines.core.sentences import printable
 from pipelines.deliver.options import CESIUM, PageOptions, SplatOptions
 from pipelines.deliver.placement import place
 from pipelines.deliver.splat import placed_splat
-from pipelines.deliver.tiles_content import LocalCrs, fit_local_crs
-from pipelines.deliver.tiles_page import ScenePage, ShownScene, scene_page, write_page
+from pipelines.deliver.tiles_page import (
+    LocalCrs,
+    ScenePage,
+    fit_local_crs,
+    scene_page,
+    write_scene_page,
+)
 from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import ecef_from_enu, ecef_from_enu_rotation, ecef_from_lla, lla_from_ecef
 from pipelines.geodesy.vertical import parse_vertical
@@ -70,15 +75,15 @@ def page_of(survey: Survey, cautions: tuple[Caution, ...] = (), accuracy: Headli
         sh=torch.zeros(500, 1, 3),
     )
     splat = placed_splat(gaussians, place(model, survey, means, accuracy), SplatOptions())
-    scene = ShownScene(HOSTILE, splat.placement, splat.gaussians.means.numpy())
     middle_in_geo = splat.placement.file_from_geo.inverse().apply(np.zeros((1, 3)))
     target = target_crs(PageOptions(), survey.origin, middle_in_geo, survey.vertical)
-    return scene_page(scene, survey, target, "Cesium/")
+    in_file = splat.gaussians.means.numpy()
+    return scene_page(HOSTILE, splat.placement, in_file, survey=survey, target=target, cesium="Cesium/")
 
 
 def test_names_cannot_leave_the_document_that_holds_them(tmp_path: Path) -> None:
     page = page_of(surveyed(), (Caution(code="odd", sentence=HOSTILE),))
-    write_page(page, tmp_path)
+    write_scene_page(page, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["index.html"]
     (attributes, data), (_, program) = Scripts((tmp_path / "index.html").read_text(encoding="utf-8")).found
     assert attributes == {"type": "application/json", "id": "scene"}
@@ -117,7 +122,7 @@ def test_page_runs_its_own_script_and_cesium_alone(
     tmp_path: Path, cesium: str, library: str, files: str | None
 ) -> None:
     page = page_of(surveyed()).model_copy(update={"cesium": cesium})
-    write_page(page, tmp_path)
+    write_scene_page(page, tmp_path)
     text = (tmp_path / "index.html").read_text(encoding="utf-8")
     policy, program = Policies(text).found, text.partition("<script>")[2].partition("</script>")[0]
     own = base64.b64encode(hashlib.sha256(program.encode()).digest()).decode()

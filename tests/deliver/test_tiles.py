@@ -17,8 +17,7 @@ from pipelines.core.products import save_json
 from pipelines.core.stages import BLOCK_RECORD, GAUSSIANS
 from pipelines.core.workspace import StageRun
 from pipelines.deliver.options import ExportTilesOptions
-from pipelines.deliver.tiles import run, write_whole
-from pipelines.deliver.tiles_content import read_glb, write_glb
+from pipelines.deliver.tiles import read_glb, run, write_glb, write_whole
 from pipelines.formats.georef_sidecar import read_sidecar
 from pipelines.formats.splat_ply import SplatArrays, write_splat_ply
 from pipelines.splat.level_of_detail import DetailTile

@@ -108,9 +108,9 @@ def test_undoing_that_fails_can_be_repeated(tmp_path: Path) -> None:
     viewer = kept(tmp_path)
     viewer.set_mark("G1", "a.jpg", None)
     with Disk(tmp_path, "full", 1).mounted(), pytest.raises(InputError, match="No space left"):
-        viewer.undo()
+        viewer.history.undo()
     assert "a.jpg" not in marks(viewer)["G1"]
-    viewer.undo()
+    viewer.history.undo()
     assert "a.jpg" in marks(viewer)["G1"]
 
 

@@ -70,14 +70,14 @@ def test_what_was_removed_comes_back_step_by_step(tmp_path: Path) -> None:
     other.set_mark("C1", "b.jpg", (2.0, 2.0))
     viewer.remove_point("new")
     assert "new" not in marks(viewer)
-    assert viewer.undo() == "removal of new"
+    assert viewer.history.undo() == "removal of new"
     assert marks(viewer)["new"] == {"a.jpg": (1.0, 1.0)}
-    assert [viewer.undo(), viewer.undo()] == ["mark of new in a.jpg", "point new"]
-    assert viewer.undo() == "mark of G1 in a.jpg"
+    assert [viewer.history.undo(), viewer.history.undo()] == ["mark of new in a.jpg", "point new"]
+    assert viewer.history.undo() == "mark of G1 in a.jpg"
     assert "a.jpg" not in marks(viewer)["G1"]
-    assert viewer.undo() == "removal of the mark of G1 in a.jpg"
+    assert viewer.history.undo() == "removal of the mark of G1 in a.jpg"
     assert marks(viewer) == {**before, "C1": {"b.jpg": (2.0, 2.0)}}  # nobody's but its own
-    assert viewer.undo() is None
+    assert viewer.history.undo() is None
     assert marks(kept(tmp_path)) == marks(viewer)
 
 

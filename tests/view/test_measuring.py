@@ -17,7 +17,7 @@ from pipelines.survey.marks import mark_rays
 from pipelines.survey.options import CrsOptions
 from pipelines.view import measuring
 from pipelines.view.measuring import MeasuringModel
-from pipelines.view.quantities import BasePlane
+from pipelines.view.quantities import BasePlane, distances
 from tests.splat_scenes import ground_height
 from tests.view_scenes import renderer_of
 
@@ -41,7 +41,7 @@ def test_points_under_lines_of_sight_lie_on_the_hill(model: MeasuringModel, star
     # From places where no photograph was taken, steep and slanting.
     errors, sigmas = [], []
     for east, north in np.random.default_rng(3).uniform(-12, 12, (12, 2)):
-        point = model.under(sight(start, on_ground(east, north)))
+        point = model.reader.under(sight(start, on_ground(east, north)))
         assert isinstance(point, SurfacePoint)
         place = point.position_in_geo
         line = np.array(start) - on_ground(east, north)
@@ -63,13 +63,13 @@ def test_surveyed_points_are_measured_as_by_evaluate(model: MeasuringModel) -> N
     maps = [depth_around(renderer, int(camera), xy) for camera, xy in zip(rays.camera, rays.xy, strict=True)]
     expected = points_by_model(model.trained, rays, maps)
     for row, point in enumerate(survey.check_points):
-        measured = model.behind_marks(mark_rays((point,), model.trained.sparse))
+        measured = model.reader.behind_marks(mark_rays((point,), model.trained.sparse))
         assert isinstance(measured, SurfacePoint)
         np.testing.assert_allclose(measured.position_in_geo, expected[row], atol=1e-9)
 
 
 def test_nothing_is_measured_where_nothing_is(model: MeasuringModel) -> None:
-    up = model.under(Sight(np.array([0.0, 0.0, 40.0]), np.array([0.0, 0.0, 1.0]), 1 / 600))
+    up = model.reader.under(Sight(np.array([0.0, 0.0, 40.0]), np.array([0.0, 0.0, 1.0]), 1 / 600))
     assert isinstance(up, NoSurface)
     assert "nothing of the model" in up.reason
 
@@ -83,13 +83,13 @@ def test_what_photographs_look_through_is_no_surface(viewed, model: MeasuringMod
     gaussians.log_scales[row] = np.log(0.15)
     shown = MeasuringModel(viewed, renderer, CrsOptions())
     place = gaussians.means[row].double().numpy()
-    point = shown.under(sight([place[0], place[1], 60.0], place))
+    point = shown.reader.under(sight([place[0], place[1], 60.0], place))
     assert not isinstance(point, SurfacePoint) or abs(point.position_in_geo[2] - 24.0) > 10
 
 
 def corners(model: MeasuringModel, half: float) -> list[SurfacePoint]:
     places = [(-half, -half), (half, -half), (half, half), (-half, half)]
-    points = [model.under(sight([0.0, 0.0, 80.0], on_ground(*place))) for place in places]
+    points = [model.reader.under(sight([0.0, 0.0, 80.0], on_ground(*place))) for place in places]
     assert all(isinstance(point, SurfacePoint) for point in points)
     return [point for point in points if isinstance(point, SurfacePoint)]
 
@@ -118,16 +118,16 @@ def test_areas_and_volume_of_the_hill(model: MeasuringModel, monkeypatch: pytest
 
 
 def test_shared_errors_cancel_in_distances(model: MeasuringModel) -> None:
-    near = [model.under(sight([0.0, 0.0, 60.0], on_ground(east, 2.0))) for east in (1.0, 3.0)]
+    near = [model.reader.under(sight([0.0, 0.0, 60.0], on_ground(east, 2.0))) for east in (1.0, 3.0)]
     points = [point for point in near if isinstance(point, SurfacePoint)]
-    placed = model.place(points[0])
-    distance, plan, rise = model.distance(points)
-    assert placed.sigma_m is not None
+    _, sigma_m = model.place(points[0])
+    distance, plan, rise = distances(model.jointly(points))
+    assert sigma_m is not None
     assert distance.sigma is not None and plan.sigma is not None and rise.sigma is not None
     of_surface = np.sqrt(sum(point.cov_of_surface[2, 2] for point in points))
     # Two metres apart, similarity and cameras move both alike: what is left is the surface's own.
     assert rise.sigma == pytest.approx(of_surface, rel=0.2)
-    assert plan.sigma < 0.7 * np.hypot(*placed.sigma_m[:2]) * np.sqrt(2)
+    assert plan.sigma < 0.7 * np.hypot(*sigma_m[:2]) * np.sqrt(2)
     assert distance.value == pytest.approx(2.0, abs=0.2)
 
 

@@ -61,7 +61,7 @@ def test_volume_over_either_base(kind, expected: float) -> None:
     samples = np.column_stack([grid, 0.04 * grid[:, 0] + 0.5])
     chosen = np.arange(0, len(samples), 40)
     cov = 1e-4 * np.eye(3 * (4 + len(chosen)))
-    surface = SampledSurface(exact(corners, cov[:12, :12]), samples, np.zeros(len(samples)), cov, chosen, 0.5, 1.0)
+    surface = SampledSurface(exact(corners, cov[:12, :12]), samples, np.zeros(len(samples)), cov, chosen)
     above, below, volume = volumes(surface, BasePlane(kind, lowest=0))
     assert volume.value == pytest.approx(expected)
     assert (above.value, below.value) == (pytest.approx(expected), 0.0)

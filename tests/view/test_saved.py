@@ -12,14 +12,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pipelines.core.errors import InputError
+from pipelines.view.quantities import Quantity
 from pipelines.view.saved import (
     MEASUREMENTS,
     TABLE,
     Kind,
-    Measurement,
+    NamedMeasurement,
     SavedMeasurements,
     SavedPoint,
-    SavedQuantity,
     read_measurements,
 )
 
@@ -45,21 +45,21 @@ def saved_point(place, lla, sigma) -> SavedPoint:
 
 POINTS = st.builds(saved_point, st.tuples(*3 * (st.floats(-100, 100),)), LLA, st.none() | PLACES)
 MEASUREMENT = st.builds(
-    Measurement,
+    NamedMeasurement,
     name=NAMES,
     kind=st.sampled_from(["point", "distance", "polyline", "area", "volume"]),
     crs=NAMES,
     model=NAMES,
     points=st.lists(POINTS, min_size=1, max_size=3).map(tuple),
     quantities=st.lists(
-        st.builds(SavedQuantity, name=NAMES, value=FINITE, sigma=st.none() | FINITE, unit=NAMES), max_size=3
+        st.builds(Quantity, name=NAMES, value=FINITE, sigma=st.none() | FINITE, unit=NAMES), max_size=3
     ).map(tuple),
 )
 
 
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(measurements=st.lists(MEASUREMENT, max_size=3))
-def test_what_is_saved_comes_back(tmp_path: Path, measurements: list[Measurement]) -> None:
+def test_what_is_saved_comes_back(tmp_path: Path, measurements: list[NamedMeasurement]) -> None:
     saved = SavedMeasurements(tmp_path)
     for old in saved.all:  # of the example before
         saved.remove(old)
@@ -99,8 +99,8 @@ def test_other_files_are_refused(tmp_path: Path, text: str, field: str | None) -
     assert str(tmp_path / MEASUREMENTS) in str(caught.value)
 
 
-def measurement(name: str) -> Measurement:
-    return Measurement(
+def measurement(name: str) -> NamedMeasurement:
+    return NamedMeasurement(
         name=name, kind="point", crs="C", model="m", points=(saved_point((1, 2, 3), (1, 2, 3), None),)
     )
 
