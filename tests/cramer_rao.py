@@ -13,6 +13,7 @@ Signal Processing I, 1993, section 3.9).
 
 from __future__ import annotations
 
+import operator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -80,9 +81,10 @@ class CameraInformation:
     def __init__(self, ties: Network, sigma_px: float, anchors: Anchors) -> None:
         sums = _eliminated(ties, np.full(len(ties.obs_point), sigma_px), None)
         if anchors.control is not None and anchors.control_sigma_px is not None and anchors.cov_control is not None:
-            sums = sums + _eliminated(
+            control = _eliminated(
                 anchors.control, anchors.control_sigma_px, np.asarray(np.linalg.inv(anchors.cov_control))
             )
+            sums = EliminatedPoints(*map(operator.add, vars(sums).values(), vars(control).values()))
         poses = sums.poses + _information_of_fixes(anchors, len(ties.camera_id))
         poses = (poses + diags((poses.diagonal() == 0).astype(float))).tobsr((6, 6))  # cameras without observations
         diagonal = np.concatenate([poses.diagonal(), np.diag(sums.lens)])
