@@ -122,7 +122,7 @@ def _estimate(renderer: ModelRenderer, options: MeasurableOptions) -> str | None
     cameras, shown, pixels_m = trained.indices("train"), np.zeros(len(points), int), []
     for pose in map(renderer.pose, cameras):
         in_cam = (points - pose.center_in_model) @ pose.cam_from_model.T
-        inside = pose.pinhole.holds(pose.pinhole.project(in_cam))
+        inside = pose.pinhole.contains(pose.pinhole.project(in_cam))
         shown += inside
         if inside.any():
             pixels_m.append(np.median(in_cam[inside, 2]) / pose.pinhole.fx)

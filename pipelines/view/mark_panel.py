@@ -136,7 +136,7 @@ class MarkPanel(Panel):
         if point is None:
             return None
         rays = rays_of(point, self._model.trained)
-        place, cov = self._model.by_camera(rays)
+        place, cov = self._model.triangulated(rays)
         if not np.isfinite(place).all():
             return None
         return SurfacePoint(place, np.zeros((3, 3)) if cov is None else cov, rays.camera)
@@ -197,7 +197,7 @@ class MarkPanel(Panel):
 
     def _expected(self, point: MarkedPoint) -> FloatArray | None:
         """Return where a point must be (3,) in `geo`: by its marks, or by its survey."""
-        by_marks, _ = self._model.by_camera(rays_of(point, self._model.trained))
+        by_marks, _ = self._model.triangulated(rays_of(point, self._model.trained))
         if np.isfinite(by_marks).all():
             return by_marks
         return None if point.xyz is None else self._model.target.geo_from_xyz(np.array([point.xyz]))[0]
@@ -221,7 +221,7 @@ class MarkPanel(Panel):
                 self._tell(f"{note} No point yet: make one below.".lstrip())
                 return
             rays = rays_of(point, self._model.trained)
-            place, cov = self._model.by_camera(rays)
+            place, cov = self._model.triangulated(rays)
             rows, residuals = [], {}
             if point.xyz is not None:
                 surveyed = self._model.target.geo_from_xyz(np.array([point.xyz]))[0]

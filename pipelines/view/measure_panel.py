@@ -155,7 +155,7 @@ class MeasurePanel(Panel):
     def _against_survey(self, point: SurveyedPoint) -> str:
         """Return the coordinates of a surveyed point as surveyed and as triangulated, as HTML."""
         rays = mark_rays((point,), self._model.trained.sparse)
-        camera, cov = self._model.by_camera(rays)
+        camera, cov = self._model.triangulated(rays)
         rows = [PlaceRow("surveyed", np.array(point.position_in_geo), np.sqrt(np.diag(point.cov_in_geo)))]
         if np.isfinite(camera).all():
             rows.append(PlaceRow("triangulated", camera, None if cov is None else np.sqrt(np.diag(cov))))
