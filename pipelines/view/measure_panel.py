@@ -1,4 +1,4 @@
-"""Panel of the viewer in which points are measured, named, saved and loaded again."""
+"""Panel of the viewer in which points, distances, areas and volumes are measured, named, saved and deleted."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ from pipelines.view.signs import Signs
 if TYPE_CHECKING:
     import viser
 
-_LEAST = {"point": 1, "distance": 2, "polyline": 2, "area": 3, "volume": 3}
+_LEAST = {"point": 1, "distance": 2, "polyline": 2, "area": 3, "volume": 3}  # points of a measurement
 _MOST = {"point": 1, "distance": 2}
 _CLOSED = ("area", "volume")
 _BASES: tuple[BaseKind, ...] = get_args(BaseKind)
 
 
 class MeasurePanel(Panel):
-    """Panel of the measurements; those that are saved lie in a folder.
+    """Panel of the measurements; `folder` has the saved ones.
 
     Attributes:
-        kind: chosen in the page.
+        kind: dropdown of the kind of the present measurement.
         points: of the present measurement.
     """
 
@@ -113,7 +113,7 @@ class MeasurePanel(Panel):
         self._replace("point", self._kind, (*kept, point), note)
 
     def _replace(self, step: str, kind: Kind, points: tuple[SurfacePoint, ...], note: str = "") -> None:
-        """Measure with other points, as a step that can be undone."""
+        """Replace kind and points of the present measurement, as a step that can be undone under its name."""
         former_kind, former = self._kind, self.points
         if points or former:
             self._history.add(step, lambda: self._show(former_kind, former))
