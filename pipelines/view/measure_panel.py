@@ -14,6 +14,7 @@ from pipelines.survey.marks import mark_rays
 from pipelines.survey.survey import SurveyedPoint
 from pipelines.view.mark_panel import Panel
 from pipelines.view.measuring import MeasuringModel
+from pipelines.view.overlays import Overlays
 from pipelines.view.quantities import BaseKind, BasePlane, Quantity, distances, length
 from pipelines.view.saved import (
     History,
@@ -29,7 +30,6 @@ from pipelines.view.saved import (
     quantity_text,
     saved_table,
 )
-from pipelines.view.signs import Signs
 
 if TYPE_CHECKING:
     import viser
@@ -49,9 +49,9 @@ class MeasurePanel(Panel):
     """
 
     def __init__(
-        self, server: viser.ViserServer, model: MeasuringModel, signs: Signs, folder: Path, model_hash: str
+        self, server: viser.ViserServer, model: MeasuringModel, overlays: Overlays, folder: Path, model_hash: str
     ) -> None:
-        self._model, self._signs, self._hash = model, signs, model_hash
+        self._model, self._overlays, self._hash = model, overlays, model_hash
         self._names = model.trained.sparse.image_name
         survey = model.trained.survey
         self._surveyed = {point.name: point for point in (*survey.control_points, *survey.check_points)}
@@ -137,7 +137,7 @@ class MeasurePanel(Panel):
                 self._tell("Reading the surface …")
             self._quantities = self._measured(kind)
         places = np.array([point.position_in_geo for point in self.points])
-        self._signs.show_measured("now", places, closed=kind in _CLOSED and len(self.points) > 2)
+        self._overlays.show_measured("now", places, closed=kind in _CLOSED and len(self.points) > 2)
         self._result.content = self._described(note)
 
     def _measured(self, kind: Kind) -> tuple[Quantity, ...]:
@@ -273,11 +273,11 @@ class MeasurePanel(Panel):
 
     def _show_saved(self) -> None:
         for number in range(self._drawn):
-            self._signs.show_measured(f"saved{number}", np.zeros((0, 3)))
+            self._overlays.show_measured(f"saved{number}", np.zeros((0, 3)))
         rows = []
         for number, measurement in enumerate(self.saved.all):
             places = np.array([point.position_in_geo for point in measurement.points])
-            self._signs.show_measured(f"saved{number}", places, closed=measurement.kind in _CLOSED)
+            self._overlays.show_measured(f"saved{number}", places, closed=measurement.kind in _CLOSED)
             values = "; ".join(quantity_text(each) for each in measurement.quantities[:3])
             older = "" if measurement.model == self._hash else " (measured in an earlier model)"
             rows.append((measurement.name, measurement.name + older, values))
