@@ -15,7 +15,7 @@ from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.adjustment import InitialSimilarity
 from pipelines.survey.marks import mark_rays
 from pipelines.survey.survey import Survey
-from pipelines.survey.trained_survey import SolvedSurvey, points_by_camera
+from pipelines.survey.trained_survey import SolvedSurvey, triangulated_points
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def state(survey: Survey, model: SparseModel, options: InitSim3Options | None = 
     estimated = estimate_similarity(survey, model, points, options or InitSim3Options())
     posterior, weighted = estimated.posterior, estimated.initial.weighted(survey)
     rays = mark_rays(weighted.check_points, posterior.sparse)
-    position = points_by_camera(SolvedSurvey(weighted, model, posterior.solution), rays)
+    position = triangulated_points(SolvedSurvey(weighted, model, posterior.solution), rays)
     return Statement(position, posterior.of_marked_points(position, rays), estimated.initial, estimated.warnings)
 
 

@@ -67,7 +67,7 @@ def _blocks(ctx: click.Context, **values: Any) -> None:
 
 
 def _remembered(workspace: Workspace, flags: Flags) -> dict[str, dict[str, Any]]:
-    """Return the options of the training: those that it was requested with, and others."""
+    """Return the options of the training by stage: those of its last request, overridden by `flags`."""
     return remembered(workspace.root, [TRAIN.name], {TRAIN.name: flags})
 
 
@@ -92,13 +92,13 @@ def _plan(ctx: click.Context, parts: Parts, given: Flags, values: dict[str, Any]
 
 
 def _run_part(ctx: click.Context, parts: Parts, spec: StageSpec, values: dict[str, Any]) -> None:
-    """Run a part as one job does: without the lock of the workspace, which its parent may hold."""
+    """Run a part as a job does: without the workspace's lock, which the process that started the job may hold."""
     number, force, progress = values["number"], values["force"], progress_for(ctx.obj)
     if number is not None:
         parts.plan().block(number)
     elif spec is TRAIN_SCAFFOLD and (force or parts.why_missing(SOLVE)):
         parts.run(SOLVE, force=force, progress=progress)
-    variant = parts.place(number)
+    variant = parts.variant(number)
     with boundary.logged_to_file(variant, spec):
         outcome = parts.run(spec, number, force=force, progress=progress)
     print_outcome(variant, outcome, as_json=values["as_json"], told=is_told(ctx.obj))

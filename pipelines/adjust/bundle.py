@@ -26,14 +26,14 @@ from pipelines.geometry.bundle import (
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import jacobian_at
 
-_ROUNDS = 30
-_STILL = 1e-6  # change of an observation, in σ, that ends the descent
-_FLAT = 1e-6  # extent of control points across their line over that along it, which leaves the frame open
+_STEPS = 30
+_CONVERGED_SIGMAS = 1e-6  # the steps end when no residual changes by more
+_COLLINEAR = 1e-6  # width of the control points' layout over its length, below which they lie on one line
 
 
 @dataclass(frozen=True)
 class SurveyedPoints:
-    """Surveyed points of a network: their rows (J,), positions (J, 3) in metres, covariances (J, 3, 3) in m²."""
+    """Surveyed points: rows (J,) in `point_in_world`, positions (J, 3) in metres, covariances (J, 3, 3) in m²."""
 
     point: IntArray
     position_in_world: FloatArray
@@ -42,12 +42,12 @@ class SurveyedPoints:
 
 @dataclass(frozen=True)
 class AdjustedBundle:
-    """Minimum of a bundle, with its covariances; the lens is exactly known.
+    """Adjusted network with its covariances, which take the lens as exactly known.
 
     Attributes:
         residual_px: (M, 2) projected minus observed.
         sigma0: root of the weighted sum of squares over the redundancy; 1 where all σ are true.
-        points: how the points follow the cameras.
+        points: derivatives of the points by the camera poses.
     """
 
     network: Network
@@ -75,11 +75,11 @@ class AdjustedBundle:
 def adjust_bundle(network: Network, sigma_px: FloatArray, surveyed: SurveyedPoints) -> AdjustedBundle:
     """Return the least-squares adjustment of a network, from its approximate cameras and points.
 
-    The lens is held; σ (M,) are of the observations; a network needs three or more control points.
+    The lens is frozen; σ (M,) are of the observations; a network needs three or more control points.
 
     Raises:
         InputError: a point lies behind a camera that observes it.
-        ConvergenceError: the steps do not end.
+        ConvergenceError: the steps do not converge.
         DegenerateGeometryError: fewer than three control points, or all on one line.
     """
     information = np.zeros((len(network.point_in_world), 3, 3))
@@ -88,7 +88,7 @@ def adjust_bundle(network: Network, sigma_px: FloatArray, surveyed: SurveyedPoin
     target[surveyed.point] = surveyed.position_in_world
     _refuse_open_layouts(surveyed)
     before = np.full((len(sigma_px), 2), np.inf)
-    for _ in range(_ROUNDS):
+    for _ in range(_STEPS):
         if not has_positive_depth(network).all():
             raise InputError("a point of the network lies behind a camera that observes it")
         residual = projection_residuals(network)
@@ -99,7 +99,7 @@ def adjust_bundle(network: Network, sigma_px: FloatArray, surveyed: SurveyedPoin
             sums.poses, np.zeros((0, sums.poses.shape[0])), np.zeros((0, 0)), network.cam_center_in_world
         )
         points = intersection_jacobian(network, sigma_px, information)
-        if (np.abs(residual - before) / sigma_px[:, None]).max() < _STILL:
+        if (np.abs(residual - before) / sigma_px[:, None]).max() < _CONVERGED_SIGMAS:
             observed = 2 * len(sigma_px) + 3 * len(surveyed.point)
             redundancy = observed - 6 * len(network.camera_id) - 3 * len(network.point_in_world)
             squares = float(((residual / sigma_px[:, None]) ** 2).sum() + (apart * pull).sum())
@@ -109,20 +109,20 @@ def adjust_bundle(network: Network, sigma_px: FloatArray, surveyed: SurveyedPoin
         by_point, weighted = linearise_bundle(network).jacobian_point, residual / sigma_px[:, None] ** 2
         np.add.at(slope, network.obs_point, np.einsum("mij,mi->mj", by_point, weighted))
         network, before = _moved(network, step[:, 0], points, pull + slope), residual
-    raise ConvergenceError(f"the bundle does not settle in {_ROUNDS} steps: start with better cameras and points")
+    raise ConvergenceError(f"the bundle does not settle in {_STEPS} steps: start with better cameras and points")
 
 
 def _refuse_open_layouts(surveyed: SurveyedPoints) -> None:
     position = surveyed.position_in_world
     by_similarity = jacobian_at(position, position.mean(axis=0) if len(position) else np.zeros(3)).reshape(-1, 7)
-    if np.linalg.matrix_rank(by_similarity, tol=_FLAT * np.abs(by_similarity).max(initial=1.0)) < 7:
+    if np.linalg.matrix_rank(by_similarity, tol=_COLLINEAR * np.abs(by_similarity).max(initial=1.0)) < 7:
         raise DegenerateGeometryError(
             f"{len(position)} control points leave the frame open: three are needed that are not on one line"
         )
 
 
 def _moved(network: Network, step: FloatArray, points: IntersectionJacobian, slope: FloatArray) -> Network:
-    """Return the network after a step (6 n,) of the cameras, which the points follow to their own minimum."""
+    """Return the network after a step (6 n,) of the cameras; the points move to their minimum by `slope` (N, 3)."""
     turn, shift = np.split(step.reshape(-1, 6), 2, axis=1)
     followed = (points.by_poses @ step).reshape(-1, 3) - np.einsum("nij,nj->ni", points.cov_of_marks, slope)
     return replace(

@@ -1,10 +1,10 @@
-"""Stage `geolocate`: every SfM point intersected on Earth from the observed positions and attitudes.
+"""Stage `geolocate`: forward intersection of every SfM point from the observed positions and attitudes.
 
 Reads `ingest/survey.json` and `sfm/sparse`; writes `geolocate/points.npz` (`GeolocatedPoints`) and `points.ply`.
 GeoRefGS section 2.3, eqs 4–15 (doi 10.3390/drones10030195). Control and check points are not used.
 
 Fixes that contradict the layout of the cameras in the SfM model give no rays. The layout of all cameras reveals a
-bad fix. The three rays of a point do not: they cannot tell one bad fix from two good ones.
+bad fix. The few rays of one point do not tell a bad fix from good ones.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def run(stage: StageRun, options: GeolocateOptions) -> Summary:
 
 
 def geolocate(survey: Survey, model: SparseModel, options: GeolocateOptions) -> Geolocation:
-    """Return the points of a model, intersected on Earth.
+    """Return the points of a model in `geo`, by forward intersection.
 
     Without fixes, or without any rotations, the points have no positions, so that control points alone can
     georeference the survey.
@@ -87,7 +87,7 @@ def geolocate(survey: Survey, model: SparseModel, options: GeolocateOptions) -> 
     complete = both == len(fixes) or (alignment is None and both >= 2)
     use_recorded = options.attitude == "recorded" or (options.attitude == "auto" and complete)
     if alignment is None and not use_recorded:
-        # Control points may place the model nevertheless, or `init-sim3` finds what is wrong with the fixes.
+        # Control points may georeference the model nevertheless, or `init-sim3` finds the error of the fixes.
         return _without_positions(model, f"no directions for the SfM points: {problem}")
     warnings = _warnings(model, fixes, recorded, alignment, prior if use_recorded else None)
     used = recorded if use_recorded else None

@@ -2,8 +2,8 @@
 
 Single outliers are rejected in the adjustment. Where more than a third of a group would have to be rejected, or σ
 would have to be ten times the stated one, one side is wrong as a whole. The known mistakes are tried, and the one
-that fits is named. One inconsistency is everyday work: a constant shift of all fixes by up to five metres, of an
-autonomous base station, or by what σ of one fix allow. There the control points decide.
+that fits is named. One inconsistency is everyday work: a constant shift of all fixes, within the σ of one fix or by
+up to five metres, as an autonomous base station causes. Then the control points decide the position.
 """
 
 from __future__ import annotations
@@ -45,24 +45,24 @@ from pipelines.survey.survey import Survey
 _SIGMA_REFUTED = "sigma-refuted"
 # A stated σ that is too small by this factor is an inconsistency, if the scatter is so many metres or is explained.
 _WRONG_SIGMA, _WRONG_SCATTER_M = 10.0, 0.3
-# A variance factor up to this, of σ that are half as large again, is applied without blame.
+# A variance factor up to this, of σ that are larger by one half, is applied without a caution.
 _QUIET_FACTOR = 2.25
 _LEAST_FIXES = 4
 _AT_SKY = 0.3  # median up component of the views
-# Residuals share a shift that is so many times as large as what is left without it.
+# Residuals share a constant shift if it is so many times as large as their mean distance from it.
 _SHIFT_SPREADS = 5.0
 _ATTITUDE_SIGMAS, _ATTITUDE_RAD = 4.0, np.radians(8.0)
-# A turn is explained by a clock if so little is left of it.
+# A turn beyond the first is tested for a clock offset, which explains it if less than the second remains.
 _CLOCK_SIGMAS, _EXPLAINED_SIGMAS = 3.0, 1.0
 _NAMED = 5  # control points in a caution
 # A shift of all fixes up to this is everyday work with an autonomous base station.
 _EVERYDAY_SHIFT_M = 5.0
-_LEAST_FEET_M = 50.0
+_LEAST_FEET_M = 50.0  # vertical shift, below which feet are not suspected
 _FEET_PART = 0.05  # of a height, by which cameras are higher than control points
 # Size of the photographs in which marks were measured, and the factor of their pixels.
 _SCALES = {"1/2": 2.0, "1/3": 3.0, "1/4": 4.0, "2 times": 0.5, "3 times": 1 / 3, "4 times": 0.25}
 _MIRRORED_M = 0.3  # scatter about the SfM model, below which control points fit as they are
-_LEAST, _SIGMAS, _NEAR_SIGMAS, _LEAST_SCALE = 5, 5.0, 2.0, 0.01
+_LEAST_POINTS, _SCALE_SIGMAS, _CAUSE_SIGMAS, _LEAST_SCALE = 5, 5.0, 2.0, 0.01  # of two maps that differ in scale
 # From x, y and the height of the photograph to the pixels x, y without a mistake.
 _AS_STATED = np.eye(2, 3)
 _FROM_BELOW = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 1.0]])
@@ -78,7 +78,7 @@ class _Finding:
     ends: bool = False
 
 
-def judge(
+def cautions_of(
     survey: Survey, model: SparseModel, joint: JointAdjustment
 ) -> tuple[tuple[Caution, ...], tuple[Caution, ...]]:
     """Return the inconsistencies, which end the stage unless the user accepts them, and further limits."""
@@ -121,7 +121,7 @@ def unadjustable(survey: Survey, model: SparseModel, geo_from_local: Similarity 
 def marks_that_do_not_meet(unused: Sequence[UnusedControlPoint], mistake: str | None) -> tuple[Caution, ...]:
     """Return the caution that marks of control points do not meet in one point; none if they do.
 
-    `mistake` is that without which most of them would meet; then no control point is used.
+    `mistake` is the cause that explains most of them, if one is known; then no control point is used.
     """
     missed = [point for point in unused if len(point.residual_px) >= 2]
     if not missed:
@@ -135,7 +135,7 @@ def marks_that_do_not_meet(unused: Sequence[UnusedControlPoint], mistake: str | 
 
 
 def _is_wrong(factor: VarianceFactor) -> bool:
-    """Return whether a stated σ is too small by so much that it is no optimism."""
+    """Return whether a stated σ is too small by more than the factor of an inconsistency."""
     return factor.sigma_source == "stated" and factor.applied > _WRONG_SIGMA**2
 
 
@@ -191,9 +191,9 @@ def _shift_of_fixes(joint: JointAdjustment) -> Iterator[_Finding]:
         return
     for bias in joint.biases:
         information = (np.swapaxes(fixes.root_information, 1, 2) @ fixes.root_information).mean(axis=0)
-        # An estimate under a prior scatters by what the measurements have taken off the prior's variance.
-        shift_m, learned = np.array(bias.value), np.square(bias.prior) - np.square(bias.sigma)
-        if (shift_m**2 / np.maximum(learned, 1e-9)).sum() <= outlier_gate(3):
+        # The variance of an estimate under a prior is the prior's variance less the estimate's own (posterior).
+        shift_m, variance = np.array(bias.value), np.square(bias.prior) - np.square(bias.sigma)
+        if (shift_m**2 / np.maximum(variance, 1e-9)).sum() <= outlier_gate(3):
             continue
         values = ", ".join(
             f"{value:+.3f} ± {sigma:.3f}" for value, sigma in zip(bias.value, bias.sigma, strict=True)
@@ -257,7 +257,7 @@ def _apart(shift_m: FloatArray, survey: Survey, *, ends: bool) -> _Finding:
 def _attitudes(survey: Survey, fixes: StatedFixes, joint: JointAdjustment) -> Iterator[_Finding]:
     """Yield the finding that the attitudes contradict the solution.
 
-    A compass is often off by degrees, whatever its σ. A small turn is therefore heard only if a clock offset
+    A compass is often off by degrees, whatever its σ. A small turn is therefore reported only if a clock offset
     explains it: then the whole flight may lie in a wrong place.
     """
     prior = attitude_prior(survey, fixes.model)
@@ -354,7 +354,7 @@ def _mistake_in_map(survey: Survey, model: SparseModel) -> str | None:
     At least five fixes and five control points are needed: the scatter of fewer shows too little.
     """
     fixes, control = fix_correspondences(survey, model), control_correspondences(survey, model)[0]
-    if min(len(fixes), len(control)) < _LEAST:
+    if min(len(fixes), len(control)) < _LEAST_POINTS:
         return None
     try:
         (by_fixes, fix_m), (by_control, control_m) = (fit(one.in_local, one.in_geo) for one in (fixes, control))
@@ -371,9 +371,9 @@ def _mistake_in_map(survey: Survey, model: SparseModel) -> str | None:
         1.0 / FOOT_M: "the coordinates are in feet, although their CRS has metres",
     }
     near = min(causes, key=lambda scale: abs(np.log(ratio / scale)))
-    is_known = abs(np.log(ratio / near)) < _NEAR_SIGMAS * sigma + _LEAST_SCALE
+    is_known = abs(np.log(ratio / near)) < _CAUSE_SIGMAS * sigma + _LEAST_SCALE
     # Poor coordinates have any scale: one without a known cause has to be twice as evident.
-    if abs(np.log(ratio)) < (_SIGMAS if is_known else 2.0 * _SIGMAS) * sigma + _LEAST_SCALE:
+    if abs(np.log(ratio)) < (_SCALE_SIGMAS if is_known else 2.0 * _SCALE_SIGMAS) * sigma + _LEAST_SCALE:
         return None
     cause = causes[near] if is_known else "another unit or map projection"
     return f"their map is {ratio:.4g} times as large as that of the fixes: {cause}"
@@ -388,7 +388,7 @@ def _sigma_of_scale(positions: Correspondences, scatter_m: float) -> float:
 def _cause_of_shift(shift_m: FloatArray, survey: Survey) -> str:
     """Return the likely cause of a constant shift (3,) between fixes and control points: east, north, up.
 
-    Of which of the two it is, is of no account. The survey has control points.
+    The sign of the shift does not matter. The survey has control points.
     """
     height_m = survey.origin.alt_m + np.median([point.position_in_geo[2] for point in survey.control_points])
     horizontal, vertical = float(np.hypot(shift_m[0], shift_m[1])), abs(float(shift_m[2]))

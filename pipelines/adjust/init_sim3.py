@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 
 from pipelines.adjust.alignment import AdjustedSimilarity, Alignment, Correspondences, RotationPrior, align
-from pipelines.adjust.inconsistencies import judge, marks_that_do_not_meet, mistake_in_marks, unadjustable
+from pipelines.adjust.inconsistencies import cautions_of, marks_that_do_not_meet, mistake_in_marks, unadjustable
 from pipelines.adjust.joint import JointAdjustment, Start, adjust_jointly, component_of, in_own_frame
 from pipelines.adjust.measurements import (
     attitude_prior,
@@ -179,7 +179,7 @@ def robust_similarity(
         cautions = union(survey.cautions, contradictions, of_marks, (unchecked,))
         initial = _without_joint(aligned, alignment.solution, cautions)
         return Estimated(initial, solved(survey, model, initial, options.estimate), warnings)
-    contradictions, limits = judge(meets, model, joint)
+    contradictions, limits = cautions_of(meets, model, joint)
     _refuse(contradictions, options)
     initial, more = _joint_product(model, points, aligned, joint)
     cautions = union(survey.cautions, contradictions, of_marks, limits)

@@ -42,7 +42,7 @@ class Configuration:
 
     Attributes:
         title, note: the method in a few words; what differs from the other configurations, in one line.
-        sim3: its options of `init-sim3`; None: a bundle adjustment with the fixes places the model.
+        sim3: its options of `init-sim3`; None: a bundle adjustment with the fixes georeferences the model.
         train: its options of `train`; without effect if `trained_by` is set.
         trained_by: name of the configuration whose training it uses; None: its own.
     """
@@ -109,7 +109,7 @@ def select_configurations(text: str) -> tuple[Configuration, ...]:
 
 
 JSON, MARKDOWN, PLOT, PAGE = "table.json", "table.md", "plot.png", "comparison.html"
-_ROOM = __name__.rpartition(".")[0]
+_PACKAGE = __name__.rpartition(".")[0]  # its folder `templates` has the sections of the page
 
 
 def write_comparison(folder: Path, table: Comparison, survey: str) -> None:
@@ -123,7 +123,7 @@ def write_comparison(folder: Path, table: Comparison, survey: str) -> None:
     if is_held and (folder / PLOT).exists() and page_path.exists():
         return
     write_bars(folder / PLOT, bar_charts(table.rows))
-    replace_text(page_path, render_page(comparison_page(table, folder / PLOT, survey), _ROOM))
+    replace_text(page_path, render_page(comparison_page(table, folder / PLOT, survey), _PACKAGE))
     replace_text(markdown_path, markdown_text)
     replace_text(json_path, json_text)
 

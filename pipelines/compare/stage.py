@@ -69,10 +69,10 @@ def compare(
         workspace: with an ingested survey.
         configurations: rows of the table.
         flags: options of `train` for all configurations (`seed` also for the similarity). They override those of
-            the last comparison, which override those that `train` was last requested with. They are remembered.
+            the last comparison, which override those of the last request for `train`. They are remembered.
         force: run the stages of the configurations even if they are current.
         progress: shows the tasks of the stages.
-        around: makes the context in which a stage runs.
+        around: returns the context in which a stage runs, such as its log file.
 
     Returns:
         The table, and the stages in the order of their runs.
@@ -103,20 +103,20 @@ def compare(
 
 
 def _plan(workspace: Workspace, configuration: Configuration, asked: Flags) -> Iterator[VariantStage]:
-    """Yield the stages of a configuration in order, with those of the configuration whose training it uses."""
-    place, root = f"{FOLDER}/{configuration.name}", workspace.root
+    """Yield the stages of a configuration in order, after those of the configuration whose training it uses."""
+    variant_folder, root = f"{FOLDER}/{configuration.name}", workspace.root
     shared = {spec.folder: root / spec.folder for spec in _SHARED}
     seed = {"seed": asked["seed"]} if "seed" in asked else {}
-    lent = dict(shared)
+    lent = dict(shared)  # folders that the variant reads and does not write
     if configuration.sim3 is None:
-        yield VariantStage(workspace.variant(place, shared, FOLDER), ADJUST, seed)
-        lent |= dict.fromkeys(("sfm", _INIT.folder), root / place / ADJUST.folder)
+        yield VariantStage(workspace.variant(variant_folder, shared, FOLDER), ADJUST, seed)
+        lent |= dict.fromkeys(("sfm", _INIT.folder), root / variant_folder / ADJUST.folder)
     if configuration.trained_by is not None:
         trainer = BY_CONFIGURATION[configuration.trained_by]
         plan = _plan(workspace, trainer, asked)
         yield from (planned for planned in plan if planned.spec is not _EVALUATE)
         lent[_TRAIN.folder] = root / FOLDER / trainer.name / _TRAIN.folder
-    variant = workspace.variant(place, lent, FOLDER)
+    variant = workspace.variant(variant_folder, lent, FOLDER)
     if configuration.sim3 is not None:
         yield VariantStage(variant, _INIT, {**configuration.sim3, "max_residual": None, **seed})
     if configuration.trained_by is None:

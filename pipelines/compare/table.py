@@ -11,7 +11,7 @@ from pipelines.report.plots.charts import BarChart
 from pipelines.survey.report import CheckPointErrors
 from pipelines.survey.report_parts import ReferenceComparison
 
-# Errors of the check points that the table shows: how they were measured, and the field of `PointAccuracy`.
+# Errors of the check points that the table shows: the way of measuring (key of `WAYS`), field of `PointAccuracy`.
 POINT_FIGURES = (
     ("camera", "rmse_h_m"),
     ("camera", "rmse_v_m"),
@@ -97,7 +97,7 @@ def surface_accuracy(reference: ReferenceComparison | None) -> SurfaceAccuracy |
 
 
 def point_heads(ways: Mapping[str, str], between: str) -> tuple[str, ...]:
-    """Return the heads of the columns of `POINT_FIGURES`, of which the first of each way names it."""
+    """Return the column heads of `POINT_FIGURES`; `ways` has the words before the first column of each way."""
     first = dict(reversed(POINT_FIGURES))
     return tuple(
         (f"{ways[way]}{between}" if first[way] == name else "") + ERRORS[name].label for way, name in POINT_FIGURES

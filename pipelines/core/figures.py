@@ -20,9 +20,9 @@ SHORT_WAYS = {"camera": "triangulated", "model": "surface"}  # for narrow column
 
 @dataclass(frozen=True)
 class Figure:
-    """Accuracy figure as people read it: the head of its column, that of its line, and the form of its text.
+    """Accuracy figure: `label` heads its column, `meaning` its row; unit and decimals are those of its text.
 
-    Its unit is empty for a number of points.
+    The unit is empty for a number of points.
     """
 
     label: str
@@ -39,7 +39,7 @@ class Figure:
         return self.text(value) if value is None else f"{self.text(value)} {self.unit}".rstrip()
 
 
-# The headline's own: of the triangulated check points with their survey's error, else the predicted σ of the scene.
+# Figures of the headline, as `Headline` explains them.
 ACCURACY_H = Figure("H", "horizontal accuracy", "cm", 1)
 ACCURACY_V = Figure("V", "vertical accuracy", "cm", 1)
 CHECK_POINTS = Figure("checks", "check points that the accuracy was measured at", "", 0)
@@ -60,7 +60,7 @@ ERRORS = {
     "max_v_m": Figure("max V", "largest vertical error"),
     "max_3d_m": Figure("max 3D", "largest error in three dimensions"),
 }
-# Predicted σ over the cells of the scene, by the beginning of the fields of `survey.report.AccuracySummary`.
+# Predicted σ over the cells of the scene, by the prefix of the fields of `survey.report.AccuracySummary`.
 CELLS = {
     "least": Figure("least", "σ of the best cell of the scene"),
     "median": Figure("median", "median σ over the cells of the scene"),
@@ -74,8 +74,8 @@ class Headline(Product):
 
     Attributes:
         kind: `measured`: of the triangulated check points; `predicted`: of the scene; `unknown`: neither.
-        rmse_h_m, rmse_v_m: RMSE of the check points, their survey's error included, or the RMSE that the predicted
-            σ let expect: their root mean square over the scene. None: not known.
+        rmse_h_m, rmse_v_m: RMSE of the check points, their survey's error included, or the root mean square of the
+            predicted σ over the scene. None: not known.
         check_points: number of check points; 0 unless measured.
         reason: reason why it is not known; None: it is.
     """

@@ -87,7 +87,7 @@ def fingerprints(
 
 
 def _hash_part(workspace: Workspace, part: ProductPart, memo: Memo) -> dict[str, str]:
-    """Return the hash of a part and of the products that it brings; none for a missing or empty optional part."""
+    """Return the hash of a part and of the products read with it; none for a missing or empty optional part."""
     try:
         path = workspace.path(part.product)
     except MissingProductError:
@@ -112,7 +112,7 @@ def _hash_part(workspace: Workspace, part: ProductPart, memo: Memo) -> dict[str,
 
 
 def _values(path: Path, part: ProductPart) -> dict[str, Any] | None:
-    """Return the values of a JSON document that count, by field; None if all of it does."""
+    """Return the values of a JSON document that decide the result, by field; None if the whole document does."""
     if not part.fields and not part.without:
         return None
     file_size(path)
@@ -164,8 +164,8 @@ def _hash_file(path: Path) -> str:
 def _records(
     files: Mapping[str, Path], known: Mapping[str, FileRecord], progress: Progress
 ) -> dict[str, FileRecord]:
-    """Return records of files by name; those as a known record has them are not read."""
-    records = {name: known[name] for name, file in files.items() if name in known and _is_as(known[name], file)}
+    """Return records of files by name; an unchanged file keeps its known record and is not read."""
+    records = {name: known[name] for name, file in files.items() if name in known and _is_same(known[name], file)}
     unread = {name: file for name, file in files.items() if name not in records}
     if unread:
         threads = min(_MOST_THREADS, os.cpu_count() or 1)
@@ -176,13 +176,13 @@ def _records(
     return records
 
 
-def _is_as(record: FileRecord, path: Path) -> bool:
+def _is_same(record: FileRecord, path: Path) -> bool:
     stat = path.stat()
     return bool(record.sha256) and (record.size, record.mtime_ns) == (stat.st_size, stat.st_mtime_ns)
 
 
 def _record(path: Path) -> FileRecord:
-    """Return the record of a file; one that cannot be read has no hash: the stage says what is wrong with it."""
+    """Return the record of a file; an unreadable file has no hash, because the stage raises the error."""
     stat = path.stat()
     try:
         sha256 = _hash_file(path)
@@ -192,7 +192,7 @@ def _record(path: Path) -> FileRecord:
 
 
 def _input_files(folder: Path, workspace_root: Path, marker: InputMarker) -> dict[str, Path]:
-    """Return the visible files that count in a folder; a workspace inside the folder is left out."""
+    """Return the visible files of a folder that can matter, by name; a workspace inside the folder is left out."""
     # Resolved, because `workspace/../photos` is not in the workspace.
     place, workspace = folder.resolve(), workspace_root.resolve()
     return {

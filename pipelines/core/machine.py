@@ -1,4 +1,4 @@
-"""Threads that this process and its children compute with, and main memory, of the machine or of a container.
+"""Number of threads that this process and its children use, and main memory, of the machine or of a container.
 
 OpenMP, BLAS and numba read their variables when they are loaded. The limit is therefore set before the first stage
 is imported.
@@ -11,8 +11,8 @@ import os
 import sys
 from pathlib import Path
 
-_STANDARD = "OMP_NUM_THREADS"
-_VARIABLES = (_STANDARD, "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "GDAL_NUM_THREADS")
+_OPENMP = "OMP_NUM_THREADS"
+_VARIABLES = (_OPENMP, "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "GDAL_NUM_THREADS")
 
 
 def limit_threads(count: int) -> None:
@@ -25,7 +25,7 @@ def limit_threads(count: int) -> None:
 
 def thread_count() -> int:
     """Return the number of threads to compute with: the limit (`OMP_NUM_THREADS`), or the cores of this process."""
-    text = os.environ.get(_STANDARD, "")
+    text = os.environ.get(_OPENMP, "")
     return int(text) if text.isdecimal() and int(text) > 0 else available_cores()
 
 

@@ -5,8 +5,8 @@ surface is wrong by a part of the Gaussian's size. So:
 
 1. The surface of the training views is fused to points, as for the point cloud (`scene.surface_cloud`).
 2. A disc lies at each point. Its colour is that of the trained renders.
-3. Gaussians with their centre beside a disc are left out, and those that no training view shows, such as the sheet
-   beneath the scene. Others stay: what no surface explains, and what too few views confirm.
+3. Gaussians with their centre close to a disc are left out, and those that no training view shows, such as the
+   ground plane. The others stay: their surface is shown by too few views, or is none.
 4. Colours and opacities are fitted to the trained renders of the training views; no centre moves.
 
 Reads `ingest/survey.json`, the photographs, `sfm/sparse`, `train/model.json` and `train/gaussians.ply`. Writes
@@ -53,16 +53,16 @@ from pipelines.survey.trained_survey import TrainedSurvey, load_trained
 
 log = logging.getLogger(__name__)
 
-_SPACING_PX = 0.7
+_SPACING_PX = 0.7  # default distance between discs
 _MIN_VIEWS = 3  # that agree on a point of the surface, as in the point cloud
-_LEAST_SHOWN_PX = 0.05  # of a Gaussian that a view shows
-_LOOKED_AT, _LEAST_POINTS = 5000, 10  # SfM points of the estimate
-_KEPT = 0.12  # of the trained Gaussians lie beside no disc: share on a simulated flight
+_LEAST_SHOWN_PX = 0.05  # sum of a Gaussian's weights in the pixels of a view, from which on the view shows it
+_SAMPLED_POINTS, _LEAST_POINTS = 5000, 10  # SfM points of the estimate
+_KEPT_SHARE = 0.12  # of the trained Gaussians, with no disc close to them, on a simulated flight
 _PLY_VALUES = 14  # of a Gaussian, without harmonics
-# One pass over one view: fixed, by its megapixels, by millions of Gaussians.
+# Seconds of one pass over one view: fixed, for each of its megapixels, for each million Gaussians.
 _FIXED_S, _MEGAPIXEL_S, _MILLION_GAUSSIANS_S = 0.003, 0.092, 0.367
-_OTHER_PASSES = 5  # depth maps, their comparison and the choice of the Gaussians, in passes of repainting
-_BESIDE = 1.0  # spacings between the centre of a Gaussian and the disc that replaces it
+_OTHER_PASSES = 5  # time of depth maps, their comparison and the choice of Gaussians, in passes of the refinement
+_REPLACED_SPACINGS = 1.0  # largest distance of a Gaussian's centre from the disc that replaces it
 
 
 def run(stage: StageRun, options: MeasurableOptions) -> Summary:
@@ -113,16 +113,16 @@ def run(stage: StageRun, options: MeasurableOptions) -> Summary:
 
 
 def _estimate(renderer: ModelRenderer, options: MeasurableOptions) -> str | None:
-    """Return an estimate of file and time from SfM points and cameras, before anything is rendered.
+    """Return an estimate of file size and time from SfM points and cameras, before anything is rendered.
 
-    The time is that of the machine of docs/benchmarks.md. None: too few SfM points tell the extent of the surface.
+    The time is that of the machine of docs/benchmarks.md. None: too few SfM points to know the surface's extent.
     """
     trained = renderer.trained
-    points = trained.point_in_model[:: max(1, len(trained.point_in_model) // _LOOKED_AT)]
+    points = trained.point_in_model[:: max(1, len(trained.point_in_model) // _SAMPLED_POINTS)]
     cameras, shown, pixels_m = trained.indices("train"), np.zeros(len(points), int), []
     for pose in map(renderer.pose, cameras):
         in_cam = (points - pose.center_in_model) @ pose.cam_from_model.T
-        inside = pose.pinhole.holds(pose.pinhole.project(in_cam))
+        inside = pose.pinhole.contains(pose.pinhole.project(in_cam))
         shown += inside
         if inside.any():
             pixels_m.append(np.median(in_cam[inside, 2]) / pose.pinhole.fx)
@@ -133,7 +133,7 @@ def _estimate(renderer: ModelRenderer, options: MeasurableOptions) -> str | None
         return None
     spacing_m = options.disc_spacing or _SPACING_PX * trained.geo_from_model.scale * float(np.median(pixels_m))
     discs = round(ConvexHull(ground).volume / spacing_m**2)
-    gaussians = discs + round(_KEPT * len(trained.gaussians))
+    gaussians = discs + round(_KEPT_SHARE * len(trained.gaussians))
     size_bytes = gaussians * 4 * (_PLY_VALUES + 3 * coefficient_count(trained.gaussians.sh_degree))
     pixels = [pinhole.width * pinhole.height for pinhole in map(renderer.pinhole, cameras)]
     megapixels = float(np.mean(pixels)) / 1e6
@@ -148,7 +148,7 @@ def _estimate(renderer: ModelRenderer, options: MeasurableOptions) -> str | None
 def with_discs(
     gaussians: Gaussians, surface: SurfaceCloud, geo_from_model: Similarity, spacing_m: float
 ) -> tuple[Gaussians, int]:
-    """Return the Gaussians that lie beside no disc, then the discs, and the number of the discs.
+    """Return the Gaussians that are not close to a disc, then the discs, and the number of the discs.
 
     Args:
         gaussians: in `model`.
@@ -161,14 +161,14 @@ def with_discs(
     normal_in_model = surface.normal @ geo_from_model.rotation
     discs = surface_discs(center_in_model, normal_in_model, surface.rgb, spacing_in_model, gaussians.sh_degree)
     away, _ = KDTree(center_in_model).query(
-        gaussians.means.numpy().astype(np.float64), distance_upper_bound=_BESIDE * spacing_in_model
+        gaussians.means.numpy().astype(np.float64), distance_upper_bound=_REPLACED_SPACINGS * spacing_in_model
     )
     kept = gaussians.select(torch.from_numpy(np.isinf(away)))
     return Gaussians.concatenate([kept, discs]), len(discs)
 
 
 def _in_views(gaussians: Gaussians, views: SurfaceViews, backend: Rasterizer, progress: Progress) -> Tensor:
-    """Return the mask (N,) of the Gaussians that make up a part of a pixel in at least one view."""
+    """Return the mask (N,) of the Gaussians that at least one view shows."""
     most_px = torch.zeros(len(gaussians))
     with progress.task("Gaussians in view", len(views)) as task:
         for number in range(len(views)):
@@ -181,7 +181,7 @@ def _in_views(gaussians: Gaussians, views: SurfaceViews, backend: Rasterizer, pr
 
 
 def _collected(squares: Iterable[SurfaceCloud], views: SurfaceViews, trained: TrainedSurvey) -> SurfaceCloud:
-    """Return all points with a normal.
+    """Return the points of all squares that have a normal.
 
     Raises:
         ResourceError: discs at these points would not fit into the memory.

@@ -1,4 +1,4 @@
-"""Options of the deliverables, and what each file of a workspace is for, in the words of those who take it away."""
+"""Options of the deliverables, and a description of each file of a workspace for those who receive it."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ class ExportTilesOptions(WebSplatOptions, PageOptions):
 
 
 # By workspace path; a path without a suffix is a folder. In the order in which people look for them.
-PURPOSES: dict[str, str] = {
+DESCRIPTIONS: dict[str, str] = {
     "export/splat.ply": "the splat as trained, to look at and to edit (SuperSplat, Blender)",
     "measurable/splat.measurable.ply": "the splat to measure in, for viewers that pick centres; many times larger",
     "raster/orthophoto.tif": "orthophoto, for GIS and CAD",

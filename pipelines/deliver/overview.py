@@ -18,7 +18,7 @@ from pipelines.core.stages import BY_NAME, DELIVERABLES, GAUSSIANS, MODEL, REPOR
 from pipelines.core.staleness import StageState, cautions_by_stage, status
 from pipelines.core.types import FloatArray, Vector3
 from pipelines.core.workspace import Workspace
-from pipelines.deliver.options import PURPOSES
+from pipelines.deliver.options import DESCRIPTIONS
 from pipelines.deliver.placement import place, vector3
 from pipelines.formats.splat_ply import read_centres
 from pipelines.formats.vector_files import Json, feature, polygon
@@ -199,7 +199,7 @@ def _psnr(workspace: Workspace) -> float | None:
 def _files(workspace: Workspace, states: dict[str, StageState]) -> tuple[MadeFile, ...]:
     """Return the files that there are, with the state of the stage of their folder."""
     made = []
-    for name, purpose in PURPOSES.items():
+    for name, purpose in DESCRIPTIONS.items():
         path, row = workspace.root / name, states.get(name.partition("/")[0])
         if row is not None and path.exists():
             inside = path.rglob("*") if path.is_dir() else (path,)

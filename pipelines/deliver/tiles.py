@@ -39,7 +39,7 @@ from pipelines.splat.sh import coefficient_count
 from pipelines.survey.calibrated import load_survey
 from pipelines.survey.target_crs import target_crs
 
-_REACH_M = 2.0 ** (23 - FRACTIONAL_BITS)
+_REACH_M = 2.0 ** (23 - FRACTIONAL_BITS)  # largest coordinate that SPZ's 24 bits hold at their finest step
 _COPIES, _BYTES = 3, 17  # bytes of a Gaussian in SPZ before its compression, without harmonics above the constant
 # A viewer draws nothing of a tileset whose own error is below its limit (16 pixels by default): with this factor,
 # the scene is shown until it is a pixel wide.
@@ -113,7 +113,7 @@ def _page(workspace: Workspace, splat: SplatParts, options: ExportTilesOptions) 
 
 @dataclass(frozen=True)
 class Tiling:
-    """Division of a splat into tiles: box (2, 3) of the scene, numbers of all Gaussians and of a tile's at most."""
+    """Division of a splat: box (2, 3) of the scene in metres, number of Gaussians, largest number in a tile."""
 
     extent: FloatArray
     count: int

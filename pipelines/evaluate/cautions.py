@@ -1,4 +1,4 @@
-"""Cautions of an evaluation: predictions that check points refute, and check points that check little."""
+"""Cautions of an evaluation: predicted σ that check points reject, and check points close to control points."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from pipelines.robust.statistics import chi2_quantile
 from pipelines.survey.marks import mark_rays
 from pipelines.survey.report import CheckPointErrors
 from pipelines.survey.survey import Survey
-from pipelines.survey.trained_survey import SolvedSurvey, points_by_camera
+from pipelines.survey.trained_survey import SolvedSurvey, triangulated_points
 
 _LEAST_POINTS = 3
-_RANGE = (0.005, 0.995)  # of χ²: 99 % of true predictions lie within
+_RANGE = (0.005, 0.995)  # probabilities of χ²: 99 % of true predictions lie within
 _NEAR_M = 1.0
-_SINGULAR = 1e-12  # of the largest variance
+_SINGULAR = 1e-12  # of the largest variance: directions of smaller variance are left out
 
 
 def cautions_of_prediction(
-    solved: SolvedSurvey, posterior: Posterior, by_camera: CheckPointErrors, *, of_initial: bool
+    solved: SolvedSurvey, posterior: Posterior, triangulated: CheckPointErrors, *, of_initial: bool
 ) -> tuple[Caution, ...]:
-    """Return the limits of the predicted accuracy, of points that may be measured with the initial similarity."""
+    """Return the limits of the predicted accuracy; `of_initial`: the points have the initial similarity."""
     if of_initial:
         sentence = "Measured with the initial similarity: the prediction is that of the adjusted one."
         return (Caution(code="prediction-of-adjusted-similarity", sentence=sentence),)
@@ -32,7 +32,7 @@ def cautions_of_prediction(
     if len(points) < _LEAST_POINTS:
         return ()
     rays = mark_rays(points, solved.sparse)
-    position = points_by_camera(solved, rays)
+    position = triangulated_points(solved, rays)
     variance = np.diagonal(posterior.of_marked_points(position, rays), axis1=1, axis2=2)
     known = np.asarray(np.isfinite(position + variance).all(axis=1))
     if known.sum() < _LEAST_POINTS:
@@ -42,11 +42,11 @@ def cautions_of_prediction(
     cov = posterior.jointly_of_marked_points(position[known], rays.of_points(known))
     cov = cov + block_diag(*(point.cov_in_geo for point in chosen))
     names = tuple(point.name for point in chosen)
-    test = refutation(names, error.ravel(), cov, frozenset(by_camera.blunders))
+    test = chi2_caution(names, error.ravel(), cov, frozenset(triangulated.blunders))
     return () if test is None else (test,)
 
 
-def refutation(
+def chi2_caution(
     names: tuple[str, ...], error: FloatArray, cov: FloatArray, blunders: frozenset[str] = frozenset()
 ) -> Caution | None:
     """Return a caution if the errors of J points are outside the 99 % range that their covariance allows.
@@ -82,7 +82,7 @@ def refutation(
     others = tuple(name for name in names if name not in blunders)
     good = np.repeat([name not in blunders for name in names], 3)
     alone = ""
-    if _LEAST_POINTS <= len(others) < len(names) and not refutation(others, error[good], cov[np.ix_(good, good)]):
+    if _LEAST_POINTS <= len(others) < len(names) and not chi2_caution(others, error[good], cov[np.ix_(good, good)]):
         left_out = tuple(name for name in names if name in blunders)
         alone = f"; without the blunders ({listed(left_out)}) the errors agree with the prediction"
     return Caution(

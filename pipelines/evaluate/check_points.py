@@ -1,6 +1,6 @@
 """Surveyed points, measured in the solved survey: check points, cross-validation, and residuals of the fit.
 
-The sections of the report have their errors, accuracy after ASPRS, and predicted accuracy.
+Each is a section of the report, with errors, accuracy after ASPRS, and predicted accuracy.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pipelines.core.progress import Progress
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.evaluate.asprs import Assessment, assess
 from pipelines.robust.statistics import residual_stats
-from pipelines.surface.picking import DepthMap, depth_around, points_by_model
+from pipelines.surface.picking import DepthMap, depth_around, points_on_surface
 from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey.marks import MarkRays, mark_rays
 from pipelines.survey.report import (
@@ -33,16 +33,16 @@ from pipelines.survey.report import (
     RmsSigma,
 )
 from pipelines.survey.survey import SurveyedPoint
-from pipelines.survey.trained_survey import SolvedSurvey, fix_differences, points_by_camera, scene_area_km2
+from pipelines.survey.trained_survey import SolvedSurvey, fix_differences, scene_area_km2, triangulated_points
 
 
 @dataclass(frozen=True)
 class RemeasuredPoints:
-    """J surveyed points, measured in the model."""
+    """J surveyed points, measured by triangulation or on the rendered surface."""
 
     points: tuple[SurveyedPoint, ...]
     error_in_geo: FloatArray  # (J, 3) m, measured minus surveyed; NaN for a point that was not measured
-    rays: IntArray  # (J,) number of marks in registered images
+    rays: IntArray  # (J,) number of rays: of the marks in registered images
     cov_in_geo: FloatArray | None = None  # (J, 3, 3) m², predicted of the measured positions; None: no prediction
 
     @property
@@ -57,7 +57,7 @@ class RemeasuredPoints:
 
 
 def check_point_errors(measured: RemeasuredPoints, area_km2: float | None) -> CheckPointErrors:
-    """Return the report's section on check points in a scene of an area; None: not known."""
+    """Return the report's section on check points; the area is that of the scene, None: not known."""
     assessment = _assess(measured, area_km2)
     return CheckPointErrors(**_figures(measured, assessment), asprs=assessment.asprs)
 
@@ -151,7 +151,7 @@ def _predicted_sigma(measured: RemeasuredPoints) -> PredictedSigma | None:
 def triangulated_check_points(solved: SolvedSurvey, posterior: Posterior) -> CheckPointErrors:
     """Return the errors of the check points as intersections of their marks' rays, with their predicted σ."""
     points, rays = solved.survey.check_points, mark_rays(solved.survey.check_points, solved.sparse)
-    position = points_by_camera(solved, rays)
+    position = triangulated_points(solved, rays)
     cov = posterior.of_marked_points(position, rays) if points else None
     return check_point_errors(_compared(points, position, rays, cov), scene_area_km2(solved))
 
@@ -165,7 +165,7 @@ def check_points_on_surface(renderer: ModelRenderer, progress: Progress) -> Chec
         for camera, xy in zip(rays.camera, rays.xy, strict=True):
             maps.append(depth_around(renderer, int(camera), xy))
             task.advance()
-    position = points_by_model(trained, rays, maps)
+    position = points_on_surface(trained, rays, maps)
     return check_point_errors(_compared(points, position, rays), scene_area_km2(trained))
 
 
@@ -173,7 +173,7 @@ def cross_validate(solved: SolvedSurvey) -> CrossValidation:
     """Return the errors of the control points, each measured by a solution without that point.
 
     The adjustment has stored them. The covariance is that of the solution and the marks: the survey's own is
-    subtracted. A point that entered no solution, or that the others leave open, is NaN.
+    subtracted. The error is NaN for a point that entered no solution, or if the others determine none.
     """
     points = solved.survey.control_points
     error, cov = np.full((len(points), 3), np.nan), np.full((len(points), 3, 3), np.nan)
@@ -198,7 +198,7 @@ def control_residuals(solved: SolvedSurvey) -> ControlResiduals:
     """Return the residuals of the control points: the fit of the solution, not its accuracy."""
     points = solved.survey.control_points
     rays = mark_rays(points, solved.sparse)
-    measured = _compared(points, points_by_camera(solved, rays), rays)
+    measured = _compared(points, triangulated_points(solved, rays), rays)
     rejected = np.isin([point.name for point in points], solved.model.control_outliers)
     stats = residual_stats(measured.error_in_geo[measured.is_measured & ~rejected])
     return ControlResiduals(**stats.model_dump(), outliers=int(rejected.sum()), points=_residuals(measured))

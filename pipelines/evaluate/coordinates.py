@@ -35,9 +35,9 @@ def coordinates_in(crs: PointCrs, checkpoints: CheckPoints, survey: Survey) -> C
         InputError: a point lies outside the CRS's domain.
     """
     surveyed = np.array([point.position_in_geo for point in survey.check_points]).reshape(-1, 3)
-    by_camera, by_model = (surveyed + _errors(way, surveyed) for way in (checkpoints.camera, checkpoints.model))
+    measured = [surveyed + _errors(way, surveyed) for way in (checkpoints.camera, checkpoints.model)]
     # One call for all points, so that one operation transforms them all.
-    in_geo = np.concatenate([np.zeros((1, 3)), surveyed, by_camera, by_model])
+    in_geo = np.concatenate([np.zeros((1, 3)), surveyed, *measured])
     known = np.isfinite(in_geo).all(axis=1)
     lla = lla_from_ecef(ecef_from_enu(in_geo[known], survey.origin))
     xyz = np.full(in_geo.shape, np.nan)
@@ -89,7 +89,7 @@ _IN_CRS = ("crs", "x", "y", "z", "x_measured", "y_measured", "z_measured")
 def write_point_table(path: Path, report: EvaluationReport, survey: Survey) -> None:
     """Write one line for each point and way in which it was measured; what is not known stays empty.
 
-    The place is the surveyed one. With `--crs`, check points have their coordinates there too.
+    Columns latitude to up have the surveyed position. With `--crs`, check points have coordinates in it too.
     """
     place = _places(survey)
     in_crs = report.coordinates

@@ -58,14 +58,14 @@ class TrainingCoverage:
         return torch.from_numpy(share >= 0.5)
 
     def _views_of(self, points: FloatArray, *, apart_from: int) -> IntArray:
-        """Return the number (K,) of training views whose image holds each of the points (K, 3) in `model`."""
+        """Return the number (K,) of training views whose image contains each of the points (K, 3) in `model`."""
         count = np.zeros(len(points), dtype=np.int64)
         for index in self._train:
             if index == apart_from:
                 continue
             pose = self._renderer.pose(index)
             in_cam = (points - pose.center_in_model) @ pose.cam_from_model.T
-            count += pose.pinhole.holds(pose.pinhole.project(in_cam))
+            count += pose.pinhole.contains(pose.pinhole.project(in_cam))
         return count
 
 

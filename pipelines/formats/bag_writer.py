@@ -58,11 +58,11 @@ class BagFlight:
         fix_stamp_ns: (M,).
         fix_lla: (M, 3) degrees and ellipsoidal metres.
         fix_sigma_enu_m: (3,) σ that the receiver states.
-        fix_status: of `NavSatStatus`.
+        fix_status: `NavSatStatus.status` of all fixes.
         antenna_in_body: (3,) metres, forward-right-down.
         imu_stamp_ns: (K,).
         imu_enu_from_body: (K, 3, 3), body forward-right-down.
-        imu_rate, imu_force: (K, 3) rad/s and m/s², forward-right-down.
+        imu_rate, imu_force: (K, 3) angular rate in rad/s, specific force in m/s²; forward-right-down.
         imu_sigma_deg: σ of the attitude per axis.
     """
 

@@ -1,4 +1,4 @@
-"""Clouds of points, as files hold them, and PLY files of them.
+"""Point clouds of any file format, as read in chunks, and their PLY files.
 
 Coordinates are written as doubles, so that no offset can be lost. CloudCompare reads them and offers a shift for
 its display. Programs that keep float32 coordinates need the LAZ. A PLY has no CRS. PLYs are read in chunks, binary
@@ -65,12 +65,12 @@ _KINDS = {
 }  # fmt: skip
 _CLASS_NAMES = ("classification", "scalar_Classification", "scalar_classification")
 _TIME_NAMES = ("gps_time", "scalar_GpsTime", "GpsTime")
-_COARSEST_M = 5e-4  # half a step of float32 coordinates that is still exact enough
+_COARSEST_M = 5e-4  # largest rounding error of float32 coordinates that is accepted
 
 
 @dataclass(frozen=True)
 class PlyCloudFile:
-    """PLY file of points; see `CloudFile`. `dtype` is that of a vertex, `offset` the place of the first one."""
+    """PLY file of points; see `CloudFile`. `dtype` is that of a vertex, `offset` the bytes before the first one."""
 
     path: Path
     count: int
@@ -255,7 +255,7 @@ class CloudPlyWriter:
 def write_point_ply(
     path: Path, position: FloatArray, rgb: ByteArray, sigma_m: FloatArray, inlier: BoolArray
 ) -> None:
-    """Write points (N, 3) with their colour (N, 3), σ (N,) along the worst axis and use (N,), for viewers.
+    """Write points (N, 3) with their colour (N, 3), σ (N,) along the worst axis and inlier flag (N,), for viewers.
 
     Points without a position (NaN) are left out, because viewers fail on them.
     """

@@ -18,8 +18,8 @@ from xml.etree.ElementTree import Element, ParseError
 
 from pipelines.core.types import Vector3
 
-_SEARCHED = 1024 * 1024
-_MAX_PACKET = 256 * 1024
+_SEARCHED_BYTES = 1024 * 1024
+_MAX_PACKET_BYTES = 256 * 1024
 _OPEN, _CLOSE = b"<x:xmpmeta", b"</x:xmpmeta>"
 
 RTK_FIXED = 50
@@ -27,8 +27,8 @@ RTK_FLOAT = 34
 _JPEG = b"\xff\xd8"
 _TIFF = (b"II*\x00", b"MM\x00*")
 # A JPEG's EXIF lies in one of its first segments of 64 KiB. The parser gets no more than this head.
-_JPEG_HEAD = 1024 * 1024
-_MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+_JPEG_HEAD_BYTES = 1024 * 1024
+_MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # by EXIF's FocalPlaneResolutionUnit
 _BELOW_ZERO = frozenset({1, 3})  # EXIF 3.0 added 2 and 3: above and below sea level, stated explicitly
 _WGS84_NAMES = frozenset({"", "WGS84"})
 _GPS_H_ERROR = ("GPS GPSHPositioningError", "GPS Tag 0x001F")
@@ -133,7 +133,7 @@ def _exif(data: bytes, problems: list[str]) -> Mapping[str, Any]:
     import exifread
 
     if data[:2] == _JPEG:
-        data = data[:_JPEG_HEAD]
+        data = data[:_JPEG_HEAD_BYTES]
     elif data[:4] not in _TIFF:
         return {}
     try:
@@ -151,12 +151,12 @@ def _gps(tags: Mapping[str, Any], problems: list[str]) -> GpsTag | None:
         if "GPS GPSLatitude" in tags or "GPS GPSLongitude" in tags:
             problems.append("the GPS latitude or longitude is not a number")
         return None
-    south = _text(tags, "GPS GPSLatitudeRef")[:1].upper()
-    west = _text(tags, "GPS GPSLongitudeRef")[:1].upper()
-    if south not in ("N", "S") or west not in ("E", "W"):
+    lat_side = _text(tags, "GPS GPSLatitudeRef")[:1].upper()
+    lon_side = _text(tags, "GPS GPSLongitudeRef")[:1].upper()
+    if lat_side not in ("N", "S") or lon_side not in ("E", "W"):
         problems.append("the GPS position does not say its hemisphere")
         return None
-    lat, lon = (-lat if south == "S" else lat), (-lon if west == "W" else lon)
+    lat, lon = (-lat if lat_side == "S" else lat), (-lon if lon_side == "W" else lon)
     if abs(lat) > 90.0 or abs(lon) > 180.0:
         problems.append(f"the GPS position {lat:.6g}, {lon:.6g} is out of range")
         return None
@@ -282,11 +282,11 @@ def read_dji(data: bytes) -> DjiTags | None:
 
 def _find_packet(data: bytes) -> bytes | None:
     """Return the XMP packet in the first or last mebibyte of a file, or None."""
-    for part in (data[:_SEARCHED], data[max(_SEARCHED, len(data) - _SEARCHED) :]):
+    for part in (data[:_SEARCHED_BYTES], data[max(_SEARCHED_BYTES, len(data) - _SEARCHED_BYTES) :]):
         begin = part.find(_OPEN)
         if begin < 0:
             continue
-        end = part.find(_CLOSE, begin, begin + _MAX_PACKET)
+        end = part.find(_CLOSE, begin, begin + _MAX_PACKET_BYTES)
         if end < 0:
             raise XmpError("the XMP packet has no end within 256 KiB")
         return part[begin : end + len(_CLOSE)]
@@ -294,7 +294,7 @@ def _find_packet(data: bytes) -> bytes | None:
 
 
 def _values(packet: bytes) -> dict[str, str]:
-    """Return simple properties of either form by local name; the first of a name counts."""
+    """Return the properties that attributes or elements have as text, by local name; the first of a name counts."""
     from defusedxml.common import DefusedXmlException
     from defusedxml.ElementTree import fromstring
 

@@ -1,5 +1,4 @@
-"""Coordinate reference systems: from any that PROJ knows to WGS84 and back, point by point, and the axes of map
-grids.
+"""Coordinate reference systems: points from any that PROJ knows to WGS84 and back, and the axes of map grids.
 
 The only module that thinks about axis order: `xyz` here is always easting or longitude first, as in ODM's files and
 PROJ's visualisation order; `lla` is latitude first, as everywhere else.
@@ -54,12 +53,12 @@ _STEP_M = 10.0  # long against the rounding of eastings and northings, short aga
 
 @dataclass(frozen=True)
 class PointCrs:
-    """What the three coordinates of a file's points mean.
+    """CRS of the three coordinates of a file's points.
 
     Attributes:
         name: as the file or option gave it, spaces tidied.
-        vertical: what the heights count from.
-        states_vertical: whether the CRS itself said so (compound, 3D or geocentric).
+        vertical: datum of the heights.
+        states_vertical: whether the CRS itself has that datum (compound, 3D or geocentric).
     """
 
     name: str
@@ -107,7 +106,7 @@ class PointCrs:
 
     @property
     def horizontal_unit(self) -> float:
-        """The horizontal unit in metres; of a geographic CRS in radians."""
+        """Unit of the horizontal coordinates in metres; of a geographic CRS in radians."""
         return float(self._plan_axes[0].unit_conversion_factor)
 
     @property
@@ -175,8 +174,8 @@ class PointCrs:
             transformer, _ = self._operation(points[:, 1], points[:, 0])
             x, y, z = _inverse(transformer, points[:, 1], points[:, 0], points[:, 2])
         if not self._three_dimensional:
-            # PROJ's flat datum shifts take a height for one above their own ellipsoid, on the way there and on the
-            # way back: millimetres between the two. What a file's points mean is the way there.
+            # PROJ's horizontal datum shifts take a height for one above their source ellipsoid, which is another
+            # one on the way back: millimetres apart. The way to WGS84 defines the points of a file.
             lon, lat, _ = transformer.transform(x, y, points[:, 2])
             off = points[:, 1] - lon
             off -= 360.0 * np.round(off / 360.0)
@@ -192,9 +191,9 @@ class PointCrs:
         return self._operation(points[:, 1], points[:, 0])[1]
 
     def serving(self, lla: ArrayLike) -> PointCrs:
-        """Return the same CRS with the operation that serves points `lla` (N, 3), for every later call.
+        """Return the same CRS with the operation for points `lla` (N, 3) fixed for every later call.
 
-        Points that are transformed in several calls have no step between them then. Raises as `xyz_from_lla`.
+        No step then lies between points of different calls. Raises as `xyz_from_lla`.
         """
         self.xyz_from_lla(lla)
         points = np.asarray(lla, dtype=np.float64).reshape(-1, 3)

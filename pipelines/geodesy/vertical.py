@@ -1,4 +1,4 @@
-"""Vertical datums by name: what a height counts from, who said so, and what to do when its grid is missing.
+"""Vertical datums by name, whether they are stated or assumed, and the error for a missing grid.
 
 An ellipsoidal height and one above a geoid differ by up to 100 m, so every survey says which it has, and
 whether that was stated or assumed.
@@ -35,7 +35,7 @@ class VerticalChoice:
 
 
 def parse_vertical(text: str) -> VerticalChoice:
-    """Read `ellipsoidal`, `EGM84`, `EGM96`, `EGM2008` or `EPSG:n` (any case).
+    """Return the vertical datum of `ellipsoidal`, `EGM84`, `EGM96`, `EGM2008` or `EPSG:n` (any case).
 
     Raises:
         InputError: none of these.
@@ -81,7 +81,7 @@ Vertical = Annotated[VerticalChoice, from_text(parse_vertical), WRITTEN]
 
 
 class VerticalDatum(Product):
-    """What the input heights refer to, and whether the user (or file) said so or it was assumed."""
+    """Vertical datum of input heights; whether the user or the file stated it, or it was assumed; `note`: why."""
 
     name: str
     stated: bool

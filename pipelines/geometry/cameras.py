@@ -56,7 +56,7 @@ class Pinhole:
         return Pinhole(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy)
 
     def rays(self, xy_px: ArrayLike) -> FloatArray:
-        """Return viewing rays (…, 3) of pixels (…, 2) in the camera frame, of length one along the optical axis."""
+        """Return viewing rays (…, 3) of pixels (…, 2) in the camera frame, with z = 1."""
         slope = (np.asarray(xy_px, dtype=np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]
         return np.concatenate([slope, np.ones((*slope.shape[:-1], 1))], axis=-1)
 
@@ -66,7 +66,7 @@ class Pinhole:
         depth = np.where(point[..., 2:] > 0, point[..., 2:], np.nan)
         return np.asarray(point[..., :2] / depth * [self.fx, self.fy] + [self.cx, self.cy])
 
-    def holds(self, xy_px: ArrayLike) -> BoolArray:
+    def contains(self, xy_px: ArrayLike) -> BoolArray:
         """Return whether pixels (…, 2) lie within the image, as (…,); NaN does not."""
         xy = np.asarray(xy_px, dtype=np.float64)
         return np.asarray(((xy >= 0) & (xy < (self.width, self.height))).all(axis=-1))
@@ -87,7 +87,7 @@ class ViewPose:
     center_in_model: FloatArray
 
     def rays(self) -> FloatArray:
-        """Return viewing rays (H, W, 3) in `model`, of length one along the optical axis."""
+        """Return viewing rays (H, W, 3) along the axes of `model`, of length one along the optical axis."""
         x, y = np.meshgrid(np.arange(self.pinhole.width) + 0.5, np.arange(self.pinhole.height) + 0.5)
         return self.pinhole.rays(np.stack([x, y], axis=-1)) @ self.cam_from_model
 
@@ -214,10 +214,10 @@ def _distort_rational(ray: FloatArray, lens: FloatArray) -> tuple[FloatArray, tu
     k1, k2, p1, p2, k3, k4, k5, k6 = lens
     x, y = ray[:, 0], ray[:, 1]
     r2 = x * x + y * y
-    above = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    below = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-    gain = above / below
-    slope = (k1 + r2 * (2 * k2 + r2 * 3 * k3) - gain * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / below
+    numerator = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    gain = numerator / denominator
+    slope = (k1 + r2 * (2 * k2 + r2 * 3 * k3) - gain * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / denominator
     u = x * gain + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
     v = y * gain + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
     du_dx = gain + 2 * slope * x * x + 2 * p1 * y + 6 * p2 * x
@@ -284,7 +284,7 @@ class CameraPoses:
         return pose_matrix(self.cam_from_model[index], self.cam_center_in_model[index])
 
 
-_STEP = 1e-5  # of a parameter, or of 1 where that is less
+_STEP = 1e-5  # of a central difference, relative as in `parameter_derivative`
 _GRID = 24  # rays along each side of an image that a pinhole is fitted to
 _LEAST_RAYS = 8
 

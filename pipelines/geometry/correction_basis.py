@@ -43,7 +43,7 @@ class CorrectionBasis:
 def correction_basis(bundle: BundleInformation, *, lens_follows: bool = True) -> CorrectionBasis:
     """Return whitened, gauge-free coordinates of the camera corrections of a bundle at its minimum.
 
-    The points hold the gauge. Under each correction the points follow the cameras and their lens; the mean
+    The points define the gauge. Under each correction the points follow the cameras and their lens; the mean
     similarity of this movement, weighted by the information of each point, is zero.
 
     The uncertainty of the similarity is therefore that of the scene, not that of the cameras' mean. A wrong focal
@@ -52,7 +52,7 @@ def correction_basis(bundle: BundleInformation, *, lens_follows: bool = True) ->
 
     Args:
         lens_follows: whether the caller moves the lens by `lens_matrix` with the cameras. Otherwise the lens is
-            held, and the points follow through it as it is.
+            frozen, and the points follow the cameras alone.
     """
     follows, _, lens_cov = bundle.lens_elimination
     root, complement = _root(bundle)
@@ -64,13 +64,13 @@ def correction_basis(bundle: BundleInformation, *, lens_follows: bool = True) ->
 
 
 def coordinates_of(bundle: BundleInformation, correction: FloatArray) -> FloatArray:
-    """Return the coordinates z (k,) of corrections (n, 6) in the basis, without their similarity of the whole."""
+    """Return the coordinates z (k,) of corrections (n, 6) in the basis; their common similarity is dropped."""
     root, complement = _root(bundle)
     return np.asarray(root.T @ (complement.T @ (correction.ravel() / bundle.unit)))
 
 
 def _root(bundle: BundleInformation) -> tuple[FloatArray, FloatArray]:
-    """Return the Cholesky root (k, k) of the cameras' information off the similarities, and those axes (6 n, k)."""
+    """Return the Cholesky root (k, k) of the information orthogonal to the similarities, and its axes (6 n, k)."""
     follows, lens, _ = bundle.lens_elimination
     information = bundle.sums.poses.toarray() - follows.T @ lens @ follows
     scaled = (information + information.T) / 2 * bundle.unit[:, None] * bundle.unit

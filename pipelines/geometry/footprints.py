@@ -1,6 +1,6 @@
 """Footprints of photographs: the rays of the image's border, intersected with the surface of the scene.
 
-Sets of points: their voxels, their squares of the plan, and the rows of a record of arrays.
+Also functions for point sets: points by voxel, by square in plan, and rows of dataclasses of arrays.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ _BISECTIONS = 16
 
 
 class PointSurface:
-    """Surface through points (N, 3), N ≥ 1, z up: the height of the nearest one, freed of outliers.
+    """Surface through points (N, 3) in metres, N ≥ 1, z up: the smoothed height of the nearest point in plan.
 
-    That height is the median of the nearest points, the point itself among them.
+    The smoothed height is the median over the nearest points, the point itself among them.
     """
 
     def __init__(self, points: FloatArray) -> None:
@@ -103,7 +103,7 @@ def ground_points(rays: FloatArray, center: FloatArray, surface: PointSurface) -
 
 
 def _below_horizon(rays: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return rays (K, 3) of length one, and by how much they point further down than the shallowest placed ones."""
+    """Return unit rays (K, 3), and a margin (K,): positive where they point further down than `_SHALLOWEST`."""
     unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     return unit, -unit[:, 2] - _SHALLOWEST * np.hypot(unit[:, 0], unit[:, 1])
 
@@ -163,8 +163,8 @@ def _area(outline: FloatArray) -> float:
     return float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2
 
 
-_SMALLEST_M = 1e-6
-_LARGEST_NUMBER = 2**62
+_SMALLEST_M = 1e-6  # side of a voxel
+_LARGEST_NUMBER = 2**62  # of a row, without overflow of int64
 RecordT = TypeVar("RecordT")
 
 
@@ -185,7 +185,7 @@ def joined_rows(records: Sequence[RecordT]) -> RecordT:
 
 
 def rows_by_square(points: FloatArray, side_m: float) -> list[tuple[tuple[int, int], IntArray]]:
-    """Return the squares of the plan that hold points (P, 2 or more), and the rows of the points in each."""
+    """Return the squares (east, north) in plan that hold points (P, 2 or more), and the rows of their points."""
     if not len(points):
         return []
     square = np.floor(points[:, :2] / side_m).astype(np.int64)

@@ -35,7 +35,7 @@ class PositionSample:
     """A position as a message states it.
 
     Attributes:
-        place: (latitude, longitude, height), or metres east, north, up of the local frame's origin.
+        place: (latitude, longitude, height), or metres east, north, up from the local frame's origin.
         sigma_enu_m: NaN where unknown.
         frame: name of the frame that is at that place.
         world: the local frame; "" for geodetic positions.
@@ -146,7 +146,7 @@ def _px4_local(message: Any) -> PositionSample:
 
 
 def _sigmas(variance: Any) -> Vector3:
-    """Return σ of three variances; NaN all where one is not positive, or absurd."""
+    """Return σ of three variances; all NaN where one is not positive, or beyond `_LARGEST_SIGMA_M`."""
     values = np.asarray(variance, dtype=np.float64)
     if not (np.isfinite(values).all() and (values > 0).all() and (values < _LARGEST_SIGMA_M**2).all()):
         return _NAN3
@@ -233,7 +233,7 @@ POSITIONS: dict[str, Callable[[Any], PositionSample]] = {
     "geometry_msgs/msg/PoseStamped": lambda m: _local(m.pose.position, m),
     "px4_msgs/msg/VehicleOdometry": _px4_local,
 }
-# What heights count from in the types with latitude and longitude; the others are of a local frame.
+# Zero of the heights in the types with latitude and longitude; heights of the others are of a local frame.
 GEODETIC_HEIGHTS = {
     "sensor_msgs/msg/NavSatFix": "ellipsoidal by the definition of NavSatFix",
     "px4_msgs/msg/SensorGps": "PX4's altitude above the ellipsoid",

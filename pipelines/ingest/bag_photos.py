@@ -1,4 +1,4 @@
-"""Photographs out of a bag: which frames to take, each as a file, one at a time, and their lens."""
+"""Photographs from a bag: the selected frames, written as files one at a time, and their lens."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def write_photos(
 
 
 def _is_due(every: Every, time_s: FloatArray, place: FloatArray, last: int | None, number: int) -> bool:
-    """Return whether a frame is far enough from the one taken last; a frame without a place is not, in metres."""
+    """Return whether a frame is `every` step after the last one; in metres, a frame without a place never is."""
     if every.unit == "s":
         return last is None or bool(time_s[number] - time_s[last] >= every.step - _STEP_SLACK_S)
     if not np.isfinite(place[number]).all():
@@ -95,7 +95,7 @@ def _is_due(every: Every, time_s: FloatArray, place: FloatArray, last: int | Non
 
 
 def _is_blurred(data: bytes, recent: deque[float]) -> bool:
-    """Judge sharpness against the frames looked at before, taken or not: a dull scene is not blurred for ever."""
+    """Return whether a frame is blurred against those before it, taken or not, so that a dull scene is not."""
     current = sharpness(data)
     usual = float(np.median(recent)) if len(recent) >= _LEAST_NEIGHBOURS else 0.0
     recent.append(current)
@@ -105,9 +105,9 @@ def _is_blurred(data: bytes, recent: deque[float]) -> bool:
 def lens_priors(
     photos: Sequence[Photo], streams: BagStreams, options: IngestOptions, notes: Notes
 ) -> tuple[tuple[CameraPrior, ...], dict[str, int]]:
-    """Return one calibrated camera of all photographs, or else assumed ones; and the id of each one's camera.
+    """Return one calibrated camera of all photographs, or else assumed ones; and each photograph's camera id.
 
-    The names of the topics tell rectified images. `--focal-px` is stronger than the bag's `CameraInfo`.
+    A topic with `rect` in its last part or `_rect` anywhere is rectified. `--focal-px` overrides `CameraInfo`.
     """
     sizes = {(photo.file.width, photo.file.height) for photo in photos}
     if streams.info is None or options.focal_px is not None or len(sizes) != 1:

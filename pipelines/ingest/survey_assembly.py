@@ -1,4 +1,4 @@
-"""One survey in one frame out of everything that was read, and what is assumed and doubtful about it.
+"""Survey in the frame `geo` from all inputs that `ingest` has read, with its assumptions and warnings.
 
 Images and surveyed points get their positions, attitudes and covariances in geo. Fixes that share one error, of a
 base station, a receiver or a day, form a session, with the σ of that error.
@@ -52,7 +52,7 @@ COMMON_SIGMA_M = {
 }
 # Gap in time after which the base station may stand elsewhere, and the satellites do.
 SESSION_GAP_S = 4 * 3600.0
-# Median σ, horizontal, up to which a receiver that does not tell its solution has had one of that kind.
+# Median horizontal σ up to which fixes without a stated solution count as RTK fixed, or as RTK float.
 _FIXED_SIGMA_M, _FLOAT_SIGMA_M = 0.1, 1.0
 
 SigmaGroup = Literal["fixes", "control points", "marks", "attitudes"]
@@ -246,9 +246,9 @@ def fix_sessions(
 ) -> tuple[tuple[FixSession, ...], IntArray]:
     """Return the sessions, and the session of each of N images (N,), 0 for images without a position.
 
-    Positions of one kind of receiver form a session as long as none comes more than four hours after the one before
-    it. Where the time of one is unknown, all of its kind form one session: a session too many would count as an
-    independent check of a common error. σ of that error is by option, else by the kind of receiver.
+    Positions of one kind of receiver form a session until a gap of more than four hours. Where the time of one is
+    unknown, all of its kind form one session: a session too many would count as an independent check of a common
+    error. The σ of that error is that of the option, else of the kind of receiver.
     """
     given_h, given_v = options.sigma_common_h, options.sigma_common_v
     sessions: list[FixSession] = []
@@ -283,10 +283,10 @@ def _by_time(time_s: FloatArray) -> IntArray:
 
 
 def _kind(receiver: str, sigma_h_m: float) -> str:
-    """Return the kind of receiver of a session: as recorded, or better where its σ tells of corrections.
+    """Return the kind of receiver of a session: as recorded, or better where its σ is that of corrected positions.
 
-    Programs that write corrected positions into photographs leave the other tags as they were. Decimetres do not
-    tell a float solution from code corrections, whose common error is that of a plain receiver.
+    Programs that write corrected positions into photographs leave the other tags as they were. σ of decimetres may
+    be those of a float solution or of code corrections, whose common error is that of a plain receiver.
     """
     if receiver in ("RTK fixed", "RTK float"):
         return receiver

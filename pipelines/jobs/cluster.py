@@ -1,4 +1,4 @@
-"""Access to a Dask cluster: its certificate, its address, and what its workers offer.
+"""Access to a Dask cluster: its certificate, its address, and the resources of its workers.
 
 Dask executes what it is sent, and a scheduler obeys everybody who reaches it. Connections therefore need a
 certificate on both sides, or never leave this machine. Whoever holds the key of a cluster can run programs on all
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
 CERTIFICATE, KEY = "cluster.pem", "cluster.key"
-_OF_OTHERS, _OF_EVERYBODY = 0o077, 0o007  # bits of a mode
+_OF_OTHERS, _OF_EVERYBODY = 0o077, 0o007  # bits of a file's mode: permissions of group and all, of all
 _MINUTES = "%Y-%m-%d %H:%M UTC"
 _NEEDS_CRYPTOGRAPHY = "certificates need cryptography: install it with `pip install 'georefgs[cluster]'`"
 _RENEW = (
@@ -84,7 +84,7 @@ def check_own_certificates(folder: Path) -> None:
     if os.name != "posix":
         return
     for path in (folder, folder / CERTIFICATE, folder / KEY):
-        if not path.exists():  # which `check_certificates` tells
+        if not path.exists():  # `check_certificates` raises that error
             continue
         status = path.stat()
         if status.st_uid != os.geteuid():
@@ -133,7 +133,7 @@ def check_certificates(folder: Path) -> None:
 
 
 PORT = 8786
-# Names of Dask's resources; cores are told, not taken.
+# Names of Dask's resources; jobs reserve memory and GPUs, not cores.
 MEMORY, GPU, CORES = "MEMORY", "GPU", "CORES"
 _CONNECT_S = 20.0
 
@@ -243,8 +243,8 @@ def connected(cluster: ClusterAddress) -> Iterator[Client]:
 
 
 @dataclass(frozen=True)
-class Place:
-    """Worker of the cluster, and what it offers to all its jobs together; its restart gives it another address."""
+class Worker:
+    """Worker of the cluster, with its resources for all its jobs together; a restart gives it another address."""
 
     address: str
     name: str
@@ -253,42 +253,42 @@ class Place:
     gpus: int
 
 
-def places_of(workers: Mapping[str, Mapping[str, Any]]) -> dict[str, Place]:
-    """Return the workers that offer memory to jobs, by address, from what the scheduler tells of them."""
+def workers_of(described: Mapping[str, Mapping[str, Any]]) -> dict[str, Worker]:
+    """Return the workers that offer memory to jobs, by address, as the scheduler has described them."""
     return {
-        address: Place(
+        address: Worker(
             address,
             f"{worker['name']} on {worker['host']}" if worker["name"] != address else address,
             int(worker["nthreads"]),
             int(worker["resources"][MEMORY]),
             int(worker["resources"].get(GPU, 0)),
         )
-        for address, worker in workers.items()
+        for address, worker in described.items()
         if MEMORY in worker["resources"]
     }
 
 
-def place_for(
-    job: Job, places: Mapping[str, Place], running: Mapping[str, Sequence[Job]], avoided: Collection[str] = ()
-) -> Place | None:
+def worker_for(
+    job: Job, workers: Mapping[str, Worker], running: Mapping[str, Sequence[Job]], avoided: Collection[str] = ()
+) -> Worker | None:
     """Return the worker for a job: the one with the fewest jobs that has room, or None.
 
     A job that is too large for all workers runs alone on the largest. Workers on which it has failed are avoided,
     unless there are no others.
 
     Args:
-        places, running: workers, and the jobs that run on them, by address.
+        workers, running: workers, and the jobs that run on them, by address.
         avoided: addresses.
     """
-    largest_bytes = max((place.memory_bytes for place in places.values()), default=0)
+    largest_bytes = max((worker.memory_bytes for worker in workers.values()), default=0)
 
-    def has_room(place: Place) -> bool:
-        beside = running.get(place.address, ())
-        if len(beside) >= place.slots or (job.uses_gpu and sum(other.uses_gpu for other in beside) >= place.gpus):
+    def has_room(worker: Worker) -> bool:
+        beside = running.get(worker.address, ())
+        if len(beside) >= worker.slots or (job.uses_gpu and sum(other.uses_gpu for other in beside) >= worker.gpus):
             return False
-        taken = sum(min(other.peak_bytes, place.memory_bytes) for other in beside)
-        return taken + min(job.peak_bytes, largest_bytes) <= place.memory_bytes
+        taken = sum(min(other.peak_bytes, worker.memory_bytes) for other in beside)
+        return taken + min(job.peak_bytes, largest_bytes) <= worker.memory_bytes
 
-    others = [place for address, place in places.items() if address not in avoided]
-    free = filter(has_room, others or places.values())
-    return min(free, key=lambda place: len(running.get(place.address, ())), default=None)
+    others = [worker for address, worker in workers.items() if address not in avoided]
+    free = filter(has_room, others or workers.values())
+    return min(free, key=lambda worker: len(running.get(worker.address, ())), default=None)

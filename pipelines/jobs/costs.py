@@ -1,7 +1,7 @@
-"""Cost models: seconds of a reconstruction and of an iteration of training, and the time that is left of one.
+"""Cost models: seconds of a reconstruction and of an iteration of training, and the remaining time of a training.
 
 The seconds are those of a stated machine. On another one they give an estimate before the training starts, and the
-proportions of iterations with shrunken and with whole photographs, for the time left of a running training.
+proportions of iterations with shrunken and with whole photographs, for the remaining time of a running training.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pipelines.core.types import FloatArray
 # Four reconstructions of 18, 48, 48 and 40 photographs took 61, 134, 148 and 175 s, on 2 cores of an AMD EPYC
 # beside other programs, 2026-11-22. This model says 49, 147, 125 and 103 s.
 _MEASURED_CORES = 2
-_FEATURES_MEGAPIXEL_S, _PAIR_S, _MAPPING_S = 1.2, 0.12, 0.8
+_FEATURES_MEGAPIXEL_S, _PAIR_S, _MAPPING_S = 1.2, 0.12, 0.8  # mapping: of a photograph
 # Of photographs that are not doubled: one of 0.8 megapixels takes 0.72 s on one core, doubled 2.15 s.
 _OWN_SIZE_FEATURES_MEGAPIXEL_S = 0.45
 # Features a megapixel of aerial photographs, about, and their number for which `_PAIR_S` holds: matching compares
@@ -27,7 +27,7 @@ _FEATURES_MEGAPIXEL, _OWN_SIZE_FEATURES_MEGAPIXEL, _PAIR_FEATURES = 6000, 3000, 
 
 
 @dataclass(frozen=True)
-class ReconstructionPace:
+class ReconstructionCost:
     """Seconds of one core for the steps of a reconstruction."""
 
     features_s: float
@@ -39,20 +39,20 @@ class ReconstructionPace:
         return self.features_s + self.matching_s + self.mapping_s
 
 
-def reconstruction_pace(
+def reconstruction_cost(
     photographs: int, megapixels: float, pairs: float, *, doubled: bool, max_features: int
-) -> ReconstructionPace:
-    """Return about how many seconds one core needs for each step.
+) -> ReconstructionCost:
+    """Return the estimated seconds of one core for each step.
 
     Args:
         photographs, pairs: numbers of photographs, and of pairs that are matched.
-        megapixels, max_features: of each, as features are looked for.
-        doubled: whether features are looked for on twice that size, too.
+        megapixels, max_features: of each photograph at the size in which features are detected.
+        doubled: whether features are detected on twice that size, too.
     """
     detection_s = _FEATURES_MEGAPIXEL_S if doubled else _OWN_SIZE_FEATURES_MEGAPIXEL_S
     found = megapixels * (_FEATURES_MEGAPIXEL if doubled else _OWN_SIZE_FEATURES_MEGAPIXEL)
     compared = (min(found, max_features) / _PAIR_FEATURES) ** 2
-    return ReconstructionPace(
+    return ReconstructionCost(
         features_s=_MEASURED_CORES * photographs * detection_s * megapixels,
         matching_s=_MEASURED_CORES * _PAIR_S * pairs * compared,
         mapping_s=_MEASURED_CORES * photographs * _MAPPING_S,
@@ -97,15 +97,15 @@ _UNSEEN_SHARE = 0.3
 SURFACE_FACTOR = 1.9
 
 
-def iteration_seconds(pixels: float, gaussians: float, *, surface: bool, windows: int = 1) -> float:
+def iteration_seconds(pixels: float, gaussians: float, *, surface: bool, crops: int = 1) -> float:
     """Return the seconds of one iteration on the machine of `MEASURED_ON`.
 
     Args:
         pixels, gaussians: of the photograph, and of the whole model.
-        surface: whether surface losses hold the Gaussians.
-        windows: number of windows in which the photograph is seen, one at an iteration.
+        surface: whether surface losses are on.
+        crops: number of crops in which the photograph is seen, one at an iteration.
     """
-    seen = 1 / windows  # of the pixels, and of the Gaussians that the photograph shows
+    seen = 1 / crops  # share of the pixels, and of the Gaussians that the photograph shows
     of_gaussians = _MILLION_GAUSSIANS_S * (_UNSEEN_SHARE + (1 - _UNSEEN_SHARE) * seen)
     plain = _FIXED_S + _MEGAPIXEL_S * seen * pixels / 1e6 + of_gaussians * gaussians / 1e6
     return (SURFACE_FACTOR if surface else 1.0) * plain

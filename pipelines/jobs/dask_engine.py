@@ -1,8 +1,8 @@
 """Engine on the workers of a Dask cluster.
 
-The engine chooses the worker of each job, as the local engine chooses what runs beside what; Dask carries the jobs
-and the events. A job ends with the event of its worker. A cancelled task is the one sign to stop a job: Ctrl-C, the
-end of the engine and the end of the scheduler all lead to it, and the job saves its work.
+The engine chooses the worker of each job, as the local engine chooses which jobs run together; Dask carries jobs
+and events. A job ends with the event of its worker. Only the cancellation of its task stops a job: Ctrl-C, the end
+of the engine and the end of the scheduler all cancel it, and the job saves its work.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 from pipelines import __version__
 from pipelines.core.errors import ClusterError, WorkspaceBusyError
 from pipelines.core.progress import Progress, ProgressTask, StopRequest, deferred_interrupts
-from pipelines.jobs.cluster import GPU, MEMORY, ClusterAddress, Place, connected, place_for, places_of
+from pipelines.jobs.cluster import GPU, MEMORY, ClusterAddress, Worker, connected, worker_for, workers_of
 from pipelines.jobs.dask_task import UNFIT, JobRequest, folder_tokens, run_job
 from pipelines.jobs.engine import INTERRUPTED, Job, JobDisplay, JobEnd, tell_end
 from pipelines.jobs.local import ProcessEnd
@@ -35,7 +35,7 @@ MOST_FAILURES = 3
 _LOST = "lost"
 _TRIED_AGAIN = ("backend", "crash", "defect", "resources", "storage", _LOST)
 _LOOK_EVERY_S = 0.2
-# A cancelled job that waits behind those of another command never begins, and tells no end.
+# A cancelled job that waits behind those of another command never begins, and sends no event of its end.
 _START_PATIENCE_S = 3.0
 _REFRESH_EVERY_S = 1.0
 # A process whose worker was killed saves its work, and holds its lock meanwhile.
@@ -64,7 +64,7 @@ class PendingJob:
 @dataclass
 class _Attempt:
     pending: PendingJob
-    place: Place
+    worker: Worker
     future: Future[None]
     display: JobDisplay
     since: float
@@ -73,7 +73,7 @@ class _Attempt:
 
 @dataclass
 class ClusterRun:
-    """Jobs of one call of the engine: where they run, how they fare, and what comes after a failure.
+    """Jobs of one call of the engine: their workers, their events, and their further attempts after failures.
 
     Attributes:
         waiting: jobs in the order in which they begin where resources allow.
@@ -93,7 +93,7 @@ class ClusterRun:
 
     def __post_init__(self) -> None:
         self._running: dict[str, _Attempt] = {}
-        self._places: dict[str, Place] = {}
+        self._workers: dict[str, Worker] = {}
         self._unfit: set[str] = set()
         self._refreshed = -math.inf
         self._warned = ""
@@ -102,7 +102,7 @@ class ClusterRun:
         self.client.subscribe_topic(self._topic, lambda event: self._events.put(event[1]))
 
     def until_all_have_ended(self, title: str, stop: StopRequest) -> None:
-        """Start jobs where there is room, and follow them."""
+        """Start jobs where there is room, and act on their events until all have ended."""
         is_stopping, stopped = False, math.inf
         while self._running or (self.waiting and not stop.requested):
             if stop.requested and not is_stopping:
@@ -127,13 +127,13 @@ class ClusterRun:
             self.client.unsubscribe_topic(self._topic)
 
     def _refresh(self, is_stopping: bool) -> None:
-        """Look which workers there are; jobs of lost workers have failed there."""
+        """Update the workers from the scheduler; a job of a lost worker has failed there."""
         if time.monotonic() - self._refreshed < _REFRESH_EVERY_S:
             return
         try:
             if self.client.status != "running":
                 raise OSError
-            workers = self.client.scheduler_info()["workers"]
+            described = self.client.scheduler_info()["workers"]
         except (OSError, TimeoutError, RuntimeError) as error:
             for name, attempt in list(self._running.items()):
                 self._finish(name, ProcessEnd(INTERRUPTED, time.monotonic() - attempt.since))
@@ -141,21 +141,21 @@ class ClusterRun:
                 "the scheduler is lost: the jobs save their work and stop; start scheduler and workers, then "
                 "repeat the command, which goes on"
             ) from error
-        self._places = {
-            address: place for address, place in places_of(workers).items() if address not in self._unfit
+        self._workers = {
+            address: worker for address, worker in workers_of(described).items() if address not in self._unfit
         }
         self._refreshed = time.monotonic()
         for name, attempt in list(self._running.items()):
             # Dask cancels all tasks when its scheduler is lost, too; but then the program does not come here.
             is_cancelled = attempt.future.status == "cancelled" and not is_stopping
-            if is_cancelled or attempt.place.address not in workers:
+            if is_cancelled or attempt.worker.address not in described:
                 attempt.future.cancel()
                 seconds = time.monotonic() - attempt.since
                 why = "its task was cancelled" if is_cancelled else "its worker was lost"
                 self._end(name, ProcessEnd(1, seconds, why, _LOST), is_stopping)
 
     def _start(self) -> None:
-        if self._unfit and not self._places and not self._running:
+        if self._unfit and not self._workers and not self._running:
             raise ClusterError(f"no worker can run the jobs: {self._warned}")
         now = time.monotonic()
         for pending in list(self.waiting):
@@ -165,19 +165,19 @@ class ClusterRun:
                 continue
             by_worker: dict[str, list[Job]] = {}
             for attempt in self._running.values():
-                by_worker.setdefault(attempt.place.address, []).append(attempt.pending.job)
-            place = place_for(pending.job, self._places, by_worker, pending.avoided)
-            if place is not None:
+                by_worker.setdefault(attempt.worker.address, []).append(attempt.pending.job)
+            worker = worker_for(pending.job, self._workers, by_worker, pending.avoided)
+            if worker is not None:
                 self.waiting.remove(pending)
-                self._submit(pending, place)
+                self._submit(pending, worker)
         if self.waiting and not self._running and all(pending.not_before <= now for pending in self.waiting):
-            wanted = "a GPU" if self._places else f"{MEMORY}, as those of `georef cluster worker` do"
+            wanted = "a GPU" if self._workers else f"{MEMORY}, as those of `georef cluster worker` do"
             text = f"waiting: no worker offers {wanted}"
             if text != self._warned:
                 self._warned = text
                 log.warning("%s", text)
 
-    def _submit(self, pending: PendingJob, place: Place) -> None:
+    def _submit(self, pending: PendingJob, worker: Worker) -> None:
         attempt = uuid.uuid4().hex
         request = JobRequest(
             topic=self._topic,
@@ -187,16 +187,16 @@ class ClusterRun:
             token=pending.token,
             parcel=None if self.exchange is None else self.exchange.send(pending.job, attempt),
         )
-        resources = {MEMORY: min(pending.job.peak_bytes, place.memory_bytes)}
+        resources = {MEMORY: min(pending.job.peak_bytes, worker.memory_bytes)}
         if pending.job.uses_gpu:
             resources[GPU] = 1
-        log.info("%s: started on %s", pending.job.name, place.name)
+        log.info("%s: started on %s", pending.job.name, worker.name)
         future = self.client.submit(
-            run_job, request, key=f"georef-{attempt}", workers=[place.address], resources=resources, pure=False
+            run_job, request, key=f"georef-{attempt}", workers=[worker.address], resources=resources, pure=False
         )
         future.add_done_callback(lambda future: self._events.put({"attempt": attempt, "future": future}))
         display = JobDisplay(self.progress, pending.job.name)
-        self._running[attempt] = _Attempt(pending, place, future, display, time.monotonic())
+        self._running[attempt] = _Attempt(pending, worker, future, display, time.monotonic())
 
     def _take_events(self, is_stopping: bool) -> None:
         """Act on the events that have come, after waiting for one."""
@@ -228,31 +228,31 @@ class ClusterRun:
     def _end(self, name: str, end: ProcessEnd, is_stopping: bool) -> None:
         """Finish an attempt, or let its job wait for the next one."""
         attempt = self._running[name]
-        pending, place = attempt.pending, attempt.place
+        pending, worker = attempt.pending, attempt.worker
         if is_stopping:
             self._finish(name, end if end.kind != _LOST else ProcessEnd(INTERRUPTED, end.seconds))
         elif end.kind == UNFIT:
-            self._unfit.add(place.address)
-            self._places.pop(place.address, None)
-            self._warned = f"{place.name} {end.error}"
+            self._unfit.add(worker.address)
+            self._workers.pop(worker.address, None)
+            self._warned = f"{worker.name} {end.error}"
             log.warning("%s: it gets no jobs", self._warned)
             self._repeat(name)
         elif end.kind == _LOST and not attempt.has_started:
             self._repeat(name)
         elif end.code == INTERRUPTED:  # Its worker closes.
-            log.warning("%s: interrupted on %s, goes on elsewhere", pending.job.name, place.name)
-            pending.avoided.add(place.address)
+            log.warning("%s: interrupted on %s, goes on elsewhere", pending.job.name, worker.name)
+            pending.avoided.add(worker.address)
             self._repeat(name)
         elif end.kind == WorkspaceBusyError.code and self._may_wait(pending):
             self._repeat(name, _BUSY_PAUSE_S)
         elif end.code < 0 or end.kind in _TRIED_AGAIN:
             pending.failures += 1
-            pending.avoided.add(place.address)
+            pending.avoided.add(worker.address)
             if pending.failures >= MOST_FAILURES:
-                text = f"failed {pending.failures} times, at last on {place.name}: {end.error}"
+                text = f"failed {pending.failures} times, at last on {worker.name}: {end.error}"
                 self._finish(name, ProcessEnd(end.code, end.seconds, text, end.kind))
             else:
-                log.warning("%s: tried again, failed on %s: %s", pending.job.name, place.name, end.error)
+                log.warning("%s: tried again, failed on %s: %s", pending.job.name, worker.name, end.error)
                 self._repeat(name)
         else:
             self._finish(name, end)
@@ -298,11 +298,11 @@ class DaskEngine:
 
     def together(self, jobs: Sequence[Job]) -> int:
         with connected(self.cluster) as client:
-            places = places_of(client.scheduler_info()["workers"])
+            workers = workers_of(client.scheduler_info()["workers"])
         running: dict[str, list[Job]] = {}
         for job in jobs:
-            if (place := place_for(job, places, running)) is not None:
-                running.setdefault(place.address, []).append(job)
+            if (worker := worker_for(job, workers, running)) is not None:
+                running.setdefault(worker.address, []).append(job)
         count = sum(map(len, running.values()))
         return max(min(count, self.at_a_time or count), 1)
 

@@ -12,7 +12,7 @@ from pipelines.core.fingerprints import library_versions
 from pipelines.core.machine import available_cores, thread_count, total_main_memory_bytes
 from pipelines.core.progress import Progress
 from pipelines.geodesy.operations import grid_folders, installed_grids
-from pipelines.report.chromium import named_or_installed
+from pipelines.report.chromium import find_chromium
 from pipelines.splat.memory import free_memory_bytes
 from pipelines.splat.rasterizer.api import BackendName
 from pipelines.splat.rasterizer.backends import BACKENDS, chosen_backend
@@ -88,7 +88,7 @@ def inspect_machine() -> Machine:
         cuda_kernels=kernels_ready(),
         grid_folders=tuple(map(str, grid_folders())),
         grids=tuple(installed_grids()),
-        chromium=named_or_installed(),
+        chromium=find_chromium(),
         versions=library_versions(_LIBRARIES),
     )
 

@@ -20,24 +20,24 @@ _INSTALLED = (
     "C:/Program Files (x86)/Microsoft/Edge/Application/msedge.exe",
 )
 NO_NETWORK = "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"
-_PATIENCE_S = 300.0
+_TIMEOUT_S = 300.0
 _LONGEST_MESSAGE = 300
 
 
-def named_or_installed() -> str | None:
-    """Return Chromium or Chrome as the variable CHROMIUM names it, else where it is; None: nowhere."""
+def find_chromium() -> str | None:
+    """Return Chromium or Chrome: as the variable CHROMIUM names it, else an installed one; None: there is none."""
     on_path = (shutil.which(name) for name in _ON_PATH)
     installed = (place for place in _INSTALLED if Path(place).is_file())
     return os.environ.get("CHROMIUM") or next(filter(None, [*on_path, *installed]), None)
 
 
 def chromium_path() -> str:
-    """Return the path of Chromium or Chrome: that of the variable CHROMIUM, on PATH, or where it is installed.
+    """Return Chromium or Chrome as `find_chromium` does.
 
     Raises:
-        BackendUnavailableError: there is none; says what to install.
+        BackendUnavailableError: there is none, or CHROMIUM names no program; says what to install or correct.
     """
-    browser = named_or_installed()
+    browser = find_chromium()
     if os.environ.get("CHROMIUM") and browser and shutil.which(browser) is None:
         raise BackendUnavailableError(f"the variable CHROMIUM names {browser}, which is no program: correct it")
     if browser is None:
@@ -79,11 +79,11 @@ def print_pdf(page: Path, pdf: Path) -> None:
                 capture_output=True,
                 text=True,
                 errors="replace",
-                timeout=_PATIENCE_S,
+                timeout=_TIMEOUT_S,
                 check=False,
             )
         except subprocess.TimeoutExpired as error:
-            raise CrashError(f"{browser} did not print the page within {_PATIENCE_S:.0f} s") from error
+            raise CrashError(f"{browser} did not print the page within {_TIMEOUT_S:.0f} s") from error
         if done.returncode != 0 or not draft.is_file():
             reason = " ".join(done.stderr.split())[-_LONGEST_MESSAGE:]
             raise CrashError(

@@ -1,4 +1,4 @@
-"""Traffic lights of the summary: what was read, against which rule, and the reason of each verdict.
+"""Traffic lights of the summary: level, measured values, rule and reason of each verdict.
 
 Every rule is stated on the page. `unknown` is the verdict where nothing was measured.
 """
@@ -17,6 +17,7 @@ from pipelines.survey.report_parts import VarianceFactor
 
 Level = Literal["good", "fair", "poor", "unknown"]
 
+# Limits of good and of fair.
 REGISTERED = (0.95, 0.80)  # share of the photographs
 OVERLAP = (0.90, 0.70)  # share of the ground that enough photographs see
 REPROJECTION_PX = (1.0, 2.0)
@@ -29,7 +30,7 @@ TEST_PSNR_DB = (22.0, 18.0)
 
 @dataclass(frozen=True)
 class Verdict:
-    """Verdict on one quality of the survey: what was measured, what follows, and the limits of good and fair."""
+    """Verdict on one quality of the survey: `reading` is the measurement, `rule` the limits of good and fair."""
 
     subject: str
     level: Level
@@ -67,29 +68,28 @@ class Measured:
     workspace: str
 
 
-# Of a verdict: level, reading, reason, rule.
-_Told = tuple[Level, str, str, str]
+_Fields = tuple[Level, str, str, str]  # of a verdict without its subject, in their order
 
 
 def verdicts(report: EvaluationReport, measured: Measured, cautions: Sequence[Caution]) -> tuple[Verdict, ...]:
     """Return the verdicts on a survey, in the order of the work."""
-    by_camera, by_model, test = report.checkpoints.camera, report.checkpoints.model, report.test_views
-    told: dict[str, _Told] = {
+    triangulated, on_surface, test = report.checkpoints.camera, report.checkpoints.model, report.test_views
+    by_subject: dict[str, _Fields] = {
         "Registered photographs": _registered(measured),
         "Overlap": _overlap(measured),
         "Reprojection": _reprojection(measured),
         "Recorded positions": _fixes(measured),
         "Control points": _control(measured),
         "σ of the measurements": _stated_sigma(report.variance_factors),
-        "Check points": _check_points(measured, by_camera),
-        "Predicted against measured": _prediction(by_camera),
-        "Blunders": _blunders(by_camera),
-        **({} if by_model is None else {"Surface at the points": _surface(by_model)}),
+        "Check points": _check_points(measured, triangulated),
+        "Predicted against measured": _prediction(triangulated),
+        "Blunders": _blunders(triangulated),
+        **({} if on_surface is None else {"Surface at the points": _surface(on_surface)}),
         **({} if test is None else {"Test views": _views(test.psnr, test.views)}),
         "Cautions": _cautions(cautions),
         "State of the products": _current(measured),
     }
-    return tuple(Verdict(subject, *verdict) for subject, verdict in told.items())
+    return tuple(Verdict(subject, *fields) for subject, fields in by_subject.items())
 
 
 def level_of(value: float, limits: tuple[float, float], *, more_is_better: bool) -> Level:
@@ -100,7 +100,7 @@ def level_of(value: float, limits: tuple[float, float], *, more_is_better: bool)
     return "good" if value <= good else "fair" if value <= fair else "poor"
 
 
-def _registered(measured: Measured) -> _Told:
+def _registered(measured: Measured) -> _Fields:
     part = measured.registered / measured.photographs if measured.photographs else 0.0
     level = level_of(part, REGISTERED, more_is_better=True)
     lost = measured.photographs - measured.registered
@@ -109,7 +109,7 @@ def _registered(measured: Measured) -> _Told:
     return level, f"{measured.registered} of {measured.photographs} ({share(part)})", reason, rule
 
 
-def _overlap(measured: Measured) -> _Told:
+def _overlap(measured: Measured) -> _Fields:
     rule = (
         f"good if {share(OVERLAP[0])} of the ground is seen by {measured.enough} photographs or more and all hang "
         f"together, fair from {share(OVERLAP[1])}"
@@ -125,7 +125,7 @@ def _overlap(measured: Measured) -> _Told:
     return level, reading, reason, rule
 
 
-def _reprojection(measured: Measured) -> _Told:
+def _reprojection(measured: Measured) -> _Fields:
     rule = f"good up to {REPROJECTION_PX[0]:g} px, fair up to {REPROJECTION_PX[1]:g} px"
     if measured.rmse_px is None:
         return "unknown", "no observations", "the SfM model has none", rule
@@ -138,7 +138,7 @@ def _reprojection(measured: Measured) -> _Told:
     return level, f"{number_text(measured.rmse_px)} px RMSE", reason, rule
 
 
-def _fixes(measured: Measured) -> _Told:
+def _fixes(measured: Measured) -> _Fields:
     rule = f"good up to {share(FIX_OUTLIERS[0])} outliers, fair up to {share(FIX_OUTLIERS[1])}"
     if not measured.fixes:
         level: Level = "fair" if measured.control_points >= CONTROL_POINTS[1] else "unknown"
@@ -150,7 +150,7 @@ def _fixes(measured: Measured) -> _Told:
     return level, reading, reason, rule
 
 
-def _control(measured: Measured) -> _Told:
+def _control(measured: Measured) -> _Fields:
     count = measured.control_points
     level: Level = level_of(count, CONTROL_POINTS, more_is_better=True) if count else "fair"
     reason = (
@@ -165,7 +165,7 @@ def _control(measured: Measured) -> _Told:
     return level, reading, reason, rule
 
 
-def _stated_sigma(factors: tuple[VarianceFactor, ...]) -> _Told:
+def _stated_sigma(factors: tuple[VarianceFactor, ...]) -> _Fields:
     rule = "good if the σ of every tested group passed, fair if the data changed one"
     tested = [factor for factor in factors if factor.estimated is not None]
     if not tested:
@@ -180,7 +180,7 @@ def _stated_sigma(factors: tuple[VarianceFactor, ...]) -> _Told:
     return "good", f"passed: {passed}", "residuals agree with the σ", rule
 
 
-def _check_points(measured: Measured, errors: CheckPointErrors) -> _Told:
+def _check_points(measured: Measured, errors: CheckPointErrors) -> _Fields:
     least = errors.asprs.least_points
     rule = f"good from {least} measured check points (ASPRS), fair from 1, poor with none"
     if not errors.count:
@@ -196,7 +196,7 @@ def _check_points(measured: Measured, errors: CheckPointErrors) -> _Told:
     return "good" if enough else "fair", f"{errors.count} of {measured.check_points} measured", reason, rule
 
 
-def _prediction(errors: CheckPointErrors) -> _Told:
+def _prediction(errors: CheckPointErrors) -> _Fields:
     rule = (
         f"good up to {NORMALISED[0]:g}, fair up to {NORMALISED[1]:g}: mean of "
         "error² / (predicted + survey variance), 1 if both are right"
@@ -218,7 +218,7 @@ def _prediction(errors: CheckPointErrors) -> _Told:
     return level, f"{number_text(worst)} on the worst axis", reason, rule
 
 
-def _blunders(errors: CheckPointErrors) -> _Told:
+def _blunders(errors: CheckPointErrors) -> _Fields:
     rule = "good with none, fair otherwise: beyond three times the class that the others meet"
     if not errors.count:
         return "unknown", "no check points measured", "nothing to look for", rule
@@ -228,7 +228,7 @@ def _blunders(errors: CheckPointErrors) -> _Told:
     return "good", "none", "no check point stands out", rule
 
 
-def _surface(errors: CheckPointErrors) -> _Told:
+def _surface(errors: CheckPointErrors) -> _Fields:
     rule = "good if no check point is a blunder on the rendered surface, fair up to a fifth of them, poor beyond"
     if not errors.count:
         return "unknown", "no check points", "nothing to compare with", rule
@@ -242,7 +242,7 @@ def _surface(errors: CheckPointErrors) -> _Told:
     return level, f"{count} of {errors.count} off", reason, rule
 
 
-def _views(psnr_db: float | None, count: int) -> _Told:
+def _views(psnr_db: float | None, count: int) -> _Fields:
     rule = f"good from {TEST_PSNR_DB[0]:g} dB, fair from {TEST_PSNR_DB[1]:g} dB (mean PSNR)"
     if psnr_db is None:
         return "unknown", "none", "no photograph was left out of the training", rule
@@ -251,7 +251,7 @@ def _views(psnr_db: float | None, count: int) -> _Told:
     return level, f"{decibel(psnr_db)} over {count}", reason, rule
 
 
-def _cautions(cautions: Sequence[Caution]) -> _Told:
+def _cautions(cautions: Sequence[Caution]) -> _Fields:
     rule = "good with none, poor if nothing checks the positions, fair otherwise"
     if not cautions:
         return "good", "none", "no limit of the result is known", rule
@@ -259,7 +259,7 @@ def _cautions(cautions: Sequence[Caution]) -> _Told:
     return "poor" if unchecked else "fair", str(len(cautions)), "listed below the table", rule
 
 
-def _current(measured: Measured) -> _Told:
+def _current(measured: Measured) -> _Fields:
     rule = "good if every product is current"
     if not measured.stale:
         return "good", "current", "all stages belong together", rule

@@ -13,13 +13,13 @@ from pipelines.robust.statistics import median_chi2, outlier_gate
 
 LEAST_GROUP = 3  # members of a group, of which one would be a blunder
 _LEAST_SHARE = 0.15  # of all, below which the smaller group counts as blunders
-_APART = 5.0  # of the scatter within groups, by which their middles differ
-_STEPS = 20
+_APART = 5.0  # least distance of the groups' middles, in units of the scatter within the wider group
+_STEPS = 20  # of k-means
 
 
 @dataclass(frozen=True)
 class TwoGroups:
-    """Offsets that gather about two places."""
+    """Two groups of offsets (n, d), in the unit of the offsets."""
 
     second: BoolArray  # (n,) the smaller group
     apart: FloatArray  # (d,) middle of the smaller group minus that of the larger
@@ -40,7 +40,7 @@ def median_spacing(places: ArrayLike) -> float:
 
 
 def two_groups(offsets: ArrayLike) -> TwoGroups | None:
-    """Return the two places that offsets (n, d) gather about, or None if they do not.
+    """Return the two groups into which offsets (n, d) fall, or None if they do not.
 
     The best split along the axis of the largest extent is refined by k-means. One normal distribution, cut in two,
     is no such mixture: its halves lie 2.7 of their own σ apart.
@@ -80,7 +80,7 @@ def two_groups(offsets: ArrayLike) -> TwoGroups | None:
 def blunders_among(offsets: ArrayLike, sigma: float) -> BoolArray | None:
     """Return the mask (n,) of the blunders among n ≥ 1 offsets (n, d) whose majority agrees; None: none stands out.
 
-    `sigma` is that of a good one per axis; the scatter of the better half counts if it is larger.
+    `sigma` is that of a good offset per axis; the robust scatter of the offsets replaces it if it is larger.
     """
     array = np.asarray(offsets, dtype=np.float64)
     scale = max(scatter_about_median(array), sigma)

@@ -146,7 +146,7 @@ def residual_stats(residuals_in_geo: ArrayLike) -> ResidualStats:
 
 
 class ResidualStats(Product):
-    """Figures of the residuals of a fit, in metres. These are no accuracy."""
+    """Figures of the residuals of a fit, in metres; they do not measure accuracy."""
 
     count: int
     mean_h_m: float | None

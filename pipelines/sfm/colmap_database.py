@@ -24,7 +24,7 @@ MATCHES = ("matches", "two_view_geometries")
 
 
 def write_frame(colmap: Any, database: Path, survey: Survey, images: Iterable[int], options: SfmOptions) -> None:
-    """Write cameras and images (indices) into a database, made if missing, unless they are in it already.
+    """Write cameras and images (indices into the survey's) into a database, made if missing; present ones stay.
 
     Raises:
         InputError: a camera prior is none of COLMAP's cameras.
@@ -89,7 +89,7 @@ def copy_rows(source: Path, target: Path, tables: Iterable[str], images: Iterabl
 
 
 def finish_database(draft: Path, final: Path, *, without: Iterable[str] = ()) -> None:
-    """Make a draft the final database, without the rows of some tables: one whole file, on the disk."""
+    """Make a draft the final database, a single file, and delete the rows of the tables in `without`."""
     with closing(sqlite3.connect(draft, isolation_level=None)) as connection:
         for table in without:
             connection.execute(f"delete from {table}")
@@ -104,7 +104,7 @@ def remove_database(path: Path) -> None:
 
 
 def require_sound(database: Path) -> None:
-    """Refuse a damaged database of an interrupted run; COLMAP would abort, or continue without a part of it.
+    """Refuse a damaged database of an interrupted run; COLMAP would crash, or continue without a part of it.
 
     Raises:
         DamagedPartialError: SQLite finds the file damaged.

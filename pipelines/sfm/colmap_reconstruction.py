@@ -1,4 +1,4 @@
-"""Engine `colmap`: features, matches, mapping, and a last, robust adjustment; a large survey in chunks."""
+"""Engine `colmap`: features, matches, mapping, and a final robust adjustment; a large survey in chunks."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from pipelines.survey.survey import Survey
 
 log = logging.getLogger(__name__)
 
-# Over so few photographs a model bends by less than the last adjustment removes.
+# Up to this number of photographs, the final adjustment alone removes the bend of a model.
 _DRIFTLESS_UP_TO = 200
 
 
 class ColmapReconstructor:
-    """Reconstruction by COLMAP, which hears no interrupts while it works."""
+    """Reconstruction by COLMAP, which cannot be interrupted while it works."""
 
     remedy = "run it again (finished features and matches are kept), or with a smaller `--max-image-size`"
 
@@ -62,7 +62,7 @@ def reconstruct(colmap: Any, job: SfmJob, progress: Progress) -> Any:
         InputError: a photograph does not exist or is not that of the survey, or a camera prior is none of COLMAP's
             cameras.
         DegenerateGeometryError: COLMAP found no model.
-        ConvergenceError: the last adjustment found no solution.
+        ConvergenceError: the final adjustment found no solution.
     """
     missing = [image.name for image in job.survey.images if not (job.images / image.name).is_file()]
     if missing:

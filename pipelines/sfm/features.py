@@ -26,7 +26,7 @@ from pipelines.survey.survey import Survey
 # Between views that differ by a larger angle SIFT finds hardly any matches.
 _MAX_ANGLE_DEG = 60.0
 _SECTORS = 8
-_CANDIDATES_PER_NEIGHBOR = 8
+_CANDIDATES_PER_NEIGHBOR = 8  # nearest images from which the neighbours are chosen
 
 
 def select_pairs(position: FloatArray, axis: FloatArray, max_neighbors: int) -> IntArray:
@@ -74,8 +74,8 @@ def _spread(offset: FloatArray, limit: int) -> list[int]:
 _EXHAUSTIVE_UP_TO = 20
 _IMAGES_PER_STEP = 4
 _PAIRS_PER_STEP = 48
-# Of RANSAC for a pair: they find an essential matrix that 32 % of the matches obey, with a probability of 99.9 %.
-# COLMAP's 10 000 are used up by pairs that have nothing in common (docs/benchmarks.md, Time to quality).
+# Draws of RANSAC for a pair: they find an essential matrix that 32 % of the matches obey, with a probability of
+# 99.9 %. Pairs without a common place would use up COLMAP's 10 000 (docs/benchmarks.md, Time to quality).
 _MOST_TRIALS = 2_000
 
 
@@ -185,7 +185,7 @@ def match_features(colmap: Any, job: SfmJob, pairs: IntArray, progress: Progress
 
 
 def _restore_names(colmap: Any, job: SfmJob) -> None:
-    """Give images their names again: a run that was killed while it matched has left the numbers."""
+    """Restore the names of images; a run that was killed while it matched has left numbers in their place."""
     names = [image.name for image in job.survey.images]
     rename_images(colmap, job.database, {_number(index): name for index, name in enumerate(names)})
 

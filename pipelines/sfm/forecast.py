@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from pipelines.core.machine import chosen_threads, free_main_memory_bytes, thread_count
 from pipelines.core.sentences import about
-from pipelines.jobs.costs import ReconstructionPace, features_peak_bytes, mapping_peak_bytes, reconstruction_pace
+from pipelines.jobs.costs import ReconstructionCost, features_peak_bytes, mapping_peak_bytes, reconstruction_cost
 from pipelines.sfm.mapping import MapperName, chosen_mapper
 from pipelines.sfm.options import SfmOptions
 
@@ -62,12 +62,12 @@ def forecast_reconstruction(
     )
 
 
-def pace(photographs: int, photo_px: tuple[int, int], options: SfmOptions) -> ReconstructionPace:
+def pace(photographs: int, photo_px: tuple[int, int], options: SfmOptions) -> ReconstructionCost:
     """Return about how many seconds one core needs for each step."""
     every = photographs * (photographs - 1) / 2
     # Half of the largest number of neighbours: most pairs are chosen by both of their images.
     pairs = every if options.pairs == "exhaustive" else min(every, photographs * options.max_neighbors / 2)
-    return reconstruction_pace(
+    return reconstruction_cost(
         photographs,
         photo_px[0] * photo_px[1] / options.shrink(photo_px) ** 2 / 1e6,
         pairs,

@@ -22,10 +22,10 @@ REACH_M = 128.0  # half side of the painted ground
 SQUARE_M = 38.0  # half side of the central square
 RING_M = 44.0  # middle of the street around it
 OUTER_M = 101.0  # middle of the outer street
-GRASS, PAVING, ASPHALT = (255, 0, 0), (0, 255, 0), (0, 0, 255)
+GRASS, PAVING, ASPHALT = (255, 0, 0), (0, 255, 0), (0, 0, 255)  # kinds of ground
 KERB: Color = (0.36, 0.35, 0.33)
 _PIXEL_M = 0.125
-_SUBPIXEL = 4
+_SUBPIXEL = 4  # binary digits of OpenCV's coordinates after the point
 _TAR: Color = (0.085, 0.085, 0.09)
 _LINE: Color = (0.72, 0.72, 0.70)
 
@@ -175,8 +175,8 @@ class TownStyle:
 
     Attributes:
         relief_m: variation of the terrain in the town.
-        storeys: fewest and most of a building.
-        built_share: of the plots.
+        storeys: fewest and most of a building with a flat roof.
+        flat_share, built_share: share of the buildings with a flat roof, share of the plots with a building.
     """
 
     relief_m: float

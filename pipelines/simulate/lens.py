@@ -1,7 +1,7 @@
 """Simulated camera: exact projection, rays by Newton's method; rendering under sun and sky, with sensor noise.
 
-The lens shares no code with the pipeline's camera models on purpose: a mistake that both sides share would cancel,
-and never show at a check point.
+The lens shares no code with the pipeline's camera models on purpose: a common mistake would cancel at all check
+points.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ _HORIZON = np.array([0.72, 0.79, 0.86], dtype=np.float32)
 _ZENITH = np.array([0.24, 0.42, 0.75], dtype=np.float32)
 _BOUNCE = np.array([0.22, 0.20, 0.17], dtype=np.float32)
 _HAZE_M = 1300.0
-_SHADOW_LIFT_M = 0.02
+_SHADOW_LIFT_M = 0.02  # of a shadow ray's start above the surface, which would hide the sun otherwise
 _VIGNETTING = 0.22  # loss of light in the corners
 
 

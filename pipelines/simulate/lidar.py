@@ -5,8 +5,8 @@
    without one that was added since.
 3. Ranges have white noise. Beams at grazing angles, and a share of all others, do not return. One in a thousand
    returns from the air, and is classified as noise, as a producer does.
-4. A strip drifts slowly, the whole cloud may be shifted, and a part of the scanner's lever arm may be missing: the
-   error that it leaves turns with the heading.
+4. A strip drifts slowly, the whole cloud may be shifted, and a part of the scanner's lever arm may be missing: that
+   error turns with the heading.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ _FIRST_S = 1000.0  # time of the first beam
 _TURN_S = 20.0  # between strips
 # The building that was removed, in the town's axes: on the square, south of the complex.
 _REMOVED_M = ((0.0, -29.0), (44.0, 14.0, 11.0))
-_ADDED = 0  # number of the building that was added since, of the complex
-_TRACK_S = 0.1
+_ADDED = 0  # index in `scene.buildings` of the building that was added since, of the complex
+_TRACK_S = 0.1  # between places of the scanner's track
 
 
 @dataclass(frozen=True)
@@ -54,8 +54,7 @@ class Strip:
         number: from 1.
         position_in_geo: (P, 3) metres, as measured.
         classification: (P,) class of LAS.
-        of_change: (P,) whether the point lies on what has changed since: on the removed building, or on what lay
-            below the added one.
+        of_change: (P,) whether the point lies on the removed building, or at the place of the added one.
         track_s, track_in_geo: (K,), (K, 3) times and true places of the scanner.
     """
 

@@ -2,7 +2,7 @@
 
 Photographs of one flight differ in exposure and white balance. Without exposures, a model bakes these differences
 into the colours of Gaussians that few views see. The images cannot tell a change of all exposures from a change of
-all Gaussians: the mean over the training photographs is therefore held at the identity.
+all Gaussians: the mean over the training photographs is therefore fixed to the identity.
 
 Without Gaussians, exposures follow from the colours of points that several photographs show: photograph i shows the
 colour c of a point as A_i c + b_i. Robust least squares adjusts exposures and colours together, as a bundle
@@ -13,7 +13,7 @@ adjustment does with poses and points:
    it.
 3. Cauchy's weights follow from the residuals: a point may shine, or move, in one of its photographs.
 
-A weak prior holds each exposure near the identity where a photograph has too few colours to determine it.
+A weak prior keeps each exposure near the identity where a photograph has too few colours to determine it.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ _BETA1, _BETA2, _EPS = 0.9, 0.999, 1e-15
 
 
 class Exposures:
-    """Affine colour corrections (V, 3, 4) of V images, gain matrix and offset, and the Adam that moves them.
+    """Affine colour corrections (V, 3, 4) of V images, gain matrix and offset, and the Adam that changes them.
 
-    Those of the images `train` (T,) move, with a rate that falls over the iterations; the others are the identity.
+    Those of the images `train` (T,) change, with a rate that falls over the iterations; the others are identities.
     """
 
     def __init__(self, count: int, train: Tensor, iterations: int, device: torch.device) -> None:
@@ -55,7 +55,7 @@ class Exposures:
         return with_affine(colour, leaf)
 
     def step(self, iteration: int) -> None:
-        """Move the exposure that `apply` used last by its gradient, and restore the mean."""
+        """Change the exposure that `apply` used last by an Adam step, and restore the mean over the images."""
         if self._used is None or self._used[1].grad is None:
             return
         index, leaf = self._used
@@ -85,8 +85,8 @@ class Exposures:
         self._steps = [int(count) for count in state["steps"]]
 
 
-class HeldExposures:
-    """Affine colour corrections (V, 3, 4) of all images that do not move, in the place of `Exposures`."""
+class FrozenExposures:
+    """Affine colour corrections (V, 3, 4) of all images that stay as given, with the interface of `Exposures`."""
 
     def __init__(self, affine: Tensor) -> None:
         self.affine = affine
@@ -125,9 +125,9 @@ def fitted_affine(rendered: Tensor, photograph: Tensor, mask: Tensor | None = No
 
 
 _CHUNK = 2**17  # observations whose points are eliminated together
-_ROUNDS = 15
-_STILL = 5e-4  # change of an exposure that ends the adjustment: an eighth of a grey level
-_ACCURATE = 1e-3  # of a step, relative: the next one makes up for it
+_MOST_STEPS = 15
+_CONVERGED = 5e-4  # change of an exposure that ends the adjustment: an eighth of a grey level
+_STEP_TOLERANCE = 1e-3  # relative, of conjugate gradients: the next step corrects the rest
 _LEAST_SIGMA = 1e-3  # of a colour: rounding to 256 levels
 # σ of the prior: gain of a channel, leak from one channel to another, offset. A colour runs from 0 to 1.
 _GAIN, _LEAK, _OFFSET = 0.5, 0.1, 0.2
@@ -162,10 +162,10 @@ def adjusted_exposures(observed: PointColours, count: int) -> FloatArray:
     observed = PointColours(point, observed.image[several], observed.colour[several])
     seen = np.bincount(observed.image, minlength=count) > 0
     exposure = np.tile(np.eye(3, 4), (count, 1, 1))
-    for _ in range(_ROUNDS):
+    for _ in range(_MOST_STEPS):
         step = _step(observed, exposure)
         exposure = exposure + step
-        if np.abs(step).max() < _STILL:
+        if np.abs(step).max() < _CONVERGED:
             break
     # Other colours of the points make the mean of the exposures the identity.
     mean = exposure[seen].mean(axis=0)
@@ -176,7 +176,7 @@ def adjusted_exposures(observed: PointColours, count: int) -> FloatArray:
 
 
 def _step(observed: PointColours, exposure: FloatArray) -> FloatArray:
-    """Return the Gauss–Newton step (n, 3, 4) of the exposures."""
+    """Return the Gauss–Newton step (n, 3, 4) of the exposures; the points' colours are eliminated."""
     count, numbers = len(exposure), 3 * len(observed.point)
     redundancy = numbers - 3 * int(observed.point[-1] + 1) - 12 * count
     squared = np.concatenate([part.squared for part in _parts(observed, exposure, None)])
@@ -216,7 +216,7 @@ def _solved(matrix: bsr_matrix, right: FloatArray) -> FloatArray:
     preconditioner = LinearOperator(
         matrix.shape, matvec=lambda vector: (inverse @ vector.reshape(count, 12, 1)).ravel(), dtype=np.float64
     )
-    return np.asarray(cg(matrix, right, rtol=_ACCURATE, M=preconditioner)[0])
+    return np.asarray(cg(matrix, right, rtol=_STEP_TOLERANCE, M=preconditioner)[0])
 
 
 @dataclass(frozen=True)

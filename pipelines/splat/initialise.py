@@ -54,7 +54,7 @@ def gaussians_from_points(
 
     A Gaussian's standard deviation is the mean distance to the three nearest other points. Points that are not
     finite, repeated or far out are left out. Without a normal, Gaussians are isotropic; with a normal, they are
-    discs: a ball as wide as the gaps between the points would reach as far before the surface, and behind it.
+    discs, because a ball as wide as the gaps between points would extend as far in front of and behind the surface.
 
     Args:
         points_in_model: (N, 3) metres.
@@ -126,7 +126,7 @@ def _make_discs(gaussians: Gaussians, normals: FloatArray) -> None:
 
 
 def _gap(points: FloatArray) -> FloatArray:
-    """Return the mean distance (N,) to the nearest other points, clipped to the cloud's median."""
+    """Return the mean distance (N,) to the nearest other points, clipped to `_SCALE_SPREAD` about the median."""
     neighbours = min(_NEIGHBOURS, len(points) - 1)
     distance, _ = cKDTree(points).query(points, k=neighbours + 1)
     gap = np.asarray(distance)[:, 1:].mean(axis=1)

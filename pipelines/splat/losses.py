@@ -1,4 +1,4 @@
-"""Losses of Gaussians: by photographs, by free space, and by planes that were measured.
+"""Losses of Gaussians: photometric, of opacity in free space, and of distance to measured planes.
 
 The photometric loss is that of 3D Gaussian Splatting (doi 10.1145/3592433, eq. 7): 0.8 · L1 + 0.2 · (1 − SSIM).
 SSIM (doi 10.1109/TIP.2003.819861) has the 11×11 Gaussian window, σ = 1.5 px, zeros around the image. On a CPU value
@@ -160,7 +160,7 @@ class FreeSpaceLoss:
     def __call__(self, gaussians: Gaussians, visible: Tensor) -> Tensor:
         """Return the mean opacity of the visible Gaussians (K,), of which those outside free space count as 0.
 
-        The loss has no gradient by places: a Gaussian fades, rather than move to the surface that it belongs to.
+        The loss has no gradient by position: a Gaussian in free space fades, and does not move to the next surface.
         """
         cell = ((gaussians.means.detach()[visible] - self._low) / self._cell_m).floor().long()
         inside = ((cell >= 0) & (cell <= self._last)).all(dim=1)
@@ -178,7 +178,7 @@ _AROUND = np.stack(np.meshgrid(*3 * [[-1, 0, 1]], indexing="ij"), axis=-1).resha
 class MeasuredPlanes:
     """P planes in `model`: positions (P, 3) in metres, unit normals (P, 3), confidences (P,) 0 … 1.
 
-    A Gaussian's confidence is a half at the distance s = `scale_m`; one two cells away belongs to no plane.
+    A Gaussian's confidence is a half at the distance s = `scale_m`; beyond two cells from all planes it has none.
     """
 
     position: FloatArray
@@ -189,7 +189,7 @@ class MeasuredPlanes:
 
 
 class PlaneAttraction:
-    """Loss of Gaussians beside the planes, one at least, that they lie near."""
+    """Loss of the distances of Gaussians from the nearest of the planes, of which there is at least one."""
 
     def __init__(self, planes: MeasuredPlanes, device: torch.device) -> None:
         low = planes.position.min(axis=0) - planes.cell_m  # no cell around a plane has a negative number
@@ -220,7 +220,7 @@ class PlaneAttraction:
 
 
 def _keys(cell: Any) -> Any:
-    """Return the keys of cells (N, 3), an array or a tensor; sums of keys are those of the sums."""
+    """Return the keys of cells (N, 3), an array or a tensor; the key of a sum of cells is the sum of their keys."""
     return (cell[:, 0] << 2 * _SIDE_BITS) + (cell[:, 1] << _SIDE_BITS) + cell[:, 2]
 
 

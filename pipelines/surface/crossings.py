@@ -1,13 +1,13 @@
-"""Visibility of surfels, and crossings of the cells of a grid by beams.
+"""Visibility of surfels (discs at the points of a cloud) in a camera, and crossings of a grid's cells by beams.
 
-A camera sees the points of a cloud of which each hides what lies behind its disc:
+Each disc hides the points behind it:
 
 1. A point covers a disc on its plane. The disc is drawn into a depth buffer, pixel by pixel, at the depth of the
    plane. For discs seen at a grazing angle, the distance from the point's depth is limited to `_SLANT` times the
    sum of radius and pixel.
-2. A point is seen if no disc at its own pixel is nearer than its own by more than its radius.
+2. A point is seen unless a disc at its own pixel is nearer than the point's disc by more than the point's radius.
 
-Discs grow over silhouettes by their radius: a point close behind an edge counts as hidden.
+Discs extend over silhouettes by their radius: a point close behind an edge counts as hidden.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from pipelines.geometry.footprints import rows_of
 # ruff: noqa: PLR0917  (kernels take arrays, not objects)
 
 
-_NEAR = 1e-3  # least depth
+_NEAR_M = 1e-3  # least depth of a disc that is drawn
 _SLANT = 4.0
 _MOST_PX = 12  # limit of a disc's radius
 
@@ -42,7 +42,7 @@ class Surfels:
 
 @dataclass(frozen=True)
 class SeenSurfels:
-    """K discs that a camera sees: their rows among all, pixels, and depths along the camera's z axis."""
+    """K discs that a camera sees: `rows` among all discs, pixels (`row`, `column`), depths along the camera's z."""
 
     rows: IntArray
     row: IntArray
@@ -55,7 +55,7 @@ class SeenSurfels:
 
 
 def seen_surfels(surfels: Surfels, cam_from_world: FloatArray, center: FloatArray, camera: Pinhole) -> SeenSurfels:
-    """Return the discs that a camera with a rotation (3, 3) and a centre (3,) sees."""
+    """Return the discs that a camera with a rotation (3, 3) and a centre (3,) in metres sees."""
     in_cam = (surfels.position - center) @ cam_from_world.T
     normal = surfels.normal @ cam_from_world.T
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
@@ -87,7 +87,7 @@ def _draw(
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     for p in range(len(points)):
         x, y, z, radius = points[p, 0], points[p, 1], points[p, 2], radii[p]
-        if z < _NEAR:
+        if z < _NEAR_M:
             continue
         u, v = fx * x / z + cx, fy * y / z + cy
         reach = min(radius * max(fx, fy) / z, _MOST_PX)
@@ -113,11 +113,11 @@ def _draw(
                 nearest[place] = min(nearest[place], depth)
 
 
-_MOST = 255
+_MOST = 255  # crossings of a cell that are counted
 _STEP = 0.25  # of a cell's side
 
 
-def crossings(
+def count_beams(
     end: FloatArray, start: FloatArray, low: FloatArray, cell_m: float, shape: IntArray
 ) -> NDArray[np.uint8]:
     """Return how many beams cross each cell, 255 at most.
@@ -126,7 +126,7 @@ def crossings(
     be missed.
 
     Args:
-        end: (P, 3) ends of the beams, in the grid.
+        end: (P, 3) metres, ends of the beams, in the grid.
         start: (P, 3) their starts, elsewhere than the ends.
         low: (3,) low corner of the grid.
         cell_m: side of its cells.

@@ -34,8 +34,8 @@ from pipelines.surface.sweep import (
 from pipelines.survey.photographs import ImageCache, save_array
 from pipelines.survey.scene import Scene
 
-# Form of the cached arrays, a part of their key: files of another form lie in another folder.
-_FORM = b"coarse, fine: direction, offset, score, step, sharpness, by kernels"
+# Layout of the cached arrays, a part of their key: files of another layout lie in another folder.
+_LAYOUT = b"coarse, fine: direction, offset, score, step, sharpness, by kernels"
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class DepthMaps:
         self.scene, self.images = scene, images
         self._options = options or StereoOptions()
         count = self._options.neighbours
-        # All neighbours of a view need the view's own planes and neighbours again, and these do not change.
+        # Each neighbour of a view needs the view's planes and neighbours, too.
         self._neighbours = cache(lambda index: best_neighbours(scene.network, index, scene.train, count))
         self._planes = cache(self._find_planes)
         self.folder = folder / self._key()
@@ -106,7 +106,7 @@ class DepthMaps:
     def _make_all(
         self, kind: str, make: Callable[[int], Float32Array], views: list[int], task: ProgressTask
     ) -> None:
-        """Write the arrays of one step that do not exist; the kernels let go of the interpreter."""
+        """Write the missing arrays of one step in threads, since the kernels release the interpreter's lock."""
 
         def write(index: int) -> None:
             if not self._path(index, kind).exists():
@@ -135,7 +135,7 @@ class DepthMaps:
     def rgb(self, index: int, kind: str = "fine") -> ByteArray:
         """Return the photograph (H, W, 3) at the pixels of `camera`."""
         whole, pinhole = self.images.pinhole(index), self.camera(index, kind)
-        # A view is read by all of its neighbours: large photographs are shrunken once. Nothing must be cut off.
+        # All neighbours read a view: large photographs are shrunken once, by a factor that divides both sides.
         most = max(max(whole.width, whole.height) // (2 * self._options.fine_px), 1)
         shrink = max(s for s in range(1, most + 1) if whole.width % s == 0 == whole.height % s)
         image = np.array(self.images.image(index, shrink))
@@ -202,7 +202,7 @@ class DepthMaps:
 
     def _key(self) -> str:
         """Return a hash of all inputs of the depth maps."""
-        digest = hashlib.sha256(_FORM)
+        digest = hashlib.sha256(_LAYOUT)
         poses, sparse = self.scene.poses, self.scene.sparse
         arrays = (
             poses.cam_from_model, poses.cam_center_in_model, self.scene.point_in_model, self.scene.train,

@@ -21,23 +21,23 @@ from pipelines.geometry.similarity import Similarity
 from pipelines.surface.surface_views import SurfaceView, SurfaceViews
 from pipelines.surface.visibility import Support
 
-_REACH_PX = 2  # of the differences that give a normal
+_REACH_PX = 2  # from a pixel to those whose differences give its normal
 _BEND = 0.01  # limit of |z/z₁ + z/z₂ − 2| for a depth z between opposite neighbours z₁, z₂ on a smooth surface
-_LOOK_PX = 8  # between the pixels that tell which part of a view shows a square
+_LOOK_PX = 8  # between the pixels that are tested for lying in a square
 _GRAZING = 0.17  # least cosine between ray and normal (80°): blurred edges bridge two surfaces along the rays
 # Memory: candidates of one square, of about 100 bytes each, with the copies that sorting them makes.
 _MOST_CANDIDATES = 4_000_000
 _SAMPLE_PX = 8  # between the pixels from which sizes and extent are estimated
 _LEAST_VOXELS = 16  # along the side of a square
 _MARGIN = 4  # spacings around a square: fusion moves points by less, mostly
-_MOST_THROUGH = 0.5  # largest number of views that look through a point, as a part of those that agree
+_MOST_THROUGH = 0.5  # largest number of views that look through a point, over the number of those that agree
 # σ of a ray through a photograph, in pixels of the training size: on simulated flights, this and the views' own
 # disagreement explain the distances to the true surface at 68 of 100 points.
 _SIGMA_PX = 0.25
-# A point is left out if its σ exceeds this part of the pixel: beyond, one point in five was a floater on simulated
-# flights.
+# A point is left out if its σ exceeds this part of a pixel's width: beyond, one point in five was a floater on
+# simulated flights.
 _RESOLVED = 1.0
-_COARSEST = 2.0  # width of the pixels that are used, in medians: beyond lies the background, which few rays fix
+_COARSEST = 2.0  # largest width of a used pixel over the median: wider ones show background that few rays determine
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def pixel_on_surface_m(views: SurfaceViews, geo_from_model: Similarity) -> float
 def fusion_settings(
     views: SurfaceViews, geo_from_model: Similarity, min_views: int, spacing_m: float | None = None
 ) -> FusionSettings:
-    """Return the settings for a cloud; no side of the voxels: the width of a pixel on the surface."""
+    """Return the settings for a cloud; without `spacing_m`, voxels are as wide as a pixel on the surface."""
     pixel_m = pixel_on_surface_m(views, geo_from_model)
     return FusionSettings(spacing_m or pixel_m, _COARSEST * pixel_m, min_views)
 
@@ -131,8 +131,8 @@ class _Square:
     corner_m: tuple[float, float]
     side_m: float
 
-    def holds(self, position: FloatArray, margin_m: float = 0.0) -> BoolArray:
-        """Return whether points (…, 3) lie in the square, or closer to it than a margin: (…)."""
+    def covers(self, position: FloatArray, margin_m: float = 0.0) -> BoolArray:
+        """Return which points (…, 3) lie in the square widened by a margin, as (…)."""
         offset = position[..., :2] - self.corner_m
         return np.asarray(((offset >= -margin_m) & (offset < self.side_m + margin_m)).all(axis=-1))
 
@@ -159,7 +159,7 @@ def _candidates(
     distance = np.maximum(np.linalg.norm(towards, axis=-1), np.finfo(np.float64).tiny)
     cosine = np.einsum("hwi,hwi->hw", normal, towards) / distance
     pixel_m = geo_from_model.scale * depth / view.pinhole.fx
-    chosen = known & (np.abs(cosine) > _GRAZING) & (pixel_m < settings.coarsest_m) & square.holds(point, margin_m)
+    chosen = known & (np.abs(cosine) > _GRAZING) & (pixel_m < settings.coarsest_m) & square.covers(point, margin_m)
     chosen &= (row % step == step // 2) & (column % step == step // 2)
     towards_camera = normal[chosen] * np.sign(cosine[chosen])[:, None]
     return _Candidates(point[chosen], towards_camera, view.rgb[rows, columns][chosen], pixel_m[chosen])
@@ -168,11 +168,11 @@ def _candidates(
 def _window(
     view: SurfaceView, geo_from_model: Similarity, square: _Square, margin_m: float
 ) -> tuple[slice, slice] | None:
-    """Return rows and columns that hold the pixels of a view in a square, but for slivers of a few pixels."""
+    """Return rows and columns of a view that show a square; parts narrower than `_LOOK_PX` may be missed."""
     height, width = view.depth_m.shape
     rows, columns = np.nonzero(view.depth_m[::_LOOK_PX, ::_LOOK_PX])
     rows, columns = _LOOK_PX * rows, _LOOK_PX * columns
-    inside = square.holds(geo_from_model.apply(view.points(rows, columns)), margin_m)
+    inside = square.covers(geo_from_model.apply(view.points(rows, columns)), margin_m)
     if not inside.any():
         return None
     spare = _LOOK_PX + _REACH_PX
@@ -209,9 +209,9 @@ def _normals(point: FloatArray, depth: FloatArray) -> tuple[FloatArray, BoolArra
 def _plan(
     views: SurfaceViews, geo_from_model: Similarity, settings: FusionSettings, step: int
 ) -> list[tuple[_Square, IntArray]]:
-    """Return the squares that hold the surface, and the numbers of the views that may show each.
+    """Return the squares that contain the surface, and the numbers of the views that may show each.
 
-    None has more candidates than memory has room for. Squares consist of whole voxels, so that no voxel is cut.
+    Squares have at most about `_MOST_CANDIDATES` candidates. They consist of whole voxels, so that none is cut.
     """
     look, unit_m = max(_SAMPLE_PX, step), _LEAST_VOXELS * settings.spacing_m
     shown = [
@@ -223,7 +223,7 @@ def _plan(
         return []
     counts = np.concatenate([count for _, count in shown])
     owner = np.repeat(np.arange(len(shown)), [len(cell) for cell, _ in shown])
-    candidates = counts * (look / step) ** 2  # what the pixels of the look stand for
+    candidates = counts * (look / step) ** 2  # estimated from every `look`-th pixel
     level = int(np.ptp(cells, axis=0).max()).bit_length()
     while True:
         squares, member = np.unique(cells >> level, axis=0, return_inverse=True)
@@ -270,7 +270,7 @@ def _fuse(
     moved = position + support.mean_normal_m[:, None] * normal
     with np.errstate(invalid="ignore"):
         good = (support.views >= settings.min_views) & (support.seen_through <= _MOST_THROUGH * support.views)
-        good &= (sigma_m < _RESOLVED * pixel_m) & square.holds(moved)
+        good &= (sigma_m < _RESOLVED * pixel_m) & square.covers(moved)
     rows = np.flatnonzero(good)
     position, normal, rgb, variance = _voxel_means(
         side_m, moved[rows], moved[rows], normal[rows], rgb[rows], sigma_m[rows] ** 2

@@ -36,7 +36,7 @@ class DepthMap:
     left: int = 0  # pixels of the view to the left of the window, and above it
     top: int = 0  # pixels of the view to the left of the window, and above it
 
-    def holds(self, xy: FloatArray) -> bool:
+    def contains(self, xy: FloatArray) -> bool:
         """Return whether the pixel of a ray (2,) is here."""
         x, y = self._pixel(xy)
         rows, columns = self.depth_m.shape
@@ -58,7 +58,7 @@ class DepthMap:
             xy: (2,) x/z and y/z of the ray.
         """
         x, y = self._pixel(xy)
-        if not self.holds(xy):
+        if not self.contains(xy):
             return 0.0
         own_depth_m = float(self.depth_m[int(y) - self.top, int(x) - self.left])
         around = np.asarray(self.around(x, y), dtype=np.float64)
@@ -101,7 +101,7 @@ def depth_around(renderer: ModelRenderer, camera: int, xy: FloatArray, reach_px:
     return DepthMap(pinhole, renderer.depth_m(pose, Window(left, top, width, height)), left, top)
 
 
-def points_by_model(trained: TrainedSurvey, rays: MarkRays, maps: Sequence[DepthMap]) -> FloatArray:
+def points_on_surface(trained: TrainedSurvey, rays: MarkRays, maps: Sequence[DepthMap]) -> FloatArray:
     """Return the points (J, 3) in `geo` at which the model's surface lies behind their marks.
 
     The result is the spatial median of the views that count; NaN for a point with fewer than two.
@@ -260,7 +260,7 @@ class SurfaceReader:
         for camera in self._train:
             pinhole = self.renderer.pinhole(camera)
             in_cam = self._in_cam(camera, place)
-            if pinhole.holds(pinhole.project(in_cam)):
+            if pinhole.contains(pinhole.project(in_cam)):
                 detail.append((float(in_cam[2]) / pinhole.fx, camera))
         return [camera for _, camera in sorted(detail)[:_MOST_VIEWS]]
 

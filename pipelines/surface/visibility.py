@@ -341,7 +341,7 @@ def _in_view(
     in_cam = (np.concatenate(near) - center) @ rotation.T if near else np.zeros((0, 3))
     in_cam = in_cam[in_cam[:, 2] > _NEAR_M]
     xy = pinhole.project(in_cam)
-    return np.column_stack([xy, in_cam[:, 2]])[pinhole.holds(xy)]
+    return np.column_stack([xy, in_cam[:, 2]])[pinhole.contains(xy)]
 
 
 def _depth_map(shown: FloatArray, pinhole: Pinhole, shrink: float) -> tuple[Pinhole, Float32Array]:

@@ -45,7 +45,7 @@ class BlockCell(Product):
         return BlockCell(low=_moved(self.low, -margin), high=_moved(self.high, margin))
 
     def cut(self, axis: int, place: float) -> tuple[BlockCell, BlockCell]:
-        """Return the parts below and from a place on an axis (0: east, 1: north)."""
+        """Return the parts below and from a coordinate in metres on an axis (0: east, 1: north)."""
         below, above = list(self.high), list(self.low)
         below[axis] = above[axis] = place
         return BlockCell(low=self.low, high=(below[0], below[1])), BlockCell(
@@ -56,8 +56,8 @@ class BlockCell(Product):
         """Return the part that two cells have in common; None: they have none."""
         if not self.meets(other):
             return None
-        low = [_outermost(self.low[axis], other.low[axis], max) for axis in (0, 1)]
-        high = [_outermost(self.high[axis], other.high[axis], min) for axis in (0, 1)]
+        low = [_chosen_bound(self.low[axis], other.low[axis], max) for axis in (0, 1)]
+        high = [_chosen_bound(self.high[axis], other.high[axis], min) for axis in (0, 1)]
         return BlockCell(low=(low[0], low[1]), high=(high[0], high[1]))
 
     def meets(self, other: BlockCell) -> bool:
@@ -74,7 +74,7 @@ class PlannedBlock(Product):
     """Block of the plan.
 
     Attributes:
-        cell: of the Gaussians that the merged model takes from this block.
+        cell: where the merged model takes its Gaussians from this block.
         margin_m: width of the overlap beyond the cell, east and north.
         cameras: training images that see the block.
         share: of the survey's load that lies in the cell.
@@ -100,7 +100,7 @@ class PlannedBlock(Product):
 
 
 class BlockPlan(Product):
-    """Division of a survey into blocks, whose cells share the plane out among them.
+    """Division of a survey into blocks, whose cells divide the plane.
 
     Attributes:
         gaussians, scaffold_gaussians: limits for the whole, and for the coarse model of the whole.
@@ -127,8 +127,8 @@ class BlockPlan(Product):
         raise InputError(f"there is no block {number}: the plan has 0 … {len(self.blocks) - 1}", field="--id")
 
 
-def _outermost(one: float | None, other: float | None, choose: Callable[[list[float]], float]) -> float | None:
-    """Return one of two bounds; None has no end."""
+def _chosen_bound(one: float | None, other: float | None, choose: Callable[[list[float]], float]) -> float | None:
+    """Return the bound that `choose` (min or max) takes of two; None is no bound."""
     known = [bound for bound in (one, other) if bound is not None]
     return choose(known) if known else None
 
@@ -147,7 +147,7 @@ class BlockTraining(Product):
         processor_s: of all processors together, for one iteration; None: unknown.
         mean_gaussians, mean_visible: mean numbers during the training, and in a view, surroundings among these.
         mean_px: mean number of the pixels of a view that were rendered.
-        surroundings: Gaussians that stood in for the rest.
+        surroundings: number of frozen Gaussians around the block, of the scaffold.
         peak_bytes: peak of the process's memory; None: not measured on this system.
         train_psnr: mean of the last iterations, decibels.
     """
@@ -201,7 +201,7 @@ class BlockRecord(Product):
     seams: tuple[Seam, ...]
 
 
-# Gaussians of the scaffold: part of those of the whole, and limits.
+# Number of the scaffold's Gaussians: share of the survey's limit, least and largest number.
 _SCAFFOLD_SHARE, _LEAST_SCAFFOLD, _MOST_SCAFFOLD = 0.1, 2_000, 200_000
 SCAFFOLD_IMAGE_PX = 320  # longest side of the photographs that it is trained on, at most
 

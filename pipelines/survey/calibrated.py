@@ -1,4 +1,4 @@
-"""Survey with its calibrated rig: positions and attitudes computed anew from the navigation as recorded."""
+"""Survey with its calibrated rig: positions and attitudes recomputed from the recorded navigation."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ class NavigationTrack(ArrayProduct):
     Attributes:
         sigma_m: σ east, north, up; NaN where the receiver states none.
         image, image_time_s: names of images, and their times on the camera clock.
-        cam_from_body, antenna_in_body: mount and lever arm; NaN where unknown.
-        nominal_from_cam: boresight.
+        cam_from_body, antenna_in_body: nominal mount and lever arm; NaN where unknown.
+        nominal_from_cam: boresight, from the camera's axes to those of the nominal mount.
         time_offset_s: navigation clock minus camera clock.
         max_gap_s: longest gap to interpolate over.
         body_known: if false, the body's axes are set to the camera's nominal axes.
@@ -129,7 +129,7 @@ def require_estimable(track: NavigationTrack | None, wanted: Sequence[RigParamet
         )
 
 
-# A position farther than this from the median of all is a blunder.
+# A position that is farther from the median of all positions is a blunder.
 FIX_RANGE_M = 100_000.0
 ValueT = TypeVar("ValueT")
 
@@ -157,8 +157,8 @@ def load_survey(workspace: Workspace) -> Survey:
 def apply_calibration(survey: Survey, track: NavigationTrack, calibration: RigCalibration) -> Survey:
     """Return the survey with the applied estimates of a calibration in its positions and attitudes.
 
-    The other parameters of the rig keep the values of `ingest`. A new time offset can bring further images into the
-    span of the navigation. Their fixes and attitudes take σ from the image nearest in time.
+    The other parameters of the rig keep the values of `ingest`. With a new time offset, the navigation may cover
+    further images. Their fixes and attitudes take σ from the image nearest in time.
     """
     values = {estimate.name: np.array(estimate.value) for estimate in calibration.applied}
     starts = {estimate.name: np.array(estimate.start) for estimate in calibration.applied}

@@ -77,9 +77,9 @@ Way = Literal["camera", "model", "left out", "fit"]
 
 @dataclass(frozen=True)
 class PointLine:
-    """Error of one point, of a check point or of one that entered the solution.
+    """Error of one check or control point, measured in one way.
 
-    It is triangulated, on the rendered surface, by a solution that left the point out, or the residual of the fit.
+    Ways: triangulated, on the rendered surface, by a solution that left the point out, residual of the fit.
     """
 
     use: Literal["check", "control"]
@@ -100,7 +100,7 @@ class PointLine:
 def point_lines(report: EvaluationReport) -> list[PointLine]:
     """Return the errors of all points: check points triangulated and on the rendered surface, then control points.
 
-    The residual of a control point is no accuracy; its error in a solution without it is.
+    A control point's error in a solution without it measures accuracy; its residual of the fit does not.
     """
     crossed = () if report.cross_validation is None else report.cross_validation.points
     ways = report.checkpoints.by_way

@@ -134,7 +134,7 @@ def _initially_placed(model: Solution, workspace: Workspace) -> Solution:
 _CAMERA_ERRORS = RayErrors(sigma_center=0.02, sigma_attitude_rad=2e-4)
 
 
-def points_by_camera(solved: SolvedSurvey, rays: MarkRays) -> FloatArray:
+def triangulated_points(solved: SolvedSurvey, rays: MarkRays) -> FloatArray:
     """Return the intersections (J, 3) in `geo` of the rays of each point; NaN: marks in fewer than two images."""
     poses = solved.poses
     met = intersect_marks(rays, poses.cam_from_model, poses.cam_center_in_model, _CAMERA_ERRORS)

@@ -19,7 +19,7 @@ from pipelines.core.stages import ADJUSTMENT
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.core.workspace import Workspace
 from pipelines.geometry.rotations import log_so3
-from pipelines.splat.exposure import HeldExposures
+from pipelines.splat.exposure import FrozenExposures
 from pipelines.survey.adjustment import InitialSimilarity
 from pipelines.survey.scene import Scene, load_adjusted_scene
 from pipelines.survey.survey import Survey
@@ -54,13 +54,13 @@ class AdjustedScene:
         adjustment = self.adjustment.model_copy(update={"cameras": cameras})
         return replace(self, scene=self.scene.of_images(images), adjustment=adjustment)
 
-    def exposures(self, device: torch.device) -> HeldExposures | None:
+    def exposures(self, device: torch.device) -> FrozenExposures | None:
         """Return the exposures of the adjustment, the identity for cameras without one; None: nobody has one."""
         exposures = [camera.exposure for camera in self.adjustment.cameras]
         if all(exposure is None for exposure in exposures):
             return None
         every = np.array([np.eye(3, 4) if exposure is None else exposure for exposure in exposures])
-        return HeldExposures(torch.from_numpy(every).float().to(device))
+        return FrozenExposures(torch.from_numpy(every).float().to(device))
 
     def measured(self, *, control_points: bool = True, planes: Planes | None = None) -> Problem:
         """Return the measurements in use, with the systematic errors that the adjustment has estimated.

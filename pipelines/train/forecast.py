@@ -207,7 +207,7 @@ def _seconds(photographs: int, camera: Pinhole, options: TrainOptions) -> float:
 
     def one(pixels: float, windows: int) -> float:
         surface, count = options.faithful_surface, options.effort.max_gaussians
-        return iteration_seconds(pixels, count, surface=surface, windows=windows)
+        return iteration_seconds(pixels, count, surface=surface, crops=windows)
 
     seconds = _of_all_iterations(camera, camera.width * camera.height, options, one)
     if options.dense:

@@ -90,7 +90,7 @@ def _empty_cells(scene: Scene, index: int, camera: Pinhole, points: FloatArray) 
     rows = max(1, round(_BACKGROUND_COLUMNS * camera.height / camera.width))
     in_cam = (points - scene.poses.cam_center_in_model[index]) @ scene.poses.cam_from_model[index].T
     xy = camera.project(in_cam)
-    shown = xy[camera.holds(xy)]
+    shown = xy[camera.contains(xy)]
     occupied = np.zeros((rows + 2, _BACKGROUND_COLUMNS + 2), dtype=bool)
     column, row = (shown * [_BACKGROUND_COLUMNS / camera.width, rows / camera.height]).astype(int).T
     for shift_row in (0, 1, 2):
@@ -237,7 +237,7 @@ def hidden(points: FloatArray, scene: Scene, maps: DepthMaps) -> BoolArray:
         camera = maps.camera(index)
         in_cam = (points - scene.poses.cam_center_in_model[index]) @ scene.poses.cam_from_model[index].T
         xy = camera.project(in_cam)
-        shown = np.flatnonzero(camera.holds(xy))
+        shown = np.flatnonzero(camera.contains(xy))
         column, row = xy[shown].astype(np.int64).T
         depth = maps.depth(index)[row, column]
         facing[shown] += 1

@@ -24,7 +24,7 @@ from pipelines.geometry.similarity import Similarity, SimilarityRecord, covarian
 from pipelines.report.plots.maps import DrawnArea, write_lidar_map
 from pipelines.robust.statistics import mad_sigma
 from pipelines.splat.losses import FreeSpace
-from pipelines.surface.crossings import crossings
+from pipelines.surface.crossings import count_beams
 from pipelines.surface.depth_maps import DepthMaps
 from pipelines.surface.lidar_cloud import LidarCloud, ScannerTrack, read_cloud
 from pipelines.surface.measured_cloud import CloudReader
@@ -250,7 +250,7 @@ def free_space(cloud: LidarCloud, gone: BoolArray, shown: FloatArray) -> FreeSpa
     while np.prod(np.ceil((high - low) / cell_m) + 1) > _MOST_CELLS:
         cell_m *= _GROWTH
     shape = (np.ceil((high - low) / cell_m) + 1).astype(np.int64)
-    count = crossings(end[beams], cloud.scanner_in_model[beams], low, cell_m, shape)
+    count = count_beams(end[beams], cloud.scanner_in_model[beams], low, cell_m, shape)
     taken = np.zeros(shape, dtype=bool)
     for points in (end, shown):
         cell = np.floor((points - low) / cell_m).astype(np.int64)

@@ -30,7 +30,7 @@ from pipelines.splat.densify import (
     view_contributions,
 )
 from pipelines.splat.densify_mcmc import McmcSettings, McmcStrategy
-from pipelines.splat.exposure import Exposures, HeldExposures
+from pipelines.splat.exposure import Exposures, FrozenExposures
 from pipelines.splat.gaussians import FinitenessMonitor, Gaussians
 from pipelines.splat.initialise import InitialisationOptions, scene_extent
 from pipelines.splat.optimizer import GaussianAdam
@@ -122,7 +122,7 @@ class JointTrainer:
         *,
         rasterizer: Rasterizer,
         options: JointOptions,
-        exposures: Exposures | HeldExposures | None = None,
+        exposures: Exposures | FrozenExposures | None = None,
         outliers: OutlierPixels | None = None,
         region: TrainingRegion | None = None,
     ) -> None:
@@ -209,7 +209,7 @@ class JointTrainer:
         width, height = camera.width // shrink, camera.height // shrink
         windows = 1 if self.options.crops is None else self.options.crops.count(width, height)
         surface = self.options.surface is not None
-        return iteration_seconds(width * height, len(self.optimizer.gaussians), surface=surface, windows=windows)
+        return iteration_seconds(width * height, len(self.optimizer.gaussians), surface=surface, crops=windows)
 
     def slow_down(self, factor: float) -> None:
         """Multiply all learning rates but the exposures' by `factor`, and forget values that were not finite."""
@@ -339,7 +339,7 @@ def make_trainer(
     problem: GeoProblem,
     backend: Rasterizer,
     options: TrainOptions,
-    exposures: HeldExposures | None = None,
+    exposures: FrozenExposures | None = None,
 ) -> JointTrainer:
     """Return the trainer with its initial Gaussians, before the first iteration.
 
@@ -381,7 +381,7 @@ def make_finisher(
     *,
     backend: Rasterizer,
     options: TrainOptions,
-    exposures: HeldExposures | None,
+    exposures: FrozenExposures | None,
 ) -> JointTrainer:
     """Return a trainer that goes on with trained Gaussians, at a low rate, and neither adds nor removes any.
 

@@ -1,4 +1,4 @@
-"""Panel of the viewer in which points are marked in photographs, and the marks written for `--gcp`."""
+"""Panel of the viewer in which points are marked in photographs, and the marks are written for `--gcp`."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _NO_POINT = "Make a point first: its name, and its coordinates if it was surveye
 
 
 class Panel:
-    """Panel with buttons; an error of what a button does is told above the results, and leaves them as they are."""
+    """Panel with buttons and results; the error of a button's action is shown above the results, which stay."""
 
     _result: viser.GuiHtmlHandle
     _failed: viser.GuiHtmlHandle
@@ -53,7 +53,7 @@ class Panel:
 
 
 class MarkPanel(Panel):
-    """Panel of the marks, whose files lie in a folder."""
+    """Panel of the marks; `folder` has their files."""
 
     def __init__(self, server: viser.ViserServer, model: MeasuringModel, photo: PhotoView, folder: Path) -> None:
         self._model, self._photo = model, photo
@@ -117,7 +117,7 @@ class MarkPanel(Panel):
             self._show()
 
     def add(self, camera: int, direction_in_cam: FloatArray) -> None:
-        """Mark the chosen point where a line of sight (3,) leaves the camera that is shown; a failure is told."""
+        """Mark the chosen point at the pixel of a direction (3,) in the shown camera; a failure is shown."""
         with self._lock:
             point = self.point
             if point is None:
@@ -136,7 +136,7 @@ class MarkPanel(Panel):
         if point is None:
             return None
         rays = rays_of(point, self._model.trained)
-        place, cov = self._model.by_camera(rays)
+        place, cov = self._model.triangulated(rays)
         if not np.isfinite(place).all():
             return None
         return SurfacePoint(place, np.zeros((3, 3)) if cov is None else cov, rays.camera)
@@ -168,7 +168,7 @@ class MarkPanel(Panel):
             self._show_points(note=f"Undone: {step}." if step else "Nothing to undo.")
 
     def _show_points(self, name: str | None = None, note: str = "") -> None:
-        """Show the points as they are now, and choose one of them; None: leave the choice, if it is still there."""
+        """Update the list of points, and choose one; None: keep the choice if that point still exists."""
         options = self._options()
         if options != self._chosen.options:
             self._chosen.options = options
@@ -197,7 +197,7 @@ class MarkPanel(Panel):
 
     def _expected(self, point: MarkedPoint) -> FloatArray | None:
         """Return where a point must be (3,) in `geo`: by its marks, or by its survey."""
-        by_marks, _ = self._model.by_camera(rays_of(point, self._model.trained))
+        by_marks, _ = self._model.triangulated(rays_of(point, self._model.trained))
         if np.isfinite(by_marks).all():
             return by_marks
         return None if point.xyz is None else self._model.target.geo_from_xyz(np.array([point.xyz]))[0]
@@ -221,7 +221,7 @@ class MarkPanel(Panel):
                 self._tell(f"{note} No point yet: make one below.".lstrip())
                 return
             rays = rays_of(point, self._model.trained)
-            place, cov = self._model.by_camera(rays)
+            place, cov = self._model.triangulated(rays)
             rows, residuals = [], {}
             if point.xyz is not None:
                 surveyed = self._model.target.geo_from_xyz(np.array([point.xyz]))[0]
@@ -240,9 +240,9 @@ class MarkPanel(Panel):
             self._result.content = shown + places + mark_table(point.marks, residuals)
 
     def _crosses(self, point: MarkedPoint | None) -> tuple[FloatArray | None, FloatArray | None, list[FloatArray]]:
-        """Return, in the shown camera: the direction of the mark, that of the expected place, and epipolar lines.
+        """Return directions (3,) in the shown camera of the mark and the expected place, and epipolar lines.
 
-        The lines are those of sight of the other marks, (2, 3) in `model` each.
+        Each line (2, 3) in `model` is the line of sight of a mark in another photograph.
         """
         camera, trained = self._photo.camera, self._model.trained
         if point is None or camera is None:

@@ -1,8 +1,8 @@
-"""Marking of points in photographs: where a point must appear, what its marks give, and the files for `--gcp`.
+"""Marking of points in photographs: expected pixels of a point, rays of its marks, and the files for `--gcp`.
 
-Marks are kept on disk as they are set. The file has one record for each changed mark and point. A record that the
-survey has taken over, because what was written was ingested, is dropped; until then it stays, so that no viewer
-writes marks without those of another.
+Marks are saved on disk as they are set. The file has one record for each changed mark and point. A record stays
+until the written files are ingested and the survey has its content, so that each viewer writes the marks of all
+viewers.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from pipelines.view.saved import History, changing
 
 CONTROL, CHECK, MARKS = "gcp_list.txt", "checkpoints.txt", "marks.json"
 SIGMA_PX = 0.5  # of a mark that somebody sets with care; the survey's own marks keep theirs
-_SAME_PX = 1e-3  # files of marks have three decimals
+_SAME_PX = 1e-3  # largest difference of equal places: files of marks have three decimals
 _SAME_LLA = (1e-8, 1e-8, 1e-3)  # degrees, degrees, metres: a millimetre
 _IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
@@ -237,7 +237,7 @@ class KeptMarks:
         self.history.add(step, lambda: self._change(former))
 
     def _change(self, wanted: Mapping[Key, Record | None]) -> Mapping[Key, Record | None]:
-        """Set records of the file or drop them (None), and return the former ones."""
+        """Set records of the file or drop them (None), and return the former ones, None where there was none."""
         with changing(self._folder):
             records, _ = self._read()
             former = {key: records.pop(key, None) for key in wanted}

@@ -1,4 +1,4 @@
-"""Panel of the viewer in which points are measured, named, saved and loaded again."""
+"""Panel of the viewer in which points, distances, areas and volumes are measured, named, saved and deleted."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from pipelines.survey.marks import mark_rays
 from pipelines.survey.survey import SurveyedPoint
 from pipelines.view.mark_panel import Panel
 from pipelines.view.measuring import MeasuringModel
+from pipelines.view.overlays import Overlays
 from pipelines.view.quantities import BaseKind, BasePlane, Quantity, distances, length
 from pipelines.view.saved import (
     History,
@@ -29,29 +30,28 @@ from pipelines.view.saved import (
     quantity_text,
     saved_table,
 )
-from pipelines.view.signs import Signs
 
 if TYPE_CHECKING:
     import viser
 
-_LEAST = {"point": 1, "distance": 2, "polyline": 2, "area": 3, "volume": 3}
+_LEAST = {"point": 1, "distance": 2, "polyline": 2, "area": 3, "volume": 3}  # points of a measurement
 _MOST = {"point": 1, "distance": 2}
 _CLOSED = ("area", "volume")
 _BASES: tuple[BaseKind, ...] = get_args(BaseKind)
 
 
 class MeasurePanel(Panel):
-    """Panel of the measurements; those that are saved lie in a folder.
+    """Panel of the measurements; `folder` has the saved ones.
 
     Attributes:
-        kind: chosen in the page.
+        kind: dropdown of the kind of the present measurement.
         points: of the present measurement.
     """
 
     def __init__(
-        self, server: viser.ViserServer, model: MeasuringModel, signs: Signs, folder: Path, model_hash: str
+        self, server: viser.ViserServer, model: MeasuringModel, overlays: Overlays, folder: Path, model_hash: str
     ) -> None:
-        self._model, self._signs, self._hash = model, signs, model_hash
+        self._model, self._overlays, self._hash = model, overlays, model_hash
         self._names = model.trained.sparse.image_name
         survey = model.trained.survey
         self._surveyed = {point.name: point for point in (*survey.control_points, *survey.check_points)}
@@ -113,7 +113,7 @@ class MeasurePanel(Panel):
         self._replace("point", self._kind, (*kept, point), note)
 
     def _replace(self, step: str, kind: Kind, points: tuple[SurfacePoint, ...], note: str = "") -> None:
-        """Measure with other points, as a step that can be undone."""
+        """Replace kind and points of the present measurement, as a step that can be undone under its name."""
         former_kind, former = self._kind, self.points
         if points or former:
             self._history.add(step, lambda: self._show(former_kind, former))
@@ -137,7 +137,7 @@ class MeasurePanel(Panel):
                 self._tell("Reading the surface …")
             self._quantities = self._measured(kind)
         places = np.array([point.position_in_geo for point in self.points])
-        self._signs.show_measured("now", places, closed=kind in _CLOSED and len(self.points) > 2)
+        self._overlays.show_measured("now", places, closed=kind in _CLOSED and len(self.points) > 2)
         self._result.content = self._described(note)
 
     def _measured(self, kind: Kind) -> tuple[Quantity, ...]:
@@ -155,7 +155,7 @@ class MeasurePanel(Panel):
     def _against_survey(self, point: SurveyedPoint) -> str:
         """Return the coordinates of a surveyed point as surveyed and as triangulated, as HTML."""
         rays = mark_rays((point,), self._model.trained.sparse)
-        camera, cov = self._model.by_camera(rays)
+        camera, cov = self._model.triangulated(rays)
         rows = [PlaceRow("surveyed", np.array(point.position_in_geo), np.sqrt(np.diag(point.cov_in_geo)))]
         if np.isfinite(camera).all():
             rows.append(PlaceRow("triangulated", camera, None if cov is None else np.sqrt(np.diag(cov))))
@@ -273,11 +273,11 @@ class MeasurePanel(Panel):
 
     def _show_saved(self) -> None:
         for number in range(self._drawn):
-            self._signs.show_measured(f"saved{number}", np.zeros((0, 3)))
+            self._overlays.show_measured(f"saved{number}", np.zeros((0, 3)))
         rows = []
         for number, measurement in enumerate(self.saved.all):
             places = np.array([point.position_in_geo for point in measurement.points])
-            self._signs.show_measured(f"saved{number}", places, closed=measurement.kind in _CLOSED)
+            self._overlays.show_measured(f"saved{number}", places, closed=measurement.kind in _CLOSED)
             values = "; ".join(quantity_text(each) for each in measurement.quantities[:3])
             older = "" if measurement.model == self._hash else " (measured in an earlier model)"
             rows.append((measurement.name, measurement.name + older, values))

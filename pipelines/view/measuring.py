@@ -17,7 +17,7 @@ from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey.marks import MarkRays
 from pipelines.survey.options import CrsOptions
 from pipelines.survey.target_crs import TargetCrs, usable_crs
-from pipelines.survey.trained_survey import points_by_camera
+from pipelines.survey.trained_survey import triangulated_points
 from pipelines.view.quantities import (
     BasePlane,
     MeasuredPoints,
@@ -60,12 +60,12 @@ class MeasuringModel:
         self.posterior = posterior_of(workspace, self.trained.model, self.trained.sfm) if is_stated else None
         self.without_sigma = "" if self.posterior is not None else "nothing checks the σ of the positions"
 
-    def by_camera(self, rays: MarkRays) -> tuple[FloatArray, FloatArray | None]:
+    def triangulated(self, rays: MarkRays) -> tuple[FloatArray, FloatArray | None]:
         """Return the intersection (3,) in `geo` of the marks of one point, and its covariance (3, 3) in m².
 
         The intersection is NaN with fewer than two marks; the covariance is None where none is stated.
         """
-        position = points_by_camera(self.trained, rays)
+        position = triangulated_points(self.trained, rays)
         if self.posterior is None or not np.isfinite(position).all():
             return position[0], None
         return position[0], self.posterior.of_marked_points(position, rays)[0]

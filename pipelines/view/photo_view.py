@@ -10,8 +10,8 @@ import numpy as np
 from pipelines.core.types import FloatArray
 from pipelines.geometry.rotations import rotation_towards
 from pipelines.survey.trained_survey import TrainedSurvey
+from pipelines.view.overlays import Overlays, wxyz_of
 from pipelines.view.pictures import Blend, ViewFrame
-from pipelines.view.signs import Signs, wxyz_of
 
 if TYPE_CHECKING:
     import viser
@@ -27,7 +27,7 @@ class PhotoView:
     """Photograph that the pages show.
 
     Args:
-        signs: of the scene, hidden while a photograph is shown.
+        overlays: of the scene, hidden while a photograph is shown.
         changed: called when the pictures of the pages must be drawn anew.
 
     Attributes:
@@ -41,10 +41,10 @@ class PhotoView:
         server: viser.ViserServer,
         trained: TrainedSurvey,
         frame: ViewFrame,
-        signs: Signs,
+        overlays: Overlays,
         changed: Callable[[], None],
     ) -> None:
-        self._server, self._trained, self._frame, self._signs = server, trained, frame, signs
+        self._server, self._trained, self._frame, self._overlays = server, trained, frame, overlays
         self._changed = changed
         self.reach_m = 20 * frame.radius_m
         self.camera: int | None = None
@@ -59,7 +59,7 @@ class PhotoView:
     def show(self, camera: int) -> None:
         """Show a photograph whole: all pages fly there."""
         self.camera, self._is_close = camera, False
-        self._signs.hide_all(hidden=True)  # they would cover what is to be marked
+        self._overlays.hide_all(hidden=True)  # they would cover what is to be marked
         for client in self._server.get_clients().values():
             self._stand(client, None, self._whole_fov(client, camera))
         self._changed()
@@ -72,7 +72,7 @@ class PhotoView:
     def leave(self) -> None:
         """Show no photograph any more."""
         self.camera = None
-        self._signs.hide_all(hidden=False)
+        self._overlays.hide_all(hidden=False)
         self._clear()
         self._changed()
 

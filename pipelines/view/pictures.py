@@ -48,7 +48,7 @@ _FARTHEST = 150.0  # units of the viewer, for what has no surface
 _MOVING_S = 0.12  # of drawing one picture while the camera moves
 _STILL_S = 0.2  # without movement until the full picture is drawn
 _LEAST_PX, _MOST_PX = 160, 1920  # of the longer side
-_DEPTH_PX = 480  # of the longer side of the depth: it only decides which signs are hidden
+_DEPTH_PX = 480  # of the longer side of the depth: it only decides which overlays are hidden
 _QUALITY_MOVING, _QUALITY_STILL = 70, 95  # of the JPEG
 
 

@@ -29,10 +29,10 @@ from pipelines.view.mark_panel import MarkPanel
 from pipelines.view.measure_panel import MeasurePanel
 from pipelines.view.measuring import MeasuringModel
 from pipelines.view.options import ViewOptions
+from pipelines.view.overlays import OverlayKind, Overlays, PointColour
 from pipelines.view.photo_view import PhotoView
 from pipelines.view.pictures import Painter, Photographs, PictureLoop, ViewFrame, camera_of, frame_of
 from pipelines.view.saved import FOLDER, paragraph
-from pipelines.view.signs import PointColour, SignKind, Signs
 
 if TYPE_CHECKING:
     import viser
@@ -73,8 +73,8 @@ class Viewer:
         self.painter = Painter(self._renderer, Photographs(workspace, trained), self.frame)
         self.loops: dict[int, PictureLoop] = {}
         self._lock, self._first_drawn = threading.Lock(), threading.Event()
-        self.signs = Signs(server, trained, self.frame)
-        self.photo = PhotoView(server, trained, self.frame, self.signs, self.wake)
+        self.overlays = Overlays(server, trained, self.frame)
+        self.photo = PhotoView(server, trained, self.frame, self.overlays, self.wake)
         self._build(workspace, workspace.root / FOLDER)
         server.scene.on_click()(self._clicked)
 
@@ -99,15 +99,15 @@ class Viewer:
             self._build_look(workspace)
         with tabs.add_tab("Measure"):
             self.measuring = MeasurePanel(
-                self._server, self.model, self.signs, folder, hash_file(workspace.path(MODEL), {})
+                self._server, self.model, self.overlays, folder, hash_file(workspace.path(MODEL), {})
             )
         with tabs.add_tab("Mark"):
             self.marking = MarkPanel(self._server, self.model, self.photo, folder)
             gui.add_button("Measure with the marked point").on_click(lambda _: self._take_marked())
         survey = trained.survey
-        self.signs.add_cameras()
-        self.signs.add_surveyed(survey.control_points, "control")
-        self.signs.add_surveyed(survey.check_points, "check")
+        self.overlays.add_cameras()
+        self.overlays.add_surveyed(survey.control_points, "control")
+        self.overlays.add_surveyed(survey.check_points, "check")
         self._colour_points()
 
     def _build_look(self, workspace: Workspace) -> None:
@@ -117,7 +117,7 @@ class Viewer:
         gui.add_button("Fly there").on_click(lambda _: self.photo.show(names.index(self._photo.value)))
         share = gui.add_slider("Photograph over splat", 0.0, 1.0, 0.05, 1.0)
         gui.add_button("Leave the photograph").on_click(lambda _: self._leave())
-        switches: tuple[tuple[str, SignKind, bool], ...] = (
+        switches: tuple[tuple[str, OverlayKind, bool], ...] = (
             ("Cameras", "cameras", True),
             ("Control and check points", "points", True),
             ("Errors of the points", "errors", True),
@@ -135,10 +135,10 @@ class Viewer:
 
         share.on_update(lambda _: blend())
 
-    def _add_switch(self, label: str, kind: SignKind, visible: bool) -> None:
+    def _add_switch(self, label: str, kind: OverlayKind, visible: bool) -> None:
         box = self._server.gui.add_checkbox(label, visible)
-        box.on_update(lambda _: self.signs.show(kind, box.value))
-        self.signs.show(kind, visible)
+        box.on_update(lambda _: self.overlays.show(kind, box.value))
+        self.overlays.show(kind, visible)
 
     def _errors(self, workspace: Workspace) -> str:
         """Draw the errors of control and check points, and return a sentence about the arrows."""
@@ -149,14 +149,14 @@ class Viewer:
         errors = _point_errors(self.model, report)
         if not errors:
             return paragraph("No control or check point has an error to show.")
-        enlarged = self.signs.add_errors(errors)
+        enlarged = self.overlays.add_errors(errors)
         return paragraph(f"Arrows: triangulated error, × {enlarged:g}. Orange: control points and test views.")
 
     def _colour_points(self) -> None:
         grid: AccuracyGrid | None = None
         if self._colour.value != "of the photographs" and self.model.posterior is not None:
             grid = self.model.posterior.grid
-        limits = self.signs.add_points(self._colour.value, grid)
+        limits = self.overlays.add_points(self._colour.value, grid)
         if limits is not None:
             low, high = limits
             self._legend.content = paragraph(
@@ -211,7 +211,7 @@ class Viewer:
             self._mark(event.client, direction)
             return
         sight = self.frame.sight(camera, start, direction)
-        hit = self.signs.hit(start, direction, sight.pixel_rad)
+        hit = self.overlays.hit(start, direction, sight.pixel_rad)
         if isinstance(hit, int) and self.click_mode.value == "looks":
             self._photo.value = self.model.trained.sparse.image_name[hit]  # type: ignore[misc]
             self.photo.show(hit)

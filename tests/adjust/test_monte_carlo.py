@@ -22,7 +22,7 @@ from pipelines.adjust.measurements import problem_of, start_of
 from pipelines.adjust.posterior import intersection_jacobian
 from pipelines.adjust.solution import adjusted
 from pipelines.adjust.system import linearised, minimise
-from pipelines.evaluate.cautions import refutation
+from pipelines.evaluate.cautions import chi2_caution
 from pipelines.geometry.bundle import Network
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
@@ -242,7 +242,7 @@ def test_wrong_predictions_are_refuted(factor: float, code: str) -> None:
 
 def code_of(error: np.ndarray, cov: np.ndarray) -> str | None:
     """The code of the caution that check points with these errors cause."""
-    caution = refutation(tuple(map(str, range(len(error)))), error.ravel(), cov)
+    caution = chi2_caution(tuple(map(str, range(len(error)))), error.ravel(), cov)
     return None if caution is None else caution.code
 
 

@@ -62,7 +62,7 @@ class Opened:
         """Return where a point is on the page."""
         camera, (width, height) = self.camera, self.shown
         pinhole = camera.pinhole(width, height)
-        x, y, z = camera.rotation.T @ (self.viewer.signs.place(point_in_geo) - camera.position)
+        x, y, z = camera.rotation.T @ (self.viewer.overlays.place(point_in_geo) - camera.position)
         return pinhole.fx * x / z + pinhole.cx, pinhole.fy * y / z + pinhole.cy
 
     def tab(self, name: str) -> None:
@@ -171,14 +171,14 @@ def hill(workspace: Workspace, browser: Browser) -> Iterator[Opened]:
 
 def test_picture_is_the_render(hill: Opened) -> None:
     for kind in ("cameras", "points", "errors", "tie points"):
-        hill.viewer.signs.show(kind, visible=False)  # type: ignore[arg-type]
+        hill.viewer.overlays.show(kind, visible=False)  # type: ignore[arg-type]
     time.sleep(2.0)
     width, height = hill.shown
     expected = hill.viewer.painter.paint(hill.camera, width, height).rgb
     png = hill.page.screenshot(clip={"x": 0, "y": 0, "width": width, "height": height})
     shown = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)[..., ::-1] / 255.0
     for kind in ("cameras", "points", "errors"):
-        hill.viewer.signs.show(kind, visible=True)  # type: ignore[arg-type]
+        hill.viewer.overlays.show(kind, visible=True)  # type: ignore[arg-type]
     # The lower half: viser's messages lie over the upper one.
     ours, theirs = expected[height // 2 :] / 255.0, shown[height // 2 :]
     exposure = float((ours * theirs).sum() / (theirs * theirs).sum())

@@ -13,7 +13,7 @@ from pipelines.core.errors import InputError, MissingProductError
 from pipelines.core.products import NOT_CHECKED, Caution, load_json, save_json
 from pipelines.core.stages import DELIVERABLES, MODEL, SPLAT, SURVEY
 from pipelines.core.workspace import Workspace
-from pipelines.deliver.options import PURPOSES
+from pipelines.deliver.options import DESCRIPTIONS
 from pipelines.deliver.overview import overview
 from pipelines.geodesy.enu import ecef_from_enu
 from pipelines.geodesy.vertical import VerticalDatum, parse_vertical
@@ -96,7 +96,7 @@ def test_untrained_workspace_says_what_to_run(copied: Workspace) -> None:
 
 def test_every_file_that_is_handed_over_has_its_purpose() -> None:
     handed_over = [SPLAT, *(product for spec in DELIVERABLES for product in (spec.product, *spec.also))]
-    assert [product for product in handed_over if product not in PURPOSES] == []
+    assert [product for product in handed_over if product not in DESCRIPTIONS] == []
 
 
 def test_feature_is_the_rectangle_with_all_the_rest(copied: Workspace) -> None:

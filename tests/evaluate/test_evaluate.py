@@ -51,16 +51,16 @@ def test_report_has_the_form_that_scripts_read(evaluated: tuple[Workspace, Outco
     assert report["fit"]["gcp"]["rmse_3d_m"] is None
 
 
-def test_check_points_by_camera_are_as_good_as_the_measurements(evaluated: tuple[Workspace, Outcome]) -> None:
-    by_camera = report_of(evaluated[0])["checkpoints"]["camera"]
-    assert by_camera["count"] == 6
+def test_triangulated_check_points_are_as_good_as_the_measurements(evaluated: tuple[Workspace, Outcome]) -> None:
+    triangulated = report_of(evaluated[0])["checkpoints"]["camera"]
+    assert triangulated["count"] == 6
     # Marks of 0.1 px are 5 cm from 45 m, over √12 rays 2 cm; the similarity's own 1.5 and 2.4 cm, and its turn.
-    assert by_camera["rmse_h_m"] < 0.08
-    assert by_camera["rmse_v_m"] < 0.12
-    assert [row["rays"] for row in by_camera["points"]] == [14] * 6
-    errors = np.array([[row[key] for key in ("de_m", "dn_m", "du_m")] for row in by_camera["points"]])
-    assert by_camera["rmse_3d_m"] == pytest.approx(np.sqrt((errors**2).sum(axis=1).mean()))
-    assert by_camera["mean_h_m"] == pytest.approx(np.hypot(errors[:, 0], errors[:, 1]).mean())
+    assert triangulated["rmse_h_m"] < 0.08
+    assert triangulated["rmse_v_m"] < 0.12
+    assert [row["rays"] for row in triangulated["points"]] == [14] * 6
+    errors = np.array([[row[key] for key in ("de_m", "dn_m", "du_m")] for row in triangulated["points"]])
+    assert triangulated["rmse_3d_m"] == pytest.approx(np.sqrt((errors**2).sum(axis=1).mean()))
+    assert triangulated["mean_h_m"] == pytest.approx(np.hypot(errors[:, 0], errors[:, 1]).mean())
 
 
 def test_check_points_are_measured_through_the_trained_lens(altered: Workspace) -> None:
@@ -81,12 +81,12 @@ def test_check_points_are_measured_through_the_trained_lens(altered: Workspace) 
     assert sorted(path.name for path in (altered.cache / "undistorted").iterdir()) == cached
 
 
-def test_check_points_by_model_lie_on_the_surface(evaluated: tuple[Workspace, Outcome]) -> None:
-    by_model = report_of(evaluated[0])["checkpoints"]["model"]
-    assert by_model["count"] == 6
+def test_check_points_lie_on_the_surface(evaluated: tuple[Workspace, Outcome]) -> None:
+    on_surface = report_of(evaluated[0])["checkpoints"]["model"]
+    assert on_surface["count"] == 6
     # The surface is known to a Gaussian: its size, not the cameras, decides.
-    assert by_model["rmse_3d_m"] < 1.5 * SIGMA_M
-    assert by_model["rmse_h_m"] < SIGMA_M
+    assert on_surface["rmse_3d_m"] < 1.5 * SIGMA_M
+    assert on_surface["rmse_h_m"] < SIGMA_M
 
 
 def test_fit_is_that_of_the_fixes(evaluated: tuple[Workspace, Outcome]) -> None:
@@ -140,25 +140,26 @@ def test_cross_validation_without_control_points_says_so(altered: Workspace) -> 
     assert any(text.startswith("no cross-validation") for text in outcome.manifest.warnings)
 
 
-def test_prediction_agrees_with_the_errors_by_camera(evaluated: tuple[Workspace, Outcome]) -> None:
-    by_camera = report_of(evaluated[0])["checkpoints"]["camera"]
-    predicted = by_camera["predicted"]
+def test_prediction_agrees_with_the_errors_of_triangulation(evaluated: tuple[Workspace, Outcome]) -> None:
+    triangulated = report_of(evaluated[0])["checkpoints"]["camera"]
+    predicted = triangulated["predicted"]
     assert predicted["count"] == 6
     # This scene's cameras are exact, which the prediction cannot know: the errors are less than it says, by the
     # cameras' share of a few centimetres, and more than a fifth, which is the marks'.
-    assert 0.2 * predicted["rms_h_m"] < by_camera["rmse_h_m"] < 1.5 * predicted["rms_h_m"]
+    assert 0.2 * predicted["rms_h_m"] < triangulated["rmse_h_m"] < 1.5 * predicted["rms_h_m"]
     assert all(0 < value < 2 for value in predicted["normalised_error_squared"].values())
 
 
 def test_accuracy_is_stated_after_the_standard(evaluated: tuple[Workspace, Outcome]) -> None:
-    by_camera = report_of(evaluated[0])["checkpoints"]["camera"]
-    assert by_camera["survey"]["rmse_h_m"] == pytest.approx(np.sqrt(2) * NOISE.gcp_m)
-    assert by_camera["with_survey"]["rmse_h_m"] == pytest.approx(
-        np.hypot(by_camera["rmse_h_m"], np.sqrt(2) * NOISE.gcp_m)
+    triangulated = report_of(evaluated[0])["checkpoints"]["camera"]
+    assert triangulated["survey"]["rmse_h_m"] == pytest.approx(np.sqrt(2) * NOISE.gcp_m)
+    assert triangulated["with_survey"]["rmse_h_m"] == pytest.approx(
+        np.hypot(triangulated["rmse_h_m"], np.sqrt(2) * NOISE.gcp_m)
     )
-    assert by_camera["asprs"]["horizontal_class"] == f"{np.ceil(100 * by_camera['with_survey']['rmse_h_m']):.0f} cm"
-    assert by_camera["asprs"]["enough_points"] is False
-    assert by_camera["blunders"] == []
+    class_cm = np.ceil(100 * triangulated["with_survey"]["rmse_h_m"])
+    assert triangulated["asprs"]["horizontal_class"] == f"{class_cm:.0f} cm"
+    assert triangulated["asprs"]["enough_points"] is False
+    assert triangulated["blunders"] == []
 
 
 def test_cautions_of_the_model_stand_first_in_the_report(altered: Workspace) -> None:
@@ -203,11 +204,11 @@ def test_a_blunder_is_named_and_kept(altered: Workspace) -> None:
         altered, check_points=(first.model_copy(update={"position_in_geo": (east + 3, north, up)}), *rest)
     )
     outcome = run_stage(altered, EVALUATE, {"renders": 0})
-    by_camera = report_of(altered)["checkpoints"]["camera"]
-    assert by_camera["blunders"] == [first.name]
-    assert by_camera["count"] == 6
-    assert by_camera["rmse_h_m"] > 1.0
-    assert by_camera["without_blunders"]["rmse_h_m"] < 0.1
+    triangulated = report_of(altered)["checkpoints"]["camera"]
+    assert triangulated["blunders"] == [first.name]
+    assert triangulated["count"] == 6
+    assert triangulated["rmse_h_m"] > 1.0
+    assert triangulated["without_blunders"]["rmse_h_m"] < 0.1
     assert any("triangulated, 1 of 6 check points" in text for text in outcome.manifest.warnings)
 
 
@@ -236,9 +237,9 @@ def test_points_are_written_and_printed(
     workspace, _ = evaluated
     with (workspace.root / "evaluate/points.csv").open(encoding="utf-8", newline="") as handle:
         rows = [row for row in csv.DictReader(handle) if row["measured"] == "camera"]
-    by_camera = report_of(workspace)["checkpoints"]["camera"]
+    triangulated = report_of(workspace)["checkpoints"]["camera"]
     rms = np.sqrt(np.mean([float(row["dh_m"]) ** 2 for row in rows]))
-    assert rms == pytest.approx(by_camera["rmse_h_m"], abs=1e-4)  # the file has tenths of a millimetre
+    assert rms == pytest.approx(triangulated["rmse_h_m"], abs=1e-4)  # the file has tenths of a millimetre
     assert boundary.guarded(cli, ["evaluate", str(workspace.root), "--renders", "1", "--points"]) == 0
     printed = capsys.readouterr().out
     assert "current, nothing to do" in printed and "Check points one by one, metres" in printed
@@ -276,10 +277,10 @@ def test_unusable_marks_leave_a_point_unmeasured(altered: Workspace) -> None:
     )
     change_survey(altered, check_points=(alone, elsewhere, *rest))
     run_stage(altered, EVALUATE, {"renders": 0})
-    by_camera = report_of(altered)["checkpoints"]["camera"]
-    assert by_camera["count"] == 4
-    assert [row["rays"] for row in by_camera["points"][:2]] == [1, 0]
-    assert [row["de_m"] for row in by_camera["points"][:2]] == [None, None]
+    triangulated = report_of(altered)["checkpoints"]["camera"]
+    assert triangulated["count"] == 4
+    assert [row["rays"] for row in triangulated["points"][:2]] == [1, 0]
+    assert [row["de_m"] for row in triangulated["points"][:2]] == [None, None]
 
 
 def test_cameras_of_another_reconstruction_are_refused(altered: Workspace) -> None:

@@ -92,7 +92,7 @@ def test_file_has_place_error_and_coordinates(report: EvaluationReport, survey: 
     with (tmp_path / "points.csv").open(encoding="utf-8", newline="") as handle:
         rows = list(csv.DictReader(handle))
     assert len(rows) == 6
-    first, by_model, unmeasured, *_, fit = rows
+    first, on_surface, unmeasured, *_, fit = rows
     place = [float(first[name]) for name in ("latitude_deg", "longitude_deg", "ellipsoidal_height_m")]
     expected = ecef_from_enu((10.0, -20.0, 3.0), survey.origin)
     np.testing.assert_allclose(ecef_from_lla(place), expected, rtol=0, atol=2e-4)
@@ -102,10 +102,10 @@ def test_file_has_place_error_and_coordinates(report: EvaluationReport, survey: 
         "0.0200",
         "0",
     )
-    assert (by_model["dh_m"], by_model["sigma_n_m"], by_model["blunder"]) == ("5.0000", "", "1")
+    assert (on_surface["dh_m"], on_surface["sigma_n_m"], on_surface["blunder"]) == ("5.0000", "", "1")
     assert (unmeasured["de_m"], unmeasured["d3_m"], unmeasured["x"]) == ("", "", "2600000.0000")
     assert (first["crs"], first["x"], first["x_measured"]) == ("EPSG:2056+5728", "2600010.0000", "2600010.0300")
-    assert (by_model["x_measured"], unmeasured["x_measured"]) == ("2600013.0000", "")
+    assert (on_surface["x_measured"], unmeasured["x_measured"]) == ("2600013.0000", "")
     assert (fit["measured"], fit["blunder"], fit["crs"], fit["east_m"]) == ("fit", "", "", "5.0000")
 
 

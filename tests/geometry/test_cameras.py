@@ -85,11 +85,11 @@ def test_pinhole_shows_a_point_where_its_ray_leaves() -> None:
     np.testing.assert_allclose(camera.project(in_cam), xy, atol=1e-9)
     within = (xy[:, 0] >= 0) & (xy[:, 0] < 1200) & (xy[:, 1] >= 0) & (xy[:, 1] < 900)
     assert 0 < within.sum() < 200
-    np.testing.assert_array_equal(camera.holds(xy), within)
+    np.testing.assert_array_equal(camera.contains(xy), within)
     # The image ends where the next pixel would begin.
     np.testing.assert_array_equal(
-        camera.holds([[0, 0], [1200, 0], [0, 900], [-1e-9, 0]]), [True, False, False, False]
+        camera.contains([[0, 0], [1200, 0], [0, 900], [-1e-9, 0]]), [True, False, False, False]
     )
     behind = camera.project(-in_cam)
     assert np.isnan(behind).all()
-    assert not camera.holds(behind).any()
+    assert not camera.contains(behind).any()

@@ -17,7 +17,7 @@ from pipelines.core import child
 from pipelines.core.errors import ClusterError, InputError
 from pipelines.core.progress import SILENT, ProgressTask
 from pipelines.jobs import cluster as cluster_access
-from pipelines.jobs.cluster import ClusterAddress, Place, make_certificates, place_for
+from pipelines.jobs.cluster import ClusterAddress, Worker, make_certificates, worker_for
 from pipelines.jobs.dask_engine import DaskEngine
 from pipelines.jobs.engine import Job, JobEnd
 from tests.clusters import PATIENCE_S, RunningCluster, greeting, running_cluster
@@ -298,12 +298,12 @@ def test_the_key_is_for_its_owner(tmp_path: Path) -> None:
 
 
 class TestPlaces:
-    SMALL = Place("a", "a", 2, 8 * GIB, 0)
-    LARGE = Place("b", "b", 4, 32 * GIB, 1)
+    SMALL = Worker("a", "a", 2, 8 * GIB, 0)
+    LARGE = Worker("b", "b", 4, 32 * GIB, 1)
 
     def place(self, new: Job, running: dict[str, list[Job]], avoided: set[str] | None = None) -> str | None:
-        places = {place.address: place for place in (self.SMALL, self.LARGE)}
-        found = place_for(new, places, running, avoided or set())
+        workers = {worker.address: worker for worker in (self.SMALL, self.LARGE)}
+        found = worker_for(new, workers, running, avoided or set())
         return None if found is None else found.address
 
     def test_memory_gpu_and_slots_are_kept(self) -> None:

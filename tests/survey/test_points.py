@@ -9,10 +9,10 @@ from pipelines.geometry.cameras import CameraPoses, Pinhole
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.splat.initialise import gaussians_of_size
-from pipelines.surface.picking import DepthMap, points_by_model
+from pipelines.surface.picking import DepthMap, points_on_surface
 from pipelines.survey.marks import MarkRays, mark_rays
 from pipelines.survey.survey import SurveyedPoint
-from pipelines.survey.trained_survey import TrainedSurvey, points_by_camera
+from pipelines.survey.trained_survey import TrainedSurvey, triangulated_points
 from tests.scenes import (
     GEO_FROM_LOCAL,
     Measured,
@@ -72,12 +72,12 @@ def measured(
     trained: TrainedSurvey, points: tuple[SurveyedPoint, ...], depth_m: dict[int, np.ndarray]
 ) -> np.ndarray:
     rays = mark_rays(points, trained.sparse)
-    return points_by_model(trained, rays, maps(rays, depth_m))
+    return points_on_surface(trained, rays, maps(rays, depth_m))
 
 
 def test_rays_meet_in_the_surveyed_point(trained: TrainedSurvey) -> None:
     points = trained.survey.control_points
-    found = points_by_camera(trained, mark_rays(points, trained.sparse))
+    found = triangulated_points(trained, mark_rays(points, trained.sparse))
     np.testing.assert_allclose(found, surveyed(points), atol=1e-6)
 
 
@@ -86,7 +86,7 @@ def test_depth_gives_the_surveyed_point(trained: TrainedSurvey) -> None:
     points = trained.survey.control_points[:1]
     rays = mark_rays(points, trained.sparse)
     depth = planes(trained, points[0].position_in_geo[2])
-    found = points_by_model(trained, rays, maps(rays, depth))
+    found = points_on_surface(trained, rays, maps(rays, depth))
     np.testing.assert_allclose(found, surveyed(points), atol=1e-5)
 
 
@@ -101,7 +101,7 @@ def test_windows_around_the_marks_are_enough(trained: TrainedSurvey) -> None:
         left, top = max(column - 1, 0), max(row - 1, 0)
         windows.append(DepthMap(PINHOLE, rough[camera][top : row + 2, left : column + 2], left, top))
     np.testing.assert_array_equal(
-        points_by_model(trained, rays, windows), points_by_model(trained, rays, maps(rays, rough))
+        points_on_surface(trained, rays, windows), points_on_surface(trained, rays, maps(rays, rough))
     )
 
 
@@ -119,7 +119,7 @@ def test_roughness_of_the_surface_is_evened_out(trained: TrainedSurvey) -> None:
     depth = planes(trained, points[0].position_in_geo[2])
     roughness = 0.002
     rough = {i: each * (1 + roughness * rng.standard_normal(each.shape)) for i, each in depth.items()}
-    found = points_by_model(trained, rays, maps(rays, rough))
+    found = points_on_surface(trained, rays, maps(rays, rough))
     centers = trained.geo_from_model.apply(trained.poses.cam_center_in_model[rays.camera])
     distance = float(np.linalg.norm(centers - surveyed(points), axis=1).max())
     sigma_of_view = roughness * distance / 5
@@ -133,7 +133,7 @@ def test_wrong_surface_in_few_views_is_outvoted(trained: TrainedSurvey) -> None:
     views = sorted({int(i) for i in rays.camera})
     depth[views[0]] = depth[views[0]] * 0.3  # a floater before the camera
     depth[views[1]] = depth[views[1]] * 0.0  # nothing there
-    found = points_by_model(trained, rays, maps(rays, depth))
+    found = points_on_surface(trained, rays, maps(rays, depth))
     assert np.linalg.norm(found - surveyed(points)) < 0.01
 
 
@@ -142,8 +142,8 @@ def test_points_with_too_few_views_are_not_measured(trained: TrainedSurvey) -> N
     lonely = (first.model_copy(update={"marks": first.marks[:1]}), first.model_copy(update={"marks": ()}))
     rays = mark_rays(lonely, trained.sparse)
     depth = planes(trained, 0.0)
-    assert np.isnan(points_by_camera(trained, rays)).all()
-    assert np.isnan(points_by_model(trained, rays, maps(rays, depth))).all()
+    assert np.isnan(triangulated_points(trained, rays)).all()
+    assert np.isnan(points_on_surface(trained, rays, maps(rays, depth))).all()
 
 
 def test_marks_outside_of_the_map_or_lens_are_no_hits(trained: TrainedSurvey) -> None:
@@ -157,5 +157,5 @@ def test_marks_outside_of_the_map_or_lens_are_no_hits(trained: TrainedSurvey) ->
 def test_no_points_at_all(trained: TrainedSurvey) -> None:
     rays = mark_rays((), trained.sparse)
     assert rays.xy.shape == (0, 2)
-    assert points_by_camera(trained, rays).shape == (0, 3)
-    assert points_by_model(trained, rays, []).shape == (0, 3)
+    assert triangulated_points(trained, rays).shape == (0, 3)
+    assert points_on_surface(trained, rays, []).shape == (0, 3)

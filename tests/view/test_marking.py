@@ -11,7 +11,7 @@ import pytest
 from pipelines.core.errors import InputError
 from pipelines.formats.ground_points import read_ground_points
 from pipelines.survey.survey import SurveyedPoint
-from pipelines.survey.trained_survey import points_by_camera
+from pipelines.survey.trained_survey import triangulated_points
 from pipelines.view.marking import (
     CHECK,
     CONTROL,
@@ -33,13 +33,13 @@ def test_a_point_appears_where_its_marks_intersect_again(model: MeasuringModel) 
     assert len(shown) == len(trained.sparse.image_name)  # all cameras look at the hill
     marks = {trained.sparse.image_name[camera]: (float(x), float(y)) for camera, (x, y) in shown}
     rays = rays_of(MarkedPoint("P", None, marks=marks), trained)
-    found = points_by_camera(trained, rays)[0]
+    found = triangulated_points(trained, rays)[0]
     np.testing.assert_allclose(found, PLACE, atol=1e-6)
     assert residuals_px(PLACE, rays, trained).max() < 1e-4
     # A mark that is 5 px off shows it, and the others hardly move.
     image, (x, y) = next(iter(marks.items()))
     wrong = rays_of(MarkedPoint("P", None, marks={**marks, image: (x + 5.0, y)}), trained)
-    residual = residuals_px(points_by_camera(trained, wrong)[0], wrong, trained)
+    residual = residuals_px(triangulated_points(trained, wrong)[0], wrong, trained)
     names = [trained.sparse.image_name[camera] for camera in wrong.camera]
     assert residual[names.index(image)] == pytest.approx(5.0, abs=1.5)
     assert np.median(residual) < 1.0

@@ -12,7 +12,7 @@ import pytest
 from pipelines.core.errors import MissingProductError
 from pipelines.core.products import NOT_CHECKED, Caution
 from pipelines.core.workspace import Workspace
-from pipelines.surface.picking import NoSurface, Sight, SurfacePoint, depth_around, points_by_model
+from pipelines.surface.picking import NoSurface, Sight, SurfacePoint, depth_around, points_on_surface
 from pipelines.survey.marks import mark_rays
 from pipelines.survey.options import CrsOptions
 from pipelines.view import measuring
@@ -61,7 +61,7 @@ def test_surveyed_points_are_measured_as_by_evaluate(model: MeasuringModel) -> N
     survey, renderer = model.trained.survey, model.reader.renderer
     rays = mark_rays(survey.check_points, model.trained.sparse)
     maps = [depth_around(renderer, int(camera), xy) for camera, xy in zip(rays.camera, rays.xy, strict=True)]
-    expected = points_by_model(model.trained, rays, maps)
+    expected = points_on_surface(model.trained, rays, maps)
     for row, point in enumerate(survey.check_points):
         measured = model.reader.behind_marks(mark_rays((point,), model.trained.sparse))
         assert isinstance(measured, SurfacePoint)

@@ -1,4 +1,4 @@
-"""Merged model: of each block the Gaussians in its cell, and the solution that all blocks have held.
+"""Merged model: of each block the Gaussians in its cell, and the solution that was frozen in all blocks.
 
 Its internal precision is the disagreement of neighbouring blocks. A view that shows the overlap of two blocks is
 rendered twice: with the Gaussians of either block, and the scaffold around it. Where both renders show a surface in
@@ -49,16 +49,16 @@ from pipelines.train.adjusted_scene import figures_of
 from pipelines.train.blocks.parts import Parts
 from pipelines.train.schedule import BACKGROUND
 
-_VIEWS = 4  # of a seam
-_CANDIDATES = 16  # from which they are chosen, by small renders
-_CANDIDATE_PX = 80
-_IMAGE_PX = 640
-_SOLID = 0.9  # alpha of a surface
+_VIEWS = 4  # in which a seam is measured
+_CANDIDATES = 16  # views from which they are chosen, by small renders
+_CANDIDATE_PX = 80  # longest side of a small render
+_IMAGE_PX = 640  # longest side of a render that is measured
+_SOLID = 0.9  # least alpha of a surface
 _LEAST_PIXELS = 200  # of a seam: fewer tell nothing
 
 
 def compare_neighbours(parts: Parts, plan: BlockPlan, solution: Adjustment, progress: Progress) -> tuple[Seam, ...]:
-    """Return the disagreement of all neighbours whose overlap some view shows."""
+    """Return the disagreement of all neighbouring blocks whose overlap is shown by a view."""
     pairs = [pair for pair in combinations(plan.blocks, 2) if pair[0].region.meets(pair[1].region)]
     if not pairs:
         return ()
@@ -73,11 +73,11 @@ def compare_neighbours(parts: Parts, plan: BlockPlan, solution: Adjustment, prog
 
 @dataclass(frozen=True)
 class _View:
-    """Render of one block in a view: colour (H, W, 3), depth (H, W) in metres, and the pixels in a region."""
+    """Render of one block: colour (H, W, 3), depth (H, W) in metres, mask (H, W) of surface in both regions."""
 
     colour: Tensor
     depth_m: FloatArray
-    counts: BoolArray
+    shared: BoolArray
 
 
 class SeamViews:
@@ -101,12 +101,12 @@ class SeamViews:
         depths, colours, views = [], [], 0
         common = sorted(set(first.cameras) & set(second.cameras))
         common = common[:: max(1, len(common) // _CANDIDATES)]
-        shown = {name: int(self._view(first, name, _CANDIDATE_PX, (first, second)).counts.sum()) for name in common}
+        shown = {name: int(self._view(first, name, _CANDIDATE_PX, (first, second)).shared.sum()) for name in common}
         for name in sorted(common, key=lambda name: -shown[name])[:_VIEWS]:
             if not shown[name]:
                 break
             one, other = (self._view(block, name, _IMAGE_PX, (first, second)) for block in (first, second))
-            both = one.counts & other.counts
+            both = one.shared & other.shared
             if not both.any():
                 continue
             views += 1
@@ -141,8 +141,8 @@ class SeamViews:
         return _View(view.colour.clamp(0, 1), depth, solid & inside.reshape(depth.shape))
 
     def _model_of(self, number: int) -> Gaussians:
-        """Return the Gaussians of a block, with the scaffold outside of it, on the device."""
-        own = read_gaussians(self._parts.place(number).path(BLOCK_GAUSSIANS))
+        """Return the Gaussians of a block, with the scaffold's outside of its region, on the device."""
+        own = read_gaussians(self._parts.variant(number).path(BLOCK_GAUSSIANS))
         around = ~self._plan.block(number).region.contains(self._scaffold.means.double().numpy())
         return Gaussians.concatenate([own, self._scaffold.select(torch.from_numpy(around))]).to(self._device)
 
@@ -168,7 +168,7 @@ def merge_blocks(parts: Parts, plan: BlockPlan, folder: Path, progress: Progress
         backend=trainings[0].backend,
     )
     save_json(model, folder / Path(MODEL).name)
-    # Blocks hold the adjustment of init-sim3: its covariances stay.
+    # Blocks keep the adjustment of init-sim3, and with it the covariances.
     shutil.copyfile(parts.workspace.path(SIM3_POSTERIOR), folder / Path(TRAIN_POSTERIOR).name)
     _write_metrics(parts, plan, folder / "metrics.jsonl")
     seams = compare_neighbours(parts, plan, solution, progress)
@@ -182,7 +182,7 @@ def _write_metrics(parts: Parts, plan: BlockPlan, path: Path) -> None:
     """Write metrics of the whole: means over the blocks, and sums of Gaussians and seconds."""
     by_iteration: dict[int, list[dict[str, float]]] = {}
     for block in plan.blocks:
-        source = parts.place(block.id).path("block/metrics.jsonl")
+        source = parts.variant(block.id).path("block/metrics.jsonl")
         file_size(source)
         for line in source.read_text(encoding="utf-8").splitlines():
             row = json.loads(line)

@@ -55,7 +55,7 @@ class Parts:
         if self.options.lidar is not None:
             raise InputError(NOT_IN_BLOCKS, field="--lidar")
 
-    def place(self, number: int | None = None) -> Workspace:
+    def variant(self, number: int | None = None) -> Workspace:
         """Return the variant of a block, or the one that holds plan, solution, scaffold and seams."""
         lent = {spec.folder: self.workspace.root / spec.folder for spec in UPSTREAM}
         whole = self.workspace.variant(FOLDER, lent, FOLDER)
@@ -67,7 +67,7 @@ class Parts:
     @property
     def whole(self) -> Workspace:
         """Variant that holds plan, solution, scaffold and seams."""
-        return self.place()
+        return self.variant()
 
     def on_gpu(self) -> bool:
         """Return whether a block takes a GPU; a backend that is not available here is an error."""
@@ -87,7 +87,7 @@ class Parts:
 
     def training(self, block: PlannedBlock) -> BlockTraining:
         """Return the record of a trained block."""
-        return load_json(BlockTraining, self.place(block.id).path(BLOCK_TRAINING))
+        return load_json(BlockTraining, self.variant(block.id).path(BLOCK_TRAINING))
 
     def flags(self, spec: StageSpec, number: int | None = None) -> dict[str, Any]:
         """Return all options of a part; `number` is that of the block, for `TRAIN_BLOCK`."""
@@ -108,7 +108,7 @@ class Parts:
     def _hashes(self) -> Iterator[str]:
         """Yield the hash of each block's Gaussians; a block that is not trained is an error."""
         for block in self.plan().blocks:
-            manifest = self.place(block.id).manifest(TRAIN_BLOCK)
+            manifest = self.variant(block.id).manifest(TRAIN_BLOCK)
             if manifest is None:
                 command = f"georef blocks train {self.workspace.root} --id {block.id}"
                 raise MissingProductError(f"{FOLDER}/{block.id}/{BLOCK_GAUSSIANS}", command)
@@ -122,14 +122,14 @@ class Parts:
         Raises:
             GeorefError: the part fails.
         """
-        variant = self.place(number)
+        variant = self.variant(number)
         variant.root.mkdir(parents=True, exist_ok=True)
         flags = self.flags(spec, number)
         return run_stage(variant, spec, flags, force=force, resume="if-same", progress=progress)
 
     def why_missing(self, spec: StageSpec, number: int | None = None) -> str:
         """Return why a part must run: it never has, or is stale or damaged; empty if it is current."""
-        variant = self.place(number)
+        variant = self.variant(number)
         try:
             manifest = variant.manifest(spec)
             if manifest is None:

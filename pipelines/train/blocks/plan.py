@@ -32,8 +32,8 @@ from pipelines.survey.photographs import pinhole_of
 from pipelines.survey.scene import Scene, load_adjusted_scene
 from pipelines.train.options import PlanOptions
 
-_COLUMNS, _ROWS = 16, 12
-# Observations beyond this number add nothing to shares of a block, but gigabytes: points are left out evenly.
+_COLUMNS, _ROWS = 16, 12  # of a photograph's grid
+# More observations need gigabytes and do not improve the shares of a block: points are left out evenly.
 _MOST_OBSERVATIONS = 6_000_000
 
 
@@ -89,7 +89,7 @@ def observed_surface(scene: Scene, most_observations: int = _MOST_OBSERVATIONS) 
     )
 
 
-_OUTER = 0.01  # of the load lies beyond either end of a cell's extent: a stray point makes no cell long
+_OUTER = 0.01  # share of the load beyond either end of a cell's extent, so that a stray point does not extend it
 MOST_BLOCKS = 4096
 
 
@@ -99,7 +99,7 @@ def cells_of_number(
     count: int,
     cell: BlockCell = BlockCell(),  # noqa: B008
 ) -> list[BlockCell]:
-    """Return cells that share the plane, or `cell`, out among them, with loads as equal as the points allow.
+    """Return cells that divide the plane, or `cell`, with loads as equal as the points allow.
 
     Args:
         points: (P, 2 or more) east and north, metres.
@@ -118,7 +118,7 @@ def cells_of_number(
 def cells_that_fit(
     points: FloatArray, load: FloatArray, fits: Callable[[BlockCell, FloatArray], bool]
 ) -> list[BlockCell]:
-    """Return cells that share the plane out among them, halved until each fits.
+    """Return cells that divide the plane, halved until each fits.
 
     Args:
         points, load: as of `cells_of_number`.
@@ -170,7 +170,7 @@ def _quantile(values: FloatArray, load: FloatArray, share: float) -> float:
     return float(values[order[min(place, len(order) - 1)]])
 
 
-_LEAST_SHARE = 0.1  # of a photograph that shows a block which it is to train
+_LEAST_SHARE = 0.1  # of a photograph that must show the block, so that the photograph trains it
 _LEAST_CAMERAS = 8
 _PROCESS_BYTES = 400 * 2**20  # of a process with its libraries, before it reads the survey
 _OBSERVATION_BYTES = 240  # of the SfM model, which each block reads whole
@@ -285,7 +285,7 @@ class _Planner:
         return np.sort(most[share[most] > 0])
 
     def _visible(self, inside: BoolArray, cameras: IntArray) -> float:
-        """Return the mean number of Gaussians of a region in its views, without regard to what hides them."""
+        """Return the mean number of Gaussians of a region in its views; hidden Gaussians count."""
         points, surface = self.surface.point_in_model[inside], self.surface.surface[inside]
         poses, sparse = self.scene.poses, self.scene.sparse
         seen = []

@@ -1,9 +1,9 @@
 """Training across the seams: Gaussians along the sides of cells are adapted to those on the other side.
 
-Each block was trained with Gaussians of its own beyond its cell, which the merged model does not take. Their
-successors lie elsewhere: along a seam they leave gaps, or lie double. Strip by strip, the seams are therefore
-trained for a while, with the Gaussians of all blocks in it, while those around the strip are frozen. No Gaussian is
-added or removed.
+Each block was trained with Gaussians of its own beyond its cell. The merged model has the neighbour's there, which
+lie elsewhere: along a seam, there are gaps and duplicates. Each strip along a seam is therefore trained for some
+iterations, with the Gaussians of all blocks in it; those around the strip are frozen. No Gaussian is added or
+removed.
 
 Reads the survey, the SfM model, the initial similarity, the plan, the solution, the scaffold, and the Gaussians of
 the blocks. Writes `<number>.ply` with the Gaussians of each cell. An interrupted run goes on at the next seam.
@@ -37,10 +37,10 @@ from pipelines.train.options import SeamOptions
 from pipelines.train.region import SceneBox, TrainingRegion, region_masks
 from pipelines.train.trainer import make_finisher
 
-_SHARE = 0.2  # of a block's iterations
-_WIDTH = 0.5  # of the blocks' overlap, on each side of a seam
+_SHARE = 0.2  # of a block's iterations, for a strip
+_WIDTH = 0.5  # of a strip on each side of the seam, over the width of the blocks' overlap
 _LEAST_VIEWS = 2
-_DONE = "done.txt"
+_DONE = "done.txt"  # number of trained seams
 
 
 def run(stage: StageRun, options: SeamOptions) -> Summary:
@@ -95,7 +95,7 @@ def seams_of(plan: BlockPlan) -> Iterator[tuple[PlannedBlock, PlannedBlock, Bloc
 
 
 def _touches(first: BlockCell, second: BlockCell, axis: int) -> bool:
-    """Return whether one cell ends where the other begins."""
+    """Return whether one cell ends where the other begins on an axis."""
     return (first.high[axis] is not None and first.high[axis] == second.low[axis]) or (
         second.high[axis] is not None and second.high[axis] == first.low[axis]
     )
@@ -103,7 +103,7 @@ def _touches(first: BlockCell, second: BlockCell, axis: int) -> bool:
 
 @dataclass(frozen=True)
 class _SeamTrainer:
-    """Trainer of strips, with the folder of the cells' Gaussians and what all strips share."""
+    """Trainer of strips, with the folder of the cells' Gaussians and the inputs that all strips share."""
 
     folder: Path
     plan: BlockPlan
@@ -114,7 +114,7 @@ class _SeamTrainer:
     options: SeamOptions
 
     def train(self, first: PlannedBlock, second: PlannedBlock, strip: BlockCell) -> None:
-        """Train the Gaussians of a strip, and put them back."""
+        """Train the Gaussians of a strip, and write them into the files of their cells."""
         around = strip.widened(_WIDTH * np.minimum(first.margin_m, second.margin_m))
         near = [block.id for block in self.plan.blocks if block.cell.meets(around)]
         parts = {number: read_gaussians(_file(self.folder, number)) for number in near}

@@ -1,4 +1,4 @@
-"""Signs in the viewer's scene: cameras, control and check points with their errors, SfM points, measured points."""
+"""Overlays in the viewer's scene: cameras, surveyed points with their errors, SfM points, measured points."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ if TYPE_CHECKING:
     import viser
 
 PointColour = Literal["of the photographs", "by σ horizontal", "by σ vertical"]
-SignKind = Literal["cameras", "points", "errors", "tie points", "measured"]
-_KINDS: tuple[SignKind, ...] = get_args(SignKind)
+OverlayKind = Literal["cameras", "points", "errors", "tie points", "measured"]
+_KINDS: tuple[OverlayKind, ...] = get_args(OverlayKind)
 _MEASURED_RGB = (220, 30, 30)
 _MOST_POINTS = 200_000  # SfM points that are drawn
 _MOST_FRUSTUMS = 400  # cameras with a frustum to click on; of more, only the places are drawn
 # In units of the viewer; the scene's radius is 10.
-_CAMERA_SIZE, _SIGN_RADIUS, _POINT_SIZE = 0.15, 0.06, 0.012
-_SNAP_PX = 6.0  # of a click, around a sign
+_CAMERA_SIZE, _MARKER_RADIUS, _POINT_SIZE = 0.15, 0.06, 0.012
+_SNAP_PX = 6.0  # of a click, around an overlay
 _LENGTH = 0.7  # of the longest error arrow, in units of the viewer
 
 
-class Signs:
-    """Signs in the scene of a server, in the viewer's frame."""
+class Overlays:
+    """Overlays in the scene of a server, in the viewer's frame."""
 
     def __init__(self, server: viser.ViserServer, trained: TrainedSurvey, frame: ViewFrame) -> None:
         self._scene, self._trained, self._frame = server.scene, trained, frame
@@ -46,38 +46,38 @@ class Signs:
         model_from_geo = self._trained.geo_from_model.inverse()
         return (self._frame.view_from_model @ model_from_geo).apply(point_in_geo)
 
-    def show(self, kind: SignKind, visible: bool) -> None:
-        """Show or hide the signs of a kind."""
+    def show(self, kind: OverlayKind, visible: bool) -> None:
+        """Show or hide the overlays of a kind."""
         self._wanted[kind] = visible
         self._groups[kind].visible = visible and not self._hidden
 
     def hide_all(self, *, hidden: bool) -> None:
-        """Hide all signs for a while, or show again those that are wanted."""
+        """Hide all overlays for a while, or show again those that are wanted."""
         self._hidden = hidden
         for kind, wanted in self._wanted.items():
             self.show(kind, wanted)
 
     def hit(self, start: FloatArray, direction: FloatArray, pixel_rad: float) -> int | str | None:
-        """Return the sign that a line of sight meets, the nearest to its start; None: it meets none.
+        """Return the overlay that a line of sight meets, the nearest to its start; None: it meets none.
 
-        The sign is a camera by its index, or a surveyed point by its name.
+        The overlay is a camera by its index, or a surveyed point by its name.
 
         Args:
             start: (3,) in the viewer's frame.
             direction: (3,) unit vector.
             pixel_rad: width of a pixel of the page.
         """
-        signs: list[tuple[FloatArray, float, int | str]] = []
+        overlays: list[tuple[FloatArray, float, int | str]] = []
         if self._groups["points"].visible:
-            signs += [(place, _SIGN_RADIUS, name) for name, place in self._named.items()]
+            overlays += [(place, _MARKER_RADIUS, name) for name, place in self._named.items()]
         if self._groups["cameras"].visible:
-            signs += [(place, _CAMERA_SIZE, camera) for camera, place in enumerate(self._centers)]
+            overlays += [(place, _CAMERA_SIZE, camera) for camera, place in enumerate(self._centers)]
         met = []
-        for place, radius, sign in signs:
+        for place, radius, overlay in overlays:
             along = float((place - start) @ direction)
             across = float(np.linalg.norm(place - start - along * direction))
             if along > 0 and across < max(radius, _SNAP_PX * pixel_rad * along):
-                met.append((along, sign))
+                met.append((along, overlay))
         return min(met, key=lambda each: each[0])[1] if met else None
 
     def add_cameras(self) -> None:
@@ -109,8 +109,8 @@ class Signs:
             place = self._named[point.name] = self.place(np.array(point.position_in_geo))
             name = f"/points/{kind}{number}"
             colour = _rgb(ORANGE if kind == "control" else DARK)
-            self._scene.add_icosphere(name, radius=_SIGN_RADIUS, color=colour, position=place, subdivisions=2)
-            self._scene.add_label(f"{name}/name", point.name, position=(0.0, 0.0, _SIGN_RADIUS))
+            self._scene.add_icosphere(name, radius=_MARKER_RADIUS, color=colour, position=place, subdivisions=2)
+            self._scene.add_label(f"{name}/name", point.name, position=(0.0, 0.0, _MARKER_RADIUS))
 
     def add_errors(self, ends_in_geo: Sequence[tuple[FloatArray, FloatArray]]) -> float:
         """Draw arrows from surveyed to measured places (3,), enlarged so that they are seen; return by how much."""
@@ -156,7 +156,7 @@ class Signs:
             f"/measured/{name}/points",
             places,
             _MEASURED_RGB,
-            point_size=_SIGN_RADIUS,
+            point_size=_MARKER_RADIUS,
             point_shape="circle",
             precision="float32",
         )
