@@ -97,9 +97,6 @@ class ChunkPlan(Product):
     options: SfmOptions
     chunks: tuple[Chunk, ...]
 
-    def of_kind(self, kind: Kind) -> tuple[Chunk, ...]:
-        return tuple(chunk for chunk in self.chunks if chunk.kind == kind)
-
 
 def plan_chunks(survey: Survey, pairs: IntArray, options: SfmOptions) -> ChunkPlan:
     """Return the chunks of a survey, of about equal size and about `options.chunk_size` photographs.
@@ -176,10 +173,10 @@ def write_chunk(arguments: Mapping[str, Any], progress: Progress) -> None:
             finish_database(draft, chunk.database(partial))
         else:
             write_frame(colmap, draft, job.survey, chunk.images, plan.options)
-            for features in plan.of_kind("features"):
-                shared = sorted(set(chunk.images).intersection(features.images))
-                if shared:
-                    copy_finished(features, partial, draft, FEATURES, shared)
+            for other in plan.chunks:
+                shared = sorted(set(chunk.images).intersection(other.images))
+                if shared and other.kind == "features":
+                    copy_finished(other, partial, draft, FEATURES, shared)
             match_features(colmap, job, np.array(chunk.pairs, dtype=np.int64).reshape(-1, 2), progress)
             finish_database(draft, chunk.database(partial), without=FEATURES)
 
@@ -241,7 +238,7 @@ def _work(stage: StageRun, survey: Survey, plan: ChunkPlan, kind: Kind) -> None:
         stage.record_progress(f"{finished} of {len(plan.chunks)} chunks")
 
     title = _TITLES[kind]
-    waiting = [chunk for chunk in plan.of_kind(kind) if not chunk.is_finished(stage.out)]
+    waiting = [chunk for chunk in plan.chunks if chunk.kind == kind and not chunk.is_finished(stage.out)]
     jobs = [_job(stage, survey, plan, chunk) for chunk in waiting]
     if failed := failed_of(title, jobs, ended, stage.progress):
         names = listed([end.job.name for end in failed])
@@ -259,9 +256,9 @@ def _job(stage: StageRun, survey: Survey, plan: ChunkPlan, chunk: Chunk) -> Job:
     else:
         needed = set(chunk.images)
         reads = [
-            features.database(stage.out)
-            for features in plan.of_kind("features")
-            if not needed.isdisjoint(features.images)
+            other.database(stage.out)
+            for other in plan.chunks
+            if other.kind == "features" and not needed.isdisjoint(other.images)
         ]
     return Job(
         chunk.name,
