@@ -173,7 +173,7 @@ def test_a_killed_chunk_goes_on_where_it_was(flight: StageRun, photographs: Phot
         assert process.poll() is None
     process.kill()
     assert finish(process).code == -signal.SIGKILL
-    assert not chunk.is_finished(flight.out)
+    assert not chunk.database(flight.out).is_file()
     assert work_chunk(flight.workspace, chunk.name, SILENT)
     assert rows(chunk.database(flight.out), "descriptors")[:2] == before
     assert len(rows(chunk.database(flight.out), "descriptors")) == len(chunk.images)
