@@ -16,9 +16,10 @@ import cv2
 import numpy as np
 import torch
 
+from pipelines.core.products import load_json
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
-from pipelines.formats.georef_sidecar import read_sidecar
+from pipelines.formats.georef_sidecar import GeorefSidecar, sidecar_path
 from pipelines.geodesy.enu import Origin, ecef_from_enu, ecef_from_enu_rotation, lla_of
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.splat.gaussians import read_gaussians
@@ -42,7 +43,7 @@ def geo_from_cam(image: SurveyImage, trained: TrainedSurvey, recorded: bool) -> 
 
 def cam_from_ply(fix: Fix, rotation_geo_from_cam: FloatArray, origin: Origin, splat: Path) -> torch.Tensor:
     """Pose (4, 4) in the PLY's frame of a camera that stands at a fix."""
-    ply_from_ecef = read_sidecar(splat).ecef_from_file().inverse()
+    ply_from_ecef = load_json(GeorefSidecar, sidecar_path(splat)).ecef_from_file().inverse()
     center = ply_from_ecef.apply(ecef_from_enu(np.array(fix.position_in_geo), origin))
     ecef_from_cam = ecef_from_enu_rotation(lla_of(origin)) @ rotation_geo_from_cam
     rotation = (ply_from_ecef.rotation @ ecef_from_cam).T

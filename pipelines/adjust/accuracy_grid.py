@@ -12,8 +12,9 @@ from typing import ClassVar
 import numpy as np
 from scipy.spatial import cKDTree
 
+from pipelines.core.files import replace_text
 from pipelines.core.types import FloatArray, IntArray
-from pipelines.formats.tables import write_table
+from pipelines.formats.tables import table_text
 from pipelines.geodesy.enu import Origin, ecef_from_enu, lla_from_ecef
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.report import AccuracySummary
@@ -178,4 +179,4 @@ def write_csv(grid: AccuracyGrid, origin: Origin, path: Path) -> None:
         + [f"{value:.5f}" for value in sigma]
         for place, geodetic, sigma in zip(grid.position_in_geo, lla, values, strict=True)
     )
-    write_table(path, itertools.chain([_PLACE + _SIGMA], rows))
+    replace_text(path, table_text(itertools.chain([_PLACE + _SIGMA], rows)))

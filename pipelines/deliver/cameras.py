@@ -22,6 +22,7 @@ import numpy as np
 
 from pipelines.adjust.posterior import Posterior
 from pipelines.adjust.solution import posterior_of
+from pipelines.core.files import replace_text
 from pipelines.core.products import Caution, is_checked, save_npz, union
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun, Summary
@@ -30,8 +31,8 @@ from pipelines.deliver.placement import Placement, median_values, place, scene_s
 from pipelines.formats.camera_files import CameraTable, Frame, lens_of, write_camera_table, write_transforms
 from pipelines.formats.colmap import write_sparse
 from pipelines.formats.georef_sidecar import CrsSidecar, median_sigma, write_sidecar
-from pipelines.formats.tables import write_table
-from pipelines.formats.vector_files import Json, feature, polygon, write_features
+from pipelines.formats.tables import table_text
+from pipelines.formats.vector_files import Json, feature, features_text, polygon
 from pipelines.geodesy.crs import grid_from_enu, parse_crs
 from pipelines.geodesy.enu import geo_from_enu_at, lla_from_ecef, lla_from_enu
 from pipelines.geometry.bundle import Network
@@ -84,7 +85,7 @@ def run(stage: StageRun, options: ExportCamerasOptions) -> Summary:
         lens_limits = _write_nerfstudio(stage.out / "transforms.json", model, placement)
         task.advance(note="nerfstudio")
         features, corner_lla = _footprints(solved.survey, model, table, placement)
-        write_features(stage.out / "footprints.geojson", features)
+        replace_text(stage.out / "footprints.geojson", features_text(features))
         task.advance(note="footprints")
     cautions, sigma = union(solved.model.cautions, _UNKNOWN if posterior is None else ()), None
     if np.isfinite(table.sigma_enu_m).all():
@@ -200,7 +201,7 @@ def _write_covariances(folder: Path, model: SparseModel, posterior: Posterior | 
         (name, *(f"{value:.9e}" if np.isfinite(value) else "" for value in values))
         for name, values in zip(model.image_name, of_cameras[:, rows, columns].tolist(), strict=True)
     )
-    write_table(folder / "camera_covariances.csv", (("name", *header), *cells))
+    replace_text(folder / "camera_covariances.csv", table_text((("name", *header), *cells)))
     for file in ("covariances.npz", "camera_covariances.csv"):
         write_sidecar(placement.sidecar(), folder / file)
 

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from pipelines.core.files import replace_text
 from pipelines.core.types import FloatArray, Vector3
-from pipelines.formats.tables import write_table
+from pipelines.formats.tables import table_text
 from pipelines.geodesy.crs import PointCrs, parse_crs
 from pipelines.geodesy.enu import ecef_from_enu, lla_from_ecef, lla_of
 from pipelines.survey.headline import PointLine, point_lines
@@ -99,7 +100,7 @@ def write_point_table(path: Path, report: EvaluationReport, survey: Survey) -> N
         for line in point_lines(report)
         for row in (line.row,)
     )
-    write_table(path, (header, *rows))
+    replace_text(path, table_text((header, *rows)))
 
 
 def write_camera_sigma(path: Path, names: Sequence[str], cov: FloatArray) -> None:
@@ -115,7 +116,7 @@ def write_camera_sigma(path: Path, names: Sequence[str], cov: FloatArray) -> Non
         (name, *(f"{value:.5f}" for value in (*of_camera[3:], *np.degrees(of_camera[:3]))))
         for name, of_camera in zip(names, sigma, strict=True)
     )
-    write_table(path, (header, *rows))
+    replace_text(path, table_text((header, *rows)))
 
 
 def _places(survey: Survey) -> dict[str, list[str]]:

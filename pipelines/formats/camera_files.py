@@ -21,7 +21,7 @@ import numpy as np
 from pipelines.core.files import replace_text
 from pipelines.core.products import dump_json
 from pipelines.core.types import FloatArray
-from pipelines.formats.tables import write_table
+from pipelines.formats.tables import table_text
 from pipelines.geometry.cameras import Camera, distort, full_parameters, undistort
 
 _FISHEYE = "OPENCV_FISHEYE"
@@ -142,4 +142,4 @@ def write_camera_table(path: Path, table: CameraTable) -> None:
         (name, split, *(form % value if np.isfinite(value) else "" for form, value in zip(forms, row, strict=True)))
         for name, split, row in zip(table.name, table.split, numbers, strict=True)
     )
-    write_table(path, (header, *rows))
+    replace_text(path, table_text((header, *rows)))

@@ -112,10 +112,6 @@ class _Bytes:
             raise _CutOffError
         return at
 
-    def end_of_list(self, at: int, count_at: int, width: int, item_bytes: int) -> int:
-        """Return the end of a list of items, which begins at `at` and whose length stands at `count_at`."""
-        return self.end(at + item_bytes * self.unsigned(count_at, width))
-
 
 def _camera(record: _Bytes, at: int) -> int:
     model = record.unsigned(at + 4, 4)
@@ -133,7 +129,7 @@ def _image(record: _Bytes, at: int) -> int:
         record.data[name_at:name_end].decode("utf-8")
     except UnicodeDecodeError as error:
         raise ValueError(_INVALID_NAME) from error
-    return record.end_of_list(name_end + 9, name_end + 1, 8, _OBSERVATION_BYTES)
+    return record.end(name_end + 9 + _OBSERVATION_BYTES * record.unsigned(name_end + 1, 8))
 
 
 def _rig(record: _Bytes, at: int) -> int:
@@ -150,9 +146,9 @@ def _rig(record: _Bytes, at: int) -> int:
 _RECORDS: dict[str, Callable[[_Bytes, int], int]] = {
     "rigs": _rig,
     "cameras": _camera,
-    "frames": lambda record, at: record.end_of_list(at + 68, at + 64, 4, _FRAME_DATA_BYTES),
+    "frames": lambda record, at: record.end(at + 68 + _FRAME_DATA_BYTES * record.unsigned(at + 64, 4)),
     "images": _image,
-    "points3D": lambda record, at: record.end_of_list(at + 51, at + 43, 8, _TRACK_BYTES),
+    "points3D": lambda record, at: record.end(at + 51 + _TRACK_BYTES * record.unsigned(at + 43, 8)),
 }
 
 

@@ -18,7 +18,7 @@ from pydantic.alias_generators import to_camel
 
 from pipelines.core.figures import Headline
 from pipelines.core.files import replace_text
-from pipelines.core.products import Caution, Product, load_json
+from pipelines.core.products import Caution, Product
 from pipelines.core.types import FloatArray, Matrix4, Quaternion, Row7, Vector3
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
@@ -184,8 +184,3 @@ def sidecar_path(artefact: Path) -> Path:
 def write_sidecar(sidecar: GeorefSidecar | CrsSidecar, artefact: Path) -> None:
     """Write the sidecar beside its file; the sidecar appears whole or not at all."""
     replace_text(sidecar_path(artefact), sidecar.model_dump_json(by_alias=True, indent=1) + "\n")
-
-
-def read_sidecar(artefact: Path) -> GeorefSidecar:
-    """Read the sidecar of a file; an InputError names the field that is missing or not of this form."""
-    return load_json(GeorefSidecar, sidecar_path(artefact))

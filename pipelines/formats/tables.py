@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.core.errors import InputError
-from pipelines.core.files import file_size, replace_text
+from pipelines.core.files import file_size
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 
 _FORMULA = re.compile(r"'*[=+\-@\t\r]")  # those of names that begin with apostrophes, too: nothing is ambiguous
@@ -32,11 +32,6 @@ _BEGINNING_BYTES = 64 * 1024
 MAX_BYTES, MOST_LINES, LONGEST_LINE = 128 * 1024 * 1024, 1_000_000, 64 * 1024
 _SEPARATORS = ";\t,"
 _LONGEST_NAME = 100  # of a column that means something
-
-
-def write_table(path: Path, rows: Iterable[Iterable[object]]) -> None:
-    """Write rows of cells; the file appears whole or not at all."""
-    replace_text(path, table_text(rows))
 
 
 def table_text(rows: Iterable[Iterable[object]]) -> str:
@@ -53,7 +48,7 @@ def _cell(value: object) -> object:
 
 
 def plain_text(cell: str) -> str:
-    """Return the text that `write_table` was given for a cell."""
+    """Return the text that `table_text` was given for a cell."""
     return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
 
 

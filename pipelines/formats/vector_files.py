@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pipelines.core.files import replace_file, replace_text
+from pipelines.core.files import replace_file
 from pipelines.core.types import FloatArray
 from pipelines.geometry.footprints import clipped_ring
 
@@ -54,11 +54,6 @@ def feature(geometry: Json | None, properties: Mapping[str, Any], bbox: Sequence
     known = dict(properties)
     known |= {name: None for name, value in known.items() if isinstance(value, float) and math.isnan(value)}
     return {"type": "Feature", **box, "geometry": geometry, "properties": known}
-
-
-def write_features(path: Path, features: Sequence[Json]) -> None:
-    """Write a FeatureCollection, one feature a line; the file appears whole or not at all."""
-    replace_text(path, features_text(features))
 
 
 def features_text(features: Sequence[Json]) -> str:

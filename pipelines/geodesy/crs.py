@@ -78,7 +78,7 @@ class PointCrs:
     @property
     def is_geocentric(self) -> bool:
         """Whether the coordinates are Earth-centred, without a map plane and heights."""
-        return bool(self._crs.is_geocentric)
+        return self._crs.is_geocentric
 
     @property
     def _plan_axes(self) -> list[Any]:

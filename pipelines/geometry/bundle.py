@@ -47,16 +47,6 @@ class Network:
         ray -= self.cam_center_in_world[self.obs_image]
         return ray
 
-    def part(self, points: slice, rows: IntArray | BoolArray) -> Network:
-        """Return the network of a range of the points, with some rows of their observations."""
-        return replace(
-            self,
-            point_in_world=self.point_in_world[points],
-            obs_point=self.obs_point[rows] - (points.start or 0),
-            obs_image=self.obs_image[rows],
-            obs_xy_px=self.obs_xy_px[rows],
-        )
-
 
 @dataclass(frozen=True)
 class LinearisedBundle:
@@ -70,7 +60,14 @@ class LinearisedBundle:
 def with_positive_depths(network: Network) -> Network:
     """Return the network without observations of points behind their camera, which an imported model may hold."""
     positive = has_positive_depth(network)
-    return network if positive.all() else network.part(slice(None), positive)
+    if positive.all():
+        return network
+    return replace(
+        network,
+        obs_point=network.obs_point[positive],
+        obs_image=network.obs_image[positive],
+        obs_xy_px=network.obs_xy_px[positive],
+    )
 
 
 def has_positive_depth(network: Network) -> BoolArray:
@@ -333,7 +330,14 @@ def chunks_of_points(network: Network, size: int) -> Iterator[tuple[Network, sli
     while first_point < len(last):
         next_point = max(int(np.searchsorted(last, first + size, side="right")), first_point + 1)
         points, rows = slice(first_point, next_point), order[first : last[next_point - 1]]
-        yield network.part(points, rows), points, rows
+        part = replace(
+            network,
+            point_in_world=network.point_in_world[points],
+            obs_point=network.obs_point[rows] - first_point,
+            obs_image=network.obs_image[rows],
+            obs_xy_px=network.obs_xy_px[rows],
+        )
+        yield part, points, rows
         first_point, first = next_point, int(last[next_point - 1])
 
 

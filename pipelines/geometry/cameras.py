@@ -279,10 +279,6 @@ class CameraPoses:
     cam_from_model: FloatArray
     cam_center_in_model: FloatArray
 
-    def matrix(self, index: int) -> FloatArray:
-        """Return the pose (4, 4) cam ← model of a camera."""
-        return pose_matrix(self.cam_from_model[index], self.cam_center_in_model[index])
-
 
 _STEP = 1e-5  # of a central difference, relative as in `parameter_derivative`
 _GRID = 24  # rays along each side of an image that a pinhole is fitted to

@@ -87,7 +87,3 @@ class SparseModel:
             obs_image=place[self.obs_image[kept]],
             obs_xy_px=self.obs_xy_px[kept],
         )
-
-    def points_in(self, image: int) -> IntArray:
-        """Return ascending indices (K,) of the points that an image observes."""
-        return np.unique(self.obs_point[self.obs_image == image])

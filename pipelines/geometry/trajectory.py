@@ -184,12 +184,7 @@ def mount(yaw_pitch_roll_deg: ArrayLike) -> FloatArray:
 
     (0, 0, 0) looks ahead, (0, −90, 0) straight down with the top of the image ahead.
     """
-    return np.asarray(geo_from_cam(yaw_pitch_roll_deg).T @ ENU_FROM_NED)
-
-
-def boresight(rotation_vector_deg: ArrayLike) -> FloatArray:
-    """Return the rotation (3, 3) true → nominal camera axes of a rotation vector (3,) in degrees."""
-    return exp_so3(np.radians(np.asarray(rotation_vector_deg, dtype=np.float64)))
+    return geo_from_cam(yaw_pitch_roll_deg).T @ ENU_FROM_NED
 
 
 def frame_from_frd(axes: str) -> FloatArray:

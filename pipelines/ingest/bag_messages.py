@@ -121,7 +121,7 @@ def _geodetic_problem(place: Sequence[float]) -> str:
 def _local(position: Any, message: Any, frame: str = "", covariance: Any = None) -> PositionSample:
     values = np.array([position.x, position.y, position.z], dtype=np.float64)
     variance = np.zeros(3) if covariance is None else np.asarray(covariance, dtype=np.float64)[[0, 7, 14]]
-    if _is_ned(message):
+    if message.header.frame_id.lower().endswith("_ned"):
         values, variance = ENU_FROM_NED @ values, np.abs(ENU_FROM_NED) @ variance
     x, y, z = (float(value) for value in values)
     problem = "" if np.isfinite(values).all() else "position is NaN"
@@ -160,10 +160,6 @@ def _eph_epv(message: Any) -> Vector3:
     return (h / math.sqrt(2.0), h / math.sqrt(2.0), v) if good else _NAN3
 
 
-def _is_ned(message: Any) -> bool:
-    return str(message.header.frame_id).lower().endswith("_ned")
-
-
 def _px4_is_ned(message: Any) -> bool:
     if hasattr(message, "pose_frame"):
         return bool(message.pose_frame == _POSE_FRAME_NED)
@@ -179,7 +175,8 @@ def _imu(message: Any) -> AttitudeSample:
 
 def _pose(orientation: Any, message: Any, frame: str = "", covariance: Any = None) -> AttitudeSample:
     variance = np.zeros(3) if covariance is None else np.asarray(covariance, dtype=np.float64)[[21, 28, 35]]
-    return _attitude(orientation, variance, frame or BASE, _is_ned(message))
+    ned = message.header.frame_id.lower().endswith("_ned")
+    return _attitude(orientation, variance, frame or BASE, ned)
 
 
 def _px4_odometry(message: Any) -> AttitudeSample:

@@ -19,7 +19,8 @@ from pipelines.core.types import BoolArray, FloatArray
 from pipelines.formats.trajectory_csv import complete
 from pipelines.geodesy.enu import Origin, ecef_from_enu_rotation, enu_from_ecef, geo_from_enu_at, lla_from_ecef
 from pipelines.geodesy.vertical import VerticalDatum
-from pipelines.geometry.trajectory import Rig, Trajectory, boresight, mount, with_rig
+from pipelines.geometry.rotations import exp_so3
+from pipelines.geometry.trajectory import Rig, Trajectory, mount, with_rig
 from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo
@@ -74,11 +75,6 @@ class ImagePoses:
     def located(self) -> BoolArray:
         """Which images have a position (N,)."""
         return complete(self.position_in_ecef)
-
-    @property
-    def located_lla(self) -> FloatArray:
-        """WGS84 latitude, longitude and ellipsoidal height of the images that have a position (K, 3)."""
-        return lla_from_ecef(self.position_in_ecef[self.located])
 
 
 @dataclass(frozen=True)
@@ -181,7 +177,7 @@ def given_rig(options: IngestOptions) -> Rig:
     return Rig(
         cam_from_body=None if options.camera_mount is None else mount(options.camera_mount),
         antenna_in_body=None if options.lever_arm is None else np.array(options.lever_arm),
-        nominal_from_cam=boresight(options.boresight),
+        nominal_from_cam=exp_so3(np.radians(options.boresight)),
     )
 
 

@@ -82,7 +82,7 @@ def assemble_survey(
     unmarked = unmarked_points(controls, checks, notes)
     located = bool(poses.located.any())
     if located:
-        middle_in_ecef = ecef_from_lla(median_lla(poses.located_lla))
+        middle_in_ecef = ecef_from_lla(median_lla(lla_from_ecef(poses.position_in_ecef[poses.located])))
         for file in files:
             require_near(file, middle_in_ecef)
     origin = _origin(poses, marked)
@@ -331,7 +331,7 @@ def _without_far_fixes(flight: FlightRecord, notes: Notes) -> ImagePoses:
     poses = flight.poses
     if not poses.located.any():
         return poses
-    middle_in_ecef = ecef_from_lla(median_lla(poses.located_lla))
+    middle_in_ecef = ecef_from_lla(median_lla(lla_from_ecef(poses.position_in_ecef[poses.located])))
     distance_m = np.linalg.norm(poses.position_in_ecef - middle_in_ecef, axis=1)
     far = distance_m > FIX_RANGE_M
     notes.warn_counted(
@@ -343,7 +343,7 @@ def _without_far_fixes(flight: FlightRecord, notes: Notes) -> ImagePoses:
 
 
 def _origin(poses: ImagePoses, control: Sequence[GroundPoint]) -> Origin:
-    places = poses.located_lla
+    places = lla_from_ecef(poses.position_in_ecef[poses.located])
     if not len(places) and control:
         places = lla_from_ecef([point.position_in_ecef for point in control])
     require_placed(len(places) > 0)

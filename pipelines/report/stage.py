@@ -112,7 +112,7 @@ def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: Stage
             Section("processing", "Processing", "record.html", record),
             Section("photographs", "Photographs", "photographs.html", cameras),
         ),
-        document=evaluated.document,
+        document=evaluated.report.model_dump(mode="json"),
     )
     return page, summary
 

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -46,10 +45,6 @@ class EvaluatedSurvey:
     report: EvaluationReport
     posterior: Posterior
     crs: TargetCrs
-
-    @cached_property
-    def document(self) -> dict[str, Any]:
-        return self.report.model_dump(mode="json")
 
     @cached_property
     def center_in_geo(self) -> FloatArray:

@@ -44,7 +44,7 @@ def huber_weight(squared: ArrayLike, scale: float = HUBER_95) -> FloatArray:
 
 def cauchy_weight(squared: ArrayLike, dimension: int) -> FloatArray:
     """Return Cauchy's weight 1 / (1 + r²/c²); it redescends: the start must be near the solution."""
-    return np.asarray(1.0 / (1.0 + np.asarray(squared, dtype=np.float64) / CAUCHY_SCALE2[dimension]))
+    return 1.0 / (1.0 + np.asarray(squared, dtype=np.float64) / CAUCHY_SCALE2[dimension])
 
 
 def cauchy_loss(squared: ArrayLike, dimension: int) -> FloatArray:

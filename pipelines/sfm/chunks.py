@@ -86,9 +86,6 @@ class Chunk(Product):
     def database(self, partial: Path) -> Path:
         return self.folder(partial) / DATABASE
 
-    def is_finished(self, partial: Path) -> bool:
-        return self.database(partial).is_file()
-
 
 class ChunkPlan(Product):
     """Chunks of a reconstruction, those of features before those of matches."""
@@ -96,9 +93,6 @@ class ChunkPlan(Product):
     format_version: Literal[1] = 1
     options: SfmOptions
     chunks: tuple[Chunk, ...]
-
-    def of_kind(self, kind: Kind) -> tuple[Chunk, ...]:
-        return tuple(chunk for chunk in self.chunks if chunk.kind == kind)
 
 
 def plan_chunks(survey: Survey, pairs: IntArray, options: SfmOptions) -> ChunkPlan:
@@ -146,7 +140,7 @@ def work_chunk(workspace: Workspace, name: str, progress: Progress) -> bool:
     chunk = _planned(workspace, name)
     folder = chunk.folder(partial)
     with WriteLock(folder).hold(f"sfm --chunk {name}"):
-        if chunk.is_finished(partial):
+        if chunk.database(partial).is_file():
             log.info("%s: finished before", name)
             return False
         survey = workspace.path(SURVEY)
@@ -176,10 +170,10 @@ def write_chunk(arguments: Mapping[str, Any], progress: Progress) -> None:
             finish_database(draft, chunk.database(partial))
         else:
             write_frame(colmap, draft, job.survey, chunk.images, plan.options)
-            for features in plan.of_kind("features"):
-                shared = sorted(set(chunk.images).intersection(features.images))
-                if shared:
-                    copy_finished(features, partial, draft, FEATURES, shared)
+            for other in plan.chunks:
+                shared = sorted(set(chunk.images).intersection(other.images))
+                if shared and other.kind == "features":
+                    copy_finished(other, partial, draft, FEATURES, shared)
             match_features(colmap, job, np.array(chunk.pairs, dtype=np.int64).reshape(-1, 2), progress)
             finish_database(draft, chunk.database(partial), without=FEATURES)
 
@@ -194,7 +188,7 @@ def copy_finished(
             chunk is computed again.
     """
     database = chunk.database(partial)
-    if not chunk.is_finished(partial):
+    if not chunk.database(partial).is_file():
         raise InputError(f"{chunk.name} is not finished, and its features are needed", path=database)
     try:
         copy_rows(database, target, tables, images)
@@ -237,11 +231,11 @@ def work_in_chunks(stage: StageRun, survey: Survey, options: SfmOptions) -> Chun
 
 def _work(stage: StageRun, survey: Survey, plan: ChunkPlan, kind: Kind) -> None:
     def ended(_: JobEnd) -> None:
-        finished = sum(chunk.is_finished(stage.out) for chunk in plan.chunks)
+        finished = sum(chunk.database(stage.out).is_file() for chunk in plan.chunks)
         stage.record_progress(f"{finished} of {len(plan.chunks)} chunks")
 
     title = _TITLES[kind]
-    waiting = [chunk for chunk in plan.of_kind(kind) if not chunk.is_finished(stage.out)]
+    waiting = [chunk for chunk in plan.chunks if chunk.kind == kind and not chunk.database(stage.out).is_file()]
     jobs = [_job(stage, survey, plan, chunk) for chunk in waiting]
     if failed := failed_of(title, jobs, ended, stage.progress):
         names = listed([end.job.name for end in failed])
@@ -259,9 +253,9 @@ def _job(stage: StageRun, survey: Survey, plan: ChunkPlan, chunk: Chunk) -> Job:
     else:
         needed = set(chunk.images)
         reads = [
-            features.database(stage.out)
-            for features in plan.of_kind("features")
-            if not needed.isdisjoint(features.images)
+            other.database(stage.out)
+            for other in plan.chunks
+            if other.kind == "features" and not needed.isdisjoint(other.images)
         ]
     return Job(
         chunk.name,

@@ -13,7 +13,7 @@ from pipelines.core.workspace import StageRun
 from pipelines.formats.colmap import quiet_colmap, write_reconstruction
 from pipelines.sfm.chunks import PLAN, ChunkPlan, join_chunks, remove_chunks, work_in_chunks
 from pipelines.sfm.colmap_database import require_sound
-from pipelines.sfm.features import SfmJob, extract_features, match_features
+from pipelines.sfm.features import SfmJob, candidate_pairs, extract_features, match_features
 from pipelines.sfm.forecast import forecast_reconstruction, why_too_large
 from pipelines.sfm.mapping import adjust_finally, map_database, remove_drift
 from pipelines.sfm.options import SfmOptions
@@ -69,7 +69,7 @@ def reconstruct(colmap: Any, job: SfmJob, progress: Progress) -> Any:
         raise InputError(f"{len(missing)} photographs of the survey are gone", path=job.images / missing[0])
     colmap.set_random_seed(job.options.seed)
     extract_features(colmap, job, range(len(job.survey.images)), progress)
-    match_features(colmap, job, job.pairs, progress)
+    match_features(colmap, job, candidate_pairs(job.survey, job.options), progress)
     return map_matches(colmap, job, progress)
 
 

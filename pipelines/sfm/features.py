@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -98,11 +97,6 @@ class SfmJob:
     def sparse(self) -> Path:
         """Folder of the model."""
         return self.database.parent / "sparse"
-
-    @cached_property
-    def pairs(self) -> IntArray:
-        """Pairs to match, as indices (P, 2) into the images of the survey."""
-        return candidate_pairs(self.survey, self.options)
 
 
 def candidate_pairs(survey: Survey, options: SfmOptions) -> IntArray:

@@ -65,11 +65,12 @@ def forecast_reconstruction(
 def pace(photographs: int, photo_px: tuple[int, int], options: SfmOptions) -> ReconstructionCost:
     """Return about how many seconds one core needs for each step."""
     every = photographs * (photographs - 1) / 2
+    shrink = max(max(photo_px) / options.max_image_size, 1.0)  # by which features are detected on smaller images
     # Half of the largest number of neighbours: most pairs are chosen by both of their images.
     pairs = every if options.pairs == "exhaustive" else min(every, photographs * options.max_neighbors / 2)
     return reconstruction_cost(
         photographs,
-        photo_px[0] * photo_px[1] / options.shrink(photo_px) ** 2 / 1e6,
+        photo_px[0] * photo_px[1] / shrink**2 / 1e6,
         pairs,
         doubled=options.doubles(photo_px),
         max_features=options.max_features,
@@ -79,7 +80,8 @@ def pace(photographs: int, photo_px: tuple[int, int], options: SfmOptions) -> Re
 def chunk_peak_bytes(photo_px: tuple[int, int], options: SfmOptions, threads: int = 1) -> int:
     """Return the peak of a process that detects or matches features in so many threads."""
     pixels, doubled = photo_px[0] * photo_px[1], options.doubles(photo_px)
-    return features_peak_bytes(pixels, options.shrink(photo_px), doubled=doubled, threads=threads)
+    shrink = max(max(photo_px) / options.max_image_size, 1.0)
+    return features_peak_bytes(pixels, shrink, doubled=doubled, threads=threads)
 
 
 def peak_bytes(photographs: int, photo_px: tuple[int, int], options: SfmOptions) -> int:

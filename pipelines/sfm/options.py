@@ -44,10 +44,6 @@ class SfmOptions(StageOptions):
     threads: Annotated[int, EFFORT] = Field(-1, ge=-1, description="Threads (-1: all).")
     seed: int = Field(0, ge=0, description="Seed of every random choice.")
 
-    def shrink(self, photo_px: tuple[int, int]) -> float:
-        """Return the factor ≥ 1 by which photographs of this size are larger than where features are detected."""
-        return max(max(photo_px) / self.max_image_size, 1.0)
-
     def doubles(self, photo_px: tuple[int, int]) -> bool:
         """Return whether features are detected on photographs of this size doubled.
 

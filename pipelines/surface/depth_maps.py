@@ -183,7 +183,8 @@ class DepthMaps:
         others = self._neighbours(index)
         if not others:
             return []
-        points = self.scene.point_in_model[self.scene.sparse.points_in(index)]
+        sparse = self.scene.sparse
+        points = self.scene.point_in_model[np.unique(sparse.obs_point[sparse.obs_image == index])]
         pose, *around = (self._pose(j, "coarse") for j in (index, *others))
         return planes_for(pose, around, points)
 

@@ -15,8 +15,8 @@ from pipelines.core.products import ArrayProduct, load_json
 from pipelines.core.stages import RIG, SURVEY, TRACK
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.core.workspace import Workspace
-from pipelines.geometry.rotations import matrix_from_quat_xyzw, quat_xyzw_from_matrix
-from pipelines.geometry.trajectory import Rig, Trajectory, boresight, with_rig
+from pipelines.geometry.rotations import exp_so3, matrix_from_quat_xyzw, quat_xyzw_from_matrix
+from pipelines.geometry.trajectory import Rig, Trajectory, with_rig
 from pipelines.survey.survey import Attitude, Fix, RigCalibration, RigParameter, Survey, SurveyImage
 
 log = logging.getLogger(__name__)
@@ -165,7 +165,7 @@ def apply_calibration(survey: Survey, track: NavigationTrack, calibration: RigCa
     offset_s = float(values["time-offset"][0]) if "time-offset" in values else float(track.time_offset_s)
     rig = Rig(track.cam_from_body, track.antenna_in_body, track.nominal_from_cam)
     if "boresight" in values:
-        rig = replace(rig, nominal_from_cam=boresight(values["boresight"]))
+        rig = replace(rig, nominal_from_cam=exp_so3(np.radians(values["boresight"])))
     if "lever-arm" in values:
         arm = np.nan_to_num(track.antenna_in_body) + (values["lever-arm"] - starts["lever-arm"])
         rig = replace(rig, antenna_in_body=arm)

@@ -365,7 +365,8 @@ def points_to_hold(training: TrainingScene, device: torch.device) -> Callable[[i
 
     @lru_cache(maxsize=_KEPT_VIEWS)
     def points(index: int) -> ObservedPoints:
-        known = scene.point_in_model[scene.sparse.points_in(index)]
+        seen = np.unique(scene.sparse.obs_point[scene.sparse.obs_image == index])
+        known = scene.point_in_model[seen]
         weight = np.ones(len(known), dtype=np.float32)
         if training.surface is not None and index in shown:
             of_surface, its_weight = training.surface.held(index, _STRIDE)

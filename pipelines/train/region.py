@@ -15,7 +15,7 @@ import torch
 
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
-from pipelines.geometry.cameras import Pinhole
+from pipelines.geometry.cameras import Pinhole, pose_matrix
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Window
 from pipelines.surface.depth_maps import DepthMaps
@@ -125,12 +125,13 @@ def region_masks(
         stand_in: whose depth counts where the surface is not known.
         maps: known depths; None: there are none.
     """
-    sparse = solved.scene.sparse
+    sparse, poses = solved.scene.sparse, solved.adjustment.poses
     pinholes = Pinholes(images, sparse.lenses, solved.adjustment.with_lenses(sparse).lenses)
     masks: dict[int, BoolArray] = {}
     with progress.task("masks", len(views)) as task:
         for index in views.tolist():
-            pose, pinhole = solved.adjustment.poses.matrix(index), pinholes.of(index)
+            pinhole = pinholes.of(index)
+            pose = pose_matrix(poses.cam_from_model[index], poses.cam_center_in_model[index])
             depth = stand_in_depth(stand_in, pose, pinhole, rasterizer)
             masks[index] = region_mask(pose, pinhole, cell, None if maps is None else maps.depth(index), depth)
             task.advance()

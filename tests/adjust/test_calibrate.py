@@ -22,8 +22,7 @@ from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import write_sparse
 from pipelines.geodesy.enu import lla_from_enu
 from pipelines.geometry.cameras import Camera
-from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
-from pipelines.geometry.trajectory import boresight
+from pipelines.geometry.rotations import exp_so3, log_so3, matrix_from_quat_xyzw
 from pipelines.simulate.options import SimulateOptions
 from pipelines.simulate.stage import simulate
 from pipelines.simulate.truth import Truth
@@ -105,7 +104,7 @@ def flown(path: Path, flight: bags.Flight) -> dict[str, Path]:
         messages.append((topic, kind, ns, message))
     centers, nominal = bags.expected(flight, bags.ORIGIN)
     names = [f"frame_{i:06d}.jpg" for i in range(flight.count)]
-    model = write_model(path / "model", names, centers, nominal @ boresight(BORESIGHT_DEG))
+    model = write_model(path / "model", names, centers, nominal @ exp_so3(np.radians(BORESIGHT_DEG)))
     return {"--bag": bags.write(path / "bag", messages), "--import": model}
 
 
@@ -123,7 +122,7 @@ def missed(workspace: Path, flight: bags.Flight) -> tuple[np.ndarray, np.ndarray
     truth = enu_from_lla(lla_from_enu(flight.camera(flight.image_ns), bags.ORIGIN), survey.origin)
     positions = np.array([image.fix.position_in_geo for image in survey.images if image.fix])
     quats = [image.attitude.quat_xyzw for image in survey.images if image.attitude]
-    true_turns = bags.expected(flight, survey.origin)[1] @ boresight(BORESIGHT_DEG)
+    true_turns = bags.expected(flight, survey.origin)[1] @ exp_so3(np.radians(BORESIGHT_DEG))
     turned = log_so3(matrix_from_quat_xyzw(quats) @ np.swapaxes(true_turns, 1, 2))
     return positions - truth, np.degrees(np.linalg.norm(turned, axis=1))
 

@@ -19,7 +19,7 @@ from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import FloatArray
 from pipelines.geometry.rotations import exp_so3, log_so3
 from pipelines.geometry.similarity import Similarity
-from pipelines.geometry.trajectory import Trajectory, boresight
+from pipelines.geometry.trajectory import Trajectory
 from pipelines.simulate.flight import (
     RECEIVERS,
     FlightPlan,
@@ -47,12 +47,12 @@ def _data(track: TrueTrajectory, seed: int = 1, control: int = 0, *, arm_m: np.n
     `arm_m` is the lever arm to start from.
     """
     rng = np.random.default_rng(seed)
-    mounting = Mounting(ARM_M, boresight(BORESIGHT_DEG), OFFSET_S)
+    mounting = Mounting(ARM_M, exp_so3(np.radians(BORESIGHT_DEG)), OFFSET_S)
     gnss, imu = record_gnss(track, mounting, RECEIVERS["rtk"], rng), record_imu(track, mounting, 0.5, rng)
     true_geo_from_cam = track.geo_from_nominal_cam(track.photo_s) @ mounting.nominal_from_cam
     local_from_geo = GEO_FROM_LOCAL.inverse()
     count = len(track.photo_s)
-    noise = boresight(rng.normal(0, 0.02, (count, 3)))
+    noise = exp_so3(np.radians(rng.normal(0, 0.02, (count, 3))))
     start = 1_700_000_000
     points = rng.uniform(-40, 40, (control, 3))
     return RigData(
@@ -81,7 +81,7 @@ def _data(track: TrueTrajectory, seed: int = 1, control: int = 0, *, arm_m: np.n
 def test_offset_and_boresight(kind: str, seed: int) -> None:
     found = fit_rig(_data(_flight(kind, seed=seed), seed), 0.0, np.eye(3), FitOptions())
     assert found.state.offset_s == pytest.approx(OFFSET_S, abs=0.02)
-    missed_deg = np.degrees(log_so3(found.state.boresight @ boresight(BORESIGHT_DEG).T))
+    missed_deg = np.degrees(log_so3(found.state.boresight @ exp_so3(np.radians(BORESIGHT_DEG)).T))
     assert np.linalg.norm(missed_deg) < 0.1
     assert found.sigma[7] < 0.01 and abs(found.state.offset_s - OFFSET_S) < 4 * found.sigma[7]
     assert np.all(np.abs(missed_deg) < 4 * np.degrees(found.sigma[8:11]))
@@ -131,7 +131,7 @@ def _tilted(data: RigData, pixels: float) -> RigData:
 def test_sigma_counts_a_lens_that_sfm_has_not_quite_found() -> None:
     data = _tilted(_data(_flight("orbit"), control=6, arm_m=np.zeros(3)), 1.0)
     found = fit_rig(data, 0.0, np.eye(3), FitOptions(arm=True))
-    missed = log_so3(found.state.boresight @ boresight(BORESIGHT_DEG).T)
+    missed = log_so3(found.state.boresight @ exp_so3(np.radians(BORESIGHT_DEG)).T)
     assert np.linalg.norm(missed) > 0.5 * PIXEL_RAD  # it does harm
     assert np.all(np.abs(missed) < 3 * found.sigma[8:11])
     assert np.all(np.abs(found.state.arm - ARM_M) < 3 * found.sigma[11:14])

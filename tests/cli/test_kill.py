@@ -20,7 +20,7 @@ from pipelines.core import staleness as states
 from pipelines.core.products import load_json
 from pipelines.core.stages import PIPELINE, SPLAT, SURVEY
 from pipelines.core.workspace import Workspace
-from pipelines.formats.georef_sidecar import read_sidecar
+from pipelines.formats.georef_sidecar import GeorefSidecar, sidecar_path
 from pipelines.splat.gaussians import read_gaussians
 from pipelines.survey.survey import Survey
 from pipelines.train.trainer import load_checkpoint
@@ -157,7 +157,7 @@ def _assert_completes(workspace: Workspace, whole: Workspace, arguments: tuple[s
     assert _files(workspace) == _files(whole)
     assert load_json(Survey, workspace.path(SURVEY)) == load_json(Survey, whole.path(SURVEY))
     assert len(read_gaussians(workspace.path(SPLAT))) > 0
-    assert read_sidecar(workspace.path(SPLAT)).scale == 1.0
+    assert load_json(GeorefSidecar, sidecar_path(workspace.path(SPLAT))).scale == 1.0
     reports = [json.loads((w.root / "evaluate/report.json").read_text("utf-8")) for w in (workspace, whole)]
     assert [report["checkpoints"]["camera"]["count"] for report in reports] == [8, 8]
     # Two runs with other matches and views differ by what 40 iterations leave open, not by a broken half.

@@ -19,7 +19,7 @@ from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.deliver.cameras import run
 from pipelines.deliver.options import ExportCamerasOptions
 from pipelines.formats.colmap import read_sparse, write_sparse
-from pipelines.formats.georef_sidecar import CrsSidecar, read_sidecar, sidecar_path
+from pipelines.formats.georef_sidecar import CrsSidecar, GeorefSidecar, sidecar_path
 from pipelines.formats.trajectory_csv import read_trajectory
 from pipelines.geodesy.enu import Origin, ecef_from_enu, ecef_from_lla, enu_from_ecef, geo_from_enu_at, lla_from_enu
 from pipelines.geometry.cameras import Camera, project
@@ -126,7 +126,7 @@ def test_colmap_model_opens_with_small_reprojection_error_in_the_frame_of_the_sp
     assert (model.num_reg_images(), model.num_points3D()) == (IMAGES, 80)
     # Mean length of a residual of 0.3 px in two axes, less what three coordinates of each point take up.
     assert 0.2 < model.compute_mean_reprojection_error() < 0.3 * np.sqrt(np.pi / 2)
-    ecef_from_file = read_sidecar(handover.out / "colmap").ecef_from_file()
+    ecef_from_file = load_json(GeorefSidecar, sidecar_path(handover.out / "colmap")).ecef_from_file()
     centers = {image.name: image.projection_center() for image in model.images.values()}
     found = ecef_from_file.apply(np.array([centers[name] for name in handover.scene.names]))
     np.testing.assert_allclose(found, handover.ecef, atol=1e-6)
@@ -139,7 +139,9 @@ def test_colmap_model_opens_with_small_reprojection_error_in_the_frame_of_the_sp
 def test_nerfstudio_projects_a_point_to_its_pixel(handover: Handover) -> None:
     """Its own formulas: OpenGL axes, then OpenCV's polynomial."""
     document = json.loads((handover.out / "transforms.json").read_text(encoding="utf-8"))
-    file_from_ecef = read_sidecar(handover.out / "transforms.json").ecef_from_file().inverse()
+    file_from_ecef = (
+        load_json(GeorefSidecar, sidecar_path(handover.out / "transforms.json")).ecef_from_file().inverse()
+    )
     origin = handover.origin
     point_in_geo = np.array([3.0, -4.0, 5.0])
     point = file_from_ecef.apply(ecef_from_enu(point_in_geo, origin))
@@ -271,7 +273,8 @@ def test_nerfstudio_leaves_out_the_lens_that_it_cannot_hold_beside_the_others(tm
     document = json.loads((tmp_path / "out" / "transforms.json").read_text(encoding="utf-8"))
     assert [frame["file_path"] for frame in document["frames"]] == list(sparse.image_name[2:])
     assert "nerfstudio-one-camera-model" in {caution.code for caution in summary.cautions}
-    assert [caution.code for caution in read_sidecar(tmp_path / "out" / "transforms.json").cautions] == [
-        "nerfstudio-one-camera-model"
-    ]
+    assert [
+        caution.code
+        for caution in load_json(GeorefSidecar, sidecar_path(tmp_path / "out" / "transforms.json")).cautions
+    ] == ["nerfstudio-one-camera-model"]
     assert pycolmap.Reconstruction(str(tmp_path / "out" / "colmap")).num_cameras() == 2

@@ -11,13 +11,14 @@ import pytest
 import torch
 
 from pipelines.core.errors import DegenerateGeometryError, ResourceError
+from pipelines.core.products import load_json
 from pipelines.core.runner import run_stage
 from pipelines.core.stages import BY_NAME, GAUSSIANS, MEASURABLE_SPLAT, SPLAT
 from pipelines.core.staleness import status
 from pipelines.core.workspace import Workspace
 from pipelines.deliver import measurable
 from pipelines.deliver.measurable import with_discs
-from pipelines.formats.georef_sidecar import read_sidecar
+from pipelines.formats.georef_sidecar import GeorefSidecar, sidecar_path
 from pipelines.geodesy.enu import enu_from_ecef
 from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.rotations import exp_so3
@@ -141,7 +142,10 @@ def test_command_puts_centres_on_the_surface(
     workspace = Workspace(root)
     origin = load_survey(workspace).origin
     run_stage(workspace, BY_NAME["export-ply"], {})
-    plain, plain_bytes = read_sidecar(workspace.path(SPLAT)), workspace.path(SPLAT).read_bytes()
+    plain, plain_bytes = (
+        load_json(GeorefSidecar, sidecar_path(workspace.path(SPLAT))),
+        workspace.path(SPLAT).read_bytes(),
+    )
     unpainted, values = (
         run_stage(workspace, BY_NAME["export-measurable"], {"repaint_passes": passes}).manifest.values
         for passes in (0, 2)
@@ -150,7 +154,7 @@ def test_command_puts_centres_on_the_surface(
     assert told is not None
     assert int(told[1]) == pytest.approx(values["discs"], rel=0.3)
     made = workspace.path(MEASURABLE_SPLAT)
-    sidecar, after = read_sidecar(made), read_gaussians(made)
+    sidecar, after = load_json(GeorefSidecar, sidecar_path(made)), read_gaussians(made)
     assert float(told[2]) == pytest.approx(made.stat().st_size / 1e6, rel=0.3)
     assert sidecar == plain  # The same frame, whatever is in it.
     assert workspace.path(SPLAT).read_bytes() == plain_bytes

@@ -10,14 +10,14 @@ import pytest
 import torch
 
 from pipelines.core.errors import DegenerateGeometryError, InputError
-from pipelines.core.products import Caution, save_json
+from pipelines.core.products import Caution, load_json, save_json
 from pipelines.core.stages import GAUSSIANS, MODEL, SURVEY
 from pipelines.core.workspace import StageRun, Workspace
 from pipelines.deliver.options import ExportPlyOptions
 from pipelines.deliver.placement import Placement, place
 from pipelines.deliver.ply import run
 from pipelines.deliver.splat import placed_splat
-from pipelines.formats.georef_sidecar import read_sidecar, sidecar_path
+from pipelines.formats.georef_sidecar import GeorefSidecar, sidecar_path
 from pipelines.geodesy.enu import Origin, ecef_from_enu, ecef_from_lla, enu_from_ecef
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.cameras import Pinhole
@@ -91,7 +91,7 @@ def stage(tmp_path: Path) -> StageRun:
 
 def test_files_alone_put_the_gaussians_on_earth(stage: StageRun) -> None:
     summary = run(stage, OPTIONS)
-    ply, sidecar = stage.out / "splat.ply", read_sidecar(stage.out / "splat.ply")
+    ply, sidecar = stage.out / "splat.ply", load_json(GeorefSidecar, sidecar_path(stage.out / "splat.ply"))
     positions = sidecar.ecef_from_file().apply(read_gaussians(ply).means.numpy())
     expected = ecef_from_enu(GEO_FROM_MODEL.apply(gaussians().means.numpy()), survey().origin)
     # About 10 m from the origin, float32 resolves 1e-6 m.
@@ -102,7 +102,7 @@ def test_files_alone_put_the_gaussians_on_earth(stage: StageRun) -> None:
 
 def test_frame_is_east_north_up_at_its_own_rounded_origin(stage: StageRun) -> None:
     run(stage, OPTIONS)
-    sidecar = read_sidecar(stage.out / "splat.ply")
+    sidecar = load_json(GeorefSidecar, sidecar_path(stage.out / "splat.ply"))
     lat, lon, alt = sidecar.origin_lla
     assert (round(lat, 6), round(lon, 6), round(alt, 1)) == (lat, lon, alt)
     np.testing.assert_array_equal(sidecar.origin, ecef_from_lla([lat, lon, alt]))
@@ -121,7 +121,7 @@ def test_rendered_image_is_the_same_from_the_same_place(stage: StageRun) -> None
     cam_from_model[:3, :3], cam_from_model[:3, 3] = exp_so3(np.array([0.2, 0.1, 0.0])), [0.5, -0.3, 12.0]
     before = render_reference(gaussians().detached(), torch.tensor(cam_from_model).float(), camera, settings)
     # The camera moves with the model; a camera's frame keeps its metres, so its distance grows with the scale.
-    ecef_from_ply = read_sidecar(stage.out / "splat.ply").ecef_from_file()
+    ecef_from_ply = load_json(GeorefSidecar, sidecar_path(stage.out / "splat.ply")).ecef_from_file()
     geo = survey().origin
     model_from_cam = Similarity(1.0, cam_from_model[:3, :3], cam_from_model[:3, 3]).inverse()
     ecef_from_geo = Similarity(1.0, _axes(geo), ecef_from_enu(np.zeros(3), geo))
@@ -189,7 +189,10 @@ def test_sidecar_has_the_fields_that_were_promised(stage: StageRun) -> None:
 
 def test_matrix_is_the_similarity_of_the_sidecar(stage: StageRun) -> None:
     run(stage, OPTIONS)
-    path, sidecar = sidecar_path(stage.out / "splat.ply"), read_sidecar(stage.out / "splat.ply")
+    path, sidecar = (
+        sidecar_path(stage.out / "splat.ply"),
+        load_json(GeorefSidecar, sidecar_path(stage.out / "splat.ply")),
+    )
     document = json.loads(path.read_text(encoding="utf-8"))
     matrix = np.array(document["ecefFromFile"])
     points = np.random.default_rng(0).uniform(-500, 500, (20, 3))
@@ -199,23 +202,27 @@ def test_matrix_is_the_similarity_of_the_sidecar(stage: StageRun) -> None:
     np.testing.assert_array_equal(matrix[3], [0, 0, 0, 1])
     del document["ecefFromFile"]  # as it was before the matrix
     path.write_text(json.dumps(document), encoding="utf-8")
-    assert read_sidecar(stage.out / "splat.ply") == sidecar
+    assert load_json(GeorefSidecar, sidecar_path(stage.out / "splat.ply")) == sidecar
     matrix[0, 3] += 0.01
     path.write_text(json.dumps({**document, "ecefFromFile": matrix.tolist()}), encoding="utf-8")
     with pytest.raises(InputError, match="ecefFromFile"):
-        read_sidecar(stage.out / "splat.ply")
+        load_json(GeorefSidecar, sidecar_path(stage.out / "splat.ply"))
 
 
 def test_sidecar_carries_the_cautions_of_the_model_on(stage: StageRun) -> None:
     caution = Caution(code="fixes-shifted", sentence="All fixes are 1.2 m too high.")
     path = stage.workspace.root / MODEL
     save_json(model(covariance()).model_copy(update={"cautions": (caution,)}), path)
-    assert run(stage, OPTIONS).cautions == read_sidecar(stage.out / "splat.ply").cautions == (caution,)
+    assert (
+        run(stage, OPTIONS).cautions
+        == load_json(GeorefSidecar, sidecar_path(stage.out / "splat.ply")).cautions
+        == (caution,)
+    )
     for product in (path, sidecar_path(stage.out / "splat.ply")):  # as they were before cautions
         document = json.loads(product.read_text(encoding="utf-8"))
         del document["cautions"]
         product.write_text(json.dumps(document), encoding="utf-8")
-    assert read_sidecar(stage.out / "splat.ply").cautions == ()
+    assert load_json(GeorefSidecar, sidecar_path(stage.out / "splat.ply")).cautions == ()
     assert run(stage, OPTIONS).cautions == ()
 
 
@@ -225,7 +232,7 @@ def test_damaged_sidecar_is_refused(stage: StageRun) -> None:
     text = path.read_text(encoding="utf-8")
     path.write_text(text.replace('"scale": 1.0', '"scale": -1.0'), encoding="utf-8")
     with pytest.raises(InputError, match="scale"):
-        read_sidecar(stage.out / "splat.ply")
+        load_json(GeorefSidecar, sidecar_path(stage.out / "splat.ply"))
     path.write_text(text.replace('"rotation": [', '"rotation": [\n  1.0,', 1), encoding="utf-8")
     with pytest.raises(InputError, match="rotation"):
-        read_sidecar(stage.out / "splat.ply")
+        load_json(GeorefSidecar, sidecar_path(stage.out / "splat.ply"))

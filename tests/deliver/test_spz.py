@@ -9,9 +9,10 @@ import pytest
 import torch
 
 from pipelines.core.errors import InputError
+from pipelines.core.products import load_json
 from pipelines.deliver.options import ExportSpzOptions
 from pipelines.deliver.spz import run
-from pipelines.formats.georef_sidecar import read_sidecar
+from pipelines.formats.georef_sidecar import GeorefSidecar, sidecar_path
 from pipelines.formats.spz import read_spz
 from pipelines.geodesy.enu import enu_from_ecef
 from pipelines.geometry.similarity import covariance_at
@@ -23,7 +24,10 @@ def test_file_and_sidecar_put_the_gaussians_on_earth(tmp_path: Path) -> None:
     splat = splat_arrays()
     stage = write_trained(tmp_path / "ws", splat, "spz")
     summary = run(stage, ExportSpzOptions())
-    read, sidecar = read_spz(stage.out / "splat.spz"), read_sidecar(stage.out / "splat.spz")
+    read, sidecar = (
+        read_spz(stage.out / "splat.spz"),
+        load_json(GeorefSidecar, sidecar_path(stage.out / "splat.spz")),
+    )
     # Half a step of 2^-12 m along each axis.
     places = sidecar.ecef_from_file().apply(read.means)
     np.testing.assert_allclose(places, true_ecef(splat), rtol=0, atol=np.sqrt(3) * 0.5 / 4096 + 1e-5)
@@ -41,7 +45,10 @@ def test_colours_are_those_of_the_same_direction_on_earth(tmp_path: Path) -> Non
     splat = splat_arrays()
     stage = write_trained(tmp_path / "ws", splat, "spz")
     run(stage, ExportSpzOptions())
-    read, sidecar = read_spz(stage.out / "splat.spz"), read_sidecar(stage.out / "splat.spz")
+    read, sidecar = (
+        read_spz(stage.out / "splat.spz"),
+        load_json(GeorefSidecar, sidecar_path(stage.out / "splat.spz")),
+    )
     direction_in_file = np.array([0.36, 0.48, 0.8])
     in_ecef = sidecar.ecef_from_file().rotation @ direction_in_file
     geo_from_ecef = enu_from_ecef(np.vstack([np.eye(3), np.zeros(3)]), ORIGIN)
@@ -56,7 +63,7 @@ def test_colours_are_those_of_the_same_direction_on_earth(tmp_path: Path) -> Non
 def test_covariance_is_along_the_axes_of_the_file(tmp_path: Path) -> None:
     stage = write_trained(tmp_path / "ws", splat_arrays(), "spz")
     run(stage, ExportSpzOptions())
-    sidecar = read_sidecar(stage.out / "splat.spz")
+    sidecar = load_json(GeorefSidecar, sidecar_path(stage.out / "splat.spz"))
     point_in_file = np.array([[3.0, -2.0, 5.0]])
     to_ecef = sidecar.ecef_from_file()
     in_file = sidecar.covariance_at(point_in_file)

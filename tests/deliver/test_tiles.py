@@ -13,12 +13,12 @@ import pytest
 from scipy.spatial import cKDTree
 
 from pipelines.core.errors import InputError
-from pipelines.core.products import save_json
+from pipelines.core.products import load_json, save_json
 from pipelines.core.stages import BLOCK_RECORD, GAUSSIANS
 from pipelines.core.workspace import StageRun
 from pipelines.deliver.options import ExportTilesOptions
 from pipelines.deliver.tiles import read_glb, run, write_glb, write_whole
-from pipelines.formats.georef_sidecar import read_sidecar
+from pipelines.formats.georef_sidecar import GeorefSidecar, sidecar_path
 from pipelines.formats.splat_ply import SplatArrays, write_splat_ply
 from pipelines.splat.level_of_detail import DetailTile
 from pipelines.survey.block_plan import BlockCell, BlockRecord, MergedBlock
@@ -124,7 +124,7 @@ def test_tileset_says_what_a_globe_must_know(made: StageRun) -> None:
     assert georef["verticalDatum"]["name"] == "EGM2008"
     assert georef["georeferenceSigma"]["sigma_h_m"] > 0
     assert gltf_of(made.out / "splat.glb")["asset"]["extras"]["georef"] == georef
-    transform = read_sidecar(made.out / "tileset.json").ecef_from_file().matrix()
+    transform = load_json(GeorefSidecar, sidecar_path(made.out / "tileset.json")).ecef_from_file().matrix()
     np.testing.assert_array_equal(np.array(content["root"]["transform"]).reshape(4, 4).T, transform)
     assert content["geometricError"] > 2 * content["root"]["geometricError"]
 
@@ -153,7 +153,14 @@ def test_a_splat_too_large_for_one_file_is_shown_by_its_tiles(made: StageRun, sc
 
     root = tile(document(made)["root"])
     whole = (made.out / "splat.glb").read_bytes()
-    count = write_whole(made.out, [scene], root, read_sidecar(made.out / "tileset.json"), len(scene), most=1500)
+    count = write_whole(
+        made.out,
+        [scene],
+        root,
+        load_json(GeorefSidecar, sidecar_path(made.out / "tileset.json")),
+        len(scene),
+        most=1500,
+    )
     assert root.count < count <= 1500
     assert len(read_glb(made.out / "splat.glb")) == count
     (made.out / "splat.glb").write_bytes(whole)

@@ -48,7 +48,7 @@ def test_text_model_from_pycolmap_gives_its_tracks_and_centres(tmp_path: Path) -
         np.testing.assert_allclose(model.cam_center_in_local[index], image.projection_center(), atol=1e-9)
     for index in (0, 7, 39):
         point = oracle.points3D[int(model.point_id[index])]
-        seen_in = {int(model.image_id[i]) for i in range(len(model.image_id)) if index in model.points_in(i)}
+        seen_in = set(model.image_id[model.obs_image[model.obs_point == index]].tolist())
         assert seen_in == {element.image_id for element in point.track.elements}
         expected = sorted(
             (element.image_id, *oracle.images[element.image_id].points2D[element.point2D_idx].xy)

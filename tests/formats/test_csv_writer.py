@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipelines.core.files import replace_text
 from pipelines.formats.camera_files import CameraTable, write_camera_table
-from pipelines.formats.tables import plain_text, write_table
+from pipelines.formats.tables import plain_text, table_text
 from pipelines.formats.trajectory_csv import read_trajectory
 from tests.cli_runs import REPOSITORY
 
@@ -20,7 +21,7 @@ NAMES = ["a.jpg", "'quoted'", "ä=b", ""]
 
 
 def test_formulas_alone_begin_with_an_apostrophe(tmp_path: Path) -> None:
-    write_table(tmp_path / "t.csv", [[*FORMULAS, *NUMBERS, *NAMES, -1.5, None]])
+    replace_text(tmp_path / "t.csv", table_text([[*FORMULAS, *NUMBERS, *NAMES, -1.5, None]]))
     with (tmp_path / "t.csv").open(encoding="utf-8", newline="") as handle:
         (cells,) = csv.reader(handle)
     assert cells == [*(f"'{text}" for text in FORMULAS), *NUMBERS, *NAMES, "-1.5", ""]

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipelines.formats.vector_files import feature, polygon, write_features
+from pipelines.core.files import replace_text
+from pipelines.formats.vector_files import feature, features_text, polygon
 
 
 def area(ring: list[list[float]]) -> float:
@@ -52,8 +53,11 @@ def test_ring_without_area_is_an_unlocated_feature() -> None:
 
 def test_collection_is_json_without_nan(tmp_path: Path) -> None:
     path = tmp_path / "a.geojson"
-    write_features(
-        path, [feature(None, {"name": "Aé", "sigma_e_m": float("nan"), "clipped": True}), feature(None, {})]
+    replace_text(
+        path,
+        features_text(
+            [feature(None, {"name": "Aé", "sigma_e_m": float("nan"), "clipped": True}), feature(None, {})]
+        ),
     )
     document = json.loads(path.read_text(encoding="utf-8"))
     assert document["type"] == "FeatureCollection"

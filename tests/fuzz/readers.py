@@ -28,7 +28,7 @@ from pipelines.core.workspace import Manifest, Workspace
 from pipelines.formats.bag import COMPRESSED, IMAGE, BadImageError, ImageWriter, UndecodableError, open_bag
 from pipelines.formats.colmap import pycolmap_module, read_sparse
 from pipelines.formats.exif import read_tags
-from pipelines.formats.georef_sidecar import GeorefSidecar, read_sidecar, write_sidecar
+from pipelines.formats.georef_sidecar import GeorefSidecar, sidecar_path, write_sidecar
 from pipelines.formats.gnss_logs import read_mrk, read_pos
 from pipelines.formats.ground_points import read_geo, read_ground_points, read_marks, read_point_table
 from pipelines.formats.image_file import inspect_image, read_bytes
@@ -264,7 +264,7 @@ def _sidecar(folder: Path) -> None:
 
 
 def _read_sidecar(folder: Path) -> None:
-    sidecar = read_sidecar(folder / "a.ply")
+    sidecar = load_json(GeorefSidecar, sidecar_path(folder / "a.ply"))
     sidecar.ecef_from_file()
     sidecar.covariance_at([[1.0, 2.0, 3.0]])
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipelines.geometry.rotations import exp_so3
-from pipelines.geometry.trajectory import Rig, boresight, mount, with_rig
+from pipelines.geometry.trajectory import Rig, mount, with_rig
 
 COUNT = 5
 RNG = np.random.default_rng(0)
@@ -13,7 +13,7 @@ BODY = exp_so3(RNG.normal(size=(COUNT, 3)))
 CENTER = RNG.normal(size=(COUNT, 3)) * 100.0
 MOUNT = exp_so3(RNG.normal(size=(COUNT, 3)))
 ARM = RNG.normal(size=(COUNT, 3))
-BORESIGHT = boresight([0.5, -1.0, 0.3])
+BORESIGHT = exp_so3(np.radians([0.5, -1.0, 0.3]))
 ANTENNA = CENTER + np.einsum("nij,nj->ni", BODY, ARM)
 
 

@@ -173,7 +173,7 @@ def test_a_killed_chunk_goes_on_where_it_was(flight: StageRun, photographs: Phot
         assert process.poll() is None
     process.kill()
     assert finish(process).code == -signal.SIGKILL
-    assert not chunk.is_finished(flight.out)
+    assert not chunk.database(flight.out).is_file()
     assert work_chunk(flight.workspace, chunk.name, SILENT)
     assert rows(chunk.database(flight.out), "descriptors")[:2] == before
     assert len(rows(chunk.database(flight.out), "descriptors")) == len(chunk.images)
@@ -211,7 +211,7 @@ def test_every_photograph_and_every_pair_once(count: int, size: int, seed: int) 
     pairs = np.array(sorted(drawn))
     survey = survey_of([f"{index}.jpg" for index in range(count)])
     plan = plan_chunks(survey, pairs, CONFIG.model_copy(update={"chunk_size": size}))
-    features, matches = plan.of_kind("features"), plan.of_kind("matches")
+    features, matches = ([chunk for chunk in plan.chunks if chunk.kind == kind] for kind in ("features", "matches"))
     assert [index for chunk in features for index in chunk.images] == list(range(count))
     assert [pair for chunk in matches for pair in chunk.pairs] == [tuple(pair) for pair in pairs.tolist()]
     assert max(len(chunk.images) for chunk in features) <= size

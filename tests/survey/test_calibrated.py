@@ -14,7 +14,6 @@ from pipelines.core.products import load_json, save_json
 from pipelines.core.stages import RIG, SURVEY, TRACK
 from pipelines.core.workspace import Workspace
 from pipelines.geometry.rotations import exp_so3, log_so3, matrix_from_quat_xyzw, quat_xyzw_from_matrix
-from pipelines.geometry.trajectory import boresight
 from pipelines.survey.calibrated import NavigationTrack, apply_calibration, load_survey, require_estimable
 from pipelines.survey.survey import Attitude, RigCalibration, RigEstimate, RigParameter, Survey, SurveyImage
 from tests.scenes import Measured, Noise, make_scene, survey_of
@@ -97,7 +96,7 @@ def test_offset_boresight_and_arm_are_applied(survey: Survey, track: NavigationT
     at = track.image_time_s + 0.5
     np.testing.assert_allclose(places(calibrated)[:COUNT], cameras(at), atol=1e-5)
     quats = [image.attitude.quat_xyzw for image in calibrated.images[:COUNT] if image.attitude]
-    expected = bodies(at) @ MOUNT.T @ boresight(turned_deg)
+    expected = bodies(at) @ MOUNT.T @ exp_so3(np.radians(turned_deg))
     assert np.abs(log_so3(matrix_from_quat_xyzw(quats) @ np.swapaxes(expected, 1, 2))).max() < 1e-9
     # What the navigation does not know stays; what it now knows takes σ from the nearest.
     assert calibrated.images[5] == survey.images[5]

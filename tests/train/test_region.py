@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from pipelines.geometry.cameras import pose_matrix
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from pipelines.survey.block_plan import BlockCell
@@ -24,6 +25,11 @@ WALL_M = 4.0
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
+def pose_of(index: int) -> np.ndarray:
+    poses = tiny.poses()
+    return pose_matrix(poses.cam_from_model[index], poses.cam_center_in_model[index])
+
+
 def wall_depth() -> np.ndarray:
     """Depth of the wall of `tiny_training`, which the cameras look at straight."""
     return np.full((tiny.PINHOLE.height, tiny.PINHOLE.width), WALL_M, dtype=np.float32)
@@ -31,7 +37,7 @@ def wall_depth() -> np.ndarray:
 
 @pytest.mark.parametrize("index", [0, 2, 5])
 def test_mask_ends_where_the_cell_does(index: int) -> None:
-    pose = tiny.poses().matrix(index)
+    pose = pose_of(index)
     x = tiny.poses().cam_center_in_model[index, 0]
     mask = region_mask(pose, tiny.PINHOLE, WEST, None, wall_depth())
     column = tiny.PINHOLE.cx - tiny.PINHOLE.fx * x / WALL_M  # of the plane x = 0 on the wall
@@ -41,7 +47,7 @@ def test_mask_ends_where_the_cell_does(index: int) -> None:
 
 def test_known_depth_comes_before_the_stand_in() -> None:
     """The camera at x = −1 sees the plane x = 0 further to the right, the nearer the surface is."""
-    pose, known = tiny.poses().matrix(0), np.zeros((24, 32), dtype=np.float32)
+    pose, known = pose_of(0), np.zeros((24, 32), dtype=np.float32)
     known[12:] = 1.0  # half the size of the image; the upper half is unknown
     mask = region_mask(pose, tiny.PINHOLE, WEST, known, wall_depth())
     assert mask[:24].sum(axis=1).tolist() == [47] * 24
@@ -49,7 +55,7 @@ def test_known_depth_comes_before_the_stand_in() -> None:
 
 
 def test_bands_of_rows_give_the_same_mask(monkeypatch: pytest.MonkeyPatch) -> None:
-    pose, depth = tiny.poses().matrix(1), wall_depth() + np.arange(48, dtype=np.float32)[:, None] / 50
+    pose, depth = pose_of(1), wall_depth() + np.arange(48, dtype=np.float32)[:, None] / 50
     expected = region_mask(pose, tiny.PINHOLE, WEST, None, depth)
     monkeypatch.setattr("pipelines.train.region._BAND_PX", 5 * tiny.PINHOLE.width)
     np.testing.assert_array_equal(region_mask(pose, tiny.PINHOLE, WEST, None, depth), expected)
@@ -59,7 +65,7 @@ def test_bands_of_rows_give_the_same_mask(monkeypatch: pytest.MonkeyPatch) -> No
 def test_sky_belongs_to_the_cell_in_its_direction() -> None:
     empty = Gaussians.concatenate([tiny.true_gaussians(1)])
     empty.logit_opacities[:] = -9.0
-    pose = tiny.poses().matrix(3)
+    pose = pose_of(3)
     depth = stand_in_depth(empty, pose, tiny.PINHOLE, CpuRasterizer())
     mask = region_mask(pose, tiny.PINHOLE, WEST, None, depth)
     np.testing.assert_array_equal(mask, np.tile(np.arange(64) < 32, (48, 1)))
@@ -85,7 +91,7 @@ def confined(folder: Path, *, spoiled: bool) -> JointTrainer:
     images = tiny.photographs(folder, truth)
     masks = {}
     for index in range(6):
-        masks[index] = region_mask(tiny.poses().matrix(index), tiny.PINHOLE, WEST, None, wall_depth())
+        masks[index] = region_mask(pose_of(index), tiny.PINHOLE, WEST, None, wall_depth())
         if spoiled:
             file = folder / f"{index}.png"
             pixels = cv2.imread(str(file))

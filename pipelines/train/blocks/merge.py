@@ -37,6 +37,7 @@ from pipelines.core.types import BoolArray, FloatArray
 from pipelines.core.workspace import Summary
 from pipelines.formats.colmap import read_sparse
 from pipelines.formats.splat_ply import join_splat_plys
+from pipelines.geometry.cameras import pose_matrix
 from pipelines.robust.statistics import mad_sigma
 from pipelines.splat.gaussians import Gaussians, read_gaussians
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings
@@ -127,7 +128,7 @@ class SeamViews:
     def _view(self, block: PlannedBlock, name: str, size_px: int, pair: tuple[PlannedBlock, PlannedBlock]) -> _View:
         index = self._index[name]
         pinhole = pinhole_of(self._sfm.camera_of(index), min(size_px, self._parts.options.effort.max_image_size))
-        matrix = self._poses.matrix(index)
+        matrix = pose_matrix(self._poses.cam_from_model[index], self._poses.cam_center_in_model[index])
         pose = torch.as_tensor(matrix, dtype=torch.float32, device=self._device)
         gaussians = self.model_of(block.id)
         with torch.no_grad():
