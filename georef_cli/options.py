@@ -51,11 +51,6 @@ SET = click.Option(
 )
 
 
-def force_option(help_text: str = "Run even if the product is current.") -> click.Option:
-    """Return the option `--force`, which means something else for each command."""
-    return click.Option(["--force"], is_flag=True, help=help_text)
-
-
 def forgotten(options_type: type[StageOptions], names: Iterable[str]) -> list[str]:
     """Return the fields that the user names with `--forget`; `all` stands for each of them."""
     if "all" in (named := list(names)):
