@@ -212,12 +212,8 @@ class NormalMatrix:
         """
         response = self.response.reshape(len(self.position), 6, -1)[camera]
         across = by_border - by_pose @ response
-        within = by_pose @ self._camera_blocks[camera] @ np.swapaxes(by_pose, 1, 2)
+        within = by_pose @ self.factor.inverse_diagonal[camera] @ np.swapaxes(by_pose, 1, 2)
         return np.asarray(within + self._of_border(across))
-
-    @cached_property
-    def _camera_blocks(self) -> FloatArray:
-        return self.factor.inverse_diagonal()
 
     def _of_border(self, left: FloatArray) -> FloatArray:
         """Return the products left S⁻¹ leftᵀ (…, m, m) of border vectors (…, m, b)."""

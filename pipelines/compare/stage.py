@@ -13,7 +13,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 
 from pipelines.compare.configurations import BY_CONFIGURATION, COMMON_TRAIN_OPTIONS, Configuration, write_comparison
-from pipelines.compare.table import ComparedRow, Comparison, point_accuracy, surface_accuracy
+from pipelines.compare.table import ComparedRow, Comparison, PointAccuracy, surface_accuracy
 from pipelines.core.errors import ConvergenceError, DegenerateGeometryError, GeorefError
 from pipelines.core.products import union
 from pipelines.core.progress import SILENT, Progress
@@ -187,8 +187,8 @@ def _row(configuration: Configuration, plan: Sequence[VariantStage], runner: _Pl
         test_psnr_covered=test.psnr_covered,
         test_covered_share=test.covered_share,
         test_ssim=test.ssim,
-        camera=point_accuracy(report.checkpoints.camera),
-        model=point_accuracy(report.checkpoints.model),
+        camera=PointAccuracy.model_validate(report.checkpoints.camera, from_attributes=True),
+        model=PointAccuracy.model_validate(report.checkpoints.model, from_attributes=True),
         reference=surface_accuracy(report.reference),
         iterations=training.get("iterations"),
         gaussians=training.get("gaussians"),

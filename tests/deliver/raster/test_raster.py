@@ -236,7 +236,7 @@ def test_sigma_is_that_of_georeference_and_surface(workspace: Workspace) -> None
     grid = load_adjustment(workspace).grid
     assert grid is not None
     points = np.array([[-8.0, 6, 0], [0, 10, 0], [7, -7, 0]])
-    expected, xyz = grid.sigma_at(points), in_utm(points, workspace)
+    expected, xyz = np.sqrt(np.diagonal(grid.cov_at(points), axis1=1, axis2=2)), in_utm(points, workspace)
     horizontal, vertical = (at(workspace.path(f"raster/{name}.tif"), xyz) for name in ("sigma_h", "sigma_v"))
     np.testing.assert_allclose(vertical, expected[:, 2], rtol=0.03)
     np.testing.assert_allclose(horizontal, np.hypot(expected[:, 0], expected[:, 1]), rtol=0.1)
