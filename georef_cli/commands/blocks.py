@@ -15,7 +15,7 @@ from georef_cli.engines import ENGINE, asked_engine
 from georef_cli.forecast import announced_seconds
 from georef_cli.output import print_json, print_outcome, print_rich
 from pipelines.core import runner
-from pipelines.core.options import remembered
+from pipelines.core.options import remember, remembered
 from pipelines.core.products import load_json
 from pipelines.core.stages import (
     BLOCK_RECORD,
@@ -74,7 +74,7 @@ def _plan(ctx: click.Context, parts: Parts, asked: Mapping[str, Flags], values: 
 
     workspace = parts.workspace
     with workspace.lock("blocks plan"):
-        workspace.remember(asked)
+        remember(workspace.root, asked)
     with boundary.logged_to_file(parts.whole, PLAN_BLOCKS):
         outcome = parts.run(PLAN_BLOCKS, force=values["force"], progress=progress_for(ctx.obj))
     plan = parts.plan()
@@ -106,7 +106,7 @@ def _train(ctx: click.Context, parts: Parts, asked: Mapping[str, Flags], values:
 
     workspace = parts.workspace
     with workspace.lock("blocks train"):
-        workspace.remember(asked)
+        remember(workspace.root, asked)
         plan = train_blocks(parts, progress_for(ctx.obj), force=values["force"])
     if values["as_json"]:
         print_json({"blocks": [parts.training(block).model_dump(mode="json") for block in plan.blocks]})

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pipelines.compare.configurations import BY_CONFIGURATION, COMMON_TRAIN_OPTIONS, Configuration, write_comparison
 from pipelines.compare.table import ComparedRow, Comparison, PointAccuracy, surface_accuracy
 from pipelines.core.errors import ConvergenceError, DegenerateGeometryError, GeorefError
+from pipelines.core.options import read_requests, remember
 from pipelines.core.products import union
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.runner import Outcome, run_pipeline, run_stage
@@ -82,14 +83,14 @@ def compare(
     """
     must_exist(workspace)
     with workspace.lock(FOLDER):
-        requests = workspace.requests()
+        requests = read_requests(workspace.root)
         asked = {**requests.get("train", {}), **requests.get(FOLDER, {}), **flags}
         asked = {name: value for name, value in asked.items() if name in COMMON_TRAIN_OPTIONS}
         plans = [(configuration, tuple(_plan(workspace, configuration, asked))) for configuration in configurations]
         for _, plan in plans:
             for planned in plan:
                 stage_config(planned.variant, planned.spec, planned.flags)  # a bad option costs no hours
-        workspace.remember({FOLDER: asked})
+        remember(workspace.root, {FOLDER: asked})
     shared = run_pipeline(workspace, _SHARED, {}, progress=progress, around=lambda spec: around(workspace, spec))
     with workspace.lock(FOLDER):
         runner = _PlanRunner([ComparedStage(None, outcome) for outcome in shared], force, progress, around)
@@ -123,7 +124,7 @@ def _plan(workspace: Workspace, configuration: Configuration, asked: Flags) -> I
         yield VariantStage(variant, _TRAIN, {**asked, **configuration.train})
     similarity = "trained" if configuration.trained_by is None else "initial"
     backend = {"backend": asked["backend"]} if "backend" in asked else {}
-    evaluated = workspace.requests().get(_EVALUATE.name, {})
+    evaluated = read_requests(workspace.root).get(_EVALUATE.name, {})
     yield VariantStage(variant, _EVALUATE, {**evaluated, **backend, "similarity": similarity})
 
 

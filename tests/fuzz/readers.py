@@ -19,7 +19,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pipelines.core.errors import GeorefError
-from pipelines.core.options import load_toml, resolve
+from pipelines.core.options import load_toml, remember, resolve
 from pipelines.core.products import load_json, save_json
 from pipelines.core.runner import run_stage
 from pipelines.core.stages import BY_NAME, POINTS, SPARSE
@@ -320,7 +320,7 @@ def _workspace(folder: Path) -> None:
     (folder / "georef.toml").write_text(
         '[ingest]\nsigma_h = 0.02\nlever_arm = "0.1,0,-0.3"\ntime_offset = "2"\n[train]\niterations = 40\n'
     )
-    workspace.remember({"sfm": {"threads": 1}, "train": {"preset": "smoke"}})
+    remember(workspace.root, {"sfm": {"threads": 1}, "train": {"preset": "smoke"}})
     manifest = Manifest(
         stage="sfm", config={}, inputs={}, versions={}, started="2026-01-01T00:00:00Z", duration_s=1.0,
         key_figure="3 of 3", values={"registered": 3}, warnings=["careful"],
