@@ -110,14 +110,14 @@ def _plan(workspace: Workspace, configuration: Configuration, asked: Flags) -> I
     seed = {"seed": asked["seed"]} if "seed" in asked else {}
     lent = dict(shared)
     if configuration.sim3 is None:
-        yield VariantStage(workspace.variant(place, shared, FOLDER), ADJUST, seed)
+        yield VariantStage(Workspace(root / place, workspace, shared, FOLDER), ADJUST, seed)
         lent |= dict.fromkeys(("sfm", _INIT.folder), root / place / ADJUST.folder)
     if configuration.trained_by is not None:
         trainer = BY_CONFIGURATION[configuration.trained_by]
         plan = _plan(workspace, trainer, asked)
         yield from (planned for planned in plan if planned.spec is not _EVALUATE)
         lent[_TRAIN.folder] = root / FOLDER / trainer.name / _TRAIN.folder
-    variant = workspace.variant(place, lent, FOLDER)
+    variant = Workspace(root / place, workspace, lent, FOLDER)
     if configuration.sim3 is not None:
         yield VariantStage(variant, _INIT, {**configuration.sim3, "max_residual": None, **seed})
     if configuration.trained_by is None:

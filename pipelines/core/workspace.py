@@ -171,10 +171,6 @@ class Workspace:
     lent: Mapping[str, Path] = field(default_factory=dict, hash=False)
     command: str = ""
 
-    def variant(self, place: str, lent: Mapping[str, Path], command: str) -> Workspace:
-        """Return a variant in a folder of this workspace, in which some stages run with other options."""
-        return Workspace(self.root / place, self, lent, command)
-
     def path(self, product: str) -> Path:
         """Return the path of a finished product; a MissingProductError names the command that makes it."""
         folder, _, inside = product.partition("/")

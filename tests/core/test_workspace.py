@@ -241,7 +241,8 @@ def test_requests_are_kept_by_stage(workspace: Workspace) -> None:
 
 def test_variant_reads_what_is_lent_and_writes_its_own(tmp_path: Path) -> None:
     workspace, elsewhere = Workspace(tmp_path / "flight"), tmp_path / "elsewhere"
-    variant = workspace.variant("compare/A", {"sfm": workspace.root / "sfm", "geolocate": elsewhere}, "compare")
+    lent = {"sfm": workspace.root / "sfm", "geolocate": elsewhere}
+    variant = Workspace(workspace.root / "compare/A", workspace, lent, "compare")
     for path in (workspace.root / SPARSE, elsewhere / "points.npz", variant.root / SIM3):
         path.mkdir(parents=True)
     assert variant.path(SPARSE) == workspace.root / SPARSE
