@@ -200,9 +200,9 @@ def _handler(verbosity: Verbosity) -> logging.Handler:
         handler = SentRecords(stderr_sender())
         handler.setFormatter(SafeFormatter())
     elif sys.stderr.isatty():
-        from georef_cli.display import ConsoleHandler, stderr_console
+        from georef_cli.display import STDERR, ConsoleHandler
 
-        handler = ConsoleHandler(stderr_console())
+        handler = ConsoleHandler(STDERR)
     else:
         handler = _StderrHandler(sys.stderr)
         handler.setFormatter(LineFormatter())

@@ -8,7 +8,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Task, TaskID, TextColumn
@@ -25,15 +24,10 @@ LINE_EVERY_S = 30.0
 # Columns of a terminal from which a bar shows the speed too, and the columns of the bar itself.
 _WIDE, _WIDE_BAR, _NARROW_BAR = 100, 20, 8
 _MARGIN_LINES = 4  # for log lines above the bars
+STDERR = Console(stderr=True, emoji=False)  # one for all: bars and log lines must not overwrite each other
 LEVEL_STYLES = {logging.ERROR: "red", logging.WARNING: "yellow", logging.INFO: ""}
 
 log = logging.getLogger(__name__)
-
-
-@cache
-def stderr_console() -> Console:
-    """Return the console on stderr, always the same: bars and log lines must not overwrite each other."""
-    return Console(stderr=True, emoji=False)
 
 
 class ConsoleHandler(logging.Handler):
@@ -63,7 +57,7 @@ def progress_for(verbosity: Verbosity) -> Progress:
         return stderr_sender()
     if verbosity.quiet:
         return SILENT
-    return BarProgress(stderr_console()) if sys.stderr.isatty() else LineProgress()
+    return BarProgress(STDERR) if sys.stderr.isatty() else LineProgress()
 
 
 class _TextColumn(Column):

@@ -14,11 +14,11 @@ import click
 from pydantic.fields import FieldInfo
 
 from pipelines.core.options import (
+    WRITTEN,
     StageOptions,
-    WrittenMarker,
     flag_name,
-    has_mark,
     input_markers,
+    marks_of,
     names_of_flags,
     notation,
     parse_toml,
@@ -51,11 +51,6 @@ SET = click.Option(
 )
 
 
-def force_option(help_text: str = "Run even if the product is current.") -> click.Option:
-    """Return the option `--force`, which means something else for each command."""
-    return click.Option(["--force"], is_flag=True, help=help_text)
-
-
 def forgotten(options_type: type[StageOptions], names: Iterable[str]) -> list[str]:
     """Return the fields that the user names with `--forget`; `all` stands for each of them."""
     if "all" in (named := list(names)):
@@ -76,7 +71,7 @@ def stage_option(options_type: type[StageOptions], name: str) -> click.Option:
     """Return the click option of a field; it has no default of its own: its help states the field's."""
     info, flag = options_type.model_fields[name], flag_name(options_type, name)
     help_text = " ".join(filter(None, [info.description, _default_and_range(info)]))
-    if has_mark(info, WrittenMarker):
+    if WRITTEN in marks_of(info):
         return click.Option([flag, name], type=click.STRING, default=None, help=help_text)
     kind = _bare_type(info.annotation)
     if kind is bool:
@@ -121,7 +116,7 @@ def _click_type(kind: Any) -> click.ParamType[Any]:
 def _default_and_range(info: FieldInfo) -> str:
     """Return the default and range of a field as `[default: 1200; ≥ 128]`; empty without any."""
     parts, default = [], info.default
-    if has_mark(info, WrittenMarker):
+    if WRITTEN in marks_of(info):
         default = notation(default) if default not in (None, ()) else None
     elif isinstance(default, bool):
         default = "on" if default else "off"

@@ -65,7 +65,7 @@ class StageCommand(Command):
                 *([] if delivers is None else [target]),
                 options.FORGET,
                 options.DRY_RUN,
-                options.force_option(),
+                click.Option(["--force"], is_flag=True, help="Run even if the product is current."),
                 options.JSON,
             ],
             help=doc,

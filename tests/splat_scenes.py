@@ -13,7 +13,7 @@ from pipelines.adjust.geolocate import geolocate
 from pipelines.adjust.init_sim3 import estimate_similarity
 from pipelines.adjust.options import GeolocateOptions, InitSim3Options
 from pipelines.adjust.posterior import save_posterior
-from pipelines.core.products import load_json, save_json
+from pipelines.core.products import load_json, save_json, save_npz
 from pipelines.core.stages import ADJUSTMENT, POINTS, SIM3, SIM3_POSTERIOR, SPARSE, SURVEY
 from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import read_sparse
@@ -139,7 +139,7 @@ def adjust_workspace(workspace: Workspace, options: InitSim3Options | None = Non
     """Write what `geolocate` and `init-sim3` make of survey and model."""
     survey, sparse = load_json(Survey, workspace.path(SURVEY)), read_sparse(workspace.path(SPARSE))
     points = geolocate(survey, sparse, GeolocateOptions()).points
-    points.save(workspace.root / POINTS)
+    save_npz(workspace.root / POINTS, vars(points))
     estimated = estimate_similarity(survey, sparse, points, options or InitSim3Options())
     save_json(estimated.initial, workspace.root / SIM3)
     save_json(estimated.posterior.solution, workspace.root / ADJUSTMENT)

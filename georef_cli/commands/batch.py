@@ -10,7 +10,7 @@ import click
 
 from georef_cli import job_tables, options
 from georef_cli.command import Command
-from georef_cli.commands.run import DELIVER, OWNERS, deliverables, slice_option
+from georef_cli.commands.run import DELIVER, OWNERS, STAGE_NAME, deliverables
 from georef_cli.display import progress_for
 from georef_cli.engines import ENGINE, engine_for
 from georef_cli.forecast import RunForecast, checked_inputs, forecast_run
@@ -89,7 +89,7 @@ command = Command(
             metavar="N",
             help="Run at most this many missions at a time (default: as many as cores and predicted memory allow).",
         ),
-        slice_option(["--to", "--end-with"], "last", "Last stage to run, of every mission."),
+        click.Option(["--to", "--end-with", "last"], type=STAGE_NAME, help="Last stage to run, of every mission."),
         DELIVER,
         SET,
         *ENGINE,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ from georef_cli.engines import ENGINE, asked_engine
 from georef_cli.forecast import announced_seconds
 from georef_cli.output import print_json, print_outcome, print_rich
 from pipelines.core import runner
-from pipelines.core.options import remembered
+from pipelines.core.options import remember, remembered
 from pipelines.core.products import load_json
 from pipelines.core.stages import (
     BLOCK_RECORD,
@@ -54,30 +55,26 @@ def _blocks(ctx: click.Context, **values: Any) -> None:
     with asked_engine(values):
         from pipelines.train.blocks.parts import Parts
 
-        resolved: Any = stage_config(workspace, TRAIN, _remembered(workspace, given)[TRAIN.name])
+        asked = remembered(workspace.root, [TRAIN.name], {TRAIN.name: given})
+        resolved: Any = stage_config(workspace, TRAIN, asked[TRAIN.name])
         parts = Parts(workspace, resolved)
         if part is not None:
             _run_part(ctx, parts, part, values)
         elif action == "plan":
-            _plan(ctx, parts, given, values)
+            _plan(ctx, parts, asked, values)
         elif action == "train":
-            _train(ctx, parts, given, values)
+            _train(ctx, parts, asked, values)
         else:
-            _all(ctx, parts, given, values, only_merge=action == "merge")
+            _all(ctx, parts, asked, values, only_merge=action == "merge")
 
 
-def _remembered(workspace: Workspace, flags: Flags) -> dict[str, dict[str, Any]]:
-    """Return the options of the training by stage: those of its last request, overridden by `flags`."""
-    return remembered(workspace.root, [TRAIN.name], {TRAIN.name: flags})
-
-
-def _plan(ctx: click.Context, parts: Parts, given: Flags, values: dict[str, Any]) -> None:
+def _plan(ctx: click.Context, parts: Parts, asked: Mapping[str, Flags], values: dict[str, Any]) -> None:
     from pipelines.train.forecast import block_processor_s
     from pipelines.train.options import TrainOptions
 
     workspace = parts.workspace
     with workspace.lock("blocks plan"):
-        workspace.remember(_remembered(workspace, given))
+        remember(workspace.root, asked)
     with boundary.logged_to_file(parts.whole, PLAN_BLOCKS):
         outcome = parts.run(PLAN_BLOCKS, force=values["force"], progress=progress_for(ctx.obj))
     plan = parts.plan()
@@ -104,12 +101,12 @@ def _run_part(ctx: click.Context, parts: Parts, spec: StageSpec, values: dict[st
     print_outcome(variant, outcome, as_json=values["as_json"], told=is_told(ctx.obj))
 
 
-def _train(ctx: click.Context, parts: Parts, given: Flags, values: dict[str, Any]) -> None:
+def _train(ctx: click.Context, parts: Parts, asked: Mapping[str, Flags], values: dict[str, Any]) -> None:
     from pipelines.train.blocks.stage import train_blocks
 
     workspace = parts.workspace
     with workspace.lock("blocks train"):
-        workspace.remember(_remembered(workspace, given))
+        remember(workspace.root, asked)
         plan = train_blocks(parts, progress_for(ctx.obj), force=values["force"])
     if values["as_json"]:
         print_json({"blocks": [parts.training(block).model_dump(mode="json") for block in plan.blocks]})
@@ -117,19 +114,20 @@ def _train(ctx: click.Context, parts: Parts, given: Flags, values: dict[str, Any
         print_rich(*job_tables.block_table(plan, parts.states(plan)))
 
 
-def _all(ctx: click.Context, parts: Parts, given: Flags, values: dict[str, Any], *, only_merge: bool) -> None:
+def _all(
+    ctx: click.Context, parts: Parts, asked: Mapping[str, Flags], values: dict[str, Any], *, only_merge: bool
+) -> None:
     from pipelines.train.blocks.stage import require_trained
 
     workspace = parts.workspace
     if only_merge:
         require_trained(parts, parts.plan())
-    flags = _remembered(workspace, given)
-    announced_seconds(workspace, (TRAIN,), flags, force=values["force"])
+    announced_seconds(workspace, (TRAIN,), asked, force=values["force"])
     with boundary.logged_to_file(workspace, TRAIN):
         outcome = runner.run_stage(
             workspace,
             TRAIN,
-            flags[TRAIN.name],
+            asked[TRAIN.name],
             force=values["force"] and not only_merge,
             renew=not parts.is_merged() and (workspace.root / BLOCK_RECORD).exists(),
             resume="if-same",
@@ -145,7 +143,7 @@ command = Command(
         click.Option(["--id", "number"], type=click.IntRange(min=0), help="Train this block only."),
         *options.stage_options(TRAIN.options),
         *ENGINE,
-        options.force_option("Run even what is current, and start afresh."),
+        click.Option(["--force"], is_flag=True, help="Run even what is current, and start afresh."),
         options.JSON,
     ],
     callback=click.pass_context(_blocks),

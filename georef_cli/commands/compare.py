@@ -44,7 +44,11 @@ command = Command(
             help=f"Configurations to compare, with commas. [default: {','.join(BY_CONFIGURATION)}]",
         ),
         *options.stage_options(TrainOptions, COMMON_TRAIN_OPTIONS),
-        options.force_option("Run the stages of the configurations even if their products are current."),
+        click.Option(
+            ["--force"],
+            is_flag=True,
+            help="Run the stages of the configurations even if their products are current.",
+        ),
         options.JSON,
     ],
     callback=click.pass_context(_compare),

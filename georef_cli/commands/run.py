@@ -176,24 +176,21 @@ def _flags(
     return flags
 
 
-def slice_option(flags: list[str], dest: str, help_text: str) -> click.Option:
-    """Return an option that names a stage of the pipeline."""
-    return click.Option([*flags, dest], type=click.Choice([spec.name for spec in PIPELINE]), help=help_text)
-
+STAGE_NAME = click.Choice([spec.name for spec in PIPELINE])
 
 command = Command(
     "run",
     params=[
         options.WORKSPACE,
-        slice_option(["--from"], "first", "First stage to run."),
-        slice_option(["--rerun-from"], "rerun_from", "First stage to run, with --force."),
-        slice_option(["--to", "--end-with"], "last", "Last stage to run."),
+        click.Option(["--from", "first"], type=STAGE_NAME, help="First stage to run."),
+        click.Option(["--rerun-from"], type=STAGE_NAME, help="First stage to run, with --force."),
+        click.Option(["--to", "--end-with", "last"], type=STAGE_NAME, help="Last stage to run."),
         *(options.stage_option(BY_NAME[owners[0]].options, name) for name, owners in OWNERS.items()),
         DELIVER,
         SET,
         options.FORGET,
         options.DRY_RUN,
-        options.force_option("Run the stages even if their products are current."),
+        click.Option(["--force"], is_flag=True, help="Run the stages even if their products are current."),
         options.JSON,
     ],
     callback=click.pass_context(_run),

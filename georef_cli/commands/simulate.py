@@ -41,7 +41,7 @@ command = Command(
             ["directory"], type=click.Path(file_okay=False, resolve_path=True, path_type=Path), metavar="DIR"
         ),
         *options.stage_options(SimulateOptions),
-        options.force_option("Replace an earlier simulation in DIR."),
+        click.Option(["--force"], is_flag=True, help="Replace an earlier simulation in DIR."),
         options.JSON,
     ],
     callback=click.pass_context(_simulate),

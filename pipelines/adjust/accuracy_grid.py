@@ -85,10 +85,6 @@ class AccuracyGrid:
         raster[self.cell[:, 1], self.cell[:, 0]] = values
         return raster
 
-    def sigma_at(self, position_in_geo: FloatArray) -> FloatArray:
-        """Return σ (N, 3) east, north, up at points (N, 3) of the scene, in metres."""
-        return np.asarray(np.sqrt(np.diagonal(self.cov_at(position_in_geo), axis1=1, axis2=2)))
-
     def cov_at(self, position_in_geo: FloatArray) -> FloatArray:
         """Return the covariance (N, 3, 3) of each of the points (N, 3) of the scene, in m².
 

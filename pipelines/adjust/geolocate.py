@@ -19,6 +19,7 @@ from pipelines.adjust.alignment import Alignment, Correspondences, RotationPrior
 from pipelines.adjust.measurements import RecordedRotations, attitude_prior, fix_correspondences, recorded_rotations
 from pipelines.adjust.options import GeolocateOptions
 from pipelines.core.errors import DegenerateGeometryError, InputError
+from pipelines.core.products import save_npz
 from pipelines.core.sentences import listed
 from pipelines.core.stages import SPARSE
 from pipelines.core.types import BoolArray, FloatArray, IntArray
@@ -54,7 +55,7 @@ def run(stage: StageRun, options: GeolocateOptions) -> Summary:
     model = read_sparse(stage.workspace.path(SPARSE))
     geolocation = geolocate(survey, model, options)
     points, cloud = geolocation.points, stage.out / "points.ply"
-    points.save(stage.out / "points.npz")
+    save_npz(stage.out / "points.npz", vars(points))
     write_point_ply(cloud, points.position_in_geo, model.point_rgb, geolocation.sigma_m, points.inlier)
     return Summary(geolocation.key_figure, _values(points), geolocation.warnings)
 

@@ -117,7 +117,8 @@ class Posterior:
         The points share the errors of similarity, cameras and lens. Those of the marks are independent.
         """
         jacobian = self._jacobian(point_in_geo, rays.point, rays.camera, rays.sigma_px)
-        return np.asarray(self._jointly(point_in_geo, jacobian) + block_diag(*self._cov_of_marks(jacobian)))
+        joint = self.normal.covariance(*self._derivatives(jacobian)) + self._second_order(point_in_geo)
+        return np.asarray(joint + block_diag(*self._cov_of_marks(jacobian)))
 
     def of_scene(self, point_in_geo: FloatArray, point: IntArray, camera: IntArray) -> FloatArray:
         """Return the covariance (J, 3, 3) in m² of points (J, 3) of the scene, without errors of marks.
@@ -129,7 +130,8 @@ class Posterior:
 
     def jointly_of_scene(self, point_in_geo: FloatArray, point: IntArray, camera: IntArray) -> FloatArray:
         """Return the joint covariance (3 J, 3 J) in m² of points of the scene; arguments as of `of_scene`."""
-        return self._jointly(point_in_geo, self._jacobian(point_in_geo, point, camera))
+        jacobian = self._jacobian(point_in_geo, point, camera)
+        return self.normal.covariance(*self._derivatives(jacobian)) + self._second_order(point_in_geo)
 
     def of_tie_points(self, point_in_geo: FloatArray, point: IntArray, camera: IntArray) -> FloatArray:
         """Return the covariance (J, 3, 3) in m² of tie points, errors of their own image observations included.
@@ -180,15 +182,14 @@ class Posterior:
         cov[np.bincount(point, minlength=len(cov)) < 2] = np.nan
         return cov
 
-    def _jointly(self, point_in_geo: FloatArray, jacobian: IntersectionJacobian) -> FloatArray:
-        """Return the joint covariance of points, with the second-order error of the similarity.
+    def _second_order(self, point_in_geo: FloatArray) -> FloatArray:
+        """Return the second-order part (3 J, 3 J) of the joint covariance of points (J, 3): that of the similarity.
 
         Relative positions are known far better than the similarity, so that the square of a rotation can exceed
         their σ.
         """
         pivot = np.array(self.solution.geo_from_model.pivot)
-        of_similarity = second_moment_at(point_in_geo, self.of_similarity, pivot)
-        return self.normal.covariance(*self._derivatives(jacobian)) + of_similarity
+        return second_moment_at(point_in_geo, self.of_similarity, pivot)
 
     def _jacobian(
         self, point_in_geo: FloatArray, point: IntArray, camera: IntArray, sigma_px: FloatArray | None = None

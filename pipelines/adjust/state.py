@@ -48,10 +48,6 @@ class SystematicErrors:
     def __len__(self) -> int:
         return 3 * len(self.blocks)
 
-    @property
-    def sigma(self) -> FloatArray:
-        return np.array([block.sigma for block in self.blocks], dtype=np.float64).reshape(-1)
-
     def columns(self, name: ErrorName, session: int | None = None) -> slice | None:
         """Return the place of an error in v; None if it is not among them."""
         places = (i for i, block in enumerate(self.blocks) if (block.name, block.session) == (name, session))

@@ -32,6 +32,7 @@ from pipelines.core.errors import ConvergenceError, DegenerateGeometryError
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.geometry.bundle import BundleInformation
 from pipelines.geometry.cameras import CameraPoses
+from pipelines.geometry.rotations import skew
 from pipelines.geometry.similarity import perturbation
 from pipelines.geometry.sparse_cholesky import SparseCholesky
 from pipelines.robust.statistics import NOISE_WEIGHT, cauchy_loss, cauchy_weight
@@ -96,7 +97,11 @@ class Problem:
         return np.asarray(modes.T @ (self.bundle.sums.poses @ modes))
 
     def at(self, state: State) -> At:
-        return At.of(state, self.base, self.errors)
+        poses, turn = state.poses(self.base), skew(state.correction[:, :3])
+        # Exp(−(ω + δ)) = Exp(−ω) Exp(−J δ) with J = I + ½ [ω] + ⅙ [ω]² + …
+        jacobian = np.eye(3) + turn / 2 + turn @ turn / 6
+        rotation, center = poses.cam_from_model, poses.cam_center_in_model
+        return At(rotation, center, state.geo_from_model, state.lens, self.errors, state.errors, jacobian)
 
     def residuals(self, state: State) -> dict[str, FloatArray]:
         at = self.at(state)
@@ -212,12 +217,8 @@ class NormalMatrix:
         """
         response = self.response.reshape(len(self.position), 6, -1)[camera]
         across = by_border - by_pose @ response
-        within = by_pose @ self._camera_blocks[camera] @ np.swapaxes(by_pose, 1, 2)
+        within = by_pose @ self.factor.inverse_diagonal[camera] @ np.swapaxes(by_pose, 1, 2)
         return np.asarray(within + self._of_border(across))
-
-    @cached_property
-    def _camera_blocks(self) -> FloatArray:
-        return self.factor.inverse_diagonal()
 
     def _of_border(self, left: FloatArray) -> FloatArray:
         """Return the products left S⁻¹ leftᵀ (…, m, m) of border vectors (…, m, b)."""

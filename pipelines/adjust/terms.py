@@ -13,9 +13,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from pipelines.adjust.state import State, SystematicErrors
+from pipelines.adjust.state import SystematicErrors
 from pipelines.core.types import FloatArray, IntArray
-from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.rotations import exp_so3, log_so3, right_jacobian_inverse_so3, skew
 from pipelines.geometry.similarity import Similarity, jacobian_at
 
@@ -39,14 +38,6 @@ class At:
     errors: SystematicErrors
     vector: FloatArray
     turn_by_correction: FloatArray
-
-    @classmethod
-    def of(cls, state: State, base: CameraPoses, errors: SystematicErrors) -> At:
-        poses, turn = state.poses(base), skew(state.correction[:, :3])
-        # Exp(−(ω + δ)) = Exp(−ω) Exp(−J δ) with J = I + ½ [ω] + ⅙ [ω]² + …
-        jacobian = np.eye(3) + turn / 2 + turn @ turn / 6
-        rotation, center = poses.cam_from_model, poses.cam_center_in_model
-        return cls(rotation, center, state.geo_from_model, state.lens, errors, state.errors, jacobian)
 
     def geo_from_cam(self, camera: IntArray) -> FloatArray:
         """Return the rotations geo ← cam (K, 3, 3) of cameras (K,)."""

@@ -13,8 +13,9 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 
 from pipelines.compare.configurations import BY_CONFIGURATION, COMMON_TRAIN_OPTIONS, Configuration, write_comparison
-from pipelines.compare.table import ComparedRow, Comparison, point_accuracy, surface_accuracy
+from pipelines.compare.table import ComparedRow, Comparison, PointAccuracy, surface_accuracy
 from pipelines.core.errors import ConvergenceError, DegenerateGeometryError, GeorefError
+from pipelines.core.options import read_requests, remember
 from pipelines.core.products import union
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.runner import Outcome, run_pipeline, run_stage
@@ -82,14 +83,14 @@ def compare(
     """
     must_exist(workspace)
     with workspace.lock(FOLDER):
-        requests = workspace.requests()
+        requests = read_requests(workspace.root)
         asked = {**requests.get("train", {}), **requests.get(FOLDER, {}), **flags}
         asked = {name: value for name, value in asked.items() if name in COMMON_TRAIN_OPTIONS}
         plans = [(configuration, tuple(_plan(workspace, configuration, asked))) for configuration in configurations]
         for _, plan in plans:
             for planned in plan:
                 stage_config(planned.variant, planned.spec, planned.flags)  # a bad option costs no hours
-        workspace.remember({FOLDER: asked})
+        remember(workspace.root, {FOLDER: asked})
     shared = run_pipeline(workspace, _SHARED, {}, progress=progress, around=lambda spec: around(workspace, spec))
     with workspace.lock(FOLDER):
         runner = _PlanRunner([ComparedStage(None, outcome) for outcome in shared], force, progress, around)
@@ -109,21 +110,21 @@ def _plan(workspace: Workspace, configuration: Configuration, asked: Flags) -> I
     seed = {"seed": asked["seed"]} if "seed" in asked else {}
     lent = dict(shared)  # folders that the variant reads and does not write
     if configuration.sim3 is None:
-        yield VariantStage(workspace.variant(variant_folder, shared, FOLDER), ADJUST, seed)
+        yield VariantStage(Workspace(root / variant_folder, workspace, shared, FOLDER), ADJUST, seed)
         lent |= dict.fromkeys(("sfm", _INIT.folder), root / variant_folder / ADJUST.folder)
     if configuration.trained_by is not None:
         trainer = BY_CONFIGURATION[configuration.trained_by]
         plan = _plan(workspace, trainer, asked)
         yield from (planned for planned in plan if planned.spec is not _EVALUATE)
         lent[_TRAIN.folder] = root / FOLDER / trainer.name / _TRAIN.folder
-    variant = workspace.variant(variant_folder, lent, FOLDER)
+    variant = Workspace(root / variant_folder, workspace, lent, FOLDER)
     if configuration.sim3 is not None:
         yield VariantStage(variant, _INIT, {**configuration.sim3, "max_residual": None, **seed})
     if configuration.trained_by is None:
         yield VariantStage(variant, _TRAIN, {**asked, **configuration.train})
     similarity = "trained" if configuration.trained_by is None else "initial"
     backend = {"backend": asked["backend"]} if "backend" in asked else {}
-    evaluated = workspace.requests().get(_EVALUATE.name, {})
+    evaluated = read_requests(workspace.root).get(_EVALUATE.name, {})
     yield VariantStage(variant, _EVALUATE, {**evaluated, **backend, "similarity": similarity})
 
 
@@ -187,8 +188,8 @@ def _row(configuration: Configuration, plan: Sequence[VariantStage], runner: _Pl
         test_psnr_covered=test.psnr_covered,
         test_covered_share=test.covered_share,
         test_ssim=test.ssim,
-        camera=point_accuracy(report.checkpoints.camera),
-        model=point_accuracy(report.checkpoints.model),
+        camera=PointAccuracy.model_validate(report.checkpoints.camera, from_attributes=True),
+        model=PointAccuracy.model_validate(report.checkpoints.model, from_attributes=True),
         reference=surface_accuracy(report.reference),
         iterations=training.get("iterations"),
         gaussians=training.get("gaussians"),

@@ -8,7 +8,6 @@ from typing import Literal
 from pipelines.core.figures import ERRORS, MISSING, SHORT_WAYS, WAYS
 from pipelines.core.products import Caution, Product
 from pipelines.report.plots.charts import BarChart
-from pipelines.survey.report import CheckPointErrors
 from pipelines.survey.report_parts import ReferenceComparison
 
 # Errors of the check points that the table shows: the way of measuring (key of `WAYS`), field of `PointAccuracy`.
@@ -79,10 +78,6 @@ class Comparison(Product):
     format_version: Literal[1] = 1
     options: dict[str, JsonScalar]
     rows: tuple[ComparedRow, ...]
-
-
-def point_accuracy(errors: CheckPointErrors) -> PointAccuracy:
-    return PointAccuracy(**{name: getattr(errors, name) for name in PointAccuracy.model_fields})
 
 
 def surface_accuracy(reference: ReferenceComparison | None) -> SurfaceAccuracy | None:

@@ -125,7 +125,7 @@ def input_markers(options_type: type[StageOptions]) -> dict[str, InputMarker]:
     return {
         name: mark
         for name, info in options_type.model_fields.items()
-        for mark in _marks(info)
+        for mark in marks_of(info)
         if isinstance(mark, InputMarker)
     }
 
@@ -139,7 +139,8 @@ def input_paths(options: StageOptions) -> dict[str, Path]:
 def decisive_fields(options_type: type[StageOptions]) -> list[str]:
     """Return the options whose values decide a stage's result: all but those of effort, and paths of inputs."""
     fields = options_type.model_fields
-    return [name for name, info in fields.items() if not has_mark(info, EffortMarker, InputMarker)]
+    inputs = input_markers(options_type)
+    return [name for name, info in fields.items() if name not in inputs and EFFORT not in marks_of(info)]
 
 
 def as_flags(options: StageOptions, names: Collection[str]) -> str:
@@ -154,11 +155,6 @@ def as_flags(options: StageOptions, names: Collection[str]) -> str:
         else:
             words += [flag, notation(value)]
     return " ".join(words)
-
-
-def has_mark(info: FieldInfo, *kinds: type) -> bool:
-    """Return whether an option has a mark of one of these kinds."""
-    return any(isinstance(mark, kinds) for mark in _marks(info))
 
 
 def names_of_flags(options_type: type[StageOptions], flags: Collection[str]) -> list[str]:
@@ -273,7 +269,7 @@ def load_toml(path: Path, stages: Collection[str]) -> dict[str, dict[str, Any]]:
     return document
 
 
-def _marks(info: FieldInfo) -> list[object]:
+def marks_of(info: FieldInfo) -> list[object]:
     """Return a field's marks, with those that `… | None` hides in a member of the union."""
     members = getattr(info.annotation, "__args__", ())
     return [*info.metadata, *(mark for member in members for mark in getattr(member, "__metadata__", ()))]
@@ -300,7 +296,7 @@ def remembered(
 
 
 def read_requests(root: Path) -> dict[str, dict[str, Any]]:
-    """Return the options that the stages of a workspace were last requested with, by stage.
+    """Return the options that stages were last requested with, by stage; `georef run` starts from them.
 
     Input paths are remembered as absolute paths, with the place of the workspace. A path that is gone after the
     workspace was moved is looked for where it would lie if it had been moved along.
@@ -327,9 +323,10 @@ def read_requests(root: Path) -> dict[str, dict[str, Any]]:
     }
 
 
-def write_requests(root: Path, flags: Mapping[str, Mapping[str, Any]]) -> None:
-    """Record the options that stages are requested with, by stage."""
-    document = {**{stage: dict(given) for stage, given in flags.items()}, _PLACE: {"root": str(root)}}
+def remember(root: Path, flags: Mapping[str, Mapping[str, Any]]) -> None:
+    """Record the options that some stages are requested with, by stage."""
+    asked = {**read_requests(root), **flags}
+    document = {**{stage: dict(given) for stage, given in asked.items()}, _PLACE: {"root": str(root)}}
     replace_text(root / REQUESTS, json.dumps(document, indent=1, default=str) + "\n")
 
 

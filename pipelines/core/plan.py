@@ -11,7 +11,7 @@ from typing import Any, Literal
 from pipelines.core import staleness
 from pipelines.core.errors import InputError
 from pipelines.core.manifest import Memo
-from pipelines.core.options import StageOptions, flag_name, input_paths, load_toml
+from pipelines.core.options import StageOptions, flag_name, input_paths, load_toml, read_requests
 from pipelines.core.stages import BY_NAME, StageSpec
 from pipelines.core.staleness import BY_HAND, Flags
 from pipelines.core.workspace import Workspace
@@ -38,7 +38,7 @@ def option_origins(workspace: Workspace, spec: StageSpec, flags: Flags | None = 
     Raises:
         InputError: an option is unknown or invalid.
     """
-    remembered = workspace.requests().get(spec.name, {})
+    remembered = read_requests(workspace.root).get(spec.name, {})
     asked = remembered if flags is None else flags
     options = staleness.stage_config(workspace, spec, asked)
     table = load_toml(workspace.config_file, BY_NAME).get(spec.name, {})
@@ -160,7 +160,7 @@ def photograph_folder(workspace: Workspace, image_dir: str) -> Path:
         return named
     spec = BY_NAME["ingest"]
     with contextlib.suppress(InputError):
-        options = staleness.stage_config(home, spec, home.requests().get(spec.name, {}))
+        options = staleness.stage_config(home, spec, read_requests(home.root).get(spec.name, {}))
         images: Path | None = getattr(options, "images", None)
         if images is not None and images.is_dir():
             return images

@@ -86,10 +86,6 @@ class ArrayProduct:
 
     FORMS: ClassVar[dict[str, tuple[Any, ...] | None]]
 
-    def save(self, path: Path) -> None:
-        """Write the product as NPZ."""
-        save_npz(path, vars(self))
-
     @classmethod
     def load(cls, path: Path) -> Self:
         """Read the product from NPZ.

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -29,13 +30,13 @@ from pipelines.core.files import remove, replace_text
 from pipelines.core.fingerprints import library_versions
 from pipelines.core.lock import WriteLock
 from pipelines.core.manifest import MANIFEST, Manifest, Memo, record_files
-from pipelines.core.options import REQUESTS, remembered
+from pipelines.core.options import REQUESTS, read_requests, remember, remembered
 from pipelines.core.products import AT_END, union
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.sentences import duration
 from pipelines.core.stages import STAGES, StageSpec, products_of
 from pipelines.core.staleness import BY_HAND, Flags, Request
-from pipelines.core.workspace import Resume, StageRun, Summary, Workspace, now
+from pipelines.core.workspace import Resume, StageRun, Summary, Workspace
 
 log = logging.getLogger(__name__)
 
@@ -130,14 +131,14 @@ def run_stage(
             previous = None
         if previous is None and not force:
             staleness.refuse_loss(workspace, spec, asked.options, asked.inputs.hashes)
-        before = workspace.requests().get(spec.name, {})
-        workspace.remember({spec.name: flags})
+        before = read_requests(workspace.root).get(spec.name, {})
+        remember(workspace.root, {spec.name: flags})
         if previous is not None:
             return Outcome(spec.name, False, _with_present_files(workspace, asked, previous))
         try:
             manifest = _execute(workspace, asked, "never" if force else resume, progress, place)
         except InputError:
-            workspace.remember({spec.name: before})
+            remember(workspace.root, {spec.name: before})
             raise
         return Outcome(spec.name, True, manifest)
 
@@ -169,7 +170,7 @@ def run_pipeline(
     """
     if stages[0].reads:
         staleness.must_exist(workspace)
-    before = workspace.requests()
+    before = read_requests(workspace.root)
     asked = remembered(workspace.root, [spec.name for spec in stages], flags, forget)
     for spec in stages:
         options = staleness.stage_config(workspace, spec, asked[spec.name])
@@ -178,7 +179,7 @@ def run_pipeline(
     outcomes: list[Outcome] = []
     with no_traces_of_refusal(workspace):
         with workspace.lock("run"):
-            workspace.remember(asked)
+            remember(workspace.root, asked)
         try:
             for number, spec in enumerate(stages, start=1):
                 with around(spec):
@@ -196,7 +197,7 @@ def run_pipeline(
             done = {outcome.stage for outcome in outcomes}
             refused = [spec.name for spec in stages if spec.name not in done]
             with workspace.lock("run"):
-                workspace.remember({name: before.get(name, {}) for name in refused})
+                remember(workspace.root, {name: before.get(name, {}) for name in refused})
             raise
     return outcomes
 
@@ -235,7 +236,7 @@ def _execute(workspace: Workspace, asked: Request, resume: Resume, progress: Pro
             log.info("%s: goes on with an interrupted run: %s", spec.name, found)
         else:
             log.warning("%s: starts afresh; what an interrupted run had done is dropped: %s", spec.name, found)
-    started, clock = now(), time.monotonic()
+    started, clock = datetime.now(UTC).replace(microsecond=0), time.monotonic()
     summary = _run(workspace, asked, resume, progress, place)
     for product in products_of(spec):
         if not (partial.folder / product.removeprefix(f"{spec.folder}/")).exists():
@@ -324,7 +325,7 @@ def _current(workspace: Workspace, asked: Request, memo: Memo) -> Manifest | Non
             config={},
             inputs=asked.inputs.hashes,
             versions={},
-            started=now(),
+            started=datetime.now(UTC).replace(microsecond=0),
             duration_s=0.0,
             key_figure=BY_HAND,
             values={},

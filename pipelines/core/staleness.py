@@ -16,8 +16,9 @@ from typing import Any, Literal
 
 from pipelines.core.errors import InputError, MissingProductError
 from pipelines.core.fingerprints import Fingerprints, fingerprints
+from pipelines.core.lock import WriteLock
 from pipelines.core.manifest import MANIFEST, Manifest, Memo
-from pipelines.core.options import StageOptions, as_flags, decisive_fields, load_toml, resolve
+from pipelines.core.options import StageOptions, as_flags, decisive_fields, load_toml, read_requests, resolve
 from pipelines.core.products import Caution, union
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import BY_NAME, DELIVERABLES, PIPELINE, StageSpec, producer_of, products_of
@@ -127,7 +128,7 @@ def continuing_command(workspace: Workspace, spec: StageSpec) -> str:
     before = _options_of_partial(workspace, spec)
     if before is None or workspace.base is not None:
         return command
-    now = stage_config(workspace, spec, workspace.requests().get(spec.name, {}))
+    now = stage_config(workspace, spec, read_requests(workspace.root).get(spec.name, {}))
     other = [name for name in decisive_fields(spec.options) if getattr(now, name) != getattr(before, name)]
     return f"{command} {as_flags(before, other)}".rstrip()
 
@@ -197,7 +198,7 @@ def status(workspace: Workspace, memo: Memo | None = None, before: StageSpec | N
     """
     must_exist(workspace)
     memo = {} if memo is None else memo
-    requests, writer = workspace.requests(), workspace.writer()
+    requests, writer = read_requests(workspace.root), WriteLock(workspace.root).activity()
     begun = [
         spec
         for spec in (DELIVERABLES if before is None else ())

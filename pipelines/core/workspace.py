@@ -12,7 +12,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,7 +20,7 @@ from pipelines.core.errors import InputError, MissingProductError, storage_failu
 from pipelines.core.files import remove, replace_file, replace_folder, replace_text, sync_tree
 from pipelines.core.lock import WriteLock
 from pipelines.core.manifest import MANIFEST, Manifest, Memo, damaged_files
-from pipelines.core.options import CONFIG_FILE, REQUESTS, read_requests, write_requests
+from pipelines.core.options import CONFIG_FILE, REQUESTS
 from pipelines.core.products import Caution, load_json, save_json
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import STAGES, StageSpec, producer_of, products_of
@@ -171,10 +171,6 @@ class Workspace:
     lent: Mapping[str, Path] = field(default_factory=dict, hash=False)
     command: str = ""
 
-    def variant(self, place: str, lent: Mapping[str, Path], command: str) -> Workspace:
-        """Return a variant in a folder of this workspace, in which some stages run with other options."""
-        return Workspace(self.root / place, self, lent, command)
-
     def path(self, product: str) -> Path:
         """Return the path of a finished product; a MissingProductError names the command that makes it."""
         folder, _, inside = product.partition("/")
@@ -244,10 +240,6 @@ class Workspace:
         begun = (self.root / REQUESTS, *(self.partial(spec) for spec in STAGES))
         return self.has_product() or any(path.exists() for path in begun)
 
-    def writer(self) -> str | None:
-        """Return the activity of the process that is writing now (`train`), or None."""
-        return WriteLock(self.root).activity()
-
     def _recover(self, spec: StageSpec) -> None:
         final, old = self.root / spec.folder, self.root / f".{spec.folder}.old"
         if (self.partial(spec) / MANIFEST).exists():  # complete: only the renames are missing
@@ -307,14 +299,6 @@ class Workspace:
             target.parent.mkdir(parents=True, exist_ok=True)
             (self.root / name).replace(target)
 
-    def requests(self) -> dict[str, dict[str, Any]]:
-        """Return the flags that stages were last requested with, by stage; `georef run` starts from them."""
-        return read_requests(self.root)
-
-    def remember(self, flags: Mapping[str, Mapping[str, Any]]) -> None:
-        """Record the flags that some stages are requested with, by stage."""
-        write_requests(self.root, {**self.requests(), **flags})
-
 
 def _refuse_what_is_no_folder(folder: Path) -> None:
     if folder.is_symlink():
@@ -325,8 +309,3 @@ def _refuse_what_is_no_folder(folder: Path) -> None:
         )
     if folder.exists() and not folder.is_dir():
         raise InputError("is a file where the stage's folder belongs: move it away", path=folder)
-
-
-def now() -> datetime:
-    """Return the present time for manifests: UTC, whole seconds."""
-    return datetime.now(UTC).replace(microsecond=0)

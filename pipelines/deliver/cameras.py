@@ -91,14 +91,13 @@ def run(stage: StageRun, options: ExportCamerasOptions) -> Summary:
     if np.isfinite(table.sigma_enu_m).all():
         east, north, up = table.sigma_enu_m.T
         sigma = scene_sigma("positions of the cameras: similarity, cameras and lens", np.hypot(east, north), up)
-
-    def stated(target: TargetCrs, places: FloatArray) -> CrsSidecar:
-        return target.sidecar([places.min(axis=0), places.max(axis=0)], accuracy, sigma, cautions)
-
     on_ellipsoid = TargetCrs(parse_crs("EPSG:4979"), crs.origin, corner_lla)
-    write_sidecar(stated(on_ellipsoid, corner_lla[:, [1, 0, 2]]), stage.out / "footprints.geojson")
+    corner = corner_lla[:, [1, 0, 2]]
+    of_footprints = on_ellipsoid.sidecar([corner.min(axis=0), corner.max(axis=0)], accuracy, sigma, cautions)
+    write_sidecar(of_footprints, stage.out / "footprints.geojson")
     write_camera_table(stage.out / "cameras.csv", table)
-    sidecar = stated(crs, table.position)
+    position = table.position
+    sidecar = crs.sidecar([position.min(axis=0), position.max(axis=0)], accuracy, sigma, cautions)
     write_sidecar(sidecar, stage.out / "cameras.csv")
     return _summary(table, model, sidecar, union(cautions, lens_limits))
 

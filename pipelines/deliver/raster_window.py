@@ -265,7 +265,7 @@ def _georeference_sigma(
     columns, rows = (np.linspace(0, size, size // _NODE_PX + 2) for size in (frame.columns, frame.rows))
     cell = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
     in_geo = _in_geo(source, frame, cell, np.full(len(cell), np.nanmedian(height)))
-    sigma = source.sigma.sigma_at(in_geo)
+    sigma = np.sqrt(np.diagonal(source.sigma.cov_at(in_geo), axis1=1, axis2=2))
     shape = (len(rows), len(columns))
     spread = _spread(rows, frame.rows), _spread(columns, frame.columns)
     horizontal, vertical = np.hypot(sigma[:, 0], sigma[:, 1]).reshape(shape), sigma[:, 2].reshape(shape)

@@ -249,9 +249,11 @@ def fit_local_crs(crs: PointCrs, origin_lla: ArrayLike, half_extent_m: Vector3) 
     )
     plan_m = crs.horizontal_unit * (SEMI_MAJOR_M if crs.is_geographic else 1.0)
     unit_m = np.array([plan_m, plan_m, crs.height_unit_m])
-    values = _coordinates(crs, origin_lla, np.vstack([nodes, checks]) * half_extent_m)
-    solved = np.linalg.lstsq(_powers(nodes), values[: len(nodes)], rcond=None)[0]
-    errors = np.abs(_powers(checks) @ solved - values[len(nodes) :]).max(axis=0)
+    places = np.vstack([nodes, checks])
+    values = _coordinates(crs, origin_lla, places * half_extent_m)
+    powers = np.stack([np.prod(places ** np.array(exponents), axis=1) for exponents in _EXPONENTS], axis=1)
+    solved = np.linalg.lstsq(powers[: len(nodes)], values[: len(nodes)], rcond=None)[0]
+    errors = np.abs(powers[len(nodes) :] @ solved - values[len(nodes) :]).max(axis=0)
     decimals = np.clip(np.floor(-np.log10(2 * errors + 1e-12)), 0, _MOST_DECIMALS + np.round(np.log10(unit_m)))
     axes = [
         Axis(name=name, unit=_SHORT_UNIT.get(unit, unit), decimals=int(count))
@@ -264,10 +266,6 @@ def fit_local_crs(crs: PointCrs, origin_lla: ArrayLike, half_extent_m: Vector3) 
         coefficients=tuple((x, y, z) for x, y, z in solved.tolist()),
         error_m=float((errors * unit_m).max()),
     )
-
-
-def _powers(unit: FloatArray) -> FloatArray:
-    return np.stack([np.prod(unit ** np.array(powers), axis=1) for powers in _EXPONENTS], axis=1)
 
 
 def _coordinates(crs: PointCrs, origin_lla: ArrayLike, enu: FloatArray) -> FloatArray:

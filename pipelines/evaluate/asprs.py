@@ -108,13 +108,9 @@ def error_stats(error_in_geo: ArrayLike) -> ErrorStats:
     )
 
 
-def classes_cm(rmse: Rmse) -> tuple[int, int]:
-    """Return the smallest class, horizontal and vertical, in whole centimetres; the standard allows any number."""
-    return _class_cm(rmse.rmse_h_m), _class_cm(rmse.rmse_v_m)
-
-
-def _class_cm(rmse_m: float) -> int:
-    return max(math.ceil(100 * rmse_m - 1e-9), 1)
+def classes_cm(*rmse_m: float) -> list[int]:
+    """Return the smallest class of each RMSE in whole centimetres; the standard allows any number."""
+    return [max(math.ceil(100 * value - 1e-9), 1) for value in rmse_m]
 
 
 def least_points(area_km2: float | None) -> int:
@@ -150,8 +146,8 @@ def _statement(
         under = f"RMSE_V {100 * vegetated.rmse_v_m:.1f} cm at {vegetated.count} points under vegetation (VVA)"
     if tested is None:
         return asprs.model_copy(update={"statement": under or None})
-    horizontal, vertical = (f"{class_cm} cm" for class_cm in classes_cm(tested))
-    class_3d = f"{_class_cm(tested.rmse_3d_m)} cm"
+    classes_of = classes_cm(tested.rmse_h_m, tested.rmse_v_m, tested.rmse_3d_m)
+    horizontal, vertical, class_3d = (f"{class_cm} cm" for class_cm in classes_of)
     sample = f"tested on {count} check points: " if asprs.enough_points else f"{few_points(asprs)}. "
     classes = {"horizontal_class": horizontal, "vertical_class": vertical, "class_3d": class_3d}
     statement = (
@@ -193,5 +189,5 @@ def _blunders(error: FloatArray, variance: FloatArray) -> BoolArray:
 
 def _beyond(size: FloatArray, others: Rmse) -> BoolArray:
     """Return the mask (N,) of errors (N, 2), horizontal and vertical, beyond three times the class of `others`."""
-    allowed_m = BLUNDER_FACTOR * np.array(classes_cm(others)) / 100
+    allowed_m = BLUNDER_FACTOR * np.array(classes_cm(others.rmse_h_m, others.rmse_v_m)) / 100
     return np.asarray((size > allowed_m).any(axis=1))

@@ -50,11 +50,6 @@ class RemeasuredPoints:
         """Mask (J,) of the points that were measured."""
         return np.asarray(np.isfinite(self.error_in_geo).all(axis=1))
 
-    @property
-    def cov_survey(self) -> FloatArray:
-        """Covariances (J, 3, 3) of the surveyed positions in m²."""
-        return np.array([point.cov_in_geo for point in self.points]).reshape(-1, 3, 3)
-
 
 def check_point_errors(measured: RemeasuredPoints, area_km2: float | None) -> CheckPointErrors:
     """Return the report's section on check points; the area is that of the scene, None: not known."""
@@ -83,7 +78,8 @@ def _residuals(measured: RemeasuredPoints) -> tuple[PointResidual, ...]:
 def _assess(measured: RemeasuredPoints, area_km2: float | None = None) -> Assessment:
     known = measured.is_measured
     vegetated = np.array([point.land_cover == "vegetated" for point in measured.points], dtype=bool)
-    return assess(measured.error_in_geo[known], measured.cov_survey[known], vegetated[known], area_km2)
+    cov_survey = [point.cov_in_geo for point in compress(measured.points, known)]
+    return assess(measured.error_in_geo[known], cov_survey, vegetated[known], area_km2)
 
 
 def _figures(measured: RemeasuredPoints, assessment: Assessment) -> dict[str, Any]:
@@ -138,7 +134,8 @@ def _predicted_sigma(measured: RemeasuredPoints) -> PredictedSigma | None:
     """
     if measured.cov_in_geo is None:
         return None
-    variance = np.diagonal(measured.cov_in_geo + measured.cov_survey, axis1=1, axis2=2)
+    cov_survey = np.array([point.cov_in_geo for point in measured.points]).reshape(-1, 3, 3)
+    variance = np.diagonal(measured.cov_in_geo + cov_survey, axis1=1, axis2=2)
     known = measured.is_measured & np.isfinite(variance).all(axis=1)
     normalised = ByAxis(e=None, n=None, u=None)
     if known.any():

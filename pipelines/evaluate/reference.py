@@ -232,35 +232,33 @@ _SEEN = 0.05
 
 def cautions_of_reference(found: ComparedReference) -> tuple[Caution, ...]:
     """Return the limits of a comparison with a reference."""
-    comparison, cautions = found.comparison, []
-
-    def warn(code: str, sentence: str) -> None:
-        cautions.append(Caution(code=code, sentence=sentence))
-
-    for assumption in found.assumptions:
-        warn("reference-heights", assumption[0].upper() + assumption[1:] + ".")
+    comparison = found.comparison
+    cautions = [
+        Caution(code="reference-heights", sentence=assumption[0].upper() + assumption[1:] + ".")
+        for assumption in found.assumptions
+    ]
     fine = max(comparison.spacing_m, comparison.model_spacing_m)
     least = comparison.groups[0].scores[0].threshold_m
     if fine > least:
-        warn(
-            "reference-spacing",
+        apart = (
             f"Points are {fine:.3f} m apart: shares within shorter distances, and C2C, say more about the "
-            "spacing than about the surface. M3C2 does not depend on it.",
+            "spacing than about the surface. M3C2 does not depend on it."
         )
+        cautions.append(Caution(code="reference-spacing", sentence=apart))
     shift = comparison.shift
     if shift is not None and comparison.aligned == "none":
         sigma = [max(s, comparison.georeference_sigma_m or 0.0, comparison.sigma_m) for s in shift.sigma_m]
         if any(abs(value) > _SHIFTED_SIGMAS * s for value, s in zip(shift.enu_m, sigma, strict=True)):
-            warn(
-                "reference-shifted",
+            off = (
                 "The model lies off the reference as a whole: moving it by "
                 f"{shift.enu_m[0]:+.3f} m east, {shift.enu_m[1]:+.3f} m north and {shift.enu_m[2]:+.3f} m up "
                 "fits best, which is more than three times the σ of both (--reference-align shift judges the "
-                "shape alone).",
+                "shape alone)."
             )
+            cautions.append(Caution(code="reference-shifted", sentence=off))
     if comparison.seen < _SEEN:
         seen = f"Photographs saw {100 * comparison.seen:.1f} % of the reference's points within the scene."
-        warn("reference-unseen", seen)
+        cautions.append(Caution(code="reference-unseen", sentence=seen))
     return tuple(cautions)
 
 

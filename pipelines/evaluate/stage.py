@@ -139,14 +139,17 @@ def _named(points: Sequence[SurveyedPoint], rows: Sequence[PointResidual]) -> Na
 def _coordinates(origin: Origin, crs: PointCrs | None) -> MapCoordinates:
     """Return the coordinates of places at the height of the origin."""
 
-    def lla(place: FloatArray) -> FloatArray:
-        return lla_from_ecef(ecef_from_enu(np.column_stack([place, np.zeros(len(place))]), origin))
+    served = None if crs is None or crs.is_geocentric else crs
 
-    if crs is None or crs.is_geocentric:
-        return MapCoordinates("WGS84", ("longitude", "latitude"), "°", lambda place: lla(place)[:, [1, 0]])
-    names = ("longitude", "latitude") if crs.is_geographic else ("easting", "northing")
-    unit = "°" if crs.units[0] == "degree" else {"metre": "m"}.get(crs.units[0], crs.units[0])
-    return MapCoordinates(crs.name, names, unit, lambda place: crs.xyz_from_lla(lla(place))[:, :2])
+    def coordinates(place: FloatArray) -> FloatArray:
+        lla = lla_from_ecef(ecef_from_enu(np.column_stack([place, np.zeros(len(place))]), origin))
+        return lla[:, [1, 0]] if served is None else served.xyz_from_lla(lla)[:, :2]
+
+    if served is None:
+        return MapCoordinates("WGS84", ("longitude", "latitude"), "°", coordinates)
+    names = ("longitude", "latitude") if served.is_geographic else ("easting", "northing")
+    unit = "°" if served.units[0] == "degree" else {"metre": "m"}.get(served.units[0], served.units[0])
+    return MapCoordinates(served.name, names, unit, coordinates)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
@@ -100,8 +100,9 @@ class SparseCholesky:
                 form += own.T @ own
         return form
 
+    @cached_property
     def inverse_diagonal(self) -> FloatArray:
-        """Return the diagonal blocks (n, w, w) of the inverse matrix."""
+        """Diagonal blocks (n, w, w) of the inverse matrix."""
         count = sum(len(front.own) for front in self._fronts)
         blocks, width = np.empty((count, self._width, self._width)), self._width
         for places, inverse in self._inverse_on_fronts():

@@ -12,7 +12,7 @@ import shutil
 from pathlib import Path
 
 from pipelines.core.errors import InputError
-from pipelines.core.products import save_json
+from pipelines.core.products import save_json, save_npz
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.ingest.bag_flight import count_frames, read_bag
@@ -41,7 +41,7 @@ def run(stage: StageRun, options: IngestOptions) -> Summary:
         survey = survey.model_copy(update={"image_dir": "ingest/images"})
     save_json(survey, stage.out / "survey.json")
     if track is not None:
-        track.save(stage.out / "track.npz")
+        save_npz(stage.out / "track.npz", vars(track))
     for assumption in survey.assumptions:
         log.info("assumed: %s", assumption)
     return _summary(survey)

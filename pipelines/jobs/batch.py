@@ -8,6 +8,7 @@ import logging
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
 from urllib.parse import quote
@@ -22,7 +23,6 @@ from pipelines.core.products import Caution, Product, union
 from pipelines.core.progress import Progress
 from pipelines.core.stages import REPORT, REPORT_PAGE
 from pipelines.core.staleness import cautions_by_stage
-from pipelines.core.workspace import now
 from pipelines.jobs.engine import Engine, Job, JobEnd
 from pipelines.jobs.missions import Mission, MissionList
 from pipelines.report.page import Page, Section, moment, render_page
@@ -145,7 +145,7 @@ def batch_page(table: BatchTable) -> Page:
     return Page(
         title=f"Batch: {table.batch}",
         subtitle=f"{len(table.missions)} missions: {table.states}",
-        about={"Program": f"GeoRefGS {__version__}", "Made": moment(now())},
+        about={"Program": f"GeoRefGS {__version__}", "Made": moment(datetime.now(UTC))},
         sections=(
             Section("missions", "Missions", "missions.html", facts),
             *([Section("failures", "Failures", "failures.html", facts)] if failed else []),

@@ -123,7 +123,8 @@ class BlockCost:
 
     def of(self, pixels: float, visible: float, gaussians: float) -> float:
         """Return the cost of a block with so many pixels and visible Gaussians in a view, and Gaussians in all."""
-        return float((_design(np.array([[pixels, visible, gaussians]])) @ self.coefficients).item())
+        terms = np.array([[1.0, pixels / 1e6, visible / 1e6, gaussians / 1e6]])
+        return float((terms @ self.coefficients).item())
 
     @staticmethod
     def fitted(sizes: FloatArray, measured: FloatArray) -> BlockCost:
@@ -133,17 +134,14 @@ class BlockCost:
             sizes: (B, 3) pixels, visible and all Gaussians of each block.
             measured: (B,) their cost.
         """
-        return BlockCost(nnls(_design(sizes) / measured[:, None], np.ones(len(measured)))[0])
+        terms = np.column_stack([np.ones(len(sizes)), sizes / 1e6])
+        return BlockCost(nnls(terms / measured[:, None], np.ones(len(measured)))[0])
 
 
 # Processor seconds of an iteration, fitted by examples/benchmarks/block_cost.py to 16 blocks of 7 000 … 51 000
 # Gaussians and 35 000 … 141 000 pixels a view, on one thread of an AMD EPYC, 2026-11-22. For a million Gaussians in
 # 1.2 megapixels it gives 1.0 s, and the measurements above 0.96 s.
 BLOCK_SECONDS = BlockCost(np.array([0.0046, 0.202, 1.20, 0.353]))
-
-
-def _design(sizes: FloatArray) -> FloatArray:
-    return np.column_stack([np.ones(len(sizes)), sizes / 1e6])
 
 
 class TimeLeft:

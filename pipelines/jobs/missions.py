@@ -17,7 +17,7 @@ from pydantic import ValidationError
 
 from pipelines.core.errors import GeorefError, InputError
 from pipelines.core.files import file_size
-from pipelines.core.options import CONFIG_FILE, REQUESTS, input_markers, load_toml, read_toml
+from pipelines.core.options import CONFIG_FILE, REQUESTS, input_markers, load_toml, read_requests, read_toml
 from pipelines.core.stages import BY_NAME, StageSpec, named_deliverables, stage_slice
 from pipelines.core.staleness import Flags
 from pipelines.core.validators import stays_inside
@@ -118,7 +118,7 @@ def _in_folder(folder: Path) -> MissionList:
         workspace = Workspace(root)
         known = {
             *load_toml(workspace.config_file, BY_NAME).get("ingest", {}),
-            *workspace.requests().get("ingest", {}),
+            *read_requests(workspace.root).get("ingest", {}),
         }
         usual = {
             option: root / name

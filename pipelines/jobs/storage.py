@@ -105,13 +105,13 @@ class Storage:
             (store, home), before = self._place(part), self.index(part)
             if writer == "worker" and before is not None and before.attempt != attempt:
                 raise StorageError(f"{part}: another attempt at the job has taken over")
-            held = set() if before is None else {_object(name, state) for name, state in before.files.items()}
+            held = set() if before is None else {_digest(name, *state) for name, state in before.files.items()}
             if urlsplit(self.url).scheme not in _WITHOUT_FOLDERS:
                 store.makedirs(home, exist_ok=True)
             while True:
                 files = dict(_files_of(folder / part))
                 try:
-                    keys = {name: _object(name, state) for name, state in files.items()}
+                    keys = {name: _digest(name, *state) for name, state in files.items()}
                     for names in _batches([name for name, key in keys.items() if key not in held]):
                         places = [f"{home}/{keys[name]}" for name in names]
                         store.put([str(folder / part / name) for name in names], places)
@@ -146,7 +146,7 @@ class Storage:
                     if not path.parent.resolve().is_relative_to(folder.resolve()):
                         raise InputError("a symbolic link leads out of the folder", path=path)
                 drafts = [path.with_name(path.name + _DRAFT) for path in paths]
-                objects = [f"{home}/{_object(name, index.files[name])}" for name in names]
+                objects = [f"{home}/{_digest(name, *index.files[name])}" for name in names]
                 store.get(objects, [str(draft) for draft in drafts])
                 for name, path, draft in zip(names, paths, drafts, strict=True):
                     time_ns = index.files[name][1]
@@ -221,12 +221,8 @@ def _batches(names: list[str]) -> Iterator[list[str]]:
         yield names[start : start + _AT_ONCE]
 
 
-def _object(name: str, state: tuple[int, int]) -> str:
-    return _digest(f"{name}\0{state[0]}\0{state[1]}")
-
-
-def _digest(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()[:32]
+def _digest(*parts: str | int) -> str:
+    return hashlib.sha256("\0".join(map(str, parts)).encode()).hexdigest()[:32]
 
 
 _SAVE_EVERY_S = 60.0

@@ -96,7 +96,8 @@ class AdjustedScene:
 
         An error that it does not have is zero, with the σ of its prior.
         """
-        value, sigma = np.zeros(len(errors)), errors.sigma
+        sigma = np.array([block.sigma for block in errors.blocks], dtype=np.float64).reshape(-1)
+        value = np.zeros(len(errors))
         for estimate in self.adjustment.estimated_errors:
             columns = errors.columns(estimate.name, estimate.session)
             if columns is not None:

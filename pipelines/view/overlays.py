@@ -133,7 +133,8 @@ class Overlays:
         point, shown = point[::every], shown[::every]
         limits = None
         if colour != "of the photographs" and grid is not None and len(point):
-            sigma = grid.sigma_at(self._trained.geo_from_model.apply(point))
+            cov = grid.cov_at(self._trained.geo_from_model.apply(point))
+            sigma = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
             values = np.hypot(sigma[:, 0], sigma[:, 1]) if colour == "by σ horizontal" else sigma[:, 2]
             low, high = np.quantile(values, [0.02, 0.98]).tolist()
             shown, limits = colours_of(values, low, high), (low, high)

@@ -237,35 +237,31 @@ class PictureLoop:
         drawn: Callable[[], None],
     ) -> None:
         self._client, self._painter, self._blend, self._told = client, painter, blend, drawn
-        self._changed, self._ended = threading.Event(), threading.Event()
+        self.changed, self._ended = threading.Event(), threading.Event()
         self._moving_px = 480.0
         self.drawn = 0  # pictures at full size
         self._thread = threading.Thread(target=self._run, daemon=True)
-        client.camera.on_update(lambda _: self.wake())
+        client.camera.on_update(lambda _: self.changed.set())
         self._thread.start()
-        self.wake()
-
-    def wake(self) -> None:
-        """Draw anew."""
-        self._changed.set()
+        self.changed.set()
 
     def end(self) -> None:
         """End the loop."""
         self._ended.set()
-        self._changed.set()
+        self.changed.set()
 
     def _run(self) -> None:
         while True:
-            self._changed.wait()
+            self.changed.wait()
             if self._ended.is_set():
                 return
-            self._changed.clear()
+            self.changed.clear()
             try:
                 began = time.monotonic()
                 self._draw(int(self._moving_px), _QUALITY_MOVING)
                 factor = np.clip(np.sqrt(_MOVING_S / max(time.monotonic() - began, 1e-3)), 0.5, 1.3)
                 self._moving_px = float(np.clip(self._moving_px * factor, _LEAST_PX, _MOST_PX))
-                if not self._changed.wait(_STILL_S):
+                if not self.changed.wait(_STILL_S):
                     self._draw(_MOST_PX, _QUALITY_STILL)
                     self.drawn += 1
                     self._told()

@@ -176,7 +176,7 @@ class Viewer:
     def wake(self) -> None:
         """Draw the pictures of all pages anew."""
         for loop in tuple(self.loops.values()):
-            loop.wake()
+            loop.changed.set()
 
     def _connected(self, client: viser.ClientHandle) -> None:
         with self._lock:

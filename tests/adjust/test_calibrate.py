@@ -234,9 +234,8 @@ def test_a_comparison_reads_the_calibration_where_it_is(tmp_path: Path, command:
     inputs, workspace = flown(tmp_path, Winding(count=24)), tmp_path / "ws"
     command("run", workspace, *arguments(inputs), "--time-offset", "auto", "--to", "geolocate")
     root = Workspace(workspace)
-    variant = root.variant(
-        "compare/A", {spec.folder: workspace / spec.folder for spec in stage_slice(None, "geolocate")}, "compare"
-    )
+    lent = {spec.folder: workspace / spec.folder for spec in stage_slice(None, "geolocate")}
+    variant = Workspace(workspace / "compare/A", root, lent, "compare")
     spec = BY_NAME["geolocate"]
     before = fingerprints(variant, spec, spec.options(), {}).hashes
     assert before == fingerprints(root, spec, spec.options(), {}).hashes

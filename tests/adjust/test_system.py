@@ -495,7 +495,7 @@ def test_two_sessions_with_unknown_errors_differ_by_their_priors_alone() -> None
     normal = linearised(sessions, start_of(sessions, GEO_FROM_MODEL)).normal(ones(sessions))
     sigma = np.sqrt(np.diag(normal.of_errors(LENSES, 6)))
     # All fixes share what both errors have in common: only their difference is observed.
-    prior = sessions.errors.sigma
+    prior = np.concatenate([block.sigma for block in sessions.errors.blocks])
     assert (sigma <= prior).all()
     common = 1 / np.sqrt(1 / prior[:3] ** 2 + 1 / prior[3:] ** 2)
     assert (sigma[:3] >= 0.99 * common).all()

@@ -14,6 +14,8 @@ from pathlib import Path
 import pytest
 
 from pipelines.core import child
+from pipelines.core.lock import WriteLock
+from pipelines.core.options import read_requests
 from pipelines.core.stages import BY_NAME
 from pipelines.core.workspace import Workspace
 from tests import fakes
@@ -96,7 +98,7 @@ def test_a_broken_one_is_told_and_the_others_finish(real_georef: Georef, with_fa
         "mill": (9, "global"),
         "broken": None,
     }
-    assert Workspace(tmp_path / "north").requests()["ingest"]["test_every"] == 3
+    assert read_requests(tmp_path / "north")["ingest"]["test_every"] == 3
     assert not (tmp_path / "north/calibrate").exists(), "the last stage is sfm"
     assert "ingest: started" in (tmp_path / "north/logs/ingest.log").read_text("utf-8")
     assert json.loads((tmp_path / "valley.batch.json").read_text("utf-8")) == first.document
@@ -138,7 +140,7 @@ def test_ctrl_c_stops_all_and_the_same_command_goes_on(
     assert ended.err.splitlines()[-1] == "interrupted"
     table = json.loads((tmp_path / f"{tmp_path.name}.batch.json").read_text("utf-8"))
     assert [row["state"] for row in table["missions"]] == ["interrupted"] * 2
-    assert all(Workspace(tmp_path / name).writer() is None for name in names), "no process is left behind"
+    assert all(WriteLock(tmp_path / name).activity() is None for name in names), "no process is left behind"
     planned = real_georef(*words, "--dry-run", "--json").document["missions"]
     assert [row["stages"]["train"] for row in planned] == ["resume"] * 2
     text = real_georef(*words, "--dry-run").out
@@ -187,7 +189,7 @@ def test_settings_reach_their_stage(georef: Georef, workspace: Workspace, photos
     """Texts of TOML, plain texts and paths, which become absolute."""
     words = ("--set", "sfm.seed=4", "--set", 'sfm.mapper="global"', "--set", "ingest.vertical=ellipsoidal")
     assert georef("run", workspace.root, "--images", photos, "--to", "sfm", *words).code == 0
-    requests = workspace.requests()
+    requests = read_requests(workspace.root)
     assert requests["sfm"] == {"seed": 4, "mapper": "global"}
     assert requests["ingest"] == {"images": str(photos), "vertical": "ellipsoidal"}
     assert georef("run", workspace.root, "--to", "sfm", "--set", "train.seed=4").code == 2

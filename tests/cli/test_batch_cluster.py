@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from pipelines.core.lock import WriteLock
+from pipelines.core.options import read_requests
 from pipelines.core.workspace import Workspace
 from tests import fakes
 from tests.cli_runs import Result, start
@@ -90,7 +92,7 @@ def test_killed_engine(tmp_path: Path) -> None:
         wait_until(lambda: len(steps_of(missions / "c")) > 3, "the third begins when one has ended")
         process.kill()
         process.communicate()
-        wait_until(lambda: all(Workspace(missions / name).writer() is None for name in "abc"), "the jobs stop")
+        wait_until(lambda: all(WriteLock(missions / name).activity() is None for name in "abc"), "the jobs stop")
         missing = [name for name in "abc" if len(steps_of(missions / name)) < STEPS]
         assert "c" in missing and len(missing) < 3
         ended = finish_patiently(batch(cluster, missions))
@@ -111,7 +113,7 @@ def test_killed_scheduler(tmp_path: Path) -> None:
         assert lost.document["error"]["code"] == "cluster" and "the scheduler is lost" in lost.err
         table = json.loads((missions / "missions.batch.json").read_text("utf-8"))
         assert {row["state"] for row in table["missions"]} == {"done", "interrupted"}
-        wait_until(lambda: all(Workspace(missions / name).writer() is None for name in "abc"), "the jobs stop")
+        wait_until(lambda: all(WriteLock(missions / name).activity() is None for name in "abc"), "the jobs stop")
         cluster.restart()
         ended = finish_patiently(batch(cluster, missions))
     assert_complete(ended, missions, "a", "b", "c", again=1)
@@ -178,6 +180,6 @@ def test_files_go_through_a_storage(tmp_path: Path) -> None:
         assert not list(scratch.glob("**/ingest")), "nothing is left on the workers"
     assert_complete(ended, missions, "one", "two", again=0)
     made = Workspace(missions / "one")
-    assert made.requests()["ingest"]["images"] == str(missions / "a/images"), "paths of this machine"
+    assert read_requests(made.root)["ingest"]["images"] == str(missions / "a/images"), "paths of this machine"
     planned = finish_patiently(start("batch", listed, "--to", "train", "--dry-run", "--json", code=PLAIN)).document
     assert all(set(row["stages"].values()) == {"keep"} for row in planned["missions"])

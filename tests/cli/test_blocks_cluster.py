@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from pipelines.core.lock import WriteLock
 from pipelines.core.products import load_json
 from pipelines.core.stages import BLOCK_RECORD
 from pipelines.core.workspace import Workspace
@@ -89,7 +90,7 @@ def test_a_killed_driver_leaves_only_what_is_missing(tmp_path: Path, field: Work
         process.kill()
         process.communicate()
         in_training = [Workspace(field.root / f"blocks/{number}") for number in begun(field)]
-        wait_until(lambda: all(block.writer() is None for block in in_training), "the jobs stop")
+        wait_until(lambda: all(WriteLock(block.root).activity() is None for block in in_training), "the jobs stop")
         kept, stopped = finished(field), begun(field)
         ended = finish_patiently(blocks(cluster, field))
     assert_complete(ended, field)

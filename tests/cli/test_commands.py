@@ -9,6 +9,7 @@ import pytest
 
 from pipelines.core.errors import ConvergenceError
 from pipelines.core.machine import chosen_threads, thread_count
+from pipelines.core.options import read_requests
 from pipelines.core.stages import BY_NAME, PIPELINE
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from tests import fakes
@@ -70,7 +71,7 @@ class TestRunOptions:
     def test_each_option_reaches_its_stages(self, georef: Georef, done: Path) -> None:
         result = georef("run", done, "--seed", 3, "--backend", "cpu", "--preset", "smoke", "--max-image-size", 400)
         assert result.code == 0
-        requests = Workspace(done).requests()
+        requests = read_requests(done)
         assert requests["sfm"] == {"seed": 3}
         assert requests["init-sim3"] == {"seed": 3}
         assert requests["train"] == {"seed": 3, "backend": "cpu", "preset": "smoke", "max_image_size": 400}
@@ -122,7 +123,7 @@ class TestFlags:
 
     def test_repeated_option(self, georef: Georef, done: Path, photos: Path) -> None:
         georef("ingest", done, "--images", photos, "--check", "P1", "--check", "P2", "--no-copy")
-        assert Workspace(done).requests()["ingest"] == {
+        assert read_requests(done)["ingest"] == {
             "images": str(photos),
             "check": ["P1", "P2"],
             "copy_images": False,

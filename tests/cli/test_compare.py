@@ -11,6 +11,7 @@ import pytest
 
 from pipelines.compare.configurations import BY_CONFIGURATION
 from pipelines.core.errors import ConvergenceError, InputError
+from pipelines.core.lock import WriteLock
 from pipelines.core.options import StageOptions
 from pipelines.core.products import Caution, dump_json
 from pipelines.core.stages import BY_NAME, PIPELINE
@@ -278,7 +279,7 @@ def test_workspace_is_held_while_configurations_run(georef: Georef, survey: Path
     seen = []
 
     def looking(stage: StageRun, config: StageOptions) -> Summary:
-        seen.append(Workspace(survey).writer())
+        seen.append(WriteLock(survey).activity())
         return reporting(stage, config)
 
     fakes.install(evaluate=looking)

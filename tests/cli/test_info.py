@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from georef_cli.output import print_outcomes, size
 from pipelines.core.manifest import MANIFEST, Manifest
 from pipelines.core.products import save_json
 from pipelines.core.stages import BY_NAME, MODEL, SPLAT
-from pipelines.core.workspace import StageRun, Workspace, now
+from pipelines.core.workspace import StageRun, Workspace
 from pipelines.deliver.overview import overview
 from pipelines.survey.options import CrsOptions
 from tests.cli_runs import Georef
@@ -33,7 +34,7 @@ def record_stage(workspace: Workspace, stage: str) -> None:
         config={},
         inputs={MODEL: "another"},
         versions={},
-        started=now(),
+        started=datetime.now(UTC),
         duration_s=1.0,
         key_figure="80 Gaussians",
         values={},

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from pipelines.core.errors import ConvergenceError
+from pipelines.core.options import read_requests
 from pipelines.core.stages import BY_NAME
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from tests import fakes
@@ -52,7 +53,7 @@ def test_other_options_are_refused(georef: Georef, interrupted: Path, words: tup
     command, *options = words
     result = georef(command, interrupted, *options, "--preset", "high", "--json")
     assert_refused(result, interrupted, "option preset changed")
-    assert Workspace(interrupted).requests()["train"] == {"preset": "fast"}, "the refused option is not remembered"
+    assert read_requests(interrupted)["train"] == {"preset": "fast"}, "the refused option is not remembered"
 
 
 def test_run_refuses_before_its_first_stage(georef: Georef, interrupted: Path, photos: Path) -> None:

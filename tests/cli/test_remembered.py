@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from pipelines.core.options import read_requests, remember
 from pipelines.core.workspace import Workspace
 from tests.cli_runs import Georef
 
@@ -17,7 +18,7 @@ def done(georef: Georef, workspace: Workspace, photos: Path, tmp_path: Path) -> 
     (tmp_path / "model").mkdir()
     assert georef("ingest", workspace.root, "--images", photos, "--gcp", tmp_path / "gcp.txt").code == 0
     assert georef("sfm", workspace.root, "--import", tmp_path / "model").code == 0
-    workspace.remember({"train": {"preset": "fast"}})
+    remember(workspace.root, {"train": {"preset": "fast"}})
     return workspace.root
 
 
@@ -30,31 +31,31 @@ def test_bare_command_repeats_what_was_asked_for(georef: Georef, done: Path) -> 
 def test_one_option_more_keeps_the_others(georef: Georef, done: Path, photos: Path, tmp_path: Path) -> None:
     assert georef("ingest", done, "--test-every", 4).code == 0
     expected = {"images": str(photos), "gcp": str(tmp_path / "gcp.txt"), "test_every": 4}
-    assert Workspace(done).requests()["ingest"] == expected
+    assert read_requests(done)["ingest"] == expected
 
 
 @pytest.mark.parametrize("words", [("ingest",), ("run", "--to", "ingest")])
 def test_forget_drops_one_option(georef: Georef, done: Path, photos: Path, words: tuple[str, ...]) -> None:
     command, *options = words
     assert georef(command, done, *options, "--forget", "gcp").code == 0
-    assert Workspace(done).requests()["ingest"] == {"images": str(photos)}
-    assert Workspace(done).requests()["train"] == {"preset": "fast"}
+    assert read_requests(done)["ingest"] == {"images": str(photos)}
+    assert read_requests(done)["train"] == {"preset": "fast"}
 
 
 @pytest.mark.parametrize("name", ["import", "--import", "all"])
 def test_forget_knows_flags_and_all(georef: Georef, done: Path, name: str) -> None:
     result = georef("sfm", done, "--forget", name, "--max-features", 900, "--json")
     assert result.document["ran"]
-    assert Workspace(done).requests()["sfm"] == {"max_features": 900}
+    assert read_requests(done)["sfm"] == {"max_features": 900}
 
 
 @pytest.mark.parametrize("command", ["sfm", "run"])
 def test_forgetting_what_is_no_option_is_a_usage_error(georef: Georef, done: Path, command: str) -> None:
-    before = Workspace(done).requests()
+    before = read_requests(done)
     result = georef(command, done, "--forget", "gcps")
     result.assert_failed(2)
     assert "'gcps' is no option" in result.err
-    assert Workspace(done).requests() == before
+    assert read_requests(done) == before
 
 
 def test_status_shows_options_with_their_origin(georef: Georef, done: Path, photos: Path, tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from pipelines.core.errors import BackendUnavailableError, InputError
 from pipelines.core.lock import LOCK, WriteLock
+from pipelines.core.options import read_requests
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from tests import fakes
 from tests.cli_runs import Georef
@@ -67,7 +68,7 @@ def test_interrupted_and_broken_commands_keep_their_log(
     text = (workspace.root / "logs/ingest.log").read_text()
     assert "ingest: started" in text
     assert ("Traceback" in text) is (error is None)
-    assert workspace.requests()["ingest"]["images"] == str(photos)
+    assert read_requests(workspace.root)["ingest"]["images"] == str(photos)
 
 
 def test_a_later_failure_removes_nothing(georef: Georef, workspace: Workspace, photos: Path) -> None:

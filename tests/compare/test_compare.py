@@ -113,7 +113,7 @@ def test_b_is_a_elsewhere_on_earth(compared: Compared) -> None:
     assert not (root / "B/train").exists()
     assert (rows["B"].test_psnr, rows["B"].gaussians) == (rows["A"].test_psnr, rows["A"].gaussians)
     shared = {folder: workspace.root / folder for folder in ("ingest", "sfm", "geolocate")}
-    variant = workspace.variant("compare/B", {**shared, "train": root / "A/train"}, "compare")
+    variant = Workspace(root / "B", workspace, {**shared, "train": root / "A/train"}, "compare")
     here, there = load_trained(variant, "initial"), load_trained(variant)
     initial = load_json(InitialSimilarity, root / "B" / SIM3)
     assert initial.method == "paper"

@@ -11,7 +11,6 @@ from pipelines.compare.table import (
     PointAccuracy,
     cells,
     markdown,
-    point_accuracy,
     remarks_on,
 )
 from tests.reports import check_points_with
@@ -65,10 +64,6 @@ def test_files_are_written_when_they_say_something_new(tmp_path: Path) -> None:
 
 
 def test_figures_are_those_of_the_report() -> None:
-    assert (
-        point_accuracy(
-            check_points_with(count=3, mean_h_m=0.0123, median_h_m=0.01, rmse_h_m=0.015, rmse_v_m=25.128)
-        )
-        == GOOD
-    )
-    assert point_accuracy(check_points_with()) == PointAccuracy()
+    errors = check_points_with(count=3, mean_h_m=0.0123, median_h_m=0.01, rmse_h_m=0.015, rmse_v_m=25.128)
+    assert PointAccuracy.model_validate(errors, from_attributes=True) == GOOD
+    assert PointAccuracy.model_validate(check_points_with(), from_attributes=True) == PointAccuracy()

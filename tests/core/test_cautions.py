@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from datetime import UTC, datetime
 
 import pytest
 from pydantic import ValidationError
@@ -10,7 +11,7 @@ from pydantic import ValidationError
 from pipelines.core.products import Caution, union
 from pipelines.core.stages import BY_NAME
 from pipelines.core.staleness import cautions_by_stage
-from pipelines.core.workspace import Manifest, Workspace, now
+from pipelines.core.workspace import Manifest, Workspace
 
 SHIFT = Caution(code="fixes-shifted", sentence="All fixes are 1.2 m too high.")
 FEW = Caution(code="few-points", sentence="Nothing checks the height.")
@@ -25,7 +26,7 @@ def put(workspace: Workspace, stage: str, *cautions: Caution) -> None:
         config={},
         inputs={},
         versions={},
-        started=now(),
+        started=datetime.now(UTC),
         duration_s=1.0,
         key_figure="",
         values={},

@@ -12,6 +12,7 @@ import pytest
 from pipelines.core import runner
 from pipelines.core import staleness as states
 from pipelines.core.manifest import MANIFEST
+from pipelines.core.options import read_requests, remember
 from pipelines.core.plan import photograph_folder
 from pipelines.core.stages import BY_NAME, stage_slice
 from pipelines.core.workspace import StageRun, Summary, Workspace
@@ -62,7 +63,7 @@ class TestNothingIsStale:
         moved = Workspace(project.rename(tmp_path / "archive") / "ws")
         assert stale(moved) == {}
         assert made(moved) == []
-        assert moved.requests()["ingest"]["images"] == str(tmp_path / "archive/photos")
+        assert read_requests(moved.root)["ingest"]["images"] == str(tmp_path / "archive/photos")
 
     def test_workspace_moved_alone(self, project: Path, tmp_path: Path) -> None:
         moved = Workspace((project / "ws").rename(tmp_path / "fast-disk"))
@@ -72,7 +73,7 @@ class TestNothingIsStale:
     def test_workspace_copied_with_relative_options(self, project: Path, tmp_path: Path) -> None:
         workspace = Workspace(project / "ws")
         workspace.config_file.write_text('[ingest]\nimages = "../photos"\ntrajectory = "../track.csv"\n')
-        workspace.remember({"ingest": {}})
+        remember(workspace.root, {"ingest": {}})
         assert stale(workspace) == {}
         copied = Workspace(shutil.copytree(project, tmp_path / "copy") / "ws")
         shutil.rmtree(project)
@@ -122,7 +123,7 @@ class TestChangesAreNoticed:
 
     def test_table_given_no_more(self, project: Path) -> None:
         workspace = Workspace(project / "ws")
-        workspace.remember({"ingest": {"images": str(project / "photos")}})
+        remember(workspace.root, {"ingest": {"images": str(project / "photos")}})
         assert stale(workspace)["ingest"] == "--trajectory changed"
 
 
@@ -161,7 +162,7 @@ def test_interrupted_stage_is_resumed_after_a_move(project: Path, tmp_path: Path
         runner.run_stage(workspace, BY_NAME["sfm"], {"import_model": model})
     fakes.install()
     moved = Workspace(project.rename(tmp_path / "archive") / "ws")
-    outcome = runner.run_stage(moved, BY_NAME["sfm"], moved.requests()["sfm"], resume="always")
+    outcome = runner.run_stage(moved, BY_NAME["sfm"], read_requests(moved.root)["sfm"], resume="always")
     assert outcome.manifest.values["resumed"]
 
 

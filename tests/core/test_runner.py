@@ -20,6 +20,7 @@ from pipelines.core.errors import (
     MissingProductError,
 )
 from pipelines.core.fingerprints import fingerprints
+from pipelines.core.options import read_requests
 from pipelines.core.stages import BY_NAME, PIPELINE, SPARSE, stage_slice
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.ingest.options import IngestOptions
@@ -196,16 +197,16 @@ class TestRequests:
     def test_options_are_remembered(self, workspace: Workspace, photos: Path) -> None:
         runner.run_stage(workspace, BY_NAME["ingest"], {"images": photos, "test_every": 4})
         assert "ingest" not in complete(workspace)
-        assert workspace.requests()["ingest"] == {"images": str(photos), "test_every": 4}
+        assert read_requests(workspace.root)["ingest"] == {"images": str(photos), "test_every": 4}
 
     def test_options_of_run_come_on_top(self, done: Workspace, photos: Path) -> None:
         complete(done, ingest={"test_every": 4})
-        assert done.requests()["ingest"] == {"images": str(photos), "test_every": 4}
+        assert read_requests(done.root)["ingest"] == {"images": str(photos), "test_every": 4}
 
     def test_options_of_a_stage_stand_alone(self, done: Workspace) -> None:
         runner.run_stage(done, BY_NAME["train"], {"seed": 1})
         runner.run_stage(done, BY_NAME["train"], {"preset": "fast"})
-        assert done.requests()["train"] == {"preset": "fast"}
+        assert read_requests(done.root)["train"] == {"preset": "fast"}
 
     def test_refused_options_are_not_remembered(self, done: Workspace, photos: Path, tmp_path: Path) -> None:
         def refuse(stage: StageRun, options: object) -> Summary:
@@ -218,7 +219,7 @@ class TestRequests:
             runner.run_stage(done, BY_NAME["ingest"], {"images": tmp_path / "phots"})
         with pytest.raises(InputError, match="--test-every"):
             runner.run_stage(done, BY_NAME["ingest"], {"images": photos, "test_every": -1})
-        assert done.requests()["ingest"] == {"images": str(photos)}
+        assert read_requests(done.root)["ingest"] == {"images": str(photos)}
 
     def test_options_of_all_stages_are_remembered_before_the_first_begins(
         self, workspace: Workspace, photos: Path
@@ -244,10 +245,10 @@ class TestRequests:
         assert not workspace.root.exists()
 
     def test_refused_run_is_not_remembered(self, done: Workspace, photos: Path, tmp_path: Path) -> None:
-        before = done.requests()
+        before = read_requests(done.root)
         with pytest.raises(InputError, match="no such file or folder"):
             complete(done, ingest={"images": tmp_path / "phots"}, train={"preset": "smoke"})
-        assert done.requests() == before
+        assert read_requests(done.root) == before
 
     def test_failed_demand_is_remembered(self, done: Workspace) -> None:
         """A bound that did not hold must not be dropped by the next `georef run`."""

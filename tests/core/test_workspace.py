@@ -16,6 +16,8 @@ import pytest
 from pipelines.core import runner
 from pipelines.core import staleness as states
 from pipelines.core.errors import InputError, MissingProductError, WorkspaceBusyError
+from pipelines.core.lock import WriteLock
+from pipelines.core.options import read_requests, remember
 from pipelines.core.plan import photograph_folder
 from pipelines.core.stages import BY_NAME, MODEL, PIPELINE, POINTS, SIM3, SPARSE, stage_slice
 from pipelines.core.workspace import Workspace
@@ -151,10 +153,10 @@ class TestLock:
             pass
 
     def test_writer_is_seen_while_it_writes(self, workspace: Workspace) -> None:
-        assert workspace.writer() is None
+        assert WriteLock(workspace.root).activity() is None
         with workspace.lock("train"):
-            assert workspace.writer() == "train"
-        assert workspace.writer() is None
+            assert WriteLock(workspace.root).activity() == "train"
+        assert WriteLock(workspace.root).activity() is None
 
     @FORKS
     def test_lock_dies_with_its_holder(self, workspace: Workspace) -> None:
@@ -164,7 +166,7 @@ class TestLock:
                 os.kill(os.getpid(), signal.SIGKILL)
         os.waitpid(child, 0)
         with workspace.lock("ingest"):
-            assert workspace.writer() == "ingest"
+            assert WriteLock(workspace.root).activity() == "ingest"
 
     def test_file_in_place_of_workspace(self, tmp_path: Path) -> None:
         (tmp_path / "flight").write_text("not a folder")
@@ -222,21 +224,25 @@ def test_damaged_requests_are_named(workspace: Workspace, text: str) -> None:
     path = workspace.root / "requests.json"
     path.write_text(text, encoding="latin-1")
     with pytest.raises(InputError, match=r"requests\.json.*delete it"):
-        workspace.requests()
+        read_requests(workspace.root)
 
 
 def test_requests_are_kept_by_stage(workspace: Workspace) -> None:
     workspace.root.mkdir()
-    workspace.remember({"ingest": {"images": Path("/photos"), "check": ("P1", "P2")}})
-    workspace.remember({"train": {"preset": "fast"}})
-    workspace.remember({"train": {"seed": 3}})
-    assert workspace.requests() == {"ingest": {"images": "/photos", "check": ["P1", "P2"]}, "train": {"seed": 3}}
+    remember(workspace.root, {"ingest": {"images": Path("/photos"), "check": ("P1", "P2")}})
+    remember(workspace.root, {"train": {"preset": "fast"}})
+    remember(workspace.root, {"train": {"seed": 3}})
+    assert read_requests(workspace.root) == {
+        "ingest": {"images": "/photos", "check": ["P1", "P2"]},
+        "train": {"seed": 3},
+    }
     assert json.loads((workspace.root / "requests.json").read_text())
 
 
 def test_variant_reads_what_is_lent_and_writes_its_own(tmp_path: Path) -> None:
     workspace, elsewhere = Workspace(tmp_path / "flight"), tmp_path / "elsewhere"
-    variant = workspace.variant("compare/A", {"sfm": workspace.root / "sfm", "geolocate": elsewhere}, "compare")
+    lent = {"sfm": workspace.root / "sfm", "geolocate": elsewhere}
+    variant = Workspace(workspace.root / "compare/A", workspace, lent, "compare")
     for path in (workspace.root / SPARSE, elsewhere / "points.npz", variant.root / SIM3):
         path.mkdir(parents=True)
     assert variant.path(SPARSE) == workspace.root / SPARSE
@@ -264,7 +270,7 @@ def test_requests_nested_too_deeply_are_refused(workspace: Workspace, text: str)
     workspace.root.mkdir()
     (workspace.root / "requests.json").write_text(text)
     with pytest.raises(InputError, match=r"requests\.json: not valid JSON: delete it"):
-        workspace.requests()
+        read_requests(workspace.root)
 
 
 @pytest.mark.parametrize("duration", ["1e300", "1e999", "NaN"])

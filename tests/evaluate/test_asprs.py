@@ -30,7 +30,7 @@ def test_survey_is_added_in_quadrature() -> None:
     assert (assessment.survey.rmse_h_m, assessment.survey.rmse_v_m) == pytest.approx((0.04, 0.12))
     assert (assessment.with_survey.rmse_h_m, assessment.with_survey.rmse_v_m) == pytest.approx((0.05, 0.13))
     assert assessment.with_survey.rmse_3d_m == pytest.approx(np.hypot(0.05, 0.13))
-    assert classes_cm(assessment.with_survey) == (5, 13)
+    assert classes_cm(assessment.with_survey.rmse_h_m, assessment.with_survey.rmse_v_m) == [5, 13]
     assert assessment.stats.rmse_h_m == pytest.approx(0.03)  # the raw one stays beside it
     asprs = assessment.asprs
     assert (asprs.horizontal_class, asprs.vertical_class, asprs.class_3d) == ("5 cm", "13 cm", "14 cm")  # 3-D: 13.9
@@ -44,7 +44,7 @@ def test_survey_is_added_in_quadrature() -> None:
 def test_class_is_the_smallest_that_is_met(error_m: float, class_cm: int) -> None:
     assessment = assess(np.tile([error_m, 0, error_m], (30, 1)), np.tile(EXACT, (30, 1, 1)))
     assert assessment.with_survey is not None
-    assert classes_cm(assessment.with_survey) == (class_cm, class_cm)
+    assert classes_cm(assessment.with_survey.rmse_h_m, assessment.with_survey.rmse_v_m) == [class_cm, class_cm]
 
 
 def test_too_few_points_are_told_plainly() -> None:

@@ -19,8 +19,8 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pipelines.core.errors import GeorefError
-from pipelines.core.options import load_toml, resolve
-from pipelines.core.products import load_json, save_json
+from pipelines.core.options import load_toml, remember, resolve
+from pipelines.core.products import load_json, save_json, save_npz
 from pipelines.core.runner import run_stage
 from pipelines.core.stages import BY_NAME, POINTS, SPARSE
 from pipelines.core.staleness import status
@@ -296,7 +296,7 @@ def _arrays(folder: Path) -> None:
         np.arange(count), np.zeros((count, 3)), np.zeros((count, 3, 3)), np.ones(count, np.int32), np.ones(count),
         np.ones(count), np.ones(count, bool), "sfm",
     )  # fmt: skip
-    points.save(folder / Path(POINTS).name)
+    save_npz(folder / Path(POINTS).name, vars(points))
     shapes = {
         "position_time_s": (3,), "antenna_in_geo": (3, 3), "sigma_m": (3, 3), "attitude_time_s": (3,),
         "geo_from_body": (3, 3, 3), "image_time_s": (2,), "cam_from_body": (2, 3, 3), "antenna_in_body": (2, 3),
@@ -304,7 +304,7 @@ def _arrays(folder: Path) -> None:
     }  # fmt: skip
     zeros = {name: np.zeros(shape) for name, shape in shapes.items()}
     track = NavigationTrack(image=np.array(["a.jpg", "b.jpg"]), body_known=np.array(True), **zeros)
-    track.save(folder / "track.npz")
+    save_npz(folder / "track.npz", vars(track))
     np.savez(folder / "checkpoint.npz", iteration=np.array(3), **{"gaussians/means": np.zeros((5, 3), np.float32)})
 
 
@@ -320,7 +320,7 @@ def _workspace(folder: Path) -> None:
     (folder / "georef.toml").write_text(
         '[ingest]\nsigma_h = 0.02\nlever_arm = "0.1,0,-0.3"\ntime_offset = "2"\n[train]\niterations = 40\n'
     )
-    workspace.remember({"sfm": {"threads": 1}, "train": {"preset": "smoke"}})
+    remember(workspace.root, {"sfm": {"threads": 1}, "train": {"preset": "smoke"}})
     manifest = Manifest(
         stage="sfm", config={}, inputs={}, versions={}, started="2026-01-01T00:00:00Z", duration_s=1.0,
         key_figure="3 of 3", values={"registered": 3}, warnings=["careful"],

@@ -51,7 +51,7 @@ def test_parts_of_the_inverse_are_those_of_the_dense_inverse(
     np.testing.assert_allclose(factor.solve(right), inverse @ right, **exact)
     np.testing.assert_allclose(factor.inverse_form(csc_matrix(right)), right.T @ inverse @ right, atol=1e-9 * scale)
     blocks = inverse.reshape(count, WIDTH, count, WIDTH)[np.arange(count), :, np.arange(count)]
-    np.testing.assert_allclose(factor.inverse_diagonal(), blocks, **exact)
+    np.testing.assert_allclose(factor.inverse_diagonal, blocks, **exact)
     root = factor.coloured(np.eye(count * WIDTH))
     np.testing.assert_allclose(root @ root.T, inverse, **exact)
 

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from georef_cli.commands.run import OWNERS
 from georef_cli.options import settings
 from pipelines.core.errors import InputError
+from pipelines.core.options import remember
 from pipelines.core.stages import BY_NAME
-from pipelines.core.workspace import Workspace
 from pipelines.jobs.batch import run_arguments
 from pipelines.jobs.missions import load_missions
 
@@ -102,7 +102,7 @@ def test_a_folder_of_mission_folders(tmp_path: Path) -> None:
     for name in ("a/gcp_list.txt", "b/trajectory.csv"):
         (tmp_path / name).touch()
     (tmp_path / "c/georef.toml").write_text('[ingest]\nbag = "flight.mcap"\n')
-    Workspace(tmp_path / "b").remember({"ingest": {"trajectory": "/rtk.csv"}})
+    remember(tmp_path / "b", {"ingest": {"trajectory": "/rtk.csv"}})
     flags = {mission.name: dict(mission.flags["ingest"]) for mission in load_missions(tmp_path, OWNERS).missions}
     assert flags == {
         "a": {"images": tmp_path / "a/images", "gcp": tmp_path / "a/gcp_list.txt"},

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.adjust.state import State, SystematicError, SystematicErrors
+from pipelines.adjust.state import SystematicError, SystematicErrors
 from pipelines.adjust.terms import At
 from pipelines.core.errors import InputError
-from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.footprints import voxel_keys
 from pipelines.geometry.similarity import Similarity
 from pipelines.surface.lidar_cloud import planes_of
@@ -104,9 +103,8 @@ def test_planes_agree_with_the_shift_that_was_found() -> None:
     similarity = Similarity(translation=np.array([9.0, 5.0, 1.0]))
     planes = plane_observations(found, similarity)
     errors = SystematicErrors((SystematicError("lidar-shift", (1.0, 1.0, 1.0)),))
-    state = State(similarity, np.zeros((1, 6)), np.zeros(0), found.shift_m)
-    base = CameraPoses(np.eye(3)[None], np.zeros((1, 3)))
-    white = planes.whitened(At.of(state, base, errors))
+    turn = np.eye(3)[None]
+    white = planes.whitened(At(turn, np.zeros((1, 3)), similarity, np.zeros(0), errors, found.shift_m, turn))
     assert len(planes) > 30
     # The medians of clusters, in units of their robust spread.
     assert abs(np.median(white)) < 0.5 and np.median(np.abs(white)) == pytest.approx(0.6745, rel=0.1)

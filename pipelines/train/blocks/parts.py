@@ -58,11 +58,11 @@ class Parts:
     def variant(self, number: int | None = None) -> Workspace:
         """Return the variant of a block, or the one that holds plan, solution, scaffold and seams."""
         lent = {spec.folder: self.workspace.root / spec.folder for spec in UPSTREAM}
-        whole = self.workspace.variant(FOLDER, lent, FOLDER)
+        whole = Workspace(self.workspace.root / FOLDER, self.workspace, lent, FOLDER)
         if number is None:
             return whole
         own = {spec.folder: whole.root / spec.folder for spec in (PLAN_BLOCKS, SOLVE, TRAIN_SCAFFOLD)}
-        return self.workspace.variant(f"{FOLDER}/{number}", lent | own, FOLDER)
+        return Workspace(whole.root / str(number), self.workspace, lent | own, FOLDER)
 
     @property
     def whole(self) -> Workspace:

@@ -223,7 +223,8 @@ class LearnableErrors(torch.nn.Module):
         self.start: Tensor
         self.unit: Tensor
         self.sigma: Tensor
-        for name, values in (("start", start), ("unit", unit), ("sigma", errors.sigma)):
+        sigma = np.array([block.sigma for block in errors.blocks], dtype=np.float64).reshape(-1)
+        for name, values in (("start", start), ("unit", unit), ("sigma", sigma)):
             self.register_buffer(name, torch.tensor(values, dtype=torch.float64))
 
     def vector(self) -> Tensor:

@@ -19,7 +19,7 @@ from rio_cogeo.cogeo import cog_validate
 from pipelines.adjust.geolocate import geolocate
 from pipelines.adjust.options import GeolocateOptions
 from pipelines.core.errors import InputError
-from pipelines.core.products import load_json, save_json
+from pipelines.core.products import load_json, save_json, save_npz
 from pipelines.core.runner import run_stage
 from pipelines.core.stages import BY_NAME, GAUSSIANS, MODEL, POINTS, SIM3
 from pipelines.core.workspace import Workspace
@@ -116,7 +116,7 @@ def write_trained(root: Path) -> Workspace:
     covariance = np.diag([1e-3, 1e-3, 1e-3, 1e-3, 0.02, 0.02, 0.03]) ** 2
     record = GEO_FROM_MODEL.to_record("local", "geo", covariance=covariance)
     save_json(initial_product(record), root / SIM3)
-    geolocate(survey, sparse, GeolocateOptions()).points.save(root / POINTS)
+    save_npz(root / POINTS, vars(geolocate(survey, sparse, GeolocateOptions()).points))
     save_json(trained_model(GEO_FROM_MODEL, max_image_size=192, cameras=cameras), root / MODEL)
     write_gaussians(root / GAUSSIANS, transformed(surface_gaussians(), GEO_FROM_MODEL.inverse()))
     write_adjustment(workspace)
@@ -236,7 +236,7 @@ def test_sigma_is_that_of_georeference_and_surface(workspace: Workspace) -> None
     grid = load_adjustment(workspace).grid
     assert grid is not None
     points = np.array([[-8.0, 6, 0], [0, 10, 0], [7, -7, 0]])
-    expected, xyz = grid.sigma_at(points), in_utm(points, workspace)
+    expected, xyz = np.sqrt(np.diagonal(grid.cov_at(points), axis1=1, axis2=2)), in_utm(points, workspace)
     horizontal, vertical = (at(workspace.path(f"raster/{name}.tif"), xyz) for name in ("sigma_h", "sigma_v"))
     np.testing.assert_allclose(vertical, expected[:, 2], rtol=0.03)
     np.testing.assert_allclose(horizontal, np.hypot(expected[:, 0], expected[:, 1]), rtol=0.1)

@@ -49,7 +49,8 @@ def drawn(scene: Scene, problem: Problem, seed: int) -> State:
     lens = 1e-3 * rng.normal(size=len(problem.bundle.sums.lens))
     lens[:2] *= 1e3  # focal lengths
     away = perturbation(rng.normal(size=7) * ([1e-3] * 4 + [0.1] * 3), np.array([5.0, -3.0, 60.0]))
-    errors = 0.5 * problem.errors.sigma * rng.normal(size=len(problem.errors))
+    sigma = np.array([block.sigma for block in problem.errors.blocks]).reshape(-1)
+    errors = 0.5 * sigma * rng.normal(size=len(problem.errors))
     return State(away @ scene.geo_from_model, correction, lens, errors)
 
 
