@@ -10,7 +10,6 @@ import csv
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +35,7 @@ class PoseTable:
     """N rows of a trajectory, all that the file has. Absent columns are None, absent cells NaN.
 
     Attributes:
+        source: kind of file, as fixes and attitudes of the survey state it.
         lines: (N,).
         names: image of each row.
         time_s: (N,) seconds since 1970; a text without a zone is read as UTC.
@@ -53,7 +53,7 @@ class PoseTable:
     """
 
     path: Path
-    source: Literal["csv", "geo.txt", "metashape", "pos", "mrk"]
+    source: str
     lines: IntArray
     names: tuple[str, ...] | None
     time_s: FloatArray | None

@@ -27,9 +27,7 @@ from pipelines.ingest.photo_folder import Photo
 from pipelines.survey.calibrated import NavigationTrack
 from pipelines.survey.survey import CameraPrior
 
-PoseSource = Literal["exif", "csv", "geo.txt", "metashape", "pos", "mrk", "bag"]
 SigmaSource = Literal["file", "option", "default"]
-AttitudeSource = Literal["gimbal", "csv", "geo.txt", "metashape", "pos", "mrk", "bag"]
 LEAST_IMAGES = 3
 # σ horizontal and vertical in metres where the file is silent, by kind of receiver, from the best to the worst.
 RECEIVER_SIGMA_M = {
@@ -51,7 +49,7 @@ class ImagePoses:
         sigma_source: (N,) who gave σ.
         receivers: (N,) kinds of receiver, of `RECEIVERS`, as recorded.
         enu_from_cam: (N, 3, 3) attitude against north and up at the camera.
-        attitude_source: (N,).
+        attitude_source: (N,) kinds of file, as of `survey.survey.Attitude`.
         sigma_attitude_deg: (N,) σ that the attitudes state.
         time_s: (N,) seconds since 1970 UTC.
         source: of the positions, with their CRS and the datum that their heights counted from.
@@ -63,10 +61,10 @@ class ImagePoses:
     sigma_source: tuple[SigmaSource, ...]
     receivers: tuple[str, ...]
     enu_from_cam: FloatArray
-    attitude_source: tuple[AttitudeSource, ...]
+    attitude_source: tuple[str, ...]
     sigma_attitude_deg: FloatArray
     time_s: FloatArray
-    source: PoseSource
+    source: str
     crs_name: str
     vertical: VerticalDatum
     recorded: Trajectory | None = None

@@ -18,7 +18,7 @@ from pipelines.geodesy.enu import ecef_from_lla
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.trajectory import Trajectory
 from pipelines.ingest.exif_poses import altitude_m, compare_with_exif, gimbal_attitudes, photo_times
-from pipelines.ingest.flight_record import RECEIVERS, AttitudeSource, ImagePoses, with_defaults
+from pipelines.ingest.flight_record import RECEIVERS, ImagePoses, with_defaults
 from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import ImageNames, Photo
@@ -66,14 +66,13 @@ def poses_from_table(table: PoseTable, photos: Sequence[Photo], options: IngestO
     )
     sigma, sigma_source = with_defaults(at_images.sigma_m, receivers, located, options, notes)
     from_file = np.asarray(np.isfinite(at_images.rotation).all(axis=(1, 2)))
-    attitude_source: list[AttitudeSource] = [table.source if row else "gimbal" for row in from_file]
     poses = ImagePoses(
         position_in_ecef=at_images.position,
         sigma_enu_m=sigma,
         sigma_source=sigma_source,
         receivers=receivers,
         enu_from_cam=np.where(from_file[:, None, None], at_images.rotation, gimbal_attitudes(photos)),
-        attitude_source=tuple(attitude_source),
+        attitude_source=tuple(table.source if row else "gimbal" for row in from_file),
         sigma_attitude_deg=np.full(len(photos), np.nan),
         time_s=time_s,
         source=table.source,

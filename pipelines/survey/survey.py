@@ -119,11 +119,14 @@ class CameraPrior(Product):
 
 
 class Fix(Product):
-    """Measured position of a camera centre in metres and m²; `session` is an index into the survey's `sessions`."""
+    """Measured position of a camera centre in metres and m²; `session` is an index into the survey's `sessions`.
+
+    `source` is the kind of file that it was read from, such as `exif`, `csv` or `bag`.
+    """
 
     position_in_geo: Vector3
     cov_in_geo: Covariance3
-    source: Literal["exif", "csv", "geo.txt", "metashape", "pos", "mrk", "bag"]
+    source: str
     sigma_source: Literal["file", "option", "default"]
     session: int = Field(0, ge=0)
 
@@ -141,11 +144,14 @@ class FixSession(Product):
 
 
 class Attitude(Product):
-    """Measured rotation of a camera, with σ per axis: `p_geo = R(quat_xyzw) p_cam + centre`."""
+    """Measured rotation of a camera, with σ per axis: `p_geo = R(quat_xyzw) p_cam + centre`.
+
+    `source` is the kind of file that it was read from; `gimbal`: the photograph's own XMP.
+    """
 
     quat_xyzw: Rotation
     sigma_deg: float = Field(gt=0)
-    source: Literal["gimbal", "csv", "geo.txt", "metashape", "pos", "mrk", "bag"]
+    source: str
 
 
 class SurveyImage(Product):

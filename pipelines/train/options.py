@@ -84,7 +84,7 @@ Solve = Literal["auto", "joint", "once"]
 
 
 class GeographicOptions(StageOptions):
-    """Options of the geographic losses: measurements in use, and their weights."""
+    """Options of the geographic losses: measurements in use, and how they are weighed."""
 
     geo_loss: bool = Field(
         True, description="Use the geographic losses; without them, similarity and cameras are held."
@@ -98,10 +98,6 @@ class GeographicOptions(StageOptions):
         "camera", description="Find control points by intersecting their marks, or through the rendered depth."
     )
     rel_loss: bool = Field(True, description="Use distances between located points, L_rel.")
-    geo_weight: float = Field(0.05, gt=0, description="Final weight w_max of the geographic losses (eq. 27).")
-    geo_schedule: Literal["rising", "constant"] = Field(
-        "rising", description="Let that weight rise as in eq. 27, or be final from the first iteration."
-    )
     loss_weights: Literal["fixed", "learned"] = Field(
         "fixed", description="Weigh the geographic losses by the stated σ, or learn a variance factor for each."
     )
@@ -140,6 +136,15 @@ class GeographicOptions(StageOptions):
                     f"solved once, by init-sim3: use {name} {plain}, --solve joint or --no-optimize-cameras",
                     field=name,
                 )
+
+
+class LossOptions(StageOptions):
+    """Weights of the losses that the user decides."""
+
+    geo_weight: float = Field(0.05, gt=0, description="Final weight w_max of the geographic losses (eq. 27).")
+    geo_schedule: Literal["rising", "constant"] = Field(
+        "rising", description="Let that weight rise as in eq. 27, or be final from the first iteration."
+    )
 
 
 class GaussianOptions(StageOptions):
@@ -207,7 +212,7 @@ class PlanOptions(BlockOptions):
     sh_degree: int = Field(ge=0, le=3)
 
 
-class TrainOptions(GeographicOptions, GaussianOptions, BlockOptions, LidarOptions):
+class TrainOptions(LossOptions, GeographicOptions, GaussianOptions, BlockOptions, LidarOptions):
     """Options of the joint optimisation of Gaussians, similarity and camera corrections."""
 
     checkpoint_every: int = Field(500, ge=1, description="Iterations between checkpoints.")

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from pipelines.core.types import IntArray
 from pipelines.splat.surface import SurfaceSettings
-from pipelines.train.options import TrainOptions
+from pipelines.train.options import LossOptions, TrainOptions
 from pipelines.train.target_images import Crops
 
 _FINAL_RATE = 0.05  # of the geographic unknowns, relative to their first learning rate
@@ -28,8 +27,7 @@ class JointOptions:
 
     Attributes:
         sh_degree: degree that the spherical harmonics reach.
-        geo_weight: w_max of eq. 27.
-        geo_schedule: "rising" as in eq. 27, or "constant": w_max from the first iteration.
+        losses: weights that the user decides.
         similarity_rate: first learning rate of the similarity and of constant errors of the measurements, in
             standard deviations an iteration.
         camera_rate: first learning rate of the camera corrections, in standard deviations an iteration.
@@ -43,8 +41,7 @@ class JointOptions:
 
     iterations: int
     sh_degree: int = 3
-    geo_weight: float = 0.05
-    geo_schedule: Literal["rising", "constant"] = "rising"
+    losses: LossOptions = field(default_factory=LossOptions)
     similarity_rate: float = 0.1
     camera_rate: float = 0.01
     seed: int = 0
@@ -60,8 +57,7 @@ class JointOptions:
         return cls(
             options.effort.iterations,
             options.sh_degree,
-            geo_weight=options.geo_weight,
-            geo_schedule=options.geo_schedule,
+            losses=options,
             seed=options.seed,
             coarse=COARSE if options.coarse_to_fine else (),
             crops=Crops(options.crop_size, options.seed),
@@ -138,10 +134,10 @@ class TrainingSchedule:
 
     def geographic_weight(self, iteration: int) -> float:
         """Return w(t) = w_max (1 − exp(−t/τ)), GeoRefGS eq. 27, or w_max if the weight is constant."""
-        options = self.options
-        if options.geo_schedule == "constant":
-            return options.geo_weight
-        return options.geo_weight * (1.0 - math.exp(-iteration / (_GEO_RISE * options.iterations)))
+        weights = self.options.losses
+        if weights.geo_schedule == "constant":
+            return weights.geo_weight
+        return weights.geo_weight * (1.0 - math.exp(-iteration / (_GEO_RISE * self.options.iterations)))
 
     def geographic_rate(self, iteration: int) -> float:
         """Return the factor on the first learning rates of the geographic unknowns."""

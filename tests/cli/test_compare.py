@@ -14,14 +14,14 @@ from pipelines.core.errors import ConvergenceError, InputError
 from pipelines.core.lock import WriteLock
 from pipelines.core.options import StageOptions
 from pipelines.core.products import Caution, dump_json
-from pipelines.core.stages import BY_NAME, PIPELINE
+from pipelines.core.stages import BY_NAME, PIPELINE, stage_slice
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from tests import fakes
 from tests.cli_runs import Georef, Result
 from tests.reports import check_points_with, report_with
 
 NAMES = tuple(BY_CONFIGURATION)
-SHARED = ["ingest", "sfm", "calibrate", "geolocate"]
+SHARED = [spec.name for spec in stage_slice(None, "geolocate")]
 OWN = ["init-sim3", "train", "evaluate"]
 
 

@@ -75,8 +75,7 @@ def test_status_shows_options_with_their_origin(georef: Georef, done: Path, phot
 
 def test_aliases_of_other_programs(georef: Georef, done: Path) -> None:
     result = georef("run", done, "--rerun-from", "sfm", "--end-with", "calibrate", "--json")
-    assert [(row["stage"], row["ran"]) for row in result.document["stages"]] == [
-        ("sfm", True),
-        ("calibrate", True),
-    ]
+    stages = result.document["stages"]
+    assert (stages[0]["stage"], stages[-1]["stage"]) == ("sfm", "calibrate")
+    assert all(row["ran"] for row in stages)
     georef("run", done, "--from", "sfm", "--rerun-from", "sfm").assert_failed(2)

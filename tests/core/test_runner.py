@@ -28,7 +28,7 @@ from tests import fakes
 
 pytestmark = pytest.mark.usefixtures("fake_stages")
 
-ALL = ["ingest", "sfm", "calibrate", "geolocate", "init-sim3", "train", "evaluate", "export-ply"]
+ALL = [spec.name for spec in PIPELINE]
 
 
 def complete(workspace: Workspace, **flags: dict[str, object]) -> list[str]:

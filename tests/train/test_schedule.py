@@ -7,6 +7,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
+from pipelines.train.options import LossOptions
 from pipelines.train.schedule import JointOptions, TrainingSchedule
 from pipelines.train.target_images import Crops
 
@@ -45,7 +46,7 @@ def test_large_photographs_are_pyramids() -> None:
 
 def test_weight_rises_or_stays_and_rates_fall() -> None:
     rising, constant = (
-        TrainingSchedule(JointOptions(1000, geo_weight=0.05, geo_schedule=kind), VIEWS)
+        TrainingSchedule(JointOptions(1000, losses=LossOptions(geo_weight=0.05, geo_schedule=kind)), VIEWS)
         for kind in ("rising", "constant")
     )
     # Eq. 27 with τ of a tenth of the training.
