@@ -63,7 +63,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "rich": ("georef_cli",),
     "pyproj": ("pipelines.geodesy",),
     "pycolmap": ("pipelines.sfm", "pipelines.formats"),
-    "numba": ("pipelines.splat", "pipelines.surface", "pipelines.geometry", "pipelines.robust"),
+    "numba": ("pipelines.splat", "pipelines.surface"),
     "gsplat": ("pipelines.splat.rasterizer.cuda_kernels",),
     "torch": ("pipelines.splat", "pipelines.survey", "pipelines.surface", "pipelines.jobs.machine", *STAGE_ROOMS),
     "filelock": ("pipelines.core",),

@@ -64,6 +64,18 @@ def test_code_named_by_the_conventions_exists() -> None:
         pkgutil.resolve_name(f"pipelines.{name}")
 
 
+def test_functions_on_the_walks_through_the_house_exist() -> None:
+    """Each of the four walks has five steps, which name functions as `room/file.function`."""
+    text = (REPOSITORY / "docs/architecture.md").read_text(encoding="utf-8")
+    walks = text.partition("## Four walks")[2].partition("\n## ")[0]
+    assert re.findall(r"^(\d)\. ", walks, re.MULTILINE) == 4 * list("12345")
+    names = re.findall(r"`([a-z_/]+/\w+\.[\w.]+)`", walks)
+    named = [name for name in names if not name.endswith((".ply", ".json", ".html"))]
+    assert len(named) >= 20
+    for name in named:
+        pkgutil.resolve_name(f"pipelines.{name.replace('/', '.')}")
+
+
 def test_no_time_is_stated_for_a_gpu() -> None:
     """Nothing was timed on one: no cell of a table whose head or row names a GPU is a duration."""
     stated = []

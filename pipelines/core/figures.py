@@ -1,7 +1,7 @@
 """Accuracy figures, each defined once (label, meaning, unit, decimals); and the headline, the accuracy of a result.
 
 Tables, pages and sentences take their words and decimals from here, so that one figure has one name and the same
-digits everywhere. `survey.trained_model` says which figure is the headline of a workspace.
+digits everywhere. `survey.headline` says which figure is the headline of a workspace.
 """
 
 from __future__ import annotations
