@@ -75,7 +75,7 @@ def _plan(ctx: click.Context, parts: Parts, asked: Mapping[str, Flags], values: 
     workspace = parts.workspace
     with workspace.lock("blocks plan"):
         remember(workspace.root, asked)
-    with boundary.logged_to_file(parts.whole, PLAN_BLOCKS):
+    with boundary.logged_to_file(parts.variant(), PLAN_BLOCKS):
         outcome = parts.run(PLAN_BLOCKS, force=values["force"], progress=progress_for(ctx.obj))
     plan = parts.plan()
     if values["as_json"]:

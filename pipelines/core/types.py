@@ -1,9 +1,12 @@
-"""Array and tuple types that all rooms share.
+"""Array and tuple types that all rooms share, and rows of records of arrays.
 
 Arrays are numpy's. Their shapes, units and frames are stated in the docstrings of the functions and classes.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,3 +24,21 @@ Matrix3 = tuple[Vector3, Vector3, Vector3]
 Matrix34 = tuple[Vector4, Vector4, Vector4]
 Matrix4 = tuple[Vector4, Vector4, Vector4, Vector4]
 Row7 = tuple[float, float, float, float, float, float, float]
+
+RecordT = TypeVar("RecordT")
+
+
+def rows_of(record: RecordT, rows: IntArray | BoolArray) -> RecordT:
+    """Return the same dataclass of arrays (P, …), with some of their rows; what is no array stays."""
+    arrays = {name: value[rows] for name, value in vars(record).items() if isinstance(value, np.ndarray)}
+    return type(record)(**(vars(record) | arrays))
+
+
+def joined_rows(records: Sequence[RecordT]) -> RecordT:
+    """Return the rows of all dataclasses of arrays (P, …), at least one; what is no array is that of the first."""
+    arrays = {
+        name: np.concatenate([vars(record)[name] for record in records])
+        for name, value in vars(records[0]).items()
+        if isinstance(value, np.ndarray)
+    }
+    return type(records[0])(**(vars(records[0]) | arrays))

@@ -135,7 +135,7 @@ def _estimate(renderer: ModelRenderer, options: MeasurableOptions) -> str | None
     discs = round(ConvexHull(ground).volume / spacing_m**2)
     gaussians = discs + round(_KEPT_SHARE * len(trained.gaussians))
     size_bytes = gaussians * 4 * (_PLY_VALUES + 3 * coefficient_count(trained.gaussians.sh_degree))
-    pixels = [pinhole.width * pinhole.height for pinhole in map(renderer.pinhole, cameras)]
+    pixels = [pinhole.width * pinhole.height for pinhole in map(renderer.pinholes.of, cameras)]
     megapixels = float(np.mean(pixels)) / 1e6
     pass_s = _FIXED_S + _MEGAPIXEL_S * megapixels + _MILLION_GAUSSIANS_S * gaussians / 1e6
     seconds = (options.repaint_passes + _OTHER_PASSES) * len(cameras) * pass_s

@@ -23,7 +23,7 @@ from pipelines.core.errors import InputError
 from pipelines.core.files import file_size, replace_text
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import TILES_GLB
-from pipelines.core.types import FloatArray
+from pipelines.core.types import FloatArray, joined_rows
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.deliver.options import ExportTilesOptions
 from pipelines.deliver.placement import require_space
@@ -31,7 +31,7 @@ from pipelines.deliver.splat import SplatParts, load_splat_parts, splat_values
 from pipelines.deliver.tiles_page import TILESET, ScenePage, scene_page, write_scene_page
 from pipelines.formats.georef_sidecar import GeorefSidecar, write_sidecar
 from pipelines.formats.gltf import SPLATS, SPZ_IN_GLTF, encode_glb, spz_in_glb
-from pipelines.formats.splat_ply import SplatArrays, concatenated
+from pipelines.formats.splat_ply import SplatArrays
 from pipelines.formats.spz import FRACTIONAL_BITS, decode_spz, encode_spz
 from pipelines.geodesy.vertical import ELLIPSOIDAL, parse_vertical
 from pipelines.splat.level_of_detail import DetailTile, Tiler, best_cut, build_tiles, scene_box
@@ -163,7 +163,7 @@ def write_whole(
     """
     if count > most:
         parts = [read_glb(folder / _content_uri(tile.name)) for tile in best_cut(root, most)]
-    splat = concatenated(list(parts))
+    splat = joined_rows(list(parts))
     write_glb(folder / GLB, splat, {"georef": sidecar.model_dump(mode="json", by_alias=True)})
     return len(splat)
 

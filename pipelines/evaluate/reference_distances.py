@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pipelines.core.errors import BackendUnavailableError, InputError
-from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
-from pipelines.geometry.footprints import first_of_voxels, rows_by_square, rows_of
+from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray, rows_of
+from pipelines.geometry.footprints import first_of_voxels, rows_by_square
 from pipelines.surface.visibility import SeenSurface
 
 LEAST_POINTS = 4  # in the cylinder, of each cloud

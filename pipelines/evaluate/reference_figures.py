@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from pipelines.core.types import BoolArray, FloatArray, IntArray
+from pipelines.core.types import BoolArray, FloatArray, IntArray, joined_rows
 from pipelines.evaluate.reference_distances import (
     CLASSES,
     CONFIDENCE_95,
@@ -17,7 +17,6 @@ from pipelines.evaluate.reference_distances import (
     Kinds,
     SquareDistances,
 )
-from pipelines.geometry.footprints import joined_rows
 from pipelines.survey.report_parts import CloudDistances, M3c2Figures, ReferenceGroup, SurfaceScore
 
 THRESHOLDS_M = (0.05, 0.1, 0.3)

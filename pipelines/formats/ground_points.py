@@ -29,9 +29,9 @@ from pipelines.formats.tables import (
     numbered_lines,
     read_lines,
     refuse_first,
-    rows_of,
     separator_of,
     split,
+    table_rows,
 )
 from pipelines.formats.trajectory_csv import PoseTable, camera_quaternions, complete
 
@@ -181,7 +181,7 @@ def _odm_table(path: Path, columns: Sequence[str]) -> Table:
     if not lines[1:]:
         raise InputError("has a CRS but no rows", path=path)
     places = {name: at for at, name in enumerate(columns)}
-    return Table(path, None, places, (), rows_of(path, lines[1:], None, places), crs_text)
+    return Table(path, None, places, (), table_rows(path, lines[1:], None, places), crs_text)
 
 
 def _comma_hint(row: Row) -> str:
@@ -285,7 +285,7 @@ def _pix4d_table(
         raise InputError(f"has {len(header)} columns, expected {expected}", path=path, line=first)
     if any(map(is_number, header[numeric])):
         places = {name: at for at, name in enumerate(in_order)}
-        return Table(path, None, places, (), rows_of(path, lines, separator, places))
+        return Table(path, None, places, (), table_rows(path, lines, separator, places))
     columns, unknown = named_columns(header, aliases, path, first)
     named = tuple(name for name in unknown if bare_name(name))
-    return Table(path, first, columns, named, rows_of(path, lines[1:], separator, columns))
+    return Table(path, first, columns, named, table_rows(path, lines[1:], separator, columns))

@@ -30,9 +30,9 @@ from pipelines.formats.tables import (
     bare_name,
     named_columns,
     numbered_lines,
-    rows_of,
     separator_of,
     split,
+    table_rows,
 )
 from pipelines.formats.trajectory_csv import PoseTable, camera_quaternions, complete
 
@@ -300,7 +300,7 @@ def _reference(path: Path) -> tuple[Table, bool | None]:
         raise InputError(f"the header names no {', '.join(missing)}", path=path, line=header_line)
     kept = [(at, text) for at, text in lines if at > header_line and not text.startswith("#")]
     named = tuple(name for name in unknown if bare_name(name) and not _RESULT.search(name))
-    listed = rows_of(path, kept, separator, columns)
+    listed = table_rows(path, kept, separator, columns)
     table = Table(path, header_line, columns, named, listed, crs_text, crs_line)
     if not table.rows:
         raise InputError("has a header but no rows", path=path)

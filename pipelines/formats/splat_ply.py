@@ -16,7 +16,7 @@ from plyfile import PlyData, PlyElement, PlyParseError
 
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size, replace_file
-from pipelines.core.types import Float32Array, IntArray
+from pipelines.core.types import Float32Array
 
 _HEADER_LIMIT = 64 * 1024
 _POSITION = ("x", "y", "z")
@@ -53,15 +53,6 @@ class SplatArrays:
 
     def __len__(self) -> int:
         return len(self.means)
-
-    def select(self, index: IntArray) -> SplatArrays:
-        """Return copies of the rows (M,)."""
-        return SplatArrays(**{name: values[index] for name, values in vars(self).items()})
-
-
-def concatenated(parts: Sequence[SplatArrays]) -> SplatArrays:
-    """Return all rows of parts of one SH degree, in order."""
-    return SplatArrays(**{name: np.concatenate([vars(part)[name] for part in parts]) for name in vars(parts[0])})
 
 
 def write_splat_ply(path: Path, splat: SplatArrays) -> None:

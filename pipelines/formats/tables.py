@@ -240,7 +240,7 @@ def split(text: str, separator: str | None, *, path: Path, line: int) -> list[st
         raise InputError(f"is no CSV: {error}", path=path, line=line) from error
 
 
-def rows_of(
+def table_rows(
     path: Path, lines: Sequence[tuple[int, str]], separator: str | None, columns: Mapping[str, int]
 ) -> list[Row]:
     """Return the rows of numbered lines; see `split`."""

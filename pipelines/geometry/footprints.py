@@ -5,15 +5,13 @@ Also functions for point sets: points by voxel, by square in plan, and rows of d
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from pipelines.core.machine import thread_count
-from pipelines.core.types import BoolArray, FloatArray, IntArray
+from pipelines.core.types import FloatArray, IntArray
 from pipelines.geometry.cameras import Camera, undistort
 
 _PER_SIDE = 16  # border pixels: the bow of a lens and the relief show in the outline
@@ -165,23 +163,6 @@ def _area(outline: FloatArray) -> float:
 
 _SMALLEST_M = 1e-6  # side of a voxel
 _LARGEST_NUMBER = 2**62  # of a row, without overflow of int64
-RecordT = TypeVar("RecordT")
-
-
-def rows_of(record: RecordT, rows: IntArray | BoolArray) -> RecordT:
-    """Return the same dataclass of arrays (P, …), with some of their rows; what is no array stays."""
-    arrays = {name: value[rows] for name, value in vars(record).items() if isinstance(value, np.ndarray)}
-    return type(record)(**(vars(record) | arrays))
-
-
-def joined_rows(records: Sequence[RecordT]) -> RecordT:
-    """Return the rows of all dataclasses of arrays (P, …), at least one; what is no array is that of the first."""
-    arrays = {
-        name: np.concatenate([vars(record)[name] for record in records])
-        for name, value in vars(records[0]).items()
-        if isinstance(value, np.ndarray)
-    }
-    return type(records[0])(**(vars(records[0]) | arrays))
 
 
 def rows_by_square(points: FloatArray, side_m: float) -> list[tuple[tuple[int, int], IntArray]]:

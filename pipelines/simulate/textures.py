@@ -7,14 +7,14 @@ width of the pixel on the surface, and filters itself: a box filter for stripes,
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipelines.core.types import ByteArray, Float32Array
+from pipelines.core.types import ByteArray, Float32Array, rows_of
 from pipelines.simulate.mesh import Material
 
 _LATTICE, _UPSAMPLE = 128, 4
@@ -179,9 +179,6 @@ class TextureSamples:
         """Width of a pixel for patterns without direction; slightly small, because images are supersampled."""
         return np.float32(0.75) * np.maximum(self.du, self.dv)
 
-    def select(self, chosen: np.ndarray) -> TextureSamples:
-        return TextureSamples(*(getattr(self, field.name)[chosen] for field in fields(self)))
-
 
 @dataclass(frozen=True)
 class GroundPlan:
@@ -222,7 +219,7 @@ def wall(s: TextureSamples) -> Float32Array:
     for style, stone_m, joint, contrast in ((1, (0.8, 0.4), 0.035, 0.75), (2, (3.0, 1.5), 0.05, 0.3)):
         own = np.nonzero(s.params[:, STYLE] == style)[0]
         if len(own):
-            tone, joints = _masonry(s.select(own), stone_m, joint, style)
+            tone, joints = _masonry(rows_of(s, own), stone_m, joint, style)
             color[own] = mix(_tinted(color[own], contrast * tone), color[own] * np.float32(0.5), joints)
     plinth = band(s.v, -50.0, 0.7, s.dv)
     color = mix(color, s.params[:, BASE] * np.float32(0.35) + np.float32(0.05), plinth * np.float32(0.8))
@@ -332,13 +329,13 @@ def ground(s: TextureSamples, plan: GroundPlan) -> Float32Array:
     away = np.maximum(np.abs(s.u), np.abs(s.v))
     outside = np.clip((away - np.float32(plan.reach_m - 12)) / np.float32(10), 0, 1)
     beyond = np.nonzero(outside > 0)[0]
-    color[beyond] = mix(color[beyond], _fields(s.select(beyond)), outside[beyond])
+    color[beyond] = mix(color[beyond], _fields(rows_of(s, beyond)), outside[beyond])
     kind *= (1 - outside)[:, None]
     kind[:, 0] += outside
     green = np.nonzero(kind[:, 0] > 0.02)[0]
-    color[green] = _meadow(s.select(green), color[green], kind[green, 0])
+    color[green] = _meadow(rows_of(s, green), color[green], kind[green, 0])
     hard = np.nonzero(kind[:, 1] + kind[:, 2] > 0.02)[0]
-    color[hard] = _pavement(s.select(hard), color[hard], kind[hard])
+    color[hard] = _pavement(rows_of(s, hard), color[hard], kind[hard])
     return color
 
 
@@ -358,7 +355,7 @@ def _pavement(s: TextureSamples, color: Float32Array, kind: Float32Array) -> Flo
     rough = (paving * np.float32(0.4) + asphalt * np.float32(0.75)) * grit
     color = _tinted(color, rough + paving * np.float32(0.55) * slab)
     tarred = np.nonzero(asphalt > 0.3)[0]
-    t = s.select(tarred)
+    t = rows_of(s, tarred)
     crack = np.abs(fbm(t.u, t.v + np.float32(90), (4.0, 1.7, 0.7), t.pixel)) < 0.012
     share = asphalt[tarred] * crack * visible(0.25, t.pixel)
     color[tarred] = mix(color[tarred], color[tarred] * np.float32(0.45), share)
@@ -393,6 +390,6 @@ def albedo(samples: TextureSamples, material: np.ndarray, plan: GroundPlan) -> F
     color = np.zeros((len(material), 3), dtype=np.float32)
     for kind in np.unique(material):
         chosen = np.nonzero(material == kind)[0]
-        part = samples.select(chosen)
+        part = rows_of(samples, chosen)
         color[chosen] = ground(part, plan) if kind == Material.TERRAIN else _TEXTURES[Material(kind)](part)
     return color

@@ -26,8 +26,8 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from pipelines.core.types import BoolArray, Float32Array, FloatArray, IntArray
-from pipelines.formats.splat_ply import SplatArrays, concatenated
+from pipelines.core.types import BoolArray, Float32Array, FloatArray, IntArray, joined_rows, rows_of
+from pipelines.formats.splat_ply import SplatArrays
 from pipelines.geometry.rotations import matrix_from_quat_xyzw, quat_xyzw_from_matrix
 from pipelines.splat.spatial import BITS, morton_codes
 
@@ -57,14 +57,6 @@ class Mixture:
     def sizes_m(self) -> FloatArray:
         """Root of the trace of the covariances (N,): between one and √3 times the largest σ."""
         return np.asarray(np.sqrt(np.einsum("nii->n", self.covariances)))
-
-    def select(self, index: IntArray) -> Mixture:
-        return Mixture(**{name: values[index] for name, values in vars(self).items()})
-
-    @staticmethod
-    def concatenate(parts: list[Mixture]) -> Mixture:
-        names = vars(parts[0])
-        return Mixture(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
 
 def shadow_areas(sigmas: FloatArray) -> FloatArray:
@@ -192,11 +184,11 @@ def build_tiles(parts: Iterable[SplatArrays], box: FloatArray, tiler: Tiler) -> 
     for number, part in enumerate(parts):
         outside = _outside(part, box)
         if not outside.all():
-            inner.plant(_octree(part.select(np.flatnonzero(~outside)), tiler, f"s{number}p"))
-        outer.append(part.select(np.flatnonzero(outside)))
+            inner.plant(_octree(rows_of(part, np.flatnonzero(~outside)), tiler, f"s{number}p"))
+        outer.append(rows_of(part, np.flatnonzero(outside)))
     trees = [("s", tree) for tree in inner.grown()]
     if far := [part for part in outer if len(part)]:
-        trees.append(("f", _octree(concatenated(far), tiler, "f")))
+        trees.append(("f", _octree(joined_rows(far), tiler, "f")))
     tops = [tiler.overview(name, tree) for name, tree in trees]
     return (tops[0] if len(tops) == 1 else tiler.joined("r", tops)).tile
 
@@ -265,10 +257,10 @@ class _Curve:
         if len(rows) == 0:
             return self
         starts = np.concatenate([[0], 1 + np.flatnonzero(np.diff(self._cells(small, level)))])
-        mixture = Mixture.concatenate([merged(self.mixture.select(rows), starts), self.mixture.select(alone)])
+        mixture = joined_rows([merged(rows_of(self.mixture, rows), starts), rows_of(self.mixture, alone)])
         codes = np.concatenate([self.codes[rows][starts], self.codes[alone]])
         order = np.argsort(codes, kind="stable")
-        return _Curve(mixture.select(order), codes[order], self.edge_m)
+        return _Curve(rows_of(mixture, order), codes[order], self.edge_m)
 
     def cell_m(self, level: int) -> float:
         return self.edge_m * 2.0**level
@@ -307,10 +299,10 @@ class Tiler:
 
     def joined(self, name: str, children: list[_Shown]) -> _Shown:
         """Return the tile above tops of different trees."""
-        both = Mixture.concatenate([child.curve.mixture for child in children])
+        both = joined_rows([child.curve.mixture for child in children])
         codes, edge_m = _codes(both.means)
         order = np.argsort(codes, kind="stable")
-        return self.parent(name, children, _Curve(both.select(order), codes[order], edge_m))
+        return self.parent(name, children, _Curve(rows_of(both, order), codes[order], edge_m))
 
     def overview(self, name: str, top: _Shown) -> _Shown:
         """Return the top of the levels above a tree."""
@@ -358,7 +350,7 @@ def _octree(splat: SplatArrays, tiler: Tiler, name: str) -> _Shown:
     def cell(name: str, first: int, last: int, height: int) -> _Shown:
         """Return the tile of rows `first` … `last`, which lie in one cell of 2^height cells a side."""
         if last - first <= tiler.largest_tile:
-            content = splat.select(rows[first:last])
+            content = rows_of(splat, rows[first:last])
             tiler.write(name, content, is_leaf=True)
             mixture = mixture_of(content)
             tile = DetailTile(name, len(content), 0.0, bounds_of(mixture))
@@ -371,7 +363,7 @@ def _octree(splat: SplatArrays, tiler: Tiler, name: str) -> _Shown:
             cell(f"{name}{number}", *span, max(height - 1, 0))
             for number, span in enumerate(itertools.pairwise(ends))
         ]
-        mixture = Mixture.concatenate([child.curve.mixture for child in children])
+        mixture = joined_rows([child.curve.mixture for child in children])
         places = np.concatenate([child.curve.codes for child in children])
         return tiler.parent(name, children, _Curve(mixture, places, edge_m))
 

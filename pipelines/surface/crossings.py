@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.geometry.cameras import Pinhole
-from pipelines.geometry.footprints import rows_of
 
 # ruff: noqa: PLR0917  (kernels take arrays, not objects)
 
@@ -48,10 +47,6 @@ class SeenSurfels:
     row: IntArray
     column: IntArray
     depth_m: FloatArray
-
-    def part(self, kept: np.ndarray) -> SeenSurfels:
-        """Return the discs of a mask (K,)."""
-        return rows_of(self, kept)
 
 
 def seen_surfels(surfels: Surfels, cam_from_world: FloatArray, center: FloatArray, camera: Pinhole) -> SeenSurfels:

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.progress import SILENT, Progress
-from pipelines.core.types import BoolArray, ByteArray, FloatArray, IntArray
-from pipelines.geometry.footprints import joined_rows, voxel_keys
+from pipelines.core.types import BoolArray, ByteArray, FloatArray, IntArray, joined_rows
+from pipelines.geometry.footprints import voxel_keys
 from pipelines.geometry.similarity import Similarity
 from pipelines.surface.surface_views import SurfaceView, SurfaceViews
 from pipelines.surface.visibility import Support

@@ -14,7 +14,6 @@ from pipelines.core.types import ByteArray, FloatArray, IntArray
 from pipelines.formats.trajectory_csv import read_trajectory
 from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import Origin, ecef_from_lla, enu_from_ecef
-from pipelines.geometry.footprints import rows_of
 from pipelines.geometry.trajectory import Trajectory
 from pipelines.surface.measured_cloud import CloudReader, Thinning, read_thinned
 from pipelines.survey.options import CloudCrs
@@ -106,9 +105,6 @@ class LidarCloud:
 
     def __len__(self) -> int:
         return len(self.position_in_model)
-
-    def part(self, rows: IntArray | np.ndarray) -> LidarCloud:
-        return rows_of(self, rows)
 
     def moved(self, shift: FloatArray) -> LidarCloud:
         scanner = None if self.scanner_in_model is None else self.scanner_in_model + shift

@@ -18,12 +18,12 @@ import numpy as np
 
 from pipelines.core.errors import InputError
 from pipelines.core.progress import SILENT, Progress
-from pipelines.core.types import ByteArray, FloatArray, IntArray
+from pipelines.core.types import ByteArray, FloatArray, IntArray, joined_rows, rows_of
 from pipelines.formats.cloud_ply import CloudChunk, CloudFile, open_cloud_ply
 from pipelines.formats.las import open_las
 from pipelines.geodesy.crs import PointCrs, parse_crs
 from pipelines.geodesy.enu import Origin, ecef_from_lla, enu_from_ecef
-from pipelines.geometry.footprints import joined_rows, rows_of, voxel_keys
+from pipelines.geometry.footprints import voxel_keys
 from pipelines.survey.options import CLOUD_SUFFIXES, CloudCrs
 
 log = logging.getLogger(__name__)

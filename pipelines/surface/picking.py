@@ -190,7 +190,7 @@ class SurfaceReader:
 
     def focal_px(self, camera: int) -> float:
         """Return the focal length of a camera's depth map."""
-        return self.renderer.pinhole(camera).fx
+        return self.renderer.pinholes.of(camera).fx
 
     def under(self, sight: Sight) -> SurfacePoint | NoSurface:
         """Return the point of the surface under a line of sight, or why there is none to measure.
@@ -258,7 +258,7 @@ class SurfaceReader:
         """Return the training cameras that hold a place in their image, the most detailed ones first."""
         detail = []
         for camera in self._train:
-            pinhole = self.renderer.pinhole(camera)
+            pinhole = self.renderer.pinholes.of(camera)
             in_cam = self._in_cam(camera, place)
             if pinhole.contains(pinhole.project(in_cam)):
                 detail.append((float(in_cam[2]) / pinhole.fx, camera))
@@ -324,6 +324,6 @@ class SurfaceReader:
         ray = arm / length[:, None]
         mean = ray.mean(axis=0) / np.linalg.norm(ray.mean(axis=0))
         spread_rad = float(np.sqrt(np.mean(np.arccos(np.clip(ray @ mean, -1.0, 1.0)) ** 2)))
-        focal = np.array([self.renderer.pinhole(int(camera)).fx for camera in cameras])
+        focal = np.array([self.renderer.pinholes.of(int(camera)).fx for camera in cameras])
         across = _SIGMA_PX * float(np.mean(length / focal)) / np.sqrt(len(cameras))
         return float((across / max(spread_rad, 1e-6)) ** 2)

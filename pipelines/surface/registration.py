@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from pipelines.core.errors import DegenerateGeometryError
-from pipelines.core.types import BoolArray, FloatArray
+from pipelines.core.types import BoolArray, FloatArray, rows_of
 from pipelines.geometry.similarity import Similarity, jacobian_at, perturbation
 from pipelines.robust.statistics import cauchy_weight, mad_sigma
 from pipelines.surface.lidar_cloud import LidarCloud
@@ -73,7 +73,7 @@ def registration(cloud: LidarCloud, views: DepthViews, seed: int) -> Registratio
     rows = np.flatnonzero(plane)
     if len(rows) > _MOST_POINTS:
         rows = np.sort(np.random.default_rng(seed).choice(rows, _MOST_POINTS, replace=False))
-    planes = cloud.part(rows)
+    planes = rows_of(cloud, rows)
     total = np.zeros(3)
     for capture in _CAPTURES:
         matches = _matches(planes.moved(-total), views, capture)

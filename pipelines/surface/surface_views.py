@@ -66,7 +66,7 @@ class ModelRenderer:
     def __init__(self, trained: TrainedSurvey, images: ImageCache, backend: Rasterizer) -> None:
         self.trained, self.images = trained, images
         self._backend = backend
-        self._pinholes = Pinholes(images, trained.sfm.lenses, trained.sparse.lenses)
+        self.pinholes = Pinholes(images, trained.sfm.lenses, trained.sparse.lenses)
         device = torch.device("cuda" if backend.name == "cuda" else "cpu")
         self._gaussians = trained.gaussians.to(device)
 
@@ -78,14 +78,10 @@ class ModelRenderer:
     def _blocks(self) -> SpatialBlocks:
         return SpatialBlocks(self.trained.gaussians)
 
-    def pinhole(self, index: int) -> Pinhole:
-        """Return the pinhole of camera `index`, at the size of its render."""
-        return self._pinholes.of(index)
-
     def pose(self, index: int) -> ViewPose:
         """Return the pose of camera `index`."""
         poses = self.trained.poses
-        return ViewPose(self.pinhole(index), poses.cam_from_model[index], poses.cam_center_in_model[index])
+        return ViewPose(self.pinholes.of(index), poses.cam_from_model[index], poses.cam_center_in_model[index])
 
     def render(self, view: int | ViewPose, *, depth: bool = False, window: Window | None = None) -> Render:
         """Return the render of a camera, by its index or from anywhere, without gradients.
@@ -179,7 +175,7 @@ class SurfaceViews:
         self.folder = folder
         self._trained = renderer.trained
         self.cameras = renderer.trained.indices("train")
-        self.pinholes = tuple(renderer.pinhole(index) for index in self.cameras)
+        self.pinholes = tuple(renderer.pinholes.of(index) for index in self.cameras)
         pixels = [pinhole.width * pinhole.height for pinhole in self.pinholes]
         self._start = np.concatenate([[0], np.cumsum(pixels)]).astype(np.int64)
         folder.mkdir(parents=True, exist_ok=True)

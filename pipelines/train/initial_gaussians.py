@@ -27,7 +27,7 @@ import torch
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from pipelines.core.types import BoolArray, ByteArray, FloatArray, IntArray
+from pipelines.core.types import BoolArray, ByteArray, FloatArray, IntArray, joined_rows, rows_of
 from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.footprints import PointSurface, ground_points, thin_to_voxels
 from pipelines.splat.gaussians import Gaussians
@@ -209,7 +209,7 @@ def underlay(points: SurfacePoints, count: int, seed: int) -> tuple[SurfacePoint
     low, high = np.quantile(place[:, :2], [_STRAY, 1 - _STRAY], axis=0)
     side_m = float(np.sqrt(np.prod(high - low) / max(count, 1)))
     if count < 1 or not side_m > 0:
-        return points.part(np.zeros(0, dtype=np.int64)), 0.0
+        return rows_of(points, np.zeros(0, dtype=np.int64)), 0.0
     columns, rows = (int(n) for n in np.maximum((high - low) // side_m, 1))
     cell = np.floor((place[:, :2] - low) / side_m).astype(np.int64)
     inside = np.flatnonzero(((cell >= 0) & (cell < (columns, rows))).all(axis=1))
@@ -310,13 +310,13 @@ def initial_gaussians(training: TrainingScene, options: InitialisationOptions, m
     if training.surface is not None:
         share = _SURFACE_SHARE * min(1.0, training.surface.known_share() / _MOSTLY_KNOWN)
         surface = training.surface.sample(int(share * most), seed, training.in_region)
-        start = SurfacePoints.concatenate([start.part(_off_surface(start, surface)), surface])
+        start = joined_rows([rows_of(start, _off_surface(start, surface)), surface])
         unknown = int(max(_SURFACE_SHARE - share, _UNKNOWN_SHARE) * most)
         guessed = guessed_points(scene, training.surface.maps, unknown, seed, training.in_region)
-        start = SurfacePoints.concatenate([start, guessed])
+        start = joined_rows([start, guessed])
     behind = background(scene, training.images, start.point_in_model)
     beneath = _sheet(training, start, options, int(_BENEATH_SHARE * most), seed)
-    start = start.part(np.flatnonzero(training.in_region(start.point_in_model)))
+    start = rows_of(start, np.flatnonzero(training.in_region(start.point_in_model)))
     near = gaussians_from_points(start.point_in_model, start.rgb, options, start.normal_in_model)
     far = gaussians_of_size(behind.point_in_model, behind.rgb, behind.sigma_m, options)
     if training.region is not None:
@@ -338,7 +338,7 @@ def _sheet(
     if training.surface is not None:
         place = sheet.point_in_model
         kept = training.in_region(place) & hidden(place, training.scene, training.surface.maps)
-    sheet = sheet.part(np.flatnonzero(kept))
+    sheet = rows_of(sheet, np.flatnonzero(kept))
     sigma_m = np.full(len(sheet.rgb), _BENEATH_SIGMA * side_m)
     discs = gaussians_of_size(sheet.point_in_model, sheet.rgb, sigma_m, replace(options, opacity=_BENEATH_OPACITY))
     discs.log_scales[:, 2] += math.log(_BENEATH_THICKNESS)

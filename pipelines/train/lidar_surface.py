@@ -22,7 +22,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from pipelines.core.types import BoolArray, Float32Array, FloatArray, IntArray
+from pipelines.core.types import BoolArray, Float32Array, FloatArray, IntArray, joined_rows, rows_of
 from pipelines.splat.losses import FreeSpace, FreeSpaceLoss, MeasuredPlanes, PlaneAttraction
 from pipelines.surface.crossings import SeenSurfels, Surfels, seen_surfels
 from pipelines.surface.depth_maps import DepthMaps
@@ -200,7 +200,7 @@ class LidarPlanes:
 
     def __init__(self, cloud: LidarCloud, confidence: FloatArray, pixel_m: float) -> None:
         trusted = np.flatnonzero(confidence >= _LEAST_CONFIDENCE)
-        self.cloud, self.confidence = cloud.part(trusted), confidence[trusted]
+        self.cloud, self.confidence = rows_of(cloud, trusted), confidence[trusted]
         self._pixel_m = pixel_m
         self._tree = cKDTree(self.cloud.position_in_model) if len(trusted) else None
 
@@ -248,7 +248,7 @@ class FusedSurface(SceneSurface):
         self.planes = LidarPlanes(cloud, judged.confidence, pixel_m)
         # All points hide what lies behind them, those that training does not trust too, but none that are gone.
         standing = np.flatnonzero(~judged.rejected)
-        self._cloud, self._confidence = cloud.part(standing), judged.confidence[standing]
+        self._cloud, self._confidence = rows_of(cloud, standing), judged.confidence[standing]
         radius_m = np.clip(_GAP * self._cloud.reach_m, _LEAST_GAP * cloud.voxel_m, _MOST_GAP * cloud.voxel_m)
         self._surfels = Surfels(self._cloud.position_in_model, self._cloud.normal_in_model, radius_m)
 
@@ -275,7 +275,7 @@ class FusedSurface(SceneSurface):
             drawn = super().sample(count - len(alone.rgb), seed, inside)
         points, normal, confidence = self.planes.onto(drawn.point_in_model)
         normals = np.where((confidence > 0)[:, None], normal, drawn.normal_in_model)
-        return SurfacePoints.concatenate([SurfacePoints(points, drawn.rgb, normals), alone])
+        return joined_rows([SurfacePoints(points, drawn.rgb, normals), alone])
 
     def losses(self, device: torch.device) -> list[Loss]:
         """Return the loss of Gaussians in free space, and beside the LiDAR's planes if those are to hold them."""
@@ -303,7 +303,7 @@ class FusedSurface(SceneSurface):
             eyes = cloud.scanner_in_model[seen.rows], center
             sides = [np.einsum("pi,pi->p", eye - place, normal) for eye in eyes]
             counts &= ~(sides[0] * sides[1] < 0)  # on the side that the scanner saw, where that is known
-        return seen.part(counts)
+        return rows_of(seen, counts)
 
     def _start_alone(
         self, stereo: FloatArray, most: int, inside: Callable[[FloatArray], BoolArray] | None
@@ -316,7 +316,7 @@ class FusedSurface(SceneSurface):
         size_m = np.full(len(self._cloud), np.inf)  # of a pixel of the nearest view
         for index in map(int, self._train):
             seen, focal_px = self._alone_in_view(index), self.maps.camera(index).fx
-            seen = seen.part(seen.depth_m < focal_px * size_m[seen.rows])
+            seen = rows_of(seen, seen.depth_m < focal_px * size_m[seen.rows])
             size_m[seen.rows] = seen.depth_m / focal_px
             colours[seen.rows] = self.maps.rgb(index)[seen.row, seen.column]
         rows = np.flatnonzero(np.isfinite(size_m))

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
+from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray, joined_rows, rows_of
 from pipelines.geometry.footprints import thin_to_voxels
 from pipelines.surface.depth_maps import DepthMaps
 
@@ -87,16 +87,6 @@ class SurfacePoints:
     rgb: ByteArray
     normal_in_model: FloatArray
 
-    @staticmethod
-    def concatenate(parts: list[SurfacePoints]) -> SurfacePoints:
-        """Return the points of all `parts` in their order; at least one part."""
-        columns = zip(*((part.point_in_model, part.rgb, part.normal_in_model) for part in parts), strict=True)
-        return SurfacePoints(*map(np.concatenate, columns))
-
-    def part(self, rows: IntArray) -> SurfacePoints:
-        """Return the points of the given rows."""
-        return SurfacePoints(self.point_in_model[rows], self.rgb[rows], self.normal_in_model[rows])
-
 
 class SceneSurface:
     """Surface that the depth maps of all training views, already built, show together."""
@@ -145,11 +135,11 @@ class SceneSurface:
             rgb = self.maps.rgb(index)[rows, columns]
             views.append(SurfacePoints(self._points(index, rows, columns), rgb, normals))
             sizes.append(self.maps.depth(index)[rows, columns].astype(np.float64) / self.maps.camera(index).fx)
-        candidates, size_m = SurfacePoints.concatenate(views), np.concatenate(sizes)
+        candidates, size_m = joined_rows(views), np.concatenate(sizes)
         if inside is not None:
             kept = np.flatnonzero(inside(candidates.point_in_model))
-            candidates, size_m = candidates.part(kept), size_m[kept]
-        return candidates.part(spread_evenly(candidates.point_in_model, size_m, count))
+            candidates, size_m = rows_of(candidates, kept), size_m[kept]
+        return rows_of(candidates, spread_evenly(candidates.point_in_model, size_m, count))
 
     def _normals(self, index: int, rows: IntArray, columns: IntArray) -> FloatArray:
         """Return unit normals (P, 3) of the surface at pixels of a view; NaN at the edges of surface and image."""

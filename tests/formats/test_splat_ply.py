@@ -10,9 +10,9 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from pipelines.core.errors import InputError
+from pipelines.core.types import joined_rows
 from pipelines.formats.splat_ply import (
     SplatArrays,
-    concatenated,
     join_splat_plys,
     read_centres,
     read_splat_ply,
@@ -59,7 +59,7 @@ def test_files_are_joined_in_their_order(tmp_path: Path) -> None:
     for number, part in enumerate(parts):
         write_splat_ply(tmp_path / f"{number}.ply", part)
     assert join_splat_plys([tmp_path / "0.ply", tmp_path / "1.ply"], tmp_path / "joined.ply") == 8
-    write_splat_ply(tmp_path / "whole.ply", concatenated(parts))
+    write_splat_ply(tmp_path / "whole.ply", joined_rows(parts))
     assert (tmp_path / "joined.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
     second = read_splat_ply(tmp_path / "joined.ply", slice(3, 8))
     for name, values in vars(parts[1]).items():

@@ -6,6 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipelines.core.types import rows_of
 from pipelines.formats.splat_ply import SplatArrays
 from pipelines.splat.level_of_detail import (
     DetailTile,
@@ -79,7 +80,7 @@ def test_tree(seed: int, count: int, largest: int, most_parts: int) -> None:
     number = np.arange(count, dtype=np.float32)
     gaussians.sh[:, 0, 0] = number
     rows = np.array_split(np.argsort(gaussians.means[:, 0]), min(most_parts, count))
-    parts = [gaussians.select(part) for part in rows]
+    parts = [rows_of(gaussians, part) for part in rows]
     contents: dict[str, SplatArrays] = {}
     leaves: list[str] = []
 

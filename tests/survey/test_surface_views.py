@@ -30,13 +30,11 @@ class Renderer:
         self.rendered: list[int] = []
         self.fails_at = fails_at
         self.images: Any = None
+        self.pinholes = SimpleNamespace(of=lambda _index: CAMERA)
         poses = CameraPoses(np.tile(DOWN, (5, 1, 1)), np.array(CENTERS))
         self.trained = SimpleNamespace(
             poses=poses, geo_from_model=GEO_FROM_MODEL, indices=lambda split: TRAINING if split == "train" else [2]
         )
-
-    def pinhole(self, _index: int) -> Any:
-        return CAMERA
 
     def surface(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         if index == self.fails_at:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.core.types import FloatArray
+from pipelines.core.types import FloatArray, rows_of
 from pipelines.geometry.cameras import CameraPoses, Pinhole
 from pipelines.train.initial_gaussians import hidden, underlay
 from pipelines.train.surface import SurfacePoints
@@ -60,7 +60,7 @@ def test_sheet_has_the_colour_of_the_ground_around(town: SurfacePoints) -> None:
 
 def test_cells_without_points_are_filled(town: SurfacePoints) -> None:
     lake = np.linalg.norm(town.point_in_model[:, :2] - [40, 50], axis=1) < 25
-    sheet, side_m = underlay(town.part(np.flatnonzero(~lake)), 800, seed=0)
+    sheet, side_m = underlay(rows_of(town, np.flatnonzero(~lake)), 800, seed=0)
     x, y, z = sheet.point_in_model.T
     within = np.hypot(x - 40, y - 50) < 20
     assert within.sum() > 0.8 * np.pi * 20**2 / side_m**2
@@ -69,7 +69,7 @@ def test_cells_without_points_are_filled(town: SurfacePoints) -> None:
 
 def test_no_count_and_no_extent_give_no_sheet(town: SurfacePoints) -> None:
     assert len(underlay(town, 0, seed=0)[0].rgb) == 0
-    assert len(underlay(town.part(np.array([5])), 100, seed=0)[0].rgb) == 0
+    assert len(underlay(rows_of(town, np.array([5])), 100, seed=0)[0].rgb) == 0
 
 
 def test_a_place_is_hidden_by_known_depths_or_where_no_view_looks() -> None:

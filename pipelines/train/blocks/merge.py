@@ -94,7 +94,7 @@ class SeamViews:
         self._poses = solution.poses
         self._sfm = solution.with_lenses(read_sparse(parts.workspace.path(SPARSE)))
         self._index = self._sfm.image_index()
-        self._scaffold = read_gaussians(parts.whole.path(SCAFFOLD))
+        self._scaffold = read_gaussians(parts.variant().path(SCAFFOLD))
         self.model_of = lru_cache(2)(self._model_of)
 
     def seam(self, first: PlannedBlock, second: PlannedBlock) -> Seam | None:
@@ -156,9 +156,9 @@ def merge_blocks(parts: Parts, plan: BlockPlan, folder: Path, progress: Progress
     """
     trainings = [parts.training(block) for block in plan.blocks]
     # The Gaussians of each cell, adapted to those of its neighbours.
-    cells = [parts.whole.root / TRAIN_SEAMS.folder / f"{block.id}.ply" for block in plan.blocks]
+    cells = [parts.variant().root / TRAIN_SEAMS.folder / f"{block.id}.ply" for block in plan.blocks]
     count = join_splat_plys(cells, folder / "gaussians.ply")
-    solution = load_json(Adjustment, parts.whole.path(SOLUTION))
+    solution = load_json(Adjustment, parts.variant().path(SOLUTION))
     model = TrainedModel(
         **dict(solution),
         max_image_size=parts.options.effort.max_image_size,

@@ -64,11 +64,6 @@ class Parts:
         own = {spec.folder: whole.root / spec.folder for spec in (PLAN_BLOCKS, SOLVE, TRAIN_SCAFFOLD)}
         return Workspace(whole.root / str(number), self.workspace, lent | own, FOLDER)
 
-    @property
-    def whole(self) -> Workspace:
-        """Variant that holds plan, solution, scaffold and seams."""
-        return self.variant()
-
     def on_gpu(self) -> bool:
         """Return whether a block takes a GPU; a backend that is not available here is an error."""
         return chosen_backend(self.options.backend) == "cuda"
@@ -80,7 +75,7 @@ class Parts:
             MissingProductError: there is none.
             InputError: the plan cannot be read.
         """
-        path = self.whole.root / BLOCK_PLAN
+        path = self.variant().root / BLOCK_PLAN
         if not path.is_file():
             raise MissingProductError(f"{FOLDER}/{BLOCK_PLAN}", f"georef blocks plan {self.workspace.root}")
         return load_json(BlockPlan, path)

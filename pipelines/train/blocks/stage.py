@@ -82,7 +82,7 @@ def require_trained(parts: Parts, plan: BlockPlan) -> None:
 
 def _placed(job: Job, parts: Parts, place: str, *, force: bool) -> Job:
     """Return a job with the workspace in its arguments, and `place`, the folder of its product in `blocks/`."""
-    root, shared = parts.workspace.root.absolute(), parts.whole.root.absolute()
+    root, shared = parts.workspace.root.absolute(), parts.variant().root.absolute()
     command, action, *more = job.arguments
     read = [root / name for name in (*(spec.folder for spec in UPSTREAM), REQUESTS, CONFIG_FILE)]
     read += [shared / spec.folder for spec in (PLAN_BLOCKS, SOLVE, TRAIN_SCAFFOLD)]
