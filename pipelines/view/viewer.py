@@ -92,7 +92,7 @@ class Viewer:
     def _build(self, workspace: Workspace, folder: Path) -> None:
         gui, trained = self._server.gui, self.model.trained
         self._notice = gui.add_html("")
-        gui.add_html(accuracy_line(workspace))
+        gui.add_html(accuracy_html(workspace))
         self.click_mode = gui.add_dropdown("A click", get_args(ClickMode), hint="What a click in the scene does")
         tabs = gui.add_tab_group()
         with tabs.add_tab("See"):
@@ -242,7 +242,7 @@ class Viewer:
         self._server.gui.reset()
 
 
-def accuracy_line(workspace: Workspace) -> str:
+def accuracy_html(workspace: Workspace) -> str:
     """Return the accuracy of the result as HTML; empty where nothing states it."""
     headline = headline_of(workspace)
     return "" if headline is None else paragraph(f"The {headline.sentence}.", mark="accuracy")
