@@ -121,7 +121,7 @@ def _geodetic_problem(place: Sequence[float]) -> str:
 def _local(position: Any, message: Any, frame: str = "", covariance: Any = None) -> PositionSample:
     values = np.array([position.x, position.y, position.z], dtype=np.float64)
     variance = np.zeros(3) if covariance is None else np.asarray(covariance, dtype=np.float64)[[0, 7, 14]]
-    if message.header.frame_id.lower().endswith("_ned"):
+    if str(message.header.frame_id).lower().endswith("_ned"):
         values, variance = ENU_FROM_NED @ values, np.abs(ENU_FROM_NED) @ variance
     x, y, z = (float(value) for value in values)
     problem = "" if np.isfinite(values).all() else "position is NaN"
@@ -175,7 +175,7 @@ def _imu(message: Any) -> AttitudeSample:
 
 def _pose(orientation: Any, message: Any, frame: str = "", covariance: Any = None) -> AttitudeSample:
     variance = np.zeros(3) if covariance is None else np.asarray(covariance, dtype=np.float64)[[21, 28, 35]]
-    ned = message.header.frame_id.lower().endswith("_ned")
+    ned = str(message.header.frame_id).lower().endswith("_ned")
     return _attitude(orientation, variance, frame or BASE, ned)
 
 
