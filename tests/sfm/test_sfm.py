@@ -157,7 +157,7 @@ def test_file_names_with_blanks(photographs: Photographs, tmp_path: Path, monkey
         shutil.copy(photographs.folder / name, photos / f"# flight 1 {name}")
     survey = survey_of(sorted(path.name for path in photos.iterdir()))
     asked = np.array([(0, 1), (1, 2), (2, 3), (3, 4), (0, 2), (1, 3), (2, 4)])
-    monkeypatch.setattr("pipelines.sfm.features.candidate_pairs", lambda *_: asked)
+    monkeypatch.setattr("pipelines.sfm.colmap_reconstruction.candidate_pairs", lambda *_: asked)
     job = SfmJob(survey, photos, tmp_path / "database.db", CONFIG)
     with quiet_colmap() as colmap:
         model = reconstruct(colmap, job, SILENT)
