@@ -23,7 +23,7 @@ import click
 
 from georef_cli.verbosity import LineFormatter, SafeFormatter, Verbosity, stderr_sender
 from pipelines.core.errors import GeorefError, InputError, storage_error
-from pipelines.core.progress import SIGNALS
+from pipelines.core.progress import AT_END, SIGNALS
 from pipelines.core.sentences import printable, printable_lines
 
 if TYPE_CHECKING:
@@ -70,8 +70,9 @@ def _of_click(error: click.ClickException) -> Ending:
     return Ending(error.exit_code, printable_lines(text.getvalue().rstrip("\n")), document)
 
 
-def _document(code: str, message: str) -> ErrorDocument:
-    return {"code": code, "message": message, "path": None, "line": None, "field": None, "hint": None}
+def _document(kind: str, message: str) -> ErrorDocument:
+    """Return the JSON form of a failure that is no `GeorefError`: its kind is its code."""
+    return {"kind": kind, "code": kind, "message": message, "path": None, "line": None, "field": None, "hint": None}
 
 
 LOGGERS = ("pipelines", "georef_cli")
@@ -100,7 +101,7 @@ def guarded(group: click.Group, arguments: Sequence[str] | None) -> int:
                 click.echo(dump_json({"error": document}))
         if tells_progress:
             with contextlib.suppress(KeyboardInterrupt):  # Nobody reads it.
-                stderr_sender().send("error", code=document["code"])
+                stderr_sender().send("error", error_kind=document["kind"])
         if ending is None:
             raise
         _say(ending.message)
@@ -207,6 +208,7 @@ def _handler(verbosity: Verbosity) -> logging.Handler:
         handler = _StderrHandler(sys.stderr)
         handler.setFormatter(LineFormatter())
     handler.setLevel(verbosity.level)
+    handler.addFilter(lambda record: not getattr(record, AT_END, False))  # The result on stdout ends with it.
     return handler
 
 

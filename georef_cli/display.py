@@ -17,7 +17,6 @@ from rich.table import Column as TableColumn
 from rich.text import Text
 
 from georef_cli.verbosity import LineFormatter, Verbosity, stderr_sender
-from pipelines.core.products import AT_END
 from pipelines.core.progress import SILENT, Progress, ProgressTask
 
 LINE_EVERY_S = 30.0
@@ -39,9 +38,6 @@ class ConsoleHandler(logging.Handler):
         self._console = console
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Print a record, unless stdout, on the same terminal, ends with it."""
-        if getattr(record, AT_END, False) and sys.stdout.isatty():
-            return
         style = next((style for level, style in LEVEL_STYLES.items() if record.levelno >= level), "dim")
         self._console.print(Text(self.format(record), style=style))
 

@@ -14,7 +14,7 @@ from rich.text import Text
 from georef_cli import tables
 from georef_cli.layout import ByWidth, Safe, plain_table, shown
 from georef_cli.tables import Renderable
-from pipelines.core.products import Caution, dump_json, union
+from pipelines.core.products import Remark, dump_json, union
 from pipelines.core.runner import Outcome
 from pipelines.core.staleness import cautions_by_stage
 from pipelines.core.workspace import Workspace
@@ -142,22 +142,23 @@ def document_of(outcome: Outcome) -> dict[str, Any]:
     }
 
 
-def document_of_cautions(by_stage: Mapping[str, Sequence[Caution]]) -> list[dict[str, str]]:
+def document_of_cautions(by_stage: Mapping[str, Sequence[Remark]]) -> list[dict[str, str]]:
     return [
         {"stage": stage, **caution.model_dump()} for stage, cautions in by_stage.items() for caution in cautions
     ]
 
 
 def print_outcome(workspace: Workspace, outcome: Outcome, *more: RenderableType, as_json: bool, told: bool) -> None:
-    """Print the result of a stage, what more there is to show of it, and the cautions of the workspace.
+    """Print the result of a stage, what more there is to show of it, and the cautions that the stage adds.
 
-    `told`: the log on the same terminal has shown the headline.
+    The JSON document has those of the whole workspace. `told`: the log on the same terminal has shown the headline.
     """
     cautions = cautions_by_stage(workspace)
     if as_json:
         print_json({**document_of(outcome), "cautions": document_of_cautions(cautions)})
     else:
-        print_rich(*tables.outcome(workspace, outcome, headline=not told), *more, *tables.cautions(cautions))
+        added = {outcome.stage: cautions.get(outcome.stage, ())}
+        print_rich(*tables.outcome(workspace, outcome, headline=not told), *more, *tables.cautions(added))
 
 
 def print_outcomes(

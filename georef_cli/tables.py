@@ -15,7 +15,7 @@ from pipelines.compare.table import REFERENCE_HEADS, Comparison, cells, referenc
 from pipelines.core.figures import ERRORS, MISSING, SHORT_WAYS, Headline
 from pipelines.core.options import notation
 from pipelines.core.plan import OptionOrigin
-from pipelines.core.products import Caution
+from pipelines.core.products import Remark
 from pipelines.core.runner import Outcome
 from pipelines.core.sentences import duration
 from pipelines.core.stages import REPORT
@@ -70,7 +70,7 @@ _FORGET = "[dim]georef run WS --forget OPTION drops a remembered one[/]"
 Renderable = Group | Table | ByWidth | FirstThatFits | str
 
 
-def states(rows: Iterable[StageState], cautions: Mapping[str, Sequence[Caution]]) -> ByWidth:
+def states(rows: Iterable[StageState], cautions: Mapping[str, Sequence[Remark]]) -> ByWidth:
     """Return the table of `georef status`: stage, state, end, duration, new cautions if any, key figure.
 
     A narrow terminal has no room for the end and the number of cautions, whose sentences follow the table.
@@ -109,7 +109,7 @@ def accuracy_line(headline: Headline | None) -> list[Renderable]:
     return [] if headline is None else [f"[bold]accuracy[/] {shown(headline.text)}"]
 
 
-def cautions(by_stage: Mapping[str, Sequence[Caution]]) -> list[Renderable]:
+def cautions(by_stage: Mapping[str, Sequence[Remark]]) -> list[Renderable]:
     return [
         f"[bold yellow]caution:[/] {shown(caution.sentence)} ({stage}, {caution.code})"
         for stage, of_stage in by_stage.items()
@@ -133,7 +133,7 @@ def outcome(workspace: Workspace, result: Outcome, *, headline: bool = True) -> 
                 table.add_row(shown(name), shown(_number(value)))
         parts.append(table)
     if not result.ran:  # the warnings of a stage that just ran are on stderr already
-        parts += [f"[yellow]warning:[/] {shown(text)}" for text in manifest.warnings]
+        parts += [f"[yellow]warning:[/] {shown(warning.sentence)}" for warning in manifest.warnings]
     return parts
 
 
@@ -145,7 +145,7 @@ def outcomes(results: Sequence[Outcome]) -> Table:
         done = "[green]done[/]" if result.ran else "[dim]current[/]"
         table.add_row(result.stage, done, duration(manifest.duration_s), shown(manifest.key_figure))
         for warning in () if result.ran else manifest.warnings:
-            table.add_row("", "[yellow]warning[/]", "", shown(warning))
+            table.add_row("", "[yellow]warning[/]", "", shown(warning.sentence))
     return table
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pipelines.core.products import Caution, load_json, save_json
+from pipelines.core.products import Remark, load_json, save_json
 from pipelines.core.stages import METRICS, RENDERS, REPORT, SURVEY
 from pipelines.core.types import Vector3
 from pipelines.core.workspace import Workspace
@@ -68,7 +68,7 @@ def evaluated_workspace(root: Path, rename: str = "") -> Evaluated:
         camera=check_point_errors(measured, area_km2),
         model=check_point_errors(replace(measured, cov_in_geo=None), area_km2),
         test={**photometric, "views": 1, "lpips_reason": "none", "per_view": views},
-        cautions=(Caution(code="made-up", sentence=f"Nothing is real here {rename}."),),
+        cautions=(Remark(code="made-up", sentence=f"Nothing is real here {rename}."),),
     )
     (root / REPORT).parent.mkdir(parents=True)
     write_report(report, root / REPORT)

@@ -15,7 +15,7 @@ from pathlib import Path
 from types import ModuleType
 
 from pipelines.core.options import StageOptions
-from pipelines.core.products import Caution, dump_json
+from pipelines.core.products import Remark, dump_json
 from pipelines.core.stages import PIPELINE, STAGES, StageSpec, producer_of, products_of
 from pipelines.core.workspace import StageRun, Summary, Workspace
 
@@ -80,7 +80,7 @@ def _in_form(spec: StageSpec, text: str) -> str:
         return text
     from tests.reports import report_with
 
-    return dump_json(report_with(cautions=(Caution(code="fake", sentence=text),)).model_dump(mode="json"))
+    return dump_json(report_with(cautions=(Remark(code="fake", sentence=text),)).model_dump(mode="json"))
 
 
 def _digest(text: str) -> str:

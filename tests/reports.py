@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from pipelines.core.products import Caution
+from pipelines.core.products import Remark
 from pipelines.core.stages import REPORT
 from pipelines.core.workspace import Workspace
 from pipelines.robust.statistics import ResidualStats
@@ -56,7 +56,7 @@ def report_with(
     crossed: CrossValidation | None = None,
     gnss: dict[str, Any] | None = None,
     scene: AccuracySummary | None = None,
-    cautions: tuple[Caution, ...] = (),
+    cautions: tuple[Remark, ...] = (),
 ) -> EvaluationReport:
     """A report with the given parts; nothing was measured of the others.
 

@@ -9,7 +9,7 @@ import numpy as np
 from pipelines.adjust.geolocate import geolocate
 from pipelines.adjust.init_sim3 import estimate_similarity
 from pipelines.adjust.options import GeolocateOptions, InitSim3Options
-from pipelines.core.products import Caution
+from pipelines.core.products import Remark
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.adjustment import InitialSimilarity
@@ -35,7 +35,7 @@ class Statement:
     warnings: tuple[str, ...]
 
     @property
-    def cautions(self) -> tuple[Caution, ...]:
+    def cautions(self) -> tuple[Remark, ...]:
         """Cautions of the result."""
         return self.initial.cautions
 

@@ -324,8 +324,9 @@ def align(data: Correspondences, rng: np.random.Generator, *, attitude: Rotation
     """
     if len(data) < 2 or (len(data) < 3 and attitude is None):
         raise DegenerateGeometryError(
+            "todo-positions-fixes-registered-images",
             f"{len(data)} positions (fixes of registered images and control points) do not determine where the "
-            f"model lies; 3 are needed: {_ADVICE}"
+            f"model lies; 3 are needed: {_ADVICE}",
         )
     # Starts of the fixes and of the control points, else of both together.
     parts = [data.part(members) for members in (~data.control, data.control) if members.sum() >= 3]
@@ -337,7 +338,10 @@ def align(data: Correspondences, rng: np.random.Generator, *, attitude: Rotation
         if attitude is None:
             worst = min((np.degrees(candidate.rotation_sigma_rad) for candidate in candidates), default=np.inf)
             size = f"is known to {worst:.0f}° only" if worst < 90 else "is not determined"
-            raise DegenerateGeometryError(f"the positions lie on one line: the rotation about it {size}; {_ADVICE}")
+            raise DegenerateGeometryError(
+                "todo-positions-lie-on-one",
+                f"the positions lie on one line: the rotation about it {size}; {_ADVICE}",
+            )
         prior, firm = attitude, _candidates(data, [_start_with_rotation(data, attitude.rotation, rng)], attitude)
     # A bias of the fixes costs as much as an outlier.
     best = min(firm, key=lambda one: one.cost + OUTLIER_GATE * (one.state.fix_bias_in_geo is not None))
@@ -403,7 +407,9 @@ def _start_with_rotation(data: Correspondences, rotation: FloatArray, rng: np.ra
         (a, b), (p, q) = turned[chosen], data.in_geo[chosen]
         scale = float((b - a) @ (q - p) / max((b - a) @ (b - a), np.finfo(float).tiny))
         if scale <= 0:
-            raise DegenerateGeometryError("the two positions run against each other")
+            raise DegenerateGeometryError(
+                "todo-two-positions-run-against", "the two positions run against each other"
+            )
         return Similarity(scale, rotation, (p + q - scale * (a + b)) / 2)
 
     options = RansacOptions(2, OUTLIER_GATE * _GATE_FACTORS[-1] ** 2, max_draws=300)

@@ -26,7 +26,7 @@ from pipelines.adjust.rig_fit import (
     fit_rig,
 )
 from pipelines.core.errors import DegenerateGeometryError
-from pipelines.core.products import load_json, save_json
+from pipelines.core.products import Remark, load_json, save_json
 from pipelines.core.stages import SPARSE, SURVEY
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun, Summary
@@ -163,17 +163,22 @@ def _key_figure(calibration: RigCalibration) -> str:
     return "; ".join(parts) or "nothing of the rig is observable"
 
 
-def _warnings(calibration: RigCalibration, survey: Survey) -> tuple[str, ...]:
+def _warnings(calibration: RigCalibration, survey: Survey) -> tuple[Remark, ...]:
     """Return warnings of parameters that keep the values of `ingest` although they were to be estimated."""
     if calibration.problem:
-        return (f"{calibration.problem}; {', '.join(calibration.wanted)} stay as told",)
+        sentence = f"{calibration.problem}; {', '.join(calibration.wanted)} stay as told"
+        return (Remark(code="rig-not-calibrated", sentence=sentence),)
     warnings = [
-        f"{estimate.name} is not observable in this flight (σ {max(estimate.sigma):.2g} {estimate.unit}): it stays "
-        "as told"
+        Remark(
+            code="rig-not-observable",
+            sentence=f"{estimate.name} is not observable in this flight (σ {max(estimate.sigma):.2g} "
+            f"{estimate.unit}): it stays as told",
+        )
         for estimate in calibration.estimates
         if not estimate.usable
     ]
     missed = [name for name in survey.estimate if name not in calibration.wanted]
     if missed:
-        warnings.append(f"--estimate leaves out what ingest was asked to estimate: {', '.join(missed)}")
+        sentence = f"--estimate leaves out what ingest was asked to estimate: {', '.join(missed)}"
+        warnings.append(Remark(code="rig-not-estimated", sentence=sentence))
     return tuple(warnings)

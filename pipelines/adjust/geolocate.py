@@ -19,7 +19,7 @@ from pipelines.adjust.alignment import Alignment, Correspondences, RotationPrior
 from pipelines.adjust.measurements import RecordedRotations, attitude_prior, fix_correspondences, recorded_rotations
 from pipelines.adjust.options import GeolocateOptions
 from pipelines.core.errors import DegenerateGeometryError, InputError
-from pipelines.core.products import save_npz
+from pipelines.core.products import Remark, save_npz
 from pipelines.core.sentences import listed
 from pipelines.core.stages import SPARSE
 from pipelines.core.types import BoolArray, FloatArray, IntArray
@@ -46,7 +46,7 @@ class Geolocation:
     points: GeolocatedPoints
     sigma_m: FloatArray
     key_figure: str
-    warnings: tuple[str, ...]
+    warnings: tuple[Remark, ...]
 
 
 def run(stage: StageRun, options: GeolocateOptions) -> Summary:
@@ -83,7 +83,9 @@ def geolocate(survey: Survey, model: SparseModel, options: GeolocateOptions) -> 
     both = int(np.isin(fixed, recorded.image).sum())
     if options.attitude == "recorded" and both < 2:
         raise InputError(
-            f"{both} images have a fix and an attitude, 2 are needed: use auto or sfm", field="--attitude"
+            "todo-images-have-fix-attitude",
+            f"{both} images have a fix and an attitude, 2 are needed: use auto or sfm",
+            field="--attitude",
         )
     complete = both == len(fixes) or (alignment is None and both >= 2)
     use_recorded = options.attitude == "recorded" or (options.attitude == "auto" and complete)
@@ -97,7 +99,8 @@ def geolocate(survey: Survey, model: SparseModel, options: GeolocateOptions) -> 
     intersections = intersect_rays(rays, views, len(model.point_id))
     sigma, inlier = _judge(intersections, rays, views, options)
     if inlier.sum() < 0.5 * len(inlier):
-        warnings.append(f"only {inlier.sum()} of {len(inlier)} points have rays that agree: check σ and attitudes")
+        sentence = f"only {inlier.sum()} of {len(inlier)} points have rays that agree: check σ and attitudes"
+        warnings.append(Remark(code="few-points-agree", sentence=sentence))
     middle = f", median σ {np.median(sigma[inlier]):.3g} m" if inlier.any() else ""
     source = "recorded" if use_recorded else "sfm"
     figure = f"{inlier.sum()} of {len(inlier)} points{middle} ({source} rotations)"
@@ -107,7 +110,7 @@ def geolocate(survey: Survey, model: SparseModel, options: GeolocateOptions) -> 
 def _without_positions(model: SparseModel, why: str) -> Geolocation:
     count = len(model.point_id)
     points = _points(model, Intersections.none(count), np.zeros(count, dtype=bool), "sfm")
-    return Geolocation(points, np.full(count, np.nan), why, (why,))
+    return Geolocation(points, np.full(count, np.nan), why, (Remark(code="points-not-located", sentence=why),))
 
 
 def _points(model: SparseModel, found: Intersections, inlier: BoolArray, source: str) -> GeolocatedPoints:
@@ -129,32 +132,36 @@ def _warnings(
     recorded: RecordedRotations,
     alignment: Alignment | None,
     prior: RotationPrior | None,
-) -> list[str]:
+) -> list[Remark]:
     """Return warnings of unused measurements, and of a `prior` turned against an alignment made without it."""
     warnings, turned, total = [], recorded.contradicting, len(model.image_name)
     if turned:
-        warnings.append(
+        sentence = (
             f"{len(turned)} attitudes contradict the SfM model and are not used: {listed(sorted(turned))}. "
             "Were these photographs turned in an image viewer?"
         )
+        warnings.append(Remark(code="attitudes-inconsistent", sentence=sentence))
     if len(fixes) < total:
-        warnings.append(f"{total - len(fixes)} of {total} registered images have no fix and give no rays")
+        sentence = f"{total - len(fixes)} of {total} registered images have no fix and give no rays"
+        warnings.append(Remark(code="photographs-without-fix", sentence=sentence))
     if alignment is None:
         return warnings
     rejected = [name for name, good in zip(fixes.name, alignment.solution.state.inlier, strict=True) if not good]
     if rejected:
-        warnings.append(
+        sentence = (
             f"{len(rejected)} of {len(fixes)} fixes contradict the SfM model and give no rays: "
             f"{listed(sorted(rejected))}"
         )
+        warnings.append(Remark(code="fixes-inconsistent", sentence=sentence))
     if prior is not None and not alignment.attitude_used:
         turn = turn_against(prior, alignment.geo_from_local)
         sigma = np.hypot(np.sqrt(prior.cov_rad2[0, 0]), alignment.solution.rotation_sigma_rad)
         if turn > 4 * sigma:
-            warnings.append(
+            sentence = (
                 f"recorded attitudes are turned by {np.degrees(turn):.1f}° against the fixes "
                 f"(σ {np.degrees(sigma):.1f}°): boresight, compass, or positions at other times or in other axes?"
             )
+            warnings.append(Remark(code="attitudes-turned", sentence=sentence))
     return warnings
 
 

@@ -31,7 +31,7 @@ from pipelines.adjust.measurements import (
 )
 from pipelines.adjust.terms import ControlPoints, Fixes
 from pipelines.core.errors import DegenerateGeometryError
-from pipelines.core.products import Caution
+from pipelines.core.products import Remark
 from pipelines.core.sentences import listed
 from pipelines.core.types import FloatArray
 from pipelines.geodesy.vertical import FOOT_M, MOST_GEOID_M
@@ -71,7 +71,7 @@ _EXCHANGED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
 
 @dataclass(frozen=True)
 class _Finding:
-    """Caution, and whether it is an inconsistency that ends the stage."""
+    """Remark, and whether it is an inconsistency that ends the stage."""
 
     code: str
     sentence: str
@@ -80,7 +80,7 @@ class _Finding:
 
 def cautions_of(
     survey: Survey, model: SparseModel, joint: JointAdjustment
-) -> tuple[tuple[Caution, ...], tuple[Caution, ...]]:
+) -> tuple[tuple[Remark, ...], tuple[Remark, ...]]:
     """Return the inconsistencies, which end the stage unless the user accepts them, and further limits."""
     fixes = StatedFixes(survey, model)
     findings, mistake = list(_upside_down(fixes, joint.geo_from_local)), _mistake_in_map(survey, model)
@@ -94,17 +94,17 @@ def cautions_of(
     findings += of_map or [*_shift_of_fixes(joint), *_control_points(joint)]
     findings += [*_attitudes(survey, fixes, joint), *_weak_checks(joint), *_guesses(joint)]
     ending, others = (
-        tuple(Caution(code=found.code, sentence=found.sentence) for found in findings if found.ends == ends)
+        tuple(Remark(code=found.code, sentence=found.sentence) for found in findings if found.ends == ends)
         for ends in (True, False)
     )
     return ending, others
 
 
-def unadjustable(survey: Survey, model: SparseModel, geo_from_local: Similarity | None) -> tuple[Caution, ...]:
+def unadjustable(survey: Survey, model: SparseModel, geo_from_local: Similarity | None) -> tuple[Remark, ...]:
     """Return the inconsistencies of measurements that determine no adjustment, and perhaps no alignment (None)."""
     fixes = StatedFixes(survey, model)
     if geo_from_local is not None and hangs_upside_down(model, geo_from_local):
-        return tuple(Caution(code=one.code, sentence=one.sentence) for one in _upside_down(fixes, geo_from_local))
+        return tuple(Remark(code=one.code, sentence=one.sentence) for one in _upside_down(fixes, geo_from_local))
     if len(fixes.name) < _LEAST_FIXES:
         return ()
     try:
@@ -115,10 +115,10 @@ def unadjustable(survey: Survey, model: SparseModel, geo_from_local: Similarity 
         return ()
     cause = "are they those of these photographs?" if best is None else best.sentence
     sentence = f"the fixes scatter by {scatter:.2f} m an axis about the SfM model, and fix no similarity: {cause}"
-    return (Caution(code=_SIGMA_REFUTED if best is None else best.code, sentence=sentence),)
+    return (Remark(code=_SIGMA_REFUTED if best is None else best.code, sentence=sentence),)
 
 
-def marks_that_do_not_meet(unused: Sequence[UnusedControlPoint], mistake: str | None) -> tuple[Caution, ...]:
+def marks_that_do_not_meet(unused: Sequence[UnusedControlPoint], mistake: str | None) -> tuple[Remark, ...]:
     """Return the caution that marks of control points do not meet in one point; none if they do.
 
     `mistake` is the cause that explains most of them, if one is known; then no control point is used.
@@ -131,7 +131,7 @@ def marks_that_do_not_meet(unused: Sequence[UnusedControlPoint], mistake: str | 
     more = "" if len(missed) <= _NAMED else f" and {len(missed) - _NAMED} more"
     sentence = f"the marks of {len(missed)} control points do not meet in one point: {named}{more}; "
     sentence += "these are not used" if mistake is None else f"no control point is used. Probably {mistake}"
-    return (Caution(code="control-marks", sentence=sentence),)
+    return (Remark(code="control-marks", sentence=sentence),)
 
 
 def _is_wrong(factor: VarianceFactor) -> bool:

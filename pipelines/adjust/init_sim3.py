@@ -20,6 +20,7 @@ from pipelines.adjust.alignment import AdjustedSimilarity, Alignment, Correspond
 from pipelines.adjust.inconsistencies import cautions_of, marks_that_do_not_meet, mistake_in_marks, unadjustable
 from pipelines.adjust.joint import JointAdjustment, Start, adjust_jointly, component_of, in_own_frame
 from pipelines.adjust.measurements import (
+    UnusedControlPoint,
     attitude_prior,
     control_correspondences,
     fix_correspondences,
@@ -41,7 +42,7 @@ from pipelines.adjust.solution import adjusted
 from pipelines.adjust.system import minimise
 from pipelines.adjust.terms import ControlPoints, Fixes
 from pipelines.core.errors import ContradictionError, ConvergenceError, DegenerateGeometryError, InputError
-from pipelines.core.products import NOT_CHECKED, Caution, save_json, union
+from pipelines.core.products import NOT_CHECKED, Remark, save_json, union
 from pipelines.core.sentences import listed
 from pipelines.core.stages import ADJUSTMENT, POINTS, SIM3, SIM3_POSTERIOR, SPARSE
 from pipelines.core.workspace import StageRun, Summary
@@ -64,7 +65,7 @@ class Estimated:
 
     initial: InitialSimilarity
     posterior: Posterior
-    warnings: tuple[str, ...]
+    warnings: tuple[Remark, ...]
 
 
 def run(stage: StageRun, options: InitSim3Options) -> Summary:
@@ -91,14 +92,17 @@ def estimate_similarity(
         InputError: `points` belongs to another model.
     """
     if not np.array_equal(points.point_id, model.point_id):
-        raise InputError("the geolocated points are of another model: run `georef geolocate` again")
+        raise InputError(
+            "todo-geolocated-points-another-model",
+            "the geolocated points are of another model: run `georef geolocate` again",
+        )
     if not options.control_points:
         survey = survey.model_copy(update={"control_points": ()})
     if options.method == "paper":
         control, unused = control_correspondences(survey, model)
         initial = similarity_by_paper(model, points, fix_correspondences(survey, model).joined(control))
         posterior = solved(survey, model, initial, options.estimate)
-        estimated = Estimated(initial, posterior, tuple(point.sentence for point in unused))
+        estimated = Estimated(initial, posterior, _of_unused(unused))
     else:
         estimated = robust_similarity(survey, model, points, options)
     _check_residual(estimated.initial, options.max_residual)
@@ -112,9 +116,10 @@ def _check_residual(initial: InitialSimilarity, limit_m: float | None) -> None:
         return
     what = "camera centres" if kind == "gnss" else "control points"
     raise ConvergenceError(
+        "todo-rms-residual-horizontal-vertical",
         f"RMS residual of {stats.count} {what} is {stats.rmse_3d_m:.3f} m (horizontal {stats.rmse_h_m:.3f}, "
         f"vertical {stats.rmse_v_m:.3f}), more than --max-residual {limit_m:g} m: look for wrong positions or a "
-        "bent SfM model, or allow more"
+        "bent SfM model, or allow more",
     )
 
 
@@ -163,11 +168,11 @@ def robust_similarity(
     except DegenerateGeometryError as error:
         _refuse(unadjustable(survey, model, None), options)
         reasons = [positions_in_use(survey, model, data, unused), *(caution.sentence for caution in of_marks)]
-        raise DegenerateGeometryError(f"{error}. {'; '.join(reasons)}") from error
+        raise DegenerateGeometryError("todo-x", f"{error}. {'; '.join(reasons)}") from error
     aligned = _aligned_product(model, points, data, alignment).model_copy(
         update={"control_outliers": tuple(p.name for p in survey.control_points if p.name not in control.name)}
     )
-    warnings = () if mistake else tuple(point.sentence for point in unused)  # else the caution says why
+    warnings = () if mistake else _of_unused(unused)  # else the caution says why
     meeting = tuple(point for point in survey.control_points if point.name in control.name)
     meets = survey.model_copy(update={"control_points": meeting})
     try:
@@ -175,7 +180,7 @@ def robust_similarity(
     except DegenerateGeometryError as error:
         contradictions = unadjustable(meets, model, alignment.geo_from_local)
         _refuse(contradictions, options)
-        unchecked = Caution(code=NOT_CHECKED, sentence=f"nothing checks the stated σ: {error}")
+        unchecked = Remark(code=NOT_CHECKED, sentence=f"nothing checks the stated σ: {error}")
         cautions = union(survey.cautions, contradictions, of_marks, (unchecked,))
         initial = _without_joint(aligned, alignment.solution, cautions)
         return Estimated(initial, solved(survey, model, initial, options.estimate), warnings)
@@ -217,11 +222,12 @@ def solved(
     return adjusted(scene, problem, state, initial, rejected_of(scene, survey, initial))
 
 
-def _refuse(contradictions: tuple[Caution, ...], options: InitSim3Options) -> None:
+def _refuse(contradictions: tuple[Remark, ...], options: InitSim3Options) -> None:
     if contradictions and not options.accept_contradiction:
         raise ContradictionError(
+            "todo-x",
             "; ".join(caution.sentence for caution in contradictions)
-            + ". Correct what is wrong, or go on with --accept-contradiction, which widens every σ"
+            + ". Correct what is wrong, or go on with --accept-contradiction, which widens every σ",
         )
 
 
@@ -282,7 +288,7 @@ def _record_of(solution: AdjustedSimilarity) -> SimilarityRecord:
 
 
 def _without_joint(
-    aligned: InitialSimilarity, solution: AdjustedSimilarity, cautions: tuple[Caution, ...]
+    aligned: InitialSimilarity, solution: AdjustedSimilarity, cautions: tuple[Remark, ...]
 ) -> InitialSimilarity:
     """Return the alignment with σ widened by what its few residuals show."""
     count = len(solution.squared)
@@ -296,9 +302,13 @@ def _without_joint(
     )
 
 
+def _of_unused(unused: tuple[UnusedControlPoint, ...]) -> tuple[Remark, ...]:
+    return tuple(Remark(code="control-point-unused", sentence=point.sentence) for point in unused)
+
+
 def _joint_product(
     model: SparseModel, points: GeolocatedPoints, aligned: InitialSimilarity, joint: JointAdjustment
-) -> tuple[InitialSimilarity, tuple[str, ...]]:
+) -> tuple[InitialSimilarity, tuple[Remark, ...]]:
     """Return the result of the joint adjustment, and warnings of outliers."""
     similarity = joint.geo_from_local
     inliers = aligned.inliers | {"points": int(agreeing_points(model, points, similarity).sum())}
@@ -313,7 +323,8 @@ def _joint_product(
         bad = [(name, miss) for name, miss, good in zip(names, missed, used, strict=True) if not good]
         if bad:
             sizes = [f"{name} ({np.linalg.norm(miss):.2f} m)" for name, miss in bad]
-            warnings.append(f"{len(bad)} of {len(names)} {group} are outliers: {listed(sizes)}")
+            sentence = f"{len(bad)} of {len(names)} {group} are outliers: {listed(sizes)}"
+            warnings.append(Remark(code=f"{kind}-outliers", sentence=sentence))
         rejected[kind] = tuple(name for name, _ in bad)
     pivot = np.array(aligned.geo_from_local.pivot)
     return aligned.model_copy(

@@ -123,7 +123,7 @@ def adjust_jointly(
         InputError: an error is to be estimated whose measurements were not recorded.
     """
     solutions: list[JointAdjustment] = []
-    refusal = DegenerateGeometryError("no start for the joint adjustment")
+    refusal = DegenerateGeometryError("todo-no-start-for-joint", "no start for the joint adjustment")
     frame: Scene | None = None
     for start in starts:
         try:
@@ -132,7 +132,7 @@ def adjust_jointly(
             if solutions[0].is_consistent:
                 break
         except (DegenerateGeometryError, ConvergenceError) as error:
-            refusal = DegenerateGeometryError(str(error))
+            refusal = DegenerateGeometryError("todo-x", str(error))
     if not solutions:
         raise refusal
     return min(solutions, key=lambda solution: solution.cost)
@@ -170,7 +170,7 @@ def _adjust(
 
     problem = problem_at(applied)
     if not problem.measured:
-        raise DegenerateGeometryError("no position takes part in the adjustment")
+        raise DegenerateGeometryError("todo-no-position-takes-part", "no position takes part in the adjustment")
     geo_from_local = Similarity.from_record(start.initial.geo_from_local)
     geo_from_model = geo_from_local @ scene.model_from_local.inverse()
     state = replace(start_of(scene, problem), geo_from_model=geo_from_model)

@@ -234,7 +234,11 @@ def problem_of(
     attitudes = attitudes_of(scene, survey) if with_attitudes or "boresight" in wanted else None
     for name, source, what in (("lever-arm", fixes, "positions"), ("boresight", attitudes, "attitudes")):
         if name in wanted and source is None:
-            raise InputError(f"{name} cannot be estimated: no {what} were recorded", field="--estimate")
+            raise InputError(
+                "todo-cannot-be-estimated-no",
+                f"{name} cannot be estimated: no {what} were recorded",
+                field="--estimate",
+            )
     blocks = [] if fixes is None else _common_errors(survey, fixes)
     if "lever-arm" in wanted:
         blocks.append(SystematicError("lever-arm", (SIGMA_ARM_M,) * 3))

@@ -277,7 +277,9 @@ def load_posterior(path: Path, solution: Adjustment, sfm: SparseModel) -> Poster
         and arrays["indptr"].shape == (n + 1,)
     )
     if not fits:
-        raise InputError(f"does not belong to the solution beside it: {_ADVICE}", path=path)
+        raise InputError(
+            "todo-does-not-belong-solution", f"does not belong to the solution beside it: {_ADVICE}", path=path
+        )
     poses = bsr_matrix((arrays["data"], arrays["indices"], arrays["indptr"]), shape=(6 * n, 6 * n))
     normal, sparse = NormalMatrix(poses, border, corner, position), solution.with_lenses(sfm)
     return Posterior(solution, sparse, normal, followed, lens, camera_cov, AccuracyGrid.of_arrays(arrays))

@@ -153,7 +153,7 @@ class NormalMatrix:
         try:
             return SparseCholesky(self.poses, self.position)
         except DegenerateGeometryError:
-            raise DegenerateGeometryError(_ADVICE) from None
+            raise DegenerateGeometryError("todo-x", _ADVICE) from None
 
     @cached_property
     def response(self) -> FloatArray:
@@ -177,7 +177,7 @@ class NormalMatrix:
         scaled = schur * scale[:, None] * scale
         size = np.linalg.svd(scaled, compute_uv=False)
         if size[-1] <= _OPEN * size[0]:
-            raise DegenerateGeometryError(_ADVICE)
+            raise DegenerateGeometryError("todo-x", _ADVICE)
         factors = lu_factor(scaled)
         return lambda right: np.asarray(lu_solve(factors, right * scale[:, None]) * scale[:, None])
 
@@ -314,7 +314,7 @@ class Linearised:
         scale = 1.0 / np.sqrt(np.diag(information) + np.abs(np.diag(problem.of_rounding)))
         beyond = (information - problem.of_rounding) * scale[:, None] * scale
         if np.linalg.eigvalsh(beyond)[0] <= _OPEN:
-            raise DegenerateGeometryError(_ADVICE)
+            raise DegenerateGeometryError("todo-x", _ADVICE)
 
     @property
     def _width(self) -> int:
@@ -382,7 +382,10 @@ def minimise(problem: Problem, start: State, normal: NormalMatrix | None = None)
             if reached <= cost + _NOISE * (1 + abs(cost)) or change < _STILL:
                 break
         else:
-            raise ConvergenceError(f"the cameras do not settle: the last step changed a residual by {change:.1e} σ")
+            raise ConvergenceError(
+                "todo-cameras-do-not-settle",
+                f"the cameras do not settle: the last step changed a residual by {change:.1e} σ",
+            )
         state, residuals, cost = moved, new, reached
         if change < _STILL:
             return Minimum(state, cost, normal)
@@ -391,7 +394,9 @@ def minimise(problem: Problem, start: State, normal: NormalMatrix | None = None)
         whole = change / (stretch * 0.5**halving)
         stretch = 2 * stretch if not halving and _SLOW * unstretched < whole < unstretched else 1.0
         last, unstretched = change, whole
-    raise ConvergenceError(f"the cameras do not settle: the last step changed a residual by {last:.1e} σ")
+    raise ConvergenceError(
+        "todo-cameras-do-not-settle", f"the cameras do not settle: the last step changed a residual by {last:.1e} σ"
+    )
 
 
 def _moved(problem: Problem, state: State, step: tuple[FloatArray, FloatArray], part: float) -> State:

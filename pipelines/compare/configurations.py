@@ -104,7 +104,7 @@ def select_configurations(text: str) -> tuple[Configuration, ...]:
     if unknown or not names:
         known = ", ".join(BY_CONFIGURATION)
         message = f"{unknown[0]!r} is none of {known}" if unknown else f"choose from {known}"
-        raise InputError(message, field="--configs")
+        raise InputError("todo-x", message, field="--configs")
     return tuple(BY_CONFIGURATION[name] for name in dict.fromkeys(names))
 
 

@@ -194,6 +194,6 @@ def _row(configuration: Configuration, plan: Sequence[VariantStage], runner: _Pl
         iterations=training.get("iterations"),
         gaussians=training.get("gaussians"),
         training_s=training.get("seconds") if configuration.trained_by is None else None,
-        warnings=tuple(text for manifest in manifests.values() for text in manifest.warnings),
+        warnings=union(*(manifest.warnings for manifest in manifests.values())),
         cautions=union(*(manifest.cautions for manifest in manifests.values())),
     )

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Literal
 
 from pipelines.core.figures import ERRORS, MISSING, SHORT_WAYS, WAYS
-from pipelines.core.products import Caution, Product
+from pipelines.core.products import Product, Remark
 from pipelines.report.plots.charts import BarChart
 from pipelines.survey.report_parts import ReferenceComparison
 
@@ -68,8 +68,8 @@ class ComparedRow(Product):
     iterations: int | None = None
     gaussians: int | None = None
     training_s: float | None = None
-    warnings: tuple[str, ...] = ()
-    cautions: tuple[Caution, ...] = ()
+    warnings: tuple[Remark, ...] = ()
+    cautions: tuple[Remark, ...] = ()
 
 
 class Comparison(Product):
@@ -173,7 +173,7 @@ def reference_cells(row: ComparedRow) -> tuple[str, ...]:
 def remarks_on(row: ComparedRow) -> tuple[str, ...]:
     """Return the reason why a row is empty, and the warnings and cautions of its stages."""
     failure = () if row.failure is None else (f"failed: {row.failure}",)
-    return (*failure, *row.warnings, *(caution.sentence for caution in row.cautions))
+    return (*failure, *(remark.sentence for remark in (*row.warnings, *row.cautions)))
 
 
 def _line(parts: Iterable[str]) -> str:

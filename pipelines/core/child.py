@@ -229,7 +229,7 @@ def _error(message: Mapping[str, Any]) -> Exception:
         return RuntimeError(f"in a child process:\n{message['text']}")
     kind = getattr(errors, message["type"], GeorefError)
     kind = GeorefError if kind is MissingProductError else kind
-    error: Exception = kind(message["text"])
+    error: Exception = kind(message["code"], message["text"])
     return error
 
 
@@ -239,12 +239,17 @@ def _crash(code: int, native_log: IO[str], remedy: str) -> GeorefError:
     for line in lines[-50:]:
         log.debug("the child process wrote: %s", line)
     if code == -signal.SIGKILL:
-        return ResourceError(f"the system killed the computation, as it does when memory is short: {remedy}")
+        return ResourceError(
+            "todo-system-killed-computation-does",
+            f"the system killed the computation, as it does when memory is short: {remedy}",
+        )
     ending = signal.Signals(-code).name if code < 0 else f"exit code {code}"
     # glog begins the line of a failed check with F and the date; the first line is the cause of those below.
     checks = [line for line in lines if line[:1] == "F" and line[1:5].isdigit()]
     cause = (checks or lines[-1:] or ["no message"])[0].rpartition("] ")[2]
-    return CrashError(f"a native library crashed ({ending}: {cause[:_MOST_OF_A_LINE]}): {remedy}")
+    return CrashError(
+        "todo-native-library-crashed", f"a native library crashed ({ending}: {cause[:_MOST_OF_A_LINE]}): {remedy}"
+    )
 
 
 def _main(task: str, parent: str) -> None:
@@ -263,13 +268,14 @@ def _main(task: str, parent: str) -> None:
         result = getattr(importlib.import_module(module), name)(document["arguments"], messages)
         messages.send("result", result=result)
     except GeorefError as error:
-        messages.send("error", type=type(error).__name__, text=str(error))
+        messages.send("error", type=type(error).__name__, code=error.code, text=str(error))
     except MemoryError:
-        messages.send("error", type="ResourceError", text="memory is short: use smaller or fewer photographs")
+        text = "The memory of this machine is too small: use smaller or fewer photographs."
+        messages.send("error", type="ResourceError", code="out-of-memory", text=text)
     except Exception as error:
         storage = storage_error(error)
         if storage is not None:
-            messages.send("error", type="StorageError", text=str(storage))
+            messages.send("error", type="StorageError", code=storage.code, text=str(storage))
         else:
             messages.send("defect", text=traceback.format_exc())
     sys.stderr.flush()

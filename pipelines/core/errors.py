@@ -16,26 +16,33 @@ class GeorefError(Exception):
     """Failure that the user can understand and act on.
 
     Attributes:
-        code: kind of the failure, for machines: lower-case words joined by hyphens.
+        kind: class of the failure, for machines.
+        code: the failure itself, for machines and tests: lower-case words joined by hyphens, stable while the
+            wording of the message changes.
         hint: the remedy, where it is known apart from the message.
     """
 
-    code: ClassVar[str] = "failed"
+    kind: ClassVar[str] = "failed"
     hint: str | None = None
 
+    def __init__(self, code: str, message: str) -> None:
+        super().__init__(message)
+        self.code = code
+
     def document(self) -> dict[str, str | int | None]:
-        """Return the JSON form: code, message, path, line, field and hint."""
+        """Return the JSON form: kind, code, message, path, line, field and hint."""
         nowhere = dict.fromkeys(("path", "line", "field"))
-        return {"code": self.code, "message": str(self), **nowhere, "hint": self.hint}
+        return {"kind": self.kind, "code": self.code, "message": str(self), **nowhere, "hint": self.hint}
 
 
 class InputError(GeorefError):
     """Bad input: a file, a line (counted from 1) or field of it, or an option."""
 
-    code = "input"
+    kind = "input"
 
     def __init__(
         self,
+        code: str,
         message: str,
         *,
         path: Path | str | None = None,
@@ -51,7 +58,7 @@ class InputError(GeorefError):
         where = "" if path is None else str(path) + (f":{line}" if line is not None else "")
         if field is not None:
             where = f"{where} [{field}]" if where else f"[{field}]"
-        super().__init__(f"{where}: {message}" if where else message)
+        super().__init__(code, f"{where}: {message}" if where else message)
 
     @property
     def is_usage(self) -> bool:
@@ -62,7 +69,7 @@ class InputError(GeorefError):
         """Return the JSON form; the message is without path and field."""
         return {
             **super().document(),
-            "code": "usage" if self.is_usage else self.code,
+            "kind": "usage" if self.is_usage else self.kind,
             "message": self.message,
             "path": None if self.path is None else str(self.path),
             "line": self.line,
@@ -73,73 +80,73 @@ class InputError(GeorefError):
 class MissingProductError(GeorefError):
     """Missing product of another stage: its workspace path, and the command line that makes it."""
 
-    code = "missing-product"
+    kind = "missing-product"
 
     def __init__(self, product: str, command: str) -> None:
         self.product = product
         self.command = command
         self.hint = f"run `{command}` first"
-        super().__init__(f"{product} is missing: run `{command}` first")
+        super().__init__("missing-product", f"{product} is missing: run `{command}` first")
 
 
 class WorkspaceBusyError(GeorefError):
     """Workspace that another process is writing to."""
 
-    code = "busy"
+    kind = "busy"
 
 
 class DegenerateGeometryError(GeorefError):
     """Observations that do not determine the unknowns (parallel rays, collinear cameras …)."""
 
-    code = "geometry"
+    kind = "geometry"
 
 
 class ContradictionError(GeorefError):
     """Sources that contradict each other as a whole; the message names both sides and what would reconcile them."""
 
-    code = "contradiction"
+    kind = "contradiction"
 
 
 class ConvergenceError(GeorefError):
     """Optimisation that diverged, or ended outside the bound that the user set."""
 
-    code = "convergence"
+    kind = "convergence"
 
 
 class ResourceError(GeorefError):
     """Machine too small for the options; the message names options that need less."""
 
-    code = "resources"
+    kind = "resources"
 
 
 class CrashError(GeorefError):
     """Native library that ended its process."""
 
-    code = "crash"
+    kind = "crash"
 
 
 class BackendUnavailableError(GeorefError):
     """Missing optional library or device; the message names the extra to install."""
 
-    code = "backend"
+    kind = "backend"
 
 
 class ClusterError(GeorefError):
     """Cluster of which no scheduler answers, or none of whose workers can run the jobs."""
 
-    code = "cluster"
+    kind = "cluster"
 
 
 class StorageError(GeorefError):
     """Disk or file system that is full, fails, or may not be written; names the file."""
 
-    code = "storage"
+    kind = "storage"
 
 
 class DamagedPartialError(InputError):
     """Partial product of an interrupted run that cannot be continued; the runner starts the stage afresh."""
 
-    code = "damaged-partial"
+    kind = "damaged-partial"
 
 
 _SQLITE_ERRNO = {8: errno.EROFS, 10: errno.EIO, 13: errno.ENOSPC}
@@ -190,15 +197,20 @@ def storage_error(error: BaseException, place: Path | None = None) -> StorageErr
         code = _SQLITE_ERRNO.get(getattr(cause, "sqlite_errorcode", 0) & 0xFF, code)
         if code in _STORAGE_REASONS and (cause is error or code in _DISK_FAILURES):
             path = getattr(cause, "filename", None)
-            return StorageError(f"{path or place or 'workspace or output'}: {_STORAGE_REASONS[code]}")
+            return StorageError(*_storage_message(code, path or place or "workspace or output"))
         cause = cause.__cause__ or cause.__context__
     return None
 
 
 def storage_error_in(text: str, path: Path) -> StorageError | None:
     """Return the storage failure at a path that messages of SQLite or of the C library name, or None."""
-    reason = next((reason for words, reason in _NATIVE_WORDS.items() if words in text), None)
-    return None if reason is None else StorageError(f"{path}: {_STORAGE_REASONS[reason]}")
+    code = next((code for words, code in _NATIVE_WORDS.items() if words in text), None)
+    return None if code is None else StorageError(*_storage_message(code, path))
+
+
+def _storage_message(code: int, path: Path | str) -> tuple[str, str]:
+    """Return code and message of a storage failure, e.g. `storage-enospc`."""
+    return f"storage-{errno.errorcode[code].lower()}", f"{path}: {_STORAGE_REASONS[code]}"
 
 
 @contextmanager

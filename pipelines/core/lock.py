@@ -64,18 +64,25 @@ class WriteLock:
                 self.folder.mkdir(parents=True, exist_ok=True)
                 handle = (self.folder / LOCK).open("ab")
             except OSError as error:
-                raise InputError(f"cannot be used as a workspace: {error.strerror}", path=self.folder) from error
+                raise InputError(
+                    "todo-cannot-be-used-workspace",
+                    f"cannot be used as a workspace: {error.strerror}",
+                    path=self.folder,
+                ) from error
             try:
                 locked = _lock(handle, patience_s)
             except OSError as error:
                 handle.close()
-                raise InputError(f"cannot be locked: {error.strerror}", path=self.folder) from error
+                raise InputError(
+                    "todo-cannot-be-locked", f"cannot be locked: {error.strerror}", path=self.folder
+                ) from error
             if locked and self._is_current(handle):
                 return handle
             handle.close()
             if not locked:
                 raise WorkspaceBusyError(
-                    f"{self.folder} is being written by {self._holder()}: wait for it, or stop it"
+                    "todo-being-written-by-wait",
+                    f"{self.folder} is being written by {self._holder()}: wait for it, or stop it",
                 )
 
     def _is_current(self, handle: BinaryIO) -> bool:

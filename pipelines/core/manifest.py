@@ -11,7 +11,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, FiniteFloat, model_validator
 
 from pipelines.core.files import file_size
-from pipelines.core.products import Caution
+from pipelines.core.products import Remark
 
 MANIFEST = "manifest.json"
 Memo = dict[Path, str]
@@ -52,8 +52,8 @@ class Manifest(BaseModel):
     duration_s: FiniteFloat
     key_figure: str
     values: dict[str, Any]
-    warnings: list[str]
-    cautions: tuple[Caution, ...] = ()
+    warnings: tuple[Remark, ...]
+    cautions: tuple[Remark, ...] = ()
     files: dict[str, FileRecord] = {}
     input_files: dict[str, dict[str, FileRecord]] = {}
 

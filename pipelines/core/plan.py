@@ -125,7 +125,12 @@ def _action(
     if manifest is None:
         for name, path in input_paths(options).items():  # no hashes: those of new photographs take minutes
             if not path.exists():
-                raise InputError("no such file or folder", path=path, field=flag_name(type(options), name))
+                raise InputError(
+                    "todo-no-such-file-or",
+                    "no such file or folder",
+                    path=path,
+                    field=flag_name(type(options), name),
+                )
         resumes = spec.resumable and workspace.partial(spec).exists()
         return ("resume", f"interrupted: {interrupted}") if resumes else ("run", "never run")
     if found.damaged:

@@ -56,13 +56,17 @@ def load_json(product_type: type[ProductT], path: Path) -> ProductT:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
-        raise InputError(first["msg"].removeprefix("Value error, "), path=path, field=where or None) from error
+        raise InputError(
+            "todo-x", first["msg"].removeprefix("Value error, "), path=path, field=where or None
+        ) from error
     except UnicodeDecodeError as error:
-        raise InputError("not a UTF-8 text file", path=path) from error
+        raise InputError("todo-not-utf-text-file", "not a UTF-8 text file", path=path) from error
     except (np.linalg.LinAlgError, RecursionError) as error:  # of a validator that computes
-        raise InputError(f"has values that cannot be used: {error}", path=path) from error
+        raise InputError(
+            "todo-has-values-cannot-be", f"has values that cannot be used: {error}", path=path
+        ) from error
     except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", path=path) from error
+        raise InputError("todo-cannot-be-read", f"cannot be read: {error.strerror}", path=path) from error
 
 
 def dump_json(document: Any) -> str:
@@ -106,28 +110,28 @@ class ArrayProduct:
                 expected = lengths.setdefault(wanted, length) if isinstance(wanted, str) else wanted
                 matches = matches and length == expected
             if not matches:
-                raise InputError(f"has the form {array.shape} {array.dtype}", path=path, field=name)
+                raise InputError(
+                    "todo-has-form", f"has the form {array.shape} {array.dtype}", path=path, field=name
+                )
         return cls(**arrays)
 
 
 # Code of the caution that nothing checks the σ of the positions: no accuracy is stated then.
 NOT_CHECKED = "not-checked"
-# Attribute of log records with a caution: the command line repeats cautions at its end.
-AT_END = "at_end"
 
 
-class Caution(Product):
-    """Limit of a result: one full sentence for people, and a code for machines (docs/accuracy.md lists them)."""
+class Remark(Product):
+    """Warning of a command, or caution of a product: a full sentence for people, a code for machines and tests."""
 
     code: Annotated[str, StringConstraints(pattern=r"^[a-z0-9]+(-[a-z0-9]+)*$")]
     sentence: Annotated[str, StringConstraints(min_length=1)]
 
 
-def union(*groups: tuple[Caution, ...]) -> tuple[Caution, ...]:
-    """Return the cautions of all groups in order, each once."""
+def union(*groups: tuple[Remark, ...]) -> tuple[Remark, ...]:
+    """Return the remarks of all groups in order, each once."""
     return tuple(dict.fromkeys(caution for group in groups for caution in group))
 
 
-def is_checked(cautions: tuple[Caution, ...]) -> bool:
+def is_checked(cautions: tuple[Remark, ...]) -> bool:
     """Return whether something checks the σ of the positions; no accuracy is stated otherwise."""
     return all(caution.code != NOT_CHECKED for caution in cautions)

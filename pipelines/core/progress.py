@@ -52,6 +52,9 @@ class SilentProgress:
 SILENT = SilentProgress()
 
 
+# Attribute of log records with a caution: for the file alone, since the result of the command ends with it.
+AT_END = "at_end"
+
 SIGNALS = [signal.SIGINT, signal.SIGTERM]
 if sys.platform == "win32":  # There SIGTERM kills without a handler; another process can send Ctrl-Break instead.
     SIGNALS.append(signal.SIGBREAK)

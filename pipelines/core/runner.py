@@ -31,8 +31,8 @@ from pipelines.core.fingerprints import library_versions
 from pipelines.core.lock import WriteLock
 from pipelines.core.manifest import MANIFEST, Manifest, Memo, record_files
 from pipelines.core.options import REQUESTS, read_requests, remember, remembered
-from pipelines.core.products import AT_END, union
-from pipelines.core.progress import SILENT, Progress
+from pipelines.core.products import union
+from pipelines.core.progress import AT_END, SILENT, Progress
 from pipelines.core.sentences import duration
 from pipelines.core.stages import STAGES, StageSpec, products_of
 from pipelines.core.staleness import BY_HAND, Flags, Request
@@ -242,7 +242,7 @@ def _execute(workspace: Workspace, asked: Request, resume: Resume, progress: Pro
         if not (partial.folder / product.removeprefix(f"{spec.folder}/")).exists():
             raise RuntimeError(f"{spec.module} did not write {product}")
     for warning in summary.warnings:
-        log.warning("%s: %s", spec.name, warning)
+        log.warning("%s: %s", spec.name, warning.sentence, extra={"code": warning.code})
     carried = set(union(*staleness.cautions_by_stage(workspace, before=spec).values()))
     for caution in summary.cautions:
         if caution not in carried:
@@ -257,7 +257,7 @@ def _execute(workspace: Workspace, asked: Request, resume: Resume, progress: Pro
         duration_s=round(time.monotonic() - clock, 3),
         key_figure=summary.key_figure,
         values=summary.values,
-        warnings=list(summary.warnings),
+        warnings=summary.warnings,
         cautions=summary.cautions,
         files=record_files(partial.folder, spec.working),
         input_files=asked.inputs.files,
@@ -306,8 +306,9 @@ def _run(workspace: Workspace, asked: Request, resume: Resume, progress: Progres
     except _WITHOUT_SOLUTION as error:
         cause = " ".join(str(error).split())[:200]
         degenerate = DegenerateGeometryError(
+            "todo-products-reads-lead-no",
             f"the products that {spec.name} reads lead to no solution ({cause}): were they edited? "
-            f"`georef run {workspace.root} --force` makes them again"
+            f"`georef run {workspace.root} --force` makes them again",
         )
         workspace.partial_product(spec).fail(str(degenerate), worthless=True)
         raise degenerate from error

@@ -421,5 +421,8 @@ def stage_slice(first: str | None, last: str | None) -> tuple[StageSpec, ...]:
     begin = names.index(first) if first else 0
     end = names.index(last) if last else len(names) - 1
     if begin > end:
-        raise GeorefError(f"--from {first} comes after --to {last}: the order is {', '.join(names)}")
+        raise GeorefError(
+            "todo-from-comes-after-order",
+            f"--from {first} comes after --to {last}: the order is {', '.join(names)}",
+        )
     return PIPELINE[begin : end + 1]

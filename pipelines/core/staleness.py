@@ -19,7 +19,7 @@ from pipelines.core.fingerprints import Fingerprints, fingerprints
 from pipelines.core.lock import WriteLock
 from pipelines.core.manifest import MANIFEST, Manifest, Memo
 from pipelines.core.options import StageOptions, as_flags, decisive_fields, load_toml, read_requests, resolve
-from pipelines.core.products import Caution, union
+from pipelines.core.products import Remark, union
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import BY_NAME, DELIVERABLES, PIPELINE, StageSpec, producer_of, products_of
 from pipelines.core.validators import require_text
@@ -263,13 +263,13 @@ def producers(spec: StageSpec) -> list[StageSpec]:
     return list(dict.fromkeys(producer_of(part.product) for part in spec.reads))
 
 
-def cautions_by_stage(workspace: Workspace, before: StageSpec | None = None) -> dict[str, tuple[Caution, ...]]:
+def cautions_by_stage(workspace: Workspace, before: StageSpec | None = None) -> dict[str, tuple[Remark, ...]]:
     """Return the cautions of a workspace's products, each under the first stage that has it, in order.
 
     Only the stages of the pipeline ahead of `before` are read, if it is given. A damaged manifest tells none.
     """
-    by_stage: dict[str, tuple[Caution, ...]] = {}
-    known: set[Caution] = set()
+    by_stage: dict[str, tuple[Remark, ...]] = {}
+    known: set[Remark] = set()
     for spec in (*_ahead_of(before), *(DELIVERABLES if before is None else ())):
         manifest = _readable_manifest(workspace, spec)
         new = () if manifest is None else tuple(c for c in union(manifest.cautions) if c not in known)
@@ -294,7 +294,9 @@ def must_exist(workspace: Workspace) -> None:
     """Refuse a workspace that does not exist."""
     require_text(workspace.root)
     if not workspace.root.is_dir():
-        raise InputError("no such workspace: `georef ingest` makes one", path=workspace.root)
+        raise InputError(
+            "todo-no-such-workspace-georef", "no such workspace: `georef ingest` makes one", path=workspace.root
+        )
 
 
 def warn_of_stale_inputs(workspace: Workspace, spec: StageSpec, memo: Memo) -> None:
@@ -311,6 +313,7 @@ def refuse_damaged_inputs(workspace: Workspace, spec: StageSpec, memo: Memo) -> 
         damage = why_damaged(finding(workspace, producer, memo, by_content=True).damaged)
         if damage:
             raise InputError(
+                "todo-georef-run-makes-again",
                 f"{damage}: `georef run {(workspace.base or workspace).root}` makes it again; to "
                 f"keep it as it is, delete {producer.folder}/{MANIFEST}",
                 path=workspace.root,
@@ -353,6 +356,7 @@ def refuse_loss(
         command = continuing_command(workspace, spec)
         how = "" if reason.startswith("option") else " with the former input"
         raise InputError(
+            "todo-interrupted-would-be-lost",
             f"an interrupted {spec.name} would be lost ({found_interrupted(workspace, spec)}), because {reason}: "
             f"`{command}`{how} continues it, --force drops it",
             path=partial.folder,

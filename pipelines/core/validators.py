@@ -32,7 +32,9 @@ def require_text(path: Path, field: str | None = None) -> None:
     try:
         str(path).encode("utf-8")
     except UnicodeEncodeError as error:
-        raise InputError("the name is not UTF-8 text: rename it", path=path, field=field) from error
+        raise InputError(
+            "todo-name-not-utf-text", "the name is not UTF-8 text: rename it", path=path, field=field
+        ) from error
 
 
 def image_name(name: str) -> str:

@@ -21,7 +21,7 @@ from pipelines.core.files import remove, replace_file, replace_folder, replace_t
 from pipelines.core.lock import WriteLock
 from pipelines.core.manifest import MANIFEST, Manifest, Memo, damaged_files
 from pipelines.core.options import CONFIG_FILE, REQUESTS
-from pipelines.core.products import Caution, load_json, save_json
+from pipelines.core.products import Remark, load_json, save_json
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import STAGES, StageSpec, producer_of, products_of
 
@@ -97,6 +97,7 @@ class PartialProduct:
             return True
         if insist:
             raise InputError(
+                "todo-interrupted-run-had-other",
                 "the interrupted run had other inputs or options: give those, or start afresh with --force",
                 path=self.folder,
             )
@@ -126,8 +127,8 @@ class Summary:
 
     key_figure: str
     values: dict[str, Any] = field(default_factory=dict)
-    warnings: tuple[str, ...] = ()
-    cautions: tuple[Caution, ...] = ()
+    warnings: tuple[Remark, ...] = ()
+    cautions: tuple[Remark, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -303,9 +304,12 @@ class Workspace:
 def _refuse_what_is_no_folder(folder: Path) -> None:
     if folder.is_symlink():
         raise InputError(
+            "todo-symbolic-link-stage-replaces",
             "is a symbolic link, and a stage replaces its folder as a whole: put the folder itself there, or the "
             "whole workspace on the other disk",
             path=folder,
         )
     if folder.exists() and not folder.is_dir():
-        raise InputError("is a file where the stage's folder belongs: move it away", path=folder)
+        raise InputError(
+            "todo-file-where-stage-folder", "is a file where the stage's folder belongs: move it away", path=folder
+        )

@@ -23,7 +23,7 @@ import numpy as np
 from pipelines.adjust.posterior import Posterior
 from pipelines.adjust.solution import posterior_of
 from pipelines.core.files import replace_text
-from pipelines.core.products import Caution, is_checked, save_npz, union
+from pipelines.core.products import Remark, is_checked, save_npz, union
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import ExportCamerasOptions
@@ -52,7 +52,7 @@ _LEAST_RAYS = 3  # of a point that counts as a part of the surface
 _RIM = 0.005  # fraction of the points that are taken for errors above, and below
 _LENS_TOLERANCE_PX = 0.01  # of a lens that nerfstudio's model replaces: below, nobody need know
 _UNKNOWN = (
-    Caution(code="cameras-without-sigma", sentence="The cameras have no σ: nothing checks the σ of the positions."),
+    Remark(code="cameras-without-sigma", sentence="The cameras have no σ: nothing checks the σ of the positions."),
 )
 
 
@@ -205,7 +205,7 @@ def _write_covariances(folder: Path, model: SparseModel, posterior: Posterior | 
         write_sidecar(placement.sidecar(), folder / file)
 
 
-def _write_nerfstudio(path: Path, model: SparseModel, placement: Placement) -> tuple[Caution, ...]:
+def _write_nerfstudio(path: Path, model: SparseModel, placement: Placement) -> tuple[Remark, ...]:
     """Write the cameras in nerfstudio's form, with the sidecar, and return what that form cannot hold."""
     lenses = {key: lens_of(camera) for key, camera in model.cameras.items()}
     owner = [lenses[int(key)] for key in model.image_camera_id]
@@ -234,7 +234,7 @@ def _write_nerfstudio(path: Path, model: SparseModel, placement: Placement) -> t
             f"transforms.json has a polynomial in place of the rational lens FULL_OPENCV: {error:.2f} px off at "
             "most."
         )
-    cautions = tuple(Caution(code=code, sentence=sentence) for code, sentence in limits.items())
+    cautions = tuple(Remark(code=code, sentence=sentence) for code, sentence in limits.items())
     sidecar = placement.sidecar()
     write_sidecar(sidecar.model_copy(update={"cautions": union(sidecar.cautions, cautions)}), path)
     return cautions
@@ -298,7 +298,7 @@ def _iso(seconds: float | None) -> str | None:
         return None
 
 
-def _summary(table: CameraTable, model: SparseModel, sidecar: CrsSidecar, cautions: tuple[Caution, ...]) -> Summary:
+def _summary(table: CameraTable, model: SparseModel, sidecar: CrsSidecar, cautions: tuple[Remark, ...]) -> Summary:
     count = len(table.name)
     figure = f"{count} cameras, {sidecar.crs}{median_sigma(sidecar.sigma, 'camera positions')}"
     seen = model.point_error_px[np.isfinite(model.point_error_px)]

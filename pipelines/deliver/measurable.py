@@ -198,13 +198,15 @@ def _collected(squares: Iterable[SurfaceCloud], views: SurfaceViews, trained: Tr
         size = TrainingSize(len(trained.gaussians) + count, largest, trained.gaussians.sh_degree, 0)
         if free_bytes is not None and predicted_peak_bytes(size) > USABLE * free_bytes:
             raise ResourceError(
+                "todo-memory-has-no-room",
                 f"the memory has no room for the discs on the surface: {count} and more of them need over "
-                f"{USABLE * free_bytes / 2**30:.1f} GiB. Choose a larger --disc-spacing"
+                f"{USABLE * free_bytes / 2**30:.1f} GiB. Choose a larger --disc-spacing",
             )
     if not count:
         raise DegenerateGeometryError(
+            "todo-no-point-surface-seen",
             f"no point of the surface is seen alike by {_MIN_VIEWS} training views: train longer, or "
-            "hand over export/splat.ply alone"
+            "hand over export/splat.ply alone",
         )
     names = vars(parts[0])
     return SurfaceCloud(*(np.concatenate([vars(part)[name] for part in parts]) for name in names))

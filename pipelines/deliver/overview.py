@@ -13,7 +13,7 @@ import numpy as np
 
 from pipelines.core.errors import GeorefError
 from pipelines.core.figures import Headline
-from pipelines.core.products import Caution, load_json
+from pipelines.core.products import Remark, load_json
 from pipelines.core.stages import BY_NAME, DELIVERABLES, GAUSSIANS, MODEL, REPORT, StageSpec
 from pipelines.core.staleness import StageState, cautions_by_stage, status
 from pipelines.core.types import FloatArray, Vector3
@@ -103,7 +103,7 @@ class Overview:
     outdated: tuple[StageState, ...]
     interrupted: dict[str, str]
     further: tuple[StageSpec, ...]
-    cautions: dict[str, tuple[Caution, ...]]
+    cautions: dict[str, tuple[Remark, ...]]
 
     def feature(self) -> Json:
         """Return the overview as a GeoJSON feature: the bounds as geometry, all else as properties."""

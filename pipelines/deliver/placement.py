@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from pipelines.core.errors import InputError
 from pipelines.core.figures import Headline
-from pipelines.core.products import Caution, is_checked
+from pipelines.core.products import Remark, is_checked
 from pipelines.core.types import FloatArray, Quaternion, Row7, Vector3
 from pipelines.formats.georef_sidecar import GeoreferenceSigma, GeorefSidecar, SceneSigma, georeference_sigma
 from pipelines.geodesy.crs import ECEF, parse_crs
@@ -59,7 +59,7 @@ class Placement:
     geo_from_model: Similarity
     covariance: FloatArray | None
     vertical: VerticalDatum
-    cautions: tuple[Caution, ...]
+    cautions: tuple[Remark, ...]
     accuracy: Headline | None
 
     @property
@@ -185,4 +185,6 @@ def require_space(folder: Path, needed_bytes: int, files: str, advice: str) -> N
     if needed_bytes > free_bytes:
         needed, free = f"{needed_bytes / 2**30:.1f} GiB", f"{free_bytes / 2**30:.1f} GiB"
         advice = f"{advice}, or make room on this disk"
-        raise InputError(f"{files} may need {needed}, and {free} are free: {advice}", path=folder)
+        raise InputError(
+            "todo-may-need-free", f"{files} may need {needed}, and {free} are free: {advice}", path=folder
+        )

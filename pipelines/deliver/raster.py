@@ -18,7 +18,7 @@ from scipy.ndimage import gaussian_filter
 
 from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.files import remove
-from pipelines.core.products import Caution, union
+from pipelines.core.products import Remark, union
 from pipelines.core.types import BoolArray, ByteArray, FloatArray
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import ExportRasterOptions
@@ -69,7 +69,8 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
     height = mosaic.sample("dsm")
     if not len(height):
         raise DegenerateGeometryError(
-            f"no cell is shown by {options.min_views} training views or more: lower --min-views"
+            "todo-no-cell-shown-by",
+            f"no cell is shown by {options.min_views} training views or more: lower --min-views",
         )
     sigma = None
     if not reason:
@@ -111,12 +112,12 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
     )
 
 
-def _detail_of_training(training_m: float) -> tuple[Caution, ...]:
+def _detail_of_training(training_m: float) -> tuple[Remark, ...]:
     sentence = (
         f"The model was trained at {training_m:.3f} m a pixel on the ground, and shows no finer detail, whatever "
         "the size of a raster's cells."
     )
-    return (Caution(code="detail-of-training", sentence=sentence),)
+    return (Remark(code="detail-of-training", sentence=sentence),)
 
 
 def _write_pictures(folder: Path, heights_by_plan: float) -> None:
@@ -175,7 +176,9 @@ def _contour_lines(height: FloatArray, frame: RasterFrame, interval: float) -> l
     levels = interval * np.arange(math.ceil(low / interval), math.floor(high / interval) + 1)
     if len(levels) > _MOST_LEVELS:
         raise InputError(
-            f"{len(levels)} heights are more than {_MOST_LEVELS}: give a larger interval", field="--contours"
+            "todo-heights-more-than-give",
+            f"{len(levels)} heights are more than {_MOST_LEVELS}: give a larger interval",
+            field="--contours",
         )
     west, south, east, north = frame.bounds
     step = (east - west) / height.shape[1], (north - south) / height.shape[0]

@@ -125,7 +125,11 @@ def _rows_of_blocks(workspace: Workspace, count: int) -> tuple[slice, ...]:
     numbers = [block.training.gaussians_in_cell for block in load_json(BlockRecord, record).blocks]
     ends = np.cumsum([0, *numbers]).tolist()
     if ends[-1] != count:
-        raise InputError(f"its blocks have {ends[-1]} Gaussians, and {GAUSSIANS} has {count}", path=record)
+        raise InputError(
+            "todo-its-blocks-have-gaussians",
+            f"its blocks have {ends[-1]} Gaussians, and {GAUSSIANS} has {count}",
+            path=record,
+        )
     return tuple(slice(first, last) for first, last in itertools.pairwise(ends))
 
 
@@ -149,7 +153,8 @@ def _is_opaque(logit_opacities: Float32Array, options: SplatOptions) -> BoolArra
 def _require_opaque(opaque: BoolArray, options: SplatOptions) -> None:
     if not opaque.any():
         raise DegenerateGeometryError(
-            f"none of {len(opaque)} Gaussians has an opacity of {options.min_opacity} or more: lower --min-opacity"
+            "todo-none-gaussians-has-opacity",
+            f"none of {len(opaque)} Gaussians has an opacity of {options.min_opacity} or more: lower --min-opacity",
         )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pipelines.adjust.accuracy_grid import AccuracyGrid
 from pipelines.adjust.solution import posterior_of
-from pipelines.core.products import Caution, is_checked
+from pipelines.core.products import Remark, is_checked
 from pipelines.core.workspace import StageRun, Workspace
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.surface_views import ModelRenderer, SurfaceViews
@@ -40,6 +40,6 @@ def predicted_sigma(workspace: Workspace, solved: SolvedSurvey) -> tuple[Accurac
     return grid, "" if grid is not None else "the scene has too few points"
 
 
-def without_sigma(files: str, reason: str) -> tuple[Caution, ...]:
+def without_sigma(files: str, reason: str) -> tuple[Remark, ...]:
     """Return the caution of files without σ, and what of them is empty therefore; none without a reason."""
-    return (Caution(code="no-sigma", sentence=f"{files}: {reason}."),) if reason else ()
+    return (Remark(code="no-sigma", sentence=f"{files}: {reason}."),) if reason else ()

@@ -21,6 +21,7 @@ import numpy as np
 
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size, replace_text
+from pipelines.core.products import Remark
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import TILES_GLB
 from pipelines.core.types import FloatArray, joined_rows
@@ -80,7 +81,8 @@ def run(stage: StageRun, options: ExportTilesOptions) -> Summary:
         "glb_gaussians": in_glb,
         "bytes": size,
     }
-    merged = (f"{GLB} holds {in_glb} merged Gaussians: viewers cannot load all {count} from one file",)
+    sentence = f"{GLB} holds {in_glb} merged Gaussians: viewers cannot load all {count} from one file"
+    merged = (Remark(code="glb-merged", sentence=sentence),)
     return Summary(
         f"{count} Gaussians, {len(tiles)} tiles, {size / 2**20:.0f} MiB",
         values,

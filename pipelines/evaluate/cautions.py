@@ -6,7 +6,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from pipelines.adjust.posterior import Posterior
-from pipelines.core.products import Caution
+from pipelines.core.products import Remark
 from pipelines.core.sentences import listed
 from pipelines.core.types import FloatArray
 from pipelines.robust.statistics import chi2_quantile
@@ -23,11 +23,11 @@ _SINGULAR = 1e-12  # of the largest variance: directions of smaller variance are
 
 def cautions_of_prediction(
     solved: SolvedSurvey, posterior: Posterior, triangulated: CheckPointErrors, *, of_initial: bool
-) -> tuple[Caution, ...]:
+) -> tuple[Remark, ...]:
     """Return the limits of the predicted accuracy; `of_initial`: the points have the initial similarity."""
     if of_initial:
         sentence = "Measured with the initial similarity: the prediction is that of the adjusted one."
-        return (Caution(code="prediction-of-adjusted-similarity", sentence=sentence),)
+        return (Remark(code="prediction-of-adjusted-similarity", sentence=sentence),)
     points = solved.survey.check_points
     if len(points) < _LEAST_POINTS:
         return ()
@@ -48,7 +48,7 @@ def cautions_of_prediction(
 
 def chi2_caution(
     names: tuple[str, ...], error: FloatArray, cov: FloatArray, blunders: frozenset[str] = frozenset()
-) -> Caution | None:
+) -> Remark | None:
     """Return a caution if the errors of J points are outside the 99 % range that their covariance allows.
 
     The points share errors, so the test takes their joint covariance: eᵀ C⁻¹ e is χ² with 3 J degrees of freedom.
@@ -74,7 +74,7 @@ def chi2_caution(
         f"and {least / freedom:.2g} to {most / freedom:.2g} was to be expected (99 %)"
     )
     if squared < least:
-        return Caution(
+        return Remark(
             code="prediction-pessimistic",
             sentence=f"The predicted accuracy is pessimistic: {figures}; the σ of prediction, marks and check "
             f"points together are too large by a factor of {ratio**-0.5:.1f}.",
@@ -85,14 +85,14 @@ def chi2_caution(
     if _LEAST_POINTS <= len(others) < len(names) and not chi2_caution(others, error[good], cov[np.ix_(good, good)]):
         left_out = tuple(name for name in names if name in blunders)
         alone = f"; without the blunders ({listed(left_out)}) the errors agree with the prediction"
-    return Caution(
+    return Remark(
         code="prediction-refuted",
         sentence=f"Check points refute the predicted accuracy: {figures}; the σ of prediction, marks and check "
         f"points together are too small by a factor of {ratio**0.5:.1f}{alone}.",
     )
 
 
-def dependent_check_points(survey: Survey) -> tuple[Caution, ...]:
+def dependent_check_points(survey: Survey) -> tuple[Remark, ...]:
     """Return a caution that names the check points within 1 m of a control point, horizontally and vertically."""
     control = np.array([point.position_in_geo for point in survey.control_points]).reshape(-1, 3)
     pairs = []
@@ -109,4 +109,4 @@ def dependent_check_points(survey: Survey) -> tuple[Caution, ...]:
         f"{len(pairs)} of {len(survey.check_points)} check points may be the same feature as a control point, so "
         f"that their errors say little of the accuracy: {listed(tuple(pairs))}."
     )
-    return (Caution(code="check-point-not-independent", sentence=sentence),)
+    return (Remark(code="check-point-not-independent", sentence=sentence),)

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from pipelines.adjust.accuracy_grid import AccuracyGrid
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.files import remove
-from pipelines.core.products import Caution, is_checked
+from pipelines.core.products import Remark, is_checked
 from pipelines.core.progress import Progress
 from pipelines.core.stages import REFERENCE_HISTOGRAM, REFERENCE_MAP
 from pipelines.core.types import FloatArray
@@ -62,7 +62,7 @@ class ComparedReference:
     comparison: ReferenceComparison
     cores: CorePoints
     lod_m: FloatArray
-    assumptions: tuple[str, ...]
+    assumptions: tuple[Remark, ...]
 
 
 def open_reference(options: EvaluateOptions) -> CloudReader | None:
@@ -164,7 +164,10 @@ def _model(
         sample.append(square.position[first_of_voxels(square.position, 2 * _OVERVIEW_M)])
     views.close()
     if not len(delivered):
-        raise DegenerateGeometryError("no point of the surface is seen alike by three training views: train longer")
+        raise DegenerateGeometryError(
+            "todo-no-point-surface-seen",
+            "no point of the surface is seen alike by three training views: train longer",
+        )
     sparse = overview.position_in_geo[first_of_voxels(overview.position_in_geo, 2 * _OVERVIEW_M)]
     normal, kind = plane_normals(sparse, 2 * _OVERVIEW_M), options.reference_align
     found = fit_alignment(np.concatenate(sample), sparse, normal, 2 * _OVERVIEW_M, kind)
@@ -172,8 +175,9 @@ def _model(
         return delivered, settings, None if found is None else found[1], None
     if found is None:
         raise DegenerateGeometryError(
+            "todo-reference-align-surface-reference",
             f"--reference-align {kind}: the surface and the reference have too little in common to move one onto "
-            "the other, or nothing in them fixes all axes: compare without it"
+            "the other, or nothing in them fixes all axes: compare without it",
         )
     similarity, shift = found
     moved = TiledPoints(scratch / "moved", delivered.side_m)
@@ -230,13 +234,10 @@ _SHIFTED_SIGMAS = 3.0
 _SEEN = 0.05
 
 
-def cautions_of_reference(found: ComparedReference) -> tuple[Caution, ...]:
+def cautions_of_reference(found: ComparedReference) -> tuple[Remark, ...]:
     """Return the limits of a comparison with a reference."""
     comparison = found.comparison
-    cautions = [
-        Caution(code="reference-heights", sentence=assumption[0].upper() + assumption[1:] + ".")
-        for assumption in found.assumptions
-    ]
+    cautions = list(found.assumptions)
     fine = max(comparison.spacing_m, comparison.model_spacing_m)
     least = comparison.groups[0].scores[0].threshold_m
     if fine > least:
@@ -244,7 +245,7 @@ def cautions_of_reference(found: ComparedReference) -> tuple[Caution, ...]:
             f"Points are {fine:.3f} m apart: shares within shorter distances, and C2C, say more about the "
             "spacing than about the surface. M3C2 does not depend on it."
         )
-        cautions.append(Caution(code="reference-spacing", sentence=apart))
+        cautions.append(Remark(code="reference-spacing", sentence=apart))
     shift = comparison.shift
     if shift is not None and comparison.aligned == "none":
         sigma = [max(s, comparison.georeference_sigma_m or 0.0, comparison.sigma_m) for s in shift.sigma_m]
@@ -255,10 +256,10 @@ def cautions_of_reference(found: ComparedReference) -> tuple[Caution, ...]:
                 "fits best, which is more than three times the σ of both (--reference-align shift judges the "
                 "shape alone)."
             )
-            cautions.append(Caution(code="reference-shifted", sentence=off))
+            cautions.append(Remark(code="reference-shifted", sentence=off))
     if comparison.seen < _SEEN:
         seen = f"Photographs saw {100 * comparison.seen:.1f} % of the reference's points within the scene."
-        cautions.append(Caution(code="reference-unseen", sentence=seen))
+        cautions.append(Remark(code="reference-unseen", sentence=seen))
     return tuple(cautions)
 
 

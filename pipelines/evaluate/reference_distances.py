@@ -76,7 +76,7 @@ def require_py4dgeo() -> Any:
         import py4dgeo
     except ImportError as error:
         message = "--reference needs py4dgeo: pip install 'georefgs[reference]'"
-        raise BackendUnavailableError(message) from error
+        raise BackendUnavailableError("todo-x", message) from error
     # It logs to stdout, which belongs to our results, and into a file of the current folder.
     log = logging.getLogger("py4dgeo")
     for handler in list(log.handlers):
@@ -134,7 +134,11 @@ class TiledPoints:
         """
         rows = np.zeros(len(position), dtype=_ROW)
         if shutil.disk_usage(self._folder).free < rows.nbytes + _SPARE_BYTES:
-            raise InputError("no room for the points that are compared: make room on this disk", path=self._folder)
+            raise InputError(
+                "todo-no-room-for-points",
+                "no room for the points that are compared: make room on this disk",
+                path=self._folder,
+            )
         rows["position"] = position
         if normal is not None:
             rows["normal"] = normal

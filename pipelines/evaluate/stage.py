@@ -22,7 +22,7 @@ from pipelines.adjust.posterior import Posterior
 from pipelines.adjust.solution import posterior_of
 from pipelines.core.errors import InputError
 from pipelines.core.figures import WAYS
-from pipelines.core.products import is_checked, union
+from pipelines.core.products import Remark, is_checked, union
 from pipelines.core.sentences import listed
 from pipelines.core.stages import BY_NAME
 from pipelines.core.types import FloatArray
@@ -96,20 +96,22 @@ def _test_views(test: PhotometricFigures | None) -> str:
     return f"test PSNR {test.psnr:.2f} dB, {test.psnr_covered:.2f} dB on the {test.covered_share:.0%} covered"
 
 
-def _warnings(report: EvaluationReport) -> tuple[str, ...]:
+def _warnings(report: EvaluationReport) -> tuple[Remark, ...]:
     warnings = []
     asprs = report.checkpoints.camera.asprs
     if asprs.points and not asprs.enough_points:
-        warnings.append(few_points(asprs))
+        warnings.append(Remark(code="few-check-points", sentence=few_points(asprs)))
     for way, errors in report.checkpoints.by_way.items():
         if errors.blunders:
-            warnings.append(
+            sentence = (
                 f"{WAYS[way]}, {len(errors.blunders)} of {errors.count} check points are off by more than three "
                 f"times the class that the others meet: {listed(errors.blunders)}"
             )
+            warnings.append(Remark(code="check-point-blunders", sentence=sentence))
     crossed = report.cross_validation
     if crossed is not None and crossed.reason is not None:
-        warnings.append(f"no cross-validation: {crossed.reason}")
+        sentence = f"no cross-validation: {crossed.reason}"
+        warnings.append(Remark(code="no-cross-validation", sentence=sentence))
     return tuple(warnings)
 
 
@@ -255,4 +257,8 @@ def _refuse_what_needs_gaussians(stage: StageRun, options: EvaluateOptions) -> N
     for flag, value in (("--reference", options.reference), ("--lpips-weights", options.lpips_weights)):
         if value is not None:
             command = stage.workspace.command_of(BY_NAME["train"])
-            raise InputError(f"needs a trained model: run `{command}` first, or leave the option out", field=flag)
+            raise InputError(
+                "todo-needs-trained-model-run",
+                f"needs a trained model: run `{command}` first, or leave the option out",
+                field=flag,
+            )

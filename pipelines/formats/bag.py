@@ -194,13 +194,13 @@ def open_bag(path: Path) -> Iterator[Bag]:
         InputError: no bag, damaged beyond opening, or with chunks too large for memory.
     """
     if not path.exists():
-        raise InputError("no such bag", path=path, field="--bag")
+        raise InputError("todo-no-such-bag", "no such bag", path=path, field="--bag")
     if path.is_dir() and not (path / "metadata.yaml").exists():
         message = "has no metadata.yaml: give the .mcap or .db3 file in it, or `ros2 bag reindex` the folder"
-        raise InputError(message, path=path, field="--bag")
+        raise InputError("todo-x", message, path=path, field="--bag")
     if not path.is_dir() and path.suffix not in (".bag", ".mcap", ".db3"):
         message = "is no bag: give a rosbag2 folder, or a .mcap, .db3 or .bag file"
-        raise InputError(message, path=path, field="--bag")
+        raise InputError("todo-x", message, path=path, field="--bag")
     reader = _opened(path)
     try:
         for part in _parts(reader):
@@ -209,7 +209,9 @@ def open_bag(path: Path) -> Iterator[Bag]:
         for link in reader.connections:  # SQLite and YAML have any type in any place
             types = isinstance(link.topic, str), isinstance(link.msgtype, str), isinstance(link.msgcount, int)
             if not all(types):
-                raise InputError(f"is damaged (topic {str(link.topic)[:40]!r}): {_REPAIR}", path=path)
+                raise InputError(
+                    "todo-damaged-topic", f"is damaged (topic {str(link.topic)[:40]!r}): {_REPAIR}", path=path
+                )
         yield Bag(path, reader, path.suffix != ".bag")
     finally:
         reader.close()
@@ -229,9 +231,11 @@ def _opened(path: Path) -> Any:
     except Exception as error:  # truncated and forged files make the parser raise any error
         if isinstance(error, KeyError) and error.args[0] in _FOREIGN_SCHEMAS:
             message = f"has a topic in {error.args[0]!r}, which is not ROS 2's: leave it out with `mcap filter`"
-            raise InputError(message, path=path) from error
+            raise InputError("todo-x", message, path=path) from error
         cause = f"{type(error).__name__}: {error}".rstrip(": ").rstrip(".")
-        raise InputError(f"is no bag, or is damaged ({cause}): {_REPAIR}", path=path) from error
+        raise InputError(
+            "todo-no-bag-or-damaged", f"is no bag, or is damaged ({cause}): {_REPAIR}", path=path
+        ) from error
     return reader
 
 

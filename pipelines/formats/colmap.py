@@ -47,10 +47,15 @@ class _CutOffError(ValueError):
 def _check_model_files(folder: Path) -> None:
     """Refuse a COLMAP model, binary or text, whose files do not hold what they state."""
     if not folder.is_dir():
-        raise InputError("no such folder; expected a COLMAP model (cameras, images, points3D)", path=folder)
+        raise InputError(
+            "todo-no-such-folder-expected",
+            "no such folder; expected a COLMAP model (cameras, images, points3D)",
+            path=folder,
+        )
     suffix = next((s for s in (".bin", ".txt") if all((folder / (n + s)).exists() for n in _REQUIRED)), None)
     if suffix is None:
         raise InputError(
+            "todo-not-readable-colmap-model",
             "not a readable COLMAP model: cameras, images and points3D, all .bin or all .txt, are needed",
             path=folder,
         )
@@ -68,22 +73,28 @@ def _check_model_files(folder: Path) -> None:
 def _check_binary(file: Path, size: int, record_end: Callable[[_Bytes, int], int]) -> None:
     cut_off = "shorter than the number of its records says: it is truncated, copy it again"
     if size < 8:
-        raise InputError(cut_off, path=file)
+        raise InputError("todo-x", cut_off, path=file)
     with file.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
         record = _Bytes(data, size)
         (count,) = struct.unpack_from("<Q", data)
         if count > size:
-            raise InputError(cut_off, path=file)
+            raise InputError("todo-x", cut_off, path=file)
         at = 8
         for number in range(count):
             try:
                 at = record_end(record, at)
             except _CutOffError as error:
-                raise InputError(f"{cut_off} (record {number + 1} of {count})", path=file) from error
+                raise InputError("todo-record", f"{cut_off} (record {number + 1} of {count})", path=file) from error
             except ValueError as error:
-                raise InputError(f"record {number + 1} of {count} {error}: it is damaged", path=file) from error
+                raise InputError(
+                    "todo-record-damaged", f"record {number + 1} of {count} {error}: it is damaged", path=file
+                ) from error
         if at != size:
-            raise InputError(f"has {size - at} bytes behind its {count} records: it is damaged", path=file)
+            raise InputError(
+                "todo-has-bytes-behind-its",
+                f"has {size - at} bytes behind its {count} records: it is damaged",
+                path=file,
+            )
 
 
 def _check_text(file: Path) -> None:
@@ -92,7 +103,7 @@ def _check_text(file: Path) -> None:
             try:
                 line.decode("utf-8")
             except UnicodeDecodeError as error:
-                raise InputError(_INVALID_NAME, path=file, line=number) from error
+                raise InputError("todo-x", _INVALID_NAME, path=file, line=number) from error
 
 
 @dataclass(frozen=True)
@@ -206,7 +217,9 @@ def pycolmap_module() -> Any:
     try:
         import pycolmap
     except ImportError as error:
-        raise BackendUnavailableError("pycolmap is not installed: `pip install pycolmap`") from error
+        raise BackendUnavailableError(
+            "todo-pycolmap-not-installed-pip", "pycolmap is not installed: `pip install pycolmap`"
+        ) from error
     if threading.current_thread() is threading.main_thread():
         handler = signal.getsignal(signal.SIGTERM)  # Python's own record, which the import has not changed
         signal.signal(signal.SIGTERM, signal.SIG_DFL if handler is None else handler)
@@ -244,7 +257,9 @@ def write_reconstruction(reconstruction: Any, folder: Path) -> None:
     except InputError:
         whole = False
     if not whole:
-        raise storage_failure_of(folder) or StorageError(f"{folder}: the model could not be written whole")
+        raise storage_failure_of(folder) or StorageError(
+            "todo-model-could-not-be", f"{folder}: the model could not be written whole"
+        )
 
 
 def load_reconstruction(path: Path) -> Any:
@@ -259,7 +274,9 @@ def load_reconstruction(path: Path) -> Any:
     try:
         return pycolmap.Reconstruction(str(path))
     except (ValueError, RuntimeError, IndexError, MemoryError) as error:
-        raise InputError(f"not a readable COLMAP model: {error}", path=path) from error
+        raise InputError(
+            "todo-not-readable-colmap-model", f"not a readable COLMAP model: {error}", path=path
+        ) from error
 
 
 def _observations(images: list[Any], point_ids: IntArray) -> tuple[IntArray, IntArray, FloatArray]:
@@ -289,13 +306,18 @@ def _check(model: SparseModel, path: Path) -> None:
     values += [("camera params", camera.params) for camera in model.cameras.values()]
     for name, numbers in values:
         if not np.isfinite(numbers).all():
-            raise InputError("contains values that are not finite: reconstruct again", path=path, field=name)
+            raise InputError(
+                "todo-contains-values-not-finite",
+                "contains values that are not finite: reconstruct again",
+                path=path,
+                field=name,
+            )
     if len(set(model.image_name)) != len(model.image_name):
-        raise InputError("two images have the same name", path=path, field="images")
+        raise InputError("todo-two-images-have-same", "two images have the same name", path=path, field="images")
     astray = next((name for name in model.image_name if not stays_inside(name)), None)
     if astray is not None:
         message = f"{astray!r} leaves the folder of photographs: names are relative to it"
-        raise InputError(message, path=path, field="images")
+        raise InputError("todo-x", message, path=path, field="images")
 
 
 def write_sparse(model: SparseModel, path: Path) -> None:

@@ -18,7 +18,7 @@ from pydantic.alias_generators import to_camel
 
 from pipelines.core.figures import Headline
 from pipelines.core.files import replace_text
-from pipelines.core.products import Caution, Product
+from pipelines.core.products import Product, Remark
 from pipelines.core.types import FloatArray, Matrix4, Quaternion, Row7, Vector3
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
@@ -79,7 +79,7 @@ class GeorefSidecar(_CamelCase):
     covariance: Covariance7 | None
     accuracy: Headline | None
     georeference_sigma: GeoreferenceSigma | None
-    cautions: tuple[Caution, ...] = ()
+    cautions: tuple[Remark, ...] = ()
 
     @field_validator("rotation")
     @classmethod
@@ -157,7 +157,7 @@ class CrsSidecar(_CamelCase):
     accuracy: Headline | None
     sigma: SceneSigma | None
     assumed: tuple[str, ...] = ()
-    cautions: tuple[Caution, ...] = ()
+    cautions: tuple[Remark, ...] = ()
 
 
 def georeference_sigma(covariance: ArrayLike, point_in_file: ArrayLike) -> GeoreferenceSigma:

@@ -98,7 +98,7 @@ def read_spz(path: Path) -> SplatArrays:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", path=path) from error
+        raise InputError("todo-cannot-be-read", f"cannot be read: {error.strerror}", path=path) from error
     return decode_spz(data, path)
 
 
@@ -142,22 +142,31 @@ def decode_spz(data: bytes, path: Path | None = None) -> SplatArrays:
     try:
         layout, body = unpacked(data, limit_bytes)
     except ValueError as error:
-        raise InputError(str(error), path=path) from error
+        raise InputError("todo-x", str(error), path=path) from error
     return _dequantised(layout, body)
 
 
 def _check_values(splat: SplatArrays, fractional_bits: int) -> None:
     for name, values in vars(splat).items():
         if not np.isfinite(values).all():
-            raise InputError("Gaussians with values that are not finite cannot be written as SPZ", field=name)
+            raise InputError(
+                "todo-gaussians-with-values-not",
+                "Gaussians with values that are not finite cannot be written as SPZ",
+                field=name,
+            )
     if not splat.quats_wxyz.any(axis=1).all():
-        raise InputError("a rotation of length zero cannot be written as SPZ", field="quats_wxyz")
+        raise InputError(
+            "todo-rotation-length-zero-cannot",
+            "a rotation of length zero cannot be written as SPZ",
+            field="quats_wxyz",
+        )
     furthest = float(np.abs(splat.means).max())
     reach = _POSITION_LIMIT / 2.0**fractional_bits
     # The rounded positive end of the range would be the negative one.
     if furthest >= reach - 0.5 / 2.0**fractional_bits:
         outside = int((np.abs(splat.means).max(axis=1) >= reach).sum())
         raise InputError(
+            "todo-spz-holds-positions-within",
             f"SPZ holds positions within ±{reach:.0f} m, and {max(outside, 1)} of {len(splat)} Gaussians lie "
             f"beyond, up to {furthest:.0f} m from the origin",
             field="means",

@@ -130,7 +130,10 @@ class PointCrs:
                 return str(self._crs.to_wkt("WKT1_GDAL"))
             flat = self._crs.to_2d().to_wkt("WKT1_GDAL")
         except CRSError as error:
-            raise InputError(f"{self.name} cannot be written as WKT1, which the file needs: {error}") from error
+            raise InputError(
+                "todo-cannot-be-written-wkt",
+                f"{self.name} cannot be written as WKT1, which the file needs: {error}",
+            ) from error
         return f'COMPD_CS["{self._crs.name.replace(chr(34), "")} + Ellipsoid (metre)",{flat},{_ELLIPSOID_HEIGHT}]'
 
     def lla_from_xyz(
@@ -238,10 +241,12 @@ def parse_crs(
     try:
         crs = _parse(name, refusal)
         if not (crs.is_geographic or crs.is_projected or crs.is_geocentric):
-            raise refusal(f"{_short(name)} is a {crs.type_name}, which places no points on Earth")
+            raise refusal(
+                "crs-not-of-points", f"{_short(name)} is a {crs.type_name}, which places no points on Earth"
+            )
         return _point_crs(crs, name, vertical)
     except ProjError as error:  # of a CRS that PROJ reads, but whose parts it does not combine
-        raise refusal(f"PROJ cannot use {_short(name)!r}: {error}") from error
+        raise refusal("crs-unusable", f"PROJ cannot use {_short(name)!r}: {error}") from error
 
 
 def _point_crs(crs: CRS, name: str, vertical: VerticalChoice | None) -> PointCrs:
@@ -293,9 +298,11 @@ def _vertical_crs(choice: VerticalChoice) -> CRS:
     try:
         crs = CRS.from_user_input(f"EPSG:{choice.epsg}")
     except CRSError as error:
-        raise InputError(f"PROJ knows no {choice.name}", field="--vertical") from error
+        raise InputError("todo-proj-knows-no", f"PROJ knows no {choice.name}", field="--vertical") from error
     if not crs.is_vertical or crs.is_compound:
-        raise InputError(f"{choice.name} ({crs.name}) is no vertical CRS", field="--vertical")
+        raise InputError(
+            "todo-no-vertical-crs", f"{choice.name} ({crs.name}) is no vertical CRS", field="--vertical"
+        )
     return crs
 
 
@@ -326,8 +333,9 @@ def grid_from_enu(crs: PointCrs, lla: ArrayLike) -> FloatArray:
     rotations[:, :2, :2] = left @ right
     if (np.linalg.det(rotations) < 0).any():
         raise InputError(
+            "todo-axes-left-handed-angles",
             f"the axes of {crs.name} are left-handed, and angles of cameras are not defined in them: give a CRS "
-            "whose coordinates are easting and northing"
+            "whose coordinates are easting and northing",
         )
     return rotations
 

@@ -56,7 +56,9 @@ def proj_errors(name: str, path: Path | str | None = None) -> Iterator[None]:
     try:
         yield
     except ProjError as error:
-        raise InputError(f"PROJ cannot transform points of {name}: {error}", path=path) from error
+        raise InputError(
+            "todo-proj-cannot-transform-points", f"PROJ cannot transform points of {name}: {error}", path=path
+        ) from error
 
 
 def best_operation(request: OperationRequest, lon: FloatArray, lat: FloatArray) -> tuple[Transformer, Operation]:
@@ -118,7 +120,7 @@ def _no_operation(request: OperationRequest) -> InputError:
             f"heights above {request.crs.sub_crs_list[1].name} cannot be made ellipsoidal: PROJ knows no geoid for "
             "them. Give ellipsoidal heights, the horizontal CRS alone and `--vertical ellipsoidal`"
         )
-        return InputError(message, path=request.path)
+        return InputError("todo-x", message, path=request.path)
     message = (
         f"no transformation from {request.name} to WGS84 is known here: name its datum (+datum=… or +towgs84=… in "
         "a PROJ string), or give another CRS"
@@ -134,7 +136,7 @@ def _no_operation(request: OperationRequest) -> InputError:
             warnings.simplefilter("ignore", UserWarning)  # "you will lose information": the datum, which is stated
             projection = horizontal.to_proj4().replace(" +no_defs", "").replace(" +type=crs", "")
         message += f". If its datum is WGS84 as closely as you need: {projection} +towgs84=0,0,0"
-    return InputError(message, path=request.path)
+    return InputError("todo-x", message, path=request.path)
 
 
 def _area(lon: FloatArray, lat: FloatArray) -> AreaOfInterest:

@@ -39,7 +39,7 @@ class ListedPoints:
         count = int((~good).sum())
         more = f" ({count} such points)" if count > 1 else ""
         line = self.lines[worst] if self.lines is not None else None
-        raise InputError(f"({text}): {message}{more}", path=self.path, line=line, field=field)
+        raise InputError("todo-x", f"({text}): {message}{more}", path=self.path, line=line, field=field)
 
 
 def horizontal_of(crs: CRS) -> CRS:

@@ -48,7 +48,9 @@ def parse_vertical(text: str) -> VerticalChoice:
     match = re.fullmatch(r"EPSG:(\d{1,6})", name, re.IGNORECASE)
     if match is None:
         known = ", ".join([ELLIPSOIDAL, *_EPSG_OF, "EPSG:n"])
-        raise InputError(f"{text!r} is no vertical datum: give one of {known}", field="--vertical")
+        raise InputError(
+            "todo-no-vertical-datum-give", f"{text!r} is no vertical datum: give one of {known}", field="--vertical"
+        )
     epsg = int(match[1])
     return VerticalChoice(NAME_OF_EPSG.get(epsg, f"EPSG:{epsg}"), epsg)
 
@@ -70,6 +72,7 @@ def missing_grid_error(
     files = f"the PROJ grid {grids[0]} is" if len(grids) == 1 else f"the PROJ grids {', '.join(grids)} are"
     command = " ".join(["pyproj sync", *(f"--file {grid}" for grid in grids)])
     return InputError(
+        "todo-not-installed-run-or",
         f"{problem}: {files} not installed. Run `{command}`, or copy from https://cdn.proj.org into {folder}. "
         f"{instead}",
         path=path,

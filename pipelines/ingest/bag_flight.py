@@ -57,7 +57,10 @@ def read_bag(
             bag, streams.images, place, options=options, folder=folder, notes=notes, progress=progress
         )
     if len(photos) > _MANY_FRAMES and options.every is None:
-        notes.warn(f"all {len(photos)} frames were taken: --every 2s or --every 5m takes fewer")
+        notes.warn(
+            "todo-all-frames-were-taken",
+            f"all {len(photos)} frames were taken: --every 2s or --every 5m takes fewer",
+        )
     require_enough(len(photos), path, "--bag", notes)
     cameras, camera_of = lens_priors(photos, streams, options, notes)
     time_s = streams.images.time_s[numbers]
@@ -96,13 +99,14 @@ def _positions(streams: BagStreams, options: IngestOptions, notes: Notes) -> tup
     series = streams.positions
     if series is None or not len(series.stamps):
         if series is not None:
-            notes.warn(f"no message of {series.topic} has a usable position")
+            notes.warn("todo-no-message-has-usable", f"no message of {series.topic} has a usable position")
         return Trajectory.from_samples(np.empty(0)), VerticalDatum(name=ELLIPSOIDAL, stated=True)
     values = series.table()
     if series.type in GEODETIC_HEIGHTS:
         position_in_ecef, vertical = _geodetic(series, options, notes)
     elif options.origin is None:
         raise InputError(
+            "todo-has-positions-local-frame",
             f"{series.topic} has positions in the local frame {series.world!r} only: give --origin LAT,LON,HEIGHT "
             "of its zero (its axes being East-North-Up), or a topic with latitude and longitude as --fix-topic",
             path=streams.path,
@@ -113,7 +117,10 @@ def _positions(streams: BagStreams, options: IngestOptions, notes: Notes) -> tup
         position_in_ecef = ecef_from_enu(values[:, :3], Origin(lat_deg=lat_deg, lon_deg=lon_deg, alt_m=alt_m))
         note = "height of --origin taken as ellipsoidal"
         vertical = VerticalDatum(name=ELLIPSOIDAL, stated=False, note=note)
-        notes.assume(f"the frame {series.world!r} of {series.topic} is East-North-Up, with its zero at --origin")
+        notes.assume(
+            "todo-frame-east-north-up",
+            f"the frame {series.world!r} of {series.topic} is East-North-Up, with its zero at --origin",
+        )
     positions = Trajectory.from_samples(
         series.time_s[series.usable],
         position=position_in_ecef[series.usable],
@@ -127,7 +134,10 @@ def _geodetic(series: TopicSamples, options: IngestOptions, notes: Notes) -> tup
     """Return positions in ECEF (K, 3) of latitudes, longitudes and heights, and what the heights counted from."""
     crs, heights = parse_crs(WGS84, vertical=options.vertical), GEODETIC_HEIGHTS[series.type]
     if options.vertical is None:
-        notes.assume(f"heights of {series.topic} are {heights}; if its driver does otherwise, see --vertical")
+        notes.assume(
+            "todo-heights-if-its-driver",
+            f"heights of {series.topic} are {heights}; if its driver does otherwise, see --vertical",
+        )
     by_definition = VerticalDatum(name=ELLIPSOIDAL, stated=True, note=heights)
     lla = crs.lla_from_xyz(series.table()[:, [1, 0, 2]])
     return ecef_from_lla(lla), crs.vertical if crs.vertical.stated else by_definition
@@ -151,12 +161,18 @@ def _rig_at(time_s: FloatArray, attitudes: Trajectory, streams: BagStreams, give
     """Return mount and lever arm at times (N,) of the navigation: given, else of `/tf`; NaN where neither tells."""
     mounts, arms = given.of_each(len(time_s))
     if streams.attitudes is None or not len(attitudes):
-        notes.warn("no attitudes: only the photographs tell how the cameras were turned")
+        notes.warn(
+            "todo-no-attitudes-only-photographs",
+            "no attitudes: only the photographs tell how the cameras were turned",
+        )
         return Rig(mounts, arms, given.nominal_from_cam)
     frames, body, axes = streams.transforms, streams.attitudes.frame, streams.attitudes.axes
     image_frame, from_frd = streams.images.frame, frame_from_frd(axes)
     if body not in frames and BASE in frames and axes == "flu":
-        notes.assume(f"the frame {body!r} of the attitudes is not in /tf and is taken as {BASE}")
+        notes.assume(
+            "todo-frame-attitudes-not-tf",
+            f"the frame {body!r} of the attitudes is not in /tf and is taken as {BASE}",
+        )
         body = BASE
     camera = frames.between(body, image_frame, time_s)
     if body == image_frame and axes != "optical":
@@ -164,18 +180,25 @@ def _rig_at(time_s: FloatArray, attitudes: Trajectory, streams: BagStreams, give
     if given.cam_from_body is None and camera is not None:
         mounts = np.swapaxes(camera[0], 1, 2) @ from_frd
         if "optical" not in image_frame:
-            notes.assume(f"the frame {image_frame!r} of the images is optical: x right, y down, z forward")
+            notes.assume(
+                "todo-frame-images-optical-right",
+                f"the frame {image_frame!r} of the images is optical: x right, y down, z forward",
+            )
     elif given.cam_from_body is None:
         notes.warn(
+            "todo-tf-does-not-link",
             f"/tf does not link the frames {image_frame!r} of the camera and {body!r} of the attitudes: "
-            "the cameras have no attitude; give --camera-mount YAW,PITCH,ROLL"
+            "the cameras have no attitude; give --camera-mount YAW,PITCH,ROLL",
         )
     if given.antenna_in_body is None:
         antenna = frames.between(body, streams.positions.frame, time_s) if streams.positions else None
         if antenna is not None and camera is not None:
             arms = (antenna[1] - camera[1]) @ from_frd
         else:
-            notes.assume("the lever arm is not known: positions are taken for those of the camera; see --lever-arm")
+            notes.assume(
+                "todo-lever-arm-not-known",
+                "the lever arm is not known: positions are taken for those of the camera; see --lever-arm",
+            )
     return Rig(mounts, arms, given.nominal_from_cam)
 
 
@@ -188,6 +211,7 @@ def _poses(
     antenna, body = recorded.positions.at(at_s), recorded.attitudes.at(at_s)
     stamps = [f"{stamp:.3f} s" for stamp in time_s]
     notes.warn_counted(
+        "todo-frame-has-no-position",
         [stamps[row] for row in np.flatnonzero(~complete(antenna.position))],
         f"frame has no position within --max-gap {options.max_gap:g} s",
         f"frames have no position within --max-gap {options.max_gap:g} s",

@@ -75,13 +75,20 @@ def write_photos(
             (folder / name).write_bytes(data)
             photos.append(Photo(name, file, PhotoTags(timestamp_s=float(images.time_s[number]))))
             numbers.append(number)
-    notes.warn_counted(failed, f"image of {topic} was left out", f"images of {topic} were left out")
+    notes.warn_counted(
+        "todo-image-was-left-out", failed, f"image of {topic} was left out", f"images of {topic} were left out"
+    )
     if blurred:
-        notes.warn(f"{blurred} frames are blurred and were passed over")
+        notes.warn("todo-frames-blurred-were-passed", f"{blurred} frames are blurred and were passed over")
     if copies:
-        notes.warn(f"{copies} frames are copies of earlier ones and were left out")
+        notes.warn(
+            "todo-frames-copies-earlier-ones", f"{copies} frames are copies of earlier ones and were left out"
+        )
     if writer.bits is not None:
-        notes.assume(f"16-bit images of {topic} have {writer.bits} bits in use, as the first one has")
+        notes.assume(
+            "todo-bit-images-have-bits",
+            f"16-bit images of {topic} have {writer.bits} bits in use, as the first one has",
+        )
     return photos, numbers
 
 
@@ -119,9 +126,9 @@ def lens_priors(
     if prior is not None and fitted is None:
         remark = f"CameraInfo is of images of {prior.width}×{prior.height}, these are {width}×{height}"
     if fitted is None:
-        notes.warn(f"{remark}: it is not used")
+        notes.warn("todo-not-used", f"{remark}: it is not used")
         return camera_priors(photos, options.focal_px, notes)
-    notes.assume(f"lens from {streams.info_topic}: {remark}")
+    notes.assume("todo-lens-from", f"lens from {streams.info_topic}: {remark}")
     return (fitted,), {photo.name: 1 for photo in photos}
 
 

@@ -107,7 +107,7 @@ def _pick(
             is_other = requested in bag.topics
             problem = f"is a {bag.topics[requested].type}" if is_other else "is not in the bag"
             fitting = f"those with {subject}: {', '.join(names)}" if names else f"no topic has {subject}"
-            raise InputError(f"{requested} {problem}; {fitting}", path=bag.path, field=flag)
+            raise InputError("todo-x", f"{requested} {problem}; {fitting}", path=bag.path, field=flag)
         return requested
     if len(names) > 1:
         remarks.append(f"{subject} are from {names[0]}, not {', '.join(names[1:5])}: see {flag}")
@@ -188,13 +188,14 @@ def read_streams(bag: Bag, options: IngestOptions, notes: Notes, progress: Progr
     topics = select_topics(bag, options)
     if topics.image is None:
         problem = "has no topic of sensor_msgs/Image or CompressedImage: see `georef inspect`"
-        raise InputError(problem, path=bag.path)
+        raise InputError("todo-x", problem, path=bag.path)
     notes.assume(
+        "todo-topics-photographs-from-lens",
         f"topics: photographs from {topics.image}, lens from {topics.info or 'none'}, positions from "
-        f"{topics.fix or 'none'}, attitudes from {topics.attitude or 'none'}"
+        f"{topics.fix or 'none'}, attitudes from {topics.attitude or 'none'}",
     )
     for remark in topics.remarks:
-        notes.assume(remark)
+        notes.assume("todo-x", remark)
     images, positions, attitudes = (
         None if topic is None else TopicSamples(topic, bag.topics[topic].type, width)
         for topic, width in ((topics.image, 0), (topics.fix, 6), (topics.attitude, 5))
@@ -229,19 +230,32 @@ def _note_losses(
     bag: Bag, series: list[TopicSamples], undecodable: dict[str, list[str]], refused: int, notes: Notes
 ) -> None:
     for topic, errors in undecodable.items():
-        notes.warn(f"{len(errors)} messages of {topic} do not decode and were left out: {errors[0]}")
+        notes.warn(
+            "todo-messages-do-not-decode",
+            f"{len(errors)} messages of {topic} do not decode and were left out: {errors[0]}",
+        )
     if refused:
-        notes.warn(f"{refused} transforms in /tf are not finite or not possible and were left out")
+        notes.warn(
+            "todo-transforms-tf-not-finite",
+            f"{refused} transforms in /tf are not finite or not possible and were left out",
+        )
     if bag.damage is not None:
         count = sum(samples.messages for samples in series)
-        notes.warn(f"{bag.path.name} is damaged: it could be read for {count} messages only ({bag.damage})")
+        notes.warn(
+            "todo-damaged-could-be-read",
+            f"{bag.path.name} is damaged: it could be read for {count} messages only ({bag.damage})",
+        )
     if bag.fallback_types:
         notes.assume(
-            f"the bag lacks definitions of {', '.join(sorted(bag.fallback_types))}: the usual ones are used"
+            "todo-bag-lacks-definitions-usual",
+            f"the bag lacks definitions of {', '.join(sorted(bag.fallback_types))}: the usual ones are used",
         )
     for samples in series:
         for problem, count in samples.problems.items():
-            notes.warn(f"{count} of {samples.messages} messages of {samples.topic} were left out: {problem}")
+            notes.warn(
+                "todo-messages-were-left-out",
+                f"{count} of {samples.messages} messages of {samples.topic} were left out: {problem}",
+            )
 
 
 def _frame(bag: Bag, message: RawMessage) -> str:
@@ -296,14 +310,18 @@ def _settle_clocks(series: list[TopicSamples], notes: Notes) -> None:
     for topic, (stamp, bag) in raw.items():
         without = int((stamp == 0).sum())
         if without:
-            notes.assume(f"{without} messages of {topic} have no stamp: the time of recording is used")
+            notes.assume(
+                "todo-messages-have-no-stamp",
+                f"{without} messages of {topic} have no stamp: the time of recording is used",
+            )
         time = np.where(stamp == 0, bag + offset[topic], stamp)
         jump = np.abs(time - bag - offset[topic]) > _JUMP_NS
         _note_left_out(notes, jump, topic, "have a stamp more than a minute off the others")
         if mixed and topic in other_epoch:
             time = time - offset[topic]
             notes.assume(
-                f"stamps of {topic} count from another epoch: brought to the recorder's clock by their median"
+                "todo-stamps-count-from-another",
+                f"stamps of {topic} count from another epoch: brought to the recorder's clock by their median",
             )
         usable = ~jump
         latest = np.maximum.accumulate(np.where(usable, time, np.iinfo(np.int64).min))
@@ -316,4 +334,7 @@ def _settle_clocks(series: list[TopicSamples], notes: Notes) -> None:
 
 def _note_left_out(notes: Notes, bad: BoolArray, topic: str, reason: str) -> None:
     if bad.any():
-        notes.warn(f"{int(bad.sum())} of {len(bad)} messages of {topic} {reason}, and were left out")
+        notes.warn(
+            "todo-messages-were-left-out",
+            f"{int(bad.sum())} of {len(bad)} messages of {topic} {reason}, and were left out",
+        )

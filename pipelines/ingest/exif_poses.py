@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from pipelines.core.errors import ContradictionError
-from pipelines.core.products import Caution
+from pipelines.core.products import Remark
 from pipelines.core.sentences import listed
 from pipelines.core.types import FloatArray
 from pipelines.formats.exif import RTK_FIXED, RTK_FLOAT, PhotoTags
@@ -56,11 +56,14 @@ def poses_from_tags(photos: Sequence[Photo], options: IngestOptions, notes: Note
     located = complete(xyz)
     flat = [photo.name for photo in photos if photo.tags.gps is not None and altitude_m(photo.tags) is None]
     notes.warn_counted(
-        flat, "image has a GPS position without altitude", "images have GPS positions without altitude"
+        "todo-image-has-gps-position",
+        flat,
+        "image has a GPS position without altitude",
+        "images have GPS positions without altitude",
     )
     datums = sorted({photo.tags.gps.datum for photo in photos if photo.tags.gps is not None} - {""})
     if datums:
-        notes.assume(f"GPSMapDatum {', '.join(datums)} is taken as WGS84")
+        notes.assume("todo-gpsmapdatum-taken-wgs", f"GPSMapDatum {', '.join(datums)} is taken as WGS84")
     crs = parse_crs(WGS84, vertical=options.vertical)
     position_in_ecef = np.full((len(photos), 3), np.nan)
     position_in_ecef[located] = ecef_from_lla(crs.lla_from_xyz(xyz[located]))
@@ -154,9 +157,10 @@ def compare_with_exif(
     for fatal, caution in filter(None, found):
         if fatal and not options.accept_contradiction:
             raise ContradictionError(
-                f"{path}: {caution.sentence}. Correct what is wrong, or go on with --accept-contradiction"
+                "todo-correct-what-wrong-or",
+                f"{path}: {caution.sentence}. Correct what is wrong, or go on with --accept-contradiction",
             )
-        notes.caution(caution)
+        notes.caution(caution.code, caution.sentence)
 
 
 @dataclass(frozen=True)
@@ -170,7 +174,7 @@ class _Places:
     time_s: FloatArray  # (n,) NaN where unknown
 
 
-def _horizontal(places: _Places, path: Path) -> tuple[bool, Caution] | None:
+def _horizontal(places: _Places, path: Path) -> tuple[bool, Remark] | None:
     """Return the caution of positions that differ, and whether it is fatal."""
     distance = np.hypot(*(places.table - places.exif).T)
     allowed = np.maximum(_SIGMAS * np.hypot(*places.sigma_m.T), _LEAST_M)
@@ -179,7 +183,7 @@ def _horizontal(places: _Places, path: Path) -> tuple[bool, Caution] | None:
         return None
     cause = _cause(places, float(np.median(distance)), float(np.median(allowed)) / _SIGMAS)
     sentence = f"{int(contradicting.sum())} of {len(distance)} positions in {path.name} {cause}"
-    return True, Caution(code="table-against-exif", sentence=sentence)
+    return True, Remark(code="table-against-exif", sentence=sentence)
 
 
 def _cause(places: _Places, typical_m: float, sigma_m: float) -> str:
@@ -238,7 +242,7 @@ def _clock_offset(places: _Places) -> float | None:
 
 def _heights(
     heights_m: FloatArray, apart_m: FloatArray, sigma_m: FloatArray, path: Path
-) -> tuple[bool, Caution] | None:
+) -> tuple[bool, Remark] | None:
     """Return the caution of heights (n, 2) of table and EXIF that are too far apart (n,) for the σ (n,) of both."""
     offset, spread = float(np.median(apart_m)), mad_sigma(apart_m)
     allowed = max(_SIGMAS * float(np.median(sigma_m)), _LEAST_M)
@@ -249,9 +253,9 @@ def _heights(
         tolerance = max(_UNIT_PART * abs(float(np.median(heights_m[:, 1]))), allowed / _SIGMAS)
         if abs(offset) > _EVIDENT * allowed and left < tolerance:
             sentence = f"the heights in {path.name} are {cause}: those in EXIF are {factor:.4g} times as large"
-            return True, Caution(code="feet", sentence=sentence)
+            return True, Remark(code="feet", sentence=sentence)
     sentence = (
         f"the heights in {path.name} differ from those in EXIF by {offset:+.1f} m (± {spread:.1f} m): one is above "
         "the ellipsoid, the other above a geoid, the take-off or a barometer's zero; see --vertical"
     )
-    return abs(offset) > MOST_GEOID_M, Caution(code="heights-apart", sentence=sentence)
+    return abs(offset) > MOST_GEOID_M, Remark(code="heights-apart", sentence=sentence)

@@ -129,7 +129,10 @@ def with_defaults(
         parts = [f"{horizontal_m:g} m horizontal"] if options.sigma_h is None else []
         parts += [f"{vertical_m:g} m vertical"] if options.sigma_v is None else []
         if rows.any() and parts:
-            notes.assume(f"σ of positions without one ({int(rows.sum())}): {', '.join(parts)} ({receiver})")
+            notes.assume(
+                "todo-positions-without-one",
+                f"σ of positions without one ({int(rows.sum())}): {', '.join(parts)} ({receiver})",
+            )
     overridden = options.sigma_h is not None or options.sigma_v is not None
     sources: list[SigmaSource] = ["option" if overridden else "file" if row else "default" for row in from_file]
     return sigma, tuple(sources)
@@ -165,9 +168,9 @@ def track_in_geo(recorded: RecordedNavigation, origin: Origin) -> NavigationTrac
 def require_enough(count: int, source: Path, field: str, notes: Notes) -> None:
     """Refuse fewer photographs than a survey needs, with everything that was noted on the way."""
     if count < LEAST_IMAGES:
-        reasons = "".join(f"; {warning}" for warning in notes.warnings)
+        reasons = "".join(f"; {warning.sentence}" for warning in notes.warnings)
         message = f"{count} usable images, a survey needs {LEAST_IMAGES}{reasons}"
-        raise InputError(message, path=source, field=field)
+        raise InputError("todo-x", message, path=source, field=field)
 
 
 def given_rig(options: IngestOptions) -> Rig:
@@ -191,7 +194,11 @@ def at_cameras(poses: ImagePoses, rig: Rig, names: Sequence[str], notes: Notes) 
         InputError: a lever arm without the mount, whose axes it is given in.
     """
     if rig.antenna_in_body is not None and rig.cam_from_body is None:
-        raise InputError("is given in the body's axes: give --camera-mount YAW,PITCH,ROLL too", field="--lever-arm")
+        raise InputError(
+            "todo-given-body-axes-give",
+            "is given in the body's axes: give --camera-mount YAW,PITCH,ROLL too",
+            field="--lever-arm",
+        )
     mounted = replace(rig, cam_from_body=body_mount(rig))
     enu_from_body = poses.enu_from_cam @ body_mount(rig)
     position_in_ecef, enu_from_cam = camera_poses(poses.position_in_ecef, enu_from_body, mounted, names, notes)
@@ -211,6 +218,7 @@ def camera_poses(
     located = complete(antenna_in_ecef)
     lost = np.flatnonzero(located & ~complete(offset_in_enu))
     notes.warn_counted(
+        "todo-position-without-attitude-apply",
         [names[row] for row in lost.tolist()],
         "position is without an attitude to apply the lever arm by, and was left out",
         "positions are without attitudes to apply the lever arm by, and were left out",

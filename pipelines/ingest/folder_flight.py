@@ -55,8 +55,9 @@ def read_folder(
     require_enough(len(photos), folder, "--images", notes)
     for problem in sorted({problem for photo in photos for problem in photo.tags.problems}):
         with_it = [photo.name for photo in photos if problem in photo.tags.problems]
-        notes.warn_counted(with_it, f"image where {problem}", f"images where {problem}")
+        notes.warn_counted("todo-image-where", with_it, f"image where {problem}", f"images where {problem}")
     notes.warn_counted(
+        "todo-image-has-exif-orientation",
         [photo.name for photo in photos if photo.tags.orientation != 1],
         "image has an EXIF orientation, which is ignored: pixels count as stored",
         "images have an EXIF orientation, which is ignored: pixels count as stored",
@@ -64,6 +65,7 @@ def read_folder(
     poses = _poses(photos, options, notes)
     if options.time_offset_s and poses.recorded is None:
         raise InputError(
+            "todo-for-navigation-by-time",
             "is for navigation by time: a --bag, or a --trajectory without a column of images",
             field="--time-offset",
         )
@@ -86,7 +88,11 @@ def _poses(photos: list[Photo], options: IngestOptions, notes: Notes) -> ImagePo
     if options.events is None:
         return poses_from_table(table, photos, options, notes)
     if table.names is not None:
-        raise InputError("is for a --trajectory by time: this one names its images", field="--events")
+        raise InputError(
+            "todo-for-trajectory-by-time",
+            "is for a --trajectory by time: this one names its images",
+            field="--events",
+        )
     events = read_mrk(options.events)
     rows = _event_of_each(events, photos, notes)
     timed = []
@@ -112,13 +118,19 @@ def _read_positions(path: Path, photos: Sequence[Photo], notes: Notes) -> PoseTa
     """
     lines = [line for line in beginning(path).splitlines() if line.strip()]
     if lines and lines[0].startswith("%"):
-        notes.assume(f"{path.name} is read as RTKLIB's solution: positions of the antenna")
+        notes.assume(
+            "todo-read-rtklib-solution-positions",
+            f"{path.name} is read as RTKLIB's solution: positions of the antenna",
+        )
         return read_pos(path)
     if lines and FIRST_LINE.match(lines[0]):
-        notes.assume(f"{path.name} is read as DJI's timestamp file: positions of the camera, by photograph number")
+        notes.assume(
+            "todo-read-dji-timestamp-file",
+            f"{path.name} is read as DJI's timestamp file: positions of the camera, by photograph number",
+        )
         return _positions_of_events(read_mrk(path), photos, notes)
     if any(HEADER.match(line) for line in lines):
-        notes.assume(f"{path.name} is read as {REFERENCE}")
+        notes.assume("todo-read", f"{path.name} is read as {REFERENCE}")
         return read_cameras(path)
     return read_trajectory(path)
 
@@ -158,24 +170,28 @@ def _event_of_each(events: CameraEvents, photos: Sequence[Photo], notes: Notes) 
     folders = sorted({PurePosixPath(photo.name).parent.as_posix() for photo, _ in tied})
     if not folders:
         raise InputError(
+            "todo-has-events-no-photograph",
             f"has the events {events.number.min()} to {events.number.max()}, and no photograph has such a number "
             f"in its name, as DJI_0007.JPG has: the folder has {photos[0].name!r} …",
             path=events.path,
         )
     if len(folders) > 1:
         raise InputError(
+            "todo-counts-photographs-one-flight",
             "counts the photographs of one flight, but its numbers occur in several folders "
             f"({', '.join(folders[:3])}): take one folder and its file",
             path=events.path,
         )
     _refuse_other_times(events, [(photo, row) for photo, row in tied if photo.tags.timestamp_s])
     notes.warn_counted(
+        "todo-image-has-no-event",
         [photo.name for photo, row in zip(photos, rows, strict=True) if row < 0],
         f"image has no event in {events.path.name}",
         f"images have no event in {events.path.name}",
     )
     unused = np.setdiff1d(np.arange(len(events.number)), rows)
     notes.warn_counted(
+        "todo-event-has-no-photograph",
         [f"{events.path.name}:{events.lines[row]}" for row in unused.tolist()],
         "event has no photograph here",
         "events have no photographs here",
@@ -192,9 +208,10 @@ def _refuse_other_times(events: CameraEvents, timed: Sequence[tuple[Photo, int]]
     if off_s.max() > _MOST_SPREAD_S:
         worst = timed[int(off_s.argmax())][0].name
         raise ContradictionError(
+            "todo-by-number-photographs-do",
             f"{events.path}: by number, {int((off_s > _MOST_SPREAD_S).sum())} of {len(timed)} photographs do not "
             f"have the times of their events (EXIF of {worst}: {off_s.max():.0f} s off): is it the file of another "
-            "flight?"
+            "flight?",
         )
 
 

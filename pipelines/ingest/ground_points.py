@@ -75,6 +75,7 @@ def read_ground_files(options: IngestOptions, notes: Notes) -> tuple[GroundFile 
     marks = ground_points.read_marks(options.marks)
     known = {point.name for file in (control, check) if file is not None for point in file.points}
     notes.warn_counted(
+        "todo-mark-names-no-ground",
         [f"{options.marks.name}:{mark.line} ({mark.name})" for mark in marks if mark.name not in known],
         "mark names no ground point",
         "marks name no ground point",
@@ -109,20 +110,25 @@ def _recognised(path: Path, notes: Notes) -> GroundPoints:
         listed = ground_points.read_point_table(path)
     else:
         return ground_points.read_ground_points(path)
-    notes.assume(f"{path.name} is read as {listed.kind}")
+    notes.assume("todo-read", f"{path.name} is read as {listed.kind}")
     notes.warn_counted(
+        "todo-column-unknown-was-ignored",
         [f"{path.name} ({name})" for name in listed.unknown_columns],
         "column is unknown and was ignored",
         "columns are unknown and were ignored",
     )
     notes.warn_counted(
+        "todo-mark-not-pinned-so",
         listed.left_out,
         "mark is not pinned, so placed by Metashape itself, and was left out",
         "marks are not pinned, so placed by Metashape itself, and were left out",
     )
     checks = [point.name for point in listed.points if point.is_check]
     if checks:
-        notes.assume(f"points that are not enabled in {path.name} are check points: {shortened(checks)}")
+        notes.assume(
+            "todo-points-not-enabled-check",
+            f"points that are not enabled in {path.name} are check points: {shortened(checks)}",
+        )
     return listed
 
 
@@ -167,6 +173,7 @@ def tie_marks(file: GroundFile, sizes: Mapping[str, tuple[int, int]], sigma_px: 
             width, height = sizes[image]
             if not (0.0 <= mark.x_px <= width and 0.0 <= mark.y_px <= height):
                 raise InputError(
+                    "todo-mark-at-lies-outside",
                     f"the mark of {mark.name} at ({mark.x_px:g}, {mark.y_px:g}) lies outside {image} "
                     f"({width}×{height} pixels): was it made on an image of another size?",
                     path=path,
@@ -175,12 +182,17 @@ def tie_marks(file: GroundFile, sizes: Mapping[str, tuple[int, int]], sigma_px: 
                 )
             if image in marks[mark.name]:
                 message = f"{mark.name} is marked in {image} already"
-                raise InputError(message, path=path, line=mark.line, field="image")
+                raise InputError("todo-x", message, path=path, line=mark.line, field="image")
             marks[mark.name][image] = Mark(image=image, x_px=mark.x_px, y_px=mark.y_px, sigma_px=sigma_px)
         if listed and len(unknown) == len(listed):
             message = f"names none of the images: it has {listed[0].image!r} …, the folder {min(sizes)!r} …"
-            raise InputError(message, path=path, field="image")
-        notes.warn_counted(unknown, "mark is in an image that is not here", "marks are in images that are not here")
+            raise InputError("todo-x", message, path=path, field="image")
+        notes.warn_counted(
+            "todo-mark-image-not-here",
+            unknown,
+            "mark is in an image that is not here",
+            "marks are in images that are not here",
+        )
     points = tuple(replace(point, marks=tuple(marks[point.name].values())) for point in file.points)
     return replace(file, points=points)
 
@@ -198,7 +210,7 @@ def split_checks(
     for name in names:
         if name not in usable:
             message = f"{name!r} is no usable point there: it has {', '.join(sorted(usable))}"
-            raise InputError(message, path=None if control is None else control.path, field="--check")
+            raise InputError("todo-x", message, path=None if control is None else control.path, field="--check")
     listed = () if check is None else check.points
     for point in listed:
         twin = next((other for other in points if _are_one(other, point)), None)
@@ -206,7 +218,7 @@ def split_checks(
             message = (
                 f"{point.name} is also control point {twin.name} (line {twin.line}): it can be one of them only"
             )
-            raise InputError(message, path=check.path, line=point.line)
+            raise InputError("todo-x", message, path=check.path, line=point.line)
     moved = [point.name in names or point.is_check for point in points]
     kept = tuple(point for point, is_check in zip(points, moved, strict=True) if not is_check)
     return kept, (*listed, *(point for point, is_check in zip(points, moved, strict=True) if is_check))
@@ -221,6 +233,7 @@ def unmarked_points(
         "check": [point for point in check if not point.is_marked],
     }
     notes.warn_counted(
+        "todo-ground-point-has-marks",
         [f"{point.name} ({use})" for use, of_use in points.items() for point in of_use],
         "ground point has marks in fewer than 2 images, and enters nothing until it is marked",
         "ground points have marks in fewer than 2 images, and enter nothing until they are marked",
@@ -240,4 +253,4 @@ def require_near(file: GroundFile, middle_in_ecef: FloatArray) -> None:
         distance_m = float(np.linalg.norm(point.position_in_ecef - middle_in_ecef))
         if distance_m > _RANGE_M:
             message = f"{point.name} is {distance_m / 1000:.0f} km from the images: wrong CRS, or x and y swapped?"
-            raise InputError(message, path=file.path, line=point.line)
+            raise InputError("todo-x", message, path=file.path, line=point.line)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from pipelines.core.products import Caution
+from pipelines.core.products import Remark
 
 _SHOWN = 4
 
@@ -14,32 +14,34 @@ _SHOWN = 4
 class Notes:
     """Assumptions, warnings and cautions, gathered while a survey is read, in order and without repeats."""
 
-    assumptions: list[str] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
-    cautions: list[Caution] = field(default_factory=list)
+    assumptions: list[Remark] = field(default_factory=list)
+    warnings: list[Remark] = field(default_factory=list)
+    cautions: list[Remark] = field(default_factory=list)
 
-    def assume(self, text: str) -> None:
-        """Record an assumption."""
-        if text not in self.assumptions:
-            self.assumptions.append(text)
+    def assume(self, code: str, sentence: str) -> None:
+        """Record what stands in for what the input does not state."""
+        _add(self.assumptions, code, sentence)
 
-    def warn(self, text: str) -> None:
-        """Record a warning."""
-        if text not in self.warnings:
-            self.warnings.append(text)
+    def warn(self, code: str, sentence: str) -> None:
+        _add(self.warnings, code, sentence)
 
-    def caution(self, caution: Caution) -> None:
+    def caution(self, code: str, sentence: str) -> None:
         """Record a limit of every result of this survey."""
-        if caution not in self.cautions:
-            self.cautions.append(caution)
+        _add(self.cautions, code, sentence)
 
-    def warn_counted(self, items: Sequence[str], singular: str, plural: str) -> None:
+    def warn_counted(self, code: str, items: Sequence[str], singular: str, plural: str) -> None:
         """Record one warning for all items (files, or places as `file:line`), with their count and the first few.
 
         The fault of one, e.g. "image is empty and was left out", is `singular`, and that of many is `plural`.
         """
         if items:
-            self.warn(f"{len(items)} {singular if len(items) == 1 else plural}: {shortened(items)}")
+            self.warn(code, f"{len(items)} {singular if len(items) == 1 else plural}: {shortened(items)}")
+
+
+def _add(remarks: list[Remark], code: str, sentence: str) -> None:
+    remark = Remark(code=code, sentence=sentence)
+    if remark not in remarks:
+        remarks.append(remark)
 
 
 def shortened(items: Sequence[str]) -> str:

@@ -44,22 +44,26 @@ def scan_folder(root: Path, notes: Notes, progress: Progress = SILENT, *, decode
         InputError: no such folder, or no JPEG, PNG or TIFF file in it.
     """
     if not root.is_dir():
-        raise InputError("no such folder of photographs", path=root, field="--images")
+        raise InputError(
+            "todo-no-such-folder-photographs", "no such folder of photographs", path=root, field="--images"
+        )
     names = sorted(path.relative_to(root).as_posix() for path in _candidates(root))
     inside = [name for name in names if (root / name).resolve().is_relative_to(root.resolve())]
     notes.warn_counted(
+        "todo-image-link-leaves-folder",
         sorted(set(names) - set(inside)),
         "image is a link that leaves the folder and was left out",
         "images are links that leave the folder and were left out",
     )
     usable = [name for name in inside if stays_inside(name)]
     notes.warn_counted(
+        "todo-image-has-name-no",
         [ascii(name) for name in sorted(set(inside) - set(usable))],
         "image has a name that is no text and was left out",
         "images have names that are no text and were left out",
     )
     if not usable:
-        raise InputError("holds no JPEG, PNG or TIFF image", path=root, field="--images")
+        raise InputError("todo-holds-no-jpeg-png", "holds no JPEG, PNG or TIFF image", path=root, field="--images")
     photos: list[Photo] = []
     damaged: list[str] = []
     inspected = partial(_inspect, root=root, decode=decode)
@@ -70,7 +74,7 @@ def scan_folder(root: Path, notes: Notes, progress: Progress = SILENT, *, decode
                 photos.append(photo)
             else:
                 damaged.append(f"{name} ({photo})")
-    notes.warn_counted(damaged, "image was left out", "images were left out")
+    notes.warn_counted("todo-image-was-left-out", damaged, "image was left out", "images were left out")
     return _without_duplicates(photos, notes)
 
 
@@ -83,11 +87,13 @@ def glance(root: Path) -> tuple[int, int, tuple[int, int]]:
         InputError: no such folder, or no image in it.
     """
     if not root.is_dir():
-        raise InputError("no such folder of photographs", path=root, field="--images")
+        raise InputError(
+            "todo-no-such-folder-photographs", "no such folder of photographs", path=root, field="--images"
+        )
     paths = sorted(_candidates(root))
     size_px = next(filter(None, (header_size(data) for data in map(_beginning, paths))), None)
     if size_px is None:
-        raise InputError("holds no JPEG, PNG or TIFF image", path=root, field="--images")
+        raise InputError("todo-holds-no-jpeg-png", "holds no JPEG, PNG or TIFF image", path=root, field="--images")
     return len(paths), sum(path.stat().st_size for path in paths), size_px
 
 
@@ -127,7 +133,10 @@ def _without_duplicates(photos: list[Photo], notes: Notes) -> list[Photo]:
             first[photo.file.sha256] = photo.name
             kept.append(photo)
     notes.warn_counted(
-        dropped, "image is a copy of another and was left out", "images are copies of others and were left out"
+        "todo-image-copy-another-was",
+        dropped,
+        "image is a copy of another and was left out",
+        "images are copies of others and were left out",
     )
     return kept
 
@@ -156,14 +165,14 @@ class ImageNames:
         pure = PurePosixPath(name)
         if pure.is_absolute() or ".." in pure.parts or name[1:2] == ":":
             message = f"{text!r} leaves the image folder: name images relative to it"
-            raise InputError(message, path=path, line=line, field="image")
+            raise InputError("todo-x", message, path=path, line=line, field="image")
         if name in self._exact:
             return name
         for form, key in zip(self._forms, _keys(name), strict=True):
             candidates = form.get(key, [])
             if len(candidates) > 1:
                 message = f"{text!r} may be {' or '.join(candidates[:3])}: name it with its folder and suffix"
-                raise InputError(message, path=path, line=line, field="image")
+                raise InputError("todo-x", message, path=path, line=line, field="image")
             if candidates:
                 return candidates[0]
         return None
@@ -237,10 +246,15 @@ def camera_priors(
                 focal_source=source if given_focal_px is None else "option",
                 make_model=name,
             )
-            notes.assume(f"focal length of {name or 'the camera'} at {width}×{height}: {focal:.1f} px, {origin}")
+            notes.assume(
+                "todo-focal-length-at-px",
+                f"focal length of {name or 'the camera'} at {width}×{height}: {focal:.1f} px, {origin}",
+            )
         camera_of[photo.name] = cameras[key].camera_id
     sizes = sorted({(width, height) for width, height, _, _ in cameras})
     if len(sizes) > 1:
         listed = ", ".join(f"{width}×{height}" for width, height in sizes)
-        notes.warn(f"images have {len(sizes)} sizes ({listed}): each is a camera of its own")
+        notes.warn(
+            "todo-images-have-sizes-each", f"images have {len(sizes)} sizes ({listed}): each is a camera of its own"
+        )
     return tuple(cameras.values()), camera_of

@@ -31,19 +31,27 @@ def crs_of_table(table: PoseTable, options: IngestOptions, notes: Notes) -> Poin
     if options.crs is not None:
         crs = parse_crs(options.crs, vertical=options.vertical, field="--crs")
         if table.geographic and not crs.is_geographic:
-            raise InputError(f"{path.name} has latitude and longitude, but {crs.name} has none", field="--crs")
+            raise InputError(
+                "todo-has-latitude-longitude-but",
+                f"{path.name} has latitude and longitude, but {crs.name} has none",
+                field="--crs",
+            )
         if _contradicts(crs, options):
             message = f"contradicts --crs {crs.name}, whose heights are {crs.vertical.name}"
-            raise InputError(message, field="--vertical")
+            raise InputError("todo-x", message, field="--vertical")
         return crs
     if table.heights_above_geoid and options.vertical is None:
         message = "its heights are above a geoid that it does not name (geodetic): name it, e.g. EGM96"
-        raise InputError(message, path=path, field="--vertical")
+        raise InputError("todo-x", message, path=path, field="--vertical")
     assumed = table.assumed_crs or (WGS84 if table.geographic else None)
     if assumed is None:
-        raise InputError("columns x,y,z need their CRS: give --crs, e.g. --crs EPSG:32632", path=path)
+        raise InputError(
+            "todo-columns-need-their-crs",
+            "columns x,y,z need their CRS: give --crs, e.g. --crs EPSG:32632",
+            path=path,
+        )
     what = "latitude and longitude" if table.geographic else "coordinates"
-    notes.assume(f"{what} in {path.name} are WGS84 ({assumed})")
+    notes.assume("todo-wgs", f"{what} in {path.name} are WGS84 ({assumed})")
     crs = parse_crs(assumed, vertical=options.vertical)
     _note_own_heights(crs, path, options, notes)
     return crs
@@ -58,19 +66,27 @@ def crs_of_points(listed: GroundPoints, options: IngestOptions, notes: Notes) ->
     path = listed.path
     if listed.crs_text is not None:
         if options.gcp_crs is not None:
-            notes.assume(f"{path.name} states its CRS; --gcp-crs does not apply to it")
+            notes.assume("todo-states-its-crs-gcp", f"{path.name} states its CRS; --gcp-crs does not apply to it")
         crs = parse_crs(listed.crs_text, vertical=options.vertical, path=path, line=listed.crs_line)
         _note_own_heights(crs, path, options, notes)
         return crs
     if options.gcp_crs is not None:
         crs = parse_crs(options.gcp_crs, vertical=options.vertical, field="--gcp-crs")
     elif listed.geographic:
-        notes.assume(f"latitude and longitude in {path.name} are WGS84 ({WGS84})")
+        notes.assume("todo-latitude-longitude-wgs", f"latitude and longitude in {path.name} are WGS84 ({WGS84})")
         crs = parse_crs(WGS84, vertical=options.vertical)
     else:
-        raise InputError(f"{path.name} states no CRS: give it, e.g. EPSG:32632 or EPSG:4326", field="--gcp-crs")
+        raise InputError(
+            "todo-states-no-crs-give",
+            f"{path.name} states no CRS: give it, e.g. EPSG:32632 or EPSG:4326",
+            field="--gcp-crs",
+        )
     if listed.geographic and not crs.is_geographic:
-        raise InputError(f"{path.name} has latitude and longitude, but {crs.name} has none", field="--gcp-crs")
+        raise InputError(
+            "todo-has-latitude-longitude-but",
+            f"{path.name} has latitude and longitude, but {crs.name} has none",
+            field="--gcp-crs",
+        )
     return crs
 
 
@@ -81,12 +97,16 @@ def east_first(listed: GroundPoints, crs: PointCrs, notes: Notes) -> FloatArray:
     if listed.in_order_of_crs:
         order = (first, second) if crs.northing_first else (second, first)
         notes.assume(
+            "todo-has-no-header-stands",
             f"{listed.path.name} has no header: the {order[0]} stands before the {order[1]}, as in the definition "
-            f"of {crs.name}"
+            f"of {crs.name}",
         )
         return xyz[:, [1, 0, 2]] if crs.northing_first else xyz
     if crs.northing_first and not listed.geographic and not crs.is_geographic:
-        notes.assume(f"x in {listed.path.name} is the easting, although {crs.name} has the northing first")
+        notes.assume(
+            "todo-easting-although-has-northing",
+            f"x in {listed.path.name} is the easting, although {crs.name} has the northing first",
+        )
     return xyz
 
 
@@ -97,17 +117,24 @@ def note_operation(crs: PointCrs, lla: FloatArray, notes: Notes) -> None:
     operation = crs.operation(lla)
     if operation.accuracy_m is None or operation.accuracy_m >= 0.5:
         accuracy = "an unknown accuracy" if operation.accuracy_m is None else f"{operation.accuracy_m:g} m"
-        notes.assume(f"{crs.name} is brought to WGS84 by “{operation.name}”, published with {accuracy}")
+        notes.assume(
+            "todo-brought-wgs-by-published",
+            f"{crs.name} is brought to WGS84 by “{operation.name}”, published with {accuracy}",
+        )
     if operation.missing_grids:
-        notes.warn(f"{crs.name}: a better way to WGS84 needs the PROJ grid {', '.join(operation.missing_grids)}")
+        notes.warn(
+            "todo-better-way-wgs-needs",
+            f"{crs.name}: a better way to WGS84 needs the PROJ grid {', '.join(operation.missing_grids)}",
+        )
     if crs.height_unit != "metre":
-        notes.assume(f"heights of {crs.name} are in {crs.height_unit}")
+        notes.assume("todo-heights", f"heights of {crs.name} are in {crs.height_unit}")
 
 
 def _note_own_heights(crs: PointCrs, path: Path, options: IngestOptions, notes: Notes) -> None:
     if _contradicts(crs, options):
         notes.assume(
-            f"heights of {path.name} are {crs.vertical.name}, as its CRS says; --vertical does not apply to them"
+            "todo-heights-its-crs-says",
+            f"heights of {path.name} are {crs.vertical.name}, as its CRS says; --vertical does not apply to them",
         )
 
 

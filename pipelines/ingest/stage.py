@@ -43,7 +43,7 @@ def run(stage: StageRun, options: IngestOptions) -> Summary:
     if track is not None:
         save_npz(stage.out / "track.npz", vars(track))
     for assumption in survey.assumptions:
-        log.info("assumed: %s", assumption)
+        log.info("assumed: %s", assumption.sentence)
     return _summary(survey)
 
 
@@ -67,7 +67,7 @@ def _refuse_inside_photographs(workspace: Workspace, options: IngestOptions) -> 
     """Refuse a workspace whose files would count as photographs."""
     if options.images is not None and workspace.root.resolve().is_relative_to(options.images.resolve()):
         message = "the workspace lies inside the folder of photographs: put it elsewhere"
-        raise InputError(message, path=workspace.root)
+        raise InputError("todo-x", message, path=workspace.root)
 
 
 def survey_and_track(
@@ -82,8 +82,9 @@ def survey_and_track(
     check_options(options, frames)
     if options.estimated:
         notes.assume(
+            "todo-given-until-georef-run",
             f"{', '.join(options.estimated)}: as given, until `georef run` or `georef calibrate` has estimated it "
-            "after sfm"
+            "after sfm",
         )
     ground = read_ground_files(options, notes)  # ahead of the photographs, which take minutes
     if options.bag is not None and frames is not None:
@@ -91,7 +92,9 @@ def survey_and_track(
     elif options.images is not None:
         flight = read_folder(options.images, options, notes, progress, decode=decode)
     else:
-        raise InputError("give the folder of photographs, or a --bag", field="--images")
+        raise InputError(
+            "todo-give-folder-photographs-or", "give the folder of photographs, or a --bag", field="--images"
+        )
     sizes = {photo.name: (photo.file.width, photo.file.height) for photo in flight.photos}
     control, check = (
         None if file is None else tie_marks(file, sizes, options.sigma_mark, notes) for file in ground

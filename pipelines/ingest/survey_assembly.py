@@ -88,7 +88,9 @@ def assemble_survey(
     origin = _origin(poses, marked)
     _note_coverage(flight, len(marked), notes)
     if options.test_every and not _held_out(len(flight.photos), options.test_every):
-        notes.warn(f"{len(flight.photos)} images are too few to hold any out for testing")
+        notes.warn(
+            "todo-images-too-few-hold", f"{len(flight.photos)} images are too few to hold any out for testing"
+        )
     track = None if flight.navigation is None else track_in_geo(flight.navigation, origin)
     if options.estimated:
         require_estimable(track, options.estimated, "--estimate" if options.estimate else "--time-offset")
@@ -121,7 +123,8 @@ def require_placed(placed: bool) -> None:
     """Refuse a survey that nothing places on Earth."""
     if not placed:
         raise InputError(
-            "no image has a position, and there are no ground control points: give --trajectory, --geo or --gcp"
+            "todo-no-image-has-position",
+            "no image has a position, and there are no ground control points: give --trajectory, --geo or --gcp",
         )
 
 
@@ -131,6 +134,7 @@ def _require_checks(checks: Sequence[GroundPoint], vegetated: Sequence[str]) -> 
     for name in vegetated:
         if name not in known:
             raise InputError(
+                "todo-no-check-point-there",
                 f"{name!r} is no check point: there are {', '.join(sorted(known)) or 'none'} (--checkpoints, "
                 "--check)",
                 field="--vegetated",
@@ -304,8 +308,9 @@ def _note_default(kind: str, count: int, options: IngestOptions, notes: Notes) -
         defaults["--sigma-common-v"] = f"{vertical_m:g} m vertical"
     if defaults:
         notes.assume(
+            "todo-error-positions-session-share",
             f"σ of the error that the positions of a session share ({count}): {', '.join(defaults.values())} "
-            f"({kind}); state yours with {' and '.join(defaults)}"
+            f"({kind}); state yours with {' and '.join(defaults)}",
         )
 
 
@@ -335,6 +340,7 @@ def _without_far_fixes(flight: FlightRecord, notes: Notes) -> ImagePoses:
     distance_m = np.linalg.norm(poses.position_in_ecef - middle_in_ecef, axis=1)
     far = distance_m > FIX_RANGE_M
     notes.warn_counted(
+        "todo-position-far-from-others",
         [f"{flight.photos[row].name} ({distance_m[row] / 1000:.0f} km)" for row in np.flatnonzero(far).tolist()],
         "position is far from the others and was left out",
         "positions are far from the others and were left out",
@@ -355,12 +361,18 @@ def _note_coverage(flight: FlightRecord, points: int, notes: Notes) -> None:
     located = flight.poses.located
     if flight.poses.source == "exif":
         names = [flight.photos[row].name for row in np.flatnonzero(~located).tolist()]
-        notes.warn_counted(names, "image has no position in EXIF", "images have no position in EXIF")
+        notes.warn_counted(
+            "todo-image-has-no-position", names, "image has no position in EXIF", "images have no position in EXIF"
+        )
     if not located.any():
-        notes.warn(f"no image has a position: {points} ground control points alone place the model")
+        notes.warn(
+            "todo-no-image-has-position",
+            f"no image has a position: {points} ground control points alone place the model",
+        )
     elif located.sum() < LEAST_IMAGES and points < LEAST_IMAGES:
         notes.warn(
-            f"only {int(located.sum())} positions and {points} control points: three of a kind place a model"
+            "todo-only-positions-control-points",
+            f"only {int(located.sum())} positions and {points} control points: three of a kind place a model",
         )
 
 
@@ -370,12 +382,13 @@ def _vertical(poses: ImagePoses, files: Sequence[GroundFile], notes: Notes) -> V
     datums |= {file.path.name: file.crs.vertical for file in files}
     for place, datum in datums.items():
         if not datum.stated:
-            notes.assume(f"heights of {place} are {datum.name}: {datum.note}")
+            notes.assume("todo-heights", f"heights of {place} are {datum.name}: {datum.note}")
     stated = [place for place, datum in datums.items() if datum.stated]
     assumed = [place for place, datum in datums.items() if not datum.stated]
     if stated and assumed:
         notes.warn(
+            "todo-vertical-datum-stated-only",
             f"the vertical datum of {', '.join(stated)} is stated, that of {', '.join(assumed)} only assumed: they "
-            "may differ by a geoid's height, up to 100 m; see --vertical"
+            "may differ by a geoid's height, up to 100 m; see --vertical",
         )
     return next(iter(datums.values()))

@@ -60,6 +60,7 @@ def poses_from_table(table: PoseTable, photos: Sequence[Photo], options: IngestO
         receivers = _worse_neighbour(receiver[order], recorded.time_s, time_s + options.time_offset_s)
     located = complete(at_images.position)
     notes.warn_counted(
+        "todo-image-has-no-position",
         [images[row] for row in np.flatnonzero(~located)],
         f"image has no position in {table.path.name}",
         f"images have no position in {table.path.name}",
@@ -95,24 +96,28 @@ def usable_rows(table: PoseTable, notes: Notes) -> PoseTable:
     """
     file = table.path.name
     notes.warn_counted(
+        "todo-column-unknown-was-ignored",
         [f"{file}:{table.header_line} ({name or 'unnamed'})" for name in table.unknown_columns],
         "column is unknown and was ignored",
         "columns are unknown and were ignored",
     )
     if table.zoneless_times:
-        notes.assume(f"times without a zone in {file} are UTC")
+        notes.assume("todo-times-without-zone-utc", f"times without a zone in {file} are UTC")
     needed, gaps = (2, "NaN") if table.source == "geo.txt" else (3, "empty or NaN")
     located = complete(table.xyz[:, :needed])
     places = [f"{file}:{line}" for line in table.lines[~located]]
-    notes.warn_counted(places, f"row has no position ({gaps})", f"rows have no position ({gaps})")
+    notes.warn_counted(
+        "todo-row-has-no-position", places, f"row has no position ({gaps})", f"rows have no position ({gaps})"
+    )
     if not located.any():
-        raise InputError("no row has a position", path=table.path)
+        raise InputError("todo-no-row-has-position", "no row has a position", path=table.path)
     table = table.take(located)
     if table.names is not None or table.time_s is None:
         return table
     _, first = np.unique(table.time_s, return_index=True)
     repeated = np.setdiff1d(np.arange(len(table.lines)), first)
     notes.warn_counted(
+        "todo-row-repeats-earlier-time",
         [f"{file}:{line}" for line in table.lines[repeated]],
         "row repeats an earlier time and was left out",
         "rows repeat earlier times and were left out",
@@ -137,18 +142,20 @@ def match_by_name(table: PoseTable, images: list[str], notes: Notes) -> PoseTabl
             continue
         if name in row_of:
             message = f"{name} has a row already, in line {int(table.lines[row_of[name]])}"
-            raise InputError(message, path=table.path, line=line, field="image")
+            raise InputError("todo-x", message, path=table.path, line=line, field="image")
         if Path(text.replace("\\", "/")).name != Path(name).name:
             loose.append(f"{table.path.name}:{line} ({text} for {name})")
         row_of[name] = row
     if not row_of:
         raise InputError(
+            "todo-names-none-images-has",
             f"names none of the images: it has {(table.names or ('nothing',))[0]!r} …, the folder {images[0]!r} …",
             path=table.path,
             field="image",
         )
-    notes.warn_counted(unknown, "row names no image here", "rows name no image here")
+    notes.warn_counted("todo-row-names-no-image", unknown, "row names no image here", "rows name no image here")
     notes.warn_counted(
+        "todo-row-names-its-image",
         loose,
         "row names its image with another case or without suffix",
         "rows name their images with another case or without suffix",
@@ -166,17 +173,25 @@ def match_by_time(
         InputError: no row or no photograph has a time, or none of them lies within the trajectory.
     """
     if not len(trajectory):
-        raise InputError("no row has a time", path=path, field="timestamp")
+        raise InputError("todo-no-row-has-time", "no row has a time", path=path, field="timestamp")
     time_s = photo_times(photos)
     timeless = [photo.name for photo in photos if photo.tags.timestamp_s is None]
-    notes.warn_counted(timeless, "image has no time in EXIF", "images have no time in EXIF")
+    notes.warn_counted(
+        "todo-image-has-no-time", timeless, "image has no time in EXIF", "images have no time in EXIF"
+    )
     if len(timeless) == len(photos):
-        raise InputError("has no column image, and no image has a time in EXIF", path=path, field="timestamp")
+        raise InputError(
+            "todo-has-no-column-image",
+            "has no column image, and no image has a time in EXIF",
+            path=path,
+            field="timestamp",
+        )
     if any(photo.tags.time_source == "assumed UTC" for photo in photos):
-        notes.assume("EXIF times without a zone are UTC")
+        notes.assume("todo-exif-times-without-zone", "EXIF times without a zone are UTC")
     matched = trajectory.at(time_s + options.time_offset_s)
     if not complete(matched.position).any():
         raise InputError(
+            "todo-covers-images-none-fits",
             f"covers {_span(trajectory.time_s)}, the images {_span(time_s)}: none fits, with gaps of "
             f"{trajectory.max_gap_s:g} s at most. Is the camera's clock in another time zone? Is --max-gap too "
             "small?",
@@ -203,11 +218,21 @@ def _with_heights(table: PoseTable, photos: Sequence[Photo], crs: PointCrs, note
         xyz[lacking, 2] = [np.nan if height is None else height for height in heights]
     filled = complete(xyz)
     if filled[lacking].any():
-        notes.assume(f"heights that {table.path.name} lacks are from EXIF ({int(filled[lacking].sum())})")
+        notes.assume(
+            "todo-heights-lacks-from-exif",
+            f"heights that {table.path.name} lacks are from EXIF ({int(filled[lacking].sum())})",
+        )
     places = [f"{table.path.name}:{line}" for line in table.lines[~filled]]
-    notes.warn_counted(places, "row has no height and was left out", "rows have no height and were left out")
+    notes.warn_counted(
+        "todo-row-has-no-height",
+        places,
+        "row has no height and was left out",
+        "rows have no height and were left out",
+    )
     if not filled.any():
-        raise InputError("has no heights (z), and EXIF has none either", path=table.path)
+        raise InputError(
+            "todo-has-no-heights-exif", "has no heights (z), and EXIF has none either", path=table.path
+        )
     return replace(table, xyz=xyz).take(filled)
 
 
@@ -216,7 +241,10 @@ def _measured(table: PoseTable, crs: PointCrs, options: IngestOptions, notes: No
     lla = crs.lla_from_xyz(table.xyz, path=table.path, lines=table.lines.tolist())
     note_operation(crs, lla, notes)
     if table.sigma_enu_m is not None and "foot" in crs.units[0]:
-        notes.assume(f"σ in {table.path.name} are in metres, although {crs.name} counts in feet")
+        notes.assume(
+            "todo-metres-although-counts-feet",
+            f"σ in {table.path.name} are in metres, although {crs.name} counts in feet",
+        )
     enu_from_cam = np.full((len(lla), 3, 3), np.nan)
     if table.quat_xyzw is not None:
         turned = complete(table.quat_xyzw)

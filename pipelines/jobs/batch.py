@@ -19,7 +19,7 @@ from pipelines.core.figures import Headline
 from pipelines.core.files import replace_text
 from pipelines.core.manifest import Manifest
 from pipelines.core.plan import Action
-from pipelines.core.products import Caution, Product, union
+from pipelines.core.products import Product, Remark, union
 from pipelines.core.progress import Progress
 from pipelines.core.stages import REPORT, REPORT_PAGE
 from pipelines.core.staleness import cautions_by_stage
@@ -60,8 +60,8 @@ class MissionRow(Product):
     accuracy: Headline | None = None
     test_psnr: float | None = None
     report: str | None = None
-    warnings: tuple[str, ...] = ()
-    cautions: tuple[Caution, ...] = ()
+    warnings: tuple[Remark, ...] = ()
+    cautions: tuple[Remark, ...] = ()
 
 
 class BatchTable(Product):
@@ -110,7 +110,7 @@ def _figures(mission: Mission) -> dict[str, object]:
         "processing_s": round(sum(manifest.duration_s for manifest in manifests.values()), 3),
         "images": _count(manifests, "ingest", "images"),
         "registered": _count(manifests, "sfm", "registered"),
-        "warnings": tuple(dict.fromkeys(text for manifest in manifests.values() for text in manifest.warnings)),
+        "warnings": union(*(manifest.warnings for manifest in manifests.values())),
         "cautions": union(*cautions_by_stage(workspace).values()),
         "accuracy": headline_of(workspace),
         "report": f"{mission.place}/{REPORT_PAGE}" if (workspace.root / REPORT_PAGE).is_file() else None,

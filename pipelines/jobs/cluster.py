@@ -41,7 +41,8 @@ def import_distributed() -> Any:
         import distributed
     except ImportError as error:
         raise BackendUnavailableError(
-            "a cluster needs Dask: install it with `pip install 'georefgs[cluster]'`"
+            "todo-cluster-needs-dask-install",
+            "a cluster needs Dask: install it with `pip install 'georefgs[cluster]'`",
         ) from error
     return distributed
 
@@ -56,13 +57,15 @@ def make_certificates(folder: Path) -> None:
     try:
         security = distributed.Security.temporary()
     except ImportError as error:
-        raise BackendUnavailableError(_NEEDS_CRYPTOGRAPHY) from error
+        raise BackendUnavailableError("todo-x", _NEEDS_CRYPTOGRAPHY) from error
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     for name, text in ((KEY, security.tls_client_key), (CERTIFICATE, security.tls_client_cert)):
         try:
             descriptor = os.open(folder / name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
         except FileExistsError as error:
-            raise InputError("exists: delete it to make another", path=folder / name) from error
+            raise InputError(
+                "todo-exists-delete-make-another", "exists: delete it to make another", path=folder / name
+            ) from error
         with os.fdopen(descriptor, "w", encoding="utf-8") as handle:
             handle.write(text)
 
@@ -88,9 +91,14 @@ def check_own_certificates(folder: Path) -> None:
             continue
         status = path.stat()
         if status.st_uid != os.geteuid():
-            raise InputError("belongs to another user, who can run programs as you: delete it", path=path)
+            raise InputError(
+                "todo-belongs-another-user-who",
+                "belongs to another user, who can run programs as you: delete it",
+                path=path,
+            )
         if status.st_mode & _OF_OTHERS:
             raise InputError(
+                "todo-open-other-users-who",
                 "is open to other users, who can run programs as you. If none of them has read or changed it: "
                 f"`chmod -R go-rwx {folder}`; else delete it",
                 path=path,
@@ -107,29 +115,34 @@ def check_certificates(folder: Path) -> None:
     for name in (CERTIFICATE, KEY):
         if not (folder / name).is_file():
             raise InputError(
+                "todo-has-no-name-folder",
                 f"has no {name}: name the folder of the cluster's certificate with --certificates. `georef cluster "
                 "certificates DIR` makes one; `georef cluster scheduler` makes yours for this machine",
                 path=folder,
             )
     if os.name == "posix" and (folder / KEY).stat().st_mode & _OF_EVERYBODY:
-        raise InputError("can be read by every user of this machine: `chmod 600` it", path=folder / KEY)
+        raise InputError(
+            "todo-can-be-read-by", "can be read by every user of this machine: `chmod 600` it", path=folder / KEY
+        )
     try:
         from cryptography import x509
     except ImportError as error:
-        raise BackendUnavailableError(_NEEDS_CRYPTOGRAPHY) from error
+        raise BackendUnavailableError("todo-x", _NEEDS_CRYPTOGRAPHY) from error
     path = folder / CERTIFICATE
     try:
         certificates = x509.load_pem_x509_certificates(path.read_bytes())
     except ValueError as error:
-        raise InputError(f"is no certificate in the form PEM: {_RENEW}", path=path) from error
+        raise InputError(
+            "todo-no-certificate-form-pem", f"is no certificate in the form PEM: {_RENEW}", path=path
+        ) from error
     now = datetime.now(UTC)
     for certificate in certificates:
         since, until = certificate.not_valid_before_utc, certificate.not_valid_after_utc
         if now > until:
-            raise InputError(f"has expired on {until:{_MINUTES}}: {_RENEW}", path=path)
+            raise InputError("todo-has-expired-on", f"has expired on {until:{_MINUTES}}: {_RENEW}", path=path)
         if now < since:
             clock = f"the clock of this machine says {now:{_MINUTES}}: set it, or {_RENEW}"
-            raise InputError(f"is valid from {since:{_MINUTES}} on, and {clock}", path=path)
+            raise InputError("todo-valid-from-on", f"is valid from {since:{_MINUTES}} on, and {clock}", path=path)
 
 
 PORT = 8786
@@ -234,7 +247,9 @@ def connected(cluster: ClusterAddress) -> Iterator[Client]:
         )
     except (OSError, TimeoutError, ValueError, RuntimeError) as error:
         hint = "" if not security else ", and whether it has the same certificate"
-        raise ClusterError(f"no scheduler answers at {cluster.url}: check that it runs{hint}") from error
+        raise ClusterError(
+            "todo-no-scheduler-answers-at", f"no scheduler answers at {cluster.url}: check that it runs{hint}"
+        ) from error
     try:
         yield client
     finally:

@@ -138,8 +138,9 @@ class ClusterRun:
             for name, attempt in list(self._running.items()):
                 self._finish(name, ProcessEnd(INTERRUPTED, time.monotonic() - attempt.since))
             raise ClusterError(
+                "todo-scheduler-lost-jobs-save",
                 "the scheduler is lost: the jobs save their work and stop; start scheduler and workers, then "
-                "repeat the command, which goes on"
+                "repeat the command, which goes on",
             ) from error
         self._workers = {
             address: worker for address, worker in workers_of(described).items() if address not in self._unfit
@@ -156,7 +157,7 @@ class ClusterRun:
 
     def _start(self) -> None:
         if self._unfit and not self._workers and not self._running:
-            raise ClusterError(f"no worker can run the jobs: {self._warned}")
+            raise ClusterError("todo-no-worker-can-run", f"no worker can run the jobs: {self._warned}")
         now = time.monotonic()
         for pending in list(self.waiting):
             if len(self._running) >= self.at_a_time:
@@ -243,7 +244,7 @@ class ClusterRun:
             log.warning("%s: interrupted on %s, goes on elsewhere", pending.job.name, worker.name)
             pending.avoided.add(worker.address)
             self._repeat(name)
-        elif end.kind == WorkspaceBusyError.code and self._may_wait(pending):
+        elif end.kind == WorkspaceBusyError.kind and self._may_wait(pending):
             self._repeat(name, _BUSY_PAUSE_S)
         elif end.code < 0 or end.kind in _TRIED_AGAIN:
             pending.failures += 1

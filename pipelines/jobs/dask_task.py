@@ -82,7 +82,7 @@ def _run_where_its_files_are(worker: Any, request: JobRequest, events: _Events) 
         with worker_exchange(parcel, scratch):
             return _run(worker, arguments_in(parcel, arguments, scratch), events)
     except GeorefError as error:
-        return ProcessEnd(1, time.monotonic() - started, str(error), error.code)
+        return ProcessEnd(1, time.monotonic() - started, str(error), error.kind)
 
 
 def _run(worker: Any, arguments: Sequence[str], events: _Events) -> ProcessEnd:

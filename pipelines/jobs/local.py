@@ -39,7 +39,7 @@ _KILLED = "the system killed it, as it does when memory is short: run fewer at a
 class ProcessEnd:
     """End of a process: exit code, below zero the signal that ended it, and if it failed its message.
 
-    The kind is that of the failure (`GeorefError.code`); empty if it did not tell.
+    The kind is that of the failure (`GeorefError.kind`); empty if it did not tell.
     """
 
     code: int
@@ -99,7 +99,7 @@ class JobProcess:
             for line in lines:
                 message = _message(line)
                 if message is not None and message["kind"] == "error":
-                    self._kind = str(message["code"])
+                    self._kind = str(message["error_kind"])
                 elif message is None or not self._take(message):
                     self._plain.append(line.rstrip())
         code = self._process.wait()

@@ -39,11 +39,15 @@ def chromium_path() -> str:
     """
     browser = find_chromium()
     if os.environ.get("CHROMIUM") and browser and shutil.which(browser) is None:
-        raise BackendUnavailableError(f"the variable CHROMIUM names {browser}, which is no program: correct it")
+        raise BackendUnavailableError(
+            "todo-variable-chromium-names-which",
+            f"the variable CHROMIUM names {browser}, which is no program: correct it",
+        )
     if browser is None:
         raise BackendUnavailableError(
+            "todo-chromium-missing-install-apt",
             "Chromium is missing: install it (`apt-get install chromium`, or Chrome from google.com/chrome), or "
-            "name a Chromium or Chrome in the variable CHROMIUM"
+            "name a Chromium or Chrome in the variable CHROMIUM",
         )
     return browser
 
@@ -83,11 +87,14 @@ def print_pdf(page: Path, pdf: Path) -> None:
                 check=False,
             )
         except subprocess.TimeoutExpired as error:
-            raise CrashError(f"{browser} did not print the page within {_TIMEOUT_S:.0f} s") from error
+            raise CrashError(
+                "todo-did-not-print-page", f"{browser} did not print the page within {_TIMEOUT_S:.0f} s"
+            ) from error
         if done.returncode != 0 or not draft.is_file():
             reason = " ".join(done.stderr.split())[-_LONGEST_MESSAGE:]
             raise CrashError(
+                "todo-did-not-print-page",
                 f"{browser} did not print the page (exit code {done.returncode}): {reason}. Without --pdf the page "
-                "is written, and any browser prints it"
+                "is written, and any browser prints it",
             )
     replace_file(draft, pdf)

@@ -84,7 +84,9 @@ def cut_chips(
             name = sparse.image_name[image]
             pixels = decoded_photograph(folder / name, sha256.get(name, ""))
             if pixels is None:
-                raise InputError("does not decode: put the photograph back", path=folder / name)
+                raise InputError(
+                    "todo-does-not-decode-put", "does not decode: put the photograph back", path=folder / name
+                )
             for chip in of_image:
                 chips[chip.owner].append(_cut(pixels[..., ::-1], name, chip, side))
             task.advance()

@@ -12,7 +12,7 @@ from typing import Any
 
 from pipelines.core.errors import InputError
 from pipelines.core.options import flag_name, notation
-from pipelines.core.products import Caution, load_json
+from pipelines.core.products import Remark, load_json
 from pipelines.core.stages import BY_NAME, LIDAR, LIDAR_MAP, REFERENCE_HISTOGRAM, REFERENCE_MAP, StageSpec
 from pipelines.core.staleness import cautions_by_stage, status
 from pipelines.core.workspace import Workspace
@@ -42,7 +42,7 @@ class StageRecord:
     key_figure: str
     options: dict[str, str]
     inputs: dict[str, str]
-    warnings: tuple[str, ...]
+    warnings: tuple[Remark, ...]
 
 
 @dataclass(frozen=True)
@@ -58,8 +58,8 @@ class RecordFacts:
     stages: tuple[StageRecord, ...]
     total_s: float
     versions: dict[str, str]
-    assumptions: tuple[str, ...]
-    cautions: dict[str, tuple[Caution, ...]]
+    assumptions: tuple[Remark, ...]
+    cautions: dict[str, tuple[Remark, ...]]
     by_hand: tuple[str, ...]
 
 
@@ -100,7 +100,7 @@ def _stage(workspace: Workspace, spec: StageSpec, state: str, reason: str) -> tu
         key_figure=manifest.key_figure,
         options=_options(spec, manifest.config),
         inputs=manifest.inputs,
-        warnings=tuple(manifest.warnings),
+        warnings=manifest.warnings,
     )
     return record, manifest.versions
 

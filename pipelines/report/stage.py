@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from pipelines import __version__
 from pipelines.core.figures import Headline
 from pipelines.core.files import replace_text
-from pipelines.core.products import Caution, union
+from pipelines.core.products import Remark, union
 from pipelines.core.stages import REPORT_PAGE
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.report.accuracy import accuracy_facts
@@ -137,7 +137,7 @@ class SummaryFacts:
     """Summary of an evaluated survey: traffic lights, cautions, headline, and what the headline's figures are."""
 
     verdicts: tuple[Verdict, ...]
-    cautions: tuple[Caution, ...]
+    cautions: tuple[Remark, ...]
     headline: Headline
     accuracy_note: str
 

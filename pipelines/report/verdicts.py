@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from pipelines.core.products import NOT_CHECKED, Caution
+from pipelines.core.products import NOT_CHECKED, Remark
 from pipelines.core.sentences import listed
 from pipelines.report.page import decibel, number_text, share
 from pipelines.survey.report import ByAxis, CheckPointErrors, EvaluationReport
@@ -71,7 +71,7 @@ class Measured:
 _Fields = tuple[Level, str, str, str]  # of a verdict without its subject, in their order
 
 
-def verdicts(report: EvaluationReport, measured: Measured, cautions: Sequence[Caution]) -> tuple[Verdict, ...]:
+def verdicts(report: EvaluationReport, measured: Measured, cautions: Sequence[Remark]) -> tuple[Verdict, ...]:
     """Return the verdicts on a survey, in the order of the work."""
     triangulated, on_surface, test = report.checkpoints.camera, report.checkpoints.model, report.test_views
     by_subject: dict[str, _Fields] = {
@@ -251,7 +251,7 @@ def _views(psnr_db: float | None, count: int) -> _Fields:
     return level, f"{decibel(psnr_db)} over {count}", reason, rule
 
 
-def _cautions(cautions: Sequence[Caution]) -> _Fields:
+def _cautions(cautions: Sequence[Remark]) -> _Fields:
     rule = "good with none, poor if nothing checks the positions, fair otherwise"
     if not cautions:
         return "good", "none", "no limit of the result is known", rule

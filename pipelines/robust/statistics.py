@@ -195,7 +195,9 @@ def ransac(
         DegenerateGeometryError: too few observations, or no draw gave a model.
     """
     if count < options.sample_size:
-        raise DegenerateGeometryError(f"{options.sample_size} observations are needed, there are {count}")
+        raise DegenerateGeometryError(
+            "todo-observations-needed-there", f"{options.sample_size} observations are needed, there are {count}"
+        )
     best: RansacResult[ModelT] | None = None
     needed = float(options.max_draws)
     draws = 0
@@ -211,7 +213,9 @@ def ransac(
             best = RansacResult(model, squared <= options.gate, cost)
             needed = draws_needed(float(best.inlier.mean()), options)
     if best is None:
-        raise DegenerateGeometryError(f"none of {draws} random samples determines a model")
+        raise DegenerateGeometryError(
+            "todo-none-random-samples-determines", f"none of {draws} random samples determines a model"
+        )
     return best
 
 

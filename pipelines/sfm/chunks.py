@@ -189,27 +189,37 @@ def copy_finished(
     """
     database = chunk.database(partial)
     if not chunk.database(partial).is_file():
-        raise InputError(f"{chunk.name} is not finished, and its features are needed", path=database)
+        raise InputError(
+            "todo-not-finished-its-features",
+            f"{chunk.name} is not finished, and its features are needed",
+            path=database,
+        )
     try:
         copy_rows(database, target, tables, images)
     except DamagedPartialError as error:
         remove_database(database)
-        raise InputError(f"{error.message}: it was removed; run `georef sfm` again", path=database) from error
+        raise InputError(
+            "todo-was-removed-run-georef", f"{error.message}: it was removed; run `georef sfm` again", path=database
+        ) from error
 
 
 def _planned(workspace: Workspace, name: str) -> Chunk:
     path = workspace.partial(BY_NAME["sfm"]) / PLAN
     if not path.is_file():
-        raise InputError(f"no chunks are planned: `georef sfm {workspace.root}` plans them", path=path)
+        raise InputError(
+            "todo-no-chunks-planned-georef",
+            f"no chunks are planned: `georef sfm {workspace.root}` plans them",
+            path=path,
+        )
     chunks = load_json(ChunkPlan, path).chunks
     chunk = next((chunk for chunk in chunks if chunk.name == name), None)
     if chunk is None:
         names = f"{chunks[0].name} … {chunks[-1].name}" if chunks else "none"
-        raise InputError(f"{name!r} is none of the chunks {names}", field="--chunk")
+        raise InputError("todo-none-chunks", f"{name!r} is none of the chunks {names}", field="--chunk")
     count = len(load_json(Survey, workspace.path(SURVEY)).images)
     if max((*chunk.images, *(index for pair in chunk.pairs for index in pair)), default=0) >= count:
         message = f"{name} has more photographs than the survey: `georef sfm {workspace.root}` plans anew"
-        raise InputError(message, path=path)
+        raise InputError("todo-x", message, path=path)
     return chunk
 
 
@@ -240,8 +250,9 @@ def _work(stage: StageRun, survey: Survey, plan: ChunkPlan, kind: Kind) -> None:
     if failed := failed_of(title, jobs, ended, stage.progress):
         names = listed([end.job.name for end in failed])
         raise GeorefError(
+            "todo-failed-same-command-works",
             f"{len(failed)} of {len(jobs)} {title} failed ({names}): {failed[0].error}; the same command works on "
-            "those again and keeps the others"
+            "those again and keeps the others",
         )
 
 

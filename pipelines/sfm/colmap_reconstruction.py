@@ -36,7 +36,7 @@ class ColmapReconstructor:
         count = len(survey.images)
         reason = why_too_large(count, survey.largest_photograph_px, options, free_main_memory_bytes())
         if reason is not None:
-            raise ResourceError(reason)
+            raise ResourceError("todo-x", reason)
         if count > options.chunk_size:
             work_in_chunks(stage, survey, options)
         return count <= options.chunk_size
@@ -66,7 +66,11 @@ def reconstruct(colmap: Any, job: SfmJob, progress: Progress) -> Any:
     """
     missing = [image.name for image in job.survey.images if not (job.images / image.name).is_file()]
     if missing:
-        raise InputError(f"{len(missing)} photographs of the survey are gone", path=job.images / missing[0])
+        raise InputError(
+            "todo-photographs-survey-gone",
+            f"{len(missing)} photographs of the survey are gone",
+            path=job.images / missing[0],
+        )
     colmap.set_random_seed(job.options.seed)
     extract_features(colmap, job, range(len(job.survey.images)), progress)
     match_features(colmap, job, candidate_pairs(job.survey, job.options), progress)
@@ -79,8 +83,9 @@ def map_matches(colmap: Any, job: SfmJob, progress: Progress) -> Any:
     models = map_database(colmap, job, progress)
     if not models:
         raise DegenerateGeometryError(
+            "todo-no-two-photographs-could",
             "no two photographs could be tied together: is there enough overlap and texture? "
-            "`--max-features` and `--pairs exhaustive` may help"
+            "`--max-features` and `--pairs exhaustive` may help",
         )
     if len(models) > 1:
         sizes = [model.num_reg_images() for model in models]

@@ -60,7 +60,9 @@ def import_model(path: Path, survey: Survey) -> Any:
         model.deregister_frame(frame_id)
     if model.num_reg_images() < 3:
         raise InputError(
-            f"only {model.num_reg_images()} of its images are in the survey: names must be equal", path=folder
+            "todo-only-its-images-survey",
+            f"only {model.num_reg_images()} of its images are in the survey: names must be equal",
+            path=folder,
         )
     if foreign:
         log.warning("%d images of the imported model are not in the survey and were left out", len(foreign))
@@ -95,6 +97,7 @@ def _check_cameras(model: Any, survey: Survey, folder: Path) -> None:
         if (camera.width, camera.height) != (width, height):
             cause = "undistorted copies" if undistorted else "copies of another size"
             raise InputError(
+                "todo-its-camera-has-pixels",
                 f"its camera {image.camera_id} ({camera.model_name}) has {camera.width}×{camera.height} pixels, "
                 f"the photograph {image.name} {width}×{height}: the model was made of {cause}. Import the model of "
                 "the photographs themselves, or give the folder of the copies to `georef ingest --images`",

@@ -190,7 +190,10 @@ def _adjust(colmap: Any, model: Any, adjustment: Any) -> None:
     bundle.fix_gauge(colmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     summary = colmap.create_default_bundle_adjuster(adjustment, bundle, model).solve()
     if not summary.is_solution_usable():
-        raise ConvergenceError(f"the last bundle adjustment found no solution: {summary.brief_report()}")
+        raise ConvergenceError(
+            "todo-last-bundle-adjustment-found",
+            f"the last bundle adjustment found no solution: {summary.brief_report()}",
+        )
 
 
 def _free_principal_point(colmap: Any, model: Any, adjustment: Any) -> bool:

@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from pipelines.core.child import run_in_child
 from pipelines.core.errors import CrashError, DamagedPartialError, DegenerateGeometryError
 from pipelines.core.plan import photograph_folder
-from pipelines.core.products import load_json
+from pipelines.core.products import Remark, load_json
 from pipelines.core.progress import Progress
 from pipelines.core.stages import SURVEY
 from pipelines.core.workspace import StageRun, Summary
@@ -51,9 +50,12 @@ def run(stage: StageRun, options: SfmOptions) -> Summary:
     except (CrashError, RuntimeError) as error:
         if stage.resumed and continues:
             cause = str(error).strip().splitlines()[-1]
-            raise DamagedPartialError(f"COLMAP cannot continue it: {cause}", path=stage.out) from error
+            raise DamagedPartialError(
+                "todo-colmap-cannot-continue", f"COLMAP cannot continue it: {cause}", path=stage.out
+            ) from error
         raise
-    return Summary(document["key_figure"], document["values"], tuple(document["warnings"]))
+    warnings = tuple(Remark(**warning) for warning in document["warnings"])
+    return Summary(document["key_figure"], document["values"], warnings)
 
 
 def write_model(arguments: Mapping[str, Any], progress: Progress) -> dict[str, Any]:
@@ -68,14 +70,16 @@ def write_model(arguments: Mapping[str, Any], progress: Progress) -> dict[str, A
     job = SfmJob(survey, Path(arguments["images"]), database, options)
     if job.sparse.exists():
         shutil.rmtree(job.sparse)
-    return asdict(_summarise(reconstructor_of(options).reconstruct(job, progress), survey))
+    summary = _summarise(reconstructor_of(options).reconstruct(job, progress), survey)
+    return {**vars(summary), "warnings": [warning.model_dump() for warning in summary.warnings]}
 
 
 def _summarise(model: Any, survey: Survey) -> Summary:
     registered, total = model.num_reg_images(), len(survey.images)
     if registered < 3:
         raise DegenerateGeometryError(
-            f"only {registered} of {total} photographs could be registered: a splat needs 3 or more"
+            "todo-only-photographs-could-be",
+            f"only {registered} of {total} photographs could be registered: a splat needs 3 or more",
         )
     error_px = model.compute_mean_reprojection_error()
     left_out = sorted(
@@ -83,10 +87,11 @@ def _summarise(model: Any, survey: Survey) -> Summary:
     )
     warnings = []
     if registered < _FEW_REGISTERED * total:
-        warnings.append(
-            f"ONLY {registered} OF {total} PHOTOGRAPHS WERE REGISTERED: the splat will have holes. "
+        sentence = (
+            f"Only {registered} of {total} photographs were registered: the splat will have holes. "
             f"Not registered: {', '.join(left_out[:5])}{' …' if len(left_out) > 5 else ''}"
         )
+        warnings.append(Remark(code="few-photographs-registered", sentence=sentence))
     values = {
         "registered": registered,
         "images": total,

@@ -87,7 +87,11 @@ class BrownLens:
             guess = guess - self._newton_step(guess, residual)
         solved = np.abs(self._distort(guess) - target).max(initial=0.0) < 1e-9
         if not solved or np.square(guess).sum(axis=1).max(initial=0.0) >= self._fold_radius() ** 2:
-            raise InputError("the distortion is too strong for this field of view: use a smaller one", field="--k1")
+            raise InputError(
+                "todo-distortion-too-strong-for",
+                "the distortion is too strong for this field of view: use a smaller one",
+                field="--k1",
+            )
         return np.concatenate([guess, np.ones((len(guess), 1))], axis=1)
 
     def _distort(self, xy: FloatArray) -> FloatArray:

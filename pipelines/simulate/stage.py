@@ -127,12 +127,20 @@ def _check_folder(directory: Path, *, overwrite: bool) -> None:
     if not directory.exists():
         return
     if not directory.is_dir():
-        raise InputError("exists and is not a folder", path=directory)
+        raise InputError("todo-exists-not-folder", "exists and is not a folder", path=directory)
     if any(directory.iterdir()):
         if not (directory / TRUTH).exists():
-            raise InputError("exists and holds something other than a simulation: choose another", path=directory)
+            raise InputError(
+                "todo-exists-holds-something-other",
+                "exists and holds something other than a simulation: choose another",
+                path=directory,
+            )
         if not overwrite:
-            raise InputError("holds a simulation already: --force replaces it", path=directory)
+            raise InputError(
+                "todo-holds-simulation-already-force",
+                "holds a simulation already: --force replaces it",
+                path=directory,
+            )
 
 
 def write_lidar_flight(
@@ -158,7 +166,7 @@ def _draft(directory: Path) -> Iterator[Path]:
     try:
         draft.mkdir(parents=True)
     except OSError as error:
-        raise InputError(f"cannot be made: {error.strerror}", path=directory) from error
+        raise InputError("todo-cannot-be-made", f"cannot be made: {error.strerror}", path=directory) from error
     try:
         yield draft
         sync_tree(draft)

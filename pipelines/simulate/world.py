@@ -193,5 +193,7 @@ def check_clearance(world: World, raycaster: Raycaster) -> None:
         if buried or nearest < _CLEARANCE_M:
             where = "in the ground" if buried else f"{nearest:.1f} m from a surface"
             raise InputError(
-                f"photograph {i} would be taken {where}: choose another height or radius", field="--height"
+                "todo-photograph-would-be-taken",
+                f"photograph {i} would be taken {where}: choose another height or radius",
+                field="--height",
             )

@@ -124,7 +124,7 @@ _NEVER = 2**62
 class NonFiniteError(ConvergenceError):
     def __init__(self, name: str, iteration: int) -> None:
         self.name, self.iteration = name, iteration
-        super().__init__(f"the {name} is not finite at iteration {iteration}")
+        super().__init__("not-finite", f"the {name} is not finite at iteration {iteration}")
 
 
 class FinitenessMonitor:

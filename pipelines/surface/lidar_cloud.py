@@ -42,11 +42,16 @@ class ScannerTrack:
         """
         table = read_trajectory(path)
         if table.time_s is None:
-            raise InputError("has no column `timestamp`", path=path, field="--lidar-trajectory")
+            raise InputError(
+                "todo-has-no-column-timestamp", "has no column `timestamp`", path=path, field="--lidar-trajectory"
+            )
         text = _WGS84 if table.geographic else stated.crs
         if text is None:
             raise InputError(
-                "has projected coordinates: --lidar-crs states their CRS", path=path, field="--lidar-trajectory"
+                "todo-has-projected-coordinates-lidar",
+                "has projected coordinates: --lidar-crs states their CRS",
+                path=path,
+                field="--lidar-trajectory",
             )
         lla = parse_crs(text, vertical=stated.vertical, path=path).lla_from_xyz(table.xyz, path=path)
         order = np.argsort(table.time_s, kind="stable")
@@ -66,6 +71,7 @@ class ScannerTrack:
         covered = float(np.isfinite(place[:, 0]).mean())
         if covered < _LEAST_COVERED:
             raise InputError(
+                "todo-has-place-for-times",
                 f"has a place for the times of {covered:.0%} of the points: it counts on another clock, or belongs "
                 "to another flight",
                 field="--lidar-trajectory",
@@ -139,7 +145,11 @@ def read_cloud(
     low, high = low - np.array([margin, margin, _BELOW_M]), high + np.array([margin, margin, _ABOVE_M])
     cloud = read_thinned(files, survey.origin, Thinning(pixel_m, _MOST_POINTS, low, high), progress)
     if len(cloud) <= 10 * _NEIGHBOURS:
-        raise InputError(f"only {len(cloud)} points lie in the scene of the photographs", field="--lidar")
+        raise InputError(
+            "todo-only-points-lie-scene",
+            f"only {len(cloud)} points lie in the scene of the photographs",
+            field="--lidar",
+        )
     model_from_geo = scene.geo_from_model.inverse()
     scanner = None if track is None else model_from_geo.apply(track.at(cloud.gps_time_s))
     planes = planes_of(

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.core.errors import InputError
+from pipelines.core.products import Remark
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import ByteArray, FloatArray, IntArray, joined_rows, rows_of
 from pipelines.formats.cloud_ply import CloudChunk, CloudFile, open_cloud_ply
@@ -94,8 +95,11 @@ class CloudReader:
         silent = {_short_name(crs.name) for crs in self._crs if not crs.vertical.stated}
         self.crs_names = tuple(dict.fromkeys(_short_name(crs.name) for crs in self._crs))
         self.assumptions = tuple(
-            f"the heights of the cloud were taken as ellipsoidal: {name} has no vertical part "
-            f"({stated.flag}-vertical states one)"
+            Remark(
+                code=f"{stated.flag.removeprefix('--')}-heights",
+                sentence=f"The heights of the cloud were taken as ellipsoidal: {name} has no vertical part "
+                f"({stated.flag}-vertical states one).",
+            )
             for name in sorted(silent)
         )
 
@@ -122,7 +126,9 @@ class CloudReader:
     def _valid(self, chunk: CloudChunk, path: Path) -> CloudChunk:
         """Return the points that count, and note the others."""
         if not np.isfinite(chunk.position).all():
-            raise InputError("holds coordinates that are not finite", path=path)
+            raise InputError(
+                "todo-holds-coordinates-not-finite", "holds coordinates that are not finite", path=path
+            )
         noise = np.isin(chunk.classification, NOISE_CLASSES)
         keep = ~(noise | chunk.withheld | chunk.overlap)
         self.tally.read += len(chunk)
@@ -155,8 +161,9 @@ def read_thinned(
             waiting, held, voxel_m = [merged], len(merged), merged.voxel_m
     if not held:
         raise InputError(
+            "todo-none-points-lies-where",
             f"none of the {files.tally.read} points lies where the photographs look: another place, or a wrong CRS "
-            f"({', '.join(files.crs_names)})"
+            f"({', '.join(files.crs_names)})",
         )
     cloud = _limited(waiting, voxel_m, thinning.most)
     log.info(
@@ -184,7 +191,10 @@ def _thinned(parts: list[MeasuredCloud], voxel_m: float) -> MeasuredCloud:
     low, high = position.min(axis=0), position.max(axis=0)
     if not (high - low < _KEY_SIDE * voxel_m).all():
         reach_m = float((high - low).max())
-        raise InputError(f"points {reach_m / 1000:.0f} km apart do not fit into voxels of {voxel_m:g} m")
+        raise InputError(
+            "todo-points-km-apart-do",
+            f"points {reach_m / 1000:.0f} km apart do not fit into voxels of {voxel_m:g} m",
+        )
     keys = voxel_keys(position, voxel_m)
     _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
     weight = np.bincount(inverse, cloud.weight).astype(np.int64)
@@ -209,9 +219,13 @@ def _paths(path: Path, stated: CloudCrs) -> list[Path]:
         and not any(part[0] == "." for part in file.relative_to(path).parts)
     )
     if not files:
-        raise InputError("no LAS, LAZ or PLY file in this folder", path=path, field=stated.flag)
+        raise InputError(
+            "todo-no-las-laz-or", "no LAS, LAZ or PLY file in this folder", path=path, field=stated.flag
+        )
     if len(files) > _MOST_FILES:
-        raise InputError(f"{len(files)} files (limit {_MOST_FILES})", path=path, field=stated.flag)
+        raise InputError(
+            "todo-files-limit", f"{len(files)} files (limit {_MOST_FILES})", path=path, field=stated.flag
+        )
     return files
 
 
@@ -219,7 +233,9 @@ def _opened(path: Path, stated: CloudCrs) -> CloudFile:
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
         hint = " (CloudCompare and PDAL convert E57)" if path.suffix.lower() == ".e57" else ""
-        raise InputError(f"expected .las, .laz or .ply{hint}", path=path, field=stated.flag)
+        raise InputError(
+            "todo-expected-las-laz-or", f"expected .las, .laz or .ply{hint}", path=path, field=stated.flag
+        )
     return reader(path)
 
 
@@ -228,6 +244,7 @@ def _crs_of(file: CloudFile, stated: CloudCrs) -> PointCrs:
         return parse_crs(file.crs, vertical=stated.vertical, path=file.path)
     if stated.crs is None:
         raise InputError(
+            "todo-states-no-crs-give",
             f"states no CRS: give {stated.flag}-crs EPSG:n, or EPSG:n+m with the vertical CRS",
             path=file.path,
             field=stated.flag,

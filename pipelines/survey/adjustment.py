@@ -8,7 +8,7 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.core.products import ArrayProduct, Caution, Covariance3, Product, Rotation
+from pipelines.core.products import ArrayProduct, Covariance3, Product, Remark, Rotation
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.geometry.similarity import SimilarityRecord
 from pipelines.robust.statistics import ResidualStats
@@ -50,7 +50,7 @@ class InitialSimilarity(Product):
     attitude_used: bool
     attitude: AttitudeRecord | None = None
     variance_factors: tuple[VarianceFactor, ...] = ()
-    cautions: tuple[Caution, ...] = ()
+    cautions: tuple[Remark, ...] = ()
 
     def weighted(self, survey: Survey) -> Survey:
         """Return a survey with the applied variance factors in its covariances."""

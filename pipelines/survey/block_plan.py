@@ -124,7 +124,11 @@ class BlockPlan(Product):
         for block in self.blocks:
             if block.id == number:
                 return block
-        raise InputError(f"there is no block {number}: the plan has 0 … {len(self.blocks) - 1}", field="--id")
+        raise InputError(
+            "todo-there-no-block-plan",
+            f"there is no block {number}: the plan has 0 … {len(self.blocks) - 1}",
+            field="--id",
+        )
 
 
 def _chosen_bound(one: float | None, other: float | None, choose: Callable[[list[float]], float]) -> float | None:

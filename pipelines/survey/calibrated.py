@@ -96,6 +96,7 @@ def load_track(workspace: Workspace) -> NavigationTrack:
         path = workspace.path(TRACK)
     except MissingProductError as error:
         raise InputError(
+            "todo-survey-has-no-navigation",
             "the survey has no navigation recorded by time, only a position for each image: ingest a --bag, or a "
             "--trajectory by time",
             path=workspace.root / TRACK,
@@ -114,18 +115,27 @@ def require_estimable(track: NavigationTrack | None, wanted: Sequence[RigParamet
     """
     if track is None or len(track.position_time_s) < 2:
         raise InputError(
+            "todo-needs-navigation-recorded-by",
             "needs the navigation recorded by time: a --bag, or a --trajectory without a column of images",
             field=field,
         )
     turned = len(track.attitude_time_s) > 1
     if "lever-arm" in wanted and not turned:
-        raise InputError("lever-arm needs attitudes, which were not recorded", field=field)
+        raise InputError(
+            "todo-lever-arm-needs-attitudes", "lever-arm needs attitudes, which were not recorded", field=field
+        )
     if "lever-arm" in wanted and not track.body_known:
-        raise InputError("lever-arm needs the body's axes: give --camera-mount YAW,PITCH,ROLL", field=field)
+        raise InputError(
+            "todo-lever-arm-needs-body",
+            "lever-arm needs the body's axes: give --camera-mount YAW,PITCH,ROLL",
+            field=field,
+        )
     mounted = bool(np.isfinite(track.cam_from_body).all(axis=(1, 2)).any())
     if "boresight" in wanted and not (turned and mounted):
         raise InputError(
-            "boresight needs recorded attitudes and the camera's mount (/tf or --camera-mount)", field=field
+            "todo-boresight-needs-recorded-attitudes",
+            "boresight needs recorded attitudes and the camera's mount (/tf or --camera-mount)",
+            field=field,
         )
 
 

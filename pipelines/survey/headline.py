@@ -11,7 +11,7 @@ from typing import Literal
 
 from pipelines.core.errors import GeorefError
 from pipelines.core.figures import Headline
-from pipelines.core.products import Caution, is_checked
+from pipelines.core.products import Remark, is_checked
 from pipelines.core.stages import REPORT
 from pipelines.core.types import Vector3
 from pipelines.core.workspace import Workspace
@@ -28,7 +28,7 @@ from pipelines.survey.report import (
 NOTHING_CHECKS = "nothing checks the σ of the positions"
 
 
-def headline(triangulated: CheckPointErrors, scene: AccuracySummary, cautions: tuple[Caution, ...]) -> Headline:
+def headline(triangulated: CheckPointErrors, scene: AccuracySummary, cautions: tuple[Remark, ...]) -> Headline:
     """Return the accuracy as the triangulated check points outside vegetation measure it, else as σ predict it."""
     total = triangulated.with_survey
     if total is None:
@@ -37,7 +37,7 @@ def headline(triangulated: CheckPointErrors, scene: AccuracySummary, cautions: t
     return Headline(kind="measured", rmse_h_m=total.rmse_h_m, rmse_v_m=total.rmse_v_m, check_points=count)
 
 
-def predicted(scene: AccuracySummary, cautions: tuple[Caution, ...]) -> Headline:
+def predicted(scene: AccuracySummary, cautions: tuple[Remark, ...]) -> Headline:
     """Return the predicted accuracy: the root mean square of σ over the cells of the scene.
 
     Without anything that checks the σ of the positions, the accuracy is not known.

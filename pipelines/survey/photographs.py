@@ -144,7 +144,7 @@ class ImageCache:
             stat = photograph.file.stat()
         except OSError as error:
             message = f"the photograph cannot be read ({error.strerror}): put it back, or run `georef ingest` again"
-            raise InputError(message, path=photograph.file) from error
+            raise InputError("todo-x", message, path=photograph.file) from error
         camera = photograph.camera
         key = (
             f"{photograph.name}|{stat.st_size}|{stat.st_mtime_ns}|{camera.model}|{camera.width}x{camera.height}|"
@@ -156,9 +156,12 @@ class ImageCache:
         photograph, pinhole = self._photographs[index], self.pinhole(index)
         full = decoded_photograph(photograph.file, photograph.sha256)
         if full is None:
-            raise InputError("the photograph cannot be read", path=photograph.file)
+            raise InputError(
+                "todo-photograph-cannot-be-read", "the photograph cannot be read", path=photograph.file
+            )
         if (full.shape[1], full.shape[0]) != (photograph.camera.width, photograph.camera.height):
             raise InputError(
+                "todo-photograph-its-camera",
                 f"the photograph is {full.shape[1]}×{full.shape[0]}, its camera "
                 f"{photograph.camera.width}×{photograph.camera.height}",
                 path=photograph.file,

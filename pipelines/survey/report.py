@@ -13,7 +13,7 @@ from pydantic import SerializerFunctionWrapHandler, model_serializer, model_vali
 
 from pipelines.core.errors import InputError
 from pipelines.core.figures import Headline
-from pipelines.core.products import Caution, ImageName, Product, dump_json, load_json
+from pipelines.core.products import ImageName, Product, Remark, dump_json, load_json
 from pipelines.core.types import Vector3
 from pipelines.robust.statistics import ResidualStats
 from pipelines.survey.report_parts import ReferenceComparison, VarianceFactor
@@ -337,7 +337,7 @@ class EvaluationReport(_OptionalKeys):
     coordinates: Coordinates | None = None
     reference: ReferenceComparison | None = None
     variance_factors: tuple[VarianceFactor, ...] = ()
-    cautions: tuple[Caution, ...] = ()
+    cautions: tuple[Remark, ...] = ()
 
     @property
     def test_views(self) -> PhotometricFigures | None:
@@ -375,4 +375,4 @@ def read_report(path: Path) -> EvaluationReport:
         if not isinstance(error.__cause__, ValueError):  # The file cannot be read: its content is not at fault.
             raise
         message = "not a report: make it again with `georef evaluate --force`"
-        raise InputError(message, path=path, field=error.field) from error
+        raise InputError("todo-x", message, path=path, field=error.field) from error

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from pipelines.core.products import Covariance3, Product
+from pipelines.core.products import Covariance3, Product, Remark
 from pipelines.core.types import Matrix3, Matrix34, Vector3
 from pipelines.survey.survey import Survey, SurveyedPoint, SurveyImage
 
@@ -187,7 +187,7 @@ class LidarReport(Product):
     rejected_share: float
     confidence: float
     areas: tuple[LidarArea, ...]
-    assumptions: tuple[str, ...] = ()
+    assumptions: tuple[Remark, ...] = ()
 
 
 Group = Literal["fixes", "control points", "marks", "attitudes", "tie points"]

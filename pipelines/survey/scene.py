@@ -106,7 +106,10 @@ def make_scene(sparse: SparseModel, survey: Survey, model_from_local: Similarity
     train = np.array([index[name] for name in survey.names("train") if name in index], dtype=np.int64)
     test = np.array([index[name] for name in survey.names("test") if name in index], dtype=np.int64)
     if len(train) < 2:
-        raise DegenerateGeometryError(f"{len(train)} registered training images are too few to train on")
+        raise DegenerateGeometryError(
+            "todo-registered-training-images-too",
+            f"{len(train)} registered training images are too few to train on",
+        )
     return Scene(sparse, model_from_local, Similarity(translation=shift), train, test)
 
 
@@ -159,6 +162,7 @@ def photographs(sparse: SparseModel, survey: Survey, workspace: Workspace, max_s
     foreign = [name for name in sparse.image_name if name not in known]
     if foreign:
         raise InputError(
+            "todo-images-not-survey-first",
             f"{len(foreign)} images are not in the survey, the first is {foreign[0]!r}: take the model over with "
             "`georef sfm --import`, which leaves them out",
             path=workspace.root / SPARSE,

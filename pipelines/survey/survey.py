@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import AfterValidator, Field, model_validator
 
 from pipelines.core.options import WRITTEN, from_text, listed_names
-from pipelines.core.products import Caution, Covariance3, ImageName, Product, Rotation
+from pipelines.core.products import Covariance3, ImageName, Product, Remark, Rotation
 from pipelines.core.types import Vector3
 from pipelines.core.validators import image_dir
 from pipelines.geodesy.enu import Origin
@@ -228,9 +228,9 @@ class Survey(Product):
     control_points: tuple[SurveyedPoint, ...] = ()
     check_points: tuple[SurveyedPoint, ...] = ()
     unmarked_points: tuple[UnmarkedPoint, ...] = ()
-    assumptions: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
-    cautions: tuple[Caution, ...] = ()
+    assumptions: tuple[Remark, ...] = ()
+    warnings: tuple[Remark, ...] = ()
+    cautions: tuple[Remark, ...] = ()
     estimate: tuple[RigParameter, ...] = ()
     default_sigmas: tuple[Literal["fixes", "control points", "marks", "attitudes"], ...] = ()
 

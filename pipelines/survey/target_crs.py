@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from pipelines.core.errors import InputError
 from pipelines.core.figures import Headline
-from pipelines.core.products import Caution
+from pipelines.core.products import Remark
 from pipelines.core.types import FloatArray, Vector3
 from pipelines.formats.georef_sidecar import CrsSidecar, SceneSigma
 from pipelines.geodesy.crs import PointCrs, parse_crs
@@ -73,7 +73,7 @@ class TargetCrs:
         bounds: ArrayLike,
         accuracy: Headline | None,
         sigma: SceneSigma | None,
-        cautions: tuple[Caution, ...],
+        cautions: tuple[Remark, ...],
     ) -> CrsSidecar:
         """Return the sidecar of a file in this CRS.
 

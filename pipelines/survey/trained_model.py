@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from pipelines.core.products import Caution, Covariance3, ImageName, Product, Rotation, load_json
+from pipelines.core.products import Covariance3, ImageName, Product, Remark, Rotation, load_json
 from pipelines.core.stages import ADJUSTMENT, MODEL
 from pipelines.core.types import Matrix34, Vector3
 from pipelines.core.workspace import Workspace
@@ -93,7 +93,7 @@ class Adjustment(Product):
     sigma_px: float | None = None
     accuracy: AccuracySummary | None = None
     variance_factors: tuple[VarianceFactor, ...] = ()
-    cautions: tuple[Caution, ...] = ()
+    cautions: tuple[Remark, ...] = ()
 
     @property
     def similarity(self) -> Similarity:

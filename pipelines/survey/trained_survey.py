@@ -112,11 +112,21 @@ def _loaded(
 def _require_same_cameras(model: Adjustment, sparse: SparseModel, path: Path, advice: str) -> None:
     """Refuse a solution of another SfM model."""
     if tuple(camera.name for camera in model.cameras) != sparse.image_name:
-        raise InputError(f"its cameras are not those of sfm/sparse: {advice}", path=path, field="cameras")
+        raise InputError(
+            "todo-its-cameras-not-those",
+            f"its cameras are not those of sfm/sparse: {advice}",
+            path=path,
+            field="cameras",
+        )
     for lens in model.lenses:
         camera = sparse.cameras.get(lens.camera_id)
         if camera is None or (camera.model, len(camera.params)) != (lens.model, len(lens.params)):
-            raise InputError(f"its lenses are not those of sfm/sparse: {advice}", path=path, field="lenses")
+            raise InputError(
+                "todo-its-lenses-not-those",
+                f"its lenses are not those of sfm/sparse: {advice}",
+                path=path,
+                field="lenses",
+            )
 
 
 def _initially_placed(model: Solution, workspace: Workspace) -> Solution:
@@ -181,7 +191,9 @@ def scene_points(solved: SolvedSurvey) -> FloatArray:
         DegenerateGeometryError: the SfM model has no points.
     """
     if not len(solved.sfm.point_in_local):
-        raise DegenerateGeometryError("the SfM model has no points: nothing says where the scene ends")
+        raise DegenerateGeometryError(
+            "todo-sfm-model-has-no", "the SfM model has no points: nothing says where the scene ends"
+        )
     points = solved.geo_from_model.apply(solved.point_in_model)
     low, high = np.quantile(points[:, :2], [_RIM, 1 - _RIM], axis=0)
     return np.asarray(points[((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)])

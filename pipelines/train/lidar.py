@@ -188,6 +188,7 @@ def registration_of(cloud: LidarCloud, shown: FloatArray, views: DepthViews, see
     height_m, cells = _height_difference(cloud.position_in_model, shown)
     if cells and abs(height_m) > _ANOTHER_DATUM_M:
         raise InputError(
+            "todo-lidar-lies-surface-photographs",
             f"the LiDAR lies {abs(height_m):.2f} m {'above' if height_m > 0 else 'below'} the surface of the "
             f"photographs (median of {cells} places): the heights of one of them count from another vertical "
             "datum, or are in another unit. State the LiDAR's by --lidar-vertical or --lidar-crs, and the survey's "
@@ -197,7 +198,11 @@ def registration_of(cloud: LidarCloud, shown: FloatArray, views: DepthViews, see
     try:
         return registration(cloud, views, seed)
     except DegenerateGeometryError as error:
-        raise InputError(f"{error}: another place, another time, or a wrong CRS", field="--lidar") from error
+        raise InputError(
+            "todo-another-place-another-time",
+            f"{error}: another place, another time, or a wrong CRS",
+            field="--lidar",
+        ) from error
 
 
 def plane_observations(found: Registration, geo_from_model: Similarity) -> Planes:
@@ -285,6 +290,7 @@ def _checked(
     log.info("lidar: shift east, north, up %s m against the photographs, of %d points", text, record.points)
     if (np.abs(compared.shift_m) > _GATE_SIGMAS * sigma).any() and not options.lidar_register:
         raise InputError(
+            "todo-lidar-shifted-by-east",
             f"the LiDAR is shifted by {text} m (east, north, up) against the photographs, beyond 3 σ. Check its "
             "CRS, its datum and the survey's georeference; --lidar-register takes the shift out, --lidar-sigma "
             "states a lower accuracy",

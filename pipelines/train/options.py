@@ -132,6 +132,7 @@ class GeographicOptions(StageOptions):
         ):
             if value != plain:
                 raise InputError(
+                    "todo-changes-solution-cameras-during",
                     f"{value!r} changes the solution of the cameras during the training, and these {cameras} are "
                     f"solved once, by init-sim3: use {name} {plain}, --solve joint or --no-optimize-cameras",
                     field=name,

@@ -20,7 +20,7 @@ import numpy as np
 
 from pipelines.adjust.posterior import Posterior, save_posterior
 from pipelines.adjust.system import minimise
-from pipelines.core.products import load_json, save_json
+from pipelines.core.products import Remark, load_json, save_json
 from pipelines.core.stages import LIDAR, LIDAR_MAP, MODEL, POINTS, SIM3_POSTERIOR, TRAIN_POSTERIOR
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.splat.gaussians import write_gaussians
@@ -169,19 +169,22 @@ def _summary(
     key_figure = f"{model.gaussians} gaussians, train PSNR {psnr:.2f} dB"
     # A common error of the fixes is everyday: init-sim3 has tested it against its prior, and its cautions tell it.
     told = [_warning_of(error) for error in model.estimated_errors if error.name != "bias"]
-    warnings = [text for text in (*told, record.recovery) if text is not None]
+    warnings = [warning for warning in told if warning is not None]
+    if record.recovery is not None:
+        warnings.append(Remark(code="training-recovered", sentence=record.recovery))
     if lidar is not None:
         warnings += lidar.assumptions
     if lidar is not None and lidar.areas:
         area_m2 = sum(area.area_m2 for area in lidar.areas)
-        warnings.append(
+        sentence = (
             f"LiDAR and photographs contradict each other on {area_m2:.0f} m² in {len(lidar.areas)} places, which "
             "train/lidar.json lists and train/lidar.png shows: the LiDAR is not used there"
         )
+        warnings.append(Remark(code="lidar-inconsistent", sentence=sentence))
     return Summary(key_figure, values, tuple(warnings), model.cautions)
 
 
-def _warning_of(error: EstimatedError) -> str | None:
+def _warning_of(error: EstimatedError) -> Remark | None:
     """Return a warning if the error exceeds 3 σ or is not observable along every axis; else None."""
     axes = "east, north, up" if error.name == "lidar-shift" else "right, down, forward"
     values = ", ".join(f"{value:+.3f} ± {sigma:.3f}" for value, sigma in zip(error.value, error.sigma, strict=True))
@@ -191,9 +194,10 @@ def _warning_of(error: EstimatedError) -> str | None:
     ]
     if any(evident):
         evidence = f"{error.name} of ({values}) {error.unit} {axes}, beyond 3 σ: it is taken out here"
-        return f"{evidence}. {_CAUSES[error.name]}"
+        return Remark(code=f"{error.name}-estimated", sentence=f"{evidence}. {_CAUSES[error.name]}")
     if not all(error.observed):
-        return f"{error.name} is not observable along every axis: ({values}) {error.unit} {axes}"
+        sentence = f"{error.name} is not observable along every axis: ({values}) {error.unit} {axes}"
+        return Remark(code=f"{error.name}-not-observable", sentence=sentence)
     return None
 
 

@@ -440,7 +440,9 @@ def load_checkpoint(path: Path) -> dict[str, Tensor]:
         TypeError,
         ValueError,
     ) as error:  # torch has no complex halves, texts or foreign byte orders
-        raise InputError(f"not a readable checkpoint: {error}; train without --resume") from error
+        raise InputError(
+            "todo-not-readable-checkpoint-train", f"not a readable checkpoint: {error}; train without --resume"
+        ) from error
 
 
 def prefixed(prefix: str, state: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -202,8 +202,9 @@ def start_server(port: int, title: str, *, dark: bool = False) -> tuple[viser.Vi
     if not _refuses_strangers(server.get_port(), keeper.key):
         stop_server(server)
         raise GeorefError(
+            "todo-this-version-viser-cannot",
             "this version of viser cannot be kept from answering strangers: install viser 1.1 "
-            "(pip install --constraint constraints.txt georefgs)"
+            "(pip install --constraint constraints.txt georefgs)",
         )
     if server.get_port() != port:
         log.warning("port %d is taken: the viewer is at port %d", port, server.get_port())
@@ -220,7 +221,9 @@ def _start(port: int, title: str, keeper: Doorkeeper) -> viser.ViserServer:
     try:
         import viser
     except ImportError as error:
-        raise BackendUnavailableError(f"viser cannot be imported ({error}): pip install georefgs") from error
+        raise BackendUnavailableError(
+            "todo-viser-cannot-be-imported", f"viser cannot be imported ({error}): pip install georefgs"
+        ) from error
 
     class Server(viser.ViserServer):
         """Server that opens no tunnel to the Internet when a page asks for one."""

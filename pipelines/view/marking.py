@@ -115,7 +115,7 @@ def mark_texts(crs: str, points: Sequence[MarkedPoint]) -> dict[str, str]:
             for image, (x_px, y_px) in point.marks.items():
                 bad = next((text for text in (point.name, image) if len(text.split()) != 1), None)
                 if bad is not None:
-                    raise InputError(f"{file} has no place for a space: rename {bad!r}")
+                    raise InputError("todo-has-no-place-for", f"{file} has no place for a space: rename {bad!r}")
                 x, y, z = point.xyz
                 lines.append(f"{x:.12g}\t{y:.12g}\t{z:.4f}\t{x_px:.3f}\t{y_px:.3f}\t{image}\t{point.name}")
         if len(lines) > 1:
@@ -201,7 +201,10 @@ class KeptMarks:
             GeorefError: nothing was changed, and why.
         """
         if len(name.split()) != 1:
-            raise InputError(f"the files of marks have no place for a space: name {name!r} without one")
+            raise InputError(
+                "todo-files-marks-have-no",
+                f"the files of marks have no place for a space: name {name!r} without one",
+            )
         former = self._records.get((name, None))
         lla = former.lla if isinstance(former, KeptPoint) else None
         if xyz is not None:
@@ -216,7 +219,10 @@ class KeptMarks:
             GeorefError: nothing was changed, and why.
         """
         if name in self._surveyed:
-            raise InputError(f"{name} is a point of the survey: remove its marks, or ingest the survey without it")
+            raise InputError(
+                "todo-point-survey-remove-its",
+                f"{name} is a point of the survey: remove its marks, or ingest the survey without it",
+            )
         self._step(dict.fromkeys(key for key in self._records if key[0] == name), f"removal of {name}")
 
     def write(self, crs: str) -> list[Path]:

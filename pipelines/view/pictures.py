@@ -155,7 +155,11 @@ class Photographs:
         pixels = decoded_photograph(file, sha256.get(name, ""))
         lens = self._trained.sparse.camera_of(camera)
         if pixels is None or pixels.shape[:2] != (lens.height, lens.width):
-            raise InputError("the photograph cannot be read, or has another size than its camera", path=file)
+            raise InputError(
+                "todo-photograph-cannot-be-read",
+                "the photograph cannot be read, or has another size than its camera",
+                path=file,
+            )
         return np.ascontiguousarray(pixels[..., ::-1])
 
 

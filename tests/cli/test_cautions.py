@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 
 from pipelines.core.options import StageOptions
-from pipelines.core.products import Caution
+from pipelines.core.products import Remark
 from pipelines.core.stages import BY_NAME, PIPELINE
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from tests import fakes
 from tests.cli_runs import Georef
 
-SHIFT = Caution(code="fixes-shifted", sentence="All fixes are [red]1.2 m[/red] too high.")
-FEW = Caution(code="few-points", sentence="Nothing checks the height.")
+SHIFT = Remark(code="fixes-shifted", sentence="All fixes are [red]1.2 m[/red] too high.")
+FEW = Remark(code="few-points", sentence="Nothing checks the height.")
 IN_ORDER = [
     {"stage": "init-sim3", **SHIFT.model_dump()},
     {"stage": "train", **FEW.model_dump()},
@@ -26,7 +26,7 @@ LAST_LINES = [
 ]
 
 
-def cautious(stage: str, *cautions: Caution) -> Callable[[StageRun, StageOptions], Summary]:
+def cautious(stage: str, *cautions: Remark) -> Callable[[StageRun, StageOptions], Summary]:
     """The `run` of a fake stage whose product has limits."""
 
     def run(out: StageRun, options: StageOptions) -> Summary:

@@ -13,7 +13,7 @@ from pipelines.compare.configurations import BY_CONFIGURATION
 from pipelines.core.errors import ConvergenceError, InputError
 from pipelines.core.lock import WriteLock
 from pipelines.core.options import StageOptions
-from pipelines.core.products import Caution, dump_json
+from pipelines.core.products import Remark, dump_json
 from pipelines.core.stages import BY_NAME, PIPELINE, stage_slice
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from tests import fakes
@@ -37,7 +37,7 @@ def reporting(stage: StageRun, config: StageOptions) -> Summary:
     error = error_of(text)
     # Two points, as far off.
     points = check_points_with(count=2, mean_h_m=error, median_h_m=error, rmse_h_m=error, rmse_v_m=2 * error)
-    cautions = (Caution(code="fake", sentence=text),)
+    cautions = (Remark(code="fake", sentence=text),)
     report = report_with(test={"psnr": 20.0 + error, "ssim": 0.5}, camera=points, model=points, cautions=cautions)
     fakes.write_products(stage, spec, dump_json(report.model_dump(mode="json")))
     return Summary("evaluated", {}, ("few check points",))
@@ -213,7 +213,7 @@ def test_interrupted_comparison_goes_on(georef: Georef, survey: Path) -> None:
 
 def test_a_configuration_that_fails_has_a_row_that_says_why(georef: Georef, survey: Path) -> None:
     def diverging(stage: StageRun, config: StageOptions) -> Summary:
-        raise ConvergenceError("it diverged")
+        raise ConvergenceError("todo-diverged", "it diverged")
 
     fakes.install(evaluate=reporting, train=diverging, adjust=diverging)
     result = georef("compare", survey, "--configs", "baseline,A,B", "--json")
@@ -230,7 +230,7 @@ def test_a_configuration_that_fails_has_a_row_that_says_why(georef: Georef, surv
 
 def test_other_errors_end_it(georef: Georef, survey: Path) -> None:
     def refusing(stage: StageRun, config: StageOptions) -> Summary:
-        raise InputError("no such thing")
+        raise InputError("todo-no-such-thing", "no such thing")
 
     fakes.install(evaluate=reporting, train=refusing)
     result = georef("compare", survey)

@@ -16,7 +16,7 @@ from georef_cli import display, tables
 from georef_cli.output import print_rich
 from georef_cli.verbosity import Verbosity
 from pipelines.compare.table import ComparedRow, Comparison, PointAccuracy
-from pipelines.core.products import Caution
+from pipelines.core.products import Remark
 from pipelines.core.progress import SILENT
 from pipelines.core.runner import Outcome
 from pipelines.core.sentences import duration
@@ -199,7 +199,7 @@ def test_markup_in_names_is_printed_as_it_stands(monkeypatch: pytest.MonkeyPatch
         duration_s=1.0, key_figure=HOSTILE, values={HOSTILE: HOSTILE}, warnings=[HOSTILE],
     )  # fmt: skip
     outcome = Outcome("ingest", False, manifest)
-    cautions = {"ingest": [Caution(code="hostile", sentence=HOSTILE)]}
+    cautions = {"ingest": [Remark(code="hostile", sentence=HOSTILE)]}
     parts = [tables.topics([row]), tables.states([state], cautions), tables.outcomes([outcome])]
     parts += [*tables.outcome(Workspace(Path("ws")), outcome), *tables.cautions(cautions)]
     for part in parts:

@@ -14,7 +14,7 @@ from georef_cli import job_tables
 from georef_cli.output import print_outcomes, print_rich
 from pipelines.core.figures import Headline
 from pipelines.core.fingerprints import fingerprints
-from pipelines.core.products import NOT_CHECKED, Caution, load_json, save_json
+from pipelines.core.products import NOT_CHECKED, Remark, load_json, save_json
 from pipelines.core.stages import BY_NAME, DELIVERABLES, HEADLINE, PIPELINE, REPORT
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.deliver import cameras, ply, spz, tiles
@@ -33,7 +33,7 @@ from tests.reports import check_points_with
 from tests.scenes import WITH_GCPS, Noise, make_scene, sparse_model, survey_of, write_workspace
 from tests.trained_workspaces import load_adjustment, untrained
 
-UNCHECKED = (Caution(code=NOT_CHECKED, sentence="Nothing checks the positions."),)
+UNCHECKED = (Remark(code=NOT_CHECKED, sentence="Nothing checks the positions."),)
 
 
 @pytest.fixture

@@ -8,16 +8,16 @@ from datetime import UTC, datetime
 import pytest
 from pydantic import ValidationError
 
-from pipelines.core.products import Caution, union
+from pipelines.core.products import Remark, union
 from pipelines.core.stages import BY_NAME
 from pipelines.core.staleness import cautions_by_stage
 from pipelines.core.workspace import Manifest, Workspace
 
-SHIFT = Caution(code="fixes-shifted", sentence="All fixes are 1.2 m too high.")
-FEW = Caution(code="few-points", sentence="Nothing checks the height.")
+SHIFT = Remark(code="fixes-shifted", sentence="All fixes are 1.2 m too high.")
+FEW = Remark(code="few-points", sentence="Nothing checks the height.")
 
 
-def put(workspace: Workspace, stage: str, *cautions: Caution) -> None:
+def put(workspace: Workspace, stage: str, *cautions: Remark) -> None:
     """Write the manifest of a stage."""
     folder = workspace.root / BY_NAME[stage].folder
     folder.mkdir(parents=True)
@@ -39,7 +39,7 @@ def put(workspace: Workspace, stage: str, *cautions: Caution) -> None:
 @pytest.mark.parametrize("code", ["", "Fixes", "fixes shifted", "fixes_shifted", "-fixes", "fixes--shifted"])
 def test_codes_are_kebab_case(code: str) -> None:
     with pytest.raises(ValidationError):
-        Caution(code=code, sentence="It is so.")
+        Remark(code=code, sentence="It is so.")
 
 
 def test_union_keeps_the_order_and_each_once() -> None:

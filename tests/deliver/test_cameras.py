@@ -13,7 +13,7 @@ import pytest
 from pyproj import Proj, Transformer
 
 from pipelines.core.errors import InputError
-from pipelines.core.products import NOT_CHECKED, Caution, load_json, save_json
+from pipelines.core.products import NOT_CHECKED, Remark, load_json, save_json
 from pipelines.core.stages import MODEL, SPARSE, SURVEY
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.deliver.cameras import run
@@ -205,7 +205,7 @@ def _inside(pixel: np.ndarray, width: int, height: int) -> np.ndarray:
 def test_unchecked_positions_have_no_sigma(handover: Handover, tmp_path: Path) -> None:
     _, workspace = trained_workspace(tmp_path / "ws")
     model = load_json(TrainedModel, workspace.path(MODEL))
-    unchecked = Caution(code=NOT_CHECKED, sentence="Nothing checks the positions.")
+    unchecked = Remark(code=NOT_CHECKED, sentence="Nothing checks the positions.")
     save_json(model.model_copy(update={"cautions": (unchecked,)}), workspace.root / MODEL)
     summary = handed_over(workspace, tmp_path / "out", crs="EPSG:4326")
     table = replace(handover, out=tmp_path / "out")

@@ -10,7 +10,7 @@ import pytest
 from pyproj import Transformer
 
 from pipelines.core.errors import InputError, MissingProductError
-from pipelines.core.products import NOT_CHECKED, Caution, load_json, save_json
+from pipelines.core.products import NOT_CHECKED, Remark, load_json, save_json
 from pipelines.core.stages import DELIVERABLES, MODEL, SPLAT, SURVEY
 from pipelines.core.workspace import Workspace
 from pipelines.deliver.options import DESCRIPTIONS
@@ -79,7 +79,7 @@ def test_accuracy_is_that_of_the_evaluation_and_unknown_where_nothing_checks_it(
     before = overview(copied, CrsOptions()).accuracy
     assert before is not None and before.kind == "predicted"  # by the adjustment: not evaluated
     scene = AccuracySummary(cells=4, rms_sigma_h_m=0.03, rms_sigma_v_m=0.04, reason=None)
-    unchecked = Caution(code=NOT_CHECKED, sentence="Nothing checks the positions.")
+    unchecked = Remark(code=NOT_CHECKED, sentence="Nothing checks the positions.")
     for cautions, kind in (((), "predicted"), ((unchecked,), "unknown")):
         save_json(report_with(scene=scene, cautions=cautions), copied.root / "evaluate/report.json")
         accuracy = overview(copied, CrsOptions()).accuracy

@@ -15,7 +15,7 @@ import torch
 from pydantic import ValidationError
 
 from pipelines.core.figures import Headline
-from pipelines.core.products import Caution
+from pipelines.core.products import Remark
 from pipelines.core.sentences import printable
 from pipelines.deliver.options import CESIUM, PageOptions, SplatOptions
 from pipelines.deliver.placement import place
@@ -64,7 +64,7 @@ def surveyed() -> Survey:
     return survey.model_copy(update={"control_points": named, "check_points": tuple(others)})
 
 
-def page_of(survey: Survey, cautions: tuple[Caution, ...] = (), accuracy: Headline | None = None) -> ScenePage:
+def page_of(survey: Survey, cautions: tuple[Remark, ...] = (), accuracy: Headline | None = None) -> ScenePage:
     means = np.random.default_rng(3).normal(0, 20, (500, 3))
     model = trained_model(Similarity()).model_copy(update={"cautions": cautions})
     gaussians = Gaussians(
@@ -82,7 +82,7 @@ def page_of(survey: Survey, cautions: tuple[Caution, ...] = (), accuracy: Headli
 
 
 def test_names_cannot_leave_the_document_that_holds_them(tmp_path: Path) -> None:
-    page = page_of(surveyed(), (Caution(code="odd", sentence=HOSTILE),))
+    page = page_of(surveyed(), (Remark(code="odd", sentence=HOSTILE),))
     write_scene_page(page, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["index.html"]
     (attributes, data), (_, program) = Scripts((tmp_path / "index.html").read_text(encoding="utf-8")).found

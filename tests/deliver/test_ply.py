@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from pipelines.core.errors import DegenerateGeometryError, InputError
-from pipelines.core.products import Caution, load_json, save_json
+from pipelines.core.products import Remark, load_json, save_json
 from pipelines.core.stages import GAUSSIANS, MODEL, SURVEY
 from pipelines.core.workspace import StageRun, Workspace
 from pipelines.deliver.options import ExportPlyOptions
@@ -210,7 +210,7 @@ def test_matrix_is_the_similarity_of_the_sidecar(stage: StageRun) -> None:
 
 
 def test_sidecar_carries_the_cautions_of_the_model_on(stage: StageRun) -> None:
-    caution = Caution(code="fixes-shifted", sentence="All fixes are 1.2 m too high.")
+    caution = Remark(code="fixes-shifted", sentence="All fixes are 1.2 m too high.")
     path = stage.workspace.root / MODEL
     save_json(model(covariance()).model_copy(update={"cautions": (caution,)}), path)
     assert (

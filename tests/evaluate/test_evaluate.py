@@ -15,7 +15,7 @@ from georef_cli import boundary
 from georef_cli.main import cli
 from pipelines.adjust import system
 from pipelines.core.errors import InputError
-from pipelines.core.products import Caution, load_json, save_json
+from pipelines.core.products import Remark, load_json, save_json
 from pipelines.core.runner import Outcome, run_stage
 from pipelines.core.stages import BY_NAME, MODEL, SURVEY
 from pipelines.core.staleness import status
@@ -163,7 +163,7 @@ def test_accuracy_is_stated_after_the_standard(evaluated: tuple[Workspace, Outco
 
 
 def test_cautions_of_the_model_stand_first_in_the_report(altered: Workspace) -> None:
-    caution = Caution(code="fixes-shifted", sentence="All fixes are 1.2 m too high.")
+    caution = Remark(code="fixes-shifted", sentence="All fixes are 1.2 m too high.")
     model = load_json(TrainedModel, altered.path(MODEL))
     save_json(model.model_copy(update={"cautions": (caution,)}), altered.root / MODEL)
     survey = load_json(Survey, altered.path(SURVEY))

@@ -46,7 +46,7 @@ def test_same_seed_gives_the_same_answer() -> None:
 
 def test_too_few_observations_and_samples_that_never_fit_are_refused() -> None:
     def refuse(_: np.ndarray) -> float:
-        raise DegenerateGeometryError("all on one line")
+        raise DegenerateGeometryError("todo-all-on-one-line", "all on one line")
 
     def residuals(_: float) -> np.ndarray:
         return np.zeros(5)

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from pipelines.core.errors import InputError
-from pipelines.core.products import Caution
+from pipelines.core.products import Remark
 from pipelines.survey.report import (
     Coordinates,
     EvaluationReport,
@@ -21,7 +21,7 @@ from pipelines.survey.report import (
 )
 from tests.reports import check_points_with, report_with
 
-CAUTION = Caution(code="prediction-refuted", sentence="Check points refute the predicted accuracy.")
+CAUTION = Remark(code="prediction-refuted", sentence="Check points refute the predicted accuracy.")
 MEASURED = {"name": "P1", "rays": 4, "de_m": 0.01, "dn_m": -0.02, "du_m": 0.1 + 0.2, "blunder": False}
 UNMEASURED = {"name": "P2", "rays": 1, "de_m": None, "dn_m": None, "du_m": None, "blunder": False}
 

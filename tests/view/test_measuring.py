@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pipelines.core.errors import MissingProductError
-from pipelines.core.products import NOT_CHECKED, Caution
+from pipelines.core.products import NOT_CHECKED, Remark
 from pipelines.core.workspace import Workspace
 from pipelines.surface.picking import NoSurface, Sight, SurfacePoint, depth_around, points_on_surface
 from pipelines.survey.marks import mark_rays
@@ -134,7 +134,7 @@ def test_shared_errors_cancel_in_distances(model: MeasuringModel) -> None:
 def test_no_sigma_is_stated_that_nothing_checks(viewed: Workspace, model: MeasuringModel, tmp_path: Path) -> None:
     """And the viewer solves nothing: without a stored posterior there is none."""
     renderer = model.reader.renderer
-    unchecked = (Caution(code=NOT_CHECKED, sentence="Nothing checks the positions."),)
+    unchecked = (Remark(code=NOT_CHECKED, sentence="Nothing checks the positions."),)
     trained = replace(renderer.trained, model=renderer.trained.model.model_copy(update={"cautions": unchecked}))
     fresh = MeasuringModel(viewed, SimpleNamespace(trained=trained), CrsOptions())  # type: ignore[arg-type]
     assert fresh.posterior is None and "nothing checks" in fresh.without_sigma

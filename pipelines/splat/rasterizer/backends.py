@@ -25,7 +25,9 @@ def chosen_backend(name: Literal["auto", "cpu", "cuda"]) -> BackendName:
         BackendUnavailableError: `cuda`, and a part that it needs is missing; names each missing part.
     """
     if name not in ("auto", *BACKENDS):
-        raise BackendUnavailableError(f"no rasteriser is called {name!r}: use auto, cpu or cuda")
+        raise BackendUnavailableError(
+            "todo-no-rasteriser-called-use", f"no rasteriser is called {name!r}: use auto, cpu or cuda"
+        )
     if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
         return "cpu"
     from pipelines.splat.rasterizer.cuda_kernels import missing_for_cuda
@@ -34,7 +36,9 @@ def chosen_backend(name: Literal["auto", "cpu", "cuda"]) -> BackendName:
     if missing is None:
         return "cuda"
     if name == "cuda":
-        raise BackendUnavailableError(f"the cuda backend cannot be used: {missing}. Or use the cpu backend")
+        raise BackendUnavailableError(
+            "todo-cuda-backend-cannot-be", f"the cuda backend cannot be used: {missing}. Or use the cpu backend"
+        )
     log.warning("the GPU is not used: %s", missing)
     return "cpu"
 

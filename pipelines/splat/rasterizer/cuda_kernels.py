@@ -68,7 +68,9 @@ def compile_kernels(progress: Progress = SILENT) -> Path:
     """
     missing = lacking((gsplat(), *compiling_parts()))
     if missing is not None:
-        raise BackendUnavailableError(f"the kernels of the cuda backend cannot be compiled: {missing}")
+        raise BackendUnavailableError(
+            "todo-kernels-cuda-backend-cannot", f"the kernels of the cuda backend cannot be compiled: {missing}"
+        )
     folder = _folder() / "_".join(_architectures())
     with _alone_in(folder):
         library = folder / _LIBRARY
@@ -101,7 +103,9 @@ def load_gsplat(progress: Progress = SILENT) -> ModuleType:
         return importlib.import_module("gsplat")
     except ImportError as error:
         remedy = f"delete {_folder()} and run the command again, or use the cpu backend"
-        raise BackendUnavailableError(f"gsplat cannot be loaded ({error}): {remedy}") from error
+        raise BackendUnavailableError(
+            "todo-gsplat-cannot-be-loaded", f"gsplat cannot be loaded ({error}): {remedy}"
+        ) from error
 
 
 def missing_for_cuda() -> str | None:
@@ -150,12 +154,14 @@ def _architectures() -> list[str]:
     found = sorted(name.removesuffix("+PTX") for name in named) or _capabilities()
     if not found:
         raise InputError(
+            "todo-there-no-gpu-compile",
             "there is no GPU to compile for: name its compute capability in the variable TORCH_CUDA_ARCH_LIST "
-            "(8.6 for the RTX 30 series, 8.9 for 40, 12.0 for 50, 8.0 for A100, 9.0 for H100; several with blanks)"
+            "(8.6 for the RTX 30 series, 8.9 for 40, 12.0 for 50, 8.0 for A100, 9.0 for H100; several with blanks)",
         )
     if not all(name.replace(".", "").removesuffix("a").isdecimal() for name in found):
         raise InputError(
-            f"TORCH_CUDA_ARCH_LIST={' '.join(named)!r}: expected numbers like 8.6, with blanks between"
+            "todo-torch-cuda-arch-list",
+            f"TORCH_CUDA_ARCH_LIST={' '.join(named)!r}: expected numbers like 8.6, with blanks between",
         )
     return found
 
@@ -195,7 +201,9 @@ def _compile(draft: Path, log: Path, progress: Progress) -> None:
     if process.returncode != 0 or not (draft / _NAME / _LIBRARY).is_file():
         lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
         cause = next((line for line in lines if "error" in line.lower()), "no message")[:_MOST_OF_A_LINE]
-        raise BackendUnavailableError(f"gsplat's kernels could not be compiled ({cause.strip()}): see {log}")
+        raise BackendUnavailableError(
+            "todo-gsplat-kernels-could-not", f"gsplat's kernels could not be compiled ({cause.strip()}): see {log}"
+        )
 
 
 def _environment(draft: Path) -> dict[str, str]:

@@ -52,7 +52,10 @@ def run(stage: StageRun, options: BlockTrainOptions) -> Summary:
     index = whole.scene.sparse.image_index()
     rows = np.array([index[name] for name in block.cameras if name in index], dtype=np.int64)
     if len(rows) < _LEAST_VIEWS:
-        raise DegenerateGeometryError(f"{len(rows)} photographs show block {block.id}: give fewer --blocks")
+        raise DegenerateGeometryError(
+            "todo-photographs-show-block-give",
+            f"{len(rows)} photographs show block {block.id}: give fewer --blocks",
+        )
     solved = whole.of_images(rows)
     options = options.model_copy(update={"max_gaussians": block.gaussians, "optimize_cameras": False})
     images = photographs(solved.scene.sparse, solved.survey, workspace, options.effort.max_image_size)
@@ -70,7 +73,10 @@ def run(stage: StageRun, options: BlockTrainOptions) -> Summary:
     )
     seeing = masks.seeing()
     if len(seeing) < _LEAST_VIEWS:
-        raise DegenerateGeometryError(f"{len(seeing)} photographs show the surface of a block: give fewer --blocks")
+        raise DegenerateGeometryError(
+            "todo-photographs-show-surface-block",
+            f"{len(seeing)} photographs show the surface of a block: give fewer --blocks",
+        )
     surface = None if maps is None else SceneSurface(maps)
     scene, region = replace(solved.scene, train=seeing), _region(block, box, scaffold, masks)
     training, exposures = TrainingScene(scene, images, surface, region), solved.exposures(device_of(backend))

@@ -255,7 +255,10 @@ def distance_term(
         InputError: `points` belongs to another model.
     """
     if points is not None and not np.array_equal(points.point_id, scene.sparse.point_id):
-        raise InputError("the geolocated points are of another model: run `georef geolocate` again")
+        raise InputError(
+            "todo-geolocated-points-another-model",
+            "the geolocated points are of another model: run `georef geolocate` again",
+        )
     located = np.zeros(0, dtype=np.int64) if points is None else np.flatnonzero(points.inlier)
     if points is not None and len(located) >= 2:
         in_model, in_geo, cov_in_geo = scene.point_in_model, points.position_in_geo, points.cov_in_geo
