@@ -131,8 +131,7 @@ class PointCrs:
             flat = self._crs.to_2d().to_wkt("WKT1_GDAL")
         except CRSError as error:
             raise InputError(
-                "todo-cannot-be-written-wkt",
-                f"{self.name} cannot be written as WKT1, which the file needs: {error}",
+                "crs-not-wkt1", f"{self.name} cannot be written as WKT1, which the file needs: {error}."
             ) from error
         return f'COMPD_CS["{self._crs.name.replace(chr(34), "")} + Ellipsoid (metre)",{flat},{_ELLIPSOID_HEIGHT}]'
 
@@ -158,7 +157,9 @@ class PointCrs:
             x, y, z = transformer.transform(points[:, 0], points[:, 1], height)
         lla = np.stack([y, x, z if self._three_dimensional else height], axis=-1)
         lla[:, 1] -= 360.0 * np.round(lla[:, 1] / 360.0)
-        listed.require(np.isfinite(lla).all(axis=1), f"outside the domain of {self.name}")
+        listed.require(
+            np.isfinite(lla).all(axis=1), "point-outside-domain", f"is outside the domain of {self.name}"
+        )
         return lla
 
     def xyz_from_lla(self, lla: ArrayLike) -> FloatArray:
@@ -171,7 +172,7 @@ class PointCrs:
         if not len(points):
             return points
         listed = ListedPoints(points, self.name)
-        listed.require(np.isfinite(points).all(axis=1), "not a number")
+        listed.require(np.isfinite(points).all(axis=1), "point-not-finite", "is not a number")
         with proj_errors(self.name):
             check_area(self._crs, points[:, 1], points[:, 0], listed)
             transformer, _ = self._operation(points[:, 1], points[:, 0])
@@ -185,7 +186,9 @@ class PointCrs:
             x, y, _ = _inverse(transformer, points[:, 1] + off, 2 * points[:, 0] - lat, points[:, 2])
             z = points[:, 2] / self._height_unit_m
         xyz = np.stack([x, y, z], axis=-1)
-        listed.require(np.isfinite(xyz).all(axis=1), f"outside the domain of {self.name}")
+        listed.require(
+            np.isfinite(xyz).all(axis=1), "point-outside-domain", f"is outside the domain of {self.name}"
+        )
         return xyz
 
     def operation(self, lla: ArrayLike) -> Operation:
@@ -242,11 +245,11 @@ def parse_crs(
         crs = _parse(name, refusal)
         if not (crs.is_geographic or crs.is_projected or crs.is_geocentric):
             raise refusal(
-                "crs-not-of-points", f"{_short(name)} is a {crs.type_name}, which places no points on Earth"
+                "crs-not-of-points", f"{_short(name)} is a {crs.type_name}, which has no points on Earth."
             )
         return _point_crs(crs, name, vertical)
     except ProjError as error:  # of a CRS that PROJ reads, but whose parts it does not combine
-        raise refusal("crs-unusable", f"PROJ cannot use {_short(name)!r}: {error}") from error
+        raise refusal("crs-unusable", f"PROJ cannot use {_short(name)!r}: {error}.") from error
 
 
 def _point_crs(crs: CRS, name: str, vertical: VerticalChoice | None) -> PointCrs:
@@ -272,25 +275,27 @@ def _point_crs(crs: CRS, name: str, vertical: VerticalChoice | None) -> PointCrs
     return PointCrs(short, datum_of, False, unit[0], crs, unit[1], False)
 
 
-def _parse(name: str, refusal: Callable[[str], InputError]) -> CRS:
+def _parse(name: str, refusal: Callable[[str, str], InputError]) -> CRS:
     if len(name) > _MAX_TEXT:
-        raise refusal(f"no CRS is {len(name)} characters long")
+        raise refusal("crs-too-long", f"The text of a CRS has at most {_MAX_TEXT} characters, not {len(name)}.")
     file = file_in(name)
     if file is not None:
         raise refusal(
-            f"{_short(file)!r} would open a file: give EPSG:n, or a grid by its bare name in PROJ's own folders"
+            "crs-opens-file",
+            f"{_short(file)!r} would open a file. Give EPSG:n, or a grid by its bare name in PROJ's own folders.",
         )
     utm = _UTM.fullmatch(name)
     if utm:
         zone, south = int(utm[1]), utm[2].upper() == "S"
         if not 1 <= zone <= 60:
-            raise refusal(f"UTM has zones 1 to 60, not {zone}")
+            raise refusal("utm-zone", f"UTM has zones 1 to 60, not {zone}.")
         return CRS.from_epsg((32700 if south else 32600) + zone)
     try:
         return CRS.from_user_input(name)
     except CRSError as error:
         raise refusal(
-            f"{_short(name)!r} is no CRS that PROJ knows: give EPSG:n, EPSG:n+m, PROJ string, WGS84 UTM 16N or WKT"
+            "crs-unknown",
+            f"PROJ knows no CRS {_short(name)!r}. Give EPSG:n, EPSG:n+m, a PROJ string, WGS84 UTM 16N or WKT.",
         ) from error
 
 
@@ -298,10 +303,10 @@ def _vertical_crs(choice: VerticalChoice) -> CRS:
     try:
         crs = CRS.from_user_input(f"EPSG:{choice.epsg}")
     except CRSError as error:
-        raise InputError("todo-proj-knows-no", f"PROJ knows no {choice.name}", field="--vertical") from error
+        raise InputError("vertical-crs-unknown", f"PROJ knows no {choice.name}.", field="--vertical") from error
     if not crs.is_vertical or crs.is_compound:
         raise InputError(
-            "todo-no-vertical-crs", f"{choice.name} ({crs.name}) is no vertical CRS", field="--vertical"
+            "not-a-vertical-crs", f"{choice.name} ({crs.name}) is no vertical CRS.", field="--vertical"
         )
     return crs
 
@@ -333,9 +338,9 @@ def grid_from_enu(crs: PointCrs, lla: ArrayLike) -> FloatArray:
     rotations[:, :2, :2] = left @ right
     if (np.linalg.det(rotations) < 0).any():
         raise InputError(
-            "todo-axes-left-handed-angles",
-            f"the axes of {crs.name} are left-handed, and angles of cameras are not defined in them: give a CRS "
-            "whose coordinates are easting and northing",
+            "axes-left-handed",
+            f"The axes of {crs.name} are left-handed, and angles of cameras are not defined in them. Give a CRS "
+            "with easting and northing.",
         )
     return rotations
 

@@ -57,7 +57,7 @@ def proj_errors(name: str, path: Path | str | None = None) -> Iterator[None]:
         yield
     except ProjError as error:
         raise InputError(
-            "todo-proj-cannot-transform-points", f"PROJ cannot transform points of {name}: {error}", path=path
+            "transformation-failed", f"PROJ cannot transform points of {name}: {error}.", path=path
         ) from error
 
 
@@ -116,14 +116,16 @@ def _no_operation(request: OperationRequest) -> InputError:
     horizontal = request.crs.sub_crs_list[0] if request.crs.is_compound else request.crs
     flat = _group(horizontal, WGS84, None) if request.crs.is_compound else None
     if flat is not None and (flat.transformers or flat.unavailable_operations):
-        message = (
-            f"heights above {request.crs.sub_crs_list[1].name} cannot be made ellipsoidal: PROJ knows no geoid for "
-            "them. Give ellipsoidal heights, the horizontal CRS alone and `--vertical ellipsoidal`"
+        return InputError(
+            "geoid-unknown",
+            f"Heights above {request.crs.sub_crs_list[1].name} cannot be converted to ellipsoidal heights: PROJ "
+            "knows no geoid for them. "
+            "Give ellipsoidal heights, the horizontal CRS alone and --vertical ellipsoidal.",
+            path=request.path,
         )
-        return InputError("todo-x", message, path=request.path)
     message = (
-        f"no transformation from {request.name} to WGS84 is known here: name its datum (+datum=… or +towgs84=… in "
-        "a PROJ string), or give another CRS"
+        f"PROJ knows no transformation from {request.name} to WGS84. Name its datum (+datum=… or +towgs84=… in a "
+        "PROJ string), or give another CRS."
     )
     ellipsoid = horizontal.ellipsoid
     low, high = _MODERN_FLATTENING
@@ -135,8 +137,8 @@ def _no_operation(request: OperationRequest) -> InputError:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # "you will lose information": the datum, which is stated
             projection = horizontal.to_proj4().replace(" +no_defs", "").replace(" +type=crs", "")
-        message += f". If its datum is WGS84 as closely as you need: {projection} +towgs84=0,0,0"
-    return InputError("todo-x", message, path=request.path)
+        message += f" If its datum is close enough to WGS84, give: {projection} +towgs84=0,0,0"
+    return InputError("no-transformation", message, path=request.path)
 
 
 def _area(lon: FloatArray, lat: FloatArray) -> AreaOfInterest:

@@ -29,17 +29,17 @@ class ListedPoints:
     path: Path | str | None = None
     lines: Sequence[int] | None = None
 
-    def require(self, accepted: ArrayLike, message: str, field: str | None = None) -> None:
-        """Raise an InputError for the first point that is not accepted (N,)."""
+    def require(self, accepted: ArrayLike, code: str, fault: str, field: str | None = None) -> None:
+        """Raise an InputError for the first point that is not accepted (N,); the fault is said of the point."""
         good = np.asarray(accepted)
         if good.all():
             return
         worst = int(np.argmin(good))
         text = ", ".join(f"{value:.10g}" for value in self.points[worst])
         count = int((~good).sum())
-        more = f" ({count} such points)" if count > 1 else ""
+        more = f" {count} points are so." if count > 1 else ""
         line = self.lines[worst] if self.lines is not None else None
-        raise InputError("todo-x", f"({text}): {message}{more}", path=self.path, line=line, field=field)
+        raise InputError(code, f"Point ({text}) {fault}.{more}", path=self.path, line=line, field=field)
 
 
 def horizontal_of(crs: CRS) -> CRS:
@@ -55,24 +55,28 @@ def rough_lon_lat(crs: CRS, listed: ListedPoints) -> tuple[FloatArray, FloatArra
             CRS's area.
     """
     points, name = listed.points, listed.crs_name
-    listed.require(np.isfinite(points).all(axis=1), "not a number")
+    listed.require(np.isfinite(points).all(axis=1), "point-not-finite", "is not a number")
     if crs.is_geocentric:
         lla = lla_from_ecef(points)
-        listed.require(np.abs(lla[:, 2]) < 1e5, f"not near the Earth's surface in {name}")
+        listed.require(np.abs(lla[:, 2]) < 1e5, "point-not-on-earth", f"is not near the Earth's surface in {name}")
         return lla[:, 1], lla[:, 0]
     horizontal = horizontal_of(crs)
     geodetic = horizontal.geodetic_crs or horizontal
     if horizontal.is_geographic:
         lon, lat = _from_greenwich(geodetic, points[:, 0], points[:, 1])
-        order = f"(in {name} x is the longitude, y the latitude)"
-        listed.require(np.abs(lat) <= 90.0, f"latitude out of range −90 … 90 {order}", "latitude")
-        listed.require(np.abs(lon) <= 360.0, "longitude out of range −180 … 180", "longitude")
+        order = f"(x is the longitude in {name}, y the latitude)"
+        listed.require(
+            np.abs(lat) <= 90.0, "latitude-range", f"has a latitude out of −90 … 90° {order}", "latitude"
+        )
+        listed.require(np.abs(lon) <= 360.0, "longitude-range", "has a longitude out of −180 … 180°", "longitude")
     else:
         to_degrees = Transformer.from_crs(horizontal, geodetic, always_xy=True)
         lon, lat = _from_greenwich(geodetic, *to_degrees.transform(points[:, 0], points[:, 1]))
-        listed.require(np.isfinite(lon + lat), f"outside the domain of {name}")
+        listed.require(np.isfinite(lon + lat), "point-outside-domain", f"is outside the domain of {name}")
         degrees = _look_like_degrees(horizontal, points, lon, lat)
-        listed.require(~degrees, f"degrees? {name} has eastings and northings: wrong CRS")
+        listed.require(
+            ~degrees, "degrees-in-projection", f"seems to be in degrees, but {name} has eastings and northings"
+        )
     check_area(crs, lon, lat, listed)
     return lon, lat
 
@@ -82,8 +86,8 @@ def check_area(crs: CRS, lon: FloatArray, lat: FloatArray, listed: ListedPoints)
     area = horizontal_of(crs).area_of_use
     if area is not None:
         bounds = f"{area.south:g} … {area.north:g}° N, {area.west:g} … {area.east:g}° E"
-        message = f"far outside the area of {listed.crs_name} ({bounds}): wrong CRS, or x and y swapped?"
-        listed.require(_within(horizontal_of(crs), lon, lat, _AREA_MARGIN_DEG), message)
+        fault = f"is far outside the area of {listed.crs_name} ({bounds}): the CRS is wrong, or x and y are swapped"
+        listed.require(_within(horizontal_of(crs), lon, lat, _AREA_MARGIN_DEG), "point-outside-area", fault)
 
 
 def _from_greenwich(geodetic: CRS, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:

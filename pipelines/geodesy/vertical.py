@@ -49,7 +49,7 @@ def parse_vertical(text: str) -> VerticalChoice:
     if match is None:
         known = ", ".join([ELLIPSOIDAL, *_EPSG_OF, "EPSG:n"])
         raise InputError(
-            "todo-no-vertical-datum-give", f"{text!r} is no vertical datum: give one of {known}", field="--vertical"
+            "vertical-datum-unknown", f"{text!r} is no vertical datum. Give one of {known}.", field="--vertical"
         )
     epsg = int(match[1])
     return VerticalChoice(NAME_OF_EPSG.get(epsg, f"EPSG:{epsg}"), epsg)
@@ -62,17 +62,17 @@ def missing_grid_error(
 
     `datum` is that of the heights, if they do not count from the ellipsoid.
     """
-    problem = f"points of {crs_name} cannot be brought to WGS84"
-    instead = "Or give coordinates in another CRS"
+    problem = f"Points of {crs_name} cannot be transformed to WGS84"
+    instead = "Or give coordinates in another CRS."
     if datum is not None:
-        problem = f"heights above {datum} cannot be made ellipsoidal"
+        problem = f"Heights above {datum} cannot be converted to ellipsoidal heights"
         instead = (
-            "If the heights are ellipsoidal after all, give the horizontal CRS alone and `--vertical ellipsoidal`"
+            "If the heights are ellipsoidal already, give the horizontal CRS alone and --vertical ellipsoidal."
         )
     files = f"the PROJ grid {grids[0]} is" if len(grids) == 1 else f"the PROJ grids {', '.join(grids)} are"
     command = " ".join(["pyproj sync", *(f"--file {grid}" for grid in grids)])
     return InputError(
-        "todo-not-installed-run-or",
+        "grid-not-installed",
         f"{problem}: {files} not installed. Run `{command}`, or copy from https://cdn.proj.org into {folder}. "
         f"{instead}",
         path=path,

@@ -34,14 +34,14 @@ from pipelines.ingest.flight_record import (
     require_enough,
     with_defaults,
 )
-from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
+from pipelines.ingest.remarks import Remarks
 
 _MANY_FRAMES = 1000
 
 
 def read_bag(
-    path: Path, options: IngestOptions, folder: Path, notes: Notes, progress: Progress = SILENT
+    path: Path, options: IngestOptions, folder: Path, remarks: Remarks, progress: Progress = SILENT
 ) -> FlightRecord:
     """Read a bag, and write its chosen photographs into `folder`.
 
@@ -50,25 +50,24 @@ def read_bag(
             local frame without `--origin`.
     """
     with open_bag(path) as bag:
-        streams = read_streams(bag, options, notes, progress)
-        positions, vertical = _positions(streams, options, notes)
+        streams = read_streams(bag, options, remarks, progress)
+        positions, vertical = _positions(streams, options, remarks)
         place = positions.at(streams.images.time_s + options.time_offset_s).position
         photos, numbers = write_photos(
-            bag, streams.images, place, options=options, folder=folder, notes=notes, progress=progress
+            bag, streams.images, place, options=options, folder=folder, remarks=remarks, progress=progress
         )
     if len(photos) > _MANY_FRAMES and options.every is None:
-        notes.warn(
-            "todo-all-frames-were-taken",
-            f"all {len(photos)} frames were taken: --every 2s or --every 5m takes fewer",
+        remarks.warn(
+            "all-frames-taken", f"All {len(photos)} frames were taken. --every 2s or --every 5m takes fewer."
         )
-    require_enough(len(photos), path, "--bag", notes)
-    cameras, camera_of = lens_priors(photos, streams, options, notes)
+    require_enough(len(photos), path, "--bag", remarks)
+    cameras, camera_of = lens_priors(photos, streams, options, remarks)
     time_s = streams.images.time_s[numbers]
     attitudes = _attitudes(streams, options)
     recorded = RecordedNavigation(
         positions=positions,
         attitudes=attitudes,
-        rig=_rig_at(time_s + options.time_offset_s, attitudes, streams, given_rig(options), notes),
+        rig=_rig_at(time_s + options.time_offset_s, attitudes, streams, given_rig(options), remarks),
         body_known=True,
         images=tuple(photo.name for photo in photos),
         image_time_s=time_s,
@@ -76,39 +75,43 @@ def read_bag(
     )
     receivers = [] if streams.positions is None else streams.positions.receivers
     worst = max(receivers, key=RECEIVERS.index, default=RECEIVERS[-1])
-    poses = _poses(recorded, worst, vertical, options, notes)
+    poses = _poses(recorded, worst, vertical, options, remarks)
     return FlightRecord(folder.resolve(), photos, cameras, camera_of, poses, recorded)
 
 
-def count_frames(path: Path, options: IngestOptions, notes: Notes, progress: Progress = SILENT) -> tuple[int, int]:
+def count_frames(
+    path: Path, options: IngestOptions, remarks: Remarks, progress: Progress = SILENT
+) -> tuple[int, int]:
     """Return the number of frames with a usable stamp, and of those with a position; nothing is written.
 
     Raises as `read_bag`, but for frames that are damaged, blurred or passed over.
     """
     with open_bag(path) as bag:
-        streams = read_streams(bag, options, notes, progress)
-    images, (positions, _) = streams.images, _positions(streams, options, notes)
+        streams = read_streams(bag, options, remarks, progress)
+    images, (positions, _) = streams.images, _positions(streams, options, remarks)
     located = complete(positions.at(images.time_s + options.time_offset_s).position) & images.usable
     count = int(images.usable.sum())
-    require_enough(count, path, "--bag", notes)
+    require_enough(count, path, "--bag", remarks)
     return count, int(located.sum())
 
 
-def _positions(streams: BagStreams, options: IngestOptions, notes: Notes) -> tuple[Trajectory, VerticalDatum]:
+def _positions(streams: BagStreams, options: IngestOptions, remarks: Remarks) -> tuple[Trajectory, VerticalDatum]:
     """Return the positions, Earth-centred with the σ of the messages, and what their heights counted from."""
     series = streams.positions
     if series is None or not len(series.stamps):
         if series is not None:
-            notes.warn("todo-no-message-has-usable", f"no message of {series.topic} has a usable position")
+            remarks.warn("no-usable-position", f"No message of {series.topic} has a usable position.")
         return Trajectory.from_samples(np.empty(0)), VerticalDatum(name=ELLIPSOIDAL, stated=True)
     values = series.table()
     if series.type in GEODETIC_HEIGHTS:
-        position_in_ecef, vertical = _geodetic(series, options, notes)
+        position_in_ecef, vertical = _geodetic(series, options, remarks)
     elif options.origin is None:
         raise InputError(
-            "todo-has-positions-local-frame",
-            f"{series.topic} has positions in the local frame {series.world!r} only: give --origin LAT,LON,HEIGHT "
-            "of its zero (its axes being East-North-Up), or a topic with latitude and longitude as --fix-topic",
+            "local-frame-without-origin",
+            f"{series.topic} has positions in the local frame {series.world!r}, whose place on Earth is unknown. "
+            "Give its zero with "
+            "--origin LAT,LON,HEIGHT (its axes are taken as East-North-Up), or a topic with latitude and "
+            "longitude with --fix-topic.",
             path=streams.path,
             field="--origin",
         )
@@ -117,9 +120,9 @@ def _positions(streams: BagStreams, options: IngestOptions, notes: Notes) -> tup
         position_in_ecef = ecef_from_enu(values[:, :3], Origin(lat_deg=lat_deg, lon_deg=lon_deg, alt_m=alt_m))
         note = "height of --origin taken as ellipsoidal"
         vertical = VerticalDatum(name=ELLIPSOIDAL, stated=False, note=note)
-        notes.assume(
-            "todo-frame-east-north-up",
-            f"the frame {series.world!r} of {series.topic} is East-North-Up, with its zero at --origin",
+        remarks.assume(
+            "local-frame-axes",
+            f"The frame {series.world!r} of {series.topic} is East-North-Up, with its zero at --origin.",
         )
     positions = Trajectory.from_samples(
         series.time_s[series.usable],
@@ -130,13 +133,13 @@ def _positions(streams: BagStreams, options: IngestOptions, notes: Notes) -> tup
     return positions, vertical
 
 
-def _geodetic(series: TopicSamples, options: IngestOptions, notes: Notes) -> tuple[FloatArray, VerticalDatum]:
+def _geodetic(series: TopicSamples, options: IngestOptions, remarks: Remarks) -> tuple[FloatArray, VerticalDatum]:
     """Return positions in ECEF (K, 3) of latitudes, longitudes and heights, and what the heights counted from."""
     crs, heights = parse_crs(WGS84, vertical=options.vertical), GEODETIC_HEIGHTS[series.type]
     if options.vertical is None:
-        notes.assume(
-            "todo-heights-if-its-driver",
-            f"heights of {series.topic} are {heights}; if its driver does otherwise, see --vertical",
+        remarks.assume(
+            "bag-heights",
+            f"Heights of {series.topic} are {heights}. If its driver writes others, state them with --vertical.",
         )
     by_definition = VerticalDatum(name=ELLIPSOIDAL, stated=True, note=heights)
     lla = crs.lla_from_xyz(series.table()[:, [1, 0, 2]])
@@ -157,21 +160,19 @@ def _attitudes(streams: BagStreams, options: IngestOptions) -> Trajectory:
     )
 
 
-def _rig_at(time_s: FloatArray, attitudes: Trajectory, streams: BagStreams, given: Rig, notes: Notes) -> Rig:
+def _rig_at(time_s: FloatArray, attitudes: Trajectory, streams: BagStreams, given: Rig, remarks: Remarks) -> Rig:
     """Return mount and lever arm at times (N,) of the navigation: given, else of `/tf`; NaN where neither tells."""
     mounts, arms = given.of_each(len(time_s))
     if streams.attitudes is None or not len(attitudes):
-        notes.warn(
-            "todo-no-attitudes-only-photographs",
-            "no attitudes: only the photographs tell how the cameras were turned",
+        remarks.warn(
+            "no-attitudes", "The bag has no attitudes: only the photographs tell how the cameras were turned."
         )
         return Rig(mounts, arms, given.nominal_from_cam)
     frames, body, axes = streams.transforms, streams.attitudes.frame, streams.attitudes.axes
     image_frame, from_frd = streams.images.frame, frame_from_frd(axes)
     if body not in frames and BASE in frames and axes == "flu":
-        notes.assume(
-            "todo-frame-attitudes-not-tf",
-            f"the frame {body!r} of the attitudes is not in /tf and is taken as {BASE}",
+        remarks.assume(
+            "attitude-frame", f"/tf lacks the frame {body!r} of the attitudes, which is taken as {BASE}."
         )
         body = BASE
     camera = frames.between(body, image_frame, time_s)
@@ -180,45 +181,46 @@ def _rig_at(time_s: FloatArray, attitudes: Trajectory, streams: BagStreams, give
     if given.cam_from_body is None and camera is not None:
         mounts = np.swapaxes(camera[0], 1, 2) @ from_frd
         if "optical" not in image_frame:
-            notes.assume(
-                "todo-frame-images-optical-right",
-                f"the frame {image_frame!r} of the images is optical: x right, y down, z forward",
+            remarks.assume(
+                "image-frame-axes",
+                f"The frame {image_frame!r} of the images is optical: x right, y down, z forward.",
             )
     elif given.cam_from_body is None:
-        notes.warn(
-            "todo-tf-does-not-link",
-            f"/tf does not link the frames {image_frame!r} of the camera and {body!r} of the attitudes: "
-            "the cameras have no attitude; give --camera-mount YAW,PITCH,ROLL",
+        remarks.warn(
+            "camera-mount-unknown",
+            f"/tf does not link the frames {image_frame!r} of the camera and {body!r} of the attitudes, so that "
+            "the cameras have no attitude. "
+            "Give --camera-mount YAW,PITCH,ROLL.",
         )
     if given.antenna_in_body is None:
         antenna = frames.between(body, streams.positions.frame, time_s) if streams.positions else None
         if antenna is not None and camera is not None:
             arms = (antenna[1] - camera[1]) @ from_frd
         else:
-            notes.assume(
-                "todo-lever-arm-not-known",
-                "the lever arm is not known: positions are taken for those of the camera; see --lever-arm",
+            remarks.assume(
+                "lever-arm-unknown",
+                "The lever arm is unknown: positions of the antenna are taken as those of the camera. State it "
+                "with --lever-arm.",
             )
     return Rig(mounts, arms, given.nominal_from_cam)
 
 
 def _poses(
-    recorded: RecordedNavigation, receiver: str, vertical: VerticalDatum, options: IngestOptions, notes: Notes
+    recorded: RecordedNavigation, receiver: str, vertical: VerticalDatum, options: IngestOptions, remarks: Remarks
 ) -> ImagePoses:
     """Return poses of the cameras at their stamps (N,)."""
     time_s = recorded.image_time_s
     at_s = time_s + options.time_offset_s
     antenna, body = recorded.positions.at(at_s), recorded.attitudes.at(at_s)
     stamps = [f"{stamp:.3f} s" for stamp in time_s]
-    notes.warn_counted(
-        "todo-frame-has-no-position",
+    remarks.warn_counted(
+        "images-without-position",
         [stamps[row] for row in np.flatnonzero(~complete(antenna.position))],
-        f"frame has no position within --max-gap {options.max_gap:g} s",
-        f"frames have no position within --max-gap {options.max_gap:g} s",
+        f"Frames have no position within --max-gap {options.max_gap:g} s",
     )
-    position_in_ecef, enu_from_cam = camera_poses(antenna.position, body.rotation, recorded.rig, stamps, notes)
+    position_in_ecef, enu_from_cam = camera_poses(antenna.position, body.rotation, recorded.rig, stamps, remarks)
     receivers, located = (receiver,) * len(time_s), complete(position_in_ecef)
-    sigma, sigma_source = with_defaults(antenna.sigma_m, receivers, located, options, notes)
+    sigma, sigma_source = with_defaults(antenna.sigma_m, receivers, located, options, remarks)
     return ImagePoses(
         position_in_ecef=position_in_ecef,
         sigma_enu_m=sigma,

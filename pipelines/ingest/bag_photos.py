@@ -16,9 +16,9 @@ from pipelines.formats.bag import BadImageError, Bag, ImageWriter, UndecodableEr
 from pipelines.formats.exif import PhotoTags
 from pipelines.formats.image_file import MAX_PIXELS, inspect_image
 from pipelines.ingest.bag_streams import BagStreams, TopicSamples
-from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import Every, IngestOptions
 from pipelines.ingest.photo_folder import Photo, camera_priors
+from pipelines.ingest.remarks import Remarks
 from pipelines.survey.survey import CameraPrior
 
 # A frame is blurred if it is less than half as sharp as the frames around it.
@@ -35,7 +35,7 @@ def write_photos(
     *,
     options: IngestOptions,
     folder: Path,
-    notes: Notes,
+    remarks: Remarks,
     progress: Progress = SILENT,
 ) -> tuple[list[Photo], list[int]]:
     """Write the chosen frames into `folder` as `frame_nnnnnn.jpg` or `.png`, numbered as in the bag.
@@ -75,19 +75,14 @@ def write_photos(
             (folder / name).write_bytes(data)
             photos.append(Photo(name, file, PhotoTags(timestamp_s=float(images.time_s[number]))))
             numbers.append(number)
-    notes.warn_counted(
-        "todo-image-was-left-out", failed, f"image of {topic} was left out", f"images of {topic} were left out"
-    )
+    remarks.warn_counted("image-unreadable", failed, f"Images of {topic} cannot be read and are left out")
     if blurred:
-        notes.warn("todo-frames-blurred-were-passed", f"{blurred} frames are blurred and were passed over")
+        remarks.warn("blurred-frames", f"{blurred} frames are blurred and are left out (--skip-blurred).")
     if copies:
-        notes.warn(
-            "todo-frames-copies-earlier-ones", f"{copies} frames are copies of earlier ones and were left out"
-        )
+        remarks.warn("image-copies", f"{copies} frames are copies of earlier ones and are left out.")
     if writer.bits is not None:
-        notes.assume(
-            "todo-bit-images-have-bits",
-            f"16-bit images of {topic} have {writer.bits} bits in use, as the first one has",
+        remarks.assume(
+            "image-bit-depth", f"16-bit images of {topic} use {writer.bits} bits, as the first one does."
         )
     return photos, numbers
 
@@ -110,7 +105,7 @@ def _is_blurred(data: bytes, recent: deque[float]) -> bool:
 
 
 def lens_priors(
-    photos: Sequence[Photo], streams: BagStreams, options: IngestOptions, notes: Notes
+    photos: Sequence[Photo], streams: BagStreams, options: IngestOptions, remarks: Remarks
 ) -> tuple[tuple[CameraPrior, ...], dict[str, int]]:
     """Return one calibrated camera of all photographs, or else assumed ones; and each photograph's camera id.
 
@@ -118,17 +113,17 @@ def lens_priors(
     """
     sizes = {(photo.file.width, photo.file.height) for photo in photos}
     if streams.info is None or options.focal_px is not None or len(sizes) != 1:
-        return camera_priors(photos, options.focal_px, notes)
+        return camera_priors(photos, options.focal_px, remarks)
     topic = streams.images.topic
     prior, remark = _camera_prior(streams.info, "rect" in topic.rpartition("/")[2] or "_rect" in topic)
     (width, height) = next(iter(sizes))
     fitted = _scaled_prior(prior, width, height) if prior is not None else None
     if prior is not None and fitted is None:
-        remark = f"CameraInfo is of images of {prior.width}×{prior.height}, these are {width}×{height}"
+        remark = f"CameraInfo is for images of {prior.width}×{prior.height}, but these are {width}×{height}"
     if fitted is None:
-        notes.warn("todo-not-used", f"{remark}: it is not used")
-        return camera_priors(photos, options.focal_px, notes)
-    notes.assume("todo-lens-from", f"lens from {streams.info_topic}: {remark}")
+        remarks.warn("camera-info-unused", f"{remark}. It is not used.")
+        return camera_priors(photos, options.focal_px, remarks)
+    remarks.assume("lens-from-camera-info", f"The lens is from {streams.info_topic}: {remark}.")
     return (fitted,), {photo.name: 1 for photo in photos}
 
 

@@ -19,8 +19,8 @@ from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.formats.bag import COMPRESSED, IMAGE, INFO, Bag, BagTopic, RawMessage, UndecodableError
 from pipelines.ingest.bag_messages import ATTITUDES, POSITIONS, TRANSFORM_TYPES, Axes, Transforms, stamp_ns
-from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
+from pipelines.ingest.remarks import Remarks
 
 # Pictures that are no photographs.
 _NOT_PHOTOS = ("depth", "disparity", "mask", "confidence", "segmentation", "thermal", "theora")
@@ -106,11 +106,18 @@ def _pick(
         if requested not in names:
             is_other = requested in bag.topics
             problem = f"is a {bag.topics[requested].type}" if is_other else "is not in the bag"
-            fitting = f"those with {subject}: {', '.join(names)}" if names else f"no topic has {subject}"
-            raise InputError("todo-x", f"{requested} {problem}; {fitting}", path=bag.path, field=flag)
+            fitting = f"Topics with {subject}: {', '.join(names)}" if names else f"No topic has {subject}"
+            raise InputError(
+                "topic-type" if is_other else "topic-unknown",
+                f"{requested} {problem}. {fitting}.",
+                path=bag.path,
+                field=flag,
+            )
         return requested
     if len(names) > 1:
-        remarks.append(f"{subject} are from {names[0]}, not {', '.join(names[1:5])}: see {flag}")
+        remarks.append(
+            f"The {subject} are from {names[0]}, not {', '.join(names[1:5])}. {flag} selects another topic."
+        )
     return names[0] if names else None
 
 
@@ -179,7 +186,7 @@ class BagStreams:
     info_topic: str | None
 
 
-def read_streams(bag: Bag, options: IngestOptions, notes: Notes, progress: Progress = SILENT) -> BagStreams:
+def read_streams(bag: Bag, options: IngestOptions, remarks: Remarks, progress: Progress = SILENT) -> BagStreams:
     """Read everything but the pictures; messages that cannot be used are counted and noted.
 
     Raises:
@@ -187,15 +194,18 @@ def read_streams(bag: Bag, options: IngestOptions, notes: Notes, progress: Progr
     """
     topics = select_topics(bag, options)
     if topics.image is None:
-        problem = "has no topic of sensor_msgs/Image or CompressedImage: see `georef inspect`"
-        raise InputError("todo-x", problem, path=bag.path)
-    notes.assume(
-        "todo-topics-photographs-from-lens",
-        f"topics: photographs from {topics.image}, lens from {topics.info or 'none'}, positions from "
-        f"{topics.fix or 'none'}, attitudes from {topics.attitude or 'none'}",
+        raise InputError(
+            "no-image-topic",
+            "The bag has no topic of type sensor_msgs/Image or CompressedImage. `georef inspect` lists its topics.",
+            path=bag.path,
+        )
+    remarks.assume(
+        "bag-topics",
+        f"Photographs are from {topics.image}, the lens from {topics.info or 'none'}, positions from "
+        f"{topics.fix or 'none'}, attitudes from {topics.attitude or 'none'}.",
     )
     for remark in topics.remarks:
-        notes.assume("todo-x", remark)
+        remarks.assume("bag-topic-choice", remark)
     images, positions, attitudes = (
         None if topic is None else TopicSamples(topic, bag.topics[topic].type, width)
         for topic, width in ((topics.image, 0), (topics.fix, 6), (topics.attitude, 5))
@@ -221,40 +231,37 @@ def read_streams(bag: Bag, options: IngestOptions, notes: Notes, progress: Progr
             except UndecodableError as error:
                 undecodable.setdefault(message.topic, []).append(str(error)[:120])
     series = [samples for samples in (images, positions, attitudes) if samples is not None]
-    _note_losses(bag, series, undecodable, transforms.refused, notes)
-    _settle_clocks(series, notes)
+    _note_losses(bag, series, undecodable, transforms.refused, remarks)
+    _settle_clocks(series, remarks)
     return BagStreams(bag.path, images, positions, attitudes, transforms, info, topics.info)
 
 
 def _note_losses(
-    bag: Bag, series: list[TopicSamples], undecodable: dict[str, list[str]], refused: int, notes: Notes
+    bag: Bag, series: list[TopicSamples], undecodable: dict[str, list[str]], refused: int, remarks: Remarks
 ) -> None:
     for topic, errors in undecodable.items():
-        notes.warn(
-            "todo-messages-do-not-decode",
-            f"{len(errors)} messages of {topic} do not decode and were left out: {errors[0]}",
+        remarks.warn(
+            "message-damaged", f"{len(errors)} messages of {topic} do not decode and are left out: {errors[0]}."
         )
     if refused:
-        notes.warn(
-            "todo-transforms-tf-not-finite",
-            f"{refused} transforms in /tf are not finite or not possible and were left out",
+        remarks.warn(
+            "transform-unusable", f"{refused} transforms in /tf are not finite or impossible, and are left out."
         )
     if bag.damage is not None:
         count = sum(samples.messages for samples in series)
-        notes.warn(
-            "todo-damaged-could-be-read",
-            f"{bag.path.name} is damaged: it could be read for {count} messages only ({bag.damage})",
+        remarks.warn(
+            "bag-damaged", f"{bag.path.name} is damaged: only {count} messages could be read ({bag.damage})."
         )
     if bag.fallback_types:
-        notes.assume(
-            "todo-bag-lacks-definitions-usual",
-            f"the bag lacks definitions of {', '.join(sorted(bag.fallback_types))}: the usual ones are used",
+        remarks.assume(
+            "message-definitions",
+            f"The bag lacks definitions of {', '.join(sorted(bag.fallback_types))}: the usual ones are used.",
         )
     for samples in series:
         for problem, count in samples.problems.items():
-            notes.warn(
-                "todo-messages-were-left-out",
-                f"{count} of {samples.messages} messages of {samples.topic} were left out: {problem}",
+            remarks.warn(
+                "message-unusable",
+                f"{count} of {samples.messages} messages of {samples.topic} are left out: {problem}.",
             )
 
 
@@ -289,7 +296,7 @@ def _add_navigation(
             attitudes.add(stamp_ns(decoded), message.bag_ns, (*attitude.quat_xyzw, attitude.sigma_deg))
 
 
-def _settle_clocks(series: list[TopicSamples], notes: Notes) -> None:
+def _settle_clocks(series: list[TopicSamples], remarks: Remarks) -> None:
     """Put the samples of all topics on one clock, in seconds: the messages' own stamps, where they have any.
 
     Messages without a stamp get the time of recording. Topics that count from another epoch than the rest (since
@@ -310,31 +317,31 @@ def _settle_clocks(series: list[TopicSamples], notes: Notes) -> None:
     for topic, (stamp, bag) in raw.items():
         without = int((stamp == 0).sum())
         if without:
-            notes.assume(
-                "todo-messages-have-no-stamp",
-                f"{without} messages of {topic} have no stamp: the time of recording is used",
+            remarks.assume(
+                "messages-without-stamp",
+                f"{without} messages of {topic} have no stamp: the time of recording is used.",
             )
         time = np.where(stamp == 0, bag + offset[topic], stamp)
         jump = np.abs(time - bag - offset[topic]) > _JUMP_NS
-        _note_left_out(notes, jump, topic, "have a stamp more than a minute off the others")
+        _note_left_out(remarks, "stamp-jump", jump, topic, "have a stamp more than a minute off the others")
         if mixed and topic in other_epoch:
             time = time - offset[topic]
-            notes.assume(
-                "todo-stamps-count-from-another",
-                f"stamps of {topic} count from another epoch: brought to the recorder's clock by their median",
+            remarks.assume(
+                "clock-epoch",
+                f"Stamps of {topic} count from another epoch and are brought to the recorder's clock by their "
+                "median.",
             )
         usable = ~jump
         latest = np.maximum.accumulate(np.where(usable, time, np.iinfo(np.int64).min))
         backwards = usable & np.concatenate([[False], time[1:] <= latest[:-1]])
-        _note_left_out(notes, backwards, topic, "have a stamp that is not later than one before")
+        _note_left_out(
+            remarks, "stamp-not-later", backwards, topic, "have a stamp that is not later than one before"
+        )
         for samples in series:
             if samples.topic == topic:  # positions and attitudes may be of one topic
                 samples.time_s, samples.usable = time / 1e9, usable & ~backwards
 
 
-def _note_left_out(notes: Notes, bad: BoolArray, topic: str, reason: str) -> None:
+def _note_left_out(remarks: Remarks, code: str, bad: BoolArray, topic: str, reason: str) -> None:
     if bad.any():
-        notes.warn(
-            "todo-messages-were-left-out",
-            f"{int(bad.sum())} of {len(bad)} messages of {topic} {reason}, and were left out",
-        )
+        remarks.warn(code, f"{int(bad.sum())} of {len(bad)} messages of {topic} {reason}, and are left out.")

@@ -25,16 +25,16 @@ from pipelines.geodesy.operations import WGS84
 from pipelines.geodesy.vertical import ELLIPSOIDAL, FOOT_M, MOST_GEOID_M, VerticalDatum
 from pipelines.geometry.rotations import geo_from_cam
 from pipelines.ingest.flight_record import ImagePoses, with_defaults
-from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo
+from pipelines.ingest.remarks import Remarks
 from pipelines.robust.patterns import blunders_among, median_spacing, scatter_about_median, two_groups
 from pipelines.robust.statistics import mad_sigma
 
 # Vertical over horizontal σ of a fix that states only the horizontal one.
 _VERTICAL_RATIO = 2.0
 _RECEIVER = {RTK_FIXED: "RTK fixed", RTK_FLOAT: "RTK float"}
-_EXIF_NOTE = "EXIF altitude, which is often above a geoid or barometric, taken as ellipsoidal: see --vertical"
+_EXIF_NOTE = "EXIF's altitude is often above a geoid or barometric, and --vertical states its datum"
 _SIGMAS, _LEAST_M = 4.0, 1.0
 _MOST_CONTRADICTING = 1 / 3
 # Another unit shows if heights differ by this many times what σ allow, and that unit leaves this part of a height.
@@ -43,7 +43,7 @@ _KILOMETRES_M = 2_000.0
 _LEAST_TIMED = 6  # photographs, for a velocity
 
 
-def poses_from_tags(photos: Sequence[Photo], options: IngestOptions, notes: Notes) -> ImagePoses:
+def poses_from_tags(photos: Sequence[Photo], options: IngestOptions, remarks: Remarks) -> ImagePoses:
     """Return positions from EXIF, attitudes and RTK σ from DJI's XMP.
 
     Raises:
@@ -55,22 +55,21 @@ def poses_from_tags(photos: Sequence[Photo], options: IngestOptions, notes: Note
             xyz[row] = photo.tags.gps.lon_deg, photo.tags.gps.lat_deg, _or_nan(altitude_m(photo.tags))
     located = complete(xyz)
     flat = [photo.name for photo in photos if photo.tags.gps is not None and altitude_m(photo.tags) is None]
-    notes.warn_counted(
-        "todo-image-has-gps-position",
-        flat,
-        "image has a GPS position without altitude",
-        "images have GPS positions without altitude",
+    remarks.warn_counted(
+        "image-without-altitude", flat, "Images have a GPS position without altitude, which is not used"
     )
     datums = sorted({photo.tags.gps.datum for photo in photos if photo.tags.gps is not None} - {""})
     if datums:
-        notes.assume("todo-gpsmapdatum-taken-wgs", f"GPSMapDatum {', '.join(datums)} is taken as WGS84")
+        remarks.assume(
+            "exif-datum", f"The datum {', '.join(datums)} of EXIF's positions (GPSMapDatum) is taken as WGS84."
+        )
     crs = parse_crs(WGS84, vertical=options.vertical)
     position_in_ecef = np.full((len(photos), 3), np.nan)
     position_in_ecef[located] = ecef_from_lla(crs.lla_from_xyz(xyz[located]))
     stated = np.array([_stated_sigma(photo.tags) for photo in photos])
     flags = [0 if photo.tags.dji is None else photo.tags.dji.rtk_flag or 0 for photo in photos]
     receivers = tuple(_RECEIVER.get(flag, "single-frequency") for flag in flags)
-    sigma, sigma_source = with_defaults(stated, receivers, located, options, notes)
+    sigma, sigma_source = with_defaults(stated, receivers, located, options, remarks)
     assumed = VerticalDatum(name=ELLIPSOIDAL, stated=False, note=_EXIF_NOTE)
     return ImagePoses(
         position_in_ecef=position_in_ecef,
@@ -125,7 +124,7 @@ def _or_nan(value: float | None) -> float:
 
 
 def compare_with_exif(
-    poses: ImagePoses, photos: Sequence[Photo], path: Path, options: IngestOptions, notes: Notes
+    poses: ImagePoses, photos: Sequence[Photo], path: Path, options: IngestOptions, remarks: Remarks
 ) -> None:
     """Compare the positions of a table, whose file is `path`, with those of EXIF; what differs is a caution.
 
@@ -134,7 +133,7 @@ def compare_with_exif(
     """
     # Stated σ are those of the table: a track good to centimetres says nothing about the photographs' receiver.
     own_sigma = options.model_copy(update={"sigma_h": None, "sigma_v": None})
-    exif = poses_from_tags(photos, own_sigma, Notes())
+    exif = poses_from_tags(photos, own_sigma, Remarks())
     both = np.flatnonzero(poses.located & exif.located)
     if not len(both):
         return
@@ -157,10 +156,10 @@ def compare_with_exif(
     for fatal, caution in filter(None, found):
         if fatal and not options.accept_contradiction:
             raise ContradictionError(
-                "todo-correct-what-wrong-or",
-                f"{path}: {caution.sentence}. Correct what is wrong, or go on with --accept-contradiction",
+                caution.code,
+                f"{path}: {caution.sentence} Correct the wrong file, or continue with --accept-contradiction.",
             )
-        notes.caution(caution.code, caution.sentence)
+        remarks.caution(caution.code, caution.sentence)
 
 
 @dataclass(frozen=True)

@@ -21,9 +21,9 @@ from pipelines.geodesy.enu import Origin, ecef_from_enu_rotation, enu_from_ecef,
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.trajectory import Rig, Trajectory, mount, with_rig
-from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo
+from pipelines.ingest.remarks import Remarks
 from pipelines.survey.calibrated import NavigationTrack
 from pipelines.survey.survey import CameraPrior
 
@@ -110,7 +110,7 @@ class FlightRecord:
 
 
 def with_defaults(
-    stated: FloatArray, receivers: Sequence[str], located: BoolArray, options: IngestOptions, notes: Notes
+    stated: FloatArray, receivers: Sequence[str], located: BoolArray, options: IngestOptions, remarks: Remarks
 ) -> tuple[FloatArray, tuple[SigmaSource, ...]]:
     """Return σ east, north, up (N, 3) by precedence, and who gave it (N,).
 
@@ -129,9 +129,10 @@ def with_defaults(
         parts = [f"{horizontal_m:g} m horizontal"] if options.sigma_h is None else []
         parts += [f"{vertical_m:g} m vertical"] if options.sigma_v is None else []
         if rows.any() and parts:
-            notes.assume(
-                "todo-positions-without-one",
-                f"σ of positions without one ({int(rows.sum())}): {', '.join(parts)} ({receiver})",
+            remarks.assume(
+                "default-position-sigma",
+                f"{int(rows.sum())} positions have no σ of their own: {', '.join(parts)} is assumed ({receiver}). "
+                "State it with --sigma-h and --sigma-v.",
             )
     overridden = options.sigma_h is not None or options.sigma_v is not None
     sources: list[SigmaSource] = ["option" if overridden else "file" if row else "default" for row in from_file]
@@ -165,12 +166,16 @@ def track_in_geo(recorded: RecordedNavigation, origin: Origin) -> NavigationTrac
     )
 
 
-def require_enough(count: int, source: Path, field: str, notes: Notes) -> None:
+def require_enough(count: int, source: Path, field: str, remarks: Remarks) -> None:
     """Refuse fewer photographs than a survey needs, with everything that was noted on the way."""
     if count < LEAST_IMAGES:
-        reasons = "".join(f"; {warning.sentence}" for warning in notes.warnings)
-        message = f"{count} usable images, a survey needs {LEAST_IMAGES}{reasons}"
-        raise InputError("todo-x", message, path=source, field=field)
+        reasons = "".join(f" {warning.sentence}" for warning in remarks.warnings)
+        raise InputError(
+            "too-few-images",
+            f"{count} images are usable, at least {LEAST_IMAGES} are needed.{reasons}",
+            path=source,
+            field=field,
+        )
 
 
 def given_rig(options: IngestOptions) -> Rig:
@@ -187,7 +192,7 @@ def body_mount(rig: Rig) -> FloatArray:
     return np.eye(3) if rig.cam_from_body is None else rig.cam_from_body
 
 
-def at_cameras(poses: ImagePoses, rig: Rig, names: Sequence[str], notes: Notes) -> ImagePoses:
+def at_cameras(poses: ImagePoses, rig: Rig, names: Sequence[str], remarks: Remarks) -> ImagePoses:
     """Bring positions of the antenna to the camera, and attitudes of the nominal camera to the true one.
 
     Raises:
@@ -195,18 +200,18 @@ def at_cameras(poses: ImagePoses, rig: Rig, names: Sequence[str], notes: Notes) 
     """
     if rig.antenna_in_body is not None and rig.cam_from_body is None:
         raise InputError(
-            "todo-given-body-axes-give",
-            "is given in the body's axes: give --camera-mount YAW,PITCH,ROLL too",
+            "mount-missing",
+            "--lever-arm is given in the axes of the body. Give these with --camera-mount YAW,PITCH,ROLL.",
             field="--lever-arm",
         )
     mounted = replace(rig, cam_from_body=body_mount(rig))
     enu_from_body = poses.enu_from_cam @ body_mount(rig)
-    position_in_ecef, enu_from_cam = camera_poses(poses.position_in_ecef, enu_from_body, mounted, names, notes)
+    position_in_ecef, enu_from_cam = camera_poses(poses.position_in_ecef, enu_from_body, mounted, names, remarks)
     return replace(poses, position_in_ecef=position_in_ecef, enu_from_cam=enu_from_cam)
 
 
 def camera_poses(
-    antenna_in_ecef: FloatArray, enu_from_body: FloatArray, rig: Rig, names: Sequence[str], notes: Notes
+    antenna_in_ecef: FloatArray, enu_from_body: FloatArray, rig: Rig, names: Sequence[str], remarks: Remarks
 ) -> tuple[FloatArray, FloatArray]:
     """Return camera centres in ECEF (N, 3) and attitudes camera → East-North-Up (N, 3, 3), NaN where unknown.
 
@@ -217,11 +222,10 @@ def camera_poses(
     offset_in_enu, enu_from_cam = with_rig(np.zeros_like(antenna_in_ecef), enu_from_body, rig)
     located = complete(antenna_in_ecef)
     lost = np.flatnonzero(located & ~complete(offset_in_enu))
-    notes.warn_counted(
-        "todo-position-without-attitude-apply",
+    remarks.warn_counted(
+        "attitude-missing",
         [names[row] for row in lost.tolist()],
-        "position is without an attitude to apply the lever arm by, and was left out",
-        "positions are without attitudes to apply the lever arm by, and were left out",
+        "Positions without an attitude to apply the lever arm with are left out",
     )
     ecef_from_enu = ecef_from_enu_rotation(lla_from_ecef(antenna_in_ecef[located]))
     position_in_ecef = antenna_in_ecef.copy()

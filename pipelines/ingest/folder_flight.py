@@ -32,9 +32,9 @@ from pipelines.ingest.flight_record import (
     given_rig,
     require_enough,
 )
-from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo, camera_priors, scan_folder
+from pipelines.ingest.remarks import Remarks
 from pipelines.ingest.table_poses import poses_from_table
 
 _EVENT_NUMBER = re.compile(r"(?<!\d)\d{4}(?!\d)")  # DJI_20240501120000_0007_V, DJI_0007, 100_0042_0007
@@ -43,7 +43,7 @@ _MOST_SPREAD_S = 3.0
 
 
 def read_folder(
-    folder: Path, options: IngestOptions, notes: Notes, progress: Progress = SILENT, *, decode: bool = True
+    folder: Path, options: IngestOptions, remarks: Remarks, progress: Progress = SILENT, *, decode: bool = True
 ) -> FlightRecord:
     """Read photographs, and the trajectory or `geo.txt` that the options name; `decode` as of `scan_folder`.
 
@@ -51,55 +51,55 @@ def read_folder(
         ContradictionError: the files contradict each other.
         InputError: anything wrong with the files, or too few photographs.
     """
-    photos = scan_folder(folder, notes, progress, decode=decode)
-    require_enough(len(photos), folder, "--images", notes)
+    photos = scan_folder(folder, remarks, progress, decode=decode)
+    require_enough(len(photos), folder, "--images", remarks)
     for problem in sorted({problem for photo in photos for problem in photo.tags.problems}):
         with_it = [photo.name for photo in photos if problem in photo.tags.problems]
-        notes.warn_counted("todo-image-where", with_it, f"image where {problem}", f"images where {problem}")
-    notes.warn_counted(
-        "todo-image-has-exif-orientation",
+        remarks.warn_counted("exif-unusable", with_it, f"Tags of images are not used, because {problem}")
+    remarks.warn_counted(
+        "exif-orientation",
         [photo.name for photo in photos if photo.tags.orientation != 1],
-        "image has an EXIF orientation, which is ignored: pixels count as stored",
-        "images have an EXIF orientation, which is ignored: pixels count as stored",
+        "Images have an EXIF orientation, which is ignored: pixels are read as stored",
     )
-    poses = _poses(photos, options, notes)
+    poses = _poses(photos, options, remarks)
     if options.time_offset_s and poses.recorded is None:
         raise InputError(
-            "todo-for-navigation-by-time",
-            "is for navigation by time: a --bag, or a --trajectory without a column of images",
+            "time-offset-without-times",
+            "--time-offset needs a --bag, or a --trajectory with times and without image names. Remove "
+            "--time-offset.",
             field="--time-offset",
         )
     rig, names = given_rig(options), [photo.name for photo in photos]
     navigation = None
     if poses.recorded is not None:
         navigation = _navigation(poses.recorded, rig, names, poses.time_s, options)
-    poses = at_cameras(poses, rig, names, notes)
-    cameras, camera_of = camera_priors(photos, options.focal_px, notes)
+    poses = at_cameras(poses, rig, names, remarks)
+    cameras, camera_of = camera_priors(photos, options.focal_px, remarks)
     return FlightRecord(folder.resolve(), photos, cameras, camera_of, poses, navigation)
 
 
-def _poses(photos: list[Photo], options: IngestOptions, notes: Notes) -> ImagePoses:
+def _poses(photos: list[Photo], options: IngestOptions, remarks: Remarks) -> ImagePoses:
     if options.trajectory is not None:
-        table = _read_positions(options.trajectory, photos, notes)
+        table = _read_positions(options.trajectory, photos, remarks)
     elif options.geo is not None:
         table = read_geo(options.geo)
     else:
-        return poses_from_tags(photos, options, notes)
+        return poses_from_tags(photos, options, remarks)
     if options.events is None:
-        return poses_from_table(table, photos, options, notes)
+        return poses_from_table(table, photos, options, remarks)
     if table.names is not None:
         raise InputError(
-            "todo-for-trajectory-by-time",
-            "is for a --trajectory by time: this one names its images",
+            "events-without-times",
+            f"--events needs a trajectory with times; {table.path.name} lists image names. Remove --events.",
             field="--events",
         )
     events = read_mrk(options.events)
-    rows = _event_of_each(events, photos, notes)
+    rows = _event_of_each(events, photos, remarks)
     timed = []
     for photo, row in zip(photos, rows, strict=True):
         time_s = float(events.time_s[row]) if row >= 0 else None
         timed.append(replace(photo, tags=replace(photo.tags, timestamp_s=time_s, time_source=None)))
-    poses = poses_from_table(table, timed, options, notes)
+    poses = poses_from_table(table, timed, options, remarks)
     # From the antenna to the camera, by the events' offsets.
     moved = np.flatnonzero(poses.located & (rows >= 0))
     position = poses.position_in_ecef.copy()
@@ -108,7 +108,7 @@ def _poses(photos: list[Photo], options: IngestOptions, notes: Notes) -> ImagePo
     return replace(poses, position_in_ecef=position, recorded=None)
 
 
-def _read_positions(path: Path, photos: Sequence[Photo], notes: Notes) -> PoseTable:
+def _read_positions(path: Path, photos: Sequence[Photo], remarks: Remarks) -> PoseTable:
     """Read a table of poses; the kind of the file follows from its content, and is noted.
 
     1. The first line begins with %: RTKLIB's solution.
@@ -118,26 +118,23 @@ def _read_positions(path: Path, photos: Sequence[Photo], notes: Notes) -> PoseTa
     """
     lines = [line for line in beginning(path).splitlines() if line.strip()]
     if lines and lines[0].startswith("%"):
-        notes.assume(
-            "todo-read-rtklib-solution-positions",
-            f"{path.name} is read as RTKLIB's solution: positions of the antenna",
-        )
+        remarks.assume("file-kind", f"{path.name} is read as RTKLIB's solution: positions of the antenna.")
         return read_pos(path)
     if lines and FIRST_LINE.match(lines[0]):
-        notes.assume(
-            "todo-read-dji-timestamp-file",
-            f"{path.name} is read as DJI's timestamp file: positions of the camera, by photograph number",
+        remarks.assume(
+            "file-kind",
+            f"{path.name} is read as DJI's timestamp file: positions of the camera, by photograph number.",
         )
-        return _positions_of_events(read_mrk(path), photos, notes)
+        return _positions_of_events(read_mrk(path), photos, remarks)
     if any(HEADER.match(line) for line in lines):
-        notes.assume("todo-read", f"{path.name} is read as {REFERENCE}")
+        remarks.assume("file-kind", f"{path.name} is read as {REFERENCE}.")
         return read_cameras(path)
     return read_trajectory(path)
 
 
-def _positions_of_events(events: CameraEvents, photos: Sequence[Photo], notes: Notes) -> PoseTable:
+def _positions_of_events(events: CameraEvents, photos: Sequence[Photo], remarks: Remarks) -> PoseTable:
     """Return the positions of the photographs' events, as a table by name."""
-    row_of_photo = _event_of_each(events, photos, notes)
+    row_of_photo = _event_of_each(events, photos, remarks)
     rows = row_of_photo[row_of_photo >= 0]
     return PoseTable(
         path=events.path,
@@ -153,7 +150,7 @@ def _positions_of_events(events: CameraEvents, photos: Sequence[Photo], notes: N
     )
 
 
-def _event_of_each(events: CameraEvents, photos: Sequence[Photo], notes: Notes) -> IntArray:
+def _event_of_each(events: CameraEvents, photos: Sequence[Photo], remarks: Remarks) -> IntArray:
     """Return the row of each photograph's event (N,), −1 without one; what did not fit is noted.
 
     Raises:
@@ -170,31 +167,30 @@ def _event_of_each(events: CameraEvents, photos: Sequence[Photo], notes: Notes) 
     folders = sorted({PurePosixPath(photo.name).parent.as_posix() for photo, _ in tied})
     if not folders:
         raise InputError(
-            "todo-has-events-no-photograph",
-            f"has the events {events.number.min()} to {events.number.max()}, and no photograph has such a number "
-            f"in its name, as DJI_0007.JPG has: the folder has {photos[0].name!r} …",
+            "event-numbers",
+            f"The events have the numbers {events.number.min()} to {events.number.max()}, and no photograph has "
+            "such a number in its name "
+            f"(as DJI_0007.JPG has); the folder has {photos[0].name!r} …",
             path=events.path,
         )
     if len(folders) > 1:
         raise InputError(
-            "todo-counts-photographs-one-flight",
-            "counts the photographs of one flight, but its numbers occur in several folders "
-            f"({', '.join(folders[:3])}): take one folder and its file",
+            "event-folders",
+            "The file numbers the photographs of one flight, but its numbers occur in several folders "
+            f"({', '.join(folders[:3])}). Give one folder and its file.",
             path=events.path,
         )
     _refuse_other_times(events, [(photo, row) for photo, row in tied if photo.tags.timestamp_s])
-    notes.warn_counted(
-        "todo-image-has-no-event",
+    remarks.warn_counted(
+        "image-without-event",
         [photo.name for photo, row in zip(photos, rows, strict=True) if row < 0],
-        f"image has no event in {events.path.name}",
-        f"images have no event in {events.path.name}",
+        f"Images have no event in {events.path.name}",
     )
     unused = np.setdiff1d(np.arange(len(events.number)), rows)
-    notes.warn_counted(
-        "todo-event-has-no-photograph",
+    remarks.warn_counted(
+        "event-without-image",
         [f"{events.path.name}:{events.lines[row]}" for row in unused.tolist()],
-        "event has no photograph here",
-        "events have no photographs here",
+        "Events have no photograph here",
     )
     return rows
 
@@ -208,10 +204,10 @@ def _refuse_other_times(events: CameraEvents, timed: Sequence[tuple[Photo, int]]
     if off_s.max() > _MOST_SPREAD_S:
         worst = timed[int(off_s.argmax())][0].name
         raise ContradictionError(
-            "todo-by-number-photographs-do",
-            f"{events.path}: by number, {int((off_s > _MOST_SPREAD_S).sum())} of {len(timed)} photographs do not "
-            f"have the times of their events (EXIF of {worst}: {off_s.max():.0f} s off): is it the file of another "
-            "flight?",
+            "event-times",
+            f"{events.path}: {int((off_s > _MOST_SPREAD_S).sum())} of {len(timed)} photographs do not have the "
+            "times of the events with "
+            f"their numbers (EXIF of {worst} is off by {off_s.max():.0f} s). Is it the file of another flight?",
         )
 
 

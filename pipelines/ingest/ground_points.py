@@ -16,10 +16,10 @@ from pipelines.formats.ground_points import GroundPoints, ListedMark
 from pipelines.formats.tables import beginning, is_number, separator_of, split
 from pipelines.geodesy.crs import PointCrs
 from pipelines.geodesy.enu import ecef_from_lla
-from pipelines.ingest.notes import Notes, shortened
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import ImageNames
 from pipelines.ingest.reference_system import crs_of_points, east_first, note_operation
+from pipelines.ingest.remarks import Remarks, shortened
 from pipelines.survey.survey import Mark
 
 _LEAST_MARKS = 2
@@ -58,7 +58,7 @@ class GroundFile:
     listed_marks: tuple[tuple[Path, Sequence[ListedMark]], ...]
 
 
-def read_ground_files(options: IngestOptions, notes: Notes) -> tuple[GroundFile | None, GroundFile | None]:
+def read_ground_files(options: IngestOptions, remarks: Remarks) -> tuple[GroundFile | None, GroundFile | None]:
     """Return control and check points on Earth, not yet tied to images.
 
     Marks of the table of marks that name no point are noted.
@@ -67,18 +67,17 @@ def read_ground_files(options: IngestOptions, notes: Notes) -> tuple[GroundFile 
         InputError: a malformed file, no CRS, one name at two places, or impossible coordinates.
     """
     control, check = (
-        None if path is None else _placed(_recognised(path, notes), options, notes)
+        None if path is None else _placed(_recognised(path, remarks), options, remarks)
         for path in (options.gcp, options.checkpoints)
     )
     if options.marks is None:
         return control, check
     marks = ground_points.read_marks(options.marks)
     known = {point.name for file in (control, check) if file is not None for point in file.points}
-    notes.warn_counted(
-        "todo-mark-names-no-ground",
+    remarks.warn_counted(
+        "mark-of-unknown-point",
         [f"{options.marks.name}:{mark.line} ({mark.name})" for mark in marks if mark.name not in known],
-        "mark names no ground point",
-        "marks name no ground point",
+        "Marks name no ground point",
     )
     return (
         None if control is None else _with_table_of_marks(control, options.marks, marks),
@@ -92,7 +91,7 @@ def _with_table_of_marks(file: GroundFile, path: Path, marks: Sequence[ListedMar
     return replace(file, listed_marks=(*file.listed_marks, (path, own)))
 
 
-def _recognised(path: Path, notes: Notes) -> GroundPoints:
+def _recognised(path: Path, remarks: Remarks) -> GroundPoints:
     """Read ground points; the kind of the file follows from its content, and is noted.
 
     1. XML: Metashape's markers.
@@ -110,24 +109,20 @@ def _recognised(path: Path, notes: Notes) -> GroundPoints:
         listed = ground_points.read_point_table(path)
     else:
         return ground_points.read_ground_points(path)
-    notes.assume("todo-read", f"{path.name} is read as {listed.kind}")
-    notes.warn_counted(
-        "todo-column-unknown-was-ignored",
+    remarks.assume("file-kind", f"{path.name} is read as {listed.kind}.")
+    remarks.warn_counted(
+        "unknown-column",
         [f"{path.name} ({name})" for name in listed.unknown_columns],
-        "column is unknown and was ignored",
-        "columns are unknown and were ignored",
+        "Columns are unknown and are ignored",
     )
-    notes.warn_counted(
-        "todo-mark-not-pinned-so",
-        listed.left_out,
-        "mark is not pinned, so placed by Metashape itself, and was left out",
-        "marks are not pinned, so placed by Metashape itself, and were left out",
+    remarks.warn_counted(
+        "mark-not-pinned", listed.left_out, "Marks that are not pinned (Metashape set them itself) are left out"
     )
     checks = [point.name for point in listed.points if point.is_check]
     if checks:
-        notes.assume(
-            "todo-points-not-enabled-check",
-            f"points that are not enabled in {path.name} are check points: {shortened(checks)}",
+        remarks.assume(
+            "points-not-enabled",
+            f"Points that are not enabled in {path.name} are check points: {shortened(checks)}.",
         )
     return listed
 
@@ -141,11 +136,11 @@ def _begins_a_table(lines: list[str], path: Path) -> bool:
     return len(cells) >= 4 and (all(map(is_number, cells[1:4])) or not any(map(is_number, cells)))
 
 
-def _placed(listed: GroundPoints, options: IngestOptions, notes: Notes) -> GroundFile:
-    crs = crs_of_points(listed, options, notes)
-    xyz = east_first(listed, crs, notes)
+def _placed(listed: GroundPoints, options: IngestOptions, remarks: Remarks) -> GroundFile:
+    crs = crs_of_points(listed, options, remarks)
+    xyz = east_first(listed, crs, remarks)
     lla = crs.lla_from_xyz(xyz, path=listed.path, lines=[point.line for point in listed.points])
-    note_operation(crs, lla, notes)
+    note_operation(crs, lla, remarks)
     points = tuple(
         GroundPoint(point.name, position, point.line, point.sigma_h_m, point.sigma_v_m, point.is_check)
         for point, position in zip(listed.points, ecef_from_lla(lla), strict=True)
@@ -153,7 +148,9 @@ def _placed(listed: GroundPoints, options: IngestOptions, notes: Notes) -> Groun
     return GroundFile(listed.path, crs, points, ((listed.path, listed.marks),))
 
 
-def tie_marks(file: GroundFile, sizes: Mapping[str, tuple[int, int]], sigma_px: float, notes: Notes) -> GroundFile:
+def tie_marks(
+    file: GroundFile, sizes: Mapping[str, tuple[int, int]], sigma_px: float, remarks: Remarks
+) -> GroundFile:
     """Return the points of a file with their marks in the images; marks in images that are not here are noted.
 
     `sizes` has width and height of each image by name.
@@ -173,26 +170,31 @@ def tie_marks(file: GroundFile, sizes: Mapping[str, tuple[int, int]], sigma_px: 
             width, height = sizes[image]
             if not (0.0 <= mark.x_px <= width and 0.0 <= mark.y_px <= height):
                 raise InputError(
-                    "todo-mark-at-lies-outside",
-                    f"the mark of {mark.name} at ({mark.x_px:g}, {mark.y_px:g}) lies outside {image} "
-                    f"({width}×{height} pixels): was it made on an image of another size?",
+                    "mark-outside-image",
+                    f"The mark of {mark.name} at ({mark.x_px:g}, {mark.y_px:g}) lies outside {image} "
+                    f"({width}×{height} px). "
+                    "Was it made on an image of another size?",
                     path=path,
                     line=mark.line,
                     field="px py",
                 )
             if image in marks[mark.name]:
-                message = f"{mark.name} is marked in {image} already"
-                raise InputError("todo-x", message, path=path, line=mark.line, field="image")
+                raise InputError(
+                    "mark-twice",
+                    f"{mark.name} is already marked in {image}.",
+                    path=path,
+                    line=mark.line,
+                    field="image",
+                )
             marks[mark.name][image] = Mark(image=image, x_px=mark.x_px, y_px=mark.y_px, sigma_px=sigma_px)
         if listed and len(unknown) == len(listed):
-            message = f"names none of the images: it has {listed[0].image!r} …, the folder {min(sizes)!r} …"
-            raise InputError("todo-x", message, path=path, field="image")
-        notes.warn_counted(
-            "todo-mark-image-not-here",
-            unknown,
-            "mark is in an image that is not here",
-            "marks are in images that are not here",
-        )
+            raise InputError(
+                "no-image-matched",
+                f"The file names none of the images: it has {listed[0].image!r} …, the folder {min(sizes)!r} …",
+                path=path,
+                field="image",
+            )
+        remarks.warn_counted("mark-in-unknown-image", unknown, "Marks are in images that are not here")
     points = tuple(replace(point, marks=tuple(marks[point.name].values())) for point in file.points)
     return replace(file, points=points)
 
@@ -209,34 +211,39 @@ def split_checks(
     usable = {point.name for point in points}
     for name in names:
         if name not in usable:
-            message = f"{name!r} is no usable point there: it has {', '.join(sorted(usable))}"
-            raise InputError("todo-x", message, path=None if control is None else control.path, field="--check")
+            raise InputError(
+                "check-not-a-point",
+                f"{name!r} is no control point with coordinates: the file has {', '.join(sorted(usable))}.",
+                path=None if control is None else control.path,
+                field="--check",
+            )
     listed = () if check is None else check.points
     for point in listed:
         twin = next((other for other in points if _are_one(other, point)), None)
         if check is not None and twin is not None:
-            message = (
-                f"{point.name} is also control point {twin.name} (line {twin.line}): it can be one of them only"
+            raise InputError(
+                "point-control-and-check",
+                f"{point.name} is also control point {twin.name} (line {twin.line}). Remove one of them.",
+                path=check.path,
+                line=point.line,
             )
-            raise InputError("todo-x", message, path=check.path, line=point.line)
     moved = [point.name in names or point.is_check for point in points]
     kept = tuple(point for point, is_check in zip(points, moved, strict=True) if not is_check)
     return kept, (*listed, *(point for point, is_check in zip(points, moved, strict=True) if is_check))
 
 
 def unmarked_points(
-    control: Sequence[GroundPoint], check: Sequence[GroundPoint], notes: Notes
+    control: Sequence[GroundPoint], check: Sequence[GroundPoint], remarks: Remarks
 ) -> dict[Use, list[GroundPoint]]:
     """Return the points whose marks do not place them, by use; they are noted, as they enter nothing."""
     points: dict[Use, list[GroundPoint]] = {
         "control": [point for point in control if not point.is_marked],
         "check": [point for point in check if not point.is_marked],
     }
-    notes.warn_counted(
-        "todo-ground-point-has-marks",
+    remarks.warn_counted(
+        "point-unmarked",
         [f"{point.name} ({use})" for use, of_use in points.items() for point in of_use],
-        "ground point has marks in fewer than 2 images, and enters nothing until it is marked",
-        "ground points have marks in fewer than 2 images, and enter nothing until they are marked",
+        "Ground points with marks in fewer than 2 images are not used until they are marked",
     )
     return points
 
@@ -252,5 +259,10 @@ def require_near(file: GroundFile, middle_in_ecef: FloatArray) -> None:
     for point in file.points:
         distance_m = float(np.linalg.norm(point.position_in_ecef - middle_in_ecef))
         if distance_m > _RANGE_M:
-            message = f"{point.name} is {distance_m / 1000:.0f} km from the images: wrong CRS, or x and y swapped?"
-            raise InputError("todo-x", message, path=file.path, line=point.line)
+            raise InputError(
+                "point-far-away",
+                f"{point.name} is {distance_m / 1000:.0f} km from the images. Is the CRS wrong, or are x and y "
+                "swapped?",
+                path=file.path,
+                line=point.line,
+            )

@@ -169,60 +169,58 @@ def check_options(options: IngestOptions, frames: Path | None) -> None:
     """Refuse options that make no survey; photographs of a bag need a place, `frames`, to be written to."""
     if options.bag is not None:
         _check_bag(options, frames)
-    elif given := [name for name in _BAG_ONLY if getattr(options, name) is not None]:
-        raise InputError(
-            "todo-for-bag-which-not", "is for a --bag, which is not given", field="--" + given[0].replace("_", "-")
-        )
+    else:
+        for name in _BAG_ONLY:
+            if getattr(options, name) is not None:
+                flag = flag_name(IngestOptions, name)
+                raise InputError("needs-bag", f"{flag} needs a --bag, which is not given.", field=flag)
     if options.trajectory is not None and options.geo is not None:
-        raise InputError("todo-give-trajectory-or-geo", "give a trajectory or a geo.txt, not both", field="--geo")
+        raise InputError(
+            "two-position-files", "--trajectory and --geo are both given. Remove one of them.", field="--geo"
+        )
     if options.crs is not None and options.trajectory is None:
         raise InputError(
-            "todo-for-columns-trajectory-other",
-            "is for the columns of --trajectory; other files state their CRS",
+            "crs-without-trajectory",
+            "--crs is for the x,y,z columns of --trajectory; other files state their CRS. Remove --crs.",
             field="--crs",
         )
     if options.events is not None and (options.trajectory is None or options.lever_arm is not None):
         raise InputError(
-            "todo-for-trajectory-antenna-by",
-            "is for a --trajectory of the antenna by time, and has the lever arm itself: give it with --trajectory "
-            "and without --lever-arm; as positions, a .MRK is given by --trajectory",
+            "events-need-antenna-track",
+            "--events needs the antenna's --trajectory with times, and has the lever arm itself. Give "
+            "--trajectory, and remove --lever-arm. "
+            "A .MRK without a trajectory is given by --trajectory.",
             field="--events",
         )
     for name in ("marks", "gcp_crs"):
         if getattr(options, name) is not None and options.gcp is None and options.checkpoints is None:
+            flag = flag_name(IngestOptions, name)
             raise InputError(
-                "todo-for-ground-points-give",
-                "is for ground points: give --gcp or --checkpoints",
-                field=flag_name(IngestOptions, name),
+                "needs-ground-points", f"{flag} needs ground points. Give --gcp or --checkpoints.", field=flag
             )
     if options.check and options.gcp is None:
-        raise InputError(
-            "todo-names-points-gcp-which", "names points of --gcp, which is not given", field="--check"
-        )
+        raise InputError("check-without-gcp", "--check names points of --gcp, which is not given.", field="--check")
     if options.test_every == 1:
         raise InputError(
-            "todo-would-leave-nothing-train",
-            "1 would leave nothing to train on: give 0, or 2 and more",
+            "nothing-to-train-on",
+            "--test-every 1 leaves no image to train on. Give 0, or 2 and more.",
             field="--test-every",
         )
 
 
 def _check_bag(options: IngestOptions, frames: Path | None) -> None:
     if frames is None:
-        raise InputError(
-            "todo-bag-needs-workspace-put", "a bag needs a workspace to put its photographs in", field="--bag"
-        )
+        raise InputError("bag-without-workspace", "A bag needs a workspace for its photographs.", field="--bag")
     if options.crs is not None:
         raise InputError(
-            "todo-has-no-meaning-for",
-            "has no meaning for a --bag: its positions are latitude, longitude and ellipsoidal height, or metres "
-            "in a frame whose zero --origin names",
+            "crs-with-bag",
+            "A --bag has latitude, longitude and ellipsoidal height, or metres from --origin. Remove --crs.",
             field="--crs",
         )
     beside = [name for name in ("images", "trajectory", "geo", "events") if getattr(options, name) is not None]
     if beside:
         raise InputError(
-            "todo-has-photographs-positions-itself",
-            f"has photographs and positions itself: give it without --{beside[0]}",
+            "bag-and-other-source",
+            f"A --bag already has photographs and positions. Remove --{beside[0]}.",
             field="--bag",
         )

@@ -19,7 +19,7 @@ from pipelines.core.progress import SILENT, Progress
 from pipelines.core.validators import stays_inside
 from pipelines.formats.exif import PhotoTags, read_tags
 from pipelines.formats.image_file import SUFFIXES, ImageFile, header_size, inspect_image, read_bytes, read_head
-from pipelines.ingest.notes import Notes
+from pipelines.ingest.remarks import Remarks
 from pipelines.survey.survey import CameraPrior
 
 
@@ -32,7 +32,7 @@ class Photo:
     tags: PhotoTags
 
 
-def scan_folder(root: Path, notes: Notes, progress: Progress = SILENT, *, decode: bool = True) -> list[Photo]:
+def scan_folder(root: Path, remarks: Remarks, progress: Progress = SILENT, *, decode: bool = True) -> list[Photo]:
     """Return every usable photograph below `root`, sorted by name; files that are left out are noted.
 
     Left out are files that are empty, damaged or too large, links that lead out of the folder, and all but the
@@ -43,27 +43,21 @@ def scan_folder(root: Path, notes: Notes, progress: Progress = SILENT, *, decode
     Raises:
         InputError: no such folder, or no JPEG, PNG or TIFF file in it.
     """
-    if not root.is_dir():
-        raise InputError(
-            "todo-no-such-folder-photographs", "no such folder of photographs", path=root, field="--images"
-        )
     names = sorted(path.relative_to(root).as_posix() for path in _candidates(root))
     inside = [name for name in names if (root / name).resolve().is_relative_to(root.resolve())]
-    notes.warn_counted(
-        "todo-image-link-leaves-folder",
+    remarks.warn_counted(
+        "image-link-outside",
         sorted(set(names) - set(inside)),
-        "image is a link that leaves the folder and was left out",
-        "images are links that leave the folder and were left out",
+        "Images that are links out of the folder are left out",
     )
     usable = [name for name in inside if stays_inside(name)]
-    notes.warn_counted(
-        "todo-image-has-name-no",
+    remarks.warn_counted(
+        "image-name-not-text",
         [ascii(name) for name in sorted(set(inside) - set(usable))],
-        "image has a name that is no text and was left out",
-        "images have names that are no text and were left out",
+        "Images with names that are not text are left out",
     )
     if not usable:
-        raise InputError("todo-holds-no-jpeg-png", "holds no JPEG, PNG or TIFF image", path=root, field="--images")
+        raise InputError("no-images", "The folder has no JPEG, PNG or TIFF image.", path=root, field="--images")
     photos: list[Photo] = []
     damaged: list[str] = []
     inspected = partial(_inspect, root=root, decode=decode)
@@ -74,8 +68,8 @@ def scan_folder(root: Path, notes: Notes, progress: Progress = SILENT, *, decode
                 photos.append(photo)
             else:
                 damaged.append(f"{name} ({photo})")
-    notes.warn_counted("todo-image-was-left-out", damaged, "image was left out", "images were left out")
-    return _without_duplicates(photos, notes)
+    remarks.warn_counted("image-unreadable", damaged, "Images cannot be read and are left out")
+    return _without_duplicates(photos, remarks)
 
 
 def glance(root: Path) -> tuple[int, int, tuple[int, int]]:
@@ -86,18 +80,18 @@ def glance(root: Path) -> tuple[int, int, tuple[int, int]]:
     Raises:
         InputError: no such folder, or no image in it.
     """
-    if not root.is_dir():
-        raise InputError(
-            "todo-no-such-folder-photographs", "no such folder of photographs", path=root, field="--images"
-        )
     paths = sorted(_candidates(root))
     size_px = next(filter(None, (header_size(data) for data in map(_beginning, paths))), None)
     if size_px is None:
-        raise InputError("todo-holds-no-jpeg-png", "holds no JPEG, PNG or TIFF image", path=root, field="--images")
+        raise InputError("no-images", "The folder has no JPEG, PNG or TIFF image.", path=root, field="--images")
     return len(paths), sum(path.stat().st_size for path in paths), size_px
 
 
 def _candidates(root: Path) -> Iterator[Path]:
+    if not root.is_dir():
+        raise InputError(
+            "no-image-folder", "The folder of photographs does not exist.", path=root, field="--images"
+        )
     for folder, folders, files in os.walk(root):
         folders[:] = [name for name in folders if not name.startswith(".")]
         for name in files:
@@ -123,7 +117,7 @@ def _beginning(path: Path) -> bytes:
         return b""
 
 
-def _without_duplicates(photos: list[Photo], notes: Notes) -> list[Photo]:
+def _without_duplicates(photos: list[Photo], remarks: Remarks) -> list[Photo]:
     first: dict[str, str] = {}
     kept, dropped = [], []
     for photo in photos:
@@ -132,12 +126,7 @@ def _without_duplicates(photos: list[Photo], notes: Notes) -> list[Photo]:
         else:
             first[photo.file.sha256] = photo.name
             kept.append(photo)
-    notes.warn_counted(
-        "todo-image-copy-another-was",
-        dropped,
-        "image is a copy of another and was left out",
-        "images are copies of others and were left out",
-    )
+    remarks.warn_counted("image-copies", dropped, "Images that are copies of others are left out")
     return kept
 
 
@@ -164,15 +153,25 @@ class ImageNames:
         name = text.strip().replace("\\", "/").removeprefix("./")
         pure = PurePosixPath(name)
         if pure.is_absolute() or ".." in pure.parts or name[1:2] == ":":
-            message = f"{text!r} leaves the image folder: name images relative to it"
-            raise InputError("todo-x", message, path=path, line=line, field="image")
+            raise InputError(
+                "image-outside-folder",
+                f"{text!r} leaves the image folder. Name images relative to it.",
+                path=path,
+                line=line,
+                field="image",
+            )
         if name in self._exact:
             return name
         for form, key in zip(self._forms, _keys(name), strict=True):
             candidates = form.get(key, [])
             if len(candidates) > 1:
-                message = f"{text!r} may be {' or '.join(candidates[:3])}: name it with its folder and suffix"
-                raise InputError("todo-x", message, path=path, line=line, field="image")
+                raise InputError(
+                    "image-ambiguous",
+                    f"{text!r} may be {' or '.join(candidates[:3])}. Name it with its folder and suffix.",
+                    path=path,
+                    line=line,
+                    field="image",
+                )
             if candidates:
                 return candidates[0]
         return None
@@ -221,7 +220,7 @@ def focal_px(tags: PhotoTags, width: int, height: int) -> tuple[float, FocalSour
 
 
 def camera_priors(
-    photos: Sequence[Photo], given_focal_px: float | None, notes: Notes
+    photos: Sequence[Photo], given_focal_px: float | None, remarks: Remarks
 ) -> tuple[tuple[CameraPrior, ...], dict[str, int]]:
     """Return a prior for each size, camera model and focal length; and the id of each image's camera by name.
 
@@ -246,15 +245,13 @@ def camera_priors(
                 focal_source=source if given_focal_px is None else "option",
                 make_model=name,
             )
-            notes.assume(
-                "todo-focal-length-at-px",
-                f"focal length of {name or 'the camera'} at {width}×{height}: {focal:.1f} px, {origin}",
+            remarks.assume(
+                "focal-length",
+                f"The focal length of {name or 'the camera'} at {width}×{height} is {focal:.1f} px, {origin}.",
             )
         camera_of[photo.name] = cameras[key].camera_id
     sizes = sorted({(width, height) for width, height, _, _ in cameras})
     if len(sizes) > 1:
         listed = ", ".join(f"{width}×{height}" for width, height in sizes)
-        notes.warn(
-            "todo-images-have-sizes-each", f"images have {len(sizes)} sizes ({listed}): each is a camera of its own"
-        )
+        remarks.warn("image-sizes", f"The images have {len(sizes)} sizes ({listed}): each is a camera of its own.")
     return tuple(cameras.values()), camera_of

@@ -18,8 +18,8 @@ from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.ingest.bag_flight import count_frames, read_bag
 from pipelines.ingest.folder_flight import read_folder
 from pipelines.ingest.ground_points import read_ground_files, tie_marks
-from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions, check_options
+from pipelines.ingest.remarks import Remarks
 from pipelines.ingest.survey_assembly import assemble_survey, require_placed
 from pipelines.survey.calibrated import NavigationTrack
 from pipelines.survey.survey import Survey
@@ -55,19 +55,22 @@ def check_inputs(workspace: Workspace, options: IngestOptions, progress: Progres
     _refuse_inside_photographs(workspace, options)
     if options.bag is None:
         return _summary(survey_and_track(options, None, progress, decode=False)[0])
-    notes = Notes()
+    remarks = Remarks()
     check_options(options, workspace.root)
-    read_ground_files(options, notes)
-    frames, located = count_frames(options.bag, options, notes, progress)
+    read_ground_files(options, remarks)
+    frames, located = count_frames(options.bag, options, remarks, progress)
     require_placed(located > 0 or options.gcp is not None)
-    return Summary(f"a bag with {frames} frames, {located} of them with a position", {}, tuple(notes.warnings))
+    return Summary(f"a bag with {frames} frames, {located} of them with a position", {}, tuple(remarks.warnings))
 
 
 def _refuse_inside_photographs(workspace: Workspace, options: IngestOptions) -> None:
     """Refuse a workspace whose files would count as photographs."""
     if options.images is not None and workspace.root.resolve().is_relative_to(options.images.resolve()):
-        message = "the workspace lies inside the folder of photographs: put it elsewhere"
-        raise InputError("todo-x", message, path=workspace.root)
+        raise InputError(
+            "workspace-in-photographs",
+            "The workspace lies inside the folder of photographs. Choose another place.",
+            path=workspace.root,
+        )
 
 
 def survey_and_track(
@@ -78,28 +81,28 @@ def survey_and_track(
     Photographs of a bag are written into `frames`; without a bag, nothing is. Photographs are decoded to their end,
     as their hashes need; without `decode`, their heads are read.
     """
-    notes = Notes()
+    remarks = Remarks()
     check_options(options, frames)
     if options.estimated:
-        notes.assume(
-            "todo-given-until-georef-run",
-            f"{', '.join(options.estimated)}: as given, until `georef run` or `georef calibrate` has estimated it "
-            "after sfm",
+        remarks.assume(
+            "rig-as-given",
+            f"{', '.join(options.estimated)}: the given value is used until `georef run` or `georef calibrate` "
+            "has estimated it after sfm.",
         )
-    ground = read_ground_files(options, notes)  # ahead of the photographs, which take minutes
+    ground = read_ground_files(options, remarks)  # ahead of the photographs, which take minutes
     if options.bag is not None and frames is not None:
-        flight = read_bag(options.bag, options, frames, notes, progress)
+        flight = read_bag(options.bag, options, frames, remarks, progress)
     elif options.images is not None:
-        flight = read_folder(options.images, options, notes, progress, decode=decode)
+        flight = read_folder(options.images, options, remarks, progress, decode=decode)
     else:
         raise InputError(
-            "todo-give-folder-photographs-or", "give the folder of photographs, or a --bag", field="--images"
+            "no-photographs-given", "Photographs are missing. Give their folder, or a --bag.", field="--images"
         )
     sizes = {photo.name: (photo.file.width, photo.file.height) for photo in flight.photos}
     control, check = (
-        None if file is None else tie_marks(file, sizes, options.sigma_mark, notes) for file in ground
+        None if file is None else tie_marks(file, sizes, options.sigma_mark, remarks) for file in ground
     )
-    return assemble_survey(flight, control, check, options, notes)
+    return assemble_survey(flight, control, check, options, remarks)
 
 
 def _copy_images(survey: Survey, stage: StageRun) -> None:

@@ -35,8 +35,8 @@ from pipelines.ingest.flight_record import (
     track_in_geo,
 )
 from pipelines.ingest.ground_points import GroundFile, GroundPoint, require_near, split_checks, unmarked_points
-from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
+from pipelines.ingest.remarks import Remarks
 from pipelines.survey.calibrated import FIX_RANGE_M, NavigationTrack, require_estimable
 from pipelines.survey.survey import Attitude, Fix, FixSession, Survey, SurveyedPoint, SurveyImage, UnmarkedPoint
 
@@ -63,7 +63,7 @@ def assemble_survey(
     control: GroundFile | None,
     check: GroundFile | None,
     options: IngestOptions,
-    notes: Notes,
+    remarks: Remarks,
 ) -> tuple[Survey, NavigationTrack | None]:
     """Return the survey, and the navigation in the same frame where it was recorded by time.
 
@@ -74,31 +74,29 @@ def assemble_survey(
         InputError: nothing has a position, points that are nowhere near the images or of both kinds, or a rig to
             estimate without the navigation for it.
     """
-    flight = replace(flight, poses=_without_far_fixes(flight, notes))
+    flight = replace(flight, poses=_without_far_fixes(flight, remarks))
     poses, files = flight.poses, [file for file in (control, check) if file is not None]
     controls, checks = split_checks(control, check, options.check)
     _require_checks(checks, options.vegetated)
     marked, marked_checks = ([point for point in points if point.is_marked] for points in (controls, checks))
-    unmarked = unmarked_points(controls, checks, notes)
+    unmarked = unmarked_points(controls, checks, remarks)
     located = bool(poses.located.any())
     if located:
         middle_in_ecef = ecef_from_lla(median_lla(lla_from_ecef(poses.position_in_ecef[poses.located])))
         for file in files:
             require_near(file, middle_in_ecef)
     origin = _origin(poses, marked)
-    _note_coverage(flight, len(marked), notes)
+    _note_coverage(flight, len(marked), remarks)
     if options.test_every and not _held_out(len(flight.photos), options.test_every):
-        notes.warn(
-            "todo-images-too-few-hold", f"{len(flight.photos)} images are too few to hold any out for testing"
-        )
+        remarks.warn("no-test-images", f"{len(flight.photos)} images are too few to hold any out for testing.")
     track = None if flight.navigation is None else track_in_geo(flight.navigation, origin)
     if options.estimated:
         require_estimable(track, options.estimated, "--estimate" if options.estimate else "--time-offset")
-    sessions, session_of = fix_sessions(poses, options, notes)
+    sessions, session_of = fix_sessions(poses, options, remarks)
     survey = Survey(
         origin=origin,
         source_crs=poses.crs_name if located or control is None else control.crs.name,
-        vertical=_vertical(poses, files, notes),
+        vertical=_vertical(poses, files, remarks),
         image_dir=str(flight.folder),
         cameras=flight.cameras,
         images=_images(flight, session_of, origin, options),
@@ -110,9 +108,9 @@ def assemble_survey(
             for use, points in unmarked.items()
             for record in _surveyed(points, origin, options)
         ),
-        assumptions=tuple(notes.assumptions),
-        warnings=tuple(notes.warnings),
-        cautions=tuple(notes.cautions),
+        assumptions=tuple(remarks.assumptions),
+        warnings=tuple(remarks.warnings),
+        cautions=tuple(remarks.cautions),
         estimate=options.estimated,
         default_sigmas=_default_sigmas(poses, marked, options),
     )
@@ -123,8 +121,8 @@ def require_placed(placed: bool) -> None:
     """Refuse a survey that nothing places on Earth."""
     if not placed:
         raise InputError(
-            "todo-no-image-has-position",
-            "no image has a position, and there are no ground control points: give --trajectory, --geo or --gcp",
+            "no-positions",
+            "No image has a position, and there are no ground control points. Give --trajectory, --geo or --gcp.",
         )
 
 
@@ -134,9 +132,9 @@ def _require_checks(checks: Sequence[GroundPoint], vegetated: Sequence[str]) -> 
     for name in vegetated:
         if name not in known:
             raise InputError(
-                "todo-no-check-point-there",
-                f"{name!r} is no check point: there are {', '.join(sorted(known)) or 'none'} (--checkpoints, "
-                "--check)",
+                "vegetated-not-a-check",
+                f"{name!r} is no check point: there are {', '.join(sorted(known)) or 'none'}. Add it with "
+                "--checkpoints or --check.",
                 field="--vegetated",
             )
 
@@ -246,7 +244,7 @@ def _matrix(values: FloatArray) -> Matrix3:
 
 
 def fix_sessions(
-    poses: ImagePoses, options: IngestOptions, notes: Notes
+    poses: ImagePoses, options: IngestOptions, remarks: Remarks
 ) -> tuple[tuple[FixSession, ...], IntArray]:
     """Return the sessions, and the session of each of N images (N,), 0 for images without a position.
 
@@ -274,7 +272,7 @@ def fix_sessions(
             int(count) for session, count in zip(sessions, counts, strict=True) if session.receiver == kind
         )
         if of_kind:
-            _note_default(kind, of_kind, options, notes)
+            _note_default(kind, of_kind, options, remarks)
     return tuple(sessions), session_of
 
 
@@ -299,7 +297,7 @@ def _kind(receiver: str, sigma_h_m: float) -> str:
     return "RTK float" if receiver == RECEIVERS[-1] and sigma_h_m <= _FLOAT_SIGMA_M else receiver
 
 
-def _note_default(kind: str, count: int, options: IngestOptions, notes: Notes) -> None:
+def _note_default(kind: str, count: int, options: IngestOptions, remarks: Remarks) -> None:
     horizontal_m, vertical_m = COMMON_SIGMA_M[kind]
     defaults = {}
     if options.sigma_common_h is None:
@@ -307,10 +305,11 @@ def _note_default(kind: str, count: int, options: IngestOptions, notes: Notes) -
     if options.sigma_common_v is None:
         defaults["--sigma-common-v"] = f"{vertical_m:g} m vertical"
     if defaults:
-        notes.assume(
-            "todo-error-positions-session-share",
-            f"σ of the error that the positions of a session share ({count}): {', '.join(defaults.values())} "
-            f"({kind}); state yours with {' and '.join(defaults)}",
+        remarks.assume(
+            "default-common-sigma",
+            f"The error that the {count} positions of a session share has a σ of {', '.join(defaults.values())} "
+            f"({kind}). "
+            f"State it with {' and '.join(defaults)}.",
         )
 
 
@@ -332,18 +331,17 @@ def _default_sigmas(
     return tuple(group for is_default, group in groups if is_default)
 
 
-def _without_far_fixes(flight: FlightRecord, notes: Notes) -> ImagePoses:
+def _without_far_fixes(flight: FlightRecord, remarks: Remarks) -> ImagePoses:
     poses = flight.poses
     if not poses.located.any():
         return poses
     middle_in_ecef = ecef_from_lla(median_lla(lla_from_ecef(poses.position_in_ecef[poses.located])))
     distance_m = np.linalg.norm(poses.position_in_ecef - middle_in_ecef, axis=1)
     far = distance_m > FIX_RANGE_M
-    notes.warn_counted(
-        "todo-position-far-from-others",
+    remarks.warn_counted(
+        "position-far-away",
         [f"{flight.photos[row].name} ({distance_m[row] / 1000:.0f} km)" for row in np.flatnonzero(far).tolist()],
-        "position is far from the others and was left out",
-        "positions are far from the others and were left out",
+        "Positions far from the others are left out",
     )
     return replace(poses, position_in_ecef=np.where(far[:, None], np.nan, poses.position_in_ecef))
 
@@ -357,38 +355,37 @@ def _origin(poses: ImagePoses, control: Sequence[GroundPoint]) -> Origin:
     return Origin(lat_deg=round(float(lat), 5), lon_deg=round(float(lon), 5), alt_m=round(float(alt)))
 
 
-def _note_coverage(flight: FlightRecord, points: int, notes: Notes) -> None:
+def _note_coverage(flight: FlightRecord, points: int, remarks: Remarks) -> None:
     located = flight.poses.located
     if flight.poses.source == "exif":
         names = [flight.photos[row].name for row in np.flatnonzero(~located).tolist()]
-        notes.warn_counted(
-            "todo-image-has-no-position", names, "image has no position in EXIF", "images have no position in EXIF"
-        )
+        remarks.warn_counted("images-without-position", names, "Images have no position in EXIF")
     if not located.any():
-        notes.warn(
-            "todo-no-image-has-position",
-            f"no image has a position: {points} ground control points alone place the model",
+        remarks.warn(
+            "no-positions", f"No image has a position: {points} ground control points alone georeference the model."
         )
     elif located.sum() < LEAST_IMAGES and points < LEAST_IMAGES:
-        notes.warn(
-            "todo-only-positions-control-points",
-            f"only {int(located.sum())} positions and {points} control points: three of a kind place a model",
+        remarks.warn(
+            "too-few-positions",
+            f"There are {int(located.sum())} positions and {points} control points: at least three fixes or "
+            "control points are needed.",
         )
 
 
-def _vertical(poses: ImagePoses, files: Sequence[GroundFile], notes: Notes) -> VerticalDatum:
+def _vertical(poses: ImagePoses, files: Sequence[GroundFile], remarks: Remarks) -> VerticalDatum:
     """Return the datum of the image positions, or of the control points if there are none; note all assumptions."""
     datums = {"the images": poses.vertical} if poses.located.any() else {}
     datums |= {file.path.name: file.crs.vertical for file in files}
     for place, datum in datums.items():
         if not datum.stated:
-            notes.assume("todo-heights", f"heights of {place} are {datum.name}: {datum.note}")
+            remarks.assume("vertical-datum-assumed", f"Heights of {place} are {datum.name}: {datum.note}.")
     stated = [place for place, datum in datums.items() if datum.stated]
     assumed = [place for place, datum in datums.items() if not datum.stated]
     if stated and assumed:
-        notes.warn(
-            "todo-vertical-datum-stated-only",
-            f"the vertical datum of {', '.join(stated)} is stated, that of {', '.join(assumed)} only assumed: they "
-            "may differ by a geoid's height, up to 100 m; see --vertical",
+        remarks.warn(
+            "vertical-datums-mixed",
+            f"The vertical datum of {', '.join(stated)} is stated, that of {', '.join(assumed)} only assumed. "
+            "They may differ by a "
+            "geoid's height, up to 100 m. State both with --vertical.",
         )
     return next(iter(datums.values()))

@@ -19,13 +19,15 @@ from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.trajectory import Trajectory
 from pipelines.ingest.exif_poses import altitude_m, compare_with_exif, gimbal_attitudes, photo_times
 from pipelines.ingest.flight_record import RECEIVERS, ImagePoses, with_defaults
-from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import ImageNames, Photo
 from pipelines.ingest.reference_system import crs_of_table, note_operation
+from pipelines.ingest.remarks import Remarks
 
 
-def poses_from_table(table: PoseTable, photos: Sequence[Photo], options: IngestOptions, notes: Notes) -> ImagePoses:
+def poses_from_table(
+    table: PoseTable, photos: Sequence[Photo], options: IngestOptions, remarks: Remarks
+) -> ImagePoses:
     """Return positions, and attitudes if the table has them; else attitudes from XMP.
 
     Rows are matched by name if the table has names, else by time. An image without a row has no position here,
@@ -36,12 +38,12 @@ def poses_from_table(table: PoseTable, photos: Sequence[Photo], options: IngestO
         InputError: no row with a position, no CRS for x,y,z, contradicting options, impossible coordinates, or no
             image matched.
     """
-    table = usable_rows(table, notes)
-    crs = crs_of_table(table, options, notes)
+    table = usable_rows(table, remarks)
+    crs = crs_of_table(table, options, remarks)
     images = [photo.name for photo in photos]
     if table.names is not None:
-        table = _with_heights(match_by_name(table, images, notes), photos, crs, notes)
-    measured = _measured(table, crs, options, notes)
+        table = _with_heights(match_by_name(table, images, remarks), photos, crs, remarks)
+    measured = _measured(table, crs, options, remarks)
     receiver = np.full(len(table.lines), RECEIVERS[-1]) if table.receiver is None else table.receiver
     time_s = photo_times(photos)
     recorded = None
@@ -56,16 +58,15 @@ def poses_from_table(table: PoseTable, photos: Sequence[Photo], options: IngestO
         order = np.argsort(measured.time_s, kind="stable")
         order = order[np.isfinite(measured.time_s[order])]
         recorded = _rows(measured, order)
-        at_images = match_by_time(recorded, photos, table.path, options, notes)
+        at_images = match_by_time(recorded, photos, table.path, options, remarks)
         receivers = _worse_neighbour(receiver[order], recorded.time_s, time_s + options.time_offset_s)
     located = complete(at_images.position)
-    notes.warn_counted(
-        "todo-image-has-no-position",
+    remarks.warn_counted(
+        "images-without-position",
         [images[row] for row in np.flatnonzero(~located)],
-        f"image has no position in {table.path.name}",
-        f"images have no position in {table.path.name}",
+        f"Images have no position in {table.path.name}",
     )
-    sigma, sigma_source = with_defaults(at_images.sigma_m, receivers, located, options, notes)
+    sigma, sigma_source = with_defaults(at_images.sigma_m, receivers, located, options, remarks)
     from_file = np.asarray(np.isfinite(at_images.rotation).all(axis=(1, 2)))
     poses = ImagePoses(
         position_in_ecef=at_images.position,
@@ -81,11 +82,11 @@ def poses_from_table(table: PoseTable, photos: Sequence[Photo], options: IngestO
         vertical=crs.vertical,
         recorded=recorded,
     )
-    compare_with_exif(poses, photos, table.path, options, notes)
+    compare_with_exif(poses, photos, table.path, options, remarks)
     return poses
 
 
-def usable_rows(table: PoseTable, notes: Notes) -> PoseTable:
+def usable_rows(table: PoseTable, remarks: Remarks) -> PoseTable:
     """Return the rows that have a position, without repeats of a moment where rows have no names.
 
     The rows that are left out are noted, and so are unknown columns and times without a zone. A row of `geo.txt`
@@ -95,37 +96,33 @@ def usable_rows(table: PoseTable, notes: Notes) -> PoseTable:
         InputError: no row has a position.
     """
     file = table.path.name
-    notes.warn_counted(
-        "todo-column-unknown-was-ignored",
+    remarks.warn_counted(
+        "unknown-column",
         [f"{file}:{table.header_line} ({name or 'unnamed'})" for name in table.unknown_columns],
-        "column is unknown and was ignored",
-        "columns are unknown and were ignored",
+        "Columns are unknown and are ignored",
     )
     if table.zoneless_times:
-        notes.assume("todo-times-without-zone-utc", f"times without a zone in {file} are UTC")
+        remarks.assume("time-zone", f"Times without a zone in {file} are UTC.")
     needed, gaps = (2, "NaN") if table.source == "geo.txt" else (3, "empty or NaN")
     located = complete(table.xyz[:, :needed])
     places = [f"{file}:{line}" for line in table.lines[~located]]
-    notes.warn_counted(
-        "todo-row-has-no-position", places, f"row has no position ({gaps})", f"rows have no position ({gaps})"
-    )
+    remarks.warn_counted("row-without-position", places, f"Rows have no position ({gaps})")
     if not located.any():
-        raise InputError("todo-no-row-has-position", "no row has a position", path=table.path)
+        raise InputError("file-without-positions", "No row has a position.", path=table.path)
     table = table.take(located)
     if table.names is not None or table.time_s is None:
         return table
     _, first = np.unique(table.time_s, return_index=True)
     repeated = np.setdiff1d(np.arange(len(table.lines)), first)
-    notes.warn_counted(
-        "todo-row-repeats-earlier-time",
+    remarks.warn_counted(
+        "row-repeats-time",
         [f"{file}:{line}" for line in table.lines[repeated]],
-        "row repeats an earlier time and was left out",
-        "rows repeat earlier times and were left out",
+        "Rows that repeat an earlier time are left out",
     )
     return table.take(np.sort(first))
 
 
-def match_by_name(table: PoseTable, images: list[str], notes: Notes) -> PoseTable:
+def match_by_name(table: PoseTable, images: list[str], remarks: Remarks) -> PoseTable:
     """Return the rows that belong to `images`, with the images' own names; the other rows are noted.
 
     Raises:
@@ -141,31 +138,32 @@ def match_by_name(table: PoseTable, images: list[str], notes: Notes) -> PoseTabl
             unknown.append(f"{table.path.name}:{line} ({text})")
             continue
         if name in row_of:
-            message = f"{name} has a row already, in line {int(table.lines[row_of[name]])}"
-            raise InputError("todo-x", message, path=table.path, line=line, field="image")
+            raise InputError(
+                "image-twice",
+                f"{name} already has a row, in line {int(table.lines[row_of[name]])}.",
+                path=table.path,
+                line=line,
+                field="image",
+            )
         if Path(text.replace("\\", "/")).name != Path(name).name:
             loose.append(f"{table.path.name}:{line} ({text} for {name})")
         row_of[name] = row
     if not row_of:
         raise InputError(
-            "todo-names-none-images-has",
-            f"names none of the images: it has {(table.names or ('nothing',))[0]!r} …, the folder {images[0]!r} …",
+            "no-image-matched",
+            f"The file names none of the images: it has {(table.names or ('nothing',))[0]!r} …, the folder "
+            f"{images[0]!r} …",
             path=table.path,
             field="image",
         )
-    notes.warn_counted("todo-row-names-no-image", unknown, "row names no image here", "rows name no image here")
-    notes.warn_counted(
-        "todo-row-names-its-image",
-        loose,
-        "row names its image with another case or without suffix",
-        "rows name their images with another case or without suffix",
-    )
+    remarks.warn_counted("row-of-unknown-image", unknown, "Rows name no image here")
+    remarks.warn_counted("image-name-differs", loose, "Rows name their images with another case or without suffix")
     matched = table.take(np.array(list(row_of.values()), dtype=np.int64))
     return replace(matched, names=tuple(row_of))
 
 
 def match_by_time(
-    trajectory: Trajectory, photos: Sequence[Photo], path: Path, options: IngestOptions, notes: Notes
+    trajectory: Trajectory, photos: Sequence[Photo], path: Path, options: IngestOptions, remarks: Remarks
 ) -> Trajectory:
     """Return the trajectory at the times of the photographs (N rows), NaN where it does not reach.
 
@@ -173,28 +171,27 @@ def match_by_time(
         InputError: no row or no photograph has a time, or none of them lies within the trajectory.
     """
     if not len(trajectory):
-        raise InputError("todo-no-row-has-time", "no row has a time", path=path, field="timestamp")
+        raise InputError("file-without-times", "No row has a time.", path=path, field="timestamp")
     time_s = photo_times(photos)
     timeless = [photo.name for photo in photos if photo.tags.timestamp_s is None]
-    notes.warn_counted(
-        "todo-image-has-no-time", timeless, "image has no time in EXIF", "images have no time in EXIF"
-    )
+    remarks.warn_counted("image-without-time", timeless, "Images have no time in EXIF")
     if len(timeless) == len(photos):
         raise InputError(
-            "todo-has-no-column-image",
-            "has no column image, and no image has a time in EXIF",
+            "images-without-times",
+            "The file has no column image, and no image has a time in EXIF.",
             path=path,
             field="timestamp",
         )
     if any(photo.tags.time_source == "assumed UTC" for photo in photos):
-        notes.assume("todo-exif-times-without-zone", "EXIF times without a zone are UTC")
+        remarks.assume("time-zone", "EXIF times without a zone are UTC.")
     matched = trajectory.at(time_s + options.time_offset_s)
     if not complete(matched.position).any():
         raise InputError(
-            "todo-covers-images-none-fits",
-            f"covers {_span(trajectory.time_s)}, the images {_span(time_s)}: none fits, with gaps of "
-            f"{trajectory.max_gap_s:g} s at most. Is the camera's clock in another time zone? Is --max-gap too "
-            "small?",
+            "times-apart",
+            f"The file covers {_span(trajectory.time_s)}, the images {_span(time_s)}: no image lies within it, "
+            "with gaps of at most "
+            f"{trajectory.max_gap_s:g} s. Is the camera's clock in another time zone (--time-offset)? Is "
+            "--max-gap too small?",
             path=path,
             field="timestamp",
         )
@@ -206,7 +203,7 @@ def _span(time_s: FloatArray) -> str:
     return " to ".join(end.strftime("%Y-%m-%d %H:%M:%S UTC") for end in ends)
 
 
-def _with_heights(table: PoseTable, photos: Sequence[Photo], crs: PointCrs, notes: Notes) -> PoseTable:
+def _with_heights(table: PoseTable, photos: Sequence[Photo], crs: PointCrs, remarks: Remarks) -> PoseTable:
     """Fill heights that a table by name lacks from EXIF, and leave out the rows where that has none either."""
     lacking = np.flatnonzero(np.isnan(table.xyz[:, 2]))
     if not len(lacking) or table.names is None:
@@ -218,32 +215,23 @@ def _with_heights(table: PoseTable, photos: Sequence[Photo], crs: PointCrs, note
         xyz[lacking, 2] = [np.nan if height is None else height for height in heights]
     filled = complete(xyz)
     if filled[lacking].any():
-        notes.assume(
-            "todo-heights-lacks-from-exif",
-            f"heights that {table.path.name} lacks are from EXIF ({int(filled[lacking].sum())})",
+        remarks.assume(
+            "heights-from-exif", f"{int(filled[lacking].sum())} heights that {table.path.name} lacks are from EXIF."
         )
     places = [f"{table.path.name}:{line}" for line in table.lines[~filled]]
-    notes.warn_counted(
-        "todo-row-has-no-height",
-        places,
-        "row has no height and was left out",
-        "rows have no height and were left out",
-    )
+    remarks.warn_counted("row-without-height", places, "Rows without a height are left out")
     if not filled.any():
-        raise InputError(
-            "todo-has-no-heights-exif", "has no heights (z), and EXIF has none either", path=table.path
-        )
+        raise InputError("no-heights", "The file has no heights (z), and EXIF has none either.", path=table.path)
     return replace(table, xyz=xyz).take(filled)
 
 
-def _measured(table: PoseTable, crs: PointCrs, options: IngestOptions, notes: Notes) -> Trajectory:
+def _measured(table: PoseTable, crs: PointCrs, options: IngestOptions, remarks: Remarks) -> Trajectory:
     """Return the rows Earth-centred, in the order of the file; NaN where a row has no time, attitude or σ."""
     lla = crs.lla_from_xyz(table.xyz, path=table.path, lines=table.lines.tolist())
-    note_operation(crs, lla, notes)
+    note_operation(crs, lla, remarks)
     if table.sigma_enu_m is not None and "foot" in crs.units[0]:
-        notes.assume(
-            "todo-metres-although-counts-feet",
-            f"σ in {table.path.name} are in metres, although {crs.name} counts in feet",
+        remarks.assume(
+            "sigma-in-metres", f"σ in {table.path.name} are in metres, although {crs.name} counts in feet."
         )
     enu_from_cam = np.full((len(lla), 3, 3), np.nan)
     if table.quat_xyzw is not None:

@@ -196,7 +196,7 @@ def ransac(
     """
     if count < options.sample_size:
         raise DegenerateGeometryError(
-            "todo-observations-needed-there", f"{options.sample_size} observations are needed, there are {count}"
+            "too-few-observations", f"{options.sample_size} observations are needed, there are {count}."
         )
     best: RansacResult[ModelT] | None = None
     needed = float(options.max_draws)
@@ -213,9 +213,7 @@ def ransac(
             best = RansacResult(model, squared <= options.gate, cost)
             needed = draws_needed(float(best.inlier.mean()), options)
     if best is None:
-        raise DegenerateGeometryError(
-            "todo-none-random-samples-determines", f"none of {draws} random samples determines a model"
-        )
+        raise DegenerateGeometryError("no-model-found", f"None of {draws} random samples determines a model.")
     return best
 
 

@@ -88,8 +88,8 @@ class BrownLens:
         solved = np.abs(self._distort(guess) - target).max(initial=0.0) < 1e-9
         if not solved or np.square(guess).sum(axis=1).max(initial=0.0) >= self._fold_radius() ** 2:
             raise InputError(
-                "todo-distortion-too-strong-for",
-                "the distortion is too strong for this field of view: use a smaller one",
+                "distortion-too-strong",
+                "The distortion is too strong for this field of view. Use a smaller --k1 or a larger --focal.",
                 field="--k1",
             )
         return np.concatenate([guess, np.ones((len(guess), 1))], axis=1)

@@ -171,9 +171,9 @@ class Raycaster:
             from embreex.rtcore_scene import EmbreeScene
         except ImportError as error:
             raise BackendUnavailableError(
-                "todo-simulator-needs-ray-caster",
-                "the simulator needs the ray caster `embreex`: pip install embreex "
-                "(wheels exist for Linux x86-64, macOS and Windows)",
+                "ray-caster-missing",
+                "The simulator needs the ray caster `embreex`: pip install embreex (wheels exist for Linux "
+                "x86-64, macOS and Windows).",
             ) from error
         self._mesh = mesh
         self._scene = EmbreeScene(robust=True)

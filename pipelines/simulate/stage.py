@@ -21,7 +21,7 @@ import numpy as np
 from pipelines.core.errors import InputError
 from pipelines.core.files import replace_folder, sync_tree
 from pipelines.core.machine import chosen_threads
-from pipelines.core.products import save_json
+from pipelines.core.products import Remark, save_json
 from pipelines.core.progress import SILENT, Progress
 from pipelines.formats.bag_writer import BagCamera, BagFlight, write_bag
 from pipelines.formats.exif_writer import DroneTags, with_tags
@@ -49,7 +49,7 @@ class SimulationSummary:
     check_points: int
     well_seen: int
     bag_messages: int
-    warnings: tuple[str, ...]
+    warnings: tuple[Remark, ...]
 
     @property
     def key_figure(self) -> str:
@@ -117,7 +117,7 @@ def simulate(
         warnings=_warnings(options, well_seen, control),
     )
     for warning in summary.warnings:
-        log.warning("simulate: %s", warning)
+        log.warning("simulate: %s", warning.sentence)
     log.info("simulate: %s", summary.key_figure)
     return summary
 
@@ -127,19 +127,17 @@ def _check_folder(directory: Path, *, overwrite: bool) -> None:
     if not directory.exists():
         return
     if not directory.is_dir():
-        raise InputError("todo-exists-not-folder", "exists and is not a folder", path=directory)
+        raise InputError("not-a-folder", "The path exists and is not a folder.", path=directory)
     if any(directory.iterdir()):
         if not (directory / TRUTH).exists():
             raise InputError(
-                "todo-exists-holds-something-other",
-                "exists and holds something other than a simulation: choose another",
+                "folder-not-empty",
+                "The folder holds something other than a simulation. Choose another.",
                 path=directory,
             )
         if not overwrite:
             raise InputError(
-                "todo-holds-simulation-already-force",
-                "holds a simulation already: --force replaces it",
-                path=directory,
+                "simulation-exists", "The folder already holds a simulation. --force replaces it.", path=directory
             )
 
 
@@ -166,7 +164,9 @@ def _draft(directory: Path) -> Iterator[Path]:
     try:
         draft.mkdir(parents=True)
     except OSError as error:
-        raise InputError("todo-cannot-be-made", f"cannot be made: {error.strerror}", path=directory) from error
+        raise InputError(
+            "folder-not-made", f"The folder cannot be made: {error.strerror}.", path=directory
+        ) from error
     try:
         yield draft
         sync_tree(draft)
@@ -259,13 +259,17 @@ def _write_records(options: SimulateOptions, world: World, recording: Recording,
     return write_bag(folder / "bag", options.bag, flight)
 
 
-def _warnings(options: SimulateOptions, well_seen: int, control: int) -> tuple[str, ...]:
-    messages = []
+def _warnings(options: SimulateOptions, well_seen: int, control: int) -> tuple[Remark, ...]:
+    warnings = []
     if options.targets and well_seen < WANTED_CHECKS:
-        messages.append(
-            f"only {well_seen} check points are seen in {WANTED_RAYS} photographs or more: "
-            "take more --images, larger ones (--size), or more --targets"
+        sentence = (
+            f"Only {well_seen} check points are seen in {WANTED_RAYS} photographs or more. Take more --images, "
+            "larger ones (--size), or more --targets."
         )
+        warnings.append(Remark(code="few-check-points", sentence=sentence))
     if control < options.control:
-        messages.append(f"only {control} of {options.control} control points found a place")
-    return tuple(messages)
+        sentence = (
+            f"Only {control} of {options.control} control points are placed. Take more --targets or --images."
+        )
+        warnings.append(Remark(code="few-control-points", sentence=sentence))
+    return tuple(warnings)

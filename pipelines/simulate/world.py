@@ -193,7 +193,7 @@ def check_clearance(world: World, raycaster: Raycaster) -> None:
         if buried or nearest < _CLEARANCE_M:
             where = "in the ground" if buried else f"{nearest:.1f} m from a surface"
             raise InputError(
-                "todo-photograph-would-be-taken",
-                f"photograph {i} would be taken {where}: choose another height or radius",
+                "camera-too-near",
+                f"Photograph {i} would be taken {where}. Choose another --height or --radius.",
                 field="--height",
             )

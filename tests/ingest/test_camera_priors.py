@@ -8,8 +8,8 @@ import pytest
 
 from pipelines.formats.exif import LensTags, PhotoTags
 from pipelines.formats.image_file import ImageFile
-from pipelines.ingest.notes import Notes
 from pipelines.ingest.photo_folder import Photo, camera_priors, focal_px
+from pipelines.ingest.remarks import Remarks
 
 
 def _photo(name: str, width: int, height: int, tags: PhotoTags) -> Photo:
@@ -54,14 +54,14 @@ def test_one_camera_for_each_size_model_and_focal_length() -> None:
         _photo("3", 60, 40, far),
         _photo("4", 30, 20, near),
     ]
-    notes = Notes()
-    cameras, camera_of = camera_priors(photos, None, notes)
+    remarks = Remarks()
+    cameras, camera_of = camera_priors(photos, None, remarks)
     assert camera_of == {"1": 1, "2": 1, "3": 2, "4": 3}
     assert cameras[0].model == "SIMPLE_RADIAL" and cameras[0].params[1:] == (30.0, 20.0, 0.0)
-    assert notes.warnings == ["images have 2 sizes (30×20, 60×40): each is a camera of its own"]
+    assert remarks.warnings == ["images have 2 sizes (30×20, 60×40): each is a camera of its own"]
 
 
 def test_an_option_overrides_exif() -> None:
     photos = [_photo("1", 60, 40, PhotoTags(model="FC300S", lens=LensTags(focal_mm=3.61)))]
-    cameras, _ = camera_priors(photos, 77.0, Notes())
+    cameras, _ = camera_priors(photos, 77.0, Remarks())
     assert cameras[0].params[0] == 77.0 and cameras[0].focal_source == "option"

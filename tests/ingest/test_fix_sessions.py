@@ -19,8 +19,8 @@ from pipelines.core.workspace import Workspace
 from pipelines.geodesy.enu import ecef_from_lla
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.ingest.flight_record import RECEIVER_SIGMA_M, RECEIVERS, ImagePoses
-from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
+from pipelines.ingest.remarks import Remarks
 from pipelines.ingest.stage import survey_and_track
 from pipelines.ingest.survey_assembly import COMMON_SIGMA_M, SESSION_GAP_S, fix_sessions
 from pipelines.survey.survey import FixSession, Survey
@@ -67,9 +67,9 @@ def test_sessions_do_not_depend_on_the_order_of_the_photographs(data: st.DataObj
     fixes = data.draw(FIXES)
     order = data.draw(st.permutations(range(len(fixes))))
     receivers, sigma, time = (list(column) for column in zip(*fixes, strict=True))
-    sessions, of = fix_sessions(poses_of(receivers, sigma, time), IngestOptions(), Notes())
+    sessions, of = fix_sessions(poses_of(receivers, sigma, time), IngestOptions(), Remarks())
     moved = poses_of(*([column[row] for row in order] for column in (receivers, sigma, time)))
-    again, of_moved = fix_sessions(moved, IngestOptions(), Notes())
+    again, of_moved = fix_sessions(moved, IngestOptions(), Remarks())
     assert again == sessions
     assert of_moved.tolist() == of[order].tolist()
     assert set(of.tolist()) == set(range(len(sessions)))  # none is empty
@@ -81,7 +81,7 @@ def test_sessions_do_not_depend_on_the_order_of_the_photographs(data: st.DataObj
 def test_a_session_ends_after_four_hours_and_with_the_kind_of_receiver() -> None:
     def of(receivers: list[str], sigma: list[float], hours: list[float]) -> tuple[list[str], list[int]]:
         time_s = [3600 * hour for hour in hours]
-        sessions, index = fix_sessions(poses_of(receivers, sigma, time_s), IngestOptions(), Notes())
+        sessions, index = fix_sessions(poses_of(receivers, sigma, time_s), IngestOptions(), Remarks())
         return [each.receiver for each in sessions], index.tolist()
 
     rtk, plain = "RTK fixed", "single-frequency"
@@ -104,7 +104,7 @@ def test_a_session_ends_after_four_hours_and_with_the_kind_of_receiver() -> None
 )
 def test_stated_sigma_tells_the_kind_where_no_flag_does(receiver: str, sigma_m: list[float], kind: str) -> None:
     count = len(sigma_m)
-    sessions, of = fix_sessions(poses_of([receiver] * count, sigma_m, [0.0] * count), IngestOptions(), Notes())
+    sessions, of = fix_sessions(poses_of([receiver] * count, sigma_m, [0.0] * count), IngestOptions(), Remarks())
     assert sessions == (session(kind),)
     assert not of.any()
 

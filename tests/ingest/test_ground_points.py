@@ -17,27 +17,27 @@ from pipelines.ingest.ground_points import (
     tie_marks,
     unmarked_points,
 )
-from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
+from pipelines.ingest.remarks import Remarks
 
 SIZES = {"a.jpg": (64, 48), "b.jpg": (64, 48)}
 G1 = "7.75 46.02 1620 10.5 20.5 a.jpg G1\n7.75 46.02 1620 11.5 21.5 b.jpg G1\n"
 G2 = "7.76 46.02 1620 10.5 20.5 a.jpg G2\n7.76 46.02 1620 11.5 21.5 b.jpg G2\n"
 
 
-def _read(tmp_path: Path, rows: str, name: str = "gcp_list.txt", notes: Notes | None = None) -> GroundFile:
+def _read(tmp_path: Path, rows: str, name: str = "gcp_list.txt", remarks: Remarks | None = None) -> GroundFile:
     path = tmp_path / name
     path.write_text("EPSG:4979\n" + rows)
-    options, notes = IngestOptions(gcp=path), notes or Notes()
-    file, _ = read_ground_files(options, notes)
+    options, remarks = IngestOptions(gcp=path), remarks or Remarks()
+    file, _ = read_ground_files(options, remarks)
     assert file is not None
-    return tie_marks(file, SIZES, options.sigma_mark, notes)
+    return tie_marks(file, SIZES, options.sigma_mark, remarks)
 
 
 def test_points_and_marks(tmp_path: Path) -> None:
-    notes = Notes()
+    remarks = Remarks()
     rows = G1 + G2 + "7.75 46.02 1620 1 1 absent.jpg G1\n7.77 46.02 1620 1 1 a.jpg G3\n"
-    file = _read(tmp_path, rows, notes=notes)
+    file = _read(tmp_path, rows, remarks=remarks)
     assert [(point.name, point.is_marked) for point in file.points] == [("G1", True), ("G2", True), ("G3", False)]
     np.testing.assert_allclose(
         file.points[0].position_in_ecef, ecef_from_lla([46.02, 7.75, 1620.0]), rtol=0, atol=1e-8
@@ -45,13 +45,13 @@ def test_points_and_marks(tmp_path: Path) -> None:
     mark = file.points[0].marks[1]
     assert (mark.image, mark.x_px, mark.y_px, mark.sigma_px) == ("b.jpg", 11.5, 21.5, 0.5)
     assert file.crs.vertical.stated and file.crs.vertical.name == "ellipsoidal"
-    assert notes.warnings == [
+    assert remarks.warnings == [
         "1 mark is in an image that is not here: gcp_list.txt:6 (absent.jpg)",
     ]
     control, check = split_checks(file, None, [])
     assert [point.name for point in control if point.is_marked] == ["G1", "G2"]
-    unmarked_points(control, check, notes)
-    assert notes.warnings[1:] == [
+    unmarked_points(control, check, remarks)
+    assert remarks.warnings[1:] == [
         "1 ground point has marks in fewer than 2 images, and enters nothing until it is marked: G3 (control)"
     ]
 

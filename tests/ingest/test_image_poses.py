@@ -16,9 +16,9 @@ from pipelines.geodesy import enu
 from pipelines.geometry.rotations import geo_from_cam
 from pipelines.ingest.exif_poses import poses_from_tags
 from pipelines.ingest.flight_record import RECEIVER_SIGMA_M, ImagePoses
-from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo
+from pipelines.ingest.remarks import Remarks
 from pipelines.ingest.table_poses import poses_from_table
 
 GPS = GpsTag(46.02, 7.75, 1620.0, None, "")
@@ -57,8 +57,8 @@ def test_sigma_by_receiver_and_precedence() -> None:
         PhotoTags(gps=replace(GPS, sigma_h_m=1.2)),
         PhotoTags(gps=GPS),
     )
-    notes = Notes()
-    poses = poses_from_tags(photos, IngestOptions(), notes)
+    remarks = Remarks()
+    poses = poses_from_tags(photos, IngestOptions(), remarks)
     expected = [
         [0.02, 0.02, 0.03],
         [0.5, 0.5, 1.0],
@@ -69,110 +69,110 @@ def test_sigma_by_receiver_and_precedence() -> None:
     ]
     np.testing.assert_allclose(poses.sigma_enu_m, expected)
     assert poses.sigma_source == ("default", "default", "default", "file", "file", "default")
-    assert "σ of positions without one (1): 0.02 m horizontal, 0.03 m vertical (RTK fixed)" in notes.assumptions
+    assert "σ of positions without one (1): 0.02 m horizontal, 0.03 m vertical (RTK fixed)" in remarks.assumptions
 
-    notes = Notes()
-    overridden = poses_from_tags(photos, IngestOptions(sigma_h=0.7), notes)
-    assert "σ of positions without one (1): 0.03 m vertical (RTK fixed)" in notes.assumptions
+    remarks = Remarks()
+    overridden = poses_from_tags(photos, IngestOptions(sigma_h=0.7), remarks)
+    assert "σ of positions without one (1): 0.03 m vertical (RTK fixed)" in remarks.assumptions
     np.testing.assert_allclose(overridden.sigma_enu_m[:, :2], 0.7)
     assert overridden.sigma_enu_m[3, 2] == 0.025
     assert set(overridden.sigma_source) == {"option"}
 
 
 def test_exif_heights_are_assumed_not_refused() -> None:
-    poses = poses_from_tags(_photos(PhotoTags(gps=GPS)), IngestOptions(), Notes())
+    poses = poses_from_tags(_photos(PhotoTags(gps=GPS)), IngestOptions(), Remarks())
     assert poses.vertical.name == "ellipsoidal" and not poses.vertical.stated
     assert "often above a geoid" in poses.vertical.note
-    stated = poses_from_tags(_photos(PhotoTags(gps=GPS)), IngestOptions(vertical="ellipsoidal"), Notes())
+    stated = poses_from_tags(_photos(PhotoTags(gps=GPS)), IngestOptions(vertical="ellipsoidal"), Remarks())
     assert stated.vertical.stated
 
 
 def test_exif_heights_stated_above_a_geoid_need_its_grid() -> None:
     with pytest.raises(InputError, match=r"us_nga_egm96_15\.tif is not installed"):
-        poses_from_tags(_photos(PhotoTags(gps=GPS)), IngestOptions(vertical="EGM96"), Notes())
+        poses_from_tags(_photos(PhotoTags(gps=GPS)), IngestOptions(vertical="EGM96"), Remarks())
 
 
 def test_a_gimbal_is_kept_with_or_without_position() -> None:
     tags = PhotoTags(dji=DjiTags(gimbal_yaw_pitch_roll_deg=(45.0, -89.9, 0.0)))
-    poses = poses_from_tags(_photos(tags, PhotoTags()), IngestOptions(), Notes())
+    poses = poses_from_tags(_photos(tags, PhotoTags()), IngestOptions(), Remarks())
     assert not poses.located.any()
     np.testing.assert_allclose(poses.enu_from_cam[0], geo_from_cam([45.0, -89.9, 0.0]), atol=1e-14)
     assert np.isnan(poses.enu_from_cam[1]).all()
 
 
 def test_images_without_altitude_and_with_other_datums_are_noted() -> None:
-    notes = Notes()
+    remarks = Remarks()
     photos = _photos(PhotoTags(gps=replace(GPS, alt_m=None)), PhotoTags(gps=replace(GPS, datum="TOKYO")))
-    assert poses_from_tags(photos, IngestOptions(), notes).located.tolist() == [False, True]
-    assert notes.warnings == ["1 image has a GPS position without altitude: 0.jpg"]
-    assert "GPSMapDatum TOKYO is taken as WGS84" in notes.assumptions
+    assert poses_from_tags(photos, IngestOptions(), remarks).located.tolist() == [False, True]
+    assert remarks.warnings == ["1 image has a GPS position without altitude: 0.jpg"]
+    assert "GPSMapDatum TOKYO is taken as WGS84" in remarks.assumptions
 
 
 def test_height_is_of_exif_or_else_of_xmp() -> None:
     flat, dji = replace(GPS, alt_m=None), DjiTags(absolute_altitude_m=198.31)
     photos = _photos(PhotoTags(gps=flat, dji=dji), PhotoTags(gps=GPS, dji=dji), PhotoTags(dji=dji))
-    poses = poses_from_tags(photos, IngestOptions(), Notes())
+    poses = poses_from_tags(photos, IngestOptions(), Remarks())
     assert poses.located.tolist() == [True, True, False]
     np.testing.assert_allclose(_lla(poses)[:2, 2], [198.31, 1620.0], rtol=0, atol=1e-8)
 
 
 def test_a_table_by_name_wins_over_exif_and_does_not_mix_with_it() -> None:
-    notes = Notes()
+    remarks = Remarks()
     photos = _photos(*[PhotoTags(gps=replace(GPS, lat_deg=46.02), timestamp_s=5.0)] * 3)
-    poses = poses_from_table(_table(), photos, IngestOptions(), notes)
+    poses = poses_from_table(_table(), photos, IngestOptions(), remarks)
     assert poses.located.tolist() == [True, True, False]
     np.testing.assert_allclose(_lla(poses)[1], [46.02, 7.7502, 1622.0], rtol=0, atol=1e-9)
     assert poses.time_s.tolist() == [100.0, 101.0, 5.0]
-    assert notes.warnings == [
+    assert remarks.warnings == [
         "1 image has no position in t.csv: 2.jpg",
     ]
-    assert "latitude and longitude in t.csv are WGS84 (EPSG:4326)" in notes.assumptions
+    assert "latitude and longitude in t.csv are WGS84 (EPSG:4326)" in remarks.assumptions
     np.testing.assert_allclose(poses.sigma_enu_m[0], np.array(RECEIVER_SIGMA_M["unknown receiver"])[[0, 0, 1]])
 
 
 def test_a_table_by_time_interpolates_along_the_line() -> None:
-    notes = Notes()
+    remarks = Remarks()
     photos = _photos(
         PhotoTags(timestamp_s=100.5, time_source="assumed UTC"), PhotoTags(timestamp_s=105.0), PhotoTags()
     )
-    poses = poses_from_table(_table(names=None), photos, IngestOptions(), notes)
+    poses = poses_from_table(_table(names=None), photos, IngestOptions(), remarks)
     assert poses.located.tolist() == [True, False, False]
     ends = enu.ecef_from_lla([[46.02, 7.75, 1620.0], [46.02, 7.7502, 1622.0]])
     np.testing.assert_allclose(poses.position_in_ecef[0], ends.mean(axis=0), rtol=0, atol=1e-7)
-    assert "EXIF times without a zone are UTC" in notes.assumptions
-    assert "1 image has no time in EXIF: 2.jpg" in notes.warnings
-    assert "2 images have no position in t.csv: 1.jpg, 2.jpg" in notes.warnings
+    assert "EXIF times without a zone are UTC" in remarks.assumptions
+    assert "1 image has no time in EXIF: 2.jpg" in remarks.warnings
+    assert "2 images have no position in t.csv: 1.jpg, 2.jpg" in remarks.warnings
 
 
 def test_clocks_that_never_meet_are_explained() -> None:
     with pytest.raises(
         InputError, match=r"1970-01-01 00:01:40 UTC to .*another time zone\? Is --max-gap too small"
     ):
-        poses_from_table(_table(names=None), _photos(PhotoTags(timestamp_s=3700.0)), IngestOptions(), Notes())
+        poses_from_table(_table(names=None), _photos(PhotoTags(timestamp_s=3700.0)), IngestOptions(), Remarks())
     with pytest.raises(InputError, match="no column image, and no image has a time in EXIF"):
-        poses_from_table(_table(names=None), _photos(PhotoTags()), IngestOptions(), Notes())
+        poses_from_table(_table(names=None), _photos(PhotoTags()), IngestOptions(), Remarks())
 
 
 def test_rows_without_a_time_do_not_count(tmp_path: Path) -> None:
     times = np.array([100.0, np.nan])
     photos = _photos(PhotoTags(timestamp_s=100.0), PhotoTags(timestamp_s=100.5))
-    poses = poses_from_table(_table(names=None, time_s=times), photos, IngestOptions(), Notes())
+    poses = poses_from_table(_table(names=None, time_s=times), photos, IngestOptions(), Remarks())
     assert poses.located.tolist() == [True, False]
     with pytest.raises(InputError, match=r"t\.csv \[timestamp\]: no row has a time"):
-        poses_from_table(_table(names=None, time_s=times * np.nan), photos, IngestOptions(), Notes())
+        poses_from_table(_table(names=None, time_s=times * np.nan), photos, IngestOptions(), Remarks())
 
 
 def test_missing_heights_are_taken_from_exif() -> None:
-    notes = Notes()
+    remarks = Remarks()
     xyz = np.array([[7.75, 46.02, np.nan], [7.7502, 46.02, np.nan]])
     table = _table(xyz=xyz, geographic=None, crs_text="EPSG:4326", source="geo.txt", path=Path("geo.txt"))
-    poses = poses_from_table(table, _photos(PhotoTags(gps=GPS), PhotoTags()), IngestOptions(), notes)
+    poses = poses_from_table(table, _photos(PhotoTags(gps=GPS), PhotoTags()), IngestOptions(), remarks)
     assert poses.located.tolist() == [True, False]
     assert _lla(poses)[0, 2] == pytest.approx(1620.0, abs=1e-8)
-    assert "heights that geo.txt lacks are from EXIF (1)" in notes.assumptions
-    assert "1 row has no height and was left out: geo.txt:3" in notes.warnings
+    assert "heights that geo.txt lacks are from EXIF (1)" in remarks.assumptions
+    assert "1 row has no height and was left out: geo.txt:3" in remarks.warnings
     with pytest.raises(InputError, match=r"geo\.txt: has no heights"):
-        poses_from_table(table, _photos(PhotoTags(), PhotoTags()), IngestOptions(), Notes())
+        poses_from_table(table, _photos(PhotoTags(), PhotoTags()), IngestOptions(), Remarks())
 
 
 @pytest.mark.parametrize(
@@ -195,27 +195,32 @@ def test_missing_heights_are_taken_from_exif() -> None:
 )
 def test_contradictions_about_the_crs(changes: dict[str, object], options: IngestOptions, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        poses_from_table(_table(**changes), _photos(PhotoTags(), PhotoTags()), options, Notes())
+        poses_from_table(_table(**changes), _photos(PhotoTags(), PhotoTags()), options, Remarks())
 
 
 def test_a_file_that_states_its_datum_keeps_it_and_says_so() -> None:
-    notes = Notes()
+    remarks = Remarks()
     table = _table(geographic=None, crs_text="EPSG:4979", path=Path("geo.txt"))
     options = IngestOptions(vertical="EGM96")
-    assert poses_from_table(table, _photos(PhotoTags(), PhotoTags()), options, notes).vertical.name == "ellipsoidal"
+    assert (
+        poses_from_table(table, _photos(PhotoTags(), PhotoTags()), options, remarks).vertical.name == "ellipsoidal"
+    )
     assert (
         "heights of geo.txt are ellipsoidal, as its CRS says; --vertical does not apply to them"
-        in notes.assumptions
+        in remarks.assumptions
     )
 
 
 def test_feet_and_the_accuracy_of_a_datum_are_told() -> None:
-    notes = Notes()
+    remarks = Remarks()
     xyz = np.array([[1450000.0, 540000.0, 1000.0], [1450010.0, 540000.0, 1000.0]])
     poses = poses_from_table(
-        _table(xyz=xyz, geographic=False), _photos(PhotoTags(), PhotoTags()), IngestOptions(crs="EPSG:2264"), notes
+        _table(xyz=xyz, geographic=False),
+        _photos(PhotoTags(), PhotoTags()),
+        IngestOptions(crs="EPSG:2264"),
+        remarks,
     )
     assert _lla(poses)[0, 2] == pytest.approx(1000.0 * 1200 / 3937)
-    assert "heights of EPSG:2264 are in US survey foot" in notes.assumptions
-    assert any("published with 4 m" in text for text in notes.assumptions)
-    assert any("us_noaa_nchpgn.tif" in text for text in notes.warnings)
+    assert "heights of EPSG:2264 are in US survey foot" in remarks.assumptions
+    assert any("published with 4 m" in text for text in remarks.assumptions)
+    assert any("us_noaa_nchpgn.tif" in text for text in remarks.warnings)

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from pipelines.core.errors import InputError
-from pipelines.ingest.notes import Notes
 from pipelines.ingest.photo_folder import scan_folder
+from pipelines.ingest.remarks import Remarks
 from tests.photos import jpeg
 
 
@@ -24,12 +24,12 @@ def test_every_defect_is_left_out_and_counted(tmp_path: Path) -> None:
     (root / "cut.jpg").write_bytes(jpeg(3)[:700])
     (root / "text.png").write_text("no image")
     (root / "._b.jpg").write_bytes(b"resource fork")
-    (root / "notes.txt").write_text("not looked at")
+    (root / "remarks.txt").write_text("not looked at")
     (root / "link.jpg").symlink_to(outside)
-    notes = Notes()
-    photos = scan_folder(root, notes)
+    remarks = Remarks()
+    photos = scan_folder(root, remarks)
     assert [photo.name for photo in photos] == ["b.jpg", "sub/a.JPEG"]
-    assert notes.warnings == [
+    assert remarks.warnings == [
         "1 image is a link that leaves the folder and was left out: link.jpg",
         "3 images were left out: cut.jpg (is damaged: it does not decode to its end), empty.jpg (is empty), "
         "text.png (is no JPEG, PNG or TIFF image)",
@@ -39,6 +39,6 @@ def test_every_defect_is_left_out_and_counted(tmp_path: Path) -> None:
 
 def test_no_folder_and_no_image(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"absent \[--images\]: no such folder of photographs"):
-        scan_folder(tmp_path / "absent", Notes())
+        scan_folder(tmp_path / "absent", Remarks())
     with pytest.raises(InputError, match="holds no JPEG, PNG or TIFF image"):
-        scan_folder(tmp_path, Notes())
+        scan_folder(tmp_path, Remarks())

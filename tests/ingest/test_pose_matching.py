@@ -9,7 +9,7 @@ import pytest
 
 from pipelines.core.errors import InputError
 from pipelines.formats.trajectory_csv import PoseTable
-from pipelines.ingest.notes import Notes
+from pipelines.ingest.remarks import Remarks
 from pipelines.ingest.table_poses import match_by_name
 
 
@@ -19,11 +19,11 @@ def _named(names: tuple[str, ...]) -> PoseTable:
 
 
 def test_match_by_name_tells_what_did_not_fit() -> None:
-    notes = Notes()
-    rows = match_by_name(_named(("b.jpg", "A.JPG", "zzz.jpg", "c")), ["a.jpg", "b.jpg", "c.jpg"], notes)
+    remarks = Remarks()
+    rows = match_by_name(_named(("b.jpg", "A.JPG", "zzz.jpg", "c")), ["a.jpg", "b.jpg", "c.jpg"], remarks)
     assert rows.names == ("b.jpg", "a.jpg", "c.jpg")
     assert rows.lines.tolist() == [2, 3, 5]
-    assert notes.warnings == [
+    assert remarks.warnings == [
         "1 row names no image here: t.csv:4 (zzz.jpg)",
         "2 rows name their images with another case or without suffix: "
         "t.csv:3 (A.JPG for a.jpg), t.csv:5 (c for c.jpg)",
@@ -40,4 +40,4 @@ def test_match_by_name_tells_what_did_not_fit() -> None:
 )
 def test_match_by_name_refuses(names: tuple[str, ...], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        match_by_name(_named(names), ["a.jpg", "b.jpg"], Notes())
+        match_by_name(_named(names), ["a.jpg", "b.jpg"], Remarks())

@@ -10,7 +10,7 @@ import pytest
 from pipelines.core.errors import InputError
 from pipelines.formats.ground_points import read_geo
 from pipelines.formats.trajectory_csv import PoseTable, read_trajectory
-from pipelines.ingest.notes import Notes
+from pipelines.ingest.remarks import Remarks
 from pipelines.ingest.table_poses import usable_rows
 
 
@@ -20,39 +20,39 @@ def _read(tmp_path: Path, name: str, text: str) -> PoseTable:
 
 
 def test_unknown_columns_are_counted(tmp_path: Path) -> None:
-    notes = Notes()
-    usable_rows(_read(tmp_path, "t.csv", "\nimage,x,y,z,battery,\na,1,2,3,77,\n"), notes)
-    assert notes.warnings == ["2 columns are unknown and were ignored: t.csv:2 (battery), t.csv:2 (unnamed)"]
+    remarks = Remarks()
+    usable_rows(_read(tmp_path, "t.csv", "\nimage,x,y,z,battery,\na,1,2,3,77,\n"), remarks)
+    assert remarks.warnings == ["2 columns are unknown and were ignored: t.csv:2 (battery), t.csv:2 (unnamed)"]
 
 
 def test_times_without_zone_are_called_utc(tmp_path: Path) -> None:
-    notes = Notes()
-    usable_rows(_read(tmp_path, "t.csv", "time,x,y,z\n2023-11-14 22:13:20,1,2,3\n"), notes)
-    assert notes.assumptions == ["times without a zone in t.csv are UTC"]
+    remarks = Remarks()
+    usable_rows(_read(tmp_path, "t.csv", "time,x,y,z\n2023-11-14 22:13:20,1,2,3\n"), remarks)
+    assert remarks.assumptions == ["times without a zone in t.csv are UTC"]
 
 
 def test_rows_without_position_are_counted(tmp_path: Path) -> None:
-    notes = Notes()
-    table = usable_rows(_read(tmp_path, "t.csv", "image,x,y,z\na,1,2,3\nb,nan,2,3\nc,,,\nd,inf,1,2\n"), notes)
+    remarks = Remarks()
+    table = usable_rows(_read(tmp_path, "t.csv", "image,x,y,z\na,1,2,3\nb,nan,2,3\nc,,,\nd,inf,1,2\n"), remarks)
     assert table.names == ("a",)
-    assert notes.warnings == ["3 rows have no position (empty or NaN): t.csv:3, t.csv:4, t.csv:5"]
+    assert remarks.warnings == ["3 rows have no position (empty or NaN): t.csv:3, t.csv:4, t.csv:5"]
 
 
 def test_a_row_of_geo_txt_may_lack_its_height(tmp_path: Path) -> None:
-    notes = Notes()
+    remarks = Remarks()
     rows = "EPSG:4326\na.jpg 7.75 46.02\nb.jpg nan 46.02 1620.5\nc.jpg 7.75 46.02 1620.5\n"
-    table = usable_rows(_read(tmp_path, "geo.txt", rows), notes)
+    table = usable_rows(_read(tmp_path, "geo.txt", rows), remarks)
     assert table.names == ("a.jpg", "c.jpg")
     assert table.lines.tolist() == [2, 4]
     assert np.isnan(table.xyz[0, 2])
-    assert notes.warnings == ["1 row has no position (NaN): geo.txt:3"]
+    assert remarks.warnings == ["1 row has no position (NaN): geo.txt:3"]
 
 
 def test_repeated_times_are_counted(tmp_path: Path) -> None:
-    notes = Notes()
-    table = usable_rows(_read(tmp_path, "t.csv", "time,x,y,z\n5,1,2,3\n4,1,2,3\n5,9,9,9\n"), notes)
+    remarks = Remarks()
+    table = usable_rows(_read(tmp_path, "t.csv", "time,x,y,z\n5,1,2,3\n4,1,2,3\n5,9,9,9\n"), remarks)
     assert table.xyz.tolist() == [[1, 2, 3], [1, 2, 3]]
-    assert notes.warnings == ["1 row repeats an earlier time and was left out: t.csv:4"]
+    assert remarks.warnings == ["1 row repeats an earlier time and was left out: t.csv:4"]
 
 
 @pytest.mark.parametrize(
@@ -61,4 +61,4 @@ def test_repeated_times_are_counted(tmp_path: Path) -> None:
 )
 def test_a_table_without_any_position_is_refused(tmp_path: Path, name: str, text: str) -> None:
     with pytest.raises(InputError, match=rf"{name}: no row has a position"):
-        usable_rows(_read(tmp_path, name, text), Notes())
+        usable_rows(_read(tmp_path, name, text), Remarks())

@@ -16,9 +16,9 @@ from pipelines.geodesy.enu import Origin, ecef_from_enu, ecef_from_lla, lla_from
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.ingest.exif_poses import compare_with_exif
 from pipelines.ingest.flight_record import ImagePoses
-from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo
+from pipelines.ingest.remarks import Remarks
 
 ORIGIN = Origin(lat_deg=46.0, lon_deg=7.75, alt_m=1600.0)
 PATH = Path("t.csv")
@@ -54,12 +54,12 @@ def table_of(positions_in_ecef: np.ndarray) -> ImagePoses:
     )
 
 
-def compared(positions: np.ndarray, options: IngestOptions | None = None) -> Notes:
-    """Notes of a table with these positions (n, 3) in geo, whose photographs are on `TRACK`."""
-    notes = Notes()
+def compared(positions: np.ndarray, options: IngestOptions | None = None) -> Remarks:
+    """Remarks of a table with these positions (n, 3) in geo, whose photographs are on `TRACK`."""
+    remarks = Remarks()
     table = table_of(ecef_from_enu(positions, ORIGIN))
-    compare_with_exif(table, photos_at(TRACK), PATH, options or IngestOptions(), notes)
-    return notes
+    compare_with_exif(table, photos_at(TRACK), PATH, options or IngestOptions(), remarks)
+    return remarks
 
 
 def test_receivers_that_differ_by_metres_agree() -> None:
@@ -98,7 +98,7 @@ def test_contradictions_are_named_and_can_be_accepted(positions: np.ndarray, say
 def test_heights_in_feet_are_recognised(factor: float, says: str) -> None:
     lla = lla_from_ecef(ecef_from_enu(TRACK, ORIGIN)) * [1.0, 1.0, factor]
     with pytest.raises(ContradictionError, match=says):
-        compare_with_exif(table_of(ecef_from_lla(lla)), photos_at(TRACK), PATH, IngestOptions(), Notes())
+        compare_with_exif(table_of(ecef_from_lla(lla)), photos_at(TRACK), PATH, IngestOptions(), Remarks())
 
 
 def test_a_clock_offset_is_named_with_its_size() -> None:
@@ -109,7 +109,7 @@ def test_a_clock_offset_is_named_with_its_size() -> None:
         for photo, when in zip(photos_at(TRACK), time_s, strict=True)
     ]
     with pytest.raises(ContradictionError, match=r"the times are off by about \+(5|6)\.\d s"):
-        compare_with_exif(table_of(ecef_from_enu(late, ORIGIN)), photos, PATH, IngestOptions(), Notes())
+        compare_with_exif(table_of(ecef_from_enu(late, ORIGIN)), photos, PATH, IngestOptions(), Remarks())
 
 
 def test_a_geoid_between_the_heights_is_a_caution() -> None:

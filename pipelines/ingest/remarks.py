@@ -1,4 +1,4 @@
-"""Notes on the way to a survey: assumptions, and rows or files that were left out and why."""
+"""Remarks on a survey: assumptions, warnings of what was left out, and cautions."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _SHOWN = 4
 
 
 @dataclass
-class Notes:
+class Remarks:
     """Assumptions, warnings and cautions, gathered while a survey is read, in order and without repeats."""
 
     assumptions: list[Remark] = field(default_factory=list)
@@ -29,13 +29,13 @@ class Notes:
         """Record a limit of every result of this survey."""
         _add(self.cautions, code, sentence)
 
-    def warn_counted(self, code: str, items: Sequence[str], singular: str, plural: str) -> None:
+    def warn_counted(self, code: str, items: Sequence[str], fault: str) -> None:
         """Record one warning for all items (files, or places as `file:line`), with their count and the first few.
 
-        The fault of one, e.g. "image is empty and was left out", is `singular`, and that of many is `plural`.
+        The fault is a sentence in the plural, without a full stop: "Empty images are left out".
         """
         if items:
-            self.warn(code, f"{len(items)} {singular if len(items) == 1 else plural}: {shortened(items)}")
+            self.warn(code, f"{fault} ({len(items)}): {shortened(items)}.")
 
 
 def _add(remarks: list[Remark], code: str, sentence: str) -> None:
