@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from pipelines.survey.survey import Survey
 from tests import bags
 
 Ingest = Callable[..., Survey]
-Refused = Callable[..., str]
+Refusal = Callable[..., dict[str, Any]]
 
 
 def check(survey: Survey, flight: bags.Flight, *, tolerance_m: float = 1e-3, attitude: bool = True) -> None:
@@ -26,5 +27,7 @@ def check(survey: Survey, flight: bags.Flight, *, tolerance_m: float = 1e-3, att
         assert np.degrees(np.linalg.norm(turned, axis=1)).max() < 0.01
 
 
-def warned(survey: Survey, text: str) -> bool:
-    return any(text in warning for warning in survey.warnings)
+def remarked(survey: Survey, code: str, *parts: str) -> bool:
+    """Whether a warning or an assumption has the code and all parts (numbers, topics, files)."""
+    remarks = (*survey.warnings, *survey.assumptions)
+    return any(one.code == code and all(part in one.sentence for part in parts) for one in remarks)

@@ -180,50 +180,55 @@ def _horizontal(places: _Places, path: Path) -> tuple[bool, Remark] | None:
     contradicting = distance > allowed
     if contradicting.mean() <= _MOST_CONTRADICTING:
         return None
-    cause = _cause(places, float(np.median(distance)), float(np.median(allowed)) / _SIGMAS)
+    code, cause = _cause(places, float(np.median(distance)), float(np.median(allowed)) / _SIGMAS)
     sentence = f"{int(contradicting.sum())} of {len(distance)} positions in {path.name} {cause}"
-    return True, Remark(code="table-against-exif", sentence=sentence)
+    return True, Remark(code=code, sentence=sentence)
 
 
-def _cause(places: _Places, typical_m: float, sigma_m: float) -> str:
-    """Return how most positions differ, by the first pattern that leaves less than half of the median distance.
+def _cause(places: _Places, typical_m: float, sigma_m: float) -> tuple[str, str]:
+    """Return code and sentence of how most positions differ.
 
+    The first pattern counts that leaves less than half of the median distance.
     `sigma_m` is the σ of that distance.
     """
     apart, names = places.table - places.exif, places.name
     if typical_m > _KILOMETRES_M:
-        return f"are {typical_m / 1000:.0f} km from those in EXIF: another CRS or zone, or exchanged axes?"
+        cause = (
+            f"are {typical_m / 1000:.0f} km from those in EXIF. Is it another CRS or zone, or are axes exchanged?"
+        )
+        return "exif-far-away", cause
     if scatter_about_median(apart) < 0.2 * typical_m:
         east, north = np.median(apart, axis=0)
-        return (
-            f"are shifted by {east:+.1f} m east and {north:+.1f} m north against EXIF: another datum, or a base "
-            "station in a wrong place?"
+        cause = (
+            f"are shifted by {east:+.1f} m east and {north:+.1f} m north against EXIF. Is it another datum, or a "
+            "base station with wrong coordinates?"
         )
+        return "exif-shift", cause
     swapped = (places.table - places.table.mean(axis=0))[:, ::-1] - (places.exif - places.exif.mean(axis=0))
     if scatter_about_median(swapped) < 0.5 * scatter_about_median(apart):
-        return "differ from those in EXIF as mirrored ones do: east and north are exchanged"
+        return "exif-axes-exchanged", "are mirrored against those in EXIF: east and north are exchanged."
     if (groups := two_groups(apart)) is not None:
         second = listed([names[row] for row in np.flatnonzero(groups.second)])
-        return (
+        cause = (
             f"differ from those in EXIF: {int(groups.second.sum())} are shifted by {groups.apart[0]:+.1f} m east "
-            f"and {groups.apart[1]:+.1f} m north against the others: another base station? ({second})"
+            f"and {groups.apart[1]:+.1f} m north against the others ({second}). Is it another base station?"
         )
+        return "exif-two-groups", cause
     if (bad := blunders_among(apart, sigma_m)) is not None and bad.mean() < 0.5:
         off = np.hypot(*(apart - np.median(apart, axis=0)).T)
         rows = np.flatnonzero(bad)[np.argsort(-off[bad], kind="stable")]
-        return (
-            "differ from those in EXIF, and the others agree: these are blunders, in the table or in EXIF: "
-            f"{listed([f'{names[row]} {off[row]:.1f} m' for row in rows])}"
-        )
+        blunders = listed([f"{names[row]} {off[row]:.1f} m" for row in rows])
+        return "exif-blunders", f"differ from those in EXIF, and the others agree. Blunders: {blunders}."
     differ = f"differ from those in EXIF by {typical_m:.1f} m"
     nearest, at = KDTree(places.exif).query(places.table)
     if (offset := _clock_offset(places)) is not None:
-        return f"{differ}, along the track: the times are off by about {offset:+.1f} s"
+        return "exif-times-off", f"{differ}, along the track: the times are off by about {offset:+.1f} s."
     if float(np.median(nearest)) < max(2.0 * sigma_m, 0.2 * typical_m) and (at != np.arange(len(at))).mean() > 0.5:
-        return f"{differ}, but lie where other photographs were taken: rows of other images, or times that are off?"
+        cause = f"{differ}, but lie where other photographs were taken. Are rows of other images, or times off?"
+        return "exif-other-images", cause
     if typical_m < median_spacing(places.exif) / 2:
-        return f"{differ}, without any pattern: noise, so that σ of the table or of EXIF is too small"
-    return f"{differ}, in changing directions: times that are off, or rows of other images?"
+        return "exif-noise", f"{differ}, without any pattern: the σ of the table or of EXIF is too small."
+    return "exif-no-pattern", f"{differ}, in changing directions. Are times off, or rows of other images?"
 
 
 def _clock_offset(places: _Places) -> float | None:
@@ -251,10 +256,11 @@ def _heights(
         left = abs(float(np.median(heights_m[:, 0] * factor - heights_m[:, 1])))
         tolerance = max(_UNIT_PART * abs(float(np.median(heights_m[:, 1]))), allowed / _SIGMAS)
         if abs(offset) > _EVIDENT * allowed and left < tolerance:
-            sentence = f"the heights in {path.name} are {cause}: those in EXIF are {factor:.4g} times as large"
+            sentence = f"The heights in {path.name} are {cause}: those in EXIF are {factor:.4g} times as large."
             return True, Remark(code="feet", sentence=sentence)
     sentence = (
-        f"the heights in {path.name} differ from those in EXIF by {offset:+.1f} m (± {spread:.1f} m): one is above "
-        "the ellipsoid, the other above a geoid, the take-off or a barometer's zero; see --vertical"
+        f"The heights in {path.name} differ from those in EXIF by {offset:+.1f} m (± {spread:.1f} m): one counts "
+        "from the ellipsoid, the other from a geoid, the take-off or a barometer's zero. State the datum with "
+        "--vertical."
     )
     return abs(offset) > MOST_GEOID_M, Remark(code="heights-apart", sentence=sentence)

@@ -8,6 +8,7 @@ from pyproj import Proj
 
 from pipelines.core.errors import InputError
 from pipelines.geodesy.crs import grid_from_enu, parse_crs
+from tests.refusals import refused
 
 
 @pytest.mark.parametrize(
@@ -45,5 +46,5 @@ def test_axes_that_point_west_and_south_are_half_a_turn() -> None:
 
 
 def test_left_handed_axes_are_refused() -> None:
-    with pytest.raises(InputError, match="left-handed"):
+    with refused("axes-left-handed", InputError):
         grid_from_enu(parse_crs("EPSG:5513"), [[50.0, 14.4, 300.0]])

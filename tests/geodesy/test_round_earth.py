@@ -29,6 +29,7 @@ from tests.map_projections import (
     polar_stereographic_north,
     utm,
 )
+from tests.refusals import refused
 
 Projection = Callable[[np.ndarray], np.ndarray]
 
@@ -189,7 +190,7 @@ def test_a_sites_own_grid_may_have_points_at_its_zero() -> None:
     lla = parse_crs(text).lla_from_xyz([[0.0, 0.0, 5.0], [40.0, 30.0, 5.0]])
     geo = enu_from_lla(lla, Origin(lat_deg=46.02, lon_deg=7.75, alt_m=5.0))
     np.testing.assert_allclose(geo, [[0, 0, 0], [40, 30, 0]], rtol=0, atol=1e-3)
-    with pytest.raises(InputError, match=r"degrees\?"):
+    with refused("degrees-in-projection", InputError):
         parse_crs("+proj=utm +zone=32 +datum=WGS84").lla_from_xyz([[7.75, 46.02, 5.0]])
 
 
@@ -208,9 +209,9 @@ def test_one_operation_across_the_date_line() -> None:
 
 
 def test_points_outside_are_not_given_coordinates() -> None:
-    with pytest.raises(InputError, match="far outside the area of EPSG:32632"):
+    with refused("point-outside-area", InputError):
         parse_crs("EPSG:32632").xyz_from_lla([[40.0, -100.0, 10.0]])
-    with pytest.raises(InputError, match="not a number"):
+    with refused("point-not-finite", InputError):
         parse_crs("EPSG:32632").xyz_from_lla([[np.nan, 9.0, 10.0]])
 
 
@@ -268,12 +269,12 @@ def test_orthometric_heights_in_feet_or_metres(
     ],
 )
 def test_without_its_grid_no_height_and_no_shift(text: str, place: tuple[float, float], grid: str) -> None:
-    with pytest.raises(InputError) as error:
+    with refused("grid-not-installed", InputError) as error:
         parse_crs(text).xyz_from_lla(around(*place))
     message = str(error.value)
-    assert f"the PROJ grid {grid} is not installed" in message and f"pyproj sync --file {grid}" in message
+    assert f"PROJ grid {grid} " in message and f"pyproj sync --file {grid}" in message
     is_of_heights = "+nadgrids" not in text and text != "EPSG:2029"
-    assert ("made ellipsoidal" in message) == is_of_heights
+    assert ("--vertical ellipsoidal" in message) == is_of_heights
 
 
 def test_a_shift_of_zero_that_the_user_states_is_one() -> None:
@@ -283,15 +284,16 @@ def test_a_shift_of_zero_that_the_user_states_is_one() -> None:
 
 
 def test_a_vertical_datum_without_any_geoid_says_so() -> None:
-    with pytest.raises(InputError, match="DHHN92 height cannot be made ellipsoidal: PROJ knows no geoid"):
+    with refused("geoid-unknown", InputError) as error:
         parse_crs("EPSG:25832+5783").xyz_from_lla(around(50.0, 9.0))
+    assert "DHHN92 height" in error.value.message
 
 
 @pytest.mark.parametrize(("crs", "place"), [("EPSG:4547", (30.0, 114.2)), ("EPSG:22217", (43.7, -80.0))])
 def test_a_modern_datum_without_a_published_way_gets_one_to_copy(crs: str, place: tuple[float, float]) -> None:
-    with pytest.raises(InputError, match="no transformation") as error:
+    with refused("no-transformation", InputError) as error:
         parse_crs(crs).xyz_from_lla(around(*place))
-    offered = str(error.value).rpartition("need: ")[2]
+    offered = str(error.value).rpartition("give: ")[2]
     lla = around(*place)
     central, scale = (114.0, 1.0) if crs == "EPSG:4547" else (-81.0, 0.9996)
     grid = TransverseMercator(central, scale=scale, flattening=GRS80_FLATTENING)
@@ -299,6 +301,6 @@ def test_a_modern_datum_without_a_published_way_gets_one_to_copy(crs: str, place
 
 
 def test_an_old_datum_gets_no_such_offer() -> None:
-    with pytest.raises(InputError, match="no transformation") as error:
+    with refused("no-transformation", InputError) as error:
         parse_crs("EPSG:2327").xyz_from_lla(around(35.0, 75.0))  # Xian 1980
     assert "towgs84=0,0,0" not in str(error.value)

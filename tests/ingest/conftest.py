@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -12,7 +14,7 @@ from pipelines.core.products import load_json
 from pipelines.survey.survey import Survey
 from tests import bags
 from tests.bags import Message
-from tests.ingested_bags import Ingest, Refused
+from tests.ingested_bags import Ingest, Refusal
 
 
 @pytest.fixture
@@ -33,14 +35,14 @@ def ingest(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Ingest:
 
 
 @pytest.fixture
-def refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Refused:
-    """What `georef ingest --bag` says of a bag that it must refuse."""
+def refusal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Refusal:
+    """The error document of `georef ingest --bag` of a bag that it must refuse."""
 
-    def call(bag: Path | list[Message], *arguments: str) -> str:
+    def call(bag: Path | list[Message], *arguments: str) -> dict[str, Any]:
         path = bag if isinstance(bag, Path) else bags.write(tmp_path / "refused", bag)
-        code = boundary.guarded(cli, ["ingest", str(tmp_path / "never"), "--bag", str(path), *arguments])
-        captured = capsys.readouterr()
-        assert (code, captured.out) in ((1, ""), (2, ""))
-        return captured.err
+        code = boundary.guarded(cli, ["ingest", str(tmp_path / "never"), "--bag", str(path), "--json", *arguments])
+        assert code in (1, 2)
+        error: dict[str, Any] = json.loads(capsys.readouterr().out)["error"]
+        return error
 
     return call

@@ -14,7 +14,7 @@ from pipelines.geometry.trajectory import mount
 from pipelines.survey.calibrated import NavigationTrack
 from tests import bags
 from tests.bags import Flight, Form, Message
-from tests.ingested_bags import Ingest, Refused, check, warned
+from tests.ingested_bags import Ingest, Refusal, check, remarked
 from tests.px4_bags import px4
 
 WHERE = "46.02,7.75,1620"
@@ -113,7 +113,7 @@ def test_sixteen_bits_keep_their_top_eight(ingest: Ingest, tmp_path: Path) -> No
     (workspace,) = tmp_path.glob("ws*")
     read = cv2.imread(str(workspace / survey.image_dir / survey.images[1].name), cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(read, bags.picture(1)[..., 0])
-    assert any("12 bits in use" in text for text in survey.assumptions)
+    assert remarked(survey, "image-bit-depth", "12 bits")
 
 
 @pytest.mark.parametrize(
@@ -163,7 +163,7 @@ def test_frames_by_time_by_distance_and_sharp(ingest: Ingest) -> None:
             message.data = cv2.imencode(".jpg", soft)[1].ravel()
     survey = ingest(messages, "--every", "2s", "--skip-blurred")
     assert [int(image.name[6:12]) for image in survey.images] == [0, 2, 4, 7, 9, 11]
-    assert warned(survey, "1 frames are blurred")
+    assert remarked(survey, "blurred-frames", "1 frames")
 
 
 class TestBadMessages:
@@ -179,10 +179,10 @@ class TestBadMessages:
             message.position_covariance_type = 0
         survey = ingest(messages)
         assert [image.fix is None for image in survey.images] == [False, False, True, True, False, False]
-        assert warned(survey, "20 of 65 messages of /gnss/fix were left out: no fix (status)")
-        assert warned(survey, "1 of 65 messages of /gnss/fix were left out: altitude is NaN")
-        assert warned(survey, "latitude or longitude is NaN")
-        assert warned(survey, "2 frames have no position within --max-gap 1 s")
+        assert remarked(survey, "message-unusable", "20 of 65", "/gnss/fix", "no fix (status)")
+        assert remarked(survey, "message-unusable", "1 of 65", "/gnss/fix", "altitude is NaN")
+        assert remarked(survey, "message-unusable", "latitude or longitude is NaN")
+        assert remarked(survey, "images-without-position", "--max-gap 1 s", "(2)")
         fix = survey.images[0].fix
         assert fix is not None and fix.sigma_source == "default"
 
@@ -194,8 +194,8 @@ class TestBadMessages:
         stamped[13].header.stamp = bags.time(bags.START + 10**13)
         survey = ingest(messages)
         check(survey, flight)
-        assert warned(survey, "1 of 65 messages of /gnss/fix have a stamp that is not later")
-        assert warned(survey, "1 of 65 messages of /gnss/fix have a stamp more than a minute off")
+        assert remarked(survey, "stamp-not-later", "1 of 65", "/gnss/fix")
+        assert remarked(survey, "stamp-jump", "1 of 65", "/gnss/fix")
 
     def test_no_stamps_at_all(self, ingest: Ingest) -> None:
         flight = Flight()
@@ -205,7 +205,7 @@ class TestBadMessages:
                 message.header.stamp = bags.time(0)
         survey = ingest(messages)
         check(survey, flight)
-        assert any("have no stamp: the time of recording" in text for text in survey.assumptions)
+        assert remarked(survey, "messages-without-stamp")
 
     def test_messages_that_do_not_decode(self, ingest: Ingest) -> None:
         flight = Flight(count=8)
@@ -219,9 +219,10 @@ class TestBadMessages:
                 message.data, message.format = np.frombuffer(b"not a picture", np.uint8), "h264"
         survey = ingest(messages)
         assert [image.name[6:12] for image in survey.images] == ["000000", *(f"{i:06d}" for i in range(3, 8))]
-        assert warned(survey, "2 images of /camera/image_raw/compressed were left out: message 1 (")
-        assert warned(survey, "is neither JPEG nor PNG (format 'h264')")
-        assert warned(survey, "1 messages of /gnss/fix do not decode")
+        assert remarked(
+            survey, "image-unreadable", "/camera/image_raw/compressed", "(2): message 1 (", "format 'h264'"
+        )
+        assert remarked(survey, "message-damaged", "1 messages", "/gnss/fix")
 
     @pytest.mark.parametrize("storage", list(StoragePlugin))
     def test_damage_in_the_middle(self, ingest: Ingest, tmp_path: Path, storage: StoragePlugin) -> None:
@@ -240,51 +241,52 @@ class TestBadMessages:
         file.write_bytes(data)
         survey = ingest(tmp_path / "bag")
         assert 5 < len(survey.images) < 20
-        assert warned(survey, "is damaged: it could be read for")
+        assert remarked(survey, "bag-damaged")
 
-    def test_truncated_bag(self, refused: Refused, tmp_path: Path) -> None:
+    def test_truncated_bag(self, refusal: Refusal, tmp_path: Path) -> None:
         for storage in StoragePlugin:
             bags.write(tmp_path / storage.name, bags.usual(Flight()), Form(storage))
             for path in (tmp_path / storage.name).iterdir():
                 if path.suffix in (".mcap", ".db3"):
                     path.write_bytes(path.read_bytes()[: path.stat().st_size // 3])
-        assert "is damaged" in refused(tmp_path / "MCAP")
+        assert "damaged" in refusal(tmp_path / "MCAP")["message"]
         # SQLite reads on as far as its pages go: what is there is too little, or the file is refused.
-        assert "damaged" in refused(tmp_path / "SQLITE3")
+        assert "damaged" in refusal(tmp_path / "SQLITE3")["message"]
 
-    def test_no_bag(self, refused: Refused, tmp_path: Path) -> None:
+    def test_no_bag(self, refusal: Refusal, tmp_path: Path) -> None:
         (tmp_path / "x.mcap").write_bytes(b"")
-        assert "is no bag, or is damaged" in refused(tmp_path / "x.mcap")
+        assert "damaged" in refusal(tmp_path / "x.mcap")["message"]
         (tmp_path / "empty").mkdir()
-        assert "has no metadata.yaml" in refused(tmp_path / "empty")
+        assert "metadata.yaml" in refusal(tmp_path / "empty")["message"]
         (tmp_path / "x.txt").write_bytes(b"text")
-        assert "give a rosbag2 folder" in refused(tmp_path / "x.txt")
+        assert "rosbag2 folder" in refusal(tmp_path / "x.txt")["message"]
 
 
 class TestWhatIsMissing:
-    def test_local_frame_needs_an_origin(self, refused: Refused) -> None:
+    def test_local_frame_needs_an_origin(self, refusal: Refusal) -> None:
         flight = Flight()
-        message = refused([*bags.poses(flight, "nav_msgs/msg/Odometry"), *bags.images(flight)])
-        assert "give --origin LAT,LON,HEIGHT" in message
+        error = refusal([*bags.poses(flight, "nav_msgs/msg/Odometry"), *bags.images(flight)])
+        assert (error["code"], error["field"]) == ("local-frame-without-origin", "--origin")
 
-    def test_no_photographs(self, refused: Refused) -> None:
-        assert "has no topic of sensor_msgs/Image" in refused(bags.fixes(Flight()))
+    def test_no_photographs(self, refusal: Refusal) -> None:
+        assert refusal(bags.fixes(Flight()))["code"] == "no-image-topic"
 
-    def test_named_topic(self, refused: Refused) -> None:
-        message = refused(bags.usual(Flight()), "--fix-topic", "/imu/data")
-        assert "/imu/data is a sensor_msgs/msg/Imu; those with positions: /gnss/fix" in message
+    def test_named_topic(self, refusal: Refusal) -> None:
+        error = refusal(bags.usual(Flight()), "--fix-topic", "/imu/data")
+        assert (error["code"], error["field"]) == ("topic-type", "--fix-topic")
+        assert all(part in error["message"] for part in ("/imu/data", "sensor_msgs/msg/Imu", "/gnss/fix"))
 
-    def test_crs_has_no_meaning(self, refused: Refused) -> None:
-        message = refused(bags.usual(Flight()), "--crs", "EPSG:32632")
-        assert "[--crs]: has no meaning for a --bag" in message and "--origin" in message
+    def test_crs_has_no_meaning(self, refusal: Refusal) -> None:
+        error = refusal(bags.usual(Flight()), "--crs", "EPSG:32632")
+        assert (error["code"], error["field"]) == ("crs-with-bag", "--crs")
 
     def test_no_mount(self, ingest: Ingest) -> None:
         flight = Flight()
         messages = [*bags.fixes(flight), *bags.imu(flight), *bags.images(flight)]
         survey = ingest(messages)
         assert all(image.attitude is None and image.fix is not None for image in survey.images)
-        assert warned(survey, "give --camera-mount")
-        assert any("the lever arm is not known" in text for text in survey.assumptions)
+        assert remarked(survey, "camera-mount-unknown", "--camera-mount")
+        assert remarked(survey, "lever-arm-unknown")
         check(ingest(messages, "--camera-mount", "0,-35,0", "--lever-arm", "0.1,-0.2,-0.3"), flight)
 
     def test_unknown_type_is_no_harm(self, ingest: Ingest) -> None:
@@ -303,11 +305,9 @@ class TestWhatIsMissing:
         ]  # fmt: skip
         survey = ingest(messages)
         check(survey, flight)
-        assert any(
-            "positions are from /gnss/fix, not /localization: see --fix-topic" in t for t in survey.assumptions
-        )
-        assert any("attitudes are from /imu/data, not /localization" in text for text in survey.assumptions)
-        assert any("not /depth/image/compressed: see --image-topic" in text for text in survey.assumptions)
+        assert remarked(survey, "bag-topic-choice", "/gnss/fix, not /localization", "--fix-topic")
+        assert remarked(survey, "bag-topic-choice", "/imu/data, not /localization", "--attitude-topic")
+        assert remarked(survey, "bag-topic-choice", "not /depth/image/compressed", "--image-topic")
 
 
 def test_moving_mount(ingest: Ingest) -> None:

@@ -10,7 +10,7 @@ from rosbags.rosbag2 import StoragePlugin
 from pipelines.formats.bag_limits import DEFINITIONS
 from tests import bags
 from tests.bags import Flight, Form
-from tests.ingested_bags import Ingest, check, warned
+from tests.ingested_bags import Ingest, check, remarked
 from tests.px4_bags import px4, px4_of
 
 WHERE = "46.02,7.75,1620"
@@ -56,7 +56,7 @@ def test_px4_of_every_release(ingest: Ingest, tmp_path: Path, kind: str, release
     survey = ingest(path, *options)
     # 10⁻⁷ degrees are 11 mm.
     check(survey, flight, tolerance_m=0.01 if (kind, release) == ("SensorGps", "1.14") else 1e-3)
-    assumptions = [text for text in survey.assumptions if "lacks definitions" in text]
+    assumptions = [one.sentence for one in survey.assumptions if one.code == "message-definitions"]
     assert assumptions == [] if stated else f"{name} (as of PX4 {release})" in assumptions[0]
 
 
@@ -65,11 +65,11 @@ def test_px4_estimates_that_are_none(ingest: Ingest) -> None:
     gps = px4(flight, "SensorGps")
     gps[3][3].fix_type, gps[4][3].fix_type = 8, 1
     survey = ingest([*gps, *bags.images(flight)])
-    assert warned(survey, "2 of 65 messages of /fmu/out/SensorGps were left out: no fix (status)")
+    assert remarked(survey, "message-unusable", "2 of 65", "/fmu/out/SensorGps", "no fix (status)")
     estimates = px4(flight, "VehicleGlobalPosition")
     estimates[3][3].dead_reckoning = True
     survey = ingest([*estimates, *bags.images(flight)])
-    assert warned(survey, "1 of 65 messages of /fmu/out/VehicleGlobalPosition were left out: dead reckoning")
+    assert remarked(survey, "message-unusable", "1 of 65", "/fmu/out/VehicleGlobalPosition", "dead reckoning")
 
 
 def test_px4_message_of_no_known_layout(ingest: Ingest, tmp_path: Path) -> None:
@@ -81,8 +81,7 @@ def test_px4_message_of_no_known_layout(ingest: Ingest, tmp_path: Path) -> None:
     strange[7:] = gps[7:]
     form = Form(definitions={"px4_msgs/msg/SensorGps": ""})
     survey = ingest(bags.write(tmp_path / "bag", [*strange, *bags.images(flight)], form))
-    assert warned(survey, "7 messages of /fmu/out/SensorGps do not decode")
-    assert warned(survey, "are none of the layouts of px4_msgs/msg/SensorGps that are known here")
+    assert remarked(survey, "message-damaged", "7 messages", "/fmu/out/SensorGps", "px4_msgs/msg/SensorGps")
     assert all(image.fix for image in survey.images[1:])
 
 
@@ -95,4 +94,4 @@ def test_px4_counts_from_boot(ingest: Ingest) -> None:
     ]  # fmt: skip
     survey = ingest(messages)
     check(survey, flight)
-    assert any("count from another epoch" in text for text in survey.assumptions)
+    assert remarked(survey, "clock-epoch")

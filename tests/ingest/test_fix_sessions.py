@@ -25,6 +25,7 @@ from pipelines.ingest.stage import survey_and_track
 from pipelines.ingest.survey_assembly import COMMON_SIGMA_M, SESSION_GAP_S, fix_sessions
 from pipelines.survey.survey import FixSession, Survey
 from tests.photos import Exif, dji_xmp, gps_entries, jpeg, write_flight
+from tests.refusals import codes, numbers, said
 
 
 def poses_of(receivers: list[str], sigma_h_m: list[float], time_s: list[float]) -> ImagePoses:
@@ -121,10 +122,12 @@ def test_exif_states_kinds_of_receiver(tmp_path: Path) -> None:
     survey, _ = survey_and_track(IngestOptions(images=tmp_path), None)
     assert survey.sessions == (session("RTK fixed"), session("RTK float"), session("single-frequency"))
     assert [image.fix and image.fix.session for image in survey.images] == [0, 0, 1, 2, None]
-    assert (
-        "σ of the error that the positions of a session share (2): 0.03 m horizontal, 0.05 m vertical (RTK fixed); "
-        "state yours with --sigma-common-h and --sigma-common-v" in survey.assumptions
+    fixed = next(
+        one.sentence
+        for one in survey.assumptions
+        if one.code == "default-common-sigma" and "(RTK fixed)" in one.sentence
     )
+    assert numbers(fixed) == [2.0, 0.03, 0.05] and "--sigma-common-h and --sigma-common-v" in fixed
 
 
 def test_stated_sigma_and_options_decide_for_a_table(tmp_path: Path) -> None:
@@ -144,13 +147,12 @@ def test_stated_sigma_and_options_decide_for_a_table(tmp_path: Path) -> None:
     one = ingested(",,", sigma_common_h=0.0)
     assert one.sessions[0].sigma_common_m == (0.0, 0.0, 4.0)
     assert one.sessions[0].sigma_source == "option"
-    assert any(
-        "(4): 4 m vertical (unknown receiver); state yours with --sigma-common-v" in text
-        for text in one.assumptions
-    )
+    sentence = said(one.assumptions, "default-common-sigma")
+    assert numbers(sentence) == [4.0, 4.0] and "(unknown receiver)" in sentence
+    assert "--sigma-common-v" in sentence and "--sigma-common-h" not in sentence
     both = ingested(",,", sigma_common_h=0.2, sigma_common_v=0.4)
     assert both.sessions[0].sigma_common_m == (0.2, 0.2, 0.4)
-    assert not any("session" in text for text in both.assumptions)
+    assert "default-common-sigma" not in codes(both.assumptions)
 
 
 def test_option_reaches_the_survey_and_an_earlier_survey_is_made_anew(

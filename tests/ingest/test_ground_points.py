@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from pipelines.ingest.ground_points import (
 )
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.remarks import Remarks
+from tests.refusals import codes, refused, said
 
 SIZES = {"a.jpg": (64, 48), "b.jpg": (64, 48)}
 G1 = "7.75 46.02 1620 10.5 20.5 a.jpg G1\n7.75 46.02 1620 11.5 21.5 b.jpg G1\n"
@@ -45,35 +47,36 @@ def test_points_and_marks(tmp_path: Path) -> None:
     mark = file.points[0].marks[1]
     assert (mark.image, mark.x_px, mark.y_px, mark.sigma_px) == ("b.jpg", 11.5, 21.5, 0.5)
     assert file.crs.vertical.stated and file.crs.vertical.name == "ellipsoidal"
-    assert remarks.warnings == [
-        "1 mark is in an image that is not here: gcp_list.txt:6 (absent.jpg)",
-    ]
+    assert codes(remarks.warnings) == ["mark-in-unknown-image"]
+    assert "(1): gcp_list.txt:6 (absent.jpg)" in remarks.warnings[0].sentence
     control, check = split_checks(file, None, [])
     assert [point.name for point in control if point.is_marked] == ["G1", "G2"]
     unmarked_points(control, check, remarks)
-    assert remarks.warnings[1:] == [
-        "1 ground point has marks in fewer than 2 images, and enters nothing until it is marked: G3 (control)"
-    ]
+    assert "(1): G3 (control)" in said(remarks.warnings[1:], "point-unmarked")
 
 
 @pytest.mark.parametrize(
-    ("rows", "message"),
+    ("rows", "code", "place", "says"),
     [
-        (G1 + "7.75 46.02 1621 1 1 a.jpg G1\n", r"gcp_list\.txt:4 \[x y z\]: G1 has other coordinates in line 2"),
-        (G1 + "7.75 46.02 1620 1 1 a.jpg G1\n", r"gcp_list\.txt:4 \[image\]: G1 is marked in a\.jpg already"),
-        (
-            "7.75 46.02 1620 65 20 a.jpg G1\n",
-            r"gcp_list\.txt:2 \[px py\]: the mark of G1 at \(65, 20\) lies outside",
-        ),
-        ("7.75 46.02 1620 -1 20 a.jpg G1\n", r"lies outside a\.jpg \(64×48 pixels\)"),
-        ("7.75 46.02 1620 1 1 x.jpg G1\n", r"names none of the images: it has 'x\.jpg' …, the folder 'a\.jpg' …"),
-        ("7.75 46.02 1620 1 1 ../a.jpg G1\n", r"gcp_list\.txt:2 \[image\]: .*leaves the image folder"),
-        ("46.02 97.75 1620 1 1 a.jpg G1\n", r"gcp_list\.txt:2 \[latitude\]: .*out of range.*x is the longitude"),
+        (G1 + "7.75 46.02 1620 1 1 a.jpg G1\n", "mark-twice", (4, "image"), "G1 .* a.jpg"),
+        ("7.75 46.02 1620 65 20 a.jpg G1\n", "mark-outside-image", (2, "px py"), r"G1 .*\(65, 20\)"),
+        ("7.75 46.02 1620 -1 20 a.jpg G1\n", "mark-outside-image", (2, "px py"), r"a\.jpg \(64×48 px\)"),
+        ("7.75 46.02 1620 1 1 x.jpg G1\n", "no-image-matched", (None, "image"), r"'x\.jpg' .*'a\.jpg' …"),
+        ("7.75 46.02 1620 1 1 ../a.jpg G1\n", "image-outside-folder", (2, "image"), "../a.jpg"),
+        ("46.02 97.75 1620 1 1 a.jpg G1\n", "latitude-range", (2, "latitude"), "x is the longitude"),
     ],
 )
-def test_refusals(tmp_path: Path, rows: str, message: str) -> None:
-    with pytest.raises(InputError, match=message):
+def test_refusals(tmp_path: Path, rows: str, code: str, place: tuple[int | None, str], says: str) -> None:
+    with refused(code, InputError) as error:
         _read(tmp_path, rows)
+    assert (error.value.line, error.value.field) == place and error.value.path.name == "gcp_list.txt"
+    assert re.search(says, error.value.message)
+
+
+def test_one_point_has_one_place(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="line 2") as error:
+        _read(tmp_path, G1 + "7.75 46.02 1621 1 1 a.jpg G1\n")
+    assert (error.value.line, error.value.field) == (4, "x y z")
 
 
 def test_named_control_points_become_check_points(tmp_path: Path) -> None:
@@ -83,22 +86,21 @@ def test_named_control_points_become_check_points(tmp_path: Path) -> None:
 
 
 def test_an_unknown_name_is_refused_with_the_known_ones(tmp_path: Path) -> None:
-    with pytest.raises(
-        InputError, match=r"gcp_list\.txt \[--check\]: 'G9' is no usable point there: it has G1, G2"
-    ):
+    with refused("check-not-a-point", InputError) as error:
         split_checks(_read(tmp_path, G1 + G2), None, ["G9"])
+    assert re.search(r"gcp_list\.txt \[--check\]: 'G9' .*G1, G2", str(error.value))
 
 
 @pytest.mark.parametrize("rows", [G1, G1.replace("G1", "other")])
 def test_a_point_in_both_files_is_refused_whatever_its_name(tmp_path: Path, rows: str) -> None:
     control = _read(tmp_path, G1 + G2)
     check = _read(tmp_path, rows, "checkpoints.txt")
-    with pytest.raises(InputError, match=r"checkpoints\.txt:2: .* is also control point G1 \(line 2\)"):
+    with refused("point-control-and-check", InputError) as error:
         split_checks(control, check, [])
+    assert re.search(r"checkpoints\.txt:2: .* G1 \(line 2\)", str(error.value))
 
 
 def test_points_in_another_country_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(
-        InputError, match=r"gcp_list\.txt:2: G1 is \d+ km from the images: wrong CRS, or x and y swapped"
-    ):
+    with refused("point-far-away", InputError) as error:
         require_near(_read(tmp_path, G1), ecef_from_lla([7.75, 46.02, 1620.0]))
+    assert re.search(r"gcp_list\.txt:2: G1 is \d+ km", str(error.value))

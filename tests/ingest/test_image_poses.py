@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,8 +21,15 @@ from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo
 from pipelines.ingest.remarks import Remarks
 from pipelines.ingest.table_poses import poses_from_table
+from tests.refusals import codes, numbers, refused, said
 
 GPS = GpsTag(46.02, 7.75, 1620.0, None, "")
+
+
+def default_sigmas(remarks: Remarks, receiver: str) -> list[list[float]]:
+    """Numbers of the default σ of a receiver: how many positions, and metres."""
+    given = [one.sentence for one in remarks.assumptions if one.code == "default-position-sigma"]
+    return [numbers(sentence) for sentence in given if f"({receiver})" in sentence]
 
 
 def _photos(*tags: PhotoTags) -> list[Photo]:
@@ -69,11 +77,11 @@ def test_sigma_by_receiver_and_precedence() -> None:
     ]
     np.testing.assert_allclose(poses.sigma_enu_m, expected)
     assert poses.sigma_source == ("default", "default", "default", "file", "file", "default")
-    assert "σ of positions without one (1): 0.02 m horizontal, 0.03 m vertical (RTK fixed)" in remarks.assumptions
+    assert [1.0, 0.02, 0.03] in default_sigmas(remarks, "RTK fixed")
 
     remarks = Remarks()
     overridden = poses_from_tags(photos, IngestOptions(sigma_h=0.7), remarks)
-    assert "σ of positions without one (1): 0.03 m vertical (RTK fixed)" in remarks.assumptions
+    assert [1.0, 0.03] in default_sigmas(remarks, "RTK fixed")
     np.testing.assert_allclose(overridden.sigma_enu_m[:, :2], 0.7)
     assert overridden.sigma_enu_m[3, 2] == 0.025
     assert set(overridden.sigma_source) == {"option"}
@@ -88,8 +96,9 @@ def test_exif_heights_are_assumed_not_refused() -> None:
 
 
 def test_exif_heights_stated_above_a_geoid_need_its_grid() -> None:
-    with pytest.raises(InputError, match=r"us_nga_egm96_15\.tif is not installed"):
+    with refused("grid-not-installed", InputError) as error:
         poses_from_tags(_photos(PhotoTags(gps=GPS)), IngestOptions(vertical="EGM96"), Remarks())
+    assert "us_nga_egm96_15.tif" in str(error.value)
 
 
 def test_a_gimbal_is_kept_with_or_without_position() -> None:
@@ -104,8 +113,8 @@ def test_images_without_altitude_and_with_other_datums_are_noted() -> None:
     remarks = Remarks()
     photos = _photos(PhotoTags(gps=replace(GPS, alt_m=None)), PhotoTags(gps=replace(GPS, datum="TOKYO")))
     assert poses_from_tags(photos, IngestOptions(), remarks).located.tolist() == [False, True]
-    assert remarks.warnings == ["1 image has a GPS position without altitude: 0.jpg"]
-    assert "GPSMapDatum TOKYO is taken as WGS84" in remarks.assumptions
+    assert "(1): 0.jpg." in said(remarks.warnings, "image-without-altitude")
+    assert "TOKYO" in said(remarks.assumptions, "exif-datum")
 
 
 def test_height_is_of_exif_or_else_of_xmp() -> None:
@@ -123,10 +132,9 @@ def test_a_table_by_name_wins_over_exif_and_does_not_mix_with_it() -> None:
     assert poses.located.tolist() == [True, True, False]
     np.testing.assert_allclose(_lla(poses)[1], [46.02, 7.7502, 1622.0], rtol=0, atol=1e-9)
     assert poses.time_s.tolist() == [100.0, 101.0, 5.0]
-    assert remarks.warnings == [
-        "1 image has no position in t.csv: 2.jpg",
-    ]
-    assert "latitude and longitude in t.csv are WGS84 (EPSG:4326)" in remarks.assumptions
+    assert codes(remarks.warnings) == ["images-without-position"]
+    assert "t.csv (1): 2.jpg." in remarks.warnings[0].sentence
+    assert "t.csv are WGS84 (EPSG:4326)" in said(remarks.assumptions, "crs-assumed")
     np.testing.assert_allclose(poses.sigma_enu_m[0], np.array(RECEIVER_SIGMA_M["unknown receiver"])[[0, 0, 1]])
 
 
@@ -139,17 +147,16 @@ def test_a_table_by_time_interpolates_along_the_line() -> None:
     assert poses.located.tolist() == [True, False, False]
     ends = enu.ecef_from_lla([[46.02, 7.75, 1620.0], [46.02, 7.7502, 1622.0]])
     np.testing.assert_allclose(poses.position_in_ecef[0], ends.mean(axis=0), rtol=0, atol=1e-7)
-    assert "EXIF times without a zone are UTC" in remarks.assumptions
-    assert "1 image has no time in EXIF: 2.jpg" in remarks.warnings
-    assert "2 images have no position in t.csv: 1.jpg, 2.jpg" in remarks.warnings
+    assert "EXIF" in said(remarks.assumptions, "time-zone")
+    assert "(1): 2.jpg." in said(remarks.warnings, "image-without-time")
+    assert "t.csv (2): 1.jpg, 2.jpg." in said(remarks.warnings, "images-without-position")
 
 
 def test_clocks_that_never_meet_are_explained() -> None:
-    with pytest.raises(
-        InputError, match=r"1970-01-01 00:01:40 UTC to .*another time zone\? Is --max-gap too small"
-    ):
+    with refused("times-apart", InputError) as error:
         poses_from_table(_table(names=None), _photos(PhotoTags(timestamp_s=3700.0)), IngestOptions(), Remarks())
-    with pytest.raises(InputError, match="no column image, and no image has a time in EXIF"):
+    assert "1970-01-01 00:01:40 UTC to " in str(error.value) and "--max-gap" in str(error.value)
+    with refused("images-without-times", InputError):
         poses_from_table(_table(names=None), _photos(PhotoTags()), IngestOptions(), Remarks())
 
 
@@ -158,8 +165,9 @@ def test_rows_without_a_time_do_not_count(tmp_path: Path) -> None:
     photos = _photos(PhotoTags(timestamp_s=100.0), PhotoTags(timestamp_s=100.5))
     poses = poses_from_table(_table(names=None, time_s=times), photos, IngestOptions(), Remarks())
     assert poses.located.tolist() == [True, False]
-    with pytest.raises(InputError, match=r"t\.csv \[timestamp\]: no row has a time"):
+    with refused("file-without-times", InputError) as error:
         poses_from_table(_table(names=None, time_s=times * np.nan), photos, IngestOptions(), Remarks())
+    assert str(error.value).startswith("t.csv [timestamp]: ")
 
 
 def test_missing_heights_are_taken_from_exif() -> None:
@@ -169,33 +177,38 @@ def test_missing_heights_are_taken_from_exif() -> None:
     poses = poses_from_table(table, _photos(PhotoTags(gps=GPS), PhotoTags()), IngestOptions(), remarks)
     assert poses.located.tolist() == [True, False]
     assert _lla(poses)[0, 2] == pytest.approx(1620.0, abs=1e-8)
-    assert "heights that geo.txt lacks are from EXIF (1)" in remarks.assumptions
-    assert "1 row has no height and was left out: geo.txt:3" in remarks.warnings
-    with pytest.raises(InputError, match=r"geo\.txt: has no heights"):
+    assert said(remarks.assumptions, "heights-from-exif").startswith("1 heights that geo.txt")
+    assert "(1): geo.txt:3." in said(remarks.warnings, "row-without-height")
+    with refused("no-heights", InputError):
         poses_from_table(table, _photos(PhotoTags(), PhotoTags()), IngestOptions(), Remarks())
 
 
 @pytest.mark.parametrize(
-    ("changes", "options", "message"),
+    ("changes", "options", "code", "says"),
     [
-        ({"geographic": False}, IngestOptions(), r"t\.csv: columns x,y,z need their CRS: give --crs"),
-        (
-            {},
-            IngestOptions(crs="EPSG:32632"),
-            r"\[--crs\]: t\.csv has latitude and longitude, but EPSG:32632 has none",
-        ),
-        ({}, IngestOptions(crs="EPSG:0"), r"\[--crs\]: 'EPSG:0' is no CRS"),
+        ({"geographic": False}, IngestOptions(), "crs-missing", r"t\.csv: .*--crs"),
+        ({}, IngestOptions(crs="EPSG:32632"), "crs-not-geographic", r"\[--crs\]: t\.csv .* EPSG:32632"),
+        ({}, IngestOptions(crs="EPSG:0"), "crs-unknown", r"\[--crs\]: .*'EPSG:0'"),
         (
             {},
             IngestOptions(crs="EPSG:4979", vertical="EGM96"),
-            r"\[--vertical\]: contradicts --crs EPSG:4979, whose heights are ellipsoidal",
+            "vertical-contradicts-crs",
+            r"\[--vertical\]: .*--crs EPSG:4979, .*ellipsoidal",
         ),
-        ({"geographic": False}, IngestOptions(crs="EPSG:32632"), r"t\.csv:2: .*degrees\? EPSG:32632 has eastings"),
+        (
+            {"geographic": False},
+            IngestOptions(crs="EPSG:32632"),
+            "degrees-in-projection",
+            r"t\.csv:2: .*EPSG:32632",
+        ),
     ],
 )
-def test_contradictions_about_the_crs(changes: dict[str, object], options: IngestOptions, message: str) -> None:
-    with pytest.raises(InputError, match=message):
+def test_contradictions_about_the_crs(
+    changes: dict[str, object], options: IngestOptions, code: str, says: str
+) -> None:
+    with refused(code, InputError) as error:
         poses_from_table(_table(**changes), _photos(PhotoTags(), PhotoTags()), options, Remarks())
+    assert re.search(says, str(error.value))
 
 
 def test_a_file_that_states_its_datum_keeps_it_and_says_so() -> None:
@@ -205,10 +218,7 @@ def test_a_file_that_states_its_datum_keeps_it_and_says_so() -> None:
     assert (
         poses_from_table(table, _photos(PhotoTags(), PhotoTags()), options, remarks).vertical.name == "ellipsoidal"
     )
-    assert (
-        "heights of geo.txt are ellipsoidal, as its CRS says; --vertical does not apply to them"
-        in remarks.assumptions
-    )
+    assert "geo.txt are ellipsoidal" in said(remarks.assumptions, "vertical-unused")
 
 
 def test_feet_and_the_accuracy_of_a_datum_are_told() -> None:
@@ -221,6 +231,6 @@ def test_feet_and_the_accuracy_of_a_datum_are_told() -> None:
         remarks,
     )
     assert _lla(poses)[0, 2] == pytest.approx(1000.0 * 1200 / 3937)
-    assert "heights of EPSG:2264 are in US survey foot" in remarks.assumptions
-    assert any("published with 4 m" in text for text in remarks.assumptions)
-    assert any("us_noaa_nchpgn.tif" in text for text in remarks.warnings)
+    assert "EPSG:2264 are in US survey foot" in said(remarks.assumptions, "height-unit")
+    assert " 4 m" in said(remarks.assumptions, "crs-transformation")
+    assert "us_noaa_nchpgn.tif" in said(remarks.warnings, "better-grid-missing")

@@ -21,6 +21,7 @@ from pipelines.ingest.stage import survey_and_track
 from pipelines.survey.survey import Survey
 from tests.earth import enu_from_lla
 from tests.photos import FLIGHT_START_S, Exif, dji_xmp, gps_entries, jpeg, write_flight
+from tests.refusals import codes, numbers, refused, said
 
 LAT, LON = 46.02, 7.75
 
@@ -56,7 +57,7 @@ def test_exif_alone(tmp_path: Path) -> None:
     np.testing.assert_allclose(fix.cov_in_geo, np.diag([2.5**2, 2.5**2, 5.0**2]), atol=1e-3)
     assert survey.images[3].timestamp_s == FLIGHT_START_S + 3
     assert not survey.vertical.stated
-    assert any("often above a geoid" in text for text in survey.assumptions)
+    assert "ellipsoidal" in said(survey.assumptions, "vertical-datum-assumed")
 
 
 def test_through_the_runner(tmp_path: Path) -> None:
@@ -133,15 +134,16 @@ def test_geo_txt_control_and_check_points(tmp_path: Path) -> None:
     files: dict[str, Any] = {"geo": tmp_path / "geo.txt", "gcp": gcp, "checkpoints": checks}
     survey = _build(tmp_path / "images", **files, check=("P1",), vegetated=("P1",), sigma_mark=0.3)
     assert [point.land_cover for point in survey.check_points] == ["open", "vegetated"]
-    with pytest.raises(InputError, match=r"\[--vegetated\]: 'P2' is no check point: there are C0 \(--checkpoints"):
+    with refused("vegetated-not-a-check", InputError) as error:
         _build(tmp_path / "images", **files, vegetated=("P2",))
+    assert error.value.field == "--vegetated" and all(name in error.value.message for name in ("'P2'", "C0"))
     assert [point.name for point in survey.control_points] == ["P0", "P2"]
     assert [point.name for point in survey.check_points] == ["C0", "P1"]
     for point, place in zip(survey.control_points, lla[[0, 2]], strict=True):
         np.testing.assert_allclose(point.position_in_geo, enu_from_lla(place, survey.origin), rtol=0, atol=2e-4)
         np.testing.assert_allclose(point.cov_in_geo, np.diag([4e-4, 4e-4, 9e-4]), rtol=0, atol=1e-7)
     assert survey.control_points[0].marks[1].sigma_px == 0.3
-    assert any("is stated" in text and "only assumed" in text for text in survey.warnings)
+    assert "vertical-datums-mixed" in codes(survey.warnings)
 
 
 def test_ground_points_without_any_position(tmp_path: Path) -> None:
@@ -151,7 +153,7 @@ def test_ground_points_without_any_position(tmp_path: Path) -> None:
     assert all(image.fix is None for image in survey.images)
     assert (survey.origin.lat_deg, survey.origin.lon_deg, survey.origin.alt_m) == (LAT, LON, 451.0)
     assert survey.source_crs == "EPSG:4979" and survey.vertical.stated
-    assert "no image has a position: 3 ground control points alone place the model" in survey.warnings
+    assert numbers(said(survey.warnings, "no-positions")) == [3.0]
 
 
 def test_time_matched_trajectory(tmp_path: Path) -> None:
@@ -172,12 +174,14 @@ def test_some_without_position_and_one_astray(tmp_path: Path) -> None:
     (images / "large.jpg").write_bytes(jpeg(53, size=(96, 64), exif=Exif(image=[(0x0112, 3, 6)])))
     survey = _build(images)
     assert sum(image.fix is not None for image in survey.images) == 5
-    text = "\n".join(survey.warnings)
-    assert "1 position is far from the others and was left out: astray.jpg (" in text
-    assert "4 images have no position in EXIF: astray.jpg, large.jpg, no_gps.jpg, null.jpg" in text
-    assert "1 image where the GPS position is 0, 0, which means none: null.jpg" in text
-    assert "images have 2 sizes (64×48, 96×64): each is a camera of its own" in text
-    assert "1 image has an EXIF orientation, which is ignored: pixels count as stored: large.jpg" in text
+    for code, says in {
+        "position-far-away": "(1): astray.jpg (",
+        "images-without-position": "(4): astray.jpg, large.jpg, no_gps.jpg, null.jpg.",
+        "exif-unusable": "the GPS position is 0, 0, which means none (1): null.jpg.",
+        "image-sizes": "2 sizes (64×48, 96×64)",
+        "exif-orientation": "(1): large.jpg.",
+    }.items():
+        assert says in said(survey.warnings, code)
     assert len(survey.cameras) == 2
 
 
@@ -185,7 +189,7 @@ def test_three_images_hold_none_out(tmp_path: Path) -> None:
     write_flight(tmp_path / "images", 3)
     survey = _build(tmp_path / "images")
     assert survey.names("test") == ()
-    assert "3 images are too few to hold any out for testing" in survey.warnings
+    assert numbers(said(survey.warnings, "no-test-images")) == [3.0]
 
 
 def test_sigma_and_focal_options(tmp_path: Path) -> None:
@@ -199,34 +203,45 @@ def test_sigma_and_focal_options(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("options", "code", "field"),
     [
-        ({"images": None}, r"\[--images\]: give the folder of photographs"),
-        ({"trajectory": "t.csv", "geo": "geo.txt"}, r"\[--geo\]: give a trajectory or a geo\.txt, not both"),
-        ({"crs": "EPSG:32632"}, r"\[--crs\]: is for the columns of --trajectory"),
-        ({"check": ("P1",)}, r"\[--check\]: names points of --gcp, which is not given"),
-        ({"test_every": 1}, r"\[--test-every\]: 1 would leave nothing to train on"),
-        ({"vertical": "sea"}, r"\[--vertical\]: 'sea' is no vertical datum"),
-        ({"vertical": "EGM2008"}, r"us_nga_egm08_25\.tif is not installed"),
-        ({"trajectory": "absent.csv"}, r"absent\.csv: cannot be read"),
+        ({"images": None}, "no-photographs-given", "--images"),
+        ({"trajectory": "t.csv", "geo": "geo.txt"}, "two-position-files", "--geo"),
+        ({"crs": "EPSG:32632"}, "crs-without-trajectory", "--crs"),
+        ({"check": ("P1",)}, "check-without-gcp", "--check"),
+        ({"test_every": 1}, "nothing-to-train-on", "--test-every"),
+        ({"vertical": "sea"}, "vertical-datum-unknown", "--vertical"),
+        ({"vertical": "EGM2008"}, "grid-not-installed", None),
+        ({"every": "2s"}, "needs-bag", "--every"),
     ],
 )
-def test_options_that_cannot_be(tmp_path: Path, options: dict[str, Any], message: str) -> None:
+def test_options_that_cannot_be(tmp_path: Path, options: dict[str, Any], code: str, field: str | None) -> None:
     write_flight(tmp_path / "images", 3)
-    with pytest.raises(InputError, match=message):
-        survey_and_track(IngestOptions(**{"images": tmp_path / "images", **options}), None)[0]
+    with refused(code, InputError) as error:
+        survey_and_track(IngestOptions(**{"images": tmp_path / "images", **options}), None)
+    assert error.value.field == field
+    assert code != "grid-not-installed" or "us_nga_egm08_25.tif" in error.value.message
+
+
+def test_a_trajectory_that_is_not_there(tmp_path: Path) -> None:
+    write_flight(tmp_path / "images", 3)
+    with pytest.raises(InputError) as error:
+        _build(tmp_path / "images", trajectory=Path("absent.csv"))
+    assert error.value.path == Path("absent.csv")
 
 
 def test_too_few_usable_images_say_why(tmp_path: Path) -> None:
     write_flight(tmp_path / "images", 2)
     (tmp_path / "images" / "cut.jpg").write_bytes(jpeg(5)[:600])
-    with pytest.raises(InputError, match=r"images \[--images\]: 2 usable images, a survey needs 3; .*cut\.jpg"):
+    with refused("too-few-images", InputError) as error:
         _build(tmp_path / "images")
+    assert (error.value.path, error.value.field) == (tmp_path / "images", "--images")
+    assert numbers(error.value.message)[:2] == [2.0, 3.0] and "cut.jpg" in error.value.message
 
 
 def test_nothing_to_place_the_survey_with(tmp_path: Path) -> None:
     write_flight(tmp_path / "images", 3, positions=False)
-    with pytest.raises(InputError, match="no image has a position, and there are no ground control points"):
+    with refused("no-positions", InputError):
         _build(tmp_path / "images")
 
 
@@ -234,13 +249,12 @@ def test_control_points_far_away(tmp_path: Path) -> None:
     names = write_flight(tmp_path / "images", 3)
     swapped = np.array([[LAT, LON, 450.0]])
     gcp = _points(tmp_path / "gcp_list.txt", "EPSG:4979", swapped, names)
-    with pytest.raises(
-        InputError, match=r"gcp_list\.txt:2: P0 is \d+ km from the images: wrong CRS, or x and y swapped"
-    ):
+    with refused("point-far-away", InputError) as error:
         _build(tmp_path / "images", gcp=gcp)
+    assert (error.value.path, error.value.line) == (gcp, 2) and "P0" in error.value.message
 
 
 def test_a_workspace_among_its_photographs_is_refused(tmp_path: Path) -> None:
     write_flight(tmp_path, 3)
-    with pytest.raises(InputError, match="the workspace lies inside the folder of photographs"):
+    with refused("workspace-in-photographs", InputError):
         run_stage(Workspace(tmp_path / "ws"), BY_NAME["ingest"], {"images": str(tmp_path)})

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
-
 from pipelines.core.errors import InputError
 from pipelines.ingest.photo_folder import scan_folder
 from pipelines.ingest.remarks import Remarks
 from tests.photos import jpeg
+from tests.refusals import codes, refused
 
 
 def test_every_defect_is_left_out_and_counted(tmp_path: Path) -> None:
@@ -24,21 +23,20 @@ def test_every_defect_is_left_out_and_counted(tmp_path: Path) -> None:
     (root / "cut.jpg").write_bytes(jpeg(3)[:700])
     (root / "text.png").write_text("no image")
     (root / "._b.jpg").write_bytes(b"resource fork")
-    (root / "remarks.txt").write_text("not looked at")
+    (root / "notes.txt").write_text("not looked at")
     (root / "link.jpg").symlink_to(outside)
     remarks = Remarks()
     photos = scan_folder(root, remarks)
     assert [photo.name for photo in photos] == ["b.jpg", "sub/a.JPEG"]
-    assert remarks.warnings == [
-        "1 image is a link that leaves the folder and was left out: link.jpg",
-        "3 images were left out: cut.jpg (is damaged: it does not decode to its end), empty.jpg (is empty), "
-        "text.png (is no JPEG, PNG or TIFF image)",
-        "1 image is a copy of another and was left out: copy.jpg (as b.jpg)",
-    ]
+    assert codes(remarks.warnings) == ["image-link-outside", "image-unreadable", "image-copies"]
+    link, unreadable, copies = (warning.sentence for warning in remarks.warnings)
+    assert "(1): link.jpg" in link and "(1): copy.jpg (as b.jpg)" in copies
+    assert "(3): " in unreadable and all(f"{name} (" in unreadable for name in ("cut.jpg", "empty.jpg", "text.png"))
 
 
 def test_no_folder_and_no_image(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"absent \[--images\]: no such folder of photographs"):
+    with refused("no-image-folder", InputError) as error:
         scan_folder(tmp_path / "absent", Remarks())
-    with pytest.raises(InputError, match="holds no JPEG, PNG or TIFF image"):
+    assert (error.value.path, error.value.field) == (tmp_path / "absent", "--images")
+    with refused("no-images", InputError):
         scan_folder(tmp_path, Remarks())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from pipelines.ingest.stage import survey_and_track
 from pipelines.survey.survey import Survey
 from tests.formats.test_surveyors_tables import DEGREES, SECOND, TAIL, WEEK, WGS84
 from tests.photos import FLIGHT_START_S, Exif, dji_xmp, gps_entries, jpeg, write_flight
+from tests.refusals import codes, refused, said
 
 PLACES = {"G1": (46.0201, 7.7501, 100.0), "G2": (46.0199, 7.7502, 101.0)}  # latitude, longitude, ellipsoidal height
 MARKS = {"G1": [("IMG_0000.JPG", 10.5, 20.25), ("IMG_0001.JPG", 12.5, 21.0)], "G2": [("IMG_0001.JPG", 30.0, 31.0)]}
@@ -107,68 +109,69 @@ def test_every_file_of_points_gives_the_same_survey(kind: str, flight: Path, tmp
         marks = [(mark.image, mark.x_px, mark.y_px) for mark in point.marks]
         assert marks == MARKS[point.name]
     assert (control.name, unmarked.name, unmarked.use) == ("G1", "G2", "control")
-    assert any("G2 (control)" in warning and "until it is marked" in warning for warning in survey.warnings)
-    told = [text for text in survey.assumptions if text.startswith("points.dat is read as")]
-    assert len(told) == (kind != "gcp_list.txt")
+    assert "G2 (control)" in said(survey.warnings, "point-unmarked")
+    assert ("file-kind" in codes(survey.assumptions)) == (kind != "gcp_list.txt")
 
 
 @pytest.mark.parametrize(
-    ("text", "options", "says"),
+    ("text", "options", "code", "says"),
     [
         (
             pix4d(),
             {"gcp_crs": "EPSG:4326"},
+            "axis-order",
             "the latitude stands before the longitude, as in the definition of EPSG:4326",
         ),
         (
             pix4d(crs=EAST_FIRST, order=(1, 0, 2)),
             {"gcp_crs": EAST_FIRST},
+            "axis-order",
             f"the easting stands before the northing, as in the definition of {EAST_FIRST}",
         ),
         (
             pix4d(header="id,y,x,z\n", crs=NORTH_FIRST),
             {"gcp_crs": NORTH_FIRST},
-            f"x in points.csv is the easting, although {NORTH_FIRST} has the northing first",
+            "axis-order",
+            f"x in points.csv is the easting, although {NORTH_FIRST}",
         ),
-        (metashape_reference(), {"gcp_crs": "EPSG:32632"}, "states its CRS; --gcp-crs does not apply to it"),
+        (metashape_reference(), {"gcp_crs": "EPSG:32632"}, "gcp-crs-unused", "points.csv"),
     ],
 )
 def test_order_of_axes_is_told(
-    text: str, options: dict[str, object], says: str, flight: Path, tmp_path: Path
+    text: str, options: dict[str, object], code: str, says: str, flight: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "points.csv").write_text(text)
     survey = survey_of(flight, gcp=tmp_path / "points.csv", **options)
-    assert any(says in assumption for assumption in survey.assumptions)
+    assert says in said(survey.assumptions, code)
     assert survey.control_points == () and [point.name for point in survey.unmarked_points] == ["G1", "G2"]
 
 
 @pytest.mark.parametrize(
-    ("text", "options", "message"),
+    ("text", "options", "code", "says"),
     [
-        (pix4d(), {}, r"--gcp-crs.*points\.csv states no CRS"),
-        (
-            pix4d(order=(1, 0, 2)),
-            {"gcp_crs": "EPSG:4326"},
-            r"points\.csv:1: G1 is \d+ km from the images: .* swapped",
-        ),
+        (pix4d(), {}, "crs-missing", r"\[--gcp-crs\]: points\.csv"),
+        (pix4d(order=(1, 0, 2)), {"gcp_crs": "EPSG:4326"}, "point-far-away", r"points\.csv:1: G1 is \d+ km"),
         (
             pix4d(header="Label,Longitude,Latitude,Z\n", order=(1, 0, 2)),
             {"gcp_crs": "EPSG:32632"},
-            r"points\.csv has latitude and longitude, but EPSG:32632 has none",
+            "crs-not-geographic",
+            r"\[--gcp-crs\]: points\.csv .*EPSG:32632",
         ),
         (
             metashape_reference().replace(WGS84, 'LOCAL_CS["Local (m)"]'),
             {},
+            "crs-not-of-points",
             r"points\.csv:1: ",
         ),
     ],
 )
 def test_points_that_are_refused(
-    text: str, options: dict[str, object], message: str, flight: Path, tmp_path: Path
+    text: str, options: dict[str, object], code: str, says: str, flight: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "points.csv").write_text(text)
-    with pytest.raises(InputError, match=message):
+    with refused(code, InputError) as error:
         survey_of(flight, gcp=tmp_path / "points.csv", **options)
+    assert re.search(says, str(error.value))
 
 
 def test_sigma_and_check_points_of_the_file_count(flight: Path, tmp_path: Path) -> None:
@@ -189,11 +192,12 @@ def test_marks_that_name_no_point_are_counted(flight: Path, tmp_path: Path) -> N
     (tmp_path / "points.csv").write_text(pix4d())
     (tmp_path / "marks.csv").write_text(MARK_TABLE + "IMG_0002.JPG,G9,1,2\nIMG_0009.JPG,G1,1,2\n")
     survey = survey_of(flight, gcp=tmp_path / "points.csv", gcp_crs="EPSG:4326", marks=tmp_path / "marks.csv")
-    assert "1 mark names no ground point: marks.csv:4 (G9)" in survey.warnings
-    assert "1 mark is in an image that is not here: marks.csv:5 (IMG_0009.JPG)" in survey.warnings
+    assert "(1): marks.csv:4 (G9)." in said(survey.warnings, "mark-of-unknown-point")
+    assert "(1): marks.csv:5 (IMG_0009.JPG)." in said(survey.warnings, "mark-in-unknown-image")
     (tmp_path / "marks.csv").write_text(MARK_TABLE + MARK_TABLE)
-    with pytest.raises(InputError, match=r"marks\.csv:4 \[image\]: G1 is marked in IMG_0000\.JPG already"):
+    with refused("mark-twice", InputError) as error:
         survey_of(flight, gcp=tmp_path / "points.csv", gcp_crs="EPSG:4326", marks=tmp_path / "marks.csv")
+    assert re.search(r"marks\.csv:4 \[image\]: G1 .* IMG_0000\.JPG", str(error.value))
 
 
 COUNT = 6
@@ -247,10 +251,7 @@ class TestDji:
             np.testing.assert_allclose(np.sqrt(np.diag(image.fix.cov_in_geo)), [0.012, 0.011, 0.025], atol=1e-6)
             assert image.timestamp_s == pytest.approx(FLIGHT_START_S + exposure_s(index), abs=1e-5)
         assert survey.vertical.stated and survey.vertical.name == "ellipsoidal"
-        assert (
-            "flight_Timestamp.MRK is read as DJI's timestamp file: positions of the camera, by photograph number"
-            in (survey.assumptions)
-        )
+        assert "flight_Timestamp.MRK" in said(survey.assumptions, "file-kind")
 
     def test_solution_at_the_events_is_moved_to_the_camera(self, dji: Path) -> None:
         """The antenna's path at the times of the events, and their offsets; EXIF's clock is hours off."""
@@ -281,14 +282,16 @@ class TestDji:
         assert [image.fix and image.fix.session for image in survey.images] == [0, 0, 0, 1, 1, 1]
 
     def test_solution_without_events_is_told_to_miss(self, dji: Path) -> None:
-        with pytest.raises(InputError, match=r"flight\.pos \[timestamp\]: covers .* none fits"):
+        with refused("times-apart", InputError) as error:
             survey_of(dji, trajectory=dji / "flight.pos")
+        assert (error.value.path, error.value.field) == (dji / "flight.pos", "timestamp")
 
     def test_what_does_not_fit_is_counted(self, dji: Path) -> None:
         (dji / "DJI_20240501140000_0003_V.JPG").rename(dji / "DJI_20240501140000_0103_V.JPG")
         survey = survey_of(dji, trajectory=dji / "flight_Timestamp.MRK")
-        assert "1 image has no event in flight_Timestamp.MRK: DJI_20240501140000_0103_V.JPG" in survey.warnings
-        assert "1 event has no photograph here: flight_Timestamp.MRK:3" in survey.warnings
+        lonely = said(survey.warnings, "image-without-event")
+        assert "flight_Timestamp.MRK (1): DJI_20240501140000_0103_V.JPG." in lonely
+        assert "(1): flight_Timestamp.MRK:3." in said(survey.warnings, "event-without-image")
 
     def test_file_of_another_flight_is_refused(self, dji: Path) -> None:
         """Counted backwards, the two events in the middle are less than three seconds off."""
@@ -296,37 +299,42 @@ class TestDji:
         path.write_text(
             "".join(f"{COUNT + 1 - int(line[0])}{line[1:]}\n" for line in path.read_text().splitlines())
         )
-        with pytest.raises(ContradictionError, match="4 of 6 photographs do not have the times of their events"):
+        with refused("event-times", ContradictionError) as error:
             survey_of(dji, trajectory=path)
+        assert "4 of 6 photographs" in str(error.value)
 
     def test_numbers_of_two_flights_are_refused(self, dji: Path) -> None:
         (dji / "second").mkdir()
         (dji / "second/DJI_0001.JPG").write_bytes(jpeg(99))
-        with pytest.raises(InputError, match=r"several folders \(\., second\): take one folder"):
+        with refused("event-folders", InputError) as error:
             survey_of(dji, trajectory=dji / "flight_Timestamp.MRK")
+        assert "(., second)" in error.value.message
 
     @pytest.mark.parametrize(
-        ("options", "message"),
+        ("options", "code", "field"),
         [
-            ({"events": "flight_Timestamp.MRK"}, r"--events.*is for a --trajectory of the antenna"),
+            ({"events": "flight_Timestamp.MRK"}, "events-need-antenna-track", "--events"),
             (
                 {"events": "flight_Timestamp.MRK", "trajectory": "flight_Timestamp.MRK"},
-                r"--events.*names its images",
+                "events-without-times",
+                "--events",
             ),
-            ({"marks": "flight.pos"}, r"--marks.*is for ground points"),
+            ({"marks": "flight.pos"}, "needs-ground-points", "--marks"),
         ],
     )
-    def test_options_that_cannot_be(self, dji: Path, options: dict[str, str], message: str) -> None:
-        with pytest.raises(InputError, match=message):
+    def test_options_that_cannot_be(self, dji: Path, options: dict[str, str], code: str, field: str) -> None:
+        with refused(code, InputError) as error:
             survey_of(dji, **{name: dji / file for name, file in options.items()})
+        assert error.value.field == field
 
 
 def test_heights_above_an_unnamed_geoid_are_refused(dji: Path) -> None:
     path = dji / "flight.pos"
     path.write_text(path.read_text().replace("WGS84/ellipsoidal", "WGS84/geodetic"))
     options = IngestOptions(images=dji, trajectory=path, events=dji / "flight_Timestamp.MRK")
-    with pytest.raises(InputError, match=r"--vertical.*above a geoid that it does not name"):
+    with refused("geoid-not-named", InputError) as error:
         survey_and_track(options, None)
+    assert (error.value.path, error.value.field) == (path, "--vertical")
 
 
 def test_metashape_cameras_are_matched_by_label(flight: Path, tmp_path: Path) -> None:

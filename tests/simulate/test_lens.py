@@ -8,6 +8,7 @@ import pytest
 
 from pipelines.core.errors import InputError
 from pipelines.simulate.lens import BrownLens, LensModel
+from tests.refusals import refused
 
 LENSES = [
     BrownLens("pinhole", 640, 480, 544.0, (320.0, 240.0)),
@@ -48,5 +49,5 @@ def test_what_lies_behind_or_beyond_the_fold_is_not_seen() -> None:
 @pytest.mark.parametrize("model", ["radial", "opencv"])
 def test_distortion_that_folds_inside_the_image_is_refused(model: LensModel) -> None:
     lens = BrownLens(model, 640, 480, 200.0, (320.0, 240.0), -0.4, 0.0)
-    with pytest.raises(InputError, match="too strong"):
+    with refused("distortion-too-strong", InputError):
         lens.directions(corners_and_middle(lens))

@@ -30,6 +30,7 @@ from pipelines.simulate.stage import SimulationSummary, fly_survey, simulate
 from pipelines.simulate.truth import Truth
 from pipelines.simulate.world import make_world
 from tests.earth import enu_from_lla
+from tests.refusals import refused
 
 ORIGIN = "-33.86,151.21,-20"  # south, east, below the ellipsoid
 SMALL: dict[str, Any] = {"size": "160x120", "samples": "1", "images": 4, "targets": 30}
@@ -320,21 +321,21 @@ def test_only_a_simulation_is_replaced(tmp_path: Path) -> None:
     folder.mkdir()
     options = SimulateOptions(**{**SMALL, "images": 3, "targets": 0})
     simulate(options, folder)  # an empty folder may be used
-    with pytest.raises(InputError, match="--force"):
+    with refused("simulation-exists", InputError):
         simulate(options, folder)
     simulate(options, folder, overwrite=True)
     other = tmp_path / "thesis"
     other.mkdir()
     (other / "chapter.txt").write_text("years of work", encoding="utf-8")
-    with pytest.raises(InputError, match="something other"):
+    with refused("folder-not-empty", InputError):
         simulate(options, other, overwrite=True)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["survey", "thesis"]
 
 
 def test_a_failed_simulation_leaves_nothing(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"photograph \d+ would be taken"):
+    with refused("camera-too-near", InputError):
         simulate(SimulateOptions(**SMALL, heights=(4.0,), radius=60.0), tmp_path / "low")
-    with pytest.raises(InputError, match="too strong"):
+    with refused("distortion-too-strong", InputError):
         simulate(SimulateOptions(**SMALL, focal=0.35, k1=-0.45), tmp_path / "bent")
     assert list(tmp_path.iterdir()) == []
 
