@@ -70,8 +70,8 @@ def load_json(product_type: type[ProductT], path: Path) -> ProductT:
 
 
 def dump_json(document: Any) -> str:
-    """Return the JSON text of a plain document, which may hold no NaN and no infinity."""
-    return json.dumps(document, indent=1, allow_nan=False)
+    """Return the JSON text of a plain document, also with remarks in it; it may hold no NaN and no infinity."""
+    return json.dumps(document, indent=1, allow_nan=False, default=Remark.model_dump)
 
 
 def save_npz(path: Path, arrays: dict[str, Any]) -> None:

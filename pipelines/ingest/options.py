@@ -1,4 +1,4 @@
-"""The options of `georef ingest`; those that contradict each other are refused before anything is read."""
+"""Options of `georef ingest`; those that contradict each other are refused before anything is read."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class IngestOptions(StageOptions):
     every: FrameDistance | None = Field(
         None, description="Take a frame of the bag every 2s, or every 5m flown (default: all)."
     )
-    skip_blurred: bool = Field(False, description="Pass over blurred frames of the bag.")
+    skip_blurred: bool = Field(False, description="Leave out blurred frames of the bag.")
     origin: PlaceOnEarth | None = Field(
         None,
         description="Zero of a bag's local frame (odometry, poses): latitude,longitude,ellipsoidal height.",
@@ -87,11 +87,11 @@ class IngestOptions(StageOptions):
     )
     lever_arm: Triple | None = Field(
         None,
-        description="Antenna seen from the camera in the body's axes, forward,right,down in metres (default: /tf).",
+        description="Antenna from the camera along the body's axes, forward,right,down in metres (default: /tf).",
     )
     camera_mount: Triple | None = Field(
         None,
-        description="How the camera is turned in the body, yaw,pitch,roll in degrees; 0,-90,0 looks down "
+        description="Rotation of the camera in the body, yaw,pitch,roll in degrees; 0,-90,0 looks down "
         "(default: /tf).",
     )
     boresight: Triple = Field(
@@ -145,7 +145,7 @@ class IngestOptions(StageOptions):
     max_gap: float = Field(1.0, gt=0, description="Longest gap to interpolate over in the trajectory, in seconds.")
     focal_px: float | None = Field(None, gt=0, description="Focal length in pixels, instead of the one from EXIF.")
     accept_contradiction: bool = Field(
-        False, description="Go on where the table of positions contradicts EXIF, with a caution."
+        False, description="Continue where the table of positions contradicts EXIF, with a caution."
     )
     copy_images: bool = Field(
         False, description="Copy the photographs into the workspace.", json_schema_extra={"flag": "--copy"}

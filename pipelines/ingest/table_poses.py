@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.core.errors import InputError
-from pipelines.core.types import FloatArray, IntArray
+from pipelines.core.types import FloatArray, rows_of
 from pipelines.formats.trajectory_csv import PoseTable, complete
 from pipelines.geodesy.crs import PointCrs
 from pipelines.geodesy.enu import ecef_from_lla
@@ -57,7 +57,7 @@ def poses_from_table(
     else:
         order = np.argsort(measured.time_s, kind="stable")
         order = order[np.isfinite(measured.time_s[order])]
-        recorded = _rows(measured, order)
+        recorded = rows_of(measured, order)
         at_images = match_by_time(recorded, photos, table.path, options, remarks)
         receivers = _worse_neighbour(receiver[order], recorded.time_s, time_s + options.time_offset_s)
     located = complete(at_images.position)
@@ -246,22 +246,11 @@ def _measured(table: PoseTable, crs: PointCrs, options: IngestOptions, remarks: 
     )
 
 
-def _rows(samples: Trajectory, rows: IntArray) -> Trajectory:
-    return replace(
-        samples,
-        time_s=samples.time_s[rows],
-        position=samples.position[rows],
-        rotation=samples.rotation[rows],
-        sigma_m=samples.sigma_m[rows],
-        sigma_deg=samples.sigma_deg[rows],
-    )
-
-
 def _spread(samples: Trajectory, rows: Sequence[int], count: int) -> Trajectory:
     """Return samples of N images of which a table has only those at `rows`; NaN for the others."""
     source = np.full(count, -1)
     source[rows] = np.arange(len(rows))
-    spread = _rows(samples, source)
+    spread = rows_of(samples, source)
     for values in (spread.time_s, spread.position, spread.rotation, spread.sigma_m):
         values[source < 0] = np.nan
     return spread

@@ -15,7 +15,7 @@ class LidarFlightOptions(StageOptions):
     lidar: bool = Field(False, description="Write a LiDAR flight too: lidar.laz and lidar_trajectory.csv.")
     lidar_height: float = Field(60.0, ge=20, le=300, description="Height of the LiDAR flight in metres.")
     lidar_radius: float = Field(60.0, ge=10, le=300, description="Half side of the scanned square in metres.")
-    lidar_density: float = Field(100.0, gt=0, le=2000, description="Returns for a square metre of level ground.")
+    lidar_density: float = Field(100.0, gt=0, le=2000, description="Returns per square metre of level ground.")
     lidar_fov: float = Field(40.0, ge=5, le=75, description="Largest angle of a beam from the vertical in degrees.")
     lidar_sigma: float = Field(0.02, ge=0, le=1, description="White noise of the ranges in metres.")
     lidar_drift: float = Field(0.0, ge=0, le=1, description="RMS of a slow drift of each strip per axis in metres.")
@@ -62,7 +62,7 @@ class SimulateOptions(LidarFlightOptions):
         description="Seconds between photographs (default: 2, more above 8 m/s).",
     )
     gnss: Literal["rtk", "ppk", "consumer", "outliers"] = Field(
-        "rtk", description="Receiver: sets σ, slow bias and outliers; further options set each by itself."
+        "rtk", description="Receiver: sets σ, slow bias and outliers, which options below set one by one."
     )
     sigma_h: float | None = Field(None, ge=0, description="White noise of the fixes, horizontal σ in metres.")
     sigma_v: float | None = Field(None, ge=0, description="White noise of the fixes, vertical σ in metres.")
@@ -91,7 +91,7 @@ class SimulateOptions(LidarFlightOptions):
     p2: float = Field(-0.0003, ge=-0.02, le=0.02, description="Tangential distortion (opencv).")
     exposure: float = Field(0.08, ge=0, le=0.5, description="Variation of the exposure (σ of its logarithm).")
     noise: float = Field(1.0, ge=0, le=20, description="Sensor noise; 1 is a small sensor at base sensitivity.")
-    samples: Literal["1", "4", "9", "16"] = Field("4", description="Rays for a pixel (anti-aliasing).")
+    samples: Literal["1", "4", "9", "16"] = Field("4", description="Rays per pixel (anti-aliasing).")
     quality: int = Field(95, ge=50, le=100, description="JPEG quality.")
     targets: int = Field(60, ge=0, le=500, description="Survey targets to lay out.")
     target_size: float | None = Field(

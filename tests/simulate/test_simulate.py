@@ -18,7 +18,7 @@ from rosbags.highlevel import AnyReader
 
 from pipelines.core.errors import InputError
 from pipelines.core.options import resolve
-from pipelines.core.products import load_json
+from pipelines.core.products import dump_json, load_json
 from pipelines.geodesy.enu import Origin, lla_from_enu
 from pipelines.geometry.rotations import geo_from_cam, log_so3
 from pipelines.ingest.options import IngestOptions
@@ -30,7 +30,7 @@ from pipelines.simulate.stage import SimulationSummary, fly_survey, simulate
 from pipelines.simulate.truth import Truth
 from pipelines.simulate.world import make_world
 from tests.earth import enu_from_lla
-from tests.refusals import refused
+from tests.refusals import numbers, refused
 
 ORIGIN = "-33.86,151.21,-20"  # south, east, below the ellipsoid
 SMALL: dict[str, Any] = {"size": "160x120", "samples": "1", "images": 4, "targets": 30}
@@ -362,6 +362,12 @@ def test_lidar_is_written_on_request(survey: SimulatedSurvey) -> None:
     assert survey.truth.lidar is not None and survey.truth.lidar.returns > 1000
     assert (survey.folder / "lidar.laz").stat().st_size > 10_000
     assert len(survey.table("lidar_trajectory.csv")) > 100
+
+
+def test_too_few_points_are_told_with_their_number(survey: SimulatedSurvey) -> None:
+    warnings = json.loads(dump_json({"warnings": survey.summary.warnings}))["warnings"]
+    few = next(warning for warning in warnings if warning["code"] == "few-check-points")
+    assert numbers(few["sentence"])[0] == survey.summary.well_seen < 30
 
 
 def test_truth_is_plain_json(survey: SimulatedSurvey) -> None:
