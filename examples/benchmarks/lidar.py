@@ -62,8 +62,8 @@ TRAININGS: dict[str, tuple[str | None, tuple[str, ...]]] = {
     "photographs": (None, ()),
     "lidar": ("none", ()),
     "lidar, track": ("none", ("--lidar-trajectory",)),
-    "lidar, gaussians": ("none", ("--lidar-pull", "gaussians")),
-    "lidar, depth": ("none", ("--lidar-pull", "depth")),
+    "lidar, gaussians": ("none", ("--lidar-loss", "gaussians")),
+    "lidar, depth": ("none", ("--lidar-loss", "depth")),
     "lidar, removed": ("removed", ()),
 }
 STRIDE, EVERY = 2, 4  # of the pixels, and of the training views

@@ -1,4 +1,4 @@
-"""What training takes from LiDAR of a town of boxes: points to hold and to start from, free space, the track."""
+"""LiDAR of a town of boxes in training: points of the depth loss and to start from, free space, the trajectory."""
 
 from __future__ import annotations
 
@@ -53,11 +53,11 @@ def fused() -> FusedSurface:
     return FusedSurface(cast(Any, TownMaps()), cloud, judged, PIXEL_M)
 
 
-def test_views_are_held_to_lidar_that_they_see_where_stereo_found_nothing() -> None:
+def test_depth_loss_has_lidar_that_views_see_where_stereo_found_nothing() -> None:
     surface = fused()
     hidden = unseen = 0
     for index in range(12):
-        points, weight = surface.held(index, 3)
+        points, weight = surface.depth_loss_points(index, 3)
         alone = points[len(surface.points(index, 3)) :]
         assert len(weight) == len(points) and len(alone) > 50
         in_cam = (alone - VIEWS.center_in_world[index]) @ VIEWS.cam_from_world[index].T
