@@ -196,8 +196,8 @@ def _of_all_iterations(
     coarse, crops = COARSE if options.coarse_to_fine else (), Crops(options.crop_size)
     for shrink, until in pyramid(camera.width, camera.height, coarse, crops):
         side = (pixels / (camera.width * camera.height)) ** 0.5 / shrink
-        crops = crops.count(max(int(side * camera.width), 1), max(int(side * camera.height), 1))
-        seconds += (until - begun) * options.effort.iterations * one(pixels / shrink**2, crops)
+        parts = crops.count(max(int(side * camera.width), 1), max(int(side * camera.height), 1))
+        seconds += (until - begun) * options.effort.iterations * one(pixels / shrink**2, parts)
         begun = until
     return seconds
 

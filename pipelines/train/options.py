@@ -105,8 +105,8 @@ class GeographicOptions(StageOptions):
     )
     optimize_cameras: bool = Field(
         True,
-        description="Refine similarity, cameras and, with --weighting whitened, the lens during training; else they "
-        "stay as adjusted by init-sim3.",
+        description="Refine similarity, cameras and, with --weighting whitened, the lens during training; else "
+        "they stay as adjusted by init-sim3.",
     )
     solve: Solve = Field(
         "auto",

@@ -177,8 +177,8 @@ def _summary(
     if lidar is not None and lidar.areas:
         area_m2 = sum(area.area_m2 for area in lidar.areas)
         sentence = (
-            f"LiDAR and photographs contradict each other on {area_m2:.0f} m² in {len(lidar.areas)} places, which "
-            "train/lidar.json lists and train/lidar.png shows: the LiDAR is not used there"
+            f"LiDAR and photographs are inconsistent on {area_m2:.0f} m² in {len(lidar.areas)} places, where the "
+            "LiDAR is not used (list: train/lidar.json, map: train/lidar.png)."
         )
         warnings.append(Remark(code="lidar-inconsistent", sentence=sentence))
     return Summary(key_figure, values, tuple(warnings), model.cautions)
@@ -193,10 +193,10 @@ def _warning_of(error: EstimatedError) -> Remark | None:
         for value, sigma, observed in zip(error.value, error.sigma, error.observed, strict=True)
     ]
     if any(evident):
-        evidence = f"{error.name} of ({values}) {error.unit} {axes}, beyond 3 σ: it is taken out here"
+        evidence = f"The {error.name} of ({values}) {error.unit} {axes} exceeds 3 σ and was removed"
         return Remark(code=f"{error.name}-estimated", sentence=f"{evidence}. {_CAUSES[error.name]}")
     if not all(error.observed):
-        sentence = f"{error.name} is not observable along every axis: ({values}) {error.unit} {axes}"
+        sentence = f"The {error.name} is not observable along every axis: ({values}) {error.unit} {axes}."
         return Remark(code=f"{error.name}-not-observable", sentence=sentence)
     return None
 
