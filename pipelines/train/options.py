@@ -89,26 +89,26 @@ class GeographicOptions(StageOptions):
     geo_loss: bool = Field(
         True, description="Use the geographic losses; without them, similarity and cameras are frozen."
     )
-    weighting: Literal["whitened", "paper"] = Field(
+    geo_weighting: Literal["whitened", "paper"] = Field(
         "whitened",
         description="Geographic losses: residuals divided by their σ, or plain mean squares as in the paper.",
     )
     gcp_loss: bool = Field(True, description="Use the loss of the control points, L_gcp.")
-    gcp_mode: Literal["camera", "depth"] = Field(
-        "camera",
+    gcp_mode: Literal["triangulated", "depth"] = Field(
+        "triangulated",
         description="Position of control points: triangulated from marks, or from the rendered depth.",
     )
-    rel_loss: bool = Field(True, description="Use the loss of distances between located points, L_rel.")
-    loss_weights: Literal["fixed", "learned"] = Field(
+    distance_loss: bool = Field(True, description="Use the loss of distances between pairs of points, L_rel.")
+    variance_factors: Literal["fixed", "learned"] = Field(
         "fixed",
         description="Geographic losses are weighted by the stated σ, or by variance factors that are learned.",
     )
     optimize_cameras: bool = Field(
         True,
-        description="Refine similarity, cameras and, with --weighting whitened, the lens during training; else "
+        description="Refine similarity, cameras and, with --geo-weighting whitened, the lens during training; else "
         "they stay as adjusted by init-sim3.",
     )
-    solve: Solve = Field(
+    solve_cameras: Solve = Field(
         "auto",
         description="Solve similarity and cameras jointly with the Gaussians, or once, by init-sim3; "
         f"auto: once beyond {MOST_JOINT_CAMERAS} photographs.",
@@ -116,7 +116,7 @@ class GeographicOptions(StageOptions):
 
     def solves_once(self, cameras: int) -> bool:
         """Return whether a training of that many cameras keeps what init-sim3 has solved."""
-        wanted = self.solve == "once" or (self.solve == "auto" and cameras > MOST_JOINT_CAMERAS)
+        wanted = self.solve_cameras == "once" or (self.solve_cameras == "auto" and cameras > MOST_JOINT_CAMERAS)
         return wanted and self.optimize_cameras and self.geo_loss
 
     def refined_cameras(self, cameras: int) -> int:
@@ -128,15 +128,15 @@ class GeographicOptions(StageOptions):
         if not self.solves_once(cameras):
             return
         for value, plain, name in (
-            (self.weighting, "whitened", "--weighting"),
-            (self.loss_weights, "fixed", "--loss-weights"),
-            (self.gcp_mode, "camera", "--gcp-mode"),
+            (self.geo_weighting, "whitened", "--geo-weighting"),
+            (self.variance_factors, "fixed", "--variance-factors"),
+            (self.gcp_mode, "triangulated", "--gcp-mode"),
         ):
             if value != plain:
                 raise InputError(
                     "cameras-solved-once",
                     f"{value!r} changes the cameras during training, but {cameras} photographs are solved once, by "
-                    f"init-sim3: use {name} {plain}, --solve joint or --no-optimize-cameras",
+                    f"init-sim3: use {name} {plain}, --solve-cameras joint or --no-optimize-cameras",
                     field=name,
                 )
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+import pytest
 
 from pipelines.core.errors import InputError
 from pipelines.geodesy.enu import Origin, lla_from_enu
@@ -143,8 +144,12 @@ def test_another_clock_is_refused(tmp_path: Path) -> None:
 def test_a_track_without_times_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "track.csv"
     path.write_text("latitude,longitude,altitude\n46,7.7,500\n")
-    with refused("no-timestamps", InputError):
+    with pytest.raises(InputError, match="timestamp"):
         ScannerTrack.read(path, CloudCrs(), ORIGIN)
+    path.write_text("image,latitude,longitude,altitude\na.jpg,46,7.7,500\n")
+    with refused("no-timestamps", InputError) as error:
+        ScannerTrack.read(path, CloudCrs(), ORIGIN)
+    assert error.value.field == "--lidar-trajectory"
 
 
 def test_a_track_in_projected_coordinates_needs_a_crs(tmp_path: Path) -> None:

@@ -280,10 +280,10 @@ def refining_problem(
             terms.append(tensor_term(on_surface, measured.errors))
         else:
             terms.append(tensor_term(term, measured.errors))
-        if isinstance(term, adjustment.Fixes) and options.rel_loss and len(term) > 1:
+        if isinstance(term, adjustment.Fixes) and options.distance_loss and len(term) > 1:
             distances = distance_term(scene, term, points, seed)
             terms += [] if distances is None else [distances]
-    lens_follows = options.weighting == "whitened"
+    lens_follows = options.geo_weighting == "whitened"
     bundle = scene.bundle if lens_follows else bundle_information(scene.network)
     basis = correction_basis(bundle, lens_follows=lens_follows)
     z = coordinates_of(scene.bundle, state.correction)
@@ -293,8 +293,8 @@ def refining_problem(
         CameraCorrections(scene.poses, basis.matrix, lens, state, z),
         terms,
         errors=LearnableErrors(measured.errors, *adjusted.error_estimates(measured.errors)),
-        weighting=options.weighting,
-        learned_weights=options.loss_weights == "learned",
+        weighting=options.geo_weighting,
+        learned_weights=options.variance_factors == "learned",
         control_by_depth=by_depth,
     )
 
