@@ -240,7 +240,7 @@ def free_space(cloud: LidarCloud, gone: BoolArray, shown: FloatArray) -> FreeSpa
 
     Args:
         cloud: with the scanner's places.
-        gone: (P,) points that contradict the photographs: their beams do not count.
+        gone: (P,) points inconsistent with the photographs: their beams do not count.
         shown: (S, 3) surface that the photographs show; what stands there now is not free.
     """
     if cloud.scanner_in_model is None:

@@ -4,7 +4,7 @@
    consistently, what the cloud shows there is gone.
 2. Where the photographs show a surface above all points of the cloud, something was added: from the air, the
    scanner would have met it.
-3. The neighbours of a point decide with it. A single contradiction is noise, of stereo or cloud.
+3. The neighbours of a point decide with it. A single inconsistent point is noise, of stereo or cloud.
 4. The confidence of the other points is a product of factors from 0 to 1: stated accuracy against that of stereo,
    flatness and density of the neighbours, incidence of the beam, and agreement with the photographs.
 5. Points of stereo are moved onto the planes of the LiDAR that is trusted.
@@ -34,7 +34,7 @@ from pipelines.train.options import LidarLoss
 from pipelines.train.surface import SceneSurface, SurfacePoints, spread_evenly
 
 _TOLERANCE = 0.005  # of the distance: photographs that differ by less agree
-_LEAST_LOOKS = 2  # through a point, that contradict it
+_LEAST_LOOKS = 2  # through a point, for it to be inconsistent
 _NEIGHBOURS = 16
 _ADDED_M = 1.0  # height of a surface that the cloud lacks
 _CELL_M = 0.5  # least side of cells in plan
@@ -73,8 +73,8 @@ class CloudVerdict:
     """What the photographs say of a cloud.
 
     Attributes:
-        rejected: (P,) whether a point contradicts the photographs.
-        confidence: (P,) in the points, 0 … 1; 0 where they contradict the photographs.
+        rejected: (P,) whether a point is inconsistent with the photographs.
+        confidence: (P,) in the points, 0 … 1; 0 where they are inconsistent with the photographs.
         areas: that have changed, the largest first.
     """
 
@@ -91,7 +91,7 @@ def verdict(
     sigma_m: float,
     pixel_m: float,
 ) -> CloudVerdict:
-    """Return confidence and contradictions of the P points of a registered cloud.
+    """Return confidence and inconsistencies of the P points of a registered cloud.
 
     Args:
         views: depth maps of the training photographs.

@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from pipelines.core.errors import InputError
 from pipelines.core.options import InputPath, StageOptions
 from pipelines.geodesy.vertical import Vertical
-from pipelines.survey.options import CloudCrs, CloudPath
+from pipelines.survey.options import CloudPath
 
 
 @dataclass(frozen=True)
@@ -71,11 +71,6 @@ class LidarOptions(StageOptions):
                 "--lidar-crs, --lidar-vertical, --lidar-trajectory and --lidar-register belong to --lidar"
             )
         return self
-
-    @property
-    def lidar_stated(self) -> CloudCrs:
-        """CRS of the LiDAR as the user states it."""
-        return CloudCrs(self.lidar_crs, self.lidar_vertical)
 
 
 # A dense basis of more cameras takes more than 2 GiB (`geometry.correction_basis`).

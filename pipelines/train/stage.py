@@ -31,6 +31,7 @@ from pipelines.surface.lidar_cloud import ScannerTrack
 from pipelines.surface.measured_cloud import CloudReader
 from pipelines.survey.adjustment import GeolocatedPoints
 from pipelines.survey.calibrated import load_survey
+from pipelines.survey.options import CloudCrs
 from pipelines.survey.report_parts import EstimatedError, LidarReport
 from pipelines.survey.scene import photographs
 from pipelines.survey.trained_model import Adjustment, TrainedModel
@@ -68,11 +69,11 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     # First, so that `--backend cuda` without a GPU fails at once.
     backend = rasterizer(options.backend, stage.progress)
     workspace = stage.workspace
-    clouds = None if options.lidar is None else CloudReader(options.lidar, options.lidar_stated)
-    adjusted = AdjustedScene.load(workspace)
+    stated = CloudCrs(options.lidar_crs, options.lidar_vertical)
+    clouds = None if options.lidar is None else CloudReader(options.lidar, stated)
+    adjusted, path = AdjustedScene.load(workspace), options.lidar_trajectory
     survey, scene = adjusted.survey, adjusted.scene
-    of_scanner, stated = options.lidar_trajectory, options.lidar_stated
-    track = None if of_scanner is None else ScannerTrack.read(of_scanner, stated, survey.origin)
+    track = None if path is None else ScannerTrack.read(path, stated, survey.origin)
     options.require_trainable(len(scene.sparse.image_name))
     images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
     free_bytes = free_memory_bytes(device_of(backend))

@@ -109,7 +109,7 @@ class JointTrainer:
         strategy: density control.
         problem: similarity, cameras and constant errors, with the geographic losses.
         exposures: of the photographs, optimised as well or held; None: all photographs have the same exposure.
-        outliers: finds pixels that contradict the model, which do not count; None: all do.
+        outliers: finds outlier pixels, which do not count; None: all do.
         region: part of the scene that the Gaussians are to show; None: all of it.
     """
 

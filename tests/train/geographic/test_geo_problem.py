@@ -240,7 +240,7 @@ def test_bounds_hold_whatever_is_learned(weighting: str) -> None:
             assert value == pytest.approx(math.exp(math.copysign(math.log(factor), far)), rel=1e-9)
 
 
-def test_options_that_a_held_solution_contradicts_are_refused() -> None:
+def test_options_that_change_a_solved_camera_are_refused() -> None:
     options = GeographicOptions(gcp_mode="depth")
     options.require_trainable(MOST_JOINT_CAMERAS)
     with refused("cameras-solved-once", InputError) as error:
