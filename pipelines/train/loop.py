@@ -190,7 +190,7 @@ class _Loop:
         """Return to the last checkpoint and lower the learning rates; a second time is a `ConvergenceError`."""
         advice = "Train again with a smaller --geo-weight, another --seed or fewer --max-gaussians."
         if self.recovery is not None:
-            raise ConvergenceError("training-diverged", f"{error}; earlier: {self.recovery}. {advice}") from error
+            raise ConvergenceError("training-diverged", f"{error}; earlier, {self.recovery}. {advice}") from error
         self._go_back()
         self.trainer.slow_down(_RECOVERY_RATE)
         self.recovery = (

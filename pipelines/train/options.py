@@ -79,7 +79,7 @@ Solve = Literal["auto", "joint", "once"]
 
 
 class GeographicOptions(StageOptions):
-    """Options of the geographic losses: measurements in use, and how they are weighed."""
+    """Options of the geographic losses: measurements in use, and their weights."""
 
     geo_loss: bool = Field(
         True, description="Use the geographic losses; without them, similarity and cameras are frozen."

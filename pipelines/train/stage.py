@@ -103,7 +103,7 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
         points = GeolocatedPoints.load(workspace.path(POINTS))
         problem = refining_problem(adjusted, measured, options, points, options.seed)
     else:
-        log.info("similarity and cameras are held at the adjustment of init-sim3")
+        log.info("similarity and cameras are frozen at the adjustment of init-sim3")
         problem = held_problem(adjusted)
     if compared is not None and clouds is not None:
         shift_m = measured.errors.value(adjusted.error_estimates(measured.errors)[0], "lidar-shift")

@@ -108,7 +108,7 @@ class JointTrainer:
         optimizer: the Gaussians and their moments.
         strategy: density control.
         problem: similarity, cameras and constant errors, with the geographic losses.
-        exposures: of the photographs, optimised as well or held; None: all photographs have the same exposure.
+        exposures: of the photographs, optimised as well or frozen; None: all photographs have the same exposure.
         outliers: finds outlier pixels, which do not count; None: all do.
         region: part of the scene that the Gaussians are to show; None: all of it.
     """
@@ -346,7 +346,7 @@ def make_trainer(
     Args:
         training: cameras, photographs and surface.
         problem: the geographic losses, moved to the backend's device.
-        exposures: to be held; None: those of the training photographs are fitted, if the options say so.
+        exposures: frozen; None: those of the training photographs are fitted, if the options say so.
 
     Raises:
         DegenerateGeometryError: fewer than two different points to start from.
@@ -388,8 +388,8 @@ def make_finisher(
     Args:
         training: cameras, photographs and region.
         gaussians: on the backend's device.
-        problem: holds the cameras.
-        exposures: to be held; None: none.
+        problem: with frozen cameras.
+        exposures: frozen; None: none.
     """
     device, scene, iterations = device_of(backend), training.scene, options.effort.iterations
     extent_m = scene_extent(scene.poses.cam_center_in_model[scene.train])

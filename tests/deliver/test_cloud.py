@@ -134,7 +134,7 @@ def test_pixel_on_the_ground_is_depth_over_focal_length(tmp_path: Path) -> None:
 def test_a_model_without_surface_is_refused(tmp_path: Path) -> None:
     with refused("no-common-surface", DegenerateGeometryError) as error:
         pixel_on_surface_m(surface_views(tmp_path, -1e9), GEO_FROM_MODEL)
-    assert numbers(error.value.message) == [8]
+    assert numbers(str(error.value)) == [8]
 
 
 def test_cloud_of_a_trained_survey_lies_on_its_ground(

@@ -125,7 +125,7 @@ def test_a_second_divergence_stops_and_names_both(images: ImageCache, tmp_path: 
     _spoil(trainer, {3, 33})
     with refused("training-diverged", ConvergenceError) as error:
         optimise(trainer, files(tmp_path), SILENT)
-    assert re.search(r"iteration 33; earlier: .* iteration 3; continued from.*--seed", str(error.value))
+    assert re.search(r"iteration 33; earlier, .* iteration 3; continued from.*--seed", str(error.value))
     # Whoever resumes does so from a sound state that knows of the first one.
     resumed = tiny.trainer(images, OPTIONS)
     outcome = optimise(resumed, files(tmp_path, resume=True), SILENT)

@@ -170,7 +170,7 @@ class GeoProblem(torch.nn.Module):
             in_metres = self.weighting == "paper" and term.in_metres
             residual = term.residuals(at) if in_metres else term.whitened(at)
             values[term.kind] = self._rho(term, residual).mean()
-        # A problem that holds the cameras has no z, and no loss.
+        # A problem with frozen cameras has no z, and no loss.
         values["cameras"] = self.cameras.z.square().sum() / self._normaliser()
         if len(at.vector):
             values["errors"] = self.errors.prior() / self._normaliser()
@@ -260,7 +260,7 @@ def refining_problem(
 ) -> GeoProblem:
     """Return the problem of a training that refines similarity, cameras, lens and systematic errors.
 
-    With `paper` the lens stays, because plain mean squares hold no lens to the photographs.
+    With `paper` the lens stays, because plain mean squares compare no lens with the photographs.
 
     Args:
         adjusted: the adjustment, from which the training starts.
@@ -300,7 +300,7 @@ def refining_problem(
 
 
 def held_problem(adjusted: AdjustedScene) -> GeoProblem:
-    """Return the problem of a training that holds similarity, cameras and lens of the adjustment."""
+    """Return the problem of a training with similarity, cameras and lens frozen at the adjustment."""
     record, poses = adjusted.adjustment.geo_from_model, adjusted.adjustment.poses
     state = replace(adjusted.state(SystematicErrors()), correction=np.zeros((len(poses.cam_from_model), 6)))
     return GeoProblem(
