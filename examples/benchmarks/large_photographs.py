@@ -1,7 +1,7 @@
 """Compare the memory of a training on large photographs with its forecast: large_photographs.py --help.
 
 Photographs of a workspace are enlarged, with their cameras, and trained at that size for a few iterations, as in
-the last part of a training: in windows of photographs that are not shrunken.
+the last part of a training: in crops of photographs that are not shrunken.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ def main() -> None:
     largest = images.largest()
     print(
         f"{len(shots)} photographs of {largest.width}×{largest.height} px, {len(trainer.optimizer.gaussians)} "
-        f"Gaussians, windows of {pixels / max(arguments.iterations - 1, 1) / 1e6:.2f} megapixels: "
+        f"Gaussians, crops of {pixels / max(arguments.iterations - 1, 1) / 1e6:.2f} megapixels: "
         f"{worked:.2f} processor s an iteration, peak {peak_mib() - before:.0f} MiB more, "
         f"forecast {predicted_peak_bytes(size) / 2**20:.0f} MiB"
     )

@@ -62,8 +62,8 @@ TRAININGS: dict[str, tuple[str | None, tuple[str, ...]]] = {
     "photographs": (None, ()),
     "lidar": ("none", ()),
     "lidar, track": ("none", ("--lidar-trajectory",)),
-    "lidar, gaussians": ("none", ("--lidar-pull", "gaussians")),
-    "lidar, depth": ("none", ("--lidar-pull", "depth")),
+    "lidar, gaussians": ("none", ("--lidar-loss", "gaussians")),
+    "lidar, depth": ("none", ("--lidar-loss", "depth")),
     "lidar, removed": ("removed", ()),
 }
 STRIDE, EVERY = 2, 4  # of the pixels, and of the training views
@@ -164,7 +164,10 @@ def comparison(workspace: Workspace, flight: RecordedFlight, unchanged: Path, us
     survey, scene = adjusted.survey, adjusted.scene
     images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
     images.build(SILENT)
-    maps, files = DepthMaps(workspace.cache / "surface", scene, images), CloudReader(used, options.lidar_stated)
+    maps, files = (
+        DepthMaps(workspace.cache / "surface", scene, images),
+        CloudReader(used, CloudCrs(options.lidar_crs, options.lidar_vertical)),
+    )
     maps.build(SILENT)
     compared = compared_lidar(
         options, files, maps, survey,

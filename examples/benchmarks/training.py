@@ -121,7 +121,7 @@ def curve(arguments: argparse.Namespace) -> None:
                 "max_image_size": arguments.max_image_size,
                 "max_gaussians": most,
                 "backend": arguments.backend,
-                "faithful_surface": arguments.faithful_surface,
+                "geometry_regularisation": arguments.geometry_regularisation,
             }
         )
         trainer, scene, images = trainer_on(arguments.workspace, config)
@@ -208,7 +208,7 @@ def main() -> None:
     time_line.add_argument("--max-image-size", type=int, default=600)
     time_line.add_argument("--max-gaussians", type=int, nargs="+", default=[80_000])
     time_line.add_argument("--look", type=Path, help="folder for photographs beside their renders")
-    time_line.add_argument("--faithful-surface", action=argparse.BooleanOptionalAction, default=True)
+    time_line.add_argument("--geometry-regularisation", action=argparse.BooleanOptionalAction, default=True)
     time_line.set_defaults(run=curve)
     arguments = parser.parse_args()
     arguments.run(arguments)

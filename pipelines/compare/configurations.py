@@ -30,7 +30,7 @@ _FIXED: Flags = {
     "optimize_cameras": False,
     "geo_loss": False,
     "gcp_loss": False,
-    "rel_loss": False,
+    "distance_loss": False,
     "geo_schedule": "constant",
 }
 _JOINT: Flags = {**_FIXED, "optimize_cameras": True, "geo_loss": True}
@@ -79,13 +79,13 @@ CONFIGURATIONS: tuple[Configuration, ...] = (
     Configuration(
         "D", "C + L_gcp + L_rel",
         "control points and relative distances too, at constant weight",
-        {"method": "robust", "control_points": True}, {**_JOINT, "gcp_loss": True, "rel_loss": True},
+        {"method": "robust", "control_points": True}, {**_JOINT, "gcp_loss": True, "distance_loss": True},
     ),
     Configuration(
         "E", "D + adaptive weight, the full method",
         "the weight of the geographic losses rises while training",
         {"method": "robust", "control_points": True},
-        {**_JOINT, "gcp_loss": True, "rel_loss": True, "geo_schedule": "rising"},
+        {**_JOINT, "gcp_loss": True, "distance_loss": True, "geo_schedule": "rising"},
     ),
 )  # fmt: skip
 BY_CONFIGURATION = {configuration.name: configuration for configuration in CONFIGURATIONS}

@@ -32,7 +32,7 @@ class TrainingSize:
 
     Attributes:
         gaussians: largest number.
-        camera: of the largest image that is rendered: a photograph, or a window of it.
+        camera: of the largest image that is rendered: a photograph, or a crop of it.
         cameras: number of those whose poses training refines together.
         photograph_px: pixels of the largest photograph at its training size; 0: no larger than `camera`.
     """

@@ -1,9 +1,9 @@
 """Surfaces in a splat: losses that make Gaussians lie on them, discs that are one, and the depth to measure in.
 
-1. The rendered depth is pulled to the depth of the points that a view observes (as in DS-NeRF,
+1. The rendered depth is compared with the depth of the points that a view observes (as in DS-NeRF,
    doi 10.1109/CVPR52688.2022.01254).
 2. Each Gaussian is flattened towards a disc (as in PGSR, doi 10.1109/TVCG.2024.3494046, eq. 1).
-3. The normals of the discs are pulled to the normals of the rendered depth (2D Gaussian Splatting,
+3. The normals of the discs are compared with the normals of the rendered depth (2D Gaussian Splatting,
    doi 10.1145/3641519.3657428, eq. 14).
 """
 
@@ -92,7 +92,7 @@ def measured_depth(median_m: Tensor, expected_m: Tensor, variance_m2: Tensor) ->
 
 _SPREAD = 0.005  # of the depth: the loss of a smaller spread grows with its square
 _NEAR = 0.002  # of the depth
-_FIRMNESS = 9.0  # additional pull on depths that near to their point
+_FIRMNESS = 9.0  # additional slope of the loss of depths that near to their point
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ class SurfaceSettings:
 
 @dataclass(frozen=True)
 class ObservedPoints:
-    """Points (K, 3) that a view observes, and the weights (K,) of their pull; None: 1."""
+    """Points (K, 3) that a view observes, and their weights (K,) in the depth loss; None: 1."""
 
     point_in_model: Tensor
     weight: Tensor | None = None
@@ -133,7 +133,7 @@ def depth_loss(
 
     1. Gaussians are blended in the order of their centres. On a slanted surface the nearer Gaussians hide the
        others. A surface behind the true one, by a part of the Gaussians' size, then matches the photographs best.
-    2. Within s of a point its pull is 1 + F times as strong as further away, and withstands that bias.
+    2. Within s of a point its loss is 1 + F times as steep as further away, and withstands that bias.
     3. Further away the point is more likely to be wrong, and the photographs prevail.
 
     Points outside the image do not count, nor do points where the render is nearly transparent: there is no surface
@@ -145,9 +145,9 @@ def depth_loss(
     rendered_m, seen = depth_at(depth_m, alpha, in_cam[:, :2] / z[:, None], camera)
     counts = seen * (in_cam[:, 2] > 1e-3)
     off = (rendered_m / z - 1).abs()
-    pull = off + _FIRMNESS * _NEAR * (1 - torch.exp(-off / _NEAR))
-    pull = pull if points.weight is None else points.weight * pull
-    return (pull * counts).sum() / counts.sum().clamp_min(1)
+    loss = off + _FIRMNESS * _NEAR * (1 - torch.exp(-off / _NEAR))
+    loss = loss if points.weight is None else points.weight * loss
+    return (loss * counts).sum() / counts.sum().clamp_min(1)
 
 
 def compactness_loss(depth_m: Tensor, variance_m2: Tensor, alpha: Tensor) -> Tensor:

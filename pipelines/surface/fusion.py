@@ -75,9 +75,9 @@ def pixel_on_surface_m(views: SurfaceViews, geo_from_model: Similarity) -> float
             medians.append(geo_from_model.scale * float(np.median(depth[depth > 0])) / view.pinhole.fx)
     if not medians:
         raise DegenerateGeometryError(
-            "todo-none-training-views-shows",
-            f"none of {len(views)} training views shows a surface on which the others agree: train longer, or with "
-            "--dense",
+            "no-common-surface",
+            f"In none of the {len(views)} training views do rendered depths agree with those of other views. Train "
+            "with more --iterations, or with --dense.",
         )
     return float(np.median(medians))
 

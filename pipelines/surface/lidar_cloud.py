@@ -42,14 +42,12 @@ class ScannerTrack:
         """
         table = read_trajectory(path)
         if table.time_s is None:
-            raise InputError(
-                "todo-has-no-column-timestamp", "has no column `timestamp`", path=path, field="--lidar-trajectory"
-            )
+            raise InputError("no-timestamps", "has no column `timestamp`", path=path, field="--lidar-trajectory")
         text = _WGS84 if table.geographic else stated.crs
         if text is None:
             raise InputError(
-                "todo-has-projected-coordinates-lidar",
-                "has projected coordinates: --lidar-crs states their CRS",
+                "crs-unknown",
+                "has projected coordinates: state their CRS with --lidar-crs",
                 path=path,
                 field="--lidar-trajectory",
             )
@@ -71,9 +69,9 @@ class ScannerTrack:
         covered = float(np.isfinite(place[:, 0]).mean())
         if covered < _LEAST_COVERED:
             raise InputError(
-                "todo-has-place-for-times",
-                f"has a place for the times of {covered:.0%} of the points: it counts on another clock, or belongs "
-                "to another flight",
+                "times-outside-trajectory",
+                f"covers the times of {covered:.0%} of the points only: its clock is not that of the LiDAR, or it "
+                "belongs to another flight",
                 field="--lidar-trajectory",
             )
         return place
@@ -146,8 +144,9 @@ def read_cloud(
     cloud = read_thinned(files, survey.origin, Thinning(pixel_m, _MOST_POINTS, low, high), progress)
     if len(cloud) <= 10 * _NEIGHBOURS:
         raise InputError(
-            "todo-only-points-lie-scene",
-            f"only {len(cloud)} points lie in the scene of the photographs",
+            "no-overlap",
+            f"only {len(cloud)} points lie in the scene of the photographs: check the cloud's place and its CRS "
+            "(--lidar-crs)",
             field="--lidar",
         )
     model_from_geo = scene.geo_from_model.inverse()

@@ -126,9 +126,7 @@ class CloudReader:
     def _valid(self, chunk: CloudChunk, path: Path) -> CloudChunk:
         """Return the points that count, and note the others."""
         if not np.isfinite(chunk.position).all():
-            raise InputError(
-                "todo-holds-coordinates-not-finite", "holds coordinates that are not finite", path=path
-            )
+            raise InputError("not-finite", "contains coordinates that are not finite", path=path)
         noise = np.isin(chunk.classification, NOISE_CLASSES)
         keep = ~(noise | chunk.withheld | chunk.overlap)
         self.tally.read += len(chunk)
@@ -161,9 +159,9 @@ def read_thinned(
             waiting, held, voxel_m = [merged], len(merged), merged.voxel_m
     if not held:
         raise InputError(
-            "todo-none-points-lies-where",
-            f"none of the {files.tally.read} points lies where the photographs look: another place, or a wrong CRS "
-            f"({', '.join(files.crs_names)})",
+            "no-overlap",
+            f"None of the {files.tally.read} points lies in the scene of the photographs: the cloud is of another "
+            f"place, or its CRS ({', '.join(files.crs_names)}) is wrong.",
         )
     cloud = _limited(waiting, voxel_m, thinning.most)
     log.info(
@@ -192,8 +190,8 @@ def _thinned(parts: list[MeasuredCloud], voxel_m: float) -> MeasuredCloud:
     if not (high - low < _KEY_SIDE * voxel_m).all():
         reach_m = float((high - low).max())
         raise InputError(
-            "todo-points-km-apart-do",
-            f"points {reach_m / 1000:.0f} km apart do not fit into voxels of {voxel_m:g} m",
+            "cloud-too-large",
+            f"The points extend over {reach_m / 1000:.0f} km, too far for voxels of {voxel_m:g} m.",
         )
     keys = voxel_keys(position, voxel_m)
     _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
@@ -219,12 +217,10 @@ def _paths(path: Path, stated: CloudCrs) -> list[Path]:
         and not any(part[0] == "." for part in file.relative_to(path).parts)
     )
     if not files:
-        raise InputError(
-            "todo-no-las-laz-or", "no LAS, LAZ or PLY file in this folder", path=path, field=stated.flag
-        )
+        raise InputError("no-cloud-files", "no LAS, LAZ or PLY file in this folder", path=path, field=stated.flag)
     if len(files) > _MOST_FILES:
         raise InputError(
-            "todo-files-limit", f"{len(files)} files (limit {_MOST_FILES})", path=path, field=stated.flag
+            "too-many-files", f"{len(files)} files (limit {_MOST_FILES})", path=path, field=stated.flag
         )
     return files
 
@@ -233,9 +229,7 @@ def _opened(path: Path, stated: CloudCrs) -> CloudFile:
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
         hint = " (CloudCompare and PDAL convert E57)" if path.suffix.lower() == ".e57" else ""
-        raise InputError(
-            "todo-expected-las-laz-or", f"expected .las, .laz or .ply{hint}", path=path, field=stated.flag
-        )
+        raise InputError("format-unknown", f"expected .las, .laz or .ply{hint}", path=path, field=stated.flag)
     return reader(path)
 
 
@@ -244,7 +238,7 @@ def _crs_of(file: CloudFile, stated: CloudCrs) -> PointCrs:
         return parse_crs(file.crs, vertical=stated.vertical, path=file.path)
     if stated.crs is None:
         raise InputError(
-            "todo-states-no-crs-give",
+            "crs-unknown",
             f"states no CRS: give {stated.flag}-crs EPSG:n, or EPSG:n+m with the vertical CRS",
             path=file.path,
             field=stated.flag,

@@ -79,9 +79,9 @@ def registration(cloud: LidarCloud, views: DepthViews, seed: int) -> Registratio
         matches = _matches(planes.moved(-total), views, capture)
         if len(matches) < _LEAST_POINTS:
             raise DegenerateGeometryError(
-                "todo-only-lidar-points-lie",
-                f"only {len(matches)} LiDAR points lie within {capture:.1%} of the distance from the surface of "
-                "the photographs: too few to compare them",
+                "no-overlap",
+                f"Only {len(matches)} LiDAR points lie within {capture:.1%} of the camera's distance from the "
+                "surface of the photographs, too few for a comparison",
             )
         values, covariance, spread = _solved(matches)
         total = total + values[:3]
@@ -122,7 +122,7 @@ def _solved(matches: PlaneMatches) -> tuple[FloatArray, FloatArray, float]:
             break
     if np.linalg.eigvalsh(normal[:3, :3])[0] * spread**2 < 1e-3 * len(matches):
         raise DegenerateGeometryError(
-            "todo-planes-lidar-face-one", "the planes of the LiDAR face one direction: its shift is not determined"
+            "planes-parallel", "All planes of the LiDAR face one direction, which leaves its shift undetermined"
         )
     residual = matches.distance_m - design @ value
     score = _summed_by_cell((weight * residual)[:, None] * design / spread**2, matches.point_in_model, _CLUSTER_M)

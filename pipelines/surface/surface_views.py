@@ -240,7 +240,7 @@ class SurfaceViews:
         free = shutil.disk_usage(self.folder).free - _SPARE_BYTES
         if needed > free:
             raise InputError(
-                "todo-depth-maps-training-views",
+                "disk-full",
                 f"the depth maps of the training views need {needed / 2**30:.1f} GiB, and "
                 f"{max(free, 0) / 2**30:.1f} GiB are free: make room on this disk",
                 path=self.folder,

@@ -35,8 +35,8 @@ def training_size(options: TrainOptions, photographs: int, largest: Pinhole, bes
         beside: number of frozen Gaussians that are rendered too.
     """
     gaussians, cameras = options.effort.max_gaussians + beside, options.refined_cameras(photographs)
-    window, whole_px = Crops(options.crop_size).largest_of(largest), largest.width * largest.height
-    return TrainingSize(gaussians, window, options.sh_degree, cameras, whole_px)
+    crop, whole_px = Crops(options.crop_size).largest_of(largest), largest.width * largest.height
+    return TrainingSize(gaussians, crop, options.sh_degree, cameras, whole_px)
 
 
 def with_gaussian_limit(
@@ -76,7 +76,7 @@ class TrainingForecast:
     Attributes:
         photo_px: width and height of the largest photograph.
         training_px: width and height at which it is trained.
-        windows: number of windows in which it is seen, one at an iteration, when it is not shrunken further.
+        crops: number of crops in which it is seen, one at an iteration, when it is not shrunken further.
         backend: `cpu` or `cuda`.
         seconds: about; None on a GPU, where nothing was measured.
         peak_bytes: predicted peak of the memory.
@@ -88,7 +88,7 @@ class TrainingForecast:
     photographs: int
     photo_px: tuple[int, int]
     training_px: tuple[int, int]
-    windows: int
+    crops: int
     iterations: int
     max_gaussians: int
     backend: str
@@ -119,8 +119,8 @@ class TrainingForecast:
         reduction = max(self.photo_px) / max(self.training_px)
         if reduction > 1.05:
             size += f", 1/{reduction:.1f} of their side (--max-image-size)"
-        if self.windows > 1:
-            size += f", each in {self.windows} windows (--crop-size)"
+        if self.crops > 1:
+            size += f", each in {self.crops} crops (--crop-size)"
         took = "time not measured on a GPU"
         if self.seconds is not None:
             took = f"about {about(self.seconds)} on {self.threads} threads of this machine"
@@ -149,7 +149,7 @@ def training_forecast(photographs: int, photo_px: tuple[int, int], options: Trai
         photographs=photographs,
         photo_px=photo_px,
         training_px=(camera.width, camera.height),
-        windows=Crops(options.crop_size).count(camera.width, camera.height),
+        crops=Crops(options.crop_size).count(camera.width, camera.height),
         iterations=effort.iterations,
         max_gaussians=effort.max_gaussians,
         backend=backend,
@@ -165,12 +165,12 @@ def training_forecast(photographs: int, photo_px: tuple[int, int], options: Trai
 def block_processor_s(plan: BlockPlan, photo_px: tuple[int, int], options: TrainOptions) -> dict[int, float]:
     """Return the processor seconds that the CPU backend needs for each block of a plan, by number, on one core."""
     seconds, camera = {}, training_pinhole(photo_px, options)
-    factor = SURFACE_FACTOR if options.faithful_surface else 1.0
+    factor = SURFACE_FACTOR if options.geometry_regularisation else 1.0
     for block in plan.blocks:
 
-        def one(pixels: float, windows: int, block: PlannedBlock = block) -> float:
+        def one(pixels: float, crops: int, block: PlannedBlock = block) -> float:
             count = block.gaussians + plan.scaffold_gaussians
-            return factor * BLOCK_SECONDS.of(pixels / windows, block.visible / windows, count)
+            return factor * BLOCK_SECONDS.of(pixels / crops, block.visible / crops, count)
 
         iterating = _of_all_iterations(camera, block.view_px, options, one)
         stereo = MEASURED_CORES * _stereo_s(len(block.cameras), camera)
@@ -190,14 +190,14 @@ def _of_all_iterations(
 ) -> float:
     """Return the seconds of all iterations on photographs with so many pixels that count.
 
-    `one` returns those of an iteration, by the pixels of a shrunken photograph and its windows.
+    `one` returns those of an iteration, by the pixels of a shrunken photograph and its crops.
     """
     seconds, begun = 0.0, 0.0
     coarse, crops = COARSE if options.coarse_to_fine else (), Crops(options.crop_size)
     for shrink, until in pyramid(camera.width, camera.height, coarse, crops):
         side = (pixels / (camera.width * camera.height)) ** 0.5 / shrink
-        windows = crops.count(max(int(side * camera.width), 1), max(int(side * camera.height), 1))
-        seconds += (until - begun) * options.effort.iterations * one(pixels / shrink**2, windows)
+        parts = crops.count(max(int(side * camera.width), 1), max(int(side * camera.height), 1))
+        seconds += (until - begun) * options.effort.iterations * one(pixels / shrink**2, parts)
         begun = until
     return seconds
 
@@ -205,9 +205,9 @@ def _of_all_iterations(
 def _seconds(photographs: int, camera: Pinhole, options: TrainOptions) -> float:
     """Return the seconds of stereo and of all iterations on this machine."""
 
-    def one(pixels: float, windows: int) -> float:
-        surface, count = options.faithful_surface, options.effort.max_gaussians
-        return iteration_seconds(pixels, count, surface=surface, crops=windows)
+    def one(pixels: float, crops: int) -> float:
+        surface, count = options.geometry_regularisation, options.effort.max_gaussians
+        return iteration_seconds(pixels, count, surface=surface, crops=crops)
 
     seconds = _of_all_iterations(camera, camera.width * camera.height, options, one)
     if options.dense:

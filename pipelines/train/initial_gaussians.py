@@ -1,17 +1,17 @@
-"""Initial Gaussians of a training, and the points that its surface losses hold them to.
+"""Initial Gaussians of a training, and the points of its depth loss.
 
 Beside the surface, three parts of the photographs need Gaussians to start from:
 
 - Sky, horizon and bare ground around the scene (`background`): Gaussians of the scene would grow in mid-air until
   they cover them. Each ray starts with a Gaussian of the pixel's colour, on the ground, or far away if the ray does
   not meet the ground.
-- Crowns in wind, water and smooth ground, whose depth stereo does not know (`guessed_points`): density control
+- Crowns in wind, water and smooth ground, whose depth stereo does not know (`fallback_points`): density control
   would have to split the few Gaussians that reach into them, again and again. Points at the height of the SfM
   points around them start as dense as the surface.
-- Gaps that no photograph shows, such as narrow yards (`underlay`): with nothing behind it, a gap is a black hole,
-  and whatever Gaussian is near grows over it. A sheet of flat Gaussians in the colours of the ground ends each ray
-  that looks down. It lies only where a known surface hides it from photographs, or none looks: elsewhere
-  photographs decide what is there, and the sheet would count as a surface.
+- Gaps that no photograph shows, such as narrow yards (`background_plane`): with nothing behind it, a gap is a black
+  hole, and whatever Gaussian is near grows over it. Flat Gaussians in the colours of the ground end each ray that
+  looks down. They lie only where a known surface hides them from photographs, or none looks: elsewhere
+  photographs decide what is there, and the plane would count as a surface.
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ _CANDIDATES = 4  # drawn for each wanted point
 _RAY_COLUMNS = 64  # along the longer side of a view: neighbouring rays meet neighbouring ground
 
 
-def guessed_points(
+def fallback_points(
     scene: Scene,
     maps: DepthMaps,
     count: int,
@@ -189,18 +189,18 @@ def _ground_depth(scene: Scene, index: int, camera: Pinhole, ground: PointSurfac
     return np.asarray(cv2.resize(along, size, interpolation=cv2.INTER_LINEAR))
 
 
-_STRAY = 0.01  # of the points at either end of an axis lie outside of the sheet
+_STRAY = 0.01  # of the points at either end of an axis lie outside of the plane
 _LOW = 0.05  # of the points of a cell may lie below it: stereo errs
 _ROOF_REACH_M = 20.0  # a cell whose points lie on a roof has ground within this distance
 _DEPTH = 0.5  # below the ground, in cells
 _LOOKED_AT = 16  # points near a place whose mean colour it has
 _HIDDEN_SHARE = 0.5  # of the views that face a place: some know no depth before it
 _COLOUR_POINTS = 40_000
-_UPRIGHT = 3.0  # factor on heights, when points near a place of the sheet are looked for: not those of roofs
+_UPRIGHT = 3.0  # factor on heights, when points near a place of the plane are looked for: not those of roofs
 
 
-def underlay(points: SurfacePoints, count: int, seed: int) -> tuple[SurfacePoints, float]:
-    """Return places on a sheet beneath the points, on a square grid with z up, and the side of its cells in metres.
+def background_plane(points: SurfacePoints, count: int, seed: int) -> tuple[SurfacePoints, float]:
+    """Return places on a plane beneath the points, on a square grid with z up, and the side of its cells in metres.
 
     Each place lies half a side below the lowest ground that points show within 20 m, smoothed but never above them.
     There are `count` places at most, and at least one point; the seed is that of the points for the colours.
@@ -222,9 +222,9 @@ def underlay(points: SurfacePoints, count: int, seed: int) -> tuple[SurfacePoint
     smooth = ndimage.uniform_filter(ndimage.minimum_filter(known, size=reach, mode="nearest"), 3, mode="nearest")
     height = np.minimum(smooth, known) - _DEPTH * side_m
     row, column = np.divmod(np.arange(columns * rows), columns)
-    sheet = np.column_stack([low + side_m * (np.stack([column, row], axis=1) + 0.5), height.ravel()])[:count]
-    normal = np.broadcast_to([0.0, 0.0, 1.0], sheet.shape)
-    return SurfacePoints(sheet, _colours(points, sheet, seed), normal), side_m
+    plane = np.column_stack([low + side_m * (np.stack([column, row], axis=1) + 0.5), height.ravel()])[:count]
+    normal = np.broadcast_to([0.0, 0.0, 1.0], plane.shape)
+    return SurfacePoints(plane, _colours(points, plane, seed), normal), side_m
 
 
 def hidden(points: FloatArray, scene: Scene, maps: DepthMaps) -> BoolArray:
@@ -256,20 +256,20 @@ def _low_heights(cell: IntArray, height: FloatArray, count: int) -> FloatArray:
     return low
 
 
-def _colours(points: SurfacePoints, sheet: FloatArray, seed: int) -> ByteArray:
-    """Return the mean colour (K, 3) of the points near each place of the sheet."""
+def _colours(points: SurfacePoints, plane: FloatArray, seed: int) -> ByteArray:
+    """Return the mean colour (K, 3) of the points near each place of the plane."""
     drawn = np.random.default_rng(seed).permutation(len(points.rgb))[:_COLOUR_POINTS]
     stretch = np.array([1.0, 1.0, _UPRIGHT])
     tree = cKDTree(points.point_in_model[drawn] * stretch)
-    _, near = tree.query(sheet * stretch, k=min(_LOOKED_AT, len(drawn)))
-    return np.asarray(points.rgb[drawn][near.reshape(len(sheet), -1)].mean(axis=1).round().astype(np.uint8))
+    _, near = tree.query(plane * stretch, k=min(_LOOKED_AT, len(drawn)))
+    return np.asarray(points.rgb[drawn][near.reshape(len(plane), -1)].mean(axis=1).round().astype(np.uint8))
 
 
 _SURFACE_SHARE = 0.8  # of the limit of Gaussians starts on the surface; density control places the others
 _MOSTLY_KNOWN = 0.6  # of the pixels: with fewer known depths, more Gaussians are needed off the surface
 _UNKNOWN_SHARE = 0.05  # of the limit starts where no depth is known, at least: density control finds corners late
 _BENEATH_SHARE = 0.02  # of the limit lies beneath the scene
-_BENEATH_SIGMA = 0.6  # in cells of the sheet: it has no gaps
+_BENEATH_SIGMA = 0.6  # in cells of the plane: it has no gaps
 _BENEATH_THICKNESS = 0.2
 _BENEATH_OPACITY = 0.7
 _STRIDE = 3  # of rows and columns of a depth map: Gaussians are wider than its pixels
@@ -298,7 +298,7 @@ def initial_gaussians(training: TrainingScene, options: InitialisationOptions, m
     2. Balls lie at SfM points where no surface is known. On a surface discs are better: an SfM point has no normal,
        and a ball reaches as far behind a wall as the gap to the wall's next point.
     3. Balls lie at the height of the SfM points where photographs show no known surface: the more of it, the more.
-    4. A sheet lies beneath the surface: what photographs do not show is no hole.
+    4. A background plane lies beneath the surface: what photographs do not show is no hole.
     5. Balls lie in the background, as far as the limit leaves room. In a region, the sky is that of the model which
        stands in for the rest: all blocks of a survey then have the same.
 
@@ -312,10 +312,10 @@ def initial_gaussians(training: TrainingScene, options: InitialisationOptions, m
         surface = training.surface.sample(int(share * most), seed, training.in_region)
         start = joined_rows([rows_of(start, _off_surface(start, surface)), surface])
         unknown = int(max(_SURFACE_SHARE - share, _UNKNOWN_SHARE) * most)
-        guessed = guessed_points(scene, training.surface.maps, unknown, seed, training.in_region)
-        start = joined_rows([start, guessed])
+        fallback = fallback_points(scene, training.surface.maps, unknown, seed, training.in_region)
+        start = joined_rows([start, fallback])
     behind = background(scene, training.images, start.point_in_model)
-    beneath = _sheet(training, start, options, int(_BENEATH_SHARE * most), seed)
+    beneath = _flat_gaussians(training, start, options, int(_BENEATH_SHARE * most), seed)
     start = rows_of(start, np.flatnonzero(training.in_region(start.point_in_model)))
     near = gaussians_from_points(start.point_in_model, start.rgb, options, start.normal_in_model)
     far = gaussians_of_size(behind.point_in_model, behind.rgb, behind.sigma_m, options)
@@ -329,18 +329,18 @@ def initial_gaussians(training: TrainingScene, options: InitialisationOptions, m
     return Gaussians.concatenate([near, far.select(keep)])
 
 
-def _sheet(
+def _flat_gaussians(
     training: TrainingScene, start: SurfacePoints, options: InitialisationOptions, count: int, seed: int
 ) -> Gaussians:
     """Return flat Gaussians beneath the points that a training starts from; none where no surface hides them."""
-    sheet, side_m = underlay(start, count, seed)
-    kept = np.zeros(len(sheet.rgb), dtype=bool)
+    plane, side_m = background_plane(start, count, seed)
+    kept = np.zeros(len(plane.rgb), dtype=bool)
     if training.surface is not None:
-        place = sheet.point_in_model
+        place = plane.point_in_model
         kept = training.in_region(place) & hidden(place, training.scene, training.surface.maps)
-    sheet = rows_of(sheet, np.flatnonzero(kept))
-    sigma_m = np.full(len(sheet.rgb), _BENEATH_SIGMA * side_m)
-    discs = gaussians_of_size(sheet.point_in_model, sheet.rgb, sigma_m, replace(options, opacity=_BENEATH_OPACITY))
+    plane = rows_of(plane, np.flatnonzero(kept))
+    sigma_m = np.full(len(plane.rgb), _BENEATH_SIGMA * side_m)
+    discs = gaussians_of_size(plane.point_in_model, plane.rgb, sigma_m, replace(options, opacity=_BENEATH_OPACITY))
     discs.log_scales[:, 2] += math.log(_BENEATH_THICKNESS)
     return discs
 
@@ -355,7 +355,7 @@ def _off_surface(points: SurfacePoints, surface: SurfacePoints) -> IntArray:
     return np.flatnonzero(distance > _OFF_SURFACE * gap[nearest, 1])
 
 
-def points_to_hold(training: TrainingScene, device: torch.device) -> Callable[[int], ObservedPoints]:
+def depth_loss_points(training: TrainingScene, device: torch.device) -> Callable[[int], ObservedPoints]:
     """Return a function of an image's index that gives the points in `model`, float32, that the image shows.
 
     These are SfM points and, in training images, points of the surface.
@@ -369,7 +369,7 @@ def points_to_hold(training: TrainingScene, device: torch.device) -> Callable[[i
         known = scene.point_in_model[seen]
         weight = np.ones(len(known), dtype=np.float32)
         if training.surface is not None and index in shown:
-            of_surface, its_weight = training.surface.held(index, _STRIDE)
+            of_surface, its_weight = training.surface.depth_loss_points(index, _STRIDE)
             known, weight = np.concatenate([known, of_surface]), np.concatenate([weight, its_weight])
         inside = training.in_region(known)
         known, weight = known[inside], weight[inside]

@@ -1,4 +1,4 @@
-"""LiDAR of a training, from its files to the surface that Gaussians are held to.
+"""LiDAR of a training, from its files to the surface of the depth losses.
 
 1. Cloud of the scene, in `model`.
 2. Registration against the depth maps: a shift beyond 3 σ is refused, or taken out on request. It is never taken
@@ -140,7 +140,7 @@ def lidar_surface(
         assumptions=files.assumptions,
     )
     free = free_space(cloud, judged.rejected, compared.shown)
-    surface = FusedSurface(compared.maps, cloud, judged, compared.pixel_m, pull=options.lidar_pull, free=free)
+    surface = FusedSurface(compared.maps, cloud, judged, compared.pixel_m, loss=options.lidar_loss, free=free)
     return LidarSurface(surface, report, judged, cloud)
 
 
@@ -188,19 +188,18 @@ def registration_of(cloud: LidarCloud, shown: FloatArray, views: DepthViews, see
     height_m, cells = _height_difference(cloud.position_in_model, shown)
     if cells and abs(height_m) > _ANOTHER_DATUM_M:
         raise InputError(
-            "todo-lidar-lies-surface-photographs",
-            f"the LiDAR lies {abs(height_m):.2f} m {'above' if height_m > 0 else 'below'} the surface of the "
-            f"photographs (median of {cells} places): the heights of one of them count from another vertical "
-            "datum, or are in another unit. State the LiDAR's by --lidar-vertical or --lidar-crs, and the survey's "
-            "by `georef ingest --vertical`",
+            "lidar-height-offset",
+            f"The LiDAR lies {abs(height_m):.2f} m {'above' if height_m > 0 else 'below'} the surface of the "
+            f"photographs (median of {cells} places): vertical datums or units of height differ. State the LiDAR's "
+            "datum with --lidar-vertical or --lidar-crs, and the survey's with `georef ingest --vertical`.",
             field="--lidar",
         )
     try:
         return registration(cloud, views, seed)
     except DegenerateGeometryError as error:
         raise InputError(
-            "todo-another-place-another-time",
-            f"{error}: another place, another time, or a wrong CRS",
+            error.code,
+            f"{error}: the cloud is of another place or time, or its CRS is wrong (--lidar-crs).",
             field="--lidar",
         ) from error
 
@@ -241,7 +240,7 @@ def free_space(cloud: LidarCloud, gone: BoolArray, shown: FloatArray) -> FreeSpa
 
     Args:
         cloud: with the scanner's places.
-        gone: (P,) points that contradict the photographs: their beams do not count.
+        gone: (P,) points inconsistent with the photographs: their beams do not count.
         shown: (S, 3) surface that the photographs show; what stands there now is not free.
     """
     if cloud.scanner_in_model is None:
@@ -290,10 +289,10 @@ def _checked(
     log.info("lidar: shift east, north, up %s m against the photographs, of %d points", text, record.points)
     if (np.abs(compared.shift_m) > _GATE_SIGMAS * sigma).any() and not options.lidar_register:
         raise InputError(
-            "todo-lidar-shifted-by-east",
-            f"the LiDAR is shifted by {text} m (east, north, up) against the photographs, beyond 3 σ. Check its "
-            "CRS, its datum and the survey's georeference; --lidar-register takes the shift out, --lidar-sigma "
-            "states a lower accuracy",
+            "lidar-shifted",
+            f"The LiDAR is shifted by {text} m (east, north, up) from the photographs, more than 3 σ. Check its "
+            "CRS, its datum and the survey's georeference. --lidar-register removes the shift; --lidar-sigma "
+            "states a lower accuracy.",
             field="--lidar",
         )
     return record

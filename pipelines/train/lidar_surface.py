@@ -4,7 +4,7 @@
    consistently, what the cloud shows there is gone.
 2. Where the photographs show a surface above all points of the cloud, something was added: from the air, the
    scanner would have met it.
-3. The neighbours of a point decide with it. A single contradiction is noise, of stereo or cloud.
+3. The neighbours of a point decide with it. A single inconsistent point is noise, of stereo or cloud.
 4. The confidence of the other points is a product of factors from 0 to 1: stated accuracy against that of stereo,
    flatness and density of the neighbours, incidence of the beam, and agreement with the photographs.
 5. Points of stereo are moved onto the planes of the LiDAR that is trusted.
@@ -30,11 +30,11 @@ from pipelines.surface.lidar_cloud import LidarCloud
 from pipelines.surface.registration import UP
 from pipelines.surface.visibility import DepthViews, Support, support
 from pipelines.train.losses import Loss, RenderedView
-from pipelines.train.options import LidarPull
+from pipelines.train.options import LidarLoss
 from pipelines.train.surface import SceneSurface, SurfacePoints, spread_evenly
 
 _TOLERANCE = 0.005  # of the distance: photographs that differ by less agree
-_LEAST_LOOKS = 2  # through a point, that contradict it
+_LEAST_LOOKS = 2  # through a point, for it to be inconsistent
 _NEIGHBOURS = 16
 _ADDED_M = 1.0  # height of a surface that the cloud lacks
 _CELL_M = 0.5  # least side of cells in plan
@@ -49,7 +49,7 @@ _SPARSE = 4.0  # distances between points, to the furthest neighbour on a well-s
 
 @dataclass(frozen=True)
 class ChangedArea:
-    """Area where cloud and photographs contradict each other.
+    """Area where cloud and photographs are inconsistent.
 
     Attributes:
         kind: `removed`: the photographs look through the cloud; `added`: they show a surface above it.
@@ -73,8 +73,8 @@ class CloudVerdict:
     """What the photographs say of a cloud.
 
     Attributes:
-        rejected: (P,) whether a point contradicts the photographs.
-        confidence: (P,) in the points, 0 … 1; 0 where they contradict the photographs.
+        rejected: (P,) whether a point is inconsistent with the photographs.
+        confidence: (P,) in the points, 0 … 1; 0 where they are inconsistent with the photographs.
         areas: that have changed, the largest first.
     """
 
@@ -91,7 +91,7 @@ def verdict(
     sigma_m: float,
     pixel_m: float,
 ) -> CloudVerdict:
-    """Return confidence and contradictions of the P points of a registered cloud.
+    """Return confidence and inconsistencies of the P points of a registered cloud.
 
     Args:
         views: depth maps of the training photographs.
@@ -183,7 +183,7 @@ def _areas(cloud: LidarCloud, marked: BoolArray, kind: Literal["removed", "added
 _LEAST_CONFIDENCE = 0.1
 _REACH = 2.0  # distances between points, from a point of stereo to the LiDAR
 _OFF_PIXELS = 2.0  # of the depth maps: a point of stereo further from the plane lies on another surface
-_WEIGHT = 4.0  # of a trusted LiDAR point's pull, relative to that of stereo
+_WEIGHT = 4.0  # of a trusted LiDAR point's depth loss, relative to that of stereo
 _WEIGHT_ALONE = 1.0  # the same where stereo found nothing: what a view sees there is less certain
 _MOST_ALONE = 0.15  # of the points to start from: LiDAR where stereo found none
 _FREE_SPACE = 0.1  # weight of the mean opacity of Gaussians in free space
@@ -229,7 +229,7 @@ class FusedSurface(SceneSurface):
         maps: depth maps, already built.
         judged: verdict of the photographs on the LiDAR.
         pixel_m: size of a pixel of the depth maps on the surface.
-        pull: what is held to the LiDAR.
+        loss: losses of the LiDAR.
         free: where its beams met nothing; None: unknown.
     """
 
@@ -240,11 +240,11 @@ class FusedSurface(SceneSurface):
         judged: CloudVerdict,
         pixel_m: float,
         *,
-        pull: LidarPull = "both",
+        loss: LidarLoss = "both",
         free: FreeSpace | None = None,
     ) -> None:
         super().__init__(maps)
-        self._pull, self._free, self._pixel_m = pull, free, pixel_m
+        self._loss, self._free, self._pixel_m = loss, free, pixel_m
         self.planes = LidarPlanes(cloud, judged.confidence, pixel_m)
         # All points hide what lies behind them, those that training does not trust too, but none that are gone.
         standing = np.flatnonzero(~judged.rejected)
@@ -252,11 +252,11 @@ class FusedSurface(SceneSurface):
         radius_m = np.clip(_GAP * self._cloud.reach_m, _LEAST_GAP * cloud.voxel_m, _MOST_GAP * cloud.voxel_m)
         self._surfels = Surfels(self._cloud.position_in_model, self._cloud.normal_in_model, radius_m)
 
-    def held(self, index: int, stride: int) -> tuple[FloatArray, Float32Array]:
-        """Return the points (P, 3) that a training view is held to, and the weight of each (P,)."""
-        if self._pull == "gaussians":
-            return super().held(index, stride)
-        stereo, by_contrast = super().held(index, stride)
+    def depth_loss_points(self, index: int, stride: int) -> tuple[FloatArray, Float32Array]:
+        """Return the points (P, 3) of a training view's depth loss, and the weight of each (P,)."""
+        if self._loss == "gaussians":
+            return super().depth_loss_points(index, stride)
+        stereo, by_contrast = super().depth_loss_points(index, stride)
         points, _, confidence = self.planes.onto(stereo)
         seen = self._alone_in_view(index)
         _, first = np.unique(np.stack([seen.row, seen.column]) // stride, axis=1, return_index=True)
@@ -278,11 +278,11 @@ class FusedSurface(SceneSurface):
         return joined_rows([SurfacePoints(points, drawn.rgb, normals), alone])
 
     def losses(self, device: torch.device) -> list[Loss]:
-        """Return the loss of Gaussians in free space, and beside the LiDAR's planes if those are to hold them."""
+        """Return the loss of Gaussians in free space, and beside the LiDAR's planes if those count."""
         losses = []
         if self._free is not None:
             losses.append(_loss("free space", _FREE_SPACE, FreeSpaceLoss(self._free, device)))
-        if self._pull != "depth" and len(self.planes.confidence):
+        if self._loss != "depth" and len(self.planes.confidence):
             cloud, scale_m = self.planes.cloud, _SCALE_PX * self._pixel_m
             place, normal, reach_m = cloud.position_in_model, cloud.normal_in_model, _REACH * cloud.voxel_m
             measured = MeasuredPlanes(place, normal, self.planes.confidence, scale_m, reach_m)

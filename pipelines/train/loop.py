@@ -146,7 +146,7 @@ class _Loop:
                 self._spent = self._go_back()
             except (InputError, KeyError, ValueError, RuntimeError, TypeError) as error:
                 text = f"the checkpoint is damaged: {error}"
-                raise DamagedPartialError("todo-x", text, path=options.checkpoint) from error
+                raise DamagedPartialError("checkpoint-damaged", text, path=options.checkpoint) from error
             if options.extend:
                 trainer.schedule.extended_from = trainer.iteration
             log.info("%s at iteration %d", "extended" if options.extend else "resumed", trainer.iteration)
@@ -188,13 +188,13 @@ class _Loop:
 
     def recover(self, error: NonFiniteError) -> None:
         """Return to the last checkpoint and lower the learning rates; a second time is a `ConvergenceError`."""
-        advice = "train again with a smaller --geo-weight, another --seed or fewer --max-gaussians"
+        advice = "Train again with a smaller --geo-weight, another --seed or fewer --max-gaussians."
         if self.recovery is not None:
-            raise ConvergenceError("todo-before", f"{error}, and before that {self.recovery}: {advice}") from error
+            raise ConvergenceError("training-diverged", f"{error}; earlier, {self.recovery}. {advice}") from error
         self._go_back()
         self.trainer.slow_down(_RECOVERY_RATE)
         self.recovery = (
-            f"{error}; went back to iteration {self.trainer.iteration} and on at {_RECOVERY_RATE} × the rate"
+            f"{error}; continued from iteration {self.trainer.iteration} at {_RECOVERY_RATE} × the learning rates"
         )
         log.warning("%s", self.recovery)
         self.save()

@@ -30,7 +30,7 @@ class RenderedView:
     Attributes:
         index: of the view.
         pose: (4, 4) cam ← model.
-        target: the photograph, or a window of it.
+        target: the photograph, or a crop of it.
         gaussians: in training.
         render: of these and of those around a region; with depths if a loss needs them.
         stats: of the render, for the Gaussians in training alone.
@@ -58,7 +58,7 @@ class Loss:
         name: in reports.
         of: returns the value for a view, a scalar; None: the view has no such loss.
         weight: at an iteration, from 1; 0: the loss is not computed.
-        share: factor of a window, such that the mean over all windows of a photograph is its loss.
+        share: factor of a crop, such that the mean over all crops of a photograph is its loss.
     """
 
     name: str
@@ -108,8 +108,8 @@ def training_losses(
         if render.expected_depth is None:
             return None
         loss = problem.depth_loss(view.index, render.expected_depth, render.alpha, camera)
-        # Marks outside the window do not count: each is seen in one of the windows.
-        return None if loss is None else view.target.part.windows * loss
+        # Marks outside the crop do not count: each is seen in one of the crops.
+        return None if loss is None else view.target.part.crops * loss
 
     def compactness(view: RenderedView) -> Tensor | None:
         render, mask = view.render, view.target.mask
@@ -166,13 +166,13 @@ def _by_pixels(view: RenderedView) -> float:
 
 
 def _by_points(view: RenderedView) -> Tensor | float:
-    """Return the number of windows, times the share of the photograph's points that lie in this window."""
+    """Return the number of crops, times the share of the photograph's points that lie in this crop."""
     target, points, pose = view.target, view.points, view.pose
-    if target.part.windows == 1 or points is None:
+    if target.part.crops == 1 or points is None:
         return 1.0
     in_cam = points.point_in_model @ pose[:3, :3].detach().T.to(points.point_in_model) + pose[:3, 3].detach()
     here, anywhere = (_inside(in_cam, camera).sum() for camera in (target.camera, target.whole))
-    return target.part.windows * here / anywhere.clamp_min(1)
+    return target.part.crops * here / anywhere.clamp_min(1)
 
 
 def _inside(in_cam: Tensor, camera: Pinhole) -> Tensor:

@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from pipelines.core.errors import InputError
 from pipelines.core.options import InputPath, StageOptions
 from pipelines.geodesy.vertical import Vertical
-from pipelines.survey.options import CloudCrs, CloudPath
+from pipelines.survey.options import CloudPath
 
 
 @dataclass(frozen=True)
@@ -37,14 +37,14 @@ RUN_MINUTES = {"smoke": 1, "fast": 2, "standard": 4, "high": 10}
 
 
 _EFFORTS = "; ".join(f"{name}: {preset}, about {RUN_MINUTES[name]} min" for name, preset in PRESETS.items())
-LidarPull = Literal["depth", "gaussians", "both"]
+LidarLoss = Literal["depth", "gaussians", "both"]
 
 
 class LidarOptions(StageOptions):
     """Options of a LiDAR cloud: where it lies, how accurate it is, and how training uses it."""
 
     lidar: CloudPath | None = Field(
-        None, description="LiDAR of the same place to hold the surface to: LAS, LAZ or PLY, or a folder of tiles."
+        None, description="LiDAR of the same place, for the surface: LAS, LAZ or PLY, or a folder of tiles."
     )
     lidar_crs: str | None = Field(None, description="CRS of the LiDAR, for files that state none.")
     lidar_vertical: Vertical | None = Field(
@@ -52,15 +52,15 @@ class LidarOptions(StageOptions):
     )
     lidar_trajectory: InputPath | None = Field(
         None,
-        description="Track of the LiDAR's scanner, on the clock of its points: CSV with timestamp, latitude, "
+        description="Trajectory of the LiDAR's scanner, on the clock of its points: CSV with timestamp, latitude, "
         "longitude, altitude.",
     )
     lidar_sigma: float = Field(0.03, gt=0, le=10, description="Stated σ of the LiDAR's points in metres.")
-    lidar_pull: LidarPull = Field(
+    lidar_loss: LidarLoss = Field(
         "both",
-        description="Hold rendered depths to the LiDAR, Gaussians, each with a confidence of its own, or both.",
+        description="Losses of the LiDAR: on rendered depth, on distances of Gaussians from its planes, or both.",
     )
-    lidar_register: bool = Field(False, description="Estimate a shift of the LiDAR, and take it out.")
+    lidar_register: bool = Field(False, description="Estimate a shift of the LiDAR and remove it.")
 
     @model_validator(mode="after")
     def _used(self) -> LidarOptions:
@@ -72,11 +72,6 @@ class LidarOptions(StageOptions):
             )
         return self
 
-    @property
-    def lidar_stated(self) -> CloudCrs:
-        """CRS of the LiDAR as the user states it."""
-        return CloudCrs(self.lidar_crs, self.lidar_vertical)
-
 
 # A dense basis of more cameras takes more than 2 GiB (`geometry.correction_basis`).
 MOST_JOINT_CAMERAS = 1300
@@ -84,37 +79,39 @@ Solve = Literal["auto", "joint", "once"]
 
 
 class GeographicOptions(StageOptions):
-    """Options of the geographic losses: measurements in use, and how they are weighed."""
+    """Options of the geographic losses: measurements in use, and their weights."""
 
     geo_loss: bool = Field(
-        True, description="Use the geographic losses; without them, similarity and cameras are held."
+        True, description="Use the geographic losses; without them, similarity and cameras are frozen."
     )
-    weighting: Literal["whitened", "paper"] = Field(
+    geo_weighting: Literal["whitened", "paper"] = Field(
         "whitened",
-        description="Residuals divided by their σ, or plain mean squares as in the paper.",
+        description="Geographic losses: residuals divided by their σ, or plain mean squares as in the paper.",
     )
-    gcp_loss: bool = Field(True, description="Use the control points, L_gcp.")
-    gcp_mode: Literal["camera", "depth"] = Field(
-        "camera", description="Find control points by intersecting their marks, or through the rendered depth."
+    gcp_loss: bool = Field(True, description="Use the loss of the control points, L_gcp.")
+    gcp_mode: Literal["triangulated", "depth"] = Field(
+        "triangulated",
+        description="Position of control points: triangulated from marks, or from the rendered depth.",
     )
-    rel_loss: bool = Field(True, description="Use distances between located points, L_rel.")
-    loss_weights: Literal["fixed", "learned"] = Field(
-        "fixed", description="Weigh the geographic losses by the stated σ, or learn a variance factor for each."
+    distance_loss: bool = Field(True, description="Use the loss of distances between pairs of points, L_rel.")
+    variance_factors: Literal["fixed", "learned"] = Field(
+        "fixed",
+        description="Geographic losses are weighted by the stated σ, or by variance factors that are learned.",
     )
     optimize_cameras: bool = Field(
         True,
-        description="Refine similarity, cameras and, unless weighted as in the paper, the lens while training; "
-        "or hold them as init-sim3 has adjusted them.",
+        description="Refine similarity, cameras and, with --geo-weighting whitened, the lens during training; else "
+        "they stay as adjusted by init-sim3.",
     )
-    solve: Solve = Field(
+    solve_cameras: Solve = Field(
         "auto",
-        description="Refine similarity and cameras jointly with the Gaussians, or hold them as solved once by "
-        f"init-sim3; auto: once beyond {MOST_JOINT_CAMERAS} photographs.",
+        description="Solve similarity and cameras jointly with the Gaussians, or once, by init-sim3; "
+        f"auto: once beyond {MOST_JOINT_CAMERAS} photographs.",
     )
 
     def solves_once(self, cameras: int) -> bool:
-        """Return whether a training of that many cameras holds what init-sim3 has solved."""
-        wanted = self.solve == "once" or (self.solve == "auto" and cameras > MOST_JOINT_CAMERAS)
+        """Return whether a training of that many cameras keeps what init-sim3 has solved."""
+        wanted = self.solve_cameras == "once" or (self.solve_cameras == "auto" and cameras > MOST_JOINT_CAMERAS)
         return wanted and self.optimize_cameras and self.geo_loss
 
     def refined_cameras(self, cameras: int) -> int:
@@ -122,19 +119,19 @@ class GeographicOptions(StageOptions):
         return cameras if self.optimize_cameras and self.geo_loss and not self.solves_once(cameras) else 0
 
     def require_trainable(self, cameras: int) -> None:
-        """Refuse options that change the cameras' solution during a training that holds it, by an `InputError`."""
+        """Refuse options that change the cameras' solution during a training that keeps it, by an `InputError`."""
         if not self.solves_once(cameras):
             return
         for value, plain, name in (
-            (self.weighting, "whitened", "--weighting"),
-            (self.loss_weights, "fixed", "--loss-weights"),
-            (self.gcp_mode, "camera", "--gcp-mode"),
+            (self.geo_weighting, "whitened", "--geo-weighting"),
+            (self.variance_factors, "fixed", "--variance-factors"),
+            (self.gcp_mode, "triangulated", "--gcp-mode"),
         ):
             if value != plain:
                 raise InputError(
-                    "todo-changes-solution-cameras-during",
-                    f"{value!r} changes the solution of the cameras during the training, and these {cameras} are "
-                    f"solved once, by init-sim3: use {name} {plain}, --solve joint or --no-optimize-cameras",
+                    "cameras-solved-once",
+                    f"{value!r} changes the cameras during training, but {cameras} photographs are solved once, by "
+                    f"init-sim3: use {name} {plain}, --solve-cameras joint or --no-optimize-cameras",
                     field=name,
                 )
 
@@ -142,9 +139,9 @@ class GeographicOptions(StageOptions):
 class LossOptions(StageOptions):
     """Weights of the losses that the user decides."""
 
-    geo_weight: float = Field(0.05, gt=0, description="Final weight w_max of the geographic losses (eq. 27).")
+    geo_weight: float = Field(0.05, gt=0, description="Final weight of the geographic losses (w_max of eq. 27).")
     geo_schedule: Literal["rising", "constant"] = Field(
-        "rising", description="Let that weight rise as in eq. 27, or be final from the first iteration."
+        "rising", description="Weight of the geographic losses: rising as in eq. 27, or constant."
     )
 
 
@@ -161,21 +158,25 @@ class GaussianOptions(StageOptions):
     crop_size: int = Field(
         1400,
         ge=32,
-        description="Side in pixels: a photograph larger than this square is trained in windows of its area.",
+        description="Side of crops in pixels: a photograph with more pixels than such a square is trained in "
+        "crops of its area.",
     )
     max_gaussians: int | None = Field(None, ge=100, description="Limit of Gaussians (default: the preset's).")
     backend: Literal["auto", "cpu", "cuda"] = Field("auto", description="Rasteriser.")
     sh_degree: int = Field(3, ge=0, le=3, description="Degree of the spherical harmonics.")
     strategy: Literal["default", "mcmc", "fast"] = Field(
-        "default", description="Where Gaussians are added and removed: as 3DGS, by MCMC, or as several views agree."
+        "default", description="Densification: as in 3DGS, by MCMC, or by errors in several views (fast)."
     )
-    coarse_to_fine: bool = Field(True, description="Start with shrunken photographs.")
+    coarse_to_fine: bool = Field(True, description="Start with photographs of lower resolution.")
     exposure: bool = Field(True, description="Fit the exposure of each training photograph.")
     robust_photometric: bool = Field(
-        False, description="Leave out parts of photographs that contradict the others: moved cars, shadows."
+        False, description="Mask outliers of the photometric loss: moving cars, shadows."
     )
-    dense: bool = Field(True, description="Find the scene's surface by multi-view stereo first, to start from.")
-    faithful_surface: bool = Field(True, description="Hold the Gaussians to the surface, for depths to measure in.")
+    dense: bool = Field(True, description="Initialise the Gaussians from dense multi-view stereo.")
+    geometry_regularisation: bool = Field(
+        True,
+        description="Use depth and normal losses, for a surface to measure on.",
+    )
 
     @property
     def effort(self) -> Preset:
@@ -222,9 +223,9 @@ class TrainOptions(LossOptions, GeographicOptions, GaussianOptions, BlockOptions
 
     @model_validator(mode="after")
     def _lidar_needs_a_surface(self) -> TrainOptions:
-        if self.lidar is not None and not (self.dense and self.faithful_surface):
+        if self.lidar is not None and not (self.dense and self.geometry_regularisation):
             raise ValueError(
-                "--lidar is compared with the surface of the photographs: it needs --dense and --faithful-surface"
+                "--lidar needs the surface of the photographs: use --dense and --geometry-regularisation"
             )
         return self
 

@@ -34,7 +34,7 @@ class JointOptions:
         seed: of the order of views.
         coarse: (factor, fraction) pairs: photographs are shrunken by a factor up to a fraction of the training.
         coarse_least_px: lower limit of the longest side of a shrunken photograph.
-        crops: windows of large photographs; None: all are trained as wholes.
+        crops: of large photographs; None: all are trained as wholes.
         surface: weights of the surface losses; None: no surface losses.
         finishing: whether the Gaussians are trained already, with all their harmonics.
     """
@@ -61,7 +61,7 @@ class JointOptions:
             seed=options.seed,
             coarse=COARSE if options.coarse_to_fine else (),
             crops=Crops(options.crop_size, options.seed),
-            surface=SurfaceSettings() if options.faithful_surface else None,
+            surface=SurfaceSettings() if options.geometry_regularisation else None,
         )
 
 
@@ -70,13 +70,13 @@ def pyramid(
 ) -> list[tuple[int, float]]:
     """Return factors by which a photograph is shrunken, and the fraction of the training up to which it is.
 
-    A photograph that is trained in windows is first shrunken until it is seen as a whole, and then by half of that
+    A photograph that is trained in crops is first shrunken until it is seen as a whole, and then by half of that
     factor until density control ends.
 
     Args:
         width, height: of the photograph in pixels.
         coarse: factors and fractions of photographs that are trained as wholes; empty: none is shrunken.
-        crops: windows of large photographs; None: there are none.
+        crops: of large photographs; None: there are none.
     """
     if not coarse:
         return [(1, 1.0)]

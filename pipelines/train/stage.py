@@ -31,6 +31,7 @@ from pipelines.surface.lidar_cloud import ScannerTrack
 from pipelines.surface.measured_cloud import CloudReader
 from pipelines.survey.adjustment import GeolocatedPoints
 from pipelines.survey.calibrated import load_survey
+from pipelines.survey.options import CloudCrs
 from pipelines.survey.report_parts import EstimatedError, LidarReport
 from pipelines.survey.scene import photographs
 from pipelines.survey.trained_model import Adjustment, TrainedModel
@@ -68,11 +69,11 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     # First, so that `--backend cuda` without a GPU fails at once.
     backend = rasterizer(options.backend, stage.progress)
     workspace = stage.workspace
-    clouds = None if options.lidar is None else CloudReader(options.lidar, options.lidar_stated)
-    adjusted = AdjustedScene.load(workspace)
+    stated = CloudCrs(options.lidar_crs, options.lidar_vertical)
+    clouds = None if options.lidar is None else CloudReader(options.lidar, stated)
+    adjusted, path = AdjustedScene.load(workspace), options.lidar_trajectory
     survey, scene = adjusted.survey, adjusted.scene
-    of_scanner, stated = options.lidar_trajectory, options.lidar_stated
-    track = None if of_scanner is None else ScannerTrack.read(of_scanner, stated, survey.origin)
+    track = None if path is None else ScannerTrack.read(path, stated, survey.origin)
     options.require_trainable(len(scene.sparse.image_name))
     images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
     free_bytes = free_memory_bytes(device_of(backend))
@@ -102,7 +103,7 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
         points = GeolocatedPoints.load(workspace.path(POINTS))
         problem = refining_problem(adjusted, measured, options, points, options.seed)
     else:
-        log.info("similarity and cameras are held at the adjustment of init-sim3")
+        log.info("similarity and cameras are frozen at the adjustment of init-sim3")
         problem = held_problem(adjusted)
     if compared is not None and clouds is not None:
         shift_m = measured.errors.value(adjusted.error_estimates(measured.errors)[0], "lidar-shift")
@@ -177,8 +178,8 @@ def _summary(
     if lidar is not None and lidar.areas:
         area_m2 = sum(area.area_m2 for area in lidar.areas)
         sentence = (
-            f"LiDAR and photographs contradict each other on {area_m2:.0f} m² in {len(lidar.areas)} places, which "
-            "train/lidar.json lists and train/lidar.png shows: the LiDAR is not used there"
+            f"LiDAR and photographs are inconsistent on {area_m2:.0f} m² in {len(lidar.areas)} places, where the "
+            "LiDAR is not used (list: train/lidar.json, map: train/lidar.png)."
         )
         warnings.append(Remark(code="lidar-inconsistent", sentence=sentence))
     return Summary(key_figure, values, tuple(warnings), model.cautions)
@@ -193,10 +194,10 @@ def _warning_of(error: EstimatedError) -> Remark | None:
         for value, sigma, observed in zip(error.value, error.sigma, error.observed, strict=True)
     ]
     if any(evident):
-        evidence = f"{error.name} of ({values}) {error.unit} {axes}, beyond 3 σ: it is taken out here"
+        evidence = f"The {error.name} of ({values}) {error.unit} {axes} exceeds 3 σ and was removed"
         return Remark(code=f"{error.name}-estimated", sentence=f"{evidence}. {_CAUSES[error.name]}")
     if not all(error.observed):
-        sentence = f"{error.name} is not observable along every axis: ({values}) {error.unit} {axes}"
+        sentence = f"The {error.name} is not observable along every axis: ({values}) {error.unit} {axes}."
         return Remark(code=f"{error.name}-not-observable", sentence=sentence)
     return None
 

@@ -1,7 +1,7 @@
 """Surface of the scene, from the depth maps of its training photographs, and weights of its points.
 
-Training starts from this surface and holds the Gaussians to it. On ground with little texture, Gaussians would
-otherwise float metres above the ground, and their renders would fit the photographs as well.
+Training starts from this surface, and its depth loss compares with it. On ground with little texture, Gaussians
+would otherwise float metres above the ground, and their renders would fit the photographs as well.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ _REACH_PX = 3  # of the test for an unbroken surface
 _PLANE_BEND = 0.005  # limit of |z/z₁ + z/z₂ − 2| for a depth z between opposite neighbours z₁, z₂
 
 
-def pull_weights(rgb: ByteArray, depth_m: Float32Array) -> Float32Array:
-    """Return the weight (H, W) of each depth's pull, 0.3 … 12, proportional to the contrast of the photograph.
+def depth_loss_weights(rgb: ByteArray, depth_m: Float32Array) -> Float32Array:
+    """Return weights (H, W) of the depth loss, 0.3 … 12, proportional to the contrast of the photograph.
 
     Gaussians are blended in the order of their centres. The photometric loss therefore draws the Gaussians of a
     slanted surface behind it, with a force that grows with the contrast: most of all those of small details, such
@@ -100,14 +100,14 @@ class SceneSurface:
         rows, columns = np.nonzero(self.maps.depth(index)[::stride, ::stride])
         return self._points(index, stride * rows, stride * columns)
 
-    def held(self, index: int, stride: int) -> tuple[FloatArray, Float32Array]:
-        """Return the points (P, 3) in `model` that a training view is held to, and the weight of each (P,).
+    def depth_loss_points(self, index: int, stride: int) -> tuple[FloatArray, Float32Array]:
+        """Return the points (P, 3) in `model` of a training view's depth loss, and the weight of each (P,).
 
-        The points are those of `points`, with the weights of `pull_weights`.
+        The points are those of `points`, with the weights of `depth_loss_weights`.
         """
         depth = self.maps.depth(index)
         rows, columns = np.nonzero(depth[::stride, ::stride])
-        weight = pull_weights(self.maps.rgb(index), depth)[stride * rows, stride * columns]
+        weight = depth_loss_weights(self.maps.rgb(index), depth)[stride * rows, stride * columns]
         return self._points(index, stride * rows, stride * columns), weight
 
     def known_share(self) -> float:

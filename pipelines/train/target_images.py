@@ -1,6 +1,6 @@
-"""Photographs on the device: shrunken as the schedule demands, cut into windows if large, and read ahead on a GPU.
+"""Photographs on the device: shrunken as the schedule demands, cut into crops if large, and read ahead on a GPU.
 
-Windows bound the memory and time of an iteration.
+Crops bound the memory and time of an iteration.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from pipelines.splat.rasterizer.api import Window
 from pipelines.survey.photographs import ImageCache, Pinholes
 from pipelines.train.region import RegionMasks
 
-_SHIFT = 1 / 8  # of a window's side: cuts move to either side by up to this, so that no pixel is always beside one
+_SHIFT = 1 / 8  # of a crop's side: cuts move to either side by up to this, so that no pixel is always beside one
 
 
 @dataclass(frozen=True)
 class Crops:
-    """Windows of photographs, as a grid of equal cells whose inner cuts are shifted by chance in each round.
+    """Crops of photographs, as a grid of equal cells whose inner cuts are shifted by chance in each round.
 
-    Each round of visits to a photograph shows all of its windows once, in an order by chance: each pixel is seen
+    Each round of visits to a photograph shows all of its crops once, in an order by chance: each pixel is seen
     equally often.
 
     Attributes:
-        size_px: a photograph with more pixels than a square of this side is seen in windows of so many pixels.
+        size_px: a photograph with more pixels than a square of this side is seen in crops of so many pixels.
     """
 
     size_px: int
@@ -49,11 +49,11 @@ class Crops:
         return min(grids, key=lambda grid: (grid[0] - 1) * height + (grid[1] - 1) * width)
 
     def count(self, width: int, height: int) -> int:
-        """Return the number of windows in which an image is seen."""
+        """Return the number of crops in which an image is seen."""
         return prod(self.grid(width, height))
 
     def largest_of(self, camera: Pinhole) -> Pinhole:
-        """Return a camera of the size of the largest window of an image."""
+        """Return a camera of the size of the largest crop of an image."""
         sides = zip((camera.width, camera.height), self.grid(camera.width, camera.height), strict=True)
         width, height = (
             side if cells == 1 else min(side, int(np.ceil((1 + _SHIFT) * side / cells)) + 1)
@@ -68,8 +68,8 @@ class Crops:
             shrink += 1
         return shrink
 
-    def windows(self, index: int, whole: Window, turn: int) -> list[Window]:
-        """Return the windows of round `turn`, from 0, which cover `whole` of a photograph without overlap."""
+    def of(self, index: int, whole: Window, turn: int) -> list[Window]:
+        """Return the crops of round `turn`, from 0, which cover `whole` of a photograph without overlap."""
         random = np.random.default_rng([self.seed, index, turn])
         columns, rows = self.grid(whole.width, whole.height)
         across, down = _cuts(whole.width, columns, random), _cuts(whole.height, rows, random)
@@ -86,7 +86,7 @@ def _cuts(side: int, cells: int, random: np.random.Generator) -> list[int]:
 
 
 _MASKS = 64  # limit on the device; all photographs of a camera share one
-_PARTS = 256  # windows kept: density control samples others between an iteration and the next
+_PARTS = 256  # crops kept: density control samples others between an iteration and the next
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class ImageLook:
 
     Attributes:
         shrink: every pixel is the mean of shrink × shrink pixels.
-        visit: number of the visit, from 0, for the choice of a window of a large photograph; None: all of it.
+        visit: number of the visit, from 0, for the choice of a crop of a large photograph; None: all of it.
     """
 
     index: int
@@ -109,16 +109,16 @@ class ImagePart:
 
     Attributes:
         window: in pixels of the whole photograph at its size; None: all of it.
-        windows: number of windows in which all that is trained of the photograph is seen, one at a visit.
-        weight: of a mean over the pixels that count in this window: the mean of weighted means over all windows is
+        crops: number of crops in which all that is trained of the photograph is seen, one at a visit.
+        weight: of a mean over the pixels that count in this crop: the mean of weighted means over all crops is
             the mean over all pixels that count.
-        share: of the whole photograph's pixels that count in all windows, if a region is trained; else 1.
-        low, high: corners (x, y) of the window in pixels, infinite on the sides where no other window follows. The
-            centre of each Gaussian lies between the corners of one window.
+        share: of the whole photograph's pixels that count in all crops, if a region is trained; else 1.
+        low, high: corners (x, y) of the crop in pixels, infinite on the sides where no other crop follows. The
+            centre of each Gaussian lies between the corners of one crop.
     """
 
     window: Window | None = None
-    windows: int = 1
+    crops: int = 1
     weight: float = 1.0
     share: float = 1.0
     low: tuple[float, float] = (-inf, -inf)
@@ -153,7 +153,7 @@ class TargetImages:
     Args:
         pinholes: cameras of the undistorted photographs, with the lens in use.
         region: pixels of each photograph to train on; None: all.
-        crops: windows of large photographs; None: all are seen as wholes.
+        crops: of large photographs; None: all are seen as wholes.
     """
 
     def __init__(
@@ -173,7 +173,7 @@ class TargetImages:
         self._next: tuple[ImageLook, Future[Tensor]] | None = None
 
     def get(self, look: ImageLook, upcoming: ImageLook | None = None) -> TargetImage:
-        """Return a photograph, or a window of it; `upcoming` is the next look, to read ahead, None if unknown."""
+        """Return a photograph, or a crop of it; `upcoming` is the next look, to read ahead, None if unknown."""
         ahead, part = self._next, self._part(look)
         pixels = ahead[1].result() if ahead is not None and ahead[0] == look else self._read(look)
         if self._reader is not None and upcoming is not None:
@@ -200,11 +200,11 @@ class TargetImages:
         if self._crops is None or look.visit is None or self._crops.count(trained.width, trained.height) == 1:
             return ImagePart(None if shown is None else trained, share=share)
         turn, place = divmod(look.visit, self._crops.count(trained.width, trained.height))
-        windows = self._crops.windows(look.index, trained, turn)
-        counts = [self._count(look, window) for window in windows]
+        crops = self._crops.of(look.index, trained, turn)
+        counts = [self._count(look, window) for window in crops]
         seen = [place for place, count in enumerate(counts) if count]
-        window = windows[seen[place % len(seen)]] if seen else windows[0]
-        weight = len(seen) * counts[windows.index(window)] / max(sum(counts), 1)
+        window = crops[seen[place % len(seen)]] if seen else crops[0]
+        weight = len(seen) * counts[crops.index(window)] / max(sum(counts), 1)
         right, bottom = window.left + window.width, window.top + window.height
         low = (
             -inf if window.left == trained.left else float(window.left),
@@ -217,7 +217,7 @@ class TargetImages:
         return ImagePart(window, len(seen) or 1, weight, share, low, high)
 
     def _count(self, look: ImageLook, window: Window) -> int:
-        """Return the number of pixels that count in a window."""
+        """Return the number of pixels that count in a crop."""
         key = self._images.mask_key(look.index)
         if key not in self._complete:
             self._complete[key] = bool(self._images.mask(look.index).all())
@@ -226,7 +226,7 @@ class TargetImages:
         return int(self._counting(look, window).sum())
 
     def _counting(self, look: ImageLook, window: Window) -> BoolArray:
-        """Return the pixels (H, W) of a window that count: of the photograph, and of the region if there is one."""
+        """Return the pixels (H, W) of a crop that count: of the photograph, and of the region if there is one."""
         s = look.shrink
         covered = self._images.mask(look.index)[
             window.top * s : (window.top + window.height) * s, window.left * s : (window.left + window.width) * s

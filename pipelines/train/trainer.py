@@ -40,7 +40,7 @@ from pipelines.splat.rasterizer.backends import device_of
 from pipelines.splat.surface import ObservedPoints
 from pipelines.survey.photographs import ImageCache, Pinholes
 from pipelines.train.geographic.problem import GeographicAdam, GeoProblem
-from pipelines.train.initial_gaussians import TrainingScene, initial_gaussians, points_to_hold
+from pipelines.train.initial_gaussians import TrainingScene, depth_loss_points, initial_gaussians
 from pipelines.train.lidar_surface import FusedSurface
 from pipelines.train.losses import Loss, RenderedView, training_losses, weighted_sum
 from pipelines.train.options import TrainOptions
@@ -108,8 +108,8 @@ class JointTrainer:
         optimizer: the Gaussians and their moments.
         strategy: density control.
         problem: similarity, cameras and constant errors, with the geographic losses.
-        exposures: of the photographs, optimised as well or held; None: all photographs have the same exposure.
-        outliers: finds pixels that contradict the model, which do not count; None: all do.
+        exposures: of the photographs, optimised as well or frozen; None: all photographs have the same exposure.
+        outliers: finds outlier pixels, which do not count; None: all do.
         region: part of the scene that the Gaussians are to show; None: all of it.
     """
 
@@ -152,7 +152,7 @@ class JointTrainer:
     def step(self) -> StepReport:
         """Run one iteration and return its figures.
 
-        1. One training view, or a window of it, is rendered and compared with its photograph.
+        1. One training view, or a crop of it, is rendered and compared with its photograph.
         2. The gradient of all losses moves Gaussians, similarity, cameras, constant errors, weights and exposures.
         3. Density control records the render, and edits the Gaussians if its schedule says so.
         """
@@ -207,9 +207,9 @@ class JointTrainer:
         camera = self.views.images.pinhole(int(self.views.camera[0]))
         shrink = self.schedule.shrink(iteration, camera.width, camera.height)
         width, height = camera.width // shrink, camera.height // shrink
-        windows = 1 if self.options.crops is None else self.options.crops.count(width, height)
+        crops = 1 if self.options.crops is None else self.options.crops.count(width, height)
         surface = self.options.surface is not None
-        return iteration_seconds(width * height, len(self.optimizer.gaussians), surface=surface, crops=windows)
+        return iteration_seconds(width * height, len(self.optimizer.gaussians), surface=surface, crops=crops)
 
     def slow_down(self, factor: float) -> None:
         """Multiply all learning rates but the exposures' by `factor`, and forget values that were not finite."""
@@ -267,14 +267,14 @@ class JointTrainer:
     def _of_whole(self, stats: ScreenStats, pose: Tensor, target: TargetImage) -> ScreenStats:
         """Return the statistics as a part of those of the whole photograph."""
         part = target.part
-        if part.windows == 1:
+        if part.crops == 1:
             return stats if part.share == 1.0 else stats.of_part(part.share)
         means = self.optimizer.gaussians.means[stats.visible]
         in_cam, camera = means @ pose[:3, :3].to(means).T + pose[:3, 3].to(means), target.whole
         x, y, z = in_cam.unbind(dim=1)
         x, y = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
         here = (x >= part.low[0]) & (x < part.high[0]) & (y >= part.low[1]) & (y < part.high[1])
-        return stats.of_part(part.share / part.windows, here)
+        return stats.of_part(part.share / part.crops, here)
 
     def _watched(self, photometric: Tensor, geographic: Tensor) -> dict[str, Tensor]:
         """Return the scalars that must stay finite, by what messages call them."""
@@ -346,7 +346,7 @@ def make_trainer(
     Args:
         training: cameras, photographs and surface.
         problem: the geographic losses, moved to the backend's device.
-        exposures: to be held; None: those of the training photographs are fitted, if the options say so.
+        exposures: frozen; None: those of the training photographs are fitted, if the options say so.
 
     Raises:
         DegenerateGeometryError: fewer than two different points to start from.
@@ -358,14 +358,14 @@ def make_trainer(
     extent_m = scene_extent(scene.poses.cam_center_in_model)
     train = torch.from_numpy(scene.train)
     fitted = Exposures(len(images), train, effort.iterations, device) if options.exposure else None
-    hold = points_to_hold(training, device) if options.faithful_surface else None
+    known = depth_loss_points(training, device) if options.geometry_regularisation else None
     measured = surface.losses(device) if isinstance(surface, FusedSurface) else ()
     outliers = OutlierSettings(views=int(_OUTLIERS_FROM * effort.iterations))
     return JointTrainer(
         GaussianAdam(gaussians, extent_m, effort.iterations),
         _strategy(options, extent_m, len(gaussians)),
         problem.to(device),
-        TrainingViews(scene.train, images, hold, scene.sparse.lenses, measured),
+        TrainingViews(scene.train, images, known, scene.sparse.lenses, measured),
         rasterizer=backend,
         options=JointOptions.of(options),
         exposures=exposures or fitted,
@@ -388,19 +388,19 @@ def make_finisher(
     Args:
         training: cameras, photographs and region.
         gaussians: on the backend's device.
-        problem: holds the cameras.
-        exposures: to be held; None: none.
+        problem: with frozen cameras.
+        exposures: frozen; None: none.
     """
     device, scene, iterations = device_of(backend), training.scene, options.effort.iterations
     extent_m = scene_extent(scene.poses.cam_center_in_model[scene.train])
     optimizer = GaussianAdam(gaussians, extent_m, iterations)
     optimizer.rate_factor = _FINISHING_RATE
-    hold = points_to_hold(training, device) if options.faithful_surface else None
+    known = depth_loss_points(training, device) if options.geometry_regularisation else None
     return JointTrainer(
         optimizer,
         DefaultStrategy(DefaultSettings(stop=0, reset_every=0), extent_m, len(gaussians), options.seed),
         problem.to(device),
-        TrainingViews(scene.train, training.images, hold, scene.sparse.lenses),
+        TrainingViews(scene.train, training.images, known, scene.sparse.lenses),
         rasterizer=backend,
         options=replace(JointOptions.of(options), sh_degree=gaussians.sh_degree, coarse=(), finishing=True),
         exposures=exposures,
@@ -441,7 +441,7 @@ def load_checkpoint(path: Path) -> dict[str, Tensor]:
         ValueError,
     ) as error:  # torch has no complex halves, texts or foreign byte orders
         raise InputError(
-            "todo-not-readable-checkpoint-train", f"not a readable checkpoint: {error}; train without --resume"
+            "checkpoint-damaged", f"not a readable checkpoint ({error}): train without --resume"
         ) from error
 
 

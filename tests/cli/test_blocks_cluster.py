@@ -25,7 +25,16 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform == "win32", reas
 BLOCKS, ITERATIONS, CHECKPOINT = 4, 240, 20
 OPTIONS = (
     *("--blocks", BLOCKS, "--iterations", ITERATIONS, "--checkpoint-every", CHECKPOINT, "--log-every", 1),
-    *("--max-gaussians", 1500, "--max-image-size", 96, "--sh-degree", 0, "--no-faithful-surface", "--no-dense"),
+    *(
+        "--max-gaussians",
+        1500,
+        "--max-image-size",
+        96,
+        "--sh-degree",
+        0,
+        "--no-geometry-regularisation",
+        "--no-dense",
+    ),
 )
 PLAIN = "from georef_cli.main import main; main()"
 

@@ -81,7 +81,7 @@ def test_each_configuration_is_what_the_method_says(georef: Georef, survey: Path
     assert georef("compare", survey).code == 0
     train = {name: options_of(survey, name) for name in ("baseline", "A", "C", "D", "E")}
     assert not (survey / "compare/B/train").exists()  # its Gaussians are those of A
-    losses = ("optimize_cameras", "geo_loss", "gcp_loss", "rel_loss", "geo_schedule")
+    losses = ("optimize_cameras", "geo_loss", "gcp_loss", "distance_loss", "geo_schedule")
     assert {name: tuple(options[loss] for loss in losses) for name, options in train.items()} == {
         "baseline": (False, False, False, False, "constant"),
         "A": (False, False, False, False, "constant"),

@@ -108,7 +108,16 @@ def test_chunks_of_a_mission(poisoned: Path) -> None:
 def test_blocks(poisoned: Path) -> None:
     """Trainings as jobs."""
     field = write_field(poisoned / "field", make_field(5, 3, points=400, test_views=(7,)))
-    few = ("--max-gaussians", 1500, "--max-image-size", 96, "--sh-degree", 0, "--no-faithful-surface", "--no-dense")
+    few = (
+        "--max-gaussians",
+        1500,
+        "--max-image-size",
+        96,
+        "--sh-degree",
+        0,
+        "--no-geometry-regularisation",
+        "--no-dense",
+    )
     ended = finish(start_in(poisoned, "blocks", field.root, "--blocks", 2, "--iterations", 20, *few), 300)
     assert_not_run(poisoned)
     assert ended.code == 0, ended.err

@@ -53,14 +53,14 @@ def test_a_run_begins_with_the_forecast(georef: Georef, tmp_path: Path) -> None:
     assert sum("Gaussians" in line for line in lines) == 1
 
 
-def test_large_photographs_are_trained_in_windows(georef: Georef, tmp_path: Path) -> None:
-    """A window of 32×32 px takes a quarter of 64×48 px and more."""
+def test_large_photographs_are_trained_in_crops(georef: Georef, tmp_path: Path) -> None:
+    """A crop of 32×32 px takes a quarter of 64×48 px and more."""
     write_flight(tmp_path / "photos", 5, lat=46.0, lon=7.7)
     words = ("run", tmp_path / "ws", "--images", tmp_path / "photos", "--dry-run")
     whole, cropped = (georef(*words, *more, "--json").document["training"] for more in ((), ("--crop-size", 32)))
-    assert (whole["windows"], cropped["windows"]) == (1, 4)
+    assert (whole["crops"], cropped["crops"]) == (1, 4)
     assert cropped["seconds"] < whole["seconds"] and cropped["peak_bytes"] < whole["peak_bytes"]
-    assert "each in 4 windows (--crop-size)" in " ".join(georef(*words, "--crop-size", 32).out.split())
+    assert "each in 4 crops (--crop-size)" in " ".join(georef(*words, "--crop-size", 32).out.split())
 
 
 def test_a_missing_file_is_told(georef: Georef, tmp_path: Path) -> None:

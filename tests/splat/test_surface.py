@@ -107,7 +107,7 @@ def test_depth_is_held_to_the_points_that_are_seen_in_it() -> None:
     assert float(loss.detach()) == pytest.approx(0.5 * (0.25 + 0.018), rel=1e-5)
     loss.backward()
     assert depth.grad is not None
-    # Only the four pixels around the middle are pulled, and nearer.
+    # Only the four pixels around the middle have a gradient, towards nearer.
     assert (depth.grad[17:19, 23:25] > 0).all() and int((depth.grad.abs() > 1e-6).sum()) <= 8
     fourfold = ObservedPoints(points, torch.tensor([4.0, 9, 1, 1, 1]))
     weighted = depth_loss(depth.detach(), alpha, fourfold, POSE, CAMERA)
@@ -118,18 +118,18 @@ def test_depth_is_held_to_the_points_that_are_seen_in_it() -> None:
     assert float(far) == pytest.approx(0.0, abs=1e-6)
 
 
-def test_depth_is_held_firmly_where_it_is_nearly_right() -> None:
+def test_depth_loss_is_steepest_where_depth_is_nearly_right() -> None:
     alpha, point = torch.ones(36, 48), torch.tensor([[0.0, 0.0, 4.0]])
 
-    def pull(depth_m: float) -> float:
+    def slope(depth_m: float) -> float:
         depth = torch.full((36, 48), depth_m, requires_grad=True)
         depth_loss(depth, alpha, ObservedPoints(point), POSE, CAMERA).backward()
         assert depth.grad is not None
         return float(depth.grad.sum())
 
-    assert pull(4.4) == pytest.approx(0.25, rel=1e-3)  # 1 / z: 10 % off
-    assert pull(4.0004) == pytest.approx(10 * 0.25, rel=0.06)  # 0.01 % off
-    assert pull(3.9996) == pytest.approx(-10 * 0.25, rel=0.06)
+    assert slope(4.4) == pytest.approx(0.25, rel=1e-3)  # 1 / z: 10 % off
+    assert slope(4.0004) == pytest.approx(10 * 0.25, rel=0.06)  # 0.01 % off
+    assert slope(3.9996) == pytest.approx(-10 * 0.25, rel=0.06)
 
 
 def haze(apart_m: float) -> Gaussians:

@@ -16,6 +16,7 @@ from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.surface.surface_views import SurfaceViews
 from tests.depth_scenes import BOX_M, CAMERA, DOWN, depth_map, looking_down
+from tests.refusals import refused
 
 CENTERS = looking_down(5)
 TRAINING = [0, 1, 3, 4]
@@ -102,6 +103,6 @@ def test_support_is_in_metres_on_earth(tmp_path: Path) -> None:
 def test_full_disk_is_an_error_before_rendering(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=1 << 28))
     renderer = Renderer()
-    with pytest.raises(InputError, match="make room"):
+    with refused("disk-full", InputError):
         opened(renderer, tmp_path)
     assert renderer.rendered == []

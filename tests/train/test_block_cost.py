@@ -45,14 +45,14 @@ def plan(*blocks: tuple[float, float, int]) -> BlockPlan:
 
 def test_a_forecast_is_that_of_its_iterations() -> None:
     options = TrainOptions(
-        iterations=300, dense=False, coarse_to_fine=False, faithful_surface=False, max_image_size=640
+        iterations=300, dense=False, coarse_to_fine=False, geometry_regularisation=False, max_image_size=640
     )
     document = plan((50_000, 3_000, 8_000), (25_000, 1_000, 2_000))
     predicted = block_processor_s(document, PHOTO_PX, options)
     # A block's iterations see the scaffold around it, too.
     expected = [300 * BLOCK_SECONDS.of(5e4, 3e3, 8_500), 300 * BLOCK_SECONDS.of(2.5e4, 1e3, 2_500)]
     np.testing.assert_allclose([predicted[0], predicted[1]], expected)
-    surface = block_processor_s(document, PHOTO_PX, options.model_copy(update={"faithful_surface": True}))
+    surface = block_processor_s(document, PHOTO_PX, options.model_copy(update={"geometry_regularisation": True}))
     assert surface[0] == pytest.approx(SURFACE_FACTOR * predicted[0])
     coarse = block_processor_s(document, PHOTO_PX, options.model_copy(update={"coarse_to_fine": True}))
     assert predicted[0] / 4 < coarse[0] < predicted[0]  # a part of the iterations is of shrunken photographs

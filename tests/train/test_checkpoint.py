@@ -10,6 +10,7 @@ import torch
 
 from pipelines.core.errors import InputError
 from pipelines.train.trainer import load_checkpoint, prefixed, save_checkpoint, unprefixed
+from tests.refusals import refused
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -48,14 +49,14 @@ def test_failed_save_leaves_the_old_one(tmp_path: Path, monkeypatch: pytest.Monk
 def test_damaged_files_are_told(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "c.npz"
     path.write_bytes(content)
-    with pytest.raises(InputError, match="train without --resume"):
+    with refused("checkpoint-damaged", InputError):
         load_checkpoint(path)
 
 
 def test_pickles_are_not_opened(tmp_path: Path) -> None:
     path = tmp_path / "c.npz"
     np.savez(path, evil=np.array([object()], dtype=object))
-    with pytest.raises(InputError, match="not a readable checkpoint"):
+    with refused("checkpoint-damaged", InputError):
         load_checkpoint(path)
 
 

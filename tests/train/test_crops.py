@@ -1,4 +1,4 @@
-"""Training in windows: each photograph is covered evenly, and the windows together are the photograph."""
+"""Training in crops: each photograph is covered evenly, and the crops together are the photograph."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests import tiny_training as tiny
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 CROPS = Crops(32)
-WINDOWS = CROPS.count(64, 48)
+ROUND = CROPS.count(64, 48)
 
 
 @pytest.fixture(scope="module")
@@ -37,22 +37,22 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> ImageCache:
     ("size", "size_px"),
     [((64, 48), 32), ((640, 480), 100), ((5472, 3648), 1024), ((3000, 1), 32), ((1, 3000), 32), ((7, 900), 32)],
 )
-def test_windows_cover_each_pixel_once_and_are_small_enough(size: tuple[int, int], size_px: int) -> None:
+def test_crops_cover_each_pixel_once_and_are_small_enough(size: tuple[int, int], size_px: int) -> None:
     width, height = size
     crops = Crops(size_px, seed=3)
     whole = Window(5, 9, width, height)
     for turn in range(3):
         seen = np.zeros((height + 9, width + 5), dtype=np.uint8)
-        windows = crops.windows(7, whole, turn)
-        assert len(windows) == crops.count(width, height)
-        for window in windows:
+        cells = crops.of(7, whole, turn)
+        assert len(cells) == crops.count(width, height)
+        for window in cells:
             seen[window.slices] += 1
             # Cuts are shifted by an eighth of a cell.
             assert window.width * window.height <= 1.35 * size_px**2 or size_px**2 > width * height
         assert (seen[9:, 5:] == 1).all() and seen.sum() == width * height
     largest = crops.largest_of(tiny.PINHOLE)
     for turn in range(20):
-        for window in crops.windows(0, Window(0, 0, tiny.PINHOLE.width, tiny.PINHOLE.height), turn):
+        for window in crops.of(0, Window(0, 0, tiny.PINHOLE.width, tiny.PINHOLE.height), turn):
             assert window.width <= largest.width and window.height <= largest.height
 
 
@@ -62,14 +62,14 @@ def test_each_round_of_visits_shows_each_pixel_once(images: ImageCache) -> None:
     places = []
     for turn in range(2):
         shown = torch.full_like(whole.colour, torch.nan)
-        for visit in range(WINDOWS):
-            target = targets.get(ImageLook(2, visit=WINDOWS * turn + visit))
-            assert target.part.window is not None and target.part.windows == WINDOWS
+        for visit in range(ROUND):
+            target = targets.get(ImageLook(2, visit=ROUND * turn + visit))
+            assert target.part.window is not None and target.part.crops == ROUND
             assert torch.isnan(shown[target.part.window.slices]).all()
             shown[target.part.window.slices] = target.colour
             places.append(target.part.window)
         assert torch.equal(shown, whole.colour)
-    assert len(set(places)) > WINDOWS, "cuts move from round to round"
+    assert len(set(places)) > ROUND, "cuts move from round to round"
 
 
 def losses(targets: TargetImages, looks: list[ImageLook], gaussians: Gaussians, ssim: float) -> Iterator[tuple]:
@@ -82,8 +82,8 @@ def losses(targets: TargetImages, looks: list[ImageLook], gaussians: Gaussians, 
             gaussians, pose, target.whole, RasterSettings(sh_degree=0, window=target.part.window)
         )
         loss = photometric_loss(render.colour, target.colour, target.mask, ssim_weight=ssim)
-        (target.part.weight * loss / target.part.windows).backward()
-        yield target, float(target.part.weight * loss.detach() / target.part.windows), render.stats
+        (target.part.weight * loss / target.part.crops).backward()
+        yield target, float(target.part.weight * loss.detach() / target.part.crops), render.stats
 
 
 def leaves() -> Gaussians:
@@ -94,10 +94,10 @@ def leaves() -> Gaussians:
 
 
 @pytest.mark.parametrize("region", [False, True])
-def test_windows_add_up_to_the_loss_of_the_photograph(images: ImageCache, region: bool) -> None:
+def test_crops_add_up_to_the_loss_of_the_photograph(images: ImageCache, region: bool) -> None:
     """Without SSIM exactly; SSIM sees zeros beyond a cut, as beyond the photograph's edge.
 
-    A third of these small windows lies within the five pixels from a cut that SSIM reaches.
+    A third of these small crops lies within the five pixels from a cut that SSIM reaches.
     """
     mask = np.zeros((48, 64), dtype=bool)
     mask[4:44, 10:60] = True
@@ -106,7 +106,7 @@ def test_windows_add_up_to_the_loss_of_the_photograph(images: ImageCache, region
     parts, whole = (
         TargetImages(images, Pinholes(images), torch.device("cpu"), masks, crops) for crops in (Crops(30), None)
     )
-    count = parts.get(ImageLook(1, visit=0)).part.windows
+    count = parts.get(ImageLook(1, visit=0)).part.crops
     assert count > 2
     for ssim, tolerance in ((0.0, 1e-5), (0.2, 0.3)):
         one, many = leaves(), leaves()
@@ -136,32 +136,32 @@ def recorded(images: ImageCache, crops: Crops | None, iterations: int) -> tuple[
 
 
 def test_density_control_sees_what_it_sees_of_whole_photographs(images: ImageCache) -> None:
-    """After a round of all windows: as many observations, and gradients of the photographs' losses.
+    """After a round of all crops: as many observations, and gradients of the photographs' losses.
 
     The gradient of a Gaussian on a cut comes in parts, whose lengths add up to more than the length of their sum.
     """
     views = len(images)
     gradient, observations = recorded(images, None, views)
-    in_parts, observed = recorded(images, CROPS, WINDOWS * views)
+    in_parts, observed = recorded(images, CROPS, ROUND * views)
     assert torch.equal(observations, observed)
     ratio = (in_parts / gradient)[gradient > 0.1 * gradient.median()]
     low, middle, high = ratio.quantile(torch.tensor([0.05, 0.5, 0.95])).tolist()
     assert low > 0.95 and 0.99 < middle < 1.1 and high < 2.5, (low, middle, high)
 
 
-def test_each_place_belongs_to_one_window_of_a_round(images: ImageCache) -> None:
+def test_each_place_belongs_to_one_crop_of_a_round(images: ImageCache) -> None:
     targets = TargetImages(images, Pinholes(images), torch.device("cpu"), crops=CROPS)
     for turn in range(3):
         seen = 0
-        for visit in range(WINDOWS):
-            target = targets.get(ImageLook(0, visit=WINDOWS * turn + visit))
+        for visit in range(ROUND):
+            target = targets.get(ImageLook(0, visit=ROUND * turn + visit))
             place = torch.tensor([[20.3, 31.8], [50.1, 7.2], [-9.0, 60.0]])  # the last beyond a corner
             low, high = torch.tensor(target.part.low), torch.tensor(target.part.high)
             seen += int(((place >= low) & (place < high)).all(dim=1).sum())
         assert seen == len(place)
 
 
-def test_windows_add_up_to_the_surface_losses_of_the_photograph(images: ImageCache) -> None:
+def test_crops_add_up_to_the_surface_losses_of_the_photograph(images: ImageCache) -> None:
     """By its points and its pixels; depths are interpolated among fewer pixels beside a cut."""
     parts, whole = (TargetImages(images, Pinholes(images), torch.device("cpu"), crops=c) for c in (CROPS, None))
     random = torch.Generator().manual_seed(1)
@@ -178,7 +178,7 @@ def test_windows_add_up_to_the_surface_losses_of_the_photograph(images: ImageCac
         values = []
         for targets, looks in (
             (whole, [ImageLook(1)]),
-            (parts, [ImageLook(1, visit=visit) for visit in range(WINDOWS)]),
+            (parts, [ImageLook(1, visit=visit) for visit in range(ROUND)]),
         ):
             for target in map(targets.get, looks):
                 raster = RasterSettings(sh_degree=0, depth=True, median=False, window=target.part.window)
@@ -186,4 +186,4 @@ def test_windows_add_up_to_the_surface_losses_of_the_photograph(images: ImageCac
                 view = RenderedView(1, pose, target, gaussians, render, render.stats, render.colour, points=points)
                 values.append(float(weighted_sum(losses, view, 1)[0]))
         assert np.mean(values[1:]) == pytest.approx(values[0], rel=0.02)
-        assert max(values[1:]) > 1.1 * values[0], "windows differ"
+        assert max(values[1:]) > 1.1 * values[0], "crops differ"

@@ -1,4 +1,4 @@
-"""What training takes from LiDAR of a town of boxes: points to hold and to start from, free space, the track."""
+"""LiDAR of a town of boxes in training: points of the depth loss and to start from, free space, the trajectory."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from pipelines.surface.lidar_cloud import ScannerTrack
 from pipelines.survey.options import CloudCrs
 from pipelines.train.lidar import free_space
 from pipelines.train.lidar_surface import CloudVerdict, FusedSurface
+from tests.refusals import refused
 from tests.towns import EXTRA, FOCAL_PX, HOUSES, PIXEL_M, SIZE, TOWN, WITH_EXTRA, scanned, surface_of, views_of
 
 CAMERA = Pinhole(*SIZE, FOCAL_PX, FOCAL_PX, SIZE[0] / 2, SIZE[1] / 2)
@@ -53,11 +54,11 @@ def fused() -> FusedSurface:
     return FusedSurface(cast(Any, TownMaps()), cloud, judged, PIXEL_M)
 
 
-def test_views_are_held_to_lidar_that_they_see_where_stereo_found_nothing() -> None:
+def test_depth_loss_has_lidar_that_views_see_where_stereo_found_nothing() -> None:
     surface = fused()
     hidden = unseen = 0
     for index in range(12):
-        points, weight = surface.held(index, 3)
+        points, weight = surface.depth_loss_points(index, 3)
         alone = points[len(surface.points(index, 3)) :]
         assert len(weight) == len(points) and len(alone) > 50
         in_cam = (alone - VIEWS.center_in_world[index]) @ VIEWS.cam_from_world[index].T
@@ -136,7 +137,7 @@ def test_the_scanner_is_found_by_time(tmp_path: Path) -> None:
 
 def test_another_clock_is_refused(tmp_path: Path) -> None:
     track = ScannerTrack.read(track_file(tmp_path, np.arange(20.0), np.zeros((20, 3))), CloudCrs(), ORIGIN)
-    with pytest.raises(InputError, match="another clock"):
+    with refused("times-outside-trajectory", InputError):
         track.at(np.arange(5000.0, 5100.0))
 
 
@@ -145,10 +146,14 @@ def test_a_track_without_times_is_refused(tmp_path: Path) -> None:
     path.write_text("latitude,longitude,altitude\n46,7.7,500\n")
     with pytest.raises(InputError, match="timestamp"):
         ScannerTrack.read(path, CloudCrs(), ORIGIN)
+    path.write_text("image,latitude,longitude,altitude\na.jpg,46,7.7,500\n")
+    with refused("no-timestamps", InputError) as error:
+        ScannerTrack.read(path, CloudCrs(), ORIGIN)
+    assert error.value.field == "--lidar-trajectory"
 
 
 def test_a_track_in_projected_coordinates_needs_a_crs(tmp_path: Path) -> None:
     path = tmp_path / "track.csv"
     path.write_text("timestamp,x,y,z\n1,400000,5000000,500\n")
-    with pytest.raises(InputError, match="--lidar-crs"):
+    with refused("crs-unknown", InputError):
         ScannerTrack.read(path, CloudCrs(), ORIGIN)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +22,7 @@ from pipelines.train.loop import LoopOptions, optimise
 from pipelines.train.schedule import JointOptions
 from pipelines.train.trainer import JointTrainer
 from tests import tiny_training as tiny
+from tests.refusals import refused
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -110,7 +112,7 @@ def test_a_divergence_is_recovered_from_once_at_a_lower_rate(images: ImageCache,
     outcome = optimise(trainer, files(tmp_path), SILENT)
     assert outcome.recovery is not None
     assert "photometric loss is not finite at iteration 23" in outcome.recovery
-    assert "went back to iteration 20" in outcome.recovery
+    assert "continued from iteration 20" in outcome.recovery
     assert trainer.iteration == ITERATIONS and trainer.optimizer.rate_factor < 0.5
     assert all(bool(value.isfinite().all()) for value in result(trainer).values())
     rows = [json.loads(row) for row in (tmp_path / "metrics.jsonl").read_text().splitlines()]
@@ -121,8 +123,9 @@ def test_a_divergence_is_recovered_from_once_at_a_lower_rate(images: ImageCache,
 def test_a_second_divergence_stops_and_names_both(images: ImageCache, tmp_path: Path) -> None:
     trainer = tiny.trainer(images, OPTIONS)
     _spoil(trainer, {3, 33})
-    with pytest.raises(ConvergenceError, match=r"iteration 33, and before that .* iteration 3; went back.*--seed"):
+    with refused("training-diverged", ConvergenceError) as error:
         optimise(trainer, files(tmp_path), SILENT)
+    assert re.search(r"iteration 33; earlier, .* iteration 3; continued from.*--seed", str(error.value))
     # Whoever resumes does so from a sound state that knows of the first one.
     resumed = tiny.trainer(images, OPTIONS)
     outcome = optimise(resumed, files(tmp_path, resume=True), SILENT)
@@ -145,8 +148,9 @@ def test_damaged_checkpoint_is_recognised(images: ImageCache, tmp_path: Path, da
     checkpoint = files(tmp_path).checkpoint
     whole = checkpoint.read_bytes()
     checkpoint.write_bytes(whole[: len(whole) // 2] if damage is None else damage)
-    with pytest.raises(DamagedPartialError, match=r"checkpoint\.npz: the checkpoint is damaged"):
+    with refused("checkpoint-damaged", DamagedPartialError) as error:
         optimise(tiny.trainer(images, JointOptions(1, sh_degree=0)), files(tmp_path, resume=True), SILENT)
+    assert error.value.path == checkpoint
 
 
 def test_extended_training_is_as_good_as_an_uninterrupted_one(images: ImageCache, tmp_path: Path) -> None:

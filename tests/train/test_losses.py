@@ -1,4 +1,4 @@
-"""The sum of a training's losses: weights, schedule, shares of windows, and losses that a view does not have."""
+"""The sum of a training's losses: weights, schedule, shares of crops, and losses that a view does not have."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from pipelines.splat.initialise import InitialisationOptions
 from pipelines.surface.depth_maps import DepthMaps
 from pipelines.survey.photographs import ImageCache, save_array
 from pipelines.survey.scene import Scene, make_scene, photographs
-from pipelines.train.initial_gaussians import TrainingScene, guessed_points, initial_gaussians, points_to_hold
+from pipelines.train.initial_gaussians import TrainingScene, depth_loss_points, fallback_points, initial_gaussians
 from pipelines.train.surface import SceneSurface, spread_evenly
 from tests.scenes import GEO_FROM_LOCAL, write_workspace
 from tests.splat_scenes import CAMERA, Rendered, ground_height, make_rendered
@@ -106,17 +106,17 @@ def test_sample_knows_the_slope_of_the_hill(surface: SceneSurface) -> None:
     assert np.median(angle) < 2 * 3.6
 
 
-def test_guessed_points_lie_at_the_height_of_the_sfm_points(
+def test_fallback_points_lie_at_the_height_of_the_sfm_points(
     surface: SceneSurface, material: tuple[Rendered, Scene, ImageCache]
 ) -> None:
     scene = material[1]
-    east = guessed_points(scene, surface.maps, 300, 0, lambda points: points[:, 0] > 0)
+    east = fallback_points(scene, surface.maps, 300, 0, lambda points: points[:, 0] > 0)
     assert 150 < len(east.rgb) <= 300 and east.rgb.std() > 20
     assert (east.point_in_model[:, 0] > 0).all() and np.isnan(east.normal_in_model).all()
     near = east.point_in_model[(np.abs(east.point_in_model[:, :2]) < 26).all(axis=1)]
     # Heights are those of the nine nearest of some hundred points, metres apart on slopes of up to a half.
     assert np.median(np.abs(near[:, 2] - ground_height(near[:, 0], near[:, 1]))) < 4 * QUARTER_PX_M
-    nothing = guessed_points(scene, surface.maps, 0, 0, lambda points: points[:, 0] > 0)
+    nothing = fallback_points(scene, surface.maps, 0, 0, lambda points: points[:, 0] > 0)
     assert len(nothing.rgb) == 0
 
 
@@ -195,15 +195,15 @@ def test_fewer_start_on_a_surface_of_which_less_is_known(
     assert 0 < discs(quarter) < most / 3 < discs(surface)
 
 
-def test_points_to_hold_are_those_of_the_view(
+def test_depth_loss_points_are_those_of_the_view(
     surface: SceneSurface, material: tuple[Rendered, Scene, ImageCache]
 ) -> None:
     _, scene, images = material
-    hold = points_to_hold(TrainingScene(scene, images, surface), torch.device("cpu"))
+    known = depth_loss_points(TrainingScene(scene, images, surface), torch.device("cpu"))
     train, test = int(scene.train[0]), int(scene.test[0])
     seen = len(np.unique(scene.sparse.obs_point[scene.sparse.obs_image == train]))
-    assert len(hold(train).point_in_model) > seen
-    assert len(hold(test).point_in_model) == len(np.unique(scene.sparse.obs_point[scene.sparse.obs_image == test]))
+    assert len(known(train).point_in_model) > seen
+    assert len(known(test).point_in_model) == len(np.unique(scene.sparse.obs_point[scene.sparse.obs_image == test]))
 
 
 def test_spreading_keeps_few_enough_and_covers_all() -> None:

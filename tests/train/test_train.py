@@ -225,7 +225,7 @@ def test_wrong_fix_is_named_and_moves_nothing(flights: list[RenderedFlight]) -> 
     assert (rejected.kind, rejected.name) == ("fix", images[5].name)
 
 
-@pytest.mark.parametrize("options", [{"optimize_cameras": False}, {"solve": "once"}], ids=["held", "once"])
+@pytest.mark.parametrize("options", [{"optimize_cameras": False}, {"solve_cameras": "once"}], ids=["held", "once"])
 def test_cameras_can_be_held(flights: list[RenderedFlight], options: dict[str, object]) -> None:
     workspace = flights[0].workspace(f"held by {next(iter(options))}")
     run_stage(workspace, TRAIN, {**SHORT, "iterations": 4, **options})
@@ -260,7 +260,7 @@ def test_two_cameras_are_needed(flights: list[RenderedFlight]) -> None:
 
 
 BIAS_M = (1.5, -1.0, 3.0)
-EVERYTHING = {**SHORT, "gcp_mode": "depth", "loss_weights": "learned"}
+EVERYTHING = {**SHORT, "gcp_mode": "depth", "variance_factors": "learned"}
 
 
 def with_control(workspace: Workspace, offset_m: tuple[float, float, float] = BIAS_M) -> Workspace:

@@ -134,7 +134,7 @@ def test_views_are_seen_through_the_lens_that_follows(workspace: Workspace) -> N
 
 
 def test_cameras_that_were_solved_once_do_not_move(workspace: Workspace) -> None:
-    trainer = trainer_of(workspace, CONFIG.model_copy(update={"solve": "once"}))
+    trainer = trainer_of(workspace, CONFIG.model_copy(update={"solve_cameras": "once"}))
     problem = trainer.problem
     center, similarity = problem.cameras.moved()[1].detach().clone(), problem.similarity.current()
     lens, affine = problem.cameras.lens().clone(), trainer.exposures.affine.clone()  # type: ignore[union-attr]

@@ -53,8 +53,8 @@ def run(stage: StageRun, options: BlockTrainOptions) -> Summary:
     rows = np.array([index[name] for name in block.cameras if name in index], dtype=np.int64)
     if len(rows) < _LEAST_VIEWS:
         raise DegenerateGeometryError(
-            "todo-photographs-show-block-give",
-            f"{len(rows)} photographs show block {block.id}: give fewer --blocks",
+            "block-unseen",
+            f"Block {block.id} is seen by {len(rows)} photographs only: reduce --blocks.",
         )
     solved = whole.of_images(rows)
     options = options.model_copy(update={"max_gaussians": block.gaussians, "optimize_cameras": False})
@@ -74,8 +74,8 @@ def run(stage: StageRun, options: BlockTrainOptions) -> Summary:
     seeing = masks.seeing()
     if len(seeing) < _LEAST_VIEWS:
         raise DegenerateGeometryError(
-            "todo-photographs-show-surface-block",
-            f"{len(seeing)} photographs show the surface of a block: give fewer --blocks",
+            "block-unseen",
+            f"The surface of block {block.id} is seen by {len(seeing)} photographs only: reduce --blocks.",
         )
     surface = None if maps is None else SceneSurface(maps)
     scene, region = replace(solved.scene, train=seeing), _region(block, box, scaffold, masks)

@@ -53,7 +53,7 @@ class Parts:
 
     def __post_init__(self) -> None:
         if self.options.lidar is not None:
-            raise InputError("todo-x", NOT_IN_BLOCKS, field="--lidar")
+            raise InputError("lidar-in-blocks", NOT_IN_BLOCKS, field="--lidar")
 
     def variant(self, number: int | None = None) -> Workspace:
         """Return the variant of a block, or the one that holds plan, solution, scaffold and seams."""

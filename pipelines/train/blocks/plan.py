@@ -137,9 +137,9 @@ def cells_that_fit(
             waiting += reversed(_halves(cell, points[inside], load[inside], 0.5))
         if len(waiting) + len(done) > MOST_BLOCKS:
             raise DegenerateGeometryError(
-                "todo-more-than-blocks-would",
-                f"more than {MOST_BLOCKS} blocks would be needed: give a smaller --max-gaussians, a smaller "
-                "--max-image-size or workers with more memory (--block-memory)",
+                "too-many-blocks",
+                f"More than {MOST_BLOCKS} blocks would be needed to fit into memory. Reduce --max-gaussians or "
+                "--max-image-size, or use workers with more memory (--block-memory).",
             )
     return done
 
@@ -161,7 +161,7 @@ def _halves(cell: BlockCell, points: FloatArray, load: FloatArray, share: float)
             place = max(_quantile(values, load, share), float(np.nextafter(values.min(), np.inf)))
             return cell.cut(int(axis), min(place, float(values.max())))
     raise DegenerateGeometryError(
-        "todo-survey-has-too-few", "the survey has too few points for so many blocks: give fewer --blocks"
+        "too-few-points", "The survey has too few points for this number of blocks: reduce --blocks."
     )
 
 
@@ -243,9 +243,9 @@ class _Planner:
         usable = USABLE * memory_bytes
         if self._peak_bytes(1) > usable:
             raise ResourceError(
-                "todo-block-needs-at-least",
-                f"a block needs at least {self._peak_bytes(1) / 2**30:.1f} GiB, and a worker may use "
-                f"{usable / 2**30:.1f}: give a smaller --max-image-size, or a larger --block-memory",
+                "not-enough-memory",
+                f"A block needs at least {self._peak_bytes(1) / 2**30:.1f} GiB of memory, and a worker may use "
+                f"{usable / 2**30:.1f} GiB. Reduce --max-image-size or --crop-size, or raise --block-memory.",
             )
 
         def fits(cell: BlockCell, extent_m: FloatArray) -> bool:

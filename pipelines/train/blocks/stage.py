@@ -111,6 +111,6 @@ def _run_jobs(title: str, jobs: Sequence[Job], progress: Progress, note: Callabl
     if failed := failed_of(title, jobs, ended, progress):
         reasons = "; ".join(f"{end.job.name}: {end.error}" for end in failed)
         raise GeorefError(
-            "todo-failed-same-command-trains",
-            f"{len(failed)} of {len(jobs)} {title} failed ({reasons}): the same command trains what is missing",
+            "blocks-failed",
+            f"{len(failed)} of {len(jobs)} {title} failed ({reasons}). Run the same command again to train them.",
         )

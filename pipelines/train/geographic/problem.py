@@ -170,7 +170,7 @@ class GeoProblem(torch.nn.Module):
             in_metres = self.weighting == "paper" and term.in_metres
             residual = term.residuals(at) if in_metres else term.whitened(at)
             values[term.kind] = self._rho(term, residual).mean()
-        # A problem that holds the cameras has no z, and no loss.
+        # A problem with frozen cameras has no z, and no loss.
         values["cameras"] = self.cameras.z.square().sum() / self._normaliser()
         if len(at.vector):
             values["errors"] = self.errors.prior() / self._normaliser()
@@ -260,7 +260,7 @@ def refining_problem(
 ) -> GeoProblem:
     """Return the problem of a training that refines similarity, cameras, lens and systematic errors.
 
-    With `paper` the lens stays, because plain mean squares hold no lens to the photographs.
+    With `paper` the lens stays, because plain mean squares compare no lens with the photographs.
 
     Args:
         adjusted: the adjustment, from which the training starts.
@@ -280,10 +280,10 @@ def refining_problem(
             terms.append(tensor_term(on_surface, measured.errors))
         else:
             terms.append(tensor_term(term, measured.errors))
-        if isinstance(term, adjustment.Fixes) and options.rel_loss and len(term) > 1:
+        if isinstance(term, adjustment.Fixes) and options.distance_loss and len(term) > 1:
             distances = distance_term(scene, term, points, seed)
             terms += [] if distances is None else [distances]
-    lens_follows = options.weighting == "whitened"
+    lens_follows = options.geo_weighting == "whitened"
     bundle = scene.bundle if lens_follows else bundle_information(scene.network)
     basis = correction_basis(bundle, lens_follows=lens_follows)
     z = coordinates_of(scene.bundle, state.correction)
@@ -293,14 +293,14 @@ def refining_problem(
         CameraCorrections(scene.poses, basis.matrix, lens, state, z),
         terms,
         errors=LearnableErrors(measured.errors, *adjusted.error_estimates(measured.errors)),
-        weighting=options.weighting,
-        learned_weights=options.loss_weights == "learned",
+        weighting=options.geo_weighting,
+        learned_weights=options.variance_factors == "learned",
         control_by_depth=by_depth,
     )
 
 
 def held_problem(adjusted: AdjustedScene) -> GeoProblem:
-    """Return the problem of a training that holds similarity, cameras and lens of the adjustment."""
+    """Return the problem of a training with similarity, cameras and lens frozen at the adjustment."""
     record, poses = adjusted.adjustment.geo_from_model, adjusted.adjustment.poses
     state = replace(adjusted.state(SystematicErrors()), correction=np.zeros((len(poses.cam_from_model), 6)))
     return GeoProblem(

@@ -256,8 +256,8 @@ def distance_term(
     """
     if points is not None and not np.array_equal(points.point_id, scene.sparse.point_id):
         raise InputError(
-            "todo-geolocated-points-another-model",
-            "the geolocated points are of another model: run `georef geolocate` again",
+            "points-of-another-model",
+            "The located points belong to another SfM model: run `georef geolocate` again.",
         )
     located = np.zeros(0, dtype=np.int64) if points is None else np.flatnonzero(points.inlier)
     if points is not None and len(located) >= 2:

@@ -29,7 +29,16 @@ from pipelines.train.options import TrainOptions
 from tests.block_scenes import make_field, write_field
 from tests.threads import single_thread
 
-OPTIONS = ("--max-gaussians", 1500, "--max-image-size", 96, "--sh-degree", 0, "--no-faithful-surface", "--no-dense")
+OPTIONS = (
+    "--max-gaussians",
+    1500,
+    "--max-image-size",
+    96,
+    "--sh-degree",
+    0,
+    "--no-geometry-regularisation",
+    "--no-dense",
+)
 SHORT = (*OPTIONS, "--iterations", 60, "--checkpoint-every", 20)
 
 

@@ -9,6 +9,7 @@ from pipelines.core.errors import ResourceError
 from pipelines.survey.scene import Scene, initial_scene
 from pipelines.train.blocks.plan import observed_surface, plan_blocks
 from pipelines.train.options import PlanOptions
+from tests.refusals import refused
 from tests.scenes import Measured, Noise, initial, make_scene, sparse_model, survey_of
 
 OPTIONS = PlanOptions(max_gaussians=100_000, max_image_size=320, sh_degree=3, blocks=4)
@@ -65,7 +66,7 @@ def test_memory_decides_on_the_number(scene: Scene) -> None:
         assert max(block.peak_bytes for block in plan.blocks) <= 0.9 * gib * 2**30
     enough = many.model_copy(update={"blocks": None, "block_memory": 1.2 * whole.peak_bytes / 2**30})
     assert len(plan_blocks(scene, enough).blocks) == 1
-    with pytest.raises(ResourceError, match="--block-memory"):
+    with refused("not-enough-memory", ResourceError):
         plan_blocks(scene, OPTIONS.model_copy(update={"blocks": None, "block_memory": 0.05}))
 
 

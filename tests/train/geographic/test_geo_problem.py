@@ -25,6 +25,7 @@ from pipelines.train.geographic.problem import GeoProblem, TermWeights, held_pro
 from pipelines.train.geographic.terms import SURFACE_SIGMA, DistanceTerm, depth_residuals
 from pipelines.train.options import MOST_JOINT_CAMERAS, GeographicOptions, TrainOptions
 from tests.adjusted_scenes import adjusted_model, block
+from tests.refusals import refused
 from tests.scenes import Measured, Noise, survey_of
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -70,7 +71,7 @@ def of_survey(survey: Survey, sparse: object, estimate: tuple[str, ...] = ()) ->
 )
 def test_training_starts_at_the_minimum_of_its_own_loss(noise: Noise, estimate: tuple[str, ...]) -> None:
     given = adjusted(noise, estimate)
-    problem, solution = given.problem(rel_loss=False), given.posterior.solution
+    problem, solution = given.problem(distance_loss=False), given.posterior.solution
     rotation, center = (each.detach().numpy() for each in problem.cameras.moved())
     np.testing.assert_allclose(rotation, solution.poses.cam_from_model, atol=1e-12)
     np.testing.assert_allclose(center, solution.poses.cam_center_in_model, atol=1e-9)
@@ -142,7 +143,7 @@ def test_exposures_come_back() -> None:
 
 
 def test_losses_are_means_of_rho_or_plain_squares() -> None:
-    given, problem, plain = adjusted(), adjusted().problem(), adjusted().problem(weighting="paper")
+    given, problem, plain = adjusted(), adjusted().problem(), adjusted().problem(geo_weighting="paper")
     measured = given.scene.measured()
     residual = measured.residuals(given.scene.state(measured.errors))
     for kind, name in (("fixes", "absolute"), ("control points", "control")):
@@ -158,7 +159,7 @@ def test_losses_are_means_of_rho_or_plain_squares() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "gone"), [({"gcp_loss": False}, {"control"}), ({"rel_loss": False}, {"relative"}), ({}, set())]
+    ("options", "gone"), [({"gcp_loss": False}, {"control"}), ({"distance_loss": False}, {"relative"}), ({}, set())]
 )
 def test_terms_can_be_switched_off(options: dict[str, bool], gone: set[str]) -> None:
     problem = adjusted().problem(**options)
@@ -166,7 +167,7 @@ def test_terms_can_be_switched_off(options: dict[str, bool], gone: set[str]) -> 
 
 
 def test_everything_moves_to_a_device_together() -> None:
-    problem = adjusted(NOISE, ("lever-arm", "boresight")).problem(loss_weights="learned", gcp_mode="depth")
+    problem = adjusted(NOISE, ("lever-arm", "boresight")).problem(variance_factors="learned", gcp_mode="depth")
     assert problem.to("meta").loss().device.type == "meta"
 
 
@@ -186,7 +187,7 @@ def test_distances_say_of_the_scale_a_tenth_of_what_the_fixes_say() -> None:
     of_cameras = lost.problem().term(DistanceTerm)
     assert of_cameras is not None and of_cameras.camera is not None
     foreign = replace(given, points=replace(given.points, point_id=given.points.point_id + 1))
-    with pytest.raises(InputError, match="another model"):
+    with refused("points-of-another-model", InputError):
         foreign.problem()
 
 
@@ -212,7 +213,7 @@ def test_depth_mode_finds_control_points_by_the_surface() -> None:
 
 def learned_factor(scale: float) -> float:
     """Variance factor of the fixes that training learns, where their σ are `scale` times too small."""
-    problem = adjusted().problem(loss_weights="learned", rel_loss=False)
+    problem = adjusted().problem(variance_factors="learned", distance_loss=False)
     (fixes, *others) = problem.terms
     problem.terms = (replace(fixes, root_information=scale * fixes.root_information), *others)  # type: ignore[type-var]
     adam = torch.optim.Adam([problem.weights.u], lr=0.1)
@@ -239,18 +240,21 @@ def test_bounds_hold_whatever_is_learned(weighting: str) -> None:
             assert value == pytest.approx(math.exp(math.copysign(math.log(factor), far)), rel=1e-9)
 
 
-def test_options_that_a_held_solution_contradicts_are_refused() -> None:
+def test_options_that_change_a_solved_camera_are_refused() -> None:
     options = GeographicOptions(gcp_mode="depth")
     options.require_trainable(MOST_JOINT_CAMERAS)
-    with pytest.raises(InputError, match=r"'depth' changes .* use --gcp-mode camera, --solve joint"):
+    with refused("cameras-solved-once", InputError) as error:
         options.require_trainable(MOST_JOINT_CAMERAS + 1)
-    with pytest.raises(InputError, match="--weighting whitened"):
-        GeographicOptions(weighting="paper", solve="once").require_trainable(10)
+    assert error.value.field == "--gcp-mode"
+    assert "--gcp-mode triangulated, --solve-cameras joint" in str(error.value)
+    with refused("cameras-solved-once", InputError) as error:
+        GeographicOptions(geo_weighting="paper", solve_cameras="once").require_trainable(10)
+    assert error.value.field == "--geo-weighting" and "--geo-weighting whitened" in str(error.value)
 
 
 def test_cameras_are_refined_only_where_something_holds_them_to_the_earth() -> None:
     assert predicted_basis_bytes(MOST_JOINT_CAMERAS) < 2 * 2**30
     assert GeographicOptions().refined_cameras(MOST_JOINT_CAMERAS) == MOST_JOINT_CAMERAS
-    for options in ({"solve": "once"}, {"geo_loss": False}, {"optimize_cameras": False}):
+    for options in ({"solve_cameras": "once"}, {"geo_loss": False}, {"optimize_cameras": False}):
         assert GeographicOptions.model_validate(options).refined_cameras(10) == 0
     assert GeographicOptions().refined_cameras(MOST_JOINT_CAMERAS + 1) == 0

@@ -1,10 +1,10 @@
-"""Weights of a depth map's pull: they grow with contrast, where the surface goes on."""
+"""Weights of the depth loss: they grow with contrast, where the surface goes on."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from pipelines.train.surface import pull_weights
+from pipelines.train.surface import depth_loss_weights
 
 HEIGHT, WIDTH = 60, 80
 
@@ -20,25 +20,25 @@ def pictures() -> tuple[np.ndarray, np.ndarray]:
     return rgb, np.tile(depth.astype(np.float32), (HEIGHT, 1))
 
 
-def test_details_pull_more_than_the_wall_around_them() -> None:
+def test_details_weigh_more_than_the_wall_around_them() -> None:
     rgb, depth = pictures()
-    weight = pull_weights(rgb, depth)
+    weight = depth_loss_weights(rgb, depth)
     assert weight[5:55, 10:40].min() >= 1.0
     assert weight[20, 20] > 3 * np.median(weight[:, 10:40])
 
 
-def test_photographs_of_any_exposure_pull_alike() -> None:
+def test_photographs_of_any_exposure_weigh_alike() -> None:
     rgb, depth = pictures()
     darker = (rgb.astype(np.float64) / 2).round().astype(np.uint8)
-    bright, dark = pull_weights(rgb, depth), pull_weights(darker, depth)
+    bright, dark = depth_loss_weights(rgb, depth), depth_loss_weights(darker, depth)
     # Rounding to whole grey levels moves a contrast of some 3 levels by a tenth.
     assert np.abs(dark / bright - 1)[:, 10:40].mean() < 0.1
 
 
-def test_edges_and_gaps_of_the_surface_pull_least() -> None:
+def test_edges_and_gaps_of_the_surface_weigh_least() -> None:
     rgb, depth = pictures()
-    weight = pull_weights(rgb, depth)
+    weight = depth_loss_weights(rgb, depth)
     assert (weight[:, 47:53] == weight.min()).all() and weight.min() < 1
     depth[17:19, 17:19] = 0
-    assert pull_weights(rgb, depth)[20, 20] == weight.min()
-    assert (pull_weights(rgb, np.zeros_like(depth)) == 1).all()  # nothing to compare with
+    assert depth_loss_weights(rgb, depth)[20, 20] == weight.min()
+    assert (depth_loss_weights(rgb, np.zeros_like(depth)) == 1).all()  # nothing to compare with

@@ -1,4 +1,4 @@
-"""Sheet beneath the scene, on a slope with a house whose roof alone is known."""
+"""Background plane beneath the scene, on a slope with a house whose roof alone is known."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 from pipelines.core.types import FloatArray, rows_of
 from pipelines.geometry.cameras import CameraPoses, Pinhole
-from pipelines.train.initial_gaussians import hidden, underlay
+from pipelines.train.initial_gaussians import background_plane, hidden
 from pipelines.train.surface import SurfacePoints
 
 SLOPE, ROOF_M = 0.1, 15.0
@@ -35,15 +35,15 @@ def town() -> SurfacePoints:
     return SurfacePoints(np.column_stack([place, height]), rgb, np.full((40_000, 3), np.nan))
 
 
-def test_sheet_is_closed_and_lies_below_the_ground_also_under_the_roof(town: SurfacePoints) -> None:
-    sheet, side_m = underlay(town, 800, seed=0)
-    x, y, z = sheet.point_in_model.T
+def test_plane_is_closed_and_lies_below_the_ground_also_under_the_roof(town: SurfacePoints) -> None:
+    plane, side_m = background_plane(town, 800, seed=0)
+    x, y, z = plane.point_in_model.T
     depth = terrain(x) - z
     # A wrong point is one of some fifty in its cell, and below the 5 % that may be wrong.
     assert (depth > 0).all()
     # The lowest ground within reach (and a cell of smoothing on either side), half a cell below it.
     assert (depth < SLOPE * (REACH_M + 3 * side_m) + side_m).all()
-    assert len(sheet.rgb) <= 800
+    assert len(plane.rgb) <= 800
     for axis, extent in ((x, 200), (y, 100)):
         places = np.unique(axis.round(6))
         assert np.diff(places) == pytest.approx(side_m)
@@ -51,25 +51,25 @@ def test_sheet_is_closed_and_lies_below_the_ground_also_under_the_roof(town: Sur
         assert places[-1] > 0.98 * extent - 2 * side_m
 
 
-def test_sheet_has_the_colour_of_the_ground_around(town: SurfacePoints) -> None:
-    sheet, _ = underlay(town, 800, seed=0)
-    under = np.linalg.norm(sheet.point_in_model[:, :2] - [100, 50], axis=1) < 8
+def test_plane_has_the_colour_of_the_ground_around(town: SurfacePoints) -> None:
+    plane, _ = background_plane(town, 800, seed=0)
+    under = np.linalg.norm(plane.point_in_model[:, :2] - [100, 50], axis=1) < 8
     assert under.any()
-    np.testing.assert_array_equal(sheet.rgb[under], np.broadcast_to(GROUND, (under.sum(), 3)))
+    np.testing.assert_array_equal(plane.rgb[under], np.broadcast_to(GROUND, (under.sum(), 3)))
 
 
 def test_cells_without_points_are_filled(town: SurfacePoints) -> None:
     lake = np.linalg.norm(town.point_in_model[:, :2] - [40, 50], axis=1) < 25
-    sheet, side_m = underlay(rows_of(town, np.flatnonzero(~lake)), 800, seed=0)
-    x, y, z = sheet.point_in_model.T
+    plane, side_m = background_plane(rows_of(town, np.flatnonzero(~lake)), 800, seed=0)
+    x, y, z = plane.point_in_model.T
     within = np.hypot(x - 40, y - 50) < 20
     assert within.sum() > 0.8 * np.pi * 20**2 / side_m**2
     assert (z[within] < terrain(x[within])).all()
 
 
-def test_no_count_and_no_extent_give_no_sheet(town: SurfacePoints) -> None:
-    assert len(underlay(town, 0, seed=0)[0].rgb) == 0
-    assert len(underlay(rows_of(town, np.array([5])), 100, seed=0)[0].rgb) == 0
+def test_no_count_and_no_extent_give_no_plane(town: SurfacePoints) -> None:
+    assert len(background_plane(town, 0, seed=0)[0].rgb) == 0
+    assert len(background_plane(rows_of(town, np.array([5])), 100, seed=0)[0].rgb) == 0
 
 
 def test_a_place_is_hidden_by_known_depths_or_where_no_view_looks() -> None:
