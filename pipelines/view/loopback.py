@@ -202,9 +202,8 @@ def start_server(port: int, title: str, *, dark: bool = False) -> tuple[viser.Vi
     if not _refuses_strangers(server.get_port(), keeper.key):
         stop_server(server)
         raise GeorefError(
-            "todo-this-version-viser-cannot",
-            "this version of viser cannot be kept from answering strangers: install viser 1.1 "
-            "(pip install --constraint constraints.txt georefgs)",
+            "viewer-not-private",
+            "This version of viser answers requests without the key of the page. Install viser 1.1.",
         )
     if server.get_port() != port:
         log.warning("port %d is taken: the viewer is at port %d", port, server.get_port())
@@ -222,7 +221,7 @@ def _start(port: int, title: str, keeper: Doorkeeper) -> viser.ViserServer:
         import viser
     except ImportError as error:
         raise BackendUnavailableError(
-            "todo-viser-cannot-be-imported", f"viser cannot be imported ({error}): pip install georefgs"
+            "viser-missing", f"viser cannot be imported ({error}): pip install georefgs"
         ) from error
 
     class Server(viser.ViserServer):
