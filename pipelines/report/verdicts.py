@@ -113,8 +113,8 @@ def _registered(measured: Measured) -> _Fields:
 
 def _overlap(measured: Measured) -> _Fields:
     rule = (
-        f"good if {measured.enough} photographs or more see {share(OVERLAP[0])} of the ground and all are "
-        f"connected, fair from {share(OVERLAP[1])}"
+        f"good if {measured.enough} photographs or more see {share(OVERLAP[0])} of the ground and all "
+        f"are connected, fair from {share(OVERLAP[1])}"
     )
     if measured.enough_share is None:
         return "unknown", "no scene", "too few SfM points to map the ground", rule
