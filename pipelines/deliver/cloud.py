@@ -62,9 +62,9 @@ def run(stage: StageRun, options: ExportCloudOptions) -> Summary:
     tally = _write_points(paths, points, target, wkt1, middle)
     if not tally.count:
         raise DegenerateGeometryError(
-            "todo-no-point-surface-seen",
-            f"no point of the surface is seen alike by {options.min_views} training views: train longer, or lower "
-            "--min-views",
+            "no-surface-points",
+            f"No point of the surface has the same depth in {options.min_views} training views. Train longer, or "
+            "lower --min-views.",
         )
     empty = "The cloud states no σ, and its dimensions sigma_h, sigma_v and cov_ee to cov_uu are empty"
     cautions = union(trained.model.cautions, without_sigma(empty, no_sigma))

@@ -198,15 +198,15 @@ def _collected(squares: Iterable[SurfaceCloud], views: SurfaceViews, trained: Tr
         size = TrainingSize(len(trained.gaussians) + count, largest, trained.gaussians.sh_degree, 0)
         if free_bytes is not None and predicted_peak_bytes(size) > USABLE * free_bytes:
             raise ResourceError(
-                "todo-memory-has-no-room",
-                f"the memory has no room for the discs on the surface: {count} and more of them need over "
-                f"{USABLE * free_bytes / 2**30:.1f} GiB. Choose a larger --disc-spacing",
+                "memory-discs",
+                f"{count} discs on the surface need more than {USABLE * free_bytes / 2**30:.1f} GiB of memory. "
+                "Choose a larger --disc-spacing.",
             )
     if not count:
         raise DegenerateGeometryError(
-            "todo-no-point-surface-seen",
-            f"no point of the surface is seen alike by {_MIN_VIEWS} training views: train longer, or "
-            "hand over export/splat.ply alone",
+            "no-surface-points",
+            f"No point of the surface has the same depth in {_MIN_VIEWS} training views. Train longer, or hand "
+            "over export/splat.ply alone.",
         )
     names = vars(parts[0])
     return SurfaceCloud(*(np.concatenate([vars(part)[name] for part in parts]) for name in names))

@@ -184,7 +184,5 @@ def require_space(folder: Path, needed_bytes: int, files: str, advice: str) -> N
     free_bytes = shutil.disk_usage(folder).free
     if needed_bytes > free_bytes:
         needed, free = f"{needed_bytes / 2**30:.1f} GiB", f"{free_bytes / 2**30:.1f} GiB"
-        advice = f"{advice}, or make room on this disk"
-        raise InputError(
-            "todo-may-need-free", f"{files} may need {needed}, and {free} are free: {advice}", path=folder
-        )
+        advice = f"{advice[0].upper()}{advice[1:]}, or free space on this disk"
+        raise InputError("disk-space", f"{files} may need {needed}; {free} are free. {advice}.", path=folder)

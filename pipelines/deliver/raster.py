@@ -69,8 +69,8 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
     height = mosaic.sample("dsm")
     if not len(height):
         raise DegenerateGeometryError(
-            "todo-no-cell-shown-by",
-            f"no cell is shown by {options.min_views} training views or more: lower --min-views",
+            "no-raster-cells",
+            f"No cell is seen by {options.min_views} training views or more. Lower --min-views.",
         )
     sigma = None
     if not reason:
@@ -176,8 +176,8 @@ def _contour_lines(height: FloatArray, frame: RasterFrame, interval: float) -> l
     levels = interval * np.arange(math.ceil(low / interval), math.floor(high / interval) + 1)
     if len(levels) > _MOST_LEVELS:
         raise InputError(
-            "todo-heights-more-than-give",
-            f"{len(levels)} heights are more than {_MOST_LEVELS}: give a larger interval",
+            "contour-interval",
+            f"The interval makes {len(levels)} contour heights, more than {_MOST_LEVELS}. Give a larger interval.",
             field="--contours",
         )
     west, south, east, north = frame.bounds

@@ -68,22 +68,22 @@ def make_frame(
     crs = target.crs
     if crs.is_geocentric:
         raise InputError(
-            "todo-has-no-map-plane",
-            f"{crs.name} has no map plane: give a projected CRS, such as EPSG:32632",
+            "crs-geocentric",
+            f"{crs.name} is geocentric and has no map plane. Give a projected CRS, such as EPSG:32632.",
             field="--crs",
         )
     if crs.is_geographic and options.gsd is None:
         raise InputError(
-            "todo-has-its-coordinates-give",
-            f"{crs.name} has its coordinates in {crs.units[0]}s: give the size of a cell in that unit, such as "
-            "--gsd 0.000001, or a projected CRS",
+            "gsd-in-degrees",
+            f"{crs.name} has coordinates in {crs.units[0]}s. Give the cell size in that unit, such as "
+            "--gsd 0.000001, or a projected CRS.",
             field="--gsd",
         )
     if crs.is_geographic and options.gsd is not None and options.gsd > _LARGEST_DEG:
         raise InputError(
-            "todo-more-than-kilometre-has",
-            f"{options.gsd:g} {crs.units[0]}s are more than a kilometre, and {crs.name} has no metres: give the "
-            "size of a cell in its unit, such as --gsd 0.000001",
+            "gsd-too-large",
+            f"The unit of {crs.name} is the {crs.units[0]}, not the metre, and {options.gsd:g} {crs.units[0]}s are "
+            "more than a kilometre. Give the cell size in that unit, such as --gsd 0.000001.",
             field="--gsd",
         )
     step = _readable(default_gsd_m / crs.horizontal_unit) if options.gsd is None else options.gsd
@@ -95,9 +95,10 @@ def make_frame(
     if columns * rows > options.max_pixels:
         enough = step * math.sqrt(columns * rows / options.max_pixels)
         raise InputError(
-            "todo-cells-make-cells-more",
-            f"cells of {step:g} {crs.units[0]} make {columns} × {rows} = {columns * rows:.3g} cells, more than "
-            f"--max-pixels {options.max_pixels:.3g}: give --gsd {enough:.2g} or larger, or a larger --max-pixels",
+            "too-many-cells",
+            f"A cell size of {step:g} {crs.units[0]} makes {columns} × {rows} = {columns * rows:.3g} cells, more "
+            f"than --max-pixels {options.max_pixels:.3g}. Give --gsd {enough:.2g} or larger, or "
+            "a larger --max-pixels.",
             field="--gsd",
         )
     return RasterFrame(crs.wkt1, west * step, north * step, step, step, columns, rows)
@@ -180,9 +181,10 @@ def _derivative(points: FloatArray, target: TargetCrs, frame: RasterFrame) -> Re
     by_geo = np.stack([ends[0] - ends[1], ends[2] - ends[3], ends[4] - ends[5]], axis=-1) / _STEP_M
     by_geo = by_geo / np.array([frame.step_x, -frame.step_y, -1.0])[:, None]
     if not np.isfinite(by_geo).all():
-        raise DegenerateGeometryError(
-            "todo-has-no-derivative-over", f"{target.crs.name} has no derivative over the scene"
+        message = (
+            f"{target.crs.name} does not cover the scene: its coordinates there are not finite. Give another --crs."
         )
+        raise DegenerateGeometryError("crs-not-finite", message)
     return RegularGridInterpolator(tuple(axes), by_geo.reshape(*3 * (_NODES,), 9))
 
 

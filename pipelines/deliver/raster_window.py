@@ -108,9 +108,8 @@ def _seen_gaussians(trained: TrainedSurvey, views: SurfaceViews) -> Gaussians:
     solid = torch.sigmoid(gaussians.logit_opacities) >= _LEAST_OPACITY
     chosen = gaussians.select(solid & torch.from_numpy(inside))
     if len(chosen) == 0:
-        raise DegenerateGeometryError(
-            "todo-no-gaussian-lies-within", "no Gaussian lies within the scene of the SfM points: train again"
-        )
+        message = "No opaque Gaussian lies near the SfM points. Train again with `georef train --force`."
+        raise DegenerateGeometryError("no-gaussians-in-scene", message)
     support = views.support(chosen.means.double().numpy())
     haze = (support.views == 0) & (support.seen_through >= _HAZE_VIEWS)
     return chosen.select(torch.from_numpy(~haze))

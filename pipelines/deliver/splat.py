@@ -125,11 +125,8 @@ def _rows_of_blocks(workspace: Workspace, count: int) -> tuple[slice, ...]:
     numbers = [block.training.gaussians_in_cell for block in load_json(BlockRecord, record).blocks]
     ends = np.cumsum([0, *numbers]).tolist()
     if ends[-1] != count:
-        raise InputError(
-            "todo-its-blocks-have-gaussians",
-            f"its blocks have {ends[-1]} Gaussians, and {GAUSSIANS} has {count}",
-            path=record,
-        )
+        message = f"the blocks have {ends[-1]} Gaussians, and {GAUSSIANS} has {count}; run `georef blocks` again"
+        raise InputError("blocks-mismatch", message, path=record)
     return tuple(slice(first, last) for first, last in itertools.pairwise(ends))
 
 
@@ -153,8 +150,9 @@ def _is_opaque(logit_opacities: Float32Array, options: SplatOptions) -> BoolArra
 def _require_opaque(opaque: BoolArray, options: SplatOptions) -> None:
     if not opaque.any():
         raise DegenerateGeometryError(
-            "todo-none-gaussians-has-opacity",
-            f"none of {len(opaque)} Gaussians has an opacity of {options.min_opacity} or more: lower --min-opacity",
+            "no-opaque-gaussians",
+            f"None of {len(opaque)} Gaussians has an opacity of {options.min_opacity} or more. Lower "
+            "--min-opacity.",
         )
 
 

@@ -42,9 +42,8 @@ def run(stage: StageRun, options: ExportSpzOptions) -> Summary:
     try:
         write_spz(path, codec_arrays(upright, options.sh_degree), version)
     except InputError as error:
-        raise InputError(
-            "todo-georef-export-tiles-writes", f"{error}: georef export-tiles writes scenes of any size"
-        ) from error
+        message = f"{error}. `georef export-tiles` writes scenes of any size."
+        raise InputError("spz-range", message) from error
     write_sidecar(splat.placement.sidecar(ENU_FROM_RUB), path)
     size = path.stat().st_size
     return Summary(

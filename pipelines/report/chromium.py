@@ -22,6 +22,7 @@ _INSTALLED = (
 NO_NETWORK = "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"
 _TIMEOUT_S = 300.0
 _LONGEST_MESSAGE = 300
+_WITHOUT_PDF = "Leave out --pdf, and print the page from any browser."
 
 
 def find_chromium() -> str | None:
@@ -40,14 +41,14 @@ def chromium_path() -> str:
     browser = find_chromium()
     if os.environ.get("CHROMIUM") and browser and shutil.which(browser) is None:
         raise BackendUnavailableError(
-            "todo-variable-chromium-names-which",
-            f"the variable CHROMIUM names {browser}, which is no program: correct it",
+            "chromium-variable",
+            f"The environment variable CHROMIUM names {browser}, which is no program. Correct it, or unset it.",
         )
     if browser is None:
         raise BackendUnavailableError(
-            "todo-chromium-missing-install-apt",
-            "Chromium is missing: install it (`apt-get install chromium`, or Chrome from google.com/chrome), or "
-            "name a Chromium or Chrome in the variable CHROMIUM",
+            "chromium-missing",
+            "--pdf needs Chromium or Chrome, and neither is installed. Install one (`apt-get install chromium`), "
+            "or name its path in the environment variable CHROMIUM.",
         )
     return browser
 
@@ -87,14 +88,10 @@ def print_pdf(page: Path, pdf: Path) -> None:
                 check=False,
             )
         except subprocess.TimeoutExpired as error:
-            raise CrashError(
-                "todo-did-not-print-page", f"{browser} did not print the page within {_TIMEOUT_S:.0f} s"
-            ) from error
+            message = f"{browser} did not print the page within {_TIMEOUT_S:.0f} s. {_WITHOUT_PDF}"
+            raise CrashError("chromium-timeout", message) from error
         if done.returncode != 0 or not draft.is_file():
             reason = " ".join(done.stderr.split())[-_LONGEST_MESSAGE:]
-            raise CrashError(
-                "todo-did-not-print-page",
-                f"{browser} did not print the page (exit code {done.returncode}): {reason}. Without --pdf the page "
-                "is written, and any browser prints it",
-            )
+            message = f"{browser} did not print the page (exit code {done.returncode}): {reason}. {_WITHOUT_PDF}"
+            raise CrashError("chromium-failed", message)
     replace_file(draft, pdf)

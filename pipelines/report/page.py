@@ -217,7 +217,7 @@ def png_file(path: Path) -> Picture:
     """
     data = read_bytes(path)
     if header_size(data) is None or not data.startswith(_PNG):
-        raise InputError("todo-no-png-delete-or", "is no PNG: delete it, or make it again", path=path)
+        raise InputError("not-a-png", "is no PNG; make it again with `georef evaluate --force`", path=path)
     return picture_of_png(data)
 
 
@@ -241,14 +241,10 @@ def read_picture(path: Path) -> ByteArray:
     data = read_bytes(path)
     size = header_size(data)
     if size is None or not 0 < size[0] * size[1] <= MAX_PIXELS:
-        raise InputError(
-            "todo-no-picture-can-be", "is no picture that can be shown: delete it, or make it again", path=path
-        )
+        raise InputError("not-a-picture", "is no picture that can be shown; delete it, or make it again", path=path)
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
     if pixels is None or pixels.dtype != np.uint8:
-        raise InputError(
-            "todo-no-picture-can-be", "is no picture that can be shown: delete it, or make it again", path=path
-        )
+        raise InputError("not-a-picture", "is no picture that can be shown; delete it, or make it again", path=path)
     if pixels.ndim == 2:
         pixels = np.repeat(pixels[..., None], 3, axis=2)
     if pixels.shape[2] == 4:

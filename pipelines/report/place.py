@@ -155,7 +155,7 @@ class OverlapFacts:
         matches: graph of the photographs that share points, with the strongest `drawn_links` of the `links`.
         tied_points: points that a pair must share to count as tied.
         median_tied: median number of photographs that a photograph is tied to; `least_tied` has fewest.
-        parts: groups of photographs that no tie connects; 1: all hang together.
+        parts: groups of photographs without a common point; 1: all are connected.
     """
 
     overlap: Picture | None

@@ -84,9 +84,8 @@ def cut_chips(
             name = sparse.image_name[image]
             pixels = decoded_photograph(folder / name, sha256.get(name, ""))
             if pixels is None:
-                raise InputError(
-                    "todo-does-not-decode-put", "does not decode: put the photograph back", path=folder / name
-                )
+                message = "cannot be decoded, or has changed; restore the photograph"
+                raise InputError("photograph-damaged", message, path=folder / name)
             for chip in of_image:
                 chips[chip.owner].append(_cut(pixels[..., ::-1], name, chip, side))
             task.advance()

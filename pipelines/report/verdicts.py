@@ -15,6 +15,8 @@ from pipelines.report.page import decibel, number_text, share
 from pipelines.survey.report import ByAxis, CheckPointErrors, EvaluationReport
 from pipelines.survey.report_parts import VarianceFactor
 
+# Code of the caution that check points find the predicted σ too large.
+PESSIMISTIC = "prediction-pessimistic"
 Level = Literal["good", "fair", "poor", "unknown"]
 
 # Limits of good and of fair.
@@ -82,7 +84,7 @@ def verdicts(report: EvaluationReport, measured: Measured, cautions: Sequence[Re
         "Control points": _control(measured),
         "σ of the measurements": _stated_sigma(report.variance_factors),
         "Check points": _check_points(measured, triangulated),
-        "Predicted against measured": _prediction(triangulated),
+        "Predicted against measured": _prediction(triangulated, cautions),
         "Blunders": _blunders(triangulated),
         **({} if on_surface is None else {"Surface at the points": _surface(on_surface)}),
         **({} if test is None else {"Test views": _views(test.psnr, test.views)}),
@@ -111,8 +113,8 @@ def _registered(measured: Measured) -> _Fields:
 
 def _overlap(measured: Measured) -> _Fields:
     rule = (
-        f"good if {share(OVERLAP[0])} of the ground is seen by {measured.enough} photographs or more and all hang "
-        f"together, fair from {share(OVERLAP[1])}"
+        f"good if {measured.enough} photographs or more see {share(OVERLAP[0])} of the ground and all "
+        f"are connected, fair from {share(OVERLAP[1])}"
     )
     if measured.enough_share is None:
         return "unknown", "no scene", "too few SfM points to map the ground", rule
@@ -120,7 +122,7 @@ def _overlap(measured: Measured) -> _Fields:
     reason = "enough rays everywhere" if level == "good" else "the rim of the scene is less accurate: fly beyond it"
     if measured.parts > 1:
         level = "fair" if level == "good" else level
-        reason = f"{measured.parts} groups of photographs that few points tie together: add photographs"
+        reason = f"{measured.parts} groups of photographs with few common points: add photographs"
     reading = f"{share(measured.enough_share)} of the ground in {measured.enough} photographs or more"
     return level, reading, reason, rule
 
@@ -145,7 +147,9 @@ def _fixes(measured: Measured) -> _Fields:
         return level, "none", "the control points alone place the survey", rule
     part = measured.fix_outliers / measured.fixes
     level = level_of(part, FIX_OUTLIERS, more_is_better=False)
-    reason = "the section on positions names them" if measured.fix_outliers else "none contradicts the others"
+    reason = (
+        "the section on positions names them" if measured.fix_outliers else "none is inconsistent with the others"
+    )
     reading = f"{measured.fixes} used or tested, {measured.fix_outliers} outliers"
     return level, reading, reason, rule
 
@@ -154,7 +158,7 @@ def _control(measured: Measured) -> _Fields:
     count = measured.control_points
     level: Level = level_of(count, CONTROL_POINTS, more_is_better=True) if count else "fair"
     reason = (
-        "a common error of the recorded positions cannot be seen without control points"
+        "without control points a common error of the recorded positions stays unknown"
         if not count
         else "they tie the survey to the reference frame"
         if level == "good"
@@ -173,8 +177,8 @@ def _stated_sigma(factors: tuple[VarianceFactor, ...]) -> _Fields:
     changed = [factor for factor in tested if factor.applied != 1.0]
     if changed:
         reading = ", ".join(f"{factor.group}: variance × {number_text(factor.applied)}" for factor in changed)
-        refuted = any(factor.sigma_source == "stated" for factor in changed)
-        reason = "the data refute a stated σ" if refuted else "nobody stated these σ: the data gave them"
+        rejected = any(factor.sigma_source == "stated" for factor in changed)
+        reason = "the χ² test rejects a stated σ" if rejected else "these σ were not stated: they were estimated"
         return "fair", reading, reason, rule
     passed = ", ".join(factor.group for factor in tested)
     return "good", f"passed: {passed}", "residuals agree with the σ", rule
@@ -196,7 +200,7 @@ def _check_points(measured: Measured, errors: CheckPointErrors) -> _Fields:
     return "good" if enough else "fair", f"{errors.count} of {measured.check_points} measured", reason, rule
 
 
-def _prediction(errors: CheckPointErrors) -> _Fields:
+def _prediction(errors: CheckPointErrors, cautions: Sequence[Remark]) -> _Fields:
     rule = (
         f"good up to {NORMALISED[0]:g}, fair up to {NORMALISED[1]:g}: mean of "
         "error² / (predicted + survey variance), 1 if both are right"
@@ -209,11 +213,11 @@ def _prediction(errors: CheckPointErrors) -> _Fields:
     worst = max(known)
     level = level_of(worst, NORMALISED, more_is_better=False)
     reason = (
-        "the stated σ are cautious: errors are smaller than predicted"
-        if worst < CAUTIOUS
-        else "the predicted σ may be relied on"
+        "the errors are smaller than the predicted σ"
+        if worst < CAUTIOUS or any(caution.code == PESSIMISTIC for caution in cautions)
+        else "the errors agree with the predicted σ"
         if level == "good"
-        else "errors are larger than predicted: control points, marks or the datum may be at fault"
+        else "the errors are larger than the predicted σ: check control points, marks and datum"
     )
     return level, f"{number_text(worst)} on the worst axis", reason, rule
 

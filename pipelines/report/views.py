@@ -182,9 +182,8 @@ def views_facts(workspace: Workspace, test: PhotometricFigures, most: int) -> Vi
 def _view(name: str, field: str, file: Path) -> TestView:
     parts = without_labels(read_picture(file), 3)
     if not parts[0].size:
-        raise InputError(
-            "todo-no-render-evaluate-run", "is no render of evaluate: run `georef evaluate --force`", path=file
-        )
+        message = "is no render of `georef evaluate`; run `georef evaluate --force`"
+        raise InputError("not-a-render", message, path=file)
     photograph, render, difference = (picture_of(limited(part, _VIEW_PX)) for part in parts)
     return TestView(name, field, photograph, render, difference)
 
@@ -220,9 +219,8 @@ def read_metrics(path: Path) -> list[dict[str, float]]:
                 row = {name: float(value) for name, value in json.loads(line).items()}
                 rows.append(row | {"iteration": row["iteration"]})
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
-        raise InputError(
-            "todo-line-no-row-metrics", f"line {lines} is no row of metrics: run `georef train --force`", path=path
-        ) from error
+        message = "is no row of metrics; run `georef train --force`"
+        raise InputError("metrics-row", message, path=path, line=lines) from error
     return rows
 
 

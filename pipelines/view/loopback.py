@@ -184,7 +184,9 @@ class CheckedConnection:
         if error.kind not in self._told:
             self._told.add(error.kind)
             reason = ascii(str(error))[1:-1][:_SHOWN_CHARACTERS]  # no line breaks, no signs that steer a terminal
-            log.warning("a message of a page is refused: %s (more of this kind are not logged)", reason)
+            log.warning(
+                "A message of a browser page was refused: %s. Further ones of this kind are not logged.", reason
+            )
 
 
 def start_server(port: int, title: str, *, dark: bool = False) -> tuple[viser.ViserServer, str]:
@@ -202,12 +204,11 @@ def start_server(port: int, title: str, *, dark: bool = False) -> tuple[viser.Vi
     if not _refuses_strangers(server.get_port(), keeper.key):
         stop_server(server)
         raise GeorefError(
-            "todo-this-version-viser-cannot",
-            "this version of viser cannot be kept from answering strangers: install viser 1.1 "
-            "(pip install --constraint constraints.txt georefgs)",
+            "viewer-not-private",
+            "This version of viser answers requests without the key of the page. Install viser 1.1.",
         )
     if server.get_port() != port:
-        log.warning("port %d is taken: the viewer is at port %d", port, server.get_port())
+        log.warning("Port %d is taken: the viewer uses port %d.", port, server.get_port())
     return server, f"http://{HOST}:{server.get_port()}/{keeper.key}/"
 
 
@@ -222,7 +223,7 @@ def _start(port: int, title: str, keeper: Doorkeeper) -> viser.ViserServer:
         import viser
     except ImportError as error:
         raise BackendUnavailableError(
-            "todo-viser-cannot-be-imported", f"viser cannot be imported ({error}): pip install georefgs"
+            "viser-missing", f"viser cannot be imported ({error}): pip install georefgs"
         ) from error
 
     class Server(viser.ViserServer):

@@ -115,7 +115,7 @@ def mark_texts(crs: str, points: Sequence[MarkedPoint]) -> dict[str, str]:
             for image, (x_px, y_px) in point.marks.items():
                 bad = next((text for text in (point.name, image) if len(text.split()) != 1), None)
                 if bad is not None:
-                    raise InputError("todo-has-no-place-for", f"{file} has no place for a space: rename {bad!r}")
+                    raise InputError("name-with-space", f"Names in {file} cannot contain spaces. Rename {bad!r}.")
                 x, y, z = point.xyz
                 lines.append(f"{x:.12g}\t{y:.12g}\t{z:.4f}\t{x_px:.3f}\t{y_px:.3f}\t{image}\t{point.name}")
         if len(lines) > 1:
@@ -202,8 +202,7 @@ class KeptMarks:
         """
         if len(name.split()) != 1:
             raise InputError(
-                "todo-files-marks-have-no",
-                f"the files of marks have no place for a space: name {name!r} without one",
+                "name-with-space", f"Names in {CONTROL} and {CHECK} cannot contain spaces. Rename {name!r}."
             )
         former = self._records.get((name, None))
         lla = former.lla if isinstance(former, KeptPoint) else None
@@ -220,8 +219,8 @@ class KeptMarks:
         """
         if name in self._surveyed:
             raise InputError(
-                "todo-point-survey-remove-its",
-                f"{name} is a point of the survey: remove its marks, or ingest the survey without it",
+                "point-of-survey",
+                f"{name} is a point of the survey. Remove its marks, or run `georef ingest` without the point.",
             )
         self._step(dict.fromkeys(key for key in self._records if key[0] == name), f"removal of {name}")
 

@@ -156,8 +156,8 @@ class Photographs:
         lens = self._trained.sparse.camera_of(camera)
         if pixels is None or pixels.shape[:2] != (lens.height, lens.width):
             raise InputError(
-                "todo-photograph-cannot-be-read",
-                "the photograph cannot be read, or has another size than its camera",
+                "photograph-damaged",
+                "cannot be decoded, or has another size than its camera; restore the photograph",
                 path=file,
             )
         return np.ascontiguousarray(pixels[..., ::-1])

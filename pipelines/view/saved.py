@@ -200,17 +200,15 @@ def read_measurements(folder: Path) -> list[NamedMeasurement]:
     if not path.exists():
         return []
     if path.stat().st_size > _MOST_BYTES:
-        raise InputError(
-            "todo-larger-than-mib-move", f"is larger than {_MOST_BYTES >> 20} MiB: move it away", path=path
-        )
+        message = f"is larger than {_MOST_BYTES >> 20} MiB; move the file away"
+        raise InputError("measurements-too-large", message, path=path)
     try:
         document = json.loads(path.read_text("utf-8"))
         features = document["features"]
         measurements = [each["properties"]["georef"] for each in features]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            "todo-no-file-saved-measurements", "is no file of saved measurements: move it away", path=path
-        ) from error
+        message = "is no file of saved measurements; move the file away"
+        raise InputError("not-measurements", message, path=path) from error
     read = []
     for number, each in enumerate(measurements):
         try:
@@ -218,9 +216,8 @@ def read_measurements(folder: Path) -> list[NamedMeasurement]:
         except ValidationError as error:
             first = error.errors()[0]
             field = f"features[{number}].properties.georef." + ".".join(map(str, first["loc"]))
-            raise InputError(
-                "todo-move-file-away", f"{first['msg']}: move the file away", path=path, field=field
-            ) from error
+            message = f"{first['msg']}; move the file away"
+            raise InputError("measurement-invalid", message, path=path, field=field) from error
     return read
 
 

@@ -305,7 +305,8 @@ def serve(
                 changed = model_stamp(workspace) != viewer.stamp
             if changed and not told:
                 told = True
-                log.warning("the model has changed since the viewer read it")
+                text = "The model was trained again. The page shows the old one until it is loaded anew there."
+                log.warning(text, extra={"code": "model-changed"})
                 viewer.tell_change(again.set)
     finally:
         stop_server(server)

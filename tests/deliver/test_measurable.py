@@ -29,6 +29,7 @@ from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from pipelines.splat.repainting import ShownView, repainted, shuffled_passes
 from pipelines.surface.fusion import SurfaceCloud
 from pipelines.survey.calibrated import load_survey
+from tests.refusals import refused
 from tests.splat_scenes import ground_height
 
 GEO_FROM_MODEL = Similarity(2.0, exp_so3(np.array([0.3, -0.2, 1.1])), np.array([100.0, 50.0, 3.0]))
@@ -183,7 +184,7 @@ def test_too_many_discs_are_refused(
     root = tmp_path / "ws"
     shutil.copytree(trained[0][0].root, root, symlinks=True)
     monkeypatch.setattr(measurable, "free_memory_bytes", lambda _device: 2**27)
-    with pytest.raises(ResourceError, match="--disc-spacing"):
+    with refused("memory-discs", ResourceError):
         run_stage(Workspace(root), BY_NAME["export-measurable"], {})
     assert not (root / MEASURABLE_SPLAT).exists()
 

@@ -25,6 +25,7 @@ from pipelines.report.views import read_metrics
 from pipelines.survey.survey import Survey
 from pipelines.survey.trained_survey import fix_differences
 from tests.evaluated_workspaces import CHECK_POINTS, ERROR_M
+from tests.refusals import refused
 from tests.report.conftest import Reported
 from tests.reports import check_points_with, report_with
 from tests.trained_workspaces import NOISE, scene_of
@@ -207,8 +208,9 @@ def test_limits_belong_to_the_better_verdict() -> None:
 def test_damaged_metrics_are_refused(tmp_path: Path, line: str) -> None:
     path = tmp_path / "metrics.jsonl"
     path.write_text('{"iteration": 1}\n' + line + "}"[: not line.endswith("}")] + "\n", "utf-8")
-    with pytest.raises(InputError, match="line 2 is no row of metrics"):
+    with refused("metrics-row", InputError) as error:
         read_metrics(path)
+    assert error.value.line == 2
 
 
 def test_unfinished_last_line_of_the_metrics_is_left_out(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.core.products import save_json
+from pipelines.core.products import Remark, save_json
 from pipelines.core.stages import LIDAR, LIDAR_MAP
 from pipelines.core.workspace import Workspace
 from pipelines.report.page import Page, Section, render_page
@@ -32,7 +32,7 @@ REPORT_OF_TRAINING = LidarReport(
     ),
     rejected_share=0.0265, confidence=0.9,
     areas=(area("removed", 616.4), area("added", 20.2), area("removed", 30.0)),
-    assumptions=("the heights were taken as ellipsoidal",),
+    assumptions=(Remark(code="lidar-heights", sentence="The heights were taken as ellipsoidal."),),
 )  # fmt: skip
 
 

@@ -24,6 +24,7 @@ from pipelines.report.stage import run
 from pipelines.survey.report import read_report, write_report
 from pipelines.survey.survey import Survey
 from tests.evaluated_workspaces import evaluated_workspace
+from tests.refusals import refused
 from tests.report.conftest import HOSTILE, Reported, page_of
 from tests.reports import report_with
 from tests.trained_workspaces import untrained
@@ -168,7 +169,7 @@ def test_pdf_without_chromium_is_refused_before_the_work(monkeypatch: pytest.Mon
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.delenv("CHROMIUM", raising=False)
     monkeypatch.setattr("pipelines.report.chromium._INSTALLED", ())
-    with pytest.raises(BackendUnavailableError, match="Chromium is missing: install it"):
+    with refused("chromium-missing", BackendUnavailableError):
         run(StageRun(Workspace(tmp_path), tmp_path), ReportOptions(pdf=True))
 
 

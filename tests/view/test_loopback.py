@@ -11,9 +11,9 @@ import viser
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from pipelines.core.errors import GeorefError
 from pipelines.view import loopback
 from pipelines.view.loopback import HOST, start_server, stop_server
+from tests.refusals import refused
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +130,7 @@ def test_a_server_that_cannot_be_guarded_is_not_left_running(
     monkeypatch: pytest.MonkeyPatch, name: str, careless: bool
 ) -> None:
     monkeypatch.setattr(f"{loopback.__name__}.{name}", lambda *_: careless)
-    with pytest.raises(GeorefError, match="answering strangers"):
+    with refused("viewer-not-private"):
         start_server(8690, "open")
     with pytest.raises(ConnectionRefusedError):
         status(8690, "/")

@@ -23,6 +23,7 @@ from pipelines.view.marking import (
     residuals_px,
 )
 from pipelines.view.measuring import MeasuringModel
+from tests.refusals import refused
 
 PLACE = np.array([3.0, -2.0, 5.8])
 
@@ -81,8 +82,9 @@ def test_files_of_marks_are_read_again(tmp_path: Path, model: MeasuringModel) ->
 
 def test_names_that_the_format_cannot_hold_are_refused() -> None:
     point = MarkedPoint("two words", (1.0, 2.0, 3.0), marks={"a.jpg": (1.0, 1.0)})
-    with pytest.raises(InputError, match="'two words'"):
+    with refused("name-with-space", InputError) as error:
         mark_texts("EPSG:4326", [point])
+    assert "'two words'" in str(error.value)
 
 
 def test_a_mark_is_replaced_and_taken_away() -> None:

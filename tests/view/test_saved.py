@@ -22,6 +22,7 @@ from pipelines.view.saved import (
     SavedPoint,
     read_measurements,
 )
+from tests.refusals import refused
 
 NAMES = st.text(st.characters(codec="utf-8", exclude_categories=("Cs", "Cc")), min_size=1, max_size=8)
 FINITE = st.floats(-1e6, 1e6)
@@ -83,17 +84,21 @@ def test_without_a_file_nothing_is_saved(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "field"),
+    ("text", "code", "field"),
     [
-        ("no json", None),
-        ("[]", None),
-        ('{"features": [{"properties": {}}]}', None),
-        ('{"features": [{"properties": {"georef": {"name": "a"}}}]}', "features[0].properties.georef.kind"),
+        ("no json", "not-measurements", None),
+        ("[]", "not-measurements", None),
+        ('{"features": [{"properties": {}}]}', "not-measurements", None),
+        (
+            '{"features": [{"properties": {"georef": {"name": "a"}}}]}',
+            "measurement-invalid",
+            "features[0].properties.georef.kind",
+        ),
     ],
 )
-def test_other_files_are_refused(tmp_path: Path, text: str, field: str | None) -> None:
+def test_other_files_are_refused(tmp_path: Path, text: str, code: str, field: str | None) -> None:
     (tmp_path / MEASUREMENTS).write_text(text, "utf-8")
-    with pytest.raises(InputError, match="move") as caught:
+    with refused(code, InputError) as caught:
         read_measurements(tmp_path)
     assert caught.value.field == field
     assert str(tmp_path / MEASUREMENTS) in str(caught.value)
@@ -124,7 +129,7 @@ def test_two_viewers_keep_what_the_other_saves(tmp_path: Path) -> None:
     assert names(tmp_path) == ["again", "second", "third"]
     # A file that somebody damages meanwhile stays as it is, and so does what the viewer has.
     (tmp_path / MEASUREMENTS).write_text("{", "utf-8")
-    with pytest.raises(InputError, match="move it away"):
+    with refused("not-measurements", InputError):
         one.put(measurement("fourth"))
     assert ((tmp_path / MEASUREMENTS).read_text("utf-8"), len(one.all)) == ("{", 3)
 

@@ -29,7 +29,6 @@ from pipelines.report.plots.style import (
     COLOUR_MAP,
     DARK,
     EMPTY_COLOUR,
-    FIGURE_POINTS,
     GREY,
     HEADING_POINTS,
     LABEL_POINTS,
@@ -46,8 +45,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_MOST_NAMES = 100  # more would hide the map
-_NAME_OFFSET_POINTS = (4, 3)
 _LONGEST_ARROW = 0.14  # of the longer side of the map
 _OUTLIER = 4.0  # times the median: such an arrow may leave the map
 _METRES_PER_DEGREE = 111_320.0
@@ -77,26 +74,6 @@ def write_ticks(axes: Axes, coordinates: MapCoordinates) -> None:
 
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: text(value, 0)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: text(value, 1)))
-
-
-def write_names(axes: Axes, places: FloatArray, names: Sequence[str]) -> None:
-    """Write the names beside their places (K, 2); no name where they are too many."""
-    from matplotlib.patheffects import withStroke
-
-    if len(names) > _MOST_NAMES:
-        return
-    for name, place in zip(names, places.tolist(), strict=True):
-        axes.annotate(
-            name,
-            place,
-            xytext=_NAME_OFFSET_POINTS,
-            textcoords="offset points",
-            fontsize=FIGURE_POINTS,
-            color=DARK,
-            parse_math=False,
-            annotation_clip=True,
-            path_effects=[withStroke(linewidth=1.6, foreground="white")],
-        )
 
 
 def exaggeration(lengths_m: FloatArray, side_m: float) -> float | None:
@@ -203,6 +180,9 @@ def write_accuracy_map(
         _mark(axes, points)
         axes.set_xlim(low[0], high[0])
         axes.set_ylim(low[1], high[1])
+        named = [group.place_m[: len(group.names)] for group in (points.check, points.control)]
+        names = [*points.check.names, *points.control.names]
+        add_names(figure, axes, np.concatenate(named), names, points.cameras)
         factor = _draw_errors(axes, points, errors_along, frame.longer_m)
         arrows = "" if factor is None else f"; arrows: errors × {factor:,g}"
         label(
@@ -256,8 +236,6 @@ def _mark(axes: Axes, points: MapPoints) -> None:
     for name, places, style in kinds:
         if len(places):
             axes.scatter(places[:, 0], places[:, 1], label=name, zorder=4, **style)
-    for group in (points.check, points.control):
-        write_names(axes, group.place_m[: len(group.names)], group.names)
 
 
 def _named(name: str, points: NamedPlaces, arrow: str) -> str:
