@@ -51,6 +51,6 @@ def _part(extra: Extra) -> Part:
     user, libraries = EXTRAS[extra]
     missing = [name for name in libraries if find_spec(name) is None]
     if missing:
-        remedy = f"{user} needs {' and '.join(missing)}, which the extra {extra} installs: {installing(extra)}"
+        remedy = f"{user} needs {', '.join(missing)}, which the extra {extra} installs: {installing(extra)}"
         return Part(extra, None, remedy)
     return Part(extra, ", ".join(f"{name} {metadata.version(name)}" for name in libraries), "")
