@@ -177,7 +177,7 @@ def run_pipeline(
     asked = remembered(workspace.root, [spec.name for spec in stages], flags, forget)
     for spec in stages:
         options = staleness.stage_config(workspace, spec, asked[spec.name])
-        if force or workspace.manifest(spec) is None:  # else `run_stage` knows whether the stage runs at all
+        if force or not (workspace.root / spec.product).exists():  # else it may be current, and need no extra
             require_extras(options)
         if not force:
             staleness.refuse_loss_by_options(workspace, spec, options)
