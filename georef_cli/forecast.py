@@ -17,7 +17,7 @@ from georef_cli.layout import plain_table, shown
 from georef_cli.output import print_json, print_rich, size
 from georef_cli.tables import Renderable
 from pipelines.core.errors import GeorefError
-from pipelines.core.options import OptionsT, notation
+from pipelines.core.options import OptionsT, notation, require_extras
 from pipelines.core.plan import PlannedStage, photograph_folder, plan
 from pipelines.core.products import load_json
 from pipelines.core.progress import SILENT, Progress
@@ -74,12 +74,15 @@ def forecast_run(
     """Return the forecast of a run of the stages, as of `plan`; nothing is written.
 
     Raises:
-        GeorefError: the run would be refused for its options, or for a missing file.
+        GeorefError: the run would be refused for its options, a missing file or a missing extra.
     """
     from pipelines.sfm.reconstructor import reconstructor_of
     from pipelines.train.forecast import training_forecast
 
     planned = plan(workspace, stages, flags, force=force)
+    for row in planned:
+        if row.action not in ("keep", "refuse"):
+            require_extras(row.resolved)
     photographs = _photographs(workspace, planned)
     reconstruction, training = None, None
     if photographs is not None:

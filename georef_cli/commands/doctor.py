@@ -14,6 +14,7 @@ from georef_cli.layout import plain_table, shown
 from georef_cli.output import print_json, print_rich
 
 if TYPE_CHECKING:
+    from pipelines.core.extras import Part
     from pipelines.jobs.machine import Machine
 
 _MOST_GRIDS = 12
@@ -49,9 +50,7 @@ def _lines(machine: Machine) -> list[tuple[str, str]]:
         reason = "see below" if backend.name == "cuda" else shown(backend.reason)
         state = "[green]available[/]" if backend.available else f"[yellow]no[/]: {reason}"
         lines.append((f"backend {backend.name}", state))
-    for part in machine.cuda_parts:
-        text = f"[yellow]missing[/]: {shown(part.remedy)}" if part.found is None else shown(part.found)
-        lines.append((f"  {part.name}", text))
+    lines += [(f"  {part.name}", _state(part)) for part in machine.cuda_parts]
     uncompiled = "not compiled yet: the first use compiles them, or `georef doctor --compile-cuda` now"
     lines.append(("  kernels", shown(machine.cuda_kernels or uncompiled)))
     grids = machine.grids[:_MOST_GRIDS]
@@ -64,8 +63,13 @@ def _lines(machine: Machine) -> list[tuple[str, str]]:
         ("in", shown(", ".join(machine.grid_folders))),
         ("Chromium", shown(machine.chromium or "not found; `georef report --pdf` needs it")),
     ]
+    lines += [(f"extra {part.name}", _state(part)) for part in machine.extras]
     versions = ", ".join(f"{name} {version}" for name, version in machine.versions.items())
     return [*lines, ("versions", shown(versions))]
+
+
+def _state(part: Part) -> str:
+    return f"[yellow]missing[/]: {shown(part.remedy)}" if part.found is None else shown(part.found)
 
 
 def _gib(count: int | None) -> str:
@@ -83,7 +87,7 @@ command = Command(
         ),
     ],
     callback=_doctor,
-    help="""Show what this machine offers: cores, memory, GPU, backends, geoid grids, versions.
+    help="""Show what this machine offers: cores, memory, GPU, backends, extras, geoid grids, versions.
 
     A backend that cannot be used is named with the reason: for cuda, each part that it needs and how to get it.
     Nothing is written, except the kernels that --compile-cuda asks for.

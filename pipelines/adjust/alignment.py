@@ -343,8 +343,9 @@ def align(data: Correspondences, rng: np.random.Generator, *, attitude: Rotation
                 f"the positions lie on one line: the rotation about it {size}; {_ADVICE}",
             )
         prior, firm = attitude, _candidates(data, [_start_with_rotation(data, attitude.rotation, rng)], attitude)
-    # A bias of the fixes costs as much as an outlier.
-    best = min(firm, key=lambda one: one.cost + OUTLIER_GATE * (one.state.fix_bias_in_geo is not None))
+    # A bias of the fixes costs as much as an outlier. Where both explain a single control point, rounding must not
+    # decide: it is the outlier.
+    best = min(firm, key=lambda one: one.cost + 1.001 * OUTLIER_GATE * (one.state.fix_bias_in_geo is not None))
     return Alignment(best, "line" if prior else layout_of(data.in_local[best.state.inlier]), prior)
 
 

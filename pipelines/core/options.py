@@ -24,6 +24,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Val
 from pydantic.fields import FieldInfo
 
 from pipelines.core.errors import InputError
+from pipelines.core.extras import Extra, require
 from pipelines.core.files import file_size, replace_text
 from pipelines.core.types import Vector3
 from pipelines.core.validators import require_text
@@ -47,6 +48,13 @@ class InputMarker:
 
 class WrittenMarker:
     """Mark of an option that users write as text; `notation` gives the text of its value."""
+
+
+@dataclass(frozen=True)
+class ExtraMarker:
+    """Mark of an option that needs an extra of the installation where it is given."""
+
+    extra: Extra
 
 
 class EffortMarker:
@@ -141,6 +149,14 @@ def decisive_fields(options_type: type[StageOptions]) -> list[str]:
     fields = options_type.model_fields
     inputs = input_markers(options_type)
     return [name for name, info in fields.items() if name not in inputs and EFFORT not in marks_of(info)]
+
+
+def require_extras(options: StageOptions) -> None:
+    """Raise a BackendUnavailableError if an option that is given needs an extra that is not installed."""
+    for name, info in type(options).model_fields.items():
+        for mark in marks_of(info):
+            if isinstance(mark, ExtraMarker) and getattr(options, name) is not None:
+                require(mark.extra)
 
 
 def as_flags(options: StageOptions, names: Collection[str]) -> str:

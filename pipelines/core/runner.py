@@ -30,7 +30,7 @@ from pipelines.core.files import remove, replace_text
 from pipelines.core.fingerprints import library_versions
 from pipelines.core.lock import WriteLock
 from pipelines.core.manifest import MANIFEST, Manifest, Memo, record_files
-from pipelines.core.options import REQUESTS, read_requests, remember, remembered
+from pipelines.core.options import REQUESTS, read_requests, remember, remembered, require_extras
 from pipelines.core.products import union
 from pipelines.core.progress import AT_END, SILENT, Progress
 from pipelines.core.sentences import duration
@@ -116,6 +116,7 @@ def run_stage(
         place: place of the stage in a longer run, for the log: `stage 2 of 8`.
 
     Raises:
+        BackendUnavailableError: an option needs an extra that is not installed.
         InputError: the stage refuses its input, or the request would drop what an interrupted run has done.
         GeorefError: any other known failure; the previous product stays whole.
     """
@@ -129,8 +130,10 @@ def run_stage(
         previous = None if force or renew else _current(workspace, asked, memo)
         if previous is not None and resume != "never" and _goes_on(workspace, asked):
             previous = None
-        if previous is None and not force:
-            staleness.refuse_loss(workspace, spec, asked.options, asked.inputs.hashes)
+        if previous is None:
+            require_extras(asked.options)
+            if not force:
+                staleness.refuse_loss(workspace, spec, asked.options, asked.inputs.hashes)
         before = read_requests(workspace.root).get(spec.name, {})
         remember(workspace.root, {spec.name: flags})
         if previous is not None:
@@ -174,6 +177,8 @@ def run_pipeline(
     asked = remembered(workspace.root, [spec.name for spec in stages], flags, forget)
     for spec in stages:
         options = staleness.stage_config(workspace, spec, asked[spec.name])
+        if force or not (workspace.root / spec.product).exists():  # else it may be current, and need no extra
+            require_extras(options)
         if not force:
             staleness.refuse_loss_by_options(workspace, spec, options)
     outcomes: list[Outcome] = []

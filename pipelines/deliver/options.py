@@ -7,7 +7,7 @@ from urllib.parse import urlsplit
 
 from pydantic import AfterValidator, Field
 
-from pipelines.core.options import StageOptions
+from pipelines.core.options import ExtraMarker, StageOptions
 from pipelines.survey.options import CrsOptions
 
 # The page was tried with this version: the extensions of splats in glTF are younger than those of meshes.
@@ -70,7 +70,9 @@ class ExportRasterOptions(CrsOptions):
         description="Size of a cell in units of the CRS. Without it: the ground sample distance of the "
         "photographs.",
     )
-    contours: float | None = Field(None, gt=0, description="Interval of contour lines, in the unit of the heights.")
+    contours: Annotated[float, ExtraMarker("contours")] | None = Field(
+        None, gt=0, description="Interval of contour lines, in the unit of the heights."
+    )
     min_views: int = Field(4, ge=2, description="Leave out cells whose surface fewer training views show.")
     max_pixels: float = Field(1e9, gt=0, description="Refuse a raster with more cells.")
     hillshade: bool = Field(True, description="Draw hillshade.png and preview.png.")

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
-from pipelines.core.options import InputPath, StageOptions
+from pipelines.core.options import ExtraMarker, InputPath, StageOptions
 from pipelines.geodesy.vertical import Vertical
 from pipelines.survey.options import CloudPath
 from pipelines.survey.report_parts import Alignment
@@ -29,7 +29,7 @@ class EvaluateOptions(StageOptions):
     cross_validate: bool = Field(
         False, description="Leave out each control point in turn and measure it by a solution without it."
     )
-    reference: CloudPath | None = Field(
+    reference: Annotated[CloudPath, ExtraMarker("reference")] | None = Field(
         None,
         description="Compare the surface with this cloud (LAS, LAZ or PLY, or a folder of them), where photographs "
         "saw it.",

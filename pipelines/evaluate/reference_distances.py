@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pipelines.core.errors import BackendUnavailableError, InputError
+from pipelines.core.errors import InputError
+from pipelines.core.extras import require
 from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray, rows_of
 from pipelines.geometry.footprints import first_of_voxels, rows_by_square
 from pipelines.surface.visibility import SeenSurface
@@ -72,11 +73,9 @@ def require_py4dgeo() -> Any:
     Raises:
         BackendUnavailableError: py4dgeo is not installed.
     """
-    try:
-        import py4dgeo
-    except ImportError as error:
-        message = "--reference needs py4dgeo: pip install 'georefgs[reference]'"
-        raise BackendUnavailableError("todo-x", message) from error
+    require("reference")
+    import py4dgeo
+
     # It logs to stdout, which belongs to our results, and into a file of the current folder.
     log = logging.getLogger("py4dgeo")
     for handler in list(log.handlers):

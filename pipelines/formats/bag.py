@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.core.errors import InputError
+from pipelines.core.extras import require
 from pipelines.core.types import ByteArray
 from pipelines.formats.bag_limits import DEFINITIONS, bound_decompressors, check_files, refuse_large_chunk, unpacked
 from pipelines.formats.image_file import MAX_BYTES, MAX_PIXELS, header_size
@@ -191,6 +192,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
     """Open a bag for reading.
 
     Raises:
+        BackendUnavailableError: rosbags is not installed.
         InputError: no bag, damaged beyond opening, or with chunks too large for memory.
     """
     if not path.exists():
@@ -219,6 +221,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
 
 def _opened(path: Path) -> Any:
     """Return the open reader of rosbags."""
+    require("bags")
     from rosbags import rosbag1, rosbag2
 
     try:

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.core.errors import BackendUnavailableError, InputError, StorageError
+from pipelines.core.errors import InputError, StorageError
 from pipelines.core.files import file_size, storage_failure_of
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.core.validators import stays_inside
@@ -170,7 +170,6 @@ def read_sparse(path: Path) -> SparseModel:
 
     Raises:
         InputError: unreadable, inconsistent, or with values that are not finite.
-        BackendUnavailableError: pycolmap is not installed.
     """
     model = flatten(load_reconstruction(path))
     _check(model, path)
@@ -212,14 +211,10 @@ def pycolmap_module() -> Any:
     """Return pycolmap, imported so that the process's signals stay as they are.
 
     On import, pycolmap handles SIGTERM by a stack trace and the end of the process: an interrupted stage would not
-    end cleanly. Without pycolmap, a BackendUnavailableError names the remedy.
+    end cleanly.
     """
-    try:
-        import pycolmap
-    except ImportError as error:
-        raise BackendUnavailableError(
-            "todo-pycolmap-not-installed-pip", "pycolmap is not installed: `pip install pycolmap`"
-        ) from error
+    import pycolmap
+
     if threading.current_thread() is threading.main_thread():
         handler = signal.getsignal(signal.SIGTERM)  # Python's own record, which the import has not changed
         signal.signal(signal.SIGTERM, signal.SIG_DFL if handler is None else handler)
@@ -267,7 +262,6 @@ def load_reconstruction(path: Path) -> Any:
 
     Raises:
         InputError: no such folder, not a readable model, or one whose counts do not fit its files.
-        BackendUnavailableError: pycolmap is not installed.
     """
     pycolmap = pycolmap_module()
     _check_model_files(path)

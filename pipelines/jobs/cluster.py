@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import SplitResult, urlsplit
 
-from pipelines.core.errors import BackendUnavailableError, ClusterError, InputError
+from pipelines.core.errors import ClusterError, InputError
+from pipelines.core.extras import require
 from pipelines.jobs.engine import Job
 
 if TYPE_CHECKING:
@@ -28,23 +29,10 @@ if TYPE_CHECKING:
 CERTIFICATE, KEY = "cluster.pem", "cluster.key"
 _OF_OTHERS, _OF_EVERYBODY = 0o077, 0o007  # bits of a file's mode: permissions of group and all, of all
 _MINUTES = "%Y-%m-%d %H:%M UTC"
-_NEEDS_CRYPTOGRAPHY = "certificates need cryptography: install it with `pip install 'georefgs[cluster]'`"
 _RENEW = (
     f"delete {CERTIFICATE} and {KEY} there, make new ones by `georef cluster certificates`, copy them to every "
     "machine of the cluster, and start scheduler and workers again"
 )
-
-
-def import_distributed() -> Any:
-    """Return Dask's library; a BackendUnavailableError names the extra that installs it."""
-    try:
-        import distributed
-    except ImportError as error:
-        raise BackendUnavailableError(
-            "todo-cluster-needs-dask-install",
-            "a cluster needs Dask: install it with `pip install 'georefgs[cluster]'`",
-        ) from error
-    return distributed
 
 
 def make_certificates(folder: Path) -> None:
@@ -53,11 +41,10 @@ def make_certificates(folder: Path) -> None:
     The certificate is its own authority, valid for a year, as those that Dask makes for itself. A second one in the
     folder is an InputError.
     """
-    distributed = import_distributed()
-    try:
-        security = distributed.Security.temporary()
-    except ImportError as error:
-        raise BackendUnavailableError("todo-x", _NEEDS_CRYPTOGRAPHY) from error
+    require("cluster")
+    from distributed import Security
+
+    security = Security.temporary()
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     for name, text in ((KEY, security.tls_client_key), (CERTIFICATE, security.tls_client_cert)):
         try:
@@ -74,6 +61,7 @@ def make_own_certificates(folder: Path) -> None:
     """Make the certificate of a user's clusters where there is none; several programs may ask at once."""
     if folder.is_dir() and any(folder.iterdir()):
         return
+    require("cluster")
     folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder.parent) as drafts:
         draft = Path(drafts, folder.name)
@@ -121,13 +109,10 @@ def check_certificates(folder: Path) -> None:
                 path=folder,
             )
     if os.name == "posix" and (folder / KEY).stat().st_mode & _OF_EVERYBODY:
-        raise InputError(
-            "todo-can-be-read-by", "can be read by every user of this machine: `chmod 600` it", path=folder / KEY
-        )
-    try:
-        from cryptography import x509
-    except ImportError as error:
-        raise BackendUnavailableError("todo-x", _NEEDS_CRYPTOGRAPHY) from error
+        message = "can be read by every user of this machine; run `chmod 600` on it"
+        raise InputError("key-readable", message, path=folder / KEY)
+    from cryptography import x509
+
     path = folder / CERTIFICATE
     try:
         certificates = x509.load_pem_x509_certificates(path.read_bytes())
@@ -169,6 +154,7 @@ class ClusterAddress:
     certificates: Path | None = None
 
     def __post_init__(self) -> None:
+        require("cluster")
         scheme = self._parts.scheme
         if not self.host or scheme not in ("tls", "tcp"):
             raise ValueError(f"{self.address!r} is no address such as tls://host:{PORT}")
@@ -231,7 +217,8 @@ def connected(cluster: ClusterAddress) -> Iterator[Client]:
     Raises:
         ClusterError: no scheduler answers there, or it refuses the certificate.
     """
-    distributed = import_distributed()
+    import distributed
+
     for name in ("distributed", "tornado"):  # They log each lost connection with a traceback.
         logging.getLogger(name).setLevel(logging.CRITICAL)
     security: dict[str, Any] = {}

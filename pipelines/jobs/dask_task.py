@@ -22,7 +22,7 @@ from pipelines.core import child
 from pipelines.core.child import python_environment
 from pipelines.core.errors import GeorefError
 from pipelines.core.machine import available_cores
-from pipelines.jobs.cluster import CORES, GPU, MEMORY, ClusterAddress, import_distributed
+from pipelines.jobs.cluster import CORES, GPU, MEMORY, ClusterAddress
 from pipelines.jobs.local import JobProcess, ProcessEnd
 from pipelines.jobs.storage import Parcel, arguments_in, worker_exchange
 
@@ -147,7 +147,6 @@ _PRIVATE_PAGES = ("--no-dashboard", "--dashboard-address", "127.0.0.1:0")
 
 def run_scheduler(listen: ClusterAddress) -> None:
     """Run a scheduler until it is interrupted."""
-    import_distributed()
     from distributed.cli.dask_scheduler import main
 
     scheme = listen.url.partition(":")[0]
@@ -162,7 +161,6 @@ def run_worker(
 
     It runs at most so many jobs at a time, which share cores and memory; each takes a GPU if it uses one.
     """
-    import_distributed()
     from distributed.cli.dask_worker import main
 
     resources = f"{MEMORY}={memory_bytes},{CORES}={cores}" + (f",{GPU}={gpus}" if gpus else "")

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from pipelines.core.errors import BackendUnavailableError
+from pipelines.core.extras import Part, extra_parts
 from pipelines.core.fingerprints import library_versions
 from pipelines.core.machine import available_cores, thread_count, total_main_memory_bytes
 from pipelines.core.progress import Progress
@@ -17,11 +18,11 @@ from pipelines.splat.memory import free_memory_bytes
 from pipelines.splat.rasterizer.api import BackendName
 from pipelines.splat.rasterizer.backends import BACKENDS, chosen_backend
 from pipelines.splat.rasterizer.cuda_kernels import compile_kernels, kernels_ready
-from pipelines.splat.rasterizer.cuda_parts import CudaPart, compiling_parts, running_parts
+from pipelines.splat.rasterizer.cuda_parts import compiling_parts, running_parts
 
 _LIBRARIES = (
     *("numpy", "scipy", "numba", "torch", "gsplat", "cuda-toolkit", "pycolmap", "opencv-contrib-python-headless"),
-    *("pyproj", "rasterio", "laspy", "pyogrio", "rosbags", "matplotlib", "click", "rich"),
+    *("pyproj", "rasterio", "laspy", "matplotlib", "click", "rich"),
 )
 
 
@@ -50,6 +51,7 @@ class Machine:
         system: operating system, its release, and the processor's architecture.
         cores, threads: cores that this process may use, and threads that stages compute with (`--threads`).
         memory_bytes, free_bytes: main memory; None: the system does not state it.
+        extras: optional libraries, by the extra that installs them.
         cuda_parts: what the cuda backend needs, and what compiles its kernels.
         cuda_kernels: place of the compiled kernels; None: the first use compiles them.
         grid_folders, grids: where PROJ looks for grids; file names of the installed geoid models and datum shifts.
@@ -64,7 +66,8 @@ class Machine:
     free_bytes: int | None
     gpus: tuple[Gpu, ...]
     backends: tuple[BackendState, ...]
-    cuda_parts: tuple[CudaPart, ...]
+    extras: tuple[Part, ...]
+    cuda_parts: tuple[Part, ...]
     cuda_kernels: str | None
     grid_folders: tuple[str, ...]
     grids: tuple[str, ...]
@@ -84,6 +87,7 @@ def inspect_machine() -> Machine:
         free_bytes=free_memory_bytes(torch.device("cpu")),
         gpus=tuple(Gpu(properties.name, int(properties.total_memory)) for properties in found),
         backends=tuple(_backend(name) for name in BACKENDS),
+        extras=extra_parts(),
         cuda_parts=(*running_parts(), *compiling_parts()),
         cuda_kernels=kernels_ready(),
         grid_folders=tuple(map(str, grid_folders())),

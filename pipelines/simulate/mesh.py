@@ -8,7 +8,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipelines.core.errors import BackendUnavailableError
+from pipelines.core.extras import require
 from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray
 
 Color = tuple[float, float, float]
@@ -162,19 +162,14 @@ class Raycaster:
     """Ray caster of a mesh.
 
     Raises:
-        BackendUnavailableError: embreex is not installed (it has no wheel for this platform).
+        BackendUnavailableError: embreex is not installed.
     """
 
     def __init__(self, mesh: Mesh) -> None:
-        try:
-            from embreex.mesh_construction import TriangleMesh
-            from embreex.rtcore_scene import EmbreeScene
-        except ImportError as error:
-            raise BackendUnavailableError(
-                "ray-caster-missing",
-                "The simulator needs the ray caster `embreex`: pip install embreex (wheels exist for Linux "
-                "x86-64, macOS and Windows).",
-            ) from error
+        require("simulator")
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+
         self._mesh = mesh
         self._scene = EmbreeScene(robust=True)
         corners = np.ascontiguousarray(mesh.corners.reshape(-1, 3), dtype=np.float32)

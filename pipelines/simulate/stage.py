@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 
 from pipelines.core.errors import InputError
+from pipelines.core.extras import require
 from pipelines.core.files import replace_folder, sync_tree
 from pipelines.core.machine import chosen_threads
 from pipelines.core.products import Remark, save_json
@@ -93,9 +94,12 @@ def simulate(
     The same options give the same bytes. `overwrite` allows replacing an earlier simulation, and no other folder.
 
     Raises:
+        BackendUnavailableError: `--bag` without rosbags.
         InputError: the folder is in use.
     """
     _check_folder(directory, overwrite=overwrite)
+    if options.bag != "none":
+        require("bags")
     flight = fly_survey(options)
     recording = flight.recording
     with _draft(directory) as draft:

@@ -22,17 +22,15 @@ import secrets
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
+import viser
+from websockets.asyncio import server as websockets_server
 from websockets.exceptions import ConnectionClosedError
 from websockets.frames import CloseCode
 
-from pipelines.core.errors import BackendUnavailableError, GeorefError
-
-if TYPE_CHECKING:
-    import viser
-    from websockets.asyncio.server import ServerConnection
+from pipelines.core.errors import GeorefError
 
 log = logging.getLogger(__name__)
 
@@ -138,8 +136,6 @@ def check_message(raw: object, keeper: Doorkeeper) -> None:
 
 def _takes(element: Any, value: bool | float | str) -> bool:
     """Return whether a person could give an element of the viewer this value."""
-    import viser
-
     match element:
         case viser.GuiButtonHandle():
             return value is True
@@ -157,7 +153,7 @@ def _takes(element: Any, value: bool | float | str) -> bool:
 class CheckedConnection:
     """Connection of a page that viser reads from: refused messages never reach it."""
 
-    def __init__(self, connection: ServerConnection, keeper: Doorkeeper) -> None:
+    def __init__(self, connection: websockets_server.ServerConnection, keeper: Doorkeeper) -> None:
         self._connection, self._keeper = connection, keeper
         self._told: set[str] = set()
 
@@ -193,7 +189,6 @@ def start_server(port: int, title: str, *, dark: bool = False) -> tuple[viser.Vi
     """Start a server on loopback, at a port or, if that is taken, the next free one; return it with its address.
 
     Raises:
-        BackendUnavailableError: viser is not installed.
         GeorefError: no port is free, or the server would answer strangers.
     """
     keeper = Doorkeeper()
@@ -219,13 +214,6 @@ def stop_server(server: viser.ViserServer) -> None:
 
 
 def _start(port: int, title: str, keeper: Doorkeeper) -> viser.ViserServer:
-    try:
-        import viser
-    except ImportError as error:
-        raise BackendUnavailableError(
-            "viser-missing", f"viser cannot be imported ({error}): pip install georefgs"
-        ) from error
-
     class Server(viser.ViserServer):
         """Server that opens no tunnel to the Internet when a page asks for one."""
 
@@ -240,10 +228,7 @@ def _start(port: int, title: str, keeper: Doorkeeper) -> viser.ViserServer:
 @contextlib.contextmanager
 def _checked_connections(keeper: Doorkeeper) -> Iterator[None]:
     """Let servers that start meanwhile answer whom the doorkeeper admits, and hear what a page may send."""
-    import viser
-    from websockets.asyncio import server
-
-    original, protocol = server.serve, f"viser-v{viser.__version__}"
+    original, protocol = websockets_server.serve, f"viser-v{viser.__version__}"
 
     @functools.wraps(original)
     def serve(handler: Any, host: str, port: int, *, process_request: Any, **settings: Any) -> Any:
@@ -261,11 +246,11 @@ def _checked_connections(keeper: Doorkeeper) -> Iterator[None]:
         limited = {**settings, "max_size": MOST_BYTES}
         return original(heard, host, port, process_request=admitted, **limited)
 
-    server.serve = serve  # type: ignore[assignment,misc]
+    websockets_server.serve = serve  # type: ignore[assignment,misc]
     try:
         yield
     finally:
-        server.serve = original  # type: ignore[misc]
+        websockets_server.serve = original  # type: ignore[misc]
 
 
 def _is_from_here(headers: Any, port: int) -> bool:

@@ -13,6 +13,7 @@ import numpy as np
 
 from pipelines.adjust.accuracy_grid import AccuracyGrid
 from pipelines.core.errors import GeorefError
+from pipelines.core.extras import require
 from pipelines.core.manifest import hash_file
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import GAUSSIANS, MODEL, REPORT
@@ -24,7 +25,6 @@ from pipelines.survey.headline import headline_of
 from pipelines.survey.report import EvaluationReport, read_report
 from pipelines.survey.scene import photographs
 from pipelines.survey.trained_survey import load_trained
-from pipelines.view.loopback import start_server, stop_server
 from pipelines.view.mark_panel import MarkPanel
 from pipelines.view.measure_panel import MeasurePanel
 from pipelines.view.measuring import MeasuringModel
@@ -285,9 +285,13 @@ def serve(
         ended: ends the viewer.
 
     Raises:
+        BackendUnavailableError: viser is not installed.
         MissingProductError: there is no trained model; names the command that makes it.
         GeorefError: a product is damaged, no port is free, or the CRS cannot be used.
     """
+    require("viewer")
+    from pipelines.view.loopback import start_server, stop_server
+
     model_stamp(workspace)
     server, address = start_server(options.port, f"georef view {workspace.root.name}", dark=options.dark)
     try:

@@ -13,10 +13,10 @@ from click.shell_completion import BashComplete
 from georef_cli.main import PROGRAM, cli
 from georef_cli.topics import TOPICS, topic_text
 from pipelines.core.errors import BackendUnavailableError
+from pipelines.core.extras import Part
 from pipelines.core.fingerprints import NOT_INSTALLED
 from pipelines.core.machine import available_cores
 from pipelines.jobs import machine
-from pipelines.splat.rasterizer.cuda_parts import CudaPart
 from pipelines.train.options import PRESETS
 from tests.cli.test_help import examples_in, parse
 from tests.cli_runs import REPOSITORY, Georef
@@ -29,7 +29,7 @@ def test_doctor_tells_what_there_is_and_why_not(real_georef: Georef, monkeypatch
         return name
 
     monkeypatch.setattr(machine, "chosen_backend", chosen_backend)
-    parts = CudaPart("NVIDIA driver", None, "install it"), CudaPart("C++ compiler", "g++ 12", "")
+    parts = Part("NVIDIA driver", None, "install it"), Part("C++ compiler", "g++ 12", "")
     monkeypatch.setattr(machine, "running_parts", lambda: parts[:1])
     monkeypatch.setattr(machine, "compiling_parts", lambda: parts[1:])
     monkeypatch.setattr(machine, "kernels_ready", lambda: None)

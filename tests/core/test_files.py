@@ -39,7 +39,7 @@ def test_what_is_no_file_is_refused(tmp_path: Path) -> None:
         (Path("/dev/zero"), "a device"),
         (tmp_path, "a folder"),
         (tmp_path / "gone", "No such file or directory"),
-        (Path("a\0b"), "embedded null byte"),
+        (Path("a\0b"), "embedded null (byte|character)"),
     ):
         with pytest.raises(InputError, match=f"cannot be read: .*{kind}"):
             file_size(path)

@@ -15,11 +15,12 @@ import subprocess
 import sys
 import sysconfig
 from collections.abc import Iterator
-from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
 import torch
+
+from pipelines.core.extras import Part, installing
 
 _WINDOWS = sys.platform == "win32"
 _DRIVER = "nvcuda.dll" if _WINDOWS else "libcuda.so.1"
@@ -33,19 +34,10 @@ _HEADERS = {
     "cusolverDn.h": "nvidia-cusolver",
     "cusparse.h": "nvidia-cusparse",
 }
-_EXTRA = "pip install 'georefgs[cuda]'"
+_EXTRA = installing("cuda")
 
 
-@dataclass(frozen=True)
-class CudaPart:
-    """Part of what the cuda backend needs: version and place, or None if it is missing, and then how to get it."""
-
-    name: str
-    found: str | None
-    remedy: str
-
-
-def running_parts() -> tuple[CudaPart, ...]:
+def running_parts() -> tuple[Part, ...]:
     """Return the parts that every use of the backend needs, in the order in which to install them.
 
     Without a CUDA build of torch or a driver, nothing is said of devices: there cannot be any.
@@ -55,21 +47,21 @@ def running_parts() -> tuple[CudaPart, ...]:
     return (*base, *device, gsplat())
 
 
-def compiling_parts() -> tuple[CudaPart, ...]:
+def compiling_parts() -> tuple[Part, ...]:
     """Return the parts that compile gsplat's kernels, in the order in which to install them."""
     compiler = _nvcc()
     headers = () if compiler.found is None else (_headers(),)
     return (compiler, *headers, _host_compiler(), _ninja(), _python_headers())
 
 
-def gsplat() -> CudaPart:
+def gsplat() -> Part:
     try:
-        return CudaPart("gsplat", f"gsplat {metadata.version('gsplat')}", "")
+        return Part("gsplat", f"gsplat {metadata.version('gsplat')}", "")
     except metadata.PackageNotFoundError:
-        return CudaPart("gsplat", None, f"{_EXTRA} (in a checkout: pip install '.[cuda]')")
+        return Part("gsplat", None, _EXTRA)
 
 
-def lacking(parts: tuple[CudaPart, ...]) -> str | None:
+def lacking(parts: tuple[Part, ...]) -> str | None:
     """Return what is missing of the parts, each with its remedy, as one text; None: nothing."""
     missing = [f"no {part.name}: {part.remedy}" for part in parts if part.found is None]
     return "; ".join(missing) or None
@@ -106,15 +98,15 @@ def _homes() -> Iterator[Path]:
     yield Path("/usr/local/cuda")
 
 
-def _torch_build() -> CudaPart:
+def _torch_build() -> Part:
     name = "CUDA build of torch"
     if torch.version.cuda is None:
         remedy = f"torch {torch.__version__} is built for the CPU: install its build for CUDA (pytorch.org)"
-        return CudaPart(name, None, remedy)
-    return CudaPart(name, f"torch {torch.__version__} for CUDA {torch.version.cuda}", "")
+        return Part(name, None, remedy)
+    return Part(name, f"torch {torch.__version__} for CUDA {torch.version.cuda}", "")
 
 
-def _driver() -> CudaPart:
+def _driver() -> Part:
     name, version = "NVIDIA driver", ctypes.c_int(0)
     try:
         ctypes.CDLL(_DRIVER).cuDriverGetVersion(ctypes.byref(version))
@@ -122,40 +114,40 @@ def _driver() -> CudaPart:
         remedy = (
             f"{_DRIVER} was not found. Install NVIDIA's driver; give a container the GPU (docker run --gpus all)"
         )
-        return CudaPart(name, None, remedy)
+        return Part(name, None, remedy)
     major, minor = version.value // 1000, version.value % 1000 // 10
     needed = int((torch.version.cuda or "0").partition(".")[0])
     if major < needed:
         remedy = f"it knows CUDA {major}.{minor}, torch is built for {torch.version.cuda}. Update the driver"
-        return CudaPart(f"{name} for CUDA {needed}", None, remedy)
-    return CudaPart(name, f"for CUDA {major}.{minor}", "")
+        return Part(f"{name} for CUDA {needed}", None, remedy)
+    return Part(name, f"for CUDA {major}.{minor}", "")
 
 
-def _device() -> CudaPart:
+def _device() -> Part:
     # is_available is False as well if the driver does not start: then names cannot be asked for.
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if count == 0:
         hidden = os.environ.get("CUDA_VISIBLE_DEVICES")
         remedy = "torch sees none" if hidden is None else f"torch sees none (CUDA_VISIBLE_DEVICES={hidden!r})"
-        return CudaPart("CUDA device", None, f"{remedy}. nvidia-smi lists those that the driver sees")
-    return CudaPart("CUDA device", ", ".join(torch.cuda.get_device_name(index) for index in range(count)), "")
+        return Part("CUDA device", None, f"{remedy}. nvidia-smi lists those that the driver sees")
+    return Part("CUDA device", ", ".join(torch.cuda.get_device_name(index) for index in range(count)), "")
 
 
-def _nvcc() -> CudaPart:
+def _nvcc() -> Part:
     name, home = "CUDA compiler (nvcc)", toolkit_home()
     if home is None:
-        return CudaPart(name, None, f"{_EXTRA}, or name a CUDA toolkit in the variable CUDA_HOME")
+        return Part(name, None, f"{_EXTRA}, or name a CUDA toolkit in the variable CUDA_HOME")
     version = _version_of(home / "bin" / _NVCC, r"release (\d+\.\d+)")
     if version is None:
-        return CudaPart(name, None, f"{home / 'bin' / _NVCC} does not run: {_EXTRA}")
+        return Part(name, None, f"{home / 'bin' / _NVCC} does not run: {_EXTRA}")
     needed = torch.version.cuda or version
     if version.partition(".")[0] != needed.partition(".")[0]:
         remedy = f"{home} is CUDA {version}, torch is built for {needed}: {_EXTRA}"
-        return CudaPart(f"CUDA compiler (nvcc) of CUDA {needed}", None, remedy)
-    return CudaPart(name, f"nvcc {version} in {home}", "")
+        return Part(f"CUDA compiler (nvcc) of CUDA {needed}", None, remedy)
+    return Part(name, f"nvcc {version} in {home}", "")
 
 
-def _headers() -> CudaPart:
+def _headers() -> Part:
     home = toolkit_home()
     assert home is not None  # the compiler was found
     places = (home / "include", home / "include" / "cccl")
@@ -163,37 +155,37 @@ def _headers() -> CudaPart:
         wheel for header, wheel in _HEADERS.items() if not any((place / header).is_file() for place in places)
     ]
     if absent:
-        return CudaPart("CUDA headers", None, f"{home} is without those of {', '.join(absent)}: {_EXTRA}")
-    return CudaPart("CUDA headers", str(home / "include"), "")
+        return Part("CUDA headers", None, f"{home} is without those of {', '.join(absent)}: {_EXTRA}")
+    return Part("CUDA headers", str(home / "include"), "")
 
 
-def _host_compiler() -> CudaPart:
+def _host_compiler() -> Part:
     name = "C++ compiler"
     if _WINDOWS:
         path = shutil.which("cl")
         remedy = "install Visual Studio's Build Tools, and run georef in their command prompt"
-        return CudaPart(name, path, "" if path else remedy)
+        return Part(name, path, "" if path else remedy)
     # torch compiles with CXX, nvcc with g++.
     programs = [os.environ.get("CXX", "c++"), "g++"]
     paths = [shutil.which(program) for program in programs]
     absent = [program for program, path in zip(programs, paths, strict=True) if path is None]
     if absent or paths[1] is None:
         remedy = "install g++ (apt-get install g++, or dnf install gcc-c++)"
-        return CudaPart(name, None, f"{' and '.join(dict.fromkeys(absent))} missing. {remedy.capitalize()}")
+        return Part(name, None, f"{' and '.join(dict.fromkeys(absent))} missing. {remedy.capitalize()}")
     version = _version_of(Path(paths[1]), r"(\d+\.\d+\.\d+)")
-    return CudaPart(name, f"g++ {version or ''} in {paths[1]}", "")
+    return Part(name, f"g++ {version or ''} in {paths[1]}", "")
 
 
-def _ninja() -> CudaPart:
+def _ninja() -> Part:
     path = shutil.which("ninja", path=os.pathsep.join([*map(str, tool_folders()), os.environ.get("PATH", "")]))
-    return CudaPart("ninja", path, "" if path else "pip install ninja")
+    return Part("ninja", path, "" if path else "pip install ninja")
 
 
-def _python_headers() -> CudaPart:
+def _python_headers() -> Part:
     header = Path(sysconfig.get_paths()["include"]) / "Python.h"
     remedy = f"{header} was not found. Install Python's headers (apt-get install python3-dev)"
     found = str(header) if header.is_file() else None
-    return CudaPart("header of Python", found, "" if found else remedy)
+    return Part("header of Python", found, "" if found else remedy)
 
 
 def _version_of(program: Path, pattern: str) -> str | None:

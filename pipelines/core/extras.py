@@ -1,0 +1,56 @@
+"""Extras: optional libraries, what needs them, whether they are installed, and the command that installs them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import metadata
+from importlib.util import find_spec
+from typing import Literal
+
+from pipelines.core.errors import BackendUnavailableError
+
+Extra = Literal["bags", "cluster", "contours", "reference", "simulator", "viewer"]
+# What needs each extra, and the libraries that it installs.
+EXTRAS: dict[Extra, tuple[str, tuple[str, ...]]] = {
+    "bags": ("a ROS bag (--bag, georef inspect)", ("rosbags",)),
+    "cluster": ("a cluster (--cluster, georef cluster)", ("distributed", "cryptography")),
+    "contours": ("georef export-raster --contours", ("ezdxf", "pyogrio")),
+    "reference": ("M3C2 (georef evaluate --reference)", ("py4dgeo",)),
+    "simulator": ("georef simulate", ("embreex",)),
+    "viewer": ("georef view", ("viser", "websockets", "msgspec")),
+}
+
+
+@dataclass(frozen=True)
+class Part:
+    """Part of an installation: its version or place, or None if it is missing, and then how to get it."""
+
+    name: str
+    found: str | None
+    remedy: str
+
+
+def installing(extra: str) -> str:
+    """Return the command that installs an extra."""
+    return f"pip install 'georefgs[{extra}]' (in a checkout: pip install '.[{extra}]')"
+
+
+def extra_parts() -> tuple[Part, ...]:
+    """Return the extras with the versions of their libraries."""
+    return tuple(_part(extra) for extra in EXTRAS)
+
+
+def require(extra: Extra) -> None:
+    """Raise a BackendUnavailableError unless the libraries of an extra are installed."""
+    part = _part(extra)
+    if part.found is None:
+        raise BackendUnavailableError("extra-missing", part.remedy)
+
+
+def _part(extra: Extra) -> Part:
+    user, libraries = EXTRAS[extra]
+    missing = [name for name in libraries if find_spec(name) is None]
+    if missing:
+        remedy = f"{user} needs {', '.join(missing)}, which the extra {extra} installs: {installing(extra)}"
+        return Part(extra, None, remedy)
+    return Part(extra, ", ".join(f"{name} {metadata.version(name)}" for name in libraries), "")
