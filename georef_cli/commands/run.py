@@ -16,6 +16,7 @@ from georef_cli.forecast import RunTimeLeft, announced_seconds, print_dry_run
 from georef_cli.options import SET, settings
 from georef_cli.output import print_outcomes
 from pipelines.core import runner
+from pipelines.core.child import start_in_child
 from pipelines.core.errors import GeorefError
 from pipelines.core.options import names_of_flags, remembered
 from pipelines.core.progress import SILENT, ProgressTask
@@ -97,6 +98,8 @@ def _run(ctx: click.Context, **values: Any) -> None:
 @contextlib.contextmanager
 def _counted(workspace: Workspace, spec: StageSpec, done: ProgressTask, left: RunTimeLeft) -> Iterator[None]:
     """Log a stage to its file, say what time the run has left, and count the stage when it has ended."""
+    if spec.name == "sfm":  # which leaves time, and comes before the first use of the kernels
+        start_in_child("pipelines.surface.compilation:compile_in_child")
     with boundary.logged_to_file(workspace, spec):
         if left.seconds:
             log.info("run: about %s left", about(left.seconds))

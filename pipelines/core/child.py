@@ -192,6 +192,19 @@ def run_in_child(
                     pipe.close()
 
 
+def start_in_child(task: str) -> None:
+    """Start a function in a child process that nobody waits for. It ends with this process; its errors are dropped.
+
+    The function is as for `run_in_child`, without arguments.
+    """
+
+    def run() -> None:
+        with contextlib.suppress(GeorefError, RuntimeError, OSError):
+            run_in_child(task, {}, "")
+
+    threading.Thread(target=run, daemon=True).start()
+
+
 def _follow(process: subprocess.Popen[str], arguments: Mapping[str, Any], progress: Progress) -> Any:
     """Hand over the arguments, and follow the child's messages to its result; an EOFError: it ended without one."""
     assert process.stdin is not None

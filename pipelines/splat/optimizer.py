@@ -19,15 +19,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
 
 from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.kernel_cache import kernel
 
 # ruff: noqa: PLR0917  (kernels take arrays, not objects)
 
 
-@njit(parallel=True, fastmath={"contract", "nsz"}, cache=True)
+@kernel(parallel=True, fastmath={"contract", "nsz"})
 def adam_rows(
     rows: Any,
     parameters: Any,

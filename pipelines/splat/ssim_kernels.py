@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 from numba import njit, prange
 
+from pipelines.splat.kernel_cache import kernel
+
 RADIUS = 5
 WINDOW = 2 * RADIUS + 1
 SIGMA_PX = 1.5
@@ -137,7 +139,7 @@ def _clear_invalid(valid: Any, row: int, ssim: Any, partials: Any) -> None:
                     partials[q, row, j] = 0
 
 
-@njit(parallel=True, fastmath=_FAST, cache=True)
+@kernel(parallel=True, fastmath=_FAST)
 def ssim_forward(
     rendered: Any, target: Any, valid: Any, taps: Any, c1: Any, c2: Any, bands: int, partials: Any, sums: Any
 ) -> None:
@@ -195,7 +197,7 @@ def _gradient_row(x: Any, y: Any, blurred: Any, l1_weight: Any, ssim_weight: Any
         out[j] = sign - ssim_weight * (by_mu[j] + (x[j] + x[j]) * by_xx[j] + y[j] * by_xy[j])
 
 
-@njit(parallel=True, fastmath=_FAST, cache=True)
+@kernel(parallel=True, fastmath=_FAST)
 def ssim_backward(
     rendered: Any,
     target: Any,

@@ -13,10 +13,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numba import njit
 
 from pipelines.core.types import Float32Array
 from pipelines.geometry.cameras import ViewPose
+from pipelines.splat.kernel_cache import kernel
 from pipelines.surface.matching import UNSEEN, Matcher, MatchSettings, StereoView, WinnerTakesAll, camera_matrix
 from pipelines.surface.sweep import NormalMap, SweepResult, sweep_result
 
@@ -26,7 +26,7 @@ from pipelines.surface.sweep import NormalMap, SweepResult, sweep_result
 _GRAZING = 0.1  # of the depth: a ray that grazes the planes moves further between them
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel(nogil=True, error_model="numpy")
 def compare_depths(
     depth: Any,
     ray_from_pixel: Any,

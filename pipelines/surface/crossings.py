@@ -16,11 +16,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.geometry.cameras import Pinhole
+from pipelines.splat.kernel_cache import kernel
 
 # ruff: noqa: PLR0917  (kernels take arrays, not objects)
 
@@ -63,7 +63,7 @@ def seen_surfels(surfels: Surfels, cam_from_world: FloatArray, center: FloatArra
     return SeenSurfels(rows, row, column, in_cam[rows, 2])
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel(nogil=True, error_model="numpy")
 def _draw(
     points: Any,
     normals: Any,
@@ -132,7 +132,7 @@ def count_beams(
     return count
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel(nogil=True, error_model="numpy")
 def _cross(end: Any, start: Any, low: Any, cell_m: float, count: Any) -> None:
     for p in range(len(end)):
         dx, dy, dz = start[p, 0] - end[p, 0], start[p, 1] - end[p, 1], start[p, 2] - end[p, 2]

@@ -23,6 +23,7 @@ from numba import njit
 
 from pipelines.core.types import BoolArray, Float32Array, FloatArray
 from pipelines.geometry.cameras import Pinhole, ViewPose
+from pipelines.splat.kernel_cache import kernel
 
 # ruff: noqa: PLR0917  (kernels take arrays, not objects)
 _FAST = {"contract", "nsz", "arcp", "reassoc", "nnan", "ninf"}
@@ -145,7 +146,7 @@ def _keep_largest(score: Any, largest: Any) -> None:
             score[i] = min(kept, new)
 
 
-@njit(nogil=True, cache=True, fastmath=_FAST, error_model="numpy")
+@kernel(nogil=True, fastmath=_FAST, error_model="numpy")
 def match_rows(
     depth: Any,
     rows: Any,
@@ -196,7 +197,7 @@ def match_rows(
                 _keep_largest(score, out[done])
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel(nogil=True, error_model="numpy")
 def keep_winner(number: int, score: Any, last: Any, best: Any, before: Any, after: Any, hypothesis: Any) -> None:
     """Compare the scores of hypothesis `number` with the best so far, pixel by pixel.
 

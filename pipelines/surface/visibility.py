@@ -24,6 +24,7 @@ from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, Float32Array, FloatArray, IntArray
 from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.footprints import rows_by_square
+from pipelines.splat.kernel_cache import kernel
 
 # ruff: noqa: PLR0917  (kernels take arrays, not objects)
 
@@ -178,7 +179,7 @@ def _in_cam(point: Any, rotation: Any, center: Any) -> tuple[float, float, float
     return x, y, z
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel(nogil=True, error_model="numpy")
 def _sees(middle: Any, radius: float, rotation: Any, center: Any, intrinsics: Any, size: Any) -> bool:
     """Return whether a sphere may touch the frustum of a camera."""
     x, y, z = _in_cam(middle, rotation, center)
@@ -273,7 +274,7 @@ def _sum_block(rows: Any, points: Any, normals: Any, views: Any, up: Any, tolera
             _add_view(points[row], normals[row], views, view, up, tolerance, sums[row])
 
 
-@njit(parallel=True, nogil=True, cache=True, error_model="numpy")
+@kernel(parallel=True, nogil=True, error_model="numpy")
 def _sum_support(points: Any, normals: Any, order: Any, views: Any, up: Any, tolerance: float, sums: Any) -> None:
     """Fill the sums (N, _SUMS) of all points, block by block; `order` puts the points of a block together."""
     for block in prange((len(order) + _BLOCK - 1) // _BLOCK):

@@ -21,11 +21,14 @@ import numpy as np
 from pipelines.adjust.posterior import Posterior, save_posterior
 from pipelines.adjust.system import minimise
 from pipelines.core.products import Remark, load_json, save_json
+from pipelines.core.progress import Progress
 from pipelines.core.stages import LIDAR, LIDAR_MAP, MODEL, POINTS, SIM3_POSTERIOR, TRAIN_POSTERIOR
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.splat.gaussians import write_gaussians
 from pipelines.splat.memory import free_memory_bytes, require_memory
+from pipelines.splat.rasterizer.api import Rasterizer
 from pipelines.splat.rasterizer.backends import device_of, rasterizer
+from pipelines.surface.compilation import compile_kernels
 from pipelines.surface.depth_maps import DepthMaps
 from pipelines.surface.lidar_cloud import ScannerTrack
 from pipelines.surface.measured_cloud import CloudReader
@@ -67,7 +70,7 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
         GeorefError: a product or a photograph cannot be read, or the scene has too few points.
     """
     # First, so that `--backend cuda` without a GPU fails at once.
-    backend = rasterizer(options.backend, stage.progress)
+    backend = _backend(options, stage.progress)
     workspace = stage.workspace
     stated = CloudCrs(options.lidar_crs, options.lidar_vertical)
     clouds = None if options.lidar is None else CloudReader(options.lidar, stated)
@@ -120,6 +123,13 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     write_gaussians(stage.out / "gaussians.ply", trainer.optimizer.gaussians.detached())
     metrics = [json.loads(row) for row in (stage.out / METRICS).read_text(encoding="utf-8").splitlines()]
     return _summary(model, metrics, record, None if lidar is None else lidar.report)
+
+
+def _backend(options: TrainOptions, progress: Progress) -> Rasterizer:
+    backend = rasterizer(options.backend, progress)
+    if backend.name == "cpu":
+        compile_kernels(progress)
+    return backend
 
 
 def _write_solution(

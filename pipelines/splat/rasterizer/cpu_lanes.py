@@ -10,7 +10,7 @@ Compilation of the kernels.
 2. Each worker runs one serial function (`worker_jit`), because the parallel compiler is slow on long bodies.
 3. The serial function is made of small functions (`jit`). These are always inlined: the reference counts of arrays
    passed between threads would cost more than the work.
-4. Numba's cache keeps only the functions that Python calls. They contain the others.
+4. The cache (`kernel_cache`) keeps only the functions that Python calls. They contain the others.
 
 Of all flags that allow the compiler to reorder or assume, only fused multiply-add is set: results are reproducible.
 """
@@ -26,6 +26,8 @@ from llvmlite import ir
 from numba import njit, types
 from numba.core import cgutils
 from numba.extending import models, overload, register_model
+
+from pipelines.splat.kernel_cache import kernel
 
 LANES = 16
 
@@ -209,5 +211,5 @@ _OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}}
 
 jit: Any = njit(forceinline=True, **_OPTIONS)
 worker_jit: Any = njit(**_OPTIONS)
-kernel_jit: Any = njit(cache=True, **_OPTIONS)
-parallel_jit: Any = njit(cache=True, parallel=True, **_OPTIONS)
+kernel_jit: Any = kernel(**_OPTIONS)
+parallel_jit: Any = kernel(parallel=True, **_OPTIONS)

@@ -1,0 +1,88 @@
+"""Compilation of the kernels of a training before their first use, on data of a few pixels.
+
+A machine compiles them once. `georef run` does so in a child process while COLMAP reconstructs, so that the
+training finds them in the user's cache.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from typing import Any
+
+import numpy as np
+import torch
+
+from pipelines.core.errors import InputError, WorkspaceBusyError
+from pipelines.core.lock import WriteLock
+from pipelines.core.progress import SILENT, Progress
+from pipelines.geometry.cameras import Pinhole, ViewPose
+from pipelines.splat.initialise import InitialisationOptions, gaussians_from_points
+from pipelines.splat.kernel_cache import cache_folder
+from pipelines.splat.losses import photometric_loss
+from pipelines.splat.optimizer import GaussianAdam
+from pipelines.splat.rasterizer.api import RasterSettings
+from pipelines.splat.rasterizer.cpu import CpuRasterizer
+from pipelines.surface.agreement import AgreementSettings, agreed_depth
+from pipelines.surface.matching import MatchSettings, StereoView
+from pipelines.surface.sweep import SweepPlanes, plane_sweep
+
+_PATIENCE_S = 600.0
+_WIDTH, _HEIGHT = 48, 32
+_DOWN = np.diag([1.0, -1.0, -1.0])
+
+
+def compile_in_child(_arguments: Mapping[str, Any], progress: Progress) -> None:
+    """Compile as `compile_kernels`, behind all other work of the machine: task of `core.child`."""
+    if hasattr(os, "nice"):
+        os.nice(10)
+    compile_kernels(progress)
+
+
+def compile_kernels(progress: Progress = SILENT) -> None:
+    """Compile the kernels of stereo and training that the user's cache lacks, and load the others.
+
+    One process compiles at a time: the others wait, and load what it has compiled.
+    """
+    steps = {"stereo": _match, "rendering": _render}
+    with progress.task("kernels, compiled once", len(steps)) as task, _only_one():
+        for name, step in steps.items():
+            step()
+            task.advance(note=name)
+
+
+@contextmanager
+def _only_one() -> Iterator[None]:
+    with ExitStack() as stack:
+        with suppress(InputError, WorkspaceBusyError):  # Without a cache each process compiles for itself.
+            stack.enter_context(WriteLock(cache_folder()).hold("the compilation of kernels", _PATIENCE_S))
+        yield
+
+
+def _render() -> None:
+    """Take one step of a training: render, compare, and move three Gaussians."""
+    points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.1]])
+    start = gaussians_from_points(points, np.full((3, 3), 128), InitialisationOptions(sh_degree=3))
+    optimizer = GaussianAdam(start, extent_m=1.0, iterations=2)
+    pose = torch.eye(4)
+    pose[2, 3] = 4.0
+    view = CpuRasterizer().render(
+        optimizer.gaussians, pose, Pinhole(_WIDTH, _HEIGHT, 40.0, 40.0, 24.0, 16.0), RasterSettings(depth=True)
+    )
+    assert view.expected_depth is not None
+    loss = photometric_loss(
+        view.colour, torch.zeros_like(view.colour), torch.ones(_HEIGHT, _WIDTH, dtype=torch.bool)
+    )
+    (loss + view.expected_depth.sum()).backward()
+    optimizer.step(1, view.stats.visible)
+
+
+def _match() -> None:
+    """Sweep planes through two views of a textured ground, and compare their depths."""
+    grey = np.random.default_rng(0).uniform(1, 255, (_HEIGHT, _WIDTH)).astype(np.float32)
+    pinhole = Pinhole(_WIDTH, _HEIGHT, 40.0, 40.0, 24.0, 16.0)
+    views = [StereoView(ViewPose(pinhole, _DOWN, np.array([east, 0.0, 10.0])), grey) for east in (0.0, 1.0)]
+    planes = [SweepPlanes(np.array([0.0, 0.0, 1.0]), np.linspace(-1, 1, 4))]
+    sweeps = [plane_sweep(one, [other], planes, MatchSettings()) for one, other in (views, views[::-1])]
+    agreed_depth(sweeps[0], sweeps[1:], AgreementSettings())
