@@ -134,7 +134,7 @@ def _warnings(
     prior: RotationPrior | None,
 ) -> list[Remark]:
     """Return warnings of unused measurements, and of a `prior` turned against an alignment made without it."""
-    warnings, turned, total = [], recorded.contradicting, len(model.image_name)
+    warnings, turned, total = [], recorded.inconsistent, len(model.image_name)
     if turned:
         sentence = (
             f"{len(turned)} attitudes contradict the SfM model and are not used: {listed(sorted(turned))}. "

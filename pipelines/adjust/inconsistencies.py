@@ -42,7 +42,7 @@ from pipelines.robust.statistics import outlier_gate, typical_sigma
 from pipelines.survey.report_parts import VarianceFactor
 from pipelines.survey.survey import Survey
 
-_SIGMA_REFUTED = "sigma-refuted"
+_SIGMA_REJECTED = "sigma-rejected"
 # A stated σ that is too small by this factor is an inconsistency, if the scatter is so many metres or is explained.
 _WRONG_SIGMA, _WRONG_SCATTER_M = 10.0, 0.3
 # A variance factor up to this, of σ that are larger by one half, is applied without a caution.
@@ -115,7 +115,7 @@ def unadjustable(survey: Survey, model: SparseModel, geo_from_local: Similarity 
         return ()
     cause = "are they those of these photographs?" if best is None else best.sentence
     sentence = f"the fixes scatter by {scatter:.2f} m an axis about the SfM model, and fix no similarity: {cause}"
-    return (Remark(code=_SIGMA_REFUTED if best is None else best.code, sentence=sentence),)
+    return (Remark(code=_SIGMA_REJECTED if best is None else best.code, sentence=sentence),)
 
 
 def marks_that_do_not_meet(unused: Sequence[UnusedControlPoint], mistake: str | None) -> tuple[Remark, ...]:
@@ -181,7 +181,7 @@ def _fixes_against_model(fixes: StatedFixes, joint: JointAdjustment) -> Iterator
             "no offset, time, axis or group of them explains that: it is noise, and σ is optimistic, or the SfM "
             "model is bent; every σ of the result is widened"
         )
-    yield _Finding(_SIGMA_REFUTED, f"{sides}: {remedy}", ends=is_wrong and scatter_m > _WRONG_SCATTER_M)
+    yield _Finding(_SIGMA_REJECTED, f"{sides}: {remedy}", ends=is_wrong and scatter_m > _WRONG_SCATTER_M)
 
 
 def _shift_of_fixes(joint: JointAdjustment) -> Iterator[_Finding]:
@@ -230,7 +230,7 @@ def _control_points(joint: JointAdjustment) -> Iterator[_Finding]:
             f"{weighted_m / factor.applied**0.5:.3g} m, {who}: coordinates, marks or the SfM model are wrong; "
             "every σ of the result is widened"
         )
-        yield _Finding(_SIGMA_REFUTED, sentence, ends=_is_wrong(factor) and scatter_m > _WRONG_SCATTER_M)
+        yield _Finding(_SIGMA_REJECTED, sentence, ends=_is_wrong(factor) and scatter_m > _WRONG_SCATTER_M)
     elif not used.all():
         missed_m = np.linalg.norm(residual, axis=1)
         rejected = [f"{names[row]} ({missed_m[row]:.2f} m)" for row in np.flatnonzero(~used)]
@@ -280,7 +280,7 @@ def _attitudes(survey: Survey, fixes: StatedFixes, joint: JointAdjustment) -> It
         f"the recorded attitudes are turned by {np.degrees(angle):.1f}° against this solution "
         f"(σ {np.degrees(sigma):.1f}°): {cause}"
     )
-    yield _Finding("attitudes-contradict", sentence)
+    yield _Finding("attitudes-inconsistent", sentence)
 
 
 def _weak_checks(joint: JointAdjustment) -> Iterator[_Finding]:

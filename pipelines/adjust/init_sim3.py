@@ -41,7 +41,7 @@ from pipelines.adjust.posterior import Posterior, save_posterior
 from pipelines.adjust.solution import adjusted
 from pipelines.adjust.system import minimise
 from pipelines.adjust.terms import ControlPoints, Fixes
-from pipelines.core.errors import ContradictionError, ConvergenceError, DegenerateGeometryError, InputError
+from pipelines.core.errors import ConvergenceError, DegenerateGeometryError, InconsistencyError, InputError
 from pipelines.core.products import NOT_CHECKED, Remark, save_json, union
 from pipelines.core.sentences import listed
 from pipelines.core.stages import ADJUSTMENT, POINTS, SIM3, SIM3_POSTERIOR, SPARSE
@@ -87,7 +87,7 @@ def estimate_similarity(
 
     Raises:
         DegenerateGeometryError: the measurements leave the similarity open; names further measurements.
-        ContradictionError: sources contradict each other, and the options do not accept that.
+        InconsistencyError: sources contradict each other, and the options do not accept that.
         ConvergenceError: the residual is larger than `options.max_residual`.
         InputError: `points` belongs to another model.
     """
@@ -223,11 +223,11 @@ def solved(
 
 
 def _refuse(contradictions: tuple[Remark, ...], options: InitSim3Options) -> None:
-    if contradictions and not options.accept_contradiction:
-        raise ContradictionError(
+    if contradictions and not options.accept_inconsistency:
+        raise InconsistencyError(
             "todo-x",
             "; ".join(caution.sentence for caution in contradictions)
-            + ". Correct what is wrong, or go on with --accept-contradiction, which widens every σ",
+            + ". Correct what is wrong, or go on with --accept-inconsistency, which widens every σ",
         )
 
 

@@ -29,8 +29,8 @@ from pipelines.survey.marks import MarkRays, RayErrors, intersect_marks, mark_an
 from pipelines.survey.scene import Scene
 from pipelines.survey.survey import Survey
 
-_CONTRADICTION_SIGMAS = 6.0
-_CONTRADICTION_RAD = np.radians(15.0)  # lower limit, because the σ of attitudes are often optimistic
+_INCONSISTENT_SIGMAS = 6.0
+_INCONSISTENT_RAD = np.radians(15.0)  # lower limit, because the σ of attitudes are often optimistic
 _WIDE_RAD = 1.0
 _TINY = 1e-9  # σ of exact values, where a covariance must be regular
 _LEAST_SIGMA_COMMON_M = 1e-4  # of an axis without a common error, where another axis has one
@@ -192,7 +192,7 @@ def recorded_rotations(survey: Survey, model: SparseModel) -> RecordedRotations:
         geo_from_local = rotation @ model.rotation_cam_from_local[image]
         mean = mean_rotation(geo_from_local, sigma_rad).rotation
         turn = np.linalg.norm(log_so3(geo_from_local @ mean.T), axis=1)
-        agrees = turn < np.maximum(_CONTRADICTION_SIGMAS * sigma_rad, _CONTRADICTION_RAD)
+        agrees = turn < np.maximum(_INCONSISTENT_SIGMAS * sigma_rad, _INCONSISTENT_RAD)
     return RecordedRotations(
         image=image[agrees],
         geo_from_cam=rotation[agrees],

@@ -66,6 +66,6 @@ class InitSim3Options(StageOptions):
         "with a comma; or none.",
     )
     seed: int = Field(0, ge=0, description="Seed of the RANSAC.")
-    accept_contradiction: bool = Field(
+    accept_inconsistency: bool = Field(
         False, description="Go on where sources contradict each other, with a caution and larger σ."
     )

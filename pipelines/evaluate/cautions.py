@@ -86,7 +86,7 @@ def chi2_caution(
         left_out = tuple(name for name in names if name in blunders)
         alone = f"; without the blunders ({listed(left_out)}) the errors agree with the prediction"
     return Remark(
-        code="prediction-refuted",
+        code="prediction-rejected",
         sentence=f"Check points refute the predicted accuracy: {figures}; the σ of prediction, marks and check "
         f"points together are too small by a factor of {ratio**0.5:.1f}{alone}.",
     )

@@ -98,7 +98,7 @@ def _test_views(test: PhotometricFigures | None) -> str:
 
 def _warnings(report: EvaluationReport) -> tuple[Remark, ...]:
     warnings = []
-    asprs = report.checkpoints.camera.asprs
+    asprs = report.checkpoints.triangulated.asprs
     if asprs.points and not asprs.enough_points:
         warnings.append(Remark(code="few-check-points", sentence=few_points(asprs)))
     for way, errors in report.checkpoints.by_way.items():
@@ -127,7 +127,7 @@ def draw_accuracy(
     points = MapPoints(
         cameras=solved.geo_from_model.apply(solved.poses.cam_center_in_model)[:, :2],
         control=_named(survey.control_points, report.fit.gcp.points),
-        check=_named(survey.check_points, report.checkpoints.camera.points),
+        check=_named(survey.check_points, report.checkpoints.triangulated.points),
     )
     write_accuracy_map(path, raster, points, _coordinates(survey.origin, crs))
 
@@ -209,12 +209,12 @@ def evaluate(
     """
     model = solved.model
     log_scale, *_, east, north, up = np.sqrt(np.diag(model.geo_from_model.covariance)).tolist()
-    camera = triangulated_check_points(solved, posterior)
-    checkpoints = CheckPoints(camera=camera, model=None if rendered is None else rendered.points)
+    triangulated = triangulated_check_points(solved, posterior)
+    checkpoints = CheckPoints(triangulated=triangulated, surface=None if rendered is None else rendered.points)
     scene = model.accuracy or AccuracySummary(cells=0, reason="the adjustment states no σ")
     reference = None if rendered is None else rendered.reference
     return EvaluationReport(
-        headline=headline(camera, scene, model.cautions),
+        headline=headline(triangulated, scene, model.cautions),
         photometric=None if rendered is None else rendered.photometric,
         checkpoints=checkpoints,
         cross_validation=cross_validate(solved) if options.cross_validate else None,
@@ -227,7 +227,7 @@ def evaluate(
         variance_factors=model.variance_factors,
         cautions=union(
             model.cautions,
-            cautions_of_prediction(solved, posterior, camera, of_initial=options.similarity == "initial"),
+            cautions_of_prediction(solved, posterior, triangulated, of_initial=options.similarity == "initial"),
             dependent_check_points(solved.survey),
             () if reference is None else cautions_of_reference(reference),
         ),

@@ -211,17 +211,18 @@ class CheckPointErrors(StatedErrors):
 
 
 class CheckPoints(Product):
-    """Check points, triangulated (`camera`) and on the rendered surface behind their marks (`model`).
+    """Check points, `triangulated`, and on the rendered `surface` behind their marks.
 
-    Without training, `model` is None.
+    Without training, `surface` is None.
     """
 
-    camera: CheckPointErrors
-    model: CheckPointErrors | None
+    triangulated: CheckPointErrors
+    surface: CheckPointErrors | None
 
     @property
-    def by_way(self) -> dict[Literal["camera", "model"], CheckPointErrors]:
-        return {"camera": self.camera} if self.model is None else {"camera": self.camera, "model": self.model}
+    def by_way(self) -> dict[Literal["triangulated", "surface"], CheckPointErrors]:
+        both = {"triangulated": self.triangulated, "surface": self.surface}
+        return {way: errors for way, errors in both.items() if errors is not None}
 
 
 class CrossValidation(StatedErrors):
@@ -285,8 +286,8 @@ class PointCoordinates(Product):
 
     name: str
     surveyed: Vector3
-    camera: Vector3 | None
-    model: Vector3 | None
+    triangulated: Vector3 | None
+    surface: Vector3 | None
 
 
 class Coordinates(Product):

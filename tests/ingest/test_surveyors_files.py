@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pyproj import Transformer
 
-from pipelines.core.errors import ContradictionError, InputError
+from pipelines.core.errors import InconsistencyError, InputError
 from pipelines.geodesy.enu import ecef_from_enu, ecef_from_lla, enu_from_ecef
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.stage import survey_and_track
@@ -296,7 +296,7 @@ class TestDji:
         path.write_text(
             "".join(f"{COUNT + 1 - int(line[0])}{line[1:]}\n" for line in path.read_text().splitlines())
         )
-        with pytest.raises(ContradictionError, match="4 of 6 photographs do not have the times of their events"):
+        with pytest.raises(InconsistencyError, match="4 of 6 photographs do not have the times of their events"):
             survey_of(dji, trajectory=path)
 
     def test_numbers_of_two_flights_are_refused(self, dji: Path) -> None:

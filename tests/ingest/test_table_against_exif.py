@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
-from pipelines.core.errors import ContradictionError
+from pipelines.core.errors import InconsistencyError
 from pipelines.formats.exif import GpsTag, PhotoTags
 from pipelines.formats.image_file import ImageFile
 from pipelines.geodesy.enu import Origin, ecef_from_enu, ecef_from_lla, lla_from_ecef
@@ -88,16 +88,16 @@ def test_sigma_stated_for_the_table_is_not_that_of_exif() -> None:
     ids=["mirrored", "late", "others", "half", "blunders", "noise", "shifted", "zone", "take-off"],
 )
 def test_contradictions_are_named_and_can_be_accepted(positions: np.ndarray, says: str) -> None:
-    with pytest.raises(ContradictionError, match=says):
+    with pytest.raises(InconsistencyError, match=says):
         compared(positions)
-    (caution,) = compared(positions, IngestOptions(accept_contradiction=True)).cautions
+    (caution,) = compared(positions, IngestOptions(accept_inconsistency=True)).cautions
     assert caution.code in ("table-against-exif", "heights-apart")
 
 
 @pytest.mark.parametrize(("factor", "says"), [(1 / 0.3048, "in feet"), (0.3048, "in metres, and taken for feet")])
 def test_heights_in_feet_are_recognised(factor: float, says: str) -> None:
     lla = lla_from_ecef(ecef_from_enu(TRACK, ORIGIN)) * [1.0, 1.0, factor]
-    with pytest.raises(ContradictionError, match=says):
+    with pytest.raises(InconsistencyError, match=says):
         compare_with_exif(table_of(ecef_from_lla(lla)), photos_at(TRACK), PATH, IngestOptions(), Notes())
 
 
@@ -108,7 +108,7 @@ def test_a_clock_offset_is_named_with_its_size() -> None:
         replace(photo, tags=replace(photo.tags, timestamp_s=float(when)))
         for photo, when in zip(photos_at(TRACK), time_s, strict=True)
     ]
-    with pytest.raises(ContradictionError, match=r"the times are off by about \+(5|6)\.\d s"):
+    with pytest.raises(InconsistencyError, match=r"the times are off by about \+(5|6)\.\d s"):
         compare_with_exif(table_of(ecef_from_enu(late, ORIGIN)), photos, PATH, IngestOptions(), Notes())
 
 
