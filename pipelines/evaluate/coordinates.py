@@ -56,10 +56,12 @@ def coordinates_in(crs: PointCrs, checkpoints: CheckPoints, survey: Survey) -> C
             PointCoordinates(
                 name=point.name,
                 surveyed=_vector(surveyed_xyz),
-                camera=_measured(camera_xyz),
-                model=_measured(model_xyz),
+                triangulated=_measured(triangulated_xyz),
+                surface=_measured(surface_xyz),
             )
-            for point, (surveyed_xyz, camera_xyz, model_xyz) in zip(survey.check_points, by_point, strict=True)
+            for point, (surveyed_xyz, triangulated_xyz, surface_xyz) in zip(
+                survey.check_points, by_point, strict=True
+            )
         ),
     )
 
