@@ -257,7 +257,7 @@ def _start(data: RigData, offset_s: float, boresight: FloatArray, options: FitOp
     extent_m = state.geo_from_local.scale * spread / np.sqrt(len(data.center_in_local))
     if extent_m[0] < 1.0 or extent_m[1] < 0.01 * extent_m[0]:
         raise DegenerateGeometryError(
-            "flight-without-turns",
+            "rig-not-observable",
             "The rig is not observable: the cameras stay within 1 m of one place, or on one line. Fly turns, and "
             "change the speed.",
         )

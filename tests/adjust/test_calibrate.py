@@ -182,9 +182,8 @@ def test_flight_that_shows_nothing_is_told_and_no_failure(tmp_path: Path, comman
     flight, workspace = bags.Flight(count=24), tmp_path / "ws"  # a straight line at constant speed
     inputs = flown(tmp_path, flight)
     document = command("run", workspace, *arguments(inputs), "--time-offset", "auto", "--to", "geolocate")
-    assert "nothing of the rig is observable" in document["err"]
-    assert "time-offset stay as told" in document["err"]
     rig = load_json(RigCalibration, workspace / RIG)
+    assert rig.problem in document["err"] and "time-offset" in document["err"]
     assert rig.wanted == ("time-offset",) and rig.estimates == ()
     assert load_survey(Workspace(workspace)) == load_json(Survey, workspace / SURVEY)
     again = command("run", workspace, "--to", "geolocate")
