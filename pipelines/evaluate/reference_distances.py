@@ -75,8 +75,8 @@ def require_py4dgeo() -> Any:
     try:
         import py4dgeo
     except ImportError as error:
-        message = "--reference needs py4dgeo: pip install 'georefgs[reference]'"
-        raise BackendUnavailableError("todo-x", message) from error
+        message = "--reference needs py4dgeo. Install it: pip install 'georefgs[reference]'"
+        raise BackendUnavailableError("missing-extra", message) from error
     # It logs to stdout, which belongs to our results, and into a file of the current folder.
     log = logging.getLogger("py4dgeo")
     for handler in list(log.handlers):
@@ -135,8 +135,8 @@ class TiledPoints:
         rows = np.zeros(len(position), dtype=_ROW)
         if shutil.disk_usage(self._folder).free < rows.nbytes + _SPARE_BYTES:
             raise InputError(
-                "todo-no-room-for-points",
-                "no room for the points that are compared: make room on this disk",
+                "disk-full",
+                "no room for the points that are compared; make room on this disk",
                 path=self._folder,
             )
         rows["position"] = position

@@ -104,13 +104,13 @@ def _warnings(report: EvaluationReport) -> tuple[Remark, ...]:
     for way, errors in report.checkpoints.by_way.items():
         if errors.blunders:
             sentence = (
-                f"{WAYS[way]}, {len(errors.blunders)} of {errors.count} check points are off by more than three "
-                f"times the class that the others meet: {listed(errors.blunders)}"
+                f"{len(errors.blunders)} of {errors.count} check points, {WAYS[way]}, have errors of more than "
+                f"three times the class that the others meet: {listed(errors.blunders)}."
             )
             warnings.append(Remark(code="check-point-blunders", sentence=sentence))
     crossed = report.cross_validation
     if crossed is not None and crossed.reason is not None:
-        sentence = f"no cross-validation: {crossed.reason}"
+        sentence = f"There is no cross-validation: {crossed.reason}."
         warnings.append(Remark(code="no-cross-validation", sentence=sentence))
     return tuple(warnings)
 
@@ -258,7 +258,7 @@ def _refuse_what_needs_gaussians(stage: StageRun, options: EvaluateOptions) -> N
         if value is not None:
             command = stage.workspace.command_of(BY_NAME["train"])
             raise InputError(
-                "todo-needs-trained-model-run",
-                f"needs a trained model: run `{command}` first, or leave the option out",
+                "not-trained",
+                f"needs a trained model; run `{command}` first, or leave the option out",
                 field=flag,
             )
