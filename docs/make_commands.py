@@ -23,7 +23,7 @@ Results go to stdout, everything else to stderr and to `logs/<stage>.log` in the
 
 With `--json`, stdout is one JSON document. When the command fails, the document is
 `{"error": {"code", "message", "path", "line", "field", "hint"}}`. `code` names the kind of failure: `usage`,
-`input`, `missing-product`, `busy`, `geometry`, `contradiction`, `convergence`, `resources`, `backend`, `storage`,
+`input`, `missing-product`, `busy`, `geometry`, `inconsistent`, `convergence`, `resources`, `backend`, `storage`,
 `crash`, `cluster`, `interrupted`, `failed`, or `defect` for an exception that nobody foresaw. Keys without a value
 are null.
 

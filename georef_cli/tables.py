@@ -11,8 +11,8 @@ from rich.console import Group
 from rich.table import Table
 
 from georef_cli.layout import ByWidth, FirstThatFits, figures, plain_table, shown
-from pipelines.compare.table import REFERENCE_HEADS, Comparison, cells, reference_cells, remarks_on
-from pipelines.core.figures import ERRORS, MISSING, SHORT_WAYS, Headline
+from pipelines.compare.table import POINT_FIGURES, REFERENCE_HEADS, Comparison, cells, reference_cells, remarks_on
+from pipelines.core.figures import ERRORS, MISSING, Headline
 from pipelines.core.options import notation
 from pipelines.core.plan import OptionOrigin
 from pipelines.core.products import Remark
@@ -151,9 +151,7 @@ def outcomes(results: Sequence[Outcome]) -> Table:
 
 def comparison(table: Comparison) -> list[Renderable]:
     """Return the tables of `georef compare`: a line for each configuration, and its distinctive features below."""
-    triangulated, surface = SHORT_WAYS.values()
-    points = [f"{triangulated}\n{name}" for name in ("RMSE H", "RMSE V")]
-    points += [f"{surface}\n{name}" for name in ("median H", "RMSE H", "RMSE V")]
+    points = [f"{way}\n{ERRORS[name].label}" for way, name in POINT_FIGURES]
     heads = ("test\nPSNR", "PSNR\ncovered", "\nSSIM", *points, "check\npoints", "\ntraining")
     rows = {shown(row.configuration): [shown(cell) for cell in cells(row)] for row in table.rows}
     notes = [f"[bold]{shown(row.configuration)}[/] {shown(f'{row.title}: {row.note}')}" for row in table.rows]
@@ -203,7 +201,7 @@ def report(document: EvaluationReport) -> list[Renderable]:
 
     A residual of the fit is not an accuracy, and a control point is not a check point: they never share a table.
     """
-    ways = {SHORT_WAYS[way]: errors for way, errors in document.checkpoints.by_way.items()}
+    ways = document.checkpoints.by_way
     crossed, test, cameras = document.cross_validation, document.test_views, document.cameras
     fit = {"gnss": dict(document.fit.gnss), "gcp": dict(document.fit.gcp)}
     factors: dict[str, dict[str, Any]] = {factor.group: dict(factor) for factor in document.variance_factors}
@@ -316,8 +314,8 @@ def coordinate_tables(report: EvaluationReport) -> list[Group]:
     for point in listed.points:
         for way, xyz in (
             ("surveyed", point.surveyed),
-            (SHORT_WAYS["camera"], point.camera),
-            (SHORT_WAYS["model"], point.model),
+            ("triangulated", point.triangulated),
+            ("surface", point.surface),
         ):
             name = shown(point.name) if way == "surveyed" else ""
             table.add_row(name, way, *(text or MISSING for text in listed.texts(xyz)))
@@ -337,7 +335,7 @@ def _table(lines: Sequence[PointLine], *, with_way: bool) -> Table:
         predicted = [MISSING] * 2 if sigma is None else [_length(sigma[:2]), f"{sigma[2]:.3f}"]
         table.add_row(
             shown(line.row.name),
-            *([SHORT_WAYS[line.way]] if with_way else []),
+            *([line.way] if with_way else []),
             str(line.row.rays),
             *lengths,
             *(predicted if has_sigma else []),

@@ -141,24 +141,24 @@ def first_off(count: int, *by_m: float) -> Change:
 HAND_HELD = noise(3.0)
 CONSUMER = (1.5, 1.5, 3.0)
 FALSIFIED = {
-    "4 fixes, 2 m noise": Falsified(few(4, 2.0), codes=("sigma-refuted",), says=("scatter by",)),
-    "5 fixes, 1 m noise": Falsified(few(5, 1.0), codes=("sigma-refuted",), says=("scatter by",)),
+    "4 fixes, 2 m noise": Falsified(few(4, 2.0), codes=("sigma-rejected",), says=("scatter by",)),
+    "5 fixes, 1 m noise": Falsified(few(5, 1.0), codes=("sigma-rejected",), says=("scatter by",)),
     "3 fixes, 1.5 m noise": Falsified(
         few(3, 1.5), codes=("hardly-checked",), says=("scatter by",), attitudes=False
     ),
-    "optimistic σ, 0.1 m noise": Falsified(noise(0.1), codes=("sigma-refuted",)),
-    "optimistic σ, 2 m noise": Falsified(noise(2.0), codes=("sigma-refuted",), says=("scatter by",)),
+    "optimistic σ, 0.1 m noise": Falsified(noise(0.1), codes=("sigma-rejected",)),
+    "optimistic σ, 2 m noise": Falsified(noise(2.0), codes=("sigma-rejected",), says=("scatter by",)),
     "3 control points, one 5 m off": Falsified(None, 3, first_off(1, 3.0, 4.0, 0.0), ("hardly-checked",)),
     "4 control points, one 5 m off": Falsified(
-        None, 4, first_off(1, 3.0, 4.0, 0.0), ("hardly-checked", "sigma-refuted")
+        None, 4, first_off(1, 3.0, 4.0, 0.0), ("hardly-checked", "sigma-rejected")
     ),
-    "5 control points, hand-held": Falsified(None, 5, HAND_HELD, ("sigma-refuted",)),
+    "5 control points, hand-held": Falsified(None, 5, HAND_HELD, ("sigma-rejected",)),
     "5 control points, hand-held, consumer": Falsified(
-        as_they_are, 5, HAND_HELD, ("sigma-refuted",), fix_m=CONSUMER
+        as_they_are, 5, HAND_HELD, ("sigma-rejected",), fix_m=CONSUMER
     ),
-    "3 control points, hand-held, RTK": Falsified(as_they_are, 3, HAND_HELD, ("sigma-refuted",)),
+    "3 control points, hand-held, RTK": Falsified(as_they_are, 3, HAND_HELD, ("sigma-rejected",)),
     "8 control points, 3 of them 5 m off": Falsified(
-        as_they_are, 8, first_off(3, 3.0, 4.0, 0.0), ("sigma-refuted",)
+        as_they_are, 8, first_off(3, 3.0, 4.0, 0.0), ("sigma-rejected",)
     ),
     "8 control points, one 5 m off": Falsified(as_they_are, 8, first_off(1, 3.0, 4.0, 0.0), ("control-outliers",)),
     "mirrored, no attitudes": Falsified(mirror, says=("mirrored", "upside down", "no similarity"), attitudes=False),
@@ -169,7 +169,7 @@ FALSIFIED = {
     "second half shifted by 3 m": Falsified(step(2.0, 2.0, 1.0), says=("shifted",)),
     "fixes of other images": Falsified(other_images, says=("scatter by", "no similarity", "upside down")),
     "fixes one photograph late": Falsified(
-        one_later, codes=("attitudes-contradict",), says=("clock", "scatter by", "upside")
+        one_later, codes=("attitudes-inconsistent",), says=("clock", "scatter by", "upside")
     ),
     "heights in feet": Falsified(feet, codes=("feet",), says=("feet",)),
     "control points apart by 2 m": Falsified(as_they_are, 8, shift(1.2, 1.6, 0.0), ("fixes-shifted",)),
@@ -178,7 +178,7 @@ FALSIFIED = {
     "control points 48 m lower": Falsified(as_they_are, 8, shift(0.0, 0.0, -48.0), says=("geoid",)),
     "3 control points apart by 1 m": Falsified(as_they_are, 3, shift(0.6, 0.8, 0.0), ("fixes-shifted",)),
     "3 good control points, fixes of 5 m": Falsified(
-        noise(5.0), 3, codes=("sigma-refuted",), fix_m=(5.0, 5.0, 10.0)
+        noise(5.0), 3, codes=("sigma-rejected",), fix_m=(5.0, 5.0, 10.0)
     ),
     "common bias of a consumer receiver": Falsified(
         shift(2.0, 1.0, 4.0), codes=("no-control-points",), fix_m=CONSUMER
@@ -193,7 +193,9 @@ FALSIFIED = {
     "clock of GPS time": Falsified(
         late(18.0), says=("+18.0 s against", "+18.00 s", "+17.99 s"), flights=("lines", "circle"), named=True
     ),
-    "clock 0.2 s late": Falsified(late(0.2), codes=("clock", "attitudes-contradict"), flights=("circle", "turns")),
+    "clock 0.2 s late": Falsified(
+        late(0.2), codes=("clock", "attitudes-inconsistent"), flights=("circle", "turns")
+    ),
     "marks with y from below": Falsified(
         as_they_are, 8, marks=lambda x, y: (x, CAMERA.height - y), codes=("control-marks",),
         flights=("orbit", "grid"), named=True,

@@ -74,7 +74,7 @@ def report_with(
         photometric=Photometric(
             test=PhotometricFigures(**{"views": 0, **no_views, "per_view": (), **(test or {})})
         ),
-        checkpoints=CheckPoints(camera=camera, model=model or check_points_with()),
+        checkpoints=CheckPoints(triangulated=camera, surface=model or check_points_with()),
         cross_validation=crossed,
         accuracy=scene,
         fit=Fit(

@@ -48,11 +48,11 @@ SIMULATED: dict[str, dict[str, Any]] = {"rtk_outliers": {"gnss": "rtk", "outlier
 OUTLIER_DEG = 5.0 / 111_000
 FIGURES = (
     "test_psnr",
-    "camera_mean_h_m",
-    "camera_rmse_v_m",
-    "model_mean_h_m",
-    "model_median_h_m",
-    "model_rmse_v_m",
+    "triangulated_mean_h_m",
+    "triangulated_rmse_v_m",
+    "surface_mean_h_m",
+    "surface_median_h_m",
+    "surface_rmse_v_m",
 )
 
 
@@ -153,7 +153,12 @@ def measured(survey: Survey, profile: str, arguments: argparse.Namespace) -> lis
             "profile": profile,
             "configuration": row["configuration"],
             "test_psnr": row["test_psnr"],
-            **{f"{way}_{key}": row[way][key] for way in ("camera", "model") for key in row[way] if key != "count"},
+            **{
+                f"{way}_{key}": row[way][key]
+                for way in ("triangulated", "surface")
+                for key in row[way]
+                if key != "count"
+            },
         }
         print(" ".join(_short(value) for value in figures.values()), flush=True)
         rows.append(figures)

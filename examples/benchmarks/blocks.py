@@ -96,7 +96,7 @@ def measured(place: Path, record: BlockRecord, half_width_m: float) -> dict[str,
     """Return the figures of a trained and evaluated workspace."""
     errors = squared_errors(place, record, half_width_m)
     report = read_report(place / REPORT)
-    found = report.checkpoints.model
+    found = report.checkpoints.surface
     training = json.loads((place / "train/manifest.json").read_text(encoding="utf-8"))
     return {
         "psnr_db": mean_psnr(errors["whole"]),

@@ -11,7 +11,7 @@ as viewers do it:
 
 `depth` is the difference, along the camera's z axis, between the centre and the surveyed point. H and V are the
 horizontal and vertical distances between the two. `surface` is that of the trained model, rendered at the
-same marks; the last line is the error by model of the report. All are medians.
+same marks; the last line is the error on the rendered surface, of the report. All are medians.
 """
 
 from __future__ import annotations
@@ -173,9 +173,9 @@ def main() -> None:
     rays = mark_rays(trained.survey.check_points, trained.sparse)
     surface_m = surface_errors_m(trained, rays, workspace)
     print(f"surface   {np.isfinite(surface_m).sum():5}  {np.nanmedian(surface_m):.3f}")
-    by_model = read_report(workspace.path(REPORT)).checkpoints.model
-    assert by_model is not None
-    print(f"by model: {by_model.count} points, median {by_model.median_h_m:.3f} m H")
+    on_surface = read_report(workspace.path(REPORT)).checkpoints.surface
+    assert on_surface is not None
+    print(f"on the surface: {on_surface.count} points, median {on_surface.median_h_m:.3f} m H")
 
 
 if __name__ == "__main__":

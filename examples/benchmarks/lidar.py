@@ -135,7 +135,7 @@ def cloud_of(flight: RecordedFlight, given: dict[str, Any], home: Path, change: 
 def figures(workspace: Workspace, flight: RecordedFlight, survey: Path, cloud: Path) -> dict[str, Any]:
     """Medians of the surface's errors by class, and the figures of `evaluate`."""
     report, truth = read_report(workspace.path(REPORT)), load_json(Truth, survey / "truth.json")
-    on_surface, views = report.checkpoints.model, report.test_views
+    on_surface, views = report.checkpoints.surface, report.test_views
     assert on_surface is not None and views is not None
     on_wall = {target.name for target in truth.targets if target.surface == "wall"}
     walls = [point for point in on_surface.points if point.name in on_wall and point.de_m is not None]

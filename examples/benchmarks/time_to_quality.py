@@ -2,7 +2,8 @@
 
 The first run compiles all kernels into an empty cache (cold), the others find them there (warm). While a run goes
 on, each checkpoint of its training is kept, with its age. Afterwards the checkpoints are measured: PSNR of the test
-and training views, and the errors of the check points by model. Their measuring is no part of the time, writing is.
+and training views, and errors of the check points on the rendered surface. The time includes writing them, but not
+measuring them.
 
     python examples/benchmarks/time_to_quality.py OUT --runs 2 -- --images photos --preset fast …
 """
@@ -59,9 +60,9 @@ class Row:
         gaussians: their number.
         psnr: mean over the test views, of the renders as they are, dB.
         train_psnr: mean over the training views, of the renders with the exposures of their photographs, dB.
-        model_mean_h_m: mean horizontal error of the check points by model; None: no check points.
-        model_median_h_m: likewise the median.
-        model_rmse_v_m: likewise the RMSE of the heights.
+        surface_mean_h_m: mean horizontal error of the check points on the rendered surface; None: no check points.
+        surface_median_h_m: likewise the median.
+        surface_rmse_v_m: likewise the RMSE of the heights.
     """
 
     seconds: float
@@ -69,9 +70,9 @@ class Row:
     gaussians: int
     psnr: float | None
     train_psnr: float
-    model_mean_h_m: float | None
-    model_median_h_m: float | None
-    model_rmse_v_m: float | None
+    surface_mean_h_m: float | None
+    surface_median_h_m: float | None
+    surface_rmse_v_m: float | None
 
 
 class CheckpointWatch:
@@ -178,11 +179,11 @@ def print_run(name: str, run: dict[str, object]) -> None:
     stages = ", ".join(f"{stage} {seconds} s" for stage, seconds in run["stages_s"].items())  # type: ignore[attr-defined]
     print(f"\n{name}: {run['seconds']} s ({stages}), {run['peak_mib']} MiB\n")
     print(
-        "| time | iteration | Gaussians | test PSNR | train PSNR | by model: mean H | median H | RMSE V |\n|"
+        "| time | iteration | Gaussians | test PSNR | train PSNR | on the surface: mean H | median H | RMSE V |\n|"
         + "---|" * 8
     )
     for row in run["rows"]:  # type: ignore[attr-defined]
-        errors = [row["model_mean_h_m"], row["model_median_h_m"], row["model_rmse_v_m"]]
+        errors = [row["surface_mean_h_m"], row["surface_median_h_m"], row["surface_rmse_v_m"]]
         cells = " | ".join("" if value is None else f"{value:.3f} m" for value in errors)
         quality = f"{row['psnr']:.2f} dB | {row['train_psnr']:.2f} dB"
         print(f"| {row['seconds']:.0f} s | {row['iteration']} | {row['gaussians']} | {quality} | {cells} |")

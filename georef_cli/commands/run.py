@@ -41,7 +41,7 @@ LATER: dict[str, tuple[str, ...]] = {
     "mapper": ("sfm",),
     "import_model": ("sfm",),
     "max_residual": ("init-sim3",),
-    "accept_contradiction": ("ingest", "init-sim3"),
+    "accept_inconsistency": ("ingest", "init-sim3"),
     **dict.fromkeys(_EFFORT, ("train",)),
     "backend": ("train", "evaluate"),
     **dict.fromkeys(_LIDAR, ("train",)),

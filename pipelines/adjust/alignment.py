@@ -15,9 +15,9 @@ Fixes against control points:
 
 1. Fixes of a flight often share an offset (base station, datum, antenna height). A solution with a common bias of
    the fixes therefore competes by likelihood with one without. The bias costs as much as one outlier.
-2. If the fixes contradict control points that agree with each other by more than σ allow, the control points
+2. If the fixes disagree with control points that agree with each other by more than σ allow, the control points
    determine the position. The fixes still determine scale and rotation.
-3. A *single* contradicting control point stays an outlier, because a bias costs no less. Only the joint
+3. A *single* control point that disagrees stays an outlier, because a bias costs no less. Only the joint
    adjustment, with its prior of common errors, can decide between the two.
 """
 
@@ -53,8 +53,8 @@ _FLAT = 0.02  # third extent of the layout over the first
 _GATE_FACTORS = (1.0, 3.0, 10.0, 30.0, 100.0)  # of the stated σ
 
 _ADVICE = (
-    "add control points that do not lie on that line (`georef ingest --gcp FILE`, at least 3), or attitudes "
-    "(yaw, pitch, roll of the camera) in the trajectory"
+    "Add at least three control points that are not on one line (`georef ingest --gcp FILE`), or attitudes (yaw, "
+    "pitch, roll of the camera) in the trajectory."
 )
 
 
@@ -324,9 +324,9 @@ def align(data: Correspondences, rng: np.random.Generator, *, attitude: Rotation
     """
     if len(data) < 2 or (len(data) < 3 and attitude is None):
         raise DegenerateGeometryError(
-            "todo-positions-fixes-registered-images",
-            f"{len(data)} positions (fixes of registered images and control points) do not determine where the "
-            f"model lies; 3 are needed: {_ADVICE}",
+            "too-few-positions",
+            f"{len(data)} fixes of registered images and control points can be used; at least three fixes or "
+            f"control points are needed. {_ADVICE}",
         )
     # Starts of the fixes and of the control points, else of both together.
     parts = [data.part(members) for members in (~data.control, data.control) if members.sum() >= 3]
@@ -337,10 +337,10 @@ def align(data: Correspondences, rng: np.random.Generator, *, attitude: Rotation
     if not firm:
         if attitude is None:
             worst = min((np.degrees(candidate.rotation_sigma_rad) for candidate in candidates), default=np.inf)
-            size = f"is known to {worst:.0f}° only" if worst < 90 else "is not determined"
+            size = f"has a σ of {worst:.0f}°" if worst < 90 else "is not determined"
             raise DegenerateGeometryError(
-                "todo-positions-lie-on-one",
-                f"the positions lie on one line: the rotation about it {size}; {_ADVICE}",
+                "positions-on-a-line",
+                f"The positions lie on one line, and the rotation about it {size}. {_ADVICE}",
             )
         prior, firm = attitude, _candidates(data, [_start_with_rotation(data, attitude.rotation, rng)], attitude)
     # A bias of the fixes costs as much as an outlier. Where both explain a single control point, rounding must not
@@ -408,9 +408,7 @@ def _start_with_rotation(data: Correspondences, rotation: FloatArray, rng: np.ra
         (a, b), (p, q) = turned[chosen], data.in_geo[chosen]
         scale = float((b - a) @ (q - p) / max((b - a) @ (b - a), np.finfo(float).tiny))
         if scale <= 0:
-            raise DegenerateGeometryError(
-                "todo-two-positions-run-against", "the two positions run against each other"
-            )
+            raise DegenerateGeometryError("positions-reversed", "Two positions lie in reverse order.")
         return Similarity(scale, rotation, (p + q - scale * (a + b)) / 2)
 
     options = RansacOptions(2, OUTLIER_GATE * _GATE_FACTORS[-1] ** 2, max_draws=300)

@@ -90,9 +90,7 @@ def adjust_bundle(network: Network, sigma_px: FloatArray, surveyed: SurveyedPoin
     before = np.full((len(sigma_px), 2), np.inf)
     for _ in range(_STEPS):
         if not has_positive_depth(network).all():
-            raise InputError(
-                "todo-point-network-lies-behind", "a point of the network lies behind a camera that observes it"
-            )
+            raise InputError("point-behind-camera", "A point lies behind a camera that observes it.")
         residual = projection_residuals(network)
         apart = network.point_in_world - target
         pull = np.einsum("nij,nj->ni", information, apart)
@@ -112,8 +110,8 @@ def adjust_bundle(network: Network, sigma_px: FloatArray, surveyed: SurveyedPoin
         np.add.at(slope, network.obs_point, np.einsum("mij,mi->mj", by_point, weighted))
         network, before = _moved(network, step[:, 0], points, pull + slope), residual
     raise ConvergenceError(
-        "todo-bundle-does-not-settle",
-        f"the bundle does not settle in {_STEPS} steps: start with better cameras and points",
+        "bundle-not-converged",
+        f"The bundle adjustment has not converged after {_STEPS} steps. Start with better cameras and points.",
     )
 
 
@@ -122,8 +120,9 @@ def _refuse_open_layouts(surveyed: SurveyedPoints) -> None:
     by_similarity = jacobian_at(position, position.mean(axis=0) if len(position) else np.zeros(3)).reshape(-1, 7)
     if np.linalg.matrix_rank(by_similarity, tol=_COLLINEAR * np.abs(by_similarity).max(initial=1.0)) < 7:
         raise DegenerateGeometryError(
-            "todo-control-points-leave-frame",
-            f"{len(position)} control points leave the frame open: three are needed that are not on one line",
+            "similarity-open",
+            f"{len(position)} control points do not determine the frame: at least three that are not on one line "
+            "are needed.",
         )
 
 

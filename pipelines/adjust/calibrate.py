@@ -166,19 +166,21 @@ def _key_figure(calibration: RigCalibration) -> str:
 def _warnings(calibration: RigCalibration, survey: Survey) -> tuple[Remark, ...]:
     """Return warnings of parameters that keep the values of `ingest` although they were to be estimated."""
     if calibration.problem:
-        sentence = f"{calibration.problem}; {', '.join(calibration.wanted)} stay as told"
+        sentence = (
+            f"{calibration.problem} The values that `georef ingest` set stay: {', '.join(calibration.wanted)}."
+        )
         return (Remark(code="rig-not-calibrated", sentence=sentence),)
     warnings = [
         Remark(
             code="rig-not-observable",
-            sentence=f"{estimate.name} is not observable in this flight (σ {max(estimate.sigma):.2g} "
-            f"{estimate.unit}): it stays as told",
+            sentence=f"The {estimate.name} is not observable in this flight (σ {max(estimate.sigma):.2g} "
+            f"{estimate.unit}): the value that `georef ingest` set stays.",
         )
         for estimate in calibration.estimates
         if not estimate.usable
     ]
     missed = [name for name in survey.estimate if name not in calibration.wanted]
     if missed:
-        sentence = f"--estimate leaves out what ingest was asked to estimate: {', '.join(missed)}"
+        sentence = f"--estimate leaves out parameters that `georef ingest` was to estimate: {', '.join(missed)}."
         warnings.append(Remark(code="rig-not-estimated", sentence=sentence))
     return tuple(warnings)

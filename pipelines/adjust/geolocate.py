@@ -3,8 +3,8 @@
 Reads `ingest/survey.json` and `sfm/sparse`; writes `geolocate/points.npz` (`GeolocatedPoints`) and `points.ply`.
 GeoRefGS section 2.3, eqs 4–15 (doi 10.3390/drones10030195). Control and check points are not used.
 
-Fixes that contradict the layout of the cameras in the SfM model give no rays. The layout of all cameras reveals a
-bad fix. The few rays of one point do not tell a bad fix from good ones.
+Fixes that disagree with the layout of the cameras in the SfM model give no rays. The layout of all cameras reveals
+a bad fix. The few rays of one point do not tell a bad fix from good ones.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def geolocate(survey: Survey, model: SparseModel, options: GeolocateOptions) -> 
     """
     fixes, index = fix_correspondences(survey, model), model.image_index()
     if len(fixes) == 0:
-        return _without_positions(model, "no fixes: positions come from control points")
+        return _without_positions(model, "The survey has no fixes: control points alone georeference the model.")
     prior, recorded = attitude_prior(survey, model), recorded_rotations(survey, model)
     alignment, problem = None, ""
     try:
@@ -83,15 +83,15 @@ def geolocate(survey: Survey, model: SparseModel, options: GeolocateOptions) -> 
     both = int(np.isin(fixed, recorded.image).sum())
     if options.attitude == "recorded" and both < 2:
         raise InputError(
-            "todo-images-have-fix-attitude",
-            f"{both} images have a fix and an attitude, 2 are needed: use auto or sfm",
+            "too-few-attitudes",
+            f"{both} images have a fix and an attitude; at least two are needed. Use --attitude auto or sfm.",
             field="--attitude",
         )
     complete = both == len(fixes) or (alignment is None and both >= 2)
     use_recorded = options.attitude == "recorded" or (options.attitude == "auto" and complete)
     if alignment is None and not use_recorded:
         # Control points may georeference the model nevertheless, or `init-sim3` finds the error of the fixes.
-        return _without_positions(model, f"no directions for the SfM points: {problem}")
+        return _without_positions(model, f"The SfM points were not intersected. {problem}")
     warnings = _warnings(model, fixes, recorded, alignment, prior if use_recorded else None)
     used = recorded if use_recorded else None
     views, usable = _views(model, fixes, fixed, alignment, used, sigma_px=options.sigma_px)
@@ -99,7 +99,10 @@ def geolocate(survey: Survey, model: SparseModel, options: GeolocateOptions) -> 
     intersections = intersect_rays(rays, views, len(model.point_id))
     sigma, inlier = _judge(intersections, rays, views, options)
     if inlier.sum() < 0.5 * len(inlier):
-        sentence = f"only {inlier.sum()} of {len(inlier)} points have rays that agree: check σ and attitudes"
+        sentence = (
+            f"The rays of only {inlier.sum()} of {len(inlier)} points meet within their σ. Check the attitudes, "
+            "and the σ of fixes and attitudes (--sigma-h, --sigma-v, --sigma-attitude of `georef ingest`)."
+        )
         warnings.append(Remark(code="few-points-agree", sentence=sentence))
     middle = f", median σ {np.median(sigma[inlier]):.3g} m" if inlier.any() else ""
     source = "recorded" if use_recorded else "sfm"
@@ -134,23 +137,23 @@ def _warnings(
     prior: RotationPrior | None,
 ) -> list[Remark]:
     """Return warnings of unused measurements, and of a `prior` turned against an alignment made without it."""
-    warnings, turned, total = [], recorded.contradicting, len(model.image_name)
+    warnings, turned, total = [], recorded.inconsistent, len(model.image_name)
     if turned:
         sentence = (
-            f"{len(turned)} attitudes contradict the SfM model and are not used: {listed(sorted(turned))}. "
-            "Were these photographs turned in an image viewer?"
+            f"{len(turned)} attitudes disagree with the SfM model and are not used: {listed(sorted(turned))}. "
+            "A photograph that was turned in an image viewer keeps its old attitude."
         )
         warnings.append(Remark(code="attitudes-inconsistent", sentence=sentence))
     if len(fixes) < total:
-        sentence = f"{total - len(fixes)} of {total} registered images have no fix and give no rays"
+        sentence = f"{total - len(fixes)} of {total} registered images have no fix, and give no rays."
         warnings.append(Remark(code="photographs-without-fix", sentence=sentence))
     if alignment is None:
         return warnings
     rejected = [name for name, good in zip(fixes.name, alignment.solution.state.inlier, strict=True) if not good]
     if rejected:
         sentence = (
-            f"{len(rejected)} of {len(fixes)} fixes contradict the SfM model and give no rays: "
-            f"{listed(sorted(rejected))}"
+            f"{len(rejected)} of {len(fixes)} fixes disagree with the SfM model, and give no rays: "
+            f"{listed(sorted(rejected))}."
         )
         warnings.append(Remark(code="fixes-inconsistent", sentence=sentence))
     if prior is not None and not alignment.attitude_used:
@@ -158,8 +161,8 @@ def _warnings(
         sigma = np.hypot(np.sqrt(prior.cov_rad2[0, 0]), alignment.solution.rotation_sigma_rad)
         if turn > 4 * sigma:
             sentence = (
-                f"recorded attitudes are turned by {np.degrees(turn):.1f}° against the fixes "
-                f"(σ {np.degrees(sigma):.1f}°): boresight, compass, or positions at other times or in other axes?"
+                f"The recorded attitudes are turned by {np.degrees(turn):.1f}° against the fixes, with a σ of "
+                f"{np.degrees(sigma):.1f}°. Check boresight and compass, and times and axes of the positions."
             )
             warnings.append(Remark(code="attitudes-turned", sentence=sentence))
     return warnings

@@ -199,7 +199,7 @@ def _blunders(fixes: StatedFixes, plain: Hypothesis) -> Hypothesis | None:
     distance, rows = plain.distance_m, np.flatnonzero(bad)
     worst_first = rows[np.argsort(-distance[rows], kind="stable")]
     worst = listed([f"{fixes.name[row]} ({distance[row]:.1f} m)" for row in worst_first])
-    sentence = f"{len(rows)} of {len(fixes.name)} fixes are blunders, the others agree; remove {worst}"
+    sentence = f"{len(rows)} of {len(fixes.name)} fixes are blunders; the others agree. Remove {worst}."
     return replace(plain, code="fix-outliers", sentence=sentence, scatter_m=scatter)
 
 
@@ -207,15 +207,20 @@ def _changed_axes(fixes: StatedFixes) -> Iterator[_Change]:
     position = fixes.position_in_geo
     yield (
         "axis-order",
-        "the track is mirrored: east and north are exchanged; check the order of the columns and the CRS",
+        "The track is mirrored: east and north are exchanged. Check the order of the columns and the CRS.",
         mirrored(position),
         0.0,
     )
-    yield "axis-order", "latitude and longitude are exchanged", _latitude_for_longitude(position, fixes.origin), 0.0
+    yield (
+        "axis-order",
+        "Latitude and longitude are exchanged.",
+        _latitude_for_longitude(position, fixes.origin),
+        0.0,
+    )
     for code, sentence, factor in (
-        ("feet", "the heights are in feet: give a CRS whose vertical unit is the foot", FOOT_M),
-        ("feet", "the heights are in metres, although the CRS has feet", 1.0 / FOOT_M),
-        ("heights-down", "the heights count downward", -1.0),
+        ("feet", "The heights are in feet: give a CRS whose vertical unit is the foot (--crs).", FOOT_M),
+        ("feet", "The heights are in metres, although the CRS has feet.", 1.0 / FOOT_M),
+        ("heights-down", "The heights count downward.", -1.0),
     ):
         yield code, sentence, position * np.array([1.0, 1.0, factor]), 0.0
 
@@ -238,7 +243,7 @@ def _drifts(fixes: StatedFixes, price: float) -> Iterator[_Change]:
     if not np.isfinite(since).all() or count < 2 * _LEAST or since.max() <= 0:
         return
     changed, slope = _without(fixes, since / since.max())
-    sentence = f"the fixes drift by {_vector(slope)} m east, north, up from the first photograph to the last"
+    sentence = f"The fixes drift by {_vector(slope)} m east, north, up from the first photograph to the last."
     yield "drift", sentence, changed, 3.0 * price
     steps = []
     for first in range(_LEAST, count - _LEAST + 1, max(1, count // 24)):
@@ -250,8 +255,8 @@ def _drifts(fixes: StatedFixes, price: float) -> Iterator[_Change]:
     if steps:
         _, shifted, step, changed = min(steps, key=lambda one: one[0])
         sentence = (
-            f"the last {shifted} of {count} fixes are shifted by {_vector(step)} m east, north, up against the "
-            "others: another base station or datum"
+            f"The last {shifted} of {count} fixes are shifted by {_vector(step)} m east, north, up against the "
+            "others. Check base station and datum."
         )
         yield "step", sentence, changed, 4.0 * price
 
@@ -271,7 +276,7 @@ def _groups(fixes: StatedFixes, start: Similarity, price: float) -> Iterator[_Ch
     shifted = listed([fixes.name[row] for row in np.flatnonzero(second)])
     sentence = (
         f"{int(second.sum())} of {count} fixes are shifted by {_vector(apart)} m east, north, up against the "
-        f"others: another base station, datum or receiver ({shifted})"
+        f"others ({shifted}). Check base station, datum and receiver."
     )
     yield "mixture", sentence, changed, price + _MEMBER * count
 
@@ -304,10 +309,10 @@ def _clock(fixes: StatedFixes, price: float) -> Iterator[Hypothesis]:
         similarity, _, rows = track.at(offset)
         distance, position = np.full(len(fixes.name), np.nan), track.curve(fixes.time_s[rows] + offset)
         distance[rows] = _distances(similarity, fixes.center_in_local[rows], position)
-        leap = ", as GPS time and UTC differ" if abs(abs(offset) - _LEAP_S) < 2.0 * _CLOCK_STEP_S else ""
+        leap = ", as GPS time from UTC" if abs(abs(offset) - _LEAP_S) < 2.0 * _CLOCK_STEP_S else ""
         sentence = (
-            f"the navigation clock is off by about {offset:+.2f} s against the camera's{leap}: correct the times "
-            "or let `georef ingest --time-offset auto` estimate the offset"
+            f"The navigation clock differs by {offset:+.2f} s from the camera's{leap}. Correct the times, or let "
+            "`georef ingest --time-offset auto` estimate the offset."
         )
         yield Hypothesis("clock", sentence, scatter, similarity, distance, price)
 

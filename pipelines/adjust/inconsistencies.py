@@ -15,6 +15,7 @@ import numpy as np
 
 from pipelines.adjust.alignment import Correspondences, turn_against
 from pipelines.adjust.hypotheses import (
+    Hypothesis,
     StatedFixes,
     clock_that_turns,
     explanation_of,
@@ -39,10 +40,15 @@ from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.robust.patterns import median_spacing
 from pipelines.robust.statistics import outlier_gate, typical_sigma
-from pipelines.survey.report_parts import VarianceFactor
+from pipelines.survey.report_parts import Group, VarianceFactor
 from pipelines.survey.survey import Survey
 
-_SIGMA_REFUTED = "sigma-refuted"
+_SIGMA_REJECTED = "sigma-rejected"
+_SIGMA_OPTIONS: dict[Group, str] = {
+    "fixes": "--sigma-h and --sigma-v",
+    "control points": "--sigma-gcp-h and --sigma-gcp-v",
+    "marks": "--sigma-mark",
+}
 # A stated σ that is too small by this factor is an inconsistency, if the scatter is so many metres or is explained.
 _WRONG_SIGMA, _WRONG_SCATTER_M = 10.0, 0.3
 # A variance factor up to this, of σ that are larger by one half, is applied without a caution.
@@ -86,13 +92,13 @@ def cautions_of(
     findings, mistake = list(_upside_down(fixes, joint.geo_from_local)), _mistake_in_map(survey, model)
     of_map = []
     if mistake is not None:
-        sentence = f"control points and fixes contradict each other: {mistake}"
+        sentence = f"Control points and fixes disagree: {mistake}"
         of_map.append(_Finding("control-map", sentence, ends=True))
     if not findings:
         findings += [] if of_map else _fixes_against_model(fixes, joint)
         findings += _view(model, joint.geo_from_local)
     findings += of_map or [*_shift_of_fixes(joint), *_control_points(joint)]
-    findings += [*_attitudes(survey, fixes, joint), *_weak_checks(joint), *_guesses(joint)]
+    findings += [*_attitudes(survey, fixes, joint), *_weak_checks(joint), *_assumed_sigmas(joint)]
     ending, others = (
         tuple(Remark(code=found.code, sentence=found.sentence) for found in findings if found.ends == ends)
         for ends in (True, False)
@@ -113,13 +119,13 @@ def unadjustable(survey: Survey, model: SparseModel, geo_from_local: Similarity 
         return ()
     if scatter < max(_WRONG_SIGMA * fixes.sigma_m, _WRONG_SCATTER_M):
         return ()
-    cause = "are they those of these photographs?" if best is None else best.sentence
-    sentence = f"the fixes scatter by {scatter:.2f} m an axis about the SfM model, and fix no similarity: {cause}"
-    return (Remark(code=_SIGMA_REFUTED if best is None else best.code, sentence=sentence),)
+    cause = "Check that they belong to these photographs." if best is None else best.sentence
+    sentence = f"The fixes scatter by {scatter:.2f} m along each axis about the SfM model: no similarity fits them."
+    return (Remark(code=_SIGMA_REJECTED if best is None else best.code, sentence=f"{sentence} {cause}"),)
 
 
 def marks_that_do_not_meet(unused: Sequence[UnusedControlPoint], mistake: str | None) -> tuple[Remark, ...]:
-    """Return the caution that marks of control points do not meet in one point; none if they do.
+    """Return the caution that rays of marks of control points do not meet in one point; none if they do.
 
     `mistake` is the cause that explains most of them, if one is known; then no control point is used.
     """
@@ -129,8 +135,8 @@ def marks_that_do_not_meet(unused: Sequence[UnusedControlPoint], mistake: str | 
     worst = sorted(missed, key=lambda point: -max(point.residual_px))[:_NAMED]
     named = listed([f"{point.name} ({max(point.residual_px):.0f} px)" for point in worst])
     more = "" if len(missed) <= _NAMED else f" and {len(missed) - _NAMED} more"
-    sentence = f"the marks of {len(missed)} control points do not meet in one point: {named}{more}; "
-    sentence += "these are not used" if mistake is None else f"no control point is used. Probably {mistake}"
+    sentence = f"The rays of the marks of {len(missed)} control points do not meet: {named}{more}. "
+    sentence += "These points are not used." if mistake is None else f"No control point is used. {mistake}"
     return (Remark(code="control-marks", sentence=sentence),)
 
 
@@ -142,17 +148,17 @@ def _is_wrong(factor: VarianceFactor) -> bool:
 def _upside_down(fixes: StatedFixes, geo_from_local: Similarity) -> Iterator[_Finding]:
     if not hangs_upside_down(fixes.model, geo_from_local):
         return
-    sentence = "the cameras hang upside down in this solution: the positions contradict the SfM model"
+    sentence = "The cameras hang upside down in this solution: the positions disagree with the SfM model."
     best = explanation_of(fixes)
     if best is not None:
-        sentence += f"; with this they fit upright to {best.scatter_m:.2f} m: {best.sentence}"
+        sentence += f" {_explained(best)}"
     yield _Finding("upside-down", sentence, ends=True)
 
 
 def _view(model: SparseModel, geo_from_local: Similarity) -> Iterator[_Finding]:
     up_of_views = model.rotation_cam_from_local[:, 2] @ geo_from_local.rotation[2]
     if np.median(up_of_views) > _AT_SKY:
-        sentence = "most cameras look up at the sky: if that is not so, the positions are wrong"
+        sentence = "Most cameras look up at the sky in this solution. If they did not, the positions are wrong."
         yield _Finding("looks-at-sky", sentence)
 
 
@@ -166,22 +172,23 @@ def _fixes_against_model(fixes: StatedFixes, joint: JointAdjustment) -> Iterator
         yield _apart(-shift, joint.survey, ends=is_wrong)
         return
     scatter_m, rejected = fixes.sigma_m * factor.applied**0.5, factor.count - factor.used
-    sides = f"the fixes scatter by {scatter_m:.2f} m an axis about the SfM model, their σ is {fixes.sigma_m:.3g} m"
-    if rejected:
-        sides += f", and {rejected} of {factor.count} are outliers"
+    sides = (
+        f"The fixes scatter by {scatter_m:.2f} m along each axis about the SfM model; their {_source(factor)} σ is "
+        f"{fixes.sigma_m:.3g} m"
+    )
+    sides += f", and {rejected} of {factor.count} are outliers." if rejected else "."
     best = explanation_of(fixes)
     if best is not None:
-        sentence = f"{sides}; with this they fit to {best.scatter_m:.2f} m: {best.sentence}"
-        yield _Finding(best.code, sentence, ends=is_wrong)
+        yield _Finding(best.code, f"{sides} {_explained(best)}", ends=is_wrong)
         return
     if scatter_m > median_spacing(fixes.position_in_geo) / 2:
-        remedy = "they are farther off than photographs are apart: are they those of these photographs?"
+        remedy = "They are farther off than photographs are apart. Check that they belong to these photographs."
     else:
         remedy = (
-            "no offset, time, axis or group of them explains that: it is noise, and σ is optimistic, or the SfM "
-            "model is bent; every σ of the result is widened"
+            "No offset, time, axis or group of fixes explains the scatter: the fixes are noisier than their σ, or "
+            f"the SfM model is bent. Every σ of the result is enlarged. State the σ with {_SIGMA_OPTIONS['fixes']}."
         )
-    yield _Finding(_SIGMA_REFUTED, f"{sides}: {remedy}", ends=is_wrong and scatter_m > _WRONG_SCATTER_M)
+    yield _Finding(_SIGMA_REJECTED, f"{sides} {remedy}", ends=is_wrong and scatter_m > _WRONG_SCATTER_M)
 
 
 def _shift_of_fixes(joint: JointAdjustment) -> Iterator[_Finding]:
@@ -200,9 +207,9 @@ def _shift_of_fixes(joint: JointAdjustment) -> Iterator[_Finding]:
         )
         stated = ", ".join(f"{sigma:.3g}" for sigma in bias.prior)
         sentence = (
-            f"all fixes are shifted by ({values}) m east, north, up against the control points, which decide the "
-            f"position; the σ of their common error is ({stated}) m. Either side may be wrong: "
-            f"{_cause_of_shift(shift_m, joint.survey)}"
+            f"All fixes are shifted by ({values}) m east, north, up against the control points, which determine "
+            f"the position; the σ of the fixes' common error is ({stated}) m. Either side may be wrong. Check "
+            f"{_cause_of_shift(shift_m, joint.survey)}."
         )
         within_one_fix = bool(shift_m @ information @ shift_m <= outlier_gate(3))
         is_everyday = bool(np.linalg.norm(shift_m) <= _EVERYDAY_SHIFT_M)
@@ -223,18 +230,18 @@ def _control_points(joint: JointAdjustment) -> Iterator[_Finding]:
         yield _apart(shift, joint.survey, ends=True)
     elif factor.applied > _QUIET_FACTOR:
         scatter_m = float(np.sqrt((residual**2).mean()))
-        weighted_m = typical_sigma(np.array([point.cov_in_geo for point in joint.survey.control_points]))
-        who = "which nobody stated" if factor.sigma_source == "default" else "as stated"
         sentence = (
-            f"the control points miss by {scatter_m:.2f} m RMS an axis, their σ is "
-            f"{weighted_m / factor.applied**0.5:.3g} m, {who}: coordinates, marks or the SfM model are wrong; "
-            "every σ of the result is widened"
+            f"The residuals of the control points are {scatter_m:.2f} m RMS along each axis; their "
+            f"{_source(factor)} σ is {_before_adjustment(factor, joint.survey)}. Check coordinates, marks and the "
+            f"SfM model, or state the σ with {_SIGMA_OPTIONS['control points']}. Every σ of the result is enlarged."
         )
-        yield _Finding(_SIGMA_REFUTED, sentence, ends=_is_wrong(factor) and scatter_m > _WRONG_SCATTER_M)
+        yield _Finding(_SIGMA_REJECTED, sentence, ends=_is_wrong(factor) and scatter_m > _WRONG_SCATTER_M)
     elif not used.all():
         missed_m = np.linalg.norm(residual, axis=1)
         rejected = [f"{names[row]} ({missed_m[row]:.2f} m)" for row in np.flatnonzero(~used)]
-        sentence = f"{len(rejected)} of {factor.count} control points are outliers: {listed(rejected)}"
+        sentence = (
+            f"{len(rejected)} of {factor.count} control points are outliers, and are not used: {listed(rejected)}."
+        )
         yield _Finding("control-outliers", sentence)
 
 
@@ -248,14 +255,14 @@ def _constant_shift(residual: FloatArray) -> FloatArray | None:
 def _apart(shift_m: FloatArray, survey: Survey, *, ends: bool) -> _Finding:
     values = ", ".join(f"{value:+.2f}" for value in shift_m)
     sentence = (
-        f"control points and fixes are apart by one constant shift of ({values}) m east, north, up: "
-        f"{_cause_of_shift(shift_m, survey)}"
+        f"Control points and fixes are apart by a constant shift of ({values}) m east, north, up. Check "
+        f"{_cause_of_shift(shift_m, survey)}."
     )
     return _Finding("control-shifted", sentence, ends)
 
 
 def _attitudes(survey: Survey, fixes: StatedFixes, joint: JointAdjustment) -> Iterator[_Finding]:
-    """Yield the finding that the attitudes contradict the solution.
+    """Yield the finding that the attitudes disagree with the solution.
 
     A compass is often off by degrees, whatever its σ. A small turn is therefore reported only if a clock offset
     explains it: then the whole flight may lie in a wrong place.
@@ -269,18 +276,19 @@ def _attitudes(survey: Survey, fixes: StatedFixes, joint: JointAdjustment) -> It
     clock = clock_that_turns(fixes, prior)
     if clock is not None and clock[1] < _EXPLAINED_SIGMAS * sigma:
         cause = (
-            f"a clock offset of {clock[0]:+.2f} s between positions and photographs would explain it, and the "
-            "whole flight lies in a wrong place then; or the compass is off. Check the times, or add control points"
+            f"A clock offset of {clock[0]:+.2f} s between positions and photographs would explain the turn, and "
+            "would put the whole flight in a wrong place; an error of the compass would explain it too. Check the "
+            "times, or add control points."
         )
     elif angle > max(_ATTITUDE_SIGMAS * sigma, _ATTITUDE_RAD):
-        cause = "compass, mount, or the positions (their times, their axes) are wrong"
+        cause = "Check compass, mount, and times and axes of the positions."
     else:
         return
     sentence = (
-        f"the recorded attitudes are turned by {np.degrees(angle):.1f}° against this solution "
-        f"(σ {np.degrees(sigma):.1f}°): {cause}"
+        f"The recorded attitudes are turned by {np.degrees(angle):.1f}° against this solution, with a σ of "
+        f"{np.degrees(sigma):.1f}°. {cause}"
     )
-    yield _Finding("attitudes-contradict", sentence)
+    yield _Finding("attitudes-inconsistent", sentence)
 
 
 def _weak_checks(joint: JointAdjustment) -> Iterator[_Finding]:
@@ -288,32 +296,57 @@ def _weak_checks(joint: JointAdjustment) -> Iterator[_Finding]:
     redundancy = sum(factor.redundancy for factor in tested)
     if redundancy < 6.0:
         sentence = (
-            f"only {redundancy:.0f} degrees of freedom check the σ of the positions: a wrong position can go "
-            "unnoticed; add fixes or control points"
+            f"Only {redundancy:.0f} degrees of freedom check the σ of the positions, so that a wrong position can "
+            "go unnoticed. Add fixes or control points."
         )
         yield _Finding("hardly-checked", sentence)
     if joint.problem.term(Fixes.kind) is not None and joint.factors.get("control points") is None:
         fixes = [image.fix for image in joint.survey.images if image.fix is not None]
         sigma = typical_sigma(np.array([fix.cov_in_geo for fix in fixes]))
         sentence = (
-            "no control point checks an error that all fixes share, of the base station or of a receiver without "
-            f"corrections: σ count the fixes, of {sigma:.2g} m, as independent"
+            "No control point checks an error that all fixes share, such as that of the base station. The "
+            f"predicted σ take the errors of the fixes, σ {sigma:.2g} m, as independent. Add control points with "
+            "--gcp."
         )
         yield _Finding("no-control-points", sentence)
 
 
-def _guesses(joint: JointAdjustment) -> Iterator[_Finding]:
-    guessed = [
-        f"{factor.group} ({'not checked' if factor.estimated is None else f'factor {factor.estimated:.2g}'})"
-        for factor in joint.factors.values()
-        if factor.sigma_source == "default" and factor.group in ("fixes", "control points", "marks")
-    ]
-    if guessed:
-        sentence = (
-            f"nobody stated the σ of {', '.join(guessed)}: defaults stand in, and every σ of the result hangs on "
-            "them"
-        )
-        yield _Finding("default-sigma", sentence)
+def _assumed_sigmas(joint: JointAdjustment) -> Iterator[_Finding]:
+    """Yield the finding that σ are assumed; a group whose σ another finding rejects is left out."""
+    sentences = []
+    for group, options in _SIGMA_OPTIONS.items():
+        factor = joint.factors.get(group)
+        if factor is None or factor.sigma_source != "default":
+            continue
+        assumed = _before_adjustment(factor, joint.survey)
+        if factor.estimated is None:
+            sentences.append(f"Nothing checks the assumed σ of the {group}, {assumed}: state it with {options}.")
+        elif group == "marks" or factor.applied <= _QUIET_FACTOR:
+            ratio = f"{factor.estimated**0.5:.2g}"
+            sentences.append(
+                f"The {group} scatter {ratio} times their assumed σ of {assumed}: state it with {options}."
+            )
+    if sentences:
+        yield _Finding("default-sigma", " ".join((*sentences, "Every σ of the result depends on these.")))
+
+
+def _before_adjustment(factor: VarianceFactor, survey: Survey) -> str:
+    """Return the σ of a group as stated or assumed, with its unit; `survey` has the variance factor in it."""
+    if factor.group == "marks":
+        sigma, unit = np.median([mark.sigma_px for point in survey.control_points for mark in point.marks]), "px"
+    else:
+        fixes = [image.fix for image in survey.images if image.fix is not None]
+        measured = survey.control_points if factor.group == "control points" else fixes
+        sigma, unit = typical_sigma(np.array([position.cov_in_geo for position in measured])), "m"
+    return f"{float(sigma) / factor.applied**0.5:.3g} {unit}"
+
+
+def _source(factor: VarianceFactor) -> str:
+    return "assumed" if factor.sigma_source == "default" else "stated"
+
+
+def _explained(best: Hypothesis) -> str:
+    return f"{best.sentence} With this correction the fixes fit to {best.scatter_m:.2f} m."
 
 
 def mistake_in_marks(survey: Survey, model: SparseModel) -> str | None:
@@ -336,16 +369,16 @@ def mistake_in_marks(survey: Survey, model: SparseModel) -> str | None:
         return len(control_correspondences(survey.model_copy(update={"control_points": tuple(changed)}), model)[0])
 
     changes = {
-        "their y counts from the lower edge of the photograph: count it from the upper one": _FROM_BELOW,
-        "their x and y are exchanged": _EXCHANGED,
+        "Their y counts from the lower edge of the photograph: count it from the upper edge": _FROM_BELOW,
+        "Their x and y are exchanged": _EXCHANGED,
     }
     for size, scale in _SCALES.items():
-        sentence = f"they were measured in photographs of {size} the size: measure in these, or scale the marks"
+        sentence = f"They were measured in photographs of {size} the size: measure in these, or scale the marks"
         changes[sentence] = scale * _AS_STATED
     stated = meeting(_AS_STATED)
     most, sentence = max(((meeting(change), name) for name, change in changes.items()), key=lambda one: one[0])
     explains = most >= max(2, 2 * stated) and most > len(points) / 2
-    return f"{sentence}; then {most} of {len(points)} meet" if explains else None
+    return f"{sentence}. Then the rays of {most} of {len(points)} points meet." if explains else None
 
 
 def _mistake_in_map(survey: Survey, model: SparseModel) -> str | None:
@@ -362,21 +395,21 @@ def _mistake_in_map(survey: Survey, model: SparseModel) -> str | None:
     except DegenerateGeometryError:
         return None
     if control_m > _MIRRORED_M and mirrored_m < control_m / 10.0:
-        return "their map is mirrored: east and north are exchanged; check the order of the columns and the CRS"
+        return "the map of the control points is mirrored. Check the order of the columns and the CRS."
     ratio = by_control.scale / by_fixes.scale
     sigma = float(np.hypot(_sigma_of_scale(fixes, fix_m), _sigma_of_scale(control, control_m)))
     causes = {
         1.0 / np.cos(np.radians(survey.origin.lat_deg)): "Web Mercator (EPSG:3857) has this scale at this latitude",
-        FOOT_M: "the coordinates are in metres, although their CRS has feet",
-        1.0 / FOOT_M: "the coordinates are in feet, although their CRS has metres",
+        FOOT_M: "The coordinates are in metres, although their CRS has feet",
+        1.0 / FOOT_M: "The coordinates are in feet, although their CRS has metres",
     }
     near = min(causes, key=lambda scale: abs(np.log(ratio / scale)))
     is_known = abs(np.log(ratio / near)) < _CAUSE_SIGMAS * sigma + _LEAST_SCALE
     # Poor coordinates have any scale: one without a known cause has to be twice as evident.
     if abs(np.log(ratio)) < (_SCALE_SIGMAS if is_known else 2.0 * _SCALE_SIGMAS) * sigma + _LEAST_SCALE:
         return None
-    cause = causes[near] if is_known else "another unit or map projection"
-    return f"their map is {ratio:.4g} times as large as that of the fixes: {cause}"
+    cause = causes[near] if is_known else "Check unit and map projection"
+    return f"the map of the control points is {ratio:.4g} times as large as that of the fixes. {cause}."
 
 
 def _sigma_of_scale(positions: Correspondences, scatter_m: float) -> float:
@@ -386,7 +419,7 @@ def _sigma_of_scale(positions: Correspondences, scatter_m: float) -> float:
 
 
 def _cause_of_shift(shift_m: FloatArray, survey: Survey) -> str:
-    """Return the likely cause of a constant shift (3,) between fixes and control points: east, north, up.
+    """Return what to check where fixes and control points are apart by a constant shift (3,), east, north, up.
 
     The sign of the shift does not matter. The survey has control points.
     """
@@ -396,20 +429,18 @@ def _cause_of_shift(shift_m: FloatArray, survey: Survey) -> str:
         other_m = height_m + sign * float(shift_m[2])
         for high, low, side in ((height_m, other_m, "control points"), (other_m, height_m, "fixes")):
             if vertical > _LEAST_FEET_M and abs(high * FOOT_M - low) < _FEET_PART * abs(low):
-                return f"the heights of the {side} are in feet, and taken for metres"
+                return f"the unit of the heights of the {side}: they fit as feet"
     if horizontal < 0.2 * vertical and 5.0 < vertical < MOST_GEOID_M:
-        return (
-            f"heights apart by {vertical:.1f} m: one above the ellipsoid, the other above a geoid or the take-off"
-        )
+        return f"the vertical datum: the heights are {vertical:.1f} m apart, as of ellipsoid and geoid or take-off"
     if horizontal < 0.2 * vertical and vertical >= MOST_GEOID_M:
-        return "heights above another zero: the take-off, or another unit"
+        return "the zero of the heights, which may be the take-off, and their unit"
     if horizontal > 100_000.0:
-        return "another zone, or exchanged axes"
+        return "the zone and the order of the axes"
     if horizontal > 20.0:
-        return "another datum, or another realisation of it"
+        return "the datum and its realisation"
     if horizontal > _EVERYDAY_SHIFT_M:
         return (
-            "the position of the base station, the datum, or US survey feet taken for international ones (10 m in "
-            "5 000 km)"
+            "the position of the base station, the datum, and the unit: US survey feet taken for international "
+            "feet shift by 10 m in 5 000 km"
         )
-    return "the position of the base station, the datum, or the antenna offset"
+    return "the position of the base station, the datum and the antenna offset"

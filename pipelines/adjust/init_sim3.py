@@ -41,7 +41,7 @@ from pipelines.adjust.posterior import Posterior, save_posterior
 from pipelines.adjust.solution import adjusted
 from pipelines.adjust.system import minimise
 from pipelines.adjust.terms import ControlPoints, Fixes
-from pipelines.core.errors import ContradictionError, ConvergenceError, DegenerateGeometryError, InputError
+from pipelines.core.errors import ConvergenceError, DegenerateGeometryError, InconsistencyError, InputError
 from pipelines.core.products import NOT_CHECKED, Remark, save_json, union
 from pipelines.core.sentences import listed
 from pipelines.core.stages import ADJUSTMENT, POINTS, SIM3, SIM3_POSTERIOR, SPARSE
@@ -56,7 +56,7 @@ from pipelines.survey.calibrated import load_survey
 from pipelines.survey.scene import initial_scene
 from pipelines.survey.survey import Survey
 
-_LEVEL = 0.01  # of the test that refutes σ where no joint adjustment is possible
+_LEVEL = 0.01  # of the χ² test of σ where no joint adjustment is possible
 
 
 @dataclass(frozen=True)
@@ -87,14 +87,14 @@ def estimate_similarity(
 
     Raises:
         DegenerateGeometryError: the measurements leave the similarity open; names further measurements.
-        ContradictionError: sources contradict each other, and the options do not accept that.
+        InconsistencyError: sources are inconsistent, and the options do not accept that.
         ConvergenceError: the residual is larger than `options.max_residual`.
         InputError: `points` belongs to another model.
     """
     if not np.array_equal(points.point_id, model.point_id):
         raise InputError(
-            "todo-geolocated-points-another-model",
-            "the geolocated points are of another model: run `georef geolocate` again",
+            "points-of-another-model",
+            "The geolocated points belong to another SfM model. Run `georef geolocate` again.",
         )
     if not options.control_points:
         survey = survey.model_copy(update={"control_points": ()})
@@ -116,10 +116,10 @@ def _check_residual(initial: InitialSimilarity, limit_m: float | None) -> None:
         return
     what = "camera centres" if kind == "gnss" else "control points"
     raise ConvergenceError(
-        "todo-rms-residual-horizontal-vertical",
-        f"RMS residual of {stats.count} {what} is {stats.rmse_3d_m:.3f} m (horizontal {stats.rmse_h_m:.3f}, "
-        f"vertical {stats.rmse_v_m:.3f}), more than --max-residual {limit_m:g} m: look for wrong positions or a "
-        "bent SfM model, or allow more",
+        "residual-above-limit",
+        f"The RMS residual of {stats.count} {what} is {stats.rmse_3d_m:.3f} m (horizontal {stats.rmse_h_m:.3f} m, "
+        f"vertical {stats.rmse_v_m:.3f} m), more than {limit_m:g} m. Look for wrong positions or a bent SfM model, "
+        "or raise --max-residual.",
     )
 
 
@@ -168,7 +168,7 @@ def robust_similarity(
     except DegenerateGeometryError as error:
         _refuse(unadjustable(survey, model, None), options)
         reasons = [positions_in_use(survey, model, data, unused), *(caution.sentence for caution in of_marks)]
-        raise DegenerateGeometryError("todo-x", f"{error}. {'; '.join(reasons)}") from error
+        raise DegenerateGeometryError(error.code, " ".join((str(error), *reasons))) from error
     aligned = _aligned_product(model, points, data, alignment).model_copy(
         update={"control_outliers": tuple(p.name for p in survey.control_points if p.name not in control.name)}
     )
@@ -178,20 +178,21 @@ def robust_similarity(
     try:
         joint = adjust_jointly(meets, model, _starts(data, aligned, options.seed), estimate=options.estimate)
     except DegenerateGeometryError as error:
-        contradictions = unadjustable(meets, model, alignment.geo_from_local)
-        _refuse(contradictions, options)
-        unchecked = Remark(code=NOT_CHECKED, sentence=f"nothing checks the stated σ: {error}")
-        cautions = union(survey.cautions, contradictions, of_marks, (unchecked,))
+        inconsistencies = unadjustable(meets, model, alignment.geo_from_local)
+        _refuse(inconsistencies, options)
+        unchecked = Remark(code=NOT_CHECKED, sentence=f"Nothing checks the stated σ. {error}")
+        cautions = union(survey.cautions, inconsistencies, of_marks, (unchecked,))
         initial = _without_joint(aligned, alignment.solution, cautions)
         return Estimated(initial, solved(survey, model, initial, options.estimate), warnings)
-    contradictions, limits = cautions_of(meets, model, joint)
-    _refuse(contradictions, options)
+    inconsistencies, limits = cautions_of(meets, model, joint)
+    _refuse(inconsistencies, options)
     initial, more = _joint_product(model, points, aligned, joint)
-    cautions = union(survey.cautions, contradictions, of_marks, limits)
+    cautions = union(survey.cautions, inconsistencies, of_marks, limits)
+    told = {caution.code for caution in cautions}
     initial = initial.model_copy(update={"cautions": cautions})
     posterior = solved(survey, model, initial, options.estimate, joint)
     initial = initial.model_copy(update={"geo_from_local": posterior.solution.similarity_from_local()})
-    return Estimated(initial, posterior, warnings + more)
+    return Estimated(initial, posterior, warnings + tuple(one for one in more if one.code not in told))
 
 
 def solved(
@@ -222,12 +223,12 @@ def solved(
     return adjusted(scene, problem, state, initial, rejected_of(scene, survey, initial))
 
 
-def _refuse(contradictions: tuple[Remark, ...], options: InitSim3Options) -> None:
-    if contradictions and not options.accept_contradiction:
-        raise ContradictionError(
-            "todo-x",
-            "; ".join(caution.sentence for caution in contradictions)
-            + ". Correct what is wrong, or go on with --accept-contradiction, which widens every σ",
+def _refuse(inconsistencies: tuple[Remark, ...], options: InitSim3Options) -> None:
+    if inconsistencies and not options.accept_inconsistency:
+        raise InconsistencyError(
+            inconsistencies[0].code,
+            " ".join(caution.sentence for caution in inconsistencies)
+            + " Correct the input, or go on with larger σ: --accept-inconsistency.",
         )
 
 
@@ -315,7 +316,8 @@ def _joint_product(
     residuals = aligned.residuals | {"points": residuals_of_points(model, points, similarity)}
     rejected: dict[str, tuple[str, ...]] = {"gnss": aligned.gnss_outliers, "gcp": ()}
     warnings = []
-    for kind, group in (("gnss", Fixes.kind), ("gcp", ControlPoints.kind)):
+    groups = (("gnss", Fixes.kind, "fix-outliers"), ("gcp", ControlPoints.kind, "control-outliers"))
+    for kind, group, code in groups:
         names, missed, used = joint.residuals(group)
         if not names:
             continue
@@ -323,8 +325,8 @@ def _joint_product(
         bad = [(name, miss) for name, miss, good in zip(names, missed, used, strict=True) if not good]
         if bad:
             sizes = [f"{name} ({np.linalg.norm(miss):.2f} m)" for name, miss in bad]
-            sentence = f"{len(bad)} of {len(names)} {group} are outliers: {listed(sizes)}"
-            warnings.append(Remark(code=f"{kind}-outliers", sentence=sentence))
+            sentence = f"{len(bad)} of {len(names)} {group} are outliers, and are not used: {listed(sizes)}."
+            warnings.append(Remark(code=code, sentence=sentence))
         rejected[kind] = tuple(name for name, _ in bad)
     pivot = np.array(aligned.geo_from_local.pivot)
     return aligned.model_copy(

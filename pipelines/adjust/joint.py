@@ -44,7 +44,7 @@ from pipelines.survey.survey import Survey
 
 _ROUNDS, _SETTLED = 8, 0.02  # of the factors, and their relative change at which they are final
 _NEAR = 0.5  # relative change up to which the equations before it serve the first steps
-# Level of the test below which a σ is refuted: a stated one, and one that nobody stated.
+# Level of the test below which a σ is rejected: a stated one, and one that nobody stated.
 _LEVEL: dict[SigmaSource, float] = {"stated": 0.001, "default": 0.01}
 _TESTED: tuple[Group, ...] = ("fixes", "control points")
 _EXACT = 1e-9
@@ -123,7 +123,7 @@ def adjust_jointly(
         InputError: an error is to be estimated whose measurements were not recorded.
     """
     solutions: list[JointAdjustment] = []
-    refusal = DegenerateGeometryError("todo-no-start-for-joint", "no start for the joint adjustment")
+    refusal = DegenerateGeometryError("no-start", "The joint adjustment has no start.")
     frame: Scene | None = None
     for start in starts:
         try:
@@ -132,7 +132,7 @@ def adjust_jointly(
             if solutions[0].is_consistent:
                 break
         except (DegenerateGeometryError, ConvergenceError) as error:
-            refusal = DegenerateGeometryError("todo-x", str(error))
+            refusal = DegenerateGeometryError(error.code, str(error))
     if not solutions:
         raise refusal
     return min(solutions, key=lambda solution: solution.cost)
@@ -170,7 +170,7 @@ def _adjust(
 
     problem = problem_at(applied)
     if not problem.measured:
-        raise DegenerateGeometryError("todo-no-position-takes-part", "no position takes part in the adjustment")
+        raise DegenerateGeometryError("no-positions", "The adjustment has no fix and no control point.")
     geo_from_local = Similarity.from_record(start.initial.geo_from_local)
     geo_from_model = geo_from_local @ scene.model_from_local.inverse()
     state = replace(start_of(scene, problem), geo_from_model=geo_from_model)
@@ -200,7 +200,7 @@ def _adjust(
 def _next_factors(
     survey: Survey, components: dict[str, VarianceComponent], applied: dict[Group, float]
 ) -> dict[Group, float]:
-    """Return the factors that the present residuals ask for, where the stated σ are refuted; never below 1.
+    """Return the factors that the present residuals ask for, where the χ² test rejects the stated σ; never below 1.
 
     The scatter within a survey does not show an error that all its members share. σ that look too large are
     therefore left as they are.
@@ -210,8 +210,8 @@ def _next_factors(
         component, present = components.get(group), applied.get(group, 1.0)
         if component is None:
             continue
-        refuted = component.probability(present) < _LEVEL[_source(survey, group)]
-        factors[group] = max(present * component.cautious_factor, 1.0) if refuted else 1.0
+        rejected = component.probability(present) < _LEVEL[_source(survey, group)]
+        factors[group] = max(present * component.cautious_factor, 1.0) if rejected else 1.0
     return factors
 
 

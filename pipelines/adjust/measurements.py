@@ -29,8 +29,8 @@ from pipelines.survey.marks import MarkRays, RayErrors, intersect_marks, mark_an
 from pipelines.survey.scene import Scene
 from pipelines.survey.survey import Survey
 
-_CONTRADICTION_SIGMAS = 6.0
-_CONTRADICTION_RAD = np.radians(15.0)  # lower limit, because the σ of attitudes are often optimistic
+_INCONSISTENT_SIGMAS = 6.0
+_INCONSISTENT_RAD = np.radians(15.0)  # lower limit, because the σ of attitudes are often optimistic
 _WIDE_RAD = 1.0
 _TINY = 1e-9  # σ of exact values, where a covariance must be regular
 _LEAST_SIGMA_COMMON_M = 1e-4  # of an axis without a common error, where another axis has one
@@ -38,19 +38,19 @@ _LEAST_SIGMA_COMMON_M = 1e-4  # of an axis without a common error, where another
 
 @dataclass(frozen=True)
 class RecordedRotations:
-    """Recorded attitudes of k registered images, without the images that contradict the SfM model.
+    """Recorded attitudes of k registered images, without the images that disagree with the SfM model.
 
     Attributes:
         image: (k,) index into the model's images.
         geo_from_cam: (k, 3, 3).
         sigma_rad: (k,) per axis.
-        contradicting: names of the images left out.
+        inconsistent: names of the images left out.
     """
 
     image: IntArray
     geo_from_cam: FloatArray
     sigma_rad: FloatArray
-    contradicting: tuple[str, ...]
+    inconsistent: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -74,14 +74,16 @@ class UnusedControlPoint:
         """Reason for people: images that are missing, or marks that do not meet."""
         missing = f" ({listed(self.unregistered)} not registered)" if self.unregistered else ""
         if len(self.registered) < 2:
-            return f"control point {self.name}: marked in fewer than 2 registered images{missing}, not used"
+            return (
+                f"Control point {self.name} is marked in fewer than two registered images{missing}; it is not used."
+            )
         marks = sorted(zip(self.residual_px, self.registered, strict=True), reverse=True)
-        rays = f"control point {self.name}: its {len(marks)} marks do not meet in one point"
+        rays = f"Control point {self.name} is not used: the rays of its {len(marks)} marks"
         if not np.isfinite(self.residual_px).all():
-            return f"{rays}: their rays are parallel ({listed(self.registered)}), not used; check the marks"
+            return f"{rays} are parallel ({listed(self.registered)}). Check the marks."
         rms = float(np.sqrt(np.mean(np.square(self.residual_px))))
         worst = listed(tuple(f"{image} {residual:.1f} px" for residual, image in marks))
-        return f"{rays}: up to {marks[0][0]:.1f} px off, RMS {rms:.1f} px ({worst}), not used; check the marks"
+        return f"{rays} miss one point by up to {marks[0][0]:.1f} px, RMS {rms:.1f} px ({worst}). Check the marks."
 
 
 def fix_correspondences(survey: Survey, model: SparseModel) -> Correspondences:
@@ -133,16 +135,16 @@ def positions_in_use(
     """Return how many fixes and control points there are, how many are used, and why the others are not."""
     fixes, control = int((~data.control).sum()), int(data.control.sum())
     counts = (
-        f"{len(model.image_name)} of {len(survey.images)} images are registered; in use are {fixes} of "
+        f"{len(model.image_name)} of {len(survey.images)} images are registered. {fixes} of "
         f"{sum(image.fix is not None for image in survey.images)} fixes and {control} of "
-        f"{len(survey.control_points)} control points"
+        f"{len(survey.control_points)} control points are used."
     )
-    return "; ".join([counts, *(point.sentence for point in unused)])
+    return " ".join([counts, *(point.sentence for point in unused)])
 
 
 def _unused(survey: Survey, model: SparseModel, rays: MarkRays) -> tuple[UnusedControlPoint, ...]:
     position, *_ = _intersect_in_local(model, rays)
-    # Where the rays contradict each other, none is left: within a wide σ they meet in the least-squares point.
+    # Where the rays disagree, none is left: within a wide σ they meet in the least-squares point.
     wide = RayErrors(_TINY, _TINY, _WIDE_RAD)
     compromise = intersect_marks(rays, model.rotation_cam_from_local, model.cam_center_in_local, wide)
     position = np.where(np.isfinite(position), position, compromise.position_in_geo)
@@ -177,7 +179,7 @@ def _intersect_in_local(model: SparseModel, rays: MarkRays) -> tuple[FloatArray,
 
 
 def recorded_rotations(survey: Survey, model: SparseModel) -> RecordedRotations:
-    """Return the recorded attitudes of the registered images, without those that the SfM model contradicts.
+    """Return the recorded attitudes of the registered images, without those that disagree with the SfM model.
 
     For example, a photograph that was turned in an image viewer keeps the attitude that the drone wrote. That
     attitude differs from the others by far more than its σ.
@@ -192,12 +194,12 @@ def recorded_rotations(survey: Survey, model: SparseModel) -> RecordedRotations:
         geo_from_local = rotation @ model.rotation_cam_from_local[image]
         mean = mean_rotation(geo_from_local, sigma_rad).rotation
         turn = np.linalg.norm(log_so3(geo_from_local @ mean.T), axis=1)
-        agrees = turn < np.maximum(_CONTRADICTION_SIGMAS * sigma_rad, _CONTRADICTION_RAD)
+        agrees = turn < np.maximum(_INCONSISTENT_SIGMAS * sigma_rad, _INCONSISTENT_RAD)
     return RecordedRotations(
         image=image[agrees],
         geo_from_cam=rotation[agrees],
         sigma_rad=sigma_rad[agrees],
-        contradicting=tuple(model.image_name[index] for index in image[~agrees]),
+        inconsistent=tuple(model.image_name[index] for index in image[~agrees]),
     )
 
 
@@ -235,8 +237,8 @@ def problem_of(
     for name, source, what in (("lever-arm", fixes, "positions"), ("boresight", attitudes, "attitudes")):
         if name in wanted and source is None:
             raise InputError(
-                "todo-cannot-be-estimated-no",
-                f"{name} cannot be estimated: no {what} were recorded",
+                f"no-{what}",
+                f"{name} cannot be estimated, because no {what} were recorded.",
                 field="--estimate",
             )
     blocks = [] if fixes is None else _common_errors(survey, fixes)

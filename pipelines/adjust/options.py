@@ -25,20 +25,20 @@ class CalibrateOptions(StageOptions):
 
     estimate: RigParameters | None = Field(
         None,
-        description="Any of time-offset, boresight and lever-arm, with commas (default: what ingest was asked to "
-        "estimate).",
+        description="Any of time-offset, boresight and lever-arm, with commas (default: those that ingest "
+        "was to estimate).",
     )
     max_offset: float = Field(
-        2.0, gt=0, le=60, description="Search the time offset so many seconds on either side of the present one."
+        2.0, gt=0, le=60, description="Search for the time offset up to so many seconds from the present one."
     )
     apply: bool | None = Field(
         None,
-        description="Apply the estimates that are observable, or none (default: those that ingest was asked for).",
+        description="Apply all observable estimates, or none (default: those that ingest was to estimate).",
     )
 
 
 class GeolocateOptions(StageOptions):
-    """Options of the intersection of every SfM point in the frame `geo`."""
+    """Options of the forward intersection of every SfM point in the frame `geo`."""
 
     attitude: Literal["auto", "recorded", "sfm"] = Field(
         "auto", description="Rotations of the rays: recorded with the images, or SfM's aligned to geo."
@@ -66,6 +66,6 @@ class InitSim3Options(StageOptions):
         "with a comma; or none.",
     )
     seed: int = Field(0, ge=0, description="Seed of the RANSAC.")
-    accept_contradiction: bool = Field(
-        False, description="Go on where sources contradict each other, with a caution and larger σ."
+    accept_inconsistency: bool = Field(
+        False, description="Go on where sources are inconsistent, with a caution and larger σ."
     )

@@ -28,8 +28,8 @@ def similarity_by_paper(model: SparseModel, points: GeolocatedPoints, data: Corr
     good = points.inlier
     if good.sum() < 3:
         raise DegenerateGeometryError(
-            "todo-method-paper-needs-geolocated",
-            f"--method paper needs 3 geolocated points, there are {good.sum()}: use --method robust",
+            "too-few-geolocated-points",
+            f"--method paper needs at least three geolocated points; there are {good.sum()}. Use --method robust.",
         )
     local, geo = model.point_in_local[good], points.position_in_geo[good]
     similarity = spread_ratio_similarity(local, geo)

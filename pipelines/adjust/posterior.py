@@ -79,9 +79,6 @@ def intersection_jacobian(
     return IntersectionJacobian(csr_matrix(poses), np.swapaxes(lens, 1, 2).reshape(count, 3, -1), cov)
 
 
-_ADVICE = "run `georef init-sim3` (and `georef train`) again"
-
-
 @dataclass(frozen=True)
 class Posterior:
     """Covariances of a solved survey.
@@ -278,7 +275,9 @@ def load_posterior(path: Path, solution: Adjustment, sfm: SparseModel) -> Poster
     )
     if not fits:
         raise InputError(
-            "todo-does-not-belong-solution", f"does not belong to the solution beside it: {_ADVICE}", path=path
+            "posterior-of-another-solution",
+            "does not belong to the solution beside it; run `georef init-sim3` (and `georef train`) again",
+            path=path,
         )
     poses = bsr_matrix((arrays["data"], arrays["indices"], arrays["indptr"]), shape=(6 * n, 6 * n))
     normal, sparse = NormalMatrix(poses, border, corner, position), solution.with_lenses(sfm)

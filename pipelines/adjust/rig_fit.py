@@ -47,8 +47,8 @@ _FURTHER_S = 30.0  # more than the 18 s between GPS time and UTC
 _LEAST_SIGMA_M, _LEAST_SIGMA_RAD = 1e-3, 1e-5
 _LEAST_IMAGES = 6
 _NOT_OBSERVABLE = (
-    f"nothing of the rig is observable: fewer than {_LEAST_IMAGES} images lie within the recorded navigation, or "
-    "all lie on one line or in one place"
+    f"The rig is not observable: fewer than {_LEAST_IMAGES} images lie within the recorded navigation, or all of "
+    "them lie on one line or in one place."
 )
 
 
@@ -168,9 +168,9 @@ def fit_rig(data: RigData, start_offset_s: float, start_boresight: FloatArray, o
             sigma_rad = max(mad_sigma(np.concatenate([attitude, -attitude]).ravel()), _LEAST_SIGMA_RAD)
     if options.offset and abs(state.offset_s - start_offset_s) > _INNER * options.max_offset_s:
         raise DegenerateGeometryError(
-            "todo-time-offset-fits-best",
-            f"the time offset that fits best lies at the end of the search, {options.max_offset_s:g} s from the "
-            f"present one, where others may fit better: search further with --max-offset {_FURTHER_S:g}",
+            "time-offset-at-limit",
+            f"The best time offset lies at the limit of the search, {options.max_offset_s:g} s from the present "
+            f"one; a larger offset may fit better. Search further with --max-offset {_FURTHER_S:g}.",
         )
     _, jacobian, _ = _linearised(data, state, (sigma_m, sigma_rad), start, options)
     sigma = np.where(free, np.sqrt(np.diag(_covariance(jacobian, free))), np.inf)
@@ -196,7 +196,7 @@ def _usable_images(data: RigData, offset_s: float) -> BoolArray:
         for shift in (-_DIFFERENCE_S, 0.0, _DIFFERENCE_S):
             usable &= recorded.covers(data.time_s + offset_s + shift)
     if usable.sum() < _LEAST_IMAGES:
-        raise DegenerateGeometryError("todo-x", _NOT_OBSERVABLE)
+        raise DegenerateGeometryError("rig-not-observable", _NOT_OBSERVABLE)
     return usable
 
 
@@ -251,15 +251,15 @@ def _start(data: RigData, offset_s: float, boresight: FloatArray, options: FitOp
         if best is None or cost < best[0]:
             best = cost, RigState(similarity, offset, boresight, np.zeros(3))
     if best is None:
-        raise DegenerateGeometryError("todo-x", _NOT_OBSERVABLE)
+        raise DegenerateGeometryError("rig-not-observable", _NOT_OBSERVABLE)
     state = best[1]
     spread = np.linalg.svd(data.center_in_local - data.center_in_local.mean(axis=0), compute_uv=False)
     extent_m = state.geo_from_local.scale * spread / np.sqrt(len(data.center_in_local))
     if extent_m[0] < 1.0 or extent_m[1] < 0.01 * extent_m[0]:
         raise DegenerateGeometryError(
-            "todo-nothing-rig-observable-cameras",
-            "nothing of the rig is observable: the cameras stay within a metre of one place, or on one line; "
-            "fly turns and changes of speed",
+            "rig-not-observable",
+            "The rig is not observable: the cameras stay within 1 m of one place, or on one line. Fly turns, and "
+            "change the speed.",
         )
     return state
 
@@ -313,7 +313,7 @@ def _linearised(
 
 
 def _covariance(jacobian: FloatArray, free: BoolArray) -> FloatArray:
-    """Return the covariance (14, 14) of the parameters from derivatives (m, 14); zero for the held ones."""
+    """Return the covariance (14, 14) of the parameters from derivatives (m, 14); zero for the frozen ones."""
     covariance, of_free = np.zeros((14, 14)), jacobian[:, free]
     covariance[np.ix_(free, free)] = covariance_of(of_free, 1.0 / np.linalg.norm(of_free, axis=0))
     return covariance

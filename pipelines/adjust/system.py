@@ -46,8 +46,8 @@ _NEW_FACTOR = 0.6  # a step that leaves more of the last change of the residuals
 _CHUNK = 32  # groups of rows whose covariances are computed together
 _EQUILIBRATIONS = 8
 _OPEN = 1e-13  # singular value of the equilibrated Schur complement over the largest
-_UNSEEN = 10.0  # times the bundle's loosest σ, at which a camera is held that nothing observes
-_ADVICE = "fixes and control points leave the similarity open: add control points, at least 3"
+_UNSEEN = 10.0  # times the bundle's loosest σ, at which a camera is frozen that nothing observes
+_ADVICE = "Fixes and control points do not determine the similarity. Add at least three control points."
 
 # By kind of observation: residuals (M, d), weights (M,).
 Residuals = Mapping[str, FloatArray]
@@ -153,7 +153,7 @@ class NormalMatrix:
         try:
             return SparseCholesky(self.poses, self.position)
         except DegenerateGeometryError:
-            raise DegenerateGeometryError("todo-x", _ADVICE) from None
+            raise DegenerateGeometryError("similarity-open", _ADVICE) from None
 
     @cached_property
     def response(self) -> FloatArray:
@@ -177,7 +177,7 @@ class NormalMatrix:
         scaled = schur * scale[:, None] * scale
         size = np.linalg.svd(scaled, compute_uv=False)
         if size[-1] <= _OPEN * size[0]:
-            raise DegenerateGeometryError("todo-x", _ADVICE)
+            raise DegenerateGeometryError("similarity-open", _ADVICE)
         factors = lu_factor(scaled)
         return lambda right: np.asarray(lu_solve(factors, right * scale[:, None]) * scale[:, None])
 
@@ -314,7 +314,7 @@ class Linearised:
         scale = 1.0 / np.sqrt(np.diag(information) + np.abs(np.diag(problem.of_rounding)))
         beyond = (information - problem.of_rounding) * scale[:, None] * scale
         if np.linalg.eigvalsh(beyond)[0] <= _OPEN:
-            raise DegenerateGeometryError("todo-x", _ADVICE)
+            raise DegenerateGeometryError("similarity-open", _ADVICE)
 
     @property
     def _width(self) -> int:
@@ -382,10 +382,7 @@ def minimise(problem: Problem, start: State, normal: NormalMatrix | None = None)
             if reached <= cost + _NOISE * (1 + abs(cost)) or change < _STILL:
                 break
         else:
-            raise ConvergenceError(
-                "todo-cameras-do-not-settle",
-                f"the cameras do not settle: the last step changed a residual by {change:.1e} σ",
-            )
+            raise _not_converged(change)
         state, residuals, cost = moved, new, reached
         if change < _STILL:
             return Minimum(state, cost, normal)
@@ -394,9 +391,12 @@ def minimise(problem: Problem, start: State, normal: NormalMatrix | None = None)
         whole = change / (stretch * 0.5**halving)
         stretch = 2 * stretch if not halving and _SLOW * unstretched < whole < unstretched else 1.0
         last, unstretched = change, whole
-    raise ConvergenceError(
-        "todo-cameras-do-not-settle", f"the cameras do not settle: the last step changed a residual by {last:.1e} σ"
-    )
+    raise _not_converged(last)
+
+
+def _not_converged(change: float) -> ConvergenceError:
+    sentence = f"The cameras have not converged: the last step changed a residual by {change:.1e} σ."
+    return ConvergenceError("cameras-not-converged", sentence)
 
 
 def _moved(problem: Problem, state: State, step: tuple[FloatArray, FloatArray], part: float) -> State:

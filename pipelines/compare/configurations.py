@@ -103,8 +103,8 @@ def select_configurations(text: str) -> tuple[Configuration, ...]:
     unknown = [name for name in names if name not in BY_CONFIGURATION]
     if unknown or not names:
         known = ", ".join(BY_CONFIGURATION)
-        message = f"{unknown[0]!r} is none of {known}" if unknown else f"choose from {known}"
-        raise InputError("todo-x", message, field="--configs")
+        message = f"{unknown[0]!r} is none of {known}" if unknown else f"no configuration; choose from {known}"
+        raise InputError("unknown-configuration", message, field="--configs")
     return tuple(BY_CONFIGURATION[name] for name in dict.fromkeys(names))
 
 

@@ -181,15 +181,15 @@ def _row(configuration: Configuration, plan: Sequence[VariantStage], runner: _Pl
     training = manifests[_TRAIN.name].values
     report = read_report(plan[-1].variant.path(REPORT))
     test = report.test_views
-    assert test is not None and report.checkpoints.model is not None  # every configuration trains
+    assert test is not None and report.checkpoints.surface is not None  # every configuration trains
     return ComparedRow(
         **told,
         test_psnr=test.psnr,
         test_psnr_covered=test.psnr_covered,
         test_covered_share=test.covered_share,
         test_ssim=test.ssim,
-        camera=PointAccuracy.model_validate(report.checkpoints.camera, from_attributes=True),
-        model=PointAccuracy.model_validate(report.checkpoints.model, from_attributes=True),
+        triangulated=PointAccuracy.model_validate(report.checkpoints.triangulated, from_attributes=True),
+        surface=PointAccuracy.model_validate(report.checkpoints.surface, from_attributes=True),
         reference=surface_accuracy(report.reference),
         iterations=training.get("iterations"),
         gaussians=training.get("gaussians"),

@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Literal
 
-from pipelines.core.figures import ERRORS, MISSING, SHORT_WAYS, WAYS
+from pipelines.core.figures import ERRORS, MISSING, WAYS
 from pipelines.core.products import Product, Remark
 from pipelines.report.plots.charts import BarChart
 from pipelines.survey.report_parts import ReferenceComparison
 
 # Errors of the check points that the table shows: the way of measuring (key of `WAYS`), field of `PointAccuracy`.
 POINT_FIGURES = (
-    ("camera", "rmse_h_m"),
-    ("camera", "rmse_v_m"),
-    ("model", "median_h_m"),
-    ("model", "rmse_h_m"),
-    ("model", "rmse_v_m"),
+    ("triangulated", "rmse_h_m"),
+    ("triangulated", "rmse_v_m"),
+    ("surface", "median_h_m"),
+    ("surface", "rmse_h_m"),
+    ("surface", "rmse_v_m"),
 )
 REFERENCE_HEADS = ("M3C2 median", "NMAD", "F1 0.05 m", "F1 0.1 m", "F1 0.3 m")
 JsonScalar = bool | int | float | str
@@ -48,7 +48,7 @@ class ComparedRow(Product):
         test_psnr, test_ssim: means over the test views, in dB and from 0 to 1.
         test_psnr_covered: as test_psnr, over the pixels whose ground at least two training views show.
         test_covered_share: share of these pixels; the same for all configurations of one SfM model.
-        camera, model: errors of the check points, triangulated and on the rendered surface.
+        triangulated, surface: errors of the check points, triangulated and on the rendered surface.
         reference: the surface against a reference cloud; None: there is none.
         training_s: duration; None if the training is that of another configuration.
         warnings, cautions: of its stages; a caution once.
@@ -62,8 +62,8 @@ class ComparedRow(Product):
     test_psnr_covered: float | None = None
     test_covered_share: float | None = None
     test_ssim: float | None = None
-    camera: PointAccuracy = PointAccuracy()
-    model: PointAccuracy = PointAccuracy()
+    triangulated: PointAccuracy = PointAccuracy()
+    surface: PointAccuracy = PointAccuracy()
     reference: SurfaceAccuracy | None = None
     iterations: int | None = None
     gaussians: int | None = None
@@ -121,7 +121,7 @@ def markdown(table: Comparison) -> str:
     """Return the table as Markdown, with notes and remarks below."""
     heads = (
         *("", "test PSNR dB", "PSNR covered", "SSIM"),
-        *point_heads(SHORT_WAYS, " "),
+        *point_heads({way: way for way in WAYS}, " "),
         *("check points", "training"),
     )
     lines = [
@@ -151,7 +151,7 @@ def cells(row: ComparedRow) -> tuple[str, ...]:
 
     PSNR, that of covered pixels, SSIM; check points triangulated and on the surface, and their number; time.
     """
-    points, on_surface = row.camera.count, row.model.count
+    points, on_surface = row.triangulated.count, row.surface.count
     return (
         _text(row.test_psnr, 2),
         _text(row.test_psnr_covered, 2),

@@ -101,10 +101,10 @@ class DegenerateGeometryError(GeorefError):
     kind = "geometry"
 
 
-class ContradictionError(GeorefError):
+class InconsistencyError(GeorefError):
     """Sources that contradict each other as a whole; the message names both sides and what would reconcile them."""
 
-    kind = "contradiction"
+    kind = "inconsistent"
 
 
 class ConvergenceError(GeorefError):

@@ -14,8 +14,7 @@ from pipelines.core.products import Product
 MISSING = "–"
 _PER_METRE = {"m": 1.0, "cm": 100.0}
 # How the position of a check point was measured, by the key of the report.
-WAYS = {"camera": "triangulated", "model": "on the rendered surface"}
-SHORT_WAYS = {"camera": "triangulated", "model": "surface"}  # for narrow columns
+WAYS = {"triangulated": "triangulated", "surface": "on the rendered surface"}
 
 
 @dataclass(frozen=True)

@@ -121,8 +121,10 @@ def least_points(area_km2: float | None) -> int:
 
 def few_points(asprs: AsprsStatement) -> str:
     """Return the warning of fewer check points than the standard demands."""
-    least = f"the standard ({STANDARD}) asks for at least {asprs.least_points}"
-    return f"{asprs.points} check points; {least}: the class is indicative"
+    return (
+        f"{asprs.points} check points are fewer than the {asprs.least_points} that the standard ({STANDARD}) "
+        "demands; the class is indicative."
+    )
 
 
 def _statement(
@@ -148,7 +150,7 @@ def _statement(
         return asprs.model_copy(update={"statement": under or None})
     classes_of = classes_cm(tested.rmse_h_m, tested.rmse_v_m, tested.rmse_3d_m)
     horizontal, vertical, class_3d = (f"{class_cm} cm" for class_cm in classes_of)
-    sample = f"tested on {count} check points: " if asprs.enough_points else f"{few_points(asprs)}. "
+    sample = f"tested on {count} check points: " if asprs.enough_points else f"{few_points(asprs)} "
     classes = {"horizontal_class": horizontal, "vertical_class": vertical, "class_3d": class_3d}
     statement = (
         f"{sample}RMSE_H {100 * tested.rmse_h_m:.1f} cm, RMSE_V {100 * tested.rmse_v_m:.1f} cm outside vegetation "

@@ -26,7 +26,7 @@ def cautions_of_prediction(
 ) -> tuple[Remark, ...]:
     """Return the limits of the predicted accuracy; `of_initial`: the points have the initial similarity."""
     if of_initial:
-        sentence = "Measured with the initial similarity: the prediction is that of the adjusted one."
+        sentence = "The points are measured with the initial similarity; the predicted σ are of the adjusted one."
         return (Remark(code="prediction-of-adjusted-similarity", sentence=sentence),)
     points = solved.survey.check_points
     if len(points) < _LEAST_POINTS:
@@ -70,25 +70,25 @@ def chi2_caution(
         return None
     ratio = squared / freedom
     figures = (
-        f"normalised error² is {ratio:.2g} over {len(names)} triangulated check points, "
-        f"and {least / freedom:.2g} to {most / freedom:.2g} was to be expected (99 %)"
+        f"the mean squared normalised error of {len(names)} triangulated check points is {ratio:.2g}, and 99 % of "
+        f"right predictions give {least / freedom:.2g} to {most / freedom:.2g}"
     )
     if squared < least:
         return Remark(
             code="prediction-pessimistic",
-            sentence=f"The predicted accuracy is pessimistic: {figures}; the σ of prediction, marks and check "
-            f"points together are too large by a factor of {ratio**-0.5:.1f}.",
+            sentence=f"The predicted σ are too large: {figures}. The σ of prediction, marks and check points "
+            f"together are {ratio**-0.5:.1f} times the errors. State smaller σ, such as --sigma-mark.",
         )
     others = tuple(name for name in names if name not in blunders)
     good = np.repeat([name not in blunders for name in names], 3)
     alone = ""
     if _LEAST_POINTS <= len(others) < len(names) and not chi2_caution(others, error[good], cov[np.ix_(good, good)]):
         left_out = tuple(name for name in names if name in blunders)
-        alone = f"; without the blunders ({listed(left_out)}) the errors agree with the prediction"
+        alone = f" Without the blunders ({listed(left_out)}) the errors agree with the prediction."
     return Remark(
-        code="prediction-refuted",
-        sentence=f"Check points refute the predicted accuracy: {figures}; the σ of prediction, marks and check "
-        f"points together are too small by a factor of {ratio**0.5:.1f}{alone}.",
+        code="prediction-rejected",
+        sentence=f"The predicted σ are too small: {figures}. The errors are {ratio**0.5:.1f} times the σ of "
+        f"prediction, marks and check points together.{alone}",
     )
 
 
@@ -106,7 +106,7 @@ def dependent_check_points(survey: Survey) -> tuple[Remark, ...]:
     if not pairs:
         return ()
     sentence = (
-        f"{len(pairs)} of {len(survey.check_points)} check points may be the same feature as a control point, so "
-        f"that their errors say little of the accuracy: {listed(tuple(pairs))}."
+        f"{len(pairs)} of {len(survey.check_points)} check points may be the same feature as a control point, and "
+        f"then measure no accuracy: {listed(tuple(pairs))}."
     )
     return (Remark(code="check-point-not-independent", sentence=sentence),)

@@ -36,7 +36,7 @@ def coordinates_in(crs: PointCrs, checkpoints: CheckPoints, survey: Survey) -> C
         InputError: a point lies outside the CRS's domain.
     """
     surveyed = np.array([point.position_in_geo for point in survey.check_points]).reshape(-1, 3)
-    measured = [surveyed + _errors(way, surveyed) for way in (checkpoints.camera, checkpoints.model)]
+    measured = [surveyed + _errors(way, surveyed) for way in (checkpoints.triangulated, checkpoints.surface)]
     # One call for all points, so that one operation transforms them all.
     in_geo = np.concatenate([np.zeros((1, 3)), surveyed, *measured])
     known = np.isfinite(in_geo).all(axis=1)
@@ -56,10 +56,12 @@ def coordinates_in(crs: PointCrs, checkpoints: CheckPoints, survey: Survey) -> C
             PointCoordinates(
                 name=point.name,
                 surveyed=_vector(surveyed_xyz),
-                camera=_measured(camera_xyz),
-                model=_measured(model_xyz),
+                triangulated=_measured(triangulated_xyz),
+                surface=_measured(surface_xyz),
             )
-            for point, (surveyed_xyz, camera_xyz, model_xyz) in zip(survey.check_points, by_point, strict=True)
+            for point, (surveyed_xyz, triangulated_xyz, surface_xyz) in zip(
+                survey.check_points, by_point, strict=True
+            )
         ),
     )
 
@@ -145,6 +147,6 @@ def _crs_cells(coordinates: Coordinates | None, line: PointLine) -> list[str]:
     point = next((point for point in coordinates.points if point.name == line.row.name), None)
     if point is None or line.use != "check":
         return [""] * len(_IN_CRS)
-    measured = point.camera if line.way == "camera" else point.model
+    measured = point.triangulated if line.way == "triangulated" else point.surface
     texts = coordinates.texts(point.surveyed), coordinates.texts(measured)
     return [coordinates.crs, *texts[0], *texts[1]]

@@ -165,8 +165,8 @@ def _model(
     views.close()
     if not len(delivered):
         raise DegenerateGeometryError(
-            "todo-no-point-surface-seen",
-            "no point of the surface is seen alike by three training views: train longer",
+            "surface-not-seen",
+            "No point of the surface has the same depth in three training views. Train longer.",
         )
     sparse = overview.position_in_geo[first_of_voxels(overview.position_in_geo, 2 * _OVERVIEW_M)]
     normal, kind = plane_normals(sparse, 2 * _OVERVIEW_M), options.reference_align
@@ -175,9 +175,9 @@ def _model(
         return delivered, settings, None if found is None else found[1], None
     if found is None:
         raise DegenerateGeometryError(
-            "todo-reference-align-surface-reference",
-            f"--reference-align {kind}: the surface and the reference have too little in common to move one onto "
-            "the other, or nothing in them fixes all axes: compare without it",
+            "reference-not-aligned",
+            "The surface and the reference overlap too little, or their shape leaves an axis open, so that the "
+            f"{kind} between them cannot be estimated. Compare with --reference-align none.",
         )
     similarity, shift = found
     moved = TiledPoints(scratch / "moved", delivered.side_m)
@@ -242,8 +242,8 @@ def cautions_of_reference(found: ComparedReference) -> tuple[Remark, ...]:
     least = comparison.groups[0].scores[0].threshold_m
     if fine > least:
         apart = (
-            f"Points are {fine:.3f} m apart: shares within shorter distances, and C2C, say more about the "
-            "spacing than about the surface. M3C2 does not depend on it."
+            f"Points are {fine:.3f} m apart. Shares within shorter distances, and C2C, depend on this spacing; "
+            "M3C2 does not."
         )
         cautions.append(Remark(code="reference-spacing", sentence=apart))
     shift = comparison.shift
@@ -251,10 +251,9 @@ def cautions_of_reference(found: ComparedReference) -> tuple[Remark, ...]:
         sigma = [max(s, comparison.georeference_sigma_m or 0.0, comparison.sigma_m) for s in shift.sigma_m]
         if any(abs(value) > _SHIFTED_SIGMAS * s for value, s in zip(shift.enu_m, sigma, strict=True)):
             off = (
-                "The model lies off the reference as a whole: moving it by "
-                f"{shift.enu_m[0]:+.3f} m east, {shift.enu_m[1]:+.3f} m north and {shift.enu_m[2]:+.3f} m up "
-                "fits best, which is more than three times the σ of both (--reference-align shift judges the "
-                "shape alone)."
+                "The model is shifted against the reference by more than three times the σ of both: the best fit "
+                f"moves it by {shift.enu_m[0]:+.3f} m east, {shift.enu_m[1]:+.3f} m north and "
+                f"{shift.enu_m[2]:+.3f} m up. To compare the shape alone, use --reference-align shift."
             )
             cautions.append(Remark(code="reference-shifted", sentence=off))
     if comparison.seen < _SEEN:

@@ -134,8 +134,8 @@ class TiledPoints:
         rows = np.zeros(len(position), dtype=_ROW)
         if shutil.disk_usage(self._folder).free < rows.nbytes + _SPARE_BYTES:
             raise InputError(
-                "todo-no-room-for-points",
-                "no room for the points that are compared: make room on this disk",
+                "disk-full",
+                "no room for the points that are compared; make room on this disk",
                 path=self._folder,
             )
         rows["position"] = position

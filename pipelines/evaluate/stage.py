@@ -98,19 +98,19 @@ def _test_views(test: PhotometricFigures | None) -> str:
 
 def _warnings(report: EvaluationReport) -> tuple[Remark, ...]:
     warnings = []
-    asprs = report.checkpoints.camera.asprs
+    asprs = report.checkpoints.triangulated.asprs
     if asprs.points and not asprs.enough_points:
         warnings.append(Remark(code="few-check-points", sentence=few_points(asprs)))
     for way, errors in report.checkpoints.by_way.items():
         if errors.blunders:
             sentence = (
-                f"{WAYS[way]}, {len(errors.blunders)} of {errors.count} check points are off by more than three "
-                f"times the class that the others meet: {listed(errors.blunders)}"
+                f"{len(errors.blunders)} of {errors.count} check points, {WAYS[way]}, have errors of more than "
+                f"three times the class that the others meet: {listed(errors.blunders)}."
             )
             warnings.append(Remark(code="check-point-blunders", sentence=sentence))
     crossed = report.cross_validation
     if crossed is not None and crossed.reason is not None:
-        sentence = f"no cross-validation: {crossed.reason}"
+        sentence = f"There is no cross-validation: {crossed.reason}."
         warnings.append(Remark(code="no-cross-validation", sentence=sentence))
     return tuple(warnings)
 
@@ -127,7 +127,7 @@ def draw_accuracy(
     points = MapPoints(
         cameras=solved.geo_from_model.apply(solved.poses.cam_center_in_model)[:, :2],
         control=_named(survey.control_points, report.fit.gcp.points),
-        check=_named(survey.check_points, report.checkpoints.camera.points),
+        check=_named(survey.check_points, report.checkpoints.triangulated.points),
     )
     write_accuracy_map(path, raster, points, _coordinates(survey.origin, crs))
 
@@ -209,12 +209,12 @@ def evaluate(
     """
     model = solved.model
     log_scale, *_, east, north, up = np.sqrt(np.diag(model.geo_from_model.covariance)).tolist()
-    camera = triangulated_check_points(solved, posterior)
-    checkpoints = CheckPoints(camera=camera, model=None if rendered is None else rendered.points)
+    triangulated = triangulated_check_points(solved, posterior)
+    checkpoints = CheckPoints(triangulated=triangulated, surface=None if rendered is None else rendered.points)
     scene = model.accuracy or AccuracySummary(cells=0, reason="the adjustment states no σ")
     reference = None if rendered is None else rendered.reference
     return EvaluationReport(
-        headline=headline(camera, scene, model.cautions),
+        headline=headline(triangulated, scene, model.cautions),
         photometric=None if rendered is None else rendered.photometric,
         checkpoints=checkpoints,
         cross_validation=cross_validate(solved) if options.cross_validate else None,
@@ -227,7 +227,7 @@ def evaluate(
         variance_factors=model.variance_factors,
         cautions=union(
             model.cautions,
-            cautions_of_prediction(solved, posterior, camera, of_initial=options.similarity == "initial"),
+            cautions_of_prediction(solved, posterior, triangulated, of_initial=options.similarity == "initial"),
             dependent_check_points(solved.survey),
             () if reference is None else cautions_of_reference(reference),
         ),
@@ -258,7 +258,7 @@ def _refuse_what_needs_gaussians(stage: StageRun, options: EvaluateOptions) -> N
         if value is not None:
             command = stage.workspace.command_of(BY_NAME["train"])
             raise InputError(
-                "todo-needs-trained-model-run",
-                f"needs a trained model: run `{command}` first, or leave the option out",
+                "not-trained",
+                f"needs a trained model; run `{command}` first, or leave the option out",
                 field=flag,
             )

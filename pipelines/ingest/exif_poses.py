@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import KDTree
 
-from pipelines.core.errors import ContradictionError
+from pipelines.core.errors import InconsistencyError
 from pipelines.core.products import Remark
 from pipelines.core.sentences import listed
 from pipelines.core.types import FloatArray
@@ -36,7 +36,7 @@ _VERTICAL_RATIO = 2.0
 _RECEIVER = {RTK_FIXED: "RTK fixed", RTK_FLOAT: "RTK float"}
 _EXIF_NOTE = "EXIF's altitude is often above a geoid or barometric, and --vertical states its datum"
 _SIGMAS, _LEAST_M = 4.0, 1.0
-_MOST_CONTRADICTING = 1 / 3
+_MOST_INCONSISTENT = 1 / 3
 # Another unit shows if heights differ by this many times what σ allow, and that unit leaves this part of a height.
 _EVIDENT, _UNIT_PART = 2.0, 0.05
 _KILOMETRES_M = 2_000.0
@@ -129,7 +129,7 @@ def compare_with_exif(
     """Compare the positions of a table, whose file is `path`, with those of EXIF; what differs is a caution.
 
     Raises:
-        ContradictionError: most positions differ beyond the σ of both, and the options do not accept that.
+        InconsistencyError: most positions differ beyond the σ of both, and the options do not accept that.
     """
     # Stated σ are those of the table: a track good to centimetres says nothing about the photographs' receiver.
     own_sigma = options.model_copy(update={"sigma_h": None, "sigma_v": None})
@@ -154,10 +154,10 @@ def compare_with_exif(
     heights_m = np.column_stack([in_table, lla[:, 2]])
     found = (_horizontal(places, path), _heights(heights_m, apart[:, 2], sigma[:, 2], path))
     for fatal, caution in filter(None, found):
-        if fatal and not options.accept_contradiction:
-            raise ContradictionError(
+        if fatal and not options.accept_inconsistency:
+            raise InconsistencyError(
                 caution.code,
-                f"{path}: {caution.sentence} Correct the wrong file, or continue with --accept-contradiction.",
+                f"{path}: {caution.sentence} Correct the wrong file, or continue with --accept-inconsistency.",
             )
         remarks.caution(caution.code, caution.sentence)
 
@@ -178,7 +178,7 @@ def _horizontal(places: _Places, path: Path) -> tuple[bool, Remark] | None:
     distance = np.hypot(*(places.table - places.exif).T)
     allowed = np.maximum(_SIGMAS * np.hypot(*places.sigma_m.T), _LEAST_M)
     contradicting = distance > allowed
-    if contradicting.mean() <= _MOST_CONTRADICTING:
+    if contradicting.mean() <= _MOST_INCONSISTENT:
         return None
     code, cause = _cause(places, float(np.median(distance)), float(np.median(allowed)) / _SIGMAS)
     sentence = f"{int(contradicting.sum())} of {len(distance)} positions in {path.name} {cause}"

@@ -12,7 +12,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from pipelines.core.errors import ContradictionError, InputError
+from pipelines.core.errors import InconsistencyError, InputError
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.formats.gnss_logs import FIRST_LINE, CameraEvents, read_mrk, read_pos
@@ -48,7 +48,7 @@ def read_folder(
     """Read photographs, and the trajectory or `geo.txt` that the options name; `decode` as of `scan_folder`.
 
     Raises:
-        ContradictionError: the files contradict each other.
+        InconsistencyError: the files contradict each other.
         InputError: anything wrong with the files, or too few photographs.
     """
     photos = scan_folder(folder, remarks, progress, decode=decode)
@@ -155,7 +155,7 @@ def _event_of_each(events: CameraEvents, photos: Sequence[Photo], remarks: Remar
 
     Raises:
         InputError: one number in two folders, or no event fits.
-        ContradictionError: the times in EXIF are not those of the events.
+        InconsistencyError: the times in EXIF are not those of the events.
     """
     row_of = {int(number): row for row, number in enumerate(events.number)}
     rows = np.full(len(photos), -1)
@@ -203,7 +203,7 @@ def _refuse_other_times(events: CameraEvents, timed: Sequence[tuple[Photo, int]]
     off_s = np.abs(apart_s - np.median(apart_s))
     if off_s.max() > _MOST_SPREAD_S:
         worst = timed[int(off_s.argmax())][0].name
-        raise ContradictionError(
+        raise InconsistencyError(
             "event-times",
             f"{events.path}: {int((off_s > _MOST_SPREAD_S).sum())} of {len(timed)} photographs do not have the "
             "times of the events with "

@@ -144,7 +144,7 @@ class IngestOptions(StageOptions):
     sigma_mark: float = Field(0.5, gt=0, description="σ of an image mark in pixels.")
     max_gap: float = Field(1.0, gt=0, description="Longest gap to interpolate over in the trajectory, in seconds.")
     focal_px: float | None = Field(None, gt=0, description="Focal length in pixels, instead of the one from EXIF.")
-    accept_contradiction: bool = Field(
+    accept_inconsistency: bool = Field(
         False, description="Continue where the table of positions contradicts EXIF, with a caution."
     )
     copy_images: bool = Field(

@@ -80,7 +80,7 @@ class AccuracyFacts:
 def accuracy_facts(evaluated: EvaluatedSurvey) -> AccuracyFacts:
     report = evaluated.report
     by_way = report.checkpoints.by_way
-    sigma, error = _compared(report.checkpoints.camera, evaluated.solved.survey.check_points)
+    sigma, error = _compared(report.checkpoints.triangulated, evaluated.solved.survey.check_points)
     enough = len(sigma) >= _LEAST_FOR_CHART
     crossed = report.cross_validation
     return AccuracyFacts(
@@ -94,7 +94,7 @@ def accuracy_facts(evaluated: EvaluatedSurvey) -> AccuracyFacts:
         chart=picture_of_png(predicted_against_measured(sigma, error)) if enough else None,
         within=_within(sigma, error) if enough else (),
         map=_map(evaluated),
-        surface="model" in by_way,
+        surface="surface" in by_way,
         crossed=crossed is not None and crossed.count > 0,
         crossed_reason="" if crossed is None or crossed.reason is None else crossed.reason,
         crossed_figures=_lines("cross_validation.", _CROSSED),

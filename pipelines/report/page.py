@@ -174,7 +174,7 @@ def render_page(page: Page, room: str) -> str:
 
 
 def value_at(document: Any, path: str) -> Any:
-    """Return the value at a path of keys and indices: `checkpoints.camera.points.3.de_m`.
+    """Return the value at a path of keys and indices: `checkpoints.triangulated.points.3.de_m`.
 
     None where a part on the way is None: a part of a report that does not exist has no figures.
 

@@ -131,8 +131,8 @@ class PointRow:
     """Surveyed point, with its coordinates in the CRS of the report.
 
     Attributes:
-        field, model_field: paths of its rows in the report of `evaluate`, triangulated and on the rendered surface;
-            None: it has none.
+        field, surface_field: paths of its rows in the report of `evaluate`, triangulated and on the rendered
+            surface; None: it has none.
         blunder, predicted: whether it is a blunder, triangulated; whether the row has predicted σ.
         rmse_px: root mean square distance of its marks from the adjusted point; None: it is not measured.
     """
@@ -142,7 +142,7 @@ class PointRow:
     field: str | None
     blunder: bool
     predicted: bool
-    model_field: str | None
+    surface_field: str | None
     rmse_px: float | None
     chips: tuple[Chip, ...]
 
@@ -174,7 +174,11 @@ def points_facts(
     groups = (
         _group(evaluated, "control", survey.control_points, report.fit.gcp.points, "fit.gcp.points"),
         _group(
-            evaluated, "check", survey.check_points, report.checkpoints.camera.points, "checkpoints.camera.points"
+            evaluated,
+            "check",
+            survey.check_points,
+            report.checkpoints.triangulated.points,
+            "checkpoints.triangulated.points",
         ),
     )
     total = sum(len(group.points) for group in groups)
@@ -237,14 +241,14 @@ def _facts(
 ) -> PointsFacts:
     distance = group.rays.xy_px - group.adjusted_px
     place = {row.name: index for index, row in enumerate(group.errors)}
-    surface = evaluated.report.checkpoints.model
-    by_model = {} if surface is None else {row.name: index for index, row in enumerate(surface.points)}
+    surface = evaluated.report.checkpoints.surface
+    on_surface = {} if surface is None else {row.name: index for index, row in enumerate(surface.points)}
     rows = []
     texts = texts_of(evaluated.crs, group.surveyed_in_geo)
     for index, (point, coordinates) in enumerate(zip(group.points, texts, strict=True)):
         at = place.get(point.name)
         row = None if at is None else group.errors[at]
-        model_at = by_model.get(point.name) if group.kind == "check" else None
+        surface_at = on_surface.get(point.name) if group.kind == "check" else None
         squares = (distance[group.rays.point == index] ** 2).sum(axis=1)
         rows.append(
             PointRow(
@@ -253,7 +257,7 @@ def _facts(
                 field=None if at is None else f"{group.field}.{at}",
                 blunder=bool(getattr(row, "blunder", False)),
                 predicted=isinstance(row, PredictedPointError),
-                model_field=None if model_at is None else f"checkpoints.model.points.{model_at}",
+                surface_field=None if surface_at is None else f"checkpoints.surface.points.{surface_at}",
                 rmse_px=float(np.sqrt(squares.mean())) if len(squares) and np.isfinite(squares).all() else None,
                 chips=chips.get((group.kind, point.name), ()),
             )

@@ -75,7 +75,7 @@ _Fields = tuple[Level, str, str, str]  # of a verdict without its subject, in th
 
 def verdicts(report: EvaluationReport, measured: Measured, cautions: Sequence[Remark]) -> tuple[Verdict, ...]:
     """Return the verdicts on a survey, in the order of the work."""
-    triangulated, on_surface, test = report.checkpoints.camera, report.checkpoints.model, report.test_views
+    triangulated, on_surface, test = report.checkpoints.triangulated, report.checkpoints.surface, report.test_views
     by_subject: dict[str, _Fields] = {
         "Registered photographs": _registered(measured),
         "Overlap": _overlap(measured),

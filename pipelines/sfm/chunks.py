@@ -160,7 +160,7 @@ def write_chunk(arguments: Mapping[str, Any], progress: Progress) -> None:
     try:
         require_sound(draft)
     except DamagedPartialError as error:
-        log.warning("%s: starts afresh: %s", chunk.name, error)
+        log.warning("%s starts afresh: %s", chunk.name, error)
         remove_database(draft)
     job = SfmJob(load_json(Survey, Path(arguments["survey"])), Path(arguments["images"]), draft, plan.options)
     with quiet_colmap() as colmap:
@@ -190,7 +190,7 @@ def copy_finished(
     database = chunk.database(partial)
     if not chunk.database(partial).is_file():
         raise InputError(
-            "todo-not-finished-its-features",
+            "chunk-not-finished",
             f"{chunk.name} is not finished, and its features are needed",
             path=database,
         )
@@ -199,7 +199,7 @@ def copy_finished(
     except DamagedPartialError as error:
         remove_database(database)
         raise InputError(
-            "todo-was-removed-run-georef", f"{error.message}: it was removed; run `georef sfm` again", path=database
+            "chunk-damaged", f"{error.message}; the file was removed: run `georef sfm` again", path=database
         ) from error
 
 
@@ -207,19 +207,19 @@ def _planned(workspace: Workspace, name: str) -> Chunk:
     path = workspace.partial(BY_NAME["sfm"]) / PLAN
     if not path.is_file():
         raise InputError(
-            "todo-no-chunks-planned-georef",
-            f"no chunks are planned: `georef sfm {workspace.root}` plans them",
+            "no-chunk-plan",
+            f"no chunks are planned; run `georef sfm {workspace.root}`",
             path=path,
         )
     chunks = load_json(ChunkPlan, path).chunks
     chunk = next((chunk for chunk in chunks if chunk.name == name), None)
     if chunk is None:
         names = f"{chunks[0].name} … {chunks[-1].name}" if chunks else "none"
-        raise InputError("todo-none-chunks", f"{name!r} is none of the chunks {names}", field="--chunk")
+        raise InputError("unknown-chunk", f"{name!r} is none of the chunks {names}", field="--chunk")
     count = len(load_json(Survey, workspace.path(SURVEY)).images)
     if max((*chunk.images, *(index for pair in chunk.pairs for index in pair)), default=0) >= count:
-        message = f"{name} has more photographs than the survey: `georef sfm {workspace.root}` plans anew"
-        raise InputError("todo-x", message, path=path)
+        message = f"{name} has more photographs than the survey; run `georef sfm {workspace.root}`"
+        raise InputError("chunk-plan-outdated", message, path=path)
     return chunk
 
 
@@ -250,9 +250,9 @@ def _work(stage: StageRun, survey: Survey, plan: ChunkPlan, kind: Kind) -> None:
     if failed := failed_of(title, jobs, ended, stage.progress):
         names = listed([end.job.name for end in failed])
         raise GeorefError(
-            "todo-failed-same-command-works",
-            f"{len(failed)} of {len(jobs)} {title} failed ({names}): {failed[0].error}; the same command works on "
-            "those again and keeps the others",
+            "chunks-failed",
+            f"{len(failed)} of {len(jobs)} {title} failed ({names}). The first error: {failed[0].error}. The same "
+            "command repeats these chunks, and keeps the others.",
         )
 
 

@@ -73,9 +73,7 @@ def copy_rows(source: Path, target: Path, tables: Iterable[str], images: Iterabl
             connection.execute("attach database ? as source", (f"{source.absolute().as_uri()}?immutable=1",))
             versions = {connection.execute(f"pragma {name}.user_version").fetchone() for name in ("main", "source")}
             if len(versions) > 1:
-                raise DamagedPartialError(
-                    "todo-was-made-by-another", "was made by another version of COLMAP", path=source
-                )
+                raise DamagedPartialError("colmap-version", "was made by another version of COLMAP", path=source)
             connection.execute("begin immediate")
             wanted = "" if images is None else "where image_id in (select image_id from temp.wanted)"
             if images is not None:
@@ -87,7 +85,7 @@ def copy_rows(source: Path, target: Path, tables: Iterable[str], images: Iterabl
         except sqlite3.DatabaseError as error:
             if storage_error(error) is not None:
                 raise
-            raise DamagedPartialError("todo-cannot-be-copied", f"cannot be copied: {error}", path=source) from error
+            raise DamagedPartialError("database-damaged", f"cannot be copied: {error}", path=source) from error
 
 
 def finish_database(draft: Path, final: Path, *, without: Iterable[str] = ()) -> None:
@@ -121,7 +119,7 @@ def require_sound(database: Path) -> None:
             raise
         verdict = str(error)
     if verdict != "ok":
-        raise DamagedPartialError("todo-database-damaged", f"the database is damaged: {verdict}", path=database)
+        raise DamagedPartialError("database-damaged", f"the database is damaged: {verdict}", path=database)
 
 
 def _write_camera(colmap: Any, database: Any, prior: CameraPrior, options: SfmOptions) -> None:
@@ -148,8 +146,8 @@ def _copy_shared_params(colmap: Any, prior: CameraPrior, camera: Any) -> None:
         by_name = dict(zip(names, prior.params, strict=True))
     except ValueError as error:
         raise InputError(
-            "todo-no-camera-colmap-with",
-            f"{prior.model} is no camera of COLMAP with {len(prior.params)} parameters",
+            "unknown-camera-model",
+            f"{prior.model} with {len(prior.params)} parameters is not a camera model of COLMAP",
             field=SURVEY,
         ) from error
     f = by_name.get("f", by_name.get("fx", 0.0))

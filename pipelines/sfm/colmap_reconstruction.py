@@ -36,7 +36,7 @@ class ColmapReconstructor:
         count = len(survey.images)
         reason = why_too_large(count, survey.largest_photograph_px, options, free_main_memory_bytes())
         if reason is not None:
-            raise ResourceError("todo-x", reason)
+            raise ResourceError("memory-too-small", reason)
         if count > options.chunk_size:
             work_in_chunks(stage, survey, options)
         return count <= options.chunk_size
@@ -67,8 +67,9 @@ def reconstruct(colmap: Any, job: SfmJob, progress: Progress) -> Any:
     missing = [image.name for image in job.survey.images if not (job.images / image.name).is_file()]
     if missing:
         raise InputError(
-            "todo-photographs-survey-gone",
-            f"{len(missing)} photographs of the survey are gone",
+            "photograph-missing",
+            f"{len(missing)} photographs of the survey are missing, such as this one; restore them, or run "
+            "`georef ingest` again",
             path=job.images / missing[0],
         )
     colmap.set_random_seed(job.options.seed)
@@ -83,13 +84,13 @@ def map_matches(colmap: Any, job: SfmJob, progress: Progress) -> Any:
     models = map_database(colmap, job, progress)
     if not models:
         raise DegenerateGeometryError(
-            "todo-no-two-photographs-could",
-            "no two photographs could be tied together: is there enough overlap and texture? "
-            "`--max-features` and `--pairs exhaustive` may help",
+            "no-matches",
+            "No two photographs could be matched: overlap or texture is too low. Try a larger --max-features, or "
+            "--pairs exhaustive.",
         )
     if len(models) > 1:
         sizes = [model.num_reg_images() for model in models]
-        log.warning("the survey fell apart into %d models of %s images; the largest is used", len(models), sizes)
+        log.warning("The survey fell apart into %d models of %s images; the largest is used.", len(models), sizes)
     model, threads = models[0], chosen_threads(job.options.threads)
     if len(job.survey.images) > _DRIFTLESS_UP_TO:
         fixes = {image.name: image.fix.position_in_geo for image in job.survey.images if image.fix is not None}

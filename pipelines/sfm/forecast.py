@@ -108,10 +108,10 @@ def why_too_large(
     fewer = options.max_features
     while fewer > 1000 and not fits(fewer):
         fewer -= 500
-    advice = f"use --max-features {fewer}" if fits(fewer) else "reconstruct elsewhere and use --import"
+    advice = f"Use --max-features {fewer}" if fits(fewer) else "Import a model made elsewhere with --import"
     mapper = chosen_mapper(photographs, options)
     return (
-        f"SfM of {photographs} photographs needs about {needed / 2**30:.1f} GiB at its peak ({mapper} mapper, "
-        f"{options.max_features} features a photograph) and {free_bytes / 2**30:.1f} GiB are free: {advice}, or a "
-        "machine with more memory"
+        f"SfM of {photographs} photographs needs about {needed / 2**30:.1f} GiB of memory ({mapper} mapper, "
+        f"{options.max_features} features a photograph); {free_bytes / 2**30:.1f} GiB are free. {advice}, or a "
+        "machine with more memory."
     )

@@ -60,12 +60,13 @@ def import_model(path: Path, survey: Survey) -> Any:
         model.deregister_frame(frame_id)
     if model.num_reg_images() < 3:
         raise InputError(
-            "todo-only-its-images-survey",
-            f"only {model.num_reg_images()} of its images are in the survey: names must be equal",
+            "too-few-images-in-survey",
+            f"{model.num_reg_images()} of its images are in the survey, and at least three are needed; names must "
+            "be equal",
             path=folder,
         )
     if foreign:
-        log.warning("%d images of the imported model are not in the survey and were left out", len(foreign))
+        log.warning("%d images of the imported model are not in the survey, and were left out.", len(foreign))
     _check_cameras(model, survey, folder)
     return model
 
@@ -79,7 +80,7 @@ def find_model(path: Path) -> Path:
     folder = next((place for place in places for name in _IMAGES if (place / name).exists()), path)
     others = {file.parent for name in _IMAGES for file in folder.parent.glob(f"[0-9]*/{name}")} - {folder}
     if folder != path and others:
-        log.warning("%s is imported; %d further models lie beside it", folder, len(others))
+        log.warning("%s is imported; %d further models lie beside it.", folder, len(others))
     return folder
 
 
@@ -97,7 +98,7 @@ def _check_cameras(model: Any, survey: Survey, folder: Path) -> None:
         if (camera.width, camera.height) != (width, height):
             cause = "undistorted copies" if undistorted else "copies of another size"
             raise InputError(
-                "todo-its-camera-has-pixels",
+                "photograph-size",
                 f"its camera {image.camera_id} ({camera.model_name}) has {camera.width}×{camera.height} pixels, "
                 f"the photograph {image.name} {width}×{height}: the model was made of {cause}. Import the model of "
                 "the photographs themselves, or give the folder of the copies to `georef ingest --images`",
@@ -107,7 +108,7 @@ def _check_cameras(model: Any, survey: Survey, folder: Path) -> None:
             flat.add(image.camera_id)
     if flat:
         log.warning(
-            "the imported model has no lens distortion (camera %s): if it was made of undistorted copies, import "
-            "the model of the photographs themselves",
+            "The imported model has no lens distortion (camera %s). If it was made of undistorted copies, import "
+            "the model of the photographs themselves.",
             ", ".join(map(str, sorted(flat))),
         )

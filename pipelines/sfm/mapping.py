@@ -78,7 +78,7 @@ def map_database(colmap: Any, job: SfmJob, progress: Progress) -> list[Any]:
     models = _models(colmap, mapper, job, progress)
     if mapper == "global" and job.options.mapper == "auto" and _registered(models) < _REGISTERED * count:
         log.warning(
-            "the global mapper registered %d of %d photographs: the incremental mapper follows",
+            "The global mapper registered %d of %d photographs; the incremental mapper follows.",
             _registered(models),
             count,
         )
@@ -191,15 +191,15 @@ def _adjust(colmap: Any, model: Any, adjustment: Any) -> None:
     summary = colmap.create_default_bundle_adjuster(adjustment, bundle, model).solve()
     if not summary.is_solution_usable():
         raise ConvergenceError(
-            "todo-last-bundle-adjustment-found",
-            f"the last bundle adjustment found no solution: {summary.brief_report()}",
+            "bundle-not-converged",
+            f"The last bundle adjustment found no solution: {summary.brief_report()}",
         )
 
 
 def _free_principal_point(colmap: Any, model: Any, adjustment: Any) -> bool:
     """Adjust with the principal point free, and return whether the result was accepted.
 
-    A refused principal point is held where it was, and all other parameters are adjusted anew.
+    A refused principal point is frozen where it was, and all other parameters are adjusted anew.
     """
     adjustment.refine_principal_point = True
     before = {key: camera.params.copy() for key, camera in model.cameras.items()}
@@ -212,7 +212,7 @@ def _free_principal_point(colmap: Any, model: Any, adjustment: Any) -> bool:
             astray.append(key)
     if not astray:
         return True
-    log.warning("the principal point of camera %d is not determined and stays where it was", astray[0])
+    log.warning("The principal point of camera %d is not determined, and is frozen.", astray[0])
     for key, params in before.items():
         model.cameras[key].params = params
     adjustment.refine_principal_point = False
@@ -326,7 +326,7 @@ def remove_drift(
             colmap, model, positions, iterations=_MOST_ITERATIONS, gate_m=gate_m, threads=threads
         )
         if not adjuster.solve().is_solution_usable():
-            log.warning("the adjustment with the measured positions found no solution: the model may have drifted")
+            log.warning("The adjustment with the fixes found no solution; the model may have drifted.")
         task.advance(note=f"σ {sigma_m:.2f} m")
     return sigma_m
 

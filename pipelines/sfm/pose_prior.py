@@ -101,8 +101,8 @@ def adjust_to_fixes(model: Any, survey: Survey, alignment: Alignment, seed: int 
     """
     if alignment.layout == "line":
         raise DegenerateGeometryError(
-            "todo-fixes-lie-on-one",
-            "the fixes lie on one line: a bundle adjustment that knows positions only can turn the model about it",
+            "positions-on-a-line",
+            "The fixes lie on one line: a bundle adjustment with positions alone can turn the model about it.",
         )
     colmap = pycolmap_module()
     fixes = [
@@ -115,13 +115,13 @@ def adjust_to_fixes(model: Any, survey: Survey, alignment: Alignment, seed: int 
     summary = adjuster.solve()
     if not summary.is_solution_usable():
         raise ConvergenceError(
-            "todo-bundle-adjustment-found-no", f"the bundle adjustment found no solution: {summary.brief_report()}"
+            "bundle-not-converged", f"The bundle adjustment found no solution: {summary.brief_report()}"
         )
     # If COLMAP cannot align the model with the fixes, it adjusts without them, and only its log mentions that.
     if np.median(np.linalg.norm(_residuals(model, survey), axis=1)) > limit_m:
         raise ConvergenceError(
-            "todo-bundle-adjustment-left-most",
-            f"the bundle adjustment left most cameras more than {limit_m:.2f} m off their fixes",
+            "cameras-off-fixes",
+            f"The bundle adjustment left most cameras more than {limit_m:.2f} m away from their fixes.",
         )
     model.update_point_3d_errors()
 

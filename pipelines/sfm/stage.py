@@ -51,7 +51,7 @@ def run(stage: StageRun, options: SfmOptions) -> Summary:
         if stage.resumed and continues:
             cause = str(error).strip().splitlines()[-1]
             raise DamagedPartialError(
-                "todo-colmap-cannot-continue", f"COLMAP cannot continue it: {cause}", path=stage.out
+                "partial-not-continued", f"COLMAP cannot continue it: {cause}", path=stage.out
             ) from error
         raise
     warnings = tuple(Remark(**warning) for warning in document["warnings"])
@@ -78,8 +78,8 @@ def _summarise(model: Any, survey: Survey) -> Summary:
     registered, total = model.num_reg_images(), len(survey.images)
     if registered < 3:
         raise DegenerateGeometryError(
-            "todo-only-photographs-could-be",
-            f"only {registered} of {total} photographs could be registered: a splat needs 3 or more",
+            "too-few-registered",
+            f"{registered} of {total} photographs could be registered; at least three are needed.",
         )
     error_px = model.compute_mean_reprojection_error()
     left_out = sorted(
@@ -88,8 +88,8 @@ def _summarise(model: Any, survey: Survey) -> Summary:
     warnings = []
     if registered < _FEW_REGISTERED * total:
         sentence = (
-            f"Only {registered} of {total} photographs were registered: the splat will have holes. "
-            f"Not registered: {', '.join(left_out[:5])}{' …' if len(left_out) > 5 else ''}"
+            f"{registered} of {total} photographs were registered: the splat will have holes. "
+            f"Not registered: {', '.join(left_out[:5])}{' …' if len(left_out) > 5 else ''}."
         )
         warnings.append(Remark(code="few-photographs-registered", sentence=sentence))
     values = {

@@ -125,8 +125,8 @@ class BlockPlan(Product):
             if block.id == number:
                 return block
         raise InputError(
-            "todo-there-no-block-plan",
-            f"there is no block {number}: the plan has 0 … {len(self.blocks) - 1}",
+            "unknown-block",
+            f"there is no block {number}; the plan has blocks 0 to {len(self.blocks) - 1}",
             field="--id",
         )
 

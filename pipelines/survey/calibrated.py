@@ -96,9 +96,9 @@ def load_track(workspace: Workspace) -> NavigationTrack:
         path = workspace.path(TRACK)
     except MissingProductError as error:
         raise InputError(
-            "todo-survey-has-no-navigation",
-            "the survey has no navigation recorded by time, only a position for each image: ingest a --bag, or a "
-            "--trajectory by time",
+            "navigation-not-recorded",
+            "the survey has one position for each image, and no navigation with times; run `georef ingest` with "
+            "--bag, or with a --trajectory that has times",
             path=workspace.root / TRACK,
         ) from error
     return NavigationTrack.load(path)
@@ -115,26 +115,24 @@ def require_estimable(track: NavigationTrack | None, wanted: Sequence[RigParamet
     """
     if track is None or len(track.position_time_s) < 2:
         raise InputError(
-            "todo-needs-navigation-recorded-by",
-            "needs the navigation recorded by time: a --bag, or a --trajectory without a column of images",
+            "navigation-not-recorded",
+            "needs navigation with times: a --bag, or a --trajectory without a column of image names",
             field=field,
         )
     turned = len(track.attitude_time_s) > 1
     if "lever-arm" in wanted and not turned:
-        raise InputError(
-            "todo-lever-arm-needs-attitudes", "lever-arm needs attitudes, which were not recorded", field=field
-        )
+        raise InputError("no-attitudes", "lever-arm needs attitudes, which were not recorded", field=field)
     if "lever-arm" in wanted and not track.body_known:
         raise InputError(
-            "todo-lever-arm-needs-body",
-            "lever-arm needs the body's axes: give --camera-mount YAW,PITCH,ROLL",
+            "body-axes-unknown",
+            "lever-arm needs the axes of the body; give --camera-mount YAW,PITCH,ROLL",
             field=field,
         )
     mounted = bool(np.isfinite(track.cam_from_body).all(axis=(1, 2)).any())
     if "boresight" in wanted and not (turned and mounted):
         raise InputError(
-            "todo-boresight-needs-recorded-attitudes",
-            "boresight needs recorded attitudes and the camera's mount (/tf or --camera-mount)",
+            "mount-unknown" if turned else "no-attitudes",
+            "boresight needs recorded attitudes, and the camera's mount from /tf or --camera-mount",
             field=field,
         )
 
@@ -157,7 +155,7 @@ def load_survey(workspace: Workspace) -> Survey:
     except MissingProductError:
         if survey.estimate:
             log.warning(
-                "%s were to be estimated after sfm: `georef calibrate` or `georef run` does it",
+                "%s were to be estimated after sfm; run `georef calibrate` or `georef run`",
                 ", ".join(survey.estimate),
             )
         return survey

@@ -72,7 +72,7 @@ def predicted_headline(workspace: Workspace) -> Headline | None:
     return None
 
 
-Way = Literal["camera", "model", "left out", "fit"]
+Way = Literal["triangulated", "surface", "left out", "fit"]
 
 
 @dataclass(frozen=True)

@@ -143,8 +143,8 @@ class ImageCache:
         try:
             stat = photograph.file.stat()
         except OSError as error:
-            message = f"the photograph cannot be read ({error.strerror}): put it back, or run `georef ingest` again"
-            raise InputError("todo-x", message, path=photograph.file) from error
+            message = f"the photograph cannot be read ({error.strerror}); restore it, or run `georef ingest` again"
+            raise InputError("photograph-missing", message, path=photograph.file) from error
         camera = photograph.camera
         key = (
             f"{photograph.name}|{stat.st_size}|{stat.st_mtime_ns}|{camera.model}|{camera.width}x{camera.height}|"
@@ -156,13 +156,11 @@ class ImageCache:
         photograph, pinhole = self._photographs[index], self.pinhole(index)
         full = decoded_photograph(photograph.file, photograph.sha256)
         if full is None:
-            raise InputError(
-                "todo-photograph-cannot-be-read", "the photograph cannot be read", path=photograph.file
-            )
+            raise InputError("photograph-damaged", "the photograph cannot be read", path=photograph.file)
         if (full.shape[1], full.shape[0]) != (photograph.camera.width, photograph.camera.height):
             raise InputError(
-                "todo-photograph-its-camera",
-                f"the photograph is {full.shape[1]}×{full.shape[0]}, its camera "
+                "photograph-size",
+                f"the photograph has {full.shape[1]}×{full.shape[0]} pixels, its camera "
                 f"{photograph.camera.width}×{photograph.camera.height}",
                 path=photograph.file,
             )

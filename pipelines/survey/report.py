@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import SerializerFunctionWrapHandler, model_serializer
 
 from pipelines.core.errors import InputError
 from pipelines.core.figures import Headline
@@ -211,17 +211,18 @@ class CheckPointErrors(StatedErrors):
 
 
 class CheckPoints(Product):
-    """Check points, triangulated (`camera`) and on the rendered surface behind their marks (`model`).
+    """Check points, `triangulated`, and on the rendered `surface` behind their marks.
 
-    Without training, `model` is None.
+    Without training, `surface` is None.
     """
 
-    camera: CheckPointErrors
-    model: CheckPointErrors | None
+    triangulated: CheckPointErrors
+    surface: CheckPointErrors | None
 
     @property
-    def by_way(self) -> dict[Literal["camera", "model"], CheckPointErrors]:
-        return {"camera": self.camera} if self.model is None else {"camera": self.camera, "model": self.model}
+    def by_way(self) -> dict[Literal["triangulated", "surface"], CheckPointErrors]:
+        both = {"triangulated": self.triangulated, "surface": self.surface}
+        return {way: errors for way, errors in both.items() if errors is not None}
 
 
 class CrossValidation(StatedErrors):
@@ -285,8 +286,8 @@ class PointCoordinates(Product):
 
     name: str
     surveyed: Vector3
-    camera: Vector3 | None
-    model: Vector3 | None
+    triangulated: Vector3 | None
+    surface: Vector3 | None
 
 
 class Coordinates(Product):
@@ -343,20 +344,6 @@ class EvaluationReport(_OptionalKeys):
     def test_views(self) -> PhotometricFigures | None:
         return None if self.photometric is None else self.photometric.test
 
-    @model_validator(mode="before")
-    @classmethod
-    def _with_cautions_in_one_list(cls, document: Any) -> Any:
-        """Read a report from before cautions had codes: `accuracy` held the limits of the prediction as text."""
-        accuracy = document.get("accuracy") if isinstance(document, dict) else None
-        if not isinstance(accuracy, dict) or "cautions" not in accuracy:
-            return document
-        texts = accuracy["cautions"] if isinstance(accuracy["cautions"], list) else [accuracy["cautions"]]
-        return {
-            **document,
-            "accuracy": {name: value for name, value in accuracy.items() if name != "cautions"},
-            "cautions": [{"code": "prediction-limited", "sentence": text} for text in texts],
-        }
-
 
 def write_report(report: EvaluationReport, path: Path) -> None:
     """Write a report as JSON."""
@@ -374,5 +361,5 @@ def read_report(path: Path) -> EvaluationReport:
     except InputError as error:
         if not isinstance(error.__cause__, ValueError):  # The file cannot be read: its content is not at fault.
             raise
-        message = "not a report: make it again with `georef evaluate --force`"
-        raise InputError("todo-x", message, path=path, field=error.field) from error
+        message = "not a report; make it again with `georef evaluate --force`"
+        raise InputError("report-invalid", message, path=path, field=error.field) from error

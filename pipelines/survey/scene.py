@@ -107,8 +107,8 @@ def make_scene(sparse: SparseModel, survey: Survey, model_from_local: Similarity
     test = np.array([index[name] for name in survey.names("test") if name in index], dtype=np.int64)
     if len(train) < 2:
         raise DegenerateGeometryError(
-            "todo-registered-training-images-too",
-            f"{len(train)} registered training images are too few to train on",
+            "too-few-training-images",
+            f"{len(train)} training images are registered; at least two are needed.",
         )
     return Scene(sparse, model_from_local, Similarity(translation=shift), train, test)
 
@@ -162,9 +162,9 @@ def photographs(sparse: SparseModel, survey: Survey, workspace: Workspace, max_s
     foreign = [name for name in sparse.image_name if name not in known]
     if foreign:
         raise InputError(
-            "todo-images-not-survey-first",
-            f"{len(foreign)} images are not in the survey, the first is {foreign[0]!r}: take the model over with "
-            "`georef sfm --import`, which leaves them out",
+            "images-not-in-survey",
+            f"{len(foreign)} images of the model are not in the survey, such as {foreign[0]!r}; import the model "
+            "with `georef sfm --import`, which leaves them out",
             path=workspace.root / SPARSE,
         )
     folder = photograph_folder(workspace, survey.image_dir)

@@ -113,8 +113,8 @@ def _require_same_cameras(model: Adjustment, sparse: SparseModel, path: Path, ad
     """Refuse a solution of another SfM model."""
     if tuple(camera.name for camera in model.cameras) != sparse.image_name:
         raise InputError(
-            "todo-its-cameras-not-those",
-            f"its cameras are not those of sfm/sparse: {advice}",
+            "cameras-of-another-model",
+            f"its cameras are not those of sfm/sparse; {advice}",
             path=path,
             field="cameras",
         )
@@ -122,8 +122,8 @@ def _require_same_cameras(model: Adjustment, sparse: SparseModel, path: Path, ad
         camera = sparse.cameras.get(lens.camera_id)
         if camera is None or (camera.model, len(camera.params)) != (lens.model, len(lens.params)):
             raise InputError(
-                "todo-its-lenses-not-those",
-                f"its lenses are not those of sfm/sparse: {advice}",
+                "lenses-of-another-model",
+                f"its lenses are not those of sfm/sparse; {advice}",
                 path=path,
                 field="lenses",
             )
@@ -191,9 +191,7 @@ def scene_points(solved: SolvedSurvey) -> FloatArray:
         DegenerateGeometryError: the SfM model has no points.
     """
     if not len(solved.sfm.point_in_local):
-        raise DegenerateGeometryError(
-            "todo-sfm-model-has-no", "the SfM model has no points: nothing says where the scene ends"
-        )
+        raise DegenerateGeometryError("no-sfm-points", "The SfM model has no points, so the extent is unknown.")
     points = solved.geo_from_model.apply(solved.point_in_model)
     low, high = np.quantile(points[:, :2], [_RIM, 1 - _RIM], axis=0)
     return np.asarray(points[((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)])

@@ -252,7 +252,7 @@ def _point_errors(model: MeasuringModel, report: EvaluationReport) -> list[tuple
     """Return the surveyed and the triangulated place (3,) in `geo` of control and check points."""
     survey = model.trained.survey
     place = {p.name: np.array(p.position_in_geo) for p in (*survey.control_points, *survey.check_points)}
-    rows = [*report.checkpoints.camera.points, *report.fit.gcp.points]
+    rows = [*report.checkpoints.triangulated.points, *report.fit.gcp.points]
     return [
         (place[row.name], place[row.name] + np.array([row.de_m, row.dn_m, row.du_m]))
         for row in rows

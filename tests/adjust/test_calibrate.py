@@ -182,9 +182,8 @@ def test_flight_that_shows_nothing_is_told_and_no_failure(tmp_path: Path, comman
     flight, workspace = bags.Flight(count=24), tmp_path / "ws"  # a straight line at constant speed
     inputs = flown(tmp_path, flight)
     document = command("run", workspace, *arguments(inputs), "--time-offset", "auto", "--to", "geolocate")
-    assert "nothing of the rig is observable" in document["err"]
-    assert "time-offset stay as told" in document["err"]
     rig = load_json(RigCalibration, workspace / RIG)
+    assert rig.problem in document["err"] and "time-offset" in document["err"]
     assert rig.wanted == ("time-offset",) and rig.estimates == ()
     assert load_survey(Workspace(workspace)) == load_json(Survey, workspace / SURVEY)
     again = command("run", workspace, "--to", "geolocate")
@@ -227,7 +226,8 @@ def test_what_ingest_asked_for_can_be_left_unapplied(tmp_path: Path, command: Co
     assert [row["name"] for row in values["estimates"]] == ["time-offset"] and values["applied"] == []
     assert load_survey(Workspace(workspace)) == load_json(Survey, workspace / SURVEY)
     warnings = command("calibrate", workspace, "--estimate", "boresight")["warnings"]
-    assert "--estimate leaves out what ingest was asked to estimate: time-offset" in warnings
+    (sentence,) = (row["sentence"] for row in warnings if row["code"] == "rig-not-estimated")
+    assert "time-offset" in sentence
 
 
 def test_a_comparison_reads_the_calibration_where_it_is(tmp_path: Path, command: Command) -> None:

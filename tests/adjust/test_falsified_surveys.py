@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipelines.adjust.options import InitSim3Options
-from pipelines.core.errors import ContradictionError
+from pipelines.core.errors import InconsistencyError
 from tests.adjusted_scenes import adjusted_model, block
 from tests.falsified_surveys import CASES, CONTROL, FALSIFIED, FLIGHTS, Falsified, falsified
 from tests.scenes import Noise
@@ -25,7 +25,7 @@ def outcome(
     true = of.scene.gcp_in_geo[CONTROL:]
     try:
         return state(falsified(kind, of, rng), model, options), true
-    except ContradictionError as error:
+    except InconsistencyError as error:
         return str(error), true
 
 
@@ -45,6 +45,6 @@ def test_an_accepted_contradiction_becomes_a_caution(name: str) -> None:
     kind = FALSIFIED[name]
     refused, _ = outcome(kind, "orbit")
     assert isinstance(refused, str)
-    accepted, _ = outcome(kind, "orbit", InitSim3Options(accept_contradiction=True))
+    accepted, _ = outcome(kind, "orbit", InitSim3Options(accept_inconsistency=True))
     assert isinstance(accepted, Statement)
     assert any(caution.sentence in refused for caution in accepted.cautions)

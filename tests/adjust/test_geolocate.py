@@ -18,6 +18,7 @@ from pipelines.core.stages import BY_NAME, POINTS
 from pipelines.geometry.rotations import exp_so3, matrix_from_quat_xyzw, quat_xyzw_from_matrix
 from pipelines.survey.adjustment import GeolocatedPoints
 from pipelines.survey.survey import Survey
+from tests.refusals import codes, numbers, refused, said
 from tests.scenes import (
     Measured,
     Noise,
@@ -87,7 +88,8 @@ def test_without_attitudes_sfm_rotations_are_used_and_named() -> None:
 def test_outlying_fixes_give_no_rays_and_are_named() -> None:
     noise = replace(Noise(), outliers=(3, 9, 17))
     points, scene, warnings = located(noise, Measured())
-    assert any("3 of 24 fixes contradict" in text and "image_009.jpg" in text for text in warnings)
+    sentence = said(warnings, "fixes-inconsistent")
+    assert numbers(sentence)[:2] == [3, 24] and "image_009.jpg" in sentence
     error = np.linalg.norm(points.position_in_geo - scene.point_in_geo, axis=1)
     assert np.quantile(error[points.inlier], 0.99) < 1.5
 
@@ -100,7 +102,7 @@ def test_images_without_fix_give_no_rays() -> None:
     part = geolocate(without_fixes(survey, scene.names[:6]), model, CONFIG)
     assert (part.points.ray_count <= full.points.ray_count).all()
     assert part.points.ray_count.sum() < full.points.ray_count.sum()
-    assert any("6 of 24 registered images have no fix" in text for text in part.warnings)
+    assert numbers(said(part.warnings, "photographs-without-fix")) == [6, 24]
 
 
 def test_survey_without_fixes_gives_an_empty_product_that_says_so(tmp_path: Path) -> None:
@@ -111,7 +113,7 @@ def test_survey_without_fixes_gives_an_empty_product_that_says_so(tmp_path: Path
     points = GeolocatedPoints.load(workspace.path(POINTS))
     assert not points.inlier.any()
     assert np.isnan(points.position_in_geo).all()
-    assert outcome.manifest.key_figure == "no fixes: positions come from control points"
+    assert outcome.manifest.key_figure == said(outcome.manifest.warnings, "points-not-located")
 
 
 def test_check_points_do_not_matter() -> None:
@@ -141,7 +143,7 @@ def test_boresight_error_is_told() -> None:
     whole = survey_of(scene, Noise(), Measured(), rng)
     survey = turned_attitudes(whole, scene.names, lambda rotation: about_vertical @ rotation)
     found = geolocate(survey, sparse_model(scene, Noise(), rng), CONFIG)
-    assert any("turned by 5." in text or "turned by 4." in text for text in found.warnings)
+    assert numbers(said(found.warnings, "attitudes-turned"))[0] == pytest.approx(5.0, abs=0.99)
 
 
 def test_line_without_attitudes_has_no_located_points_and_recorded_ones_are_refused() -> None:
@@ -150,9 +152,10 @@ def test_line_without_attitudes_has_no_located_points_and_recorded_ones_are_refu
     model = sparse_model(scene, Noise(), rng)
     without = geolocate(survey, model, CONFIG)
     assert not without.points.inlier.any()
-    assert any("one line" in text for text in without.warnings)
-    with pytest.raises(InputError, match="0 images have a fix and an attitude"):
+    assert codes(without.warnings) == ["points-not-located"]
+    with refused("too-few-attitudes", InputError) as error:
         geolocate(survey, model, GeolocateOptions(attitude="recorded"))
+    assert error.value.field == "--attitude" and numbers(error.value.message)[0] == 0
 
 
 def test_limits_of_angle_and_sigma_thin_the_inliers() -> None:
@@ -173,5 +176,5 @@ def test_a_photograph_turned_in_a_viewer_loses_its_attitude_not_the_survey() -> 
     survey = turned_attitudes(whole, turned, lambda rotation: rotation @ np.diag([-1.0, -1.0, 1.0]))
     found = geolocate(survey, sparse_model(scene, Noise(), rng), CONFIG)
     for name in turned:
-        assert any(name in warning and "turned" in warning for warning in found.warnings)
+        assert name in said(found.warnings, "attitudes-inconsistent")
     assert found.points.inlier.mean() > 0.9

@@ -234,7 +234,7 @@ def test_true_predictions_are_not_refuted_by_the_errors_that_points_share() -> N
     assert alone.count(None) < 0.8 * len(alone)
 
 
-@pytest.mark.parametrize(("factor", "code"), [(2.0, "prediction-refuted"), (0.5, "prediction-pessimistic")])
+@pytest.mark.parametrize(("factor", "code"), [(2.0, "prediction-rejected"), (0.5, "prediction-pessimistic")])
 def test_wrong_predictions_are_refuted(factor: float, code: str) -> None:
     found = [code_of(factor * run.error, run.joint) for profile in PROFILES for run in runs_of(30, profile)]
     assert found.count(code) > 0.97 * len(found)

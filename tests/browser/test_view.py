@@ -190,7 +190,7 @@ def test_picture_is_the_render(hill: Opened) -> None:
 def test_clicks_on_check_points_give_what_evaluate_states(hill: Opened, workspace: Workspace) -> None:
     hill.viewer.click_mode.value = "measures"
     hill.tab("Measure")
-    rows = {row.name: row for row in read_report(workspace.path(REPORT)).checkpoints.model.points}
+    rows = {row.name: row for row in read_report(workspace.path(REPORT)).checkpoints.surface.points}
     points = hill.viewer.model.trained.survey.check_points[:5]
     assert len(points) == 5
     for point in points:

@@ -244,9 +244,11 @@ def test_figures_are_those_of_the_reports(georef: Georef, survey: Path) -> None:
         text = (survey / "compare" / row["configuration"] / "evaluate/report.json").read_text("utf-8")
         report = json.loads(text)
         assert row["test_psnr"] == report["photometric"]["test"]["psnr"]
-        assert row["camera"]["rmse_v_m"] == report["checkpoints"]["camera"]["rmse_v_m"]
-        assert row["model"]["median_h_m"] == report["checkpoints"]["model"]["mean_h_m"]  # two points, as far off
-        assert row["model"]["count"] == 2
+        assert row["triangulated"]["rmse_v_m"] == report["checkpoints"]["triangulated"]["rmse_v_m"]
+        assert (
+            row["surface"]["median_h_m"] == report["checkpoints"]["surface"]["mean_h_m"]
+        )  # two points, as far off
+        assert row["surface"]["count"] == 2
         assert row["warnings"] == []  # that of evaluate is of the survey
     assert json.loads((survey / "compare/table.json").read_text("utf-8"))["rows"] == rows
 

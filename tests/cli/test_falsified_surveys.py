@@ -77,7 +77,7 @@ def _run(georef: Georef, workspace: Path, arguments: tuple[object, ...]) -> Resu
 
 
 def _statement(workspace: Path) -> tuple[dict, tuple[float, float]]:
-    """Sidecar of the splat, and RMS errors of the check points by camera in metres, horizontal and vertical."""
+    """Sidecar of the splat, and RMS errors of the triangulated check points in metres, horizontal and vertical."""
     sidecar = json.loads((workspace / f"{SPLAT}.georef.json").read_text("utf-8"))
-    camera = json.loads((workspace / REPORT).read_text("utf-8"))["checkpoints"]["camera"]
-    return sidecar, (camera["rmse_h_m"], camera["rmse_v_m"])
+    triangulated = json.loads((workspace / REPORT).read_text("utf-8"))["checkpoints"]["triangulated"]
+    return sidecar, (triangulated["rmse_h_m"], triangulated["rmse_v_m"])

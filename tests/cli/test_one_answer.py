@@ -170,7 +170,7 @@ def test_a_run_without_training_ends_with_its_evaluation(real_georef: Georef, tm
     evaluation = document["evaluation"]
     stated = Headline.model_validate(evaluation["headline"])
     assert stated.check_points == 2 and stated.text in " ".join(ended.out.split())
-    assert evaluation["checkpoints"]["model"] is None and evaluation["cameras"]["count"] == len(scene.names)
+    assert evaluation["checkpoints"]["surface"] is None and evaluation["cameras"]["count"] == len(scene.names)
     # The stage, asked for by its name, states the same; and so does the report, without what Gaussians show.
     assert real_georef("evaluate", root).code == 0
     assert read_report(root / REPORT).model_dump(mode="json") == evaluation

@@ -179,7 +179,7 @@ def write_perfect_model(root: Path, made: Site) -> None:
     write_flawless_posterior(root, model)
     start = Similarity(translation=shift).to_record("local", "geo", covariance=1e-6 * np.eye(7))
     save_json(initial_product(start), root / SIM3)
-    # One far from everything: by model, no point is found.
+    # One far from everything: on the rendered surface, no point is found.
     speck = Gaussians(
         torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.zeros(1, 3), torch.zeros(1), torch.zeros(1, 1, 3)
     )
@@ -245,11 +245,11 @@ def test_positions_agree_across_crs_and_10_km(
         assert (found["crs"], found["heights"]) == (grid.crs, "ellipsoidal")
         truth = grid.of_lla(made.point_lla)[3:7]
         unit_m = US_FOOT_M if "foot" in found["units"][0] else 1.0
-        for kind in ("surveyed", "camera"):
+        for kind in ("surveyed", "triangulated"):
             xyz = np.array([row[kind] for row in found["points"]])
             assert np.linalg.norm((xyz - truth) * unit_m, axis=1).max() < 1e-3
         assert [row["name"] for row in found["points"]] == ["P3", "P4", "P5", "P6"]
-        assert [row["model"] for row in found["points"]] == [None] * 4
+        assert [row["surface"] for row in found["points"]] == [None] * 4
 
 
 @pytest.mark.usefixtures("one_thread")

@@ -29,7 +29,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 Compared = tuple[Workspace, Comparison, list[ComparedStage]]
 SHORT = {"iterations": 60, "dense": False, "sh_degree": 0, "log_every": 5, "checkpoint_every": 10}
 # Marks of 0.1 px are 5 cm from 45 m, over 14 rays 1.5 cm; the similarity of 14 fixes adds 1.5 cm and 2.4 cm up.
-BY_CAMERA_M = 0.08
+TRIANGULATED_M = 0.08
 
 
 def prepare(flight: RenderedFlight, name: str) -> Workspace:
@@ -73,7 +73,7 @@ def test_every_configuration_reaches_something(compared: Compared) -> None:
         assert row.failure is None
         assert row.test_psnr is not None
         assert row.test_psnr > 18.0
-        assert (row.camera.count, row.model.count) == (3, 3)
+        assert (row.triangulated.count, row.surface.count) == (3, 3)
         assert row.iterations == SHORT["iterations"]
     assert [row.training_s is None for row in table.rows] == [False, False, True, False, False, False]
     assert load_json(Comparison, workspace.root / "compare/table.json") == table
@@ -85,7 +85,7 @@ def test_table_holds_what_the_reports_say(compared: Compared) -> None:
         report = report_of(workspace, row.configuration)
         assert row.test_psnr == report["photometric"]["test"]["psnr"]
         assert row.test_ssim == report["photometric"]["test"]["ssim"]
-        for way, accuracy in (("camera", row.camera), ("model", row.model)):
+        for way, accuracy in (("triangulated", row.triangulated), ("surface", row.surface)):
             points = report["checkpoints"][way]["points"]
             distance = np.hypot([point["de_m"] for point in points], [point["dn_m"] for point in points])
             assert accuracy.mean_h_m == pytest.approx(distance.mean())
@@ -99,12 +99,12 @@ def test_with_good_fixes_all_but_the_papers_start_are_right(
 ) -> None:
     rows = rows_of(compared[1])
     for name in ("baseline", "A", "C", "D", "E"):
-        assert rows[name].camera.rmse_h_m is not None
-        assert rows[name].camera.rmse_h_m < BY_CAMERA_M, name
+        assert rows[name].triangulated.rmse_h_m is not None
+        assert rows[name].triangulated.rmse_h_m < TRIANGULATED_M, name
     # Its points hang on attitudes of 0.5°, 0.4 m at 45 m.
-    assert rows["B"].camera.rmse_h_m is not None
-    assert rows["A"].camera.rmse_h_m is not None
-    assert rows["B"].camera.rmse_h_m > rows["A"].camera.rmse_h_m
+    assert rows["B"].triangulated.rmse_h_m is not None
+    assert rows["A"].triangulated.rmse_h_m is not None
+    assert rows["B"].triangulated.rmse_h_m > rows["A"].triangulated.rmse_h_m
 
 
 def test_b_is_a_elsewhere_on_earth(compared: Compared) -> None:
@@ -186,5 +186,5 @@ def test_without_check_points_there_are_images_only(flights: list[RenderedFlight
     table, _ = compare(workspace, select_configurations("A"), {**SHORT, "iterations": 5})
     (row,) = table.rows
     assert row.test_psnr is not None
-    assert (row.camera.count, row.camera.mean_h_m, row.model.median_h_m) == (0, None, None)
+    assert (row.triangulated.count, row.triangulated.mean_h_m, row.surface.median_h_m) == (0, None, None)
     assert (workspace.root / "compare/plot.png").stat().st_size > 1000

@@ -13,13 +13,14 @@ from pipelines.compare.table import (
     markdown,
     remarks_on,
 )
+from pipelines.core.products import Remark
 from tests.reports import check_points_with
 
 GOOD = PointAccuracy(count=3, mean_h_m=0.0123, median_h_m=0.01, rmse_h_m=0.015, rmse_v_m=25.128)
 ROW = ComparedRow(
     configuration="E", title="full", note="everything", test_psnr=25.317, test_psnr_covered=26.25, test_ssim=0.87,
-    camera=GOOD, model=GOOD,
-    training_s=61.4, warnings=("one fix is wrong",),
+    triangulated=GOOD, surface=GOOD,
+    training_s=61.4, warnings=(Remark(code="fixes-rejected", sentence="One fix is wrong."),),
 )  # fmt: skip
 FAILED = ComparedRow(configuration="A", title="plain", note="nothing", failure="it diverged")
 
@@ -28,12 +29,12 @@ def test_figures_are_told_to_what_they_are_worth() -> None:
     on_surface = ("0.0100", "0.0150", "25.13")
     assert cells(ROW) == ("25.32", "26.25", "0.8700", "0.0150", "25.13", *on_surface, "3", "61 s")
     assert cells(FAILED) == (*["–"] * 8, "0", "–")
-    fewer = ROW.model_copy(update={"model": GOOD.model_copy(update={"count": 2})})
+    fewer = ROW.model_copy(update={"surface": GOOD.model_copy(update={"count": 2})})
     assert cells(fewer)[-2] == "3, 2"
 
 
 def test_remarks_say_why_a_row_is_empty() -> None:
-    assert remarks_on(ROW) == ("one fix is wrong",)
+    assert remarks_on(ROW) == ("One fix is wrong.",)
     assert remarks_on(FAILED) == ("failed: it diverged",)
 
 

@@ -42,8 +42,8 @@ def test_report_has_the_form_that_scripts_read(evaluated: tuple[Workspace, Outco
     report = report_of(evaluated[0])
     test = report["photometric"]["test"]
     assert {"views", "psnr", "ssim", "lpips"} <= set(test)
-    assert set(report["checkpoints"]) == {"camera", "model"}
-    for way in ("camera", "model"):
+    assert set(report["checkpoints"]) == {"triangulated", "surface"}
+    for way in ("triangulated", "surface"):
         assert set(report["checkpoints"][way]) >= STATS
     assert set(report["fit"]) == {"gnss", "gcp"}
     assert set(report["fit"]["gnss"]) >= STATS
@@ -52,7 +52,7 @@ def test_report_has_the_form_that_scripts_read(evaluated: tuple[Workspace, Outco
 
 
 def test_triangulated_check_points_are_as_good_as_the_measurements(evaluated: tuple[Workspace, Outcome]) -> None:
-    triangulated = report_of(evaluated[0])["checkpoints"]["camera"]
+    triangulated = report_of(evaluated[0])["checkpoints"]["triangulated"]
     assert triangulated["count"] == 6
     # Marks of 0.1 px are 5 cm from 45 m, over √12 rays 2 cm; the similarity's own 1.5 and 2.4 cm, and its turn.
     assert triangulated["rmse_h_m"] < 0.08
@@ -75,14 +75,16 @@ def test_check_points_are_measured_through_the_trained_lens(altered: Workspace) 
     after = report_of(altered)
     # Narrower rays from cameras that look inward meet lower, though their axes hold the middle; and what is
     # rendered no longer fits the photographs.
-    assert after["checkpoints"]["camera"]["mean_u_m"] < before["checkpoints"]["camera"]["mean_u_m"] - 0.15
+    assert (
+        after["checkpoints"]["triangulated"]["mean_u_m"] < before["checkpoints"]["triangulated"]["mean_u_m"] - 0.15
+    )
     assert after["photometric"]["test"]["psnr"] < before["photometric"]["test"]["psnr"] - 1.0
     # The photographs stay as they were undistorted once.
     assert sorted(path.name for path in (altered.cache / "undistorted").iterdir()) == cached
 
 
 def test_check_points_lie_on_the_surface(evaluated: tuple[Workspace, Outcome]) -> None:
-    on_surface = report_of(evaluated[0])["checkpoints"]["model"]
+    on_surface = report_of(evaluated[0])["checkpoints"]["surface"]
     assert on_surface["count"] == 6
     # The surface is known to a Gaussian: its size, not the cameras, decides.
     assert on_surface["rmse_3d_m"] < 1.5 * SIGMA_M
@@ -99,7 +101,7 @@ def test_fit_is_that_of_the_fixes(evaluated: tuple[Workspace, Outcome]) -> None:
 
 
 def test_few_check_points_are_remarked_on(evaluated: tuple[Workspace, Outcome]) -> None:
-    asprs = AsprsStatement.model_validate(report_of(evaluated[0])["checkpoints"]["camera"]["asprs"])
+    asprs = AsprsStatement.model_validate(report_of(evaluated[0])["checkpoints"]["triangulated"]["asprs"])
     assert evaluated[1].manifest.warnings == [few_points(asprs)]
     # The points are on a square of 54 m, whose corners few cameras see.
     assert asprs.area_km2 == pytest.approx(54e-3**2, rel=0.3)
@@ -110,8 +112,8 @@ def test_control_points_are_a_fit_and_not_an_accuracy(altered: Workspace, render
     change_survey(altered, control_points=survey.check_points, check_points=())
     run_stage(altered, EVALUATE, {"renders": 0})
     report = report_of(altered)
-    assert report["checkpoints"]["camera"]["count"] == 0
-    assert report["checkpoints"]["model"]["rmse_3d_m"] is None
+    assert report["checkpoints"]["triangulated"]["count"] == 0
+    assert report["checkpoints"]["surface"]["rmse_3d_m"] is None
     assert report["fit"]["gcp"]["count"] == 6
     assert report["cross_validation"] is None  # nobody asked
 
@@ -126,7 +128,7 @@ def test_cross_validation_is_of_control_points_and_stands_alone(altered: Workspa
     assert crossed["count"] == 5
     assert crossed["reason"] is None
     assert "asprs" not in crossed
-    assert report["checkpoints"]["camera"]["count"] == 1
+    assert report["checkpoints"]["triangulated"]["count"] == 1
     # Twelve fixes of 5 and 8 cm, and the other four points: each is found to a few centimetres, and no better than
     # it fits when it is not left out.
     assert crossed["rmse_h_m"] < 0.08
@@ -141,7 +143,7 @@ def test_cross_validation_without_control_points_says_so(altered: Workspace) -> 
 
 
 def test_prediction_agrees_with_the_errors_of_triangulation(evaluated: tuple[Workspace, Outcome]) -> None:
-    triangulated = report_of(evaluated[0])["checkpoints"]["camera"]
+    triangulated = report_of(evaluated[0])["checkpoints"]["triangulated"]
     predicted = triangulated["predicted"]
     assert predicted["count"] == 6
     # This scene's cameras are exact, which the prediction cannot know: the errors are less than it says, by the
@@ -151,7 +153,7 @@ def test_prediction_agrees_with_the_errors_of_triangulation(evaluated: tuple[Wor
 
 
 def test_accuracy_is_stated_after_the_standard(evaluated: tuple[Workspace, Outcome]) -> None:
-    triangulated = report_of(evaluated[0])["checkpoints"]["camera"]
+    triangulated = report_of(evaluated[0])["checkpoints"]["triangulated"]
     assert triangulated["survey"]["rmse_h_m"] == pytest.approx(np.sqrt(2) * NOISE.gcp_m)
     assert triangulated["with_survey"]["rmse_h_m"] == pytest.approx(
         np.hypot(triangulated["rmse_h_m"], np.sqrt(2) * NOISE.gcp_m)
@@ -189,7 +191,7 @@ def test_check_points_that_are_off_together_refute_the_prediction(altered: Works
     )
     change_survey(altered, check_points=shifted)
     run_stage(altered, EVALUATE, {"renders": 0})
-    (caution,) = (row for row in report_of(altered)["cautions"] if row["code"] == "prediction-refuted")
+    (caution,) = (row for row in report_of(altered)["cautions"] if row["code"] == "prediction-rejected")
     assert "over 6 triangulated check points" in caution["sentence"]
     change_survey(altered, check_points=shifted[:2])
     run_stage(altered, EVALUATE, {"renders": 0})
@@ -204,7 +206,7 @@ def test_a_blunder_is_named_and_kept(altered: Workspace) -> None:
         altered, check_points=(first.model_copy(update={"position_in_geo": (east + 3, north, up)}), *rest)
     )
     outcome = run_stage(altered, EVALUATE, {"renders": 0})
-    triangulated = report_of(altered)["checkpoints"]["camera"]
+    triangulated = report_of(altered)["checkpoints"]["triangulated"]
     assert triangulated["blunders"] == [first.name]
     assert triangulated["count"] == 6
     assert triangulated["rmse_h_m"] > 1.0
@@ -236,8 +238,8 @@ def test_points_are_written_and_printed(
 ) -> None:
     workspace, _ = evaluated
     with (workspace.root / "evaluate/points.csv").open(encoding="utf-8", newline="") as handle:
-        rows = [row for row in csv.DictReader(handle) if row["measured"] == "camera"]
-    triangulated = report_of(workspace)["checkpoints"]["camera"]
+        rows = [row for row in csv.DictReader(handle) if row["measured"] == "triangulated"]
+    triangulated = report_of(workspace)["checkpoints"]["triangulated"]
     rms = np.sqrt(np.mean([float(row["dh_m"]) ** 2 for row in rows]))
     assert rms == pytest.approx(triangulated["rmse_h_m"], abs=1e-4)  # the file has tenths of a millimetre
     assert boundary.guarded(cli, ["evaluate", str(workspace.root), "--renders", "1", "--points"]) == 0
@@ -277,7 +279,7 @@ def test_unusable_marks_leave_a_point_unmeasured(altered: Workspace) -> None:
     )
     change_survey(altered, check_points=(alone, elsewhere, *rest))
     run_stage(altered, EVALUATE, {"renders": 0})
-    triangulated = report_of(altered)["checkpoints"]["camera"]
+    triangulated = report_of(altered)["checkpoints"]["triangulated"]
     assert triangulated["count"] == 4
     assert [row["rays"] for row in triangulated["points"][:2]] == [1, 0]
     assert [row["de_m"] for row in triangulated["points"][:2]] == [None, None]
@@ -294,13 +296,13 @@ def test_cameras_are_evaluated_before_training(evaluated: tuple[Workspace, Outco
     outcome = run_stage(untrained, EVALUATE, {"cross_validate": True})
     found, trained = report_of(untrained), report_of(evaluated[0])
     # Not zero, but absent.
-    assert found["photometric"] is None and found["checkpoints"]["model"] is None
-    assert not {"psnr", "model_count"} & set(outcome.manifest.values)
+    assert found["photometric"] is None and found["checkpoints"]["surface"] is None
+    assert not {"psnr", "surface_count"} & set(outcome.manifest.values)
     assert "not trained yet" in outcome.manifest.key_figure
     # The adjustment is the same, and so is all that does not show Gaussians.
     for name in ("headline", "accuracy", "fit", "similarity", "cameras", "cautions"):
         assert found[name] == trained[name], name
-    assert found["checkpoints"]["camera"] == trained["checkpoints"]["camera"]
+    assert found["checkpoints"]["triangulated"] == trained["checkpoints"]["triangulated"]
     folder = untrained.root / "evaluate"
     written = {path.name for path in folder.iterdir()}
     assert {"accuracy.csv", "accuracy.png", "cameras.csv", "points.csv"} <= written and "renders" not in written

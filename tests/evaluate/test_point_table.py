@@ -77,10 +77,10 @@ def report() -> EvaluationReport:
 def test_every_point_and_way_is_listed(report: EvaluationReport) -> None:
     lines = [(line.row.name, line.use, line.way, line.is_blunder) for line in point_lines(report)]
     assert lines == [
-        (FIRST, "check", "camera", False),
-        (FIRST, "check", "model", True),
-        (SECOND, "check", "camera", False),
-        (SECOND, "check", "model", False),
+        (FIRST, "check", "triangulated", False),
+        (FIRST, "check", "surface", True),
+        (SECOND, "check", "triangulated", False),
+        (SECOND, "check", "surface", False),
         ("G1", "control", "left out", False),
         ("G1", "control", "fit", False),
     ]

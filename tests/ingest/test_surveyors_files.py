@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from pyproj import Transformer
 
-from pipelines.core.errors import ContradictionError, InputError
+from pipelines.core.errors import InconsistencyError, InputError
 from pipelines.geodesy.enu import ecef_from_enu, ecef_from_lla, enu_from_ecef
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.stage import survey_and_track
@@ -299,7 +299,7 @@ class TestDji:
         path.write_text(
             "".join(f"{COUNT + 1 - int(line[0])}{line[1:]}\n" for line in path.read_text().splitlines())
         )
-        with refused("event-times", ContradictionError) as error:
+        with refused("event-times", InconsistencyError) as error:
             survey_of(dji, trajectory=path)
         assert "4 of 6 photographs" in str(error.value)
 

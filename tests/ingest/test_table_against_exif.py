@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
-from pipelines.core.errors import ContradictionError
+from pipelines.core.errors import InconsistencyError
 from pipelines.formats.exif import GpsTag, PhotoTags
 from pipelines.formats.image_file import ImageFile
 from pipelines.geodesy.enu import Origin, ecef_from_enu, ecef_from_lla, lla_from_ecef
@@ -90,17 +90,17 @@ def test_sigma_stated_for_the_table_is_not_that_of_exif() -> None:
     ids=["mirrored", "late", "others", "half", "blunders", "noise", "shifted", "zone", "take-off"],
 )
 def test_contradictions_are_named_and_can_be_accepted(positions: np.ndarray, code: str, says: str) -> None:
-    with refused(code, ContradictionError) as error:
+    with refused(code, InconsistencyError) as error:
         compared(positions)
     assert re.search(says, str(error.value))
-    (caution,) = compared(positions, IngestOptions(accept_contradiction=True)).cautions
+    (caution,) = compared(positions, IngestOptions(accept_inconsistency=True)).cautions
     assert caution.code == code
 
 
 @pytest.mark.parametrize("factor", [1 / 0.3048, 0.3048])
 def test_heights_in_feet_are_recognised(factor: float) -> None:
     lla = lla_from_ecef(ecef_from_enu(TRACK, ORIGIN)) * [1.0, 1.0, factor]
-    with refused("feet", ContradictionError) as error:
+    with refused("feet", InconsistencyError) as error:
         compare_with_exif(table_of(ecef_from_lla(lla)), photos_at(TRACK), PATH, IngestOptions(), Remarks())
     assert numbers(str(error.value))[-1] == pytest.approx(1 / factor, abs=1e-3)
 
@@ -112,7 +112,7 @@ def test_a_clock_offset_is_named_with_its_size() -> None:
         replace(photo, tags=replace(photo.tags, timestamp_s=float(when)))
         for photo, when in zip(photos_at(TRACK), time_s, strict=True)
     ]
-    with refused("exif-times-off", ContradictionError) as error:
+    with refused("exif-times-off", InconsistencyError) as error:
         compare_with_exif(table_of(ecef_from_enu(late, ORIGIN)), photos, PATH, IngestOptions(), Remarks())
     assert 5.0 <= numbers(str(error.value))[-1] < 7.0
 

@@ -157,11 +157,11 @@ def test_no_chips_are_cut_when_none_are_wanted(reported: Reported) -> None:
 
 def test_ninety_percent_factors_are_those_of_the_normal_distribution() -> None:
     errors = check_points_with(count=4, rmse_e_m=0.03, rmse_n_m=0.03, rmse_v_m=0.05)
-    radii = ninety_percent("camera", errors)
+    radii = ninety_percent("triangulated", errors)
     assert radii.ce90_m == pytest.approx(0.03 * np.sqrt(chi2.ppf(0.9, 2)), rel=1e-4)
     assert radii.le90_m == pytest.approx(0.05 * norm.ppf(0.95), rel=1e-4)
     assert radii.measured_h_m is None  # four points have no 90 % quantile
-    assert ninety_percent("camera", check_points_with()).ce90_m is None
+    assert ninety_percent("triangulated", check_points_with()).ce90_m is None
 
 
 MEASURED = Measured(

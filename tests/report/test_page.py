@@ -176,7 +176,7 @@ def test_pdf_without_chromium_is_refused_before_the_work(monkeypatch: pytest.Mon
 def test_before_training_the_sections_of_the_cameras_are_there(tmp_path: Path) -> None:
     made = evaluated_workspace(tmp_path / "flight")
     report = read_report(made.workspace.path(REPORT))
-    alone = report.checkpoints.model_copy(update={"model": None})
+    alone = report.checkpoints.model_copy(update={"surface": None})
     untrained(made.workspace)
     update = {"photometric": None, "checkpoints": alone}
     write_report(report.model_copy(update=update), made.workspace.path(REPORT))

@@ -21,7 +21,7 @@ from pipelines.survey.report import (
 )
 from tests.reports import check_points_with, report_with
 
-CAUTION = Remark(code="prediction-refuted", sentence="Check points refute the predicted accuracy.")
+CAUTION = Remark(code="prediction-rejected", sentence="Check points refute the predicted accuracy.")
 MEASURED = {"name": "P1", "rays": 4, "de_m": 0.01, "dn_m": -0.02, "du_m": 0.1 + 0.2, "blunder": False}
 UNMEASURED = {"name": "P2", "rays": 1, "de_m": None, "dn_m": None, "du_m": None, "blunder": False}
 
@@ -44,8 +44,8 @@ def test_report_is_read_as_written(tmp_path: Path) -> None:
     document = document_of(report, tmp_path / "report.json")
     assert read_report(tmp_path / "report.json") == report
     rows = document["checkpoints"]
-    assert rows["camera"]["points"] == [{**MEASURED, **sigma}, {**UNMEASURED, **unknown}]
-    assert rows["model"]["points"] == [MEASURED, UNMEASURED]  # without prediction there is no key for it
+    assert rows["triangulated"]["points"] == [{**MEASURED, **sigma}, {**UNMEASURED, **unknown}]
+    assert rows["surface"]["points"] == [MEASURED, UNMEASURED]  # without prediction there is no key for it
 
 
 def test_keys_that_were_not_asked_for_are_absent_and_unknown_figures_are_null(tmp_path: Path) -> None:
@@ -75,7 +75,7 @@ def test_report_from_before_cautions_had_codes_is_read(tmp_path: Path) -> None:
 
 
 def test_coordinates_of_an_unmeasured_point_are_null(tmp_path: Path) -> None:
-    point = PointCoordinates(name="P1", surveyed=(1.0, 2.0, 3.0), camera=(1.0, 2.0, 3.5), model=None)
+    point = PointCoordinates(name="P1", surveyed=(1.0, 2.0, 3.0), triangulated=(1.0, 2.0, 3.5), surface=None)
     coordinates = Coordinates(
         crs="EPSG:32632",
         units=("metre", "metre", "metre"),
@@ -88,7 +88,7 @@ def test_coordinates_of_an_unmeasured_point_are_null(tmp_path: Path) -> None:
     report = report_with().model_copy(update={"coordinates": coordinates})
     document = document_of(report, tmp_path / "report.json")["coordinates"]
     assert document["operation_accuracy_m"] is None
-    row = {"name": "P1", "surveyed": [1.0, 2.0, 3.0], "camera": [1.0, 2.0, 3.5], "model": None}
+    row = {"name": "P1", "surveyed": [1.0, 2.0, 3.0], "triangulated": [1.0, 2.0, 3.5], "surface": None}
     assert document["points"] == [row]
     assert read_report(tmp_path / "report.json") == report
 
@@ -103,7 +103,7 @@ def test_coordinates_of_an_unmeasured_point_are_null(tmp_path: Path) -> None:
         b"[" * 100_000,
         b'{"photometric": {"test": {}}}',
         b'{"photometric": {"test": null}, "checkpoints": {}}',
-        b'{"checkpoints": {"camera": null, "model": null}}',
+        b'{"checkpoints": {"triangulated": null, "surface": null}}',
         b'{"fit": {}}',
     ],
 )
@@ -117,11 +117,11 @@ def test_content_that_is_no_report_is_refused(content: bytes, tmp_path: Path) ->
 def test_figures_of_the_wrong_kind_are_refused_by_name(tmp_path: Path) -> None:
     path = tmp_path / "report.json"
     document = document_of(report_with(), path)
-    document["checkpoints"]["model"]["mean_h_m"] = "far"
+    document["checkpoints"]["surface"]["mean_h_m"] = "far"
     path.write_text(json.dumps(document), encoding="utf-8")
     with pytest.raises(InputError, match="not a report") as raised:
         read_report(path)
-    assert raised.value.field == "checkpoints.model.mean_h_m"
+    assert raised.value.field == "checkpoints.surface.mean_h_m"
 
 
 def test_report_that_cannot_be_read_is_not_called_another_thing(tmp_path: Path) -> None:

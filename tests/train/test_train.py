@@ -272,7 +272,7 @@ def with_control(workspace: Workspace, offset_m: tuple[float, float, float] = BI
         images.append(image.model_copy(update={"fix": image.fix.model_copy(update={"position_in_geo": place})}))
     update = {"images": tuple(images), "control_points": survey.check_points, "check_points": ()}
     save_json(survey.model_copy(update=update), workspace.root / SURVEY)
-    adjust_workspace(workspace, InitSim3Options(accept_contradiction=True, estimate=("lever-arm", "boresight")))
+    adjust_workspace(workspace, InitSim3Options(accept_inconsistency=True, estimate=("lever-arm", "boresight")))
     return workspace
 
 

@@ -57,7 +57,7 @@ def adjusted(noise: Noise = NOISE, estimate: tuple[str, ...] = ()) -> Adjusted:
 
 def of_survey(survey: Survey, sparse: object, estimate: tuple[str, ...] = ()) -> Adjusted:
     points = geolocate(survey, sparse, GeolocateOptions()).points  # type: ignore[arg-type]
-    options = InitSim3Options(accept_contradiction=True, estimate=estimate)  # type: ignore[arg-type]
+    options = InitSim3Options(accept_inconsistency=True, estimate=estimate)  # type: ignore[arg-type]
     estimated = estimate_similarity(survey, sparse, points, options)  # type: ignore[arg-type]
     weighted, solution = estimated.initial.weighted(survey), estimated.posterior.solution
     scene = adjusted_scene(sparse, weighted, solution)  # type: ignore[arg-type]
