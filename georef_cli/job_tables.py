@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from georef_cli.forecast import RunForecast
+from georef_cli.estimate import RunEstimate
 from georef_cli.layout import ByWidth, plain_table, shown
 from georef_cli.tables import WIDE, Renderable
 from pipelines.core.figures import ACCURACY_H, ACCURACY_V, CHECK_POINTS, MISSING
@@ -50,7 +50,7 @@ def batch(table: BatchTable, page: Path) -> list[Renderable]:
     return [ByWidth(WIDE, wide, narrow), *(["", *failures] if failures else []), ending]
 
 
-def dry_rows(missions: Iterable[tuple[PlannedMission, RunForecast | None]]) -> list[dict[str, Any]]:
+def dry_rows(missions: Iterable[tuple[PlannedMission, RunEstimate | None]]) -> list[dict[str, Any]]:
     """Return what a batch would do, a row for each mission, as plain values."""
     return [
         {

@@ -17,7 +17,7 @@ from rich.console import RenderableType
 from georef_cli import boundary, options
 from georef_cli.command import Command, merged_verbosity
 from georef_cli.display import is_told, progress_for
-from georef_cli.forecast import announced_seconds, print_dry_run
+from georef_cli.estimate import announced_seconds, print_dry_run
 from georef_cli.output import print_outcome
 from pipelines.core import runner
 from pipelines.core.errors import InputError, storage_failures

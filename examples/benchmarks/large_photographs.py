@@ -1,4 +1,4 @@
-"""Compare the memory of a training on large photographs with its forecast: large_photographs.py --help.
+"""Compare the memory of a training on large photographs with its estimate: large_photographs.py --help.
 
 Photographs of a workspace are enlarged, with their cameras, and trained at that size for a few iterations, as in
 the last part of a training: in crops of photographs that are not shrunken.
@@ -23,7 +23,7 @@ from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.depth_maps import DepthMaps
 from pipelines.survey.photographs import ImageCache, Photograph
 from pipelines.train.adjusted_scene import AdjustedScene
-from pipelines.train.forecast import training_size
+from pipelines.train.estimate import training_size
 from pipelines.train.geographic.problem import held_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import TrainOptions
@@ -112,7 +112,7 @@ def main() -> None:
         f"{len(shots)} photographs of {largest.width}×{largest.height} px, {len(trainer.optimizer.gaussians)} "
         f"Gaussians, crops of {pixels / max(arguments.iterations - 1, 1) / 1e6:.2f} megapixels: "
         f"{worked:.2f} processor s an iteration, peak {peak_mib() - before:.0f} MiB more, "
-        f"forecast {predicted_peak_bytes(size) / 2**20:.0f} MiB"
+        f"estimated {predicted_peak_bytes(size) / 2**20:.0f} MiB"
     )
 
 

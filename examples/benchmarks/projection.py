@@ -12,12 +12,12 @@ from dataclasses import dataclass
 
 from block_plan import made_up_scene
 
-from pipelines.sfm.forecast import pace
+from pipelines.sfm.estimate import estimated_cost
 from pipelines.sfm.options import SfmOptions
 from pipelines.survey.block_plan import BlockPlan
 from pipelines.survey.scene import Scene
 from pipelines.train.blocks.plan import plan_blocks
-from pipelines.train.forecast import block_processor_s
+from pipelines.train.estimate import block_processor_s
 from pipelines.train.options import PlanOptions, TrainOptions
 
 PHOTO_PX = (5280, 3956)
@@ -64,7 +64,7 @@ def plan_of(scene: Scene, machines: Machines) -> BlockPlan:
 
 def projected(count: int, scene: Scene, machines: Machines) -> list[str]:
     """Return the steps of a survey on some machines: times, and the number and memory of the blocks."""
-    reconstruction = pace(count, PHOTO_PX, SfmOptions())
+    reconstruction = estimated_cost(count, PHOTO_PX, SfmOptions())
     plan = plan_of(scene, machines)
     options = TrainOptions(preset="standard", max_image_size=TRAINED_PX)
     whole = block_processor_s(plan, PHOTO_PX, options)

@@ -13,7 +13,7 @@ from georef_cli.command import Command
 from georef_cli.commands.run import DELIVER, OWNERS, STAGE_NAME, deliverables
 from georef_cli.display import progress_for
 from georef_cli.engines import ENGINE, engine_for
-from georef_cli.forecast import RunForecast, checked_inputs, forecast_run
+from georef_cli.estimate import RunEstimate, checked_inputs, estimate_run
 from georef_cli.options import SET, settings
 from georef_cli.output import print_json, print_rich
 from pipelines.core.errors import GeorefError
@@ -37,11 +37,11 @@ def _batch(ctx: click.Context, **values: Any) -> int:
     listed = load_missions(values["missions"], OWNERS, values["last"], values["deliver"], flags)
     deliverables(values["deliver"])  # refuses a bad name
     progress = progress_for(ctx.obj)
-    forecasts = [_planned(mission, check=values["dry_run"], progress=progress) for mission in listed.missions]
-    planned = [mission for mission, _ in forecasts]
+    estimates = [_planned(mission, check=values["dry_run"], progress=progress) for mission in listed.missions]
+    planned = [mission for mission, _ in estimates]
     engine = engine_for(values, values["at_a_time"])
     if values["dry_run"]:
-        rows = job_tables.dry_rows(forecasts)
+        rows = job_tables.dry_rows(estimates)
         if values["as_json"]:
             print_json({"batch": listed.name, "missions": rows})
         else:
@@ -56,8 +56,8 @@ def _batch(ctx: click.Context, **values: Any) -> int:
     return 0 if table.is_complete else FAILED
 
 
-def _planned(mission: Mission, *, check: bool, progress: Progress) -> tuple[PlannedMission, RunForecast | None]:
-    """Return a mission with what its run needs; the forecast is None where the run will be refused, or unknown."""
+def _planned(mission: Mission, *, check: bool, progress: Progress) -> tuple[PlannedMission, RunEstimate | None]:
+    """Return a mission with what its run needs; the estimate is None where the run will be refused, or unknown."""
     try:
         asked = remembered(mission.workspace.root, [spec.name for spec in mission.stages], mission.flags)
         rows = plan(mission.workspace, mission.stages, asked)
@@ -68,9 +68,9 @@ def _planned(mission: Mission, *, check: bool, progress: Progress) -> tuple[Plan
     except GeorefError as error:
         return PlannedMission(mission, {}, refusal=str(error)), None
     try:
-        run = forecast_run(mission.workspace, mission.stages, asked, force=False)
+        run = estimate_run(mission.workspace, mission.stages, asked, force=False)
     except GeorefError as error:  # The run itself will tell it.
-        log.debug("%s: no forecast: %s", mission.name, error)
+        log.debug("%s: no estimate: %s", mission.name, error)
         run = None
     inputs = tuple(path for config in configs for path in input_paths(config).values())
     if run is None or run.training is None:

@@ -12,7 +12,7 @@ from georef_cli import boundary, job_tables, options
 from georef_cli.command import Command
 from georef_cli.display import is_told, progress_for
 from georef_cli.engines import ENGINE, asked_engine
-from georef_cli.forecast import announced_seconds
+from georef_cli.estimate import announced_seconds
 from georef_cli.output import print_json, print_outcome, print_rich
 from pipelines.core import runner
 from pipelines.core.options import remember, remembered
@@ -69,7 +69,7 @@ def _blocks(ctx: click.Context, **values: Any) -> None:
 
 
 def _plan(ctx: click.Context, parts: Parts, asked: Mapping[str, Flags], values: dict[str, Any]) -> None:
-    from pipelines.train.forecast import block_processor_s
+    from pipelines.train.estimate import block_processor_s
     from pipelines.train.options import TrainOptions
 
     workspace = parts.workspace

@@ -12,7 +12,7 @@ import click
 from georef_cli import boundary, options
 from georef_cli.command import Command
 from georef_cli.display import is_told, progress_for
-from georef_cli.forecast import RunTimeLeft, announced_seconds, print_dry_run
+from georef_cli.estimate import RunTimeLeft, announced_seconds, print_dry_run
 from georef_cli.options import SET, settings
 from georef_cli.output import print_outcomes
 from pipelines.core import runner

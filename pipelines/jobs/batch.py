@@ -161,7 +161,7 @@ BASE_BYTES = 1 << 30
 
 @dataclass(frozen=True)
 class PlannedMission:
-    """Mission with the forecast of its run.
+    """Mission with the estimate of its run.
 
     Attributes:
         actions: what its run would do with each stage; none where the run will be refused.
@@ -205,7 +205,7 @@ def run_batch(
     """Run the missions that are not current, and return the table of all; one that fails stops no other.
 
     The table is written beside the missions at the beginning and at the end of each mission, as JSON and as a page.
-    `planned` are the missions of the list with their forecasts, in the same order.
+    `planned` are the missions of the list with their estimates, in the same order.
 
     Raises:
         KeyboardInterrupt: the user stopped the batch; the missions that ran have saved their work.

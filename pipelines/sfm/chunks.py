@@ -44,8 +44,8 @@ from pipelines.sfm.colmap_database import (
     require_sound,
     write_frame,
 )
+from pipelines.sfm.estimate import chunk_peak_bytes
 from pipelines.sfm.features import SfmJob, candidate_pairs, extract_features, match_features
-from pipelines.sfm.forecast import chunk_peak_bytes
 from pipelines.sfm.options import SfmOptions
 from pipelines.survey.survey import Survey
 

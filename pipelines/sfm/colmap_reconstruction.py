@@ -13,8 +13,8 @@ from pipelines.core.workspace import StageRun
 from pipelines.formats.colmap import quiet_colmap, write_reconstruction
 from pipelines.sfm.chunks import PLAN, ChunkPlan, join_chunks, remove_chunks, work_in_chunks
 from pipelines.sfm.colmap_database import require_sound
+from pipelines.sfm.estimate import estimate_reconstruction, why_too_large
 from pipelines.sfm.features import SfmJob, candidate_pairs, extract_features, match_features
-from pipelines.sfm.forecast import forecast_reconstruction, why_too_large
 from pipelines.sfm.mapping import adjust_finally, map_database, remove_drift
 from pipelines.sfm.options import SfmOptions
 from pipelines.survey.survey import Survey
@@ -30,7 +30,7 @@ class ColmapReconstructor:
 
     remedy = "run it again (finished features and matches are kept), or with a smaller `--max-image-size`"
 
-    forecast = staticmethod(forecast_reconstruction)
+    estimate = staticmethod(estimate_reconstruction)
 
     def prepare(self, stage: StageRun, survey: Survey, options: SfmOptions) -> bool:
         count = len(survey.images)

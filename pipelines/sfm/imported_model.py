@@ -30,7 +30,7 @@ class ImportedModel:
     path: Path
     remedy: str = "COLMAP cannot read the imported model: export it again"
 
-    def forecast(self, photographs: int, photo_px: tuple[int, int], options: SfmOptions) -> None:
+    def estimate(self, photographs: int, photo_px: tuple[int, int], options: SfmOptions) -> None:
         return None
 
     def prepare(self, stage: StageRun, survey: Survey, options: SfmOptions) -> bool:

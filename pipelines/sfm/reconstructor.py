@@ -7,8 +7,8 @@ from typing import Any, Protocol
 from pipelines.core.progress import Progress
 from pipelines.core.workspace import StageRun
 from pipelines.sfm.colmap_reconstruction import ColmapReconstructor
+from pipelines.sfm.estimate import ReconstructionEstimate
 from pipelines.sfm.features import SfmJob
-from pipelines.sfm.forecast import ReconstructionForecast
 from pipelines.sfm.imported_model import ImportedModel
 from pipelines.sfm.options import SfmOptions
 from pipelines.survey.survey import Survey
@@ -24,10 +24,10 @@ class Reconstructor(Protocol):
     def remedy(self) -> str:
         """What to do after a crash."""
 
-    def forecast(
+    def estimate(
         self, photographs: int, photo_px: tuple[int, int], options: SfmOptions
-    ) -> ReconstructionForecast | None:
-        """Return the forecast for photographs whose largest has so many pixels; None: nothing is to be computed."""
+    ) -> ReconstructionEstimate | None:
+        """Return the estimate for photographs whose largest has so many pixels; None: nothing is to be computed."""
 
     def prepare(self, stage: StageRun, survey: Survey, options: SfmOptions) -> bool:
         """Do what comes before `reconstruct` in the process of the stage, which can start jobs.

@@ -41,7 +41,7 @@ def test_before_the_first_run(georef: Georef, tmp_path: Path) -> None:
     assert "5 of 64×48 px" in text and "Nothing was run" in text
 
 
-def test_a_run_begins_with_the_forecast(georef: Georef, tmp_path: Path) -> None:
+def test_a_run_begins_with_the_estimate(georef: Georef, tmp_path: Path) -> None:
     """Ahead of the first stage, and once."""
     write_flight(tmp_path / "photos", 5, lat=46.0, lon=7.7)
     lines = georef("run", tmp_path / "ws", "--images", tmp_path / "photos", "--max-image-size", 40).err.splitlines()
@@ -141,7 +141,7 @@ class TestInputs:
 class TestOfAWorkspace:
     @pytest.fixture
     def done(self, georef: Georef, workspace: Workspace, photos: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-        monkeypatch.setattr("georef_cli.forecast._photographs", lambda *_: None)  # fake surveys have none
+        monkeypatch.setattr("georef_cli.estimate._photographs", lambda *_: None)  # fake surveys have none
         assert georef("run", workspace.root, "--images", photos, "--iterations", 300).code == 0
         return workspace.root
 
@@ -203,7 +203,7 @@ class TestPace:
 def test_a_reconstruction_that_does_not_fit(
     georef: Georef, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipelines.sfm.forecast.free_main_memory_bytes", lambda: 100 << 20)
+    monkeypatch.setattr("pipelines.sfm.estimate.free_main_memory_bytes", lambda: 100 << 20)
     write_flight(tmp_path / "photos", 5, lat=46.0, lon=7.7)
     words = ("run", tmp_path / "ws", "--images", tmp_path / "photos")
     assert actions(georef, *words)["sfm"] == "refuse"

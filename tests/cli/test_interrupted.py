@@ -127,7 +127,7 @@ class TestBesideAFinishedProduct:
         assert training(forced) == (False, "fast")
 
     def test_it_is_told_before(self, georef: Georef, forced: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("georef_cli.forecast._photographs", lambda *_: None)  # fake surveys have none
+        monkeypatch.setattr("georef_cli.estimate._photographs", lambda *_: None)  # fake surveys have none
         state = " ".join(georef("status", forced).out.split())
         assert re.search(f"an interrupted run: {FOUND}, with --preset fast; `georef train", state)
         row = next(row for row in georef("status", forced, "--json").document["stages"] if row["stage"] == "train")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from georef_cli.forecast import RunTimeLeft
+from georef_cli.estimate import RunTimeLeft
 
 
 def test_a_machine_twice_as_slow_doubles_the_rest() -> None:
@@ -15,12 +15,12 @@ def test_a_machine_twice_as_slow_doubles_the_rest() -> None:
         left.begin()
         now[0] += took_s
         left.end(stage)
-    assert left.seconds == pytest.approx(200.0)  # ingest has no forecast: it says nothing of the pace
+    assert left.seconds == pytest.approx(200.0)  # ingest has no estimate: its time corrects none
     left.begin()
     left.end("train")
     assert left.seconds == 0.0
 
 
-def test_a_training_on_a_gpu_has_no_forecast() -> None:
+def test_a_training_on_a_gpu_has_no_estimate() -> None:
     assert RunTimeLeft({"sfm": 60.0, "train": None}).seconds is None
     assert RunTimeLeft({}).seconds == 0

@@ -16,8 +16,8 @@ from pipelines.core.progress import SILENT
 from pipelines.core.stages import BY_NAME, SURVEY
 from pipelines.core.workspace import StageRun, Workspace
 from pipelines.sfm import colmap_reconstruction, mapping, stage
+from pipelines.sfm.estimate import chunk_peak_bytes, peak_bytes, why_too_large
 from pipelines.sfm.features import SfmJob
-from pipelines.sfm.forecast import chunk_peak_bytes, peak_bytes, why_too_large
 from pipelines.sfm.mapping import chosen_mapper, map_database
 from pipelines.sfm.options import SfmOptions
 from pipelines.sfm.reconstructor import reconstructor_of
@@ -88,7 +88,7 @@ def test_memory_follows_size_and_options() -> None:
     fewer = options.model_copy(update={"max_features": 1000})
     assert peak_bytes(4000, PHOTO_PX, fewer) < 0.3 * sizes[2]
     imported = SfmOptions(import_model=Path("sparse"))
-    assert reconstructor_of(imported).forecast(4000, PHOTO_PX, imported) is None  # needs no memory
+    assert reconstructor_of(imported).estimate(4000, PHOTO_PX, imported) is None  # needs no memory
     small = SfmOptions(max_image_size=600)
     assert chunk_peak_bytes(PHOTO_PX, small) < chunk_peak_bytes(PHOTO_PX, options) < 2 * GIB
 

@@ -1,4 +1,4 @@
-"""The cost of blocks: the model is found again from measured blocks, and a plan's forecast follows its sizes."""
+"""The cost of blocks: the model is found again from measured blocks, and a plan's estimate follows its sizes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 
 from pipelines.jobs.costs import BLOCK_SECONDS, SURFACE_FACTOR, BlockCost
 from pipelines.survey.block_plan import BlockCell, BlockPlan, PlannedBlock
-from pipelines.train.forecast import block_processor_s
+from pipelines.train.estimate import block_processor_s
 from pipelines.train.options import TrainOptions
 
 PHOTO_PX = (640, 480)
@@ -43,7 +43,7 @@ def plan(*blocks: tuple[float, float, int]) -> BlockPlan:
     return BlockPlan(blocks=planned, gaussians=10_000, scaffold_gaussians=500, photographs=2)
 
 
-def test_a_forecast_is_that_of_its_iterations() -> None:
+def test_an_estimate_is_that_of_its_iterations() -> None:
     options = TrainOptions(
         iterations=300, dense=False, coarse_to_fine=False, geometry_regularisation=False, max_image_size=640
     )

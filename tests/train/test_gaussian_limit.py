@@ -8,7 +8,7 @@ import pytest
 
 from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.memory import USABLE, predicted_peak_bytes
-from pipelines.train.forecast import training_size, with_gaussian_limit
+from pipelines.train.estimate import training_size, with_gaussian_limit
 from pipelines.train.options import PRESETS, TrainOptions
 
 STANDARD = PRESETS["standard"]

@@ -24,7 +24,7 @@ from pipelines.splat.gaussians import read_gaussians
 from pipelines.survey.block_plan import BlockPlan, BlockRecord
 from pipelines.survey.trained_model import TrainedModel
 from pipelines.survey.trained_survey import load_trained
-from pipelines.train.forecast import training_forecast
+from pipelines.train.estimate import estimate_training
 from pipelines.train.options import TrainOptions
 from tests.block_scenes import make_field, write_field
 from tests.threads import single_thread
@@ -87,8 +87,8 @@ def test_lidar_is_refused_before_any_work(
     code, jobs = georef("blocks", "plan", field.root, "--blocks", 2, "--lidar", cloud)
     assert (code, jobs) == (2, [])
     assert "a training in blocks does not use LiDAR" in " ".join(capsys.readouterr().err.split())
-    assert training_forecast(9, (96, 72), TrainOptions(blocks=2, lidar=cloud)).refusal
-    assert not training_forecast(9, (96, 72), TrainOptions(blocks=1, lidar=cloud)).refusal
+    assert estimate_training(9, (96, 72), TrainOptions(blocks=2, lidar=cloud)).refusal
+    assert not estimate_training(9, (96, 72), TrainOptions(blocks=1, lidar=cloud)).refusal
 
 
 def test_each_gaussian_is_that_of_its_cell(trained: tuple[Workspace, list[str]]) -> None:

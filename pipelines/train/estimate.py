@@ -1,4 +1,4 @@
-"""Forecast of a training: size, time and memory for the photographs of a survey, before it starts.
+"""Estimate of a training: size, time and memory for the photographs of a survey, before it starts.
 
 Default limit of Gaussians: by the pixels of the photographs, within what the preset and the memory allow.
 """
@@ -70,8 +70,8 @@ _MOST_CORES = 16
 
 
 @dataclass(frozen=True)
-class TrainingForecast:
-    """Forecast of a training.
+class TrainingEstimate:
+    """Estimate of a training.
 
     Attributes:
         photo_px: width and height of the largest photograph.
@@ -112,7 +112,7 @@ class TrainingForecast:
         return NOT_IN_BLOCKS if self.lidar and self.in_blocks else ""
 
     def sentences(self) -> list[str]:
-        """Return the forecast for people: effort, size of the images, time and memory."""
+        """Return the estimate for people: effort, size of the images, time and memory."""
         effort = f"{self.preset}: {self.iterations} iterations, at most {self.max_gaussians} Gaussians"
         (width, height), (small_width, small_height) = self.photo_px, self.training_px
         size = f"{self.photographs} photographs of {width}×{height} px are trained at {small_width}×{small_height}"
@@ -132,8 +132,8 @@ class TrainingForecast:
         return [effort, size, f"in {many}; one run would take {took.removeprefix('about ')}, {memory}"]
 
 
-def training_forecast(photographs: int, photo_px: tuple[int, int], options: TrainOptions) -> TrainingForecast:
-    """Return the forecast of a training.
+def estimate_training(photographs: int, photo_px: tuple[int, int], options: TrainOptions) -> TrainingEstimate:
+    """Return the estimate of a training.
 
     The time is that of the machine of `MEASURED_ON`, divided by the ratio of the threads.
 
@@ -144,7 +144,7 @@ def training_forecast(photographs: int, photo_px: tuple[int, int], options: Trai
     free_bytes = free_memory_bytes(torch.device(backend))
     options = with_gaussian_limit(options, photographs, camera, free_bytes)
     effort, size = options.effort, training_size(options, photographs, camera)
-    return TrainingForecast(
+    return TrainingEstimate(
         preset=options.preset,
         photographs=photographs,
         photo_px=photo_px,

@@ -1,4 +1,4 @@
-"""Forecast of a reconstruction by COLMAP: mapper, chunks, time and memory for the photographs of a survey.
+"""Estimate of a reconstruction by COLMAP: mapper, chunks, time and memory for the photographs of a survey.
 
 `jobs.costs` has the constants. The largest photographs of a survey have `photo_px` pixels, width and height.
 """
@@ -18,8 +18,8 @@ _USABLE = 0.9  # of the free memory: other programs grow, too
 
 
 @dataclass(frozen=True)
-class ReconstructionForecast:
-    """Forecast of a reconstruction.
+class ReconstructionEstimate:
+    """Estimate of a reconstruction.
 
     Attributes:
         chunks: of features; 1: the survey is worked in one process.
@@ -37,7 +37,7 @@ class ReconstructionForecast:
     refusal: str
 
     def sentences(self) -> list[str]:
-        """Return the forecast for people: mapper, chunks, time and memory."""
+        """Return the estimate for people: mapper, chunks, time and memory."""
         parts = "" if self.chunks == 1 else f", features and matches in {self.chunks} chunks each"
         free = "" if self.free_bytes is None else f" of {self.free_bytes / 2**30:.1f} GiB free"
         return [
@@ -46,23 +46,23 @@ class ReconstructionForecast:
         ]
 
 
-def forecast_reconstruction(
+def estimate_reconstruction(
     photographs: int, photo_px: tuple[int, int], options: SfmOptions
-) -> ReconstructionForecast:
-    """Return the forecast of a reconstruction on this machine."""
+) -> ReconstructionEstimate:
+    """Return the estimate of a reconstruction on this machine."""
     free_bytes = free_main_memory_bytes()
-    return ReconstructionForecast(
+    return ReconstructionEstimate(
         photographs=photographs,
         mapper=chosen_mapper(photographs, options),
         chunks=max(math.ceil(photographs / options.chunk_size), 1),
-        seconds=pace(photographs, photo_px, options).total_s / thread_count(),
+        seconds=estimated_cost(photographs, photo_px, options).total_s / thread_count(),
         peak_bytes=peak_bytes(photographs, photo_px, options),
         free_bytes=free_bytes,
         refusal=why_too_large(photographs, photo_px, options, free_bytes) or "",
     )
 
 
-def pace(photographs: int, photo_px: tuple[int, int], options: SfmOptions) -> ReconstructionCost:
+def estimated_cost(photographs: int, photo_px: tuple[int, int], options: SfmOptions) -> ReconstructionCost:
     """Return about how many seconds one core needs for each step."""
     every = photographs * (photographs - 1) / 2
     shrink = max(max(photo_px) / options.max_image_size, 1.0)  # by which features are detected on smaller images

@@ -1,6 +1,6 @@
-"""Forecast of a run: what its stages would do, for which photographs, for how long, with how much memory.
+"""Estimate of a run: what its stages would do, for which photographs, for how long, with how much memory.
 
-A dry run prints it; a run tells from it, and from the pace of the stages that are done, what time it has left.
+A dry run prints it. A run derives its remaining time from it, corrected by the times of the stages that are done.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from pipelines.survey.survey import Survey
 from pipelines.train.options import TrainOptions
 
 if TYPE_CHECKING:
-    from pipelines.sfm.forecast import ReconstructionForecast
-    from pipelines.train.forecast import TrainingForecast
+    from pipelines.sfm.estimate import ReconstructionEstimate
+    from pipelines.train.estimate import TrainingEstimate
 
 log = logging.getLogger(__name__)
 
@@ -52,8 +52,8 @@ class FoundPhotographs:
 
 
 @dataclass(frozen=True)
-class RunForecast:
-    """Forecast of a run.
+class RunEstimate:
+    """Estimate of a run.
 
     Attributes:
         photographs: of the survey; None: in a bag that was not read yet.
@@ -64,20 +64,20 @@ class RunForecast:
     planned: Sequence[PlannedStage]
     photographs: FoundPhotographs | None
     seconds: Mapping[str, float | None]
-    reconstruction: ReconstructionForecast | None
-    training: TrainingForecast | None
+    reconstruction: ReconstructionEstimate | None
+    training: TrainingEstimate | None
 
 
-def forecast_run(
+def estimate_run(
     workspace: Workspace, stages: tuple[StageSpec, ...], flags: Mapping[str, Flags], *, force: bool
-) -> RunForecast:
-    """Return the forecast of a run of the stages, as of `plan`; nothing is written.
+) -> RunEstimate:
+    """Return the estimate of a run of the stages, as of `plan`; nothing is written.
 
     Raises:
         GeorefError: the run would be refused for its options, a missing file or a missing extra.
     """
     from pipelines.sfm.reconstructor import reconstructor_of
-    from pipelines.train.forecast import training_forecast
+    from pipelines.train.estimate import estimate_training
 
     planned = plan(workspace, stages, flags, force=force)
     for row in planned:
@@ -88,19 +88,19 @@ def forecast_run(
     if photographs is not None:
         photo_px = photographs.size_px
         if (sfm := _to_run(planned, SfmOptions)) is not None:
-            reconstruction = reconstructor_of(sfm).forecast(photographs.count, photo_px, sfm)
+            reconstruction = reconstructor_of(sfm).estimate(photographs.count, photo_px, sfm)
         if (train := _to_run(planned, TrainOptions)) is not None:
-            training = training_forecast(photographs.count, photo_px, train)
+            training = estimate_training(photographs.count, photo_px, train)
     seconds: dict[str, float | None] = {}
-    for name, forecast in (("sfm", reconstruction), ("train", training)):
-        if forecast is not None and forecast.refusal:
+    for name, estimate in (("sfm", reconstruction), ("train", training)):
+        if estimate is not None and estimate.refusal:
             planned = [
-                replace(row, action="refuse", reason=forecast.refusal) if row.stage == name else row
+                replace(row, action="refuse", reason=estimate.refusal) if row.stage == name else row
                 for row in planned
             ]
-        elif forecast is not None:
-            seconds[name] = forecast.seconds
-    return RunForecast(planned, photographs, seconds, reconstruction, training)
+        elif estimate is not None:
+            seconds[name] = estimate.seconds
+    return RunEstimate(planned, photographs, seconds, reconstruction, training)
 
 
 def checked_inputs(
@@ -164,7 +164,7 @@ def print_dry_run(
     Raises:
         GeorefError: the run would be refused for its options or its input.
     """
-    run = forecast_run(workspace, stages, flags, force=force)
+    run = estimate_run(workspace, stages, flags, force=force)
     survey = checked_inputs(workspace, run.planned, progress)
     for warning in () if survey is None else survey.warnings:
         log.warning("ingest: %s", warning.sentence)
@@ -192,12 +192,12 @@ def print_dry_run(
 def announced_seconds(
     workspace: Workspace, stages: tuple[StageSpec, ...], flags: Mapping[str, Flags], *, force: bool
 ) -> Mapping[str, float | None]:
-    """Return the forecast seconds of a run's stages that take long; none for a run that will be refused.
+    """Return the estimated seconds of a run's stages that take long; none for a run that will be refused.
 
-    The forecast of the training is logged at the start: not after hours of other stages.
+    The estimate of the training is logged at the start: not after hours of other stages.
     """
     try:
-        run = forecast_run(workspace, stages, flags, force=force)
+        run = estimate_run(workspace, stages, flags, force=force)
         for sentence in () if run.training is None else run.training.sentences():
             log.info("train: %s", sentence)
     except GeorefError:
@@ -205,7 +205,7 @@ def announced_seconds(
     return run.seconds
 
 
-def _document(workspace: Workspace, run: RunForecast, survey: Summary | None) -> dict[str, Any]:
+def _document(workspace: Workspace, run: RunEstimate, survey: Summary | None) -> dict[str, Any]:
     stages = [
         {
             "stage": row.stage,
@@ -227,25 +227,25 @@ def _document(workspace: Workspace, run: RunForecast, survey: Summary | None) ->
 
 
 class RunTimeLeft:
-    """Time that the remaining stages of a run will take, from their forecast seconds; None: not known.
+    """Time that the remaining stages of a run will take, from their estimated seconds; None: not known.
 
-    Stages that the forecast knows no time for count as nothing: they take seconds. Stages that are done correct the
-    forecast of the others, because one machine is slower than another by a factor.
+    Stages without an estimate count as nothing: they take seconds. The stages that are done correct the estimates
+    of the others, because one machine is slower than another by a factor.
     """
 
     def __init__(self, seconds: Mapping[str, float | None], clock: Callable[[], float] = time.monotonic) -> None:
         self._unknown = any(value is None for value in seconds.values())
         self._left = {stage: value for stage, value in seconds.items() if value is not None}
         self._clock, self._began = clock, clock()
-        self._forecast_s = self._took_s = 0.0
+        self._estimated_s = self._took_s = 0.0
 
     def begin(self) -> None:
         self._began = self._clock()
 
     def end(self, stage: str) -> None:
-        forecast_s = self._left.pop(stage, 0.0)
-        if forecast_s:
-            self._forecast_s += forecast_s
+        estimated_s = self._left.pop(stage, 0.0)
+        if estimated_s:
+            self._estimated_s += estimated_s
             self._took_s += self._clock() - self._began
 
     @property
@@ -253,4 +253,4 @@ class RunTimeLeft:
         """Seconds that the stages not yet done will take; None: not known."""
         if self._unknown:
             return None
-        return sum(self._left.values()) * (self._took_s / self._forecast_s if self._forecast_s else 1.0)
+        return sum(self._left.values()) * (self._took_s / self._estimated_s if self._estimated_s else 1.0)
