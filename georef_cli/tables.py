@@ -252,7 +252,7 @@ def _rows(title: str, rows: Mapping[str, Mapping[str, Any]], columns: Mapping[st
     return Group(f"\n[bold]{title}[/]", figures(tuple(heads.values()), cells))
 
 
-def _accuracy(ways: Mapping[str, CheckPointErrors]) -> Group | None:
+def _accuracy(ways: Mapping[Any, CheckPointErrors]) -> Group | None:
     """Return the accuracy by the check points after the standard, beside the prediction."""
     rows = {}
     for way, errors in ways.items():

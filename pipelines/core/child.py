@@ -253,7 +253,7 @@ def _crash(code: int, native_log: IO[str], remedy: str) -> GeorefError:
         log.debug("the child process wrote: %s", line)
     if code == -signal.SIGKILL:
         return ResourceError(
-            "todo-system-killed-computation-does",
+            "system-killed-computation-does",
             f"the system killed the computation, as it does when memory is short: {remedy}",
         )
     ending = signal.Signals(-code).name if code < 0 else f"exit code {code}"
@@ -261,7 +261,7 @@ def _crash(code: int, native_log: IO[str], remedy: str) -> GeorefError:
     checks = [line for line in lines if line[:1] == "F" and line[1:5].isdigit()]
     cause = (checks or lines[-1:] or ["no message"])[0].rpartition("] ")[2]
     return CrashError(
-        "todo-native-library-crashed", f"a native library crashed ({ending}: {cause[:_MOST_OF_A_LINE]}): {remedy}"
+        "native-library-crashed", f"a native library crashed ({ending}: {cause[:_MOST_OF_A_LINE]}): {remedy}"
     )
 
 

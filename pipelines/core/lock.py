@@ -65,7 +65,7 @@ class WriteLock:
                 handle = (self.folder / LOCK).open("ab")
             except OSError as error:
                 raise InputError(
-                    "todo-cannot-be-used-workspace",
+                    "cannot-be-used-workspace",
                     f"cannot be used as a workspace: {error.strerror}",
                     path=self.folder,
                 ) from error
@@ -74,14 +74,14 @@ class WriteLock:
             except OSError as error:
                 handle.close()
                 raise InputError(
-                    "todo-cannot-be-locked", f"cannot be locked: {error.strerror}", path=self.folder
+                    "cannot-be-locked", f"cannot be locked: {error.strerror}", path=self.folder
                 ) from error
             if locked and self._is_current(handle):
                 return handle
             handle.close()
             if not locked:
                 raise WorkspaceBusyError(
-                    "todo-being-written-by-wait",
+                    "being-written-by-wait",
                     f"{self.folder} is being written by {self._holder()}: wait for it, or stop it",
                 )
 

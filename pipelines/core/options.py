@@ -216,7 +216,7 @@ def resolve(
         hint = f"unknown key; known keys: {known}" if first["type"] == "extra_forbidden" else first["msg"]
         in_file = key if stage is None else f"{stage}.{key}"
         name = in_file if from_file else flag_name(options_type, key)
-        raise InputError("todo-x", hint, path=toml if from_file else None, field=name) from error
+        raise InputError("option-invalid", hint, path=toml if from_file else None, field=name) from error
     for name in options_type.model_fields:
         value = getattr(options, name)
         if isinstance(value, Path):
@@ -229,9 +229,9 @@ def read_toml(path: Path) -> dict[str, Any]:
     try:
         return parse_toml(path.read_text(encoding="utf-8-sig"))
     except ValueError as error:
-        raise InputError("todo-not-valid-toml", f"not valid TOML: {error}", path=path) from error
+        raise InputError("not-valid-toml", f"not valid TOML: {error}", path=path) from error
     except OSError as error:
-        raise InputError("todo-cannot-be-read", f"cannot be read: {error.strerror}", path=path) from error
+        raise InputError("cannot-be-read", f"cannot be read: {error.strerror}", path=path) from error
 
 
 def parse_toml(text: str) -> dict[str, Any]:
@@ -280,13 +280,13 @@ def load_toml(path: Path, stages: Collection[str]) -> dict[str, dict[str, Any]]:
     for name, table in document.items():
         if name not in stages:
             raise InputError(
-                "todo-unknown-table-stages",
+                "unknown-table-stages",
                 f"unknown table; the stages are {', '.join(stages)}",
                 path=path,
                 field=name,
             )
         if not isinstance(table, dict):
-            raise InputError("todo-expected-table-options", "expected a table of options", path=path, field=name)
+            raise InputError("expected-table-options", "expected a table of options", path=path, field=name)
     return document
 
 
@@ -333,11 +333,11 @@ def read_requests(root: Path) -> dict[str, dict[str, Any]]:
         document = json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise InputError(
-            "todo-not-valid-json-delete", "not valid JSON: delete it and give the options again", path=path
+            "not-valid-json-delete", "not valid JSON: delete it and give the options again", path=path
         ) from error
     if not isinstance(document, dict) or not all(isinstance(flags, dict) for flags in document.values()):
         raise InputError(
-            "todo-not-table-options-by", "not a table of options by stage: delete it and give them again", path=path
+            "not-table-options-by", "not a table of options by stage: delete it and give them again", path=path
         )
     place = document.pop(_PLACE, {}).get("root")
     if not isinstance(place, str) or place == str(root):

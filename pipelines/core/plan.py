@@ -126,7 +126,7 @@ def _action(
         for name, path in input_paths(options).items():  # no hashes: those of new photographs take minutes
             if not path.exists():
                 raise InputError(
-                    "todo-no-such-file-or",
+                    "no-such-file-or",
                     "no such file or folder",
                     path=path,
                     field=flag_name(type(options), name),

@@ -57,16 +57,14 @@ def load_json(product_type: type[ProductT], path: Path) -> ProductT:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
         raise InputError(
-            "todo-x", first["msg"].removeprefix("Value error, "), path=path, field=where or None
+            "product-invalid", first["msg"].removeprefix("Value error, "), path=path, field=where or None
         ) from error
     except UnicodeDecodeError as error:
-        raise InputError("todo-not-utf-text-file", "not a UTF-8 text file", path=path) from error
+        raise InputError("not-utf-text-file", "not a UTF-8 text file", path=path) from error
     except (np.linalg.LinAlgError, RecursionError) as error:  # of a validator that computes
-        raise InputError(
-            "todo-has-values-cannot-be", f"has values that cannot be used: {error}", path=path
-        ) from error
+        raise InputError("has-values-cannot-be", f"has values that cannot be used: {error}", path=path) from error
     except OSError as error:
-        raise InputError("todo-cannot-be-read", f"cannot be read: {error.strerror}", path=path) from error
+        raise InputError("cannot-be-read", f"cannot be read: {error.strerror}", path=path) from error
 
 
 def dump_json(document: Any) -> str:
@@ -110,9 +108,7 @@ class ArrayProduct:
                 expected = lengths.setdefault(wanted, length) if isinstance(wanted, str) else wanted
                 matches = matches and length == expected
             if not matches:
-                raise InputError(
-                    "todo-has-form", f"has the form {array.shape} {array.dtype}", path=path, field=name
-                )
+                raise InputError("has-form", f"has the form {array.shape} {array.dtype}", path=path, field=name)
         return cls(**arrays)
 
 

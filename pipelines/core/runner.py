@@ -311,7 +311,7 @@ def _run(workspace: Workspace, asked: Request, resume: Resume, progress: Progres
     except _WITHOUT_SOLUTION as error:
         cause = " ".join(str(error).split())[:200]
         degenerate = DegenerateGeometryError(
-            "todo-products-reads-lead-no",
+            "products-reads-lead-no",
             f"the products that {spec.name} reads lead to no solution ({cause}): were they edited? "
             f"`georef run {workspace.root} --force` makes them again",
         )

@@ -295,7 +295,7 @@ def must_exist(workspace: Workspace) -> None:
     require_text(workspace.root)
     if not workspace.root.is_dir():
         raise InputError(
-            "todo-no-such-workspace-georef", "no such workspace: `georef ingest` makes one", path=workspace.root
+            "no-such-workspace-georef", "no such workspace: `georef ingest` makes one", path=workspace.root
         )
 
 
@@ -313,7 +313,7 @@ def refuse_damaged_inputs(workspace: Workspace, spec: StageSpec, memo: Memo) -> 
         damage = why_damaged(finding(workspace, producer, memo, by_content=True).damaged)
         if damage:
             raise InputError(
-                "todo-georef-run-makes-again",
+                "georef-run-makes-again",
                 f"{damage}: `georef run {(workspace.base or workspace).root}` makes it again; to "
                 f"keep it as it is, delete {producer.folder}/{MANIFEST}",
                 path=workspace.root,
@@ -356,7 +356,7 @@ def refuse_loss(
         command = continuing_command(workspace, spec)
         how = "" if reason.startswith("option") else " with the former input"
         raise InputError(
-            "todo-interrupted-would-be-lost",
+            "interrupted-would-be-lost",
             f"an interrupted {spec.name} would be lost ({found_interrupted(workspace, spec)}), because {reason}: "
             f"`{command}`{how} continues it, --force drops it",
             path=partial.folder,

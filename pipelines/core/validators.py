@@ -33,7 +33,7 @@ def require_text(path: Path, field: str | None = None) -> None:
         str(path).encode("utf-8")
     except UnicodeEncodeError as error:
         raise InputError(
-            "todo-name-not-utf-text", "the name is not UTF-8 text: rename it", path=path, field=field
+            "name-not-utf-text", "the name is not UTF-8 text: rename it", path=path, field=field
         ) from error
 
 

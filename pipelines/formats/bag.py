@@ -196,13 +196,13 @@ def open_bag(path: Path) -> Iterator[Bag]:
         InputError: no bag, damaged beyond opening, or with chunks too large for memory.
     """
     if not path.exists():
-        raise InputError("todo-no-such-bag", "no such bag", path=path, field="--bag")
+        raise InputError("no-such-bag", "no such bag", path=path, field="--bag")
     if path.is_dir() and not (path / "metadata.yaml").exists():
         message = "has no metadata.yaml: give the .mcap or .db3 file in it, or `ros2 bag reindex` the folder"
-        raise InputError("todo-x", message, path=path, field="--bag")
+        raise InputError("no-bag", message, path=path, field="--bag")
     if not path.is_dir() and path.suffix not in (".bag", ".mcap", ".db3"):
         message = "is no bag: give a rosbag2 folder, or a .mcap, .db3 or .bag file"
-        raise InputError("todo-x", message, path=path, field="--bag")
+        raise InputError("no-bag", message, path=path, field="--bag")
     reader = _opened(path)
     try:
         for part in _parts(reader):
@@ -212,7 +212,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
             types = isinstance(link.topic, str), isinstance(link.msgtype, str), isinstance(link.msgcount, int)
             if not all(types):
                 raise InputError(
-                    "todo-damaged-topic", f"is damaged (topic {str(link.topic)[:40]!r}): {_REPAIR}", path=path
+                    "damaged-topic", f"is damaged (topic {str(link.topic)[:40]!r}): {_REPAIR}", path=path
                 )
         yield Bag(path, reader, path.suffix != ".bag")
     finally:
@@ -234,10 +234,10 @@ def _opened(path: Path) -> Any:
     except Exception as error:  # truncated and forged files make the parser raise any error
         if isinstance(error, KeyError) and error.args[0] in _FOREIGN_SCHEMAS:
             message = f"has a topic in {error.args[0]!r}, which is not ROS 2's: leave it out with `mcap filter`"
-            raise InputError("todo-x", message, path=path) from error
+            raise InputError("bag-unreadable", message, path=path) from error
         cause = f"{type(error).__name__}: {error}".rstrip(": ").rstrip(".")
         raise InputError(
-            "todo-no-bag-or-damaged", f"is no bag, or is damaged ({cause}): {_REPAIR}", path=path
+            "no-bag-or-damaged", f"is no bag, or is damaged ({cause}): {_REPAIR}", path=path
         ) from error
     return reader
 

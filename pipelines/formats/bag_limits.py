@@ -66,7 +66,7 @@ def refuse_large_chunk(path: Path, uncompressed_bytes: int) -> None:
     if uncompressed_bytes > MAX_CHUNK_BYTES:
         size = f"{uncompressed_bytes / 2**20:.0f} MiB (limit {MAX_CHUNK_BYTES // 2**20})"
         remedy = "rewrite it with smaller ones, e.g. `mcap compress --chunk-size 4194304`"
-        raise InputError("todo-has-chunk", f"has a chunk of {size}: {remedy}", path=path)
+        raise InputError("has-chunk", f"has a chunk of {size}: {remedy}", path=path)
 
 
 def unpacked(data: bytes, limit_bytes: int = MAX_CHUNK_BYTES) -> bytes:
@@ -125,7 +125,7 @@ def _check_unpacked(file: Path, size: int) -> None:
             total += len(block)
             if total > limit_bytes:
                 raise InputError(
-                    "todo-unpacks-more-than-mib",
+                    "unpacks-more-than-mib",
                     f"unpacks to more than {limit_bytes / 2**20:.0f} MiB: it is forged",
                     path=file,
                 )
@@ -151,7 +151,7 @@ def _check_mcap(file: Path) -> None:
     together = _together(index.values())
     if together > _MAX_TOGETHER_BYTES:
         raise InputError(
-            "todo-has-chunks-same-moment",
+            "has-chunks-same-moment",
             f"has chunks of the same moment of {together / 2**20:.0f} MiB in all (limit "
             f"{_MAX_TOGETHER_BYTES // 2**20}): sort it with `mcap sort`",
             path=file,

@@ -103,7 +103,7 @@ class PlyCloudFile:
         largest = float(np.nanmax(np.abs(position), initial=0.0))
         if np.isfinite(largest) and np.spacing(np.float32(largest)) / 2 > _COARSEST_M:
             raise InputError(
-                "todo-coordinates-single-precision-rounded",
+                "coordinates-single-precision-rounded",
                 f"coordinates of {largest:.0f} in single precision are rounded to "
                 f"{np.spacing(np.float32(largest)):.3f}: write the PLY with double coordinates, or LAZ",
                 path=self.path,
@@ -122,11 +122,11 @@ def open_cloud_ply(path: Path) -> PlyCloudFile:
     head, end, rest = start.partition(b"end_header")
     lines = [line.split() for line in head.decode("ascii", errors="replace").splitlines()]
     if not end or lines[:1] != [["ply"]]:
-        raise InputError("todo-not-ply-file", "not a PLY file", path=path)
+        raise InputError("not-ply-file", "not a PLY file", path=path)
     form = next((line[1] for line in lines if line[:1] == ["format"] and len(line) > 1), "")
     if form not in _ORDERS:
         raise InputError(
-            "todo-ply-format-write-binary",
+            "ply-format-write-binary",
             f"a PLY of format {form[:30]!r}: write it as binary_little_endian",
             path=path,
         )
@@ -135,7 +135,7 @@ def open_cloud_ply(path: Path) -> PlyCloudFile:
     offset = len(head) + len(end) + (2 if rest[:1] == b"\r" else 1)
     if count < 1 or offset + count * dtype.itemsize > size:
         raise InputError(
-            "todo-header-promises-points-bytes",
+            "header-promises-points-bytes",
             f"the header promises {count} points of {dtype.itemsize} bytes, the file has {max(size - offset, 0)}: "
             "it is empty, cut off or damaged",
             path=path,
@@ -148,9 +148,7 @@ def _vertices(path: Path, lines: list[list[str]]) -> tuple[int, list[tuple[str, 
     elements = [place for place, line in enumerate(lines) if line[:1] == ["element"]]
     first = lines[elements[0]] if elements else []
     if len(first) != 3 or first[1] != "vertex" or not first[2].isdecimal() or len(first[2]) > 15:
-        raise InputError(
-            "todo-expected-element-vertex-its", "expected `element vertex` and its number first", path=path
-        )
+        raise InputError("expected-element-vertex-its", "expected `element vertex` and its number first", path=path)
     until = elements[1] if len(elements) > 1 else len(lines)
     columns = []
     for line in lines[elements[0] + 1 : until]:
@@ -158,7 +156,7 @@ def _vertices(path: Path, lines: list[list[str]]) -> tuple[int, list[tuple[str, 
             continue
         if len(line) != 3 or line[1] not in _KINDS:
             raise InputError(
-                "todo-cannot-read-property-vertices",
+                "cannot-read-property-vertices",
                 f"cannot read the property {' '.join(line[1:])[:60]!r} of the vertices",
                 path=path,
             )
@@ -167,7 +165,7 @@ def _vertices(path: Path, lines: list[list[str]]) -> tuple[int, list[tuple[str, 
     missing = [axis for axis in "xyz" if axis not in names]
     if missing or len(set(names)) != len(names):
         raise InputError(
-            "todo-expected-properties-no-name",
+            "expected-properties-no-name",
             "expected the properties x, y and z, and no name twice",
             path=path,
             field=(missing or names)[0],

@@ -48,14 +48,14 @@ def _check_model_files(folder: Path) -> None:
     """Refuse a COLMAP model, binary or text, whose files do not hold what they state."""
     if not folder.is_dir():
         raise InputError(
-            "todo-no-such-folder-expected",
+            "no-such-folder-expected",
             "no such folder; expected a COLMAP model (cameras, images, points3D)",
             path=folder,
         )
     suffix = next((s for s in (".bin", ".txt") if all((folder / (n + s)).exists() for n in _REQUIRED)), None)
     if suffix is None:
         raise InputError(
-            "todo-not-readable-colmap-model",
+            "not-readable-colmap-model",
             "not a readable COLMAP model: cameras, images and points3D, all .bin or all .txt, are needed",
             path=folder,
         )
@@ -73,25 +73,25 @@ def _check_model_files(folder: Path) -> None:
 def _check_binary(file: Path, size: int, record_end: Callable[[_Bytes, int], int]) -> None:
     cut_off = "shorter than the number of its records says: it is truncated, copy it again"
     if size < 8:
-        raise InputError("todo-x", cut_off, path=file)
+        raise InputError("model-cut-off", cut_off, path=file)
     with file.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
         record = _Bytes(data, size)
         (count,) = struct.unpack_from("<Q", data)
         if count > size:
-            raise InputError("todo-x", cut_off, path=file)
+            raise InputError("model-cut-off", cut_off, path=file)
         at = 8
         for number in range(count):
             try:
                 at = record_end(record, at)
             except _CutOffError as error:
-                raise InputError("todo-record", f"{cut_off} (record {number + 1} of {count})", path=file) from error
+                raise InputError("record", f"{cut_off} (record {number + 1} of {count})", path=file) from error
             except ValueError as error:
                 raise InputError(
-                    "todo-record-damaged", f"record {number + 1} of {count} {error}: it is damaged", path=file
+                    "record-damaged", f"record {number + 1} of {count} {error}: it is damaged", path=file
                 ) from error
         if at != size:
             raise InputError(
-                "todo-has-bytes-behind-its",
+                "has-bytes-behind-its",
                 f"has {size - at} bytes behind its {count} records: it is damaged",
                 path=file,
             )
@@ -103,7 +103,7 @@ def _check_text(file: Path) -> None:
             try:
                 line.decode("utf-8")
             except UnicodeDecodeError as error:
-                raise InputError("todo-x", _INVALID_NAME, path=file, line=number) from error
+                raise InputError("image-name-invalid", _INVALID_NAME, path=file, line=number) from error
 
 
 @dataclass(frozen=True)
@@ -253,7 +253,7 @@ def write_reconstruction(reconstruction: Any, folder: Path) -> None:
         whole = False
     if not whole:
         raise storage_failure_of(folder) or StorageError(
-            "todo-model-could-not-be", f"{folder}: the model could not be written whole"
+            "model-could-not-be", f"{folder}: the model could not be written whole"
         )
 
 
@@ -268,9 +268,7 @@ def load_reconstruction(path: Path) -> Any:
     try:
         return pycolmap.Reconstruction(str(path))
     except (ValueError, RuntimeError, IndexError, MemoryError) as error:
-        raise InputError(
-            "todo-not-readable-colmap-model", f"not a readable COLMAP model: {error}", path=path
-        ) from error
+        raise InputError("not-readable-colmap-model", f"not a readable COLMAP model: {error}", path=path) from error
 
 
 def _observations(images: list[Any], point_ids: IntArray) -> tuple[IntArray, IntArray, FloatArray]:
@@ -301,17 +299,17 @@ def _check(model: SparseModel, path: Path) -> None:
     for name, numbers in values:
         if not np.isfinite(numbers).all():
             raise InputError(
-                "todo-contains-values-not-finite",
+                "contains-values-not-finite",
                 "contains values that are not finite: reconstruct again",
                 path=path,
                 field=name,
             )
     if len(set(model.image_name)) != len(model.image_name):
-        raise InputError("todo-two-images-have-same", "two images have the same name", path=path, field="images")
+        raise InputError("two-images-have-same", "two images have the same name", path=path, field="images")
     astray = next((name for name in model.image_name if not stays_inside(name)), None)
     if astray is not None:
         message = f"{astray!r} leaves the folder of photographs: names are relative to it"
-        raise InputError("todo-x", message, path=path, field="images")
+        raise InputError("images-missing", message, path=path, field="images")
 
 
 def write_sparse(model: SparseModel, path: Path) -> None:

@@ -110,12 +110,12 @@ def read_mrk(path: Path) -> CameraEvents:
         match = _LINE.fullmatch(text)
         if match is None:
             raise InputError(
-                "todo-no-line-dji-timestamp", f"is no line of a DJI timestamp file: {_LAYOUT}", path=path, line=line
+                "no-line-dji-timestamp", f"is no line of a DJI timestamp file: {_LAYOUT}", path=path, line=line
             )
         number = int(match[1])
         if number in line_of:
             message = f"event {number} stands in line {line_of[number]} already"
-            raise InputError("todo-x", message, path=path, line=line)
+            raise InputError("photograph-twice", message, path=path, line=line)
         line_of[number] = line
         lines.append(line)
         values.append([float(value) for value in match.groups()])
@@ -164,7 +164,7 @@ def read_pos(path: Path) -> PoseTable:
     rows = [(at, re.split(r"[\s,;]+", text.strip(",;"))) for at, text in lines if not text.startswith("%")]
     at_lines = np.array([at for at, _ in rows], dtype=np.int64)
     if not rows:
-        raise InputError("todo-has-header-but-no", "has a header but no rows", path=path)
+        raise InputError("has-header-but-no", "has a header but no rows", path=path)
     places = 7 if header.form == "sexagesimal" else 3
     table = np.array([_numbers(cells[2:], places, path, at) for at, cells in rows])
     if header.form == "ecef":
@@ -204,7 +204,7 @@ def _header(comments: Sequence[tuple[int, str]], path: Path) -> _Header:
             continue
         if "baseline" in text:
             raise InputError(
-                "todo-has-baselines-from-base",
+                "has-baselines-from-base",
                 "has baselines from the base station, not positions: let RTKLIB write Lat/Lon/Height",
                 path=path,
                 line=line,
@@ -217,7 +217,7 @@ def _header(comments: Sequence[tuple[int, str]], path: Path) -> _Header:
         if form is not None:
             return _Header(line, clock, form, above_geoid and form != "ecef")
     raise InputError(
-        "todo-has-no-header-rtklib",
+        "has-no-header-rtklib",
         "has no header of RTKLIB: let it be written (Output Header), it states clock and coordinates",
         path=path,
     )
@@ -227,7 +227,7 @@ def _numbers(cells: Sequence[str], places: int, path: Path, line: int) -> list[f
     """Return three coordinates, quality, satellites, three σ and three correlated σ; NaN for what is missing."""
     if len(cells) < places:
         raise InputError(
-            "todo-has-cells-expected-time",
+            "has-cells-expected-time",
             f"has {len(cells) + 2} cells, expected time, position, quality …",
             path=path,
             line=line,
@@ -287,5 +287,5 @@ def _date(cells: Sequence[str], path: Path, line: int) -> float:
             raise ValueError(text)
     except ValueError:
         message = f"{text[:40]!r} is no time like 2024/05/01 12:00:00.000"
-        raise InputError("todo-x", message, path=path, line=line, field="time") from None
+        raise InputError("time-invalid", message, path=path, line=line, field="time") from None
     return start + second + float(f"0{match[7] or ''}")

@@ -97,7 +97,7 @@ def without_repeats(points: Sequence[ListedPoint], path: Path) -> tuple[ListedPo
         other = first.setdefault(point.name, point)
         if point.xyz != other.xyz:
             message = f"{point.name} has other coordinates in line {other.line}"
-            raise InputError("todo-x", message, path=path, line=point.line, field="x y z")
+            raise InputError("point-moved", message, path=path, line=point.line, field="x y z")
     return tuple(first.values())
 
 
@@ -121,7 +121,7 @@ def read_geo(path: Path) -> PoseTable:
     for row in table.rows:
         if len(row.cells) not in (3, 4, 7, 9) and len(row.cells) < 10:  # words may follow nine columns
             message = f"has {len(row.cells)} columns, expected 3, 4, 7 or 9: {_GEO_FORM}{_comma_hint(row)}"
-            raise InputError("todo-x", message, path=path, line=row.line)
+            raise InputError("wrong-columns", message, path=path, line=row.line)
         numbers.append([row.number(column) for column in _GEO_COLUMNS[1:]])
     values = np.array(numbers)
     angles, accuracy = values[:, 3:6] + _GIMBAL_FROM_ODM_DEG, values[:, 6:8]
@@ -159,7 +159,7 @@ def read_ground_points(path: Path) -> GroundPoints:
     for row in table.rows:
         if len(row.cells) < 6:
             message = f"has {len(row.cells)} columns, expected at least 6: {_GCP_FORM}{_comma_hint(row)}"
-            raise InputError("todo-x", message, path=path, line=row.line)
+            raise InputError("wrong-columns", message, path=path, line=row.line)
         xyz = (row.finite("x"), row.finite("y"), row.finite("z"))
         x_px, y_px = row.finite("px"), row.finite("py")
         name = row.text("name") or unnamed.setdefault(xyz, f"point-{len(unnamed) + 1}")
@@ -172,14 +172,14 @@ def _odm_table(path: Path, columns: Sequence[str]) -> Table:
     """Return the rows below the CRS but comments, cells between spaces, with columns in an order."""
     lines = [(at, text) for at, text in numbered_lines(path) if not text.startswith("#")]
     if not lines:
-        raise InputError("todo-empty", "is empty", path=path)
+        raise InputError("empty", "is empty", path=path)
     first, crs_text = lines[0]
     words = crs_text.split()
     if len(words) >= 3 and is_number(words[1], decimal_comma=False) and not crs_text.startswith("+"):
         message = "the first line must be the CRS, e.g. EPSG:4326 or WGS84 UTM 16N; this is a row"
-        raise InputError("todo-x", message, path=path, line=first)
+        raise InputError("crs-missing", message, path=path, line=first)
     if not lines[1:]:
-        raise InputError("todo-has-crs-but-no", "has a CRS but no rows", path=path)
+        raise InputError("has-crs-but-no", "has a CRS but no rows", path=path)
     places = {name: at for at, name in enumerate(columns)}
     return Table(path, None, places, (), table_rows(path, lines[1:], None, places), crs_text)
 
@@ -229,9 +229,9 @@ def read_point_table(path: Path) -> GroundPoints:
             message = (
                 f"the header must name label, z, and either x and y or longitude and latitude; it is {header!r}"
             )
-            raise InputError("todo-x", message[:300], path=path, line=table.header_line)
+            raise InputError("columns-missing", message[:300], path=path, line=table.header_line)
     if not table.rows:
-        raise InputError("todo-has-header-but-no", "has a header but no rows", path=path)
+        raise InputError("has-header-but-no", "has a header but no rows", path=path)
     points = [
         ListedPoint(
             line=row.line,
@@ -262,10 +262,10 @@ def read_marks(path: Path) -> tuple[ListedMark, ...]:
     missing = [name for name in _MARK_COLUMNS if name not in table.columns]
     if missing:
         raise InputError(
-            "todo-header-names-no", f"the header names no {', '.join(missing)}", path=path, line=table.header_line
+            "header-names-no", f"the header names no {', '.join(missing)}", path=path, line=table.header_line
         )
     if not table.rows:
-        raise InputError("todo-has-header-but-no", "has a header but no rows", path=path)
+        raise InputError("has-header-but-no", "has a header but no rows", path=path)
     return tuple(
         ListedMark(row.line, row.named("label"), row.text("image"), row.finite("x"), row.finite("y"))
         for row in table.rows
@@ -279,13 +279,13 @@ def _pix4d_table(
     lines = [(at, text) for at, text in enumerate(read_lines(path), start=1) if text.strip()]
     lines = [(at, text) for at, text in lines if not text.lstrip().startswith("#")]
     if not lines:
-        raise InputError("todo-has-comments-only", "has comments only", path=path)
+        raise InputError("has-comments-only", "has comments only", path=path)
     first, text = lines[0]
     separator = separator_of(text)
     header = split(text, separator, path=path, line=first)
     if len(header) < 4:
         raise InputError(
-            "todo-has-columns-expected", f"has {len(header)} columns, expected {expected}", path=path, line=first
+            "has-columns-expected", f"has {len(header)} columns, expected {expected}", path=path, line=first
         )
     if any(map(is_number, header[numeric])):
         places = {name: at for at, name in enumerate(in_order)}

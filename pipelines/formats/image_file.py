@@ -42,10 +42,10 @@ def read_bytes(path: Path) -> bytes:
     """
     try:
         if file_size(path, limit_bytes=MAX_BYTES, kind="photograph") == 0:
-            raise InputError("todo-empty", "is empty", path=path)
+            raise InputError("empty", "is empty", path=path)
         return path.read_bytes()
     except OSError as error:
-        raise InputError("todo-cannot-be-read", f"cannot be read: {error.strerror}", path=path) from error
+        raise InputError("cannot-be-read", f"cannot be read: {error.strerror}", path=path) from error
 
 
 def read_head(path: Path) -> bytes:
@@ -58,7 +58,7 @@ def read_head(path: Path) -> bytes:
         with path.open("rb") as file:
             head = file.read(_HEAD_BYTES)
     except OSError as error:
-        raise InputError("todo-cannot-be-read", f"cannot be read: {error.strerror}", path=path) from error
+        raise InputError("cannot-be-read", f"cannot be read: {error.strerror}", path=path) from error
     return head if head[:2] == _JPEG and header_size(head) is not None else read_bytes(path)
 
 
@@ -67,7 +67,7 @@ def require_unchanged(data: bytes, sha256: str, path: Path) -> None:
     if sha256 and hashlib.sha256(data).hexdigest() != sha256:
         remedy = "put it back, or run `georef ingest` again"
         raise InputError(
-            "todo-photograph-has-changed-since",
+            "photograph-has-changed-since",
             f"the photograph has changed since `georef ingest` read it: {remedy}",
             path=path,
         )
@@ -83,16 +83,16 @@ def inspect_image(data: bytes, path: Path, *, decode: bool = True) -> ImageFile:
     """
     size = header_size(data)
     if size is None:
-        raise InputError("todo-no-jpeg-png-or", "is no JPEG, PNG or TIFF image", path=path)
+        raise InputError("no-jpeg-png-or", "is no JPEG, PNG or TIFF image", path=path)
     width, height = size
     if not (0 < width * height <= MAX_PIXELS):
         raise InputError(
-            "todo-claims-pixels-limit-million",
+            "claims-pixels-limit-million",
             f"claims {width}×{height} pixels (limit {MAX_PIXELS // 10**6} million)",
             path=path,
         )
     if decode and not _decodes(data):
-        raise InputError("todo-damaged-does-not-decode", "is damaged: it does not decode to its end", path=path)
+        raise InputError("damaged-does-not-decode", "is damaged: it does not decode to its end", path=path)
     return ImageFile(width, height, hashlib.sha256(data).hexdigest())
 
 

@@ -78,7 +78,7 @@ class LasFile:
                 yield _chunk(record)
         if done != self.count:
             raise InputError(
-                "todo-header-promises-points-file",
+                "header-promises-points-file",
                 f"the header promises {self.count} points, the file holds {done}",
                 path=self.path,
             )
@@ -102,7 +102,7 @@ def open_las(path: Path) -> LasFile:
             least = _POINT_BITS_LEAST / 8 if header.are_points_compressed else record
             if count < 1 or body < count * least:
                 raise InputError(
-                    "todo-header-promises-points-file",
+                    "header-promises-points-file",
                     f"the header promises {count} points, the file has {max(body, 0)} bytes for them: it is empty, "
                     "cut off or damaged",
                     path=path,
@@ -115,12 +115,12 @@ def _check_head(path: Path, size: int) -> None:
     with path.open("rb") as stream:
         head = stream.read(_HEADER_BYTES)
         if len(head) < _HEADER_BYTES or head[:4] != b"LASF":
-            raise InputError("todo-not-las-or-laz", "not a LAS or LAZ file", path=path)
+            raise InputError("not-las-or-laz", "not a LAS or LAZ file", path=path)
         offset, records = struct.unpack_from("<II", head, 96)
         point_format, record_bytes = struct.unpack_from("<BH", head, 104)
         if offset > size or records * _VLR_BYTES > offset or record_bytes == 0:
             raise InputError(
-                "todo-header-damaged-its-records",
+                "header-damaged-its-records",
                 "the header is damaged: its records reach beyond the file's end",
                 path=path,
             )
@@ -133,7 +133,7 @@ def _check_head(path: Path, size: int) -> None:
             table = struct.unpack("<q", stream.read(8))[0]
         if not offset < table <= size - 8:
             raise InputError(
-                "todo-table-compressed-chunks-missing",
+                "table-compressed-chunks-missing",
                 "the table of compressed chunks is missing: the file is cut off",
                 path=path,
             )
@@ -141,7 +141,7 @@ def _check_head(path: Path, size: int) -> None:
         _, chunks = struct.unpack("<II", stream.read(8))
         if chunks > size - offset:
             raise InputError(
-                "todo-compressed-chunks-do-not",
+                "compressed-chunks-do-not",
                 f"{chunks} compressed chunks do not fit into the file: it is damaged",
                 path=path,
             )
@@ -193,7 +193,7 @@ def _damage(path: Path) -> Iterator[None]:
         raise
     except BaseException as error:  # the decompressor's panics are no `Exception`
         raise InputError(
-            "todo-damaged-las-file", f"damaged LAS file: {' '.join(str(error).split())[:200]}", path=path
+            "damaged-las-file", f"damaged LAS file: {' '.join(str(error).split())[:200]}", path=path
         ) from error
 
 

@@ -69,13 +69,13 @@ def read_markers_xml(path: Path) -> GroundPoints:
                 parser.feed(data)
                 if len(data) == _LONGEST_TAG and reader.events == before:
                     message = f"a tag or comment is longer than {_LONGEST_TAG >> 20} MiB, the limit"
-                    raise InputError("todo-x", message, path=path, line=reader.line)
+                    raise InputError("xml-invalid", message, path=path, line=reader.line)
         parser.close()
     except OSError as error:
-        raise InputError("todo-cannot-be-read", f"cannot be read: {error.strerror}", path=path) from error
+        raise InputError("cannot-be-read", f"cannot be read: {error.strerror}", path=path) from error
     except (SAXException, DefusedXmlException, ValueError, LookupError) as error:
         message = " ".join(str(error).split())[:200]
-        raise InputError("todo-no-well-formed-xml", f"is no well-formed XML: {message}", path=path) from error
+        raise InputError("no-well-formed-xml", f"is no well-formed XML: {message}", path=path) from error
     return reader.result()
 
 
@@ -109,12 +109,12 @@ class _Reader(ContentHandler):
         parent = self._open[-1] if self._open else ""
         self._open.append(name)
         if len(self._open) > _MAX_DEPTH:
-            raise InputError("todo-nested-too-deeply", "is nested too deeply", path=self._path, line=self.line)
+            raise InputError("nested-too-deeply", "is nested too deeply", path=self._path, line=self.line)
         if name == "chunk":
             self._chunks += 1
             if self._chunks > 1:
                 raise InputError(
-                    "todo-has-several-chunks-export",
+                    "has-several-chunks-export",
                     "has several chunks: export the markers of one",
                     path=self._path,
                     line=self.line,
@@ -144,12 +144,12 @@ class _Reader(ContentHandler):
             self._crs += content
             if len(self._crs) > _LONGEST_CRS:
                 message = f"the CRS is longer than {_LONGEST_CRS} characters, the limit"
-                raise InputError("todo-x", message, path=self._path, line=self.line)
+                raise InputError("xml-invalid", message, path=self._path, line=self.line)
 
     def result(self) -> GroundPoints:
         if not self._points:
             raise InputError(
-                "todo-has-no-marker-with",
+                "has-no-marker-with",
                 "has no marker with coordinates: is it an export of markers?",
                 path=self._path,
             )
@@ -179,10 +179,10 @@ class _Reader(ContentHandler):
         if not {"x", "y", "z"} <= set(values):
             return
         if not name:
-            raise InputError("todo-has-no-name", "has no name", path=self._path, line=self.line, field="label")
+            raise InputError("has-no-name", "has no name", path=self._path, line=self.line, field="label")
         if self._ids.setdefault(name, marker) != marker:
             raise InputError(
-                "todo-two-markers-have-name", f"two markers have the name {name}", path=self._path, line=self.line
+                "two-markers-have-name", f"two markers have the name {name}", path=self._path, line=self.line
             )
         self._names[marker] = name
         both = self._sigma(values, "sxyz")
@@ -214,7 +214,7 @@ class _Reader(ContentHandler):
             value = math.nan
         if not math.isfinite(value):
             message = f"{values[key][:40]!r} is no number"
-            raise InputError("todo-x", message, path=self._path, line=self.line, field=key)
+            raise InputError("number-invalid", message, path=self._path, line=self.line, field=key)
         return value
 
     def _sigma(self, values: dict[str, str], key: str) -> float | None:
@@ -254,7 +254,7 @@ def read_markers(path: Path) -> GroundPoints:
             xyz = (row.finite("x"), row.finite("y"), row.finite("z"))
             points.append(ListedPoint(row.line, row.text("label"), xyz, *_sigma_m(row), not _is_enabled(row)))
     if not points:
-        raise InputError("todo-has-no-marker-with", "has no marker with coordinates", path=path)
+        raise InputError("has-no-marker-with", "has no marker with coordinates", path=path)
     return GroundPoints(
         path=path,
         kind=REFERENCE,
@@ -300,7 +300,7 @@ def _reference(path: Path) -> tuple[Table, bool | None]:
     lines = numbered_lines(path)
     found = next(((at, text) for at, text in lines if HEADER.match(text)), None)
     if found is None:
-        raise InputError("todo-has-no-line-begins", "has no line that begins with #Label", path=path)
+        raise InputError("has-no-line-begins", "has no line that begins with #Label", path=path)
     header_line, header = found
     crs_line, crs_text = next(((at, crs[1]) for at, text in lines if (crs := _CRS.match(text))), (1, None))
     separator = separator_of(header)
@@ -309,14 +309,14 @@ def _reference(path: Path) -> tuple[Table, bool | None]:
     missing = [name for name in ("label", "x", "y", "z") if name not in columns]
     if missing:
         raise InputError(
-            "todo-header-names-no", f"the header names no {', '.join(missing)}", path=path, line=header_line
+            "header-names-no", f"the header names no {', '.join(missing)}", path=path, line=header_line
         )
     kept = [(at, text) for at, text in lines if at > header_line and not text.startswith("#")]
     named = tuple(name for name in unknown if bare_name(name) and not _RESULT.search(name))
     listed = table_rows(path, kept, separator, columns)
     table = Table(path, header_line, columns, named, listed, crs_text, crs_line)
     if not table.rows:
-        raise InputError("todo-has-header-but-no", "has a header but no rows", path=path)
+        raise InputError("has-header-but-no", "has a header but no rows", path=path)
     for row in table.rows:
         row.named("label")
     return table, True if "longitude" in header.lower() else None

@@ -91,7 +91,7 @@ def join_splat_plys(parts: Sequence[Path], path: Path) -> int:
     for ply in plys[1:]:
         if ply.names != plys[0].names:
             raise InputError(
-                "todo-has-other-properties-than",
+                "has-other-properties-than",
                 f"has other properties than {parts[0]}: they cannot be joined",
                 path=ply.path,
             )
@@ -117,7 +117,7 @@ def read_splat_ply(path: Path, rows: slice = slice(None)) -> SplatArrays:
     rest_count = sum(name.startswith("f_rest_") for name in ply.names)
     if rest_count not in _REST_COUNTS:
         raise InputError(
-            "todo-coefficients-degree-has",
+            "coefficients-degree-has",
             f"{rest_count} coefficients; degree 0 to 3 has {', '.join(map(str, _REST_COUNTS))}",
             path=path,
             field="f_rest",
@@ -162,7 +162,7 @@ def _read_rows(path: Path, rows: slice = slice(None)) -> _PlyRows:
     try:
         vertices = PlyData.read(str(path), mmap="r")["vertex"].data
     except (PlyParseError, ValueError, OverflowError, KeyError) as error:
-        raise InputError("todo-damaged-ply-file", f"damaged PLY file: {error}", path=path) from error
+        raise InputError("damaged-ply-file", f"damaged PLY file: {error}", path=path) from error
     # With one type for all columns, as the format demands, this is a view; a file of mixed types is converted.
     values = recfunctions.structured_to_unstructured(vertices[rows], dtype=np.float32)
     return _PlyRows(path, tuple(vertices.dtype.names), values)
@@ -172,7 +172,7 @@ def _columns(ply: _PlyRows, names: tuple[str, ...]) -> Float32Array:
     missing = [name for name in names if name not in ply.names]
     if missing:
         message = "the property is missing: this PLY does not hold Gaussians"
-        raise InputError("todo-x", message, path=ply.path, field=missing[0])
+        raise InputError("properties-missing", message, path=ply.path, field=missing[0])
     index = [ply.names.index(name) for name in names]
     first = index[0] if index else 0
     span = slice(first, first + len(index))
@@ -181,7 +181,7 @@ def _columns(ply: _PlyRows, names: tuple[str, ...]) -> Float32Array:
     finite = np.isfinite(values).all(axis=1)
     if not finite.all():
         raise InputError(
-            "todo-gaussians-have-values-not",
+            "gaussians-have-values-not",
             f"{int((~finite).sum())} of {len(values)} Gaussians have values that are not finite, "
             f"the first is number {int(np.argmin(finite))}",
             path=ply.path,
@@ -197,27 +197,27 @@ def _check_header(path: Path) -> None:
         with path.open("rb") as stream:
             start = stream.read(_HEADER_LIMIT)
     except OSError as error:
-        raise InputError("todo-cannot-be-read", f"cannot be read: {error.strerror}", path=path) from error
+        raise InputError("cannot-be-read", f"cannot be read: {error.strerror}", path=path) from error
     head, end_marker, _ = start.partition(b"end_header")
     lines = [line.split() for line in head.decode("ascii", errors="replace").splitlines()]
     if not end_marker or lines[:1] != [["ply"]]:
-        raise InputError("todo-not-ply-file", "not a PLY file", path=path)
+        raise InputError("not-ply-file", "not a PLY file", path=path)
     if ["format", "binary_little_endian", "1.0"] not in lines:
         raise InputError(
-            "todo-expected-ply-format-binary", "expected a PLY of format binary_little_endian 1.0", path=path
+            "expected-ply-format-binary", "expected a PLY of format binary_little_endian 1.0", path=path
         )
     elements = [line for line in lines if line[:1] == ["element"]]
     if len(elements) != 1 or elements[0][1:2] != ["vertex"] or len(elements[0]) != 3:
-        raise InputError("todo-expected-one-element-vertex", "expected one element, vertex", path=path)
+        raise InputError("expected-one-element-vertex", "expected one element, vertex", path=path)
     properties = [line for line in lines if line[:1] == ["property"]]
     widths = [_WIDTHS.get(line[1], 0) if len(line) == 3 else 0 for line in properties]
     if not widths or 0 in widths:
-        raise InputError("todo-expected-properties-fixed-size", "expected properties of fixed size only", path=path)
+        raise InputError("expected-properties-fixed-size", "expected properties of fixed size only", path=path)
     promised = int(elements[0][2]) if elements[0][2].isdecimal() and len(elements[0][2]) < 16 else -1
     body = size - len(head) - len(end_marker) - (2 if start[len(head) + len(end_marker) :][:1] == b"\r" else 1)
     if promised < 1 or promised * sum(widths) != body:
         raise InputError(
-            "todo-header-promises-gaussians-bytes",
+            "header-promises-gaussians-bytes",
             f"the header promises {elements[0][2][:20]} Gaussians of {sum(widths)} bytes, the file holds "
             f"{max(body, 0)} bytes: it is empty, cut off or damaged",
             path=path,

@@ -98,7 +98,7 @@ def read_spz(path: Path) -> SplatArrays:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise InputError("todo-cannot-be-read", f"cannot be read: {error.strerror}", path=path) from error
+        raise InputError("cannot-be-read", f"cannot be read: {error.strerror}", path=path) from error
     return decode_spz(data, path)
 
 
@@ -142,7 +142,7 @@ def decode_spz(data: bytes, path: Path | None = None) -> SplatArrays:
     try:
         layout, body = unpacked(data, limit_bytes)
     except ValueError as error:
-        raise InputError("todo-x", str(error), path=path) from error
+        raise InputError("spz-damaged", str(error), path=path) from error
     return _dequantised(layout, body)
 
 
@@ -150,13 +150,13 @@ def _check_values(splat: SplatArrays, fractional_bits: int) -> None:
     for name, values in vars(splat).items():
         if not np.isfinite(values).all():
             raise InputError(
-                "todo-gaussians-with-values-not",
+                "gaussians-with-values-not",
                 "Gaussians with values that are not finite cannot be written as SPZ",
                 field=name,
             )
     if not splat.quats_wxyz.any(axis=1).all():
         raise InputError(
-            "todo-rotation-length-zero-cannot",
+            "rotation-length-zero-cannot",
             "a rotation of length zero cannot be written as SPZ",
             field="quats_wxyz",
         )
@@ -166,7 +166,7 @@ def _check_values(splat: SplatArrays, fractional_bits: int) -> None:
     if furthest >= reach - 0.5 / 2.0**fractional_bits:
         outside = int((np.abs(splat.means).max(axis=1) >= reach).sum())
         raise InputError(
-            "todo-spz-holds-positions-within",
+            "spz-holds-positions-within",
             f"SPZ holds positions within ±{reach:.0f} m, and {max(outside, 1)} of {len(splat)} Gaussians lie "
             f"beyond, up to {furthest:.0f} m from the origin",
             field="means",

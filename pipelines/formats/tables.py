@@ -67,29 +67,29 @@ def read_lines(path: Path) -> list[str]:
                 _check_line(text, path, len(lines) + 1)
                 lines.append(text.removesuffix("\n"))
     except OSError as error:
-        raise InputError("todo-cannot-be-read", f"cannot be read: {error.strerror}", path=path) from error
+        raise InputError("cannot-be-read", f"cannot be read: {error.strerror}", path=path) from error
     if not any(map(str.strip, lines)):
-        raise InputError("todo-empty", "is empty", path=path)
+        raise InputError("empty", "is empty", path=path)
     return lines
 
 
 def _check_line(text: str, path: Path, line: int) -> None:
     if line > MOST_LINES:
         raise InputError(
-            "todo-has-more-than-lines", f"has more than {MOST_LINES} lines, the limit for a text table", path=path
+            "has-more-than-lines", f"has more than {MOST_LINES} lines, the limit for a text table", path=path
         )
     if len(text) > LONGEST_LINE:
         raise InputError(
-            "todo-longer-than-characters-limit",
+            "longer-than-characters-limit",
             f"is longer than {LONGEST_LINE} characters, the limit for a line",
             path=path,
             line=line,
         )
     if _NO_UTF8.search(text):
-        raise InputError("todo-not-utf-text-save", "not UTF-8 text: save the file as UTF-8", path=path, line=line)
+        raise InputError("not-utf-text-save", "not UTF-8 text: save the file as UTF-8", path=path, line=line)
     if "\x00" in text:
         raise InputError(
-            "todo-contains-zero-bytes-not",
+            "contains-zero-bytes-not",
             "contains zero bytes: not a text file, or UTF-16; save it as UTF-8",
             path=path,
         )
@@ -111,7 +111,7 @@ def beginning(path: Path) -> str:
         with path.open("rb") as handle:
             return handle.read(_BEGINNING_BYTES).decode("utf-8-sig", "replace")
     except OSError as error:
-        raise InputError("todo-cannot-be-read", f"cannot be read: {error.strerror}", path=path) from error
+        raise InputError("cannot-be-read", f"cannot be read: {error.strerror}", path=path) from error
 
 
 def number_of(text: str, *, path: Path, line: int, field: str, decimal_comma: bool = False) -> float:
@@ -134,7 +134,7 @@ def number_of(text: str, *, path: Path, line: int, field: str, decimal_comma: bo
     except ValueError:
         hint = ": write decimals with a point" if "," in cell else ""
         raise InputError(
-            "todo-no-number", f"{text.strip()[:40]!r} is no number{hint}", path=path, line=line, field=field
+            "no-number", f"{text.strip()[:40]!r} is no number{hint}", path=path, line=line, field=field
         ) from None
     return value if math.isfinite(value) else math.nan
 
@@ -170,7 +170,7 @@ class Row:
         """Return a cell that is not empty."""
         text = self.text(column)
         if not text:
-            raise InputError("todo-has-no-name", "has no name", path=self.path, line=self.line, field=column)
+            raise InputError("has-no-name", "has no name", path=self.path, line=self.line, field=column)
         return text
 
     def number(self, column: str) -> float:
@@ -184,7 +184,7 @@ class Row:
         """Return the number of a cell that is not empty."""
         value = self.number(column)
         if math.isnan(value):
-            raise InputError("todo-not-number", "is not a number", path=self.path, line=self.line, field=column)
+            raise InputError("not-number", "is not a number", path=self.path, line=self.line, field=column)
         return value
 
     def sigma_m(self, column: str) -> float | None:
@@ -192,7 +192,7 @@ class Row:
         value = self.number(column)
         if value < 0:
             message = f"{value:g} is no σ: it must be above zero"
-            raise InputError("todo-x", message, path=self.path, line=self.line, field=column)
+            raise InputError("sigma-negative", message, path=self.path, line=self.line, field=column)
         return value if value > 0 else None
 
 
@@ -226,7 +226,7 @@ class Table:
         if present and len(present) < len(columns):
             missing = ", ".join(name for name in columns if name not in self.columns)
             raise InputError(
-                "todo-has-but-not",
+                "has-but-not",
                 f"has {', '.join(present)} but not {missing}",
                 path=self.path,
                 line=self.header_line,
@@ -255,7 +255,7 @@ def split(text: str, separator: str | None, *, path: Path, line: int) -> list[st
     try:
         return next(csv.reader([text], delimiter=separator), [])
     except csv.Error as error:
-        raise InputError("todo-no-csv", f"is no CSV: {error}", path=path, line=line) from error
+        raise InputError("no-csv", f"is no CSV: {error}", path=path, line=line) from error
 
 
 def table_rows(
@@ -293,7 +293,7 @@ def named_columns(
             unknown.append(text.strip())
         elif key in columns:
             raise InputError(
-                "todo-two-columns-for",
+                "two-columns-for",
                 f"two columns for {key}: {header[columns[key]]}, {text}",
                 path=path,
                 line=line,
@@ -309,7 +309,7 @@ def refuse_first(
     """Raise an InputError for the first row that is bad (N,), with the message on it and its line (N,)."""
     if bad.any():
         row = int(np.argmax(bad))
-        raise InputError("todo-x", message(row), path=path, line=int(lines[row]), field=field)
+        raise InputError("value-out-of-range", message(row), path=path, line=int(lines[row]), field=field)
 
 
 def require_range(

@@ -143,7 +143,7 @@ def read_trajectory(path: Path) -> PoseTable:
     if geographic == projected:
         which = "both" if geographic else "neither of"
         message = f"has {which} latitude,longitude,altitude and x,y,z"
-        raise InputError("todo-x", message, path=path, line=table.header_line)
+        raise InputError("columns-missing", message, path=path, line=table.header_line)
     xyz = _in_range(table, _GEOGRAPHIC) if geographic else table.numbers(_PROJECTED)
     time_s, zoneless = _times(table) if "timestamp" in table.columns else (None, False)
     return PoseTable(
@@ -170,7 +170,7 @@ def _read_table(path: Path) -> Table:
     separator = separator_of(header)
     if separator is None:
         message = "the header has one column only: separate columns by , ; or tab"
-        raise InputError("todo-x", message, path=path, line=first + 1)
+        raise InputError("header-missing", message, path=path, line=first + 1)
     names = [name.strip() for name in split(header, separator, path=path, line=first + 1)]
     columns, unknown = named_columns(
         names, _CANONICAL, path, first + 1, lambda name: name.lower().replace(" ", "_")
@@ -179,11 +179,9 @@ def _read_table(path: Path) -> Table:
         message = (
             "the first line must be a header: image and/or timestamp, then latitude,longitude,altitude or x,y,z"
         )
-        raise InputError("todo-x", message, path=path, line=first + 1)
+        raise InputError("columns-missing", message, path=path, line=first + 1)
     if "image" not in columns and "timestamp" not in columns:
-        raise InputError(
-            "todo-needs-column-image-or", "needs a column image or timestamp", path=path, line=first + 1
-        )
+        raise InputError("needs-column-image-or", "needs a column image or timestamp", path=path, line=first + 1)
     width = header.count(separator) + 1
     rows = []
     reader = csv.reader(lines[first + 1 :], delimiter=separator)
@@ -195,18 +193,16 @@ def _read_table(path: Path) -> Table:
             if len(cells) > width and any(cell.strip() for cell in cells[width:]):
                 hint = "; decimal commas need ; as separator" if separator == "," else ""
                 raise InputError(
-                    "todo-has-cells-header-has",
+                    "has-cells-header-has",
                     f"has {len(cells)} cells, the header has {width}{hint}",
                     path=path,
                     line=line,
                 )
             rows.append(Row(path, line, cells, columns, separator != ","))
     except csv.Error as error:
-        raise InputError(
-            "todo-no-csv", f"is no CSV: {error}", path=path, line=first + 1 + reader.line_num
-        ) from error
+        raise InputError("no-csv", f"is no CSV: {error}", path=path, line=first + 1 + reader.line_num) from error
     if not rows:
-        raise InputError("todo-has-header-but-no", "has a header but no rows", path=path)
+        raise InputError("has-header-but-no", "has a header but no rows", path=path)
     return Table(path, first + 1, columns, unknown, rows)
 
 
@@ -225,7 +221,7 @@ def _attitudes(table: Table) -> FloatArray | None:
     angles, quaternion = table.has(_ANGLES), table.has(_QUATERNION)
     if angles and quaternion:
         raise InputError(
-            "todo-has-both-yaw-pitch",
+            "has-both-yaw-pitch",
             "has both yaw,pitch,roll and qx,qy,qz,qw",
             path=table.path,
             line=table.header_line,
@@ -269,7 +265,7 @@ def _time(row: Row) -> tuple[float, bool]:
         moment = datetime.fromisoformat(text)
     except ValueError:
         raise InputError(
-            "todo-no-iso-time", f"{text!r} is no ISO 8601 time", path=row.path, line=row.line, field="timestamp"
+            "no-iso-time", f"{text!r} is no ISO 8601 time", path=row.path, line=row.line, field="timestamp"
         ) from None
     zoneless = moment.tzinfo is None
     return (moment.replace(tzinfo=UTC) if zoneless else moment).timestamp(), zoneless

@@ -270,7 +270,7 @@ def bundle_information(
     redundancy = 2 * observations - 6 * n - 3 * points
     if redundancy <= 0:
         raise DegenerateGeometryError(
-            "todo-observations-do-not-determine",
+            "observations-do-not-determine",
             f"{observations} observations do not determine {n} cameras and {points} points",
         )
     typical_m = float(np.median(np.linalg.norm(network.rays(), axis=1)))

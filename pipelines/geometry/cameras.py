@@ -199,19 +199,19 @@ def full_parameters(camera: Camera) -> FloatArray:
     layout = _LAYOUT.get(camera.model)
     if layout is None:
         raise InputError(
-            "todo-camera-model-not-supported",
+            "camera-model-not-supported",
             f"camera model {camera.model} is not supported; use one of {', '.join(MODELS)}",
         )
     if len(camera.params) != len(layout):
         raise InputError(
-            "todo-camera-model-has-parameters",
+            "camera-model-has-parameters",
             f"camera model {camera.model} has {len(layout)} parameters, not {len(camera.params)}",
         )
     full = np.zeros(12)
     for value, slots in zip(camera.params, layout, strict=True):
         full[list(slots)] = value
     if not (full[:2] > 0).all():
-        raise InputError("todo-focal-length-px-not", f"focal length {full[0]:g} px is not positive")
+        raise InputError("focal-length-px-not", f"focal length {full[0]:g} px is not positive")
     return full
 
 

@@ -125,7 +125,7 @@ def umeyama(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = No
     u, singular, vt = np.linalg.svd((p0 * w[:, None]).T @ q0)  # eq. 19: H = Σ (p−p̄)(q−q̄)ᵀ = U Σ Vᵀ
     if singular[1] <= 1e-12 * max(singular[0], np.finfo(float).tiny):
         raise DegenerateGeometryError(
-            "todo-points-lie-on-one", "the points lie on one line: the rotation about it is not determined"
+            "points-lie-on-one", "the points lie on one line: the rotation about it is not determined"
         )
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))])
     rotation = vt.T @ np.diag(sign) @ u.T  # eq. 20
@@ -154,7 +154,7 @@ def _checked(
         raise ValueError(f"expected two arrays of shape (N, 3), got {p.shape} and {q.shape}")
     if len(p) < 3:
         raise DegenerateGeometryError(
-            "todo-similarity-needs-points-there", f"a similarity needs 3 points, there are {len(p)}"
+            "similarity-needs-points-there", f"a similarity needs 3 points, there are {len(p)}"
         )
     w = np.ones(len(p)) if weights is None else np.asarray(weights, dtype=np.float64)
     return p, q, w / w.sum()

@@ -145,7 +145,7 @@ class SparseCholesky:
                 diagonal = cholesky(dense[:size, :size], lower=True, check_finite=False)
             except np.linalg.LinAlgError:
                 raise DegenerateGeometryError(
-                    "todo-observations-do-not-determine", "the observations do not determine all cameras"
+                    "observations-do-not-determine", "the observations do not determine all cameras"
                 ) from None
             below = np.ascontiguousarray(_solved(diagonal, dense[size:, :size].T).T)
             updates[index] = dense[size:, size:] - below @ below.T

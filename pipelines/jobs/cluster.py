@@ -51,7 +51,7 @@ def make_certificates(folder: Path) -> None:
             descriptor = os.open(folder / name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
         except FileExistsError as error:
             raise InputError(
-                "todo-exists-delete-make-another", "exists: delete it to make another", path=folder / name
+                "exists-delete-make-another", "exists: delete it to make another", path=folder / name
             ) from error
         with os.fdopen(descriptor, "w", encoding="utf-8") as handle:
             handle.write(text)
@@ -80,13 +80,13 @@ def check_own_certificates(folder: Path) -> None:
         status = path.stat()
         if status.st_uid != os.geteuid():
             raise InputError(
-                "todo-belongs-another-user-who",
+                "belongs-another-user-who",
                 "belongs to another user, who can run programs as you: delete it",
                 path=path,
             )
         if status.st_mode & _OF_OTHERS:
             raise InputError(
-                "todo-open-other-users-who",
+                "open-other-users-who",
                 "is open to other users, who can run programs as you. If none of them has read or changed it: "
                 f"`chmod -R go-rwx {folder}`; else delete it",
                 path=path,
@@ -103,7 +103,7 @@ def check_certificates(folder: Path) -> None:
     for name in (CERTIFICATE, KEY):
         if not (folder / name).is_file():
             raise InputError(
-                "todo-has-no-name-folder",
+                "has-no-name-folder",
                 f"has no {name}: name the folder of the cluster's certificate with --certificates. `georef cluster "
                 "certificates DIR` makes one; `georef cluster scheduler` makes yours for this machine",
                 path=folder,
@@ -118,16 +118,16 @@ def check_certificates(folder: Path) -> None:
         certificates = x509.load_pem_x509_certificates(path.read_bytes())
     except ValueError as error:
         raise InputError(
-            "todo-no-certificate-form-pem", f"is no certificate in the form PEM: {_RENEW}", path=path
+            "no-certificate-form-pem", f"is no certificate in the form PEM: {_RENEW}", path=path
         ) from error
     now = datetime.now(UTC)
     for certificate in certificates:
         since, until = certificate.not_valid_before_utc, certificate.not_valid_after_utc
         if now > until:
-            raise InputError("todo-has-expired-on", f"has expired on {until:{_MINUTES}}: {_RENEW}", path=path)
+            raise InputError("has-expired-on", f"has expired on {until:{_MINUTES}}: {_RENEW}", path=path)
         if now < since:
             clock = f"the clock of this machine says {now:{_MINUTES}}: set it, or {_RENEW}"
-            raise InputError("todo-valid-from-on", f"is valid from {since:{_MINUTES}} on, and {clock}", path=path)
+            raise InputError("valid-from-on", f"is valid from {since:{_MINUTES}} on, and {clock}", path=path)
 
 
 PORT = 8786
@@ -235,7 +235,7 @@ def connected(cluster: ClusterAddress) -> Iterator[Client]:
     except (OSError, TimeoutError, ValueError, RuntimeError) as error:
         hint = "" if not security else ", and whether it has the same certificate"
         raise ClusterError(
-            "todo-no-scheduler-answers-at", f"no scheduler answers at {cluster.url}: check that it runs{hint}"
+            "no-scheduler-answers-at", f"no scheduler answers at {cluster.url}: check that it runs{hint}"
         ) from error
     try:
         yield client

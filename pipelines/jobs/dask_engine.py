@@ -138,7 +138,7 @@ class ClusterRun:
             for name, attempt in list(self._running.items()):
                 self._finish(name, ProcessEnd(INTERRUPTED, time.monotonic() - attempt.since))
             raise ClusterError(
-                "todo-scheduler-lost-jobs-save",
+                "scheduler-lost-jobs-save",
                 "the scheduler is lost: the jobs save their work and stop; start scheduler and workers, then "
                 "repeat the command, which goes on",
             ) from error
@@ -157,7 +157,7 @@ class ClusterRun:
 
     def _start(self) -> None:
         if self._unfit and not self._workers and not self._running:
-            raise ClusterError("todo-no-worker-can-run", f"no worker can run the jobs: {self._warned}")
+            raise ClusterError("no-worker-can-run", f"no worker can run the jobs: {self._warned}")
         now = time.monotonic()
         for pending in list(self.waiting):
             if len(self._running) >= self.at_a_time:

@@ -89,7 +89,7 @@ def load_missions(
     """
     listed = _in_folder(path) if path.is_dir() else _in_file(path, owners)
     if not listed.missions:
-        raise InputError("todo-holds-no-mission", "holds no mission", path=path)
+        raise InputError("holds-no-mission", "holds no mission", path=path)
     missions = tuple(
         replace(
             mission,
@@ -137,17 +137,17 @@ def _in_file(path: Path, owners: Owners) -> MissionList:
     for key, value in document.items():
         if key not in ("defaults", "missions"):
             raise InputError(
-                "todo-unknown-table-there-defaults",
+                "unknown-table-there-defaults",
                 "unknown table; there are defaults and missions",
                 path=path,
                 field=key,
             )
         if not isinstance(value, dict):
-            raise InputError("todo-expected-table", "expected a table", path=path, field=key)
+            raise InputError("expected-table", "expected a table", path=path, field=key)
     tables = document.get("missions", {})
     if len(tables) > _MOST_MISSIONS:
         raise InputError(
-            "todo-missions-too-many-limit",
+            "missions-too-many-limit",
             f"{len(tables)} missions are too many (limit {_MOST_MISSIONS})",
             path=path,
         )
@@ -174,7 +174,7 @@ class _Table:
     def read(self, table: Any) -> _Settings:
         """Return the content of the table, or raise an InputError for an unknown key or a bad value."""
         if not isinstance(table, dict):
-            raise InputError("todo-expected-table", "expected a table", path=self.path, field=self.name)
+            raise InputError("expected-table", "expected a table", path=self.path, field=self.name)
         own: dict[str, str] = {}
         flags: dict[str, dict[str, Any]] = {}
         for key, value in table.items():
@@ -228,7 +228,7 @@ class _Table:
         return value
 
     def _error(self, key: str, message: str) -> InputError:
-        return InputError("todo-x", message, path=self.path, field=f"{self.name}.{key}")
+        return InputError("mission-invalid", message, path=self.path, field=f"{self.name}.{key}")
 
 
 def _mission(path: Path, name: str, table: Any, defaults: _Settings, owners: Owners) -> Mission:
@@ -241,7 +241,9 @@ def _mission(path: Path, name: str, table: Any, defaults: _Settings, owners: Own
         try:
             BY_NAME[stage].options.model_validate(given)
         except ValidationError as error:
-            raise InputError("todo-x", error.errors()[0]["msg"], path=path, field=f"{label}.{stage}") from error
+            raise InputError(
+                "mission-invalid", error.errors()[0]["msg"], path=path, field=f"{label}.{stage}"
+            ) from error
     place = own.own.get("workspace", f"{defaults.own['workspace']}/{name}" if "workspace" in defaults.own else name)
     root = path.parent.absolute() / place
     _require_inside(root, path.parent, path, label)
@@ -251,14 +253,14 @@ def _mission(path: Path, name: str, table: Any, defaults: _Settings, owners: Own
         stages = (key,) if key in BY_NAME else owners.get(key, ())
         if stages and not running.intersection(stages):
             text = f"is for {' and '.join(stages)}, which is not among the stages to run"
-            raise InputError("todo-x", text, path=path, field=f"{label}.{key}")
+            raise InputError("mission-invalid", text, path=path, field=f"{label}.{key}")
     return mission
 
 
 def _require_name(name: str, path: Path, label: str) -> None:
     if not _NAME.fullmatch(name):
         raise InputError(
-            "todo-cannot-be-name-mission",
+            "cannot-be-name-mission",
             "cannot be the name of a mission: use letters, digits, '.', '-' and '_'",
             path=path,
             field=label,
@@ -269,7 +271,7 @@ def _require_inside(root: Path, folder: Path, path: Path, label: str) -> None:
     """Refuse a workspace that a symbolic link leads out of its folder."""
     if not root.resolve().is_relative_to(folder.resolve()):
         raise InputError(
-            "todo-its-workspace-leads-out",
+            "its-workspace-leads-out",
             "its workspace leads out of the folder of missions",
             path=path,
             field=label,
@@ -283,7 +285,7 @@ def _require_own_workspaces(path: Path, missions: Sequence[Mission]) -> None:
         place = str(mission.workspace.root.resolve()).casefold()
         if place in taken:
             raise InputError(
-                "todo-has-workspace",
+                "has-workspace",
                 f"has the workspace of {taken[place]}",
                 path=path,
                 field=f"missions.{mission.name}.workspace",

@@ -84,18 +84,18 @@ class Storage:
             if not store.exists(place):
                 return None
             if store.size(place) > _MOST_INDEX_BYTES:
-                raise InputError("todo-too-large-for-index", "is too large for an index", path=place)
+                raise InputError("too-large-for-index", "is too large for an index", path=place)
             try:
                 index = PartIndex.model_validate_json(store.cat_file(place))
             except ValidationError as error:
                 raise InputError(
-                    "todo-damaged-index-delete",
+                    "damaged-index-delete",
                     f"is a damaged index: delete it; {error.errors()[0]['msg']}",
                     path=place,
                 ) from error
             if index.part != part or not all(name == "." or stays_inside(name) for name in index.files):
                 raise InputError(
-                    "todo-lists-what-does-not", "lists what does not belong to its part: delete it", path=place
+                    "lists-what-does-not", "lists what does not belong to its part: delete it", path=place
                 )
             return index
 
@@ -108,9 +108,7 @@ class Storage:
         with self._reached():
             (store, home), before = self._place(part), self.index(part)
             if writer == "worker" and before is not None and before.attempt != attempt:
-                raise StorageError(
-                    "todo-another-attempt-at-job", f"{part}: another attempt at the job has taken over"
-                )
+                raise StorageError("another-attempt-at-job", f"{part}: another attempt at the job has taken over")
             held = set() if before is None else {_digest(name, *state) for name, state in before.files.items()}
             if urlsplit(self.url).scheme not in _WITHOUT_FOLDERS:
                 store.makedirs(home, exist_ok=True)
@@ -151,7 +149,7 @@ class Storage:
                     path.parent.mkdir(parents=True, exist_ok=True)
                     if not path.parent.resolve().is_relative_to(folder.resolve()):
                         raise InputError(
-                            "todo-symbolic-link-leads-out", "a symbolic link leads out of the folder", path=path
+                            "symbolic-link-leads-out", "a symbolic link leads out of the folder", path=path
                         )
                 drafts = [path.with_name(path.name + _DRAFT) for path in paths]
                 objects = [f"{home}/{_digest(name, *index.files[name])}" for name in names]
@@ -185,9 +183,9 @@ class Storage:
         except GeorefError:
             raise
         except ImportError as error:
-            raise BackendUnavailableError("todo-x", f"{self.url}: {error}") from error
+            raise BackendUnavailableError("storage-library-missing", f"{self.url}: {error}") from error
         except Exception as error:  # Each library of a store has exceptions of its own.
-            raise StorageError("todo-x", f"{self.url}: {type(error).__name__}: {error}") from error
+            raise StorageError("storage-failed", f"{self.url}: {type(error).__name__}: {error}") from error
 
 
 def _files_of(path: Path) -> Iterator[tuple[str, tuple[int, int]]]:
@@ -264,7 +262,7 @@ class EngineExchange:
         """
         if job.folder is None or job.writes is None:
             raise InputError(
-                "todo-cannot-run-through-storage",
+                "cannot-run-through-storage",
                 f"{job.name} cannot run through a storage: use a shared folder",
                 field="--storage",
             )
@@ -330,7 +328,7 @@ def _part(folder: Path, path: Path) -> str:
         return path.resolve().relative_to(folder).as_posix()
     except ValueError:
         raise InputError(
-            "todo-lies-outside-with-storage",
+            "lies-outside-with-storage",
             f"lies outside {folder}: with --storage everything that a job reads lies in one folder",
             path=path,
         ) from None

@@ -158,7 +158,7 @@ def adjusted_exposures(observed: PointColours, count: int) -> FloatArray:
     several = rays[observed.point] >= 2
     if not several.any():
         raise DegenerateGeometryError(
-            "todo-no-point-seen-two", "no point is seen in two photographs: exposures cannot be compared"
+            "no-point-seen-two", "no point is seen in two photographs: exposures cannot be compared"
         )
     point = np.unique(observed.point[several], return_inverse=True)[1]
     observed = PointColours(point, observed.image[several], observed.colour[several])

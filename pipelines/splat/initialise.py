@@ -73,7 +73,7 @@ def gaussians_from_points(
         log.info("left out %d of %d points: repeated, far out or not finite", len(points) - len(keep), len(points))
     if len(keep) < 2:
         raise DegenerateGeometryError(
-            "todo-usable-sfm-points-too", f"{len(keep)} usable SfM points are too few to start Gaussians from"
+            "usable-sfm-points-too", f"{len(keep)} usable SfM points are too few to start Gaussians from"
         )
     order = keep[morton_order(torch.as_tensor(points[keep])).numpy()]
     if options.max_gaussians is not None and len(order) > options.max_gaussians:
@@ -94,9 +94,7 @@ def scene_extent(camera_centers: ArrayLike) -> float:
     centers = np.asarray(camera_centers, dtype=np.float64).reshape(-1, 3)
     radius = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max(initial=0.0)) if len(centers) else 0.0
     if not radius > 0:
-        raise DegenerateGeometryError(
-            "todo-all-cameras-at-one", "all cameras are at one place: the scene has no size"
-        )
+        raise DegenerateGeometryError("all-cameras-at-one", "all cameras are at one place: the scene has no size")
     return 1.1 * radius
 
 

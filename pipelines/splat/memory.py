@@ -74,7 +74,7 @@ def require_memory(size: TrainingSize, free_bytes: int | None) -> None:
         else "a smaller --max-image-size and a smaller --max-gaussians"
     )
     raise ResourceError(
-        "todo-training-needs-about-at",
+        "training-needs-about-at",
         f"training needs about {_gib(needed)} at its peak ({size.gaussians} Gaussians, images of "
         f"{size.camera.width}×{size.camera.height} pixels) and {_gib(free_bytes)} are free: use {advice}"
         f"{', or a smaller --max-image-size' if fitting >= 1000 else ''}, or close other programs",

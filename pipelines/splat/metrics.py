@@ -76,7 +76,7 @@ class Lpips:
         for name, shape in _shapes().items():
             if arrays[name].shape != shape or not np.isfinite(arrays[name]).all():
                 raise InputError(
-                    "todo-expected-finite-numbers-shape",
+                    "expected-finite-numbers-shape",
                     f"expected finite numbers of shape {shape}",
                     path=weights,
                     field=name,

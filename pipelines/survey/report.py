@@ -221,8 +221,10 @@ class CheckPoints(Product):
 
     @property
     def by_way(self) -> dict[Literal["triangulated", "surface"], CheckPointErrors]:
-        both = {"triangulated": self.triangulated, "surface": self.surface}
-        return {way: errors for way, errors in both.items() if errors is not None}
+        triangulated: dict[Literal["triangulated", "surface"], CheckPointErrors] = {
+            "triangulated": self.triangulated
+        }
+        return triangulated if self.surface is None else {**triangulated, "surface": self.surface}
 
 
 class CrossValidation(StatedErrors):

@@ -213,7 +213,7 @@ def test_interrupted_comparison_goes_on(georef: Georef, survey: Path) -> None:
 
 def test_a_configuration_that_fails_has_a_row_that_says_why(georef: Georef, survey: Path) -> None:
     def diverging(stage: StageRun, config: StageOptions) -> Summary:
-        raise ConvergenceError("todo-diverged", "it diverged")
+        raise ConvergenceError("diverged", "it diverged")
 
     fakes.install(evaluate=reporting, train=diverging, adjust=diverging)
     result = georef("compare", survey, "--configs", "baseline,A,B", "--json")
@@ -230,7 +230,7 @@ def test_a_configuration_that_fails_has_a_row_that_says_why(georef: Georef, surv
 
 def test_other_errors_end_it(georef: Georef, survey: Path) -> None:
     def refusing(stage: StageRun, config: StageOptions) -> Summary:
-        raise InputError("todo-no-such-thing", "no such thing")
+        raise InputError("no-such-thing", "no such thing")
 
     fakes.install(evaluate=reporting, train=refusing)
     result = georef("compare", survey)

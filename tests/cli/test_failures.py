@@ -23,9 +23,7 @@ def done(georef: Georef, workspace: Workspace, photos: Path) -> Path:
 
 def test_error_of_a_file_names_path_line_and_field(georef: Georef, done: Path, tmp_path: Path) -> None:
     def refuse(stage: StageRun, options: object) -> Summary:
-        raise errors.InputError(
-            "todo-east-no-number", "'east' is no number", path="t.csv", line=5, field="longitude"
-        )
+        raise errors.InputError("east-no-number", "'east' is no number", path="t.csv", line=5, field="longitude")
 
     fakes.install(ingest=refuse)
     result = georef("ingest", done, "--force", "--json")
@@ -75,8 +73,8 @@ def test_option_out_of_range_in_the_file_is_no_usage_error(georef: Georef, done:
 @pytest.mark.parametrize(
     ("error", "code", "name"),
     [
-        (errors.ConvergenceError("todo-diverged", "diverged"), 1, "convergence"),
-        (errors.DegenerateGeometryError("todo-parallel-rays", "parallel rays"), 1, "geometry"),
+        (errors.ConvergenceError("diverged", "diverged"), 1, "convergence"),
+        (errors.DegenerateGeometryError("parallel-rays", "parallel rays"), 1, "geometry"),
         (OSError(28, "No space left on device", "points.npz"), 1, "storage"),
         (KeyboardInterrupt(), 130, "interrupted"),
     ],

@@ -88,7 +88,7 @@ def test_damaged_partial_is_dropped_and_said(
     def picky(stage: StageRun, options: object) -> Summary:
         resumed.append(stage.resumed)
         if stage.resumed:
-            raise DamagedPartialError("todo-not-readable-checkpoint", "not a readable checkpoint")
+            raise DamagedPartialError("not-readable-checkpoint", "not a readable checkpoint")
         return fakes.fake_run(BY_NAME["train"])(stage, options)  # type: ignore[arg-type]
 
     fakes.install(train=interrupted)

@@ -125,7 +125,7 @@ class TestStatus:
 
     def test_failed_stage_tells_why(self, done: Workspace) -> None:
         def fail(stage: StageRun, options: object) -> Summary:
-            raise ConvergenceError("todo-residual", "residual 7 m > 5 m")
+            raise ConvergenceError("residual", "residual 7 m > 5 m")
 
         fakes.install(init_sim3=fail)
         with pytest.raises(ConvergenceError):
@@ -136,7 +136,7 @@ class TestStatus:
 
     def test_first_failure_and_interruption(self, workspace: Workspace, photos: Path) -> None:
         def fail(stage: StageRun, options: object) -> Summary:
-            raise GeorefError("todo-registered", "2 of 48 registered")
+            raise GeorefError("registered", "2 of 48 registered")
 
         def stop(stage: StageRun, options: object) -> Summary:
             raise KeyboardInterrupt
@@ -210,7 +210,7 @@ class TestRequests:
 
     def test_refused_options_are_not_remembered(self, done: Workspace, photos: Path, tmp_path: Path) -> None:
         def refuse(stage: StageRun, options: object) -> Summary:
-            raise InputError("todo-no-images-give-images", "no images: give --images")
+            raise InputError("no-images-give-images", "no images: give --images")
 
         fakes.install(ingest=refuse)
         with pytest.raises(InputError):
@@ -254,7 +254,7 @@ class TestRequests:
         """A bound that did not hold must not be dropped by the next `georef run`."""
 
         def fail(stage: StageRun, options: object) -> Summary:
-            raise ConvergenceError("todo-too-large", "too large")
+            raise ConvergenceError("too-large", "too large")
 
         fakes.install(init_sim3=fail)
         for _ in range(2):
@@ -316,7 +316,7 @@ class TestFailure:
     def test_failed_stage_keeps_its_product(self, done: Workspace) -> None:
         def fail(stage: StageRun, options: object) -> Summary:
             fakes.write_products(stage, BY_NAME["train"], "half")
-            raise GeorefError("todo-diverged", "diverged")
+            raise GeorefError("diverged", "diverged")
 
         before = fakes.read_products(done, BY_NAME["train"])
         fakes.install(train=fail)

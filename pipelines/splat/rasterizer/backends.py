@@ -26,7 +26,7 @@ def chosen_backend(name: Literal["auto", "cpu", "cuda"]) -> BackendName:
     """
     if name not in ("auto", *BACKENDS):
         raise BackendUnavailableError(
-            "todo-no-rasteriser-called-use", f"no rasteriser is called {name!r}: use auto, cpu or cuda"
+            "no-rasteriser-called-use", f"no rasteriser is called {name!r}: use auto, cpu or cuda"
         )
     if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
         return "cpu"
@@ -37,7 +37,7 @@ def chosen_backend(name: Literal["auto", "cpu", "cuda"]) -> BackendName:
         return "cuda"
     if name == "cuda":
         raise BackendUnavailableError(
-            "todo-cuda-backend-cannot-be", f"the cuda backend cannot be used: {missing}. Or use the cpu backend"
+            "cuda-backend-cannot-be", f"the cuda backend cannot be used: {missing}. Or use the cpu backend"
         )
     log.warning("the GPU is not used: %s", missing)
     return "cpu"

@@ -288,29 +288,29 @@ def _validate(gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, set
         expected = shapes.get(name, (count, (gaussians.sh_degree + 1) ** 2, 3))
         if tuple(tensor.shape) != expected:
             raise InputError(
-                "todo-has-shape-must-be", f"has shape {tuple(tensor.shape)}, must be {expected}", field=name
+                "has-shape-must-be", f"has shape {tuple(tensor.shape)}, must be {expected}", field=name
             )
         if tensor.dtype != dtype or dtype not in (torch.float32, torch.float64):
             raise InputError(
-                "todo-all-must-be-float", f"is {tensor.dtype}: all must be float32 (or all float64)", field=name
+                "all-must-be-float", f"is {tensor.dtype}: all must be float32 (or all float64)", field=name
             )
         if tensor.device.type != "cpu":
             raise InputError(
-                "todo-on-cpu-backend-needs",
+                "on-cpu-backend-needs",
                 f"is on {tensor.device}: the cpu backend needs it on the cpu",
                 field=name,
             )
     if tuple(cam_from_model.shape) != (4, 4):
         raise InputError(
-            "todo-has-shape-must-be",
+            "has-shape-must-be",
             f"has shape {tuple(cam_from_model.shape)}, must be (4, 4)",
             field="cam_from_model",
         )
     highest = min(gaussians.sh_degree, 3)
     if not 0 <= settings.sh_degree <= highest:
-        raise InputError("todo-must-be", f"must be 0 to {highest}, is {settings.sh_degree}", field="sh_degree")
+        raise InputError("must-be", f"must be 0 to {highest}, is {settings.sh_degree}", field="sh_degree")
     if settings.near_m <= 0:
-        raise InputError("todo-must-be-positive", f"must be positive, is {settings.near_m}", field="near_m")
+        raise InputError("must-be-positive", f"must be positive, is {settings.near_m}", field="near_m")
     image = settings.image_of(camera)
     if image.width < 1 or image.height < 1:
-        raise InputError("todo-image-pixels", f"image of {image.width} × {image.height} pixels", field="camera")
+        raise InputError("image-pixels", f"image of {image.width} × {image.height} pixels", field="camera")

@@ -69,7 +69,7 @@ def compile_kernels(progress: Progress = SILENT) -> Path:
     missing = lacking((gsplat(), *compiling_parts()))
     if missing is not None:
         raise BackendUnavailableError(
-            "todo-kernels-cuda-backend-cannot", f"the kernels of the cuda backend cannot be compiled: {missing}"
+            "kernels-cuda-backend-cannot", f"the kernels of the cuda backend cannot be compiled: {missing}"
         )
     folder = _folder() / "_".join(_architectures())
     with _alone_in(folder):
@@ -104,7 +104,7 @@ def load_gsplat(progress: Progress = SILENT) -> ModuleType:
     except ImportError as error:
         remedy = f"delete {_folder()} and run the command again, or use the cpu backend"
         raise BackendUnavailableError(
-            "todo-gsplat-cannot-be-loaded", f"gsplat cannot be loaded ({error}): {remedy}"
+            "gsplat-cannot-be-loaded", f"gsplat cannot be loaded ({error}): {remedy}"
         ) from error
 
 
@@ -154,13 +154,13 @@ def _architectures() -> list[str]:
     found = sorted(name.removesuffix("+PTX") for name in named) or _capabilities()
     if not found:
         raise InputError(
-            "todo-there-no-gpu-compile",
+            "there-no-gpu-compile",
             "there is no GPU to compile for: name its compute capability in the variable TORCH_CUDA_ARCH_LIST "
             "(8.6 for the RTX 30 series, 8.9 for 40, 12.0 for 50, 8.0 for A100, 9.0 for H100; several with blanks)",
         )
     if not all(name.replace(".", "").removesuffix("a").isdecimal() for name in found):
         raise InputError(
-            "todo-torch-cuda-arch-list",
+            "torch-cuda-arch-list",
             f"TORCH_CUDA_ARCH_LIST={' '.join(named)!r}: expected numbers like 8.6, with blanks between",
         )
     return found
@@ -202,7 +202,7 @@ def _compile(draft: Path, log: Path, progress: Progress) -> None:
         lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
         cause = next((line for line in lines if "error" in line.lower()), "no message")[:_MOST_OF_A_LINE]
         raise BackendUnavailableError(
-            "todo-gsplat-kernels-could-not", f"gsplat's kernels could not be compiled ({cause.strip()}): see {log}"
+            "gsplat-kernels-could-not", f"gsplat's kernels could not be compiled ({cause.strip()}): see {log}"
         )
 
 
