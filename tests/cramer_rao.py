@@ -100,11 +100,11 @@ class CameraInformation:
             within = sums.lens[np.ix_(lens, lens)] * of_lens[:, None] * of_lens - self._cross.T @ self._response
             self._of_lens = cho_factor(within, lower=True)
         except (np.linalg.LinAlgError, DegenerateGeometryError) as error:
-            raise DegenerateGeometryError("todo-x", _OPEN) from error
+            raise DegenerateGeometryError("open-network", _OPEN) from error
         least_pivot = min(np.diag(pivot.diagonal).min() for pivot in self._factor.pivots if pivot.diagonal.size)
         least = min(float(least_pivot), float(np.diag(self._of_lens[0]).min(initial=1.0)))
         if least**2 < _WORST_SCALED:
-            raise DegenerateGeometryError("todo-x", _OPEN)
+            raise DegenerateGeometryError("open-network", _OPEN)
 
     def _solved(self, right: FloatArray) -> FloatArray:
         """Return the product (6 n + L, m) of the inverse scaled information and vectors of the same shape."""
