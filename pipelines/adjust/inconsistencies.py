@@ -322,7 +322,8 @@ def _assumed_sigmas(joint: JointAdjustment) -> Iterator[_Finding]:
         if factor.estimated is None:
             sentences.append(f"Nothing checks the assumed σ of the {group}, {assumed}: state it with {options}.")
         elif group == "marks" or factor.applied <= _QUIET_FACTOR:
-            ratio = f"{factor.estimated**0.5:.2g}"
+            variance = factor.estimated if factor.applied == 1.0 else factor.applied
+            ratio = f"{variance**0.5:.2g}"
             sentences.append(
                 f"The {group} scatter {ratio} times their assumed σ of {assumed}: state it with {options}."
             )

@@ -41,7 +41,7 @@ def test_report_is_read_as_written(tmp_path: Path) -> None:
         count=1, points=(PredictedPointError(**MEASURED, **sigma), PredictedPointError(**UNMEASURED, **unknown))
     )
     model = check_points_with(count=1, points=(PointError(**MEASURED), PointError(**UNMEASURED)))
-    report = report_with(test={"views": 3, "psnr": 24.0}, camera=camera, model=model, cautions=(CAUTION,))
+    report = report_with(test={"views": 3, "psnr": 24.0}, triangulated=camera, surface=model, cautions=(CAUTION,))
     document = document_of(report, tmp_path / "report.json")
     assert read_report(tmp_path / "report.json") == report
     rows = document["checkpoints"]
