@@ -50,7 +50,7 @@ def evaluated_workspace(root: Path, rename: str = "") -> Evaluated:
         "image_dir": "photos",
         "control_points": tuple(points[CHECK_POINTS:]),
         "check_points": tuple(points[:CHECK_POINTS]),
-        "assumptions": (f"the ground is flat {rename}",),
+        "assumptions": (Remark(code="flat-ground", sentence=f"The ground is flat {rename}."),),
     }
     survey = survey.model_copy(update=changed)
     save_json(survey, root / SURVEY)
