@@ -50,7 +50,7 @@ def evaluated_workspace(root: Path, rename: str = "") -> Evaluated:
         "image_dir": "photos",
         "control_points": tuple(points[CHECK_POINTS:]),
         "check_points": tuple(points[:CHECK_POINTS]),
-        "assumptions": (Remark(code="flat-ground", sentence=f"The ground is flat {rename}"),),
+        "assumptions": (Remark(code="flat-ground", sentence=f"The ground is flat {rename}."),),
     }
     survey = survey.model_copy(update=changed)
     save_json(survey, root / SURVEY)
@@ -65,8 +65,8 @@ def evaluated_workspace(root: Path, rename: str = "") -> Evaluated:
     photometric = {"psnr": 23.456789, "psnr_compensated": 24.0, "ssim": 0.81, "lpips": None}
     views = (ViewFigures(image=scene.names[2], **photometric),)
     report = report_with(
-        camera=check_point_errors(measured, area_km2),
-        model=check_point_errors(replace(measured, cov_in_geo=None), area_km2),
+        triangulated=check_point_errors(measured, area_km2),
+        surface=check_point_errors(replace(measured, cov_in_geo=None), area_km2),
         test={**photometric, "views": 1, "lpips_reason": "none", "per_view": views},
         cautions=(Remark(code="made-up", sentence=f"Nothing is real here {rename}."),),
     )

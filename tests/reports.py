@@ -51,8 +51,8 @@ def cross_validation_with(**figures: Any) -> CrossValidation:
 def report_with(
     *,
     test: dict[str, Any] | None = None,
-    camera: CheckPointErrors | None = None,
-    model: CheckPointErrors | None = None,
+    triangulated: CheckPointErrors | None = None,
+    surface: CheckPointErrors | None = None,
     crossed: CrossValidation | None = None,
     gnss: dict[str, Any] | None = None,
     scene: AccuracySummary | None = None,
@@ -65,16 +65,16 @@ def report_with(
         gnss: figures of the residuals of the fixes.
         scene: predicted σ; none without it.
     """
-    camera = camera or check_points_with()
+    triangulated = triangulated or check_points_with()
     scene = scene or AccuracySummary(cells=0, reason="the scene has too few points")
     no_views = dict.fromkeys(("psnr", "psnr_compensated", "ssim", "lpips"))
     no_residuals = {**dict.fromkeys(ResidualStats.model_fields), "count": 0}
     return EvaluationReport(
-        headline=headline(camera, scene, cautions),
+        headline=headline(triangulated, scene, cautions),
         photometric=Photometric(
             test=PhotometricFigures(**{"views": 0, **no_views, "per_view": (), **(test or {})})
         ),
-        checkpoints=CheckPoints(triangulated=camera, surface=model or check_points_with()),
+        checkpoints=CheckPoints(triangulated=triangulated, surface=surface or check_points_with()),
         cross_validation=crossed,
         accuracy=scene,
         fit=Fit(

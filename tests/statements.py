@@ -32,7 +32,7 @@ class Statement:
     position_in_geo: np.ndarray
     cov_in_geo: np.ndarray
     initial: InitialSimilarity
-    warnings: tuple[str, ...]
+    warnings: tuple[Remark, ...]
 
     @property
     def cautions(self) -> tuple[Remark, ...]:

@@ -44,6 +44,7 @@ from pipelines.survey.report_parts import Group, VarianceFactor
 from pipelines.survey.survey import Survey
 
 _SIGMA_REJECTED = "sigma-rejected"
+_OTHER_PHOTOGRAPHS = "other-photographs"
 _SIGMA_OPTIONS: dict[Group, str] = {
     "fixes": "--sigma-h and --sigma-v",
     "control points": "--sigma-gcp-h and --sigma-gcp-v",
@@ -121,7 +122,7 @@ def unadjustable(survey: Survey, model: SparseModel, geo_from_local: Similarity 
         return ()
     cause = "Check that they belong to these photographs." if best is None else best.sentence
     sentence = f"The fixes scatter by {scatter:.2f} m along each axis about the SfM model: no similarity fits them."
-    return (Remark(code=_SIGMA_REJECTED if best is None else best.code, sentence=f"{sentence} {cause}"),)
+    return (Remark(code=_OTHER_PHOTOGRAPHS if best is None else best.code, sentence=f"{sentence} {cause}"),)
 
 
 def marks_that_do_not_meet(unused: Sequence[UnusedControlPoint], mistake: str | None) -> tuple[Remark, ...]:
@@ -182,13 +183,15 @@ def _fixes_against_model(fixes: StatedFixes, joint: JointAdjustment) -> Iterator
         yield _Finding(best.code, f"{sides} {_explained(best)}", ends=is_wrong)
         return
     if scatter_m > median_spacing(fixes.position_in_geo) / 2:
+        code = _OTHER_PHOTOGRAPHS
         remedy = "They are farther off than photographs are apart. Check that they belong to these photographs."
     else:
+        code = _SIGMA_REJECTED
         remedy = (
             "No offset, time, axis or group of fixes explains the scatter: the fixes are noisier than their σ, or "
             f"the SfM model is bent. Every σ of the result is enlarged. State the σ with {_SIGMA_OPTIONS['fixes']}."
         )
-    yield _Finding(_SIGMA_REJECTED, f"{sides} {remedy}", ends=is_wrong and scatter_m > _WRONG_SCATTER_M)
+    yield _Finding(code, f"{sides} {remedy}", ends=is_wrong and scatter_m > _WRONG_SCATTER_M)
 
 
 def _shift_of_fixes(joint: JointAdjustment) -> Iterator[_Finding]:
@@ -322,7 +325,8 @@ def _assumed_sigmas(joint: JointAdjustment) -> Iterator[_Finding]:
         if factor.estimated is None:
             sentences.append(f"Nothing checks the assumed σ of the {group}, {assumed}: state it with {options}.")
         elif group == "marks" or factor.applied <= _QUIET_FACTOR:
-            ratio = f"{factor.estimated**0.5:.2g}"
+            variance = factor.estimated if factor.applied == 1.0 else factor.applied
+            ratio = f"{variance**0.5:.2g}"
             sentences.append(
                 f"The {group} scatter {ratio} times their assumed σ of {assumed}: state it with {options}."
             )

@@ -12,11 +12,9 @@ from typing import Literal
 from pipelines.core.products import NOT_CHECKED, Remark
 from pipelines.core.sentences import listed
 from pipelines.report.page import decibel, number_text, share
-from pipelines.survey.report import ByAxis, CheckPointErrors, EvaluationReport
+from pipelines.survey.report import CheckPointErrors, EvaluationReport
 from pipelines.survey.report_parts import VarianceFactor
 
-# Code of the caution that check points find the predicted σ too large.
-PESSIMISTIC = "prediction-pessimistic"
 Level = Literal["good", "fair", "poor", "unknown"]
 
 # Limits of good and of fair.
@@ -25,8 +23,7 @@ OVERLAP = (0.90, 0.70)  # share of the ground that enough photographs see
 REPROJECTION_PX = (1.0, 2.0)
 FIX_OUTLIERS = (0.05, 0.20)  # share of the fixes
 CONTROL_POINTS = (4, 3)
-NORMALISED = (2.0, 4.0)  # mean of the squared normalised errors
-CAUTIOUS = 0.5  # mean of the squared normalised errors, below which σ are larger than they need be
+LEAST_TESTED = 3  # check points, from which `evaluate` tests the predicted σ
 TEST_PSNR_DB = (22.0, 18.0)
 
 
@@ -84,7 +81,7 @@ def verdicts(report: EvaluationReport, measured: Measured, cautions: Sequence[Re
         "Control points": _control(measured),
         "σ of the measurements": _stated_sigma(report.variance_factors),
         "Check points": _check_points(measured, triangulated),
-        "Predicted against measured": _prediction(triangulated, cautions),
+        "Predicted against measured": _prediction(triangulated, report.cautions),
         "Blunders": _blunders(triangulated),
         **({} if on_surface is None else {"Surface at the points": _surface(on_surface)}),
         **({} if test is None else {"Test views": _views(test.psnr, test.views)}),
@@ -113,8 +110,8 @@ def _registered(measured: Measured) -> _Fields:
 
 def _overlap(measured: Measured) -> _Fields:
     rule = (
-        f"good if {measured.enough} photographs or more see {share(OVERLAP[0])} of the ground and all "
-        f"are connected, fair from {share(OVERLAP[1])}"
+        f"good if {share(OVERLAP[0])} of the ground is seen by {measured.enough} photographs or more and all hang "
+        f"together, fair from {share(OVERLAP[1])}"
     )
     if measured.enough_share is None:
         return "unknown", "no scene", "too few SfM points to map the ground", rule
@@ -122,7 +119,7 @@ def _overlap(measured: Measured) -> _Fields:
     reason = "enough rays everywhere" if level == "good" else "the rim of the scene is less accurate: fly beyond it"
     if measured.parts > 1:
         level = "fair" if level == "good" else level
-        reason = f"{measured.parts} groups of photographs with few common points: add photographs"
+        reason = f"{measured.parts} groups of photographs that few points tie together: add photographs"
     reading = f"{share(measured.enough_share)} of the ground in {measured.enough} photographs or more"
     return level, reading, reason, rule
 
@@ -147,9 +144,7 @@ def _fixes(measured: Measured) -> _Fields:
         return level, "none", "the control points alone place the survey", rule
     part = measured.fix_outliers / measured.fixes
     level = level_of(part, FIX_OUTLIERS, more_is_better=False)
-    reason = (
-        "the section on positions names them" if measured.fix_outliers else "none is inconsistent with the others"
-    )
+    reason = "the section on positions names them" if measured.fix_outliers else "all fixes agree with each other"
     reading = f"{measured.fixes} used or tested, {measured.fix_outliers} outliers"
     return level, reading, reason, rule
 
@@ -158,7 +153,7 @@ def _control(measured: Measured) -> _Fields:
     count = measured.control_points
     level: Level = level_of(count, CONTROL_POINTS, more_is_better=True) if count else "fair"
     reason = (
-        "without control points a common error of the recorded positions stays unknown"
+        "a common error of the recorded positions cannot be seen without control points"
         if not count
         else "they tie the survey to the reference frame"
         if level == "good"
@@ -176,9 +171,9 @@ def _stated_sigma(factors: tuple[VarianceFactor, ...]) -> _Fields:
         return "unknown", "not tested", "there is no redundancy to test them with", rule
     changed = [factor for factor in tested if factor.applied != 1.0]
     if changed:
-        reading = ", ".join(f"{factor.group}: variance × {number_text(factor.applied)}" for factor in changed)
+        reading = ", ".join(f"{factor.group}: σ × {number_text(factor.applied**0.5)}" for factor in changed)
         rejected = any(factor.sigma_source == "stated" for factor in changed)
-        reason = "the χ² test rejects a stated σ" if rejected else "these σ were not stated: they were estimated"
+        reason = "the χ² test rejects a stated σ" if rejected else "these σ were assumed: the data gave them"
         return "fair", reading, reason, rule
     passed = ", ".join(factor.group for factor in tested)
     return "good", f"passed: {passed}", "residuals agree with the σ", rule
@@ -201,25 +196,19 @@ def _check_points(measured: Measured, errors: CheckPointErrors) -> _Fields:
 
 
 def _prediction(errors: CheckPointErrors, cautions: Sequence[Remark]) -> _Fields:
+    """Return the outcome of the χ² test of `evaluate`, whose caution has the figures."""
     rule = (
-        f"good up to {NORMALISED[0]:g}, fair up to {NORMALISED[1]:g}: mean of "
-        "error² / (predicted + survey variance), 1 if both are right"
+        f"good if the errors of at least {LEAST_TESTED} triangulated check points pass the χ² test of their "
+        "predicted σ (99 %), fair if the σ are too large, poor if they are too small"
     )
-    predicted = errors.predicted
-    axes = ByAxis(e=None, n=None, u=None) if predicted is None else predicted.normalised_error_squared
-    known = [value for value in (axes.e, axes.n, axes.u) if value is not None]
-    if not known:
-        return "unknown", "not compared", "needs check points with predicted σ", rule
-    worst = max(known)
-    level = level_of(worst, NORMALISED, more_is_better=False)
-    reason = (
-        "the errors are smaller than the predicted σ"
-        if worst < CAUTIOUS or any(caution.code == PESSIMISTIC for caution in cautions)
-        else "the errors agree with the predicted σ"
-        if level == "good"
-        else "the errors are larger than the predicted σ: check control points, marks and datum"
-    )
-    return level, f"{number_text(worst)} on the worst axis", reason, rule
+    codes, tested = {caution.code for caution in cautions}, errors.predicted
+    if "prediction-rejected" in codes:
+        return "poor", "σ too small", "control points, marks or the datum may be at fault: see the caution", rule
+    if "prediction-pessimistic" in codes:
+        return "fair", "σ too large", "errors are smaller than predicted: see the caution", rule
+    if tested is None or tested.count < LEAST_TESTED or "prediction-of-adjusted-similarity" in codes:
+        return "unknown", "not tested", f"needs {LEAST_TESTED} check points with predicted σ", rule
+    return "good", f"passed at {tested.count} check points", "errors agree with the predicted σ", rule
 
 
 def _blunders(errors: CheckPointErrors) -> _Fields:

@@ -98,7 +98,7 @@ def _check_cameras(model: Any, survey: Survey, folder: Path) -> None:
         if (camera.width, camera.height) != (width, height):
             cause = "undistorted copies" if undistorted else "copies of another size"
             raise InputError(
-                "photograph-size",
+                "undistorted-copies" if undistorted else "photograph-size",
                 f"its camera {image.camera_id} ({camera.model_name}) has {camera.width}×{camera.height} pixels, "
                 f"the photograph {image.name} {width}×{height}: the model was made of {cause}. Import the model of "
                 "the photographs themselves, or give the folder of the copies to `georef ingest --images`",

@@ -38,7 +38,9 @@ def reporting(stage: StageRun, config: StageOptions) -> Summary:
     # Two points, as far off.
     points = check_points_with(count=2, mean_h_m=error, median_h_m=error, rmse_h_m=error, rmse_v_m=2 * error)
     cautions = (Remark(code="fake", sentence=text),)
-    report = report_with(test={"psnr": 20.0 + error, "ssim": 0.5}, camera=points, model=points, cautions=cautions)
+    report = report_with(
+        test={"psnr": 20.0 + error, "ssim": 0.5}, triangulated=points, surface=points, cautions=cautions
+    )
     fakes.write_products(stage, spec, dump_json(report.model_dump(mode="json")))
     return Summary("evaluated", {}, ("few check points",))
 

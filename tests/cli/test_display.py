@@ -27,8 +27,8 @@ from tests.reports import check_points_with, cross_validation_with, report_with
 
 REPORT = report_with(
     test={"views": 6, "psnr": 24.31, "ssim": 0.812},
-    camera=check_points_with(count=30, mean_h_m=0.014, rmse_h_m=0.016, rmse_v_m=0.021, rmse_3d_m=0.0264),
-    model=check_points_with(count=28, mean_h_m=0.035, rmse_h_m=0.041, rmse_v_m=0.05, rmse_3d_m=0.065),
+    triangulated=check_points_with(count=30, mean_h_m=0.014, rmse_h_m=0.016, rmse_v_m=0.021, rmse_3d_m=0.0264),
+    surface=check_points_with(count=28, mean_h_m=0.035, rmse_h_m=0.041, rmse_v_m=0.05, rmse_3d_m=0.065),
     gnss={"count": 42, "rmse_h_m": 1.5, "rmse_v_m": 3.1},
 )
 
@@ -77,7 +77,7 @@ class TestReport:
             ),
         )
         crossed = cross_validation_with(count=8, rmse_h_m=0.044)
-        parts = tables.report(report_with(camera=camera, crossed=crossed))
+        parts = tables.report(report_with(triangulated=camera, crossed=crossed))
         check, accuracy, cross = [text_of(part) for part in parts[:3]]
         line = next(line for line in accuracy.splitlines() if line.startswith("triangulated"))
         classes = ["2", "cm", "3", "cm", "3", "cm"]
@@ -88,7 +88,9 @@ class TestReport:
     def test_unknown_is_a_dash_where_another_row_is_known(self) -> None:
         parts = [text_of(part) for part in tables.report(REPORT)]
         assert "–" not in "".join(parts[:2]) and "LPIPS" not in parts[0] and "max 3D" not in parts[1]
-        beside = report_with(camera=check_points_with(count=3, rmse_h_m=0.1), model=check_points_with(count=2))
+        beside = report_with(
+            triangulated=check_points_with(count=3, rmse_h_m=0.1), surface=check_points_with(count=2)
+        )
         assert text_of(*tables.report(beside)).splitlines()[-1].split() == ["surface", "2", "–"]
 
     def test_parts_that_are_not_there_have_no_table(self) -> None:
@@ -111,7 +113,7 @@ class TestWidths:
 
     @pytest.mark.parametrize("width", [80, 120])
     def test_every_figure_of_a_report_is_shown(self, width: int) -> None:
-        ways = {"camera": self.errors(0.1), "model": self.errors(0.2)}
+        ways = {"triangulated": self.errors(0.1), "surface": self.errors(0.2)}
         points = {way: check_points_with(count=47, **errors) for way, errors in ways.items()}
         (part,) = tables.report(report_with(**points))
         text = text_of(part, width=width)
@@ -126,8 +128,8 @@ class TestWidths:
         accuracy = PointAccuracy(count=47, mean_h_m=0.111, median_h_m=0.122, rmse_h_m=0.133, rmse_v_m=0.144)
         rows = tuple(
             ComparedRow(
-                configuration=name, title=name, note="n", test_psnr=24.5, test_ssim=0.9, camera=accuracy,
-                model=accuracy, training_s=100.0,
+                configuration=name, title=name, note="n", test_psnr=24.5, test_ssim=0.9, triangulated=accuracy,
+                surface=accuracy, training_s=100.0,
             )
             for name in ("baseline", *"ABCDE")
         )  # fmt: skip

@@ -54,8 +54,8 @@ def report() -> EvaluationReport:
         **error(FIRST, 0.03, -0.04, 0.12).model_dump(), sigma_e_m=0.01, sigma_n_m=0.02, sigma_u_m=0.03
     )
     made = report_with(
-        camera=check_points_with(points=(predicted, error(SECOND))),
-        model=check_points_with(points=(error(FIRST, 3.0, 4.0, 0.0, blunder=True), error(SECOND))),
+        triangulated=check_points_with(points=(predicted, error(SECOND))),
+        surface=check_points_with(points=(error(FIRST, 3.0, 4.0, 0.0, blunder=True), error(SECOND))),
         crossed=cross_validation_with(points=(error("G1", 0.1, 0.2, 0.2),)),
     )
     coordinates = Coordinates(
@@ -63,10 +63,10 @@ def report() -> EvaluationReport:
         operation_accuracy_m=None, origin=(2600000.0, 1200000.0, 400.0),
         points=(
             PointCoordinates(
-                name=FIRST, surveyed=(2600010.0, 1199980.0, 403.0), camera=(2600010.03, 1199979.96, 403.12),
-                model=(2600013.0, 1199984.0, 403.0),
+                name=FIRST, surveyed=(2600010.0, 1199980.0, 403.0), triangulated=(2600010.03, 1199979.96, 403.12),
+                surface=(2600013.0, 1199984.0, 403.0),
             ),
-            PointCoordinates(name=SECOND, surveyed=(2600000.0, 1200000.0, 400.0), camera=None, model=None),
+            PointCoordinates(name=SECOND, surveyed=(2600000.0, 1200000.0, 400.0), triangulated=None, surface=None),
         ),
     )  # fmt: skip
     residual = PointResidual(name="G1", rays=4, de_m=0.01, dn_m=0.0, du_m=0.0)

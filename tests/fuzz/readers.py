@@ -275,7 +275,7 @@ def _products(folder: Path) -> None:
     save_json(trained_model(Similarity()), folder / "TrainedModel.json")
     shift = RigEstimate(name="time-offset", unit="s", value=(1,), sigma=(1,), start=(0,), observable=(True,))
     save_json(RigCalibration(applied=(shift,)), folder / "RigCalibration.json")
-    report = report_with(camera=check_points_with(count=3, rmse_h_m=0.1, rmse_v_m=0.1, rmse_3d_m=0.2))
+    report = report_with(triangulated=check_points_with(count=3, rmse_h_m=0.1, rmse_v_m=0.1, rmse_3d_m=0.2))
     save_json(report, folder / "EvaluationReport.json")
 
 

@@ -12,7 +12,7 @@ import pytest
 from scipy.stats import chi2, norm
 
 from pipelines.core.errors import InputError
-from pipelines.core.products import load_json
+from pipelines.core.products import Remark, load_json
 from pipelines.core.progress import SILENT
 from pipelines.core.stages import SURVEY
 from pipelines.geometry.correction_basis import correction_basis
@@ -22,6 +22,7 @@ from pipelines.report.place import links_of, overlap_facts, photographs_that_see
 from pipelines.report.points import cut_chips, points_facts
 from pipelines.report.verdicts import FIX_OUTLIERS, REGISTERED, Measured, level_of, verdicts
 from pipelines.report.views import read_metrics
+from pipelines.survey.report import ByAxis, PredictedSigma
 from pipelines.survey.survey import Survey
 from pipelines.survey.trained_survey import fix_differences
 from tests.evaluated_workspaces import CHECK_POINTS, ERROR_M
@@ -197,6 +198,25 @@ def test_verdicts_follow_their_rules(subject: str, changes: dict[str, object], l
     assert found[subject].level == level
     assert found[subject].reason
     assert found[subject].rule
+
+
+@pytest.mark.parametrize(
+    ("count", "code", "level"),
+    [
+        (3, None, "good"),
+        (2, None, "unknown"),
+        (3, "prediction-rejected", "poor"),
+        (3, "prediction-pessimistic", "fair"),
+        (3, "prediction-of-adjusted-similarity", "unknown"),
+    ],
+)
+def test_verdict_on_the_prediction_is_that_of_its_test(count: int, code: str | None, level: str) -> None:
+    axes = ByAxis(e=5.0, n=0.1, u=1.0)
+    sigma = PredictedSigma(count=count, rms_h_m=0.02, rms_v_m=0.03, normalised_error_squared=axes)
+    cautions = () if code is None else (Remark(code=code, sentence="The test says so."),)
+    report = report_with(triangulated=check_points_with(predicted=sigma), cautions=cautions)
+    found = {verdict.subject: verdict for verdict in verdicts(report, MEASURED, ())}
+    assert found["Predicted against measured"].level == level
 
 
 def test_limits_belong_to_the_better_verdict() -> None:

@@ -16,6 +16,7 @@ from pipelines.geometry.cameras import Camera
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.sfm.imported_model import find_model, import_model
 from pipelines.survey.survey import Survey
+from tests.refusals import numbers, refused
 from tests.scenes import Measured, Noise, make_scene, sparse_model, survey_of
 
 pytest.importorskip("pycolmap")
@@ -49,18 +50,18 @@ def test_forged_inner_count_is_refused_before_reading(
     assert 0 < honest < 100
     struct.pack_into(form, data, at, count % 2 ** (8 * struct.calcsize(form)) or 2**32 - 1)
     (tmp_path / name).write_bytes(data)
-    with pytest.raises(InputError, match=r"truncated, copy it again \(record 1 of") as caught:
+    with pytest.raises(InputError) as caught:
         load_reconstruction(tmp_path)
-    assert caught.value.path == tmp_path / name
+    assert caught.value.path == tmp_path / name and "record 1 of" in caught.value.message
 
 
 def test_image_name_that_is_not_utf_8_is_refused(surveyed: tuple[SparseModel, Survey], tmp_path: Path) -> None:
     write_sparse(surveyed[0], tmp_path)
     file = tmp_path / "images.bin"
     file.write_bytes(file.read_bytes().replace(b"image_003", b"image\x85003"))
-    with pytest.raises(InputError, match=r"record 4 of 6 has a name that is not UTF-8") as caught:
+    with pytest.raises(InputError) as caught:
         load_reconstruction(tmp_path)
-    assert caught.value.path == file
+    assert caught.value.path == file and "record 4 of 6" in caught.value.message
 
 
 def test_unknown_camera_model_and_bytes_behind_the_records(
@@ -69,11 +70,14 @@ def test_unknown_camera_model_and_bytes_behind_the_records(
     write_sparse(surveyed[0], tmp_path)
     cameras = (tmp_path / "cameras.bin").read_bytes()
     (tmp_path / "cameras.bin").write_bytes(cameras[:12] + struct.pack("<i", 99) + cameras[16:])
-    with pytest.raises(InputError, match=r"record 1 of 1 has a camera model that is unknown"):
+    with pytest.raises(InputError) as unknown:
         load_reconstruction(tmp_path)
+    assert "record 1 of 1" in unknown.value.message
     (tmp_path / "cameras.bin").write_bytes(cameras + b"\0")
-    with pytest.raises(InputError, match=r"has 1 bytes behind its 1 records"):
+    with pytest.raises(InputError) as behind:
         load_reconstruction(tmp_path)
+    assert behind.value.code != unknown.value.code
+    assert numbers(behind.value.message) == [1, 1]
 
 
 @pytest.mark.parametrize("place", ["", "sparse/0", "sparse", "0"])
@@ -107,9 +111,11 @@ def flat(model: SparseModel, factor: int) -> SparseModel:
 def test_model_of_undistorted_copies_is_refused(surveyed: tuple[SparseModel, Survey], tmp_path: Path) -> None:
     model, survey = surveyed
     write_sparse(flat(model, 2), tmp_path)
-    pattern = r"camera 1 \(PINHOLE\) has \d+×\d+ pixels, the photograph .* made of undistorted copies\. Import the"
-    with pytest.raises(InputError, match=pattern):
+    with refused("undistorted-copies", InputError) as error:
         import_model(tmp_path, survey)
+    size = model.cameras[1].width, model.cameras[1].height
+    assert "{}×{}".format(*size) in error.value.message
+    assert f"{2 * size[0]}×{2 * size[1]}" in error.value.message
 
 
 def test_model_of_smaller_copies_is_refused(surveyed: tuple[SparseModel, Survey], tmp_path: Path) -> None:
@@ -117,7 +123,7 @@ def test_model_of_smaller_copies_is_refused(surveyed: tuple[SparseModel, Survey]
     camera = model.cameras[1]
     small = Camera(camera.model, camera.width // 2, camera.height // 2, camera.params)
     write_sparse(replace(model, cameras={1: small}), tmp_path)
-    with pytest.raises(InputError, match="made of copies of another size"):
+    with refused("photograph-size", InputError):
         import_model(tmp_path, survey)
 
 

@@ -21,6 +21,7 @@ from pipelines.sfm.features import SfmJob
 from pipelines.sfm.mapping import chosen_mapper, map_database
 from pipelines.sfm.options import SfmOptions
 from pipelines.sfm.reconstructor import reconstructor_of
+from tests.refusals import numbers, refused
 from tests.sfm_scenes import CONFIG, HEIGHT, WIDTH, survey_of
 
 GIB = 1 << 30
@@ -115,6 +116,7 @@ def test_a_survey_that_does_not_fit_is_refused_before_work(monkeypatch: pytest.M
     partial.mkdir()
     needed = peak_bytes(900, (WIDTH, HEIGHT), SfmOptions())
     monkeypatch.setattr(colmap_reconstruction, "free_main_memory_bytes", lambda: needed // 2)
-    with pytest.raises(ResourceError, match="SfM of 900 photographs needs about"):
+    with refused("memory-too-small", ResourceError) as error:
         stage.run(StageRun(workspace, partial), SfmOptions())
+    assert numbers(str(error.value))[0] == 900
     assert list(partial.iterdir()) == []

@@ -19,9 +19,10 @@ from pipelines.survey.report import (
     read_report,
     write_report,
 )
+from tests.refusals import refused
 from tests.reports import check_points_with, report_with
 
-CAUTION = Remark(code="prediction-rejected", sentence="Check points refute the predicted accuracy.")
+CAUTION = Remark(code="prediction-rejected", sentence="The predicted σ are too small.")
 MEASURED = {"name": "P1", "rays": 4, "de_m": 0.01, "dn_m": -0.02, "du_m": 0.1 + 0.2, "blunder": False}
 UNMEASURED = {"name": "P2", "rays": 1, "de_m": None, "dn_m": None, "du_m": None, "blunder": False}
 
@@ -40,7 +41,7 @@ def test_report_is_read_as_written(tmp_path: Path) -> None:
         count=1, points=(PredictedPointError(**MEASURED, **sigma), PredictedPointError(**UNMEASURED, **unknown))
     )
     model = check_points_with(count=1, points=(PointError(**MEASURED), PointError(**UNMEASURED)))
-    report = report_with(test={"views": 3, "psnr": 24.0}, camera=camera, model=model, cautions=(CAUTION,))
+    report = report_with(test={"views": 3, "psnr": 24.0}, triangulated=camera, surface=model, cautions=(CAUTION,))
     document = document_of(report, tmp_path / "report.json")
     assert read_report(tmp_path / "report.json") == report
     rows = document["checkpoints"]
@@ -58,20 +59,6 @@ def test_keys_that_were_not_asked_for_are_absent_and_unknown_figures_are_null(tm
     assert test == {"views": 0, "psnr": None, "psnr_compensated": None, "ssim": None, "lpips": None, "per_view": []}
     with_reason = report_with(test={"lpips_reason": "no weights"})
     assert document_of(with_reason, tmp_path / "other.json")["photometric"]["test"]["lpips_reason"] == "no weights"
-
-
-def test_report_from_before_cautions_had_codes_is_read(tmp_path: Path) -> None:
-    path = tmp_path / "report.json"
-    document = document_of(report_with(), path)
-    del document["cautions"]
-    document["accuracy"]["cautions"] = ["the prediction is too good"]
-    path.write_text(json.dumps(document), encoding="utf-8")
-    (caution,) = read_report(path).cautions
-    assert (caution.code, caution.sentence) == ("prediction-limited", "the prediction is too good")
-    document["accuracy"]["cautions"] = 3
-    path.write_text(json.dumps(document), encoding="utf-8")
-    with pytest.raises(InputError, match="not a report"):
-        read_report(path)
 
 
 def test_coordinates_of_an_unmeasured_point_are_null(tmp_path: Path) -> None:
@@ -110,8 +97,9 @@ def test_coordinates_of_an_unmeasured_point_are_null(tmp_path: Path) -> None:
 def test_content_that_is_no_report_is_refused(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "report.json"
     path.write_bytes(content)
-    with pytest.raises(InputError, match="not a report: make it again with `georef evaluate --force`"):
+    with refused("report-invalid", InputError) as error:
         read_report(path)
+    assert error.value.path == path and "`georef evaluate --force`" in error.value.message
 
 
 def test_figures_of_the_wrong_kind_are_refused_by_name(tmp_path: Path) -> None:
@@ -119,11 +107,12 @@ def test_figures_of_the_wrong_kind_are_refused_by_name(tmp_path: Path) -> None:
     document = document_of(report_with(), path)
     document["checkpoints"]["surface"]["mean_h_m"] = "far"
     path.write_text(json.dumps(document), encoding="utf-8")
-    with pytest.raises(InputError, match="not a report") as raised:
+    with refused("report-invalid", InputError) as raised:
         read_report(path)
     assert raised.value.field == "checkpoints.surface.mean_h_m"
 
 
 def test_report_that_cannot_be_read_is_not_called_another_thing(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError) as error:
         read_report(tmp_path)
+    assert error.value.code != "report-invalid"

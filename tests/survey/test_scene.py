@@ -7,6 +7,7 @@ import pytest
 
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.survey.scene import initial_scene
+from tests.refusals import numbers, refused
 from tests.scenes import initial, material
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -36,5 +37,6 @@ def test_split_is_the_surveys_and_only_of_registered_images() -> None:
     assert scene.test.tolist() == [1, 5]
     assert scene.train.tolist() == [0, 2, 3, 4, 6, 7]
     few = tuple(image.model_copy(update={"split": "test"}) for image in images[:-1])
-    with pytest.raises(DegenerateGeometryError, match="1 registered training images"):
+    with refused("too-few-training-images", DegenerateGeometryError) as error:
         initial_scene(sparse, survey.model_copy(update={"images": (*few, images[-1])}), initial())
+    assert numbers(str(error.value))[0] == 1
