@@ -162,21 +162,28 @@ def file_size(path: Path, *, limit_bytes: int | None = None, kind: str = "file",
         status = path.stat()
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise InputError("cannot-be-read", f"cannot be read: {reason}", path=path, field=field) from error
+        raise InputError("file-unreadable", f"cannot be read: {reason}", path=path, field=field) from error
     if not stat.S_ISREG(status.st_mode):
         other = _SPECIAL.get(stat.S_IFMT(status.st_mode), "no regular file")
-        raise InputError(
-            "cannot-be-read-give", f"cannot be read: it is {other}, give a file", path=path, field=field
-        )
+        raise InputError("not-a-file", f"cannot be read: it is {other}, give a file", path=path, field=field)
     if limit_bytes is not None and status.st_size > limit_bytes:
         size, limit = status.st_size / 2**20, limit_bytes / 2**20
         raise InputError(
-            "mib-too-large-for",
+            "file-too-large",
             f"{size:.0f} MiB is too large for a {kind} (limit {limit:.0f} MiB)",
             path=path,
             field=field,
         )
     return status.st_size
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Turn errors of the system while a file is read into an `InputError` of the file."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError("file-unreadable", f"cannot be read: {error.strerror}", path=path) from error
 
 
 def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, NDArray[Any]]:

@@ -82,7 +82,7 @@ def fingerprints(
                 file_size(path, field=flag)
                 result.hashes[flag] = _hash_file(path)
     except OSError as error:
-        raise InputError("cannot-be-read", f"cannot be read: {error.strerror}", path=error.filename) from error
+        raise InputError("file-unreadable", f"cannot be read: {error.strerror}", path=error.filename) from error
     return result
 
 

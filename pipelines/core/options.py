@@ -231,7 +231,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     except ValueError as error:
         raise InputError("not-valid-toml", f"not valid TOML: {error}", path=path) from error
     except OSError as error:
-        raise InputError("cannot-be-read", f"cannot be read: {error.strerror}", path=path) from error
+        raise InputError("file-unreadable", f"cannot be read: {error.strerror}", path=path) from error
 
 
 def parse_toml(text: str) -> dict[str, Any]:

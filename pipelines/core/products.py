@@ -64,7 +64,7 @@ def load_json(product_type: type[ProductT], path: Path) -> ProductT:
     except (np.linalg.LinAlgError, RecursionError) as error:  # of a validator that computes
         raise InputError("has-values-cannot-be", f"has values that cannot be used: {error}", path=path) from error
     except OSError as error:
-        raise InputError("cannot-be-read", f"cannot be read: {error.strerror}", path=path) from error
+        raise InputError("file-unreadable", f"cannot be read: {error.strerror}", path=path) from error
 
 
 def dump_json(document: Any) -> str:

@@ -196,13 +196,15 @@ def open_bag(path: Path) -> Iterator[Bag]:
         InputError: no bag, damaged beyond opening, or with chunks too large for memory.
     """
     if not path.exists():
-        raise InputError("no-such-bag", "no such bag", path=path, field="--bag")
+        raise InputError("bag-missing", "the bag does not exist", path=path, field="--bag")
     if path.is_dir() and not (path / "metadata.yaml").exists():
-        message = "has no metadata.yaml: give the .mcap or .db3 file in it, or `ros2 bag reindex` the folder"
-        raise InputError("no-bag", message, path=path, field="--bag")
+        message = (
+            "the folder has no metadata.yaml: give the .mcap or .db3 file in it, or `ros2 bag reindex` the folder"
+        )
+        raise InputError("bag-metadata-missing", message, path=path, field="--bag")
     if not path.is_dir() and path.suffix not in (".bag", ".mcap", ".db3"):
-        message = "is no bag: give a rosbag2 folder, or a .mcap, .db3 or .bag file"
-        raise InputError("no-bag", message, path=path, field="--bag")
+        message = "the file is not a bag: give a rosbag2 folder, or a .mcap, .db3 or .bag file"
+        raise InputError("not-a-bag", message, path=path, field="--bag")
     reader = _opened(path)
     try:
         for part in _parts(reader):
@@ -211,9 +213,8 @@ def open_bag(path: Path) -> Iterator[Bag]:
         for link in reader.connections:  # SQLite and YAML have any type in any place
             types = isinstance(link.topic, str), isinstance(link.msgtype, str), isinstance(link.msgcount, int)
             if not all(types):
-                raise InputError(
-                    "damaged-topic", f"is damaged (topic {str(link.topic)[:40]!r}): {_REPAIR}", path=path
-                )
+                message = f"the bag is damaged (topic {str(link.topic)[:40]!r}): {_REPAIR}"
+                raise InputError("bag-damaged", message, path=path)
         yield Bag(path, reader, path.suffix != ".bag")
     finally:
         reader.close()
@@ -233,12 +234,11 @@ def _opened(path: Path) -> Any:
         raise
     except Exception as error:  # truncated and forged files make the parser raise any error
         if isinstance(error, KeyError) and error.args[0] in _FOREIGN_SCHEMAS:
-            message = f"has a topic in {error.args[0]!r}, which is not ROS 2's: leave it out with `mcap filter`"
-            raise InputError("bag-unreadable", message, path=path) from error
+            message = f"a topic is in {error.args[0]!r}, not in ROS 2's messages: leave it out with `mcap filter`"
+            raise InputError("bag-foreign-schema", message, path=path) from error
         cause = f"{type(error).__name__}: {error}".rstrip(": ").rstrip(".")
-        raise InputError(
-            "no-bag-or-damaged", f"is no bag, or is damaged ({cause}): {_REPAIR}", path=path
-        ) from error
+        message = f"the file is not a bag, or it is damaged ({cause}): {_REPAIR}"
+        raise InputError("bag-damaged", message, path=path) from error
     return reader
 
 

@@ -64,9 +64,9 @@ def check_files(path: Path) -> None:
 def refuse_large_chunk(path: Path, uncompressed_bytes: int) -> None:
     """Refuse a chunk that unpacks to more than 200 MiB, with its size and a command that rewrites the bag."""
     if uncompressed_bytes > MAX_CHUNK_BYTES:
-        size = f"{uncompressed_bytes / 2**20:.0f} MiB (limit {MAX_CHUNK_BYTES // 2**20})"
+        size = f"{uncompressed_bytes / 2**20:.0f} MiB; the limit is {MAX_CHUNK_BYTES // 2**20} MiB"
         remedy = "rewrite it with smaller ones, e.g. `mcap compress --chunk-size 4194304`"
-        raise InputError("has-chunk", f"has a chunk of {size}: {remedy}", path=path)
+        raise InputError("chunk-too-large", f"the bag has a chunk of {size}: {remedy}", path=path)
 
 
 def unpacked(data: bytes, limit_bytes: int = MAX_CHUNK_BYTES) -> bytes:
@@ -124,11 +124,8 @@ def _check_unpacked(file: Path, size: int) -> None:
         while block := stream.read(_BLOCK_BYTES):
             total += len(block)
             if total > limit_bytes:
-                raise InputError(
-                    "unpacks-more-than-mib",
-                    f"unpacks to more than {limit_bytes / 2**20:.0f} MiB: it is forged",
-                    path=file,
-                )
+                message = f"the file is forged: it unpacks to more than {limit_bytes / 2**20:.0f} MiB"
+                raise InputError("unpacks-too-large", message, path=file)
 
 
 def _check_mcap(file: Path) -> None:
@@ -150,12 +147,9 @@ def _check_mcap(file: Path) -> None:
         raise ValueError(f"the index does not agree with the chunk at {wrong}")
     together = _together(index.values())
     if together > _MAX_TOGETHER_BYTES:
-        raise InputError(
-            "has-chunks-same-moment",
-            f"has chunks of the same moment of {together / 2**20:.0f} MiB in all (limit "
-            f"{_MAX_TOGETHER_BYTES // 2**20}): sort it with `mcap sort`",
-            path=file,
-        )
+        size = f"{together / 2**20:.0f} MiB; the limit is {_MAX_TOGETHER_BYTES // 2**20} MiB"
+        message = f"the chunks of one moment have {size}: sort the bag with `mcap sort`"
+        raise InputError("chunks-overlap", message, path=file)
 
 
 def _records(data: mmap.mmap) -> Iterator[tuple[int, int, int]]:

@@ -102,12 +102,10 @@ class PlyCloudFile:
             return
         largest = float(np.nanmax(np.abs(position), initial=0.0))
         if np.isfinite(largest) and np.spacing(np.float32(largest)) / 2 > _COARSEST_M:
-            raise InputError(
-                "coordinates-single-precision-rounded",
-                f"coordinates of {largest:.0f} in single precision are rounded to "
-                f"{np.spacing(np.float32(largest)):.3f}: write the PLY with double coordinates, or LAZ",
-                path=self.path,
-            )
+            step = np.spacing(np.float32(largest))
+            message = f"coordinates of {largest:.0f} m in single precision are rounded to {step:.3f} m"
+            remedy = "write the PLY with double coordinates, or LAZ"
+            raise InputError("single-precision", f"{message}: {remedy}", path=self.path)
 
 
 def open_cloud_ply(path: Path) -> PlyCloudFile:
@@ -122,24 +120,19 @@ def open_cloud_ply(path: Path) -> PlyCloudFile:
     head, end, rest = start.partition(b"end_header")
     lines = [line.split() for line in head.decode("ascii", errors="replace").splitlines()]
     if not end or lines[:1] != [["ply"]]:
-        raise InputError("not-ply-file", "not a PLY file", path=path)
+        raise InputError("not-a-ply", "the file is not a PLY file", path=path)
     form = next((line[1] for line in lines if line[:1] == ["format"] and len(line) > 1), "")
     if form not in _ORDERS:
-        raise InputError(
-            "ply-format-write-binary",
-            f"a PLY of format {form[:30]!r}: write it as binary_little_endian",
-            path=path,
-        )
+        message = f"the format of the PLY is {form[:30]!r}: write it as binary_little_endian"
+        raise InputError("ply-format", message, path=path)
     count, columns = _vertices(path, lines)
     dtype = np.dtype([(name, _ORDERS[form] + kind) for name, kind in columns])
     offset = len(head) + len(end) + (2 if rest[:1] == b"\r" else 1)
     if count < 1 or offset + count * dtype.itemsize > size:
-        raise InputError(
-            "header-promises-points-bytes",
-            f"the header promises {count} points of {dtype.itemsize} bytes, the file has {max(size - offset, 0)}: "
-            "it is empty, cut off or damaged",
-            path=path,
+        message = (
+            f"the header promises {count} points of {dtype.itemsize} bytes, the file has {max(size - offset, 0)}"
         )
+        raise InputError("size-differs", f"{message}: it is empty, cut off or damaged", path=path)
     return PlyCloudFile(path, count, dtype, offset)
 
 
@@ -148,28 +141,21 @@ def _vertices(path: Path, lines: list[list[str]]) -> tuple[int, list[tuple[str, 
     elements = [place for place, line in enumerate(lines) if line[:1] == ["element"]]
     first = lines[elements[0]] if elements else []
     if len(first) != 3 or first[1] != "vertex" or not first[2].isdecimal() or len(first[2]) > 15:
-        raise InputError("expected-element-vertex-its", "expected `element vertex` and its number first", path=path)
+        raise InputError("ply-elements", "the first element of the PLY is not a number of vertices", path=path)
     until = elements[1] if len(elements) > 1 else len(lines)
     columns = []
     for line in lines[elements[0] + 1 : until]:
         if line[:1] != ["property"]:
             continue
         if len(line) != 3 or line[1] not in _KINDS:
-            raise InputError(
-                "cannot-read-property-vertices",
-                f"cannot read the property {' '.join(line[1:])[:60]!r} of the vertices",
-                path=path,
-            )
+            message = f"the property {' '.join(line[1:])[:60]!r} of the vertices has no known type of fixed size"
+            raise InputError("ply-properties", message, path=path)
         columns.append((line[2], _KINDS[line[1]]))
     names = [name for name, _ in columns]
     missing = [axis for axis in "xyz" if axis not in names]
     if missing or len(set(names)) != len(names):
-        raise InputError(
-            "expected-properties-no-name",
-            "expected the properties x, y and z, and no name twice",
-            path=path,
-            field=(missing or names)[0],
-        )
+        message = "the vertices have no x, y and z, or two properties of one name"
+        raise InputError("ply-coordinates", message, path=path, field=(missing or names)[0])
     return int(first[2]), columns
 
 

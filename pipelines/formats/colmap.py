@@ -47,18 +47,12 @@ class _CutOffError(ValueError):
 def _check_model_files(folder: Path) -> None:
     """Refuse a COLMAP model, binary or text, whose files do not hold what they state."""
     if not folder.is_dir():
-        raise InputError(
-            "no-such-folder-expected",
-            "no such folder; expected a COLMAP model (cameras, images, points3D)",
-            path=folder,
-        )
+        message = "the folder does not exist: give that of a COLMAP model (cameras, images, points3D)"
+        raise InputError("folder-missing", message, path=folder)
     suffix = next((s for s in (".bin", ".txt") if all((folder / (n + s)).exists() for n in _REQUIRED)), None)
     if suffix is None:
-        raise InputError(
-            "not-readable-colmap-model",
-            "not a readable COLMAP model: cameras, images and points3D, all .bin or all .txt, are needed",
-            path=folder,
-        )
+        message = "the folder has no COLMAP model: cameras, images and points3D, all .bin or all .txt, are needed"
+        raise InputError("not-a-colmap-model", message, path=folder)
     for name in FILES:
         file = folder / (name + suffix)
         if not file.exists():
@@ -71,30 +65,27 @@ def _check_model_files(folder: Path) -> None:
 
 
 def _check_binary(file: Path, size: int, record_end: Callable[[_Bytes, int], int]) -> None:
-    cut_off = "shorter than the number of its records says: it is truncated, copy it again"
+    cut_off = "the file is shorter than its number of records requires: it is truncated, copy it again"
     if size < 8:
-        raise InputError("model-cut-off", cut_off, path=file)
+        raise InputError("file-cut-off", cut_off, path=file)
     with file.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
         record = _Bytes(data, size)
         (count,) = struct.unpack_from("<Q", data)
         if count > size:
-            raise InputError("model-cut-off", cut_off, path=file)
+            raise InputError("file-cut-off", cut_off, path=file)
         at = 8
         for number in range(count):
             try:
                 at = record_end(record, at)
             except _CutOffError as error:
-                raise InputError("record", f"{cut_off} (record {number + 1} of {count})", path=file) from error
+                message = f"{cut_off} (record {number + 1} of {count})"
+                raise InputError("file-cut-off", message, path=file) from error
             except ValueError as error:
-                raise InputError(
-                    "record-damaged", f"record {number + 1} of {count} {error}: it is damaged", path=file
-                ) from error
+                message = f"record {number + 1} of {count} is damaged: it {error}"
+                raise InputError("file-damaged", message, path=file) from error
         if at != size:
-            raise InputError(
-                "has-bytes-behind-its",
-                f"has {size - at} bytes behind its {count} records: it is damaged",
-                path=file,
-            )
+            message = f"the file is damaged: {size - at} bytes follow its {count} records"
+            raise InputError("file-damaged", message, path=file)
 
 
 def _check_text(file: Path) -> None:
@@ -103,7 +94,8 @@ def _check_text(file: Path) -> None:
             try:
                 line.decode("utf-8")
             except UnicodeDecodeError as error:
-                raise InputError("image-name-invalid", _INVALID_NAME, path=file, line=number) from error
+                message = f"the image {_INVALID_NAME}"
+                raise InputError("name-not-utf8", message, path=file, line=number) from error
 
 
 @dataclass(frozen=True)
@@ -252,9 +244,8 @@ def write_reconstruction(reconstruction: Any, folder: Path) -> None:
     except InputError:
         whole = False
     if not whole:
-        raise storage_failure_of(folder) or StorageError(
-            "model-could-not-be", f"{folder}: the model could not be written whole"
-        )
+        message = f"{folder}: the model could not be written whole"
+        raise storage_failure_of(folder) or StorageError("model-not-written", message)
 
 
 def load_reconstruction(path: Path) -> Any:
@@ -268,7 +259,7 @@ def load_reconstruction(path: Path) -> Any:
     try:
         return pycolmap.Reconstruction(str(path))
     except (ValueError, RuntimeError, IndexError, MemoryError) as error:
-        raise InputError("not-readable-colmap-model", f"not a readable COLMAP model: {error}", path=path) from error
+        raise InputError("model-unreadable", f"COLMAP cannot read the model: {error}", path=path) from error
 
 
 def _observations(images: list[Any], point_ids: IntArray) -> tuple[IntArray, IntArray, FloatArray]:
@@ -298,18 +289,14 @@ def _check(model: SparseModel, path: Path) -> None:
     values += [("camera params", camera.params) for camera in model.cameras.values()]
     for name, numbers in values:
         if not np.isfinite(numbers).all():
-            raise InputError(
-                "contains-values-not-finite",
-                "contains values that are not finite: reconstruct again",
-                path=path,
-                field=name,
-            )
+            message = "the model contains values that are not finite: reconstruct again"
+            raise InputError("values-not-finite", message, path=path, field=name)
     if len(set(model.image_name)) != len(model.image_name):
-        raise InputError("two-images-have-same", "two images have the same name", path=path, field="images")
+        raise InputError("image-twice", "two images have the same name", path=path, field="images")
     astray = next((name for name in model.image_name if not stays_inside(name)), None)
     if astray is not None:
-        message = f"{astray!r} leaves the folder of photographs: names are relative to it"
-        raise InputError("images-missing", message, path=path, field="images")
+        message = f"the image name {astray!r} leaves the folder of photographs: names are relative to it"
+        raise InputError("image-outside-folder", message, path=path, field="images")
 
 
 def write_sparse(model: SparseModel, path: Path) -> None:

@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.formats.exif import RTK_FIXED, RTK_FLOAT
-from pipelines.formats.tables import number_of, numbered_lines, refuse_first, require_range
+from pipelines.formats.tables import number_of, numbered_lines, refuse_first, require_range, require_rows
 from pipelines.formats.trajectory_csv import PoseTable
 from pipelines.geodesy.enu import ecef_from_enu_rotation, lla_from_ecef
 
@@ -109,13 +109,12 @@ def read_mrk(path: Path) -> CameraEvents:
     for line, text in numbered_lines(path):
         match = _LINE.fullmatch(text)
         if match is None:
-            raise InputError(
-                "no-line-dji-timestamp", f"is no line of a DJI timestamp file: {_LAYOUT}", path=path, line=line
-            )
+            message = f"the line is not that of a DJI timestamp file: {_LAYOUT}"
+            raise InputError("line-layout", message, path=path, line=line)
         number = int(match[1])
         if number in line_of:
-            message = f"event {number} stands in line {line_of[number]} already"
-            raise InputError("photograph-twice", message, path=path, line=line)
+            message = f"event {number} is in line {line_of[number]} already"
+            raise InputError("event-twice", message, path=path, line=line)
         line_of[number] = line
         lines.append(line)
         values.append([float(value) for value in match.groups()])
@@ -163,8 +162,7 @@ def read_pos(path: Path) -> PoseTable:
     header = _header([(at, text) for at, text in lines if text.startswith("%")], path)
     rows = [(at, re.split(r"[\s,;]+", text.strip(",;"))) for at, text in lines if not text.startswith("%")]
     at_lines = np.array([at for at, _ in rows], dtype=np.int64)
-    if not rows:
-        raise InputError("has-header-but-no", "has a header but no rows", path=path)
+    require_rows(rows, path)
     places = 7 if header.form == "sexagesimal" else 3
     table = np.array([_numbers(cells[2:], places, path, at) for at, cells in rows])
     if header.form == "ecef":
@@ -176,7 +174,8 @@ def read_pos(path: Path) -> PoseTable:
     if header.form == "ecef":
         distance = np.linalg.norm(xyz, axis=1)
         off_earth = (distance < _EARTH_M[0]) | (distance > _EARTH_M[1])
-    refuse_first(off_earth, lambda _: "is no place on Earth", path=path, lines=at_lines, field="position")
+    outside = "the position is not on Earth"
+    refuse_first(off_earth, "position-off-earth", lambda _: outside, path=path, lines=at_lines, field="position")
     return PoseTable(
         path=path,
         source="pos",
@@ -203,12 +202,8 @@ def _header(comments: Sequence[tuple[int, str]], path: Path) -> _Header:
         if clock not in ("GPST", "UTC", "JST"):
             continue
         if "baseline" in text:
-            raise InputError(
-                "has-baselines-from-base",
-                "has baselines from the base station, not positions: let RTKLIB write Lat/Lon/Height",
-                path=path,
-                line=line,
-            )
+            message = "the rows are baselines from the base station, not positions: let RTKLIB write Lat/Lon/Height"
+            raise InputError("baselines", message, path=path, line=line)
         form: _Form | None = None
         if "x-ecef" in text:
             form = "ecef"
@@ -216,22 +211,15 @@ def _header(comments: Sequence[tuple[int, str]], path: Path) -> _Header:
             form = "degrees" if "(deg)" in text else "sexagesimal"
         if form is not None:
             return _Header(line, clock, form, above_geoid and form != "ecef")
-    raise InputError(
-        "has-no-header-rtklib",
-        "has no header of RTKLIB: let it be written (Output Header), it states clock and coordinates",
-        path=path,
-    )
+    message = "the file has no header of RTKLIB, which states clock and coordinates: switch Output Header on"
+    raise InputError("header-missing", message, path=path)
 
 
 def _numbers(cells: Sequence[str], places: int, path: Path, line: int) -> list[float]:
     """Return three coordinates, quality, satellites, three σ and three correlated σ; NaN for what is missing."""
     if len(cells) < places:
-        raise InputError(
-            "has-cells-expected-time",
-            f"has {len(cells) + 2} cells, expected time, position, quality …",
-            path=path,
-            line=line,
-        )
+        message = f"the line has {len(cells) + 2} cells, expected time, position, quality …"
+        raise InputError("wrong-columns", message, path=path, line=line)
     values = [number_of(text, path=path, line=line, field="position") for text in cells[:places]]
     if places == 7:
         values = [_degrees(cells[0], values[:3]), _degrees(cells[3], values[3:6]), values[6]]
@@ -269,7 +257,8 @@ def _times(clock: str, rows: Sequence[tuple[int, list[str]]], path: Path) -> Flo
     ).T
     good = (week >= 0) & (week < 1e5) & (second >= 0) & (second <= WEEK_S)
     lines = [at for at, _ in rows]
-    refuse_first(~good, lambda _: "is no GPS week and second", path=path, lines=lines, field="time")
+    message = "the time is not a GPS week and second of the week"
+    refuse_first(~good, "time-invalid", lambda _: message, path=path, lines=lines, field="time")
     return unix_from_week(week, second)
 
 
@@ -286,6 +275,6 @@ def _date(cells: Sequence[str], path: Path, line: int) -> float:
         if second > 60:
             raise ValueError(text)
     except ValueError:
-        message = f"{text[:40]!r} is no time like 2024/05/01 12:00:00.000"
+        message = f"{text[:40]!r} is not a time like 2024/05/01 12:00:00.000"
         raise InputError("time-invalid", message, path=path, line=line, field="time") from None
     return start + second + float(f"0{match[7] or ''}")

@@ -29,6 +29,8 @@ from pipelines.formats.tables import (
     numbered_lines,
     read_lines,
     refuse_first,
+    require_columns,
+    require_rows,
     separator_of,
     split,
     table_rows,
@@ -96,8 +98,8 @@ def without_repeats(points: Sequence[ListedPoint], path: Path) -> tuple[ListedPo
     for point in points:
         other = first.setdefault(point.name, point)
         if point.xyz != other.xyz:
-            message = f"{point.name} has other coordinates in line {other.line}"
-            raise InputError("point-moved", message, path=path, line=point.line, field="x y z")
+            message = f"the point {point.name} has other coordinates in line {other.line}"
+            raise InputError("point-twice", message, path=path, line=point.line, field="x y z")
     return tuple(first.values())
 
 
@@ -120,14 +122,14 @@ def read_geo(path: Path) -> PoseTable:
     numbers = []
     for row in table.rows:
         if len(row.cells) not in (3, 4, 7, 9) and len(row.cells) < 10:  # words may follow nine columns
-            message = f"has {len(row.cells)} columns, expected 3, 4, 7 or 9: {_GEO_FORM}{_comma_hint(row)}"
-            raise InputError("wrong-columns", message, path=path, line=row.line)
+            raise _wrong_columns(row, f"3, 4, 7 or 9: {_GEO_FORM}")
         numbers.append([row.number(column) for column in _GEO_COLUMNS[1:]])
     values = np.array(numbers)
     angles, accuracy = values[:, 3:6] + _GIMBAL_FROM_ODM_DEG, values[:, 6:8]
     refuse_first(
         np.any(accuracy <= 0.0, axis=1),
-        lambda _: "must be above zero",
+        "sigma-not-positive",
+        lambda row: f"the accuracies {accuracy[row, 0]:g} and {accuracy[row, 1]:g} m are not both above zero",
         path=path,
         lines=table.lines,
         field="h_acc, v_acc",
@@ -158,8 +160,7 @@ def read_ground_points(path: Path) -> GroundPoints:
     unnamed: dict[Vector3, str] = {}
     for row in table.rows:
         if len(row.cells) < 6:
-            message = f"has {len(row.cells)} columns, expected at least 6: {_GCP_FORM}{_comma_hint(row)}"
-            raise InputError("wrong-columns", message, path=path, line=row.line)
+            raise _wrong_columns(row, f"at least 6: {_GCP_FORM}")
         xyz = (row.finite("x"), row.finite("y"), row.finite("z"))
         x_px, y_px = row.finite("px"), row.finite("py")
         name = row.text("name") or unnamed.setdefault(xyz, f"point-{len(unnamed) + 1}")
@@ -171,22 +172,21 @@ def read_ground_points(path: Path) -> GroundPoints:
 def _odm_table(path: Path, columns: Sequence[str]) -> Table:
     """Return the rows below the CRS but comments, cells between spaces, with columns in an order."""
     lines = [(at, text) for at, text in numbered_lines(path) if not text.startswith("#")]
-    if not lines:
-        raise InputError("empty", "is empty", path=path)
+    require_rows(lines, path)
     first, crs_text = lines[0]
     words = crs_text.split()
     if len(words) >= 3 and is_number(words[1], decimal_comma=False) and not crs_text.startswith("+"):
         message = "the first line must be the CRS, e.g. EPSG:4326 or WGS84 UTM 16N; this is a row"
         raise InputError("crs-missing", message, path=path, line=first)
-    if not lines[1:]:
-        raise InputError("has-crs-but-no", "has a CRS but no rows", path=path)
+    require_rows(lines[1:], path)
     places = {name: at for at, name in enumerate(columns)}
     return Table(path, None, places, (), table_rows(path, lines[1:], None, places), crs_text)
 
 
-def _comma_hint(row: Row) -> str:
+def _wrong_columns(row: Row, expected: str) -> InputError:
     has_commas = any("," in cell or ";" in cell for cell in row.cells)
-    return "; separate columns by spaces or tabs" if has_commas else ""
+    hint = "; separate columns by spaces or tabs" if has_commas else ""
+    return row.fault("wrong-columns", f"the line has {len(row.cells)} columns, expected {expected}{hint}")
 
 
 PIX4D_POINTS = "a table of points (PIX4D)"
@@ -229,9 +229,8 @@ def read_point_table(path: Path) -> GroundPoints:
             message = (
                 f"the header must name label, z, and either x and y or longitude and latitude; it is {header!r}"
             )
-            raise InputError("columns-missing", message[:300], path=path, line=table.header_line)
-    if not table.rows:
-        raise InputError("has-header-but-no", "has a header but no rows", path=path)
+            raise InputError("column-missing", message[:300], path=path, line=table.header_line)
+    require_rows(table.rows, path)
     points = [
         ListedPoint(
             line=row.line,
@@ -259,13 +258,8 @@ def read_marks(path: Path) -> tuple[ListedMark, ...]:
         InputError: no rows, a column is missing, or a cell is no number.
     """
     table = _pix4d_table(path, _MARK_ALIASES, _MARK_COLUMNS, slice(2, 4), "image, label, x and y")
-    missing = [name for name in _MARK_COLUMNS if name not in table.columns]
-    if missing:
-        raise InputError(
-            "header-names-no", f"the header names no {', '.join(missing)}", path=path, line=table.header_line
-        )
-    if not table.rows:
-        raise InputError("has-header-but-no", "has a header but no rows", path=path)
+    require_columns(table.columns, _MARK_COLUMNS, path, table.header_line)
+    require_rows(table.rows, path)
     return tuple(
         ListedMark(row.line, row.named("label"), row.text("image"), row.finite("x"), row.finite("y"))
         for row in table.rows
@@ -278,15 +272,13 @@ def _pix4d_table(
     """Return a table whose first line is a header if none of its cells `numeric` is a number."""
     lines = [(at, text) for at, text in enumerate(read_lines(path), start=1) if text.strip()]
     lines = [(at, text) for at, text in lines if not text.lstrip().startswith("#")]
-    if not lines:
-        raise InputError("has-comments-only", "has comments only", path=path)
+    require_rows(lines, path)
     first, text = lines[0]
     separator = separator_of(text)
     header = split(text, separator, path=path, line=first)
     if len(header) < 4:
-        raise InputError(
-            "has-columns-expected", f"has {len(header)} columns, expected {expected}", path=path, line=first
-        )
+        message = f"the line has {len(header)} columns, expected {expected}"
+        raise InputError("wrong-columns", message, path=path, line=first)
     if any(map(is_number, header[numeric])):
         places = {name: at for at, name in enumerate(in_order)}
         return Table(path, None, places, (), table_rows(path, lines, separator, places))

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.core.errors import InputError
-from pipelines.core.files import file_size
+from pipelines.core.files import file_size, reading
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff"})
 MAX_BYTES = 512 * 1024 * 1024
@@ -40,12 +40,10 @@ def read_bytes(path: Path) -> bytes:
     Raises:
         InputError: unreadable, empty, or larger than 512 MiB.
     """
-    try:
-        if file_size(path, limit_bytes=MAX_BYTES, kind="photograph") == 0:
-            raise InputError("empty", "is empty", path=path)
+    if file_size(path, limit_bytes=MAX_BYTES, kind="photograph") == 0:
+        raise InputError("file-empty", "the file is empty", path=path)
+    with reading(path):
         return path.read_bytes()
-    except OSError as error:
-        raise InputError("cannot-be-read", f"cannot be read: {error.strerror}", path=path) from error
 
 
 def read_head(path: Path) -> bytes:
@@ -54,11 +52,8 @@ def read_head(path: Path) -> bytes:
     Raises:
         InputError: as `read_bytes`.
     """
-    try:
-        with path.open("rb") as file:
-            head = file.read(_HEAD_BYTES)
-    except OSError as error:
-        raise InputError("cannot-be-read", f"cannot be read: {error.strerror}", path=path) from error
+    with reading(path), path.open("rb") as file:
+        head = file.read(_HEAD_BYTES)
     return head if head[:2] == _JPEG and header_size(head) is not None else read_bytes(path)
 
 
@@ -66,11 +61,8 @@ def require_unchanged(data: bytes, sha256: str, path: Path) -> None:
     """Refuse a photograph whose hash is not the recorded one of the whole file; empty: none was recorded."""
     if sha256 and hashlib.sha256(data).hexdigest() != sha256:
         remedy = "put it back, or run `georef ingest` again"
-        raise InputError(
-            "photograph-has-changed-since",
-            f"the photograph has changed since `georef ingest` read it: {remedy}",
-            path=path,
-        )
+        message = f"the photograph has changed since `georef ingest` read it: {remedy}"
+        raise InputError("photograph-changed", message, path=path)
 
 
 def inspect_image(data: bytes, path: Path, *, decode: bool = True) -> ImageFile:
@@ -83,16 +75,14 @@ def inspect_image(data: bytes, path: Path, *, decode: bool = True) -> ImageFile:
     """
     size = header_size(data)
     if size is None:
-        raise InputError("no-jpeg-png-or", "is no JPEG, PNG or TIFF image", path=path)
+        raise InputError("not-an-image", "the file is not a JPEG, PNG or TIFF image", path=path)
     width, height = size
     if not (0 < width * height <= MAX_PIXELS):
-        raise InputError(
-            "claims-pixels-limit-million",
-            f"claims {width}×{height} pixels (limit {MAX_PIXELS // 10**6} million)",
-            path=path,
-        )
+        message = f"the header states {width}×{height} pixels; the limit is {MAX_PIXELS // 10**6} million"
+        raise InputError("too-many-pixels", message, path=path)
     if decode and not _decodes(data):
-        raise InputError("damaged-does-not-decode", "is damaged: it does not decode to its end", path=path)
+        message = "the photograph is damaged: it does not decode to its end"
+        raise InputError("photograph-damaged", message, path=path)
     return ImageFile(width, height, hashlib.sha256(data).hexdigest())
 
 

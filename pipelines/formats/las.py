@@ -77,11 +77,8 @@ class LasFile:
                 done += len(record)
                 yield _chunk(record)
         if done != self.count:
-            raise InputError(
-                "header-promises-points-file",
-                f"the header promises {self.count} points, the file holds {done}",
-                path=self.path,
-            )
+            message = f"the header promises {self.count} points, the file holds {done}"
+            raise InputError("size-differs", message, path=self.path)
 
 
 def open_las(path: Path) -> LasFile:
@@ -101,12 +98,8 @@ def open_las(path: Path) -> LasFile:
             body = size - int(header.offset_to_point_data)
             least = _POINT_BITS_LEAST / 8 if header.are_points_compressed else record
             if count < 1 or body < count * least:
-                raise InputError(
-                    "header-promises-points-file",
-                    f"the header promises {count} points, the file has {max(body, 0)} bytes for them: it is empty, "
-                    "cut off or damaged",
-                    path=path,
-                )
+                message = f"the header promises {count} points, the file has {max(body, 0)} bytes for them"
+                raise InputError("size-differs", f"{message}: it is empty, cut off or damaged", path=path)
             return LasFile(path, count, _crs(header))
 
 
@@ -115,15 +108,12 @@ def _check_head(path: Path, size: int) -> None:
     with path.open("rb") as stream:
         head = stream.read(_HEADER_BYTES)
         if len(head) < _HEADER_BYTES or head[:4] != b"LASF":
-            raise InputError("not-las-or-laz", "not a LAS or LAZ file", path=path)
+            raise InputError("not-a-las", "the file is not a LAS or LAZ file", path=path)
         offset, records = struct.unpack_from("<II", head, 96)
         point_format, record_bytes = struct.unpack_from("<BH", head, 104)
         if offset > size or records * _VLR_BYTES > offset or record_bytes == 0:
-            raise InputError(
-                "header-damaged-its-records",
-                "the header is damaged: its records reach beyond the file's end",
-                path=path,
-            )
+            message = "the header is damaged: its records reach beyond the file's end"
+            raise InputError("file-damaged", message, path=path)
         if not point_format & 0x80:
             return
         stream.seek(offset)
@@ -132,19 +122,13 @@ def _check_head(path: Path, size: int) -> None:
             stream.seek(size - 8)
             table = struct.unpack("<q", stream.read(8))[0]
         if not offset < table <= size - 8:
-            raise InputError(
-                "table-compressed-chunks-missing",
-                "the table of compressed chunks is missing: the file is cut off",
-                path=path,
-            )
+            message = "the table of compressed chunks is missing: the file is cut off"
+            raise InputError("file-cut-off", message, path=path)
         stream.seek(table)
         _, chunks = struct.unpack("<II", stream.read(8))
         if chunks > size - offset:
-            raise InputError(
-                "compressed-chunks-do-not",
-                f"{chunks} compressed chunks do not fit into the file: it is damaged",
-                path=path,
-            )
+            message = f"{chunks} compressed chunks do not fit into the file: it is damaged"
+            raise InputError("chunk-count", message, path=path)
 
 
 def _chunk(record: Any) -> CloudChunk:
@@ -192,9 +176,8 @@ def _damage(path: Path) -> Iterator[None]:
     except (InputError, GeneratorExit, KeyboardInterrupt, SystemExit):
         raise
     except BaseException as error:  # the decompressor's panics are no `Exception`
-        raise InputError(
-            "damaged-las-file", f"damaged LAS file: {' '.join(str(error).split())[:200]}", path=path
-        ) from error
+        message = f"the LAS file is damaged: {' '.join(str(error).split())[:200]}"
+        raise InputError("file-damaged", message, path=path) from error
 
 
 class LazFile:

@@ -22,7 +22,7 @@ from xml.sax import ContentHandler, SAXException
 import numpy as np
 
 from pipelines.core.errors import InputError
-from pipelines.core.files import file_size
+from pipelines.core.files import file_size, reading
 from pipelines.formats.ground_points import GroundPoints, ListedMark, ListedPoint, without_repeats
 from pipelines.formats.tables import (
     Row,
@@ -30,6 +30,8 @@ from pipelines.formats.tables import (
     bare_name,
     named_columns,
     numbered_lines,
+    require_columns,
+    require_rows,
     separator_of,
     split,
     table_rows,
@@ -44,6 +46,7 @@ _MAX_BYTES = 64 * 1024 * 1024
 _LONGEST_TAG = 1 << 20  # The parser begins an unfinished tag again with every part of the file.
 _LONGEST_CRS, _MAX_DEPTH = 1 << 16, 100
 _OFF = frozenset({"0", "false"})
+_NO_MARKERS = "no marker has coordinates: export markers with their reference"
 
 
 def read_markers_xml(path: Path) -> GroundPoints:
@@ -63,19 +66,18 @@ def read_markers_xml(path: Path) -> GroundPoints:
     parser.setContentHandler(reader)
     reader.setDocumentLocator(parser)
     try:
-        with path.open("rb") as stream:
+        with reading(path), path.open("rb") as stream:
             while data := stream.read(_LONGEST_TAG):
                 before = reader.events
                 parser.feed(data)
                 if len(data) == _LONGEST_TAG and reader.events == before:
-                    message = f"a tag or comment is longer than {_LONGEST_TAG >> 20} MiB, the limit"
-                    raise InputError("xml-invalid", message, path=path, line=reader.line)
+                    raise reader.fault(
+                        "xml-tag-too-long", f"a tag is longer than {_LONGEST_TAG >> 20} MiB, the limit"
+                    )
         parser.close()
-    except OSError as error:
-        raise InputError("cannot-be-read", f"cannot be read: {error.strerror}", path=path) from error
     except (SAXException, DefusedXmlException, ValueError, LookupError) as error:
         message = " ".join(str(error).split())[:200]
-        raise InputError("no-well-formed-xml", f"is no well-formed XML: {message}", path=path) from error
+        raise InputError("xml-invalid", f"the file is not well-formed XML: {message}", path=path) from error
     return reader.result()
 
 
@@ -109,16 +111,11 @@ class _Reader(ContentHandler):
         parent = self._open[-1] if self._open else ""
         self._open.append(name)
         if len(self._open) > _MAX_DEPTH:
-            raise InputError("nested-too-deeply", "is nested too deeply", path=self._path, line=self.line)
+            raise self.fault("xml-too-deep", f"the elements are nested more than {_MAX_DEPTH} deep, the limit")
         if name == "chunk":
             self._chunks += 1
             if self._chunks > 1:
-                raise InputError(
-                    "has-several-chunks-export",
-                    "has several chunks: export the markers of one",
-                    path=self._path,
-                    line=self.line,
-                )
+                raise self.fault("several-chunks", "the file has several chunks: export the markers of one")
         elif name == "camera" and "id" in values and "label" in values:
             self._labels[values["id"]] = values["label"]
         elif name == "marker" and "marker_id" in values:
@@ -143,16 +140,11 @@ class _Reader(ContentHandler):
         if self._open and self._open[-1] == "reference":
             self._crs += content
             if len(self._crs) > _LONGEST_CRS:
-                message = f"the CRS is longer than {_LONGEST_CRS} characters, the limit"
-                raise InputError("xml-invalid", message, path=self._path, line=self.line)
+                raise self.fault("crs-too-long", f"the CRS is longer than {_LONGEST_CRS} characters, the limit")
 
     def result(self) -> GroundPoints:
         if not self._points:
-            raise InputError(
-                "has-no-marker-with",
-                "has no marker with coordinates: is it an export of markers?",
-                path=self._path,
-            )
+            raise InputError("no-markers", _NO_MARKERS, path=self._path)
         known = {point.name for point in self._points}
         marks = [
             ListedMark(line, self._names[marker], self._labels.get(camera, f"camera {camera}"), x, y)
@@ -174,16 +166,18 @@ class _Reader(ContentHandler):
     def line(self) -> int:
         return 1 if self._place is None else int(self._place.getLineNumber() or 1)
 
+    def fault(self, code: str, message: str, field: str | None = None) -> InputError:
+        """Return the error of the line that is being read."""
+        return InputError(code, message, path=self._path, line=self.line, field=field)
+
     def _read_point(self, values: dict[str, str]) -> None:
         marker, name = self._marker or ("", "")
         if not {"x", "y", "z"} <= set(values):
             return
         if not name:
-            raise InputError("has-no-name", "has no name", path=self._path, line=self.line, field="label")
+            raise self.fault("name-missing", "the name is missing", "label")
         if self._ids.setdefault(name, marker) != marker:
-            raise InputError(
-                "two-markers-have-name", f"two markers have the name {name}", path=self._path, line=self.line
-            )
+            raise self.fault("marker-twice", f"two markers have the name {name}")
         self._names[marker] = name
         both = self._sigma(values, "sxyz")
         horizontal = [sigma for axis in ("sx", "sy") if (sigma := self._sigma(values, axis)) is not None]
@@ -213,8 +207,7 @@ class _Reader(ContentHandler):
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            message = f"{values[key][:40]!r} is no number"
-            raise InputError("number-invalid", message, path=self._path, line=self.line, field=key)
+            raise self.fault("not-a-number", f"{values[key][:40]!r} is not a number", key)
         return value
 
     def _sigma(self, values: dict[str, str], key: str) -> float | None:
@@ -254,7 +247,7 @@ def read_markers(path: Path) -> GroundPoints:
             xyz = (row.finite("x"), row.finite("y"), row.finite("z"))
             points.append(ListedPoint(row.line, row.text("label"), xyz, *_sigma_m(row), not _is_enabled(row)))
     if not points:
-        raise InputError("has-no-marker-with", "has no marker with coordinates", path=path)
+        raise InputError("no-markers", _NO_MARKERS, path=path)
     return GroundPoints(
         path=path,
         kind=REFERENCE,
@@ -300,23 +293,18 @@ def _reference(path: Path) -> tuple[Table, bool | None]:
     lines = numbered_lines(path)
     found = next(((at, text) for at, text in lines if HEADER.match(text)), None)
     if found is None:
-        raise InputError("has-no-line-begins", "has no line that begins with #Label", path=path)
+        raise InputError("header-missing", "no line begins with #Label", path=path)
     header_line, header = found
     crs_line, crs_text = next(((at, crs[1]) for at, text in lines if (crs := _CRS.match(text))), (1, None))
     separator = separator_of(header)
     cells = split(header.lstrip("# "), separator, path=path, line=header_line)
     columns, unknown = named_columns(cells, _ALIASES, path, header_line)
-    missing = [name for name in ("label", "x", "y", "z") if name not in columns]
-    if missing:
-        raise InputError(
-            "header-names-no", f"the header names no {', '.join(missing)}", path=path, line=header_line
-        )
+    require_columns(columns, ("label", "x", "y", "z"), path, header_line)
     kept = [(at, text) for at, text in lines if at > header_line and not text.startswith("#")]
     named = tuple(name for name in unknown if bare_name(name) and not _RESULT.search(name))
     listed = table_rows(path, kept, separator, columns)
     table = Table(path, header_line, columns, named, listed, crs_text, crs_line)
-    if not table.rows:
-        raise InputError("has-header-but-no", "has a header but no rows", path=path)
+    require_rows(table.rows, path)
     for row in table.rows:
         row.named("label")
     return table, True if "longitude" in header.lower() else None

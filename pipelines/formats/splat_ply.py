@@ -15,7 +15,7 @@ from numpy.lib import recfunctions
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from pipelines.core.errors import InputError
-from pipelines.core.files import file_size, replace_file
+from pipelines.core.files import file_size, reading, replace_file
 from pipelines.core.types import Float32Array
 
 _HEADER_LIMIT = 64 * 1024
@@ -90,11 +90,8 @@ def join_splat_plys(parts: Sequence[Path], path: Path) -> int:
     plys = [_read_rows(part) for part in parts]
     for ply in plys[1:]:
         if ply.names != plys[0].names:
-            raise InputError(
-                "has-other-properties-than",
-                f"has other properties than {parts[0]}: they cannot be joined",
-                path=ply.path,
-            )
+            message = f"the PLY has other properties than {parts[0]}: the two cannot be joined"
+            raise InputError("properties-differ", message, path=ply.path)
     count = sum(len(ply.rows) for ply in plys)
     draft = path.with_name(path.name + ".tmp")
     with draft.open("wb") as stream:
@@ -116,12 +113,9 @@ def read_splat_ply(path: Path, rows: slice = slice(None)) -> SplatArrays:
     ply = _read_rows(path, rows)
     rest_count = sum(name.startswith("f_rest_") for name in ply.names)
     if rest_count not in _REST_COUNTS:
-        raise InputError(
-            "coefficients-degree-has",
-            f"{rest_count} coefficients; degree 0 to 3 has {', '.join(map(str, _REST_COUNTS))}",
-            path=path,
-            field="f_rest",
-        )
+        counts = ", ".join(map(str, _REST_COUNTS))
+        message = f"the PLY has {rest_count} SH coefficients above degree 0; degrees 0 to 3 have {counts}"
+        raise InputError("sh-coefficients", message, path=path, field="f_rest")
     higher = _columns(ply, tuple(f"f_rest_{i}" for i in range(rest_count)))
     higher = higher.reshape(len(higher), 3, rest_count // 3)
     dc = _columns(ply, _DC)[:, None, :]
@@ -162,7 +156,7 @@ def _read_rows(path: Path, rows: slice = slice(None)) -> _PlyRows:
     try:
         vertices = PlyData.read(str(path), mmap="r")["vertex"].data
     except (PlyParseError, ValueError, OverflowError, KeyError) as error:
-        raise InputError("damaged-ply-file", f"damaged PLY file: {error}", path=path) from error
+        raise InputError("file-damaged", f"the PLY file is damaged: {error}", path=path) from error
     # With one type for all columns, as the format demands, this is a view; a file of mixed types is converted.
     values = recfunctions.structured_to_unstructured(vertices[rows], dtype=np.float32)
     return _PlyRows(path, tuple(vertices.dtype.names), values)
@@ -172,7 +166,7 @@ def _columns(ply: _PlyRows, names: tuple[str, ...]) -> Float32Array:
     missing = [name for name in names if name not in ply.names]
     if missing:
         message = "the property is missing: this PLY does not hold Gaussians"
-        raise InputError("properties-missing", message, path=ply.path, field=missing[0])
+        raise InputError("not-gaussians", message, path=ply.path, field=missing[0])
     index = [ply.names.index(name) for name in names]
     first = index[0] if index else 0
     span = slice(first, first + len(index))
@@ -180,45 +174,37 @@ def _columns(ply: _PlyRows, names: tuple[str, ...]) -> Float32Array:
     values = np.array(ply.rows[:, span] if in_order else ply.rows[:, index], dtype=np.float32)
     finite = np.isfinite(values).all(axis=1)
     if not finite.all():
-        raise InputError(
-            "gaussians-have-values-not",
-            f"{int((~finite).sum())} of {len(values)} Gaussians have values that are not finite, "
-            f"the first is number {int(np.argmin(finite))}",
-            path=ply.path,
-            field=" ".join(names[:4]),
+        message = (
+            f"{int((~finite).sum())} of {len(values)} Gaussians have values that are not finite; "
+            f"the first is number {int(np.argmin(finite))}"
         )
+        raise InputError("values-not-finite", message, path=ply.path, field=" ".join(names[:4]))
     return values
 
 
 def _check_header(path: Path) -> None:
     """Refuse, before memory is allocated, a file whose size differs from the promise of its header."""
     size = file_size(path)
-    try:
-        with path.open("rb") as stream:
-            start = stream.read(_HEADER_LIMIT)
-    except OSError as error:
-        raise InputError("cannot-be-read", f"cannot be read: {error.strerror}", path=path) from error
+    with reading(path), path.open("rb") as stream:
+        start = stream.read(_HEADER_LIMIT)
     head, end_marker, _ = start.partition(b"end_header")
     lines = [line.split() for line in head.decode("ascii", errors="replace").splitlines()]
     if not end_marker or lines[:1] != [["ply"]]:
-        raise InputError("not-ply-file", "not a PLY file", path=path)
+        raise InputError("not-a-ply", "the file is not a PLY file", path=path)
     if ["format", "binary_little_endian", "1.0"] not in lines:
-        raise InputError(
-            "expected-ply-format-binary", "expected a PLY of format binary_little_endian 1.0", path=path
-        )
+        raise InputError("ply-format", "the format of the PLY is not binary_little_endian 1.0", path=path)
     elements = [line for line in lines if line[:1] == ["element"]]
     if len(elements) != 1 or elements[0][1:2] != ["vertex"] or len(elements[0]) != 3:
-        raise InputError("expected-one-element-vertex", "expected one element, vertex", path=path)
+        raise InputError("ply-elements", "the PLY has elements other than one, vertex", path=path)
     properties = [line for line in lines if line[:1] == ["property"]]
     widths = [_WIDTHS.get(line[1], 0) if len(line) == 3 else 0 for line in properties]
     if not widths or 0 in widths:
-        raise InputError("expected-properties-fixed-size", "expected properties of fixed size only", path=path)
+        raise InputError("ply-properties", "the PLY has no properties, or some without a fixed size", path=path)
     promised = int(elements[0][2]) if elements[0][2].isdecimal() and len(elements[0][2]) < 16 else -1
     body = size - len(head) - len(end_marker) - (2 if start[len(head) + len(end_marker) :][:1] == b"\r" else 1)
     if promised < 1 or promised * sum(widths) != body:
-        raise InputError(
-            "header-promises-gaussians-bytes",
+        message = (
             f"the header promises {elements[0][2][:20]} Gaussians of {sum(widths)} bytes, the file holds "
-            f"{max(body, 0)} bytes: it is empty, cut off or damaged",
-            path=path,
+            f"{max(body, 0)} bytes: it is empty, cut off or damaged"
         )
+        raise InputError("size-differs", message, path=path)

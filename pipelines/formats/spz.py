@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.core.errors import InputError
-from pipelines.core.files import file_size, replace_file
+from pipelines.core.files import file_size, reading, replace_file
 from pipelines.core.types import ByteArray, Float32Array, FloatArray
 from pipelines.formats.splat_ply import SplatArrays
 
@@ -95,10 +95,8 @@ def read_spz(path: Path) -> SplatArrays:
             unpack to more than sixteen times its size (and 16 MiB).
     """
     file_size(path)
-    try:
+    with reading(path):
         data = path.read_bytes()
-    except OSError as error:
-        raise InputError("cannot-be-read", f"cannot be read: {error.strerror}", path=path) from error
     return decode_spz(data, path)
 
 
@@ -139,104 +137,102 @@ def decode_spz(data: bytes, path: Path | None = None) -> SplatArrays:
     """Return the Gaussians in the bytes of an SPZ file; raises as `read_spz`, and names the path."""
     limit_bytes = max(_SMALL_BYTES, _MOST_UNPACKED * len(data))
     unpacked = _unpacked_gzip if data[:2] == b"\x1f\x8b" else _unpacked_zstd
-    try:
-        layout, body = unpacked(data, limit_bytes)
-    except ValueError as error:
-        raise InputError("spz-damaged", str(error), path=path) from error
+    layout, body = unpacked(data, limit_bytes, path)
     return _dequantised(layout, body)
 
 
 def _check_values(splat: SplatArrays, fractional_bits: int) -> None:
     for name, values in vars(splat).items():
         if not np.isfinite(values).all():
-            raise InputError(
-                "gaussians-with-values-not",
-                "Gaussians with values that are not finite cannot be written as SPZ",
-                field=name,
-            )
+            message = "Gaussians with values that are not finite cannot be written as SPZ"
+            raise InputError("values-not-finite", message, field=name)
     if not splat.quats_wxyz.any(axis=1).all():
-        raise InputError(
-            "rotation-length-zero-cannot",
-            "a rotation of length zero cannot be written as SPZ",
-            field="quats_wxyz",
-        )
+        message = "a rotation of length zero cannot be written as SPZ"
+        raise InputError("quaternion-length", message, field="quats_wxyz")
     furthest = float(np.abs(splat.means).max())
     reach = _POSITION_LIMIT / 2.0**fractional_bits
     # The rounded positive end of the range would be the negative one.
     if furthest >= reach - 0.5 / 2.0**fractional_bits:
         outside = int((np.abs(splat.means).max(axis=1) >= reach).sum())
-        raise InputError(
-            "spz-holds-positions-within",
-            f"SPZ holds positions within ±{reach:.0f} m, and {max(outside, 1)} of {len(splat)} Gaussians lie "
-            f"beyond, up to {furthest:.0f} m from the origin",
-            field="means",
+        message = (
+            f"SPZ holds positions within ±{reach:.0f} m; {max(outside, 1)} of {len(splat)} Gaussians are farther, "
+            f"up to {furthest:.0f} m from the origin"
         )
+        raise InputError("spz-range", message, field="means")
 
 
-def _unpacked_gzip(data: bytes, limit_bytes: int) -> tuple[_Layout, ByteArray]:
+def _unpacked_gzip(data: bytes, limit_bytes: int, path: Path | None) -> tuple[_Layout, ByteArray]:
     stream = zlib.decompressobj(16 + zlib.MAX_WBITS)
     try:
         head = stream.decompress(data, _HEADER.size)
-        layout = _stated_layout(head, versions=(2, 3), limit_bytes=limit_bytes)
+        layout = _stated_layout(head, (2, 3), limit_bytes, path)
         # One byte more than promised tells a longer stream from a whole one.
         body = stream.decompress(stream.unconsumed_tail, layout.body_bytes + 1)
     except zlib.error as error:
-        raise ValueError(f"damaged SPZ file: {error}") from error
+        raise _damage(f"{error}", path) from error
     if len(body) != layout.body_bytes or not stream.eof:
-        raise ValueError(
-            f"the header promises {layout.count} Gaussians in {layout.body_bytes} bytes, the file holds "
-            f"{'more' if len(body) > layout.body_bytes else 'fewer'}: it is cut off or damaged"
+        held = "more" if len(body) > layout.body_bytes else "fewer"
+        message = (
+            f"the header promises {layout.count} Gaussians in {layout.body_bytes} bytes, the file holds {held}"
         )
+        raise InputError("size-differs", f"{message}: it is cut off or damaged", path=path)
     return layout, np.frombuffer(body, np.uint8)
 
 
-def _unpacked_zstd(data: bytes, limit_bytes: int) -> tuple[_Layout, ByteArray]:
+def _unpacked_zstd(data: bytes, limit_bytes: int, path: Path | None) -> tuple[_Layout, ByteArray]:
     import zstandard
 
-    layout = _stated_layout(data[: _HEADER.size], versions=(4,), limit_bytes=limit_bytes)
+    layout = _stated_layout(data[: _HEADER.size], (4,), limit_bytes, path)
     streams = data[_HEADER.size - 1]
     if streams != len(layout.widths) or len(data) < _HEADER4_BYTES:
-        raise ValueError(f"{streams} streams where a degree of {layout.degree} has {len(layout.widths)}")
+        raise _damage(f"{streams} streams instead of the {len(layout.widths)} of degree {layout.degree}", path)
     (table,) = struct.unpack_from("<I", data, _HEADER.size)
     place = table + streams * _TABLE_ROW.size
     if table < _HEADER4_BYTES or place > len(data):
-        raise ValueError("damaged SPZ file: its table lies outside the file")
+        raise _damage("its table lies outside the file", path)
     parts = []
     for index, width in enumerate(layout.widths):
         packed, size = _TABLE_ROW.unpack_from(data, table + index * _TABLE_ROW.size)
         if size != width * layout.count or packed > len(data) - place:
-            raise ValueError(f"stream {index} has another size than the header promises: cut off or damaged")
+            message = f"stream {index} has another size than the header promises: the file is cut off or damaged"
+            raise InputError("size-differs", message, path=path)
         try:
             with zstandard.ZstdDecompressor().stream_reader(data[place : place + packed]) as reader:
                 part = reader.read(size + 1)
         except zstandard.ZstdError as error:
-            raise ValueError(f"damaged SPZ file: {error}") from error
+            raise _damage(f"{error}", path) from error
         if len(part) != size:
-            raise ValueError(f"stream {index} unpacks to another size than promised: cut off or damaged")
+            message = f"stream {index} unpacks to another size than the header promises: the file is damaged"
+            raise InputError("unpacked-size-differs", message, path=path)
         parts.append(part)
         place += packed
     return layout, np.frombuffer(b"".join(parts), np.uint8)
 
 
-def _stated_layout(head: bytes, versions: tuple[int, ...], limit_bytes: int) -> _Layout:
+def _damage(reason: str, path: Path | None) -> InputError:
+    return InputError("file-damaged", f"the SPZ file is damaged: {reason}", path=path)
+
+
+def _stated_layout(head: bytes, versions: tuple[int, ...], limit_bytes: int, path: Path | None) -> _Layout:
     if len(head) < _HEADER.size or head[:4] != struct.pack("<I", _MAGIC):
-        raise ValueError("not an SPZ file")
+        raise InputError("not-an-spz", "the file is not an SPZ file", path=path)
     _, version, count, degree, fractional_bits, flags, _ = _HEADER.unpack(head)
     if version not in versions:
-        raise ValueError(f"SPZ version {version} is not read: versions 2, 3 and 4 are")
+        message = f"the SPZ version is {version}; versions 2, 3 and 4 are supported"
+        raise InputError("spz-version", message, path=path)
     if degree > 3 or not 1 <= fractional_bits <= 23 or count == 0:
-        raise ValueError(
-            f"{count} Gaussians of degree {degree} with {fractional_bits} fractional bits: expected at least one "
-            "Gaussian, degree 0 to 3 and 1 to 23 bits"
+        message = (
+            f"the header states {count} Gaussians of degree {degree} with {fractional_bits} fractional bits, "
+            "expected at least one Gaussian, degree 0 to 3 and 1 to 23 bits"
         )
+        raise InputError("spz-header", message, path=path)
     if flags & _HAS_EXTENSIONS:
-        raise ValueError("SPZ files with extensions are not read")
+        raise InputError("spz-extensions", "SPZ files with extensions are not supported", path=path)
     layout = _Layout(version, count, degree, fractional_bits)
     if layout.body_bytes > limit_bytes:
-        raise ValueError(
-            f"the header promises {layout.body_bytes / 2**20:.0f} MiB, and {limit_bytes / 2**20:.0f} MiB are the "
-            "limit for a file of this size"
-        )
+        size, limit = layout.body_bytes / 2**20, limit_bytes / 2**20
+        message = f"the header promises {size:.0f} MiB; the limit for a file of this size is {limit:.0f} MiB"
+        raise InputError("unpacks-too-large", message, path=path)
     return layout
 
 

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.core.errors import InputError
-from pipelines.core.files import file_size
+from pipelines.core.files import file_size, reading
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 
 _FORMULA = re.compile(r"'*[=+\-@\t\r]")  # those of names that begin with apostrophes, too: nothing is ambiguous
@@ -60,39 +60,27 @@ def read_lines(path: Path) -> list[str]:
             64 KiB, empty, or not UTF-8.
     """
     lines: list[str] = []
-    try:
-        file_size(path, limit_bytes=MAX_BYTES, kind="text table")
-        with path.open(encoding="utf-8-sig", errors="surrogateescape") as handle:
-            while text := handle.readline(LONGEST_LINE + 1):
-                _check_line(text, path, len(lines) + 1)
-                lines.append(text.removesuffix("\n"))
-    except OSError as error:
-        raise InputError("cannot-be-read", f"cannot be read: {error.strerror}", path=path) from error
+    file_size(path, limit_bytes=MAX_BYTES, kind="text table")
+    with reading(path), path.open(encoding="utf-8-sig", errors="surrogateescape") as handle:
+        while text := handle.readline(LONGEST_LINE + 1):
+            _check_line(text, path, len(lines) + 1)
+            lines.append(text.removesuffix("\n"))
     if not any(map(str.strip, lines)):
-        raise InputError("empty", "is empty", path=path)
+        raise InputError("file-empty", "the file is empty", path=path)
     return lines
 
 
 def _check_line(text: str, path: Path, line: int) -> None:
     if line > MOST_LINES:
-        raise InputError(
-            "has-more-than-lines", f"has more than {MOST_LINES} lines, the limit for a text table", path=path
-        )
+        raise InputError("too-many-lines", f"the table has more than {MOST_LINES} lines, the limit", path=path)
     if len(text) > LONGEST_LINE:
-        raise InputError(
-            "longer-than-characters-limit",
-            f"is longer than {LONGEST_LINE} characters, the limit for a line",
-            path=path,
-            line=line,
-        )
+        message = f"the line is longer than {LONGEST_LINE} characters, the limit"
+        raise InputError("line-too-long", message, path=path, line=line)
     if _NO_UTF8.search(text):
-        raise InputError("not-utf-text-save", "not UTF-8 text: save the file as UTF-8", path=path, line=line)
+        raise InputError("not-utf8", "the text is not UTF-8: save the file as UTF-8", path=path, line=line)
     if "\x00" in text:
-        raise InputError(
-            "contains-zero-bytes-not",
-            "contains zero bytes: not a text file, or UTF-16; save it as UTF-8",
-            path=path,
-        )
+        message = "the file contains zero bytes: it is not text, or it is UTF-16; save it as UTF-8"
+        raise InputError("not-text", message, path=path)
 
 
 def numbered_lines(path: Path) -> list[tuple[int, str]]:
@@ -106,12 +94,9 @@ def beginning(path: Path) -> str:
     Raises:
         InputError: it cannot be read.
     """
-    try:
-        file_size(path)
-        with path.open("rb") as handle:
-            return handle.read(_BEGINNING_BYTES).decode("utf-8-sig", "replace")
-    except OSError as error:
-        raise InputError("cannot-be-read", f"cannot be read: {error.strerror}", path=path) from error
+    file_size(path)
+    with reading(path), path.open("rb") as handle:
+        return handle.read(_BEGINNING_BYTES).decode("utf-8-sig", "replace")
 
 
 def number_of(text: str, *, path: Path, line: int, field: str, decimal_comma: bool = False) -> float:
@@ -133,9 +118,8 @@ def number_of(text: str, *, path: Path, line: int, field: str, decimal_comma: bo
         value = float(cell)
     except ValueError:
         hint = ": write decimals with a point" if "," in cell else ""
-        raise InputError(
-            "no-number", f"{text.strip()[:40]!r} is no number{hint}", path=path, line=line, field=field
-        ) from None
+        message = f"{text.strip()[:40]!r} is not a number{hint}"
+        raise InputError("not-a-number", message, path=path, line=line, field=field) from None
     return value if math.isfinite(value) else math.nan
 
 
@@ -161,6 +145,10 @@ class Row:
     columns: Mapping[str, int]
     decimal_comma: bool = False
 
+    def fault(self, code: str, message: str, column: str | None = None) -> InputError:
+        """Return the error of this line."""
+        return InputError(code, message, path=self.path, line=self.line, field=column)
+
     def text(self, column: str) -> str:
         """Return a cell, without spaces around it; empty if the row is too short."""
         at = self.columns[column]
@@ -170,7 +158,7 @@ class Row:
         """Return a cell that is not empty."""
         text = self.text(column)
         if not text:
-            raise InputError("has-no-name", "has no name", path=self.path, line=self.line, field=column)
+            raise self.fault("name-missing", "the name is missing", column)
         return text
 
     def number(self, column: str) -> float:
@@ -184,15 +172,14 @@ class Row:
         """Return the number of a cell that is not empty."""
         value = self.number(column)
         if math.isnan(value):
-            raise InputError("not-number", "is not a number", path=self.path, line=self.line, field=column)
+            raise self.fault("number-missing", "the number is missing", column)
         return value
 
     def sigma_m(self, column: str) -> float | None:
         """Return the σ of a cell, not negative; None if it is empty, zero, or there is no such column."""
         value = self.number(column)
         if value < 0:
-            message = f"{value:g} is no σ: it must be above zero"
-            raise InputError("sigma-negative", message, path=self.path, line=self.line, field=column)
+            raise self.fault("sigma-not-positive", f"the σ of {value:g} is not above zero", column)
         return value if value > 0 else None
 
 
@@ -222,16 +209,10 @@ class Table:
         Raises:
             InputError: a part of them.
         """
-        present = [name for name in columns if name in self.columns]
-        if present and len(present) < len(columns):
-            missing = ", ".join(name for name in columns if name not in self.columns)
-            raise InputError(
-                "has-but-not",
-                f"has {', '.join(present)} but not {missing}",
-                path=self.path,
-                line=self.header_line,
-            )
-        return bool(present)
+        present = any(name in self.columns for name in columns)
+        if present:
+            require_columns(self.columns, columns, self.path, self.header_line)
+        return present
 
     def numbers(self, columns: Sequence[str]) -> FloatArray:
         """Return the numbers of columns (N, K); NaN where empty."""
@@ -255,7 +236,7 @@ def split(text: str, separator: str | None, *, path: Path, line: int) -> list[st
     try:
         return next(csv.reader([text], delimiter=separator), [])
     except csv.Error as error:
-        raise InputError("no-csv", f"is no CSV: {error}", path=path, line=line) from error
+        raise InputError("not-csv", f"the line is not CSV: {error}", path=path, line=line) from error
 
 
 def table_rows(
@@ -292,24 +273,40 @@ def named_columns(
         if key is None:
             unknown.append(text.strip())
         elif key in columns:
-            raise InputError(
-                "two-columns-for",
-                f"two columns for {key}: {header[columns[key]]}, {text}",
-                path=path,
-                line=line,
-            )
+            message = f"two columns are {key}: {header[columns[key]]}, {text}"
+            raise InputError("column-twice", message, path=path, line=line)
         else:
             columns[key] = at
     return columns, tuple(unknown)
 
 
+def require_columns(columns: Mapping[str, int], needed: Iterable[str], path: Path, line: int | None) -> None:
+    """Raise an InputError that names the needed columns which the header does not have."""
+    missing = [name for name in needed if name not in columns]
+    if missing:
+        message = f"the header has no column {', '.join(missing)}"
+        raise InputError("column-missing", message, path=path, line=line)
+
+
+def require_rows(rows: Sequence[object], path: Path) -> None:
+    """Raise an InputError for a table without rows."""
+    if not rows:
+        raise InputError("no-rows", "the table has no rows of data", path=path)
+
+
 def refuse_first(
-    bad: BoolArray, message: Callable[[int], str], *, path: Path, lines: Sequence[int] | IntArray, field: str
+    bad: BoolArray,
+    code: str,
+    message: Callable[[int], str],
+    *,
+    path: Path,
+    lines: Sequence[int] | IntArray,
+    field: str,
 ) -> None:
     """Raise an InputError for the first row that is bad (N,), with the message on it and its line (N,)."""
     if bad.any():
         row = int(np.argmax(bad))
-        raise InputError("value-out-of-range", message(row), path=path, line=int(lines[row]), field=field)
+        raise InputError(code, message(row), path=path, line=int(lines[row]), field=field)
 
 
 def require_range(
@@ -320,4 +317,5 @@ def require_range(
     def message(row: int) -> str:
         return f"{values[row]:g} is out of range {low:g} … {high:g}"
 
-    refuse_first((values < low) | (values > high), message, path=path, lines=lines, field=field)
+    out = (values < low) | (values > high)
+    refuse_first(out, "value-out-of-range", message, path=path, lines=lines, field=field)

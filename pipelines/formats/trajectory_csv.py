@@ -24,6 +24,7 @@ from pipelines.formats.tables import (
     read_lines,
     refuse_first,
     require_range,
+    require_rows,
     separator_of,
     split,
 )
@@ -141,9 +142,9 @@ def read_trajectory(path: Path) -> PoseTable:
     table = _read_table(path)
     geographic, projected = table.has(_GEOGRAPHIC), table.has(_PROJECTED)
     if geographic == projected:
-        which = "both" if geographic else "neither of"
-        message = f"has {which} latitude,longitude,altitude and x,y,z"
-        raise InputError("columns-missing", message, path=path, line=table.header_line)
+        code, which = ("columns-ambiguous", "both") if geographic else ("column-missing", "neither of")
+        message = f"the header has {which} latitude,longitude,altitude and x,y,z"
+        raise InputError(code, message, path=path, line=table.header_line)
     xyz = _in_range(table, _GEOGRAPHIC) if geographic else table.numbers(_PROJECTED)
     time_s, zoneless = _times(table) if "timestamp" in table.columns else (None, False)
     return PoseTable(
@@ -170,7 +171,7 @@ def _read_table(path: Path) -> Table:
     separator = separator_of(header)
     if separator is None:
         message = "the header has one column only: separate columns by , ; or tab"
-        raise InputError("header-missing", message, path=path, line=first + 1)
+        raise InputError("one-column", message, path=path, line=first + 1)
     names = [name.strip() for name in split(header, separator, path=path, line=first + 1)]
     columns, unknown = named_columns(
         names, _CANONICAL, path, first + 1, lambda name: name.lower().replace(" ", "_")
@@ -179,9 +180,10 @@ def _read_table(path: Path) -> Table:
         message = (
             "the first line must be a header: image and/or timestamp, then latitude,longitude,altitude or x,y,z"
         )
-        raise InputError("columns-missing", message, path=path, line=first + 1)
+        raise InputError("header-missing", message, path=path, line=first + 1)
     if "image" not in columns and "timestamp" not in columns:
-        raise InputError("needs-column-image-or", "needs a column image or timestamp", path=path, line=first + 1)
+        message = "the header has no column image and no column timestamp"
+        raise InputError("column-missing", message, path=path, line=first + 1)
     width = header.count(separator) + 1
     rows = []
     reader = csv.reader(lines[first + 1 :], delimiter=separator)
@@ -192,17 +194,13 @@ def _read_table(path: Path) -> Table:
                 continue
             if len(cells) > width and any(cell.strip() for cell in cells[width:]):
                 hint = "; decimal commas need ; as separator" if separator == "," else ""
-                raise InputError(
-                    "has-cells-header-has",
-                    f"has {len(cells)} cells, the header has {width}{hint}",
-                    path=path,
-                    line=line,
-                )
+                message = f"the line has {len(cells)} cells, the header has {width}{hint}"
+                raise InputError("wrong-columns", message, path=path, line=line)
             rows.append(Row(path, line, cells, columns, separator != ","))
     except csv.Error as error:
-        raise InputError("no-csv", f"is no CSV: {error}", path=path, line=first + 1 + reader.line_num) from error
-    if not rows:
-        raise InputError("has-header-but-no", "has a header but no rows", path=path)
+        line = first + 1 + reader.line_num
+        raise InputError("not-csv", f"the line is not CSV: {error}", path=path, line=line) from error
+    require_rows(rows, path)
     return Table(path, first + 1, columns, unknown, rows)
 
 
@@ -220,12 +218,8 @@ def _attitudes(table: Table) -> FloatArray | None:
     """Return rotations camera → East-North-Up (N, 4), NaN where a row has none."""
     angles, quaternion = table.has(_ANGLES), table.has(_QUATERNION)
     if angles and quaternion:
-        raise InputError(
-            "has-both-yaw-pitch",
-            "has both yaw,pitch,roll and qx,qy,qz,qw",
-            path=table.path,
-            line=table.header_line,
-        )
+        message = "the header has both yaw,pitch,roll and qx,qy,qz,qw"
+        raise InputError("columns-ambiguous", message, path=table.path, line=table.header_line)
     if angles:
         return camera_quaternions(_in_range(table, _ANGLES))
     if not quaternion:
@@ -235,6 +229,7 @@ def _attitudes(table: Table) -> FloatArray | None:
     known = complete(values)
     refuse_first(
         known & (np.abs(length - 1.0) > 0.01),
+        "quaternion-length",
         lambda row: f"the quaternion has length {length[row]:g}, not 1",
         path=table.path,
         lines=table.lines,
@@ -249,7 +244,8 @@ def _times(table: Table) -> tuple[FloatArray, bool]:
     times = np.array([seconds for seconds, _ in moments])
     refuse_first(
         np.abs(times) > _LATEST_S,
-        lambda row: f"{times[row]:.0f} looks like milliseconds or finer: give seconds since 1970",
+        "time-unit",
+        lambda row: f"the time {times[row]:.0f} is probably in milliseconds or finer: give seconds since 1970",
         path=table.path,
         lines=table.lines,
         field="timestamp",
@@ -264,8 +260,6 @@ def _time(row: Row) -> tuple[float, bool]:
     try:
         moment = datetime.fromisoformat(text)
     except ValueError:
-        raise InputError(
-            "no-iso-time", f"{text!r} is no ISO 8601 time", path=row.path, line=row.line, field="timestamp"
-        ) from None
+        raise row.fault("time-invalid", f"{text!r} is not an ISO 8601 time", "timestamp") from None
     zoneless = moment.tzinfo is None
     return (moment.replace(tzinfo=UTC) if zoneless else moment).timestamp(), zoneless

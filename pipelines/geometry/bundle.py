@@ -269,10 +269,8 @@ def bundle_information(
     n, points, observations = len(network.camera_id), len(network.point_in_world), len(network.obs_point)
     redundancy = 2 * observations - 6 * n - 3 * points
     if redundancy <= 0:
-        raise DegenerateGeometryError(
-            "observations-do-not-determine",
-            f"{observations} observations do not determine {n} cameras and {points} points",
-        )
+        message = f"{observations} observations do not determine {n} cameras and {points} points."
+        raise DegenerateGeometryError("network-undetermined", message)
     typical_m = float(np.median(np.linalg.norm(network.rays(), axis=1)))
     residual, variance = projection_residuals(network), 1.0
     if sigma_px is None:

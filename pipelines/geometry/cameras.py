@@ -198,20 +198,16 @@ def full_parameters(camera: Camera) -> FloatArray:
     """
     layout = _LAYOUT.get(camera.model)
     if layout is None:
-        raise InputError(
-            "camera-model-not-supported",
-            f"camera model {camera.model} is not supported; use one of {', '.join(MODELS)}",
-        )
+        message = f"The camera model {camera.model} is not supported. Use one of {', '.join(MODELS)}."
+        raise InputError("camera-model-unknown", message)
     if len(camera.params) != len(layout):
-        raise InputError(
-            "camera-model-has-parameters",
-            f"camera model {camera.model} has {len(layout)} parameters, not {len(camera.params)}",
-        )
+        message = f"The camera model {camera.model} has {len(layout)} parameters, not {len(camera.params)}."
+        raise InputError("camera-parameters", message)
     full = np.zeros(12)
     for value, slots in zip(camera.params, layout, strict=True):
         full[list(slots)] = value
     if not (full[:2] > 0).all():
-        raise InputError("focal-length-px-not", f"focal length {full[0]:g} px is not positive")
+        raise InputError("focal-length", f"The focal length of {full[0]:g} px is not positive.")
     return full
 
 

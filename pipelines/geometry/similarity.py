@@ -124,9 +124,8 @@ def umeyama(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = No
     p0, q0 = p - w @ p, q - w @ q
     u, singular, vt = np.linalg.svd((p0 * w[:, None]).T @ q0)  # eq. 19: H = Σ (p−p̄)(q−q̄)ᵀ = U Σ Vᵀ
     if singular[1] <= 1e-12 * max(singular[0], np.finfo(float).tiny):
-        raise DegenerateGeometryError(
-            "points-lie-on-one", "the points lie on one line: the rotation about it is not determined"
-        )
+        message = "The points lie on one line: the rotation about it is not determined."
+        raise DegenerateGeometryError("points-on-a-line", message)
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))])
     rotation = vt.T @ np.diag(sign) @ u.T  # eq. 20
     scale = float((singular * sign).sum() / (w @ (p0**2).sum(axis=1)))
@@ -153,9 +152,8 @@ def _checked(
     if p.shape != q.shape or p.ndim != 2 or p.shape[1] != 3:
         raise ValueError(f"expected two arrays of shape (N, 3), got {p.shape} and {q.shape}")
     if len(p) < 3:
-        raise DegenerateGeometryError(
-            "similarity-needs-points-there", f"a similarity needs 3 points, there are {len(p)}"
-        )
+        message = f"A similarity needs at least 3 points; there are {len(p)}."
+        raise DegenerateGeometryError("too-few-points", message)
     w = np.ones(len(p)) if weights is None else np.asarray(weights, dtype=np.float64)
     return p, q, w / w.sum()
 

@@ -144,9 +144,8 @@ class SparseCholesky:
             try:
                 diagonal = cholesky(dense[:size, :size], lower=True, check_finite=False)
             except np.linalg.LinAlgError:
-                raise DegenerateGeometryError(
-                    "observations-do-not-determine", "the observations do not determine all cameras"
-                ) from None
+                message = "The observations do not determine all cameras."
+                raise DegenerateGeometryError("network-undetermined", message) from None
             below = np.ascontiguousarray(_solved(diagonal, dense[size:, :size].T).T)
             updates[index] = dense[size:, size:] - below @ below.T
             pivots.append(Pivot(_rows(front.own, width), _rows(front.border, width), diagonal, below))

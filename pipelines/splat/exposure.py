@@ -157,9 +157,8 @@ def adjusted_exposures(observed: PointColours, count: int) -> FloatArray:
     rays = np.bincount(observed.point)
     several = rays[observed.point] >= 2
     if not several.any():
-        raise DegenerateGeometryError(
-            "no-point-seen-two", "no point is seen in two photographs: exposures cannot be compared"
-        )
+        message = "No point is seen in two photographs: exposures cannot be compared."
+        raise DegenerateGeometryError("no-common-points", message)
     point = np.unique(observed.point[several], return_inverse=True)[1]
     observed = PointColours(point, observed.image[several], observed.colour[several])
     seen = np.bincount(observed.image, minlength=count) > 0

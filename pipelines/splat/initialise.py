@@ -72,9 +72,8 @@ def gaussians_from_points(
     if len(keep) < len(points):
         log.info("left out %d of %d points: repeated, far out or not finite", len(points) - len(keep), len(points))
     if len(keep) < 2:
-        raise DegenerateGeometryError(
-            "usable-sfm-points-too", f"{len(keep)} usable SfM points are too few to start Gaussians from"
-        )
+        message = f"At least 2 usable SfM points are needed to initialise Gaussians; there are {len(keep)}."
+        raise DegenerateGeometryError("too-few-points", message)
     order = keep[morton_order(torch.as_tensor(points[keep])).numpy()]
     if options.max_gaussians is not None and len(order) > options.max_gaussians:
         order = order[np.linspace(0, len(order) - 1, max(options.max_gaussians, 2)).astype(np.int64)]
@@ -94,7 +93,9 @@ def scene_extent(camera_centers: ArrayLike) -> float:
     centers = np.asarray(camera_centers, dtype=np.float64).reshape(-1, 3)
     radius = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max(initial=0.0)) if len(centers) else 0.0
     if not radius > 0:
-        raise DegenerateGeometryError("all-cameras-at-one", "all cameras are at one place: the scene has no size")
+        raise DegenerateGeometryError(
+            "cameras-at-one-place", "All cameras are at one place: the scene has no size."
+        )
     return 1.1 * radius
 
 

@@ -68,17 +68,15 @@ def require_memory(size: TrainingSize, free_bytes: int | None) -> None:
     if free_bytes is None or needed <= USABLE * free_bytes:
         return
     fitting = fitting_gaussians(size, free_bytes)
-    advice = (
-        f"--max-gaussians {fitting}"
-        if fitting >= 1000
-        else "a smaller --max-image-size and a smaller --max-gaussians"
+    advice = "a smaller --max-image-size and a smaller --max-gaussians"
+    if fitting >= 1000:
+        advice = f"--max-gaussians {fitting} or a smaller --max-image-size"
+    message = (
+        f"Training needs about {_gib(needed)} of memory at its peak ({size.gaussians} Gaussians, images of "
+        f"{size.camera.width}×{size.camera.height} pixels); {_gib(free_bytes)} are free. Use {advice}, or close "
+        "other programs."
     )
-    raise ResourceError(
-        "training-needs-about-at",
-        f"training needs about {_gib(needed)} at its peak ({size.gaussians} Gaussians, images of "
-        f"{size.camera.width}×{size.camera.height} pixels) and {_gib(free_bytes)} are free: use {advice}"
-        f"{', or a smaller --max-image-size' if fitting >= 1000 else ''}, or close other programs",
-    )
+    raise ResourceError("training-memory", message)
 
 
 def fitting_gaussians(size: TrainingSize, free_bytes: int) -> int:

@@ -75,12 +75,8 @@ class Lpips:
         arrays = read_npz(weights, tuple(_shapes()))
         for name, shape in _shapes().items():
             if arrays[name].shape != shape or not np.isfinite(arrays[name]).all():
-                raise InputError(
-                    "expected-finite-numbers-shape",
-                    f"expected finite numbers of shape {shape}",
-                    path=weights,
-                    field=name,
-                )
+                message = f"the weights are not finite numbers of shape {shape}"
+                raise InputError("lpips-weights", message, path=weights, field=name)
         self._weights = {name: torch.as_tensor(array, dtype=torch.float32) for name, array in arrays.items()}
 
     def __call__(self, image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:

@@ -59,7 +59,7 @@ GCP = "--gcp {here}/gcp.txt"
 REFUSED = (
     # positions
     Case("missing file", {}, CSV, "t.csv [--trajectory]: no such file or folder"),
-    Case("empty table", {"t.csv": b" \n"}, CSV, "t.csv: is empty"),
+    Case("empty table", {"t.csv": b" \n"}, CSV, "t.csv: the file is empty"),
     Case("header only", {"t.csv": b"image,lat,lon,alt\n"}, CSV, "t.csv: has a header but no rows"),
     Case("no header", {"t.csv": b"IMG_0000.JPG,46,7,500\n"}, CSV, "t.csv:1: the first line must be a header"),
     Case("not text", {"t.csv": b"\xff\xfe\x00"}, CSV, "t.csv:1: not UTF-8 text: save the file as UTF-8"),
@@ -120,7 +120,7 @@ REFUSED = (
     ),
     # ground points
     Case(
-        "cut off mark", {"gcp.txt": marks("7.75 46.02 500 10")}, GCP, "gcp.txt:4: has 4 columns, expected at least"
+        "cut off mark", {"gcp.txt": marks("7.75 46.02 500 10")}, GCP, "gcp.txt:4: the line has 4 columns, expected at least"
     ),
     Case(
         "mark that is no number", {"gcp.txt": marks("7.75 46.02 500 nan 1 IMG_0002.JPG P1")}, GCP, "gcp.txt:4 [px]"

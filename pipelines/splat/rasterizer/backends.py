@@ -25,9 +25,8 @@ def chosen_backend(name: Literal["auto", "cpu", "cuda"]) -> BackendName:
         BackendUnavailableError: `cuda`, and a part that it needs is missing; names each missing part.
     """
     if name not in ("auto", *BACKENDS):
-        raise BackendUnavailableError(
-            "no-rasteriser-called-use", f"no rasteriser is called {name!r}: use auto, cpu or cuda"
-        )
+        message = f"The rasteriser {name!r} is unknown. Use auto, cpu or cuda."
+        raise BackendUnavailableError("rasteriser-unknown", message)
     if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
         return "cpu"
     from pipelines.splat.rasterizer.cuda_kernels import missing_for_cuda
@@ -36,9 +35,8 @@ def chosen_backend(name: Literal["auto", "cpu", "cuda"]) -> BackendName:
     if missing is None:
         return "cuda"
     if name == "cuda":
-        raise BackendUnavailableError(
-            "cuda-backend-cannot-be", f"the cuda backend cannot be used: {missing}. Or use the cpu backend"
-        )
+        message = f"The cuda backend cannot be used: {missing}. Or use the cpu backend."
+        raise BackendUnavailableError("cuda-unavailable", message)
     log.warning("the GPU is not used: %s", missing)
     return "cpu"
 

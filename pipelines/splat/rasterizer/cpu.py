@@ -286,31 +286,27 @@ def _validate(gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, set
     shapes = {"means": (count, 3), "quats_wxyz": (count, 4), "log_scales": (count, 3), "logit_opacities": (count,)}
     for name, tensor in gaussians.tensors().items():
         expected = shapes.get(name, (count, (gaussians.sh_degree + 1) ** 2, 3))
-        if tuple(tensor.shape) != expected:
-            raise InputError(
-                "has-shape-must-be", f"has shape {tuple(tensor.shape)}, must be {expected}", field=name
-            )
+        _require_shape(tensor, expected, name)
         if tensor.dtype != dtype or dtype not in (torch.float32, torch.float64):
-            raise InputError(
-                "all-must-be-float", f"is {tensor.dtype}: all must be float32 (or all float64)", field=name
-            )
+            message = f"the tensor is {tensor.dtype}: all must be float32, or all float64"
+            raise InputError("tensor-type", message, field=name)
         if tensor.device.type != "cpu":
-            raise InputError(
-                "on-cpu-backend-needs",
-                f"is on {tensor.device}: the cpu backend needs it on the cpu",
-                field=name,
-            )
-    if tuple(cam_from_model.shape) != (4, 4):
-        raise InputError(
-            "has-shape-must-be",
-            f"has shape {tuple(cam_from_model.shape)}, must be (4, 4)",
-            field="cam_from_model",
-        )
+            message = f"the tensor is on {tensor.device}: the cpu backend needs it on the cpu"
+            raise InputError("tensor-device", message, field=name)
+    _require_shape(cam_from_model, (4, 4), "cam_from_model")
     highest = min(gaussians.sh_degree, 3)
     if not 0 <= settings.sh_degree <= highest:
-        raise InputError("must-be", f"must be 0 to {highest}, is {settings.sh_degree}", field="sh_degree")
+        message = f"the degree must be 0 to {highest}, it is {settings.sh_degree}"
+        raise InputError("sh-degree", message, field="sh_degree")
     if settings.near_m <= 0:
-        raise InputError("must-be-positive", f"must be positive, is {settings.near_m}", field="near_m")
+        raise InputError("near-plane", f"the distance of {settings.near_m} m is not positive", field="near_m")
     image = settings.image_of(camera)
     if image.width < 1 or image.height < 1:
-        raise InputError("image-pixels", f"image of {image.width} × {image.height} pixels", field="camera")
+        message = f"the image of {image.width} × {image.height} pixels is empty"
+        raise InputError("image-empty", message, field="camera")
+
+
+def _require_shape(tensor: Tensor, expected: tuple[int, ...], name: str) -> None:
+    if tuple(tensor.shape) != expected:
+        message = f"the shape is {tuple(tensor.shape)}, it must be {expected}"
+        raise InputError("tensor-shape", message, field=name)

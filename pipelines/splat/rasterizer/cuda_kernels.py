@@ -68,9 +68,8 @@ def compile_kernels(progress: Progress = SILENT) -> Path:
     """
     missing = lacking((gsplat(), *compiling_parts()))
     if missing is not None:
-        raise BackendUnavailableError(
-            "kernels-cuda-backend-cannot", f"the kernels of the cuda backend cannot be compiled: {missing}"
-        )
+        message = f"The kernels of the cuda backend cannot be compiled: {missing}."
+        raise BackendUnavailableError("cuda-compiler-missing", message)
     folder = _folder() / "_".join(_architectures())
     with _alone_in(folder):
         library = folder / _LIBRARY
@@ -102,9 +101,9 @@ def load_gsplat(progress: Progress = SILENT) -> ModuleType:
             sys.modules["gsplat.csrc"] = kernels
         return importlib.import_module("gsplat")
     except ImportError as error:
-        remedy = f"delete {_folder()} and run the command again, or use the cpu backend"
+        remedy = f"Delete {_folder()} and run the command again, or use the cpu backend."
         raise BackendUnavailableError(
-            "gsplat-cannot-be-loaded", f"gsplat cannot be loaded ({error}): {remedy}"
+            "gsplat-unloadable", f"gsplat cannot be loaded ({error}). {remedy}"
         ) from error
 
 
@@ -153,16 +152,15 @@ def _architectures() -> list[str]:
     named = os.environ.get("TORCH_CUDA_ARCH_LIST", "").replace(";", " ").split()
     found = sorted(name.removesuffix("+PTX") for name in named) or _capabilities()
     if not found:
-        raise InputError(
-            "there-no-gpu-compile",
-            "there is no GPU to compile for: name its compute capability in the variable TORCH_CUDA_ARCH_LIST "
-            "(8.6 for the RTX 30 series, 8.9 for 40, 12.0 for 50, 8.0 for A100, 9.0 for H100; several with blanks)",
+        message = (
+            "This machine has no GPU to compile for. Name its compute capability in the variable "
+            "TORCH_CUDA_ARCH_LIST (8.6 for the RTX 30 series, 8.9 for 40, 12.0 for 50, 8.0 for A100, 9.0 for H100; "
+            "several with blanks)."
         )
+        raise InputError("gpu-unknown", message)
     if not all(name.replace(".", "").removesuffix("a").isdecimal() for name in found):
-        raise InputError(
-            "torch-cuda-arch-list",
-            f"TORCH_CUDA_ARCH_LIST={' '.join(named)!r}: expected numbers like 8.6, with blanks between",
-        )
+        message = f"TORCH_CUDA_ARCH_LIST is {' '.join(named)!r}; numbers like 8.6 with blanks between are expected."
+        raise InputError("compute-capability", message)
     return found
 
 
@@ -201,9 +199,8 @@ def _compile(draft: Path, log: Path, progress: Progress) -> None:
     if process.returncode != 0 or not (draft / _NAME / _LIBRARY).is_file():
         lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
         cause = next((line for line in lines if "error" in line.lower()), "no message")[:_MOST_OF_A_LINE]
-        raise BackendUnavailableError(
-            "gsplat-kernels-could-not", f"gsplat's kernels could not be compiled ({cause.strip()}): see {log}"
-        )
+        message = f"gsplat's kernels could not be compiled ({cause.strip()}). The compiler's log is {log}."
+        raise BackendUnavailableError("kernels-not-compiled", message)
 
 
 def _environment(draft: Path) -> dict[str, str]:
