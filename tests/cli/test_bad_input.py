@@ -120,7 +120,10 @@ REFUSED = (
     ),
     # ground points
     Case(
-        "cut off mark", {"gcp.txt": marks("7.75 46.02 500 10")}, GCP, "gcp.txt:4: the line has 4 columns, expected at least"
+        "cut off mark",
+        {"gcp.txt": marks("7.75 46.02 500 10")},
+        GCP,
+        "gcp.txt:4: the line has 4 columns, expected at least",
     ),
     Case(
         "mark that is no number", {"gcp.txt": marks("7.75 46.02 500 nan 1 IMG_0002.JPG P1")}, GCP, "gcp.txt:4 [px]"
