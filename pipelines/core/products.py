@@ -18,6 +18,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, StringConstraints, V
 
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size, read_npz
+from pipelines.core.sentences import fault_sentence
 from pipelines.core.types import Matrix3, Quaternion
 from pipelines.core.validators import covariance, image_name, unit_quaternion
 
@@ -56,17 +57,13 @@ def load_json(product_type: type[ProductT], path: Path) -> ProductT:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
-        raise InputError(
-            "todo-x", first["msg"].removeprefix("Value error, "), path=path, field=where or None
-        ) from error
+        raise InputError("product-invalid", fault_sentence(first), path=path, field=where or None) from error
     except UnicodeDecodeError as error:
-        raise InputError("todo-not-utf-text-file", "not a UTF-8 text file", path=path) from error
+        raise InputError("not-utf8", "is not a UTF-8 text file.", path=path) from error
     except (np.linalg.LinAlgError, RecursionError) as error:  # of a validator that computes
-        raise InputError(
-            "todo-has-values-cannot-be", f"has values that cannot be used: {error}", path=path
-        ) from error
+        raise InputError("product-invalid", f"has values that cannot be used: {error}.", path=path) from error
     except OSError as error:
-        raise InputError("todo-cannot-be-read", f"cannot be read: {error.strerror}", path=path) from error
+        raise InputError("file-unreadable", f"cannot be read: {error.strerror}.", path=path) from error
 
 
 def dump_json(document: Any) -> str:
@@ -111,7 +108,7 @@ class ArrayProduct:
                 matches = matches and length == expected
             if not matches:
                 raise InputError(
-                    "todo-has-form", f"has the form {array.shape} {array.dtype}", path=path, field=name
+                    "array-shape", f"has the shape {array.shape} and the type {array.dtype}.", path=path, field=name
                 )
         return cls(**arrays)
 
