@@ -37,28 +37,28 @@ ErrorDocument = dict[str, str | int | None]
 
 
 @dataclass(frozen=True)
-class Ending:
-    """End of a command by an exception: exit code, text for stderr, and JSON form."""
+class Exit:
+    """Exit of a command by an exception: exit code, text for stderr, and JSON form."""
 
     code: int
     message: str
     error: ErrorDocument
 
 
-def ending_of(error: BaseException) -> Ending | None:
-    """Return the end of a command by a known exception; None for one that nobody foresaw."""
+def exit_of(error: BaseException) -> Exit | None:
+    """Return the exit by a known exception; None for one that nobody foresaw."""
     if isinstance(error, click.Abort | KeyboardInterrupt):
-        return Ending(INTERRUPTED, "interrupted", _document("interrupted", "interrupted"))
+        return Exit(INTERRUPTED, "interrupted", _document("interrupted", "interrupted"))
     if isinstance(error, click.ClickException):
         return _of_click(error)
     known = error if isinstance(error, GeorefError) else storage_error(error)
     if known is None:
         return None
     usage = isinstance(known, InputError) and known.is_usage
-    return Ending(USAGE if usage else FAILED, f"error: {printable(str(known))}", known.document())
+    return Exit(USAGE if usage else FAILED, f"error: {printable(str(known))}", known.document())
 
 
-def _of_click(error: click.ClickException) -> Ending:
+def _of_click(error: click.ClickException) -> Exit:
     text = io.StringIO()
     error.show(text)
     context = getattr(error, "ctx", None)
@@ -67,7 +67,7 @@ def _of_click(error: click.ClickException) -> Ending:
     document = _document("usage" if error.exit_code == USAGE else "failed", error.format_message())
     document["field"] = field or getattr(error, "option_name", None)
     document["hint"] = None if context is None else f"{context.command_path} --help"
-    return Ending(error.exit_code, printable_lines(text.getvalue().rstrip("\n")), document)
+    return Exit(error.exit_code, printable_lines(text.getvalue().rstrip("\n")), document)
 
 
 def _document(kind: str, message: str) -> ErrorDocument:
@@ -92,8 +92,8 @@ def guarded(group: click.Group, arguments: Sequence[str] | None) -> int:
         _drop_stdout()  # Its reader has closed the pipe.
         return FAILED
     except (Exception, KeyboardInterrupt) as error:
-        ending = ending_of(error)
-        document = _document("defect", f"{type(error).__name__}: {error}") if ending is None else ending.error
+        ended = exit_of(error)
+        document = _document("defect", f"{type(error).__name__}: {error}") if ended is None else ended.error
         if as_json:
             from pipelines.core.products import dump_json  # here, because it imports the validation library
 
@@ -102,11 +102,11 @@ def guarded(group: click.Group, arguments: Sequence[str] | None) -> int:
         if tells_progress:
             with contextlib.suppress(KeyboardInterrupt):  # Nobody reads it.
                 stderr_sender().send("error", error_kind=document["kind"])
-        if ending is None:
+        if ended is None:
             raise
-        _say(ending.message)
+        _say(ended.message)
         _drop_stdout()
-        return ending.code
+        return ended.code
     return code if isinstance(code, int) else 0
 
 

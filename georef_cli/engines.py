@@ -88,11 +88,12 @@ def cluster_address(text: str, values: Mapping[str, Any], option: str, *, is_nod
     certificates: Path | None = values["certificates"]
     if values["insecure"]:
         if certificates is not None:
-            raise click.UsageError("--insecure uses no certificate: leave out --certificates.")
+            raise click.UsageError("--insecure uses no certificate. Remove --certificates.")
         log.warning(
-            "--insecure: no certificate protects the cluster at %s. Every program of this machine, of any user, "
-            "can run programs as you through it",
+            "No certificate protects the cluster at %s (--insecure). Every program of this machine, of any user, "
+            "can run programs as you through it.",
             text,
+            extra={"code": "cluster-insecure"},
         )
     try:
         if certificates is None and not values["insecure"]:

@@ -167,7 +167,7 @@ def print_dry_run(
     run = estimate_run(workspace, stages, flags, force=force)
     survey = checked_inputs(workspace, run.planned, progress)
     for warning in () if survey is None else survey.warnings:
-        log.warning("ingest: %s", warning.sentence)
+        log.warning("ingest: %s", warning.sentence, extra={"code": warning.code})
     if as_json:
         print_json(_document(workspace, run, survey))
         return

@@ -46,8 +46,8 @@ def batch(table: BatchTable, page: Path) -> list[Renderable]:
         for row in table.missions
         if row.failure is not None
     ]
-    ending = f"\n{len(table.missions)} missions: {table.states}. All of it is in {shown(str(page))}"
-    return [ByWidth(WIDE, wide, narrow), *(["", *failures] if failures else []), ending]
+    counts = f"\n{len(table.missions)} missions: {table.states}. All of it is in {shown(str(page))}"
+    return [ByWidth(WIDE, wide, narrow), *(["", *failures] if failures else []), counts]
 
 
 def dry_rows(missions: Iterable[tuple[PlannedMission, RunEstimate | None]]) -> list[dict[str, Any]]:

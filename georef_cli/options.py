@@ -141,13 +141,15 @@ def settings(texts: Iterable[str], stages: Iterable[StageSpec]) -> dict[str, dic
         key, equals, value = text.partition("=")
         stage, _, name = key.partition(".")
         if not equals or not name:
-            raise click.UsageError(f"--set: {text!r} is not of the form stage.option=value, like train.sh_degree=1")
+            raise click.UsageError(
+                f"--set: {text!r} has not the form stage.option=value, such as train.sh_degree=1."
+            )
         if stage not in by_name:
-            raise click.UsageError(f"--set: {stage!r} is not among the stages to run: {', '.join(by_name)}")
+            raise click.UsageError(f"--set: {stage!r} is not among the stages to run ({', '.join(by_name)}).")
         options = by_name[stage].options
         if name not in options.model_fields:
             raise click.UsageError(
-                f"--set: {stage} has no option {name!r}; it has {', '.join(options.model_fields)}"
+                f"--set: {stage} has no option {name!r}. Its options are {', '.join(options.model_fields)}."
             )
         parsed = _value(value)
         is_path = name in input_markers(options) and isinstance(parsed, str)

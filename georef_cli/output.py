@@ -32,7 +32,7 @@ def overview_text(result: Overview) -> list[Renderable]:
     wide = plain_table("\nfile", "\nsize", "\nmade", "\nstate", "\nuse", right=[1])
     narrow = plain_table("\nfile", "\nsize", "\nstate", "\nuse", right=[1])
     for file in result.files:
-        name, count, use = shown(file.path), size(file.bytes), shown(file.purpose)
+        name, count, use = shown(file.path), size(file.bytes), shown(file.description)
         state = f"[{tables.STATE_STYLE.get(file.state, 'dim')}]{file.state}[/]"
         wide.add_row(name, count, tables.when(file.made), state, use)
         narrow.add_row(name, count, state, use)
@@ -45,7 +45,7 @@ def overview_text(result: Overview) -> list[Renderable]:
     return [*parts, *tables.cautions(result.cautions)]
 
 
-def run_ending(result: Overview) -> list[Renderable]:
+def run_summary(result: Overview) -> list[Renderable]:
     """Return the end of `georef run`: where the result is, how good it is, where the files are, what comes next."""
     workspace = result.workspace
     files = plain_table("", "", header=False)
@@ -53,7 +53,7 @@ def run_ending(result: Overview) -> list[Renderable]:
     for file in result.files:
         style = tables.STATE_STYLE.get(file.state, "dim")
         state = "" if file.state == "current" else f"[{style}]{file.state}[/] "
-        files.add_row(f"  {shown(file.path)}", f"{state}[dim]{shown(file.purpose)}[/]")
+        files.add_row(f"  {shown(file.path)}", f"{state}[dim]{shown(file.description)}[/]")
     names = ",".join(spec.name.removeprefix("export-") for spec in result.further)
     further = {
         f"georef view {workspace}": "see it in a browser, and measure in it",
@@ -188,7 +188,7 @@ def print_outcomes(
     if not told:
         print_rich(tables.outcomes(outcomes))
     if result is not None:
-        print_rich(*run_ending(result))
+        print_rich(*run_summary(result))
     else:
         if solved is not None:
             print_rich(*tables.report(solved))

@@ -139,28 +139,24 @@ def check_target(target: Path, spec: StageSpec, *, folder: bool, overwrite: bool
     suffix = Path(spec.product).suffix
     if folder and target.is_dir() and not (target / Path(spec.product).name).exists():
         raise InputError(
-            "folder-did-not-write",
-            f"is a folder that {spec.name} did not write, and would be replaced: give a new name",
+            "target-not-replaced",
+            f"is a folder that {spec.name} did not write, and would be replaced. Give a new name.",
             path=target,
         )
     if folder and target.suffix and not target.is_dir():
         raise InputError(
-            "writes-folder-not-file",
-            f"{spec.name} writes a folder, not a {target.suffix} file: give a folder",
+            "target-suffix",
+            f"is the name of a {target.suffix} file, but {spec.name} writes a folder. Give a folder.",
             path=target,
         )
     if not folder and target.suffix.lower() != suffix:
-        named = f"a {target.suffix} file" if target.suffix else "a name without a suffix"
-        raise InputError(
-            "writes-not-end-name",
-            f"{spec.name} writes {suffix}, not {named}: end the name with {suffix}",
-            path=target,
-        )
+        message = f"is not the name of a {suffix} file, which {spec.name} writes. End the name with {suffix}."
+        raise InputError("target-suffix", message, path=target)
     require_text(target)
     if not target.parent.is_dir():
-        raise InputError("no-such-folder-make", "no such folder: make it first", path=target.parent)
+        raise InputError("no-such-file", "does not exist. Make the folder first.", path=target.parent)
     if target.exists() and not overwrite:
-        raise InputError("exists-already-force-replaces", "exists already: --force replaces it", path=target)
+        raise InputError("target-exists", "exists already. --force replaces it.", path=target)
 
 
 def deliver(source: Path, target: Path) -> None:

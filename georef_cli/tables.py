@@ -88,9 +88,9 @@ def states(rows: Iterable[StageState], cautions: Mapping[str, Sequence[Remark]])
 
 
 def origins(rows: Sequence[OptionOrigin]) -> list[Renderable]:
-    """Return the table of options that are no defaults, with where their values come from."""
+    """Return the table of the changed options, with where their values come from."""
     if not rows:
-        return ["", "[bold]Options[/]: all are defaults"]
+        return ["", "[bold]Changed options[/]: none"]
     table = plain_table("stage", "option", "value", "from")
     table.columns[2].overflow = "fold"
     before = ""
@@ -98,7 +98,7 @@ def origins(rows: Sequence[OptionOrigin]) -> list[Renderable]:
         table.add_row(row.stage if row.stage != before else "", row.flag, shown(notation(row.value)), row.origin)
         before = row.stage
     return [
-        "\n[bold]Options that are no defaults[/]",
+        "\n[bold]Changed options[/]",
         table,
         *([_FORGET] if any(row.origin == "remembered" for row in rows) else []),
     ]
@@ -189,10 +189,10 @@ def topics(rows: Iterable[Mapping[str, Any]]) -> ByWidth:
         ]
         remarks += ["no stamps" if row["clock"] == "recording" else "", row["problem"]]
         name, messages, rate = shown(row["name"]), str(row["messages"]), _number(row["rate_hz"])
-        ending = (f"[green]{shown(row['use'])}[/]", shown(", ".join(filter(None, remarks))))
+        use = (f"[green]{shown(row['use'])}[/]", shown(", ".join(filter(None, remarks))))
         kind, times = shown(row["type"].replace("/msg/", "/")), (duration(span), duration(row["longest_gap_s"]))
-        table.add_row(name, kind, messages, rate, *times, shown(row["frame"]), *ending)
-        narrow.add_row(name, messages, rate, *ending)
+        table.add_row(name, kind, messages, rate, *times, shown(row["frame"]), *use)
+        narrow.add_row(name, messages, rate, *use)
     return ByWidth(WIDE, table, narrow)
 
 

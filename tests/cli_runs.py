@@ -19,25 +19,32 @@ WITH_FAKES = "from tests import fakes; fakes.install(); from georef_cli.main imp
 
 @dataclass(frozen=True)
 class Result:
-    """How a command ended."""
+    """Exit of a command; error and warnings are known of a command in this process."""
 
     code: int
     out: str
     err: str
+    error: dict[str, Any] | None = None  # JSON form of the error
+    warned: tuple[str, ...] = ()  # codes of the warnings
 
     @property
     def document(self) -> Any:
         """stdout as the one JSON document that it must be."""
         return json.loads(self.out)
 
-    def assert_failed(self, code: int) -> None:
-        """The command failed with this exit code: stdout has no result, at most the document of the error."""
+    def assert_failed(self, code: int, error_code: str | None = None) -> None:
+        """The command failed with this exit code: stdout has no result, at most the document of the error.
+
+        Of a command in this process, the code of the error can be asked for too.
+        """
+        if error_code is not None:
+            assert self.error is not None and self.error["code"] == error_code, self.error
         assert self.code == code, self.err
         if self.out:
             assert set(self.document) == {"error"}
             error = self.document["error"]
-            assert set(error) == {"code", "message", "path", "line", "field", "hint"}
-            assert (error["code"] == "usage") is (code == 2)
+            assert set(error) == {"kind", "code", "message", "path", "line", "field", "hint"}
+            assert (error["kind"] == "usage") is (code == 2)
             assert printable(error["message"]) in self.err
 
 

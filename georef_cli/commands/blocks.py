@@ -42,7 +42,7 @@ ACTIONS = ("plan", "scaffold", "train", "seams", "merge")
 def _blocks(ctx: click.Context, **values: Any) -> None:
     place, number = values["place"], values["number"]
     if len(place) > 2 or (len(place) == 2 and place[0] not in ACTIONS):
-        raise click.UsageError(f"expected `georef blocks [{'|'.join(ACTIONS)}] WS`.")
+        raise click.UsageError(f"The form of the command is `georef blocks [{'|'.join(ACTIONS)}] WS`.")
     action = place[0] if len(place) == 2 else ""
     workspace = Workspace(Path(place[-1]).resolve())
     must_exist(workspace)
@@ -50,7 +50,7 @@ def _blocks(ctx: click.Context, **values: Any) -> None:
     if number is not None and action != "train":
         raise click.UsageError("--id is for `georef blocks train`.")
     if given and (action in ("scaffold", "seams", "merge") or number is not None):
-        raise click.UsageError("options of the training are given to `georef blocks` or `georef blocks plan`.")
+        raise click.UsageError("Options of the training belong to `georef blocks` or `georef blocks plan`.")
     part = TRAIN_BLOCK if number is not None else {"scaffold": TRAIN_SCAFFOLD, "seams": TRAIN_SEAMS}.get(action)
     with asked_engine(values):
         from pipelines.train.blocks.parts import Parts

@@ -32,7 +32,7 @@ def _worker(
     scheduler = cluster_address(address, values, "ADDRESS", is_node=True)
     free = free_main_memory_bytes()
     if memory_gib is None and free is None:
-        raise ResourceError("free-memory-not-known", "the free memory is not known here: give --memory")
+        raise ResourceError("free-memory-unknown", "The system does not state its free memory. Give --memory.")
     memory_bytes = int(memory_gib * _GIB) if memory_gib is not None else int(_USABLE * (free or 0))
     if gpus is None:
         from pipelines.jobs.machine import inspect_machine

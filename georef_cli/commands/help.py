@@ -19,7 +19,7 @@ class TopicType(click.ParamType[str]):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
         if value not in _names(ctx):
-            self.fail(f"{value!r} is no topic and no command; the topics are {', '.join(TOPICS)}", param, ctx)
+            self.fail(f"{value!r} is no topic and no command. The topics are {', '.join(TOPICS)}.", param, ctx)
         return str(value)
 
     def shell_complete(

@@ -158,7 +158,7 @@ def _forgotten(names: Sequence[str], stages: Sequence[StageSpec]) -> dict[str, l
             with contextlib.suppress(ValueError):
                 by_stage.setdefault(spec.name, []).extend(names_of_flags(spec.options, [name]))
         if not any(by_stage.values()):
-            raise click.UsageError(f"--forget: {name!r} is no option of the stages to run")
+            raise click.UsageError(f"--forget: {name!r} is no option of the stages to run.")
     return by_stage
 
 

@@ -45,7 +45,7 @@ command = Command(
         click.Option(
             ["--options", "with_options"],
             is_flag=True,
-            help="Show the options that are no defaults too: remembered from earlier commands, or of georef.toml.",
+            help="Show the changed options too: remembered from earlier commands, or of georef.toml.",
         ),
         options.JSON,
     ],

@@ -155,7 +155,7 @@ def run_in_child(
 
     Args:
         task: `module:function`; the function takes a document and a `Progress`, and returns a document.
-        remedy: what to do if the child crashes.
+        remedy: sentence on what to do if the child crashes.
         writes: folder that native code writes into; None: it writes nothing.
 
     Raises:
@@ -253,15 +253,16 @@ def _crash(code: int, native_log: IO[str], remedy: str) -> GeorefError:
         log.debug("the child process wrote: %s", line)
     if code == -signal.SIGKILL:
         return ResourceError(
-            "system-killed-computation-does",
-            f"the system killed the computation, as it does when memory is short: {remedy}",
+            "out-of-memory",
+            f"The system killed the computation, as it does when memory is short. {remedy}",
         )
-    ending = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+    end = signal.Signals(-code).name if code < 0 else f"exit code {code}"
     # glog begins the line of a failed check with F and the date; the first line is the cause of those below.
     checks = [line for line in lines if line[:1] == "F" and line[1:5].isdigit()]
     cause = (checks or lines[-1:] or ["no message"])[0].rpartition("] ")[2]
     return CrashError(
-        "native-library-crashed", f"a native library crashed ({ending}: {cause[:_MOST_OF_A_LINE]}): {remedy}"
+        "library-crashed",
+        f"A native library crashed ({end}: {cause[:_MOST_OF_A_LINE]}). {remedy}",
     )
 
 

@@ -86,7 +86,7 @@ class MissingProductError(GeorefError):
         self.product = product
         self.command = command
         self.hint = f"run `{command}` first"
-        super().__init__("missing-product", f"{product} is missing: run `{command}` first")
+        super().__init__("missing-product", f"{product} is missing. Run `{command}` first.")
 
 
 class WorkspaceBusyError(GeorefError):

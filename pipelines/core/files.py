@@ -162,15 +162,15 @@ def file_size(path: Path, *, limit_bytes: int | None = None, kind: str = "file",
         status = path.stat()
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise InputError("file-unreadable", f"cannot be read: {reason}", path=path, field=field) from error
+        raise InputError("file-unreadable", f"cannot be read: {reason}.", path=path, field=field) from error
     if not stat.S_ISREG(status.st_mode):
-        other = _SPECIAL.get(stat.S_IFMT(status.st_mode), "no regular file")
-        raise InputError("not-a-file", f"cannot be read: it is {other}, give a file", path=path, field=field)
+        other = _SPECIAL.get(stat.S_IFMT(status.st_mode), "not a regular file")
+        raise InputError("not-a-file", f"cannot be read: it is {other}. Give a file.", path=path, field=field)
     if limit_bytes is not None and status.st_size > limit_bytes:
         size, limit = status.st_size / 2**20, limit_bytes / 2**20
         raise InputError(
             "file-too-large",
-            f"{size:.0f} MiB is too large for a {kind} (limit {limit:.0f} MiB)",
+            f"is too large for a {kind}: {size:.0f} MiB (limit {limit:.0f} MiB).",
             path=path,
             field=field,
         )
@@ -201,7 +201,7 @@ def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, NDAr
             entries = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
             missing = [name for name in names or () if name not in entries]
             if missing:
-                raise InputError("array-missing", f"array {missing[0]!r} is missing", path=path)
+                raise InputError("array-missing", f"has no array {missing[0]!r}.", path=path)
             wanted = entries if names is None else {name: entries[name] for name in names}
             total = sum(entry.file_size for entry in wanted.values())
             if total > limit_bytes:
@@ -210,7 +210,7 @@ def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, NDAr
     except InputError:
         raise
     except Exception as error:  # of zipfile, of its decompressors, and of Python's grammar, which reads the headers
-        raise InputError("not-readable-npz-file", f"not a readable NPZ file: {error}", path=path) from error
+        raise InputError("file-damaged", f"is not a readable NPZ file: {error}.", path=path) from error
 
 
 def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any]:

@@ -72,7 +72,7 @@ def fingerprints(
         for name, path in input_paths(options).items():
             flag = flag_name(type(options), name)
             if not path.exists():
-                raise InputError("no-such-file-or", "no such file or folder", path=path, field=flag)
+                raise InputError("no-such-file", "does not exist.", path=path, field=flag)
             if path.is_dir():
                 files = _input_files(path, workspace.root, markers[name])
                 records = _records(files, (known or {}).get(flag, {}), progress)
@@ -82,7 +82,7 @@ def fingerprints(
                 file_size(path, field=flag)
                 result.hashes[flag] = _hash_file(path)
     except OSError as error:
-        raise InputError("file-unreadable", f"cannot be read: {error.strerror}", path=error.filename) from error
+        raise InputError("file-unreadable", f"cannot be read: {error.strerror}.", path=error.filename) from error
     return result
 
 

@@ -65,8 +65,8 @@ class WriteLock:
                 handle = (self.folder / LOCK).open("ab")
             except OSError as error:
                 raise InputError(
-                    "cannot-be-used-workspace",
-                    f"cannot be used as a workspace: {error.strerror}",
+                    "workspace-unusable",
+                    f"cannot be used as a workspace: {error.strerror}.",
                     path=self.folder,
                 ) from error
             try:
@@ -74,15 +74,15 @@ class WriteLock:
             except OSError as error:
                 handle.close()
                 raise InputError(
-                    "cannot-be-locked", f"cannot be locked: {error.strerror}", path=self.folder
+                    "workspace-unlockable", f"cannot be locked: {error.strerror}.", path=self.folder
                 ) from error
             if locked and self._is_current(handle):
                 return handle
             handle.close()
             if not locked:
                 raise WorkspaceBusyError(
-                    "being-written-by-wait",
-                    f"{self.folder} is being written by {self._holder()}: wait for it, or stop it",
+                    "workspace-busy",
+                    f"{self.folder} is being written by {self._holder()}. Wait for it, or stop it.",
                 )
 
     def _is_current(self, handle: BinaryIO) -> bool:

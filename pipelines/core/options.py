@@ -26,6 +26,7 @@ from pydantic.fields import FieldInfo
 from pipelines.core.errors import InputError
 from pipelines.core.extras import Extra, require
 from pipelines.core.files import file_size, replace_text
+from pipelines.core.sentences import fault_sentence
 from pipelines.core.types import Vector3
 from pipelines.core.validators import require_text
 
@@ -96,20 +97,22 @@ def notation(value: object) -> str:
 def _triple(text: str) -> tuple[float, ...]:
     parts = text.split(",")
     if len(parts) != 3:
-        raise ValueError("three numbers with commas, like 46.02,7.75,1620")
+        raise ValueError(f"{text!r} is not three numbers with commas, such as 46.02,7.75,1620")
     return tuple(float(part) for part in parts)
 
 
 def _finite(numbers: Vector3) -> Vector3:
     if not all(abs(number) < 1e6 for number in numbers):
-        raise ValueError("three finite numbers")
+        raise ValueError("each number must be below 1000000 in magnitude")
     return numbers
 
 
 def _on_earth(place: Vector3) -> Vector3:
     lat, lon, alt = place
     if abs(lat) > 90 or abs(lon) > 180 or not -1000 <= alt <= 10000:
-        raise ValueError("latitude −90 … 90, longitude −180 … 180, height −1000 … 10000")
+        raise ValueError(
+            "the range is −90 … 90° of latitude, −180 … 180° of longitude and −1000 … 10000 m of height"
+        )
     return place
 
 
@@ -179,7 +182,7 @@ def names_of_flags(options_type: type[StageOptions], flags: Collection[str]) -> 
     named = [text.removeprefix("--").replace("_", "-") for text in flags]
     unknown = [text for text in named if text not in by_flag]
     if unknown:
-        raise ValueError(f"{unknown[0]!r} is no option; the options are {', '.join(by_flag)}")
+        raise ValueError(f"{unknown[0]!r} is no option. The options are {', '.join(by_flag)}.")
     return [by_flag[text] for text in named]
 
 
@@ -213,10 +216,12 @@ def resolve(
         key = str(first["loc"][0]) if first["loc"] else "?"
         from_file = key in table and key not in flags
         known = ", ".join(sorted(options_type.model_fields))
-        hint = f"unknown key; known keys: {known}" if first["type"] == "extra_forbidden" else first["msg"]
+        code, message = "option-invalid", fault_sentence(first)
+        if first["type"] == "extra_forbidden":
+            code, message = "unknown-option", f"is unknown. The options are {known}."
         in_file = key if stage is None else f"{stage}.{key}"
         name = in_file if from_file else flag_name(options_type, key)
-        raise InputError("option-invalid", hint, path=toml if from_file else None, field=name) from error
+        raise InputError(code, message, path=toml if from_file else None, field=name) from error
     for name in options_type.model_fields:
         value = getattr(options, name)
         if isinstance(value, Path):
@@ -229,9 +234,9 @@ def read_toml(path: Path) -> dict[str, Any]:
     try:
         return parse_toml(path.read_text(encoding="utf-8-sig"))
     except ValueError as error:
-        raise InputError("not-valid-toml", f"not valid TOML: {error}", path=path) from error
+        raise InputError("toml-invalid", f"is not valid TOML: {error}.", path=path) from error
     except OSError as error:
-        raise InputError("file-unreadable", f"cannot be read: {error.strerror}", path=path) from error
+        raise InputError("file-unreadable", f"cannot be read: {error.strerror}.", path=path) from error
 
 
 def parse_toml(text: str) -> dict[str, Any]:
@@ -245,7 +250,7 @@ def parse_toml(text: str) -> dict[str, Any]:
     key = _LONG_KEY.search(text)
     if key is not None:
         line = text.count("\n", 0, key.start()) + 1
-        raise ValueError(f"a key of more than {_MOST_PARTS} parts, the limit (at line {line})")
+        raise ValueError(f"a key has more than {_MOST_PARTS} parts (at line {line})")
     try:
         document = tomllib.loads(text)
         _require_integers(document)
@@ -280,13 +285,10 @@ def load_toml(path: Path, stages: Collection[str]) -> dict[str, dict[str, Any]]:
     for name, table in document.items():
         if name not in stages:
             raise InputError(
-                "unknown-table-stages",
-                f"unknown table; the stages are {', '.join(stages)}",
-                path=path,
-                field=name,
+                "unknown-stage", f"is no stage. The stages are {', '.join(stages)}.", path=path, field=name
             )
         if not isinstance(table, dict):
-            raise InputError("expected-table-options", "expected a table of options", path=path, field=name)
+            raise InputError("not-a-table", "is not a table of options.", path=path, field=name)
     return document
 
 
@@ -333,11 +335,11 @@ def read_requests(root: Path) -> dict[str, dict[str, Any]]:
         document = json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise InputError(
-            "not-valid-json-delete", "not valid JSON: delete it and give the options again", path=path
+            "requests-damaged", "is not valid JSON. Delete it, and give the options again.", path=path
         ) from error
     if not isinstance(document, dict) or not all(isinstance(flags, dict) for flags in document.values()):
         raise InputError(
-            "not-table-options-by", "not a table of options by stage: delete it and give them again", path=path
+            "requests-damaged", "has no options by stage. Delete it, and give the options again.", path=path
         )
     place = document.pop(_PLACE, {}).get("root")
     if not isinstance(place, str) or place == str(root):

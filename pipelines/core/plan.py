@@ -31,7 +31,7 @@ class OptionOrigin:
 
 
 def option_origins(workspace: Workspace, spec: StageSpec, flags: Flags | None = None) -> list[OptionOrigin]:
-    """Return the options of a stage whose value is no default, with their origins.
+    """Return the changed options of a stage: those of `georef.toml`, of earlier commands, of flags.
 
     The flags are the present request; None: what is remembered.
 
@@ -57,7 +57,7 @@ def option_origins(workspace: Workspace, spec: StageSpec, flags: Flags | None = 
 
 @dataclass(frozen=True)
 class PlannedStage:
-    """What a run would do with a stage, and why; its options that are no defaults, and all of them.
+    """What a run would do with a stage, and why; its changed options, and all of them.
 
     The action `perhaps`: it runs, unless the stages before it give the same products as before.
     """
@@ -125,12 +125,7 @@ def _action(
     if manifest is None:
         for name, path in input_paths(options).items():  # no hashes: those of new photographs take minutes
             if not path.exists():
-                raise InputError(
-                    "no-such-file-or",
-                    "no such file or folder",
-                    path=path,
-                    field=flag_name(type(options), name),
-                )
+                raise InputError("no-such-file", "does not exist.", path=path, field=flag_name(type(options), name))
         resumes = spec.resumable and workspace.partial(spec).exists()
         return ("resume", f"interrupted: {interrupted}") if resumes else ("run", "never run")
     if found.damaged:

@@ -18,6 +18,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, StringConstraints, V
 
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size, read_npz
+from pipelines.core.sentences import fault_sentence
 from pipelines.core.types import Matrix3, Quaternion
 from pipelines.core.validators import covariance, image_name, unit_quaternion
 
@@ -56,15 +57,13 @@ def load_json(product_type: type[ProductT], path: Path) -> ProductT:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
-        raise InputError(
-            "product-invalid", first["msg"].removeprefix("Value error, "), path=path, field=where or None
-        ) from error
+        raise InputError("product-invalid", fault_sentence(first), path=path, field=where or None) from error
     except UnicodeDecodeError as error:
-        raise InputError("not-utf-text-file", "not a UTF-8 text file", path=path) from error
+        raise InputError("not-utf8", "is not a UTF-8 text file.", path=path) from error
     except (np.linalg.LinAlgError, RecursionError) as error:  # of a validator that computes
-        raise InputError("has-values-cannot-be", f"has values that cannot be used: {error}", path=path) from error
+        raise InputError("product-invalid", f"has values that cannot be used: {error}.", path=path) from error
     except OSError as error:
-        raise InputError("file-unreadable", f"cannot be read: {error.strerror}", path=path) from error
+        raise InputError("file-unreadable", f"cannot be read: {error.strerror}.", path=path) from error
 
 
 def dump_json(document: Any) -> str:
@@ -108,7 +107,9 @@ class ArrayProduct:
                 expected = lengths.setdefault(wanted, length) if isinstance(wanted, str) else wanted
                 matches = matches and length == expected
             if not matches:
-                raise InputError("has-form", f"has the form {array.shape} {array.dtype}", path=path, field=name)
+                raise InputError(
+                    "array-shape", f"has the shape {array.shape} and the type {array.dtype}.", path=path, field=name
+                )
         return cls(**arrays)
 
 

@@ -42,7 +42,7 @@ log = logging.getLogger(__name__)
 
 
 @contextmanager
-def no_traces_of_refusal(workspace: Workspace) -> Iterator[None]:
+def clean_up_after_refusal(workspace: Workspace) -> Iterator[None]:
     """Remove what a command wrote, if it fails before the first product of a new workspace.
 
     Files of others in the folder stay, `georef.toml` among them. An interrupted command keeps what it has written:
@@ -122,7 +122,7 @@ def run_stage(
     """
     if spec.reads:
         staleness.must_exist(workspace)
-    with no_traces_of_refusal(workspace), workspace.lock(spec.name):
+    with clean_up_after_refusal(workspace), workspace.lock(spec.name):
         memo: Memo = {}
         asked = staleness.request(workspace, spec, flags, memo, progress)
         staleness.warn_of_stale_inputs(workspace, spec, memo)
@@ -182,7 +182,7 @@ def run_pipeline(
         if not force:
             staleness.refuse_loss_by_options(workspace, spec, options)
     outcomes: list[Outcome] = []
-    with no_traces_of_refusal(workspace):
+    with clean_up_after_refusal(workspace):
         with workspace.lock("run"):
             remember(workspace.root, asked)
         try:
@@ -223,8 +223,8 @@ def _goes_on(workspace: Workspace, asked: Request) -> bool:
     if spec.resumable and partial.progress() is not None:
         command = staleness.continuing_command(workspace, spec)
         log.warning(
-            "%s: beside this product lies an interrupted run: %s; `%s` goes on with it, --force drops it",
-            spec.name, found, command,
+            "%s: an interrupted run lies beside this product (%s). `%s` continues it; --force drops it.",
+            spec.name, found, command, extra={"code": "interrupted-run-kept"},
         )  # fmt: skip
         return False
     log.info("%s: a run that did not end left nothing to go on with, and is dropped: %s", spec.name, found)
@@ -240,7 +240,10 @@ def _execute(workspace: Workspace, asked: Request, resume: Resume, progress: Pro
         if resume != "never" and partial.is_of(asked.token):
             log.info("%s: goes on with an interrupted run: %s", spec.name, found)
         else:
-            log.warning("%s: starts afresh; what an interrupted run had done is dropped: %s", spec.name, found)
+            log.warning(
+                "%s: the stage starts afresh, and its interrupted run is dropped (%s).",
+                spec.name, found, extra={"code": "interrupted-run-dropped"},
+            )  # fmt: skip
     started, clock = datetime.now(UTC).replace(microsecond=0), time.monotonic()
     summary = _run(workspace, asked, resume, progress, place)
     for product in products_of(spec):
@@ -301,7 +304,10 @@ def _run(workspace: Workspace, asked: Request, resume: Resume, progress: Progres
                     StageRun(workspace, out, progress, resumed, extends, afresh), asked.options
                 )
             except DamagedPartialError as error:
-                log.warning("%s: starts afresh; what the interrupted run left is damaged (%s)", spec.name, error)
+                log.warning(
+                    "%s: the stage starts afresh, because its interrupted run is damaged: %s",
+                    spec.name, error, extra={"code": "interrupted-run-damaged"},
+                )  # fmt: skip
                 out, _ = workspace.begin(spec, token, "never")
                 summary = module.run(StageRun(workspace, out, progress, afresh=afresh), asked.options)
     except GeorefError as error:
@@ -311,9 +317,9 @@ def _run(workspace: Workspace, asked: Request, resume: Resume, progress: Progres
     except _WITHOUT_SOLUTION as error:
         cause = " ".join(str(error).split())[:200]
         degenerate = DegenerateGeometryError(
-            "products-reads-lead-no",
-            f"the products that {spec.name} reads lead to no solution ({cause}): were they edited? "
-            f"`georef run {workspace.root} --force` makes them again",
+            "no-solution",
+            f"The products that {spec.name} reads lead to no solution ({cause}). If they were edited, "
+            f"`georef run {workspace.root} --force` makes them again.",
         )
         workspace.partial_product(spec).fail(str(degenerate), worthless=True)
         raise degenerate from error
@@ -338,9 +344,17 @@ def _current(workspace: Workspace, asked: Request, memo: Memo) -> Manifest | Non
             warnings=[],
         )
     if found.unreadable:
-        log.warning("%s: made again, because %s", spec.name, found.unreadable)
+        log.warning(
+            "%s: the product is made again, because %s",
+            spec.name,
+            found.unreadable,
+            extra={"code": "manifest-damaged"},
+        )
     elif found.damaged:
-        log.warning("%s: damaged, made again: %s", spec.name, staleness.why_damaged(found.damaged))
+        damage = staleness.why_damaged(found.damaged)
+        log.warning(
+            "%s: the product is made again, because %s.", spec.name, damage, extra={"code": "product-damaged"}
+        )
     elif (manifest := found.manifest) is not None:
         reason = staleness.why_stale(workspace, asked, manifest)
         log.info("%s: %s", spec.name, f"made again: {reason}" if reason else f"current: {manifest.key_figure}")

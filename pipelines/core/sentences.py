@@ -6,7 +6,8 @@ A terminal obeys escape sequences, and marks that turn the direction of writing 
 from __future__ import annotations
 
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 _SHOWN = 8
 
@@ -14,6 +15,11 @@ _SHOWN = 8
 def listed(names: Sequence[str]) -> str:
     """Return the first eight names with commas between them, and an ellipsis if there are more."""
     return ", ".join(names[:_SHOWN]) + (" …" if len(names) > _SHOWN else "")
+
+
+def fault_sentence(fault: Mapping[str, Any]) -> str:
+    """Return the sentence of one of the errors of a pydantic `ValidationError`."""
+    return str(fault["msg"]).removeprefix("Value error, ").removesuffix(".") + "."
 
 
 def duration(seconds: float | None) -> str:

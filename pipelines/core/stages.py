@@ -422,7 +422,7 @@ def stage_slice(first: str | None, last: str | None) -> tuple[StageSpec, ...]:
     end = names.index(last) if last else len(names) - 1
     if begin > end:
         raise GeorefError(
-            "from-comes-after-order",
-            f"--from {first} comes after --to {last}: the order is {', '.join(names)}",
+            "stage-order",
+            f"--from {first} comes after --to {last}. The order is {', '.join(names)}.",
         )
     return PIPELINE[begin : end + 1]

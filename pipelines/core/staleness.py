@@ -294,9 +294,7 @@ def must_exist(workspace: Workspace) -> None:
     """Refuse a workspace that does not exist."""
     require_text(workspace.root)
     if not workspace.root.is_dir():
-        raise InputError(
-            "no-such-workspace-georef", "no such workspace: `georef ingest` makes one", path=workspace.root
-        )
+        raise InputError("no-workspace", "does not exist. `georef ingest` makes a workspace.", path=workspace.root)
 
 
 def warn_of_stale_inputs(workspace: Workspace, spec: StageSpec, memo: Memo) -> None:
@@ -304,7 +302,10 @@ def warn_of_stale_inputs(workspace: Workspace, spec: StageSpec, memo: Memo) -> N
     read = {producer.name for producer in producers(spec)}
     for row in status(workspace, memo, before=spec):
         if row.stage in read and row.state == "stale":
-            log.warning("%s builds on %s, which is stale (%s)", spec.name, row.stage, row.reason)
+            log.warning(
+                "%s builds on %s, which is stale (%s).",
+                spec.name, row.stage, row.reason, extra={"code": "input-stale"},
+            )  # fmt: skip
 
 
 def refuse_damaged_inputs(workspace: Workspace, spec: StageSpec, memo: Memo) -> None:
@@ -313,9 +314,9 @@ def refuse_damaged_inputs(workspace: Workspace, spec: StageSpec, memo: Memo) -> 
         damage = why_damaged(finding(workspace, producer, memo, by_content=True).damaged)
         if damage:
             raise InputError(
-                "georef-run-makes-again",
-                f"{damage}: `georef run {(workspace.base or workspace).root}` makes it again; to "
-                f"keep it as it is, delete {producer.folder}/{MANIFEST}",
+                "product-damaged",
+                f"{damage}. `georef run {(workspace.base or workspace).root}` makes it again. To "
+                f"keep it as it is, delete {producer.folder}/{MANIFEST}.",
                 path=workspace.root,
             )
 
@@ -356,9 +357,9 @@ def refuse_loss(
         command = continuing_command(workspace, spec)
         how = "" if reason.startswith("option") else " with the former input"
         raise InputError(
-            "interrupted-would-be-lost",
-            f"an interrupted {spec.name} would be lost ({found_interrupted(workspace, spec)}), because {reason}: "
-            f"`{command}`{how} continues it, --force drops it",
+            "interrupted-run-lost",
+            f"holds an interrupted run of {spec.name} ({found_interrupted(workspace, spec)}), which would be lost, "
+            f"because {reason}. `{command}`{how} continues it; --force drops it.",
             path=partial.folder,
             hint=f"{command}, or --force",
         )

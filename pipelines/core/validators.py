@@ -33,14 +33,14 @@ def require_text(path: Path, field: str | None = None) -> None:
         str(path).encode("utf-8")
     except UnicodeEncodeError as error:
         raise InputError(
-            "name-not-utf-text", "the name is not UTF-8 text: rename it", path=path, field=field
+            "name-not-utf8", "has a name that is not UTF-8 text. Rename it.", path=path, field=field
         ) from error
 
 
 def image_name(name: str) -> str:
     """Return an image name that is relative to the folder of photographs and stays inside."""
     if not stays_inside(name):
-        raise ValueError(f"{name!r} leaves the folder of photographs: names are relative to it")
+        raise ValueError(f"{name!r} leaves the folder of photographs. Names are relative to it")
     return name
 
 
@@ -48,7 +48,7 @@ def image_dir(path: str) -> str:
     """Return the path of a folder of photographs: absolute, or relative and inside the workspace."""
     pure = PurePosixPath(path)
     if not pure.is_absolute() and pure.parts and not stays_inside(path):
-        raise ValueError(f"{path!r} leaves the workspace: give an absolute path")
+        raise ValueError(f"{path!r} leaves the workspace. Give an absolute path")
     return path
 
 
@@ -56,7 +56,7 @@ def unit_quaternion(quat: tuple[float, float, float, float]) -> tuple[float, flo
     """Return a quaternion of length 1 ± 1e-3, in either order."""
     length = float(np.linalg.norm(quat))
     if abs(length - 1) > _UNIT_TOLERANCE:
-        raise ValueError(f"a rotation is a quaternion of length 1, this has {length:g}")
+        raise ValueError(f"the quaternion has the length {length:g}. Rotations have the length 1")
     return quat
 
 
@@ -66,5 +66,5 @@ def covariance(rows: tuple[Vector3, Vector3, Vector3]) -> tuple[Vector3, Vector3
     matrix = np.array(rows)
     values = np.linalg.eigvalsh(matrix)
     if not np.allclose(matrix, matrix.T, rtol=1e-6) or values[0] <= _LEAST_EIGENVALUE_RATIO * values[-1]:
-        raise ValueError("a covariance is symmetric and positive definite")
+        raise ValueError("the covariance is not symmetric and positive definite")
     return rows

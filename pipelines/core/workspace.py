@@ -97,8 +97,8 @@ class PartialProduct:
             return True
         if insist:
             raise InputError(
-                "interrupted-run-had-other",
-                "the interrupted run had other inputs or options: give those, or start afresh with --force",
+                "interrupted-run-differs",
+                "holds an interrupted run with other inputs or options. Give those, or start afresh with --force.",
                 path=self.folder,
             )
         return False
@@ -304,12 +304,12 @@ class Workspace:
 def _refuse_what_is_no_folder(folder: Path) -> None:
     if folder.is_symlink():
         raise InputError(
-            "symbolic-link-stage-replaces",
-            "is a symbolic link, and a stage replaces its folder as a whole: put the folder itself there, or the "
-            "whole workspace on the other disk",
+            "stage-folder-is-link",
+            "is a symbolic link, and a stage replaces its folder as a whole. Put the folder itself there, or the "
+            "whole workspace on the other disk.",
             path=folder,
         )
     if folder.exists() and not folder.is_dir():
         raise InputError(
-            "file-where-stage-folder", "is a file where the stage's folder belongs: move it away", path=folder
+            "stage-folder-is-file", "is a file where the stage's folder belongs. Move it away.", path=folder
         )

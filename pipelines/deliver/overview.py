@@ -71,7 +71,7 @@ class MadeFile:
     """
 
     path: str
-    purpose: str
+    description: str
     bytes: int
     made: datetime | None
     state: str
@@ -199,10 +199,10 @@ def _psnr(workspace: Workspace) -> float | None:
 def _files(workspace: Workspace, states: dict[str, StageState]) -> tuple[MadeFile, ...]:
     """Return the files that there are, with the state of the stage of their folder."""
     made = []
-    for name, purpose in DESCRIPTIONS.items():
+    for name, description in DESCRIPTIONS.items():
         path, row = workspace.root / name, states.get(name.partition("/")[0])
         if row is not None and path.exists():
             inside = path.rglob("*") if path.is_dir() else (path,)
             size = sum(file.stat().st_size for file in inside if file.is_file())
-            made.append(MadeFile(name, purpose, size, row.finished, row.state))
+            made.append(MadeFile(name, description, size, row.finished, row.state))
     return tuple(made)

@@ -243,7 +243,7 @@ def _write_last(listed: MissionList, table: BatchTable) -> None:
     except StorageError as error:
         if table.is_complete:
             raise
-        log.warning("the table of the batch is not that of now: %s", error)
+        log.warning("The table of the batch was not updated. %s", error)
 
 
 def run_arguments(mission: Mission) -> tuple[str, ...]:

@@ -29,10 +29,22 @@ if TYPE_CHECKING:
 CERTIFICATE, KEY = "cluster.pem", "cluster.key"
 _OF_OTHERS, _OF_EVERYBODY = 0o077, 0o007  # bits of a file's mode: permissions of group and all, of all
 _MINUTES = "%Y-%m-%d %H:%M UTC"
+_NEEDS_CRYPTOGRAPHY = "Certificates need the library cryptography: `pip install 'georefgs[cluster]'`."
 _RENEW = (
-    f"delete {CERTIFICATE} and {KEY} there, make new ones by `georef cluster certificates`, copy them to every "
-    "machine of the cluster, and start scheduler and workers again"
+    f"Delete {CERTIFICATE} and {KEY} there, make new ones with `georef cluster certificates`, copy them to every "
+    "machine of the cluster, and start scheduler and workers again."
 )
+
+
+def import_distributed() -> Any:
+    """Return Dask's library; a BackendUnavailableError names the extra that installs it."""
+    try:
+        import distributed
+    except ImportError as error:
+        raise BackendUnavailableError(
+            "missing-extra", "A cluster needs Dask: `pip install 'georefgs[cluster]'`."
+        ) from error
+    return distributed
 
 
 def make_certificates(folder: Path) -> None:
@@ -41,17 +53,18 @@ def make_certificates(folder: Path) -> None:
     The certificate is its own authority, valid for a year, as those that Dask makes for itself. A second one in the
     folder is an InputError.
     """
-    require("cluster")
-    from distributed import Security
-
-    security = Security.temporary()
+    distributed = import_distributed()
+    try:
+        security = distributed.Security.temporary()
+    except ImportError as error:
+        raise BackendUnavailableError("missing-extra", _NEEDS_CRYPTOGRAPHY) from error
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     for name, text in ((KEY, security.tls_client_key), (CERTIFICATE, security.tls_client_cert)):
         try:
             descriptor = os.open(folder / name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
         except FileExistsError as error:
             raise InputError(
-                "exists-delete-make-another", "exists: delete it to make another", path=folder / name
+                "certificate-exists", "exists. Delete it to make another.", path=folder / name
             ) from error
         with os.fdopen(descriptor, "w", encoding="utf-8") as handle:
             handle.write(text)
@@ -80,15 +93,15 @@ def check_own_certificates(folder: Path) -> None:
         status = path.stat()
         if status.st_uid != os.geteuid():
             raise InputError(
-                "belongs-another-user-who",
-                "belongs to another user, who can run programs as you: delete it",
+                "key-of-another-user",
+                "belongs to another user, who can run programs as you. Delete it.",
                 path=path,
             )
         if status.st_mode & _OF_OTHERS:
             raise InputError(
-                "open-other-users-who",
+                "key-open",
                 "is open to other users, who can run programs as you. If none of them has read or changed it: "
-                f"`chmod -R go-rwx {folder}`; else delete it",
+                f"`chmod -R go-rwx {folder}`. Otherwise delete it.",
                 path=path,
             )
 
@@ -103,31 +116,34 @@ def check_certificates(folder: Path) -> None:
     for name in (CERTIFICATE, KEY):
         if not (folder / name).is_file():
             raise InputError(
-                "has-no-name-folder",
-                f"has no {name}: name the folder of the cluster's certificate with --certificates. `georef cluster "
-                "certificates DIR` makes one; `georef cluster scheduler` makes yours for this machine",
+                "certificate-missing",
+                f"has no {name}. Name the folder of the cluster's certificate with --certificates. `georef cluster "
+                "certificates DIR` makes one; `georef cluster scheduler` makes yours for this machine.",
                 path=folder,
             )
     if os.name == "posix" and (folder / KEY).stat().st_mode & _OF_EVERYBODY:
-        message = "can be read by every user of this machine; run `chmod 600` on it"
-        raise InputError("key-readable", message, path=folder / KEY)
-    from cryptography import x509
-
+        raise InputError(
+            "key-open", "can be read by every user of this machine. Close it with `chmod 600`.", path=folder / KEY
+        )
+    try:
+        from cryptography import x509
+    except ImportError as error:
+        raise BackendUnavailableError("missing-extra", _NEEDS_CRYPTOGRAPHY) from error
     path = folder / CERTIFICATE
     try:
         certificates = x509.load_pem_x509_certificates(path.read_bytes())
     except ValueError as error:
-        raise InputError(
-            "no-certificate-form-pem", f"is no certificate in the form PEM: {_RENEW}", path=path
-        ) from error
+        raise InputError("certificate-damaged", f"is not a PEM certificate. {_RENEW}", path=path) from error
     now = datetime.now(UTC)
     for certificate in certificates:
         since, until = certificate.not_valid_before_utc, certificate.not_valid_after_utc
         if now > until:
-            raise InputError("has-expired-on", f"has expired on {until:{_MINUTES}}: {_RENEW}", path=path)
+            raise InputError("certificate-expired", f"has expired on {until:{_MINUTES}}. {_RENEW}", path=path)
         if now < since:
-            clock = f"the clock of this machine says {now:{_MINUTES}}: set it, or {_RENEW}"
-            raise InputError("valid-from-on", f"is valid from {since:{_MINUTES}} on, and {clock}", path=path)
+            clock = f"the clock of this machine says {now:{_MINUTES}}. Set the clock, or renew it. {_RENEW}"
+            raise InputError(
+                "certificate-not-yet-valid", f"is valid from {since:{_MINUTES}} on, and {clock}", path=path
+            )
 
 
 PORT = 8786
@@ -157,16 +173,16 @@ class ClusterAddress:
         require("cluster")
         scheme = self._parts.scheme
         if not self.host or scheme not in ("tls", "tcp"):
-            raise ValueError(f"{self.address!r} is no address such as tls://host:{PORT}")
+            raise ValueError(f"{self.address!r} is not an address such as tls://host:{PORT}.")
         if self.certificates is None:
             if scheme == "tls" or not is_on_this_machine(self.address):
                 raise ValueError(
-                    f"{self.address} needs certificates: without them only tcp://127.0.0.1 is used, because "
-                    "everybody who reaches a scheduler can run programs on its workers"
+                    f"{self.address} needs --certificates. Without them only tcp://127.0.0.1 is used: whoever "
+                    "reaches a scheduler can run programs on its workers."
                 )
             return
         if scheme == "tcp":
-            raise ValueError(f"{self.address} is not encrypted: write tls://, or add --insecure")
+            raise ValueError(f"{self.address} is not encrypted. Write tls://, or add --insecure.")
         check_certificates(self.certificates)
 
     @property
@@ -235,7 +251,7 @@ def connected(cluster: ClusterAddress) -> Iterator[Client]:
     except (OSError, TimeoutError, ValueError, RuntimeError) as error:
         hint = "" if not security else ", and whether it has the same certificate"
         raise ClusterError(
-            "no-scheduler-answers-at", f"no scheduler answers at {cluster.url}: check that it runs{hint}"
+            "no-scheduler", f"No scheduler answers at {cluster.url}. Check whether it runs{hint}."
         ) from error
     try:
         yield client

@@ -107,7 +107,7 @@ class ClusterRun:
         while self._running or (self.waiting and not stop.requested):
             if stop.requested and not is_stopping:
                 is_stopping, stopped = True, time.monotonic()
-                log.warning("stopping %d %s: Ctrl-C again does not wait for them", len(self._running), title)
+                log.warning("Stopping %d %s. Ctrl-C again does not wait for them.", len(self._running), title)
                 for attempt in self._running.values():
                     attempt.future.cancel()
             self._refresh(is_stopping)
@@ -138,9 +138,9 @@ class ClusterRun:
             for name, attempt in list(self._running.items()):
                 self._finish(name, ProcessEnd(INTERRUPTED, time.monotonic() - attempt.since))
             raise ClusterError(
-                "scheduler-lost-jobs-save",
-                "the scheduler is lost: the jobs save their work and stop; start scheduler and workers, then "
-                "repeat the command, which goes on",
+                "scheduler-lost",
+                "The scheduler is lost; the jobs save their work and stop. Start scheduler and workers, then "
+                "repeat the command, which continues.",
             ) from error
         self._workers = {
             address: worker for address, worker in workers_of(described).items() if address not in self._unfit
@@ -157,7 +157,7 @@ class ClusterRun:
 
     def _start(self) -> None:
         if self._unfit and not self._workers and not self._running:
-            raise ClusterError("no-worker-can-run", f"no worker can run the jobs: {self._warned}")
+            raise ClusterError("no-worker", f"No worker can run the jobs. {self._warned}")
         now = time.monotonic()
         for pending in list(self.waiting):
             if len(self._running) >= self.at_a_time:
@@ -173,10 +173,10 @@ class ClusterRun:
                 self._submit(pending, worker)
         if self.waiting and not self._running and all(pending.not_before <= now for pending in self.waiting):
             wanted = "a GPU" if self._workers else f"{MEMORY}, as those of `georef cluster worker` do"
-            text = f"waiting: no worker offers {wanted}"
+            text = f"The jobs wait, because no worker offers {wanted}."
             if text != self._warned:
                 self._warned = text
-                log.warning("%s", text)
+                log.warning("%s", text, extra={"code": "no-worker-yet"})
 
     def _submit(self, pending: PendingJob, worker: Worker) -> None:
         attempt = uuid.uuid4().hex
@@ -235,13 +235,16 @@ class ClusterRun:
         elif end.kind == UNFIT:
             self._unfit.add(worker.address)
             self._workers.pop(worker.address, None)
-            self._warned = f"{worker.name} {end.error}"
-            log.warning("%s: it gets no jobs", self._warned)
+            self._warned = f"{worker.name} gets no jobs, because it {end.error}."
+            log.warning("%s", self._warned, extra={"code": "worker-unfit"})
             self._repeat(name)
         elif end.kind == _LOST and not attempt.has_started:
             self._repeat(name)
         elif end.code == INTERRUPTED:  # Its worker closes.
-            log.warning("%s: interrupted on %s, goes on elsewhere", pending.job.name, worker.name)
+            log.warning(
+                "%s was interrupted on %s and continues on another worker.",
+                pending.job.name, worker.name, extra={"code": "job-moved"},
+            )  # fmt: skip
             pending.avoided.add(worker.address)
             self._repeat(name)
         elif end.kind == WorkspaceBusyError.kind and self._may_wait(pending):
@@ -250,10 +253,13 @@ class ClusterRun:
             pending.failures += 1
             pending.avoided.add(worker.address)
             if pending.failures >= MOST_FAILURES:
-                text = f"failed {pending.failures} times, at last on {worker.name}: {end.error}"
+                text = f"failed {pending.failures} times, at last on {worker.name}. {end.error}"
                 self._finish(name, ProcessEnd(end.code, end.seconds, text, end.kind))
             else:
-                log.warning("%s: tried again, failed on %s: %s", pending.job.name, worker.name, end.error)
+                log.warning(
+                    "%s failed on %s and is tried again. %s",
+                    pending.job.name, worker.name, end.error, extra={"code": "job-repeated"},
+                )  # fmt: skip
                 self._repeat(name)
         else:
             self._finish(name, end)

@@ -66,7 +66,7 @@ def run_job(request: JobRequest) -> None:
 def _obstacle(request: JobRequest) -> ProcessEnd | None:
     """Return why this worker cannot run the job; None: it can."""
     if request["version"] != __version__:
-        return ProcessEnd(1, 0.0, f"has georefgs {__version__}, and {request['version']} is wanted", UNFIT)
+        return ProcessEnd(1, 0.0, f"has georefgs {__version__} instead of {request['version']}", UNFIT)
     if request["token"] and not Path(request["token"]).is_file():
         return ProcessEnd(1, 0.0, f"does not see {Path(request['token']).parent}", UNFIT)
     return None
@@ -93,7 +93,7 @@ def _run(worker: Any, arguments: Sequence[str], events: _Events) -> ProcessEnd:
     try:
         running = JobProcess(child.THIS_PROGRAM, arguments, threads, events.take, ends.put)
     except OSError as error:
-        return ProcessEnd(1, 0.0, f"cannot be started: {error.strerror}")
+        return ProcessEnd(1, 0.0, f"The process cannot be started: {error.strerror}.")
     is_wanted = True
     while True:
         try:

@@ -159,6 +159,6 @@ def tell_end(end: JobEnd) -> None:
     if end.is_done:
         log.info("%s: done (%s)", end.job.name, duration(end.seconds))
     elif end.is_interrupted:
-        log.warning("%s: interrupted at %s", end.job.name, end.place or "its start")
+        log.warning("%s was interrupted at %s.", end.job.name, end.place or "its start")
     else:
-        log.error("%s: failed%s: %s", end.job.name, f" at {end.place}" if end.place else "", end.error)
+        log.error("%s failed%s. %s", end.job.name, f" at {end.place}" if end.place else "", end.error)

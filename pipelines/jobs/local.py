@@ -32,7 +32,7 @@ from pipelines.jobs.engine import INTERRUPTED, Engine, Job, JobDisplay, JobEnd, 
 log = logging.getLogger(__name__)
 
 _TAIL_LINES = 20
-_KILLED = "the system killed it, as it does when memory is short: run fewer at a time"
+_KILLED = "The system killed the process, as it does when memory is short. Run fewer at a time (--at-a-time)."
 
 
 @dataclass(frozen=True)
@@ -114,9 +114,9 @@ class JobProcess:
         text = said.removeprefix("error: ").removeprefix("Error: ")
         if code < 0:
             name = next((known.name for known in signal.Signals if known == -code), f"signal {-code}")
-            ending = _KILLED if code == -_SIGKILL else f"it crashed ({name})"
-            return f"{ending}: {text}" if text else ending
-        return text or f"it ended with exit code {code}"
+            end = _KILLED if code == -_SIGKILL else f"The process crashed ({name})."
+            return f"{end} {text}".rstrip()
+        return text or f"The process ended with exit code {code}."
 
 
 def _message(line: str) -> dict[str, Any] | None:
@@ -194,10 +194,10 @@ class LocalEngine:
                             try:
                                 running[job] = start(job)
                             except OSError as error:  # a command line that is too long, no more processes
-                                end_of(JobEnd(job, 1, 0.0, "", f"cannot be started: {error.strerror}"))
+                                end_of(JobEnd(job, 1, 0.0, "", f"The process cannot be started: {error.strerror}."))
                     elif not is_stopping:
                         is_stopping = True
-                        log.warning("stopping %d %s: Ctrl-C again ends them at once", len(running), title)
+                        log.warning("Stopping %d %s. Ctrl-C again ends them at once.", len(running), title)
                         for job_process in running.values():
                             job_process.interrupt()
                     try:

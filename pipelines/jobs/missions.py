@@ -18,6 +18,7 @@ from pydantic import ValidationError
 from pipelines.core.errors import GeorefError, InputError
 from pipelines.core.files import file_size
 from pipelines.core.options import CONFIG_FILE, REQUESTS, input_markers, load_toml, read_requests, read_toml
+from pipelines.core.sentences import fault_sentence
 from pipelines.core.stages import BY_NAME, StageSpec, named_deliverables, stage_slice
 from pipelines.core.staleness import Flags
 from pipelines.core.validators import stays_inside
@@ -89,7 +90,7 @@ def load_missions(
     """
     listed = _in_folder(path) if path.is_dir() else _in_file(path, owners)
     if not listed.missions:
-        raise InputError("holds-no-mission", "holds no mission", path=path)
+        raise InputError("no-missions", "holds no mission.", path=path)
     missions = tuple(
         replace(
             mission,
@@ -137,18 +138,18 @@ def _in_file(path: Path, owners: Owners) -> MissionList:
     for key, value in document.items():
         if key not in ("defaults", "missions"):
             raise InputError(
-                "unknown-table-there-defaults",
-                "unknown table; there are defaults and missions",
+                "unknown-table",
+                "is no table of missions. The tables are defaults and missions.",
                 path=path,
                 field=key,
             )
         if not isinstance(value, dict):
-            raise InputError("expected-table", "expected a table", path=path, field=key)
+            raise InputError("not-a-table", "is not a table.", path=path, field=key)
     tables = document.get("missions", {})
     if len(tables) > _MOST_MISSIONS:
         raise InputError(
-            "missions-too-many-limit",
-            f"{len(tables)} missions are too many (limit {_MOST_MISSIONS})",
+            "too-many-missions",
+            f"holds too many missions: {len(tables)} (limit {_MOST_MISSIONS}).",
             path=path,
         )
     defaults = _Table(path, "defaults", owners).read(document.get("defaults", {}))
@@ -174,7 +175,7 @@ class _Table:
     def read(self, table: Any) -> _Settings:
         """Return the content of the table, or raise an InputError for an unknown key or a bad value."""
         if not isinstance(table, dict):
-            raise InputError("expected-table", "expected a table", path=self.path, field=self.name)
+            raise InputError("not-a-table", "is not a table.", path=self.path, field=self.name)
         own: dict[str, str] = {}
         flags: dict[str, dict[str, Any]] = {}
         for key, value in table.items():
@@ -187,36 +188,39 @@ class _Table:
                     flags.setdefault(owner, {})[key] = self._value(BY_NAME[owner], key, value, key)
             else:
                 known = ", ".join((*_OWN_KEYS, *self.owners))
-                raise self._error(
-                    key, f"unknown key; known are {known}, and tables of stages: {', '.join(BY_NAME)}"
-                )
+                message = f"is unknown. The keys are {known}, and the tables of stages: {', '.join(BY_NAME)}."
+                raise self._error("unknown-option", key, message)
         return _Settings(own, flags)
 
     def _own(self, key: str, value: Any) -> str:
         if not isinstance(value, str):
-            raise self._error(key, "expected a text")
+            raise self._error("not-a-text", key, "is not a text.")
         try:
             if key == "to":
                 stage_slice(None, value) if value in BY_NAME else BY_NAME[value]
             elif key == "deliver":
                 named_deliverables(value)
             elif not stays_inside(value):
-                raise ValueError("leads out of the folder of the file: give a relative path inside it")
-        except (GeorefError, ValueError, KeyError) as error:
-            raise self._error(key, "is no stage" if isinstance(error, KeyError) else str(error)) from error
+                raise ValueError("leads out of the folder of the file. Give a relative path inside it.")
+        except KeyError as error:
+            raise self._error("unknown-stage", key, f"is no stage. The stages are {', '.join(BY_NAME)}.") from error
+        except (GeorefError, ValueError) as error:
+            code = "path-leaves-folder" if key == "workspace" else "option-invalid"
+            raise self._error(code, key, str(error)) from error
         return value
 
     def _stage(self, stage: str, table: Any) -> dict[str, Any]:
         if not isinstance(table, dict):
-            raise self._error(stage, "expected a table of options")
+            raise self._error("not-a-table", stage, "is not a table of options.")
         return {key: self._value(BY_NAME[stage], key, value, f"{stage}.{key}") for key, value in table.items()}
 
     def _value(self, spec: StageSpec, option: str, value: Any, key: str) -> Any:
         """Return the value of an option, with paths relative to the file made absolute."""
         if option not in spec.options.model_fields:
-            raise self._error(key, f"unknown option; {spec.name} has {', '.join(spec.options.model_fields)}")
+            known = ", ".join(spec.options.model_fields)
+            raise self._error("unknown-option", key, f"is unknown. The options of {spec.name} are {known}.")
         if any(unicodedata.category(sign) in ("Cc", "Cs") for text in _texts(value) for sign in text):
-            raise self._error(key, "has a control character")
+            raise self._error("control-character", key, "has a control character.")
         if option in input_markers(spec.options) and isinstance(value, str):
             value = str((self.path.parent / value).absolute())
         try:
@@ -224,11 +228,11 @@ class _Table:
         except ValidationError as error:
             at_option = next((fault for fault in error.errors() if fault["loc"][:1] == (option,)), None)
             if at_option is not None:  # A fault of several options together is found when all are known.
-                raise self._error(key, at_option["msg"]) from error
+                raise self._error("option-invalid", key, fault_sentence(at_option)) from error
         return value
 
-    def _error(self, key: str, message: str) -> InputError:
-        return InputError("mission-invalid", message, path=self.path, field=f"{self.name}.{key}")
+    def _error(self, code: str, key: str, message: str) -> InputError:
+        return InputError(code, message, path=self.path, field=f"{self.name}.{key}")
 
 
 def _mission(path: Path, name: str, table: Any, defaults: _Settings, owners: Owners) -> Mission:
@@ -241,9 +245,8 @@ def _mission(path: Path, name: str, table: Any, defaults: _Settings, owners: Own
         try:
             BY_NAME[stage].options.model_validate(given)
         except ValidationError as error:
-            raise InputError(
-                "mission-invalid", error.errors()[0]["msg"], path=path, field=f"{label}.{stage}"
-            ) from error
+            sentence = fault_sentence(error.errors()[0])
+            raise InputError("option-invalid", sentence, path=path, field=f"{label}.{stage}") from error
     place = own.own.get("workspace", f"{defaults.own['workspace']}/{name}" if "workspace" in defaults.own else name)
     root = path.parent.absolute() / place
     _require_inside(root, path.parent, path, label)
@@ -252,16 +255,16 @@ def _mission(path: Path, name: str, table: Any, defaults: _Settings, owners: Own
     for key in table:
         stages = (key,) if key in BY_NAME else owners.get(key, ())
         if stages and not running.intersection(stages):
-            text = f"is for {' and '.join(stages)}, which is not among the stages to run"
-            raise InputError("mission-invalid", text, path=path, field=f"{label}.{key}")
+            text = f"is for {' and '.join(stages)}, which is not among the stages to run."
+            raise InputError("stage-not-run", text, path=path, field=f"{label}.{key}")
     return mission
 
 
 def _require_name(name: str, path: Path, label: str) -> None:
     if not _NAME.fullmatch(name):
         raise InputError(
-            "cannot-be-name-mission",
-            "cannot be the name of a mission: use letters, digits, '.', '-' and '_'",
+            "mission-name",
+            "cannot be the name of a mission. Use letters, digits, '.', '-' and '_'.",
             path=path,
             field=label,
         )
@@ -271,8 +274,8 @@ def _require_inside(root: Path, folder: Path, path: Path, label: str) -> None:
     """Refuse a workspace that a symbolic link leads out of its folder."""
     if not root.resolve().is_relative_to(folder.resolve()):
         raise InputError(
-            "its-workspace-leads-out",
-            "its workspace leads out of the folder of missions",
+            "path-leaves-folder",
+            "has a workspace that leads out of the folder of missions.",
             path=path,
             field=label,
         )
@@ -285,8 +288,8 @@ def _require_own_workspaces(path: Path, missions: Sequence[Mission]) -> None:
         place = str(mission.workspace.root.resolve()).casefold()
         if place in taken:
             raise InputError(
-                "has-workspace",
-                f"has the workspace of {taken[place]}",
+                "workspace-shared",
+                f"is the workspace of {taken[place]} too. Each mission needs its own.",
                 path=path,
                 field=f"missions.{mission.name}.workspace",
             )

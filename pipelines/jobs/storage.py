@@ -24,6 +24,7 @@ from urllib.parse import urlsplit
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from pipelines.core.errors import BackendUnavailableError, GeorefError, InputError, StorageError
+from pipelines.core.sentences import fault_sentence
 from pipelines.core.validators import stays_inside
 from pipelines.jobs.engine import Job
 
@@ -84,19 +85,17 @@ class Storage:
             if not store.exists(place):
                 return None
             if store.size(place) > _MOST_INDEX_BYTES:
-                raise InputError("too-large-for-index", "is too large for an index", path=place)
+                raise InputError("file-too-large", "is too large for an index.", path=place)
             try:
                 index = PartIndex.model_validate_json(store.cat_file(place))
             except ValidationError as error:
                 raise InputError(
-                    "damaged-index-delete",
-                    f"is a damaged index: delete it; {error.errors()[0]['msg']}",
+                    "index-damaged",
+                    f"is a damaged index. {fault_sentence(error.errors()[0])} Delete it.",
                     path=place,
                 ) from error
             if index.part != part or not all(name == "." or stays_inside(name) for name in index.files):
-                raise InputError(
-                    "lists-what-does-not", "lists what does not belong to its part: delete it", path=place
-                )
+                raise InputError("index-leaves-part", "lists files outside its part. Delete it.", path=place)
             return index
 
     def send(self, folder: Path, part: str, writer: Writer, attempt: str = "") -> PartIndex:
@@ -108,7 +107,7 @@ class Storage:
         with self._reached():
             (store, home), before = self._place(part), self.index(part)
             if writer == "worker" and before is not None and before.attempt != attempt:
-                raise StorageError("another-attempt-at-job", f"{part}: another attempt at the job has taken over")
+                raise StorageError("attempt-superseded", f"Another attempt at the job of {part} has taken over.")
             held = set() if before is None else {_digest(name, *state) for name, state in before.files.items()}
             if urlsplit(self.url).scheme not in _WITHOUT_FOLDERS:
                 store.makedirs(home, exist_ok=True)
@@ -149,7 +148,7 @@ class Storage:
                     path.parent.mkdir(parents=True, exist_ok=True)
                     if not path.parent.resolve().is_relative_to(folder.resolve()):
                         raise InputError(
-                            "symbolic-link-leads-out", "a symbolic link leads out of the folder", path=path
+                            "path-leaves-folder", "leads out of the folder through a symbolic link.", path=path
                         )
                 drafts = [path.with_name(path.name + _DRAFT) for path in paths]
                 objects = [f"{home}/{_digest(name, *index.files[name])}" for name in names]
@@ -183,9 +182,11 @@ class Storage:
         except GeorefError:
             raise
         except ImportError as error:
-            raise BackendUnavailableError("storage-library-missing", f"{self.url}: {error}") from error
+            raise BackendUnavailableError("missing-extra", f"{self.url} needs a library: {error}.") from error
         except Exception as error:  # Each library of a store has exceptions of its own.
-            raise StorageError("storage-failed", f"{self.url}: {type(error).__name__}: {error}") from error
+            raise StorageError(
+                "storage-unreachable", f"{self.url} failed with {type(error).__name__}: {error}."
+            ) from error
 
 
 def _files_of(path: Path) -> Iterator[tuple[str, tuple[int, int]]]:
@@ -262,8 +263,8 @@ class EngineExchange:
         """
         if job.folder is None or job.writes is None:
             raise InputError(
-                "cannot-run-through-storage",
-                f"{job.name} cannot run through a storage: use a shared folder",
+                "storage-not-supported",
+                f"is not supported by {job.name}, whose files are not known. Use a shared folder.",
                 field="--storage",
             )
         folder = job.folder.resolve()
@@ -300,7 +301,7 @@ def worker_exchange(parcel: Parcel, scratch: Path) -> Iterator[None]:
             try:
                 storage.send(scratch, parcel["writes"], "worker", parcel["attempt"])
             except GeorefError as error:
-                log.warning("results were not put back, next attempt in a minute: %s", error)
+                log.warning("Results were not copied to the storage; the next attempt is in a minute. %s", error)
 
     saving = threading.Thread(target=save, daemon=True)
     try:
@@ -328,7 +329,7 @@ def _part(folder: Path, path: Path) -> str:
         return path.resolve().relative_to(folder).as_posix()
     except ValueError:
         raise InputError(
-            "lies-outside-with-storage",
-            f"lies outside {folder}: with --storage everything that a job reads lies in one folder",
+            "path-leaves-folder",
+            f"lies outside {folder}. With --storage all that a job reads lies in one folder.",
             path=path,
         ) from None

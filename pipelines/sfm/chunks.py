@@ -60,7 +60,7 @@ Index = Annotated[int, Field(ge=0)]
 # Matches of an image with its neighbours take about as long as its features: both kinds of chunks take as long.
 _PAIRS_PER_PHOTOGRAPH = 8
 _DRAFT = "unfinished.db"
-_RUN_AGAIN = "run the same command again (finished features and matches are kept)"
+_RUN_AGAIN = "Run the same command again: finished features and matches are kept."
 _TITLES: dict[Kind, str] = {"features": "chunks of features", "matches": "chunks of matches"}
 
 

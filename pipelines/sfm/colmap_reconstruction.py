@@ -28,7 +28,7 @@ _DRIFTLESS_UP_TO = 200
 class ColmapReconstructor:
     """Reconstruction by COLMAP, which cannot be interrupted while it works."""
 
-    remedy = "run it again (finished features and matches are kept), or with a smaller `--max-image-size`"
+    remedy = "Run it again (finished features and matches are kept), or with a smaller --max-image-size."
 
     estimate = staticmethod(estimate_reconstruction)
 

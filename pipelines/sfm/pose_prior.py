@@ -43,7 +43,7 @@ from pipelines.survey.calibrated import load_survey
 from pipelines.survey.survey import Fix, Survey
 
 _MOST_ITERATIONS = 100
-_FORCE_SFM = "COLMAP cannot adjust the model: reconstruct it again (`georef sfm --force`)"
+_FORCE_SFM = "COLMAP cannot adjust the model. Reconstruct it again with `georef sfm --force`."
 # COLMAP aligns the model with the fixes before it adjusts. Its limit of an inlier is this factor times the largest
 # residual of the inliers of `align`: with too tight a limit COLMAP has no start.
 _ALIGNMENT_SLACK = 3.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import pytest
@@ -33,9 +34,26 @@ def survey(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _in_this_process(capsys: pytest.CaptureFixture[str]) -> Georef:
+    exit_of, root = boundary.exit_of, logging.getLogger()
+
     def call(*arguments: object) -> Result:
-        code = boundary.guarded(cli, [str(argument) for argument in arguments])
+        exits: list[boundary.Exit | None] = []
+        records: list[logging.LogRecord] = []
+
+        def recorded(error: BaseException) -> boundary.Exit | None:
+            exits.append(exit_of(error))
+            return exits[-1]
+
+        handler = logging.Handler(logging.WARNING)
+        handler.emit = records.append  # type: ignore[method-assign]
+        root.addHandler(handler)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(boundary, "exit_of", recorded)
+            code = boundary.guarded(cli, [str(argument) for argument in arguments])
+        root.removeHandler(handler)
         captured = capsys.readouterr()
-        return Result(code, captured.out, captured.err)
+        error = exits[-1].error if exits and exits[-1] is not None else None
+        warned = tuple(record.code for record in records if hasattr(record, "code"))
+        return Result(code, captured.out, captured.err, error, warned)
 
     return call

@@ -94,7 +94,7 @@ def test_untrained_workspace_says_what_to_run(copied: Workspace) -> None:
         overview(copied, CrsOptions())
 
 
-def test_every_file_that_is_handed_over_has_its_purpose() -> None:
+def test_every_file_that_is_handed_over_has_its_description() -> None:
     handed_over = [SPLAT, *(product for spec in DELIVERABLES for product in (spec.product, *spec.also))]
     assert [product for product in handed_over if product not in DESCRIPTIONS] == []
 
