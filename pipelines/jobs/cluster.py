@@ -29,22 +29,10 @@ if TYPE_CHECKING:
 CERTIFICATE, KEY = "cluster.pem", "cluster.key"
 _OF_OTHERS, _OF_EVERYBODY = 0o077, 0o007  # bits of a file's mode: permissions of group and all, of all
 _MINUTES = "%Y-%m-%d %H:%M UTC"
-_NEEDS_CRYPTOGRAPHY = "Certificates need the library cryptography: `pip install 'georefgs[cluster]'`."
 _RENEW = (
     f"Delete {CERTIFICATE} and {KEY} there, make new ones with `georef cluster certificates`, copy them to every "
     "machine of the cluster, and start scheduler and workers again."
 )
-
-
-def import_distributed() -> Any:
-    """Return Dask's library; a BackendUnavailableError names the extra that installs it."""
-    try:
-        import distributed
-    except ImportError as error:
-        raise BackendUnavailableError(
-            "missing-extra", "A cluster needs Dask: `pip install 'georefgs[cluster]'`."
-        ) from error
-    return distributed
 
 
 def make_certificates(folder: Path) -> None:
@@ -53,11 +41,10 @@ def make_certificates(folder: Path) -> None:
     The certificate is its own authority, valid for a year, as those that Dask makes for itself. A second one in the
     folder is an InputError.
     """
-    distributed = import_distributed()
-    try:
-        security = distributed.Security.temporary()
-    except ImportError as error:
-        raise BackendUnavailableError("missing-extra", _NEEDS_CRYPTOGRAPHY) from error
+    require("cluster")
+    from distributed import Security
+
+    security = Security.temporary()
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     for name, text in ((KEY, security.tls_client_key), (CERTIFICATE, security.tls_client_cert)):
         try:
@@ -125,10 +112,8 @@ def check_certificates(folder: Path) -> None:
         raise InputError(
             "key-open", "can be read by every user of this machine. Close it with `chmod 600`.", path=folder / KEY
         )
-    try:
-        from cryptography import x509
-    except ImportError as error:
-        raise BackendUnavailableError("missing-extra", _NEEDS_CRYPTOGRAPHY) from error
+    from cryptography import x509
+
     path = folder / CERTIFICATE
     try:
         certificates = x509.load_pem_x509_certificates(path.read_bytes())

@@ -44,7 +44,7 @@ def marks(*last: str, crs: str = "EPSG:4979") -> bytes:
 
 
 class Case(NamedTuple):
-    """Files that a user adds to the flight, options of `georef ingest`, and what they are told."""
+    """Files that a user adds to the flight, options of `georef ingest`, and place and code of the refusal."""
 
     name: str
     files: dict[str, bytes]
@@ -58,108 +58,113 @@ GCP = "--gcp {here}/gcp.txt"
 
 REFUSED = (
     # positions
-    Case("missing file", {}, CSV, "t.csv [--trajectory]: no such file or folder"),
-    Case("empty table", {"t.csv": b" \n"}, CSV, "t.csv: the file is empty"),
-    Case("header only", {"t.csv": b"image,lat,lon,alt\n"}, CSV, "t.csv: has a header but no rows"),
-    Case("no header", {"t.csv": b"IMG_0000.JPG,46,7,500\n"}, CSV, "t.csv:1: the first line must be a header"),
-    Case("not text", {"t.csv": b"\xff\xfe\x00"}, CSV, "t.csv:1: not UTF-8 text: save the file as UTF-8"),
-    Case(
-        "no number", {"t.csv": positions("IMG_0003.JPG,46.02,east,500")}, CSV, "t.csv:5 [longitude]: 'east' is no"
-    ),
+    Case("missing file", {}, CSV, "t.csv [--trajectory] no-such-file"),
+    Case("empty table", {"t.csv": b" \n"}, CSV, "t.csv file-empty"),
+    Case("header only", {"t.csv": b"image,lat,lon,alt\n"}, CSV, "t.csv no-rows"),
+    Case("no header", {"t.csv": b"IMG_0000.JPG,46,7,500\n"}, CSV, "t.csv:1 header-missing"),
+    Case("not text", {"t.csv": b"\xff\xfe\x00"}, CSV, "t.csv:1 not-utf8"),
+    Case("no number", {"t.csv": positions("IMG_0003.JPG,46.02,east,500")}, CSV, "t.csv:5 [longitude] not-a-number"),
     Case(
         "decimal commas between commas",
         {"t.csv": positions("IMG_0003.JPG,46,02,7,7503,500")},
         CSV,
-        "t.csv:5: has 6 cells, the header has 4; decimal commas need ; as separator",
+        "t.csv:5 wrong-columns",
     ),
     Case(
         "latitude out of range",
         {"t.csv": positions("IMG_0003.JPG,96.02,7.75,500")},
         CSV,
-        "t.csv:5 [latitude]: 96.02 is out of range -90 … 90",
+        "t.csv:5 [latitude] value-out-of-range",
     ),
     Case(
         "path that leaves the folder",
         {"t.csv": positions("../IMG_0003.JPG,46.02,7.75,500")},
         CSV,
-        "t.csv:5 [image]: '../IMG_0003.JPG' leaves the image folder: name images relative to it",
+        "t.csv:5 [image] image-outside-folder",
     ),
     Case(
         "two rows of an image",
         {"t.csv": positions("IMG_0000.JPG,46.02,7.75,500")},
         CSV,
-        "t.csv:5 [image]: IMG_0000.JPG has a row already, in line 2",
+        "t.csv:5 [image] image-twice",
     ),
     Case(
         "none of the names",
         {"t.csv": table("image,lat,lon,alt", "DJI_1.JPG,46,7,500")},
         CSV,
-        "t.csv [image]: names none of the images: it has 'DJI_1.JPG' …, the folder 'IMG_0000.JPG'",
+        "t.csv [image] no-image-matched",
     ),
     Case(
         "x,y,z without CRS",
         {"t.csv": table("image,x,y,z", "IMG_0000.JPG,400000,5097000,500")},
         CSV,
-        "--crs",
+        "t.csv crs-missing",
     ),
     Case(
         "degrees in a projected CRS",
         {"t.csv": table("image,x,y,z", "IMG_0000.JPG,7.75,46.02,500")},
         CSV + " --crs EPSG:32632",
-        "t.csv:2: (7.75, 46.02, 500): degrees? EPSG:32632 has eastings and northings: wrong CRS",
+        "t.csv:2 degrees-in-projection",
     ),
-    Case("unknown CRS", {"t.csv": positions()}, CSV + " --crs EPSG:999999", "[--crs]: 'EPSG:999999' is no CRS"),
-    Case("CRS without table", {}, "--crs EPSG:32632", "[--crs]: is for the columns of --trajectory"),
-    Case("two tables", {"t.csv": positions(), "geo.txt": b"x"}, CSV + " " + GEO, "[--geo]: give a trajectory or"),
-    Case("geo.txt without CRS", {"geo.txt": b"a.jpg 7.75 46.02 500\n"}, GEO, "geo.txt:1: the first line must be"),
+    Case("unknown CRS", {"t.csv": positions()}, CSV + " --crs EPSG:999999", "[--crs] crs-unknown"),
+    Case("CRS without table", {}, "--crs EPSG:32632", "[--crs] crs-without-trajectory"),
+    Case("two tables", {"t.csv": positions(), "geo.txt": b"x"}, CSV + " " + GEO, "[--geo] two-position-files"),
+    Case("geo.txt without CRS", {"geo.txt": b"a.jpg 7.75 46.02 500\n"}, GEO, "geo.txt:1 crs-missing"),
     Case(
         "geo.txt cut off",
         {"geo.txt": b"EPSG:4326\nIMG_0000.JPG 7.75\n"},
         GEO,
-        "geo.txt:2: has 2 columns, expected 3, 4, 7 or 9: image x y [z] [yaw pitch roll] [h_acc v_acc]",
+        "geo.txt:2 wrong-columns",
     ),
     # ground points
     Case(
         "cut off mark",
         {"gcp.txt": marks("7.75 46.02 500 10")},
         GCP,
-        "gcp.txt:4: the line has 4 columns, expected at least",
+        "gcp.txt:4 wrong-columns",
     ),
     Case(
-        "mark that is no number", {"gcp.txt": marks("7.75 46.02 500 nan 1 IMG_0002.JPG P1")}, GCP, "gcp.txt:4 [px]"
+        "mark that is no number",
+        {"gcp.txt": marks("7.75 46.02 500 nan 1 IMG_0002.JPG P1")},
+        GCP,
+        "gcp.txt:4 [px] number-missing",
     ),
-    Case("mark outside", {"gcp.txt": marks("7.75 46.02 500 99 1 IMG_0002.JPG P1")}, GCP, "gcp.txt:4"),
-    Case("mark that escapes", {"gcp.txt": marks("7.75 46.02 500 9 1 /etc/x.jpg P1")}, GCP, "gcp.txt:4 [image]"),
     Case(
-        "far away", {"gcp.txt": marks().replace(b"7.75 46.02", b"46.02 7.75")}, GCP, "wrong CRS, or x and y swapped"
+        "mark outside",
+        {"gcp.txt": marks("7.75 46.02 500 99 1 IMG_0002.JPG P1")},
+        GCP,
+        "gcp.txt:4 [px py] mark-outside-image",
     ),
-    Case("unknown check point", {"gcp.txt": marks()}, GCP + " --check P9", "[--check]"),
-    Case("check without points", {}, "--check P1", "[--check]: names points of --gcp, which is not given"),
+    Case(
+        "mark that escapes",
+        {"gcp.txt": marks("7.75 46.02 500 9 1 /etc/x.jpg P1")},
+        GCP,
+        "gcp.txt:4 [image] image-outside-folder",
+    ),
+    Case("far away", {"gcp.txt": marks().replace(b"7.75 46.02", b"46.02 7.75")}, GCP, "gcp.txt:2 point-far-away"),
+    Case("unknown check point", {"gcp.txt": marks()}, GCP + " --check P9", "gcp.txt [--check] check-not-a-point"),
+    Case("check without points", {}, "--check P1", "[--check] check-without-gcp"),
     # heights and numbers
-    Case(
-        "unknown datum", {}, "--vertical sea", "[--vertical]: 'sea' is no vertical datum: give one of ellipsoidal"
-    ),
-    Case("missing grid", {}, "--vertical EGM2008", "us_nga_egm08_25.tif is not installed"),
-    Case("sigma of nothing", {}, "--sigma-h 0", "[--sigma-h]: Input should be greater than 0"),
-    Case("sigma that is no number", {}, "--sigma-h nan", "[--sigma-h]: Input should be"),
-    Case("every image held out", {}, "--test-every 1", "[--test-every]: 1 would leave nothing to train on"),
+    Case("unknown datum", {}, "--vertical sea", "[--vertical] vertical-datum-unknown"),
+    Case("missing grid", {}, "--vertical EGM2008", "grid-not-installed"),
+    Case("sigma of nothing", {}, "--sigma-h 0", "[--sigma-h] option-invalid"),
+    Case("sigma that is no number", {}, "--sigma-h nan", "[--sigma-h] option-invalid"),
+    Case("every image held out", {}, "--test-every 1", "[--test-every] nothing-to-train-on"),
     # options in the file
-    Case(
-        "unknown table", {"ws/georef.toml": b"[traim]\n"}, "", "georef.toml [traim]: unknown table; the stages are"
-    ),
+    Case("unknown table", {"ws/georef.toml": b"[traim]\n"}, "", "georef.toml [traim] unknown-stage"),
     Case(
         "unknown key",
         {"ws/georef.toml": b"[ingest]\nsigma = 1\n"},
         "",
-        "georef.toml [ingest.sigma]: unknown key; known",
+        "georef.toml [ingest.sigma] unknown-option",
     ),
     Case(
         "bad value",
         {"ws/georef.toml": b"[ingest]\nsigma_v = -1\n"},
         "",
-        "georef.toml [ingest.sigma_v]: Input should be",
+        "georef.toml [ingest.sigma_v] option-invalid",
     ),
-    Case("no TOML", {"ws/georef.toml": b"sigma_v -1"}, "", "georef.toml: not valid TOML"),
+    Case("no TOML", {"ws/georef.toml": b"sigma_v -1"}, "", "georef.toml toml-invalid"),
 )
 
 
@@ -174,7 +179,12 @@ def test_refused(real_georef: Georef, flight: Path, case: Case) -> None:
     result.assert_failed(2 if re.match(r"error: \[--", result.err.splitlines()[-1]) else 1)
     last = result.err.splitlines()[-1]
     assert last.startswith("error: ")
-    assert case.told in last
+    error = result.document["error"]
+    place = "" if error["path"] is None else Path(error["path"]).name
+    place += "" if error["line"] is None else f":{error['line']}"
+    place += "" if error["field"] is None else f" [{error['field']}]"
+    assert f"{place} {error['code']}".strip() == case.told
+    assert place in last
     assert "Traceback" not in result.err
     assert products_in(workspace) == before
 
