@@ -14,6 +14,7 @@ import pytest
 from pipelines.core.errors import InputError
 from pipelines.geometry.cameras import Camera, distort, undistort
 from pipelines.survey.photographs import ImageCache, Photograph, pinhole_of
+from tests.refusals import refused
 
 WIDTH, HEIGHT = 240, 180
 BARREL = Camera("OPENCV", WIDTH, HEIGHT, np.array([200.0, 202.0, 118.0, 93.0, -0.18, 0.03, 1e-3, -5e-4]))
@@ -145,8 +146,9 @@ def test_photograph_that_was_replaced_after_ingest_is_refused(tmp_path: Path) ->
     recorded = replace(shot, sha256=hashlib.sha256(shot.file.read_bytes()).hexdigest())
     ImageCache(tmp_path / "cache", [recorded], WIDTH).build()
     shot.file.write_bytes(shot.file.read_bytes() + b"\0")  # decodes as before
-    with pytest.raises(InputError, match=r"a\.png: the photograph has changed since `georef ingest` read it"):
+    with refused("photograph-changed", InputError) as error:
         ImageCache(tmp_path / "cache", [recorded], WIDTH).build()
+    assert error.value.path == tmp_path / "a.png"
 
 
 def test_bands_of_rows_give_the_same_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
