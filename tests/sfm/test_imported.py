@@ -59,9 +59,9 @@ def test_image_name_that_is_not_utf_8_is_refused(surveyed: tuple[SparseModel, Su
     write_sparse(surveyed[0], tmp_path)
     file = tmp_path / "images.bin"
     file.write_bytes(file.read_bytes().replace(b"image_003", b"image\x85003"))
-    with pytest.raises(InputError, match=r"record 4 of 6 has a name that is not UTF-8") as caught:
+    with refused("file-damaged", InputError) as caught:
         load_reconstruction(tmp_path)
-    assert caught.value.path == file
+    assert caught.value.path == file and "record 4 of 6" in caught.value.message and "UTF-8" in caught.value.message
 
 
 def test_unknown_camera_model_and_bytes_behind_the_records(
@@ -70,11 +70,13 @@ def test_unknown_camera_model_and_bytes_behind_the_records(
     write_sparse(surveyed[0], tmp_path)
     cameras = (tmp_path / "cameras.bin").read_bytes()
     (tmp_path / "cameras.bin").write_bytes(cameras[:12] + struct.pack("<i", 99) + cameras[16:])
-    with pytest.raises(InputError, match=r"record 1 of 1 has a camera model that is unknown"):
+    with refused("file-damaged", InputError) as caught:
         load_reconstruction(tmp_path)
+    assert "record 1 of 1" in caught.value.message and "camera model" in caught.value.message
     (tmp_path / "cameras.bin").write_bytes(cameras + b"\0")
-    with pytest.raises(InputError, match=r"has 1 bytes behind its 1 records"):
+    with refused("file-damaged", InputError) as caught:
         load_reconstruction(tmp_path)
+    assert "1 bytes follow its 1 records" in caught.value.message
 
 
 @pytest.mark.parametrize("place", ["", "sparse/0", "sparse", "0"])
