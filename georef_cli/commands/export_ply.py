@@ -25,7 +25,7 @@ _DOC = """Write the splat as a PLY with its place on Earth.
       georef export-ply flight --to splat.ply --min-opacity 0.02
       georef export-ply flight --measurable
     """
-_OF_MEASURABLE = ("disc_spacing", "repaint_passes")
+_OF_MEASURABLE = ("disc_spacing", "appearance_passes")
 _MEASURABLE = StageCommand("export-measurable", _DOC, delivers="file")
 
 

@@ -107,9 +107,7 @@ class ArrayProduct:
                 expected = lengths.setdefault(wanted, length) if isinstance(wanted, str) else wanted
                 matches = matches and length == expected
             if not matches:
-                raise InputError(
-                    "array-shape", f"has the shape {array.shape} and the type {array.dtype}.", path=path, field=name
-                )
+                raise InputError("array-form", f"has the form {array.shape} {array.dtype}", path=path, field=name)
         return cls(**arrays)
 
 

@@ -7,7 +7,8 @@ surface is wrong by a part of the Gaussian's size. So:
 2. A disc lies at each point. Its colour is that of the trained renders.
 3. Gaussians with their centre close to a disc are left out, and those that no training view shows, such as the
    ground plane. The others stay: their surface is shown by too few views, or is none.
-4. Colours and opacities are fitted to the trained renders of the training views; no centre moves.
+4. Appearance refinement: colours and opacities are fitted to the trained renders of the training views; no centre
+   moves.
 
 Reads `ingest/survey.json`, the photographs, `sfm/sparse`, `train/model.json` and `train/gaussians.ply`. Writes
 `measurable/splat.measurable.ply` and its sidecar, beside `export/splat.ply` of `export-ply`.
@@ -36,13 +37,13 @@ from pipelines.deliver.ply import write_ply
 from pipelines.deliver.splat import placed_splat, splat_values
 from pipelines.geometry.cameras import pose_matrix
 from pipelines.geometry.similarity import Similarity
+from pipelines.splat.appearance import ShownView, refine_appearance, shuffled_passes
 from pipelines.splat.densify import view_contributions
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.memory import USABLE, TrainingSize, free_memory_bytes, predicted_peak_bytes
 from pipelines.splat.metrics import psnr
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings
 from pipelines.splat.rasterizer.backends import rasterizer
-from pipelines.splat.repainting import ShownView, repainted, shuffled_passes
 from pipelines.splat.sh import coefficient_count
 from pipelines.splat.surface import surface_discs
 from pipelines.surface.fusion import SurfaceCloud, fused_squares, fusion_settings, pixel_on_surface_m
@@ -88,21 +89,21 @@ def run(stage: StageRun, options: MeasurableOptions) -> Summary:
     surface = _collected(fused_squares(views, geo_from_model, settings, progress), views, trained)
     shown = trained.gaussians.select(_in_views(trained.gaussians, views, backend, progress).nonzero()[:, 0])
     replaced, discs = with_discs(shown, surface, geo_from_model, spacing_m)
-    painted = repainted(
+    refined = refine_appearance(
         replaced,
         lambda number: _shown(views.view(number)),
-        shuffled_passes(len(views), options.repaint_passes, np.random.default_rng(0)),
+        shuffled_passes(len(views), options.appearance_passes, np.random.default_rng(0)),
         backend,
         RasterSettings(trained.model.sh_degree, trained.model.background),
         progress=progress,
     )
     views.close()
     change = _psnr_change_db(
-        renderer, ModelRenderer(replace(trained, gaussians=painted), images, backend), progress
+        renderer, ModelRenderer(replace(trained, gaussians=refined), images, backend), progress
     )
     # The place is that of the trained model, whatever the discs have replaced.
     means, accuracy = trained.gaussians.means.numpy(), headline_of(stage.workspace)
-    splat = placed_splat(painted, place(trained.model, trained.survey, means, accuracy), options)
+    splat = placed_splat(refined, place(trained.model, trained.survey, means, accuracy), options)
     write_ply(splat, stage.out / Path(MEASURABLE_SPLAT).name)
     psnr_text = "" if change is None else f", PSNR {change:+.2f} dB"
     return Summary(
@@ -138,7 +139,7 @@ def _estimate(renderer: ModelRenderer, options: MeasurableOptions) -> str | None
     pixels = [pinhole.width * pinhole.height for pinhole in map(renderer.pinholes.of, cameras)]
     megapixels = float(np.mean(pixels)) / 1e6
     pass_s = _FIXED_S + _MEGAPIXEL_S * megapixels + _MILLION_GAUSSIANS_S * gaussians / 1e6
-    seconds = (options.repaint_passes + _OTHER_PASSES) * len(cameras) * pass_s
+    seconds = (options.appearance_passes + _OTHER_PASSES) * len(cameras) * pass_s
     return (
         f"about {discs} discs {spacing_m:.3f} m apart, {size_bytes / 1e6:.3g} MB and {about(seconds)}; a larger "
         "--disc-spacing makes it smaller"

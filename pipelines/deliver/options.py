@@ -33,11 +33,12 @@ class MeasurableOptions(SplatOptions):
         description="With --measurable: metres between discs (default: 0.7 of the width of a pixel of the training "
         "photographs on the ground).",
     )
-    repaint_passes: int = Field(
+    appearance_passes: int = Field(
         7,
         ge=0,
         le=1000,
-        description="With --measurable: how often each training view is shown to the discs, for their colours.",
+        description="With --measurable: passes of the appearance refinement, which fits the colours of the discs, over "
+        "the training views.",
     )
 
 

@@ -172,7 +172,7 @@ class Row:
         """Return the number of a cell that is not empty."""
         value = self.number(column)
         if math.isnan(value):
-            raise self.fault("number-missing", "the number is missing", column)
+            raise self.fault("number-missing", "the number is missing or not finite", column)
         return value
 
     def sigma_m(self, column: str) -> float | None:

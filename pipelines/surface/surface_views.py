@@ -33,12 +33,12 @@ from pipelines.survey.photographs import ImageCache, Pinholes
 from pipelines.survey.trained_survey import TrainedSurvey
 
 _WINDOW_PX = 15
-_LEAST_SHARE = 0.5  # of the photograph's contrast, which the render must show
+_LEAST_SHARE = 0.5  # of the photograph's contrast, which a consistent render has
 _LEAST_CONTRAST = 6.0  # grey levels of 255: a fainter pattern is noise, and confirms or refutes nothing
 
 
-def shows_photograph(rendered: ByteArray, photograph: ByteArray) -> BoolArray:
-    """Return where (H, W) a render (H, W, 3) shows the contrast of its undistorted photograph (H, W, 3).
+def photo_consistent(rendered: ByteArray, photograph: ByteArray) -> BoolArray:
+    """Return where (H, W) a render (H, W, 3) has the contrast of its undistorted photograph (H, W, 3).
 
     Elsewhere, the model has no surface that the photograph confirms: a wall that is missing in the model, or a roof
     that was painted on the ground, appears blurred. The share of the photograph's contrast in the render is the
@@ -157,7 +157,7 @@ class SurfaceViews:
     Args:
         folder: scratch folder, made if missing. It belongs to the maps alone: maps that are there are continued.
         colours: keep the colours of the renders too.
-        confirmed: keep only depths where the render shows its photograph (`shows_photograph`).
+        confirmed: keep only depths where render and photograph agree (`photo_consistent`).
 
     Raises:
         InputError: the maps do not fit on the disk.
@@ -253,7 +253,7 @@ class SurfaceViews:
             for index in self.cameras[done:]:
                 depth, rgb = renderer.surface(index)
                 if self._confirmed:
-                    depth[~shows_photograph(rgb, renderer.images.image(index))] = 0
+                    depth[~photo_consistent(rgb, renderer.images.image(index))] = 0
                 maps: tuple[NDArray[Any], ...] = depth, rgb
                 for handle, values in zip(handles, maps, strict=False):
                     handle.write(values.tobytes())

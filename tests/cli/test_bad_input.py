@@ -58,17 +58,19 @@ GCP = "--gcp {here}/gcp.txt"
 
 REFUSED = (
     # positions
-    Case("missing file", {}, CSV, "t.csv [--trajectory] no-such-file"),
-    Case("empty table", {"t.csv": b" \n"}, CSV, "t.csv file-empty"),
-    Case("header only", {"t.csv": b"image,lat,lon,alt\n"}, CSV, "t.csv no-rows"),
-    Case("no header", {"t.csv": b"IMG_0000.JPG,46,7,500\n"}, CSV, "t.csv:1 header-missing"),
-    Case("not text", {"t.csv": b"\xff\xfe\x00"}, CSV, "t.csv:1 not-utf8"),
-    Case("no number", {"t.csv": positions("IMG_0003.JPG,46.02,east,500")}, CSV, "t.csv:5 [longitude] not-a-number"),
+    Case("missing file", {}, CSV, "t.csv [--trajectory]: no such file or folder"),
+    Case("empty table", {"t.csv": b" \n"}, CSV, "t.csv: the file is empty"),
+    Case("header only", {"t.csv": b"image,lat,lon,alt\n"}, CSV, "t.csv: the table has no rows of data"),
+    Case("no header", {"t.csv": b"IMG_0000.JPG,46,7,500\n"}, CSV, "t.csv:1: the first line must be a header"),
+    Case("not text", {"t.csv": b"\xff\xfe\x00"}, CSV, "t.csv:1: the text is not UTF-8: save the file as UTF-8"),
+    Case(
+        "no number", {"t.csv": positions("IMG_0003.JPG,46.02,east,500")}, CSV, "t.csv:5 [longitude]: 'east' is no"
+    ),
     Case(
         "decimal commas between commas",
         {"t.csv": positions("IMG_0003.JPG,46,02,7,7503,500")},
         CSV,
-        "t.csv:5 wrong-columns",
+        "t.csv:5: the line has 6 cells, the header has 4; decimal commas need ; as separator",
     ),
     Case(
         "latitude out of range",
@@ -114,14 +116,14 @@ REFUSED = (
         "geo.txt cut off",
         {"geo.txt": b"EPSG:4326\nIMG_0000.JPG 7.75\n"},
         GEO,
-        "geo.txt:2 wrong-columns",
+        "geo.txt:2: the line has 2 columns, expected 3, 4, 7 or 9: image x y [z] [yaw pitch roll] [h_acc v_acc]",
     ),
     # ground points
     Case(
         "cut off mark",
         {"gcp.txt": marks("7.75 46.02 500 10")},
         GCP,
-        "gcp.txt:4 wrong-columns",
+        "gcp.txt:4: the line has 4 columns, expected at least",
     ),
     Case(
         "mark that is no number",

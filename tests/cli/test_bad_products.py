@@ -77,8 +77,11 @@ def test_damaged_product(real_georef: Georef, made: Path, case: tuple[str, str, 
 @pytest.mark.parametrize(
     ("data", "told"),
     [
-        (b"ply\n", "gaussians.ply: not a PLY file"),
-        (b"ply\nformat ascii 1.0\nelement vertex 1\nend_header\n", "expected a PLY of format binary_little_endian"),
+        (b"ply\n", "gaussians.ply: the file is not a PLY file"),
+        (
+            b"ply\nformat ascii 1.0\nelement vertex 1\nend_header\n",
+            "the format of the PLY is not binary_little_endian",
+        ),
         (
             b"ply\nformat binary_little_endian 1.0\nelement vertex 9999999999\nproperty float x\nend_header\n",
             "gaussians.ply: the header promises 9999999999 Gaussians of 4 bytes, the file holds 0 bytes",
@@ -118,7 +121,7 @@ def test_cuda_without_gpu(real_georef: Georef, made: Path) -> None:
     assert real_georef("run", made, "--to", "init-sim3").code == 0
     result = real_georef("train", made, "--backend", "cuda", "--preset", "smoke")
     result.assert_failed(1)
-    assert "error: the cuda backend cannot be used: no " in result.err.splitlines()[-1]
+    assert "error: The cuda backend cannot be used: no " in result.err.splitlines()[-1]
     assert "Install NVIDIA's driver" in result.err.splitlines()[-1]
     assert not (made / "train").exists()
 
@@ -137,12 +140,12 @@ def test_points_of_another_model(real_georef: Georef, made: Path) -> None:
 @pytest.mark.parametrize(
     ("files", "told"),
     [
-        ({"notes.txt": b"hello"}, "not a readable COLMAP model"),
+        ({"notes.txt": b"hello"}, "the folder has no COLMAP model"),
         (
             dict.fromkeys(("cameras.bin", "images.bin", "points3D.bin"), b"\xff" * 64),
             "shorter than the number of",
         ),
-        ({"cameras.txt": b"1 PINHOLE x\n", "images.txt": b"", "points3D.txt": b""}, "not a readable COLMAP model"),
+        ({"cameras.txt": b"1 PINHOLE x\n", "images.txt": b"", "points3D.txt": b""}, "COLMAP cannot read the model"),
     ],
     ids=["no model", "forged", "text without numbers"],
 )

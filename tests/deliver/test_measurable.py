@@ -23,10 +23,10 @@ from pipelines.geodesy.enu import enu_from_ecef
 from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity
+from pipelines.splat.appearance import ShownView, refine_appearance, shuffled_passes
 from pipelines.splat.gaussians import Gaussians, read_gaussians, write_gaussians
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
-from pipelines.splat.repainting import ShownView, repainted, shuffled_passes
 from pipelines.surface.fusion import SurfaceCloud
 from pipelines.survey.calibrated import load_survey
 from tests.refusals import refused
@@ -108,7 +108,7 @@ def looking_down() -> torch.Tensor:
     return torch.tensor(matrix).float()
 
 
-def test_repainting_finds_the_colours_and_moves_nothing() -> None:
+def test_appearance_refinement_finds_the_colours_and_moves_nothing() -> None:
     """Grey discs are shown images of the true ones, from twelve sides, and look alike from another."""
     discs, _ = with_discs(displaced(np.zeros(0), slope(21)), slope(21), GEO_FROM_MODEL, SPACING_M)
     grey = Gaussians(**{**discs.tensors(), "sh": torch.zeros_like(discs.sh)})
@@ -122,7 +122,7 @@ def test_repainting_finds_the_colours_and_moves_nothing() -> None:
     poses[12] = looking_down()
     shown = [ShownView(pose, camera, rasterizer.render(discs, pose, camera, settings).colour) for pose in poses]
     order = shuffled_passes(12, 20, np.random.default_rng(1))
-    after = repainted(grey, shown.__getitem__, order, rasterizer, settings)
+    after = refine_appearance(grey, shown.__getitem__, order, rasterizer, settings)
     for name in ("means", "quats_wxyz", "log_scales"):
         assert torch.equal(after.tensors()[name], grey.tensors()[name])
     error = [
@@ -147,8 +147,8 @@ def test_command_puts_centres_on_the_surface(
         load_json(GeorefSidecar, sidecar_path(workspace.path(SPLAT))),
         workspace.path(SPLAT).read_bytes(),
     )
-    unpainted, values = (
-        run_stage(workspace, BY_NAME["export-measurable"], {"repaint_passes": passes}).manifest.values
+    unrefined, values = (
+        run_stage(workspace, BY_NAME["export-measurable"], {"appearance_passes": passes}).manifest.values
         for passes in (0, 2)
     )
     told = re.search(r"about (\d+) discs [\d.]+ m apart, ([\d.]+) MB and ", caplog.text)
@@ -175,7 +175,7 @@ def test_command_puts_centres_on_the_surface(
     above_m = (in_geo[:, 2] - ground_height(in_geo[:, 0], in_geo[:, 1]))[inner]
     # As for the point cloud: the hill is made of level discs, of which a pixel of 0.47 m shows sides and rims.
     assert np.sqrt(np.mean(above_m**2)) < values["spacing_m"] / 0.7
-    assert 0 > values["psnr_change_db"] > unpainted["psnr_change_db"]
+    assert 0 > values["psnr_change_db"] > unrefined["psnr_change_db"]
 
 
 def test_too_many_discs_are_refused(

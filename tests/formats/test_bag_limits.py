@@ -17,6 +17,7 @@ from pipelines.core.errors import InputError
 from pipelines.formats.bag import open_bag
 from pipelines.formats.bag_limits import MAX_CHUNK_BYTES, unpacked
 from tests import bags
+from tests.refusals import refused
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -58,7 +59,7 @@ def mcap(*chunks: tuple[int, int, int, bytes], index: list[bytes] | None = None)
     )
 
 
-def refused(path: Path, data: bytes) -> str:
+def refusal(path: Path, data: bytes) -> InputError:
     """The error of opening these bytes as a bag, which take no memory."""
     path.write_bytes(data)
     tracemalloc.start()
@@ -68,30 +69,35 @@ def refused(path: Path, data: bytes) -> str:
         assert tracemalloc.get_traced_memory()[1] < 64 * 2**20
     finally:
         tracemalloc.stop()
-    return str(caught.value)
+    return caught.value
 
 
 ZEROS = zstd.compress(bytes(100 * 2**20))
 
 
 @pytest.mark.parametrize(
-    ("data", "message"),
+    ("data", "code", "words"),
     [
-        (mcap((0, 1, MAX_CHUNK_BYTES + 1, b"x")), "has a chunk of 200 MiB"),
-        (mcap((0, 1, 2**60, b"x")), "has a chunk of 1099511627776 MiB"),
-        (mcap(*[(0, 9, 100 * 2**20, ZEROS)] * 60), "has chunks of the same moment of 6000 MiB"),
-        (mcap((0, 1, 9, b"x"), index=[indexed(0, 1, 25, 2**40, b"x")]), "index does not agree with the chunk at"),
-        (mcap((0, 1, 9, b"x"), index=[indexed(0, 1, 7, 9, b"x")]), "index does not agree with the chunk at 7"),
-        (mcap((0, 1, 9, b"x"), index=[indexed(0, 1, 25, 9, b"x")] * 2), "is in the index twice"),
-        (MAGIC + record(1, b"", 2**50) + MAGIC, "claims 1125899906842624 bytes, 0 follow"),
-        (MAGIC + record(6, struct.pack("<QQQI", 0, 1, 9, 0) + text("") + b"\xff" * 8) + MAGIC, "larger than its"),
-        (MAGIC + record(6, bytes(28) + b"\xff" * 4 + bytes(8)) + MAGIC, "larger than its record"),
-        (b"nothing", "is no bag, or is damaged"),
+        (mcap((0, 1, MAX_CHUNK_BYTES + 1, b"x")), "chunk-too-large", "200 MiB"),
+        (mcap((0, 1, 2**60, b"x")), "chunk-too-large", "1099511627776 MiB"),
+        (mcap(*[(0, 9, 100 * 2**20, ZEROS)] * 60), "chunks-overlap", "6000 MiB"),
+        (mcap((0, 1, 9, b"x"), index=[indexed(0, 1, 25, 2**40, b"x")]), "bag-damaged", "with the chunk at"),
+        (mcap((0, 1, 9, b"x"), index=[indexed(0, 1, 7, 9, b"x")]), "bag-damaged", "with the chunk at 7"),
+        (mcap((0, 1, 9, b"x"), index=[indexed(0, 1, 25, 9, b"x")] * 2), "bag-damaged", "in the index twice"),
+        (MAGIC + record(1, b"", 2**50) + MAGIC, "bag-damaged", "1125899906842624 bytes, 0 follow"),
+        (
+            MAGIC + record(6, struct.pack("<QQQI", 0, 1, 9, 0) + text("") + b"\xff" * 8) + MAGIC,
+            "bag-damaged",
+            "larger than its",
+        ),
+        (MAGIC + record(6, bytes(28) + b"\xff" * 4 + bytes(8)) + MAGIC, "bag-damaged", "larger than its record"),
+        (b"nothing", "bag-damaged", ""),
     ],
     ids=["chunk", "huge chunk", "overlap", "index", "offset", "twice", "record", "data", "name", "no mcap"],
 )
-def test_mcap_that_claims_too_much(tmp_path: Path, data: bytes, message: str) -> None:
-    assert message in refused(tmp_path / "a.mcap", data)
+def test_mcap_that_claims_too_much(tmp_path: Path, data: bytes, code: str, words: str) -> None:
+    error = refusal(tmp_path / "a.mcap", data)
+    assert error.code == code and words in error.message
 
 
 def test_frames_unpack_up_to_the_limit() -> None:
@@ -107,7 +113,7 @@ def test_frames_unpack_up_to_the_limit() -> None:
 def test_chunk_that_unpacks_to_more_than_it_states(tmp_path: Path) -> None:
     """Its own size is small; the frame's is not. Without an index it is unpacked while the bag is opened."""
     data = mcap((0, 1, 9, ZEROS), index=[])
-    assert "damaged" in refused(tmp_path / "a.mcap", data)
+    assert refusal(tmp_path / "a.mcap", data).code == "bag-damaged"
 
 
 def test_metadata_and_files_of_a_folder(tmp_path: Path) -> None:
@@ -115,19 +121,19 @@ def test_metadata_and_files_of_a_folder(tmp_path: Path) -> None:
         pytest.skip("no pipes in folders")
     (tmp_path / "metadata.yaml").write_text("{}")
     os.mkfifo(tmp_path / "a.db3")
-    with (
-        pytest.raises(InputError, match=r"a\.db3 \[--bag\]: cannot be read: it is a named pipe"),
-        open_bag(tmp_path),
-    ):
+    with refused("not-a-file", InputError) as error, open_bag(tmp_path):
         pass
+    assert (error.value.path, error.value.field) == (tmp_path / "a.db3", "--bag")
+    assert "a named pipe" in error.value.message
     os.mkfifo(tmp_path / "b.bag")
-    with pytest.raises(InputError, match="it is a named pipe"), open_bag(tmp_path / "b.bag"):
+    with refused("not-a-file", InputError), open_bag(tmp_path / "b.bag"):
         pass
     (tmp_path / "a.db3").unlink()
     with (tmp_path / "metadata.yaml").open("wb") as handle:
         handle.truncate(2**30)
-    with pytest.raises(InputError, match=r"1024 MiB is too large for a metadata\.yaml"), open_bag(tmp_path):
+    with refused("file-too-large", InputError) as error, open_bag(tmp_path):
         pass
+    assert "1024 MiB" in error.value.message and "metadata.yaml" in error.value.message
 
 
 @pytest.mark.parametrize("name", ["message_count: some", "message_count: 1.5"])
@@ -139,7 +145,7 @@ def test_metadata_with_a_count_that_is_none(tmp_path: Path, name: str) -> None:
     changed = text[:at].replace("message_count: 3", name) if "- message_count: 3" in text[:at] else text
     changed = text.replace("- message_count: 3", f"- {name}") if changed == text else changed + text[at:]
     (path / "metadata.yaml").write_text(changed)
-    with pytest.raises(InputError, match="is damaged"), open_bag(path):
+    with refused("bag-damaged", InputError), open_bag(path):
         pass
 
 
@@ -156,5 +162,5 @@ def test_sqlite_with_a_number_in_place_of_bytes(tmp_path: Path) -> None:
     with contextlib.closing(sqlite3.connect(file)) as base:
         base.execute("UPDATE topics SET name = x'00ff'")
         base.commit()
-    with pytest.raises(InputError, match="is damaged"), open_bag(file):
+    with refused("bag-damaged", InputError), open_bag(file):
         pass

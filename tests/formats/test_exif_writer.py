@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from pipelines.core.errors import InputError
 from pipelines.formats.exif_writer import DroneTags, with_tags
+from tests.refusals import refused
 
 TAGS = DroneTags(
     width=64, height=48, focal_px=54.4, stamp_ns=1_700_000_002_250_000_000,
@@ -91,5 +92,5 @@ def test_picture_is_untouched() -> None:
 
 
 def test_other_files_are_refused() -> None:
-    with pytest.raises(InputError, match="not a JPEG"):
+    with refused("not-a-jpeg", InputError):
         with_tags(b"\x89PNG\r\n", TAGS)

@@ -10,6 +10,7 @@ import pytest
 from pipelines.core.errors import InputError
 from pipelines.formats.ground_points import read_geo, read_ground_points
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
+from tests.refusals import refused
 
 
 def _write(tmp_path: Path, text: str, name: str = "geo.txt") -> Path:
@@ -50,21 +51,32 @@ def test_pitch_zero_of_geo_txt_looks_straight_down(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("text", "code", "line", "field", "words"),
     [
-        ("", r"geo\.txt: is empty"),
-        ("EPSG:4326\n", r"geo\.txt: has a CRS but no rows"),
-        ("a.jpg 7.75 46.02 1620\nb.jpg 7.75 46.02 1620\n", r"geo\.txt:1: the first line must be the CRS"),
-        ("EPSG:4326\na.jpg 7.75\n", r"geo\.txt:2: has 2 columns, expected 3, 4, 7 or 9"),
-        ("EPSG:4326\na.jpg 7.75 46.02 1620 0.02 0.03\n", r"geo\.txt:2: has 6 columns, expected 3, 4, 7 or 9"),
-        ("EPSG:4326\na.jpg,7.75,46.02\n", r"geo\.txt:2: has 1 columns.*separate columns by spaces"),
-        ("EPSG:4326\na.jpg 7,75 46,02 3\n", r"geo\.txt:2 \[x\]: '7,75' is no number: write decimals with a point"),
-        ("EPSG:4326\na.jpg 7 46 3 0 0 0 0 0.1\n", r"geo\.txt:2 \[h_acc, v_acc\]: must be above zero"),
+        ("", "file-empty", None, None, ""),
+        ("EPSG:4326\n", "no-rows", None, None, ""),
+        ("a.jpg 7.75 46.02 1620\nb.jpg 7.75 46.02 1620\n", "crs-missing", 1, None, ""),
+        ("EPSG:4326\na.jpg 7.75\n", "wrong-columns", 2, None, "2 columns, expected 3, 4, 7 or 9"),
+        (
+            "EPSG:4326\na.jpg 7.75 46.02 1620 0.02 0.03\n",
+            "wrong-columns",
+            2,
+            None,
+            "6 columns, expected 3, 4, 7 or",
+        ),
+        ("EPSG:4326\na.jpg,7.75,46.02\n", "wrong-columns", 2, None, "separate columns by spaces"),
+        ("EPSG:4326\na.jpg 7,75 46,02 3\n", "not-a-number", 2, "x", "write decimals with a point"),
+        ("EPSG:4326\na.jpg 7 46 3 0 0 0 0 0.1\n", "sigma-not-positive", 2, "h_acc, v_acc", "0 and 0.1 m"),
     ],
 )
-def test_geo_refusals(tmp_path: Path, text: str, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        read_geo(_write(tmp_path, text))
+def test_geo_refusals(
+    tmp_path: Path, text: str, code: str, line: int | None, field: str | None, words: str
+) -> None:
+    path = _write(tmp_path, text)
+    with refused(code, InputError) as error:
+        read_geo(path)
+    assert (error.value.path, error.value.line, error.value.field) == (path, line, field)
+    assert words in error.value.message
 
 
 def test_ground_points_with_and_without_names(tmp_path: Path) -> None:
@@ -86,16 +98,21 @@ def test_ground_points_with_and_without_names(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("text", "code", "line", "field", "words"),
     [
-        ("7.75 46.02 1620 100 200 a.jpg G1\n", r"gcp_list\.txt:1: the first line must be the CRS"),
-        ("EPSG:4326\n7.75 46.02 1620 100 200\n", r"gcp_list\.txt:2: has 5 columns, expected at least 6"),
-        ("EPSG:4326\n7.75,46.02,1620,100,200,a.jpg\n", r"gcp_list\.txt:2: .*separate columns by spaces or tabs"),
-        ("EPSG:4326\n7.75 46.02 nan 100 200 a.jpg G1\n", r"gcp_list\.txt:2 \[z\]: is not a number"),
-        ("EPSG:4326\n7,75 46,02 1620 100 200 a.jpg G1\n", r"gcp_list\.txt:2 \[x\]: '7,75' is no number"),
-        ("EPSG:4326\n", r"gcp_list\.txt: has a CRS but no rows"),
+        ("7.75 46.02 1620 100 200 a.jpg G1\n", "crs-missing", 1, None, ""),
+        ("EPSG:4326\n7.75 46.02 1620 100 200\n", "wrong-columns", 2, None, "5 columns, expected at least 6"),
+        ("EPSG:4326\n7.75,46.02,1620,100,200,a.jpg\n", "wrong-columns", 2, None, "separate columns by spaces"),
+        ("EPSG:4326\n7.75 46.02 nan 100 200 a.jpg G1\n", "number-missing", 2, "z", ""),
+        ("EPSG:4326\n7,75 46,02 1620 100 200 a.jpg G1\n", "not-a-number", 2, "x", "'7,75'"),
+        ("EPSG:4326\n", "no-rows", None, None, ""),
     ],
 )
-def test_ground_point_refusals(tmp_path: Path, text: str, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        read_ground_points(_write(tmp_path, text, "gcp_list.txt"))
+def test_ground_point_refusals(
+    tmp_path: Path, text: str, code: str, line: int | None, field: str | None, words: str
+) -> None:
+    path = _write(tmp_path, text, "gcp_list.txt")
+    with refused(code, InputError) as error:
+        read_ground_points(path)
+    assert (error.value.path, error.value.line, error.value.field) == (path, line, field)
+    assert words in error.value.message

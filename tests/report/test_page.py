@@ -161,7 +161,7 @@ def test_photograph_that_changed_is_refused(reported: Reported) -> None:
     trained = reported.survey.solved
     images = tuple(image.model_copy(update={"sha256": "0" * 64}) for image in trained.survey.images)
     changed = replace(trained, survey=trained.survey.model_copy(update={"images": images}))
-    with pytest.raises(InputError, match="has changed since `georef ingest` read it"):
+    with refused("photograph-changed", InputError):
         points_facts(replace(reported.survey, solved=changed), 1, SILENT)
 
 

@@ -26,7 +26,7 @@ from pipelines.sfm.imported_model import import_model
 from pipelines.sfm.options import SfmOptions
 from pipelines.sfm.stage import _summarise, run
 from pipelines.survey.survey import Fix, Survey, SurveyedPoint
-from tests.refusals import numbers, refused, said
+from tests.refusals import refused
 from tests.sfm_scenes import CONFIG, HEIGHT, IMAGES, WIDTH, Photographs, survey_of
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -149,7 +149,7 @@ def test_import_of_a_truncated_model_is_refused(tmp_path: Path, mapped: Workspac
     shutil.copytree(mapped.path(SPARSE), broken)
     points = broken / "points3D.bin"
     points.write_bytes(points.read_bytes()[:200])
-    with quiet_colmap(), pytest.raises(InputError, match="truncated"):
+    with quiet_colmap(), refused("file-cut-off", InputError):
         import_model(broken, survey_of(["a.jpg"]))
 
 
@@ -206,7 +206,7 @@ def test_photographs_that_were_replaced_after_ingest_are_refused(photographs: Ph
     job = SfmJob(survey.model_copy(update={"images": others}), photographs.folder, tmp_path / "database.db", CONFIG)
     with (
         quiet_colmap() as colmap,
-        pytest.raises(InputError) as error,
+        refused("photograph-changed", InputError),
     ):
         reconstruct(colmap, job, SILENT)
     assert error.value.path == photographs.folder / photographs.names[0]

@@ -7,6 +7,7 @@ import pytest
 
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.splat.exposure import PointColours, adjusted_exposures
+from tests.refusals import refused
 
 NOISE = 0.01
 
@@ -70,5 +71,5 @@ def test_chunks_of_points_do_not_change_the_result(monkeypatch: pytest.MonkeyPat
 
 def test_single_observations_are_refused() -> None:
     lone = PointColours(np.arange(4), np.arange(4), np.full((4, 3), 0.5, dtype=np.float32))
-    with pytest.raises(DegenerateGeometryError, match="two photographs"):
+    with refused("no-common-points", DegenerateGeometryError):
         adjusted_exposures(lone, 4)

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from pipelines.core.errors import InputError
-from pipelines.splat.metrics import Lpips
+from pipelines.splat.metrics import Lpips, _shapes
+from tests.refusals import refused
 
 VGG16 = (64, 64, "M", 128, 128, "M", 256, 256, 256, "M", 512, 512, 512, "M", 512, 512, 512)
 TAKEN = (3, 8, 15, 22, 29)  # the last ReLU before each pooling
@@ -89,6 +90,10 @@ def test_files_that_are_no_weights_are_refused(tmp_path: Path) -> None:
     np.savez(path, something=np.zeros(3))
     with pytest.raises(InputError, match=r"net\.slice1\.0\.weight"):
         Lpips(path)
+    np.savez(path, **dict.fromkeys(_shapes(), np.zeros(3)))
+    with refused("lpips-weights", InputError) as error:
+        Lpips(path)
+    assert error.value.path == path and error.value.field in _shapes()
     path.write_bytes(b"PK\x03\x04 not an archive")
-    with pytest.raises(InputError, match="NPZ"):
+    with refused("npz-damaged", InputError):
         Lpips(path)

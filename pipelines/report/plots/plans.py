@@ -149,13 +149,13 @@ def add_legend(figure: Figure, columns: int = 4) -> None:
 def add_names(figure: Figure, axes: Axes, places: FloatArray, names: Sequence[str], others: FloatArray) -> int:
     """Write names beside places (N, 2), as many as cover no sign and no other name, and return their number.
 
-    `others` (M, 2) are places of further signs.
+    `others` (M, 2) are places of further symbols.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     renderer = FigureCanvasAgg(figure).get_renderer()  # type: ignore[no-untyped-call]
     taken = [text.get_window_extent(renderer) for text in axes.texts]
-    signs = axes.transData.transform(np.concatenate([places, others]))
+    symbols = axes.transData.transform(np.concatenate([places, others]))
     inside, written = axes.get_window_extent(renderer), 0
     for place, name in zip(places, names, strict=True):
         for across, along in _SIDES:
@@ -172,7 +172,7 @@ def add_names(figure: Figure, axes: Axes, places: FloatArray, names: Sequence[st
                 parse_math=False,  # A name may hold what is a formula elsewhere.
             )
             box = text.get_window_extent(renderer)
-            free = not any(box.overlaps(other) for other in taken) and not _holds_any(box, signs)
+            free = not any(box.overlaps(other) for other in taken) and not _holds_any(box, symbols)
             if free and inside.contains(box.x0, box.y0) and inside.contains(box.x1, box.y1):
                 taken.append(box)
                 written += 1

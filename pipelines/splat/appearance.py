@@ -1,4 +1,4 @@
-"""Colours and opacities of Gaussians such that they show given images, while their geometry stays."""
+"""Appearance refinement: colours and opacities of Gaussians are fitted to images, while their geometry stays."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class ShownView:
     colour: Tensor
 
 
-def repainted(
+def refine_appearance(
     gaussians: Gaussians,
     views: Callable[[int], ShownView],
     order: list[int],
@@ -47,7 +47,7 @@ def repainted(
     """
     device = device_of(rasterizer)
     adam = GaussianAdam(gaussians.to(device), 1.0, len(order), _RATES)
-    with progress.task("repainting", len(order)) as task:
+    with progress.task("appearance refinement", len(order)) as task:
         for iteration, number in enumerate(order):
             view = views(number)
             adam.rate_factor = next(factor for begin, factor in _FALLS if iteration >= begin * len(order))
