@@ -18,7 +18,7 @@ from tests.cli_runs import REPOSITORY, Result, finish
 
 PATIENCE_S = 180.0
 # Jobs of these clusters are this program in place of `georef`.
-_PRELOAD = "from pipelines.core import restart\nrestart.THIS_PROGRAM = ('-c', {program!r})\n"
+_PRELOAD = "from pipelines.core import child\nchild.THIS_PROGRAM = ('-c', {program!r})\n"
 
 
 def finish_patiently(process: subprocess.Popen[str]) -> Result:

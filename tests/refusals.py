@@ -24,6 +24,11 @@ def codes(remarks: Iterable[Remark]) -> list[str]:
     return [remark.code for remark in remarks]
 
 
+def logged_codes(caplog: pytest.LogCaptureFixture) -> list[str]:
+    """Return the codes of the warnings that were logged."""
+    return [record.code for record in caplog.records if hasattr(record, "code")]
+
+
 def said(remarks: Iterable[Remark], code: str) -> str:
     """Return the sentence of the only remark with a code."""
     (sentence,) = (remark.sentence for remark in remarks if remark.code == code)

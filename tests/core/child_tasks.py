@@ -25,7 +25,7 @@ def work(arguments: Mapping[str, Any], progress: Progress) -> Any:
             sys.stdout.write("chatter of a library\n")
             return sum(arguments["numbers"])
         case "refuse":
-            raise DegenerateGeometryError("points-lie-on-line", "the points lie on a line")
+            raise DegenerateGeometryError("points-on-a-line", "The points lie on a line.")
         case "defect":
             raise ZeroDivisionError("a defect")
         case "abort":

@@ -15,6 +15,7 @@ import pytest
 
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size, read_npz
+from tests.refusals import numbers, refused
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="no pipes and devices in folders")
 
@@ -23,8 +24,10 @@ def test_size_of_a_file_and_of_what_a_link_leads_to(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"123")
     (tmp_path / "link").symlink_to(tmp_path / "a")
     assert file_size(tmp_path / "link", limit_bytes=3) == 3
-    with pytest.raises(InputError, match=r"a \[--gcp\]: 0 MiB is too large for a text table \(limit 0 MiB\)"):
+    with refused("file-too-large", InputError) as error:
         file_size(tmp_path / "a", limit_bytes=2, kind="text table", field="--gcp")
+    assert str(error.value).startswith(f"{tmp_path / 'a'} [--gcp]: ")
+    assert numbers(error.value.message) == [0, 0]  # MiB
 
 
 def test_what_is_no_file_is_refused(tmp_path: Path) -> None:
@@ -41,8 +44,11 @@ def test_what_is_no_file_is_refused(tmp_path: Path) -> None:
         (tmp_path / "gone", "No such file or directory"),
         (Path("a\0b"), "embedded null (byte|character)"),
     ):
-        with pytest.raises(InputError, match=f"cannot be read: .*{kind}"):
+        with refused(
+            "file-unreadable" if kind[0].isupper() or "null" in kind else "not-a-file", InputError
+        ) as error:
             file_size(path)
+        assert kind in str(error.value)
 
 
 def test_arrays_are_read_as_written(tmp_path: Path) -> None:
@@ -66,22 +72,23 @@ def forged(shape: str, content: bytes, descr: str = "<f8") -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("shape", "descr", "message"),
+    ("shape", "descr", "cause"),
     [
         ("(1000000000000,)", "<f8", "promises 8000000000000 bytes, the entry holds 16"),
-        ("(10**9,)", "<f8", "not a readable NPZ file"),
-        ("(-2, -1)", "<f8", "not a readable NPZ file"),
-        ("(2.0,)", "<f8", "not a readable NPZ file"),
+        ("(10**9,)", "<f8", ""),
+        ("(-2, -1)", "<f8", ""),
+        ("(2.0,)", "<f8", ""),
         ("(1,)", "|O", "allow_pickle=False"),
-        ("(1,", "<f8", "not a readable NPZ file"),
-        ("(" * 300 + "1" + ",)" * 300, "<f8", "not a readable NPZ file"),
+        ("(1,", "<f8", ""),
+        ("(" * 300 + "1" + ",)" * 300, "<f8", ""),
     ],
     ids=["huge", "product", "negative", "fraction", "objects", "unclosed", "nested"],
 )
-def test_headers_are_checked_before_the_data(tmp_path: Path, shape: str, descr: str, message: str) -> None:
+def test_headers_are_checked_before_the_data(tmp_path: Path, shape: str, descr: str, cause: str) -> None:
     (tmp_path / "a.npz").write_bytes(forged(shape, bytes(16), descr))
-    with pytest.raises(InputError, match=message):
+    with refused("file-damaged", InputError) as error:
         read_npz(tmp_path / "a.npz", ("a",))
+    assert cause in str(error.value)
 
 
 def test_zeros_that_unpack_to_more_than_the_limit_are_refused_unread(tmp_path: Path) -> None:
@@ -91,5 +98,6 @@ def test_zeros_that_unpack_to_more_than_the_limit_are_refused_unread(tmp_path: P
         archive.open("a.npy", "w") as entry,
     ):
         entry.write(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + bytes(300 * 2**20))
-    with pytest.raises(InputError, match=r"its arrays unpack to 300 MiB \(limit 256\)"):
+    with refused("file-damaged", InputError) as error:
         read_npz(tmp_path / "a.npz", ("a",))
+    assert numbers(error.value.message) == [300, 256]  # MiB

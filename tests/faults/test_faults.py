@@ -146,10 +146,10 @@ def test_changes_of_the_table_of_a_batch(tmp_path: Path, kind: Kind) -> None:
     mission = Mission("north", Workspace(tmp_path / "north"), "north")
     listed = MissionList("valley", tmp_path, (mission,))
     with Disk(tmp_path).mounted() as disk:
-        run_batch(listed, [PlannedMission(mission, {})], Ending(), SILENT)
+        run_batch(listed, [PlannedMission(mission, {})], InstantEngine(), SILENT)
     begun = len(disk.changes) // 3  # of the tables at the beginning, after the mission, and at the end
     for at in (1, begun + 1, 2 * begun + 1):
-        engine, told = Ending(), ""
+        engine, told = InstantEngine(), ""
         try:
             with Disk(tmp_path, kind, at).mounted():
                 run_batch(listed, [PlannedMission(mission, {})], engine, SILENT)
@@ -160,7 +160,7 @@ def test_changes_of_the_table_of_a_batch(tmp_path: Path, kind: Kind) -> None:
         assert list(tmp_path.glob("*.tmp")) == []
 
 
-class Ending:
+class InstantEngine:
     """Engine whose jobs end at once."""
 
     ended = 0

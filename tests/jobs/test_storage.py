@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from pipelines.core.errors import BackendUnavailableError, InputError, StorageError
 from pipelines.jobs.engine import Job
 from pipelines.jobs.storage import EngineExchange, Storage, arguments_in, worker_exchange
+from tests.refusals import refused
 
 NAMES = st.text("abcé .-", min_size=1, max_size=4).filter(lambda name: name.strip(". ") == name)
 FOLDERS = st.dictionaries(st.lists(NAMES, min_size=1, max_size=3).map("/".join), st.binary(max_size=20), max_size=6)
@@ -103,24 +104,24 @@ def _edit(change: Callable[[dict[str, object]], object]) -> Callable[[bytes], by
 
 
 @pytest.mark.parametrize(
-    "damage",
+    ("damage", "code"),
     [
-        lambda _: b"{",
-        lambda _: b"[]",
-        _edit(lambda document: document.update(files={"../../escape": [1, 1]})),
-        _edit(lambda document: document.update(files={"/etc/passwd": [1, 1]})),
-        _edit(lambda document: document.update(part="other")),
-        _edit(lambda document: document.update(files={"a": ["x", 1]})),
-        _edit(lambda document: document.update(format_version=2)),
+        (lambda _: b"{", "index-damaged"),
+        (lambda _: b"[]", "index-damaged"),
+        (_edit(lambda document: document.update(files={"../../escape": [1, 1]})), "index-leaves-part"),
+        (_edit(lambda document: document.update(files={"/etc/passwd": [1, 1]})), "index-leaves-part"),
+        (_edit(lambda document: document.update(part="other")), "index-leaves-part"),
+        (_edit(lambda document: document.update(files={"a": ["x", 1]})), "index-damaged"),
+        (_edit(lambda document: document.update(format_version=2)), "index-damaged"),
     ],
 )
-def test_a_damaged_index_is_refused(tmp_path: Path, damage: Callable[[bytes], bytes]) -> None:
+def test_a_damaged_index_is_refused(tmp_path: Path, damage: Callable[[bytes], bytes], code: str) -> None:
     storage = Storage((tmp_path / "store").as_uri())
     write(tmp_path / "a/ws", {"one": b"1"})
     storage.send(tmp_path / "a", "ws", "engine")
     (index,) = (tmp_path / "store").glob("*.json")
     index.write_bytes(damage(index.read_bytes()))
-    with pytest.raises(InputError):
+    with refused(code, InputError):
         storage.fetch(tmp_path / "b", "ws")
     assert not (tmp_path / "b").exists()
 
@@ -132,16 +133,18 @@ def test_links_do_not_lead_out(tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "b/ws").mkdir(parents=True)
     (tmp_path / "b/ws/sub").symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(InputError, match="leads out"):
+    with refused("path-leaves-folder", InputError):
         storage.fetch(tmp_path / "b", "ws")
     assert not read(tmp_path / "elsewhere")
 
 
 def test_faults_of_the_store_are_told() -> None:
-    with pytest.raises(BackendUnavailableError, match="dropbox"):
+    with refused("missing-extra", BackendUnavailableError) as error:
         Storage("dropbox://x").check()
-    with pytest.raises(StorageError, match="nosuch"):
+    assert "dropbox" in str(error.value)
+    with refused("storage-unreachable", StorageError) as error:
         Storage("nosuch://x").check()
+    assert "nosuch" in str(error.value)
 
 
 class TestExchange:
@@ -192,7 +195,7 @@ class TestExchange:
         """It was cut off, and another worker has begun; then it comes back with what it has."""
         engine = EngineExchange(storage)
         with (
-            pytest.raises(StorageError, match="taken over"),
+            refused("attempt-superseded", StorageError),
             worker_exchange(engine.send(job, "1"), tmp_path / "cut off"),
         ):
             write(tmp_path / "cut off", {"ws/product": b"old"})
@@ -203,7 +206,8 @@ class TestExchange:
 
     def test_what_lies_outside_is_refused(self, storage: Storage, tmp_path: Path) -> None:
         job = Job("job", (), 0, folder=tmp_path / "base", writes=tmp_path / "base/ws", reads=(tmp_path / "photos",))
-        with pytest.raises(InputError, match="lies outside"):
+        with refused("path-leaves-folder", InputError):
             EngineExchange(storage).send(job, "1")
-        with pytest.raises(InputError, match="--storage"):
+        with refused("storage-not-supported", InputError) as error:
             EngineExchange(storage).send(Job("job", (), 0), "1")
+        assert error.value.field == "--storage"
