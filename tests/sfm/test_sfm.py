@@ -26,7 +26,7 @@ from pipelines.sfm.imported_model import import_model
 from pipelines.sfm.options import SfmOptions
 from pipelines.sfm.stage import _summarise, run
 from pipelines.survey.survey import Fix, Survey, SurveyedPoint
-from tests.refusals import refused
+from tests.refusals import numbers, refused, said
 from tests.sfm_scenes import CONFIG, HEIGHT, IMAGES, WIDTH, Photographs, survey_of
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -206,7 +206,7 @@ def test_photographs_that_were_replaced_after_ingest_are_refused(photographs: Ph
     job = SfmJob(survey.model_copy(update={"images": others}), photographs.folder, tmp_path / "database.db", CONFIG)
     with (
         quiet_colmap() as colmap,
-        refused("photograph-changed", InputError),
+        refused("photograph-changed", InputError) as error,
     ):
         reconstruct(colmap, job, SILENT)
     assert error.value.path == photographs.folder / photographs.names[0]
