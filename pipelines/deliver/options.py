@@ -37,8 +37,7 @@ class MeasurableOptions(SplatOptions):
         7,
         ge=0,
         le=1000,
-        description="With --measurable: passes of the appearance refinement over the training views, for the colours "
-        "of the discs.",
+        description="With --measurable: number of passes of the appearance refinement over the training views.",
     )
 
 

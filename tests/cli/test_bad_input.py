@@ -58,19 +58,17 @@ GCP = "--gcp {here}/gcp.txt"
 
 REFUSED = (
     # positions
-    Case("missing file", {}, CSV, "t.csv [--trajectory]: no such file or folder"),
-    Case("empty table", {"t.csv": b" \n"}, CSV, "t.csv: the file is empty"),
-    Case("header only", {"t.csv": b"image,lat,lon,alt\n"}, CSV, "t.csv: the table has no rows of data"),
-    Case("no header", {"t.csv": b"IMG_0000.JPG,46,7,500\n"}, CSV, "t.csv:1: the first line must be a header"),
-    Case("not text", {"t.csv": b"\xff\xfe\x00"}, CSV, "t.csv:1: the text is not UTF-8: save the file as UTF-8"),
-    Case(
-        "no number", {"t.csv": positions("IMG_0003.JPG,46.02,east,500")}, CSV, "t.csv:5 [longitude]: 'east' is no"
-    ),
+    Case("missing file", {}, CSV, "t.csv [--trajectory] no-such-file"),
+    Case("empty table", {"t.csv": b" \n"}, CSV, "t.csv file-empty"),
+    Case("header only", {"t.csv": b"image,lat,lon,alt\n"}, CSV, "t.csv no-rows"),
+    Case("no header", {"t.csv": b"IMG_0000.JPG,46,7,500\n"}, CSV, "t.csv:1 header-missing"),
+    Case("not text", {"t.csv": b"\xff\xfe\x00"}, CSV, "t.csv:1 not-utf8"),
+    Case("no number", {"t.csv": positions("IMG_0003.JPG,46.02,east,500")}, CSV, "t.csv:5 [longitude] not-a-number"),
     Case(
         "decimal commas between commas",
         {"t.csv": positions("IMG_0003.JPG,46,02,7,7503,500")},
         CSV,
-        "t.csv:5: the line has 6 cells, the header has 4; decimal commas need ; as separator",
+        "t.csv:5 wrong-columns",
     ),
     Case(
         "latitude out of range",
@@ -116,14 +114,14 @@ REFUSED = (
         "geo.txt cut off",
         {"geo.txt": b"EPSG:4326\nIMG_0000.JPG 7.75\n"},
         GEO,
-        "geo.txt:2: the line has 2 columns, expected 3, 4, 7 or 9: image x y [z] [yaw pitch roll] [h_acc v_acc]",
+        "geo.txt:2 wrong-columns",
     ),
     # ground points
     Case(
         "cut off mark",
         {"gcp.txt": marks("7.75 46.02 500 10")},
         GCP,
-        "gcp.txt:4: the line has 4 columns, expected at least",
+        "gcp.txt:4 wrong-columns",
     ),
     Case(
         "mark that is no number",
@@ -195,21 +193,22 @@ def test_refused(real_georef: Georef, flight: Path, case: Case) -> None:
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        ("--trajectory {here}/pipe", "pipe [--trajectory]: cannot be read: it is a named pipe, give a file"),
-        ("--trajectory /dev/zero", "/dev/zero [--trajectory]: cannot be read: it is a device, give a file"),
-        ("--geo {here}/pipe", "pipe [--geo]: cannot be read: it is a named pipe"),
-        ("--gcp {here}/pipe", "pipe [--gcp]: cannot be read: it is a named pipe"),
-        ("--bag {here}/pipe.bag", "cannot be read: it is a named pipe"),
+        ("--trajectory {here}/pipe", "pipe [--trajectory]: "),
+        ("--trajectory /dev/zero", "/dev/zero [--trajectory]: "),
+        ("--geo {here}/pipe", "pipe [--geo]: "),
+        ("--gcp {here}/pipe", "pipe [--gcp]: "),
+        ("--bag {here}/pipe.bag", "pipe.bag [--bag]: "),
     ],
 )
 def test_pipes_and_devices_are_refused_at_once(real_georef: Georef, flight: Path, options: str, told: str) -> None:
     os.mkfifo(flight / "pipe")
     os.mkfifo(flight / "pipe.bag")
     result = real_georef(
-        "ingest", flight / "ws", "--images", flight / "photos", *options.format(here=flight).split()
+        "ingest", flight / "ws", "--images", flight / "photos", *options.format(here=flight).split(), "--json"
     )
     result.assert_failed(1)
     assert told in result.err.splitlines()[-1]
+    assert result.document["error"]["code"] == "no-regular-file"
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no pipes and devices in folders")
@@ -217,41 +216,41 @@ def test_pipe_among_the_photographs_is_left_out(real_georef: Georef, flight: Pat
     os.mkfifo(flight / "photos/Z.JPG")
     result = real_georef("ingest", flight / "ws", "--images", flight / "photos")
     assert result.code == 0, result.err
-    assert "1 image was left out: Z.JPG (cannot be read: it is a named pipe, give a file)" in result.err
+    assert "(1): Z.JPG (" in result.err and "named pipe" in result.err
     (flight / "ws/georef.toml").unlink(missing_ok=True)
     os.mkfifo(flight / "ws/georef.toml")
-    assert "georef.toml: cannot be read: it is a named pipe" in real_georef("status", flight / "ws").err
+    assert "georef.toml: " in real_georef("status", flight / "ws").err
 
 
 COUNTED = (
-    Case("empty image", {"photos/E.JPG": b""}, "", "1 image was left out: E.JPG ("),
-    Case("damaged image", {"photos/D.JPG": jpeg(8)[:700]}, "", "1 image was left out: D.JPG ("),
-    Case("no image", {"photos/N.JPG": b"GIF89a"}, "", "1 image was left out: N.JPG ("),
+    Case("empty image", {"photos/E.JPG": b""}, "", "(1): E.JPG ("),
+    Case("damaged image", {"photos/D.JPG": jpeg(8)[:700]}, "", "(1): D.JPG ("),
+    Case("no image", {"photos/N.JPG": b"GIF89a"}, "", "(1): N.JPG ("),
     Case(
         "duplicate image",
         {"photos/A.JPG": jpeg(7), "photos/B.JPG": jpeg(7)},
         "",
-        "1 image is a copy of another and was left out: B.JPG (as A.JPG)",
+        "(1): B.JPG (as A.JPG)",
     ),
-    Case("mixed sizes", {"photos/L.JPG": jpeg(8, (96, 64))}, "", "images have 2 sizes (64×48, 96×64)"),
-    Case("no GPS on some", {"photos/Z.JPG": jpeg(8)}, "", "1 image has no position in EXIF: Z.JPG"),
+    Case("mixed sizes", {"photos/L.JPG": jpeg(8, (96, 64))}, "", "(64×48, 96×64)"),
+    Case("no GPS on some", {"photos/Z.JPG": jpeg(8)}, "", "EXIF (1): Z.JPG"),
     Case(
         "position out of range",
         {"photos/Z.JPG": jpeg(8, exif=Exif(gps=gps_entries(91.5, 7.75)))},
         "",
-        "1 image has no position in EXIF: Z.JPG",
+        "EXIF (1): Z.JPG",
     ),
     Case(
         "position far away",
         {"photos/Z.JPG": jpeg(8, exif=Exif(gps=gps_entries(-33.0, 151.0)))},
         "",
-        "1 position is far from the others and was left out: Z.JPG (",
+        "(1): Z.JPG (",
     ),
     Case(
         "name that is not here",
         {"t.csv": positions("DJI_9.JPG,46.02,7.75,500")},
         CSV,
-        "1 row names no image here: t.csv:5 (DJI_9.JPG)",
+        "(1): t.csv:5 (DJI_9.JPG)",
     ),
     Case("NaN", {"t.csv": positions("IMG_0003.JPG,nan,7.75,500")}, CSV, "t.csv:5"),
     Case("unknown column", {"t.csv": positions(header="image,lat,lon,alt,mood")}, CSV, "t.csv:1 (mood)"),
@@ -297,31 +296,31 @@ def test_read_as_meant(real_georef: Georef, flight: Path, data: bytes) -> None:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "told"),
+    ("spoil", "code"),
     [
         (
             lambda photos: [path.unlink() for path in sorted(photos.iterdir())[2:]],
-            "2 usable images, a survey needs 3",
+            "too-few-images",
         ),
-        (shutil.rmtree, "photos [--images]: no such file or folder"),
+        (shutil.rmtree, "no-such-file"),
         (
             lambda photos: [path.rename(path.with_suffix(".raw")) for path in photos.iterdir()],
-            "holds no JPEG, PNG or",
+            "no-images",
         ),
         (
             lambda photos: [path.write_bytes(jpeg(i)) for i, path in enumerate(sorted(photos.iterdir()))],
-            "no image has a position, and there are no ground control points: give --trajectory, --geo or --gcp",
+            "no-positions",
         ),
     ],
     ids=["two images", "no folder", "no images", "no positions at all"],
 )
 def test_photographs_that_make_no_survey(
-    real_georef: Georef, flight: Path, spoil: Callable[[Path], object], told: str
+    real_georef: Georef, flight: Path, spoil: Callable[[Path], object], code: str
 ) -> None:
     spoil(flight / "photos")
-    result = real_georef("ingest", flight / "ws", "--images", flight / "photos")
+    result = real_georef("ingest", flight / "ws", "--images", flight / "photos", "--json")
     result.assert_failed(1)
-    assert told in result.err.splitlines()[-1]
+    assert result.document["error"]["code"] == code
 
 
 @pytest.mark.parametrize(
