@@ -37,8 +37,8 @@ class MeasurableOptions(SplatOptions):
         7,
         ge=0,
         le=1000,
-        description="With --measurable: passes of the appearance refinement, which fits the colours of the discs, over "
-        "the training views.",
+        description="With --measurable: passes over the training views of the appearance refinement, which fits "
+        "the colours of the discs.",
     )
 
 
