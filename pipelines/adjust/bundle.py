@@ -93,8 +93,8 @@ def adjust_bundle(network: Network, sigma_px: FloatArray, surveyed: SurveyedPoin
             raise InputError("point-behind-camera", "A point lies behind a camera that observes it.")
         residual = projection_residuals(network)
         apart = network.point_in_world - target
-        pull = np.einsum("nij,nj->ni", information, apart)
-        sums = eliminate_points(network, 1.0 / sigma_px, information, residual=residual, pull=pull)
+        gradient = np.einsum("nij,nj->ni", information, apart)
+        sums = eliminate_points(network, 1.0 / sigma_px, information, residual=residual, surveyed_gradient=gradient)
         normal = NormalMatrix(
             sums.poses, np.zeros((0, sums.poses.shape[0])), np.zeros((0, 0)), network.cam_center_in_world
         )
@@ -102,13 +102,13 @@ def adjust_bundle(network: Network, sigma_px: FloatArray, surveyed: SurveyedPoin
         if (np.abs(residual - before) / sigma_px[:, None]).max() < _CONVERGED_SIGMAS:
             observed = 2 * len(sigma_px) + 3 * len(surveyed.point)
             redundancy = observed - 6 * len(network.camera_id) - 3 * len(network.point_in_world)
-            squares = float(((residual / sigma_px[:, None]) ** 2).sum() + (apart * pull).sum())
+            squares = float(((residual / sigma_px[:, None]) ** 2).sum() + (apart * gradient).sum())
             return AdjustedBundle(network, residual, np.sqrt(squares / redundancy), redundancy, normal, points)
         step, _ = normal.solve(-sums.pose_slope[:, None], np.zeros((0, 1)))
-        slope = np.zeros_like(pull)  # of half the weighted squares of the observations, by the points
+        slope = np.zeros_like(gradient)  # of half the weighted squares of the observations, by the points
         by_point, weighted = linearise_bundle(network).jacobian_point, residual / sigma_px[:, None] ** 2
         np.add.at(slope, network.obs_point, np.einsum("mij,mi->mj", by_point, weighted))
-        network, before = _moved(network, step[:, 0], points, pull + slope), residual
+        network, before = _moved(network, step[:, 0], points, gradient + slope), residual
     raise ConvergenceError(
         "bundle-not-converged",
         f"The bundle adjustment has not converged after {_STEPS} steps. Start with better cameras and points.",

@@ -37,7 +37,8 @@ class MeasurableOptions(SplatOptions):
         7,
         ge=0,
         le=1000,
-        description="With --measurable: number of passes of the appearance refinement over the training views.",
+        description="With --measurable: passes over the training views of the appearance refinement, which fits "
+        "the colours of the discs.",
     )
 
 

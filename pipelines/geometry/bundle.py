@@ -145,7 +145,7 @@ def similarity_modes(cam_center_in_world: FloatArray) -> FloatArray:
 
 _CHUNK = 2**19  # observations that are linearised together
 _RIDGE = 1e-12  # small: what it adds to each point holds the similarity of the whole as well
-# A camera with few observations is held to a tenth of its distance from the scene.
+# A camera with few observations is constrained to a tenth of its distance from the scene.
 _LOOSEST_RELATIVE_SIGMA = 0.1
 # Means of the weight w and of w r²/2 under Gaussian noise of σ = 1, where r²/2 is exponentially distributed. Robust
 # weights lower the sum of squares of pure noise: without these means the stated σ would be a fifth too small.
@@ -164,8 +164,8 @@ class EliminatedPoints:
     poses: bsr_matrix  # (6 n, 6 n) sparse, in blocks (6, 6)
     cross: FloatArray  # (6 n, L)
     lens: FloatArray  # (L, L)
-    pose_pull: FloatArray  # (6 n, 7) of the poses on the points' similarity
-    lens_pull: FloatArray  # (L, 7) of the lens on it
+    pose_modes: FloatArray  # (6 n, 7) of the poses on the points' similarity
+    lens_modes: FloatArray  # (L, 7) of the lens on it
     modes: FloatArray  # (7, 7) information on it
     pose_slope: FloatArray  # (6 n,)
     lens_slope: FloatArray  # (L,)
@@ -184,7 +184,7 @@ class BundleInformation:
         sums: the information.
         similarity_modes: (6 n, 7) as `geometry.bundle.similarity_modes`.
         unit: (6 n,) corrections that count as one metre at the scene.
-        loosest_sigma_m: σ in these units to which even a camera without observations is held.
+        loosest_sigma_m: σ in these units to which even a camera without observations is constrained.
         sigma_px: σ of an image coordinate, estimated from the residuals, or 1 where each observation has its own.
     """
 
@@ -197,8 +197,8 @@ class BundleInformation:
     @cached_property
     def followed(self) -> FloatArray:
         """Mean similarity (7, 6 n + L) of the points that follow cameras and lens."""
-        pull = np.concatenate([self.sums.pose_pull, self.sums.lens_pull])
-        return np.asarray(-np.linalg.solve(self.sums.modes, pull.T))
+        cross = np.concatenate([self.sums.pose_modes, self.sums.lens_modes])
+        return np.asarray(-np.linalg.solve(self.sums.modes, cross.T))
 
     @cached_property
     def lens_elimination(self) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -235,8 +235,8 @@ class BundleInformation:
                 poses=bsr_matrix((blocks, poses.indices, poses.indptr), shape=poses.shape),
                 cross=of_poses(sums.cross),
                 lens=sums.lens,
-                pose_pull=of_poses(sums.pose_pull) @ by_similarity.T,
-                lens_pull=sums.lens_pull @ by_similarity.T,
+                pose_modes=of_poses(sums.pose_modes) @ by_similarity.T,
+                lens_modes=sums.lens_modes @ by_similarity.T,
                 modes=by_similarity @ sums.modes @ by_similarity.T,
                 pose_slope=of_poses(sums.pose_slope),
                 lens_slope=sums.lens_slope,
@@ -296,7 +296,7 @@ def eliminate_points(
     surveyed: FloatArray | None = None,
     *,
     residual: FloatArray | None = None,
-    pull: FloatArray | None = None,
+    surveyed_gradient: FloatArray | None = None,
     ridge: float = _RIDGE,
 ) -> EliminatedPoints:
     """Return the normal equations of poses and lens of a network, chunk by chunk of its points.
@@ -306,14 +306,14 @@ def eliminate_points(
         root_weight: (M,) inverse σ of the observations, 1/px.
         surveyed: (N, 3, 3) information on the points beyond their observations, 1/m²; None: there is none.
         residual: (M, 2) pixels, for the slope; None: the slope is zero.
-        pull: (N, 3) gradient of half the squares of `surveyed`, 1/m, for the slope; None: it is zero.
+        surveyed_gradient: (N, 3) gradient of half the squares of `surveyed`, 1/m, for the slope; None: it is zero.
         ridge: added to the information on a point, relative to its trace, for a point that its rays leave open.
     """
     total: EliminatedPoints | None = None
     for part, points, rows in chunks_of_points(network, _CHUNK):
-        known, own_pull = (None if array is None else array[points] for array in (surveyed, pull))
+        known, own_gradient = (None if array is None else array[points] for array in (surveyed, surveyed_gradient))
         left = None if residual is None else residual[rows]
-        sums = _eliminated(part, root_weight[rows], known, left, own_pull, ridge=ridge)
+        sums = _eliminated(part, root_weight[rows], known, left, own_gradient, ridge=ridge)
         if total is not None:
             sums = EliminatedPoints(*map(operator.add, vars(total).values(), vars(sums).values()))
         total = sums
@@ -345,7 +345,7 @@ def _eliminated(
     root_weight: FloatArray,
     surveyed: FloatArray | None,
     residual: FloatArray | None,
-    pull: FloatArray | None,
+    surveyed_gradient: FloatArray | None,
     *,
     ridge: float,
 ) -> EliminatedPoints:
@@ -372,8 +372,10 @@ def _eliminated(
     if residual is not None:
         white_residual = (residual * root_weight[:, None]).ravel()
         of_points = sparse_jacobian(white, network.obs_point, points)
-        of_pull = 0.0 if pull is None else np.einsum("nji,nj->ni", inverse_root, pull).ravel()
-        white_residual = white_residual - of_points @ (of_points.T @ white_residual + of_pull)
+        of_gradient = (
+            0.0 if surveyed_gradient is None else np.einsum("nji,nj->ni", inverse_root, surveyed_gradient).ravel()
+        )
+        white_residual = white_residual - of_points @ (of_points.T @ white_residual + of_gradient)
     return EliminatedPoints(
         own - pose_point @ pose_point.T,
         (pose.T @ intrinsics - pose_point.tocsr() @ intrinsics_point.T).toarray(),

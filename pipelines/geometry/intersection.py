@@ -218,10 +218,10 @@ def _fit_robust(bundle: _RayBundle, cameras: UncertainCameras, start: _RayFit) -
     position, whitener, information = start.position, start.whitener, start.information
     convex, redescending = partial(huber_weight, scale=_CONVEX_SCALE), partial(cauchy_weight, dimension=2)
     for steps, weigh in ((_CONVEX_STEPS, convex), (_REDESCENDING_STEPS, redescending)):
-        pull = (information @ bundle.center[..., None])[..., 0]
+        weighted_center = (information @ bundle.center[..., None])[..., 0]
         for _ in range(steps):
             weight = weigh(_squared_residuals(whitener, position[bundle.owner] - bundle.center))
-            position = _solve_points(bundle, information * weight[:, None, None], pull * weight[:, None])
+            position = _solve_points(bundle, information * weight[:, None, None], weighted_center * weight[:, None])
         whitener, information = _whitener(bundle, cameras, position)  # the distances have changed
     used = np.ones(len(bundle.owner), dtype=bool)
     for _ in range(2):
@@ -270,10 +270,14 @@ def _squared_residuals(whitener: FloatArray, offset: FloatArray) -> FloatArray:
     return np.asarray((whitened**2).sum(axis=1))
 
 
-def _solve_points(bundle: _RayBundle, information: FloatArray, pull: FloatArray | None = None) -> FloatArray:
-    """Solve (Σ W) X = Σ W C for each point (eq. 9); `pull` (m, 3) is W C where it is known."""
+def _solve_points(
+    bundle: _RayBundle, information: FloatArray, weighted_center: FloatArray | None = None
+) -> FloatArray:
+    """Solve (Σ W) X = Σ W C for each point (eq. 9); `weighted_center` (m, 3) is W C where it is known."""
     normal = bundle.sum_by_point(information)
-    right = bundle.sum_by_point((information @ bundle.center[..., None])[..., 0] if pull is None else pull)
+    right = bundle.sum_by_point(
+        (information @ bundle.center[..., None])[..., 0] if weighted_center is None else weighted_center
+    )
     # Without the ridge, parallel rays would stop the whole batch. The condition number reveals them afterwards.
     ridge = 1e-14 * np.trace(normal, axis1=1, axis2=2) + np.finfo(float).tiny
     normal[:, [0, 1, 2], [0, 1, 2]] += ridge[:, None]
@@ -325,7 +329,7 @@ class RefinedPoints:
 
 
 def refined_points(network: Network) -> RefinedPoints:
-    """Return the points at the least robust reprojection error, with the cameras held.
+    """Return the points at the least robust reprojection error, with the cameras frozen.
 
     Gauss–Newton with Cauchy's kernel from the points' present positions; a step that does not lower a point's error
     is not taken.
@@ -343,10 +347,10 @@ def _refine(network: Network) -> tuple[FloatArray, FloatArray]:
         jacobian = _jacobian(network, residual, usable)
         weight = usable * cauchy_weight((residual**2).sum(axis=1), 2)
         normal = _sums(network, weight[:, None, None] * np.swapaxes(jacobian, 1, 2) @ jacobian)
-        pull = _sums(network, weight[:, None] * np.einsum("mda,md->ma", jacobian, residual))
+        gradient = _sums(network, weight[:, None] * np.einsum("mda,md->ma", jacobian, residual))
         trace = np.trace(normal, axis1=1, axis2=2)
         damping = np.where(trace > 0, _DAMPING * trace, 1.0)
-        step = np.linalg.solve(normal + damping[:, None, None] * np.eye(3), pull[..., None])[..., 0]
+        step = np.linalg.solve(normal + damping[:, None, None] * np.eye(3), gradient[..., None])[..., 0]
         moved = replace(network, point_in_world=network.point_in_world - step)
         moved_residual, moved_usable = _residuals(moved)
         moved_cost = _sums(network, moved_usable * cauchy_loss((moved_residual**2).sum(axis=1), 2))

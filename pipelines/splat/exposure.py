@@ -257,11 +257,11 @@ def _parts(observed: PointColours, exposure: FloatArray, weight: FloatArray | No
 
 def _part(point: IntArray, image: IntArray, colour: FloatArray, exposure: FloatArray, weight: FloatArray) -> _Part:
     gain, count = exposure[:, :, :3], int(point[-1]) + 1
-    pull = weight[:, None, None] * np.swapaxes(gain, 1, 2)
+    weighted_gain = weight[:, None, None] * np.swapaxes(gain, 1, 2)
     start = np.flatnonzero(np.diff(point, prepend=-1))
-    normal = np.add.reduceat(pull @ gain, start)
+    normal = np.add.reduceat(weighted_gain @ gain, start)
     normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-    right = np.add.reduceat((pull @ (colour - exposure[:, :, 3])[:, :, None]), start)
+    right = np.add.reduceat((weighted_gain @ (colour - exposure[:, :, 3])[:, :, None]), start)
     of_point = np.linalg.solve(normal, right)[:, :, 0]
     residual = (exposure @ np.append(of_point, np.ones((count, 1)), axis=1)[point][:, :, None])[:, :, 0] - colour
     known = np.append(of_point, np.ones((count, 1)), axis=1)[point]  # (m, 4)
@@ -272,7 +272,7 @@ def _part(point: IntArray, image: IntArray, colour: FloatArray, exposure: FloatA
         own[:, channel, :, channel] = outer
     white_gain = (weight[:, None, None] * gain) @ inverse_root[point]  # (m, 3, 3)
     cross = (white_gain[:, :, None, :] * known[:, None, :, None]).reshape(-1, 12, 3)
-    by_point = np.add.reduceat(pull @ residual[:, :, None], start)
+    by_point = np.add.reduceat(weighted_gain @ residual[:, :, None], start)
     return _Part(
         points=count,
         point=point,

@@ -421,7 +421,7 @@ def test_frame_of_the_cameras_does_not_matter(name: str) -> None:
         point_in_world=new_from_old.apply(case.network.point_in_world),
     )
     again = bundle_information(network, sigma_px=np.full(len(network.obs_point), SIGMA_PX))
-    for part in ("poses", "cross", "lens", "pose_pull", "lens_pull", "modes"):
+    for part in ("poses", "cross", "lens", "pose_modes", "lens_modes", "modes"):
         ours, expected = (getattr(each.sums, part) for each in (bundle, again))
         dense = [each.toarray() if part == "poses" else each for each in (ours, expected)]
         np.testing.assert_allclose(*dense, atol=1e-6 * np.abs(dense[1]).max())

@@ -14,7 +14,7 @@ import pytest
 from pipelines.core.errors import InputError
 from pipelines.geometry.cameras import Camera, distort, undistort
 from pipelines.survey.photographs import ImageCache, Photograph, pinhole_of
-from tests.refusals import refused
+from tests.refusals import numbers, refused
 
 WIDTH, HEIGHT = 240, 180
 BARREL = Camera("OPENCV", WIDTH, HEIGHT, np.array([200.0, 202.0, 118.0, 93.0, -0.18, 0.03, 1e-3, -5e-4]))
@@ -110,8 +110,7 @@ def test_photograph_of_another_size_is_refused(tmp_path: Path) -> None:
     other = Photograph(shot.name, shot.file, Camera("PINHOLE", 320, 240, np.array([200.0, 200.0, 160.0, 120.0])))
     with refused("photograph-size", InputError) as error:
         ImageCache(tmp_path / "cache", [other], WIDTH).build()
-    assert error.value.path == shot.file
-    assert "240×180" in error.value.message and "320×240" in error.value.message
+    assert error.value.path == tmp_path / "a.png" and numbers(error.value.message) == [240, 180, 320, 240]
 
 
 def test_what_is_no_photograph_is_refused(tmp_path: Path) -> None:
