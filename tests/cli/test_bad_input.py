@@ -208,7 +208,7 @@ def test_pipes_and_devices_are_refused_at_once(real_georef: Georef, flight: Path
     )
     result.assert_failed(1)
     assert told in result.err.splitlines()[-1]
-    assert result.document["error"]["code"] == "no-regular-file"
+    assert result.document["error"]["code"] == "not-a-file"
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no pipes and devices in folders")
@@ -362,7 +362,7 @@ def test_a_number_without_end_is_told_where_it_stands(tmp_path: Path, real_geore
     path.write_text(f"[missions.a]\nseed = {'9' * 5000}\n", "utf-8")
     ended = real_georef("batch", path)
     ended.assert_failed(1)
-    assert "missions.toml: not valid TOML: an integer is beyond 64 bits" in ended.err
+    assert "missions.toml: is not valid TOML: an integer is beyond 64 bits" in ended.err
     ended = real_georef("run", tmp_path / "ws", "--set", f"sfm.seed={'9' * 5000}")
     ended.assert_failed(2)
     assert "sfm.seed" in ended.err or "--seed" in ended.err
