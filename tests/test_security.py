@@ -144,7 +144,7 @@ POINT = {"name": "P1", "position_in_geo": [0, 0, 0], "cov_in_geo": [[1, 0, 0], [
 @pytest.mark.parametrize(
     ("keys", "value", "message"),
     [
-        (("image_dir",), "../elsewhere", r"\[image_dir\].*leaves the workspace: give an absolute path"),
+        (("image_dir",), "../elsewhere", r"\[image_dir\].*leaves the workspace"),
         (("images", 1, "camera_id"), 7, "which is not among the cameras"),
         (("images", 1, "name"), "DUPLICATE", "images: two have the same name"),
         (("control_points",), [{**POINT, "marks": []}] * 2, "control_points: two have the same name"),

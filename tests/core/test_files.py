@@ -42,7 +42,7 @@ def test_what_is_no_file_is_refused(tmp_path: Path) -> None:
         (Path("/dev/zero"), "a device"),
         (tmp_path, "a folder"),
         (tmp_path / "gone", "No such file or directory"),
-        (Path("a\0b"), "embedded null (byte|character)"),
+        (Path("a\0b"), "embedded null"),
     ):
         with refused(
             "file-unreadable" if kind[0].isupper() or "null" in kind else "not-a-file", InputError
@@ -86,7 +86,7 @@ def forged(shape: str, content: bytes, descr: str = "<f8") -> bytes:
 )
 def test_headers_are_checked_before_the_data(tmp_path: Path, shape: str, descr: str, cause: str) -> None:
     (tmp_path / "a.npz").write_bytes(forged(shape, bytes(16), descr))
-    with refused("file-damaged", InputError) as error:
+    with refused("npz-damaged", InputError) as error:
         read_npz(tmp_path / "a.npz", ("a",))
     assert cause in str(error.value)
 
@@ -98,6 +98,6 @@ def test_zeros_that_unpack_to_more_than_the_limit_are_refused_unread(tmp_path: P
         archive.open("a.npy", "w") as entry,
     ):
         entry.write(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + bytes(300 * 2**20))
-    with refused("file-damaged", InputError) as error:
+    with refused("npz-damaged", InputError) as error:
         read_npz(tmp_path / "a.npz", ("a",))
     assert numbers(error.value.message) == [300, 256]  # MiB
