@@ -67,8 +67,8 @@ CONFIGURATIONS: tuple[Configuration, ...] = (
         {"method": "robust", "control_points": False}, _FIXED,
     ),
     Configuration(
-        "B", "geolocation + initial similarity",
-        "the Gaussians of A, placed by the paper's similarity of the geolocated points",
+        "B", "forward intersection + initial similarity",
+        "the Gaussians of A, with the paper's similarity of the forward-intersected points",
         {"method": "paper", "control_points": False}, trained_by="A",
     ),
     Configuration(

@@ -325,7 +325,7 @@ class RefinedPoints:
 
 
 def refined_points(network: Network) -> RefinedPoints:
-    """Return the points at the least robust reprojection error, with the cameras held.
+    """Return the points at the least robust reprojection error, with the cameras frozen.
 
     Gauss–Newton with Cauchy's kernel from the points' present positions; a step that does not lower a point's error
     is not taken.

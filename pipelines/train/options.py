@@ -87,7 +87,7 @@ class GeographicOptions(StageOptions):
     """Options of the geographic losses: measurements in use, and how they are weighed."""
 
     geo_loss: bool = Field(
-        True, description="Use the geographic losses; without them, similarity and cameras are held."
+        True, description="Use the geographic losses; without them, similarity and cameras are frozen."
     )
     weighting: Literal["whitened", "paper"] = Field(
         "whitened",
@@ -108,12 +108,12 @@ class GeographicOptions(StageOptions):
     )
     solve: Solve = Field(
         "auto",
-        description="Refine similarity and cameras jointly with the Gaussians, or hold them as solved once by "
+        description="Refine similarity and cameras jointly with the Gaussians, or freeze them as solved once by "
         f"init-sim3; auto: once beyond {MOST_JOINT_CAMERAS} photographs.",
     )
 
     def solves_once(self, cameras: int) -> bool:
-        """Return whether a training of that many cameras holds what init-sim3 has solved."""
+        """Return whether a training of that many cameras freezes what init-sim3 has solved."""
         wanted = self.solve == "once" or (self.solve == "auto" and cameras > MOST_JOINT_CAMERAS)
         return wanted and self.optimize_cameras and self.geo_loss
 
@@ -122,7 +122,7 @@ class GeographicOptions(StageOptions):
         return cameras if self.optimize_cameras and self.geo_loss and not self.solves_once(cameras) else 0
 
     def require_trainable(self, cameras: int) -> None:
-        """Refuse options that change the cameras' solution during a training that holds it, by an `InputError`."""
+        """Refuse options that change the cameras' solution while a training freezes it, by an `InputError`."""
         if not self.solves_once(cameras):
             return
         for value, plain, name in (

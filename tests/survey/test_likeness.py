@@ -1,4 +1,4 @@
-"""Where renders show their photographs: blurred parts are refuted, whatever the exposure; plain ones are not."""
+"""Where renders show their photographs: blurred parts are rejected, whatever the exposure; plain ones are not."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_likeness_does_not_depend_on_exposure() -> None:
     assert shows_photograph(np.clip(0.8 * photo + 30.0, 0, 255).astype(np.uint8), photo).all()
 
 
-def test_blurred_and_foreign_texture_is_refuted() -> None:
+def test_blurred_and_foreign_texture_is_rejected() -> None:
     photo = photograph()
     inner = np.s_[10:-10, 10 : HALF - 10]
     assert not shows_photograph(cv2.GaussianBlur(photo, (0, 0), 6), photo)[inner].any()
@@ -34,7 +34,7 @@ def test_blurred_and_foreign_texture_is_refuted() -> None:
     assert shows_photograph(np.ascontiguousarray(foreign), photo)[inner].mean() < 0.05
 
 
-def test_plain_parts_refute_nothing() -> None:
+def test_plain_parts_reject_nothing() -> None:
     photo = photograph()
     plain = np.s_[:, HALF + 10 : -10]
     assert shows_photograph(np.full_like(photo, 120), photo)[plain].all()
