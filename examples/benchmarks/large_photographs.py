@@ -24,7 +24,7 @@ from pipelines.surface.depth_maps import DepthMaps
 from pipelines.survey.photographs import ImageCache, Photograph
 from pipelines.train.adjusted_scene import AdjustedScene
 from pipelines.train.forecast import training_size
-from pipelines.train.geographic.problem import held_problem
+from pipelines.train.geographic.problem import frozen_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import TrainOptions
 from pipelines.train.surface import SceneSurface
@@ -99,7 +99,7 @@ def main() -> None:
     maps.build()
     print(f"depth maps: peak {peak_mib() - before:.0f} MiB more", flush=True)
     training = TrainingScene(adjusted.scene, images, SceneSurface(maps))
-    trainer = make_trainer(training, held_problem(adjusted), backend, options)
+    trainer = make_trainer(training, frozen_problem(adjusted), backend, options)
     print(f"initial: peak {peak_mib() - before:.0f} MiB more", flush=True)
     trainer.step()
     print(f"first iteration: peak {peak_mib() - before:.0f} MiB more", flush=True)

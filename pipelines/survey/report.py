@@ -13,7 +13,7 @@ from pydantic import SerializerFunctionWrapHandler, model_serializer
 
 from pipelines.core.errors import InputError
 from pipelines.core.figures import Headline
-from pipelines.core.products import ImageName, Product, Remark, dump_json, load_json
+from pipelines.core.products import ImageName, Product, Remark, load_json
 from pipelines.core.types import Vector3
 from pipelines.robust.statistics import ResidualStats
 from pipelines.survey.report_parts import ReferenceComparison, VarianceFactor
@@ -221,8 +221,9 @@ class CheckPoints(Product):
 
     @property
     def by_way(self) -> dict[Literal["triangulated", "surface"], CheckPointErrors]:
-        both = {"triangulated": self.triangulated, "surface": self.surface}
-        return {way: errors for way, errors in both.items() if errors is not None}
+        if self.surface is None:
+            return {"triangulated": self.triangulated}
+        return {"triangulated": self.triangulated, "surface": self.surface}
 
 
 class CrossValidation(StatedErrors):
@@ -343,11 +344,6 @@ class EvaluationReport(_OptionalKeys):
     @property
     def test_views(self) -> PhotometricFigures | None:
         return None if self.photometric is None else self.photometric.test
-
-
-def write_report(report: EvaluationReport, path: Path) -> None:
-    """Write a report as JSON."""
-    path.write_text(dump_json(report.model_dump(mode="json")) + "\n", encoding="utf-8")
 
 
 def read_report(path: Path) -> EvaluationReport:
