@@ -201,7 +201,7 @@ def report(document: EvaluationReport) -> list[Renderable]:
 
     A residual of the fit is not an accuracy, and a control point is not a check point: they never share a table.
     """
-    ways = document.checkpoints.by_way
+    ways: Mapping[Any, CheckPointErrors] = document.checkpoints.by_way
     crossed, test, cameras = document.cross_validation, document.test_views, document.cameras
     fit = {"gnss": dict(document.fit.gnss), "gcp": dict(document.fit.gcp)}
     factors: dict[str, dict[str, Any]] = {factor.group: dict(factor) for factor in document.variance_factors}

@@ -16,7 +16,7 @@ from pipelines.core.workspace import Workspace
 from pipelines.evaluate.check_points import RemeasuredPoints, check_point_errors
 from pipelines.report.plots.charts import labelled
 from pipelines.survey.photographs import write_render
-from pipelines.survey.report import ViewFigures, write_report
+from pipelines.survey.report import ViewFigures
 from pipelines.survey.survey import Survey, SurveyedPoint
 from tests.reports import report_with
 from tests.scenes import TrueScene
@@ -71,7 +71,7 @@ def evaluated_workspace(root: Path, rename: str = "") -> Evaluated:
         cautions=(Remark(code="made-up", sentence=f"Nothing is real here {rename}."),),
     )
     (root / REPORT).parent.mkdir(parents=True)
-    write_report(report, root / REPORT)
+    save_json(report, root / REPORT)
     (root / RENDERS).mkdir()
     pictures = [np.full((30, 40, 3), GREY, dtype=np.uint8)] * 3
     write_render(root / RENDERS, scene.names[2], labelled(pictures, ("photograph", "render", "difference")))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from pipelines.core.products import Remark
+from pipelines.core.products import Remark, save_json
 from pipelines.core.stages import REPORT
 from pipelines.core.workspace import Workspace
 from pipelines.robust.statistics import ResidualStats
@@ -25,7 +25,6 @@ from pipelines.survey.report import (
     PhotometricFigures,
     SimilaritySigma,
     read_report,
-    write_report,
 )
 
 _NO_CLASSES = dict.fromkeys(
@@ -92,7 +91,7 @@ def report_of(workspace: Workspace) -> dict[str, Any]:
     path = workspace.path(REPORT)
     text = path.read_text(encoding="utf-8")
     copy = workspace.root / "report_copy.json"
-    write_report(read_report(path), copy)
+    save_json(read_report(path), copy)
     assert copy.read_text(encoding="utf-8") == text
     document: dict[str, Any] = json.loads(text)
     return document

@@ -77,7 +77,7 @@ def trainer(
     start = replace(start, log_scales=start.log_scales - 0.5, sh=torch.zeros_like(start.sh))
     train = np.arange(len(images))
     similarity = LearnableSimilarity(Similarity(), np.eye(7) * 1e-4, np.zeros(3))
-    cameras = CameraCorrections.held(
+    cameras = CameraCorrections.frozen(
         poses(len(images)), State(Similarity(), np.zeros((len(images), 6)), np.zeros(0))
     )
     exposures = Exposures(len(images), torch.from_numpy(train), options.iterations, torch.device("cpu"))

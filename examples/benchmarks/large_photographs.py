@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+from pipelines.train.forecast import training_size
 
 from pipelines.core.machine import peak_memory_bytes
 from pipelines.core.plan import photograph_folder
@@ -23,8 +24,7 @@ from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.depth_maps import DepthMaps
 from pipelines.survey.photographs import ImageCache, Photograph
 from pipelines.train.adjusted_scene import AdjustedScene
-from pipelines.train.estimate import training_size
-from pipelines.train.geographic.problem import held_problem
+from pipelines.train.geographic.problem import frozen_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import TrainOptions
 from pipelines.train.surface import SceneSurface
@@ -99,7 +99,7 @@ def main() -> None:
     maps.build()
     print(f"depth maps: peak {peak_mib() - before:.0f} MiB more", flush=True)
     training = TrainingScene(adjusted.scene, images, SceneSurface(maps))
-    trainer = make_trainer(training, held_problem(adjusted), backend, options)
+    trainer = make_trainer(training, frozen_problem(adjusted), backend, options)
     print(f"initial: peak {peak_mib() - before:.0f} MiB more", flush=True)
     trainer.step()
     print(f"first iteration: peak {peak_mib() - before:.0f} MiB more", flush=True)

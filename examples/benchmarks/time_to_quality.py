@@ -40,7 +40,7 @@ from pipelines.survey.adjustment import GeolocatedPoints
 from pipelines.survey.scene import photographs
 from pipelines.survey.trained_survey import TrainedSurvey
 from pipelines.train.adjusted_scene import AdjustedScene
-from pipelines.train.geographic.problem import held_problem, refining_problem
+from pipelines.train.geographic.problem import frozen_problem, refining_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import TrainOptions
 from pipelines.train.stage import trained_model
@@ -141,7 +141,7 @@ def measured(workspace: Workspace, age_s: dict[Path, float]) -> list[Row]:
     observed = adjusted.measured(control_points=options.gcp_loss)
     refines, points = options.refined_cameras(len(images)) > 0, GeolocatedPoints.load(workspace.path(POINTS))
     problem = (
-        refining_problem(adjusted, observed, options, points, options.seed) if refines else held_problem(adjusted)
+        refining_problem(adjusted, observed, options, points, options.seed) if refines else frozen_problem(adjusted)
     )
     trainer = make_trainer(TrainingScene(scene, images), problem, backend, options)
     rows: list[Row] = []

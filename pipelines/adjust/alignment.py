@@ -194,7 +194,7 @@ def _gated(data: Correspondences, state: SimilarityState) -> SimilarityState:
 
 
 def _solve(data: Correspondences, state: SimilarityState, prior: RotationPrior | None) -> AdjustedSimilarity:
-    """Return the Gauss–Newton solution of the inliers, with excess and inliers held."""
+    """Return the Gauss–Newton solution of the inliers, with excess and inliers frozen."""
     for _ in range(_STEPS):
         linear = _linearised(data, state, prior)
         every = covariance_of(linear.jacobian, linear.unit)

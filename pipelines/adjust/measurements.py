@@ -300,7 +300,7 @@ def control_of(scene: Scene, survey: Survey) -> ControlPoints | None:
 
 
 def attitudes_of(scene: Scene, survey: Survey) -> Attitudes | None:
-    """Return the recorded rotations of the registered images that the SfM model does not contradict, or None."""
+    """Return the recorded rotations of the registered images that agree with the SfM model, or None."""
     recorded = recorded_rotations(survey, scene.sparse)
     if not len(recorded.image):
         return None

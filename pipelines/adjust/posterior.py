@@ -141,7 +141,7 @@ class Posterior:
     def of_lens(self) -> FloatArray | None:
         """Return the covariance (L, L) of the lens parameters, in the order of `geometry.cameras.Lenses`.
 
-        None if the lens was held. Parameters that nothing reveals have zeros.
+        None if the lens was frozen. Parameters that nothing reveals have zeros.
         """
         if not len(self.lens):
             return None

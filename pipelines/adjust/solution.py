@@ -26,7 +26,7 @@ from pipelines.survey.trained_model import Adjustment, Measurement, TrainedCamer
 
 Named = Fixes | ControlPoints | Attitudes
 _OPEN = 1e-9  # redundancy below which the other observations leave a direction open
-_REJECTED = "contradicts the others at the 99.9 % level"
+_REJECTED = "is inconsistent with the others at the 99.9 % level"
 
 
 def adjusted(
@@ -151,7 +151,7 @@ def _left_out(near: Linearised, control: ControlPoints, normal: NormalMatrix) ->
 
     The computation is linear and needs no second solution. With the normal matrix N of all observations, a point
     with Jacobian A and weight w has the leverage H = w A N⁻¹ Aᵀ. Its residual without it is (I − H)⁻¹ r (Cook and
-    Weisberg 1982, section 2.2). The weights of the other observations are held.
+    Weisberg 1982, section 2.2). The weights of the other observations are frozen.
     """
     kind = control.kind
     white, residuals = near.rows[kind].residual, near.residuals

@@ -62,7 +62,7 @@ class Problem:
     bundle: BundleInformation
     measured: tuple[Term, ...]
     errors: SystematicErrors = field(default_factory=SystematicErrors)
-    lens_held: bool = False
+    lens_frozen: bool = False
 
     @cached_property
     def terms(self) -> tuple[Term, ...]:
@@ -77,18 +77,18 @@ class Problem:
 
     @cached_property
     def lens(self) -> IntArray:
-        """Lens parameters that are unknowns: those that an observation reveals, unless the lens is held."""
+        """Lens parameters that are unknowns: those that an observation reveals, unless the lens is frozen."""
         seen = np.flatnonzero(np.diag(self.bundle.sums.lens) > 0)
-        return seen[:0] if self.lens_held else seen
+        return seen[:0] if self.lens_frozen else seen
 
     @cached_property
     def poses(self) -> bsr_matrix:
-        """Information (6 n, 6 n) of the image observations on x, with a hold of cameras that nothing observes."""
+        """Information (6 n, 6 n) of the image observations on x, with a prior of cameras that nothing observes."""
         bundle = self.bundle
         own = bundle.sums.poses.diagonal() * bundle.unit**2
         weak = own < bundle.loosest_sigma_m**-2
-        hold = diags(weak * (_UNSEEN * bundle.unit * bundle.loosest_sigma_m) ** -2.0).tobsr((6, 6))
-        return (bundle.sums.poses + hold).tobsr((6, 6))
+        prior = diags(weak * (_UNSEEN * bundle.unit * bundle.loosest_sigma_m) ** -2.0).tobsr((6, 6))
+        return (bundle.sums.poses + prior).tobsr((6, 6))
 
     @cached_property
     def of_rounding(self) -> FloatArray:

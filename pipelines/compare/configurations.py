@@ -15,7 +15,6 @@ from pipelines.compare.table import (
     Comparison,
     bar_charts,
     markdown,
-    point_heads,
     remarks_on,
 )
 from pipelines.core.errors import InputError
@@ -67,8 +66,8 @@ CONFIGURATIONS: tuple[Configuration, ...] = (
         {"method": "robust", "control_points": False}, _FIXED,
     ),
     Configuration(
-        "B", "geolocation + initial similarity",
-        "the Gaussians of A, placed by the paper's similarity of the geolocated points",
+        "B", "forward intersection + initial similarity",
+        "the Gaussians of A, with the paper's similarity of the forward-intersected points",
         {"method": "paper", "control_points": False}, trained_by="A",
     ),
     Configuration(
@@ -131,9 +130,11 @@ def write_comparison(folder: Path, table: Comparison, survey: str) -> None:
 def comparison_page(table: Comparison, plot: Path, survey: str) -> Page:
     """Return the page of a comparison, with the PNG of its bars and the name of the workspace."""
     names = ", ".join(row.configuration for row in table.rows)
-    heads = zip(POINT_FIGURES, point_heads(WAYS, ": "), strict=True)
     facts: dict[str, Any] = {
-        "points": {f"{way}.{name}": f"{head} in {ERRORS[name].unit}" for (way, name), head in heads},
+        "points": {
+            f"{way}.{name}": f"{WAYS[way]}: {ERRORS[name].label} in {ERRORS[name].unit}"
+            for way, name in POINT_FIGURES
+        },
         "rows": table.rows,
         "bars": png_file(plot),
         "remarks": [(row, remarks_on(row)) for row in table.rows if remarks_on(row)],

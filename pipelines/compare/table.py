@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Literal
 
 from pipelines.core.figures import ERRORS, MISSING, WAYS
@@ -91,14 +91,6 @@ def surface_accuracy(reference: ReferenceComparison | None) -> SurfaceAccuracy |
     )
 
 
-def point_heads(ways: Mapping[str, str], between: str) -> tuple[str, ...]:
-    """Return the column heads of `POINT_FIGURES`; `ways` has the words before the first column of each way."""
-    first = dict(reversed(POINT_FIGURES))
-    return tuple(
-        (f"{ways[way]}{between}" if first[way] == name else "") + ERRORS[name].label for way, name in POINT_FIGURES
-    )
-
-
 def bar_charts(rows: Sequence[ComparedRow]) -> tuple[BarChart, ...]:
     members = tuple(row.configuration for row in rows)
     geometry = (
@@ -121,7 +113,7 @@ def markdown(table: Comparison) -> str:
     """Return the table as Markdown, with notes and remarks below."""
     heads = (
         *("", "test PSNR dB", "PSNR covered", "SSIM"),
-        *point_heads({way: way for way in WAYS}, " "),
+        *(f"{way} {ERRORS[name].label}" for way, name in POINT_FIGURES),
         *("check points", "training"),
     )
     lines = [

@@ -102,7 +102,7 @@ class DegenerateGeometryError(GeorefError):
 
 
 class InconsistencyError(GeorefError):
-    """Sources that contradict each other as a whole; the message names both sides and what would reconcile them."""
+    """Sources that are inconsistent as a whole; the message names both sides and what would reconcile them."""
 
     kind = "inconsistent"
 

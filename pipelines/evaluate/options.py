@@ -16,9 +16,9 @@ class EvaluateOptions(StageOptions):
     """Options of the evaluation with test views and check points."""
 
     backend: Literal["auto", "cpu", "cuda"] = Field("auto", description="Rasteriser.")
-    renders: int = Field(8, ge=0, description="Side-by-side renders to write at the most.")
+    renders: int = Field(8, ge=0, description="Largest number of side-by-side renders to write.")
     similarity: Literal["trained", "initial"] = Field(
-        "trained", description="Place the model on Earth as training found, or as init-sim3 did."
+        "trained", description="Similarity of the model: that of the training, or that of init-sim3."
     )
     crs: str | None = Field(
         None, description="List the check points in this CRS too, e.g. EPSG:32632, or EPSG:32632+5773 for heights."
@@ -38,16 +38,17 @@ class EvaluateOptions(StageOptions):
         None, description="CRS of a reference that states none: EPSG:32632, or EPSG:32632+5773 for heights."
     )
     reference_vertical: Vertical | None = Field(
-        None, description="Datum of the reference's heights where its CRS is silent: ellipsoidal, EGM96 or EPSG:n."
+        None,
+        description="Datum of the reference's heights if its CRS states none: ellipsoidal, EGM96 or EPSG:n.",
     )
     reference_sigma: float = Field(
         0.0,
         ge=0,
         le=100,
-        description="Standard deviation of the reference's place in metres: enters the level of detection.",
+        description="σ of the reference's position in metres, part of the level of detection.",
     )
     reference_align: Alignment = Field(
         "none",
-        description="Move the model onto the reference before the comparison, to judge its shape alone. The shift "
-        "is measured and stated in any case.",
+        description="Move the model onto the reference first, to compare the shape alone. The shift "
+        "is stated in any case.",
     )

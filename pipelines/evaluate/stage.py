@@ -22,7 +22,7 @@ from pipelines.adjust.posterior import Posterior
 from pipelines.adjust.solution import posterior_of
 from pipelines.core.errors import InputError
 from pipelines.core.figures import WAYS
-from pipelines.core.products import Remark, is_checked, union
+from pipelines.core.products import Remark, is_checked, save_json, union
 from pipelines.core.sentences import listed
 from pipelines.core.stages import BY_NAME
 from pipelines.core.types import FloatArray
@@ -65,7 +65,6 @@ from pipelines.survey.report import (
     PhotometricFigures,
     PointResidual,
     SimilaritySigma,
-    write_report,
 )
 from pipelines.survey.scene import photographs
 from pipelines.survey.survey import SurveyedPoint
@@ -186,7 +185,7 @@ def run(stage: StageRun, options: EvaluateOptions) -> Summary:
     write_point_table(stage.out / "points.csv", report, solved.survey)
     if report.cameras is not None:
         write_camera_sigma(stage.out / "cameras.csv", solved.sfm.image_name, posterior.camera_cov)
-    write_report(report, stage.out / "report.json")
+    save_json(report, stage.out / "report.json")
     return summarise(report)
 
 

@@ -144,8 +144,8 @@ def similarity_modes(cam_center_in_world: FloatArray) -> FloatArray:
 
 
 _CHUNK = 2**19  # observations that are linearised together
-_RIDGE = 1e-12  # small: what it adds to each point holds the similarity of the whole as well
-# A camera with few observations is constrained to a tenth of its distance from the scene.
+_RIDGE = 1e-12  # small: what it adds to each point fixes the similarity of the whole as well
+# A camera with few observations has a prior σ of a tenth of its distance from the scene.
 _LOOSEST_RELATIVE_SIGMA = 0.1
 # Means of the weight w and of w r²/2 under Gaussian noise of σ = 1, where r²/2 is exponentially distributed. Robust
 # weights lower the sum of squares of pure noise: without these means the stated σ would be a fifth too small.
@@ -184,7 +184,7 @@ class BundleInformation:
         sums: the information.
         similarity_modes: (6 n, 7) as `geometry.bundle.similarity_modes`.
         unit: (6 n,) corrections that count as one metre at the scene.
-        loosest_sigma_m: σ in these units to which even a camera without observations is constrained.
+        loosest_sigma_m: σ in these units that the prior gives even a camera without observations.
         sigma_px: σ of an image coordinate, estimated from the residuals, or 1 where each observation has its own.
     """
 

@@ -1,7 +1,7 @@
 """Poses of images from the photographs' own tags, EXIF and DJI's XMP, and a table's positions against these.
 
 EXIF is not used where a table is given. But two receivers that disagree by far more than their σ are a
-contradiction that nothing later would notice: heights in feet, another zone, exchanged axes, times that are off.
+inconsistency that nothing later would notice: heights in feet, another zone, exchanged axes, times that are off.
 """
 
 from __future__ import annotations
@@ -177,12 +177,12 @@ def _horizontal(places: _Places, path: Path) -> tuple[bool, Remark] | None:
     """Return the caution of positions that differ, and whether it is fatal."""
     distance = np.hypot(*(places.table - places.exif).T)
     allowed = np.maximum(_SIGMAS * np.hypot(*places.sigma_m.T), _LEAST_M)
-    contradicting = distance > allowed
-    if contradicting.mean() <= _MOST_INCONSISTENT:
+    inconsistent = distance > allowed
+    if inconsistent.mean() <= _MOST_INCONSISTENT:
         return None
-    code, cause = _cause(places, float(np.median(distance)), float(np.median(allowed)) / _SIGMAS)
-    sentence = f"{int(contradicting.sum())} of {len(distance)} positions in {path.name} {cause}"
-    return True, Remark(code=code, sentence=sentence)
+    cause = _cause(places, float(np.median(distance)), float(np.median(allowed)) / _SIGMAS)
+    sentence = f"{int(inconsistent.sum())} of {len(distance)} positions in {path.name} {cause}"
+    return True, Remark(code="table-against-exif", sentence=sentence)
 
 
 def _cause(places: _Places, typical_m: float, sigma_m: float) -> tuple[str, str]:

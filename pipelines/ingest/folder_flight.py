@@ -48,7 +48,7 @@ def read_folder(
     """Read photographs, and the trajectory or `geo.txt` that the options name; `decode` as of `scan_folder`.
 
     Raises:
-        InconsistencyError: the files contradict each other.
+        InconsistencyError: the files are inconsistent.
         InputError: anything wrong with the files, or too few photographs.
     """
     photos = scan_folder(folder, remarks, progress, decode=decode)

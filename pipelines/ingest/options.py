@@ -145,7 +145,7 @@ class IngestOptions(StageOptions):
     max_gap: float = Field(1.0, gt=0, description="Longest gap to interpolate over in the trajectory, in seconds.")
     focal_px: float | None = Field(None, gt=0, description="Focal length in pixels, instead of the one from EXIF.")
     accept_inconsistency: bool = Field(
-        False, description="Continue where the table of positions contradicts EXIF, with a caution."
+        False, description="Go on where the table of positions disagrees with EXIF, with a caution."
     )
     copy_images: bool = Field(
         False, description="Copy the photographs into the workspace.", json_schema_extra={"flag": "--copy"}

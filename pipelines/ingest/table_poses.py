@@ -34,7 +34,7 @@ def poses_from_table(
     even if its EXIF has one: two receivers are not mixed unseen.
 
     Raises:
-        InconsistencyError: the positions contradict those in EXIF.
+        InconsistencyError: the positions disagree with those in EXIF.
         InputError: no row with a position, no CRS for x,y,z, contradicting options, impossible coordinates, or no
             image matched.
     """

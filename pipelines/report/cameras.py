@@ -275,7 +275,7 @@ def lenses_facts(evaluated: EvaluatedSurvey) -> LensesFacts:
         photographs=len(sparse.image_name),
         lenses=tuple(lens for lens in lenses if lens.photographs),
         drawn=min(len(lenses), _MOST_LENSES),
-        no_sigma="the lens was held" if covariance is None else "",
+        no_sigma="the lens was frozen" if covariance is None else "",
     )
 
 

@@ -24,14 +24,14 @@ class SfmOptions(StageOptions):
     pairs: Literal["auto", "exhaustive"] = Field(
         "auto", description="Image pairs to match: from positions and view directions, or all."
     )
-    max_neighbors: int = Field(16, ge=2, description="Neighbours that an image is matched with at the most.")
+    max_neighbors: int = Field(16, ge=2, description="Largest number of neighbours that an image is matched with.")
     max_image_size: int = Field(1600, ge=128, description="Longest image side for features, in pixels.")
     doubled: Literal["auto", "yes", "no"] = Field(
         "auto",
-        description="Look for features on photographs of twice their size, too; auto: on those below "
+        description="Detect features on photographs enlarged to twice their size, too; auto: on those below "
         f"{_DOUBLED_BELOW_PX} pixels.",
     )
-    max_features: int = Field(5000, ge=200, description="Features an image at the most.")
+    max_features: int = Field(5000, ge=200, description="Largest number of features of an image.")
     import_model: InputPath | None = Field(
         None, description="Use this COLMAP model instead of reconstructing.", json_schema_extra={"flag": "--import"}
     )

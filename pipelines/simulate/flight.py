@@ -179,7 +179,7 @@ class Receiver:
     Attributes:
         sigma_h_m, sigma_v_m: white noise.
         bias_m: RMS of a slow bias per axis.
-        common_error_m: constant error of all fixes, east, north, up.
+        common_error_m: systematic error of all fixes, east, north, up.
         outlier_share: share of photographs around which the fixes are wrong.
         outlier_m: size of these errors.
     """

@@ -70,7 +70,7 @@ class SimulateOptions(LidarFlightOptions):
     bias_period: float = Field(60.0, gt=0, description="Period of the slow bias in seconds.")
     common_error: Triple = Field(
         (0.0, 0.0, 0.0),
-        description="Constant error of all fixes, as of a base station, east,north,up in metres.",
+        description="Systematic error of all fixes, as of a base station, east,north,up in metres.",
     )
     outlier_share: float | None = Field(None, ge=0, le=1, description="Share of photographs whose fixes are wrong.")
     outlier_size: float = Field(15.0, gt=0, description="Error of a wrong fix in metres.")

@@ -45,7 +45,7 @@ class TrueNavigation(Product):
     photograph.
 
     Attributes:
-        common_error_m: constant error of all fixes, east, north, up.
+        common_error_m: systematic error of all fixes, east, north, up.
         wrong_images: photographs around which the fixes are wrong.
         nominal_from_cam: boresight: true camera axes → axes that mounting and attitude suggest.
         cam_from_body: nominal mounting, the body forward-right-down.

@@ -1,4 +1,4 @@
-"""Pixels of photographs that contradict the model: cars and shadows that have moved between the photographs.
+"""Pixels of photographs that disagree with the model: cars and shadows that have moved between the photographs.
 
 Trimming by residuals, as in RobustNeRF (doi 10.48550/arXiv.2302.00833) and SpotLessSplats
 (doi 10.48550/arXiv.2406.20055), without a network:

@@ -33,8 +33,8 @@ from pipelines.survey.photographs import ImageCache, Pinholes
 from pipelines.survey.trained_survey import TrainedSurvey
 
 _WINDOW_PX = 15
-_LEAST_SHARE = 0.5  # of the photograph's contrast, which a consistent render has
-_LEAST_CONTRAST = 6.0  # grey levels of 255: a fainter pattern is noise, and confirms or refutes nothing
+_LEAST_SHARE = 0.5  # of the photograph's contrast, which the render must show
+_LEAST_CONTRAST = 6.0  # grey levels of 255: a fainter pattern is noise, and confirms or rejects nothing
 
 
 def photo_consistent(rendered: ByteArray, photograph: ByteArray) -> BoolArray:

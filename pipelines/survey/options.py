@@ -45,6 +45,6 @@ class CrsOptions(StageOptions):
     )
     vertical: Vertical | None = Field(
         None,
-        description="Datum of the heights where --crs is silent: ellipsoidal, EGM96, EGM2008 or EPSG:n. Without "
+        description="Datum of the heights where --crs states none: ellipsoidal, EGM96, EGM2008 or EPSG:n. Without "
         "it: that of the survey.",
     )

@@ -13,7 +13,7 @@ from pydantic import SerializerFunctionWrapHandler, model_serializer
 
 from pipelines.core.errors import InputError
 from pipelines.core.figures import Headline
-from pipelines.core.products import ImageName, Product, Remark, dump_json, load_json
+from pipelines.core.products import ImageName, Product, Remark, load_json
 from pipelines.core.types import Vector3
 from pipelines.robust.statistics import ResidualStats
 from pipelines.survey.report_parts import ReferenceComparison, VarianceFactor
@@ -221,10 +221,9 @@ class CheckPoints(Product):
 
     @property
     def by_way(self) -> dict[Literal["triangulated", "surface"], CheckPointErrors]:
-        triangulated: dict[Literal["triangulated", "surface"], CheckPointErrors] = {
-            "triangulated": self.triangulated
-        }
-        return triangulated if self.surface is None else {**triangulated, "surface": self.surface}
+        if self.surface is None:
+            return {"triangulated": self.triangulated}
+        return {"triangulated": self.triangulated, "surface": self.surface}
 
 
 class CrossValidation(StatedErrors):
@@ -345,11 +344,6 @@ class EvaluationReport(_OptionalKeys):
     @property
     def test_views(self) -> PhotometricFigures | None:
         return None if self.photometric is None else self.photometric.test
-
-
-def write_report(report: EvaluationReport, path: Path) -> None:
-    """Write a report as JSON."""
-    path.write_text(dump_json(report.model_dump(mode="json")) + "\n", encoding="utf-8")
 
 
 def read_report(path: Path) -> EvaluationReport:

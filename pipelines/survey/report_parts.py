@@ -124,7 +124,7 @@ class ReferenceComparison(Product):
 
 
 class LidarArea(Product):
-    """Area where the LiDAR and the photographs contradict each other.
+    """Area where the LiDAR and the photographs disagree.
 
     Attributes:
         kind: `removed`: the photographs look through the LiDAR's points; `added`: they show a surface above them.
@@ -168,7 +168,7 @@ class LidarReport(Product):
     Attributes:
         read, noise, withheld, overlap, outside: numbers of points read, and dropped by reason.
         points: that remain after thinning, about `voxel_m` apart.
-        rejected_share: of the points, which contradict the photographs.
+        rejected_share: of the points, which disagree with the photographs.
         confidence: median over the points.
         areas: that have changed, the largest first.
         assumptions: what the files do not say.

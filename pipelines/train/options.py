@@ -105,13 +105,13 @@ class GeographicOptions(StageOptions):
     )
     solve_cameras: Solve = Field(
         "auto",
-        description="Solve similarity and cameras jointly with the Gaussians, or once, by init-sim3; "
-        f"auto: once beyond {MOST_JOINT_CAMERAS} photographs.",
+        description="Refine similarity and cameras jointly with the Gaussians, or freeze them as solved once by "
+        f"init-sim3; auto: once beyond {MOST_JOINT_CAMERAS} photographs.",
     )
 
     def solves_once(self, cameras: int) -> bool:
-        """Return whether a training of that many cameras keeps what init-sim3 has solved."""
-        wanted = self.solve_cameras == "once" or (self.solve_cameras == "auto" and cameras > MOST_JOINT_CAMERAS)
+        """Return whether a training of that many cameras freezes what init-sim3 has solved."""
+        wanted = self.solve == "once" or (self.solve == "auto" and cameras > MOST_JOINT_CAMERAS)
         return wanted and self.optimize_cameras and self.geo_loss
 
     def refined_cameras(self, cameras: int) -> int:
@@ -119,7 +119,7 @@ class GeographicOptions(StageOptions):
         return cameras if self.optimize_cameras and self.geo_loss and not self.solves_once(cameras) else 0
 
     def require_trainable(self, cameras: int) -> None:
-        """Refuse options that change the cameras' solution during a training that keeps it, by an `InputError`."""
+        """Refuse options that change the cameras' solution while a training freezes it, by an `InputError`."""
         if not self.solves_once(cameras):
             return
         for value, plain, name in (

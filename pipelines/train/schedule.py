@@ -28,7 +28,7 @@ class JointOptions:
     Attributes:
         sh_degree: degree that the spherical harmonics reach.
         losses: weights that the user decides.
-        similarity_rate: first learning rate of the similarity and of constant errors of the measurements, in
+        similarity_rate: first learning rate of the similarity and of systematic errors of the measurements, in
             standard deviations an iteration.
         camera_rate: first learning rate of the camera corrections, in standard deviations an iteration.
         seed: of the order of views.

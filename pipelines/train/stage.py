@@ -39,8 +39,8 @@ from pipelines.survey.report_parts import EstimatedError, LidarReport
 from pipelines.survey.scene import photographs
 from pipelines.survey.trained_model import Adjustment, TrainedModel
 from pipelines.train.adjusted_scene import AdjustedScene, figures_of, with_exposures
-from pipelines.train.estimate import estimate_training, training_size, with_gaussian_limit
-from pipelines.train.geographic.problem import held_problem, refining_problem
+from pipelines.train.forecast import training_size, with_gaussian_limit
+from pipelines.train.geographic.problem import frozen_problem, refining_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.lidar import compared_lidar, draw_changes, lidar_surface, plane_observations
 from pipelines.train.loop import METRICS, TrainingRecord, train_in_folder
@@ -106,8 +106,8 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
         points = GeolocatedPoints.load(workspace.path(POINTS))
         problem = refining_problem(adjusted, measured, options, points, options.seed)
     else:
-        log.info("similarity and cameras are frozen at the adjustment of init-sim3")
-        problem = held_problem(adjusted)
+        log.info("Similarity and cameras are frozen at the adjustment of init-sim3.")
+        problem = frozen_problem(adjusted)
     if compared is not None and clouds is not None:
         shift_m = measured.errors.value(adjusted.error_estimates(measured.errors)[0], "lidar-shift")
         lidar = lidar_surface(compared, clouds, survey, options, shift_m)
@@ -133,10 +133,10 @@ def _backend(options: TrainOptions, progress: Progress) -> Rasterizer:
 
 
 def _write_solution(
-    stage: StageRun, trainer: JointTrainer, held: Adjustment, posterior: Posterior | None
+    stage: StageRun, trainer: JointTrainer, frozen: Adjustment, posterior: Posterior | None
 ) -> TrainedModel:
-    """Write and return the product of a training, which has `held` its adjustment if there is no posterior."""
-    model = trained_model(trainer, held if posterior is None else posterior.solution)
+    """Write and return the product of a training, of which `frozen` is the adjustment if there is no posterior."""
+    model = trained_model(trainer, frozen if posterior is None else posterior.solution)
     save_json(model, stage.out / Path(MODEL).name)
     path = stage.out / Path(TRAIN_POSTERIOR).name
     if posterior is None:

@@ -107,9 +107,9 @@ class JointTrainer:
     Args:
         optimizer: the Gaussians and their moments.
         strategy: density control.
-        problem: similarity, cameras and constant errors, with the geographic losses.
+        problem: similarity, cameras and systematic errors, with the geographic losses.
         exposures: of the photographs, optimised as well or frozen; None: all photographs have the same exposure.
-        outliers: finds outlier pixels, which do not count; None: all do.
+        outliers: finds pixels that contradict the model, which do not count; None: all do.
         region: part of the scene that the Gaussians are to show; None: all of it.
     """
 
@@ -152,8 +152,8 @@ class JointTrainer:
     def step(self) -> StepReport:
         """Run one iteration and return its figures.
 
-        1. One training view, or a crop of it, is rendered and compared with its photograph.
-        2. The gradient of all losses moves Gaussians, similarity, cameras, constant errors, weights and exposures.
+        1. One training view, or a window of it, is rendered and compared with its photograph.
+        2. The gradient of all losses moves Gaussians, similarity, cameras, systematic errors, weights, exposures.
         3. Density control records the render, and edits the Gaussians if its schedule says so.
         """
         self.iteration += 1
@@ -346,7 +346,7 @@ def make_trainer(
     Args:
         training: cameras, photographs and surface.
         problem: the geographic losses, moved to the backend's device.
-        exposures: frozen; None: those of the training photographs are fitted, if the options say so.
+        exposures: to be frozen; None: those of the training photographs are fitted, if the options say so.
 
     Raises:
         DegenerateGeometryError: fewer than two different points to start from.
@@ -388,8 +388,8 @@ def make_finisher(
     Args:
         training: cameras, photographs and region.
         gaussians: on the backend's device.
-        problem: with frozen cameras.
-        exposures: frozen; None: none.
+        problem: freezes the cameras.
+        exposures: to be frozen; None: none.
     """
     device, scene, iterations = device_of(backend), training.scene, options.effort.iterations
     extent_m = scene_extent(scene.poses.cam_center_in_model[scene.train])

@@ -228,3 +228,30 @@ def test_control_points_can_be_left_out() -> None:
     assert without.correspondences["gcp"] == without.residuals["gcp"].count == 0
     alone, _ = estimated(survey.model_copy(update={"control_points": ()}), model, points, CONFIG)
     assert without == alone
+
+
+def test_an_assumed_sigma_is_said_once_with_the_option_that_states_it() -> None:
+    survey, model, points = material(Noise(), Measured(gcps=True))
+    wide_px = 7.0 * survey.control_points[0].marks[0].sigma_px
+    wide = tuple(
+        point.model_copy(
+            update={"marks": tuple(mark.model_copy(update={"sigma_px": wide_px}) for mark in point.marks)}
+        )
+        for point in survey.control_points
+    )
+    assumed = survey.model_copy(update={"control_points": wide, "default_sigmas": ("control points", "marks")})
+    found, _ = estimated(assumed, model, points, CONFIG)
+    factors = {factor.group: factor for factor in found.variance_factors}
+    sentence = said(found.cautions, "default-sigma")
+    of_control, of_marks = sentence.split("--sigma-gcp-v")
+    assert "--sigma-gcp-h" in of_control and "--sigma-mark" in of_marks
+    assert factors["marks"].applied == pytest.approx(1 / 49, rel=0.5)
+    assert numbers(of_marks) == pytest.approx([np.sqrt(factors["marks"].applied), wide_px], rel=0.05)
+    off = [point.position_in_geo for point in survey.control_points]
+    poor = tuple(
+        point.model_copy(update={"position_in_geo": (east + 0.5 * (-1) ** index, north, up + 0.3 * (index % 3))})
+        for index, (point, (east, north, up)) in enumerate(zip(wide, off, strict=True))
+    )
+    rejected, _ = estimated(assumed.model_copy(update={"control_points": poor}), model, points, CONFIG)
+    assert "--sigma-gcp-h" in said(rejected.cautions, "sigma-rejected")
+    assert "--sigma-gcp-h" not in said(rejected.cautions, "default-sigma")

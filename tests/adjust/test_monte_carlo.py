@@ -226,16 +226,16 @@ def test_sigma_of_a_distance_is_true(profile: str) -> None:
         assert np.median(of_distance) < 0.3 * np.median(of_points)
 
 
-def test_true_predictions_are_not_refuted_by_the_errors_that_points_share() -> None:
+def test_true_predictions_are_not_rejected_by_the_errors_that_points_share() -> None:
     codes = [code_of(run.error, run.joint) for profile in PROFILES for run in runs_of(30, profile)]
     assert codes.count(None) >= 0.97 * len(codes)
-    # The points share most of their error: taken for independent, a third of these draws would be refuted.
+    # The points share most of their error: taken for independent, a third of these draws would be rejected.
     alone = [code_of(run.error, blocks_of(run.joint)) for profile in PROFILES for run in runs_of(30, profile)]
     assert alone.count(None) < 0.8 * len(alone)
 
 
 @pytest.mark.parametrize(("factor", "code"), [(2.0, "prediction-rejected"), (0.5, "prediction-pessimistic")])
-def test_wrong_predictions_are_refuted(factor: float, code: str) -> None:
+def test_wrong_predictions_are_rejected(factor: float, code: str) -> None:
     found = [code_of(factor * run.error, run.joint) for profile in PROFILES for run in runs_of(30, profile)]
     assert found.count(code) > 0.97 * len(found)
 

@@ -65,7 +65,7 @@ def test_leaving_out_a_control_point_is_what_solving_again_would_give() -> None:
         cov = cov + np.array(point.cov_in_geo)
         row = rows[point.name]
         sigma = np.sqrt(np.diag(cov))
-        # The robust weights of the others, which are held, change a little when it is gone.
+        # The robust weights of the others, which are frozen, change a little when it is gone.
         np.testing.assert_allclose(np.array(row.left_out_error_m) / sigma, error[0] / sigma, atol=0.35)
         np.testing.assert_allclose(np.sqrt(np.diag(np.array(row.left_out_cov_m2))), sigma, rtol=0.15)
 

@@ -119,10 +119,10 @@ def poses_of(network: Network) -> CameraPoses:
 
 
 def problem_of(
-    network: Network, terms: tuple[Term, ...], errors: SystematicErrors, *, held: bool = False
+    network: Network, terms: tuple[Term, ...], errors: SystematicErrors, *, frozen: bool = False
 ) -> Problem:
     bundle = bundle_information(network, sigma_px=np.full(len(network.obs_point), SIGMA_PX))
-    return Problem(poses_of(network), bundle, terms, errors, lens_held=held)
+    return Problem(poses_of(network), bundle, terms, errors, lens_frozen=frozen)
 
 
 def start_of(problem: Problem, geo_from_model: Similarity) -> State:
@@ -281,7 +281,7 @@ class Dense:
         unit[self.poses + 3 * POINTS :][:LENSES] = LENS_UNIT
         change = np.zeros(width)
         held = np.arange(width)
-        if self.problem.lens_held:
+        if self.problem.lens_frozen:
             held = np.delete(held, self.poses + 3 * POINTS + np.arange(LENSES))
         for _ in range(2):
             columns = []
@@ -304,8 +304,8 @@ CASES: dict[str, tuple[tuple[str, ...], SystematicErrors, bool]] = {
     "lever arm": ((Fixes.kind, ControlPoints.kind), of_kinds("bias", "lever-arm"), False),
     "attitudes": ((Fixes.kind, Attitudes.kind), of_kinds("boresight", "common"), False),
     "lidar": ((Fixes.kind, Planes.kind), of_kinds("lidar-shift"), False),
-    "held lens": ((Fixes.kind, ControlPoints.kind), of_kinds("bias"), True),
-    "held lens, fixes": ((Fixes.kind,), of_kinds(), True),
+    "frozen lens": ((Fixes.kind, ControlPoints.kind), of_kinds("bias"), True),
+    "frozen lens, fixes": ((Fixes.kind,), of_kinds(), True),
 }
 
 
@@ -319,7 +319,7 @@ class Case:
 
 
 def case_of(name: str, geo_from_model: Similarity = GEO_FROM_MODEL) -> Case:
-    kinds, errors, held = CASES[name]
+    kinds, errors, frozen = CASES[name]
     rng = np.random.default_rng(sum(map(ord, name)))
     drawn = replace(EXACT, obs_xy_px=EXACT.obs_xy_px + SMALL * rng.normal(0, SIGMA_PX, EXACT.obs_xy_px.shape))
     network = EXACT
@@ -327,7 +327,7 @@ def case_of(name: str, geo_from_model: Similarity = GEO_FROM_MODEL) -> Case:
         left = drawn.obs_xy_px - pixels(network, np.zeros(size(network)))
         network = replace(readjusted(network, SOLVE @ left.ravel()), obs_xy_px=drawn.obs_xy_px)
     terms = measured(EXACT, geo_from_model, rng, SMALL)
-    problem = problem_of(network, tuple(terms[kind] for kind in kinds), errors, held=held)
+    problem = problem_of(network, tuple(terms[kind] for kind in kinds), errors, frozen=frozen)
     return Case(network, problem, start_of(problem, geo_from_model))
 
 
@@ -355,7 +355,7 @@ def test_minimum_and_covariances_are_those_of_the_plain_adjustment(name: str) ->
     missed = np.column_stack([turned, apart / GEO_FROM_MODEL.scale]) / sigma[:n].reshape(-1, 6)
     assert np.abs(missed).max() < 1e-2 * SMALL
     np.testing.assert_allclose(state.errors, there.errors, atol=1e-2 * SMALL * 0.1)
-    if not problem.lens_held:
+    if not problem.lens_frozen:
         assert np.abs((state.lens - there.lens) / sigma[lens_at:][:LENSES]).max() < 1e-2 * SMALL
     expected = (dense.residuals(change, GEO_FROM_MODEL) ** 2).sum()
     assert minimum.cost == pytest.approx(expected - at_the_bundle(network), rel=1e-2)

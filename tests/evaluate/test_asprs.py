@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.evaluate.asprs import assess, classes_cm, error_stats
+from pipelines.evaluate.asprs import assess, classes_cm, error_stats, few_points
+from tests.refusals import numbers
 
 EXACT = np.zeros((3, 3))
 
@@ -50,13 +51,13 @@ def test_class_is_the_smallest_that_is_met(error_m: float, class_cm: int) -> Non
 def test_too_few_points_are_told_plainly() -> None:
     few = assess(np.full((12, 3), 0.01), np.tile(EXACT, (12, 1, 1)))
     assert few.asprs.statement is not None
-    assert few.asprs.statement.startswith(
-        "12 check points; the standard (ASPRS, Edition 2, Version 2, 2024) asks for at least 30"
-    )
+    assert few.asprs.statement.startswith(few_points(few.asprs))
+    assert numbers(few_points(few.asprs))[:2] == [12, 30]
     assert few.asprs.enough_points is False
     many = assess(np.full((30, 3), 0.01), np.tile(EXACT, (30, 1, 1)))
     assert many.asprs.statement is not None
-    assert "indicative" not in many.asprs.statement
+    assert many.asprs.enough_points is True
+    assert few_points(many.asprs) not in many.asprs.statement
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ def basis_of(network: Network, *, lens_follows: bool = True) -> CorrectionBasis:
 
 
 def free_covariance(network: Network) -> np.ndarray:
-    """Return the covariance (6 n, 6 n) of the poses for unit pixel noise, with the points held on the average.
+    """Return the covariance (6 n, 6 n) of the poses for unit pixel noise, with the points fixed on the average.
 
     Meissl's constraints on the cameras border the full normal matrix. Then the gauge moves to the points.
     """
@@ -86,7 +86,7 @@ def test_no_correction_moves_the_points_by_a_similarity(lens_follows: bool) -> N
     assert np.abs(mean[:4]).max() < 1e-3 * np.abs(flat.reshape(6, 6, -1)[:, :3]).max()
 
 
-def test_lens_follows_as_a_readjustment_with_held_cameras_would_have_it() -> None:
+def test_lens_follows_as_a_readjustment_with_frozen_cameras_would_have_it() -> None:
     network = exact_network()
     basis = basis_of(replace(network, obs_xy_px=network.obs_xy_px + SIGMA_PX))
     design, flat = jacobian(network), basis.matrix.reshape(36, -1)

@@ -21,7 +21,7 @@ from pipelines.report.options import ReportOptions
 from pipelines.report.page import value_at
 from pipelines.report.points import points_facts
 from pipelines.report.stage import run
-from pipelines.survey.report import read_report, write_report
+from pipelines.survey.report import read_report
 from pipelines.survey.survey import Survey
 from tests.evaluated_workspaces import evaluated_workspace
 from tests.refusals import refused
@@ -130,7 +130,7 @@ def test_what_is_missing_is_said_with_what_to_do(tmp_path: Path) -> None:
     images = tuple(image.model_copy(update={"timestamp_s": None}) for image in survey.images)
     bare = {"control_points": (), "check_points": (), "images": images}
     save_json(survey.model_copy(update=bare), root / SURVEY)
-    write_report(report_with(), root / REPORT)
+    save_json(report_with(), root / REPORT)
     (root / METRICS).unlink()
     for file in (root / RENDERS).iterdir():
         file.unlink()
@@ -179,7 +179,7 @@ def test_before_training_the_sections_of_the_cameras_are_there(tmp_path: Path) -
     alone = report.checkpoints.model_copy(update={"surface": None})
     untrained(made.workspace)
     update = {"photometric": None, "checkpoints": alone}
-    write_report(report.model_copy(update=update), made.workspace.path(REPORT))
+    save_json(report.model_copy(update=update), made.workspace.path(REPORT))
     page = page_of(made)
     sections = set(re.findall(r'<section id="([^"]+)"', page))
     assert {"summary", "accuracy", "check-points", "positions", "lenses", "photographs"} <= sections

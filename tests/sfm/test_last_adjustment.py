@@ -150,14 +150,14 @@ def test_point_far_from_the_middle_is_refused(caplog: pytest.LogCaptureFixture) 
         adjust(model)
     assert "principal point of camera 1 is not determined and stays where it was" in caplog.text
     np.testing.assert_array_equal(model.cameras[1].params[1:3], CENTER)
-    # All else is adjusted again, and comes to the minimum that it reaches with the principal point held. They end
+    # All else is adjusted again, and comes to the minimum that it reaches with the principal point frozen. They end
     # a fraction of σ from their minimum, for which the scatter of the focal length, 0.6 px, is the measure.
     np.testing.assert_allclose(model.cameras[1].params, held.cameras[1].params, atol=0.1)
     np.testing.assert_allclose(poses(model), poses(held), atol=1e-3)
 
 
 @pytest.mark.parametrize(("images", "principal_point"), [(9, True), (12, False)])
-def test_principal_point_is_held_for_few_images_and_on_demand(images: int, principal_point: bool) -> None:
+def test_principal_point_is_frozen_for_few_images_and_on_demand(images: int, principal_point: bool) -> None:
     truth, model = true_model((0.0, 0.0), images), true_model((0.0, 0.0), images)
     disturb(model, noise_px=0.1, wrong=0.06)
     as_mapped(model)

@@ -14,7 +14,7 @@ def picture(seed: int = 0) -> torch.Tensor:
     return torch.rand(12, 16, 3, generator=torch.Generator().manual_seed(seed))
 
 
-def test_gains_that_differ_are_found_and_their_mean_is_held() -> None:
+def test_gains_that_differ_are_found_and_their_mean_is_frozen() -> None:
     # Photograph 0 is 10 % brighter and 1 is 10 % darker than the scene; 3 is as the scene is.
     gain = {0: 1.1, 1: 0.9, 3: 1.0}
     exposures, colour = Exposures(4, TRAIN, 600, CPU), picture()

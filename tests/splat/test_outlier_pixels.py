@@ -1,4 +1,4 @@
-"""Pixels that contradict the model: an object in one photograph of six, and noise that is none."""
+"""Pixels that disagree with the model: an object in one photograph of six, and noise that is none."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Photo-consistency of renders: blurred parts are inconsistent, whatever the exposure; plain ones are not."""
+"""Where renders show their photographs: blurred parts are rejected, whatever the exposure; plain ones are not."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_exposure_has_no_influence() -> None:
     assert photo_consistent(np.clip(0.8 * photo + 30.0, 0, 255).astype(np.uint8), photo).all()
 
 
-def test_blurred_and_foreign_texture_is_inconsistent() -> None:
+def test_blurred_and_foreign_texture_is_rejected() -> None:
     photo = photograph()
     inner = np.s_[10:-10, 10 : HALF - 10]
     assert not photo_consistent(cv2.GaussianBlur(photo, (0, 0), 6), photo)[inner].any()
@@ -34,7 +34,7 @@ def test_blurred_and_foreign_texture_is_inconsistent() -> None:
     assert photo_consistent(np.ascontiguousarray(foreign), photo)[inner].mean() < 0.05
 
 
-def test_plain_parts_are_consistent() -> None:
+def test_plain_parts_reject_nothing() -> None:
     photo = photograph()
     plain = np.s_[:, HALF + 10 : -10]
     assert photo_consistent(np.full_like(photo, 120), photo)[plain].all()

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from pipelines.core.errors import InputError
-from pipelines.core.products import Remark
+from pipelines.core.products import Remark, save_json
 from pipelines.survey.report import (
     Coordinates,
     EvaluationReport,
@@ -17,7 +17,6 @@ from pipelines.survey.report import (
     PointError,
     PredictedPointError,
     read_report,
-    write_report,
 )
 from tests.refusals import refused
 from tests.reports import check_points_with, report_with
@@ -29,7 +28,7 @@ UNMEASURED = {"name": "P2", "rays": 1, "de_m": None, "dn_m": None, "du_m": None,
 
 def document_of(report: EvaluationReport, path: Path) -> dict[str, Any]:
     """The JSON document that is written of a report."""
-    write_report(report, path)
+    save_json(report, path)
     document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     return document
 

@@ -66,7 +66,7 @@ def test_what_has_changed_is_rejected_and_nothing_else(then: Town, now: Town, ki
 
 
 def test_places_where_half_of_the_cloud_agrees_are_not_listed() -> None:
-    # Ground with two patches of 6 m by 6 m: in one all points are inconsistent, in the other every second one.
+    # Ground with two patches of 6 m by 6 m: in one all points disagree, in the other every second one.
     east, north = (axis.ravel() for axis in np.meshgrid(np.arange(0, 40, 0.5), np.arange(0, 20, 0.5)))
     points = np.column_stack([east, north, np.zeros(len(east))])
     cloud = planes_of(points, np.ones(len(points), np.uint8), 0.5)

@@ -15,7 +15,7 @@ from pipelines.core.workspace import Workspace
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.survey.scene import photographs
 from pipelines.train.adjusted_scene import AdjustedScene
-from pipelines.train.geographic.problem import held_problem, refining_problem
+from pipelines.train.geographic.problem import frozen_problem, refining_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import TrainOptions
 from pipelines.train.trainer import JointTrainer, load_checkpoint, make_trainer, save_checkpoint
@@ -41,7 +41,7 @@ def trainer_of(workspace: Workspace, config: TrainOptions = CONFIG) -> JointTrai
     adjusted = AdjustedScene.load(workspace)
     images = photographs(adjusted.scene.sparse, adjusted.survey, workspace, 640)
     refines = config.refined_cameras(len(images)) > 0
-    problem = refining_problem(adjusted, adjusted.measured(), config) if refines else held_problem(adjusted)
+    problem = refining_problem(adjusted, adjusted.measured(), config) if refines else frozen_problem(adjusted)
     return make_trainer(TrainingScene(adjusted.scene, images), problem, rasterizer("cpu"), config)
 
 

@@ -1,6 +1,6 @@
 """Maps with what a surveyor looks for beside the colours: names, errors as arrows, coordinates, and north.
 
-They show the predicted accuracy over a scene, and the places where LiDAR and photographs contradict each other.
+They show the predicted accuracy over a scene, and the places where LiDAR and photographs disagree.
 """
 
 from __future__ import annotations

@@ -26,8 +26,8 @@ from pipelines.surface.depth_maps import DepthMaps
 from pipelines.survey.block_plan import BlockPlan, BlockTraining, PlannedBlock
 from pipelines.survey.scene import photographs
 from pipelines.train.adjusted_scene import AdjustedScene
-from pipelines.train.estimate import training_size
-from pipelines.train.geographic.problem import held_problem
+from pipelines.train.forecast import training_size
+from pipelines.train.geographic.problem import frozen_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.loop import METRICS, TrainingRecord, train_in_folder
 from pipelines.train.options import BlockTrainOptions
@@ -80,7 +80,7 @@ def run(stage: StageRun, options: BlockTrainOptions) -> Summary:
     surface = None if maps is None else SceneSurface(maps)
     scene, region = replace(solved.scene, train=seeing), _region(block, box, scaffold, masks)
     training, exposures = TrainingScene(scene, images, surface, region), solved.exposures(device_of(backend))
-    trainer = make_trainer(training, held_problem(solved), backend, options, exposures)
+    trainer = make_trainer(training, frozen_problem(solved), backend, options, exposures)
     earlier = None if stage.extends is None else stage.extends / "record.json"
     done = load_json(BlockTraining, earlier).iterations if earlier is not None and earlier.is_file() else 0
     record = train_in_folder(stage, trainer, options, done)

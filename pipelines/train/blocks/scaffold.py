@@ -14,8 +14,8 @@ from pipelines.splat.rasterizer.backends import device_of, rasterizer
 from pipelines.survey.block_plan import SCAFFOLD_IMAGE_PX, scaffold_gaussians
 from pipelines.survey.scene import photographs
 from pipelines.train.adjusted_scene import AdjustedScene
-from pipelines.train.estimate import training_size
-from pipelines.train.geographic.problem import held_problem
+from pipelines.train.forecast import training_size
+from pipelines.train.geographic.problem import frozen_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.loop import train_in_folder
 from pipelines.train.options import TrainOptions
@@ -34,7 +34,7 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     require_memory(training_size(coarse, len(images), images.largest()), free_memory_bytes(device_of(backend)))
     images.build(stage.progress)
     exposures = solved.exposures(device_of(backend))
-    trainer = make_trainer(TrainingScene(solved.scene, images), held_problem(solved), backend, coarse, exposures)
+    trainer = make_trainer(TrainingScene(solved.scene, images), frozen_problem(solved), backend, coarse, exposures)
     record = train_in_folder(stage, trainer, coarse)
     gaussians = trainer.optimizer.gaussians.detached()
     write_gaussians(stage.out / "gaussians.ply", gaussians)

@@ -31,7 +31,7 @@ from pipelines.survey.block_plan import BlockCell, BlockPlan, PlannedBlock
 from pipelines.survey.photographs import ImageCache
 from pipelines.survey.scene import photographs
 from pipelines.train.adjusted_scene import AdjustedScene
-from pipelines.train.geographic.problem import held_problem
+from pipelines.train.geographic.problem import frozen_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import SeamOptions
 from pipelines.train.region import SceneBox, TrainingRegion, region_masks
@@ -157,7 +157,7 @@ class _SeamTrainer:
         trainer = make_finisher(
             TrainingScene(replace(scene, train=seeing), self.images, None, region),
             start.to(device),
-            held_problem(self.solved),
+            frozen_problem(self.solved),
             backend=self.backend,
             options=self.options.model_copy(update={"iterations": iterations}),
             exposures=self.solved.exposures(device),

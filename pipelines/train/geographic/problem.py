@@ -170,7 +170,7 @@ class GeoProblem(torch.nn.Module):
             in_metres = self.weighting == "paper" and term.in_metres
             residual = term.residuals(at) if in_metres else term.whitened(at)
             values[term.kind] = self._rho(term, residual).mean()
-        # A problem with frozen cameras has no z, and no loss.
+        # A problem that freezes the cameras has no z, and no loss.
         values["cameras"] = self.cameras.z.square().sum() / self._normaliser()
         if len(at.vector):
             values["errors"] = self.errors.prior() / self._normaliser()
@@ -299,13 +299,13 @@ def refining_problem(
     )
 
 
-def held_problem(adjusted: AdjustedScene) -> GeoProblem:
-    """Return the problem of a training with similarity, cameras and lens frozen at the adjustment."""
+def frozen_problem(adjusted: AdjustedScene) -> GeoProblem:
+    """Return the problem of a training that freezes similarity, cameras and lens at the adjustment."""
     record, poses = adjusted.adjustment.geo_from_model, adjusted.adjustment.poses
     state = replace(adjusted.state(SystematicErrors()), correction=np.zeros((len(poses.cam_from_model), 6)))
     return GeoProblem(
         LearnableSimilarity(state.geo_from_model, np.array(record.covariance), np.array(record.pivot)),
-        CameraCorrections.held(poses, state),
+        CameraCorrections.frozen(poses, state),
     )
 
 

@@ -135,7 +135,7 @@ class LearnableSimilarity(torch.nn.Module):
 
 
 class CameraCorrections(torch.nn.Module):
-    """Poses = base corrected by (δω, δc) = held + basis · z, lens = held + lens basis · z, in float64.
+    """Poses = base corrected by (δω, δc) = frozen + basis · z, lens = frozen + lens basis · z, in float64.
 
     The basis of `geometry.correction_basis.correction_basis` has these properties:
 
@@ -146,10 +146,10 @@ class CameraCorrections(torch.nn.Module):
 
     Args:
         base: poses as SfM left them.
-        basis: (n, 6, k) rows (δω, δc), rad and m; k = 0 holds the cameras.
+        basis: (n, 6, k) rows (δω, δc), rad and m; k = 0 freezes the cameras.
         lens_basis: (L, k) response of the lens parameters: `CorrectionBasis.lens_matrix`.
         start: corrections of cameras and lens to start from.
-        z: (k,) coordinates of the start; what they do not give of it is held.
+        z: (k,) coordinates of the start; what they do not give of it is frozen.
     """
 
     def __init__(
@@ -161,31 +161,31 @@ class CameraCorrections(torch.nn.Module):
         self.lens_basis: Tensor
         self.rotation: Tensor
         self.center: Tensor
-        self.held_poses: Tensor
-        self.held_lens: Tensor
+        self.frozen_poses: Tensor
+        self.frozen_lens: Tensor
         for name, values in (
             ("basis", basis),
             ("lens_basis", lens_basis),
             ("rotation", base.cam_from_model),
             ("center", base.cam_center_in_model),
-            ("held_poses", start.correction - basis @ z),
-            ("held_lens", start.lens - lens_basis @ z),
+            ("frozen_poses", start.correction - basis @ z),
+            ("frozen_lens", start.lens - lens_basis @ z),
         ):
             self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(values)))
 
     @classmethod
-    def held(cls, base: CameraPoses, start: State) -> CameraCorrections:
+    def frozen(cls, base: CameraPoses, start: State) -> CameraCorrections:
         """Return cameras and lens that nothing moves."""
         n, lenses = len(start.correction), len(start.lens)
         return cls(base, np.zeros((n, 6, 0)), np.zeros((lenses, 0)), start, np.zeros(0))
 
     def corrections(self) -> Tensor:
         """Return the corrections (δω, δc) of all cameras (n, 6), rad and m."""
-        return self.held_poses + (self.basis.flatten(0, 1) @ self.z).view(-1, 6)
+        return self.frozen_poses + (self.basis.flatten(0, 1) @ self.z).view(-1, 6)
 
     def lens(self) -> Tensor:
         """Return the change (L,) of the lens parameters, in the order of `geometry.cameras.Lenses`; L = 0: none."""
-        return self.held_lens + self.lens_basis @ self.z
+        return self.frozen_lens + self.lens_basis @ self.z
 
     def moved(self) -> tuple[Tensor, Tensor]:
         """Return the corrected rotations cam ← model (n, 3, 3) and centres (n, 3) in `model`, metres."""
@@ -194,7 +194,7 @@ class CameraCorrections(torch.nn.Module):
 
     def pose(self, index: int) -> tuple[Tensor, Tensor]:
         """Return the corrected rotation cam ← model (3, 3) and centre (3,) of one camera."""
-        correction = self.held_poses[index] + self.basis[index] @ self.z
+        correction = self.frozen_poses[index] + self.basis[index] @ self.z
         return self.rotation[index] @ exp_so3_tensor(-correction[:3]), self.center[index] + correction[3:]
 
     def cam_from_model(self, index: int) -> Tensor:

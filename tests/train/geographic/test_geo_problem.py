@@ -21,7 +21,7 @@ from pipelines.survey.adjustment import GeolocatedPoints
 from pipelines.survey.scene import adjusted_scene
 from pipelines.survey.survey import Survey
 from pipelines.train.adjusted_scene import AdjustedScene, with_exposures
-from pipelines.train.geographic.problem import GeoProblem, TermWeights, held_problem, refining_problem
+from pipelines.train.geographic.problem import GeoProblem, TermWeights, frozen_problem, refining_problem
 from pipelines.train.geographic.terms import SURFACE_SIGMA, DistanceTerm, depth_residuals
 from pipelines.train.options import MOST_JOINT_CAMERAS, GeographicOptions, TrainOptions
 from tests.adjusted_scenes import adjusted_model, block
@@ -120,9 +120,9 @@ def test_measurements_that_leave_the_similarity_open_are_refused_before_the_trai
         few.require_determined(few.measured(control_points=False))
 
 
-def test_held_cameras_are_those_of_the_adjustment_and_do_not_move() -> None:
+def test_frozen_cameras_are_those_of_the_adjustment_and_do_not_move() -> None:
     given = adjusted()
-    problem, solution = held_problem(given.scene), given.posterior.solution
+    problem, solution = frozen_problem(given.scene), given.posterior.solution
     _, center = problem.cameras.pose(3)
     np.testing.assert_allclose(center.detach(), solution.poses.cam_center_in_model[3], atol=1e-9)
     lens = given.scene.scene.sparse.lenses.moved(problem.cameras.lens().detach().numpy())
@@ -240,7 +240,7 @@ def test_bounds_hold_whatever_is_learned(weighting: str) -> None:
             assert value == pytest.approx(math.exp(math.copysign(math.log(factor), far)), rel=1e-9)
 
 
-def test_options_that_change_a_solved_camera_are_refused() -> None:
+def test_options_that_disagree_with_a_frozen_solution_are_refused() -> None:
     options = GeographicOptions(gcp_mode="depth")
     options.require_trainable(MOST_JOINT_CAMERAS)
     with refused("cameras-solved-once", InputError) as error:

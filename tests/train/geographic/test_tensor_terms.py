@@ -60,8 +60,8 @@ def residuals_of(problem: Problem, term: Term, state: State) -> Callable[[Tensor
     tensors = tensor_term(term, problem.errors)
 
     def residuals(correction: Tensor, lens: Tensor, errors: Tensor) -> Tensor:
-        cameras = CameraCorrections.held(problem.base, state)
-        cameras.held_poses = correction
+        cameras = CameraCorrections.frozen(problem.base, state)
+        cameras.frozen_poses = correction
         return tensors.residuals(Estimate(*cameras.moved(), similarity, problem.errors, errors, lens))
 
     return residuals

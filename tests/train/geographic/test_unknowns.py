@@ -112,9 +112,9 @@ def test_cameras_and_lens_start_where_they_are_told_and_move_by_the_basis() -> N
     # R' = R Exp(−δω): the camera's axes, seen in the world, turn by +δω.
     turn = log_so3(np.swapaxes(turned, 1, 2) @ base.cam_from_model)
     np.testing.assert_allclose(turn, cameras.corrections().detach()[:, :3], atol=1e-12)
-    held = CameraCorrections.held(base, start)
-    assert len(held.z) == 0
-    np.testing.assert_allclose(held.moved()[1].detach(), wanted.cam_center_in_model, atol=1e-12)
+    frozen = CameraCorrections.frozen(base, start)
+    assert len(frozen.z) == 0
+    np.testing.assert_allclose(frozen.moved()[1].detach(), wanted.cam_center_in_model, atol=1e-12)
 
 
 def test_prior_of_an_error_is_set_aside_where_the_error_is_far_larger() -> None:
