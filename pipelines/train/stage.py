@@ -39,7 +39,7 @@ from pipelines.survey.report_parts import EstimatedError, LidarReport
 from pipelines.survey.scene import photographs
 from pipelines.survey.trained_model import Adjustment, TrainedModel
 from pipelines.train.adjusted_scene import AdjustedScene, figures_of, with_exposures
-from pipelines.train.forecast import training_size, with_gaussian_limit
+from pipelines.train.estimate import estimate_training, training_size, with_gaussian_limit
 from pipelines.train.geographic.problem import frozen_problem, refining_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.lidar import compared_lidar, draw_changes, lidar_surface, plane_observations

@@ -26,7 +26,7 @@ from pipelines.surface.depth_maps import DepthMaps
 from pipelines.survey.block_plan import BlockPlan, BlockTraining, PlannedBlock
 from pipelines.survey.scene import photographs
 from pipelines.train.adjusted_scene import AdjustedScene
-from pipelines.train.forecast import training_size
+from pipelines.train.estimate import training_size
 from pipelines.train.geographic.problem import frozen_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.loop import METRICS, TrainingRecord, train_in_folder

@@ -14,7 +14,7 @@ from pipelines.splat.rasterizer.backends import device_of, rasterizer
 from pipelines.survey.block_plan import SCAFFOLD_IMAGE_PX, scaffold_gaussians
 from pipelines.survey.scene import photographs
 from pipelines.train.adjusted_scene import AdjustedScene
-from pipelines.train.forecast import training_size
+from pipelines.train.estimate import training_size
 from pipelines.train.geographic.problem import frozen_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.loop import train_in_folder
