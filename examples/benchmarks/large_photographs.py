@@ -13,7 +13,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
-from pipelines.train.forecast import training_size
 
 from pipelines.core.machine import peak_memory_bytes
 from pipelines.core.plan import photograph_folder
@@ -24,6 +23,7 @@ from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.depth_maps import DepthMaps
 from pipelines.survey.photographs import ImageCache, Photograph
 from pipelines.train.adjusted_scene import AdjustedScene
+from pipelines.train.estimate import training_size
 from pipelines.train.geographic.problem import frozen_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import TrainOptions

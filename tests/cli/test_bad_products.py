@@ -34,12 +34,12 @@ def made(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("stage", "gone", "told"),
     [
-        ("sfm", "ingest", f"error: {SURVEY} is missing: run `georef ingest {{ws}}` first"),
-        ("geolocate", "sfm", f"error: {SPARSE} is missing: run `georef sfm {{ws}}` first"),
-        ("init-sim3", "geolocate", f"error: {POINTS} is missing: run `georef geolocate {{ws}}` first"),
-        ("train", "sim3", f"error: {SIM3} is missing: run `georef init-sim3 {{ws}}` first"),
-        ("evaluate", "sim3", f"error: {SIM3} is missing: run `georef init-sim3 {{ws}}` first"),
-        ("export-ply", "train", f"error: {MODEL} is missing: run `georef train {{ws}}` first"),
+        ("sfm", "ingest", f"error: {SURVEY} is missing. Run `georef ingest {{ws}}` first."),
+        ("geolocate", "sfm", f"error: {SPARSE} is missing. Run `georef sfm {{ws}}` first."),
+        ("init-sim3", "geolocate", f"error: {POINTS} is missing. Run `georef geolocate {{ws}}` first."),
+        ("train", "sim3", f"error: {SIM3} is missing. Run `georef init-sim3 {{ws}}` first."),
+        ("evaluate", "sim3", f"error: {SIM3} is missing. Run `georef init-sim3 {{ws}}` first."),
+        ("export-ply", "train", f"error: {MODEL} is missing. Run `georef train {{ws}}` first."),
     ],
 )
 def test_upstream_missing(real_georef: Georef, made: Path, stage: str, gone: str, told: str) -> None:
@@ -51,10 +51,10 @@ def test_upstream_missing(real_georef: Georef, made: Path, stage: str, gone: str
 
 DAMAGED = (
     ("geolocate", SURVEY, b"{", f"{SURVEY}: Invalid JSON"),
-    ("geolocate", SURVEY, b"\xff", f"{SURVEY}: not a UTF-8 text file"),
+    ("geolocate", SURVEY, b"\xff", f"{SURVEY}: is not a UTF-8 text file"),
     ("geolocate", SURVEY, b"{}", f"{SURVEY} [origin]: Field required"),
-    ("geolocate", f"{SPARSE}/images.bin", b"\xff" * 40, "images.bin: shorter than the number of its records says"),
-    ("geolocate", f"{SPARSE}/cameras.bin", b"", "cameras.bin: shorter than the number of its records says"),
+    ("geolocate", f"{SPARSE}/images.bin", b"\xff" * 40, "images.bin: the file is shorter"),
+    ("geolocate", f"{SPARSE}/cameras.bin", b"", "cameras.bin: the file is shorter"),
     ("init-sim3", POINTS, b"PK\x03\x04", f"{POINTS}: not a readable NPZ file"),
     ("train", SIM3, b"[]", f"{SIM3}: Input should be an object"),
     ("evaluate", MODEL, b'{"format_version": 1}', f"{MODEL} [geo_from_model]: Field required"),
@@ -107,7 +107,7 @@ def test_report_that_was_replaced(real_georef: Georef, made: Path, content: byte
     result = real_georef("evaluate", made)
     result.assert_failed(1)
     assert f"error: {made / REPORT}" in result.err
-    assert "not a report: make it again with `georef evaluate --force`" in result.err.splitlines()[-1]
+    assert "not a report; make it again with `georef evaluate --force`" in result.err.splitlines()[-1]
     assert (made / REPORT).read_bytes() == content
 
 
