@@ -111,7 +111,7 @@ class GeographicOptions(StageOptions):
 
     def solves_once(self, cameras: int) -> bool:
         """Return whether a training of that many cameras freezes what init-sim3 has solved."""
-        wanted = self.solve_cameras == "once" or (self.solve == "auto" and cameras > MOST_JOINT_CAMERAS)
+        wanted = self.solve_cameras == "once" or (self.solve_cameras == "auto" and cameras > MOST_JOINT_CAMERAS)
         return wanted and self.optimize_cameras and self.geo_loss
 
     def refined_cameras(self, cameras: int) -> int:
