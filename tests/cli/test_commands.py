@@ -10,6 +10,7 @@ import pytest
 from pipelines.core.errors import ConvergenceError
 from pipelines.core.machine import chosen_threads, thread_count
 from pipelines.core.options import read_requests
+from pipelines.core.products import Remark
 from pipelines.core.stages import BY_NAME, PIPELINE, stage_slice
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from tests import fakes
@@ -279,7 +280,7 @@ class TestTalk:
     def test_markup_in_results_is_text(self, georef: Georef, done: Path) -> None:
         def run(stage: StageRun, options: object) -> Summary:
             fakes.write_products(stage, BY_NAME["sfm"], "")
-            return Summary("[red]48[/red] of 48", {"[bold]a": "[b]"}, ("[i]w[/i]",))
+            return Summary("[red]48[/red] of 48", {"[bold]a": "[b]"}, (Remark(code="markup", sentence="[i]w[/i]"),))
 
         fakes.install(sfm=run)
         assert "[red]48[/red] of 48" in georef("sfm", done, "--force").out

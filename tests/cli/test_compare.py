@@ -42,7 +42,7 @@ def reporting(stage: StageRun, config: StageOptions) -> Summary:
         test={"psnr": 20.0 + error, "ssim": 0.5}, triangulated=points, surface=points, cautions=cautions
     )
     fakes.write_products(stage, spec, dump_json(report.model_dump(mode="json")))
-    return Summary("evaluated", {}, ("few check points",))
+    return Summary("evaluated", {}, (Remark(code="few-check-points", sentence="few check points"),))
 
 
 @pytest.fixture
@@ -268,7 +268,7 @@ def test_table_for_people(georef: Georef, survey: Path) -> None:
 def test_without_a_workspace_there_is_nothing_to_compare(georef: Georef, tmp_path: Path) -> None:
     result = georef("compare", tmp_path / "nowhere")
     assert result.code == 1
-    assert "no such workspace" in result.err
+    assert "does not exist" in result.err
     assert not (tmp_path / "nowhere").exists()
 
 

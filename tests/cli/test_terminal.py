@@ -18,16 +18,17 @@ ATTACKING = f"""
 import logging
 from tests import fakes
 from pipelines.core.errors import InputError
+from pipelines.core.products import Remark
 from pipelines.core.workspace import Summary
 attack = {ATTACK!r}
 def ingest(stage, options):
     logging.getLogger("pipelines.ingest").warning("camera %s", attack)
     if options.test_every == 7:
-        raise InputError("no such image", path=f"photos/{{attack}}.jpg")
+        raise InputError("image-missing", "no such image", path=f"photos/{{attack}}.jpg")
     if options.test_every == 9:
         raise ZeroDivisionError(attack)
     fakes.write_products(stage, fakes.STAGES[0], "text")
-    return Summary(f"camera {{attack}}", {{attack: attack}}, (attack,))
+    return Summary(f"camera {{attack}}", {{attack: attack}}, (Remark(code="attack", sentence=attack),))
 fakes.install(ingest=ingest)
 from georef_cli.main import main
 main()
