@@ -17,8 +17,8 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 
 from pipelines.core.errors import InputError
-from pipelines.core.files import file_size
 from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray
+from pipelines.formats.splat_ply import PLY_TYPES, ply_header
 
 
 @dataclass(frozen=True)
@@ -56,13 +56,7 @@ class CloudFile(Protocol):
         """Yield all points in chunks of at most `size`."""
 
 
-_HEADER_LIMIT = 64 * 1024
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
-_KINDS = {
-    "char": "i1", "uchar": "u1", "int8": "i1", "uint8": "u1", "short": "i2", "ushort": "u2", "int16": "i2",
-    "uint16": "u2", "int": "i4", "uint": "u4", "int32": "i4", "uint32": "u4", "float": "f4", "float32": "f4",
-    "double": "f8", "float64": "f8",
-}  # fmt: skip
 _CLASS_NAMES = ("classification", "scalar_Classification", "scalar_classification")
 _TIME_NAMES = ("gps_time", "scalar_GpsTime", "GpsTime")
 _COARSEST_M = 5e-4  # largest rounding error of float32 coordinates that is accepted
@@ -114,20 +108,13 @@ def open_cloud_ply(path: Path) -> PlyCloudFile:
     Raises:
         InputError: no such file, not a binary PLY, without coordinates, or cut off.
     """
-    size = file_size(path)
-    with path.open("rb") as stream:
-        start = stream.read(_HEADER_LIMIT)
-    head, end, rest = start.partition(b"end_header")
-    lines = [line.split() for line in head.decode("ascii", errors="replace").splitlines()]
-    if not end or lines[:1] != [["ply"]]:
-        raise InputError("not-a-ply", "the file is not a PLY file", path=path)
+    lines, offset, size = ply_header(path)
     form = next((line[1] for line in lines if line[:1] == ["format"] and len(line) > 1), "")
     if form not in _ORDERS:
         message = f"the format of the PLY is {form[:30]!r}: write it as binary_little_endian"
         raise InputError("ply-format", message, path=path)
     count, columns = _vertices(path, lines)
     dtype = np.dtype([(name, _ORDERS[form] + kind) for name, kind in columns])
-    offset = len(head) + len(end) + (2 if rest[:1] == b"\r" else 1)
     if count < 1 or offset + count * dtype.itemsize > size:
         message = (
             f"the header promises {count} points of {dtype.itemsize} bytes, the file has {max(size - offset, 0)}"
@@ -147,10 +134,10 @@ def _vertices(path: Path, lines: list[list[str]]) -> tuple[int, list[tuple[str, 
     for line in lines[elements[0] + 1 : until]:
         if line[:1] != ["property"]:
             continue
-        if len(line) != 3 or line[1] not in _KINDS:
+        if len(line) != 3 or line[1] not in PLY_TYPES:
             message = f"the property {' '.join(line[1:])[:60]!r} of the vertices has no known type of fixed size"
             raise InputError("ply-properties", message, path=path)
-        columns.append((line[2], _KINDS[line[1]]))
+        columns.append((line[2], PLY_TYPES[line[1]]))
     names = [name for name, _ in columns]
     missing = [axis for axis in "xyz" if axis not in names]
     if missing or len(set(names)) != len(names):

@@ -270,8 +270,8 @@ def _pix4d_table(
     path: Path, aliases: Mapping[str, str], in_order: Sequence[str], numeric: slice, expected: str
 ) -> Table:
     """Return a table whose first line is a header if none of its cells `numeric` is a number."""
-    lines = [(at, text) for at, text in enumerate(read_lines(path), start=1) if text.strip()]
-    lines = [(at, text) for at, text in lines if not text.lstrip().startswith("#")]
+    numbered = enumerate(read_lines(path), start=1)
+    lines = [(at, text) for at, text in numbered if text.strip() and not text.lstrip().startswith("#")]
     require_rows(lines, path)
     first, text = lines[0]
     separator = separator_of(text)

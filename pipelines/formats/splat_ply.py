@@ -25,12 +25,12 @@ _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALE = ("scale_0", "scale_1", "scale_2")
 _ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 _REST_COUNTS = (0, 9, 24, 45)  # degree 0 to 3: three channels of (degree + 1)² − 1
-_WIDTHS = {
-    **dict.fromkeys(("char", "uchar", "int8", "uint8"), 1),
-    **dict.fromkeys(("short", "ushort", "int16", "uint16"), 2),
-    **dict.fromkeys(("int", "uint", "float", "int32", "uint32", "float32"), 4),
-    **dict.fromkeys(("double", "float64"), 8),
-}
+# Kind of numpy of each type; its digit is the width in bytes.
+PLY_TYPES = {
+    "char": "i1", "uchar": "u1", "int8": "i1", "uint8": "u1", "short": "i2", "ushort": "u2", "int16": "i2",
+    "uint16": "u2", "int": "i4", "uint": "u4", "int32": "i4", "uint32": "u4", "float": "f4", "float32": "f4",
+    "double": "f8", "float64": "f8",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -182,29 +182,38 @@ def _columns(ply: _PlyRows, names: tuple[str, ...]) -> Float32Array:
     return values
 
 
-def _check_header(path: Path) -> None:
-    """Refuse, before memory is allocated, a file whose size differs from the promise of its header."""
+def ply_header(path: Path) -> tuple[list[list[str]], int, int]:
+    """Return the words of each line of a PLY's header, the bytes before its body, and those of the whole file.
+
+    Raises:
+        InputError: no such file, or not a PLY.
+    """
     size = file_size(path)
     with reading(path), path.open("rb") as stream:
         start = stream.read(_HEADER_LIMIT)
-    head, end_marker, _ = start.partition(b"end_header")
+    head, end, rest = start.partition(b"end_header")
     lines = [line.split() for line in head.decode("ascii", errors="replace").splitlines()]
-    if not end_marker or lines[:1] != [["ply"]]:
+    if not end or lines[:1] != [["ply"]]:
         raise InputError("not-a-ply", "the file is not a PLY file", path=path)
+    return lines, len(head) + len(end) + (2 if rest[:1] == b"\r" else 1), size
+
+
+def _check_header(path: Path) -> None:
+    """Refuse, before memory is allocated, a file whose size differs from the promise of its header."""
+    lines, offset, size = ply_header(path)
     if ["format", "binary_little_endian", "1.0"] not in lines:
         raise InputError("ply-format", "the format of the PLY is not binary_little_endian 1.0", path=path)
     elements = [line for line in lines if line[:1] == ["element"]]
     if len(elements) != 1 or elements[0][1:2] != ["vertex"] or len(elements[0]) != 3:
         raise InputError("ply-elements", "the PLY has elements other than one, vertex", path=path)
     properties = [line for line in lines if line[:1] == ["property"]]
-    widths = [_WIDTHS.get(line[1], 0) if len(line) == 3 else 0 for line in properties]
+    widths = [int(PLY_TYPES.get(line[1], "i0")[1]) if len(line) == 3 else 0 for line in properties]
     if not widths or 0 in widths:
         raise InputError("ply-properties", "the PLY has no properties, or some without a fixed size", path=path)
     promised = int(elements[0][2]) if elements[0][2].isdecimal() and len(elements[0][2]) < 16 else -1
-    body = size - len(head) - len(end_marker) - (2 if start[len(head) + len(end_marker) :][:1] == b"\r" else 1)
-    if promised < 1 or promised * sum(widths) != body:
+    if promised < 1 or promised * sum(widths) != size - offset:
         message = (
             f"the header promises {elements[0][2][:20]} Gaussians of {sum(widths)} bytes, the file holds "
-            f"{max(body, 0)} bytes: it is empty, cut off or damaged"
+            f"{max(size - offset, 0)} bytes: it is empty, cut off or damaged"
         )
         raise InputError("size-differs", message, path=path)
