@@ -17,7 +17,7 @@ from pipelines.report.chromium import find_chromium
 from pipelines.splat.memory import free_memory_bytes
 from pipelines.splat.rasterizer.api import BackendName
 from pipelines.splat.rasterizer.backends import BACKENDS, chosen_backend
-from pipelines.splat.rasterizer.cuda_kernels import compile_kernels, kernels_ready
+from pipelines.splat.rasterizer.cuda_kernels import compile_gsplat, kernels_ready
 from pipelines.splat.rasterizer.cuda_parts import compiling_parts, running_parts
 
 _LIBRARIES = (
@@ -105,7 +105,7 @@ def compile_cuda_kernels(progress: Progress) -> None:
         InputError: neither a GPU nor the variable TORCH_CUDA_ARCH_LIST tells what to compile for.
     """
     if kernels_ready() is None:
-        compile_kernels(progress)
+        compile_gsplat(progress)
 
 
 def _backend(name: BackendName) -> BackendState:

@@ -57,7 +57,7 @@ def kernels_file() -> Path | None:
     return next((file for file in files if needed <= set(file.parent.name.split("_"))), None)
 
 
-def compile_kernels(progress: Progress = SILENT) -> Path:
+def compile_gsplat(progress: Progress = SILENT) -> Path:
     """Compile gsplat's kernels and return their library. This needs no GPU, and minutes.
 
     They are compiled for the GPUs of this machine, or for those that the variable TORCH_CUDA_ARCH_LIST names.
@@ -92,7 +92,7 @@ def load_gsplat(progress: Progress = SILENT) -> ModuleType:
     """
     try:
         if not _prebuilt() and "gsplat.csrc" not in sys.modules:
-            library = kernels_file() or compile_kernels(progress)
+            library = kernels_file() or compile_gsplat(progress)
             specification = importlib.util.spec_from_file_location(_NAME, library)
             assert specification is not None and specification.loader is not None
             kernels = importlib.util.module_from_spec(specification)

@@ -17,7 +17,7 @@ from pipelines.core.errors import BackendUnavailableError, InputError
 from pipelines.core.progress import SILENT
 from pipelines.splat.rasterizer import cuda_kernels, cuda_parts
 from pipelines.splat.rasterizer.backends import chosen_backend, rasterizer
-from pipelines.splat.rasterizer.cuda_kernels import compile_kernels, kernels_file, kernels_ready, missing_for_cuda
+from pipelines.splat.rasterizer.cuda_kernels import compile_gsplat, kernels_file, kernels_ready, missing_for_cuda
 from tests.refusals import refused
 
 HEADERS = ("cuda_runtime.h", "crt/host_config.h", "cccl/cuda/std/type_traits", "cublas_v2.h", "cusolverDn.h")
@@ -172,20 +172,20 @@ def test_kernels_are_compiled_once_with_progress(machine):
             pass
 
     (machine.root / "go").touch()
-    library = compile_kernels(Bar())
+    library = compile_gsplat(Bar())
     assert library == kernels_file()
     assert kernels_ready() == str(library)
     assert library.read_text() == "library"
     assert library.parent.name == "8.9"
     assert [path.name for path in library.parent.iterdir() if path.is_dir()] == []
-    assert compile_kernels(SILENT) == library
+    assert compile_gsplat(SILENT) == library
     assert (machine.root / "spy").read_text() == f"{machine.home}|8.9\n"
 
 
 def test_kernels_of_another_gpu_do_not_count(machine, monkeypatch):
     (machine.root / "go").touch()
     monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "8.0 8.6+PTX")
-    assert compile_kernels().parent.name == "8.0_8.6"
+    assert compile_gsplat().parent.name == "8.0_8.6"
     assert kernels_file() is None
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda index: (8, 6))
     assert kernels_file() is not None
@@ -194,21 +194,21 @@ def test_kernels_of_another_gpu_do_not_count(machine, monkeypatch):
 def test_without_gpu_the_architecture_must_be_named(machine, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with refused("gpu-unknown", InputError) as error:
-        compile_kernels()
+        compile_gsplat()
     assert "TORCH_CUDA_ARCH_LIST" in str(error.value)
     monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "../../etc")
     with refused("compute-capability", InputError):
-        compile_kernels()
+        compile_gsplat()
     (machine.root / "go").touch()
     monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "9.0")
-    assert compile_kernels() == kernels_file()
+    assert compile_gsplat() == kernels_file()
 
 
 def test_failed_compilation_leaves_a_log_and_no_library(machine, monkeypatch):
     (machine.root / "go").touch()
     monkeypatch.setenv("FAIL", "1")
     with pytest.raises(BackendUnavailableError, match=r"a\.cu\(3\): error: no such thing.*compile\.log"):
-        compile_kernels()
+        compile_gsplat()
     assert kernels_file() is None
 
 
@@ -228,7 +228,7 @@ def test_interrupt_ends_the_compilers(machine, monkeypatch):
     monkeypatch.setattr(cuda_kernels, "subprocess", SimpleNamespace(**{**vars(subprocess), "Popen": popen}))
     monkeypatch.setattr(cuda_kernels, "time", SimpleNamespace(sleep=interrupt))
     with pytest.raises(KeyboardInterrupt):
-        compile_kernels()
+        compile_gsplat()
     assert begun[0].poll() is not None
     assert kernels_file() is None
 
@@ -236,7 +236,7 @@ def test_interrupt_ends_the_compilers(machine, monkeypatch):
 def test_second_process_waits_for_the_first(machine):
     """Both ask at once; one compiles, and both get the library."""
     found = []
-    askers = [threading.Thread(target=lambda: found.append(compile_kernels())) for _ in range(2)]
+    askers = [threading.Thread(target=lambda: found.append(compile_gsplat())) for _ in range(2)]
     for asker in askers:
         asker.start()
     (machine.root / "go").touch()
