@@ -143,7 +143,7 @@ def test_points_of_another_model(real_georef: Georef, made: Path) -> None:
         ({"notes.txt": b"hello"}, "the folder has no COLMAP model"),
         (
             dict.fromkeys(("cameras.bin", "images.bin", "points3D.bin"), b"\xff" * 64),
-            "shorter than the number of",
+            "shorter than its number of records",
         ),
         ({"cameras.txt": b"1 PINHOLE x\n", "images.txt": b"", "points3D.txt": b""}, "COLMAP cannot read the model"),
     ],
@@ -171,7 +171,7 @@ def test_import_of_a_project_and_of_a_forged_track(real_georef: Georef, made: Pa
     (model / "points3D.bin").write_bytes(points)
     result = real_georef("sfm", made, "--import", project, "--force")
     result.assert_failed(1)
-    assert "points3D.bin: shorter than the number of its records says" in result.err.splitlines()[-1]
+    assert "points3D.bin: the file is shorter than its number of records" in result.err.splitlines()[-1]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no pipes in folders")

@@ -20,7 +20,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pipelines.core.errors import GeorefError
 from pipelines.core.options import load_toml, remember, resolve
-from pipelines.core.products import load_json, save_json, save_npz
+from pipelines.core.products import Remark, load_json, save_json, save_npz
 from pipelines.core.runner import run_stage
 from pipelines.core.stages import BY_NAME, POINTS, SPARSE
 from pipelines.core.staleness import status
@@ -323,7 +323,7 @@ def _workspace(folder: Path) -> None:
     remember(workspace.root, {"sfm": {"threads": 1}, "train": {"preset": "smoke"}})
     manifest = Manifest(
         stage="sfm", config={}, inputs={}, versions={}, started="2026-01-01T00:00:00Z", duration_s=1.0,
-        key_figure="3 of 3", values={"registered": 3}, warnings=["careful"],
+        key_figure="3 of 3", values={"registered": 3}, warnings=[Remark(code="careful", sentence="Careful.")],
     )  # fmt: skip
     save_json(manifest, folder / "sfm/manifest.json")
     (folder / "geolocate.partial").mkdir()
