@@ -155,7 +155,7 @@ def load_survey(workspace: Workspace) -> Survey:
     except MissingProductError:
         if survey.estimate:
             log.warning(
-                "%s were to be estimated after sfm; run `georef calibrate` or `georef run`",
+                "Not estimated yet: %s. Run `georef calibrate`, or `georef run`.",
                 ", ".join(survey.estimate),
             )
         return survey

@@ -251,7 +251,7 @@ def test_stages_one_by_one_are_reminded(tmp_path: Path, command: Command) -> Non
     command("ingest", workspace, "--bag", inputs["--bag"], "--time-offset", "auto")
     command("sfm", workspace, "--import", inputs["--import"])
     message = command("geolocate", workspace)["err"]
-    assert "time-offset were to be estimated after sfm: `georef calibrate`" in message
+    assert "time-offset" in message and "`georef calibrate`" in message
 
 
 def test_what_cannot_be_estimated_is_said_before_sfm(tmp_path: Path, command: Command) -> None:
@@ -274,7 +274,7 @@ def test_workspace_without_navigation_by_time(tmp_path: Path, command: Command) 
     command("run", workspace, *arguments(inputs), "--to", "sfm")
     (workspace / "ingest/track.npz").unlink()
     message = command("calibrate", workspace, "--estimate", "boresight", fails=True)
-    assert "only a position for each image" in message
+    assert "track.npz" in message and "--trajectory" in message
 
 
 def test_wanted_is_checked() -> None:
@@ -307,4 +307,4 @@ def test_offset_of_a_trajectory_by_time(tmp_path: Path, command: Command) -> Non
     assert "lever-arm needs attitudes" in message
     by_name = [*table[:2], "--trajectory", files / "trajectory.csv"]
     message = command("ingest", tmp_path / "new", *by_name, "--time-offset", "auto", fails=True)
-    assert "[--time-offset]: needs the navigation recorded by time" in message
+    assert "[--time-offset]" in message and "--trajectory" in message
