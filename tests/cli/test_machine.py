@@ -25,7 +25,7 @@ from tests.cli_runs import REPOSITORY, Georef
 def test_doctor_tells_what_there_is_and_why_not(real_georef: Georef, monkeypatch: pytest.MonkeyPatch) -> None:
     def chosen_backend(name: str) -> str:
         if name == "cuda":
-            raise BackendUnavailableError("todo-no-gpu-give-backend", "no GPU: give --backend cpu")
+            raise BackendUnavailableError("no-gpu", "There is no GPU. Give --backend cpu.")
         return name
 
     monkeypatch.setattr(machine, "chosen_backend", chosen_backend)

@@ -75,7 +75,7 @@ def test_unknown_error_keeps_its_traceback(tmp_path: Path, photos: Path) -> None
 def test_full_disk_is_a_message(tmp_path: Path, photos: Path) -> None:
     result = finish(start("ingest", tmp_path / "flight", "--images", photos, code=FULL_DISK))
     assert result.code == 1
-    assert result.err.splitlines()[-1] == "error: points.npz: the disk is full"
+    assert result.err.splitlines()[-1] == "error: points.npz: the disk is full."
     assert "Traceback" not in result.err
 
 

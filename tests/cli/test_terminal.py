@@ -18,16 +18,17 @@ ATTACKING = f"""
 import logging
 from tests import fakes
 from pipelines.core.errors import InputError
+from pipelines.core.products import Remark
 from pipelines.core.workspace import Summary
 attack = {ATTACK!r}
 def ingest(stage, options):
     logging.getLogger("pipelines.ingest").warning("camera %s", attack)
     if options.test_every == 7:
-        raise InputError("no such image", path=f"photos/{{attack}}.jpg")
+        raise InputError("no-such-file", "does not exist.", path=f"photos/{{attack}}.jpg")
     if options.test_every == 9:
         raise ZeroDivisionError(attack)
     fakes.write_products(stage, fakes.STAGES[0], "text")
-    return Summary(f"camera {{attack}}", {{attack: attack}}, (attack,))
+    return Summary(f"camera {{attack}}", {{attack: attack}}, (Remark(code="attack", sentence=attack),))
 fakes.install(ingest=ingest)
 from georef_cli.main import main
 main()
@@ -106,7 +107,9 @@ def test_folder_of_photographs_whose_name_is_not_utf8(tmp_path: Path, photos: Pa
     photos.rename(odd)
     result = run("ingest", tmp_path / "flight", "--images", odd, code=WITH_FAKES)
     assert result.returncode == 1
-    assert result.stderr.endswith(b"caf\\xe9 [--images]: the name is not UTF-8 text: rename it\n"), result.stderr
+    assert result.stderr.endswith(b"caf\\xe9 [--images]: has a name that is not UTF-8 text. Rename it.\n"), (
+        result.stderr
+    )
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is full")
@@ -125,4 +128,4 @@ def test_output_on_a_full_disk(tmp_path: Path, photos: Path) -> None:
         capture_output=True,
         env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
     )
-    assert (full.returncode, full.stderr) == (1, b"error: workspace or output: the disk is full\n")
+    assert (full.returncode, full.stderr) == (1, b"error: workspace or output: the disk is full.\n")
