@@ -40,7 +40,7 @@ def reporting(stage: StageRun, config: StageOptions) -> Summary:
     cautions = (Remark(code="fake", sentence=text),)
     report = report_with(test={"psnr": 20.0 + error, "ssim": 0.5}, camera=points, model=points, cautions=cautions)
     fakes.write_products(stage, spec, dump_json(report.model_dump(mode="json")))
-    return Summary("evaluated", {}, ("few check points",))
+    return Summary("evaluated", {}, (Remark(code="few-check-points", sentence="There are few check points."),))
 
 
 @pytest.fixture
