@@ -137,7 +137,7 @@ def document_of(outcome: Outcome) -> dict[str, Any]:
         "ran": outcome.ran,
         "key_figure": manifest.key_figure,
         "values": manifest.values,
-        "warnings": [warning.model_dump() for warning in manifest.warnings],
+        "warnings": [remark.model_dump() for remark in manifest.warnings],
         "duration_s": manifest.duration_s,
     }
 

@@ -16,7 +16,7 @@ from tests.cli_runs import Georef
 
 def refuse(stage: StageRun, options: object) -> Summary:
     (stage.out / "half.json").write_text("{")
-    raise InputError("too-few-images", "Two images are too few.")
+    raise InputError("images-too-few", "2 images are too few")
 
 
 def listing(folder: Path) -> list[str]:
@@ -73,7 +73,7 @@ def test_interrupted_and_broken_commands_keep_their_log(
 
 def test_a_later_failure_removes_nothing(georef: Georef, workspace: Workspace, photos: Path) -> None:
     def fail(stage: StageRun, options: object) -> Summary:
-        raise BackendUnavailableError("no-gpu", "There is no GPU.")
+        raise BackendUnavailableError("no-gpu", "no GPU")
 
     fakes.install(sfm=fail)
     georef("run", workspace.root, "--images", photos).assert_failed(1)

@@ -232,7 +232,7 @@ class TestTalk:
 
     def test_log_keeps_the_story(self, georef: Georef, done: Path) -> None:
         def fail(stage: StageRun, options: object) -> Summary:
-            raise ConvergenceError("diverged", "diverged at iteration 7")
+            raise ConvergenceError("diverged-at-iteration", "diverged at iteration 7")
 
         fakes.install(train=fail)
         assert georef("-q", "train", done, "--force").code == 1

@@ -213,24 +213,24 @@ def test_interrupted_comparison_goes_on(georef: Georef, survey: Path) -> None:
 
 def test_a_configuration_that_fails_has_a_row_that_says_why(georef: Georef, survey: Path) -> None:
     def diverging(stage: StageRun, config: StageOptions) -> Summary:
-        raise ConvergenceError("diverged", "It diverged.")
+        raise ConvergenceError("diverged", "it diverged")
 
     fakes.install(evaluate=reporting, train=diverging, adjust=diverging)
     result = georef("compare", survey, "--configs", "baseline,A,B", "--json")
     rows = result.document["rows"]
-    assert [row["failure"] for row in rows] == ["It diverged."] * 3
+    assert [row["failure"] for row in rows] == ["it diverged"] * 3
     assert [row["test_psnr"] for row in rows] == [None] * 3
     assert result.err.count("train: started") == 1  # B waits for the same training
     table = georef("compare", survey, "--configs", "baseline")
     assert table.code == 0
-    assert "failed: It diverged." in table.out
+    assert "failed: it diverged" in table.out
     fakes.install(evaluate=reporting)
     assert georef("compare", survey, "--configs", "baseline", "--json").document["rows"][0]["failure"] is None
 
 
 def test_other_errors_end_it(georef: Georef, survey: Path) -> None:
     def refusing(stage: StageRun, config: StageOptions) -> Summary:
-        raise InputError("no-such-thing", "No such thing.")
+        raise InputError("no-such-thing", "no such thing")
 
     fakes.install(evaluate=reporting, train=refusing)
     result = georef("compare", survey)

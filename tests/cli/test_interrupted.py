@@ -92,7 +92,7 @@ def test_force_drops_it(georef: Georef, interrupted: Path, words: tuple[str, ...
 def test_a_diverged_training_is_worth_nothing(georef: Georef, interrupted: Path) -> None:
     def diverge(stage: StageRun, options: object) -> Summary:
         stage.record_progress("1600 of 7000 iterations, 13 min")
-        raise ConvergenceError("diverged", "Diverged. Train again with another --seed.")
+        raise ConvergenceError("diverged-train-again-with", "diverged: train again with another --seed")
 
     fakes.install(train=diverge)
     assert georef("train", interrupted).code == 1

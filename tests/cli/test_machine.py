@@ -25,7 +25,7 @@ from tests.cli_runs import REPOSITORY, Georef
 def test_doctor_tells_what_there_is_and_why_not(real_georef: Georef, monkeypatch: pytest.MonkeyPatch) -> None:
     def chosen_backend(name: str) -> str:
         if name == "cuda":
-            raise BackendUnavailableError("no-gpu", "There is no GPU. Give --backend cpu.")
+            raise BackendUnavailableError("no-gpu-give-backend", "no GPU: give --backend cpu")
         return name
 
     monkeypatch.setattr(machine, "chosen_backend", chosen_backend)
@@ -39,7 +39,7 @@ def test_doctor_tells_what_there_is_and_why_not(real_georef: Georef, monkeypatch
     assert offered["memory_bytes"] > offered["free_bytes"] > 0
     assert offered["backends"] == [
         {"name": "cpu", "available": True, "reason": ""},
-        {"name": "cuda", "available": False, "reason": "There is no GPU. Give --backend cpu."},
+        {"name": "cuda", "available": False, "reason": "no GPU: give --backend cpu"},
     ]
     assert offered["cuda_parts"] == [
         {"name": "NVIDIA driver", "found": None, "remedy": "install it"},
