@@ -219,7 +219,12 @@ def _document(workspace: Workspace, run: RunEstimate, survey: Summary | None) ->
     return {
         "workspace": str(workspace.root),
         "stages": stages,
-        "survey": survey and {name: getattr(survey, name) for name in ("key_figure", "values", "warnings")},
+        "survey": survey
+        and {
+            "key_figure": survey.key_figure,
+            "values": survey.values,
+            "warnings": [warning.model_dump() for warning in survey.warnings],
+        },
         "photographs": run.photographs and dataclasses.asdict(run.photographs),
         "reconstruction": run.reconstruction and dataclasses.asdict(run.reconstruction),
         "training": run.training and dataclasses.asdict(run.training),

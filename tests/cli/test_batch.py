@@ -170,7 +170,7 @@ def test_a_mission_stops_when_nobody_follows_it(tmp_path: Path) -> None:
     [
         (["--at-a-time", 0], 2, "--at-a-time"),
         (["--deliver", "rasters"], 2, "--deliver"),
-        (["--set", "train.sh_degree"], 2, "not of the form"),
+        (["--set", "train.sh_degree"], 2, "stage.option=value"),
         (["--set", "train.degree=1"], 2, "train has no option 'degree'"),
         (["--set", "training.sh_degree=1"], 2, "'training' is not among the stages"),
     ],

@@ -1,4 +1,4 @@
-"""Cautions on the screen: the last thing that a command says is what limits the result."""
+"""Cautions on the screen: each once a command, as its last lines, by the command whose stage adds it."""
 
 from __future__ import annotations
 
@@ -20,10 +20,11 @@ IN_ORDER = [
     {"stage": "init-sim3", **SHIFT.model_dump()},
     {"stage": "train", **FEW.model_dump()},
 ]
-LAST_LINES = [
-    "caution: All fixes are [red]1.2 m[/red] too high. (init-sim3, fixes-shifted)",
-    "caution: Nothing checks the height. (train, few-points)",
-]
+LINES = {
+    "init-sim3": "caution: All fixes are [red]1.2 m[/red] too high. (init-sim3, fixes-shifted)",
+    "train": "caution: Nothing checks the height. (train, few-points)",
+}
+LAST_LINES = list(LINES.values())
 
 
 def cautious(stage: str, *cautions: Remark) -> Callable[[StageRun, StageOptions], Summary]:
@@ -48,12 +49,26 @@ def limited(georef: Georef, workspace: Workspace, photos: Path) -> Path:
     return workspace.root
 
 
-@pytest.mark.parametrize("command", ["run", *(spec.name for spec in PIPELINE if spec.name != "calibrate")])
-def test_last_lines_are_the_cautions_each_once(georef: Georef, limited: Path, command: str) -> None:
-    result = georef(command, limited)
+@pytest.mark.parametrize("words", [("run",), ("run", "--force")])
+def test_the_run_ends_with_all(georef: Georef, limited: Path, words: tuple[str, ...]) -> None:
+    result = georef(words[0], limited, *words[1:])
     assert result.code == 0
+    assert [line for line in result.out.splitlines() if "caution:" in line] == LAST_LINES
     assert result.out.splitlines()[-2:] == LAST_LINES
-    assert sum("caution:" in line for line in result.out.splitlines()) == 2
+    assert FEW.sentence not in result.err and SHIFT.sentence not in result.err
+
+
+@pytest.mark.parametrize("force", [(), ("--force",)], ids=["current", "again"])
+@pytest.mark.parametrize("stage", [spec.name for spec in PIPELINE if spec.name != "calibrate"])
+def test_a_stage_ends_with_those_that_it_adds(
+    georef: Georef, limited: Path, stage: str, force: tuple[str, ...]
+) -> None:
+    result = georef(stage, limited, *force)
+    assert result.code == 0
+    told = [line for line in result.out.splitlines() if "caution:" in line]
+    assert told == ([LINES[stage]] if stage in LINES else [])
+    assert result.out.splitlines()[-1:] == told or not told
+    assert FEW.sentence not in result.err and SHIFT.sentence not in result.err
 
 
 @pytest.mark.parametrize("command", ["run", "status", *(spec.name for spec in PIPELINE)])
@@ -63,10 +78,31 @@ def test_json_has_them_with_code_sentence_and_stage(georef: Georef, limited: Pat
     assert result.document["cautions"] == IN_ORDER
 
 
-def test_stage_that_ran_says_its_own_on_stderr_and_in_its_log(georef: Georef, limited: Path) -> None:
-    result = georef("train", limited, "--force")
-    assert [line for line in result.err.splitlines() if "warning" in line] == [f"warning: train: {FEW.sentence}"]
-    assert FEW.sentence in (limited / "logs/train.log").read_text()
+def test_the_log_of_a_stage_has_those_that_it_adds(georef: Georef, limited: Path) -> None:
+    before = (limited / "logs/train.log").read_text()
+    assert georef("train", limited, "--force").code == 0
+    new = (limited / "logs/train.log").read_text().removeprefix(before)
+    assert new.count(FEW.sentence) == 1 and SHIFT.sentence not in new
+
+
+def test_a_warning_is_said_once(georef: Georef, workspace: Workspace, photos: Path) -> None:
+    """On stderr by the command whose stage just ran; on stdout while the stage is current."""
+    left_out = Remark(code="left-out", sentence="One image was left out.")
+
+    def ingest(out: StageRun, options: StageOptions) -> Summary:
+        fakes.write_products(out, BY_NAME["ingest"], "text")
+        return Summary("ingest done", {}, (left_out,))
+
+    fakes.install(ingest=ingest)
+    words = ("ingest", workspace.root, "--images", photos)
+    for command in (words, ("run", workspace.root, "--force")):
+        ran = georef(*command)
+        assert ran.warned == ("left-out",)
+        assert (ran.err.count(left_out.sentence), ran.out.count(left_out.sentence)) == (1, 0)
+    for command in (words, ("run", workspace.root)):
+        current = georef(*command)
+        assert current.warned == ()
+        assert (current.err.count(left_out.sentence), current.out.count(left_out.sentence)) == (0, 1)
 
 
 def test_status_counts_them_and_says_them_below(georef: Georef, limited: Path) -> None:

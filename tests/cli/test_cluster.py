@@ -71,7 +71,7 @@ def test_strangers_are_refused_by_default(own: Path, tmp_path: Path, port: int) 
         ended = finish(start("batch", tmp_path / "missions.toml", *address, "--dry-run", code=PLAIN))
         assert ended.code == 0, ended.err
         ended = finish(start("batch", tmp_path / "missions.toml", *address, "--insecure", code=PLAIN))
-        assert ended.code == 1 and "no scheduler answers at tcp://" in ended.err
+        assert ended.code == 1 and "tcp://" in ended.err
     finally:
         scheduler.terminate()
         scheduler.communicate(timeout=60)
@@ -93,13 +93,13 @@ def test_each_side_names_a_certificate_of_another_time(
     day = timedelta(days=1)
     write_certificate(own, NOW - 3 * day, NOW - 2 * day)
     ended = real_georef(*call)
-    ended.assert_failed(1)
-    assert f"{CERTIFICATE}: has expired on {NOW - 2 * day:%Y-%m-%d %H:%M} UTC: delete" in ended.err
+    ended.assert_failed(1, "certificate-expired")
+    assert f"{CERTIFICATE}: " in ended.err and f"{NOW - 2 * day:%Y-%m-%d %H:%M} UTC" in ended.err
     assert "`georef cluster certificates`" in ended.err
     write_certificate(tmp_path / "named", NOW + 2 * day, NOW + 3 * day)
     ended = real_georef(*call, "--certificates", tmp_path / "named")
-    ended.assert_failed(1)
-    for part in (f"{CERTIFICATE}: is valid from {NOW + 2 * day:%Y-%m-%d %H:%M} UTC on", f"{NOW:%Y-%m-%d}", "clock"):
+    ended.assert_failed(1, "certificate-not-yet-valid")
+    for part in (f"{CERTIFICATE}: ", f"{NOW + 2 * day:%Y-%m-%d %H:%M} UTC", f"{NOW:%Y-%m-%d}", "clock"):
         assert part in ended.err
 
 
@@ -108,11 +108,11 @@ def test_plain_text_is_asked_for(own: Path, real_georef: Georef, call: tuple[str
     """By name: an address does not do it, nor does a missing certificate, which is made for nodes only."""
     ended = real_georef(*(word.replace("127.0.0.1", "tcp://127.0.0.1") for word in call))
     ended.assert_failed(2)
-    assert "add --insecure" in ended.err
+    assert "--insecure" in ended.err
     if call[0] != "cluster":
         ended = real_georef(*call)
-        ended.assert_failed(1)
-        assert f"has no {CERTIFICATE}" in ended.err and not own.exists()
+        ended.assert_failed(1, "certificate-missing")
+        assert CERTIFICATE in ended.err and not own.exists()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="modes of POSIX")
@@ -124,8 +124,10 @@ def test_a_certificate_that_others_reach_is_refused(
         before = path.stat().st_mode
         path.chmod(mode)
         ended = real_georef(*CALLS["batch"])
-        ended.assert_failed(1)
-        assert f"{path}: is open to other users" in ended.err and "chmod -R go-rwx" in ended.err
+        ended.assert_failed(1, "key-open")
+        assert f"{path}: " in ended.err and "chmod -R go-rwx" in ended.err
         path.chmod(before)
     monkeypatch.setattr(os, "geteuid", lambda: own.stat().st_uid + 1)
-    assert f"{own}: belongs to another user" in real_georef(*CALLS["batch"]).err
+    ended = real_georef(*CALLS["batch"])
+    ended.assert_failed(1, "key-of-another-user")
+    assert f"{own}: " in ended.err

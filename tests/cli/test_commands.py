@@ -64,8 +64,8 @@ def test_status(georef: Georef, done: Path, photos: Path) -> None:
 
 def test_status_of_nothing(georef: Georef, tmp_path: Path) -> None:
     result = georef("status", tmp_path / "nowhere", "--json")
-    result.assert_failed(1)
-    assert result.err == f"error: {tmp_path}/nowhere: no such workspace: `georef ingest` makes one\n"
+    result.assert_failed(1, "no-workspace")
+    assert result.err.startswith(f"error: {tmp_path}/nowhere: ")
 
 
 class TestRunOptions:
@@ -93,7 +93,7 @@ class TestRunOptions:
                 "--iterations is for train, which is not among",
             ),
             (["--from", "train", "--copy"], "--copy is for ingest"),
-            (["--from", "train", "--to", "sfm"], "--from train comes after --to sfm"),
+            (["--from", "train", "--to", "sfm"], "--from train"),
             (["--from", "training"], "'training' is not one of 'ingest'"),
         ],
     )
@@ -135,7 +135,7 @@ class TestFlags:
     def test_out_of_range(self, georef: Georef, done: Path) -> None:
         result = georef("sfm", done, "--max-features", 1, "--json")
         result.assert_failed(2)
-        assert result.err == "error: [--max-features]: Input should be greater than or equal to 200\n"
+        assert result.err == "error: [--max-features]: Input should be greater than or equal to 200.\n"
 
     @pytest.mark.parametrize("arguments", [["--mapper", "best"], ["--max-features", "many"], ["--frobnicate"]])
     def test_usage(self, georef: Georef, done: Path, arguments: list[str]) -> None:
@@ -146,8 +146,8 @@ class TestFlags:
     def test_unknown_key_in_file(self, georef: Georef, done: Path) -> None:
         (done / "georef.toml").write_text("[train]\nsteps = 4\n")
         result = georef("train", done)
-        assert result.code == 1
-        assert result.err.startswith(f"error: {done}/georef.toml [train.steps]: unknown key")
+        result.assert_failed(1, "unknown-option")
+        assert result.err.startswith(f"error: {done}/georef.toml [train.steps]: ")
 
 
 class TestTrainResume:
@@ -160,8 +160,7 @@ class TestTrainResume:
         assert georef("train", done, "--preset", "fast").code == 130
         fakes.install()
         other = georef("train", done, "--preset", "high", "--resume")
-        assert other.code == 1
-        assert "other inputs or options" in other.err
+        other.assert_failed(1, "interrupted-run-differs")
         values = georef("train", done, "--resume", "--json").document["values"]
         assert values["resumed"]
         assert '"preset":"fast"' in values["text"]
@@ -187,7 +186,7 @@ class TestExport:
         target = tmp_path / "site.ply"
         target.write_text("mine")
         result = georef("export-ply", done, "-o", target)
-        assert (result.code, result.err) == (1, f"error: {target}: exists already: --force replaces it\n")
+        result.assert_failed(1, "target-exists")
         assert target.read_text() == "mine"
         assert georef("export-ply", done, "-o", target, "--force").code == 0
         assert target.read_text() == "ply"
@@ -195,8 +194,8 @@ class TestExport:
     def test_a_name_of_another_format_is_refused(self, georef: Georef, done: Path, tmp_path: Path) -> None:
         target = tmp_path / "site.spz"
         result = georef("export-ply", done, "--to", target)
-        expected = f"error: {target}: export-ply writes .ply, not a .spz file: end the name with .ply\n"
-        assert (result.code, result.err) == (1, expected)
+        result.assert_failed(1, "target-suffix")
+        assert result.err.startswith(f"error: {target}: ") and ".ply" in result.err
         assert not target.exists()
 
     def test_the_measurable_splat_is_a_file_of_its_own(self, georef: Georef, done: Path, tmp_path: Path) -> None:
@@ -213,7 +212,8 @@ class TestExport:
 
     def test_missing_folder(self, georef: Georef, done: Path, tmp_path: Path) -> None:
         result = georef("export-ply", done, "-o", tmp_path / "out" / "site.ply")
-        assert (result.code, result.err) == (1, f"error: {tmp_path}/out: no such folder: make it first\n")
+        result.assert_failed(1, "no-such-file")
+        assert result.err.startswith(f"error: {tmp_path}/out: ")
 
 
 class TestTalk:
@@ -224,7 +224,8 @@ class TestTalk:
         result = georef("sfm", done, "--force")
         assert result.out.startswith("sfm: sfm done (")
         lines = result.err.splitlines()
-        assert lines[0] == "warning: sfm builds on ingest, which is stale (--images changed)"
+        assert result.warned == ("input-stale",)
+        assert lines[0].startswith("warning: sfm ") and "(--images changed)" in lines[0]
         assert lines[1:3] == ["sfm: started", "sfm: 2/2 after 0 s, half"]
         quiet = georef("-q", "sfm", done, "--force")
         assert quiet.err.splitlines() == lines[:1]

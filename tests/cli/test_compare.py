@@ -236,8 +236,7 @@ def test_other_errors_end_it(georef: Georef, survey: Path) -> None:
 
     fakes.install(evaluate=reporting, train=refusing)
     result = georef("compare", survey)
-    result.assert_failed(1)
-    assert "no such thing" in result.err
+    result.assert_failed(1, "no-such-thing")
 
 
 def test_figures_are_those_of_the_reports(georef: Georef, survey: Path) -> None:
@@ -275,8 +274,8 @@ def test_without_a_workspace_there_is_nothing_to_compare(georef: Georef, tmp_pat
 def test_busy_workspace_is_not_touched(georef: Georef, survey: Path) -> None:
     with Workspace(survey).lock("train"):
         result = georef("compare", survey)
-    assert result.code == 1
-    assert "is being written by train" in result.err
+    result.assert_failed(1, "workspace-busy")
+    assert "train" in result.err
 
 
 def test_workspace_is_held_while_configurations_run(georef: Georef, survey: Path) -> None:

@@ -70,7 +70,7 @@ def test_children(poisoned: Path) -> None:
     """COLMAP's, which finds nothing in photographs of noise."""
     ended = finish(start_in(poisoned, "run", "flight", "--images", "photos", "--to", "sfm"))
     assert_not_run(poisoned)
-    assert "no two photographs could be tied together" in ended.err
+    assert ended.code == 1 and "photographs" in ended.err.splitlines()[-1]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
@@ -101,7 +101,7 @@ def test_chunks_of_a_mission(poisoned: Path) -> None:
     (poisoned / "missions.toml").write_text(missions, "utf-8")
     ended = finish(start_in(poisoned, "batch", "missions.toml", "--to", "sfm", "--json"), 300)
     assert_not_run(poisoned)
-    assert "no two photographs could be tied together" in ended.document["missions"][0]["failure"]
+    assert ended.document["missions"][0]["failure"].startswith("sfm: ")
 
 
 @pytest.mark.slow

@@ -164,19 +164,6 @@ class TestWidths:
         assert ("it/s" in last) is (width == 120)
 
 
-def test_nothing_twice_on_a_terminal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """Cautions end the result on stdout: where it is the same terminal as stderr, the log leaves them out."""
-    console = Console(file=io.StringIO(), width=80)
-    handler = display.ConsoleHandler(console)
-    record = logging.LogRecord("pipelines", logging.WARNING, "", 0, "sfm: no check", None, None)
-    record.at_end = True
-    for both in (False, True):
-        monkeypatch.setattr("sys.stdout.isatty", lambda both=both: both, raising=False)
-        handler.handle(record)
-    assert isinstance(console.file, io.StringIO)
-    assert console.file.getvalue().count("no check") == 1
-
-
 def test_task_without_steps_has_no_bar() -> None:
     console = Console(file=io.StringIO(), force_terminal=True, width=80)
     with display.BarProgress(console).task("depth maps", 0) as task:
@@ -196,12 +183,13 @@ def test_markup_in_names_is_printed_as_it_stands(monkeypatch: pytest.MonkeyPatch
         "messages": 1, "gaps": 0, "backwards": 0, "clock": "recording",
     }  # fmt: skip
     state = StageState("ingest", "failed", HOSTILE, key_figure=HOSTILE)
+    remark = Remark(code="hostile", sentence=HOSTILE)
     manifest = Manifest(
         stage="ingest", config={}, inputs={}, versions={}, started=datetime(2026, 1, 1, tzinfo=UTC),
-        duration_s=1.0, key_figure=HOSTILE, values={HOSTILE: HOSTILE}, warnings=[HOSTILE],
+        duration_s=1.0, key_figure=HOSTILE, values={HOSTILE: HOSTILE}, warnings=(remark,),
     )  # fmt: skip
     outcome = Outcome("ingest", False, manifest)
-    cautions = {"ingest": [Remark(code="hostile", sentence=HOSTILE)]}
+    cautions = {"ingest": [remark]}
     parts = [tables.topics([row]), tables.states([state], cautions), tables.outcomes([outcome])]
     parts += [*tables.outcome(Workspace(Path("ws")), outcome), *tables.cautions(cautions)]
     for part in parts:

@@ -78,7 +78,7 @@ def test_command_names_what_is_missing(real_georef: Georef, flight: Workspace, t
     result = real_georef("info", flight.root)
     result.assert_failed(1)
     assert f"georef train {flight.root}" in result.err
-    assert "no such workspace" in real_georef("info", tmp_path / "nowhere").err
+    real_georef("info", tmp_path / "nowhere").assert_failed(1, "no-workspace")
 
 
 def test_run_ends_with_where_the_files_are(flight: Workspace, capsys: pytest.CaptureFixture[str]) -> None:

@@ -107,7 +107,9 @@ def test_folder_of_photographs_whose_name_is_not_utf8(tmp_path: Path, photos: Pa
     photos.rename(odd)
     result = run("ingest", tmp_path / "flight", "--images", odd, code=WITH_FAKES)
     assert result.returncode == 1
-    assert result.stderr.endswith(b"caf\\xe9 [--images]: the name is not UTF-8 text: rename it\n"), result.stderr
+    assert result.stderr.endswith(b"caf\\xe9 [--images]: has a name that is not UTF-8 text. Rename it.\n"), (
+        result.stderr
+    )
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is full")
@@ -126,4 +128,4 @@ def test_output_on_a_full_disk(tmp_path: Path, photos: Path) -> None:
         capture_output=True,
         env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
     )
-    assert (full.returncode, full.stderr) == (1, b"error: workspace or output: the disk is full\n")
+    assert (full.returncode, full.stderr) == (1, b"error: workspace or output: the disk is full.\n")

@@ -210,7 +210,7 @@ def test_full_disk_under_colmap(tmp_path: Path) -> None:
     with mounted(disk, "600k"):
         command = ("run", disk / "ws", "--images", photos / "images", "--to", "sfm")
         code, lines = georef(*command)
-        assert (code, lines[-1:]) == (1, [f"error: {disk / 'ws/sfm.partial'}: the disk is full"])
+        assert (code, lines[-1:]) == (1, [f"error: {disk / 'ws/sfm.partial'}: the disk is full."])
         assert not [line for line in lines if not line.startswith(("error: ", "warning: "))], lines
         assert states.status(Workspace(disk / "ws"))[1].state in ("failed", "interrupted")
         subprocess.run(["mount", "-o", "remount,size=60m", str(disk)], check=True)
@@ -224,4 +224,7 @@ def test_read_only_workspace(tmp_path: Path, photos: Path) -> None:
         subprocess.run(["mount", "-o", "remount,ro", str(disk)], check=True)
         assert georef("status", disk / "ws") == (0, [])
         code, lines = georef("run", disk / "ws", "--force", code=WITH_FAKES)
-        assert (code, lines) == (1, [f"error: {disk / 'ws'}: cannot be used as a workspace: Read-only file system"])
+        assert (code, lines) == (
+            1,
+            [f"error: {disk / 'ws'}: cannot be used as a workspace: Read-only file system."],
+        )

@@ -1,4 +1,4 @@
-"""What failed commands leave behind: nothing, where nothing was finished."""
+"""Clean-up after failed commands: nothing is left where nothing was finished."""
 
 from __future__ import annotations
 
