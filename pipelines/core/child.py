@@ -27,6 +27,7 @@ from pipelines.core import errors
 from pipelines.core.errors import (
     CrashError,
     GeorefError,
+    InputError,
     MissingProductError,
     ResourceError,
     StorageError,
@@ -241,9 +242,18 @@ def _error(message: Mapping[str, Any]) -> Exception:
     if message["kind"] != "error":
         return RuntimeError(f"in a child process:\n{message['text']}")
     kind = getattr(errors, message["type"], GeorefError)
+    if issubclass(kind, InputError):
+        where = {name: message[name] for name in ("path", "line", "field", "hint")}
+        return kind(message["code"], message["message"], **where)
     kind = GeorefError if kind is MissingProductError else kind
-    error: Exception = kind(message["code"], message["text"])
+    error: GeorefError = kind(message["code"], message["message"])
+    error.hint = message["hint"]
     return error
+
+
+def _content(error: GeorefError) -> dict[str, Any]:
+    """Return what a message tells of an error; its own kind is another."""
+    return {name: value for name, value in error.document().items() if name != "kind"}
 
 
 def _crash(code: int, native_log: IO[str], remedy: str) -> GeorefError:
@@ -282,14 +292,14 @@ def _main(task: str, parent: str) -> None:
         result = getattr(importlib.import_module(module), name)(document["arguments"], messages)
         messages.send("result", result=result)
     except GeorefError as error:
-        messages.send("error", type=type(error).__name__, code=error.code, text=str(error))
+        messages.send("error", type=type(error).__name__, **_content(error))
     except MemoryError:
         text = "The memory of this machine is too small: use smaller or fewer photographs."
-        messages.send("error", type="ResourceError", code="out-of-memory", text=text)
+        messages.send("error", type="ResourceError", **_content(ResourceError("out-of-memory", text)))
     except Exception as error:
         storage = storage_error(error)
         if storage is not None:
-            messages.send("error", type="StorageError", code=storage.code, text=str(storage))
+            messages.send("error", type="StorageError", **_content(storage))
         else:
             messages.send("defect", text=traceback.format_exc())
     sys.stderr.flush()

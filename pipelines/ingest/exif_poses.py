@@ -180,13 +180,13 @@ def _horizontal(places: _Places, path: Path) -> tuple[bool, Remark] | None:
     inconsistent = distance > allowed
     if inconsistent.mean() <= _MOST_INCONSISTENT:
         return None
-    cause = _cause(places, float(np.median(distance)), float(np.median(allowed)) / _SIGMAS)
+    code, cause = _cause(places, float(np.median(distance)), float(np.median(allowed)) / _SIGMAS)
     sentence = f"{int(inconsistent.sum())} of {len(distance)} positions in {path.name} {cause}"
-    return True, Remark(code="table-against-exif", sentence=sentence)
+    return True, Remark(code=code, sentence=sentence)
 
 
 def _cause(places: _Places, typical_m: float, sigma_m: float) -> tuple[str, str]:
-    """Return code and sentence of how most positions differ.
+    """Return the code, and the end of a sentence on how most positions differ.
 
     The first pattern counts that leaves less than half of the median distance.
     `sigma_m` is the σ of that distance.

@@ -99,7 +99,7 @@ class JobProcess:
             for line in lines:
                 message = _message(line)
                 if message is not None and message["kind"] == "error":
-                    self._kind = str(message["error_kind"])
+                    self._kind = str(message.get("error_kind", ""))
                 elif message is None or not self._take(message):
                     self._plain.append(line.rstrip())
         code = self._process.wait()

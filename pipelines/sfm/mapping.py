@@ -212,7 +212,10 @@ def _free_principal_point(colmap: Any, model: Any, adjustment: Any) -> bool:
             astray.append(key)
     if not astray:
         return True
-    log.warning("The principal point of camera %d is not determined, and is frozen.", astray[0])
+    log.warning(
+        "The principal point of camera %d is not determined, and is frozen.",
+        astray[0], extra={"code": "principal-point-not-determined"},
+    )  # fmt: skip
     for key, params in before.items():
         model.cameras[key].params = params
     adjustment.refine_principal_point = False

@@ -181,8 +181,9 @@ class CheckedConnection:
             self._told.add(error.kind)
             reason = ascii(str(error))[1:-1][:_SHOWN_CHARACTERS]  # no line breaks, no signs that steer a terminal
             log.warning(
-                "A message of a browser page was refused: %s. Further ones of this kind are not logged.", reason
-            )
+                "A message of a browser page was refused: %s. Further ones of this kind are not logged.",
+                reason, extra={"code": "page-message-refused"},
+            )  # fmt: skip
 
 
 def start_server(port: int, title: str, *, dark: bool = False) -> tuple[viser.ViserServer, str]:
@@ -203,7 +204,8 @@ def start_server(port: int, title: str, *, dark: bool = False) -> tuple[viser.Vi
             "This version of viser answers requests without the key of the page. Install viser 1.1.",
         )
     if server.get_port() != port:
-        log.warning("Port %d is taken: the viewer uses port %d.", port, server.get_port())
+        taken = "Port %d is taken: the viewer uses port %d."
+        log.warning(taken, port, server.get_port(), extra={"code": "port-taken"})
     return server, f"http://{HOST}:{server.get_port()}/{keeper.key}/"
 
 

@@ -66,7 +66,7 @@ def test_missing_extra_is_told_before_any_work(
 def assert_told(result: Result, extra: Extra) -> None:
     result.assert_failed(1)
     error = result.document["error"]
-    assert error["code"] == "backend"
+    assert (error["kind"], error["code"]) == ("backend", "extra-missing")
     assert installing(extra) in error["message"]
     assert all(library in error["message"] for library in EXTRAS[extra][1])
 

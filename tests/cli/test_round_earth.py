@@ -34,6 +34,7 @@ from pipelines.survey.trained_model import TrainedCamera, TrainedModel
 from tests.cli_runs import Georef
 from tests.map_projections import US_FOOT_M, long_island, utm
 from tests.photos import jpeg
+from tests.refusals import codes
 from tests.scenes import initial_product, trained_model
 
 CAMERA = Camera("PINHOLE", 64, 48, np.array([40.0, 40.0, 32.0, 24.0]))
@@ -286,5 +287,4 @@ def test_sigmas_stay_metres_where_coordinates_are_feet(real_georef: Georef, tmp_
     fix = survey.images[0].fix
     assert fix is not None
     np.testing.assert_allclose(fix.cov_in_geo, np.diag([0.05**2, 0.05**2, 0.08**2]), rtol=0, atol=1e-5)
-    assert "σ in track.csv are in metres, although EPSG:2263 counts in feet" in survey.assumptions
-    assert "heights of EPSG:2263 are in US survey foot" in survey.assumptions
+    assert {"sigma-in-metres", "height-unit"} <= set(codes(survey.assumptions))

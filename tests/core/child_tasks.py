@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pipelines.core.errors import DegenerateGeometryError
+from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.progress import Progress
 
 
@@ -26,6 +26,8 @@ def work(arguments: Mapping[str, Any], progress: Progress) -> Any:
             return sum(arguments["numbers"])
         case "refuse":
             raise DegenerateGeometryError("points-on-a-line", "The points lie on a line.")
+        case "refuse a file":
+            raise InputError("folder-missing", "There is none.", path="a.csv", line=3)
         case "defect":
             raise ZeroDivisionError("a defect")
         case "abort":

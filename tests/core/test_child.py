@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from pipelines.core.child import run_in_child
-from pipelines.core.errors import CrashError, DegenerateGeometryError
+from pipelines.core.errors import CrashError, DegenerateGeometryError, InputError
 from pipelines.core.progress import ProgressTask
 from tests.cli_runs import REPOSITORY
 from tests.refusals import refused
@@ -56,6 +56,9 @@ def test_errors_come_through() -> None:
     with refused("points-on-a-line", DegenerateGeometryError) as error:
         run_in_child(TASK, {"do": "refuse"}, "")
     assert str(error.value) == "The points lie on a line."
+    with refused("folder-missing", InputError) as error:
+        run_in_child(TASK, {"do": "refuse a file"}, "")
+    assert (error.value.path, error.value.line, error.value.message) == (Path("a.csv"), 3, "There is none.")
     with pytest.raises(RuntimeError, match=r"(?s)child_tasks\.py.*ZeroDivisionError: a defect"):
         run_in_child(TASK, {"do": "defect"}, "")
 

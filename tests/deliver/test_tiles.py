@@ -190,7 +190,7 @@ def test_a_disk_that_is_too_small_is_said_before_the_work(
 def test_page_shows_ellipsoidal_heights_where_a_grid_is_missing(made: StageRun, tmp_path: Path) -> None:
     """The tiles need no grid, and must not fail without one; a CRS that the user asks for must."""
     page = (made.out / "index.html").read_text(encoding="utf-8")
-    assert "heights are ellipsoidal, because heights above EGM2008" in page
+    assert "heights are ellipsoidal, because Heights above EGM2008" in page
     assert '"name":"h"' in page
     stage = StageRun(made.workspace, tmp_path)
     with pytest.raises(InputError, match="grid"):

@@ -154,7 +154,7 @@ class TestCluster:
         """Four times busy: more often than a failure is forgiven."""
         monkeypatch.setattr("pipelines.jobs.dask_engine._BUSY_PAUSE_S", 0.05)
         busy = "open(sys.argv[2], 'a').write('x')\n"
-        busy += "if len(open(sys.argv[2]).read()) < 5: send('error', code='busy'); sys.exit(1)"
+        busy += "if len(open(sys.argv[2]).read()) < 5: send('error', error_kind='busy'); sys.exit(1)"
         assert ends_of(cluster, job("busy", busy, str(tmp_path / "tries")))["busy"].is_done
         assert (tmp_path / "tries").read_text() == "xxxxx"
 

@@ -13,7 +13,7 @@ from websockets.sync.client import connect
 
 from pipelines.view import loopback
 from pipelines.view.loopback import HOST, start_server, stop_server
-from tests.refusals import refused
+from tests.refusals import logged_codes, refused
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +112,7 @@ def test_a_taken_port_leads_to_the_next_one(server: viser.ViserServer, caplog: p
     try:
         assert second.get_port() > server.get_port()
         assert address.startswith(f"http://{HOST}:{second.get_port()}/")
-        assert f"port {server.get_port()} is taken" in caplog.text
+        assert logged_codes(caplog) == ["port-taken"]
     finally:
         stop_server(second)
 

@@ -271,7 +271,7 @@ def test_contours_run_around_the_tower(workspace: Workspace) -> None:
         ({"crs": "EPSG:4978", "gsd": 0.05}, "crs-geocentric"),
         ({"crs": "EPSG:999999"}, "crs-unknown"),
         ({"gsd": 1e-5}, "too-many-cells"),
-        ({"crs": "EPSG:2056+3855"}, "grid-missing"),
+        ({"crs": "EPSG:2056+3855"}, "grid-not-installed"),
     ],
     ids=["degrees", "metres", "geocentric", "unknown", "cells", "grid"],
 )
