@@ -79,6 +79,7 @@ def _run(ctx: click.Context, **values: Any) -> None:
     left = RunTimeLeft(announced_seconds(workspace, stages, asked, force=force))
     progress = progress_for(ctx.obj)
     # A program that follows several runs shows how many stages of each are done; bars and lines name the stages.
+    trains = any(spec.name == "train" for spec in stages)
     with (progress if ctx.obj.json_progress else SILENT).task("stages", len(stages)) as done:
         outcomes = runner.run_pipeline(
             workspace,
@@ -87,7 +88,7 @@ def _run(ctx: click.Context, **values: Any) -> None:
             forget=forget,
             force=force,
             progress=progress,
-            around=lambda spec: _counted(workspace, spec, done, left),
+            around=lambda spec: _counted(workspace, spec, done, left, trains=trains),
         )
     solved = _evaluated_cameras(workspace) if stages[-1].name == "init-sim3" else None
     print_outcomes(
@@ -96,10 +97,15 @@ def _run(ctx: click.Context, **values: Any) -> None:
 
 
 @contextlib.contextmanager
-def _counted(workspace: Workspace, spec: StageSpec, done: ProgressTask, left: RunTimeLeft) -> Iterator[None]:
+def _counted(
+    workspace: Workspace, spec: StageSpec, done: ProgressTask, left: RunTimeLeft, *, trains: bool
+) -> Iterator[None]:
     """Log a stage to its file, say what time the run has left, and count the stage when it has ended."""
-    if spec.name == "sfm":  # which leaves time, and comes before the first use of the kernels
-        start_in_child("pipelines.surface.compilation:compile_in_child")
+    if trains and spec.name == "sfm":  # which leaves time, and comes before the first use of the kernels
+        from pipelines.splat.kernel_cache import compilation_stamp
+
+        if not compilation_stamp("pipelines.surface.compilation").exists():
+            start_in_child("pipelines.surface.compilation:compile_in_child")
     with boundary.logged_to_file(workspace, spec):
         if left.seconds:
             log.info("run: about %s left", about(left.seconds))

@@ -18,6 +18,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import llvmlite.binding as llvm
+import numba
 import platformdirs
 from numba import njit
 from numba.core.caching import CompileResultCacheImpl, FunctionCache
@@ -44,6 +46,12 @@ def cache_folder() -> Path:
     """Return the folder of all compiled kernels: below NUMBA_CACHE_DIR, or the user's cache."""
     stated = os.environ.get("NUMBA_CACHE_DIR")
     return Path(stated) if stated else platformdirs.user_cache_path("georefgs", appauthor=False) / "kernels"
+
+
+def compilation_stamp(module: str) -> Path:
+    """Return the file that a compilation of all kernels below a module leaves, for this numba and processor."""
+    file = _HOME.joinpath(*module.split(".")).with_suffix(".py")
+    return cache_folder() / _digest(file) / f"numba-{numba.__version__}-{llvm.get_host_cpu_name()}.compiled"
 
 
 @cache

@@ -19,7 +19,7 @@ from pipelines.core.lock import WriteLock
 from pipelines.core.progress import SILENT, Progress
 from pipelines.geometry.cameras import Pinhole, ViewPose
 from pipelines.splat.initialise import InitialisationOptions, gaussians_from_points
-from pipelines.splat.kernel_cache import cache_folder
+from pipelines.splat.kernel_cache import cache_folder, compilation_stamp
 from pipelines.splat.losses import photometric_loss
 from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.rasterizer.api import RasterSettings
@@ -50,6 +50,10 @@ def compile_kernels(progress: Progress = SILENT) -> None:
         for name, step in steps.items():
             step()
             task.advance(note=name)
+        with suppress(OSError):
+            stamp = compilation_stamp(__name__)
+            stamp.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            stamp.touch()
 
 
 @contextmanager

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from pipelines.splat import kernel_cache
+from pipelines.surface import compilation
 
 KERNEL = "from pipelines.callee import (\n    three,\n)\n"
 CALLEE = "from pipelines import constants\n"
@@ -92,3 +93,15 @@ def test_folders_used_longest_ago_go(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert compiled(monkeypatch, tmp_path)(3) == 6
     left = sorted(path.name for path in tmp_path.iterdir())
     assert len(left) == 60 and f"{10:016x}" not in left and f"{69:016x}" in left
+
+
+def test_compilation_of_all_kernels_leaves_a_stamp(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By which a later run need not start it."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    kernel_cache._digest.cache_clear()
+    stamp = kernel_cache.compilation_stamp("pipelines.surface.compilation")
+    assert not stamp.exists()
+    monkeypatch.setattr(compilation, "_match", lambda: None)
+    monkeypatch.setattr(compilation, "_render", lambda: None)
+    compilation.compile_kernels()
+    assert stamp.is_file() and tmp_path in stamp.parents
