@@ -16,7 +16,6 @@ from georef_cli.estimate import RunTimeLeft, announced_seconds, print_dry_run
 from georef_cli.options import SET, settings
 from georef_cli.output import print_outcomes
 from pipelines.core import runner
-from pipelines.core.child import start_in_child
 from pipelines.core.errors import GeorefError
 from pipelines.core.options import names_of_flags, remembered
 from pipelines.core.progress import SILENT, ProgressTask
@@ -102,10 +101,9 @@ def _counted(
 ) -> Iterator[None]:
     """Log a stage to its file, say what time the run has left, and count the stage when it has ended."""
     if trains and spec.name == "sfm":  # which leaves time, and comes before the first use of the kernels
-        from pipelines.splat.kernel_cache import compilation_stamp
+        from pipelines.train.compilation import start_compilation
 
-        if not compilation_stamp("pipelines.surface.compilation").exists():
-            start_in_child("pipelines.surface.compilation:compile_in_child")
+        start_compilation()
     with boundary.logged_to_file(workspace, spec):
         if left.seconds:
             log.info("run: about %s left", about(left.seconds))

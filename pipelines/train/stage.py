@@ -28,7 +28,6 @@ from pipelines.splat.gaussians import write_gaussians
 from pipelines.splat.memory import free_memory_bytes, require_memory
 from pipelines.splat.rasterizer.api import Rasterizer
 from pipelines.splat.rasterizer.backends import device_of, rasterizer
-from pipelines.surface.compilation import compile_kernels
 from pipelines.surface.depth_maps import DepthMaps
 from pipelines.surface.lidar_cloud import ScannerTrack
 from pipelines.surface.measured_cloud import CloudReader
@@ -39,6 +38,7 @@ from pipelines.survey.report_parts import EstimatedError, LidarReport
 from pipelines.survey.scene import photographs
 from pipelines.survey.trained_model import Adjustment, TrainedModel
 from pipelines.train.adjusted_scene import AdjustedScene, figures_of, with_exposures
+from pipelines.train.compilation import compile_kernels
 from pipelines.train.estimate import estimate_training, training_size, with_gaussian_limit
 from pipelines.train.geographic.problem import frozen_problem, refining_problem
 from pipelines.train.initial_gaussians import TrainingScene

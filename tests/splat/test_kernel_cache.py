@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from pipelines.splat import kernel_cache
-from pipelines.surface import compilation
+from pipelines.train import compilation
 
 KERNEL = "from pipelines.callee import (\n    three,\n)\n"
 CALLEE = "from pipelines import constants\n"
@@ -99,7 +99,7 @@ def test_compilation_of_all_kernels_leaves_a_stamp(tmp_path: Path, monkeypatch: 
     """By which a later run need not start it."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     kernel_cache._digest.cache_clear()
-    stamp = kernel_cache.compilation_stamp("pipelines.surface.compilation")
+    stamp = kernel_cache.compilation_stamp("pipelines.train.compilation")
     assert not stamp.exists()
     monkeypatch.setattr(compilation, "_match", lambda: None)
     monkeypatch.setattr(compilation, "_render", lambda: None)

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from pipelines.core.child import start_in_child
 from pipelines.core.errors import InputError, WorkspaceBusyError
 from pipelines.core.lock import WriteLock
 from pipelines.core.progress import SILENT, Progress
@@ -31,6 +32,12 @@ from pipelines.surface.sweep import SweepPlanes, plane_sweep
 _PATIENCE_S = 600.0
 _WIDTH, _HEIGHT = 48, 32
 _DOWN = np.diag([1.0, -1.0, -1.0])
+
+
+def start_compilation() -> None:
+    """Start a child process that compiles what the user's cache lacks. It ends with this process."""
+    if not compilation_stamp(__name__).exists():
+        start_in_child(f"{__name__}:compile_in_child")
 
 
 def compile_in_child(_arguments: Mapping[str, Any], progress: Progress) -> None:
