@@ -35,7 +35,7 @@ class Falsified:
         says: the cause or its numbers, any of which the refusal must name too.
         attitudes: whether the survey has attitudes.
         fix_m: σ of the fixes as drawn and as stated.
-        guessed: whether σ of the control points is a default.
+        defaults: whether σ of the control points is a default.
         flights: that the kind is tried on; empty: on the orbit, and on the grid if its shape matters.
         named: the caution or refusal has to come, whatever the error.
     """
@@ -47,7 +47,7 @@ class Falsified:
     says: tuple[str, ...] = ()
     attitudes: bool = True
     fix_m: tuple[float, float, float] = (0.02, 0.02, 0.03)
-    guessed: bool = True
+    defaults: bool = True
     marks: Callable[[float, float], tuple[float, float]] | None = None
     flights: tuple[str, ...] = ()
     named: bool = False
@@ -278,7 +278,7 @@ def falsified(kind: Falsified, of: Block, rng: np.random.Generator) -> Survey:
             "images": images,
             "control_points": control,
             "check_points": checks,
-            "default_sigmas": ("control points",) if kind.guessed else (),
+            "default_sigmas": ("control points",) if kind.defaults else (),
         }
     )
 

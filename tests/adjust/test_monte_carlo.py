@@ -3,7 +3,7 @@
 Each run draws image observations, fixes, control points and marks with the σ that they state. The bundle is
 adjusted with its lens, the tool then finds similarity and cameras, and points that no one surveyed are intersected
 from their marks. The bundle is small and its lens is weak (σ of the focal length 0.3 %), so that every part of the
-prediction counts: the similarity, the cameras, the lens, the marks. In a second bundle all cameras are held level,
+prediction counts: the similarity, the cameras, the lens, the marks. In a second bundle all cameras are level,
 which leaves the principal point, and with it the heights, to the fixes.
 """
 

@@ -280,20 +280,20 @@ class Dense:
         unit[: self.poses] = np.tile([1e-2] * 3 + [1.0] * 3, IMAGES)
         unit[self.poses + 3 * POINTS :][:LENSES] = LENS_UNIT
         change = np.zeros(width)
-        held = np.arange(width)
+        open_ = np.arange(width)
         if self.problem.lens_frozen:
-            held = np.delete(held, self.poses + 3 * POINTS + np.arange(LENSES))
+            open_ = np.delete(open_, self.poses + 3 * POINTS + np.arange(LENSES))
         for _ in range(2):
             columns = []
-            for column in np.eye(width)[held] * 1e-4 * unit:
+            for column in np.eye(width)[open_] * 1e-4 * unit:
                 ahead, behind = (self.residuals(change + sign * column, geo_from_model) for sign in (1, -1))
                 columns.append((ahead - behind) / 2e-4)
             design = np.stack(columns, axis=1)
             step = np.linalg.lstsq(design, -self.residuals(change, geo_from_model), rcond=1e-14)[0]
-            change[held] += step * unit[held]
+            change[open_] += step * unit[open_]
         covariance = np.zeros((width, width))
-        root = np.linalg.pinv(design, rcond=1e-14) * unit[held, None]
-        covariance[np.ix_(held, held)] = root @ root.T
+        root = np.linalg.pinv(design, rcond=1e-14) * unit[open_, None]
+        covariance[np.ix_(open_, open_)] = root @ root.T
         return change, covariance
 
 

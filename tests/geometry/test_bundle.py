@@ -46,8 +46,10 @@ def points_follow(network: Network, corrections: np.ndarray, *, lens_follows: bo
     following = design[:, 6 * n :] if lens_follows else design[:, 6 * n : 6 * n + 3 * points]
     follow = np.linalg.lstsq(following, -design[:, : 6 * n] @ corrections, rcond=None)[0][: 3 * points]
     own = [design[:, 6 * n + 3 * j : 6 * n + 3 * j + 3] for j in range(points)]
-    pull = sum(m.T @ d.T @ d @ follow[3 * j : 3 * j + 3] for j, (m, d) in enumerate(zip(modes, own, strict=True)))
-    return np.linalg.solve(sum(m.T @ d.T @ d @ m for m, d in zip(modes, own, strict=True)), pull)
+    gradient = sum(
+        m.T @ d.T @ d @ follow[3 * j : 3 * j + 3] for j, (m, d) in enumerate(zip(modes, own, strict=True))
+    )
+    return np.linalg.solve(sum(m.T @ d.T @ d @ m for m, d in zip(modes, own, strict=True)), gradient)
 
 
 def point_modes(network: Network) -> np.ndarray:

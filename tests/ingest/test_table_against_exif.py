@@ -89,7 +89,7 @@ def test_sigma_stated_for_the_table_is_not_that_of_exif() -> None:
     ],
     ids=["mirrored", "late", "others", "half", "blunders", "noise", "shifted", "zone", "take-off"],
 )
-def test_contradictions_are_named_and_can_be_accepted(positions: np.ndarray, code: str, says: str) -> None:
+def test_inconsistencies_are_named_and_can_be_accepted(positions: np.ndarray, code: str, says: str) -> None:
     with refused(code, InconsistencyError) as error:
         compared(positions)
     assert re.search(says, str(error.value))

@@ -59,7 +59,7 @@ def test_spatial_median_is_not_moved_by_a_third_of_wrong_points() -> None:
     rng = np.random.default_rng(0)
     right = np.array([3.0, -2.0, 1.0]) + rng.normal(0, 0.05, (20, 3))
     wrong = np.array([10.0, 5.0, 0.0]) + rng.normal(0, 3.0, (9, 3))
-    # Of 20 points with σ 0.05 m, pulled by 9 from one side: a few tenths of σ, and never metres.
+    # Of 20 points with σ 0.05 m, moved by 9 from one side: a few tenths of σ, and never metres.
     found = spatial_median(np.concatenate([right, wrong]))
     assert np.linalg.norm(found - [3.0, -2.0, 1.0]) < 0.1
 

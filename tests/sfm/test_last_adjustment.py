@@ -146,15 +146,15 @@ def test_stated_errors_are_those_of_the_adjusted_model() -> None:
 
 def test_point_far_from_the_middle_is_refused(caplog: pytest.LogCaptureFixture) -> None:
     model = mapped((80.0, 0.0))  # more than 5 % of 1024 px
-    held = adjust(pycolmap.Reconstruction(model), principal_point=False)
+    frozen = adjust(pycolmap.Reconstruction(model), principal_point=False)
     with caplog.at_level(logging.WARNING):
         adjust(model)
     assert logged_codes(caplog) == ["principal-point-not-determined"]
     np.testing.assert_array_equal(model.cameras[1].params[1:3], CENTER)
     # All else is adjusted again, and comes to the minimum that it reaches with the principal point frozen. They end
     # a fraction of σ from their minimum, for which the scatter of the focal length, 0.6 px, is the measure.
-    np.testing.assert_allclose(model.cameras[1].params, held.cameras[1].params, atol=0.1)
-    np.testing.assert_allclose(poses(model), poses(held), atol=1e-3)
+    np.testing.assert_allclose(model.cameras[1].params, frozen.cameras[1].params, atol=0.1)
+    np.testing.assert_allclose(poses(model), poses(frozen), atol=1e-3)
 
 
 @pytest.mark.parametrize(("images", "principal_point"), [(9, True), (12, False)])

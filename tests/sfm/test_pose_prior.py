@@ -79,7 +79,7 @@ def test_cameras_come_to_their_true_places(rtk: tuple[Workspace, Outcome]) -> No
 
 def test_wrong_fixes_do_not_drag_it(rtk: tuple[Workspace, Outcome], tmp_path: Path) -> None:
     workspace, _ = adjusted(tmp_path, replace(RTK, outliers=(2, 9, 17), outlier_m=15.0))
-    # Cauchy's kernel leaves a fix of r = 15 m the pull of one that is c² σ²/r off, 0.2 mm. But three good fixes
+    # Cauchy's kernel leaves a fix of r = 15 m the weight of one that is c² σ²/r off, 0.2 mm. But three good fixes
     # less hold the model.
     assert error_m(workspace) < EXPECTED_M + 0.003
     found = load_json(InitialSimilarity, workspace.path("adjust/geo_from_local.json"))

@@ -33,7 +33,7 @@ def gaussians(sigma_m: list[float], opacity: float = 0.5) -> Gaussians:
     )
 
 
-def pull(gradient_px: Tensor, rows: Tensor | None = None) -> ScreenStats:
+def stats_of(gradient_px: Tensor, rows: Tensor | None = None) -> ScreenStats:
     rows = torch.arange(len(gradient_px)) if rows is None else rows
     return ScreenStats(rows, gradient_px)
 
@@ -54,14 +54,14 @@ def test_threshold_is_in_normalised_device_coordinates() -> None:
     # 2e-4 in ndc is 2e-6 per pixel along 200 pixels, and 4e-6 along 100.
     gradient = torch.tensor([[2.1e-6, 0], [1.9e-6, 0], [0, 4.1e-6], [0, 3.9e-6]])
     adam, strategy = setup(gaussians([SMALL_M] * 4))
-    strategy.observe(pull(gradient), CAMERA)
+    strategy.observe(stats_of(gradient), CAMERA)
     assert strategy.update(10, adam) == DensityEdit(cloned=2)
 
 
 def test_gradient_is_the_mean_over_the_views_that_saw_it() -> None:
     adam, strategy = setup(gaussians([SMALL_M] * 2))
-    strategy.observe(pull(torch.tensor([[3e-6, 0], [3e-6, 0]])), CAMERA)
-    strategy.observe(pull(torch.tensor([[0.5e-6, 0]]), rows=torch.tensor([1])), CAMERA)
+    strategy.observe(stats_of(torch.tensor([[3e-6, 0], [3e-6, 0]])), CAMERA)
+    strategy.observe(stats_of(torch.tensor([[0.5e-6, 0]]), rows=torch.tensor([1])), CAMERA)
     # Row 0 has a mean of 3e-6, row 1 of 1.75e-6.
     assert strategy.update(10, adam) == DensityEdit(cloned=1)
     assert sorted(adam.gaussians.sh[:, 0, 0].tolist()) == [0, 0, 1]
@@ -69,7 +69,7 @@ def test_gradient_is_the_mean_over_the_views_that_saw_it() -> None:
 
 def test_small_ones_are_cloned_and_large_ones_split() -> None:
     adam, strategy = setup(gaussians([SMALL_M, LARGE_M, SMALL_M]))
-    strategy.observe(pull(hot(3, [0, 1])), CAMERA)
+    strategy.observe(stats_of(hot(3, [0, 1])), CAMERA)
     assert strategy.update(10, adam) == DensityEdit(cloned=1, split=1)
     after = adam.gaussians
     label, sigma = after.sh[:, 0, 0], after.log_scales[:, 0].exp()
@@ -88,7 +88,7 @@ def test_children_are_spread_like_their_parent() -> None:
     start.means = torch.zeros(2000, 3)
     start.log_scales = torch.tensor([0.5, 0.2, 0.1]).log().repeat(2000, 1)
     adam, strategy = setup(start, replace(SETTINGS, max_gaussians=10_000))
-    strategy.observe(pull(hot(2000, list(range(2000)))), CAMERA)
+    strategy.observe(stats_of(hot(2000, list(range(2000)))), CAMERA)
     strategy.update(10, adam)
     turn = torch.tensor([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # (½, ½, −½, ½) as a matrix
     expected = turn @ torch.diag(torch.tensor([0.25, 0.04, 0.01])) @ turn.T
@@ -110,10 +110,10 @@ def test_transparent_and_oversized_ones_are_removed() -> None:
 def test_limit_takes_the_largest_gradients_first() -> None:
     adam, strategy = setup(gaussians([SMALL_M] * 4), replace(SETTINGS, max_gaussians=6))
     gradient = torch.tensor([[3e-6, 0], [9e-6, 0], [5e-6, 0], [7e-6, 0]])
-    strategy.observe(pull(gradient), CAMERA)
+    strategy.observe(stats_of(gradient), CAMERA)
     assert strategy.update(10, adam) == DensityEdit(cloned=2)
     assert sorted(adam.gaussians.sh[:, 0, 0].tolist()) == [0, 1, 1, 2, 3, 3]
-    strategy.observe(pull(hot(6, [0, 1, 2])), CAMERA)
+    strategy.observe(stats_of(hot(6, [0, 1, 2])), CAMERA)
     assert strategy.update(20, adam) == DensityEdit()
 
 
@@ -123,7 +123,7 @@ def test_moments_follow_their_gaussians() -> None:
         tensor.grad = torch.ones_like(tensor) * torch.arange(1, 5).reshape(4, *[1] * (tensor.ndim - 1))
     adam.step(1)
     before = adam.state()
-    strategy.observe(pull(hot(4, [0, 1])), CAMERA)
+    strategy.observe(stats_of(hot(4, [0, 1])), CAMERA)
     strategy.update(10, adam)
     after, label = adam.state(), adam.gaussians.sh[:, 0, 0].round().int()
     for row in range(4):
@@ -145,7 +145,7 @@ def test_reset_caps_the_opacities() -> None:
 def test_nothing_happens_outside_the_schedule() -> None:
     settings = replace(SETTINGS, start=20, stop=50, reset_every=30)
     adam, strategy = setup(gaussians([SMALL_M] * 3), settings)
-    strategy.observe(pull(hot(3, [0, 1, 2])), CAMERA)
+    strategy.observe(stats_of(hot(3, [0, 1, 2])), CAMERA)
     assert [strategy.update(iteration, adam) for iteration in (10, 20, 25, 55, 60)] == [DensityEdit()] * 5
     assert strategy.update(40, adam) == DensityEdit(cloned=3)
 
@@ -155,9 +155,9 @@ def test_same_seed_same_gaussians_and_restored_state_continues_exactly() -> None
     results = []
     for saved in (False, False, True):
         adam, strategy = setup(start, seed=3)
-        strategy.observe(pull(hot(5, [0, 3])), CAMERA)
+        strategy.observe(stats_of(hot(5, [0, 3])), CAMERA)
         strategy.update(10, adam)
-        strategy.observe(pull(hot(7, [1])), CAMERA)
+        strategy.observe(stats_of(hot(7, [1])), CAMERA)
         if saved:
             state, moments = strategy.state(), adam.state()
             strategy = DefaultStrategy(SETTINGS, EXTENT_M, len(adam.gaussians), seed=99)

@@ -47,7 +47,7 @@ def labels(adam: GaussianAdam) -> list[float]:
 
 def test_only_what_views_agree_to_be_wrong_is_added_to() -> None:
     adam, strategy = setup()
-    # All four are pulled. 0 is wrong in both views, 1 in one of two, 2 in the only one that sees it, 3 in none.
+    # All four have gradients. 0 is wrong in both views, 1 in one of two, 2 in the only one that sees it, 3 in none.
     seen = probe(([9.0, 9.0, 0.0, 9.0], [1.2, 1.8, 0.0, 0.1]), ([9.0, 9.0, 9.0, 9.0], [1.2, 0.0, 1.1, 0.1]))
     assert strategy.update(10, adam, seen) == DensityEdit(cloned=2)
     assert labels(adam) == [0, 0, 1, 2, 2, 3]

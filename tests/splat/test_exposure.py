@@ -36,7 +36,7 @@ def test_a_common_gain_is_left_to_the_gaussians() -> None:
         shown = exposures.apply(int(TRAIN[iteration % 3]), colour)
         (shown - 1.2 * colour).square().mean().backward()
         exposures.step(iteration)
-    # The last step pulls one of three further than the others: a rate of 5e-4 at the end.
+    # The last step moves one of three further than the others: a rate of 5e-4 at the end.
     assert float((exposures.affine - torch.eye(3, 4)).abs().max()) < 0.01
 
 

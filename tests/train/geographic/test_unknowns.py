@@ -118,13 +118,13 @@ def test_cameras_and_lens_start_where_they_are_told_and_move_by_the_basis() -> N
 
 
 def test_prior_of_an_error_is_set_aside_where_the_error_is_far_larger() -> None:
-    """The pull of the prior of a base station that is metres off its stated centimetres is next to nothing."""
+    """The gradient of the prior of a base station that is metres off its stated centimetres is next to nothing."""
     errors = SystematicErrors((SystematicError("bias", (0.03, 0.03, 0.05), 0),))
-    pulls = []
+    slopes = []
     for value in (0.03, 3.0):
         learned = LearnableErrors(errors, np.array([value, 0.0, 0.0]), np.full(3, 0.01))
         learned.prior().backward()
         assert learned.x.grad is not None
-        pulls.append(float(learned.x.grad[0]) * 0.03**2 / (2 * 0.01 * value))
-    assert pulls[0] == pytest.approx(1 / (1 + 1 / 7.815), rel=1e-6)
-    assert pulls[1] < 1e-3
+        slopes.append(float(learned.x.grad[0]) * 0.03**2 / (2 * 0.01 * value))
+    assert slopes[0] == pytest.approx(1 / (1 + 1 / 7.815), rel=1e-6)
+    assert slopes[1] < 1e-3
