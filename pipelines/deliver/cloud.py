@@ -96,7 +96,7 @@ def _points_in_crs(
 
     Without a grid, the covariance of the georeference is unknown, and so is the sum.
     """
-    georeference = np.full((len(cloud), 3, 3), np.nan) if grid is None else grid.cov_at(cloud.position)
+    georeference = np.full((len(cloud.position), 3, 3), np.nan) if grid is None else grid.cov_at(cloud.position)
     # The surface is uncertain along its normal. Along itself, a surface has no place.
     across = cloud.sigma_m[:, None] * cloud.normal
     return CloudPoints(

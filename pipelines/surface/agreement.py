@@ -203,12 +203,9 @@ def surface_prior(coarse: SweepResult, agreed: Float32Array, camera: ViewPose) -
 def refine(
     reference: StereoView, neighbours: list[StereoView], prior: SurfacePrior, settings: MatchSettings
 ) -> SweepResult:
-    """Compare a view with its neighbours at offsets around a prior, and keep the best.
+    """Compare a view with its neighbours at offsets around a prior, and keep the best; a ValueError: no neighbours.
 
     A best match at either end of the range means that the surface lies outside of it: its score becomes −1.
-
-    Raises:
-        ValueError: no neighbours.
     """
     if not neighbours:
         raise ValueError("no neighbours to compare with")

@@ -49,7 +49,6 @@ class StereoOptions:
         matching: comparison in the plane sweep; a wide window finds the surface where there is little texture.
         refining: comparison in the refinement, where the surface is nearly known; a small window does not extend it
             across the foot of a wall.
-        agreement: thresholds of agreement.
     """
 
     coarse_px: int = 320
@@ -67,7 +66,6 @@ class DepthMaps:
 
     Args:
         folder: cache, in which each scene has a folder of its own.
-        options: of the depth maps; None: the defaults.
     """
 
     def __init__(

@@ -58,9 +58,6 @@ class SurfaceCloud:
     rgb: ByteArray  # (P, 3) uint8
     sigma_m: FloatArray  # (P,) σ of the surface along the normal, without that of the georeference
 
-    def __len__(self) -> int:
-        return len(self.position)
-
 
 def pixel_on_surface_m(views: SurfaceViews, geo_from_model: Similarity) -> float:
     """Return the median width of a pixel on the surface in metres, over the views' medians.

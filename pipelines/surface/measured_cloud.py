@@ -79,7 +79,6 @@ class CloudReader:
         path: file, or folder whose LAS, LAZ and PLY files are taken, also from its subfolders.
 
     Attributes:
-        count: number of points.
         crs_names: names of the CRSs of the files, without repetition.
         assumptions: sentences on what the files do not say.
 

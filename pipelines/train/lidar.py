@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +29,7 @@ from pipelines.surface.depth_maps import DepthMaps
 from pipelines.surface.lidar_cloud import LidarCloud, ScannerTrack, read_cloud
 from pipelines.surface.measured_cloud import CloudReader
 from pipelines.surface.registration import Registration, registration
-from pipelines.surface.visibility import DepthViews
+from pipelines.surface.visibility import DepthViews, Viewpoints
 from pipelines.survey.report_parts import LidarArea, LidarRegistration, LidarReport
 from pipelines.survey.scene import Scene
 from pipelines.survey.survey import Survey
@@ -101,10 +101,7 @@ def compared_lidar(
 
     Args:
         options, files, track: of the LiDAR; None: the scanner's track is unknown.
-        maps: of the training views.
-        survey: has the origin of `geo`.
         georeference: initial similarity to `geo`, with covariance.
-        seed, progress: of random choices; shows the points read.
 
     Raises:
         InputError: the cloud lies elsewhere, in height or plan, or is shifted beyond 3 σ.
@@ -123,14 +120,9 @@ def lidar_surface(
     """Return the surface of stereo and LiDAR, without a shift (3,) of the LiDAR, axes of geo; None: none."""
     cloud = compared.cloud if shift_m is None else compared.cloud.moved(-shift_m)
     judged = verdict(cloud, compared.views, compared.shown, sigma_m=options.lidar_sigma, pixel_m=compared.pixel_m)
-    tally = files.tally
     report = LidarReport(
+        **asdict(files.tally),
         crs=files.crs_names,
-        read=tally.read,
-        noise=tally.noise,
-        withheld=tally.withheld,
-        overlap=tally.overlap,
-        outside=tally.outside,
         points=len(cloud),
         voxel_m=cloud.voxel_m,
         registration=compared.record,
@@ -166,16 +158,9 @@ def _pixel_size_m(maps: DepthMaps) -> float:
 def _depth_views(maps: DepthMaps) -> DepthViews:
     """Return the depth maps of all training views as one set, in `model`."""
     train, poses = [int(index) for index in maps.scene.train], maps.scene.poses
-    cameras = [maps.camera(index) for index in train]
-    depths = [np.asarray(maps.depth(index)).ravel() for index in train]
-    return DepthViews(
-        cam_from_world=poses.cam_from_model[train],
-        center_in_world=poses.cam_center_in_model[train],
-        intrinsics_px=np.array([(camera.fx, camera.fy, camera.cx, camera.cy) for camera in cameras]),
-        size_px=np.array([(camera.width, camera.height) for camera in cameras], dtype=np.int64),
-        start=np.concatenate([[0], np.cumsum([len(depth) for depth in depths])[:-1]]).astype(np.int64),
-        depth_m=np.concatenate(depths),
-    )
+    rotations, centers = poses.cam_from_model[train], poses.cam_center_in_model[train]
+    cameras = Viewpoints(rotations, centers, tuple(map(maps.camera, train)))
+    return DepthViews.of(cameras, np.concatenate([np.asarray(maps.depth(index)).ravel() for index in train]))
 
 
 def registration_of(cloud: LidarCloud, shown: FloatArray, views: DepthViews, seed: int) -> Registration:
@@ -239,7 +224,6 @@ def free_space(cloud: LidarCloud, gone: BoolArray, shown: FloatArray) -> FreeSpa
     """Return the cells that beams have crossed and in which nothing is seen; None: no beam is known.
 
     Args:
-        cloud: with the scanner's places.
         gone: (P,) points inconsistent with the photographs: their beams do not count.
         shown: (S, 3) surface that the photographs show; what stands there now is not free.
     """
