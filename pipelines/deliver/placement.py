@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from pipelines.core.errors import InputError
 from pipelines.core.figures import Headline
 from pipelines.core.products import Remark, is_checked
-from pipelines.core.types import FloatArray, Quaternion, Row7, Vector3
+from pipelines.core.types import FloatArray, Quaternion, Row7, vector3
 from pipelines.formats.georef_sidecar import GeoreferenceSigma, GeorefSidecar, SceneSigma, georeference_sigma
 from pipelines.geodesy.crs import ECEF, parse_crs
 from pipelines.geodesy.enu import (
@@ -49,7 +49,6 @@ class Placement:
         geo_from_model: the trained similarity.
         covariance: (7, 7) of the similarity about the origin of `file`, along its axes; None if unknown.
         vertical: what the survey's input heights referred to.
-        cautions: limits of the model.
         accuracy: headline of the result, which every file states; None: nothing states it.
     """
 
@@ -103,11 +102,8 @@ def place(model: Adjustment, survey: Survey, points_in_model: ArrayLike, accurac
     """Return the placement of a solved model on Earth.
 
     Args:
-        model: has the similarity geo ← model and its covariance.
-        survey: has the origin of geo and the vertical datum.
         points_in_model: (N, 3) centres of all its Gaussians, or without any its SfM points, N ≥ 1; their median is
             the middle of the scene.
-        accuracy: headline of the workspace; None: nothing states it.
     """
     geo_from_model = Similarity.from_record(model.geo_from_model)
     scene_in_geo = np.median(geo_from_model.apply(points_in_model), axis=0)
@@ -148,12 +144,6 @@ def _turned(covariance: FloatArray, to_from_from: FloatArray) -> FloatArray:
 def _row(values: FloatArray) -> Row7:
     s, rx, ry, rz, x, y, z = values.tolist()
     return s, rx, ry, rz, x, y, z
-
-
-def vector3(values: FloatArray) -> Vector3:
-    """Return an array (3,) as numbers for a file."""
-    x, y, z = values.tolist()
-    return x, y, z
 
 
 def scene_sigma(counts: str, horizontal_m: FloatArray, vertical_m: FloatArray) -> SceneSigma:

@@ -26,8 +26,8 @@ from pipelines.core.files import replace_file
 from pipelines.core.products import Product
 from pipelines.core.sentences import printable
 from pipelines.core.stages import TILES
-from pipelines.core.types import Float32Array, FloatArray, Vector3
-from pipelines.deliver.placement import Placement, vector3
+from pipelines.core.types import Float32Array, FloatArray, Vector3, vector3
+from pipelines.deliver.placement import Placement
 from pipelines.geodesy.crs import PointCrs
 from pipelines.geodesy.enu import (
     SEMI_MAJOR_M,
@@ -139,12 +139,8 @@ def scene_page(
     """Return the content of the page of a splat.
 
     Args:
-        title: name of the scene.
         placement: of its frame `file`.
         center_in_file: (N, 3) centres of its Gaussians, metres.
-        survey: has the control and check points.
-        target: CRS in which coordinates are shown.
-        cesium: folder of CesiumJS.
 
     Raises:
         InputError: the scene is outside the domain of the CRS, or a grid is missing.
@@ -234,7 +230,6 @@ def fit_local_crs(crs: PointCrs, origin_lla: ArrayLike, half_extent_m: Vector3) 
     """Return the polynomials of a CRS in a box around a place.
 
     Args:
-        crs: to be shown.
         origin_lla: (3,) latitude, longitude in degrees, ellipsoidal height: middle of the box.
         half_extent_m: half of its sides east, north and up.
 

@@ -25,7 +25,7 @@ import numpy as np
 
 from pipelines.core.errors import InputError
 from pipelines.core.figures import ACCURACY_H, MISSING
-from pipelines.core.sentences import printable_lines
+from pipelines.core.sentences import duration, printable_lines
 from pipelines.core.types import ByteArray
 from pipelines.formats.image_file import MAX_PIXELS, header_size, read_bytes
 
@@ -90,18 +90,6 @@ def any_text(value: object) -> str:
     return MISSING if value is None else str(value)
 
 
-def duration_text(seconds: float | None) -> str:
-    """Return a duration: `48 s`, `12 min 3 s`, `2 h 5 min`."""
-    if seconds is None:
-        return MISSING
-    if seconds < 10:
-        return f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    if minutes < 60:
-        return f"{minutes} min {rest} s" if minutes else f"{rest} s"
-    return f"{minutes // 60} h {minutes % 60} min"
-
-
 def moment(value: datetime | None) -> str:
     """Return a time in UTC, to the minute."""
     return MISSING if value is None else f"{value:%Y-%m-%d %H:%M} UTC"
@@ -113,7 +101,7 @@ FORMS: dict[str, Callable[..., str]] = {
     "as_json": partial(json.dumps, allow_nan=False),  # in full, for programs that read the page
     "whole": count_text,
     "decibel": decibel,
-    "duration": duration_text,
+    "duration": lambda seconds: duration(seconds) or MISSING,
     "in_metres": in_metres,
     "metres": metres,
     "moment": moment,
@@ -210,11 +198,7 @@ def picture_of_png(data: bytes) -> Picture:
 
 
 def png_file(path: Path) -> Picture:
-    """Return a PNG file as it is.
-
-    Raises:
-        InputError: it cannot be read, or is no PNG.
-    """
+    """Return a PNG file as it is; an InputError: it cannot be read, or is no PNG."""
     data = read_bytes(path)
     if header_size(data) is None or not data.startswith(_PNG):
         raise InputError("not-a-png", "is no PNG; make it again with `georef evaluate --force`", path=path)

@@ -151,14 +151,6 @@ class TrainingFacts:
     duration_s: float | None
 
 
-@dataclass(frozen=True)
-class PreviewsFacts:
-    """Previews of the rasters; None where they were not made."""
-
-    orthophoto: Picture | None
-    surface: Picture | None
-
-
 def views_facts(workspace: Workspace, test: PhotometricFigures, most: int) -> ViewsFacts:
     """Return the test views of a workspace, with pictures of at most `most` of them."""
     views = test.per_view
@@ -240,6 +232,7 @@ def _panels(rows: list[dict[str, float]]) -> dict[str, Mapping[str, tuple[FloatA
     return panels
 
 
-def previews_facts(workspace: Workspace) -> PreviewsFacts:
-    products = (ORTHOPHOTO_PREVIEW, HILLSHADE)
-    return PreviewsFacts(*(preview(workspace.root / product, _PREVIEW_PX) for product in products))
+def previews_facts(workspace: Workspace) -> dict[str, Picture | None]:
+    """Return the previews of the rasters; None where they were not made."""
+    products = {"orthophoto": ORTHOPHOTO_PREVIEW, "surface": HILLSHADE}
+    return {name: preview(workspace.root / product, _PREVIEW_PX) for name, product in products.items()}

@@ -29,7 +29,6 @@ class BrownLens:
 
     Attributes:
         model: determines the coefficients in use.
-        width, height: image size in pixels.
         center_px: principal point; the centre of the top-left pixel is (0.5, 0.5).
         k1, k2, p1, p2: radial and tangential coefficients of Brown's model, as OpenCV orders them.
     """

@@ -324,7 +324,6 @@ def overlap_plan(count: IntArray, corner_m: FloatArray, cell_m: float, camera_m:
     Args:
         count: (R, C) rows from the south, columns from the west; −1: no scene.
         corner_m: (2,) east and north of the south-western corner.
-        cell_m: side of a cell.
         camera_m: (n, 2) cameras.
     """
     from matplotlib import colormaps
