@@ -78,7 +78,6 @@ def plan(
         workspace: may not exist yet.
         stages: in the order of the pipeline.
         flags: all options by stage, the remembered ones among them.
-        force: run also what is current.
 
     Raises:
         InputError: an option is unknown or invalid, or a file that an option names does not exist.

@@ -250,10 +250,8 @@ def _footprints(
     are latitude, longitude, height; those of the cameras' centres if no photograph shows ground.
 
     Args:
-        survey: has the times of exposure.
         model: cameras and points in the frame of the placement, z up.
         table: the same cameras, with split and σ.
-        placement: of that frame.
     """
     surface = PointSurface(_surface_points(model))
     times = {image.name: image.timestamp_s for image in survey.images}

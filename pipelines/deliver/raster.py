@@ -138,9 +138,7 @@ def _write_pictures(folder: Path, heights_by_plan: float) -> None:
 def _hillshade(height: FloatArray, cell: float) -> ByteArray:
     """Return the light (H, W), 0 … 255, of a sun in the north-west at 45° on heights (H, W), rows from the north.
 
-    Args:
-        height: NaN: no surface.
-        cell: size of a cell, in the unit of the heights.
+    NaN: no surface. The size of a cell is in the unit of the heights.
     """
     south, east = np.gradient(np.where(np.isfinite(height), height, np.nanmedian(height)), cell)
     azimuth, elevation = np.radians(_SUN_AZIMUTH_DEG), np.radians(_SUN_ELEVATION_DEG)

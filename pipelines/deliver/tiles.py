@@ -131,8 +131,6 @@ def write_tiles(
         folder: exists.
         parts: at least one Gaussian each, in the frame of the sidecar; one after another is in memory.
         tiling: of all parts together.
-        sidecar: place of the frame on Earth.
-        progress: counts the Gaussians in leaves.
 
     Raises:
         OSError: a file cannot be written.
@@ -171,14 +169,9 @@ def write_whole(
 
 
 def write_glb(path: Path, splat: SplatArrays, extras: dict[str, Any] | None = None) -> None:
-    """Write Gaussians of an East-North-Up frame as a glb.
+    """Write N ≥ 1 Gaussians of an East-North-Up frame as a glb, with `extras` as its `asset.extras`.
 
     A scene that reaches further than ±2048 m gets coarser steps of position: 0.24 mm up to ±4096 m, and so on.
-
-    Args:
-        path: of the glb.
-        splat: N ≥ 1 Gaussians.
-        extras: for `asset.extras`.
 
     Raises:
         InputError: values that are not finite.

@@ -276,12 +276,8 @@ def worker_for(
 ) -> Worker | None:
     """Return the worker for a job: the one with the fewest jobs that has room, or None.
 
-    A job that is too large for all workers runs alone on the largest. Workers on which it has failed are avoided,
-    unless there are no others.
-
-    Args:
-        workers, running: workers, and the jobs that run on them, by address.
-        avoided: addresses.
+    A job that is too large for all workers runs alone on the largest. Workers (by address) on which it has failed
+    are avoided, unless there are no others.
     """
     largest_bytes = max((worker.memory_bytes for worker in workers.values()), default=0)
 

@@ -77,7 +77,6 @@ class TrainingEstimate:
         photo_px: width and height of the largest photograph.
         training_px: width and height at which it is trained.
         crops: number of crops in which it is seen, one at an iteration, when it is not shrunken further.
-        backend: `cpu` or `cuda`.
         seconds: about; None on a GPU, where nothing was measured.
         peak_bytes: predicted peak of the memory.
         free_bytes: memory that is free; None: unknown.

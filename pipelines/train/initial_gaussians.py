@@ -146,9 +146,7 @@ def fallback_points(
     Each lies where the ray of its pixel meets the surface through the SfM points, z up. Sky has none.
 
     Args:
-        scene, maps: cameras and SfM points; known depths.
         count: limit of the points, which are spread as evenly as the photographs resolve them.
-        seed: of the choice of pixels.
         inside: returns which of points (N, 3) count, as a mask (N,).
     """
     if count < 1:

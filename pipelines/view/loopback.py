@@ -91,7 +91,6 @@ class RefusedError(Exception):
 
     Args:
         kind: of the fault: the log has one line a page and kind.
-        reason: the fault in words.
     """
 
     def __init__(self, kind: str, reason: str) -> None:
@@ -109,11 +108,7 @@ class Doorkeeper:
 
 
 def check_message(raw: object, keeper: Doorkeeper) -> None:
-    """Check a message as a page sent it.
-
-    Raises:
-        RefusedError: the page may not send it.
-    """
+    """Check a message as a page sent it; a RefusedError: the page may not send it."""
     if not isinstance(raw, bytes):
         raise RefusedError("form", "text where viser sends bytes")
     try:

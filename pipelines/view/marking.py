@@ -56,7 +56,6 @@ def points_to_mark(survey: Survey, xyz_of: Callable[[tuple[SurveyedPoint, ...]],
     """Return the control and check points of a survey with their marks, also those with too few marks to be used.
 
     Args:
-        survey: has the points.
         xyz_of: returns the coordinates (J, 3) of J points in the CRS.
     """
     to_mark = []
@@ -160,8 +159,6 @@ class KeptMarks:
     """Points of a workspace with their marks, as surveyed and as changed in its viewers.
 
     Args:
-        folder: of the files.
-        surveyed: points of the survey.
         lla_of, xyz_of: convert points (N, 3) from the viewer's CRS to latitude, longitude, height, and back.
 
     Attributes:
@@ -186,11 +183,7 @@ class KeptMarks:
         self._take(*self._read())
 
     def set_mark(self, point: str, image: str, place_px: tuple[float, float] | None) -> None:
-        """Set the mark of a point in an image, or remove it (None).
-
-        Raises:
-            GeorefError: nothing was changed, and why.
-        """
+        """Set the mark of a point in an image, or remove it (None); a GeorefError: nothing was changed, and why."""
         step = f"{'removal of the mark' if place_px is None else 'mark'} of {point} in {image}"
         self._step({(point, image): KeptMark(point=point, image=image, place_px=place_px)}, step)
 
@@ -212,11 +205,7 @@ class KeptMarks:
         self._step({(name, None): KeptPoint(point=name, lla=lla, is_check=is_check)}, f"point {name}")
 
     def remove_point(self, name: str) -> None:
-        """Remove a point that was made here, with its marks.
-
-        Raises:
-            GeorefError: nothing was changed, and why.
-        """
+        """Remove a point that was made here, with its marks; a GeorefError: nothing was changed, and why."""
         if name in self._surveyed:
             raise InputError(
                 "point-of-survey",

@@ -41,12 +41,7 @@ _BASES: tuple[BaseKind, ...] = get_args(BaseKind)
 
 
 class MeasurePanel(Panel):
-    """Panel of the measurements; `folder` has the saved ones.
-
-    Attributes:
-        kind: dropdown of the kind of the present measurement.
-        points: of the present measurement.
-    """
+    """Panel of the measurements; `folder` has the saved ones."""
 
     def __init__(
         self, server: viser.ViserServer, model: MeasuringModel, overlays: Overlays, folder: Path, model_hash: str
@@ -210,11 +205,7 @@ class MeasurePanel(Panel):
             self._result.content = self._described(paragraph(f"Undone: {step}." if step else "Nothing to undo."))
 
     def save(self) -> None:
-        """Save the present measurement under its name.
-
-        Raises:
-            GeorefError: it was not saved, and why.
-        """
+        """Save the present measurement under its name; a GeorefError: it was not saved, and why."""
         with self._lock:
             kind, points = self._kind, self.points
             if len(points) < _LEAST[kind]:

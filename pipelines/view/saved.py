@@ -156,11 +156,7 @@ class SavedMeasurements:
         self._change(with_it)
 
     def remove(self, measurement: NamedMeasurement) -> None:
-        """Remove a measurement.
-
-        Raises:
-            GeorefError: nothing was removed, and why.
-        """
+        """Remove a measurement; a GeorefError: nothing was removed, and why."""
         self._change(lambda found: [each for each in found if each.id != measurement.id])
 
     def _change(self, changed: Callable[[list[NamedMeasurement]], list[NamedMeasurement]]) -> None:

@@ -45,11 +45,7 @@ class CpuRasterizer:
     def render(
         self, gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, settings: RasterSettings
     ) -> Render:
-        """See `Rasterizer.render`.
-
-        Raises:
-            InputError: shapes, dtypes, device or settings that do not fit together.
-        """
+        """See `Rasterizer.render`; an InputError: shapes, dtypes, device or settings that do not fit together."""
         _validate(gaussians, cam_from_model, camera, settings)
         pose = cam_from_model[:3].to(torch.float64)
         center_in_model = -torch.linalg.solve(pose[:, :3], pose[:, 3])
@@ -73,8 +69,6 @@ def predicted_bytes(
     """Return the peak memory in bytes of one render and its backward pass, with gradients, without parameters.
 
     Args:
-        count: number of Gaussians.
-        camera: the image.
         sh_degree: of the stored spherical harmonics.
         visible: number of Gaussians in the image; None: all.
         hits_per_visible: tiles (16 × 32 px) that a visible Gaussian touches on average: 3 to 6 in trained models,
@@ -94,11 +88,9 @@ class _RenderContext:
     """State of one render that the forward pass leaves for the backward pass.
 
     Attributes:
-        camera, settings: of the render.
         workers: number of threads.
         background: (3,) float64.
         view: camera in the form of the kernels.
-        stats: handed out with the render.
         visible: (M,) rows of the visible Gaussians, ascending.
         rank: (M,) places of the visible Gaussians in the order of depth.
         table: (M, SPLAT_WIDTH) splats in the order of depth.
@@ -252,7 +244,6 @@ def blend_tiles(
         lists: their hits; `tile_end` is written.
         size: height and width of the image.
         background: (3,) float64.
-        depth: whether depths are wanted.
         workers: number of threads.
     """
     depth_size = size if depth else (0, 0)

@@ -42,11 +42,7 @@ _OF_PLAN = ("preset", "blocks", "block_overlap", "block_memory")
 
 @dataclass(frozen=True)
 class Parts:
-    """Parts of the training of one workspace with given options.
-
-    Raises:
-        InputError: the training is to use LiDAR.
-    """
+    """Parts of the training of one workspace with given options; an InputError: the training is to use LiDAR."""
 
     workspace: Workspace
     options: TrainOptions

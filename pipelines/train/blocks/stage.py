@@ -43,8 +43,6 @@ def train_blocks(
     """Bring plan, solution, scaffold and all blocks up to date, and return the plan.
 
     Args:
-        parts, progress: of the training; shows the tasks and jobs.
-        force: start all afresh.
         note: receives how far the work has come, after each block (`2 of 4 blocks`).
 
     Raises:
