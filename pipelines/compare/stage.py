@@ -133,11 +133,7 @@ class _PlanRunner:
     _by_place: dict[tuple[str, str], Outcome | GeorefError] = field(default_factory=dict)
 
     def run(self, configuration: Configuration, planned: VariantStage) -> Outcome:
-        """Return the outcome of a stage, run now or before.
-
-        Raises:
-            GeorefError: the stage fails, or has failed before.
-        """
+        """Return the outcome of a stage, run now or before; a GeorefError: it fails, or has failed before."""
         key = (str(planned.variant.root), planned.spec.name)
         if key not in self._by_place:
             planned.variant.root.mkdir(parents=True, exist_ok=True)

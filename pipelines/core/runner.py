@@ -157,7 +157,7 @@ def run_pipeline(
     progress: Progress = SILENT,
     around: Callable[[StageSpec], AbstractContextManager[None]] = lambda _: nullcontext(),
 ) -> list[Outcome]:
-    """Run stages in order; current stages are skipped, and interrupted ones are resumed.
+    """Run stages in order; current ones are skipped, interrupted ones resumed. A GeorefError: the first failure.
 
     All options are checked and remembered before the first stage begins, for two reasons: a bad option of a late
     stage costs no hours, and a run that is killed early is later completed with the same options.
@@ -167,9 +167,6 @@ def run_pipeline(
         forget: remembered options by stage that no longer count.
         force: run also the stages whose product is current, and start all afresh.
         around: makes the context in which a stage runs.
-
-    Raises:
-        GeorefError: the first failure.
     """
     if stages[0].reads:
         staleness.must_exist(workspace)

@@ -57,12 +57,7 @@ _UNKNOWN = (
 
 
 def run(stage: StageRun, options: ExportCamerasOptions) -> Summary:
-    """Write the cameras in all forms, and return their key figures.
-
-    Raises:
-        MissingProductError: a stage up to init-sim3 has not been run.
-        InputError: a product is damaged, or the CRS cannot be used here.
-    """
+    """Write the cameras in all forms, and return their key figures."""
     solved = load_solved(stage.workspace)
     accuracy = headline_of(stage.workspace)
     points = solved.gaussians.means.numpy() if isinstance(solved, TrainedSurvey) else solved.point_in_model

@@ -40,13 +40,7 @@ _LEAST_M, _RATIO, _CLASSES = 1e-4, 1.01, 1700
 
 
 def run(stage: StageRun, options: ExportCloudOptions) -> Summary:
-    """Write the cloud with its sidecar, and return its key figures.
-
-    Raises:
-        InputError: the CRS cannot be used, the disk is too small, or a product or photograph cannot be read.
-        MissingProductError: a stage has not been run.
-        DegenerateGeometryError: the views agree on no point.
-    """
+    """Write the cloud with its sidecar, return its figures; a DegenerateGeometryError: the views agree nowhere."""
     trained = load_trained(stage.workspace)
     geo_from_model, box = trained.geo_from_model, corners(scene_points(trained))
     target = target_crs(options, trained.survey.origin, box, trained.survey.vertical)

@@ -70,8 +70,6 @@ def run(stage: StageRun, options: MeasurableOptions) -> Summary:
     """Write the PLY and its sidecar, and return their key figures.
 
     Raises:
-        MissingProductError: a stage has not been run.
-        InputError: a product or photograph cannot be read, or the disk is too small for the depth maps.
         ResourceError: the discs do not fit into the memory.
         DegenerateGeometryError: the views agree on no point, or no Gaussian is opaque enough.
     """

@@ -166,11 +166,7 @@ def median_values(sigma: SceneSigma | None, of: str) -> dict[str, float | None]:
 
 
 def require_space(folder: Path, needed_bytes: int, files: str, advice: str) -> None:
-    """Refuse files that the disk would not hold: a sentence names them, and advises what makes them smaller.
-
-    Raises:
-        InputError: too little space is free.
-    """
+    """Refuse files that the disk would not hold: an InputError names them, and what makes them smaller."""
     free_bytes = shutil.disk_usage(folder).free
     if needed_bytes > free_bytes:
         needed, free = f"{needed_bytes / 2**30:.1f} GiB", f"{free_bytes / 2**30:.1f} GiB"

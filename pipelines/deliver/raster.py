@@ -48,13 +48,7 @@ _CONTOUR_PX = 6000  # of the surface that lines are drawn of
 
 
 def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
-    """Write the rasters, their pictures and contours, and return their key figures.
-
-    Raises:
-        MissingProductError: a stage has not been run.
-        InputError: a product is damaged, the CRS cannot be used, the cells are too many, or the disk is too small.
-        DegenerateGeometryError: no cell of the scene was seen.
-    """
+    """Write rasters, pictures and contours, return their figures; a DegenerateGeometryError: no cell was seen."""
     trained = load_trained(stage.workspace)
     points, (photographs_m, training_m) = scene_points(trained), ground_sampling_m(trained)
     target = target_crs(options, trained.survey.origin, corners(points), trained.survey.vertical)
@@ -157,15 +151,12 @@ def _write_contours(folder: Path, frame: RasterFrame, interval: float) -> int:
 
 
 def _contour_lines(height: FloatArray, frame: RasterFrame, interval: float) -> list[ContourLine]:
-    """Return the contour lines of a surface, lowest first; short ones are left out.
+    """Return contour lines of a surface, lowest first, no short ones; an InputError: the interval is too small.
 
     Args:
         height: (H, W) rows from the north, over the whole frame; NaN: no surface.
         frame: of the raster, whose cells may be smaller.
         interval: between two lines, in the unit of the heights.
-
-    Raises:
-        InputError: the interval is too small for the scene.
     """
     known = np.isfinite(height)
     if known.sum() < 4:

@@ -81,13 +81,7 @@ def splat_values(splat: PlacedSplat | SplatParts) -> dict[str, object]:
 
 
 def load_splat(workspace: Workspace, options: SplatOptions) -> PlacedSplat:
-    """Return the splat of a workspace, placed on Earth.
-
-    Raises:
-        MissingProductError: ingest or train has not been run.
-        InputError: a product is damaged.
-        DegenerateGeometryError: no Gaussian is opaque enough.
-    """
+    """Return the splat of a workspace, placed on Earth; a DegenerateGeometryError: no Gaussian is opaque enough."""
     survey = load_survey(workspace)
     model = load_json(TrainedModel, workspace.path(MODEL))
     gaussians = read_gaussians(workspace.path(GAUSSIANS))
@@ -127,11 +121,7 @@ def _rows_of_blocks(workspace: Workspace, count: int) -> tuple[slice, ...]:
 
 
 def placed_splat(gaussians: Gaussians, placement: Placement, options: SplatOptions) -> PlacedSplat:
-    """Return the opaque ones of Gaussians in `model`, in the frame of the placement.
-
-    Raises:
-        DegenerateGeometryError: no Gaussian is opaque enough.
-    """
+    """Return the opaque Gaussians, moved from `model` to the placement; a DegenerateGeometryError: none is."""
     opaque = _is_opaque(gaussians.logit_opacities.numpy(), options)
     _require_opaque(opaque, options)
     kept = gaussians.select(torch.from_numpy(opaque))

@@ -213,11 +213,7 @@ def _parts(address: str, scheme: str) -> SplitResult:
 
 @contextmanager
 def connected(cluster: ClusterAddress) -> Iterator[Client]:
-    """Connect to the scheduler while the context lasts.
-
-    Raises:
-        ClusterError: no scheduler answers there, or it refuses the certificate.
-    """
+    """Connect to the scheduler while the context lasts; a ClusterError: none answers, or the certificate is bad."""
     import distributed
 
     for name in ("distributed", "tornado"):  # They log each lost connection with a traceback.

@@ -33,11 +33,7 @@ def find_chromium() -> str | None:
 
 
 def chromium_path() -> str:
-    """Return Chromium or Chrome as `find_chromium` does.
-
-    Raises:
-        BackendUnavailableError: there is none, or CHROMIUM names no program; says what to install or correct.
-    """
+    """Return Chromium or Chrome as `find_chromium`; a BackendUnavailableError says what to install or correct."""
     browser = find_chromium()
     if os.environ.get("CHROMIUM") and browser and shutil.which(browser) is None:
         raise BackendUnavailableError(

@@ -215,11 +215,7 @@ def picture_of(rgb: ByteArray) -> Picture:
 
 
 def read_picture(path: Path) -> ByteArray:
-    """Return a picture of the workspace as (H, W, 3) RGB, transparent pixels on white.
-
-    Raises:
-        InputError: it cannot be read, does not decode, or claims more than 400 million pixels.
-    """
+    """Return a picture as (H, W, 3) RGB, transparent pixels on white; an InputError: unreadable, or too large."""
     import cv2
 
     data = read_bytes(path)

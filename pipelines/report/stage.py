@@ -38,13 +38,7 @@ _STEPS = 8
 
 
 def run(stage: StageRun, options: ReportOptions) -> Summary:
-    """Write the report, and return its key figures.
-
-    Raises:
-        MissingProductError: a stage up to evaluate has not been run; names the command.
-        BackendUnavailableError: `--pdf` without a Chromium.
-        InputError: a product or a photograph is damaged, or the CRS cannot be used here.
-    """
+    """Write the report, and return its key figures; a BackendUnavailableError: `--pdf` without a Chromium."""
     if options.pdf:
         chromium_path()  # a missing browser is told before the work begins
     with stage.progress.task("covariances of cameras and lenses", 1) as task:

@@ -84,12 +84,7 @@ class EvaluatedSurvey:
 
 
 def load_evaluated(workspace: Workspace, options: ReportOptions) -> EvaluatedSurvey:
-    """Return the evaluated survey of a workspace.
-
-    Raises:
-        MissingProductError: a stage up to evaluate has not been run; names the command.
-        InputError: a product is damaged, or the CRS cannot be used here.
-    """
+    """Return the evaluated survey of a workspace; errors as of the `run` of a stage."""
     report = read_report(workspace.path(REPORT))
     manifest = workspace.manifest(BY_NAME["evaluate"])  # None: a report put there by hand
     initial = manifest is not None and manifest.config.get("similarity") == "initial"
@@ -195,12 +190,9 @@ def training_facts(workspace: Workspace, model: TrainedModel) -> TrainingFacts:
 
 
 def read_metrics(path: Path) -> list[dict[str, float]]:
-    """Return the rows of the training's metrics: numbers by name.
+    """Return the rows of the training's metrics: numbers by name. An InputError: too large, or a line is no row.
 
     A last line that an interrupted writer has left unfinished is not counted.
-
-    Raises:
-        InputError: too large, not text, or a line is no JSON object of numbers.
     """
     file_size(path, limit_bytes=_MOST_METRICS_BYTES, kind="file of metrics")
     rows, lines = [], 0

@@ -80,13 +80,10 @@ class DepthMaps:
         self.folder = folder / self._key()
 
     def build(self, progress: Progress = SILENT) -> None:
-        """Compute the depth maps that are not in the cache, several views at once.
+        """Compute the depth maps that the cache lacks, several at once; an InputError: a photograph is unusable.
 
         A view needs the previous step of its neighbours. Each step therefore finishes all views before the next
         step begins.
-
-        Raises:
-            InputError: a photograph cannot be read, or has another size than its camera.
         """
         train = [int(index) for index in self.scene.train]
         steps = (("coarse", self._sweep), ("fine", self._refine), ("depth", self._agree))

@@ -60,11 +60,7 @@ class SurfaceCloud:
 
 
 def pixel_on_surface_m(views: SurfaceViews, geo_from_model: Similarity) -> float:
-    """Return the median width of a pixel on the surface in metres, over the views' medians.
-
-    Raises:
-        DegenerateGeometryError: no view shows a surface.
-    """
+    """Return the median pixel width on the surface in metres, over the views; a DegenerateGeometryError: none."""
     medians = []
     for view in map(views.view, range(len(views))):
         depth = view.depth_m[::_SAMPLE_PX, ::_SAMPLE_PX]

@@ -64,11 +64,7 @@ class Registration:
 
 
 def registration(cloud: LidarCloud, views: DepthViews, seed: int) -> Registration:
-    """Return the shift of a cloud against the depth maps.
-
-    Raises:
-        DegenerateGeometryError: too few planes that both show, or planes of one direction only.
-    """
+    """Return a cloud's shift against the depth maps; a DegenerateGeometryError: too few planes or directions."""
     plane = (cloud.roughness_m < _FLAT * cloud.voxel_m + 0.05) & ~np.isin(cloud.classification, PLANTS)
     rows = np.flatnonzero(plane)
     if len(rows) > _MOST_POINTS:

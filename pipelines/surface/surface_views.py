@@ -133,15 +133,12 @@ class SurfaceView:
 
 
 class SurfaceViews:
-    """Depth maps of all training cameras, at the size of the training photographs.
+    """Depth maps of all training cameras, at the photographs' training size; an InputError: the disk is too small.
 
     Args:
         folder: scratch folder, made if missing. It belongs to the maps alone: maps that are there are continued.
         colours: keep the colours of the renders too.
         confirmed: keep only depths where render and photograph agree (`photo_consistent`).
-
-    Raises:
-        InputError: the maps do not fit on the disk.
     """
 
     def __init__(

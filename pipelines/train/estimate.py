@@ -132,12 +132,9 @@ class TrainingEstimate:
 
 
 def estimate_training(photographs: int, photo_px: tuple[int, int], options: TrainOptions) -> TrainingEstimate:
-    """Return the estimate of a training.
+    """Return the estimate of a training; a BackendUnavailableError names each missing part of `--backend cuda`.
 
     The time is that of the machine of `MEASURED_ON`, divided by the ratio of the threads.
-
-    Raises:
-        BackendUnavailableError: `--backend cuda`, and a part that it needs is missing; names each.
     """
     camera, backend = training_pinhole(photo_px, options), chosen_backend(options.backend)
     free_bytes = free_memory_bytes(torch.device(backend))

@@ -97,14 +97,11 @@ def compared_lidar(
     seed: int,
     progress: Progress,
 ) -> ComparedLidar:
-    """Return the cloud of the scene, compared with the photographs.
+    """Return the scene's cloud, compared with the photographs; an InputError: it lies elsewhere, or off by 3 σ.
 
     Args:
         options, files, track: of the LiDAR; None: the scanner's track is unknown.
         georeference: initial similarity to `geo`, with covariance.
-
-    Raises:
-        InputError: the cloud lies elsewhere, in height or plan, or is shifted beyond 3 σ.
     """
     pixel_m, views, surface = _pixel_size_m(maps), _depth_views(maps), SceneSurface(maps)
     cloud = read_cloud(files, maps.scene, survey, pixel_m, progress=progress, track=track)

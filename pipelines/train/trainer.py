@@ -338,14 +338,11 @@ def make_trainer(
     options: TrainOptions,
     exposures: FrozenExposures | None = None,
 ) -> JointTrainer:
-    """Return the trainer with its initial Gaussians, before the first iteration.
+    """Return the trainer with initial Gaussians; a DegenerateGeometryError: fewer than two different points.
 
     Args:
         problem: the geographic losses, moved to the backend's device.
         exposures: to be frozen; None: those of the training photographs are fitted, if the options say so.
-
-    Raises:
-        DegenerateGeometryError: fewer than two different points to start from.
     """
     effort, device = options.effort, device_of(backend)
     scene, images, surface = training.scene, training.images, training.surface

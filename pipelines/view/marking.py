@@ -97,13 +97,10 @@ def appears_in(point_in_geo: FloatArray, trained: TrainedSurvey) -> list[tuple[i
 
 
 def mark_texts(crs: str, points: Sequence[MarkedPoint]) -> dict[str, str]:
-    """Return the surveyed points with their marks as `gcp_list.txt` and `checkpoints.txt`, by name of the file.
+    """Return points with marks as `gcp_list.txt` and `checkpoints.txt`, by file; an InputError: a name has a space.
 
     A point without coordinates or without marks is left out: the format has no place for it. A file without points
     is left out, too.
-
-    Raises:
-        InputError: a name or an image contains a space, which the format cannot hold.
     """
     texts = {}
     for file, is_check in ((CONTROL, False), (CHECK, True)):
@@ -156,7 +153,7 @@ class KeptRecords(Product):
 
 
 class KeptMarks:
-    """Points of a workspace with their marks, as surveyed and as changed in its viewers.
+    """Points of a workspace with their marks, as surveyed and changed in its viewers; an InputError: a bad file.
 
     Args:
         lla_of, xyz_of: convert points (N, 3) from the viewer's CRS to latitude, longitude, height, and back.
@@ -165,9 +162,6 @@ class KeptMarks:
         points: all points, those of the survey first.
         is_written: whether the files for `--gcp` have all changes.
         history: steps of this viewer that can be undone.
-
-    Raises:
-        InputError: the file cannot be read, or holds no marks of the viewer.
     """
 
     def __init__(
@@ -188,11 +182,7 @@ class KeptMarks:
         self._step({(point, image): KeptMark(point=point, image=image, place_px=place_px)}, step)
 
     def set_point(self, name: str, xyz: tuple[float, float, float] | None, *, is_check: bool) -> None:
-        """Make a point, or change its coordinates in the CRS (None: leave them) and its use.
-
-        Raises:
-            GeorefError: nothing was changed, and why.
-        """
+        """Make a point, or change its place in the CRS (None: not) and use; a GeorefError: nothing was changed."""
         if len(name.split()) != 1:
             raise InputError(
                 "name-with-space", f"Names in {CONTROL} and {CHECK} cannot contain spaces. Rename {name!r}."
@@ -214,11 +204,7 @@ class KeptMarks:
         self._step(dict.fromkeys(key for key in self._records if key[0] == name), f"removal of {name}")
 
     def write(self, crs: str) -> list[Path]:
-        """Write the surveyed points with their marks for `--gcp` and `--checkpoints`; return the files written.
-
-        Raises:
-            GeorefError: nothing was written, and why.
-        """
+        """Write points and marks for `--gcp` and `--checkpoints`; return the files. A GeorefError: not written."""
         with changing(self._folder):
             self._take(*self._read())
             texts = {self._folder / name: text for name, text in mark_texts(crs, self.points).items()}

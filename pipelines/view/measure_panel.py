@@ -195,11 +195,7 @@ class MeasurePanel(Panel):
             self._replace("clearing", self._kind, ())
 
     def undo(self) -> None:
-        """Undo the last step: a point, its removal, clearing, saving or deleting.
-
-        Raises:
-            GeorefError: the file of saved measurements could not be changed, and why.
-        """
+        """Undo the last step: a point, its removal, clearing, saving, deleting; a GeorefError: it was not."""
         with self._lock:
             step = self._history.undo()
             self._result.content = self._described(paragraph(f"Undone: {step}." if step else "Nothing to undo."))

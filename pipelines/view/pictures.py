@@ -134,11 +134,7 @@ class Photographs:
         self.full = lru_cache(_KEPT_PHOTOGRAPHS)(self._decoded)
 
     def _decoded(self, camera: int) -> ByteArray:
-        """Return a photograph (H, W, 3) with its distortion.
-
-        Raises:
-            InputError: it cannot be read, or is not that of the survey.
-        """
+        """Return a photograph (H, W, 3) with its distortion; an InputError: unreadable, or not of the survey."""
         name = self._trained.sparse.image_name[camera]
         file = self._folder / name
         sha256 = {image.name: image.sha256 for image in self._trained.survey.images}

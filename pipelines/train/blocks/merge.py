@@ -147,11 +147,7 @@ class SeamViews:
 
 
 def merge_blocks(parts: Parts, plan: BlockPlan, folder: Path, progress: Progress) -> Summary:
-    """Write the product of `train` from the trained blocks of a plan, and return its key figures.
-
-    Raises:
-        InputError: a block or the scaffold cannot be read.
-    """
+    """Write the product of `train` from a plan's blocks, and return its key figures; an InputError: unreadable."""
     trainings = [parts.training(block) for block in plan.blocks]
     # The Gaussians of each cell, adapted to those of its neighbours.
     cells = [parts.variant().root / TRAIN_SEAMS.folder / f"{block.id}.ply" for block in plan.blocks]

@@ -65,12 +65,7 @@ class Parts:
         return chosen_backend(self.options.backend) == "cuda"
 
     def plan(self) -> BlockPlan:
-        """Return the plan.
-
-        Raises:
-            MissingProductError: there is none.
-            InputError: the plan cannot be read.
-        """
+        """Return the plan; a MissingProductError: there is none; an InputError: it cannot be read."""
         path = self.variant().root / BLOCK_PLAN
         if not path.is_file():
             raise MissingProductError(f"{FOLDER}/{BLOCK_PLAN}", f"georef blocks plan {self.workspace.root}")
@@ -108,11 +103,7 @@ class Parts:
     def run(
         self, spec: StageSpec, number: int | None = None, *, force: bool = False, progress: Progress = SILENT
     ) -> Outcome:
-        """Run a part, unless it is current and not forced, and return its outcome.
-
-        Raises:
-            GeorefError: the part fails.
-        """
+        """Run a part, unless it is current and not forced, and return its outcome; a GeorefError: it fails."""
         variant = self.variant(number)
         variant.root.mkdir(parents=True, exist_ok=True)
         flags = self.flags(spec, number)

@@ -67,11 +67,7 @@ def train_blocks(
 
 
 def require_trained(parts: Parts, plan: BlockPlan) -> None:
-    """Refuse to merge blocks that are not current.
-
-    Raises:
-        MissingProductError: names the first such block, and how to train it.
-    """
+    """Refuse to merge blocks that are not current: a MissingProductError names the first, and how to train it."""
     for block in plan.blocks:
         if parts.why_missing(TRAIN_BLOCK, block.id):
             command = f"georef blocks train {parts.workspace.root} --id {block.id}"
