@@ -111,7 +111,6 @@ class Tally:
         self._largest = np.zeros(2)
 
     def add(self, points: CloudPoints) -> None:
-        """Add points."""
         if not len(points):
             return
         self.count += len(points)

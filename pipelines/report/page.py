@@ -48,7 +48,6 @@ def metres(value: float | None) -> str:
 
 
 def in_metres(value: float | None) -> str:
-    """Return metres with their unit."""
     return MISSING if value is None or isnan(value) else f"{metres(value)} m"
 
 
@@ -69,7 +68,6 @@ def square_km(value: float | None) -> str:
 
 
 def decibel(value: float | None) -> str:
-    """Return decibels with their unit."""
     return MISSING if value is None else f"{number_text(value, 2)} dB"
 
 

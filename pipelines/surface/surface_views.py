@@ -72,7 +72,6 @@ class ModelRenderer:
         return SpatialBlocks(self.trained.gaussians)
 
     def pose(self, index: int) -> ViewPose:
-        """Return the pose of camera `index`."""
         poses = self.trained.poses
         return ViewPose(self.pinholes.of(index), poses.cam_from_model[index], poses.cam_center_in_model[index])
 

@@ -28,12 +28,7 @@ _PIXELS_EACH = 40
 
 
 def training_size(options: TrainOptions, photographs: int, largest: Pinhole, beside: int = 0) -> TrainingSize:
-    """Return the quantities that determine the memory of a training of so many photographs.
-
-    Args:
-        largest: camera of the largest photograph at training size.
-        beside: number of frozen Gaussians that are rendered too.
-    """
+    """Return what determines the memory of a training at its size, with `beside` frozen Gaussians rendered too."""
     gaussians, cameras = options.effort.max_gaussians + beside, options.refined_cameras(photographs)
     crop, whole_px = Crops(options.crop_size).largest_of(largest), largest.width * largest.height
     return TrainingSize(gaussians, crop, options.sh_degree, cameras, whole_px)

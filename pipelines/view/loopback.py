@@ -87,11 +87,7 @@ _DECODER = msgspec.msgpack.Decoder(_Camera | _Click | _Update | _Command)
 
 
 class RefusedError(Exception):
-    """Message that is not let through.
-
-    Args:
-        kind: of the fault: the log has one line a page and kind.
-    """
+    """Message that is not let through, with the kind of its fault: the log has one line a page and kind."""
 
     def __init__(self, kind: str, reason: str) -> None:
         self.kind = kind
@@ -215,7 +211,6 @@ def _start(port: int, title: str, keeper: Doorkeeper) -> viser.ViserServer:
         """Server that opens no tunnel to the Internet when a page asks for one."""
 
         def request_share_url(self, verbose: bool = True) -> str | None:
-            """Return None."""
             return None
 
     with _checked_connections(keeper), contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner

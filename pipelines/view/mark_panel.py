@@ -93,7 +93,6 @@ class MarkPanel(Panel):
 
     @property
     def point(self) -> MarkedPoint | None:
-        """The chosen point."""
         return next((point for point in self._kept.points if point.name == self._chosen.value), None)
 
     def choose(self, name: str) -> None:

@@ -120,11 +120,7 @@ def mark_texts(crs: str, points: Sequence[MarkedPoint]) -> dict[str, str]:
 
 
 class KeptPoint(Product):
-    """Changed point, by its name.
-
-    Attributes:
-        lla: latitude and longitude in degrees, ellipsoidal height in metres; None: as surveyed, or not surveyed.
-    """
+    """Changed point by its name; `lla` is in degrees and ellipsoidal metres; None: as surveyed, or not surveyed."""
 
     point: str = Field(min_length=1)
     lla: Vector3 | None

@@ -82,7 +82,6 @@ class Overlays:
         return min(met, key=lambda each: each[0])[1] if met else None
 
     def add_cameras(self) -> None:
-        """Draw the cameras."""
         poses, frame = self._trained.poses, self._frame
         if len(self._centers) > _MOST_FRUSTUMS:
             self._scene.add_point_cloud(

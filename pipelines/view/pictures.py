@@ -114,12 +114,7 @@ def frame_of(trained: TrainedSurvey) -> ViewFrame:
 
 @dataclass(frozen=True)
 class PageView:
-    """Picture of a page.
-
-    Attributes:
-        rgb: (H, W, 3).
-        depth: (H, W) along the camera's z axis, in units of the viewer.
-    """
+    """Picture (H, W, 3) of a page, and depth (H, W) along the camera's z axis, in units of the viewer."""
 
     rgb: ByteArray
     depth: Float32Array
@@ -233,7 +228,6 @@ class PictureLoop:
         self.changed.set()
 
     def end(self) -> None:
-        """End the loop."""
         self._ended.set()
         self.changed.set()
 

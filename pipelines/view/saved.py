@@ -84,7 +84,6 @@ class History:
 
 
 def new_id() -> str:
-    """Return the id of a new measurement."""
     return uuid.uuid4().hex
 
 

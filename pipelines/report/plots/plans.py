@@ -56,7 +56,6 @@ class PlanFrame:
 
     @property
     def longer_m(self) -> float:
-        """Longer side."""
         return float((self.high - self.low).max())
 
 

@@ -72,7 +72,6 @@ class Parts:
         return load_json(BlockPlan, path)
 
     def training(self, block: PlannedBlock) -> BlockTraining:
-        """Return the record of a trained block."""
         return load_json(BlockTraining, self.variant(block.id).path(BLOCK_TRAINING))
 
     def flags(self, spec: StageSpec, number: int | None = None) -> dict[str, Any]:

@@ -252,7 +252,6 @@ class _Planner:
         return cells_that_fit(points, load, fits)
 
     def block(self, number: int, cell: BlockCell) -> PlannedBlock:
-        """Return the block of a cell."""
         points = self.surface.point_in_model
         inside = cell.contains(points)
         margin = self.options.block_overlap * extent_of(points[inside], self.surface.surface[inside])

@@ -348,7 +348,6 @@ class GeographicAdam:
         return state
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
-        """Restore unknowns and moments."""
         for name, parameter in self._problem.learned().items():
             with torch.no_grad():
                 parameter.copy_(state[name])
