@@ -261,7 +261,7 @@ def _checked(
         shift_m=compared.shift_m.tolist(),
         sigma_m=sigma.tolist(),
         sigma_comparison_m=np.sqrt(np.diag(compared.covariance_m2)).tolist(),
-        points=len(compared.matches),
+        points=len(compared.matches.distance_m),
         spread_m=compared.spread_m,
         wall_bias_m=compared.wall_bias_m,
         removed=options.lidar_register,
