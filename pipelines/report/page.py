@@ -195,8 +195,10 @@ def picture_of_png(data: bytes) -> Picture:
     return Picture(_address("png", data), *size)
 
 
-def png_file(path: Path) -> Picture:
-    """Return a PNG file as it is; an InputError: it cannot be read, or is no PNG."""
+def png_file(path: Path) -> Picture | None:
+    """Return a PNG file as it is, or None without one; an InputError: it cannot be read, or is no PNG."""
+    if not path.is_file():
+        return None
     data = read_bytes(path)
     if header_size(data) is None or not data.startswith(_PNG):
         raise InputError("not-a-png", "is no PNG; make it again with `georef evaluate --force`", path=path)

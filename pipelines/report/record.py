@@ -163,5 +163,4 @@ def reference_facts(evaluated: EvaluatedSurvey) -> dict[str, Picture | None]:
     if evaluated.report.reference is None:
         return {}
     products = {"map": REFERENCE_MAP, "histogram": REFERENCE_HISTOGRAM}
-    paths = {name: evaluated.workspace.root / product for name, product in products.items()}
-    return {name: png_file(path) if path.is_file() else None for name, path in paths.items()}
+    return {name: png_file(evaluated.workspace.root / product) for name, product in products.items()}

@@ -12,7 +12,7 @@ import numpy as np
 
 from pipelines.adjust.posterior import Posterior
 from pipelines.adjust.solution import posterior_of
-from pipelines.core.errors import InputError, MissingProductError
+from pipelines.core.errors import InputError
 from pipelines.core.files import file_size
 from pipelines.core.stages import BY_NAME, HILLSHADE, METRICS, ORTHOPHOTO_PREVIEW, RENDERS, REPORT
 from pipelines.core.types import FloatArray
@@ -151,13 +151,8 @@ def views_facts(workspace: Workspace, test: PhotometricFigures, most: int) -> Vi
     views = test.per_view
     fields = {view.image: f"photometric.test.per_view.{index}" for index, view in enumerate(views)}
     worst_first = sorted(views, key=lambda view: view.psnr)
-    try:
-        folder = workspace.path(RENDERS)
-    except MissingProductError:
-        saved: dict[str, Path] = {}
-    else:
-        files = {view.image: folder / render_name(view.image) for view in worst_first}
-        saved = {name: file for name, file in files.items() if file.is_file()}
+    files = {view.image: workspace.root / RENDERS / render_name(view.image) for view in worst_first}
+    saved = {name: file for name, file in files.items() if file.is_file()}
     return ViewsFacts(
         shown=tuple(_view(name, fields[name], file) for name, file in list(saved.items())[:most]),
         rows=tuple((view.image, fields[view.image]) for view in views),
@@ -177,11 +172,8 @@ def _view(name: str, field: str, file: Path) -> TestView:
 
 def training_facts(workspace: Workspace, model: TrainedModel) -> TrainingFacts:
     manifest = workspace.manifest(BY_NAME["train"])
-    try:
-        rows = read_metrics(workspace.path(METRICS))
-    except MissingProductError:
-        rows = []
-    panels = _panels(rows)
+    metrics = workspace.root / METRICS
+    panels = _panels(read_metrics(metrics)) if metrics.is_file() else {}
     return TrainingFacts(
         model=model,
         curves=picture_of_png(curves("iteration", panels)) if panels else None,
