@@ -340,18 +340,10 @@ def _current(workspace: Workspace, asked: Request, memo: Memo) -> Manifest | Non
             values={},
             warnings=[],
         )
-    if found.unreadable:
-        log.warning(
-            "%s: the product is made again, because %s",
-            spec.name,
-            found.unreadable,
-            extra={"code": "manifest-damaged"},
-        )
-    elif found.damaged:
-        damage = staleness.why_damaged(found.damaged)
-        log.warning(
-            "%s: the product is made again, because %s.", spec.name, damage, extra={"code": "product-damaged"}
-        )
+    if found.unreadable or found.damaged:
+        cause = found.unreadable or f"{staleness.why_damaged(found.damaged)}."
+        code = "manifest-damaged" if found.unreadable else "product-damaged"
+        log.warning("%s: the product is made again, because %s", spec.name, cause, extra={"code": code})
     elif (manifest := found.manifest) is not None:
         reason = staleness.why_stale(workspace, asked, manifest)
         log.info("%s: %s", spec.name, f"made again: {reason}" if reason else f"current: {manifest.key_figure}")
