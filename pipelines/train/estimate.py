@@ -16,7 +16,7 @@ from pipelines.geometry.cameras import Pinhole
 from pipelines.jobs.costs import BLOCK_SECONDS, MEASURED_CORES, SURFACE_FACTOR, iteration_seconds
 from pipelines.splat.memory import USABLE, TrainingSize, fitting_gaussians, free_memory_bytes, predicted_peak_bytes
 from pipelines.splat.rasterizer.backends import chosen_backend
-from pipelines.surface.depth_maps import StereoOptions
+from pipelines.surface.depth_maps import FINE_PX
 from pipelines.survey.block_plan import BlockPlan, PlannedBlock
 from pipelines.survey.options import NOT_IN_BLOCKS
 from pipelines.train.options import PRESETS, TrainOptions
@@ -207,5 +207,5 @@ def _seconds(photographs: int, camera: Pinhole, options: TrainOptions) -> float:
 
 
 def _stereo_s(photographs: int, camera: Pinhole) -> float:
-    maps = camera.limited(StereoOptions().fine_px)
+    maps = camera.limited(FINE_PX)
     return photographs * (_STEREO_PHOTOGRAPH_S + _STEREO_MEGAPIXEL_S * maps.width * maps.height / 1e6)
