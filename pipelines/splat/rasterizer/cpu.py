@@ -63,21 +63,21 @@ class CpuRasterizer:
         return Render(colour, alpha, context.stats, expected, variance, median if settings.median else None)
 
 
-def predicted_bytes(
-    count: int, camera: Pinhole, sh_degree: int, *, visible: int | None = None, hits_per_visible: float = 6.0
-) -> int:
+# Tiles (16 × 32 px) that a visible Gaussian touches on average: 3 to 6 in trained models.
+_HITS_PER_VISIBLE = 6.0
+
+
+def predicted_bytes(count: int, camera: Pinhole, sh_degree: int, *, visible: int | None = None) -> int:
     """Return the peak memory in bytes of one render and its backward pass, with gradients, without parameters.
 
     Args:
         sh_degree: of the stored spherical harmonics.
         visible: number of Gaussians in the image; None: all.
-        hits_per_visible: tiles (16 × 32 px) that a visible Gaussian touches on average: 3 to 6 in trained models,
-            and all tiles of the image if Gaussians are huge.
     """
     gradients = count * (11 + 3 * (sh_degree + 1) ** 2) * 4 + count * 5
     splats = cpu_project.SPLAT_WIDTH + cpu_project.ELLIPSE_WIDTH
     in_view = count if visible is None else visible
-    hits = in_view * hits_per_visible * (16 + 4 * cpu_blend.HIT_GRADIENT_WIDTH)
+    hits = in_view * _HITS_PER_VISIBLE * (16 + 4 * cpu_blend.HIT_GRADIENT_WIDTH)
     # Colour, alpha, Σ w z, Σ w z² and median depth, and the gradients of all but the median.
     images = camera.width * camera.height * 13 * 4
     return int(gradients + in_view * (4 * splats + 48) + hits + images)
