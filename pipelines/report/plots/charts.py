@@ -120,8 +120,6 @@ def write_distance_map(path: Path, place_m: FloatArray, distance_m: FloatArray, 
         vmax=limit_m,
         interpolation="nearest",
     )
-    axes.set_xlim(frame.low[0], frame.high[0])
-    axes.set_ylim(frame.low[1], frame.high[1])
     text = "m; above 0: the model lies before the reference"
     add_scale(figure, image, text, cax=bar_axes(figure, axes), extend="both")
     add_bearings(axes)
