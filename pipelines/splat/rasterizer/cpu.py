@@ -85,27 +85,17 @@ def predicted_bytes(count: int, camera: Pinhole, sh_degree: int, *, visible: int
 
 @dataclass
 class _RenderContext:
-    """State of one render that the forward pass leaves for the backward pass.
-
-    Attributes:
-        workers: number of threads.
-        background: (3,) float64.
-        view: camera in the form of the kernels.
-        visible: (M,) rows of the visible Gaussians, ascending.
-        rank: (M,) places of the visible Gaussians in the order of depth.
-        table: (M, SPLAT_WIDTH) splats in the order of depth.
-        lists: hits of the splats on tiles.
-    """
+    """State of one render that the forward pass leaves for the backward pass."""
 
     camera: Pinhole
     settings: RasterSettings
     workers: int = field(default_factory=numba.get_num_threads)
-    background: _Array = field(init=False)
+    background: _Array = field(init=False)  # (3,) float64
     view: cpu_gaussian.View = field(init=False)
     stats: ScreenStats = field(init=False)
-    visible: _Array = field(init=False)
-    rank: _Array = field(init=False)
-    table: _Array = field(init=False)
+    visible: _Array = field(init=False)  # (M,) rows of the visible Gaussians, ascending
+    rank: _Array = field(init=False)  # (M,) their places in the order of depth
+    table: _Array = field(init=False)  # (M, SPLAT_WIDTH) splats in the order of depth
     lists: TileLists = field(init=False)
 
 
