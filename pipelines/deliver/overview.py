@@ -133,12 +133,7 @@ class Overview:
 
 
 def overview(workspace: Workspace, options: CrsOptions) -> Overview:
-    """Return the overview of a trained workspace, its bounds in the CRS of the options.
-
-    Raises:
-        MissingProductError: nothing has been trained; names the command.
-        InputError: a product is damaged, or the CRS cannot be used here.
-    """
+    """Return the overview of a trained workspace, its bounds in the CRS of the options; errors as of a `run`."""
     model = load_json(TrainedModel, workspace.path(MODEL))
     survey = load_survey(workspace)
     means = read_centres(workspace.path(GAUSSIANS)).astype(np.float64)

@@ -50,12 +50,7 @@ def chromium_path() -> str:
 
 
 def print_pdf(page: Path, pdf: Path) -> None:
-    """Print a page, an HTML file, as PDF, which appears when it is complete.
-
-    Raises:
-        BackendUnavailableError: there is no Chromium.
-        CrashError: Chromium did not print; says what it reported.
-    """
+    """Print an HTML file as PDF, which appears when complete; errors as of `chromium_path`, or a CrashError."""
     browser = chromium_path()
     with tempfile.TemporaryDirectory() as profile:
         draft = pdf.with_suffix(".tmp")
