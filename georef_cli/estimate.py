@@ -71,11 +71,7 @@ class RunEstimate:
 def estimate_run(
     workspace: Workspace, stages: tuple[StageSpec, ...], flags: Mapping[str, Flags], *, force: bool
 ) -> RunEstimate:
-    """Return the estimate of a run of the stages, as of `plan`; nothing is written.
-
-    Raises:
-        GeorefError: the run would be refused for its options, a missing file or a missing extra.
-    """
+    """Return the estimate of a run, as of `plan`; nothing is written. A GeorefError: the run would be refused."""
     from pipelines.sfm.reconstructor import reconstructor_of
     from pipelines.train.estimate import estimate_training
 
@@ -159,11 +155,7 @@ def print_dry_run(
     as_json: bool,
     progress: Progress,
 ) -> None:
-    """Print what a run of the stages would do, and what `ingest` would find; nothing is written.
-
-    Raises:
-        GeorefError: the run would be refused for its options or its input.
-    """
+    """Print what a run would do, and what `ingest` would find; a GeorefError: the run would be refused."""
     run = estimate_run(workspace, stages, flags, force=force)
     survey = checked_inputs(workspace, run.planned, progress)
     for warning in () if survey is None else survey.warnings:

@@ -128,12 +128,9 @@ def _default_and_range(info: FieldInfo) -> str:
 
 
 def settings(texts: Iterable[str], stages: Iterable[StageSpec]) -> dict[str, dict[str, Any]]:
-    """Return the options that texts set, by stage and field; only stages that will run have options.
+    """Return the options that texts set, by stage and field, of stages that will run; a click.UsageError: no such.
 
     A text is `stage.field=value`; the value is one of TOML, or else a plain text. Paths become absolute.
-
-    Raises:
-        click.UsageError: no such form, stage or option.
     """
     by_name = {spec.name: spec for spec in stages}
     found: dict[str, dict[str, Any]] = {}

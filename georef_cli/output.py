@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -14,9 +14,9 @@ from rich.text import Text
 from georef_cli import tables
 from georef_cli.layout import ByWidth, Safe, plain_table, shown
 from georef_cli.tables import Renderable
-from pipelines.core.products import Remark, dump_json, union
+from pipelines.core.products import dump_json, union
 from pipelines.core.runner import Outcome
-from pipelines.core.staleness import cautions_by_stage
+from pipelines.core.staleness import cautions_by_stage, document_of_cautions
 from pipelines.core.workspace import Workspace
 from pipelines.survey.headline import headline_of
 
@@ -140,12 +140,6 @@ def document_of(outcome: Outcome) -> dict[str, Any]:
         "warnings": [remark.model_dump() for remark in manifest.warnings],
         "duration_s": manifest.duration_s,
     }
-
-
-def document_of_cautions(by_stage: Mapping[str, Sequence[Remark]]) -> list[dict[str, str]]:
-    return [
-        {"stage": stage, **caution.model_dump()} for stage, cautions in by_stage.items() for caution in cautions
-    ]
 
 
 def print_outcome(workspace: Workspace, outcome: Outcome, *more: RenderableType, as_json: bool, told: bool) -> None:

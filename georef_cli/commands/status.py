@@ -9,7 +9,7 @@ import click
 
 from georef_cli import options, tables
 from georef_cli.command import Command
-from georef_cli.output import document_of_cautions, print_json, print_rich
+from georef_cli.output import print_json, print_rich
 from pipelines.core import staleness as states
 from pipelines.core.options import notation
 from pipelines.core.plan import option_origins
@@ -35,7 +35,7 @@ def _status(workspace: Workspace, with_options: bool, as_json: bool) -> None:
     }
     if with_options:
         document["options"] = [{**dataclasses.asdict(row), "value": notation(row.value)} for row in origins]
-    print_json({**document, "cautions": document_of_cautions(cautions)})
+    print_json({**document, "cautions": states.document_of_cautions(cautions)})
 
 
 command = Command(

@@ -19,7 +19,6 @@ TOPICS = {
 
 
 def topic_text(name: str) -> str:
-    """Return the text of one of `TOPICS`."""
     text = resources.files(__name__).joinpath(f"{name}.txt").read_text(encoding="utf-8")
     return text.replace("PRESETS", _presets()) if name == "presets" else text
 

@@ -93,11 +93,7 @@ COMMON_TRAIN_OPTIONS = tuple(name for name in BY_NAME["train"].options.model_fie
 
 
 def select_configurations(text: str) -> tuple[Configuration, ...]:
-    """Return the configurations named in a text, where commas separate the names; each only once.
-
-    Raises:
-        InputError: the text has an unknown name, or no name.
-    """
+    """Return the configurations named in a text with commas, each once; an InputError: an unknown name, or none."""
     names = [name.strip() for name in text.split(",") if name.strip()]
     unknown = [name for name in names if name not in BY_CONFIGURATION]
     if unknown or not names:

@@ -61,22 +61,16 @@ def compare(
     progress: Progress = SILENT,
     around: StageContext = lambda _workspace, _spec: nullcontext(),
 ) -> tuple[Comparison, list[ComparedStage]]:
-    """Bring the configurations up to date, and write and return the table of their figures.
+    """Bring the configurations up to date, write the table of their figures, and return it and the stages run.
 
     The stages up to geolocate are shared, and run first if they are not current. A configuration whose geometry or
     training fails has a row with the reason, and the others continue.
 
     Args:
-        workspace: with an ingested survey.
-        configurations: rows of the table.
         flags: options of `train` for all configurations (`seed` also for the similarity). They override those of
             the last comparison, which override those of the last request for `train`. They are remembered.
         force: run the stages of the configurations even if they are current.
-        progress: shows the tasks of the stages.
         around: returns the context in which a stage runs, such as its log file.
-
-    Returns:
-        The table, and the stages in the order of their runs.
 
     Raises:
         GeorefError: the first other failure.
@@ -139,11 +133,7 @@ class _PlanRunner:
     _by_place: dict[tuple[str, str], Outcome | GeorefError] = field(default_factory=dict)
 
     def run(self, configuration: Configuration, planned: VariantStage) -> Outcome:
-        """Return the outcome of a stage, run now or before.
-
-        Raises:
-            GeorefError: the stage fails, or has failed before.
-        """
+        """Return the outcome of a stage, run now or before; a GeorefError: it fails, or has failed before."""
         key = (str(planned.variant.root), planned.spec.name)
         if key not in self._by_place:
             planned.variant.root.mkdir(parents=True, exist_ok=True)

@@ -61,7 +61,6 @@ class MessageSender:
             self.send("end")
 
     def advance(self, steps: int = 1, note: str = "", left_s: float | None = None) -> None:
-        """Advance the innermost task."""
         self.send("advance", steps=steps, note=note, left_s=left_s)
 
 

@@ -185,7 +185,6 @@ def storage_error(error: BaseException, place: Path | None = None) -> StorageErr
     of the disk count also if the exception arose in their handling.
 
     Args:
-        error: the exception.
         place: file or folder that was written, for failures that name none, mostly those of a full disk.
     """
     seen: set[int] = set()

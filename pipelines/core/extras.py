@@ -35,19 +35,15 @@ def installing(extra: str) -> str:
     return f"pip install 'georefgs[{extra}]' (in a checkout: pip install '.[{extra}]')"
 
 
-def extra_parts() -> tuple[Part, ...]:
-    """Return the extras with the versions of their libraries."""
-    return tuple(_part(extra) for extra in EXTRAS)
-
-
 def require(extra: Extra) -> None:
     """Raise a BackendUnavailableError unless the libraries of an extra are installed."""
-    part = _part(extra)
+    part = extra_part(extra)
     if part.found is None:
         raise BackendUnavailableError("extra-missing", part.remedy)
 
 
-def _part(extra: Extra) -> Part:
+def extra_part(extra: Extra) -> Part:
+    """Return an extra with the versions of its libraries."""
     user, libraries = EXTRAS[extra]
     missing = [name for name in libraries if find_spec(name) is None]
     if missing:

@@ -151,12 +151,9 @@ _MOST_UNPACKED, _SMALL_BYTES = 8, 256 * 1024 * 1024
 
 
 def file_size(path: Path, *, limit_bytes: int | None = None, kind: str = "file", field: str | None = None) -> int:
-    """Return the size of a regular file in bytes; symbolic links are followed.
+    """Return the size of a regular file in bytes, links followed; an InputError: it is none, or above the limit.
 
     Errors name the kind of the file, and the option that names it.
-
-    Raises:
-        InputError: no such file, a folder, pipe, socket or device, or a file larger than the limit.
     """
     try:
         status = path.stat()

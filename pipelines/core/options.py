@@ -194,15 +194,12 @@ def resolve(
     *,
     stage: str | None = None,
 ) -> OptionsT:
-    """Return validated options: default < `table` < `flags`.
+    """Return validated options: default < `table` < `flags`; an InputError names file, table and key, or the flag.
 
     Args:
         table: the stage's table in `georef.toml`; its relative paths are relative to the folder of that file.
         flags: options that the user gave as flags, now or before, by field.
         toml, stage: path of `georef.toml`, and name of the table, for errors.
-
-    Raises:
-        InputError: an unknown key or a value out of range; names the file, table and key, or the flag.
     """
     inputs = input_markers(options_type)
     anchored = {
@@ -240,12 +237,9 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """Return a document of TOML.
+    """Return a document of TOML; a ValueError: none, a key of more than 16 parts, or an integer beyond 64 bits.
 
     Keys with dots cost the square of their parts in time and memory, and are bounded first.
-
-    Raises:
-        ValueError: no TOML, a key of more than 16 parts, or an integer of more than 64 bits.
     """
     key = _LONG_KEY.search(text)
     if key is not None:
@@ -273,11 +267,7 @@ def _require_integers(value: Any) -> None:
 
 
 def load_toml(path: Path, stages: Collection[str]) -> dict[str, dict[str, Any]]:
-    """Read `georef.toml` and return its tables by stage; a missing file has none.
-
-    Raises:
-        InputError: the file cannot be read or is not TOML, or a table names no stage.
-    """
+    """Return the tables of `georef.toml`, if there is one, by stage; an InputError: no TOML, or no such stage."""
     if not path.exists():
         return {}
     file_size(path, limit_bytes=_MAX_TOML_BYTES)
@@ -319,13 +309,10 @@ def remembered(
 
 
 def read_requests(root: Path) -> dict[str, dict[str, Any]]:
-    """Return the options that stages were last requested with, by stage; `georef run` starts from them.
+    """Return the options of the last requests, by stage, for `georef run`; an InputError: the file is damaged.
 
     Input paths are remembered as absolute paths, with the place of the workspace. A path that is gone after the
     workspace was moved is looked for where it would lie if it had been moved along.
-
-    Raises:
-        InputError: `requests.json` is damaged.
     """
     path = root / REQUESTS
     if not path.exists():

@@ -31,12 +31,9 @@ class OptionOrigin:
 
 
 def option_origins(workspace: Workspace, spec: StageSpec, flags: Flags | None = None) -> list[OptionOrigin]:
-    """Return the changed options of a stage: those of `georef.toml`, of earlier commands, of flags.
+    """Return a stage's changed options: of `georef.toml`, earlier commands, flags; an InputError: one is invalid.
 
     The flags are the present request; None: what is remembered.
-
-    Raises:
-        InputError: an option is unknown or invalid.
     """
     remembered = read_requests(workspace.root).get(spec.name, {})
     asked = remembered if flags is None else flags
@@ -72,16 +69,12 @@ class PlannedStage:
 def plan(
     workspace: Workspace, stages: tuple[StageSpec, ...], flags: Mapping[str, Flags], *, force: bool = False
 ) -> list[PlannedStage]:
-    """Return what a run of the stages would do; nothing is written.
+    """Return what a run of the stages would do; nothing is written. An InputError: a bad option, or no such file.
 
     Args:
         workspace: may not exist yet.
         stages: in the order of the pipeline.
         flags: all options by stage, the remembered ones among them.
-        force: run also what is current.
-
-    Raises:
-        InputError: an option is unknown or invalid, or a file that an option names does not exist.
     """
     memo: Memo = {}
     running: set[str] = set()

@@ -46,11 +46,7 @@ def save_json(product: BaseModel, path: Path) -> None:
 
 
 def load_json(product_type: type[ProductT], path: Path) -> ProductT:
-    """Read and validate a JSON product.
-
-    Raises:
-        InputError: the file is unreadable, too large, not JSON, or not of that type; names file and field.
-    """
+    """Return a JSON product; an InputError names file and field: unreadable, too large, or not of that type."""
     try:
         file_size(path, limit_bytes=_MAX_JSON_BYTES, kind="product")
         return product_type.model_validate_json(path.read_text(encoding="utf-8"))
@@ -89,11 +85,7 @@ class ArrayProduct:
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read the product from NPZ.
-
-        Raises:
-            InputError: the file is no NPZ file with these arrays, or an array has another form.
-        """
+        """Read the product from NPZ; an InputError: no NPZ file with these arrays, or one of another form."""
         arrays: dict[str, Any] = {**read_npz(path, tuple(cls.FORMS))}
         lengths: dict[str, int] = {}
         for name, form in cls.FORMS.items():

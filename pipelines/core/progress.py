@@ -23,7 +23,6 @@ class ProgressTask(Protocol):
         """Add `steps` to the count.
 
         Args:
-            steps: that are done.
             note: shown behind the bar (`23.1 dB`).
             left_s: seconds that the rest will take, where steps differ; None: as long a step as those before;
                 infinite: not known.

@@ -157,7 +157,7 @@ def run_pipeline(
     progress: Progress = SILENT,
     around: Callable[[StageSpec], AbstractContextManager[None]] = lambda _: nullcontext(),
 ) -> list[Outcome]:
-    """Run stages in order; current stages are skipped, and interrupted ones are resumed.
+    """Run stages in order; current ones are skipped, interrupted ones resumed. A GeorefError: the first failure.
 
     All options are checked and remembered before the first stage begins, for two reasons: a bad option of a late
     stage costs no hours, and a run that is killed early is later completed with the same options.
@@ -167,9 +167,6 @@ def run_pipeline(
         forget: remembered options by stage that no longer count.
         force: run also the stages whose product is current, and start all afresh.
         around: makes the context in which a stage runs.
-
-    Raises:
-        GeorefError: the first failure.
     """
     if stages[0].reads:
         staleness.must_exist(workspace)
@@ -343,18 +340,10 @@ def _current(workspace: Workspace, asked: Request, memo: Memo) -> Manifest | Non
             values={},
             warnings=[],
         )
-    if found.unreadable:
-        log.warning(
-            "%s: the product is made again, because %s",
-            spec.name,
-            found.unreadable,
-            extra={"code": "manifest-damaged"},
-        )
-    elif found.damaged:
-        damage = staleness.why_damaged(found.damaged)
-        log.warning(
-            "%s: the product is made again, because %s.", spec.name, damage, extra={"code": "product-damaged"}
-        )
+    if found.unreadable or found.damaged:
+        cause = found.unreadable or f"{staleness.why_damaged(found.damaged)}."
+        code = "manifest-damaged" if found.unreadable else "product-damaged"
+        log.warning("%s: the product is made again, because %s", spec.name, cause, extra={"code": code})
     elif (manifest := found.manifest) is not None:
         reason = staleness.why_stale(workspace, asked, manifest)
         log.info("%s: %s", spec.name, f"made again: {reason}" if reason else f"current: {manifest.key_figure}")

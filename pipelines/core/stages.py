@@ -108,7 +108,9 @@ class StageSpec:
 
     Attributes:
         name: the subcommand; in tables, `georef.toml` and logs, also where `called` is another.
-        module: module that defines `run(stage, options) -> Summary`.
+        module: module that defines `run(stage, options) -> Summary`. Each `run` raises a MissingProductError if a
+            product that it reads does not exist, and an InputError if a product, a photograph or an option cannot
+            be used, or the disk is too small. Its docstring names its other errors.
         options_place: `module:class` of its options.
         reads: products, or parts of them, that decide its result.
         product: workspace path of its main product.

@@ -279,6 +279,13 @@ def cautions_by_stage(workspace: Workspace, before: StageSpec | None = None) -> 
     return by_stage
 
 
+def document_of_cautions(by_stage: Mapping[str, Sequence[Remark]]) -> list[dict[str, str]]:
+    """Return cautions by stage as they stand in JSON documents."""
+    return [
+        {"stage": stage, **caution.model_dump()} for stage, cautions in by_stage.items() for caution in cautions
+    ]
+
+
 def _ahead_of(before: StageSpec | None) -> tuple[StageSpec, ...]:
     return PIPELINE[: PIPELINE.index(before) if before in PIPELINE else len(PIPELINE)]
 

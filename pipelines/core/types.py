@@ -25,6 +25,13 @@ Matrix34 = tuple[Vector4, Vector4, Vector4]
 Matrix4 = tuple[Vector4, Vector4, Vector4, Vector4]
 Row7 = tuple[float, float, float, float, float, float, float]
 
+
+def vector3(values: FloatArray) -> Vector3:
+    """Return an array (3,) as numbers, for a file."""
+    x, y, z = values.tolist()
+    return x, y, z
+
+
 RecordT = TypeVar("RecordT")
 
 

@@ -258,16 +258,13 @@ class Workspace:
         remove(old)
 
     def begin(self, spec: StageSpec, token: str, resume: Resume) -> tuple[Path, bool]:
-        """Open the partial folder of a stage: as an interrupted run left it, or empty.
+        """Open the partial folder of a stage; return it, and whether it holds an interrupted run to be continued.
 
         Args:
             spec: the stage; only a resumable one can be continued.
             token: text of the request, from `Request.token`.
             resume: `never` begins afresh; `if-same` continues an interrupted run with the same token, and otherwise
                 begins afresh; `always` does the same, but refuses an interrupted run with another token.
-
-        Returns:
-            The folder, and whether it holds a run to be continued.
 
         Raises:
             InputError: `resume` refuses the interrupted run, or the stage's folder is a symbolic link or a file.

@@ -57,12 +57,7 @@ _UNKNOWN = (
 
 
 def run(stage: StageRun, options: ExportCamerasOptions) -> Summary:
-    """Write the cameras in all forms, and return their key figures.
-
-    Raises:
-        MissingProductError: a stage up to init-sim3 has not been run.
-        InputError: a product is damaged, or the CRS cannot be used here.
-    """
+    """Write the cameras in all forms, and return their key figures."""
     solved = load_solved(stage.workspace)
     accuracy = headline_of(stage.workspace)
     points = solved.gaussians.means.numpy() if isinstance(solved, TrainedSurvey) else solved.point_in_model
@@ -250,10 +245,8 @@ def _footprints(
     are latitude, longitude, height; those of the cameras' centres if no photograph shows ground.
 
     Args:
-        survey: has the times of exposure.
         model: cameras and points in the frame of the placement, z up.
         table: the same cameras, with split and σ.
-        placement: of that frame.
     """
     surface = PointSurface(_surface_points(model))
     times = {image.name: image.timestamp_s for image in survey.images}

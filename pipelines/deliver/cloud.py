@@ -40,13 +40,7 @@ _LEAST_M, _RATIO, _CLASSES = 1e-4, 1.01, 1700
 
 
 def run(stage: StageRun, options: ExportCloudOptions) -> Summary:
-    """Write the cloud with its sidecar, and return its key figures.
-
-    Raises:
-        InputError: the CRS cannot be used, the disk is too small, or a product or photograph cannot be read.
-        MissingProductError: a stage has not been run.
-        DegenerateGeometryError: the views agree on no point.
-    """
+    """Write the cloud with its sidecar, return its figures; a DegenerateGeometryError: the views agree nowhere."""
     trained = load_trained(stage.workspace)
     geo_from_model, box = trained.geo_from_model, corners(scene_points(trained))
     target = target_crs(options, trained.survey.origin, box, trained.survey.vertical)
@@ -96,7 +90,7 @@ def _points_in_crs(
 
     Without a grid, the covariance of the georeference is unknown, and so is the sum.
     """
-    georeference = np.full((len(cloud), 3, 3), np.nan) if grid is None else grid.cov_at(cloud.position)
+    georeference = np.full((len(cloud.position), 3, 3), np.nan) if grid is None else grid.cov_at(cloud.position)
     # The surface is uncertain along its normal. Along itself, a surface has no place.
     across = cloud.sigma_m[:, None] * cloud.normal
     return CloudPoints(
@@ -117,7 +111,6 @@ class Tally:
         self._largest = np.zeros(2)
 
     def add(self, points: CloudPoints) -> None:
-        """Add points."""
         if not len(points):
             return
         self.count += len(points)

@@ -30,6 +30,7 @@ from pipelines.core.errors import DegenerateGeometryError, ResourceError
 from pipelines.core.progress import Progress
 from pipelines.core.sentences import about
 from pipelines.core.stages import MEASURABLE_SPLAT
+from pipelines.core.types import joined_rows, rows_of
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import MeasurableOptions
 from pipelines.deliver.placement import place
@@ -37,6 +38,7 @@ from pipelines.deliver.ply import write_ply
 from pipelines.deliver.splat import placed_splat, splat_values
 from pipelines.geometry.cameras import pose_matrix
 from pipelines.geometry.similarity import Similarity
+from pipelines.jobs.costs import iteration_seconds
 from pipelines.splat.appearance import ShownView, refine_appearance, shuffled_passes
 from pipelines.splat.densify import view_contributions
 from pipelines.splat.gaussians import Gaussians
@@ -60,8 +62,6 @@ _LEAST_SHOWN_PX = 0.05  # sum of a Gaussian's weights in the pixels of a view, f
 _SAMPLED_POINTS, _LEAST_POINTS = 5000, 10  # SfM points of the estimate
 _KEPT_SHARE = 0.12  # of the trained Gaussians, with no disc close to them, on a simulated flight
 _PLY_VALUES = 14  # of a Gaussian, without harmonics
-# Seconds of one pass over one view: fixed, for each of its megapixels, for each million Gaussians.
-_FIXED_S, _MEGAPIXEL_S, _MILLION_GAUSSIANS_S = 0.003, 0.092, 0.367
 _OTHER_PASSES = 5  # time of depth maps, their comparison and the choice of Gaussians, in passes of the refinement
 _REPLACED_SPACINGS = 1.0  # largest distance of a Gaussian's centre from the disc that replaces it
 
@@ -70,8 +70,6 @@ def run(stage: StageRun, options: MeasurableOptions) -> Summary:
     """Write the PLY and its sidecar, and return their key figures.
 
     Raises:
-        MissingProductError: a stage has not been run.
-        InputError: a product or photograph cannot be read, or the disk is too small for the depth maps.
         ResourceError: the discs do not fit into the memory.
         DegenerateGeometryError: the views agree on no point, or no Gaussian is opaque enough.
     """
@@ -137,8 +135,7 @@ def _estimate(renderer: ModelRenderer, options: MeasurableOptions) -> str | None
     gaussians = discs + round(_KEPT_SHARE * len(trained.gaussians))
     size_bytes = gaussians * 4 * (_PLY_VALUES + 3 * coefficient_count(trained.gaussians.sh_degree))
     pixels = [pinhole.width * pinhole.height for pinhole in map(renderer.pinholes.of, cameras)]
-    megapixels = float(np.mean(pixels)) / 1e6
-    pass_s = _FIXED_S + _MEGAPIXEL_S * megapixels + _MILLION_GAUSSIANS_S * gaussians / 1e6
+    pass_s = iteration_seconds(float(np.mean(pixels)), gaussians, surface=False)  # over one view
     seconds = (options.appearance_passes + _OTHER_PASSES) * len(cameras) * pass_s
     return (
         f"about {discs} discs {spacing_m:.3f} m apart, {size_bytes / 1e6:.3g} MB and {about(seconds)}; a larger "
@@ -151,11 +148,7 @@ def with_discs(
 ) -> tuple[Gaussians, int]:
     """Return the Gaussians that are not close to a disc, then the discs, and the number of the discs.
 
-    Args:
-        gaussians: in `model`.
-        surface: its points in `geo`.
-        geo_from_model: similarity.
-        spacing_m: between neighbouring points of the surface.
+    The Gaussians are in `model`, the points of the surface in `geo`, about `spacing_m` apart.
     """
     center_in_model = geo_from_model.inverse().apply(surface.position)
     spacing_in_model = spacing_m / geo_from_model.scale
@@ -193,9 +186,8 @@ def _collected(squares: Iterable[SurfaceCloud], views: SurfaceViews, trained: Tr
     largest = max(views.pinholes, key=lambda pinhole: pinhole.width * pinhole.height)
     parts, count = [], 0
     for square in squares:
-        known = np.isfinite(square.normal).all(axis=1)
-        parts.append(SurfaceCloud(*(values[known] for values in vars(square).values())))
-        count += len(parts[-1])
+        parts.append(rows_of(square, np.flatnonzero(np.isfinite(square.normal).all(axis=1))))
+        count += len(parts[-1].position)
         size = TrainingSize(len(trained.gaussians) + count, largest, trained.gaussians.sh_degree, 0)
         if free_bytes is not None and predicted_peak_bytes(size) > USABLE * free_bytes:
             raise ResourceError(
@@ -209,8 +201,7 @@ def _collected(squares: Iterable[SurfaceCloud], views: SurfaceViews, trained: Tr
             f"No point of the surface has the same depth in {_MIN_VIEWS} training views. Train longer, or hand "
             "over export/splat.ply alone.",
         )
-    names = vars(parts[0])
-    return SurfaceCloud(*(np.concatenate([vars(part)[name] for part in parts]) for name in names))
+    return joined_rows(parts)
 
 
 def _shown(view: SurfaceView) -> ShownView:

@@ -15,11 +15,11 @@ from pipelines.core.errors import GeorefError
 from pipelines.core.figures import Headline
 from pipelines.core.products import Remark, load_json
 from pipelines.core.stages import BY_NAME, DELIVERABLES, GAUSSIANS, MODEL, REPORT, StageSpec
-from pipelines.core.staleness import StageState, cautions_by_stage, status
-from pipelines.core.types import FloatArray, Vector3
+from pipelines.core.staleness import StageState, cautions_by_stage, document_of_cautions, status
+from pipelines.core.types import FloatArray, Vector3, vector3
 from pipelines.core.workspace import Workspace
 from pipelines.deliver.options import DESCRIPTIONS
-from pipelines.deliver.placement import place, vector3
+from pipelines.deliver.placement import place
 from pipelines.formats.splat_ply import read_centres
 from pipelines.formats.vector_files import Json, feature, polygon
 from pipelines.geodesy.enu import ecef_from_enu, lla_from_ecef
@@ -82,15 +82,12 @@ class Overview:
     """Result of a workspace.
 
     Attributes:
-        gaussians: number of Gaussians.
         center_lla: latitude, longitude and ellipsoidal height of the middle of the scene.
         accuracy: headline of the result; None: nothing states it yet.
         psnr: of the test views, dB; None: not known.
         files: those that there are, with their use.
         outdated: stages whose product is stale or damaged, in the order of the work.
         interrupted: by stage, what an interrupted run has left beside the product.
-        further: deliverables that were not made.
-        cautions: limits of the result, by stage.
     """
 
     workspace: Path
@@ -127,11 +124,7 @@ class Overview:
             "quality": {"accuracy": self.accuracy and self.accuracy.model_dump(), "psnr": self.psnr},
             "files": [{**asdict(file), "made": file.made and file.made.isoformat()} for file in self.files],
             "further": {spec.command(self.workspace): spec.title for spec in self.further},
-            "cautions": [
-                {"stage": stage, **caution.model_dump()}
-                for stage, cautions in self.cautions.items()
-                for caution in cautions
-            ],
+            "cautions": document_of_cautions(self.cautions),
         }
         west, south, north = bounds.west, bounds.south, bounds.north
         east = bounds.east if bounds.east >= west else bounds.east + 360.0
@@ -140,12 +133,7 @@ class Overview:
 
 
 def overview(workspace: Workspace, options: CrsOptions) -> Overview:
-    """Return the overview of a trained workspace, its bounds in the CRS of the options.
-
-    Raises:
-        MissingProductError: nothing has been trained; names the command.
-        InputError: a product is damaged, or the CRS cannot be used here.
-    """
+    """Return the overview of a trained workspace, its bounds in the CRS of the options; errors as of a `run`."""
     model = load_json(TrainedModel, workspace.path(MODEL))
     survey = load_survey(workspace)
     means = read_centres(workspace.path(GAUSSIANS)).astype(np.float64)

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from pipelines.core.errors import InputError
 from pipelines.core.figures import Headline
 from pipelines.core.products import Remark, is_checked
-from pipelines.core.types import FloatArray, Quaternion, Row7, Vector3
+from pipelines.core.types import FloatArray, Quaternion, Row7, vector3
 from pipelines.formats.georef_sidecar import GeoreferenceSigma, GeorefSidecar, SceneSigma, georeference_sigma
 from pipelines.geodesy.crs import ECEF, parse_crs
 from pipelines.geodesy.enu import (
@@ -49,7 +49,6 @@ class Placement:
         geo_from_model: the trained similarity.
         covariance: (7, 7) of the similarity about the origin of `file`, along its axes; None if unknown.
         vertical: what the survey's input heights referred to.
-        cautions: limits of the model.
         accuracy: headline of the result, which every file states; None: nothing states it.
     """
 
@@ -103,11 +102,8 @@ def place(model: Adjustment, survey: Survey, points_in_model: ArrayLike, accurac
     """Return the placement of a solved model on Earth.
 
     Args:
-        model: has the similarity geo ← model and its covariance.
-        survey: has the origin of geo and the vertical datum.
         points_in_model: (N, 3) centres of all its Gaussians, or without any its SfM points, N ≥ 1; their median is
             the middle of the scene.
-        accuracy: headline of the workspace; None: nothing states it.
     """
     geo_from_model = Similarity.from_record(model.geo_from_model)
     scene_in_geo = np.median(geo_from_model.apply(points_in_model), axis=0)
@@ -150,12 +146,6 @@ def _row(values: FloatArray) -> Row7:
     return s, rx, ry, rz, x, y, z
 
 
-def vector3(values: FloatArray) -> Vector3:
-    """Return an array (3,) as numbers for a file."""
-    x, y, z = values.tolist()
-    return x, y, z
-
-
 def scene_sigma(counts: str, horizontal_m: FloatArray, vertical_m: FloatArray) -> SceneSigma:
     """Return medians and largest of predicted σ (K,), for a sidecar that says which errors they count."""
     return SceneSigma(
@@ -176,11 +166,7 @@ def median_values(sigma: SceneSigma | None, of: str) -> dict[str, float | None]:
 
 
 def require_space(folder: Path, needed_bytes: int, files: str, advice: str) -> None:
-    """Refuse files that the disk would not hold: a sentence names them, and advises what makes them smaller.
-
-    Raises:
-        InputError: too little space is free.
-    """
+    """Refuse files that the disk would not hold: an InputError names them, and what makes them smaller."""
     free_bytes = shutil.disk_usage(folder).free
     if needed_bytes > free_bytes:
         needed, free = f"{needed_bytes / 2**30:.1f} GiB", f"{free_bytes / 2**30:.1f} GiB"

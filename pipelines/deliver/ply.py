@@ -17,13 +17,7 @@ from pipelines.splat.gaussians import write_gaussians
 
 
 def run(stage: StageRun, options: ExportPlyOptions) -> Summary:
-    """Write the PLY and its sidecar, and return their key figures.
-
-    Raises:
-        MissingProductError: ingest or train has not been run.
-        InputError: a product is damaged.
-        DegenerateGeometryError: no Gaussian is opaque enough.
-    """
+    """Write the PLY and its sidecar, and return their key figures; errors as of `load_splat`."""
     splat = load_splat(stage.workspace, options)
     write_ply(splat, stage.out / Path(SPLAT).name)
     return Summary(f"{len(splat.gaussians)} Gaussians", splat_values(splat), cautions=splat.placement.cautions)

@@ -48,13 +48,7 @@ _CONTOUR_PX = 6000  # of the surface that lines are drawn of
 
 
 def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
-    """Write the rasters, their pictures and contours, and return their key figures.
-
-    Raises:
-        MissingProductError: a stage has not been run.
-        InputError: a product is damaged, the CRS cannot be used, the cells are too many, or the disk is too small.
-        DegenerateGeometryError: no cell of the scene was seen.
-    """
+    """Write rasters, pictures and contours, return their figures; a DegenerateGeometryError: no cell was seen."""
     trained = load_trained(stage.workspace)
     points, (photographs_m, training_m) = scene_points(trained), ground_sampling_m(trained)
     target = target_crs(options, trained.survey.origin, corners(points), trained.survey.vertical)
@@ -138,9 +132,7 @@ def _write_pictures(folder: Path, heights_by_plan: float) -> None:
 def _hillshade(height: FloatArray, cell: float) -> ByteArray:
     """Return the light (H, W), 0 … 255, of a sun in the north-west at 45° on heights (H, W), rows from the north.
 
-    Args:
-        height: NaN: no surface.
-        cell: size of a cell, in the unit of the heights.
+    NaN: no surface. The size of a cell is in the unit of the heights.
     """
     south, east = np.gradient(np.where(np.isfinite(height), height, np.nanmedian(height)), cell)
     azimuth, elevation = np.radians(_SUN_AZIMUTH_DEG), np.radians(_SUN_ELEVATION_DEG)
@@ -159,15 +151,12 @@ def _write_contours(folder: Path, frame: RasterFrame, interval: float) -> int:
 
 
 def _contour_lines(height: FloatArray, frame: RasterFrame, interval: float) -> list[ContourLine]:
-    """Return the contour lines of a surface, lowest first; short ones are left out.
+    """Return contour lines of a surface, lowest first, no short ones; an InputError: the interval is too small.
 
     Args:
         height: (H, W) rows from the north, over the whole frame; NaN: no surface.
         frame: of the raster, whose cells may be smaller.
         interval: between two lines, in the unit of the heights.
-
-    Raises:
-        InputError: the interval is too small for the scene.
     """
     known = np.isfinite(height)
     if known.sum() < 4:

@@ -51,11 +51,7 @@ class _Window:
 
 
 class Mosaic:
-    """Rasters `orthophoto`, `dsm`, `sigma_h` and `sigma_v` over one frame.
-
-    Args:
-        folder: for the parts; those that are there are kept.
-    """
+    """Rasters `orthophoto`, `dsm`, `sigma_h` and `sigma_v` over one frame; parts in the folder are kept."""
 
     def __init__(self, folder: Path, frame: RasterFrame, target: TargetCrs) -> None:
         self.folder, self.frame = folder, frame

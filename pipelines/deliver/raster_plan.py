@@ -60,7 +60,6 @@ def make_frame(
         xy: (P, 2) points in the CRS, easting or longitude first.
         target: the CRS.
         default_gsd_m: size of a cell in metres without `--gsd`.
-        options: others' size, and the largest number of cells.
 
     Raises:
         InputError: a geocentric CRS, a geographic CRS without a size in degrees, or too many cells.
@@ -111,11 +110,7 @@ def _readable(gsd: float) -> float:
 
 
 def samples_per_cell(training_px: float) -> int:
-    """Return the number of samples along a side of a cell: odd, so that one lies in the middle.
-
-    Args:
-        training_px: size of a training pixel on the ground, in cells.
-    """
+    """Return the number of samples along a side of a cell: odd, so that one lies in the middle."""
     return max(round(1.0 / training_px) | 1, 1)
 
 
@@ -136,9 +131,7 @@ def plan_splats(
 
     Args:
         gaussians: those of the trained model that count, in `model`.
-        trained: the trained model.
         target: the CRS.
-        frame: of the raster.
         training_px: size of a training pixel on the ground, in cells.
     """
     geo_from_model = trained.geo_from_model

@@ -42,7 +42,6 @@ class RasterSource:
 
     Attributes:
         splats, level: Gaussians over the plane, and the height above them that their depths count from.
-        views: depth maps of the training views.
         sigma: predicted σ of the georeference over the scene; None: not known.
         training_px: size of a training pixel on the ground, in cells.
         training_gsd_m: size of a training pixel on the ground.
@@ -132,7 +131,7 @@ class WindowCells:
 
 
 def render_window(source: RasterSource, frame: RasterFrame, column: int, row: int) -> WindowCells:
-    """Return the cells of a window.
+    """Return the cells of a window, whose first cell in the raster is at `column` and `row`.
 
     1. Heights are the depths at which the view from above is half opaque, or their mean if the Gaussians of a cell
        lie on one surface.
@@ -140,11 +139,6 @@ def render_window(source: RasterSource, frame: RasterFrame, column: int, row: in
        tells the seen ground from what training left where nobody looked.
     3. σ is that of the georeference and of the surface. The surface's own is the RMS difference of the training
        views from it: their errors correlate, and more views do not make them smaller.
-
-    Args:
-        source: what it is made from.
-        frame: of the window.
-        column, row: of its first cell in the raster.
     """
     inner = samples_per_cell(source.training_px)
     view = render_orthographic(

@@ -14,10 +14,10 @@ from scipy.special import expit
 from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.products import load_json
 from pipelines.core.stages import BLOCK_RECORD, GAUSSIANS, MODEL
-from pipelines.core.types import BoolArray, Float32Array
+from pipelines.core.types import BoolArray, Float32Array, vector3
 from pipelines.core.workspace import Workspace
 from pipelines.deliver.options import SplatOptions, WebSplatOptions
-from pipelines.deliver.placement import Placement, place, vector3
+from pipelines.deliver.placement import Placement, place
 from pipelines.formats.splat_ply import SplatArrays, read_centres, read_logit_opacities
 from pipelines.splat.gaussians import Gaussians, read_gaussians, transformed
 from pipelines.splat.sh import coefficient_count
@@ -81,13 +81,7 @@ def splat_values(splat: PlacedSplat | SplatParts) -> dict[str, object]:
 
 
 def load_splat(workspace: Workspace, options: SplatOptions) -> PlacedSplat:
-    """Return the splat of a workspace, placed on Earth.
-
-    Raises:
-        MissingProductError: ingest or train has not been run.
-        InputError: a product is damaged.
-        DegenerateGeometryError: no Gaussian is opaque enough.
-    """
+    """Return the splat of a workspace, placed on Earth; a DegenerateGeometryError: no Gaussian is opaque enough."""
     survey = load_survey(workspace)
     model = load_json(TrainedModel, workspace.path(MODEL))
     gaussians = read_gaussians(workspace.path(GAUSSIANS))
@@ -95,11 +89,7 @@ def load_splat(workspace: Workspace, options: SplatOptions) -> PlacedSplat:
 
 
 def load_splat_parts(workspace: Workspace, options: WebSplatOptions) -> SplatParts:
-    """Return the splat of a workspace, placed on Earth, to be read part by part.
-
-    Raises:
-        GeorefError: as `load_splat`.
-    """
+    """Return the splat of a workspace, placed on Earth, to be read part by part; a GeorefError: as `load_splat`."""
     survey = load_survey(workspace)
     model = load_json(TrainedModel, workspace.path(MODEL))
     path = workspace.path(GAUSSIANS)
@@ -131,11 +121,7 @@ def _rows_of_blocks(workspace: Workspace, count: int) -> tuple[slice, ...]:
 
 
 def placed_splat(gaussians: Gaussians, placement: Placement, options: SplatOptions) -> PlacedSplat:
-    """Return the opaque ones of Gaussians in `model`, in the frame of the placement.
-
-    Raises:
-        DegenerateGeometryError: no Gaussian is opaque enough.
-    """
+    """Return the opaque Gaussians, moved from `model` to the placement; a DegenerateGeometryError: none is."""
     opaque = _is_opaque(gaussians.logit_opacities.numpy(), options)
     _require_opaque(opaque, options)
     kept = gaussians.select(torch.from_numpy(opaque))

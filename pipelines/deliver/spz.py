@@ -28,13 +28,7 @@ ENU_FROM_RUB = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
 def run(stage: StageRun, options: ExportSpzOptions) -> Summary:
-    """Write the SPZ file and its sidecar, and return their key figures.
-
-    Raises:
-        MissingProductError: ingest or train has not been run.
-        InputError: a product is damaged, or the scene is larger than the format can hold.
-        DegenerateGeometryError: no Gaussian is opaque enough.
-    """
+    """Write the SPZ file and its sidecar; errors as of `load_splat`, or an InputError: too large for the format."""
     splat = load_splat(stage.workspace, options)
     upright = transformed(splat.gaussians, Similarity(1.0, ENU_FROM_RUB.T))
     path = stage.out / Path(SPZ).name

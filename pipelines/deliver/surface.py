@@ -13,11 +13,7 @@ from pipelines.survey.trained_survey import SolvedSurvey, TrainedSurvey
 
 
 def surface_views(stage: StageRun, trained: TrainedSurvey, *, colours: bool = False) -> SurfaceViews:
-    """Return the depth maps of the training views; they lie in the folder of the stage until they are closed.
-
-    Raises:
-        InputError: a photograph cannot be read, or the depth maps do not fit on the disk.
-    """
+    """Return depth maps of the training views, in the stage's folder until closed; errors as of `SurfaceViews`."""
     images = photographs(trained.sfm, trained.survey, stage.workspace, trained.model.max_image_size)
     images.build(stage.progress)
     renderer = ModelRenderer(trained, images, rasterizer("auto", stage.progress))

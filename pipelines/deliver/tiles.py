@@ -51,13 +51,7 @@ _LARGEST_GLB = 3_400_000
 
 
 def run(stage: StageRun, options: ExportTilesOptions) -> Summary:
-    """Write tileset, contents, glb and sidecars, and return their key figures.
-
-    Raises:
-        MissingProductError: ingest or train has not been run.
-        InputError: a product is damaged, or the disk is too small.
-        DegenerateGeometryError: no Gaussian is opaque enough.
-    """
+    """Write tileset, contents, glb and sidecars, and return their key figures; errors as of `load_splat`."""
     splat = load_splat_parts(stage.workspace, options)
     page = _page(stage.workspace, splat, options)
     count, sidecar = len(splat.center_in_file), splat.placement.sidecar()
@@ -125,17 +119,12 @@ class Tiling:
 def write_tiles(
     folder: Path, parts: Iterable[SplatArrays], tiling: Tiling, sidecar: GeorefSidecar, progress: Progress = SILENT
 ) -> DetailTile:
-    """Write Gaussians as a tileset with levels of detail, and return its root.
+    """Write Gaussians as a tileset with levels of detail, and return its root; an OSError: a file is not written.
 
     Args:
         folder: exists.
         parts: at least one Gaussian each, in the frame of the sidecar; one after another is in memory.
         tiling: of all parts together.
-        sidecar: place of the frame on Earth.
-        progress: counts the Gaussians in leaves.
-
-    Raises:
-        OSError: a file cannot be written.
     """
     with progress.task("tiles", total=tiling.count) as task:
 
@@ -171,14 +160,9 @@ def write_whole(
 
 
 def write_glb(path: Path, splat: SplatArrays, extras: dict[str, Any] | None = None) -> None:
-    """Write Gaussians of an East-North-Up frame as a glb.
+    """Write N ≥ 1 Gaussians of an East-North-Up frame as a glb, with `extras` as its `asset.extras`.
 
     A scene that reaches further than ±2048 m gets coarser steps of position: 0.24 mm up to ±4096 m, and so on.
-
-    Args:
-        path: of the glb.
-        splat: N ≥ 1 Gaussians.
-        extras: for `asset.extras`.
 
     Raises:
         InputError: values that are not finite.
@@ -193,11 +177,7 @@ def write_glb(path: Path, splat: SplatArrays, extras: dict[str, Any] | None = No
 
 
 def read_glb(path: Path) -> SplatArrays:
-    """Return the Gaussians of a glb that `write_glb` wrote.
-
-    Raises:
-        InputError: the file cannot be read, or is damaged.
-    """
+    """Return the Gaussians of a glb that `write_glb` wrote; an InputError: it cannot be read, or is damaged."""
     file_size(path)
     return decode_spz(spz_in_glb(path.read_bytes()), path)
 

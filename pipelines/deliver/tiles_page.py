@@ -26,8 +26,8 @@ from pipelines.core.files import replace_file
 from pipelines.core.products import Product
 from pipelines.core.sentences import printable
 from pipelines.core.stages import TILES
-from pipelines.core.types import Float32Array, FloatArray, Vector3
-from pipelines.deliver.placement import Placement, vector3
+from pipelines.core.types import Float32Array, FloatArray, Vector3, vector3
+from pipelines.deliver.placement import Placement
 from pipelines.geodesy.crs import PointCrs
 from pipelines.geodesy.enu import (
     SEMI_MAJOR_M,
@@ -136,18 +136,11 @@ def scene_page(
     target: TargetCrs,
     cesium: str,
 ) -> ScenePage:
-    """Return the content of the page of a splat.
+    """Return the content of the page of a splat; an InputError: the CRS does not reach it, or lacks a grid.
 
     Args:
-        title: name of the scene.
         placement: of its frame `file`.
         center_in_file: (N, 3) centres of its Gaussians, metres.
-        survey: has the control and check points.
-        target: CRS in which coordinates are shown.
-        cesium: folder of CesiumJS.
-
-    Raises:
-        InputError: the scene is outside the domain of the CRS, or a grid is missing.
     """
     distance_m = np.linalg.norm(center_in_file, axis=1)
     radius = max(float(np.quantile(distance_m, _SHOWN)), _LEAST_RADIUS_M)
@@ -169,11 +162,7 @@ def scene_page(
 
 
 def write_scene_page(page: ScenePage, folder: Path) -> None:
-    """Write the page into a folder; the file appears whole or not at all.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """Write the page into a folder, whole or not at all; an OSError: it cannot be written."""
     program = resources.files(__package__).joinpath("templates", "tiles.html").read_text(encoding="utf-8")
     draft = folder / f"{PAGE}.tmp"
     program = program.replace(_POLICY, html.escape(_policy(program, page.cesium)), 1)
@@ -231,15 +220,11 @@ def _facts(placement: Placement, target: TargetCrs) -> tuple[Fact, ...]:
 
 
 def fit_local_crs(crs: PointCrs, origin_lla: ArrayLike, half_extent_m: Vector3) -> LocalCrs:
-    """Return the polynomials of a CRS in a box around a place.
+    """Return the polynomials of a CRS in a box around a place; an InputError: it leaves the domain, or no grid.
 
     Args:
-        crs: to be shown.
         origin_lla: (3,) latitude, longitude in degrees, ellipsoidal height: middle of the box.
         half_extent_m: half of its sides east, north and up.
-
-    Raises:
-        InputError: the box leaves the domain of the CRS, or a grid is missing.
     """
     chebyshev = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
     between = np.linspace(-1.0, 1.0, _NODES + 1)

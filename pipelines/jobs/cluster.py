@@ -213,11 +213,7 @@ def _parts(address: str, scheme: str) -> SplitResult:
 
 @contextmanager
 def connected(cluster: ClusterAddress) -> Iterator[Client]:
-    """Connect to the scheduler while the context lasts.
-
-    Raises:
-        ClusterError: no scheduler answers there, or it refuses the certificate.
-    """
+    """Connect to the scheduler while the context lasts; a ClusterError: none answers, or the certificate is bad."""
     import distributed
 
     for name in ("distributed", "tornado"):  # They log each lost connection with a traceback.
@@ -276,12 +272,8 @@ def worker_for(
 ) -> Worker | None:
     """Return the worker for a job: the one with the fewest jobs that has room, or None.
 
-    A job that is too large for all workers runs alone on the largest. Workers on which it has failed are avoided,
-    unless there are no others.
-
-    Args:
-        workers, running: workers, and the jobs that run on them, by address.
-        avoided: addresses.
+    A job that is too large for all workers runs alone on the largest. Workers (by address) on which it has failed
+    are avoided, unless there are no others.
     """
     largest_bytes = max((worker.memory_bytes for worker in workers.values()), default=0)
 

@@ -79,7 +79,6 @@ class ClusterRun:
         waiting: jobs in the order in which they begin where resources allow.
         at_a_time: most jobs at a time.
         exchange: through which files go; None: they are shared.
-        ended: called at the end of each job.
         progress, task: show a line for each job that runs, and count those that have ended.
     """
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from pipelines.core.errors import BackendUnavailableError
-from pipelines.core.extras import Part, extra_parts
+from pipelines.core.extras import EXTRAS, Part, extra_part
 from pipelines.core.fingerprints import library_versions
 from pipelines.core.machine import available_cores, thread_count, total_main_memory_bytes
 from pipelines.core.progress import Progress
@@ -87,7 +87,7 @@ def inspect_machine() -> Machine:
         free_bytes=free_memory_bytes(torch.device("cpu")),
         gpus=tuple(Gpu(properties.name, int(properties.total_memory)) for properties in found),
         backends=tuple(_backend(name) for name in BACKENDS),
-        extras=extra_parts(),
+        extras=tuple(map(extra_part, EXTRAS)),
         cuda_parts=(*running_parts(), *compiling_parts()),
         cuda_kernels=kernels_ready(),
         grid_folders=tuple(map(str, grid_folders())),

@@ -79,14 +79,11 @@ def load_missions(
     deliver: str | None = None,
     flags: Mapping[str, Flags] | None = None,
 ) -> MissionList:
-    """Return the missions of a TOML file, or of a folder.
+    """Return the missions of a TOML file, or of a folder; an InputError names file, mission and key.
 
     Args:
         owners: options that a mission may have outside the tables of its stages, with the stages that they are for.
         last, deliver, flags: as of `Mission`; they override those of every mission.
-
-    Raises:
-        InputError: no such file, or a bad name, key or value; names file, mission and key.
     """
     listed = _in_folder(path) if path.is_dir() else _in_file(path, owners)
     if not listed.missions:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pipelines.core.errors import MissingProductError
 from pipelines.core.figures import CELLS, ERRORS, WAYS, Figure
 from pipelines.core.stages import ACCURACY_MAP
 from pipelines.core.types import FloatArray
@@ -93,7 +92,7 @@ def accuracy_facts(evaluated: EvaluatedSurvey) -> AccuracyFacts:
         ways={way: WAYS[way] for way, errors in by_way.items() if errors.count},
         chart=picture_of_png(predicted_against_measured(sigma, error)) if enough else None,
         within=_within(sigma, error) if enough else (),
-        map=_map(evaluated),
+        map=png_file(evaluated.workspace.root / ACCURACY_MAP),
         surface="surface" in by_way,
         crossed=crossed is not None and crossed.count > 0,
         crossed_reason="" if crossed is None or crossed.reason is None else crossed.reason,
@@ -152,10 +151,3 @@ def _within(sigma: FloatArray, error: FloatArray) -> tuple[tuple[str, float, flo
     ratio = error / np.maximum(sigma, 1e-12)
     once, twice = (ratio <= 1).mean(axis=0).tolist(), (ratio <= 2).mean(axis=0).tolist()
     return (("horizontal", once[0], twice[0]), ("vertical", once[1], twice[1]))
-
-
-def _map(evaluated: EvaluatedSurvey) -> Picture | None:
-    try:
-        return png_file(evaluated.workspace.path(ACCURACY_MAP))
-    except MissingProductError:
-        return None

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipelines.core.products import is_checked
-from pipelines.core.types import BoolArray, FloatArray
+from pipelines.core.types import BoolArray, FloatArray, vector3
 from pipelines.geometry.cameras import LENGTHS, Camera, parameter_names, parameters_in
 from pipelines.report.page import Picture, picture_of_png
 from pipelines.report.place import Texts, heads_of, texts_of
@@ -64,7 +64,6 @@ class CamerasFacts:
         no_sigma: reason why there are no ellipses; empty: there are.
         series: residuals in time if `by_time`; otherwise, in the order of the photographs.
         bias: of the used fixes; empty without fixes.
-        outliers: fixes that were left out.
         axes: names of the coordinates with their units.
     """
 
@@ -172,17 +171,12 @@ def _rows(
             use="outlier" if is_outlier[index] else camera.split,
             measured=measured.get(index),
             adjusted=adjusted[index],
-            difference_m=_triple(moved[index]) if has_fix[index] else None,
-            sigma_m=None if sigma_m is None else _triple(sigma_m[index]),
+            difference_m=vector3(moved[index]) if has_fix[index] else None,
+            sigma_m=None if sigma_m is None else vector3(sigma_m[index]),
             sha256=sha256.get(camera.name, ""),
         )
         for index, camera in enumerate(evaluated.solved.model.cameras)
     )
-
-
-def _triple(values: FloatArray) -> tuple[float, float, float]:
-    x, y, z = values.tolist()
-    return x, y, z
 
 
 _REGIONS = 16  # along the longer side of an image

@@ -33,11 +33,7 @@ def find_chromium() -> str | None:
 
 
 def chromium_path() -> str:
-    """Return Chromium or Chrome as `find_chromium` does.
-
-    Raises:
-        BackendUnavailableError: there is none, or CHROMIUM names no program; says what to install or correct.
-    """
+    """Return Chromium or Chrome as `find_chromium`; a BackendUnavailableError says what to install or correct."""
     browser = find_chromium()
     if os.environ.get("CHROMIUM") and browser and shutil.which(browser) is None:
         raise BackendUnavailableError(
@@ -54,12 +50,7 @@ def chromium_path() -> str:
 
 
 def print_pdf(page: Path, pdf: Path) -> None:
-    """Print a page, an HTML file, as PDF, which appears when it is complete.
-
-    Raises:
-        BackendUnavailableError: there is no Chromium.
-        CrashError: Chromium did not print; says what it reported.
-    """
+    """Print an HTML file as PDF, which appears when complete; errors as of `chromium_path`, or a CrashError."""
     browser = chromium_path()
     with tempfile.TemporaryDirectory() as profile:
         draft = pdf.with_suffix(".tmp")

@@ -25,7 +25,7 @@ import numpy as np
 
 from pipelines.core.errors import InputError
 from pipelines.core.figures import ACCURACY_H, MISSING
-from pipelines.core.sentences import printable_lines
+from pipelines.core.sentences import duration, printable_lines
 from pipelines.core.types import ByteArray
 from pipelines.formats.image_file import MAX_PIXELS, header_size, read_bytes
 
@@ -48,7 +48,6 @@ def metres(value: float | None) -> str:
 
 
 def in_metres(value: float | None) -> str:
-    """Return metres with their unit."""
     return MISSING if value is None or isnan(value) else f"{metres(value)} m"
 
 
@@ -69,7 +68,6 @@ def square_km(value: float | None) -> str:
 
 
 def decibel(value: float | None) -> str:
-    """Return decibels with their unit."""
     return MISSING if value is None else f"{number_text(value, 2)} dB"
 
 
@@ -90,18 +88,6 @@ def any_text(value: object) -> str:
     return MISSING if value is None else str(value)
 
 
-def duration_text(seconds: float | None) -> str:
-    """Return a duration: `48 s`, `12 min 3 s`, `2 h 5 min`."""
-    if seconds is None:
-        return MISSING
-    if seconds < 10:
-        return f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    if minutes < 60:
-        return f"{minutes} min {rest} s" if minutes else f"{rest} s"
-    return f"{minutes // 60} h {minutes % 60} min"
-
-
 def moment(value: datetime | None) -> str:
     """Return a time in UTC, to the minute."""
     return MISSING if value is None else f"{value:%Y-%m-%d %H:%M} UTC"
@@ -113,7 +99,7 @@ FORMS: dict[str, Callable[..., str]] = {
     "as_json": partial(json.dumps, allow_nan=False),  # in full, for programs that read the page
     "whole": count_text,
     "decibel": decibel,
-    "duration": duration_text,
+    "duration": lambda seconds: duration(seconds) or MISSING,
     "in_metres": in_metres,
     "metres": metres,
     "moment": moment,
@@ -209,12 +195,10 @@ def picture_of_png(data: bytes) -> Picture:
     return Picture(_address("png", data), *size)
 
 
-def png_file(path: Path) -> Picture:
-    """Return a PNG file as it is.
-
-    Raises:
-        InputError: it cannot be read, or is no PNG.
-    """
+def png_file(path: Path) -> Picture | None:
+    """Return a PNG file as it is, or None without one; an InputError: it cannot be read, or is no PNG."""
+    if not path.is_file():
+        return None
     data = read_bytes(path)
     if header_size(data) is None or not data.startswith(_PNG):
         raise InputError("not-a-png", "is no PNG; make it again with `georef evaluate --force`", path=path)
@@ -231,11 +215,7 @@ def picture_of(rgb: ByteArray) -> Picture:
 
 
 def read_picture(path: Path) -> ByteArray:
-    """Return a picture of the workspace as (H, W, 3) RGB, transparent pixels on white.
-
-    Raises:
-        InputError: it cannot be read, does not decode, or claims more than 400 million pixels.
-    """
+    """Return a picture as (H, W, 3) RGB, transparent pixels on white; an InputError: unreadable, or too large."""
     import cv2
 
     data = read_bytes(path)

@@ -44,11 +44,7 @@ def heads_of(crs: TargetCrs) -> Texts:
 
 
 def texts_of(crs: TargetCrs, point_in_geo: FloatArray) -> list[Texts]:
-    """Return the coordinates of points (N, 3) in `geo` as text.
-
-    Raises:
-        InputError: a point lies outside the domain of the CRS.
-    """
+    """Return coordinates of points (N, 3) in `geo` as text; an InputError: one is outside the domain of the CRS."""
     if not len(point_in_geo):
         return []
     units = units_of(crs)

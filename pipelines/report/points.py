@@ -63,12 +63,9 @@ class Chip:
 def cut_chips(
     evaluated: EvaluatedSurvey, wanted: Sequence[WantedChip], progress: Progress
 ) -> tuple[dict[tuple[str, str], tuple[Chip, ...]], int]:
-    """Return chips by kind and name of their points, and their side in pixels of the photographs.
+    """Return chips by kind and name of points, and their side in pixels; an InputError: no photograph as surveyed.
 
     Photographs are decoded one at a time, each once.
-
-    Raises:
-        InputError: a photograph cannot be read, or has changed since `ingest`.
     """
     sparse, survey = evaluated.solved.sparse, evaluated.solved.survey
     folder = photograph_folder(evaluated.workspace, survey.image_dir)

@@ -158,16 +158,9 @@ def lidar_facts(workspace: Workspace) -> LidarFacts | None:
     )
 
 
-@dataclass(frozen=True)
-class ReferenceFacts:
-    """Pictures of a comparison; None: nothing was measured."""
-
-    map: Picture | None
-    histogram: Picture | None
-
-
-def reference_facts(evaluated: EvaluatedSurvey) -> ReferenceFacts:
+def reference_facts(evaluated: EvaluatedSurvey) -> dict[str, Picture | None]:
+    """Return the pictures of a comparison; None: nothing was measured."""
     if evaluated.report.reference is None:
-        return ReferenceFacts(None, None)
-    paths = (evaluated.workspace.root / product for product in (REFERENCE_MAP, REFERENCE_HISTOGRAM))
-    return ReferenceFacts(*(png_file(path) if path.is_file() else None for path in paths))
+        return {}
+    products = {"map": REFERENCE_MAP, "histogram": REFERENCE_HISTOGRAM}
+    return {name: png_file(evaluated.workspace.root / product) for name, product in products.items()}

@@ -20,7 +20,7 @@ from pipelines.report.accuracy import accuracy_facts
 from pipelines.report.cameras import LensesFacts, cameras_facts, lenses_facts
 from pipelines.report.chromium import chromium_path, print_pdf
 from pipelines.report.options import ReportOptions
-from pipelines.report.page import Page, Section, render_page
+from pipelines.report.page import Page, Section, moment, render_page
 from pipelines.report.place import OverlapFacts, overlap_facts, place_facts
 from pipelines.report.points import points_facts
 from pipelines.report.record import RecordFacts, lidar_facts, record_facts, reference_facts
@@ -38,13 +38,7 @@ _STEPS = 8
 
 
 def run(stage: StageRun, options: ReportOptions) -> Summary:
-    """Write the report, and return its key figures.
-
-    Raises:
-        MissingProductError: a stage up to evaluate has not been run; names the command.
-        BackendUnavailableError: `--pdf` without a Chromium.
-        InputError: a product or a photograph is damaged, or the CRS cannot be used here.
-    """
+    """Write the report, and return its key figures; a BackendUnavailableError: `--pdf` without a Chromium."""
     if options.pdf:
         chromium_path()  # a missing browser is told before the work begins
     with stage.progress.task("covariances of cameras and lenses", 1) as task:
@@ -94,7 +88,7 @@ def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: Stage
         if of_gaussians
         else "Georeferenced cameras, with their measured and predicted accuracy",
         about={
-            "Made": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
+            "Made": moment(datetime.now(UTC)),
             "Program": f"GeoRefGS {__version__}",
             "Photographs": f"{cameras.registered} of {cameras.photographs} registered",
             "Reference system": f"{place.crs.crs.name}, heights {place.crs.crs.vertical.name}",

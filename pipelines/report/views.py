@@ -12,7 +12,7 @@ import numpy as np
 
 from pipelines.adjust.posterior import Posterior
 from pipelines.adjust.solution import posterior_of
-from pipelines.core.errors import InputError, MissingProductError
+from pipelines.core.errors import InputError
 from pipelines.core.files import file_size
 from pipelines.core.stages import BY_NAME, HILLSHADE, METRICS, ORTHOPHOTO_PREVIEW, RENDERS, REPORT
 from pipelines.core.types import FloatArray
@@ -84,12 +84,7 @@ class EvaluatedSurvey:
 
 
 def load_evaluated(workspace: Workspace, options: ReportOptions) -> EvaluatedSurvey:
-    """Return the evaluated survey of a workspace.
-
-    Raises:
-        MissingProductError: a stage up to evaluate has not been run; names the command.
-        InputError: a product is damaged, or the CRS cannot be used here.
-    """
+    """Return the evaluated survey of a workspace; errors as of the `run` of a stage."""
     report = read_report(workspace.path(REPORT))
     manifest = workspace.manifest(BY_NAME["evaluate"])  # None: a report put there by hand
     initial = manifest is not None and manifest.config.get("similarity") == "initial"
@@ -151,26 +146,13 @@ class TrainingFacts:
     duration_s: float | None
 
 
-@dataclass(frozen=True)
-class PreviewsFacts:
-    """Previews of the rasters; None where they were not made."""
-
-    orthophoto: Picture | None
-    surface: Picture | None
-
-
 def views_facts(workspace: Workspace, test: PhotometricFigures, most: int) -> ViewsFacts:
     """Return the test views of a workspace, with pictures of at most `most` of them."""
     views = test.per_view
     fields = {view.image: f"photometric.test.per_view.{index}" for index, view in enumerate(views)}
     worst_first = sorted(views, key=lambda view: view.psnr)
-    try:
-        folder = workspace.path(RENDERS)
-    except MissingProductError:
-        saved: dict[str, Path] = {}
-    else:
-        files = {view.image: folder / render_name(view.image) for view in worst_first}
-        saved = {name: file for name, file in files.items() if file.is_file()}
+    files = {view.image: workspace.root / RENDERS / render_name(view.image) for view in worst_first}
+    saved = {name: file for name, file in files.items() if file.is_file()}
     return ViewsFacts(
         shown=tuple(_view(name, fields[name], file) for name, file in list(saved.items())[:most]),
         rows=tuple((view.image, fields[view.image]) for view in views),
@@ -190,11 +172,8 @@ def _view(name: str, field: str, file: Path) -> TestView:
 
 def training_facts(workspace: Workspace, model: TrainedModel) -> TrainingFacts:
     manifest = workspace.manifest(BY_NAME["train"])
-    try:
-        rows = read_metrics(workspace.path(METRICS))
-    except MissingProductError:
-        rows = []
-    panels = _panels(rows)
+    metrics = workspace.root / METRICS
+    panels = _panels(read_metrics(metrics)) if metrics.is_file() else {}
     return TrainingFacts(
         model=model,
         curves=picture_of_png(curves("iteration", panels)) if panels else None,
@@ -203,12 +182,9 @@ def training_facts(workspace: Workspace, model: TrainedModel) -> TrainingFacts:
 
 
 def read_metrics(path: Path) -> list[dict[str, float]]:
-    """Return the rows of the training's metrics: numbers by name.
+    """Return the rows of the training's metrics: numbers by name. An InputError: too large, or a line is no row.
 
     A last line that an interrupted writer has left unfinished is not counted.
-
-    Raises:
-        InputError: too large, not text, or a line is no JSON object of numbers.
     """
     file_size(path, limit_bytes=_MOST_METRICS_BYTES, kind="file of metrics")
     rows, lines = [], 0
@@ -240,6 +216,7 @@ def _panels(rows: list[dict[str, float]]) -> dict[str, Mapping[str, tuple[FloatA
     return panels
 
 
-def previews_facts(workspace: Workspace) -> PreviewsFacts:
-    products = (ORTHOPHOTO_PREVIEW, HILLSHADE)
-    return PreviewsFacts(*(preview(workspace.root / product, _PREVIEW_PX) for product in products))
+def previews_facts(workspace: Workspace) -> dict[str, Picture | None]:
+    """Return the previews of the rasters; None where they were not made."""
+    products = {"orthophoto": ORTHOPHOTO_PREVIEW, "surface": HILLSHADE}
+    return {name: preview(workspace.root / product, _PREVIEW_PX) for name, product in products.items()}

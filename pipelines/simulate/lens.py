@@ -29,7 +29,6 @@ class BrownLens:
 
     Attributes:
         model: determines the coefficients in use.
-        width, height: image size in pixels.
         center_px: principal point; the centre of the top-left pixel is (0.5, 0.5).
         k1, k2, p1, p2: radial and tangential coefficients of Brown's model, as OpenCV orders them.
     """
@@ -73,11 +72,7 @@ class BrownLens:
         return np.asarray(pixels)
 
     def directions(self, pixels: ArrayLike) -> FloatArray:
-        """Return directions (N, 3) with z = 1 of pixels (N, 2), exact to 1e-12.
-
-        Raises:
-            InputError: the distortion folds inside the image, so that a pixel has no ray.
-        """
+        """Return directions (N, 3), z = 1, of pixels (N, 2), exact to 1e-12; an InputError: the lens folds."""
         target = (np.asarray(pixels, dtype=np.float64) - np.array(self.center_px)) / self.focal_px
         guess = target.copy()
         for _ in range(30):

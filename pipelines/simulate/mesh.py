@@ -159,11 +159,7 @@ class Hits:
 
 
 class Raycaster:
-    """Ray caster of a mesh.
-
-    Raises:
-        BackendUnavailableError: embreex is not installed.
-    """
+    """Ray caster of a mesh; a BackendUnavailableError: embreex is not installed."""
 
     def __init__(self, mesh: Mesh) -> None:
         require("simulator")

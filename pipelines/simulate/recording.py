@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pipelines.core.types import FloatArray, IntArray, Matrix3, Vector3
+from pipelines.core.types import FloatArray, IntArray, Matrix3, vector3
 from pipelines.geodesy.enu import Origin, lla_from_enu
 from pipelines.geometry.rotations import ENU_FROM_NED, geo_from_cam, quat_xyzw_from_matrix, yaw_pitch_roll_deg
 from pipelines.simulate.flight import (
@@ -108,7 +108,6 @@ class Recording:
     """All records of a flight.
 
     Attributes:
-        photos: position and attitude of the photographs.
         gnss, imu: the logs; gnss_lla (M, 3) degrees and metres; imu_in_geo (K, 3) places of the attitudes.
         truth: of the whole survey, with its P targets.
         target_in_geo: (P, 3) places of the targets, as surveyed.
@@ -192,7 +191,7 @@ def _mark(
             ))  # fmt: skip
         position = world.sites[i].target_position
         surveyed.append(position + rng.normal(0, options.sigma_survey, 3))
-        kind, true_in_geo = world.sites[i].kind, vector(position)
+        kind, true_in_geo = world.sites[i].kind, vector3(position)
         targets.append(
             TrueTarget(name=name, role=role, surface=kind, position_in_geo=true_in_geo, marks=tuple(marks))
         )
@@ -219,21 +218,21 @@ def _truth(
         lens=TrueLens(model=lens.colmap_model, width=lens.width, height=lens.height, params=lens.colmap_params),
         images=photos.names,
         stamp_ns=tuple(int(stamp) for stamp in photos.stamp_ns),
-        centers=tuple(vector(pose.center) for pose in world.poses),
+        centers=tuple(vector3(pose.center) for pose in world.poses),
         cam_from_enu=tuple(_matrix(pose.geo_from_cam.T) for pose in world.poses),
-        fix_errors=tuple(vector(error) for error in errors),
+        fix_errors=tuple(vector3(error) for error in errors),
         navigation=TrueNavigation(
             receiver=options.gnss,
             sigma_h_m=receiver.sigma_h_m,
             sigma_v_m=receiver.sigma_v_m,
-            bias_amplitude_m=vector(gnss.bias_amplitude_m),
-            bias_phase_rad=vector(gnss.bias_phase_rad),
+            bias_amplitude_m=vector3(gnss.bias_amplitude_m),
+            bias_phase_rad=vector3(gnss.bias_phase_rad),
             bias_period_s=receiver.bias_period_s,
             common_error_m=receiver.common_error_m,
             outlier_m=receiver.outlier_m,
             wrong_images=tuple(photos.names[i] for i in gnss.wrong_photos),
             sigma_attitude_deg=options.sigma_attitude,
-            antenna_in_body_m=vector(mounting.antenna_in_body),
+            antenna_in_body_m=vector3(mounting.antenna_in_body),
             nominal_from_cam=_matrix(mounting.nominal_from_cam),
             cam_from_body=_matrix(world.trajectory.cam_from_body),
             clock_offset_s=mounting.clock_offset_s,
@@ -241,16 +240,10 @@ def _truth(
         targets=targets,
         sigma_mark_px=options.sigma_mark,
         sigma_survey_m=options.sigma_survey,
-        sun_in_geo=vector(world.scene.sun),
+        sun_in_geo=vector3(world.scene.sun),
     )
 
 
-def vector(values: FloatArray) -> Vector3:
-    """Return three numbers of numpy as Python's."""
-    x, y, z = (float(value) for value in values)
-    return x, y, z
-
-
 def _matrix(values: FloatArray) -> Matrix3:
-    a, b, c = (vector(row) for row in values)
+    a, b, c = (vector3(row) for row in values)
     return a, b, c

@@ -91,7 +91,6 @@ class SimulatedScene:
 
     Attributes:
         mesh: its triangles, metres in geo.
-        plan: paint of the ground.
         axes: (3, 3) rows: the town's east, north and up in geo.
         sun: (3,) unit vector towards the sun.
         sites: places where a survey target can be fixed.

@@ -20,17 +20,18 @@ import numpy as np
 
 from pipelines.core.errors import InputError
 from pipelines.core.extras import require
-from pipelines.core.files import replace_folder, sync_tree
+from pipelines.core.files import remove, replace_folder, sync_tree
 from pipelines.core.machine import chosen_threads
 from pipelines.core.products import Remark, save_json
 from pipelines.core.progress import SILENT, Progress
+from pipelines.core.types import vector3
 from pipelines.formats.bag_writer import BagCamera, BagFlight, write_bag
 from pipelines.formats.exif_writer import DroneTags, with_tags
 from pipelines.simulate.flight import in_local_enu
 from pipelines.simulate.lens import Renderer, Sensor
 from pipelines.simulate.lidar import LidarFlight, lidar_files
 from pipelines.simulate.options import SimulateOptions
-from pipelines.simulate.recording import Recording, record, vector, write_tables
+from pipelines.simulate.recording import Recording, record, write_tables
 from pipelines.simulate.truth import TrueLidar
 from pipelines.simulate.world import WANTED_RAYS, World, check_clearance, make_world
 
@@ -163,8 +164,7 @@ def _draft(directory: Path) -> Iterator[Path]:
     draft = directory.with_name(f".{directory.name}.partial")
     old = directory.with_name(f".{directory.name}.old")
     for left in (draft, old):
-        if left.exists():
-            shutil.rmtree(left)
+        remove(left)
     try:
         draft.mkdir(parents=True)
     except OSError as error:
@@ -191,7 +191,7 @@ def _write_photographs(options: SimulateOptions, flight: RecordedFlight, folder:
         (folder / "depth").mkdir()
     gains = 1.1 * np.exp(rng.normal(0, options.exposure, count))
     tints = np.exp(rng.normal(0, 0.15 * options.exposure, (count, 3)))
-    sensors = [Sensor(float(gain), vector(tint), options.noise) for gain, tint in zip(gains, tints, strict=True)]
+    sensors = [Sensor(float(gain), vector3(tint), options.noise) for gain, tint in zip(gains, tints, strict=True)]
     streams = rng.spawn(count)
 
     def write(i: int) -> None:
@@ -218,7 +218,7 @@ def _write_photographs(options: SimulateOptions, flight: RecordedFlight, folder:
 
 def _tags(options: SimulateOptions, world: World, recording: Recording, i: int) -> DroneTags:
     photos = recording.photos
-    lat, lon, alt = vector(photos.lla[i])
+    lat, lon, alt = vector3(photos.lla[i])
     return DroneTags(
         width=world.lens.width,
         height=world.lens.height,
@@ -228,9 +228,9 @@ def _tags(options: SimulateOptions, world: World, recording: Recording, i: int) 
         lon_deg=lon,
         alt_m=alt,
         relative_alt_m=alt - world.origin.alt_m,
-        yaw_pitch_roll_deg=vector(photos.yaw_pitch_roll_deg[i]),
-        body_yaw_pitch_roll_deg=vector(photos.body_yaw_pitch_roll_deg[i]),
-        sigma_enu_m=None if options.gnss == "consumer" else vector(photos.sigma_enu_m),
+        yaw_pitch_roll_deg=vector3(photos.yaw_pitch_roll_deg[i]),
+        body_yaw_pitch_roll_deg=vector3(photos.body_yaw_pitch_roll_deg[i]),
+        sigma_enu_m=None if options.gnss == "consumer" else vector3(photos.sigma_enu_m),
     )
 
 

@@ -127,11 +127,7 @@ class World:
 
 
 def make_world(options: SimulateOptions, seed: np.random.SeedSequence) -> World:
-    """Build the scene, fly over it, and lay out targets at sites that the flight sees.
-
-    Raises:
-        InputError: the lens folds inside the image.
-    """
+    """Build the scene, fly over it, and lay out targets that the flight sees; an InputError: the lens folds."""
     scene_seed, flight_seed, target_seed = seed.spawn(3)
     lat, lon, alt = options.origin
     lens = _lens(options)
@@ -175,11 +171,7 @@ def _lens(options: SimulateOptions) -> BrownLens:
 
 
 def check_clearance(world: World, raycaster: Raycaster) -> None:
-    """Check that no photograph is taken inside terrain or a building.
-
-    Raises:
-        InputError: a camera is in the ground, or within 2 m of a surface.
-    """
+    """Refuse photographs taken in the ground, or within 2 m of a surface, with an InputError."""
     golden = np.pi * (3 - 5**0.5)
     step = np.arange(400)
     z = 1 - (2 * step + 1) / len(step)

@@ -161,11 +161,7 @@ class DefaultStrategy:
         return None
 
     def observe(self, stats: ScreenStats, camera: Pinhole) -> None:
-        """Add a render's screen gradients to those since the last edit.
-
-        Raises:
-            ValueError: the render has had no backward pass.
-        """
+        """Add a render's screen gradients to those since the last edit; a ValueError: it had no backward pass."""
         if stats.mean_gradient is None:
             raise ValueError("the render has no screen gradients yet: call backward() first")
         # Threshold and 3DGS are in normalised device coordinates: 2 units across the image.

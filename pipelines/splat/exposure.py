@@ -145,14 +145,11 @@ class PointColours:
 
 
 def adjusted_exposures(observed: PointColours, count: int) -> FloatArray:
-    """Return the exposures (count, 3, 4) of all photographs: gain matrix and offset (A | b).
+    """Return the exposures (count, 3, 4): gain, offset (A | b); a DegenerateGeometryError: no point is seen twice.
 
     Points with one observation do not count. The mean over the photographs with observations is the identity. A
     photograph without observations has it too. Memory holds the coupled pairs of photographs, and the derivatives
     of one chunk of observations.
-
-    Raises:
-        DegenerateGeometryError: no point has two observations.
     """
     rays = np.bincount(observed.point)
     several = rays[observed.point] >= 2

@@ -140,11 +140,7 @@ class FinitenessMonitor:
         self._first = torch.where(torch.isfinite(row), self._first, self._first.clamp_max(iteration))
 
     def check(self) -> None:
-        """Wait for the device and report the first value that was not finite.
-
-        Raises:
-            NonFiniteError: of the earliest iteration; of several scalars at once, the first by order of names.
-        """
+        """Wait for the device; a NonFiniteError names the earliest value that was not finite."""
         first = self._first.cpu()
         place = int(first.argmin())
         if int(first[place]) < _NEVER:

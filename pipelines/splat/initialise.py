@@ -59,7 +59,6 @@ def gaussians_from_points(
     Args:
         points_in_model: (N, 3) metres.
         colours: (N, 3) uint8, or floats from 0 to 1.
-        options: settings of the Gaussians.
         normals_in_model: (N, 3) unit vectors, NaN if unknown; None: all are unknown.
 
     Raises:

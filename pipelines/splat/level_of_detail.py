@@ -122,9 +122,9 @@ def drawn(mixture: Mixture, cell_m: float) -> SplatArrays:
     )
 
 
-def bounds_of(mixture: Mixture, sigmas: float = 3.0) -> FloatArray:
-    """Return the box (2, 3), least and largest coordinates, of Gaussians up to a multiple of their σ."""
-    reach = sigmas * np.sqrt(np.einsum("nii->ni", mixture.covariances))
+def bounds_of(mixture: Mixture) -> FloatArray:
+    """Return the box (2, 3), least and largest coordinates, of Gaussians up to 3 σ."""
+    reach = 3 * np.sqrt(np.einsum("nii->ni", mixture.covariances))
     return np.stack([(mixture.means - reach).min(axis=0), (mixture.means + reach).max(axis=0)])
 
 

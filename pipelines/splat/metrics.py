@@ -65,11 +65,7 @@ _SMALLEST_PX = 16  # four poolings
 
 
 class Lpips:
-    """Perceptual distance of images; the weights are loaded once.
-
-    Raises:
-        InputError: not an NPZ file of such weights.
-    """
+    """Perceptual distance of images; the weights are loaded once. An InputError: no NPZ file of such weights."""
 
     def __init__(self, weights: Path) -> None:
         arrays = read_npz(weights, tuple(_shapes()))

@@ -86,20 +86,20 @@ _RAISED = {
     "sh_dc": (1 / 3, 4.0),
     "sh_rest": (1.0, 12.0),
 }
+# All rates but the centres' fall exponentially from this fraction of the training on, to this share at its end.
+_SETTLING_FROM, _SETTLED = 0.6, 0.1
+_BETA1, _BETA2 = 0.9, 0.999  # decay of the first and of the second moment
+EPS = 1e-15  # added to the denominator; tiny, because these gradients are tiny
 _CORRECTED_STEPS = 20_000  # 0.999^20000 = 2e-9: below float32's resolution of 1
 
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Learning rates and moments.
+    """Learning rates.
 
     Attributes:
         means, means_final: first and last rate of the centres, in scene extents.
         sh_dc, sh_rest: rates of the constant and of the direction-dependent colour.
-        settling_from: fraction of the training from which all rates but the centres' fall exponentially,
-        settled: and the share of them that is left at the end.
-        beta1, beta2: decay of the first and of the second moment.
-        eps: added to the denominator; tiny, because these gradients are tiny.
     """
 
     means: float = 1.6e-4
@@ -109,11 +109,6 @@ class LearningRates:
     logit_opacities: float = 5e-2
     sh_dc: float = 2.5e-3
     sh_rest: float = 1.25e-4
-    settling_from: float = 0.6
-    settled: float = 0.1
-    beta1: float = 0.9
-    beta2: float = 0.999
-    eps: float = 1e-15
 
     @classmethod
     def for_iterations(cls, iterations: int) -> LearningRates:
@@ -154,7 +149,7 @@ class GaussianAdam:
         self._exp_avg = gaussians.means.new_zeros(count, width)
         self._exp_avg_sq = torch.zeros_like(self._exp_avg)
         self._steps = torch.zeros(count, dtype=torch.int32, device=gaussians.means.device)
-        self._corrections = _bias_corrections(self.rates).to(gaussians.means.device)
+        self._corrections = _bias_corrections().to(gaussians.means.device)
 
     def zero_grad(self) -> None:
         for tensor in self.gaussians.tensors().values():
@@ -234,7 +229,7 @@ class GaussianAdam:
         rates[columns["sh"]] = own.sh_rest
         rates[columns["sh"]][:3] = own.sh_dc
         progress = min(iteration / max(self.iterations, 1), 1.0)
-        settling = own.settled ** (max(progress - own.settling_from, 0.0) / (1 - own.settling_from))
+        settling = _SETTLED ** (max(progress - _SETTLING_FROM, 0.0) / (1 - _SETTLING_FROM))
         rates *= self.rate_factor * settling
         rates[columns["means"]] = self.means_rate(iteration)
         return rates
@@ -245,8 +240,7 @@ class GaussianAdam:
             tuple(part.detach().contiguous().numpy().reshape(len(part), -1) for part in parts if part is not None)
             for parts in (tensors, [tensor.grad for tensor in tensors])
         )
-        real, rates = np.float32, self.rates
-        betas = np.array([rates.beta1, 1 - rates.beta1, rates.beta2, 1 - rates.beta2], dtype=real)
+        betas = np.array([_BETA1, 1 - _BETA1, _BETA2, 1 - _BETA2], dtype=np.float32)
         adam_rows(
             rows.contiguous().numpy(),
             parameters,
@@ -257,7 +251,7 @@ class GaussianAdam:
             self._column_rates(iteration).numpy(),
             self._corrections.numpy(),
             betas,
-            real(rates.eps),
+            np.float32(EPS),
         )
 
     def _step_by_tensors(self, iteration: int, rows: Tensor) -> None:
@@ -270,10 +264,10 @@ class GaussianAdam:
         unbias = self._corrections[self._steps[rows].long().clamp_max(len(self._corrections) - 1)]
         parts = [tensor.grad[rows].reshape(len(rows), -1) for tensor in tensors.values() if tensor.grad is not None]
         gradient = torch.cat(parts, dim=1)
-        average = self._exp_avg[rows].lerp_(gradient, 1 - self.rates.beta1)
-        square = self._exp_avg_sq[rows].lerp_(gradient * gradient, 1 - self.rates.beta2)
+        average = self._exp_avg[rows].lerp_(gradient, 1 - _BETA1)
+        square = self._exp_avg_sq[rows].lerp_(gradient * gradient, 1 - _BETA2)
         self._exp_avg[rows], self._exp_avg_sq[rows] = average, square
-        scale = square.sqrt_().mul_(unbias[:, 1:]).add_(self.rates.eps)
+        scale = square.sqrt_().mul_(unbias[:, 1:]).add_(EPS)
         change = average.mul_(unbias[:, :1]).mul_(self._column_rates(iteration)).div_(scale)
         for name, tensor in tensors.items():
             tensor.index_add_(0, rows, change[:, columns[name]].reshape(len(rows), *tensor.shape[1:]), alpha=-1)
@@ -284,8 +278,8 @@ def _leaves(gaussians: Gaussians) -> Gaussians:
     return Gaussians(**{name: tensor.requires_grad_() for name, tensor in copies.items()})
 
 
-def _bias_corrections(rates: LearningRates) -> Tensor:
+def _bias_corrections() -> Tensor:
     step = torch.arange(_CORRECTED_STEPS, dtype=torch.float64)
     step[0] = 1.0  # never used: a row's first update is its step 1
-    columns = [1 / (1 - rates.beta1**step), 1 / (1 - rates.beta2**step).sqrt()]
+    columns = [1 / (1 - _BETA1**step), 1 / (1 - _BETA2**step).sqrt()]
     return torch.stack(columns, dim=1).float()

@@ -20,7 +20,7 @@ from pipelines.core.types import ByteArray, FloatArray
 from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.splat.gaussians import Gaussians, rotation_matrices
-from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings
+from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Render
 from pipelines.splat.sh import coefficient_count, sh_from_rgb
 
 # In spacings. Wider discs hide more of the places behind them, so that a reader of depths meets a centre too near.
@@ -80,14 +80,15 @@ def depth_at(depth_m: Tensor, alpha: Tensor, xy: Tensor, camera: Pinhole) -> tup
     return sampled[0], seen
 
 
-def measured_depth(median_m: Tensor, expected_m: Tensor, variance_m2: Tensor) -> Tensor:
-    """Return the depth (H, W) to measure in, 0 without a surface, of a render's two depths and variance.
+def measured_depth(view: Render) -> Tensor:
+    """Return the depth (H, W) to measure in, 0 without a surface, of a render with depth.
 
     The median selects the surface that a pixel shows, whatever haze lies before and behind it. If all Gaussians of
     the pixel lie on one surface, the mean is less noisy than the median.
     """
-    one_surface = variance_m2 < (_ONE_SURFACE * median_m).square()
-    return torch.where(one_surface, expected_m, median_m)
+    assert view.median_depth is not None and view.expected_depth is not None and view.depth_variance is not None
+    one_surface = view.depth_variance < (_ONE_SURFACE * view.median_depth).square()
+    return torch.where(one_surface, view.expected_depth, view.median_depth)
 
 
 _SPREAD = 0.005  # of the depth: the loss of a smaller spread grows with its square

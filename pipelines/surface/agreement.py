@@ -24,6 +24,13 @@ from pipelines.surface.sweep import NormalMap, SweepResult, sweep_result
 
 
 _GRAZING = 0.1  # of the depth: a ray that grazes the planes moves further between them
+LEAST_SCORE = 0.4  # correlation that counts
+SAME_STEPS = 1.5  # largest difference of surfaces that agree, in steps of the sweep
+LEAST_VIEWS = 2  # other ones, that must agree
+FREE = 0.02  # a view looks through a place if its own surface lies further away by this part of its distance
+MOST_THROUGH = 0.5  # views that look through a surface, as a part of the views that agree
+_RIM = 0.01  # of the depth: a surface ends where the next pixel lies behind its plane by more
+THRESHOLDS = (LEAST_SCORE, SAME_STEPS, LEAST_VIEWS, FREE, MOST_THROUGH, _RIM)
 
 
 @kernel(nogil=True, error_model="numpy")
@@ -36,7 +43,6 @@ def compare_depths(
     other: Any,
     other_index: Any,
     other_normals: Any,
-    limits: Any,
     sums: Any,
     counts: Any,
 ) -> None:
@@ -51,11 +57,9 @@ def compare_depths(
         other: (4, h, w) float32: offset, score, step and sharpness of the other view.
         other_index: (h, w) rows of `other_normals`.
         other_normals: (F, 3).
-        limits: (3,) least score, steps, and free, of `AgreementSettings`.
         sums: (2, H, W) float64; grows by the weighted differences of the depth, and by their weights.
         counts: (2, H, W) int32; grows by one where the other view agrees, and where it looks through the point.
     """
-    least_score, steps, free = limits[0], limits[1], limits[2]
     rows, columns = other.shape[1], other.shape[2]
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
@@ -76,16 +80,16 @@ def compare_depths(
             if not (across >= 0 and across < columns and down >= 0 and down < rows):
                 continue
             column, row = int(across), int(down)
-            if not other[1, row, column] > least_score:
+            if not other[1, row, column] > LEAST_SCORE:
                 continue
             which = other_index[row, column]
             n0, n1, n2 = other_normals[which, 0], other_normals[which, 1], other_normals[which, 2]
             offset = p0 * n0 + p1 * n1 + p2 * n2
             residual = np.float64(other[0, row, column]) - offset
             seen_at = offset - (n0 * other_center[0] + n1 * other_center[1] + n2 * other_center[2])
-            if residual / seen_at > free:
+            if residual / seen_at > FREE:
                 counts[1, v, u] += 1
-            if abs(residual) < steps * other[2, row, column]:
+            if abs(residual) < SAME_STEPS * other[2, row, column]:
                 along = r0 * n0 + r1 * n1 + r2 * n2
                 longer = residual / along
                 if abs(longer) < _GRAZING * length:
@@ -95,28 +99,7 @@ def compare_depths(
                     counts[0, v, u] += 1
 
 
-@dataclass(frozen=True)
-class AgreementSettings:
-    """Thresholds of agreement.
-
-    Attributes:
-        least_score: smallest correlation that counts.
-        steps: largest difference, in steps of the sweep.
-        least_views: number of other views that must agree.
-        free: a view looks through a place if its own surface lies further away by this part of its distance.
-        most_through: largest number of views that look through a surface, as a part of the views that agree.
-        rim: a surface ends where the next pixel lies behind its plane by this part of the depth.
-    """
-
-    least_score: float = 0.4
-    steps: float = 1.5
-    least_views: int = 2
-    free: float = 0.02
-    most_through: float = 0.5
-    rim: float = 0.01
-
-
-def agreed_depth(own: SweepResult, others: list[SweepResult], settings: AgreementSettings) -> Float32Array:
+def agreed_depth(own: SweepResult, others: list[SweepResult]) -> Float32Array:
     """Return depths (H, W) along the optical axis of `own`, the mean of the views that agree; 0 if few do.
 
     1. Each point of `own` is reprojected into each other view. The residual is the distance to the surface of that
@@ -127,27 +110,26 @@ def agreed_depth(own: SweepResult, others: list[SweepResult], settings: Agreemen
        side of a roof take the ground beside it for roof.
     """
     camera, depth = own.camera, own.depth()
-    good = (own.score > settings.least_score) & np.isfinite(depth) & (depth > 0)
+    good = (own.score > LEAST_SCORE) & np.isfinite(depth) & (depth > 0)
     length = np.where(good, depth, 0.0)
     per_metre = own.normals.offset_per_metre(camera)
     sums, counts = np.zeros((2, *depth.shape)), np.zeros((2, *depth.shape), np.int32)
     sums[1] = (per_metre * own.sharpness) ** 2
-    limits = np.array([settings.least_score, settings.steps, settings.free])
     for other in others:
         compare_depths(
             *(length, camera.cam_from_model.T @ np.linalg.inv(camera_matrix(camera.pinhole))),
             *(camera.center_in_model, other.camera.center_in_model),
             camera_matrix(other.camera.pinhole) @ other.camera.cam_from_model,
             np.stack([other.offset_m, other.score, other.step_m, other.sharpness]),
-            *(other.normals.index, other.normals.normals_in_model, limits, sums, counts),
+            *(other.normals.index, other.normals.normals_in_model, sums, counts),
         )
     views, through = counts
-    agreed = good & (views >= settings.least_views) & (through < settings.most_through * views)
+    agreed = good & (views >= LEAST_VIEWS) & (through < MOST_THROUGH * views)
     mean = length + np.divide(sums[0], sums[1], out=np.zeros_like(length), where=agreed)
     return np.where(agreed, mean, 0.0).astype(np.float32)
 
 
-def without_rims(depth: Float32Array, reach_px: int, rim: float) -> Float32Array:
+def without_rims(depth: Float32Array, reach_px: int) -> Float32Array:
     """Return a depth map (H, W) with 0 where a surface ends before another within `reach_px`.
 
     Foreground fattening is the reason: the contrast of an edge dominates the windows across it, so that the ground
@@ -162,7 +144,7 @@ def without_rims(depth: Float32Array, reach_px: int, rim: float) -> Float32Array
         for down, right in itertools.product((-reach, 0, reach), repeat=2):
             ahead = around[reach + down :, reach + right :][:height, :width]
             behind = around[reach - down :, reach - right :][:height, :width]
-            ends |= ahead < (2 - rim) * inverse - behind
+            ends |= ahead < (2 - _RIM) * inverse - behind
     return np.where(ends, np.float32(0), depth)
 
 
@@ -203,12 +185,9 @@ def surface_prior(coarse: SweepResult, agreed: Float32Array, camera: ViewPose) -
 def refine(
     reference: StereoView, neighbours: list[StereoView], prior: SurfacePrior, settings: MatchSettings
 ) -> SweepResult:
-    """Compare a view with its neighbours at offsets around a prior, and keep the best.
+    """Compare a view with its neighbours at offsets around a prior, and keep the best; a ValueError: no neighbours.
 
     A best match at either end of the range means that the surface lies outside of it: its score becomes −1.
-
-    Raises:
-        ValueError: no neighbours.
     """
     if not neighbours:
         raise ValueError("no neighbours to compare with")

@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 
@@ -21,7 +20,7 @@ from pipelines.core.machine import thread_count
 from pipelines.core.progress import SILENT, Progress, ProgressTask
 from pipelines.core.types import ByteArray, Float32Array
 from pipelines.geometry.cameras import Pinhole, ViewPose
-from pipelines.surface.agreement import AgreementSettings, agreed_depth, refine, surface_prior, without_rims
+from pipelines.surface.agreement import THRESHOLDS, agreed_depth, refine, surface_prior, without_rims
 from pipelines.surface.matching import UNSEEN, MatchSettings, StereoView
 from pipelines.surface.sweep import (
     NormalMap,
@@ -38,26 +37,12 @@ from pipelines.survey.scene import Scene
 _LAYOUT = b"coarse, fine: direction, offset, score, step, sharpness, by kernels"
 
 
-@dataclass(frozen=True)
-class StereoOptions:
-    """Options of the depth maps.
-
-    Attributes:
-        coarse_px: longest side of the photographs in the plane sweep, whose time grows with its cube.
-        fine_px: longest side of the photographs in the refinement, and of the depth maps.
-        neighbours: number of views that each view is compared with.
-        matching: comparison in the plane sweep; a wide window finds the surface where there is little texture.
-        refining: comparison in the refinement, where the surface is nearly known; a small window does not extend it
-            across the foot of a wall.
-        agreement: thresholds of agreement.
-    """
-
-    coarse_px: int = 320
-    fine_px: int = 640
-    neighbours: int = 10
-    matching: MatchSettings = field(default_factory=MatchSettings)
-    refining: MatchSettings = field(default_factory=lambda: MatchSettings(window_px=3, reach_px=2))
-    agreement: AgreementSettings = field(default_factory=AgreementSettings)
+# Longest side of the photographs: in the plane sweep, whose time grows with its cube, and in refinement and maps.
+_COARSE_PX, FINE_PX = 320, 640
+_NEIGHBOURS = 10  # views that each view is compared with
+MATCHING = MatchSettings()  # in the sweep: a wide window finds the surface where there is little texture
+# Where the surface is nearly known, a small window does not extend it across the foot of a wall.
+REFINING = MatchSettings(window_px=3, reach_px=2)
 
 
 class DepthMaps:
@@ -67,28 +52,20 @@ class DepthMaps:
 
     Args:
         folder: cache, in which each scene has a folder of its own.
-        options: of the depth maps; None: the defaults.
     """
 
-    def __init__(
-        self, folder: Path, scene: Scene, images: ImageCache, options: StereoOptions | None = None
-    ) -> None:
+    def __init__(self, folder: Path, scene: Scene, images: ImageCache) -> None:
         self.scene, self.images = scene, images
-        self._options = options or StereoOptions()
-        count = self._options.neighbours
         # Each neighbour of a view needs the view's planes and neighbours, too.
-        self._neighbours = cache(lambda index: best_neighbours(scene.network, index, scene.train, count))
+        self._neighbours = cache(lambda index: best_neighbours(scene.network, index, scene.train, _NEIGHBOURS))
         self._planes = cache(self._find_planes)
         self.folder = folder / self._key()
 
     def build(self, progress: Progress = SILENT) -> None:
-        """Compute the depth maps that are not in the cache, several views at once.
+        """Compute the depth maps that the cache lacks, several at once; an InputError: a photograph is unusable.
 
         A view needs the previous step of its neighbours. Each step therefore finishes all views before the next
         step begins.
-
-        Raises:
-            InputError: a photograph cannot be read, or has another size than its camera.
         """
         train = [int(index) for index in self.scene.train]
         steps = (("coarse", self._sweep), ("fine", self._refine), ("depth", self._agree))
@@ -124,7 +101,7 @@ class DepthMaps:
 
     def camera(self, index: int, kind: str = "fine") -> Pinhole:
         """Return the camera of a depth map, or of the sweep's coarse pixels."""
-        longest_px = self._options.coarse_px if kind == "coarse" else self._options.fine_px
+        longest_px = _COARSE_PX if kind == "coarse" else FINE_PX
         return self.images.pinhole(index).limited(longest_px)
 
     def depth(self, index: int) -> Float32Array:
@@ -136,7 +113,7 @@ class DepthMaps:
         """Return the photograph (H, W, 3) at the pixels of `camera`."""
         whole, pinhole = self.images.pinhole(index), self.camera(index, kind)
         # All neighbours read a view: large photographs are shrunken once, by a factor that divides both sides.
-        most = max(max(whole.width, whole.height) // (2 * self._options.fine_px), 1)
+        most = max(max(whole.width, whole.height) // (2 * FINE_PX), 1)
         shrink = max(s for s in range(1, most + 1) if whole.width % s == 0 == whole.height % s)
         image = np.array(self.images.image(index, shrink))
         small = cv2.resize(image, (pinhole.width, pinhole.height), interpolation=cv2.INTER_AREA)
@@ -147,7 +124,7 @@ class DepthMaps:
         if not sweeps:
             return _empty_maps(self.camera(index, "coarse"))
         reference, *views = (self._view(j, "coarse") for j in (index, *others))
-        return _packed(plane_sweep(reference, views, sweeps, self._options.matching))
+        return _packed(plane_sweep(reference, views, sweeps, MATCHING))
 
     def _refine(self, index: int) -> Float32Array:
         own = self._surface(index, "coarse")
@@ -155,7 +132,7 @@ class DepthMaps:
             return _empty_maps(self.camera(index))
         reference, *views = (self._view(j, "fine") for j in (index, *self._neighbours(index)))
         prior = surface_prior(own, self._agreed(own, index, "coarse"), reference.camera)
-        return _packed(refine(reference, views, prior, self._options.refining))
+        return _packed(refine(reference, views, prior, REFINING))
 
     def _agree(self, index: int) -> Float32Array:
         own = self._surface(index, "fine")
@@ -165,11 +142,11 @@ class DepthMaps:
 
     def _agreed(self, own: SweepResult, index: int, kind: str) -> Float32Array:
         """Return the depths (H, W) on which views agree; 0 elsewhere."""
-        others, options = [self._surface(j, kind) for j in self._neighbours(index)], self._options
-        depth = agreed_depth(own, [other for other in others if other is not None], options.agreement)
+        others = [self._surface(j, kind) for j in self._neighbours(index)]
+        depth = agreed_depth(own, [other for other in others if other is not None])
         # Refined depths started from the sweep: its window sets the width of a rim on fine pixels too.
-        window_px = options.matching.window_px * own.camera.pinhole.width / self.camera(index, "coarse").width
-        return without_rims(depth, int(window_px / 2), options.agreement.rim)
+        window_px = MATCHING.window_px * own.camera.pinhole.width / self.camera(index, "coarse").width
+        return without_rims(depth, int(window_px / 2))
 
     def _surface(self, index: int, kind: str) -> SweepResult | None:
         sweeps = self._planes(index)
@@ -213,7 +190,7 @@ class DepthMaps:
             digest.update(np.ascontiguousarray(array).tobytes())
         for index in range(len(sparse.image_name)):
             digest.update(self.images.key(index).encode())
-        digest.update(repr(self._options).encode())
+        digest.update(repr((_COARSE_PX, FINE_PX, _NEIGHBOURS, MATCHING, REFINING, THRESHOLDS)).encode())
         return digest.hexdigest()[:32]
 
 

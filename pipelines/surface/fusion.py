@@ -58,16 +58,9 @@ class SurfaceCloud:
     rgb: ByteArray  # (P, 3) uint8
     sigma_m: FloatArray  # (P,) σ of the surface along the normal, without that of the georeference
 
-    def __len__(self) -> int:
-        return len(self.position)
-
 
 def pixel_on_surface_m(views: SurfaceViews, geo_from_model: Similarity) -> float:
-    """Return the median width of a pixel on the surface in metres, over the views' medians.
-
-    Raises:
-        DegenerateGeometryError: no view shows a surface.
-    """
+    """Return the median pixel width on the surface in metres, over the views; a DegenerateGeometryError: none."""
     medians = []
     for view in map(views.view, range(len(views))):
         depth = view.depth_m[::_SAMPLE_PX, ::_SAMPLE_PX]

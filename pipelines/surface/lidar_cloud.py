@@ -33,12 +33,9 @@ class ScannerTrack:
 
     @classmethod
     def read(cls, path: Path, stated: CloudCrs, origin: Origin) -> ScannerTrack:
-        """Return the track of a CSV file on the clock of the cloud's points.
+        """Return the track of a CSV file on the clock of the cloud's points; an InputError: a bad file, no times.
 
         The file has time, and latitude, longitude, altitude or x, y, z. A track without a CRS has the cloud's.
-
-        Raises:
-            InputError: an unreadable file, or one without times.
         """
         table = read_trajectory(path)
         if table.time_s is None:
@@ -58,11 +55,7 @@ class ScannerTrack:
         return cls(Trajectory.from_samples(time_s, position=place, max_gap_s=_MAX_GAP_S))
 
     def at(self, gps_time_s: FloatArray) -> FloatArray:
-        """Return the scanner's places (P, 3) at times (P,); NaN where the track has none.
-
-        Raises:
-            InputError: the track has none for most times.
-        """
+        """Return the scanner's places (P, 3) at times (P,), NaN where unknown; an InputError: most are unknown."""
         known = np.isfinite(gps_time_s)
         place = np.full((len(gps_time_s), 3), np.nan)
         place[known] = self.trajectory.at(gps_time_s[known]).position

@@ -79,7 +79,6 @@ class CloudReader:
         path: file, or folder whose LAS, LAZ and PLY files are taken, also from its subfolders.
 
     Attributes:
-        count: number of points.
         crs_names: names of the CRSs of the files, without repetition.
         assumptions: sentences on what the files do not say.
 
@@ -104,11 +103,7 @@ class CloudReader:
         )
 
     def chunks(self, origin: Origin, progress: Progress = SILENT) -> Iterator[MeasuredCloud]:
-        """Yield all valid points in geo, a chunk at a time and not thinned.
-
-        Raises:
-            InputError: a damaged file, points outside their CRS, or a missing grid.
-        """
+        """Yield all valid points in geo, in chunks; an InputError: damage, points outside the CRS, no grid."""
         with progress.task("lidar", self.count) as task:
             for file, crs in zip(self._files, self._crs, strict=True):
                 serving: PointCrs | None = None
@@ -139,12 +134,9 @@ class CloudReader:
 def read_thinned(
     files: CloudReader, origin: Origin, thinning: Thinning, progress: Progress = SILENT
 ) -> MeasuredCloud:
-    """Return one point of each voxel that the clouds meet, the first.
+    """Return the first point of each voxel that the clouds meet; errors as of `CloudReader.chunks`, or no point.
 
     Memory holds at most three times `thinning.most` points.
-
-    Raises:
-        InputError: as `CloudReader.chunks`; or no point lies in the box.
     """
     voxel_m, held = thinning.voxel_m, 0
     waiting: list[MeasuredCloud] = []

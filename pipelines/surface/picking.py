@@ -49,13 +49,10 @@ class DepthMap:
         return np.asarray(self.depth_m[top : row + REACH_PX + 1, left : column + REACH_PX + 1])
 
     def depth_at(self, xy: FloatArray) -> float:
-        """Return the depth at a ray, on a plane through the pixels of the same surface around it; 0: no surface.
+        """Return the depth at a ray (x/z, y/z), on a plane through pixels of the same surface; 0: no surface.
 
         Gaussians make the surface rough from pixel to pixel, and a plane through several pixels evens that out. The
         inverse depth of a plane is linear on the image.
-
-        Args:
-            xy: (2,) x/z and y/z of the ray.
         """
         x, y = self._pixel(xy)
         if not self.contains(xy):
@@ -81,13 +78,10 @@ class DepthMap:
 
 
 def depth_around(renderer: ModelRenderer, camera: int, xy: FloatArray, reach_px: int = REACH_PX) -> DepthMap:
-    """Return the depth of a camera within some pixels of a ray; empty if the ray misses the image.
+    """Return the depth of a camera within some pixels of a ray (x/z, y/z); empty if the ray misses the image.
 
     Everybody who measures renders the same small windows. Where the Gaussians of a pixel nearly lie on one surface,
     rounding decides how its depth is taken, and another window would round in another way.
-
-    Args:
-        xy: (2,) x/z and y/z of the ray.
     """
     pose = renderer.pose(camera)
     pinhole = pose.pinhole
@@ -107,7 +101,6 @@ def points_on_surface(trained: TrainedSurvey, rays: MarkRays, maps: Sequence[Dep
     The result is the spatial median of the views that count; NaN for a point with fewer than two.
 
     Args:
-        trained: the trained model.
         rays: K marks of J points.
         maps: K, the depth around each mark in its view.
     """

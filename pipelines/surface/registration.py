@@ -48,9 +48,6 @@ class PlaneMatches:
     distance_m: FloatArray  # (M,) surface of the photographs minus the point, along the normal
     wall: BoolArray  # (M,) whether the plane is upright
 
-    def __len__(self) -> int:
-        return len(self.distance_m)
-
 
 @dataclass(frozen=True)
 class Registration:
@@ -64,11 +61,7 @@ class Registration:
 
 
 def registration(cloud: LidarCloud, views: DepthViews, seed: int) -> Registration:
-    """Return the shift of a cloud against the depth maps.
-
-    Raises:
-        DegenerateGeometryError: too few planes that both show, or planes of one direction only.
-    """
+    """Return a cloud's shift against the depth maps; a DegenerateGeometryError: too few planes or directions."""
     plane = (cloud.roughness_m < _FLAT * cloud.voxel_m + 0.05) & ~np.isin(cloud.classification, PLANTS)
     rows = np.flatnonzero(plane)
     if len(rows) > _MOST_POINTS:
@@ -77,11 +70,11 @@ def registration(cloud: LidarCloud, views: DepthViews, seed: int) -> Registratio
     total = np.zeros(3)
     for capture in _CAPTURES:
         matches = _matches(planes.moved(-total), views, capture)
-        if len(matches) < _LEAST_POINTS:
+        if len(matches.distance_m) < _LEAST_POINTS:
             raise DegenerateGeometryError(
                 "no-overlap",
-                f"Only {len(matches)} LiDAR points lie within {capture:.1%} of the camera's distance from the "
-                "surface of the photographs, too few for a comparison",
+                f"Only {len(matches.distance_m)} LiDAR points lie within {capture:.1%} of the camera's distance "
+                "from the surface of the photographs, too few for a comparison",
             )
         values, covariance, spread = _solved(matches)
         total = total + values[:3]
@@ -120,7 +113,7 @@ def _solved(matches: PlaneMatches) -> tuple[FloatArray, FloatArray, float]:
         value = value + step
         if np.abs(step).max() < 1e-6:
             break
-    if np.linalg.eigvalsh(normal[:3, :3])[0] * spread**2 < 1e-3 * len(matches):
+    if np.linalg.eigvalsh(normal[:3, :3])[0] * spread**2 < 1e-3 * len(matches.distance_m):
         raise DegenerateGeometryError(
             "planes-parallel", "All planes of the LiDAR face one direction, which leaves its shift undetermined"
         )

@@ -26,6 +26,7 @@ from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
 from pipelines.geometry.cameras import Pinhole, ViewPose, pose_matrix
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Render, Window
+from pipelines.splat.rasterizer.backends import device_of
 from pipelines.splat.spatial import SpatialBlocks
 from pipelines.splat.surface import measured_depth
 from pipelines.surface.visibility import DepthViews, Support, Viewpoints, support
@@ -57,65 +58,44 @@ def photo_consistent(rendered: ByteArray, photograph: ByteArray) -> BoolArray:
 
 
 class ModelRenderer:
-    """Renderer of the trained model from its own cameras, at the size of the training photographs.
-
-    Args:
-        images: undistorted photographs of the same cameras.
-    """
+    """Renderer of the trained model from its own cameras, at the size of its undistorted photographs."""
 
     def __init__(self, trained: TrainedSurvey, images: ImageCache, backend: Rasterizer) -> None:
         self.trained, self.images = trained, images
         self._backend = backend
         self.pinholes = Pinholes(images, trained.sfm.lenses, trained.sparse.lenses)
-        device = torch.device("cuda" if backend.name == "cuda" else "cpu")
-        self._gaussians = trained.gaussians.to(device)
-
-    def prepare_windows(self) -> None:
-        """Sort the Gaussians for windows: a second for a million, which the first window would take otherwise."""
-        _ = self._blocks
+        self._gaussians = trained.gaussians.to(device_of(backend))
 
     @cached_property
-    def _blocks(self) -> SpatialBlocks:
+    def blocks(self) -> SpatialBlocks:
+        """Gaussians sorted for windows: a second for a million, which the first window takes otherwise."""
         return SpatialBlocks(self.trained.gaussians)
 
     def pose(self, index: int) -> ViewPose:
-        """Return the pose of camera `index`."""
         poses = self.trained.poses
         return ViewPose(self.pinholes.of(index), poses.cam_from_model[index], poses.cam_center_in_model[index])
 
     def render(self, view: int | ViewPose, *, depth: bool = False, window: Window | None = None) -> Render:
-        """Return the render of a camera, by its index or from anywhere, without gradients.
-
-        Args:
-            view: index of a camera, or a pose.
-            depth: render depths as well.
-            window: part of the image to render; None: all of it.
-        """
+        """Return the render of a camera, by its index or from anywhere, or of a window of it, without gradients."""
         model, pose = self.trained.model, view if isinstance(view, ViewPose) else self.pose(view)
         matrix = pose_matrix(pose.cam_from_model, pose.center_in_model)
         settings = RasterSettings(model.sh_degree, model.background, depth=depth, window=window)
         gaussians = self._gaussians
         if window is not None:  # A pass over millions of Gaussians takes longer than the window itself.
-            gaussians = self._blocks.shown(matrix, pose.pinhole, settings).to(gaussians.means.device)
+            gaussians = self.blocks.shown(matrix, pose.pinhole, settings).to(gaussians.means.device)
         cam_from_model = torch.as_tensor(matrix, dtype=torch.float32, device=gaussians.means.device)
         with torch.no_grad():
             return self._backend.render(gaussians, cam_from_model, pose.pinhole, settings)
 
     def depth_m(self, view: int | ViewPose, window: Window | None = None) -> FloatArray:
         """Return the depth (H, W) in metres of the surface along the z axis of a camera; 0: no surface."""
-        return np.asarray(_measured(self.render(view, depth=True, window=window)).cpu().numpy())
+        return np.asarray(measured_depth(self.render(view, depth=True, window=window)).cpu().numpy())
 
     def surface(self, index: int) -> tuple[Float32Array, ByteArray]:
         """Return the depth (H, W) of camera `index` as `depth_m` does, and the colours (H, W, 3) of its render."""
         view = self.render(index, depth=True)
         rgb = (255 * view.colour.clamp(0, 1)).round().to(torch.uint8)
-        return _measured(view).cpu().numpy().astype(np.float32), rgb.cpu().numpy()
-
-
-def _measured(view: Render) -> torch.Tensor:
-    assert view.median_depth is not None and view.expected_depth is not None
-    assert view.depth_variance is not None  # of every render with depth
-    return measured_depth(view.median_depth, view.expected_depth, view.depth_variance)
+        return measured_depth(view).cpu().numpy().astype(np.float32), rgb.cpu().numpy()
 
 
 # The trained surface of a simulated flight departs from the true one by less than 0.5 % of the depth at nine of ten
@@ -152,15 +132,12 @@ class SurfaceView:
 
 
 class SurfaceViews:
-    """Depth maps of all training cameras, at the size of the training photographs.
+    """Depth maps of all training cameras, at the photographs' training size; an InputError: the disk is too small.
 
     Args:
         folder: scratch folder, made if missing. It belongs to the maps alone: maps that are there are continued.
         colours: keep the colours of the renders too.
         confirmed: keep only depths where render and photograph agree (`photo_consistent`).
-
-    Raises:
-        InputError: the maps do not fit on the disk.
     """
 
     def __init__(

@@ -63,7 +63,6 @@ class SweepResult:
     """Best plane at each pixel of a view: its depths, by a sweep or its refinement.
 
     Attributes:
-        camera: the view's.
         normals: direction of that plane.
         offset_m: (H, W) refined between planes by a parabola through the neighbouring scores; NaN if no plane lies
             in front of the camera.

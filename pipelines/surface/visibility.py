@@ -305,11 +305,7 @@ class SeenSurface:
 def seen_surface(
     viewpoints: Viewpoints, position_in_geo: FloatArray, voxel_m: float, progress: Progress = SILENT
 ) -> SeenSurface:
-    """Return the depth maps of a reference.
-
-    Args:
-        position_in_geo: (P, 3) points of the reference, one a voxel.
-    """
+    """Return the depth maps of a reference, of points (P, 3) that lie one a voxel."""
     blocks = []
     for _, rows in rows_by_square(position_in_geo, _BLOCK_M):
         part = position_in_geo[rows]

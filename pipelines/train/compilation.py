@@ -25,7 +25,7 @@ from pipelines.splat.losses import photometric_loss
 from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
-from pipelines.surface.agreement import AgreementSettings, agreed_depth
+from pipelines.surface.agreement import agreed_depth
 from pipelines.surface.matching import MatchSettings, StereoView
 from pipelines.surface.sweep import SweepPlanes, plane_sweep
 
@@ -96,4 +96,4 @@ def _match() -> None:
     views = [StereoView(ViewPose(pinhole, _DOWN, np.array([east, 0.0, 10.0])), grey) for east in (0.0, 1.0)]
     planes = [SweepPlanes(np.array([0.0, 0.0, 1.0]), np.linspace(-1, 1, 4))]
     sweeps = [plane_sweep(one, [other], planes, MatchSettings()) for one, other in (views, views[::-1])]
-    agreed_depth(sweeps[0], sweeps[1:], AgreementSettings())
+    agreed_depth(sweeps[0], sweeps[1:])

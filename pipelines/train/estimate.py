@@ -16,7 +16,7 @@ from pipelines.geometry.cameras import Pinhole
 from pipelines.jobs.costs import BLOCK_SECONDS, MEASURED_CORES, SURFACE_FACTOR, iteration_seconds
 from pipelines.splat.memory import USABLE, TrainingSize, fitting_gaussians, free_memory_bytes, predicted_peak_bytes
 from pipelines.splat.rasterizer.backends import chosen_backend
-from pipelines.surface.depth_maps import StereoOptions
+from pipelines.surface.depth_maps import FINE_PX
 from pipelines.survey.block_plan import BlockPlan, PlannedBlock
 from pipelines.survey.options import NOT_IN_BLOCKS
 from pipelines.train.options import PRESETS, TrainOptions
@@ -28,12 +28,7 @@ _PIXELS_EACH = 40
 
 
 def training_size(options: TrainOptions, photographs: int, largest: Pinhole, beside: int = 0) -> TrainingSize:
-    """Return the quantities that determine the memory of a training of so many photographs.
-
-    Args:
-        largest: camera of the largest photograph at training size.
-        beside: number of frozen Gaussians that are rendered too.
-    """
+    """Return what determines the memory of a training at its size, with `beside` frozen Gaussians rendered too."""
     gaussians, cameras = options.effort.max_gaussians + beside, options.refined_cameras(photographs)
     crop, whole_px = Crops(options.crop_size).largest_of(largest), largest.width * largest.height
     return TrainingSize(gaussians, crop, options.sh_degree, cameras, whole_px)
@@ -77,7 +72,6 @@ class TrainingEstimate:
         photo_px: width and height of the largest photograph.
         training_px: width and height at which it is trained.
         crops: number of crops in which it is seen, one at an iteration, when it is not shrunken further.
-        backend: `cpu` or `cuda`.
         seconds: about; None on a GPU, where nothing was measured.
         peak_bytes: predicted peak of the memory.
         free_bytes: memory that is free; None: unknown.
@@ -133,12 +127,9 @@ class TrainingEstimate:
 
 
 def estimate_training(photographs: int, photo_px: tuple[int, int], options: TrainOptions) -> TrainingEstimate:
-    """Return the estimate of a training.
+    """Return the estimate of a training; a BackendUnavailableError names each missing part of `--backend cuda`.
 
     The time is that of the machine of `MEASURED_ON`, divided by the ratio of the threads.
-
-    Raises:
-        BackendUnavailableError: `--backend cuda`, and a part that it needs is missing; names each.
     """
     camera, backend = training_pinhole(photo_px, options), chosen_backend(options.backend)
     free_bytes = free_memory_bytes(torch.device(backend))
@@ -216,5 +207,5 @@ def _seconds(photographs: int, camera: Pinhole, options: TrainOptions) -> float:
 
 
 def _stereo_s(photographs: int, camera: Pinhole) -> float:
-    maps = camera.limited(StereoOptions().fine_px)
+    maps = camera.limited(FINE_PX)
     return photographs * (_STEREO_PHOTOGRAPH_S + _STEREO_MEGAPIXEL_S * maps.width * maps.height / 1e6)

@@ -146,9 +146,7 @@ def fallback_points(
     Each lies where the ray of its pixel meets the surface through the SfM points, z up. Sky has none.
 
     Args:
-        scene, maps: cameras and SfM points; known depths.
         count: limit of the points, which are spread as evenly as the photographs resolve them.
-        seed: of the choice of pixels.
         inside: returns which of points (N, 3) count, as a mask (N,).
     """
     if count < 1:
@@ -292,7 +290,7 @@ class TrainingScene:
 
 
 def initial_gaussians(training: TrainingScene, options: InitialisationOptions, most: int, seed: int) -> Gaussians:
-    """Return the Gaussians that a training starts from, `most` of them at most.
+    """Return at most `most` Gaussians to start from; a DegenerateGeometryError: fewer than two different points.
 
     1. Discs lie on the surface, as dense as the photographs resolve it.
     2. Balls lie at SfM points where no surface is known. On a surface discs are better: an SfM point has no normal,
@@ -301,9 +299,6 @@ def initial_gaussians(training: TrainingScene, options: InitialisationOptions, m
     4. A background plane lies beneath the surface: what photographs do not show is no hole.
     5. Balls lie in the background, as far as the limit leaves room. In a region, the sky is that of the model which
        stands in for the rest: all blocks of a survey then have the same.
-
-    Raises:
-        DegenerateGeometryError: fewer than two different points.
     """
     scene = training.scene
     start = SurfacePoints(scene.point_in_model, scene.sparse.point_rgb, np.full_like(scene.point_in_model, np.nan))

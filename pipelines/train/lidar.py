@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +29,7 @@ from pipelines.surface.depth_maps import DepthMaps
 from pipelines.surface.lidar_cloud import LidarCloud, ScannerTrack, read_cloud
 from pipelines.surface.measured_cloud import CloudReader
 from pipelines.surface.registration import Registration, registration
-from pipelines.surface.visibility import DepthViews
+from pipelines.surface.visibility import DepthViews, Viewpoints
 from pipelines.survey.report_parts import LidarArea, LidarRegistration, LidarReport
 from pipelines.survey.scene import Scene
 from pipelines.survey.survey import Survey
@@ -97,17 +97,11 @@ def compared_lidar(
     seed: int,
     progress: Progress,
 ) -> ComparedLidar:
-    """Return the cloud of the scene, compared with the photographs.
+    """Return the scene's cloud, compared with the photographs; an InputError: it lies elsewhere, or off by 3 σ.
 
     Args:
         options, files, track: of the LiDAR; None: the scanner's track is unknown.
-        maps: of the training views.
-        survey: has the origin of `geo`.
         georeference: initial similarity to `geo`, with covariance.
-        seed, progress: of random choices; shows the points read.
-
-    Raises:
-        InputError: the cloud lies elsewhere, in height or plan, or is shifted beyond 3 σ.
     """
     pixel_m, views, surface = _pixel_size_m(maps), _depth_views(maps), SceneSurface(maps)
     cloud = read_cloud(files, maps.scene, survey, pixel_m, progress=progress, track=track)
@@ -123,14 +117,9 @@ def lidar_surface(
     """Return the surface of stereo and LiDAR, without a shift (3,) of the LiDAR, axes of geo; None: none."""
     cloud = compared.cloud if shift_m is None else compared.cloud.moved(-shift_m)
     judged = verdict(cloud, compared.views, compared.shown, sigma_m=options.lidar_sigma, pixel_m=compared.pixel_m)
-    tally = files.tally
     report = LidarReport(
+        **asdict(files.tally),
         crs=files.crs_names,
-        read=tally.read,
-        noise=tally.noise,
-        withheld=tally.withheld,
-        overlap=tally.overlap,
-        outside=tally.outside,
         points=len(cloud),
         voxel_m=cloud.voxel_m,
         registration=compared.record,
@@ -166,16 +155,9 @@ def _pixel_size_m(maps: DepthMaps) -> float:
 def _depth_views(maps: DepthMaps) -> DepthViews:
     """Return the depth maps of all training views as one set, in `model`."""
     train, poses = [int(index) for index in maps.scene.train], maps.scene.poses
-    cameras = [maps.camera(index) for index in train]
-    depths = [np.asarray(maps.depth(index)).ravel() for index in train]
-    return DepthViews(
-        cam_from_world=poses.cam_from_model[train],
-        center_in_world=poses.cam_center_in_model[train],
-        intrinsics_px=np.array([(camera.fx, camera.fy, camera.cx, camera.cy) for camera in cameras]),
-        size_px=np.array([(camera.width, camera.height) for camera in cameras], dtype=np.int64),
-        start=np.concatenate([[0], np.cumsum([len(depth) for depth in depths])[:-1]]).astype(np.int64),
-        depth_m=np.concatenate(depths),
-    )
+    rotations, centers = poses.cam_from_model[train], poses.cam_center_in_model[train]
+    cameras = Viewpoints(rotations, centers, tuple(map(maps.camera, train)))
+    return DepthViews.of(cameras, np.concatenate([np.asarray(maps.depth(index)).ravel() for index in train]))
 
 
 def registration_of(cloud: LidarCloud, shown: FloatArray, views: DepthViews, seed: int) -> Registration:
@@ -239,7 +221,6 @@ def free_space(cloud: LidarCloud, gone: BoolArray, shown: FloatArray) -> FreeSpa
     """Return the cells that beams have crossed and in which nothing is seen; None: no beam is known.
 
     Args:
-        cloud: with the scanner's places.
         gone: (P,) points inconsistent with the photographs: their beams do not count.
         shown: (S, 3) surface that the photographs show; what stands there now is not free.
     """
@@ -280,7 +261,7 @@ def _checked(
         shift_m=compared.shift_m.tolist(),
         sigma_m=sigma.tolist(),
         sigma_comparison_m=np.sqrt(np.diag(compared.covariance_m2)).tolist(),
-        points=len(compared.matches),
+        points=len(compared.matches.distance_m),
         spread_m=compared.spread_m,
         wall_bias_m=compared.wall_bias_m,
         removed=options.lidar_register,

@@ -20,7 +20,6 @@ import numpy as np
 import torch
 from scipy import ndimage
 from scipy.spatial import cKDTree
-from torch import Tensor
 
 from pipelines.core.types import BoolArray, Float32Array, FloatArray, IntArray, joined_rows, rows_of
 from pipelines.splat.losses import FreeSpace, FreeSpaceLoss, MeasuredPlanes, PlaneAttraction
@@ -29,7 +28,7 @@ from pipelines.surface.depth_maps import DepthMaps
 from pipelines.surface.lidar_cloud import LidarCloud
 from pipelines.surface.registration import UP
 from pipelines.surface.visibility import DepthViews, Support, support
-from pipelines.train.losses import Loss, RenderedView
+from pipelines.train.losses import Loss
 from pipelines.train.options import LidarLoss
 from pipelines.train.surface import SceneSurface, SurfacePoints, spread_evenly
 
@@ -229,7 +228,6 @@ class FusedSurface(SceneSurface):
         maps: depth maps, already built.
         judged: verdict of the photographs on the LiDAR.
         pixel_m: size of a pixel of the depth maps on the surface.
-        loss: losses of the LiDAR.
         free: where its beams met nothing; None: unknown.
     """
 
@@ -330,7 +328,4 @@ class FusedSurface(SceneSurface):
 
 
 def _loss(name: str, weight: float, of: FreeSpaceLoss | PlaneAttraction) -> Loss:
-    def value(view: RenderedView) -> Tensor:
-        return of(view.gaussians, view.stats.visible)
-
-    return Loss(name, value, lambda _iteration: weight)
+    return Loss(name, lambda view: of(view.gaussians, view.stats.visible), lambda _iteration: weight)

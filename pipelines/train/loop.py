@@ -232,12 +232,9 @@ def _metrics_row(trainer: JointTrainer, report: StepReport, seconds: float) -> d
 
 
 def train_in_folder(stage: StageRun, trainer: JointTrainer, options: TrainOptions, done: int = 0) -> TrainingRecord:
-    """Run all remaining iterations of a training, and return its record.
+    """Run a training's remaining iterations, return its record; errors as of `optimise`, or a StorageError.
 
     An interrupted run is resumed. A finished training of fewer iterations, `done`, is extended from its last state.
-
-    Raises:
-        StorageError: a file cannot be written or copied; and the errors of `optimise`.
     """
     iterations, kept = options.effort.iterations, (CHECKPOINT, METRICS)
     earlier = None if stage.resumed else stage.extends

@@ -96,9 +96,7 @@ def training_losses(
 
     Args:
         problem, strategy: have losses of their own: geographic ones, and the penalty of density control.
-        schedule: has the weights.
         rasterizer: for the render of the normals.
-        extent_m: size of the scene.
         confined: whether only pixels of the mask show what is trained.
         measured: losses of a surface that was measured, used if the options have surface losses.
     """

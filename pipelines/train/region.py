@@ -119,7 +119,6 @@ def region_masks(
     """Return the pixels of each view whose surface lies in a region.
 
     Args:
-        solved, images: of all cameras.
         views: (T,) indices of the cameras.
         cell: the region.
         stand_in: whose depth counts where the surface is not known.

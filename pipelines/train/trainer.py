@@ -105,9 +105,6 @@ class JointTrainer:
     followed the cameras, and all views are rendered through that lens until the next read.
 
     Args:
-        optimizer: the Gaussians and their moments.
-        strategy: density control.
-        problem: similarity, cameras and systematic errors, with the geographic losses.
         exposures: of the photographs, optimised as well or frozen; None: all photographs have the same exposure.
         outliers: finds pixels that contradict the model, which do not count; None: all do.
         region: part of the scene that the Gaussians are to show; None: all of it.
@@ -341,15 +338,11 @@ def make_trainer(
     options: TrainOptions,
     exposures: FrozenExposures | None = None,
 ) -> JointTrainer:
-    """Return the trainer with its initial Gaussians, before the first iteration.
+    """Return the trainer with initial Gaussians; a DegenerateGeometryError: fewer than two different points.
 
     Args:
-        training: cameras, photographs and surface.
         problem: the geographic losses, moved to the backend's device.
         exposures: to be frozen; None: those of the training photographs are fitted, if the options say so.
-
-    Raises:
-        DegenerateGeometryError: fewer than two different points to start from.
     """
     effort, device = options.effort, device_of(backend)
     scene, images, surface = training.scene, training.images, training.surface
@@ -386,10 +379,8 @@ def make_finisher(
     """Return a trainer that goes on with trained Gaussians, at a low rate, and neither adds nor removes any.
 
     Args:
-        training: cameras, photographs and region.
         gaussians: on the backend's device.
         problem: freezes the cameras.
-        exposures: to be frozen; None: none.
     """
     device, scene, iterations = device_of(backend), training.scene, options.effort.iterations
     extent_m = scene_extent(scene.poses.cam_center_in_model[scene.train])
@@ -428,11 +419,7 @@ def save_checkpoint(path: Path, state: Mapping[str, Tensor]) -> None:
 
 
 def load_checkpoint(path: Path) -> dict[str, Tensor]:
-    """Return the tensors of a checkpoint by name.
-
-    Raises:
-        InputError: the file cannot be read as a checkpoint.
-    """
+    """Return the tensors of a checkpoint by name; an InputError: the file cannot be read as a checkpoint."""
     try:
         return {name: torch.from_numpy(array) for name, array in read_npz(path).items()}
     except (

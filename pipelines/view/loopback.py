@@ -87,12 +87,7 @@ _DECODER = msgspec.msgpack.Decoder(_Camera | _Click | _Update | _Command)
 
 
 class RefusedError(Exception):
-    """Message that is not let through.
-
-    Args:
-        kind: of the fault: the log has one line a page and kind.
-        reason: the fault in words.
-    """
+    """Message that is not let through, with the kind of its fault: the log has one line a page and kind."""
 
     def __init__(self, kind: str, reason: str) -> None:
         self.kind = kind
@@ -109,11 +104,7 @@ class Doorkeeper:
 
 
 def check_message(raw: object, keeper: Doorkeeper) -> None:
-    """Check a message as a page sent it.
-
-    Raises:
-        RefusedError: the page may not send it.
-    """
+    """Check a message as a page sent it; a RefusedError: the page may not send it."""
     if not isinstance(raw, bytes):
         raise RefusedError("form", "text where viser sends bytes")
     try:
@@ -220,7 +211,6 @@ def _start(port: int, title: str, keeper: Doorkeeper) -> viser.ViserServer:
         """Server that opens no tunnel to the Internet when a page asks for one."""
 
         def request_share_url(self, verbose: bool = True) -> str | None:
-            """Return None."""
             return None
 
     with _checked_connections(keeper), contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner

@@ -93,7 +93,6 @@ class MarkPanel(Panel):
 
     @property
     def point(self) -> MarkedPoint | None:
-        """The chosen point."""
         return next((point for point in self._kept.points if point.name == self._chosen.value), None)
 
     def choose(self, name: str) -> None:
@@ -158,11 +157,7 @@ class MarkPanel(Panel):
                 self._show_points()
 
     def undo(self) -> None:
-        """Undo the last change of marks or points.
-
-        Raises:
-            GeorefError: the change could not be kept, and why.
-        """
+        """Undo the last change of marks or points; a GeorefError: the change could not be kept, and why."""
         with self._lock:
             step = self._kept.history.undo()
             self._show_points(note=f"Undone: {step}." if step else "Nothing to undo.")

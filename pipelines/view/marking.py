@@ -56,7 +56,6 @@ def points_to_mark(survey: Survey, xyz_of: Callable[[tuple[SurveyedPoint, ...]],
     """Return the control and check points of a survey with their marks, also those with too few marks to be used.
 
     Args:
-        survey: has the points.
         xyz_of: returns the coordinates (J, 3) of J points in the CRS.
     """
     to_mark = []
@@ -98,13 +97,10 @@ def appears_in(point_in_geo: FloatArray, trained: TrainedSurvey) -> list[tuple[i
 
 
 def mark_texts(crs: str, points: Sequence[MarkedPoint]) -> dict[str, str]:
-    """Return the surveyed points with their marks as `gcp_list.txt` and `checkpoints.txt`, by name of the file.
+    """Return points with marks as `gcp_list.txt` and `checkpoints.txt`, by file; an InputError: a name has a space.
 
     A point without coordinates or without marks is left out: the format has no place for it. A file without points
     is left out, too.
-
-    Raises:
-        InputError: a name or an image contains a space, which the format cannot hold.
     """
     texts = {}
     for file, is_check in ((CONTROL, False), (CHECK, True)):
@@ -124,11 +120,7 @@ def mark_texts(crs: str, points: Sequence[MarkedPoint]) -> dict[str, str]:
 
 
 class KeptPoint(Product):
-    """Changed point, by its name.
-
-    Attributes:
-        lla: latitude and longitude in degrees, ellipsoidal height in metres; None: as surveyed, or not surveyed.
-    """
+    """Changed point by its name; `lla` is in degrees and ellipsoidal metres; None: as surveyed, or not surveyed."""
 
     point: str = Field(min_length=1)
     lla: Vector3 | None
@@ -157,20 +149,15 @@ class KeptRecords(Product):
 
 
 class KeptMarks:
-    """Points of a workspace with their marks, as surveyed and as changed in its viewers.
+    """Points of a workspace with their marks, as surveyed and changed in its viewers; an InputError: a bad file.
 
     Args:
-        folder: of the files.
-        surveyed: points of the survey.
         lla_of, xyz_of: convert points (N, 3) from the viewer's CRS to latitude, longitude, height, and back.
 
     Attributes:
         points: all points, those of the survey first.
         is_written: whether the files for `--gcp` have all changes.
         history: steps of this viewer that can be undone.
-
-    Raises:
-        InputError: the file cannot be read, or holds no marks of the viewer.
     """
 
     def __init__(
@@ -186,20 +173,12 @@ class KeptMarks:
         self._take(*self._read())
 
     def set_mark(self, point: str, image: str, place_px: tuple[float, float] | None) -> None:
-        """Set the mark of a point in an image, or remove it (None).
-
-        Raises:
-            GeorefError: nothing was changed, and why.
-        """
+        """Set the mark of a point in an image, or remove it (None); a GeorefError: nothing was changed, and why."""
         step = f"{'removal of the mark' if place_px is None else 'mark'} of {point} in {image}"
         self._step({(point, image): KeptMark(point=point, image=image, place_px=place_px)}, step)
 
     def set_point(self, name: str, xyz: tuple[float, float, float] | None, *, is_check: bool) -> None:
-        """Make a point, or change its coordinates in the CRS (None: leave them) and its use.
-
-        Raises:
-            GeorefError: nothing was changed, and why.
-        """
+        """Make a point, or change its place in the CRS (None: not) and use; a GeorefError: nothing was changed."""
         if len(name.split()) != 1:
             raise InputError(
                 "name-with-space", f"Names in {CONTROL} and {CHECK} cannot contain spaces. Rename {name!r}."
@@ -212,11 +191,7 @@ class KeptMarks:
         self._step({(name, None): KeptPoint(point=name, lla=lla, is_check=is_check)}, f"point {name}")
 
     def remove_point(self, name: str) -> None:
-        """Remove a point that was made here, with its marks.
-
-        Raises:
-            GeorefError: nothing was changed, and why.
-        """
+        """Remove a point that was made here, with its marks; a GeorefError: nothing was changed, and why."""
         if name in self._surveyed:
             raise InputError(
                 "point-of-survey",
@@ -225,11 +200,7 @@ class KeptMarks:
         self._step(dict.fromkeys(key for key in self._records if key[0] == name), f"removal of {name}")
 
     def write(self, crs: str) -> list[Path]:
-        """Write the surveyed points with their marks for `--gcp` and `--checkpoints`; return the files written.
-
-        Raises:
-            GeorefError: nothing was written, and why.
-        """
+        """Write points and marks for `--gcp` and `--checkpoints`; return the files. A GeorefError: not written."""
         with changing(self._folder):
             self._take(*self._read())
             texts = {self._folder / name: text for name, text in mark_texts(crs, self.points).items()}

@@ -41,12 +41,7 @@ _BASES: tuple[BaseKind, ...] = get_args(BaseKind)
 
 
 class MeasurePanel(Panel):
-    """Panel of the measurements; `folder` has the saved ones.
-
-    Attributes:
-        kind: dropdown of the kind of the present measurement.
-        points: of the present measurement.
-    """
+    """Panel of the measurements; `folder` has the saved ones."""
 
     def __init__(
         self, server: viser.ViserServer, model: MeasuringModel, overlays: Overlays, folder: Path, model_hash: str
@@ -200,21 +195,13 @@ class MeasurePanel(Panel):
             self._replace("clearing", self._kind, ())
 
     def undo(self) -> None:
-        """Undo the last step: a point, its removal, clearing, saving or deleting.
-
-        Raises:
-            GeorefError: the file of saved measurements could not be changed, and why.
-        """
+        """Undo the last step: a point, its removal, clearing, saving, deleting; a GeorefError: it was not."""
         with self._lock:
             step = self._history.undo()
             self._result.content = self._described(paragraph(f"Undone: {step}." if step else "Nothing to undo."))
 
     def save(self) -> None:
-        """Save the present measurement under its name.
-
-        Raises:
-            GeorefError: it was not saved, and why.
-        """
+        """Save the present measurement under its name; a GeorefError: it was not saved, and why."""
         with self._lock:
             kind, points = self._kind, self.points
             if len(points) < _LEAST[kind]:

@@ -40,9 +40,6 @@ class MeasuringModel:
     """Trained model of a workspace, to measure in.
 
     Attributes:
-        trained: the trained survey.
-        reader: of its surface.
-        target: the CRS of coordinates.
         posterior: covariances of the model; None: none are stated.
         without_sigma: why no σ is stated; empty: it is.
 

@@ -10,6 +10,7 @@ import numpy as np
 from pipelines.adjust.accuracy_grid import AccuracyGrid
 from pipelines.core.types import FloatArray
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
+from pipelines.report.plots.plans import nice_number
 from pipelines.report.plots.style import BLUE, DARK, ORANGE, colours_of
 from pipelines.survey.survey import SurveyedPoint
 from pipelines.survey.trained_survey import TrainedSurvey
@@ -81,7 +82,6 @@ class Overlays:
         return min(met, key=lambda each: each[0])[1] if met else None
 
     def add_cameras(self) -> None:
-        """Draw the cameras."""
         poses, frame = self._trained.poses, self._frame
         if len(self._centers) > _MOST_FRUSTUMS:
             self._scene.add_point_cloud(
@@ -116,7 +116,7 @@ class Overlays:
         """Draw arrows from surveyed to measured places (3,), enlarged so that they are seen; return by how much."""
         longest = max(float(np.linalg.norm(measured - surveyed)) for surveyed, measured in ends_in_geo)
         scale = self._frame.view_from_model.scale
-        enlarged = _round_factor(_LENGTH / max(longest * scale, 1e-12))
+        enlarged = nice_number(max(_LENGTH / max(longest * scale, 1e-12), 1.0))
         ends = [
             (self.place(surveyed), self.place(surveyed + enlarged * (measured - surveyed)))
             for surveyed, measured in ends_in_geo
@@ -178,9 +178,3 @@ def wxyz_of(rotation: FloatArray) -> FloatArray:
 def _rgb(colour: str) -> tuple[int, int, int]:
     """Return the numbers of a colour `#rrggbb`."""
     return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
-
-
-def _round_factor(value: float) -> float:
-    """Return the largest of 1, 2, 5, 10, 20 … that is at most `value`, and at least 1."""
-    power = 10 ** np.floor(np.log10(max(value, 1.0)))
-    return float(max(step * power for step in (1, 2, 5) if step * power <= max(value, 1.0)))

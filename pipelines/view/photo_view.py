@@ -98,12 +98,7 @@ class PhotoView:
         return True
 
     def draw(self, mark: FloatArray | None, expected: FloatArray | None, lines: list[FloatArray]) -> None:
-        """Draw the mark, the expected place, and the epipolar lines.
-
-        Args:
-            mark, expected: directions (3,) in the camera; None: there is none.
-            lines: lines of sight (2, 3) in `model`.
-        """
+        """Draw the mark and the expected place, directions (3,) or None, and epipolar lines (2, 3) in `model`."""
         self._clear()
         if self.camera is None:
             return

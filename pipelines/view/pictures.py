@@ -13,9 +13,9 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import cv2
@@ -114,12 +114,7 @@ def frame_of(trained: TrainedSurvey) -> ViewFrame:
 
 @dataclass(frozen=True)
 class PageView:
-    """Picture of a page.
-
-    Attributes:
-        rgb: (H, W, 3).
-        depth: (H, W) along the camera's z axis, in units of the viewer.
-    """
+    """Picture (H, W, 3) of a page, and depth (H, W) along the camera's z axis, in units of the viewer."""
 
     rgb: ByteArray
     depth: Float32Array
@@ -131,24 +126,10 @@ class Photographs:
     def __init__(self, workspace: Workspace, trained: TrainedSurvey) -> None:
         self._folder = photograph_folder(workspace, trained.survey.image_dir)
         self._trained = trained
-        self._kept: OrderedDict[int, ByteArray] = OrderedDict()
-        self._lock = threading.Lock()
-
-    def full(self, camera: int) -> ByteArray:
-        """Return a photograph (H, W, 3) with its distortion.
-
-        Raises:
-            InputError: it cannot be read, or is not that of the survey.
-        """
-        with self._lock:
-            if camera not in self._kept:
-                self._kept[camera] = self._decoded(camera)
-                while len(self._kept) > _KEPT_PHOTOGRAPHS:
-                    self._kept.popitem(last=False)
-            self._kept.move_to_end(camera)
-            return self._kept[camera]
+        self.full = lru_cache(_KEPT_PHOTOGRAPHS)(self._decoded)
 
     def _decoded(self, camera: int) -> ByteArray:
+        """Return a photograph (H, W, 3) with its distortion; an InputError: unreadable, or not of the survey."""
         name = self._trained.sparse.image_name[camera]
         file = self._folder / name
         sha256 = {image.name: image.sha256 for image in self._trained.survey.images}
@@ -185,9 +166,7 @@ class Painter:
         """
         pose = self._frame.pose(camera, width, height)
         render = self._renderer.render(pose, depth=True)
-        assert render.median_depth is not None and render.expected_depth is not None  # of every render with depth
-        assert render.depth_variance is not None
-        depth = measured_depth(render.median_depth, render.expected_depth, render.depth_variance).cpu().numpy()
+        depth = measured_depth(render).cpu().numpy()
         rgb = (255 * render.colour.clamp(0, 1)).round().byte().cpu().numpy()
         scaled = depth * self._frame.view_from_model.scale
         if blend is not None and blend.share > 0:
@@ -228,7 +207,6 @@ class PictureLoop:
     """Loop of one page, on a thread of its own.
 
     Args:
-        client: the page.
         blend: returns the photograph to blend over the picture, or None.
         drawn: called after each picture at full size.
     """
@@ -250,7 +228,6 @@ class PictureLoop:
         self.changed.set()
 
     def end(self) -> None:
-        """End the loop."""
         self._ended.set()
         self.changed.set()
 

@@ -45,9 +45,6 @@ class MeasuredPoints:
     cov_in_geo: FloatArray | None
     height_m: FloatArray
 
-    def __len__(self) -> int:
-        return len(self.position_in_geo)
-
 
 def distances(points: MeasuredPoints) -> tuple[Quantity, ...]:
     """Return distance in space, horizontal distance and height difference from the first point to the second."""
@@ -154,11 +151,11 @@ def volumes(surface: SampledSurface, base: BasePlane) -> tuple[Quantity, ...]:
     area, area_gradient = _area(surface.corners)
     weights = _base_weights(base, surface.corners.position_in_geo[:, :2], surface.samples[:, :2])
     above = surface.samples[:, 2] - weights @ surface.corners.position_in_geo[:, 2]
-    count = len(above)
-    gradient = np.zeros((len(surface.corners) + len(surface.chosen), 3))
-    gradient[: len(surface.corners), 2] = -area * weights.mean(axis=0)
-    gradient[: len(surface.corners)] += area_gradient * float(above.mean())
-    gradient[len(surface.corners) :, 2] = area / len(surface.chosen)
+    count, corners = len(above), len(surface.corners.position_in_geo)
+    gradient = np.zeros((corners + len(surface.chosen), 3))
+    gradient[:corners, 2] = -area * weights.mean(axis=0)
+    gradient[:corners] += area_gradient * float(above.mean())
+    gradient[corners:, 2] = area / len(surface.chosen)
     of_points = propagated(gradient, surface.cov_in_geo)
     sigma = None
     if of_points is not None:

@@ -84,7 +84,6 @@ class History:
 
 
 def new_id() -> str:
-    """Return the id of a new measurement."""
     return uuid.uuid4().hex
 
 
@@ -128,22 +127,14 @@ class NamedMeasurement(Product):
 
 
 class SavedMeasurements:
-    """Measurements that the viewers of a workspace have saved, in the order of the file.
-
-    Raises:
-        InputError: the file cannot be read, or holds no measurements of the viewer.
-    """
+    """Measurements saved by the viewers of a workspace, in the file's order; errors as of `read_measurements`."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self.all: tuple[NamedMeasurement, ...] = tuple(read_measurements(folder))
 
     def put(self, measurement: NamedMeasurement, row: int | None = None) -> None:
-        """Save a measurement: in the place of the one with its id, else in a row, else as the last one.
-
-        Raises:
-            GeorefError: nothing was saved, and why.
-        """
+        """Save a measurement, in the place of its id, else in a row, else last; a GeorefError: it was not."""
 
         def with_it(found: list[NamedMeasurement]) -> list[NamedMeasurement]:
             ids = [each.id for each in found]
@@ -156,11 +147,7 @@ class SavedMeasurements:
         self._change(with_it)
 
     def remove(self, measurement: NamedMeasurement) -> None:
-        """Remove a measurement.
-
-        Raises:
-            GeorefError: nothing was removed, and why.
-        """
+        """Remove a measurement; a GeorefError: nothing was removed, and why."""
         self._change(lambda found: [each for each in found if each.id != measurement.id])
 
     def _change(self, changed: Callable[[list[NamedMeasurement]], list[NamedMeasurement]]) -> None:
@@ -191,11 +178,7 @@ def _table(measurements: Sequence[NamedMeasurement]) -> str:
 
 
 def read_measurements(folder: Path) -> list[NamedMeasurement]:
-    """Return the saved measurements of a folder; none without a file.
-
-    Raises:
-        InputError: the file cannot be read, or holds no measurements of the viewer; names the feature.
-    """
+    """Return the saved measurements of a folder; none without a file. An InputError names a bad file or feature."""
     path = folder / MEASUREMENTS
     if not path.exists():
         return []

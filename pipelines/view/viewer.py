@@ -81,7 +81,7 @@ class Viewer:
         def prepare_clicks() -> None:
             """Sort the Gaussians after the first picture, so that neither it nor the first click waits."""
             self._first_drawn.wait(_FIRST_S)
-            self._renderer.prepare_windows()
+            _ = self._renderer.blocks
 
         threading.Thread(target=prepare_clicks, daemon=True).start()
         server.on_client_connect(self._connected)
@@ -261,11 +261,7 @@ def _point_errors(model: MeasuringModel, report: EvaluationReport) -> list[tuple
 
 
 def model_stamp(workspace: Workspace) -> tuple[int, ...]:
-    """Return what changes when the model is trained again.
-
-    Raises:
-        MissingProductError: there is no trained model.
-    """
+    """Return what changes when the model is trained again; a MissingProductError: there is no trained model."""
     return tuple(workspace.path(product).stat().st_mtime_ns for product in (MODEL, GAUSSIANS))
 
 
@@ -278,11 +274,7 @@ def serve(
 ) -> None:
     """Serve the viewer of a workspace until `ended` is set.
 
-    Args:
-        workspace: has a trained model.
-        options: of the viewer.
-        ready: called with the address, its key included, when the pages can be opened.
-        ended: ends the viewer.
+    `ready` is called with the address, its key included, when the pages can be opened.
 
     Raises:
         BackendUnavailableError: viser is not installed.

@@ -94,7 +94,7 @@ def test_squares_have_no_seam(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     parts = list(fused_squares(views, GEO_FROM_MODEL, SETTINGS))
     assert len(parts) > 8
     together = np.concatenate([part.position for part in parts])
-    assert len(together) == len(whole)
+    assert len(together) == len(whole.position)
     order = [np.lexsort(np.round(position, 6).T) for position in (together, whole.position)]
     np.testing.assert_allclose(together[order[0]], whole.position[order[1]], atol=1e-9)
 
@@ -124,7 +124,7 @@ def test_what_few_views_show_is_left_out(tmp_path: Path) -> None:
     off_m = np.minimum(np.abs(height), np.abs(height - BOX_M))
     assert (off_m < 1e-3).mean() > 0.995
     nine = FusionSettings(PIXEL_M, 2 * PIXEL_M, 9)
-    assert len(cloud(surface_views(tmp_path / "again"), nine)) == 0
+    assert len(cloud(surface_views(tmp_path / "again"), nine).position) == 0
 
 
 def test_pixel_on_the_ground_is_depth_over_focal_length(tmp_path: Path) -> None:

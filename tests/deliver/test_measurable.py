@@ -65,7 +65,7 @@ def test_discs_replace_gaussians_beside_the_surface_and_no_others() -> None:
     off_m = np.concatenate([np.linspace(-0.24, 0.24, 40), [0.26, -0.3, 1.0, 8.0]])
     before = displaced(off_m, surface)
     after, discs = with_discs(before, surface, GEO_FROM_MODEL, SPACING_M)
-    assert discs == len(surface)
+    assert discs == len(surface.position)
     # All 40 within a spacing of a disc go; the four beyond stay as they are, before the discs.
     assert len(after) == 4 + discs
     torch.testing.assert_close(after.means[:4], before.means[40:])

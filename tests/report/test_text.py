@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipelines.report.page import (
+    FORMS,
     Page,
     count_text,
-    duration_text,
     metres,
     number_text,
     parts_per_million,
@@ -44,7 +44,8 @@ def test_forms() -> None:
     )
     assert (share(0.95), share(0.9754), share(1.0)) == ("95 %", "97.5 %", "100 %")
     assert (count_text(1234567), count_text(None)) == ("1\u2009234\u2009567", "–")
-    assert [duration_text(s) for s in (0.34, 48, 723, 7500)] == ["0.3 s", "48 s", "12 min 3 s", "2 h 5 min"]
+    durations = [FORMS["duration"](s) for s in (0.34, 48, 723, 7500, None)]
+    assert durations == ["0.3 s", "48 s", "12 min 03 s", "2 h 05 min", "–"]
     assert (parts_per_million(9.64e-5), parts_per_million(0.01858)) == ("96.4 ppm", "1.86 %")
 
 

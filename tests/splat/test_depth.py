@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from pipelines.geometry.cameras import Pinhole
+from pipelines.splat.rasterizer.api import Render, ScreenStats
 from pipelines.splat.surface import depth_at, measured_depth
 
 PINHOLE = Pinhole(24, 18, 20.0, 20.0, 12.0, 9.0)
@@ -26,5 +27,6 @@ def test_measured_depth_is_the_mean_where_there_is_but_one_surface() -> None:
     # On one surface; one with haze behind it; haze before it, far off; haze alone.
     expected = torch.tensor([[10.01, 10.05, 7.0, 3.0]])
     sigma = torch.tensor([[0.02, 0.2, 4.0, 2.0]])
-    measured = measured_depth(median, expected, sigma.square())
-    torch.testing.assert_close(measured, torch.tensor([[10.01, 10.0, 10.0, 0.0]]))
+    stats = ScreenStats(torch.empty(0))
+    view = Render(median, median, stats, expected, sigma.square(), median)
+    torch.testing.assert_close(measured_depth(view), torch.tensor([[10.01, 10.0, 10.0, 0.0]]))

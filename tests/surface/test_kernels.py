@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from pipelines.core.types import Float32Array
 from pipelines.geometry.cameras import Pinhole, ViewPose
-from pipelines.surface.agreement import AgreementSettings, agreed_depth
+from pipelines.surface.agreement import FREE, LEAST_SCORE, LEAST_VIEWS, MOST_THROUGH, SAME_STEPS, agreed_depth
 from pipelines.surface.matching import (
     NOISE_VARIANCE,
     UNSEEN,
@@ -65,10 +65,10 @@ def correlation(image: Float32Array, other: Float32Array, settings: MatchSetting
     return np.where(other == 0, UNSEEN, level).astype(np.float32)
 
 
-def agreed_by_numpy(reference: SweepResult, others: list[SweepResult], settings: AgreementSettings) -> np.ndarray:
+def agreed_by_numpy(reference: SweepResult, others: list[SweepResult]) -> np.ndarray:
     """Return the depths (H, W) of `agreed_depth`, from whole arrays."""
     own, rays = reference.depth(), reference.camera.rays()
-    good = (reference.score > settings.least_score) & np.isfinite(own) & (own > 0)
+    good = (reference.score > LEAST_SCORE) & np.isfinite(own) & (own > 0)
     point = reference.camera.center_in_model + np.where(good, own, 1.0)[..., None] * rays
     weight = (reference.normals.offset_per_metre(reference.camera) * reference.sharpness) ** 2
     total, agree, through = np.zeros(own.shape), np.zeros(own.shape), np.zeros(own.shape)
@@ -81,18 +81,18 @@ def agreed_by_numpy(reference: SweepResult, others: list[SweepResult], settings:
         seen = (in_cam[..., 2] > 0) & (row >= 0) & (row < camera.pinhole.height)
         seen &= (column >= 0) & (column < camera.pinhole.width)
         row, column = np.where(seen, row, 0), np.where(seen, column, 0)
-        seen &= sweep.score[row, column] > settings.least_score
+        seen &= sweep.score[row, column] > LEAST_SCORE
         normal = sweep.normals.normal_in_model[row, column]
         offset = (point * normal).sum(axis=-1)
         residual, along = sweep.offset_m[row, column] - offset, (rays * normal).sum(axis=-1)
-        through += seen & (residual / (offset - normal @ camera.center_in_model) > settings.free)
-        near = seen & (np.abs(residual) < settings.steps * sweep.step_m[row, column])
+        through += seen & (residual / (offset - normal @ camera.center_in_model) > FREE)
+        near = seen & (np.abs(residual) < SAME_STEPS * sweep.step_m[row, column])
         near &= np.abs(residual / along) < 0.1 * own
         of_view = np.where(near, (along * sweep.sharpness[row, column]) ** 2, 0.0)
         total += of_view * np.where(near, residual / along, 0.0)
         weight = weight + of_view
         agree += near
-    agreed = good & (agree >= settings.least_views) & (through < settings.most_through * agree)
+    agreed = good & (agree >= LEAST_VIEWS) & (through < MOST_THROUGH * agree)
     return np.where(agreed, own + total / weight, 0.0)
 
 
@@ -138,8 +138,8 @@ def test_agreement_is_that_of_the_plain_version() -> None:
     ring = ring_of_views()
     surfaces = [depth_estimate(ring, index) for index in range(5)]
     others = [surfaces[index] for index in (0, 1, 3, 4)]
-    agreed = agreed_depth(surfaces[2], others, AgreementSettings())
-    plain = agreed_by_numpy(surfaces[2], others, AgreementSettings())
+    agreed = agreed_depth(surfaces[2], others)
+    plain = agreed_by_numpy(surfaces[2], others)
     # Rounding decides for a pixel on the border of a threshold: one in a thousand at the most.
     assert ((agreed > 0) == (plain > 0)).mean() > 0.999
     both = (agreed > 0) & (plain > 0)

@@ -9,13 +9,13 @@ import pytest
 from pipelines.core.types import Float32Array
 from pipelines.geometry.cameras import Pinhole, ViewPose
 from pipelines.surface.agreement import (
-    AgreementSettings,
+    LEAST_SCORE,
     SurfacePrior,
     agreed_depth,
     refine,
     surface_prior,
 )
-from pipelines.surface.depth_maps import StereoOptions
+from pipelines.surface.depth_maps import MATCHING, REFINING
 from pipelines.surface.matching import UNSEEN, MatchSettings, StereoView
 from pipelines.surface.sweep import NormalMap, SweepResult, plane_sweep
 from tests.stereo_scenes import (
@@ -74,7 +74,7 @@ def test_offsets_are_the_inverse_of_depths(fine: list[StereoView]) -> None:
 def test_a_guess_within_reach_is_corrected(fine: list[StereoView], off_m: float) -> None:
     refined = refine(fine[2], neighbours_of(fine, 2), shifted_truth(fine[2].camera, off_m), MatchSettings())
     error = height_error(fine[2].camera, refined.offset_m)[INNER]
-    trusted = refined.score[INNER] > AgreementSettings().least_score
+    trusted = refined.score[INNER] > LEAST_SCORE
     assert trusted.mean() > 0.9
     assert np.median(np.abs(error[trusted])) < TENTH_PX_M / 2  # pixels are half as wide
     np.testing.assert_array_equal(refined.step_m, STEP_M)
@@ -83,7 +83,7 @@ def test_a_guess_within_reach_is_corrected(fine: list[StereoView], off_m: float)
 def test_a_guess_out_of_reach_has_no_score(fine: list[StereoView]) -> None:
     refined = refine(fine[2], neighbours_of(fine, 2), shifted_truth(fine[2].camera, 3.0), MatchSettings())
     # By chance some texture fits itself elsewhere: less than half, and not well.
-    assert (refined.score[INNER] > AgreementSettings().least_score).mean() < 0.25
+    assert (refined.score[INNER] > LEAST_SCORE).mean() < 0.25
     assert (refined.score[INNER] == UNSEEN).any()
 
 
@@ -94,10 +94,10 @@ def test_the_ground_beside_a_roof_is_not_taken_for_roof(fine: list[StereoView], 
     height = level_normals(FINE).offset(camera, depth.astype(np.float32))
     roof = (height > GROUND_M + 3).astype(np.uint8)
     beside = (cv2.dilate(roof, np.ones((9, 9), np.uint8)) > roof)[INNER]
-    agreed = agreed_depth(coarse[2], [coarse[index] for index in (0, 1, 3, 4)], AgreementSettings())
+    agreed = agreed_depth(coarse[2], [coarse[index] for index in (0, 1, 3, 4)])
     refined = refine(fine[2], neighbours_of(fine, 2), surface_prior(coarse[2], agreed, camera), MatchSettings())
     planes = plane_sweep(fine[2], neighbours_of(fine, 2), [LEVEL], MatchSettings())
-    trusted = AgreementSettings().least_score
+    trusted = LEAST_SCORE
     wrong = [
         ((np.abs(height_error(camera, result.offset_m)) > 0.5) & (result.score > trusted))[INNER]
         for result in (refined, planes)
@@ -131,7 +131,7 @@ def test_small_windows_leave_the_foot_of_a_wall_where_it_is() -> None:
     prior = SurfacePrior(normals, offset, np.full(offset.shape, STEP_M, np.float32))
     edge = cv2.morphologyEx(upright.astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((9, 9), np.uint8)) > 0
     wrong = []
-    for settings in (StereoOptions().refining, StereoOptions().matching):
+    for settings in (REFINING, MATCHING):
         refined = refine(view, [other[0] for other in others], prior, settings)
         error = np.abs(normals.depth(view.camera, refined.offset_m) - depth)
         wrong.append(np.median(error[INNER][edge[INNER]]))
@@ -159,7 +159,7 @@ def test_pixels_that_nothing_fits_find_nothing(fine: list[StereoView], coarse: l
     prior = surface_prior(empty, np.zeros((CAMERA.height, CAMERA.width), np.float32), fine[2].camera)
     assert np.isfinite(prior.offset_m).all()
     refined = refine(fine[2], neighbours_of(fine, 2), prior, MatchSettings())
-    assert (refined.score[INNER] > AgreementSettings().least_score).mean() < 0.05
+    assert (refined.score[INNER] > LEAST_SCORE).mean() < 0.05
 
 
 def _nothing_to_see() -> tuple[StereoView, list[StereoView]]:

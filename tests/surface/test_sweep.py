@@ -7,7 +7,7 @@ import pytest
 
 from pipelines.geometry.bundle import Network
 from pipelines.geometry.cameras import ViewPose
-from pipelines.surface.agreement import AgreementSettings, agreed_depth
+from pipelines.surface.agreement import agreed_depth
 from pipelines.surface.matching import MatchSettings, StereoView
 from pipelines.surface.sweep import (
     SweepPlanes,
@@ -49,7 +49,7 @@ def test_sweep_finds_ground_and_roof(ring: list[StereoView]) -> None:
 
 def test_views_that_agree_leave_few_errors(ring: list[StereoView]) -> None:
     surfaces = [depth_estimate(ring, index) for index in range(len(ring))]
-    depth = agreed_depth(surfaces[2], [surfaces[index] for index in (0, 1, 3, 4)], AgreementSettings())
+    depth = agreed_depth(surfaces[2], [surfaces[index] for index in (0, 1, 3, 4)])
     known = depth > 0
     height_error = (depth - true_depth(ring[2].camera)) * np.abs(ring[2].camera.rays()[..., 2])
     alone = np.abs(surfaces[2].depth() - true_depth(ring[2].camera)) > 0.5
@@ -61,7 +61,7 @@ def test_views_that_agree_leave_few_errors(ring: list[StereoView]) -> None:
 
 def test_what_no_other_view_confirms_is_left_out(ring: list[StereoView]) -> None:
     own = depth_estimate(ring, 2)
-    assert not agreed_depth(own, [], AgreementSettings()).any()
+    assert not agreed_depth(own, []).any()
 
 
 def test_a_place_that_views_look_through_is_no_surface(ring: list[StereoView]) -> None:
@@ -76,12 +76,12 @@ def test_a_place_that_views_look_through_is_no_surface(ring: list[StereoView]) -
         return SweepResult(camera, level_normals(), offset, ones, 0.5 * ones, ones)
 
     own, alike, clear = flat(2, 4.0), [flat(2, 4.0), flat(2, 4.0)], [flat(2, 0.0), flat(2, 0.0)]
-    assert (agreed_depth(own, alike, AgreementSettings())[raised] > 0).all()
-    outvoted = agreed_depth(own, alike + clear, AgreementSettings())
+    assert (agreed_depth(own, alike)[raised] > 0).all()
+    outvoted = agreed_depth(own, alike + clear)
     assert not outvoted[raised].any()
     assert (outvoted[45:] > 0).all()
     # Views that see something nearer have it in their way, which says nothing.
-    hidden = agreed_depth(flat(2, 0.0), [*clear, *alike], AgreementSettings())
+    hidden = agreed_depth(flat(2, 0.0), [*clear, *alike])
     assert (hidden > 0).all()
 
 

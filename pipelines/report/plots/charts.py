@@ -42,7 +42,6 @@ class BarChart:
         axis: what the bars measure, with its unit.
         series: by name, heights of the members; None leaves a gap.
         digits: decimals of the figures on the bars.
-        least: where a linear axis begins.
     """
 
     title: str
@@ -50,7 +49,6 @@ class BarChart:
     members: tuple[str, ...]
     series: Mapping[str, Sequence[float | None]]
     digits: int = 3
-    least: float = 0.0
 
 
 def write_bars(path: Path, panels: Sequence[BarChart]) -> None:
@@ -91,7 +89,7 @@ def _scale(axes: Axes, panel: BarChart) -> None:
         axes.yaxis.set_major_formatter("{x:g}")
         axes.set_ylim(min(heights) / 2, max(heights) * 3)
     elif heights:
-        axes.set_ylim(panel.least, panel.least + 1.18 * max(max(heights) - panel.least, 1e-9))
+        axes.set_ylim(0, 1.18 * max(*heights, 1e-9))
 
 
 _MOST_CELLS = 600  # along the longer side of the map
@@ -122,8 +120,6 @@ def write_distance_map(path: Path, place_m: FloatArray, distance_m: FloatArray, 
         vmax=limit_m,
         interpolation="nearest",
     )
-    axes.set_xlim(frame.low[0], frame.high[0])
-    axes.set_ylim(frame.low[1], frame.high[1])
     text = "m; above 0: the model lies before the reference"
     add_scale(figure, image, text, cax=bar_axes(figure, axes), extend="both")
     add_bearings(axes)

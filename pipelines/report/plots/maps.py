@@ -279,11 +279,7 @@ class DrawnArea:
 
 
 def write_lidar_map(path: Path, points_in_geo: FloatArray, areas: Sequence[DrawnArea]) -> None:
-    """Write the map of a cloud (P, 3), drawn by its height, with the areas that have changed, the largest first.
-
-    Raises:
-        OSError: the picture cannot be written.
-    """
+    """Write the map of a cloud (P, 3) by height, with changed areas, the largest first; an OSError: it fails."""
     from matplotlib.collections import PolyCollection
 
     step = max(1, len(points_in_geo) // _MOST_POINTS)

@@ -43,7 +43,6 @@ def residual_field(
         size_px: width and height of the photographs.
         mean_px: (R, C, 2) mean residual of each region, rows from the top; NaN: too few observations.
         rms_px: (R, C) root mean square length.
-        title: above it.
     """
     width, height = size_px
     rows, columns = rms_px.shape

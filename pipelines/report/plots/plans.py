@@ -56,7 +56,6 @@ class PlanFrame:
 
     @property
     def longer_m(self) -> float:
-        """Longer side."""
         return float((self.high - self.low).max())
 
 
@@ -324,7 +323,6 @@ def overlap_plan(count: IntArray, corner_m: FloatArray, cell_m: float, camera_m:
     Args:
         count: (R, C) rows from the south, columns from the west; −1: no scene.
         corner_m: (2,) east and north of the south-western corner.
-        cell_m: side of a cell.
         camera_m: (n, 2) cameras.
     """
     from matplotlib import colormaps
@@ -343,10 +341,7 @@ def overlap_plan(count: IntArray, corner_m: FloatArray, cell_m: float, camera_m:
         extent=(corner_m[0], far[0], corner_m[1], far[1]),
         interpolation="nearest",
     )
-    (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
     axes.scatter(camera_m[:, 0], camera_m[:, 1], s=6, color="white", edgecolors=DARK, linewidths=0.5)
-    axes.set_xlim(west, east)
-    axes.set_ylim(south, north)
     bar = add_scale(figure, image, "photographs that see the cell", cax=bar_axes(figure, axes))
     bar.set_ticks(
         ticks=[(low + high) / 2 for low, high in pairwise(edges)],

@@ -90,10 +90,6 @@ def colours_of(values: FloatArray, low: float, high: float) -> ByteArray:
 
 
 def png_of(figure: Figure) -> bytes:
-    """Return a figure as PNG."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    FigureCanvasAgg(figure)
     data = io.BytesIO()
     figure.savefig(data, format="png", dpi="figure", metadata={"Software": None})
     return data.getvalue()

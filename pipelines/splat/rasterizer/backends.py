@@ -17,12 +17,9 @@ log = logging.getLogger(__name__)
 
 
 def chosen_backend(name: Literal["auto", "cpu", "cuda"]) -> BackendName:
-    """Return the backend that a name stands for, without loading it.
+    """Return the backend that a name stands for, not loaded; a BackendUnavailableError names each missing part.
 
     `auto` stands for cuda if nothing that it needs is missing. If there is a GPU, the log says what is missing.
-
-    Raises:
-        BackendUnavailableError: `cuda`, and a part that it needs is missing; names each missing part.
     """
     if name not in ("auto", *BACKENDS):
         message = f"The rasteriser {name!r} is unknown. Use auto, cpu or cuda."

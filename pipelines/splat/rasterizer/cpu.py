@@ -45,11 +45,7 @@ class CpuRasterizer:
     def render(
         self, gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, settings: RasterSettings
     ) -> Render:
-        """See `Rasterizer.render`.
-
-        Raises:
-            InputError: shapes, dtypes, device or settings that do not fit together.
-        """
+        """See `Rasterizer.render`; an InputError: shapes, dtypes, device or settings that do not fit together."""
         _validate(gaussians, cam_from_model, camera, settings)
         pose = cam_from_model[:3].to(torch.float64)
         center_in_model = -torch.linalg.solve(pose[:, :3], pose[:, 3])
@@ -67,23 +63,21 @@ class CpuRasterizer:
         return Render(colour, alpha, context.stats, expected, variance, median if settings.median else None)
 
 
-def predicted_bytes(
-    count: int, camera: Pinhole, sh_degree: int, *, visible: int | None = None, hits_per_visible: float = 6.0
-) -> int:
+# Tiles (16 × 32 px) that a visible Gaussian touches on average: 3 to 6 in trained models.
+_HITS_PER_VISIBLE = 6.0
+
+
+def predicted_bytes(count: int, camera: Pinhole, sh_degree: int, *, visible: int | None = None) -> int:
     """Return the peak memory in bytes of one render and its backward pass, with gradients, without parameters.
 
     Args:
-        count: number of Gaussians.
-        camera: the image.
         sh_degree: of the stored spherical harmonics.
         visible: number of Gaussians in the image; None: all.
-        hits_per_visible: tiles (16 × 32 px) that a visible Gaussian touches on average: 3 to 6 in trained models,
-            and all tiles of the image if Gaussians are huge.
     """
     gradients = count * (11 + 3 * (sh_degree + 1) ** 2) * 4 + count * 5
     splats = cpu_project.SPLAT_WIDTH + cpu_project.ELLIPSE_WIDTH
     in_view = count if visible is None else visible
-    hits = in_view * hits_per_visible * (16 + 4 * cpu_blend.HIT_GRADIENT_WIDTH)
+    hits = in_view * _HITS_PER_VISIBLE * (16 + 4 * cpu_blend.HIT_GRADIENT_WIDTH)
     # Colour, alpha, Σ w z, Σ w z² and median depth, and the gradients of all but the median.
     images = camera.width * camera.height * 13 * 4
     return int(gradients + in_view * (4 * splats + 48) + hits + images)
@@ -91,29 +85,17 @@ def predicted_bytes(
 
 @dataclass
 class _RenderContext:
-    """State of one render that the forward pass leaves for the backward pass.
-
-    Attributes:
-        camera, settings: of the render.
-        workers: number of threads.
-        background: (3,) float64.
-        view: camera in the form of the kernels.
-        stats: handed out with the render.
-        visible: (M,) rows of the visible Gaussians, ascending.
-        rank: (M,) places of the visible Gaussians in the order of depth.
-        table: (M, SPLAT_WIDTH) splats in the order of depth.
-        lists: hits of the splats on tiles.
-    """
+    """State of one render that the forward pass leaves for the backward pass."""
 
     camera: Pinhole
     settings: RasterSettings
     workers: int = field(default_factory=numba.get_num_threads)
-    background: _Array = field(init=False)
+    background: _Array = field(init=False)  # (3,) float64
     view: cpu_gaussian.View = field(init=False)
     stats: ScreenStats = field(init=False)
-    visible: _Array = field(init=False)
-    rank: _Array = field(init=False)
-    table: _Array = field(init=False)
+    visible: _Array = field(init=False)  # (M,) rows of the visible Gaussians, ascending
+    rank: _Array = field(init=False)  # (M,) their places in the order of depth
+    table: _Array = field(init=False)  # (M, SPLAT_WIDTH) splats in the order of depth
     lists: TileLists = field(init=False)
 
 
@@ -252,7 +234,6 @@ def blend_tiles(
         lists: their hits; `tile_end` is written.
         size: height and width of the image.
         background: (3,) float64.
-        depth: whether depths are wanted.
         workers: number of threads.
     """
     depth_size = size if depth else (0, 0)

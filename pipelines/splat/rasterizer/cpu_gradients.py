@@ -292,7 +292,6 @@ def gaussian_gradients(
             invisible.
         camera: (blocks, CAMERA_WIDTH) each block's share of ∂L/∂ pose and centre, written.
         g_screen: (M, 2) ∂L/∂ screen mean, written.
-        workers: number of threads.
     """
     for worker in prange(workers):
         _gaussian_gradients(

@@ -169,7 +169,6 @@ def project_visible(
         visible: (M,) rows of the Gaussians, ascending.
         rank: (M,) places of the visible Gaussians in the order of depth.
         splats, ellipses: (M, SPLAT_WIDTH), (M, ELLIPSE_WIDTH) by rank, written.
-        workers: number of threads.
     """
     for worker in prange(workers):
         _project_visible(

@@ -40,11 +40,7 @@ _LAST_ROWS = 20
 
 
 def run(stage: StageRun, options: BlockTrainOptions) -> Summary:
-    """Train the block, and return its key figures.
-
-    Raises:
-        DegenerateGeometryError: too few photographs show the block; and the errors of `train.stage.run`.
-    """
+    """Train the block, and return its figures; errors as of `train.stage.run`, or too few photographs show it."""
     backend, workspace = rasterizer(options.backend), stage.workspace
     block = load_json(BlockPlan, workspace.path(BLOCK_PLAN)).block(options.id)
     whole = AdjustedScene.load(workspace, SOLUTION)

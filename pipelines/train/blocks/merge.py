@@ -133,9 +133,7 @@ class SeamViews:
         gaussians = self.model_of(block.id)
         with torch.no_grad():
             view = self._backend.render(gaussians, pose, pinhole, RasterSettings(gaussians.sh_degree, depth=True))
-        assert view.median_depth is not None and view.expected_depth is not None and view.depth_variance is not None
-        measured = measured_depth(view.median_depth, view.expected_depth, view.depth_variance)
-        depth = measured.cpu().double().numpy()
+        depth = measured_depth(view).cpu().double().numpy()
         solid = (view.alpha > _SOLID).cpu().numpy() & (depth > 0)
         points = (pinhole.points_at(depth) - matrix[:3, 3]) @ matrix[:3, :3]
         inside = np.all([one.region.contains(points) for one in pair], axis=0)
@@ -149,11 +147,7 @@ class SeamViews:
 
 
 def merge_blocks(parts: Parts, plan: BlockPlan, folder: Path, progress: Progress) -> Summary:
-    """Write the product of `train` from the trained blocks of a plan, and return its key figures.
-
-    Raises:
-        InputError: a block or the scaffold cannot be read.
-    """
+    """Write the product of `train` from a plan's blocks, and return its key figures; an InputError: unreadable."""
     trainings = [parts.training(block) for block in plan.blocks]
     # The Gaussians of each cell, adapted to those of its neighbours.
     cells = [parts.variant().root / TRAIN_SEAMS.folder / f"{block.id}.ply" for block in plan.blocks]

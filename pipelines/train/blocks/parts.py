@@ -42,11 +42,7 @@ _OF_PLAN = ("preset", "blocks", "block_overlap", "block_memory")
 
 @dataclass(frozen=True)
 class Parts:
-    """Parts of the training of one workspace with given options.
-
-    Raises:
-        InputError: the training is to use LiDAR.
-    """
+    """Parts of the training of one workspace with given options; an InputError: the training is to use LiDAR."""
 
     workspace: Workspace
     options: TrainOptions
@@ -69,19 +65,13 @@ class Parts:
         return chosen_backend(self.options.backend) == "cuda"
 
     def plan(self) -> BlockPlan:
-        """Return the plan.
-
-        Raises:
-            MissingProductError: there is none.
-            InputError: the plan cannot be read.
-        """
+        """Return the plan; a MissingProductError: there is none; an InputError: it cannot be read."""
         path = self.variant().root / BLOCK_PLAN
         if not path.is_file():
             raise MissingProductError(f"{FOLDER}/{BLOCK_PLAN}", f"georef blocks plan {self.workspace.root}")
         return load_json(BlockPlan, path)
 
     def training(self, block: PlannedBlock) -> BlockTraining:
-        """Return the record of a trained block."""
         return load_json(BlockTraining, self.variant(block.id).path(BLOCK_TRAINING))
 
     def flags(self, spec: StageSpec, number: int | None = None) -> dict[str, Any]:
@@ -112,11 +102,7 @@ class Parts:
     def run(
         self, spec: StageSpec, number: int | None = None, *, force: bool = False, progress: Progress = SILENT
     ) -> Outcome:
-        """Run a part, unless it is current and not forced, and return its outcome.
-
-        Raises:
-            GeorefError: the part fails.
-        """
+        """Run a part, unless it is current and not forced, and return its outcome; a GeorefError: it fails."""
         variant = self.variant(number)
         variant.root.mkdir(parents=True, exist_ok=True)
         flags = self.flags(spec, number)

@@ -118,14 +118,11 @@ def cells_of_number(
 def cells_that_fit(
     points: FloatArray, load: FloatArray, fits: Callable[[BlockCell, FloatArray], bool]
 ) -> list[BlockCell]:
-    """Return cells that divide the plane, halved until each fits.
+    """Return cells, at most 4096, that divide the plane, halved until each fits; a DegenerateGeometryError: none.
 
     Args:
         points, load: as of `cells_of_number`.
         fits: returns whether a cell, with its extent (2,) in metres, is small enough.
-
-    Raises:
-        DegenerateGeometryError: a cell that does not fit cannot be cut, or there would be more than 4096.
     """
     waiting, done = [BlockCell()], list[BlockCell]()
     while waiting:
@@ -255,7 +252,6 @@ class _Planner:
         return cells_that_fit(points, load, fits)
 
     def block(self, number: int, cell: BlockCell) -> PlannedBlock:
-        """Return the block of a cell."""
         points = self.surface.point_in_model
         inside = cell.contains(points)
         margin = self.options.block_overlap * extent_of(points[inside], self.surface.surface[inside])

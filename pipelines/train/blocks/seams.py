@@ -44,12 +44,7 @@ _DONE = "done.txt"  # number of trained seams
 
 
 def run(stage: StageRun, options: SeamOptions) -> Summary:
-    """Train all seams, and return their key figures.
-
-    Raises:
-        KeyboardInterrupt: the user asked to stop; the seams that have ended are kept.
-        GeorefError: a product or a photograph cannot be read.
-    """
+    """Train all seams, and return their figures; a KeyboardInterrupt: asked to stop; those that ended are kept."""
     workspace, backend, done = stage.workspace, rasterizer(options.backend), stage.out / _DONE
     plan = load_json(BlockPlan, workspace.path(BLOCK_PLAN))
     solved = AdjustedScene.load(workspace, SOLUTION)

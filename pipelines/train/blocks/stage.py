@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 from pipelines.core.errors import GeorefError, MissingProductError
 from pipelines.core.options import CONFIG_FILE, REQUESTS
@@ -32,8 +31,7 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     plan = train_blocks(parts, stage.progress, force=force, note=note)
     if force or parts.why_missing(TRAIN_SEAMS):
         largest = max(block.peak_bytes for block in plan.blocks)
-        job = Job("seams", ("blocks", "seams"), largest)
-        _run_jobs("seams", [_placed(job, parts, "seams", force=force)], stage.progress, note)
+        _run_jobs("seams", [_job(parts, "seams", ("seams",), largest, force=force)], stage.progress, note)
     return merge_blocks(parts, plan, stage.out, stage.progress)
 
 
@@ -43,8 +41,6 @@ def train_blocks(
     """Bring plan, solution, scaffold and all blocks up to date, and return the plan.
 
     Args:
-        parts, progress: of the training; shows the tasks and jobs.
-        force: start all afresh.
         note: receives how far the work has come, after each block (`2 of 4 blocks`).
 
     Raises:
@@ -57,40 +53,36 @@ def train_blocks(
     log.info("train: %d blocks", len(plan.blocks))
     if force or parts.why_missing(TRAIN_SCAFFOLD):
         least = min(block.peak_bytes for block in plan.blocks)
-        job = Job("scaffold", ("blocks", "scaffold"), least)
-        _run_jobs("scaffold", [_placed(job, parts, "scaffold", force=force)], progress, note)
+        _run_jobs("scaffold", [_job(parts, "scaffold", ("scaffold",), least, force=force)], progress, note)
     jobs = [
-        Job(f"block {block.id}", ("blocks", "train", "--id", str(block.id)), block.peak_bytes)
+        _job(parts, f"block {block.id}", ("train", "--id", str(block.id)), block.peak_bytes, force=force)
         for block in sorted(plan.blocks, key=lambda block: -block.gaussians)  # the largest first
         if force or parts.why_missing(TRAIN_BLOCK, block.id)
     ]
-    _run_jobs("blocks", [_placed(job, parts, job.arguments[-1], force=force) for job in jobs], progress, note)
+    _run_jobs("blocks", jobs, progress, note)
     return plan
 
 
 def require_trained(parts: Parts, plan: BlockPlan) -> None:
-    """Refuse to merge blocks that are not current.
-
-    Raises:
-        MissingProductError: names the first such block, and how to train it.
-    """
+    """Refuse to merge blocks that are not current: a MissingProductError names the first, and how to train it."""
     for block in plan.blocks:
         if parts.why_missing(TRAIN_BLOCK, block.id):
             command = f"georef blocks train {parts.workspace.root} --id {block.id}"
             raise MissingProductError(f"blocks/{block.id}", command)
 
 
-def _placed(job: Job, parts: Parts, place: str, *, force: bool) -> Job:
-    """Return a job with the workspace in its arguments, and `place`, the folder of its product in `blocks/`."""
+def _job(parts: Parts, name: str, arguments: tuple[str, ...], peak_bytes: int, *, force: bool) -> Job:
+    """Return a job of `georef blocks`, whose last argument is the folder of its product in `blocks/`."""
     root, shared = parts.workspace.root.absolute(), parts.variant().root.absolute()
-    command, action, *more = job.arguments
+    (action, *more), place = arguments, arguments[-1]
     read = [root / name for name in (*(spec.folder for spec in UPSTREAM), REQUESTS, CONFIG_FILE)]
     read += [shared / spec.folder for spec in (PLAN_BLOCKS, SOLVE, TRAIN_SCAFFOLD)]
     if place == TRAIN_SEAMS.folder:
         read += [shared / str(block.id) for block in parts.plan().blocks]
-    return replace(
-        job,
-        arguments=(command, action, str(root), *more, *(("--force",) if force else ())),
+    return Job(
+        name,
+        ("blocks", action, str(root), *more, *(("--force",) if force else ())),
+        peak_bytes,
         uses_gpu=parts.on_gpu(),
         folder=root,
         writes=shared / place,

@@ -67,7 +67,6 @@ class TermWeights(torch.nn.Module):
 
     Args:
         dimensions: of the residuals, by the kind of the term.
-        weighting: of the residuals.
         learned: learn the variances; otherwise s = 0.
     """
 
@@ -199,7 +198,7 @@ class GeoProblem(torch.nn.Module):
         return self.control_by_depth is not None and camera in self.control_by_depth.rows
 
     def depth_loss(self, camera: int, depth_m: Tensor, alpha: Tensor, pinhole: Pinhole) -> Tensor | None:
-        """Return λ_gcp L_gcp of one view for control points through the rendered depth; scalar.
+        """Return λ_gcp L_gcp of one view for control points through the rendered depth; None: it has no marks.
 
         - The gradient reaches similarity, camera and Gaussians.
         - Each point has weight 1, whatever the number of its marks.
@@ -207,13 +206,9 @@ class GeoProblem(torch.nn.Module):
         - Marks on a nearly transparent render have weight 0: there is no surface yet.
 
         Args:
-            camera: index of the view.
             depth_m: (H, W) expected depth, metres, differentiable.
             alpha: (H, W) opacity of the render.
             pinhole: intrinsics of these pixels, with the present lens.
-
-        Returns:
-            None if the view has no marks.
         """
         marks, control = self.control_by_depth, self.term(ControlTerm)
         if marks is None or control is None or not self.sees_by_depth(camera):
@@ -263,10 +258,7 @@ def refining_problem(
     With `paper` the lens stays, because plain mean squares compare no lens with the photographs.
 
     Args:
-        adjusted: the adjustment, from which the training starts.
-        measured: the measurements in use.
         points: of `geolocate`, for L_rel; None: L_rel uses the cameras and their fixes.
-        options, seed: weights, further terms, and the random pairs of L_rel.
 
     Raises:
         InputError: `points` belongs to another model.
@@ -356,7 +348,6 @@ class GeographicAdam:
         return state
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
-        """Restore unknowns and moments."""
         for name, parameter in self._problem.learned().items():
             with torch.no_grad():
                 parameter.copy_(state[name])

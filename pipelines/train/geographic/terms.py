@@ -247,7 +247,6 @@ def distance_term(
     fixes. Their purpose is to steady the scale, not to decide it. None: their share of the information is zero.
 
     Args:
-        scene: cameras and points as SfM left them.
         fixes: of the cameras; at least two.
         points, seed: of `geolocate`, None: take the cameras; of the random pairs.
 

@@ -129,7 +129,6 @@ class LearnableSimilarity(torch.nn.Module):
         )
 
     def current(self) -> Similarity:
-        """Return the present similarity."""
         delta = (self.root @ self.y).detach().cpu().numpy()
         return perturbation(delta, self.pivot_in_geo) @ self.base
 
