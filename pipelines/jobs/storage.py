@@ -182,7 +182,7 @@ class Storage:
         except GeorefError:
             raise
         except ImportError as error:
-            raise BackendUnavailableError("missing-extra", f"{self.url} needs a library: {error}.") from error
+            raise BackendUnavailableError("extra-missing", f"{self.url} needs a library: {error}.") from error
         except Exception as error:  # Each library of a store has exceptions of its own.
             raise StorageError(
                 "storage-unreachable", f"{self.url} failed with {type(error).__name__}: {error}."

@@ -139,7 +139,7 @@ def test_links_do_not_lead_out(tmp_path: Path) -> None:
 
 
 def test_faults_of_the_store_are_told() -> None:
-    with refused("missing-extra", BackendUnavailableError) as error:
+    with refused("extra-missing", BackendUnavailableError) as error:
         Storage("dropbox://x").check()
     assert "dropbox" in str(error.value)
     with refused("storage-unreachable", StorageError) as error:
