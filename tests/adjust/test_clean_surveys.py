@@ -11,7 +11,7 @@ from tests.adjusted_scenes import adjusted_model, block
 from tests.scenes import WITH_GCPS, Layout, Noise, session_of, survey_of
 from tests.statements import state
 
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 CONTROL = 8  # ground points of a block before its check points
 RTK, PPK, CONSUMER = (0.02, 0.02, 0.03), (0.05, 0.05, 0.08), (1.5, 1.5, 3.0)
 # They name what nothing checks, and blame no source.

@@ -14,7 +14,7 @@ from tests.scenes import Noise
 from tests.statements import Statement, state
 
 SIGMAS = 3.0
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 
 
 def outcome(

@@ -32,7 +32,7 @@ from tests.bundle_scenes import SIGMA_PX, adjuster, exact_network, noisy, pixels
 from tests.drawn_surveys import missed, rows_of
 from tests.scenes import Measured, Noise, initial_product, material
 
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 IMAGES, MARK_PX, SURVEY_M = 8, 0.3, 0.02
 RTK, CONSUMER = np.array([0.02, 0.02, 0.03]), np.array([1.5, 1.5, 3.0])
 EXACT = exact_network(images=IMAGES)
@@ -267,7 +267,6 @@ def test_slow_descents_end() -> None:
     assert np.isfinite(one_run(1209, setting, adjuster(setting.truth)).error).all()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("profile", PROFILES)
 def test_predicted_accuracy_is_true_for_each_axis(profile: str) -> None:
     setting = PROFILES[profile]

@@ -14,7 +14,7 @@ from pipelines.adjust.init_sim3 import estimate_similarity
 from pipelines.adjust.options import GeolocateOptions, InitSim3Options
 from tests.drawn_surveys import Flight, Receiver, drawn, flight, missed, surveyed
 
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 RTK = Receiver((0.01, 0.01, 0.01), (0.03, 0.03, 0.05))
 CONSUMER = Receiver((2.5, 2.5, 5.0), (2.0, 2.0, 4.0))
 # PPK has the σ of RTK: one profile serves for both.
@@ -42,7 +42,6 @@ def test_sigma_is_true_with_a_common_error_of_the_fixes(profile: str) -> None:
         assert rmse_h_m < 0.015
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("profile", PROFILES)
 def test_sigma_of_four_hundred_cameras_is_true(profile: str) -> None:
     squares, rmse_h_m = normalised(flight(400, 2500), *PROFILES[profile], draws=20)

@@ -53,6 +53,7 @@ def solution() -> Posterior:
     return solved(measured()[1])
 
 
+@pytest.mark.slow
 def test_leaving_out_a_control_point_is_what_solving_again_would_give() -> None:
     _, survey = measured()
     rows = {row.name: row for row in solution().solution.measurements if row.kind == "control point"}

@@ -77,6 +77,7 @@ class Rows(HTMLParser):
             self.rows[-1][-1] += data.strip()
 
 
+@pytest.mark.slow
 def test_a_broken_one_is_told_and_the_others_finish(real_georef: Georef, with_fakes: None, tmp_path: Path) -> None:
     path = write_missions(tmp_path)
     dry = real_georef("batch", path, "--dry-run", "--json")
@@ -116,6 +117,7 @@ def test_a_broken_one_is_told_and_the_others_finish(real_georef: Georef, with_fa
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no process can be sent SIGINT")
+@pytest.mark.slow
 def test_ctrl_c_stops_all_and_the_same_command_goes_on(
     real_georef: Georef, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -148,6 +150,7 @@ def test_ctrl_c_stops_all_and_the_same_command_goes_on(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="pipes end otherwise there")
+@pytest.mark.slow
 def test_a_mission_stops_when_nobody_follows_it(tmp_path: Path) -> None:
     """The batch was killed: its missions save their work and end."""
     photos = fakes.photographs(tmp_path / "photos")

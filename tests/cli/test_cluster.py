@@ -53,6 +53,7 @@ def write_certificate(folder: Path, since: datetime, until: datetime) -> None:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="modes of POSIX")
+@pytest.mark.slow
 def test_strangers_are_refused_by_default(own: Path, tmp_path: Path, port: int) -> None:
     """The scheduler makes a certificate for its user alone, which the user's commands find and a stranger lacks."""
     scheduler = start("cluster", "scheduler", "--listen", f"127.0.0.1:{port}", code=PLAIN)

@@ -59,6 +59,7 @@ def assert_not_run(folder: Path) -> None:
     assert not witness.exists(), f"run: {witness.read_text('utf-8').split()}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", [(), ("-P", "-m", "georef_cli"), ("-m", "georef_cli")], ids=["script", "-P", "-m"])
 def test_jobs(poisoned: Path, way: Sequence[str]) -> None:
     ended = finish(start_in(poisoned, "batch", "missions.toml", "--json", way=way))
@@ -66,6 +67,7 @@ def test_jobs(poisoned: Path, way: Sequence[str]) -> None:
     assert "nowhere [--images]" in ended.document["missions"][0]["failure"], "the job told it"
 
 
+@pytest.mark.slow
 def test_children(poisoned: Path) -> None:
     """COLMAP's, which finds nothing in photographs of noise."""
     ended = finish(start_in(poisoned, "run", "flight", "--images", "photos", "--to", "sfm"))
@@ -73,6 +75,7 @@ def test_children(poisoned: Path) -> None:
     assert ended.code == 1 and "photographs" in ended.err.splitlines()[-1]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 def test_workers_of_a_cluster(poisoned: Path) -> None:
     """A worker is spawned by its nanny, and says that the scheduler knows it."""

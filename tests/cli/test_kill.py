@@ -27,7 +27,10 @@ from pipelines.train.trainer import load_checkpoint
 from tests.cli_runs import Result, finish, start
 from tests.killed import GEOREF, PATIENCE_S, asked, georef
 
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="no process can be sent SIGTERM or SIGKILL")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(sys.platform == "win32", reason="no process can be sent SIGTERM or SIGKILL"),
+]
 
 # The process ends itself by SIGKILL just ahead of a system call: `mkdir <workspace>/sfm.partial`.
 ENDING_ITSELF = """
@@ -109,7 +112,6 @@ def test_stopped_by_the_user_and_resumed(survey: Path, whole: Workspace) -> None
     assert [json.loads(row)["iteration"] for row in rows] == list(range(10, 101, 10))
 
 
-@pytest.mark.slow
 def test_thirty_kills_at_random(survey: Path, whole: Workspace) -> None:
     workspace = Workspace(survey.parent / "soak")
     rng = np.random.default_rng(7)

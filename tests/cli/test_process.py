@@ -99,6 +99,7 @@ def test_signs_that_stdout_lacks_are_escaped() -> None:
     assert rb"[\u2265 1]" in run.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="no process can be sent these")
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGKILL"])
 def test_ended_from_outside_and_completed_after(tmp_path: Path, photos: Path, name: str) -> None:

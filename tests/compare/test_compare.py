@@ -25,7 +25,7 @@ from pipelines.survey.trained_survey import load_trained
 from tests.splat_scenes import RenderedFlight
 
 pytest.importorskip("pycolmap")
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 Compared = tuple[Workspace, Comparison, list[ComparedStage]]
 SHORT = {"iterations": 60, "dense": False, "sh_degree": 0, "log_every": 5, "checkpoint_every": 10}
 # Marks of 0.1 px are 5 cm from 45 m, over 14 rays 1.5 cm; the similarity of 14 fixes adds 1.5 cm and 2.4 cm up.

@@ -90,6 +90,7 @@ def assert_tidy(workspace: Workspace) -> None:
 
 @FORKS
 @pytest.mark.usefixtures("fake_stages")
+@pytest.mark.slow
 class TestKilledAtAnyMoment:
     """Every change of the file system is a kill point: the process dies ahead of each in turn."""
 

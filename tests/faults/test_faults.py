@@ -37,7 +37,10 @@ from tests.scenes import Measured, Noise, make_scene, sparse_model, survey_of, t
 from tests.splat_scenes import RenderedFlight
 from tests.tiny_training import true_gaussians
 
-pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc"),
+]
 STATES_OF_A_FIRST_RUN = ("current", "failed", "interrupted", "missing")
 DISK = r"the disk|No space left|Input/output"
 KINDS: tuple[Kind, ...] = ("full", "failing")

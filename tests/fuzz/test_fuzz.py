@@ -16,7 +16,10 @@ import pytest
 from tests.cli_runs import REPOSITORY
 from tests.fuzz.mutations import mutated
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits of memory and time are those of Linux")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(sys.platform != "linux", reason="limits of memory and time are those of Linux"),
+]
 
 CASES, SLOW_CASES = 200, 10
 

@@ -56,6 +56,7 @@ print(peak() - before)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no resource module")
+@pytest.mark.slow
 def test_prediction_agrees_with_the_measured_peak() -> None:
     root = Path(__file__).parents[2]
     done = subprocess.run(

@@ -36,7 +36,7 @@ from tests.splat_scenes import TRAINING, RenderedFlight, adjust_workspace
 from tests.threads import single_thread
 from tests.trained_workspaces import load_adjustment
 
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 TRAIN = BY_NAME["train"]
 SHORT = {"iterations": 30, "sh_degree": 1, "log_every": 2, "checkpoint_every": 8}
 Pairs = list[tuple[Workspace, Workspace]]

@@ -94,6 +94,7 @@ def corners(model: MeasuringModel, half: float) -> list[SurfacePoint]:
     return [point for point in points if isinstance(point, SurfacePoint)]
 
 
+@pytest.mark.slow
 def test_areas_and_volume_of_the_hill(model: MeasuringModel, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(measuring, "_MOST_SAMPLES", 49)
     square = corners(model, 10.0)

@@ -69,7 +69,14 @@ def test_window_is_a_part_of_the_image(make_scene, leaves, camera, window):
 
 @pytest.mark.usefixtures("one_thread")
 # The last ones reach so far towards the camera that the slopes of their depths are shortened.
-@pytest.mark.parametrize(("degree", "seed", "log_scale"), [(3, 1, -1.0), (1, 2, -1.0), (0, 3, 0.7)])
+@pytest.mark.parametrize(
+    ("degree", "seed", "log_scale"),
+    [
+        (3, 1, -1.0),
+        pytest.param(1, 2, -1.0, marks=pytest.mark.slow),
+        pytest.param(0, 3, 0.7, marks=pytest.mark.slow),
+    ],
+)
 def test_gradcheck(make_scene, degree, seed, log_scale):
     # More than one tile each way, and big Gaussians: rows, columns and tiles all end somewhere within them.
     (gaussians, pose), camera = (
