@@ -7,8 +7,7 @@ import logging
 import math
 import shutil
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -75,16 +74,20 @@ def optimise(trainer: JointTrainer, options: LoopOptions, progress: Progress) ->
         InputError: the checkpoint cannot be read.
     """
     loop, iterations = _Loop(trainer, options), trainer.options.iterations
-    display = _displayed(progress, trainer.iteration, iterations, TimeLeft(trainer.work, iterations))
-    worked, since = math.nan, iterations  # the first iteration compiles kernels
-    with deferred_interrupts() as stop, display as iterated:
+    shown, time_left = trainer.iteration, TimeLeft(trainer.work, iterations)
+    worked, since = math.nan, iterations  # the first iteration is no measure of the others: it loads kernels
+    with deferred_interrupts() as stop, progress.task("training", iterations) as task:
+        task.advance(shown)
         while trainer.iteration < iterations:
             try:
                 row = loop.iterate()
                 if math.isnan(worked):
                     worked, since = time.process_time(), trainer.iteration
-                note = None if row is None else f"{row['psnr']:.1f} dB, {row['gaussians'] / 1000:.0f} k Gaussians"
-                iterated(trainer.iteration, note)
+                    time_left.start(since)
+                if row is not None:
+                    note = f"{row['psnr']:.1f} dB, {row['gaussians'] / 1000:.0f} k Gaussians"
+                    task.advance(max(trainer.iteration - shown, 0), note, time_left.after(trainer.iteration))
+                    shown = max(trainer.iteration, shown)
                 if stop.requested:
                     loop.save()
                     log.warning(
@@ -97,41 +100,6 @@ def optimise(trainer: JointTrainer, options: LoopOptions, progress: Progress) ->
         loop.save()
     each = (time.process_time() - worked) / (iterations - since) if since < iterations else math.nan
     return TrainingRecord(loop.seconds(), loop.recovery, each)
-
-
-@contextmanager
-def _displayed(
-    progress: Progress, begun: int, iterations: int, time_left: TimeLeft
-) -> Iterator[Callable[[int, str | None], None]]:
-    """Show a training of which some iterations were of earlier runs; gives what to call after each iteration.
-
-    The first iteration of a run, in which kernels compile, has a task of its own: its duration is no measure of the
-    others.
-    """
-    first, rest = ExitStack(), ExitStack()
-    shown, training = begun, None
-
-    def iterated(iteration: int, note: str | None) -> None:
-        """Without a note on the training, the display stays as it is."""
-        nonlocal shown, training
-        if training is None:
-            warming_up.advance(1, " ")
-            first.close()
-            training = rest.enter_context(progress.task("training", iterations))
-            training.advance(begun)
-            time_left.start(iteration)
-        if note is not None:
-            training.advance(max(iteration - shown, 0), note, time_left.after(iteration))
-            shown = max(iteration, shown)
-
-    try:
-        if begun < iterations:
-            warming_up = first.enter_context(progress.task("first iteration", 1))
-            warming_up.advance(0, "compiling kernels (a minute, once)")
-        yield iterated
-    finally:
-        rest.close()
-        first.close()
 
 
 class _Loop:
