@@ -413,15 +413,13 @@ def _moved(problem: Problem, state: State, step: tuple[FloatArray, FloatArray], 
 def _slope_of_bundle(problem: Problem, state: State) -> tuple[FloatArray, FloatArray]:
     """Return the slope (6 n,), (L,) of half the cost of the image observations."""
     sums, x, lens = problem.bundle.sums, state.correction.ravel(), state.lens
-    by_poses = problem.poses @ x + sums.cross @ lens + sums.pose_slope
-    return np.asarray(by_poses), np.asarray(sums.cross.T @ x + sums.lens @ lens + sums.lens_slope)
+    return np.asarray(problem.poses @ x + sums.cross @ lens), np.asarray(sums.cross.T @ x + sums.lens @ lens)
 
 
 def cost_at(problem: Problem, state: State, residuals: Residuals) -> float:
     """Return −2 ln likelihood of a state: Cauchy's cost of the residuals, and that of the image observations."""
     by_poses, by_lens = _slope_of_bundle(problem, state)
-    x, sums = state.correction.ravel(), problem.bundle.sums
-    of_bundle = x @ (by_poses + sums.pose_slope) + state.lens @ (by_lens + sums.lens_slope)
+    of_bundle = state.correction.ravel() @ by_poses + state.lens @ by_lens
     return float(of_bundle) + sum(
         float(cauchy_loss((rows**2).sum(axis=1), rows.shape[1]).sum()) for rows in residuals.values()
     )

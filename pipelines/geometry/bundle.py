@@ -156,10 +156,7 @@ _MEAN_WEIGHTED_SQUARE = _HALF_SCALE2 * (1 - _MEAN_WEIGHT)
 
 @dataclass(frozen=True)
 class EliminatedPoints:
-    """Normal equations of n poses and L lens parameters, with the points eliminated.
-
-    Slopes are gradients of half the weighted squares; zero where SfM left the observations at their minimum.
-    """
+    """Normal equations of n poses and L lens parameters, with the points eliminated."""
 
     poses: bsr_matrix  # (6 n, 6 n) sparse, in blocks (6, 6)
     cross: FloatArray  # (6 n, L)
@@ -167,15 +164,14 @@ class EliminatedPoints:
     pose_modes: FloatArray  # (6 n, 7) of the poses on the points' similarity
     lens_modes: FloatArray  # (L, 7) of the lens on it
     modes: FloatArray  # (7, 7) information on it
-    pose_slope: FloatArray  # (6 n,)
-    lens_slope: FloatArray  # (L,)
 
 
 @dataclass(frozen=True)
 class BundleInformation:
     """Information of the image observations on corrections x = (δω, δc) (6 n,) of cameras and ℓ (L,) of the lens.
 
-    The points are eliminated: the observations cost ½ (x, ℓ)ᵀ [poses, cross; crossᵀ, lens] (x, ℓ) + slopeᵀ (x, ℓ).
+    The points are eliminated: the observations, which SfM has left at their minimum, cost
+    ½ (x, ℓ)ᵀ [poses, cross; crossᵀ, lens] (x, ℓ).
     Axes and signs of (δω, δc) are those of `geometry.correction_basis.CorrectionBasis`, the order of ℓ that of
     `geometry.cameras.Lenses`. The points follow cameras and lens; `followed` is their mean similarity, weighted by
     their information.
@@ -185,7 +181,7 @@ class BundleInformation:
         similarity_modes: (6 n, 7) as `geometry.bundle.similarity_modes`.
         unit: (6 n,) corrections that count as one metre at the scene.
         loosest_sigma_m: σ in these units that the prior gives even a camera without observations.
-        sigma_px: σ of an image coordinate, estimated from the residuals, or 1 where each observation has its own.
+        sigma_px: σ of an image coordinate, estimated from the residuals.
     """
 
     sums: EliminatedPoints
@@ -201,8 +197,8 @@ class BundleInformation:
         return np.asarray(-np.linalg.solve(self.sums.modes, cross.T))
 
     @cached_property
-    def lens_elimination(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """How the lens follows the poses (L, 6 n), its information about that (L, L), and the covariance (L, L).
+    def lens_elimination(self) -> tuple[FloatArray, FloatArray]:
+        """How the lens follows the poses (L, 6 n), and its information about that (L, L).
 
         Parameters that no observation reveals have rows of zeros.
         """
@@ -211,11 +207,10 @@ class BundleInformation:
         scale = 1.0 / np.sqrt(diagonal[used])
         block = self.sums.lens[np.ix_(used, used)] * scale[:, None] * scale + 1e-9 * np.eye(len(used))
         follows = np.zeros((len(diagonal), len(self.sums.cross)))
-        information, cov = np.zeros_like(self.sums.lens), np.zeros_like(self.sums.lens)
+        information = np.zeros_like(self.sums.lens)
         follows[used] = -scale[:, None] * np.linalg.solve(block, (self.sums.cross[:, used] * scale).T)
         information[np.ix_(used, used)] = block / scale[:, None] / scale
-        cov[np.ix_(used, used)] = scale[:, None] * np.linalg.solve(block, np.eye(len(used))) * scale
-        return follows, information, cov
+        return follows, information
 
     def turned(self, new_from_old: Similarity, cam_center_in_new: FloatArray) -> BundleInformation:
         """Return the same information in another frame, whose cameras have centres (n, 3)."""
@@ -238,8 +233,6 @@ class BundleInformation:
                 pose_modes=of_poses(sums.pose_modes) @ by_similarity.T,
                 lens_modes=sums.lens_modes @ by_similarity.T,
                 modes=by_similarity @ sums.modes @ by_similarity.T,
-                pose_slope=of_poses(sums.pose_slope),
-                lens_slope=sums.lens_slope,
             ),
             similarity_modes=similarity_modes(cam_center_in_new).reshape(-1, 7),
             unit=self.unit * np.tile([1 / scale] * 3 + [1.0] * 3, count),
@@ -248,23 +241,15 @@ class BundleInformation:
         )
 
 
-def bundle_information(
-    network: Network, *, sigma_px: FloatArray | None = None, at_minimum: bool = True
-) -> BundleInformation:
+def bundle_information(network: Network) -> BundleInformation:
     """Return the information of a bundle on its cameras.
 
-    1. Cauchy's kernel weights the observations, unless their σ are stated.
+    1. Cauchy's kernel weights the observations, whose σ is estimated from the residuals.
     2. Chunks of points are eliminated one after the other, so that memory holds the derivatives of one chunk.
-
-    Args:
-        sigma_px: (M,) stated σ of the observations; None: one σ for all is estimated from the residuals.
-        at_minimum: whether SfM has left the observations at their minimum, so that their slope is zero.
 
     Raises:
         DegenerateGeometryError: fewer observations than unknowns.
     """
-    if sigma_px is not None:
-        sigma_px = sigma_px[has_positive_depth(network)]
     network = with_positive_depths(network)
     n, points, observations = len(network.camera_id), len(network.point_in_world), len(network.obs_point)
     redundancy = 2 * observations - 6 * n - 3 * points
@@ -272,17 +257,12 @@ def bundle_information(
         message = f"{observations} observations do not determine {n} cameras and {points} points."
         raise DegenerateGeometryError("network-undetermined", message)
     typical_m = float(np.median(np.linalg.norm(network.rays(), axis=1)))
-    residual, variance = projection_residuals(network), 1.0
-    if sigma_px is None:
-        length = np.linalg.norm(residual, axis=1)
-        weight = cauchy_weight((length / max(rayleigh_sigma(length), 1e-9)) ** 2, 2)
-        variance = float((weight[:, None] * residual**2).sum() / (_MEAN_WEIGHTED_SQUARE * redundancy))
-        root_weight = np.sqrt(weight / (_MEAN_WEIGHT * variance))
-    else:
-        root_weight = 1.0 / sigma_px
-    sums = eliminate_points(network, root_weight, residual=None if at_minimum else residual)
+    residual = projection_residuals(network)
+    length = np.linalg.norm(residual, axis=1)
+    weight = cauchy_weight((length / max(rayleigh_sigma(length), 1e-9)) ** 2, 2)
+    variance = float((weight[:, None] * residual**2).sum() / (_MEAN_WEIGHTED_SQUARE * redundancy))
     return BundleInformation(
-        sums=sums,
+        sums=eliminate_points(network, np.sqrt(weight / (_MEAN_WEIGHT * variance))),
         similarity_modes=similarity_modes(network.cam_center_in_world).reshape(-1, 7),
         unit=np.tile([1 / typical_m] * 3 + [1.0] * 3, n),  # rotations in metres at the scene, so that units agree
         loosest_sigma_m=_LOOSEST_RELATIVE_SIGMA * typical_m,
@@ -295,8 +275,6 @@ def eliminate_points(
     root_weight: FloatArray,
     surveyed: FloatArray | None = None,
     *,
-    residual: FloatArray | None = None,
-    surveyed_gradient: FloatArray | None = None,
     ridge: float = _RIDGE,
 ) -> EliminatedPoints:
     """Return the normal equations of poses and lens of a network, chunk by chunk of its points.
@@ -305,15 +283,11 @@ def eliminate_points(
         network: N points and M observations, each in front of its camera; at least one.
         root_weight: (M,) inverse σ of the observations, 1/px.
         surveyed: (N, 3, 3) information on the points beyond their observations, 1/m²; None: there is none.
-        residual: (M, 2) pixels, for the slope; None: the slope is zero.
-        surveyed_gradient: (N, 3) gradient of half the squares of `surveyed`, 1/m, for the slope; None: it is zero.
         ridge: added to the information on a point, relative to its trace, for a point that its rays leave open.
     """
     total: EliminatedPoints | None = None
     for part, points, rows in chunks_of_points(network, _CHUNK):
-        known, own_gradient = (None if array is None else array[points] for array in (surveyed, surveyed_gradient))
-        left = None if residual is None else residual[rows]
-        sums = _eliminated(part, root_weight[rows], known, left, own_gradient, ridge=ridge)
+        sums = _eliminated(part, root_weight[rows], None if surveyed is None else surveyed[points], ridge)
         if total is not None:
             sums = EliminatedPoints(*map(operator.add, vars(total).values(), vars(sums).values()))
         total = sums
@@ -341,13 +315,7 @@ def chunks_of_points(network: Network, size: int) -> Iterator[tuple[Network, sli
 
 
 def _eliminated(
-    network: Network,
-    root_weight: FloatArray,
-    surveyed: FloatArray | None,
-    residual: FloatArray | None,
-    surveyed_gradient: FloatArray | None,
-    *,
-    ridge: float,
+    network: Network, root_weight: FloatArray, surveyed: FloatArray | None, ridge: float
 ) -> EliminatedPoints:
     n, points = len(network.camera_id), len(network.point_in_world)
     linearised, scaled = linearise_bundle(network), root_weight[:, None, None]
@@ -368,14 +336,6 @@ def _eliminated(
     intrinsics_point = intrinsics.T @ sparse_jacobian(white, network.obs_point, points)
     by_similarity = jacobian_at(network.point_in_world, network.cam_center_in_world.mean(axis=0))
     moved = (np.swapaxes(root, 1, 2) @ by_similarity).reshape(3 * points, 7)
-    white_residual = np.zeros(2 * len(root_weight))
-    if residual is not None:
-        white_residual = (residual * root_weight[:, None]).ravel()
-        of_points = sparse_jacobian(white, network.obs_point, points)
-        of_gradient = (
-            0.0 if surveyed_gradient is None else np.einsum("nji,nj->ni", inverse_root, surveyed_gradient).ravel()
-        )
-        white_residual = white_residual - of_points @ (of_points.T @ white_residual + of_gradient)
     return EliminatedPoints(
         own - pose_point @ pose_point.T,
         (pose.T @ intrinsics - pose_point.tocsr() @ intrinsics_point.T).toarray(),
@@ -383,8 +343,6 @@ def _eliminated(
         pose_point @ moved,
         intrinsics_point @ moved,
         moved.T @ moved,
-        np.asarray(pose.T @ white_residual),
-        np.asarray(intrinsics.T @ white_residual),
     )
 
 

@@ -31,13 +31,12 @@ class CorrectionBasis:
     `δω` [rad] turns a camera about its centre, axes of the world: `R' = R Exp(−δω)`; `δc` [m] moves the centre.
 
     The lens parameters correlate with the poses. Their error, (L,) in the order of `geometry.cameras.Lenses`, is
-    lens_matrix @ z plus an error with covariance `lens_cov` that is independent of z.
+    lens_matrix @ z plus an error that is independent of z.
     """
 
     matrix: FloatArray  # (n, 6, k), rows (δω, δc), k = 6 n − 7
     sigma_px: float  # σ of an image coordinate, estimated from the residuals
     lens_matrix: FloatArray  # (L, k)
-    lens_cov: FloatArray  # (L, L)
 
 
 def correction_basis(bundle: BundleInformation, *, lens_follows: bool = True) -> CorrectionBasis:
@@ -54,13 +53,13 @@ def correction_basis(bundle: BundleInformation, *, lens_follows: bool = True) ->
         lens_follows: whether the caller moves the lens by `lens_matrix` with the cameras. Otherwise the lens is
             frozen, and the points follow the cameras alone.
     """
-    follows, _, lens_cov = bundle.lens_elimination
+    follows, _ = bundle.lens_elimination
     root, complement = _root(bundle)
     flat = solve_triangular(root, complement.T, lower=True).T * bundle.unit[:, None]
     poses = len(bundle.unit)
     through_lens = bundle.followed[:, poses:] @ follows if lens_follows else 0.0
     held = flat - bundle.similarity_modes @ ((bundle.followed[:, :poses] + through_lens) @ flat)
-    return CorrectionBasis(held.reshape(-1, 6, flat.shape[1]), bundle.sigma_px, follows @ flat, lens_cov)
+    return CorrectionBasis(held.reshape(-1, 6, flat.shape[1]), bundle.sigma_px, follows @ flat)
 
 
 def coordinates_of(bundle: BundleInformation, correction: FloatArray) -> FloatArray:
@@ -71,7 +70,7 @@ def coordinates_of(bundle: BundleInformation, correction: FloatArray) -> FloatAr
 
 def _root(bundle: BundleInformation) -> tuple[FloatArray, FloatArray]:
     """Return the Cholesky root (k, k) of the information orthogonal to the similarities, and its axes (6 n, k)."""
-    follows, lens, _ = bundle.lens_elimination
+    follows, lens = bundle.lens_elimination
     information = bundle.sums.poses.toarray() - follows.T @ lens @ follows
     scaled = (information + information.T) / 2 * bundle.unit[:, None] * bundle.unit
     complement = np.linalg.qr(bundle.similarity_modes / bundle.unit[:, None], mode="complete")[0][:, 7:]
