@@ -24,7 +24,7 @@ Fixes against control points:
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from itertools import compress
 from typing import Literal
 
@@ -32,7 +32,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from pipelines.core.errors import DegenerateGeometryError
-from pipelines.core.types import BoolArray, FloatArray
+from pipelines.core.types import BoolArray, FloatArray, Rows, joined_rows, rows_of
 from pipelines.geometry.rotations import exp_so3, log_so3
 from pipelines.geometry.similarity import Similarity, jacobian_at, perturbation, umeyama
 from pipelines.robust.statistics import (
@@ -59,7 +59,7 @@ _ADVICE = (
 
 
 @dataclass(frozen=True)
-class Correspondences:
+class Correspondences(Rows):
     """n points known in both frames.
 
     Attributes:
@@ -77,19 +77,12 @@ class Correspondences:
     in_geo: FloatArray
     cov_in_geo: FloatArray
 
-    def __len__(self) -> int:
-        return len(self.name)
-
     def part(self, chosen: BoolArray) -> Correspondences:
         """Return the correspondences that a mask (n,) selects."""
-        arrays = (getattr(self, each.name)[chosen] for each in fields(self)[1:])
-        return Correspondences(tuple(compress(self.name, chosen)), *arrays)
+        return replace(rows_of(self, chosen), name=tuple(compress(self.name, chosen)))
 
     def joined(self, other: Correspondences) -> Correspondences:
-        arrays = (
-            np.concatenate([getattr(self, each.name), getattr(other, each.name)]) for each in fields(self)[1:]
-        )
-        return Correspondences(self.name + other.name, *arrays)
+        return replace(joined_rows([self, other]), name=self.name + other.name)
 
 
 @dataclass(frozen=True)
@@ -296,18 +289,14 @@ def _excess(data: Correspondences, state: SimilarityState, members: BoolArray, r
 
 @dataclass(frozen=True)
 class Alignment:
-    """Similarity, with the layout that determines it and the attitude in use.
-
-    The layout is that of the correspondences used; "line" if the mean of the attitudes resolved the rotation.
-    """
+    """Similarity, with the layout of the correspondences used; "line" if the attitudes resolved the rotation."""
 
     solution: AdjustedSimilarity
     layout: Literal["volume", "plane", "line"]
-    attitude: RotationPrior | None
 
     @property
     def attitude_used(self) -> bool:
-        return self.attitude is not None
+        return self.layout == "line"
 
     @property
     def geo_from_local(self) -> Similarity:
@@ -346,7 +335,7 @@ def align(data: Correspondences, rng: np.random.Generator, *, attitude: Rotation
     # A bias of the fixes costs as much as an outlier. Where both explain a single control point, rounding must not
     # decide: it is the outlier.
     best = min(firm, key=lambda one: one.cost + 1.001 * OUTLIER_GATE * (one.state.fix_bias_in_geo is not None))
-    return Alignment(best, "line" if prior else layout_of(data.in_local[best.state.inlier]), prior)
+    return Alignment(best, "line" if prior else layout_of(data.in_local[best.state.inlier]))
 
 
 def layout_of(positions: FloatArray) -> Literal["volume", "plane"]:

@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pipelines.adjust.alignment import AdjustedSimilarity, Alignment, Correspondences, RotationPrior, align
+from pipelines.adjust.alignment import AdjustedSimilarity, Alignment, Correspondences, align
 from pipelines.adjust.inconsistencies import cautions_of, marks_that_do_not_meet, mistake_in_marks, unadjustable
 from pipelines.adjust.joint import JointAdjustment, Start, adjust_jointly, component_of, in_own_frame
 from pipelines.adjust.measurements import (
@@ -47,11 +47,10 @@ from pipelines.core.sentences import listed
 from pipelines.core.stages import ADJUSTMENT, POINTS, SIM3, SIM3_POSTERIOR, SPARSE
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.formats.colmap import read_sparse
-from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.geometry.similarity import SimilarityRecord
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.robust.statistics import residual_stats
-from pipelines.survey.adjustment import AttitudeRecord, GeolocatedPoints, InitialSimilarity
+from pipelines.survey.adjustment import GeolocatedPoints, InitialSimilarity
 from pipelines.survey.calibrated import load_survey
 from pipelines.survey.scene import initial_scene
 from pipelines.survey.survey import Survey
@@ -251,16 +250,7 @@ def _aligned_product(
         condition_number=solution.condition_number,
         layout=alignment.layout,
         attitude_used=alignment.attitude_used,
-        attitude=_attitude(alignment.attitude),
     )
-
-
-def _attitude(prior: RotationPrior | None) -> AttitudeRecord | None:
-    if prior is None:
-        return None
-    x, y, z, w = quat_xyzw_from_matrix(prior.rotation).tolist()
-    first, second, third = (tuple(row) for row in prior.cov_rad2.tolist())
-    return AttitudeRecord(quat_xyzw=(x, y, z, w), cov_rad2=(first, second, third))
 
 
 def _starts(data: Correspondences, aligned: InitialSimilarity, seed: int) -> Iterator[Start]:

@@ -237,7 +237,7 @@ def _marks(survey: Survey, scene: Scene) -> list[VarianceFactor]:
     """Test the σ of the control points' marks: how well their rays meet in the SfM model."""
     rays = mark_rays(survey.control_points, scene.sparse)
     rays = rays.of_points(rays.marks_of_point >= 2)
-    if not len(rays):
+    if not len(rays.point):
         return []
     poses = scene.poses
     solved = intersect_marks(rays, poses.cam_from_model, poses.cam_center_in_model, RayErrors(_EXACT, _EXACT))

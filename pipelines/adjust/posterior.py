@@ -19,7 +19,7 @@ from pipelines.adjust.system import NormalMatrix
 from pipelines.core.errors import InputError
 from pipelines.core.files import read_npz
 from pipelines.core.products import save_npz
-from pipelines.core.types import FloatArray, IntArray
+from pipelines.core.types import FloatArray, IntArray, rows_of
 from pipelines.geometry.bundle import (
     Network,
     has_positive_depth,
@@ -105,7 +105,7 @@ class Posterior:
 
         NaN for a point that is NaN, or that its marks do not determine.
         """
-        rays = rays.part(np.flatnonzero(np.isfinite(point_in_geo[rays.point]).all(axis=1)))
+        rays = rows_of(rays, np.flatnonzero(np.isfinite(point_in_geo[rays.point]).all(axis=1)))
         return self._intersected(np.nan_to_num(point_in_geo), rays.point, rays.camera, rays.sigma_px)
 
     def jointly_of_marked_points(self, point_in_geo: FloatArray, rays: MarkRays) -> FloatArray:

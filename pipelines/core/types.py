@@ -28,6 +28,19 @@ Row7 = tuple[float, float, float, float, float, float, float]
 RecordT = TypeVar("RecordT")
 
 
+def vector3(values: FloatArray) -> Vector3:
+    """Return an array (3,) as a tuple of numbers."""
+    x, y, z = values.tolist()
+    return x, y, z
+
+
+class Rows:
+    """Base of dataclasses of arrays, and as long as the first of these."""
+
+    def __len__(self) -> int:
+        return len(next(iter(vars(self).values())))
+
+
 def rows_of(record: RecordT, rows: IntArray | BoolArray) -> RecordT:
     """Return the same dataclass of arrays (P, …), with some of their rows; what is no array stays."""
     arrays = {name: value[rows] for name, value in vars(record).items() if isinstance(value, np.ndarray)}

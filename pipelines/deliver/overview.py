@@ -16,10 +16,10 @@ from pipelines.core.figures import Headline
 from pipelines.core.products import Remark, load_json
 from pipelines.core.stages import BY_NAME, DELIVERABLES, GAUSSIANS, MODEL, REPORT, StageSpec
 from pipelines.core.staleness import StageState, cautions_by_stage, status
-from pipelines.core.types import FloatArray, Vector3
+from pipelines.core.types import FloatArray, Vector3, vector3
 from pipelines.core.workspace import Workspace
 from pipelines.deliver.options import DESCRIPTIONS
-from pipelines.deliver.placement import place, vector3
+from pipelines.deliver.placement import place
 from pipelines.formats.splat_ply import read_centres
 from pipelines.formats.vector_files import Json, feature, polygon
 from pipelines.geodesy.enu import ecef_from_enu, lla_from_ecef

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from pipelines.core.errors import InputError
 from pipelines.core.figures import Headline
 from pipelines.core.products import Remark, is_checked
-from pipelines.core.types import FloatArray, Quaternion, Row7, Vector3
+from pipelines.core.types import FloatArray, Quaternion, Row7, vector3
 from pipelines.formats.georef_sidecar import GeoreferenceSigma, GeorefSidecar, SceneSigma, georeference_sigma
 from pipelines.geodesy.crs import ECEF, parse_crs
 from pipelines.geodesy.enu import (
@@ -148,12 +148,6 @@ def _turned(covariance: FloatArray, to_from_from: FloatArray) -> FloatArray:
 def _row(values: FloatArray) -> Row7:
     s, rx, ry, rz, x, y, z = values.tolist()
     return s, rx, ry, rz, x, y, z
-
-
-def vector3(values: FloatArray) -> Vector3:
-    """Return an array (3,) as numbers for a file."""
-    x, y, z = values.tolist()
-    return x, y, z
 
 
 def scene_sigma(counts: str, horizontal_m: FloatArray, vertical_m: FloatArray) -> SceneSigma:

@@ -14,10 +14,10 @@ from scipy.special import expit
 from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.products import load_json
 from pipelines.core.stages import BLOCK_RECORD, GAUSSIANS, MODEL
-from pipelines.core.types import BoolArray, Float32Array
+from pipelines.core.types import BoolArray, Float32Array, vector3
 from pipelines.core.workspace import Workspace
 from pipelines.deliver.options import SplatOptions, WebSplatOptions
-from pipelines.deliver.placement import Placement, place, vector3
+from pipelines.deliver.placement import Placement, place
 from pipelines.formats.splat_ply import SplatArrays, read_centres, read_logit_opacities
 from pipelines.splat.gaussians import Gaussians, read_gaussians, transformed
 from pipelines.splat.sh import coefficient_count

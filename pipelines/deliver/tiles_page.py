@@ -26,8 +26,8 @@ from pipelines.core.files import replace_file
 from pipelines.core.products import Product
 from pipelines.core.sentences import printable
 from pipelines.core.stages import TILES
-from pipelines.core.types import Float32Array, FloatArray, Vector3
-from pipelines.deliver.placement import Placement, vector3
+from pipelines.core.types import Float32Array, FloatArray, Vector3, vector3
+from pipelines.deliver.placement import Placement
 from pipelines.geodesy.crs import PointCrs
 from pipelines.geodesy.enu import (
     SEMI_MAJOR_M,

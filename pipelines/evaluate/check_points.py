@@ -57,16 +57,6 @@ def check_point_errors(measured: RemeasuredPoints, area_km2: float | None) -> Ch
     return CheckPointErrors(**_figures(measured, assessment), asprs=assessment.asprs)
 
 
-def cross_validation_errors(measured: RemeasuredPoints) -> CrossValidation:
-    """Return the report's section on control points, each measured by a solution without that point.
-
-    The section states no class, because control points are not check points.
-    """
-    assessment = _assess(measured)
-    impossible = "no control point can be spared, or none entered the adjustment"
-    return CrossValidation(**_figures(measured, assessment), reason=None if assessment.stats.count else impossible)
-
-
 def _residuals(measured: RemeasuredPoints) -> tuple[PointResidual, ...]:
     residual = _by_axis(measured.error_in_geo)
     return tuple(
@@ -158,7 +148,7 @@ def check_points_on_surface(renderer: ModelRenderer, progress: Progress) -> Chec
     trained = renderer.trained
     points, rays = trained.survey.check_points, mark_rays(trained.survey.check_points, trained.sparse)
     maps: list[DepthMap] = []
-    with progress.task("depth at marks", len(rays)) as task:
+    with progress.task("depth at marks", len(rays.point)) as task:
         for camera, xy in zip(rays.camera, rays.xy, strict=True):
             maps.append(depth_around(renderer, int(camera), xy))
             task.advance()
@@ -180,8 +170,10 @@ def cross_validate(solved: SolvedSurvey) -> CrossValidation:
         if row is not None and row.left_out_error_m is not None and row.left_out_cov_m2 is not None:
             error[index] = row.left_out_error_m
             cov[index] = np.array(row.left_out_cov_m2) - np.array(point.cov_in_geo)
-    rays = mark_rays(points, solved.sparse).marks_of_point
-    return cross_validation_errors(RemeasuredPoints(points, error, rays, cov))
+    measured = RemeasuredPoints(points, error, mark_rays(points, solved.sparse).marks_of_point, cov)
+    assessment = _assess(measured)  # without a class, because control points are not check points
+    impossible = "no control point can be spared, or none entered the adjustment"
+    return CrossValidation(**_figures(measured, assessment), reason=None if assessment.stats.count else impossible)
 
 
 def _compared(

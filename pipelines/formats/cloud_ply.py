@@ -17,12 +17,12 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 
 from pipelines.core.errors import InputError
-from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray
+from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, Rows
 from pipelines.formats.splat_ply import PLY_TYPES, ply_header
 
 
 @dataclass(frozen=True)
-class CloudChunk:
+class CloudChunk(Rows):
     """P points of a file.
 
     Attributes:
@@ -38,9 +38,6 @@ class CloudChunk:
     overlap: BoolArray
     withheld: BoolArray
     gps_time_s: FloatArray | None
-
-    def __len__(self) -> int:
-        return len(self.position)
 
 
 class CloudFile(Protocol):
@@ -147,7 +144,7 @@ def _vertices(path: Path, lines: list[list[str]]) -> tuple[int, list[tuple[str, 
 
 
 @dataclass(frozen=True)
-class CloudPoints:
+class CloudPoints(Rows):
     """P points in a CRS.
 
     Attributes:
@@ -171,9 +168,6 @@ class CloudPoints:
     def sigma_v_m(self) -> Float32Array:
         """Vertical σ (P,) in metres; NaN: unknown."""
         return np.asarray(np.sqrt(self.cov_m2[:, 2, 2]))
-
-    def __len__(self) -> int:
-        return len(self.position)
 
 
 _VERTEX = [

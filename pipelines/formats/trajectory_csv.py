@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.core.errors import InputError
-from pipelines.core.types import BoolArray, FloatArray, IntArray
+from pipelines.core.types import BoolArray, FloatArray, IntArray, rows_of
 from pipelines.formats.tables import (
     Row,
     Table,
@@ -73,16 +73,8 @@ class PoseTable:
 
     def take(self, rows: IntArray | BoolArray) -> PoseTable:
         """Return the rows of an index (M,) or mask (N,)."""
-        return replace(
-            self,
-            lines=self.lines[rows],
-            names=None if self.names is None else tuple(np.array(self.names, dtype=object)[rows]),
-            time_s=None if self.time_s is None else self.time_s[rows],
-            xyz=self.xyz[rows],
-            quat_xyzw=None if self.quat_xyzw is None else self.quat_xyzw[rows],
-            sigma_enu_m=None if self.sigma_enu_m is None else self.sigma_enu_m[rows],
-            receiver=None if self.receiver is None else self.receiver[rows],
-        )
+        names = None if self.names is None else tuple(np.array(self.names, dtype=object)[rows])
+        return replace(rows_of(self, rows), names=names)
 
 
 def complete(values: FloatArray) -> BoolArray:

@@ -18,14 +18,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pipelines.core.types import BoolArray, FloatArray, IntArray
+from pipelines.core.types import BoolArray, FloatArray, IntArray, Rows
 from pipelines.geometry.rotations import ENU_FROM_NED, exp_so3, geo_from_cam, log_so3
 
 _SAME_TIME_S = 1e-3
 
 
 @dataclass(frozen=True)
-class Trajectory:
+class Trajectory(Rows):
     """Samples of a motion on one clock; what was not recorded is NaN.
 
     Positions are Cartesian: degrees jump at the date line. Rotations turn axes of the moving body into the axes of
@@ -68,9 +68,6 @@ class Trajectory:
             np.full(count, np.nan) if sigma_deg is None else sigma_deg,
             max_gap_s,
         )
-
-    def __len__(self) -> int:
-        return len(self.time_s)
 
     def covers(self, time_s: FloatArray) -> BoolArray:
         """Return for which times (n,) there is a value, by rules 1 and 2."""

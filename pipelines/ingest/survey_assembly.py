@@ -11,10 +11,9 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from pipelines.core.errors import InputError
-from pipelines.core.types import FloatArray, IntArray, Matrix3, Vector3
+from pipelines.core.types import FloatArray, IntArray, Matrix3, vector3
 from pipelines.geodesy.enu import (
     Origin,
     ecef_from_lla,
@@ -182,7 +181,7 @@ def _surveyed(points: Sequence[GroundPoint], origin: Origin, options: IngestOpti
     return tuple(
         SurveyedPoint(
             name=point.name,
-            position_in_geo=_vector(position[row]),
+            position_in_geo=vector3(position[row]),
             cov_in_geo=_matrix(covariance[row]),
             marks=point.marks,
             land_cover="vegetated" if point.name in options.vegetated else "open",
@@ -196,7 +195,7 @@ def _fixes(poses: ImagePoses, session_of: IntArray, origin: Origin) -> list[Fix 
     covariance = _turned(poses.sigma_enu_m, poses.position_in_ecef, origin)
     return [
         Fix(
-            position_in_geo=_vector(position[row]),
+            position_in_geo=vector3(position[row]),
             cov_in_geo=_matrix(covariance[row]),
             source=poses.source,
             sigma_source=poses.sigma_source[row],
@@ -234,13 +233,8 @@ def _attitudes(poses: ImagePoses, origin: Origin, options: IngestOptions) -> lis
     return attitudes
 
 
-def _vector(values: ArrayLike) -> Vector3:
-    x, y, z = (float(value) for value in np.asarray(values))
-    return (x, y, z)
-
-
 def _matrix(values: FloatArray) -> Matrix3:
-    return (_vector(values[0]), _vector(values[1]), _vector(values[2]))
+    return (vector3(values[0]), vector3(values[1]), vector3(values[2]))
 
 
 def fix_sessions(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pipelines.core.errors import InputError, MissingProductError
 from pipelines.core.products import ArrayProduct, load_json
 from pipelines.core.stages import RIG, SURVEY, TRACK
-from pipelines.core.types import BoolArray, FloatArray
+from pipelines.core.types import BoolArray, FloatArray, vector3
 from pipelines.core.workspace import Workspace
 from pipelines.geometry.rotations import exp_so3, matrix_from_quat_xyzw, quat_xyzw_from_matrix
 from pipelines.geometry.trajectory import Rig, Trajectory, with_rig
@@ -239,8 +239,7 @@ def _filled(values: list[ValueT | None], time_s: FloatArray) -> list[ValueT | No
 def _fix(like: Fix | None, center: FloatArray) -> Fix | None:
     if like is None or not np.isfinite(center).all():
         return None
-    x, y, z = (float(value) for value in center)
-    return like.model_copy(update={"position_in_geo": (x, y, z)})
+    return like.model_copy(update={"position_in_geo": vector3(center)})
 
 
 def _attitude(like: Attitude | None, geo_from_cam: FloatArray) -> Attitude | None:

@@ -266,7 +266,6 @@ def _sidecar(folder: Path) -> None:
 def _read_sidecar(folder: Path) -> None:
     sidecar = load_json(GeorefSidecar, sidecar_path(folder / "a.ply"))
     sidecar.ecef_from_file()
-    sidecar.covariance_at([[1.0, 2.0, 3.0]])
 
 
 def _products(folder: Path) -> None:
