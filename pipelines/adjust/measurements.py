@@ -222,7 +222,6 @@ def problem_of(
     """Return the problem of all cameras under the survey's measurements.
 
     Args:
-        scene: cameras and points as SfM left them.
         survey: the measurements in use, with the variance factors in their covariances.
         estimate: further systematic errors to estimate, beside the common error of the fixes.
         with_attitudes: whether the attitudes take part, where positions leave the rotation open.

@@ -70,7 +70,7 @@ def assess(
         error_in_geo: (N, 3) metres.
         cov_survey: (N, 3, 3) m², of the surveyed positions.
         vegetated: (N,) mask of the points under vegetation; None: none is.
-        area_km2: area of the project; None: not known, and taken for a small one.
+        area_km2: of the project; None: not known, and taken for a small one.
     """
     error = np.asarray(error_in_geo, dtype=np.float64).reshape(-1, 3)
     variance = np.diagonal(np.asarray(cov_survey, dtype=np.float64).reshape(-1, 3, 3), axis1=1, axis2=2)

@@ -49,15 +49,10 @@ def cautions_of_prediction(
 def chi2_caution(
     names: tuple[str, ...], error: FloatArray, cov: FloatArray, blunders: frozenset[str] = frozenset()
 ) -> Remark | None:
-    """Return a caution if the errors of J points are outside the 99 % range that their covariance allows.
+    """Return a caution if errors (3 J,) are outside the 99 % range that their covariance (3 J, 3 J) allows.
 
-    The points share errors, so the test takes their joint covariance: eᵀ C⁻¹ e is χ² with 3 J degrees of freedom.
-
-    Args:
-        names: of the points.
-        error: (3 J,) metres, by point and axis.
-        cov: (3 J, 3 J) m², of the prediction and the survey.
-        blunders: names of the points that are blunders.
+    The points share errors, so the test takes their joint covariance, of prediction and survey: eᵀ C⁻¹ e is χ² with
+    3 J degrees of freedom.
     """
     if len(names) < _LEAST_POINTS:
         return None

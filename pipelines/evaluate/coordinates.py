@@ -103,9 +103,7 @@ def write_point_table(path: Path, report: EvaluationReport, survey: Survey) -> N
 def write_camera_sigma(path: Path, names: Sequence[str], cov: FloatArray) -> None:
     """Write one line for each camera: σ of its position and of its rotations, along east, north and up.
 
-    Args:
-        names: n photographs.
-        cov: (n, 6, 6) of (δθ [rad], δc [m]).
+    The covariance (n, 6, 6) is of (δθ [rad], δc [m]).
     """
     sigma = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
     header = ("name", *(f"sigma_{axis}_m" for axis in "enu"), *(f"sigma_rotation_{axis}_deg" for axis in "enu"))

@@ -90,10 +90,8 @@ def compare_with_reference(
 ) -> ComparedReference:
     """Return the comparison of a trained survey with a reference.
 
-    Args:
-        grid: predicted σ of the georeference; None: not known.
-        options: of the stage, with `reference`.
-        scratch: folder for depth maps and sorted points; removed at the end.
+    Without `grid`, the σ of the georeference is not known. The folder `scratch` holds depth maps and sorted points,
+    and is removed at the end.
 
     Raises:
         InputError: a damaged file, a missing grid, a reference of another place, or no room on the disk.

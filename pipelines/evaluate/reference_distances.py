@@ -35,17 +35,10 @@ def m3c2(
     radius_m: float,
     reach_m: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the distances of two clouds at C core points, and their σ (C,) from the roughness of both clouds.
+    """Return the distances of two clouds at core points (C, 3), and their σ (C,) from the roughness of both clouds.
 
-    Distances count from the first cloud to the second along the normals; NaN where one has too few points.
-
-    Args:
-        first: (P, 3) metres.
-        second: (Q, 3) metres.
-        core: (C, 3) places.
-        normal: (C, 3) unit vectors.
-        radius_m: of the cylinders.
-        reach_m: half the length of the cylinders: the largest distance that is found.
+    Distances count from the first cloud (P, 3) to the second (Q, 3) along unit normals (C, 3); NaN where one has
+    too few points in a cylinder. `reach_m` is half the length of a cylinder: the largest distance that is found.
     """
     nothing = np.full(len(core), np.nan)
     if not (len(core) and len(first) and len(second)):

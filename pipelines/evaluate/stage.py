@@ -197,11 +197,7 @@ def evaluate(
     crs: PointCrs | None = None,
     rendered: Rendered | None = None,
 ) -> EvaluationReport:
-    """Return the report on a solved survey.
-
-    Args:
-        crs: CRS in which the report lists the check points too; None: none.
-        rendered: what the Gaussians show; None: nothing is trained yet.
+    """Return the report on a solved survey; `crs` lists the check points, without `rendered` nothing is trained.
 
     Raises:
         InputError: a point lies outside the CRS's domain.

@@ -123,16 +123,8 @@ def median_sigma(sigma: SceneSigma | None, of: str) -> str:
 class CrsSidecar(_CamelCase):
     """Sidecar of a file whose coordinates are in a CRS; names in the file are in camelCase.
 
-    Attributes:
-        crs: as the user named it, or the default.
-        crs_wkt: WKT2:2019; without a vertical part, `vertical_datum` says what the heights count from.
-        units: of the three coordinates, easting or longitude first.
-        epoch: year of the coordinates in a dynamic datum; None: not stated.
-        operation: published operation from WGS84, and its accuracy; None: not known.
-        bounds: least and largest of each coordinate.
-        accuracy: headline of the result; None: nothing stated it when the file was written.
-        sigma: predicted σ of the file's points or cells; None: not known, or nothing checks it.
-        assumed: what the user did not state.
+    Without a vertical part in `crs_wkt`, `vertical_datum` says what the heights count from. None: not stated, not
+    known when the file was written, or, of σ, checked by nothing.
     """
 
     format: Literal["georefgs"] = "georefgs"

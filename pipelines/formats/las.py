@@ -184,11 +184,8 @@ class LazFile:
     """LAZ file of single returns that is written in chunks; a context manager.
 
     Args:
-        path: of the file.
-        wkt1: CRS as WKT1.
         angular: whether the first two coordinates are angles.
         near: (3,) coordinates near the points; the file counts from these, rounded to integers.
-        software: program that writes.
         written: date in the header; None: today.
         text: description for people, in English: vertical datum, meaning of σ.
     """

@@ -76,7 +76,7 @@ def has_positive_depth(network: Network) -> BoolArray:
 
 
 def projection_residuals(network: Network) -> FloatArray:
-    """Return the residuals (M, 2) in pixels, projected minus observed; all points lie in front of their cameras."""
+    """Return the residuals (M, 2) in pixels, projected minus observed; NaN for a point behind its camera."""
     in_cam = np.einsum("mij,mj->mi", network.cam_from_world[network.obs_image], network.rays())
     projected = project_each(network.cameras, network.camera_id[network.obs_image], in_cam)
     return np.asarray(projected - network.obs_xy_px)
