@@ -60,22 +60,14 @@ _ADVICE = (
 
 @dataclass(frozen=True)
 class Correspondences(Rows):
-    """n points known in both frames.
-
-    Attributes:
-        control: (n,) control point (True) or camera centre (False).
-        in_local: (n, 3), in units of local.
-        cov_in_local: (n, 3, 3), in squared units of local.
-        in_geo: (n, 3) metres, as measured.
-        cov_in_geo: (n, 3, 3) m².
-    """
+    """n points known in both frames."""
 
     name: tuple[str, ...]
-    control: BoolArray
-    in_local: FloatArray
-    cov_in_local: FloatArray
-    in_geo: FloatArray
-    cov_in_geo: FloatArray
+    control: BoolArray  # (n,) control point (True) or camera centre (False)
+    in_local: FloatArray  # (n, 3), in units of local
+    cov_in_local: FloatArray  # (n, 3, 3), in squared units of local
+    in_geo: FloatArray  # (n, 3) metres, as measured
+    cov_in_geo: FloatArray  # (n, 3, 3) m²
 
     def part(self, chosen: BoolArray) -> Correspondences:
         """Return the correspondences that a mask (n,) selects."""
@@ -114,24 +106,17 @@ class SimilarityState:
 
 @dataclass(frozen=True)
 class AdjustedSimilarity:
-    """Solution of the adjustment, with its covariance, residuals and cost.
-
-    Attributes:
-        covariance: (7, 7) about `pivot`, (3,) in geo; see `SimilarityRecord`.
-        response: (n, 7, 3) change of the parameters per metre of error of each measured position.
-        residual: (n, 3) metres, measured (less bias) minus mapped.
-        cost: −2 ln likelihood, with outliers at the cost of the gate; compares solutions of the same data.
-        condition_number: of the normal matrix, with angles and ln s scaled by the size of the layout.
-    """
+    """Solution of the adjustment, with its covariance, residuals and cost."""
 
     state: SimilarityState
-    covariance: FloatArray
+    covariance: FloatArray  # (7, 7) about `pivot`, (3,) in geo; see `SimilarityRecord`
     pivot: FloatArray
+    # (n, 7, 3) change of the parameters per metre of error of each measured position
     response: FloatArray = field(repr=False)
-    residual: FloatArray = field(repr=False)
+    residual: FloatArray = field(repr=False)  # (n, 3) metres, measured (less bias) minus mapped
     squared: FloatArray = field(repr=False)
-    cost: float
-    condition_number: float
+    cost: float  # −2 ln likelihood, with outliers at the cost of the gate; compares solutions of the same data
+    condition_number: float  # of the normal matrix, with angles and ln s scaled by the size of the layout
 
     @property
     def rotation_sigma_rad(self) -> float:

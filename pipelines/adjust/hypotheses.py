@@ -67,21 +67,14 @@ class StatedFixes:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A mistake that would explain the measurements, and what to do.
-
-    Attributes:
-        scatter_m: robust scatter per axis of the corrected fixes about the SfM model.
-        geo_from_local: similarity of the corrected fixes.
-        distance_m: (n,) of the corrected fixes from the SfM model; NaN where the hypothesis says nothing.
-        price: of the unknowns that it adds, in units of −2 ln likelihood.
-    """
+    """A mistake that would explain the measurements, and what to do."""
 
     code: str
     sentence: str
-    scatter_m: float
-    geo_from_local: Similarity
-    distance_m: FloatArray
-    price: float = 0.0
+    scatter_m: float  # robust scatter per axis of the corrected fixes about the SfM model
+    geo_from_local: Similarity  # of the corrected fixes
+    distance_m: FloatArray  # (n,) of the corrected fixes from the SfM model; NaN where the hypothesis says nothing
+    price: float = 0.0  # of the unknowns that it adds, in units of −2 ln likelihood
 
 
 # Code, sentence, fixes (n, 3) without the mistake, and price of its unknowns.

@@ -38,35 +38,23 @@ _LEAST_SIGMA_COMMON_M = 1e-4  # of an axis without a common error, where another
 
 @dataclass(frozen=True)
 class RecordedRotations:
-    """Recorded attitudes of k registered images, without the images that disagree with the SfM model.
+    """Recorded attitudes of k registered images, without the images that disagree with the SfM model."""
 
-    Attributes:
-        image: (k,) index into the model's images.
-        geo_from_cam: (k, 3, 3).
-        sigma_rad: (k,) per axis.
-        inconsistent: names of the images left out.
-    """
-
-    image: IntArray
-    geo_from_cam: FloatArray
-    sigma_rad: FloatArray
-    inconsistent: tuple[str, ...]
+    image: IntArray  # (k,) index into the model's images
+    geo_from_cam: FloatArray  # (k, 3, 3)
+    sigma_rad: FloatArray  # (k,) per axis
+    inconsistent: tuple[str, ...]  # names of the images left out
 
 
 @dataclass(frozen=True)
 class UnusedControlPoint:
-    """Control point that its marks do not determine.
-
-    Attributes:
-        unregistered: names of the images with marks that are not in the SfM model.
-        registered: names of the images with usable marks.
-        residual_px: angles between these marks and the point that most of them agree on, else their least-squares
-            point, in pixels; infinite: the rays are parallel.
-    """
+    """Control point that its marks do not determine."""
 
     name: str
-    unregistered: tuple[str, ...]
-    registered: tuple[str, ...]
+    unregistered: tuple[str, ...]  # names of the images with marks that are not in the SfM model
+    registered: tuple[str, ...]  # names of the images with usable marks
+    # Angles between these marks and the point that most of them agree on, else their least-squares point, in
+    # pixels; infinite: the rays are parallel
     residual_px: tuple[float, ...] = ()
 
     @property

@@ -119,34 +119,22 @@ class Problem:
 
 @dataclass(frozen=True)
 class Rows:
-    """M whitened observations of one kind near a state.
+    """M whitened observations of one kind near a state."""
 
-    Attributes:
-        residual: (M, d) at the state.
-        by_poses: (M d, 6 n) sparse derivative by the corrections of the cameras.
-        by_border: (M d, b) derivative by the border: lens, systematic errors, similarity of the points if any.
-    """
-
-    residual: FloatArray
-    by_poses: csr_matrix
+    residual: FloatArray  # (M, d) at the state
+    by_poses: csr_matrix  # (M d, 6 n) sparse derivative by the corrections of the cameras
+    # (M d, b) derivative by the border: lens, systematic errors, similarity of the points if any
     by_border: FloatArray
 
 
 @dataclass(frozen=True)
 class NormalMatrix:
-    """Matrix of the normal equations: the information of all measurements on all unknowns.
+    """Matrix of the normal equations: the information of all measurements on all unknowns."""
 
-    Attributes:
-        poses: (6 n, 6 n) N, sparse in blocks (6, 6).
-        border: (b, 6 n) B.
-        corner: (b, b) C.
-        position: (n, 3) of the cameras; decides the cost of the factorisation, not its result.
-    """
-
-    poses: bsr_matrix
-    border: FloatArray
-    corner: FloatArray
-    position: FloatArray
+    poses: bsr_matrix  # (6 n, 6 n) N, sparse in blocks (6, 6)
+    border: FloatArray  # (b, 6 n) B
+    corner: FloatArray  # (b, b) C
+    position: FloatArray  # (n, 3) of the cameras; decides the cost of the factorisation, not its result
 
     @cached_property
     def factor(self) -> SparseCholesky:

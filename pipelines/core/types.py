@@ -1,6 +1,6 @@
 """Array and tuple types that all rooms share, and rows of records of arrays.
 
-Arrays are numpy's. Their shapes, units and frames are stated in the docstrings of the functions and classes.
+Arrays are numpy's. Their shapes, units and frames are stated in docstrings, and beside the fields of classes.
 """
 
 from __future__ import annotations

@@ -35,25 +35,18 @@ _MOST_ROUNDS = 20
 
 @dataclass(frozen=True)
 class Assessment:
-    """Accuracy of a product at N check points.
+    """Accuracy of a product at N check points."""
 
-    Attributes:
-        stats: figures of all errors, blunders and points under vegetation included.
-        survey: RMSE of the check points' own survey (RMSE_H2, RMSE_V2 of the standard); None without points.
-        with_survey: errors and survey in quadrature, the accuracy after the standard; None without points. Both are
-            of the points outside vegetation.
-        asprs: classes that `with_survey` meets, and the accuracy under vegetation.
-        blunder: (N,) mask of the errors beyond three times the class that the other points meet; none is under
-            vegetation.
-        without_blunders: figures of the other points; None without blunders.
-    """
-
-    stats: ErrorStats
+    stats: ErrorStats  # figures of all errors, blunders and points under vegetation included
+    # RMSE of the check points' own survey (RMSE_H2, RMSE_V2 of the standard); None without points
     survey: Rmse | None
+    # Errors and survey in quadrature, the accuracy after the standard; None without points. Both are of the points
+    # outside vegetation.
     with_survey: TotalRmse | None
-    asprs: AsprsStatement
+    asprs: AsprsStatement  # classes that `with_survey` meets, and the accuracy under vegetation
+    # (N,) mask of the errors beyond three times the class that the other points meet; none is under vegetation
     blunder: BoolArray
-    without_blunders: ErrorStats | None
+    without_blunders: ErrorStats | None  # figures of the other points; None without blunders
 
 
 def assess(

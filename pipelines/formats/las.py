@@ -267,19 +267,12 @@ class LazWriter(LazFile):
 
 @dataclass(frozen=True)
 class LidarReturns:
-    """P returns of one strip, numbered from 1.
+    """P returns of one strip, numbered from 1."""
 
-    Attributes:
-        position: (P, 3) in the CRS, easting or longitude first.
-        classification: (P,) class of LAS.
-        gps_time_s: (P,).
-        scan_angle_deg: (P,) of the beam across the strip.
-    """
-
-    position: FloatArray
-    classification: ByteArray
-    gps_time_s: FloatArray
-    scan_angle_deg: FloatArray
+    position: FloatArray  # (P, 3) in the CRS, easting or longitude first
+    classification: ByteArray  # (P,) class of LAS
+    gps_time_s: FloatArray  # (P,)
+    scan_angle_deg: FloatArray  # (P,) of the beam across the strip
     strip: int
 
 

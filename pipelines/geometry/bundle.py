@@ -175,20 +175,13 @@ class BundleInformation:
     Axes and signs of (δω, δc) are those of `geometry.correction_basis.CorrectionBasis`, the order of ℓ that of
     `geometry.cameras.Lenses`. The points follow cameras and lens; `followed` is their mean similarity, weighted by
     their information.
-
-    Attributes:
-        sums: the information.
-        similarity_modes: (6 n, 7) as `geometry.bundle.similarity_modes`.
-        unit: (6 n,) corrections that count as one metre at the scene.
-        loosest_sigma_m: σ in these units that the prior gives even a camera without observations.
-        sigma_px: σ of an image coordinate, estimated from the residuals.
     """
 
-    sums: EliminatedPoints
-    similarity_modes: FloatArray
-    unit: FloatArray
-    loosest_sigma_m: float
-    sigma_px: float
+    sums: EliminatedPoints  # the information
+    similarity_modes: FloatArray  # (6 n, 7) as `geometry.bundle.similarity_modes`
+    unit: FloatArray  # (6 n,) corrections that count as one metre at the scene
+    loosest_sigma_m: float  # σ in these units that the prior gives even a camera without observations
+    sigma_px: float  # σ of an image coordinate, estimated from the residuals
 
     @cached_property
     def followed(self) -> FloatArray:

@@ -30,22 +30,14 @@ class Trajectory(Rows):
 
     Positions are Cartesian: degrees jump at the date line. Rotations turn axes of the moving body into the axes of
     the samples' frame, or into East-North-Up where each sample was taken.
-
-    Attributes:
-        time_s: (K,) increasing.
-        position: (K, 3) metres.
-        rotation: (K, 3, 3).
-        sigma_m: (K, 3) σ of the positions.
-        sigma_deg: (K,) σ of the rotations.
-        max_gap_s: longest time between two samples to interpolate over.
     """
 
-    time_s: FloatArray
-    position: FloatArray
-    rotation: FloatArray
-    sigma_m: FloatArray
-    sigma_deg: FloatArray
-    max_gap_s: float
+    time_s: FloatArray  # (K,) increasing
+    position: FloatArray  # (K, 3) metres
+    rotation: FloatArray  # (K, 3, 3)
+    sigma_m: FloatArray  # (K, 3) σ of the positions
+    sigma_deg: FloatArray  # (K,) σ of the rotations
+    max_gap_s: float  # longest time between two samples to interpolate over
 
     @classmethod
     def from_samples(
@@ -139,18 +131,13 @@ FLU_FROM_FRD = np.diag([1.0, -1.0, -1.0])
 
 @dataclass(frozen=True)
 class Rig:
-    """Mount, lever arm and boresight of one camera, or mount and lever arm of each of N photographs.
+    """Mount, lever arm and boresight of one camera, or mount and lever arm of each of N photographs."""
 
-    Attributes:
-        cam_from_body: (3, 3) or (N, 3, 3) mount; None or NaN where nothing is known of it.
-        antenna_in_body: (3,) or (N, 3) lever arm: metres from the camera's centre, forward-right-down; None or NaN
-            where nothing is known of it.
-        nominal_from_cam: (3, 3) boresight.
-    """
-
-    cam_from_body: FloatArray | None = None
+    cam_from_body: FloatArray | None = None  # (3, 3) or (N, 3, 3) mount; None or NaN where nothing is known of it
+    # (3,) or (N, 3) lever arm: metres from the camera's centre, forward-right-down; None or NaN where nothing is
+    # known of it
     antenna_in_body: FloatArray | None = None
-    nominal_from_cam: FloatArray = field(default_factory=lambda: np.eye(3))
+    nominal_from_cam: FloatArray = field(default_factory=lambda: np.eye(3))  # (3, 3) boresight
 
     def of_each(self, count: int) -> tuple[FloatArray, FloatArray]:
         """Return the mount (N, 3, 3) and the lever arm (N, 3) of each of N photographs, NaN where unknown."""

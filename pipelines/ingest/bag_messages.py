@@ -32,23 +32,14 @@ _POSE_FRAME_NED = 1
 
 @dataclass(frozen=True)
 class PositionSample:
-    """A position as a message states it.
+    """A position as a message states it."""
 
-    Attributes:
-        place: (latitude, longitude, height), or metres east, north, up from the local frame's origin.
-        sigma_enu_m: NaN where unknown.
-        frame: name of the frame that is at that place.
-        world: the local frame; "" for geodetic positions.
-        receiver: kind of receiver, for σ where the message has none.
-        problem: why it cannot be used, or "".
-    """
-
-    place: Vector3
-    sigma_enu_m: Vector3
-    frame: str
-    world: str = ""
-    receiver: str = "unknown receiver"
-    problem: str = ""
+    place: Vector3  # (latitude, longitude, height), or metres east, north, up from the local frame's origin
+    sigma_enu_m: Vector3  # NaN where unknown
+    frame: str  # name of the frame that is at that place
+    world: str = ""  # the local frame; "" for geodetic positions
+    receiver: str = "unknown receiver"  # kind of receiver, for σ where the message has none
+    problem: str = ""  # why it cannot be used, or ""
 
 
 @dataclass(frozen=True)

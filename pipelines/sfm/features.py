@@ -80,17 +80,11 @@ _MOST_TRIALS = 2_000
 
 @dataclass(frozen=True)
 class SfmJob:
-    """Inputs of a reconstruction, or of a part of one.
+    """Inputs of a reconstruction, or of a part of one."""
 
-    Attributes:
-        survey: photographs with priors of their cameras, positions and attitudes.
-        images: folder of the photographs.
-        database: path of COLMAP's database; an existing one is continued.
-    """
-
-    survey: Survey
-    images: Path
-    database: Path
+    survey: Survey  # photographs with priors of their cameras, positions and attitudes
+    images: Path  # folder of the photographs
+    database: Path  # path of COLMAP's database; an existing one is continued
     options: SfmOptions
 
     @property

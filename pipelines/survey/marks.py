@@ -16,25 +16,15 @@ from pipelines.survey.survey import SurveyedPoint
 
 @dataclass(frozen=True)
 class MarkRays:
-    """K image marks of J surveyed points, in registered images.
+    """K image marks of J surveyed points, in registered images."""
 
-    Attributes:
-        point_name: (J,) as in the survey.
-        point: (K,) index into the points, ascending.
-        camera: (K,) index into the images of the SfM model.
-        xy_px: (K, 2) pixels of the photograph.
-        bearing_in_cam: (K, 3) unit vectors.
-        sigma_px: (K,) σ of a mark in pixels.
-        sigma_rad: (K,) σ of a mark as an angle: `sigma_px` over the mean focal length.
-    """
-
-    point_name: tuple[str, ...]
-    point: IntArray
-    camera: IntArray
-    xy_px: FloatArray
-    bearing_in_cam: FloatArray
-    sigma_px: FloatArray
-    sigma_rad: FloatArray
+    point_name: tuple[str, ...]  # (J,) as in the survey
+    point: IntArray  # (K,) index into the points, ascending
+    camera: IntArray  # (K,) index into the images of the SfM model
+    xy_px: FloatArray  # (K, 2) pixels of the photograph
+    bearing_in_cam: FloatArray  # (K, 3) unit vectors
+    sigma_px: FloatArray  # (K,) σ of a mark in pixels
+    sigma_rad: FloatArray  # (K,) σ of a mark as an angle: `sigma_px` over the mean focal length
 
     @property
     def xy(self) -> FloatArray:
@@ -86,17 +76,11 @@ def mark_rays(points: Sequence[SurveyedPoint], sparse: SparseModel) -> MarkRays:
 
 @dataclass(frozen=True)
 class RayErrors:
-    """Errors of K rays, apart from those of their marks.
+    """Errors of K rays, apart from those of their marks."""
 
-    Attributes:
-        sigma_center: σ of a projection centre along each axis, in units of the cameras' frame.
-        sigma_attitude_rad: σ of a camera's attitude about each axis.
-        sigma_lens_rad: (K,) or scalar; added in quadrature to the σ of the marks.
-    """
-
-    sigma_center: float
-    sigma_attitude_rad: float
-    sigma_lens_rad: FloatArray | float = 0.0
+    sigma_center: float  # σ of a projection centre along each axis, in units of the cameras' frame
+    sigma_attitude_rad: float  # σ of a camera's attitude about each axis
+    sigma_lens_rad: FloatArray | float = 0.0  # (K,) or scalar; added in quadrature to the σ of the marks
 
 
 def intersect_marks(

@@ -32,18 +32,12 @@ from pipelines.survey.trained_model import Adjustment
 
 @dataclass(frozen=True)
 class Scene:
-    """n registered cameras and N points in `model`.
+    """n registered cameras and N points in `model`."""
 
-    Attributes:
-        sparse: the SfM model (frame `local`).
-        model_from_local: similarity that stays fixed.
-        geo_from_model: initial estimate, a pure shift.
-        train, test: indices of the cameras in each split.
-    """
-
-    sparse: SparseModel
-    model_from_local: Similarity
-    geo_from_model: Similarity
+    sparse: SparseModel  # the SfM model (frame `local`)
+    model_from_local: Similarity  # similarity that stays fixed
+    geo_from_model: Similarity  # initial estimate, a pure shift
+    # train and test: indices of the cameras in each split
     train: IntArray
     test: IntArray
 

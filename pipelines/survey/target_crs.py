@@ -28,18 +28,12 @@ from pipelines.survey.options import CrsOptions
 
 @dataclass(frozen=True)
 class TargetCrs:
-    """CRS of a file, with one operation for the whole scene.
-
-    Attributes:
-        origin: of the frame `geo`.
-        lla: (M, 3) places that span the scene.
-        assumed: what the user did not state, for the user and the file; empty: nothing.
-    """
+    """CRS of a file, with one operation for the whole scene."""
 
     crs: PointCrs
-    origin: Origin
-    lla: FloatArray
-    assumed: tuple[str, ...] = ()
+    origin: Origin  # of the frame `geo`
+    lla: FloatArray  # (M, 3) places that span the scene
+    assumed: tuple[str, ...] = ()  # what the user did not state, for the user and the file; empty: nothing
 
     @property
     def horizontal_unit_m(self) -> float:
