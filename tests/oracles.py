@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from pipelines.formats.splat_ply import SplatArrays
+from pipelines.formats.spz import decode_spz
 from pipelines.geometry.intersection import UncertainCameras
+
+
+def read_spz(path: Path) -> SplatArrays:
+    return decode_spz(path.read_bytes(), path)
 
 
 def map_from_cam(omega_phi_kappa_deg: np.ndarray | list[float]) -> np.ndarray:

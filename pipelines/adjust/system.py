@@ -312,11 +312,10 @@ class Linearised:
 
 @dataclass(frozen=True)
 class Minimum:
-    """Minimum of a problem: the state there, −2 ln likelihood, and equations that were factorised near by."""
+    """Minimum of a problem: the state there, and −2 ln likelihood."""
 
     state: State
     cost: float
-    normal: NormalMatrix
 
 
 def linearised(problem: Problem, state: State) -> Linearised:
@@ -373,7 +372,7 @@ def minimise(problem: Problem, start: State, normal: NormalMatrix | None = None)
             raise _not_converged(change)
         state, residuals, cost = moved, new, reached
         if change < _STILL:
-            return Minimum(state, cost, normal)
+            return Minimum(state, cost)
         if halving or change > _NEW_FACTOR * last:
             normal = None
         whole = change / (stretch * 0.5**halving)

@@ -14,7 +14,7 @@ from typing import ClassVar
 import numpy as np
 
 from pipelines.adjust.state import SystematicErrors
-from pipelines.core.types import FloatArray, IntArray
+from pipelines.core.types import FloatArray, IntArray, Rows
 from pipelines.geometry.rotations import exp_so3, log_so3, right_jacobian_inverse_so3, skew
 from pipelines.geometry.similarity import Similarity, jacobian_at
 
@@ -52,7 +52,7 @@ class Slopes:
     by_similarity: FloatArray | None = None
 
 
-class Term(ABC):
+class Term(Rows, ABC):
     """M observations of one kind.
 
     Attributes:
@@ -72,9 +72,6 @@ class Term(ABC):
     @abstractmethod
     def slopes(self, at: At) -> Slopes:
         """Return the residuals with their derivatives."""
-
-    def __len__(self) -> int:
-        return len(self.root_information)
 
     def whitened(self, at: At) -> FloatArray:
         """Return the residuals (M, d) in units of their σ."""

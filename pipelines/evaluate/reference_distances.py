@@ -105,16 +105,8 @@ class TiledPoints:
     def __init__(self, folder: Path, side_m: float) -> None:
         self.side_m = side_m
         self._folder = folder
-        self._count: dict[Square, int] = {}
+        self.count: dict[Square, int] = {}  # points, of squares that hold some
         folder.mkdir(parents=True, exist_ok=True)
-
-    def __len__(self) -> int:
-        return sum(self._count.values())
-
-    @property
-    def squares(self) -> set[Square]:
-        """Squares that hold points."""
-        return set(self._count)
 
     def append(
         self, position: FloatArray, normal: FloatArray | Float32Array | None, classification: ByteArray | None
@@ -139,7 +131,7 @@ class TiledPoints:
         for square, part in rows_by_square(position, self.side_m):
             with self._path(square).open("ab") as file:
                 file.write(rows[part].tobytes())
-            self._count[square] = self._count.get(square, 0) + len(part)
+            self.count[square] = self.count.get(square, 0) + len(part)
 
     def around(self, square: Square, margin_m: float) -> tuple[NDArray[np.void], NDArray[np.bool_]]:
         """Return the rows in a square and its margin, and which of them lie in the square itself."""
@@ -149,7 +141,7 @@ class TiledPoints:
             for across in range(-reach, reach + 1)
             for along in range(-reach, reach + 1)
         ]
-        parts = [np.fromfile(self._path(name), dtype=_ROW) for name in names if name in self._count]
+        parts = [np.fromfile(self._path(name), dtype=_ROW) for name in names if name in self.count]
         rows = np.concatenate([np.empty(0, dtype=_ROW), *parts])
         offset = rows["position"][:, :2] - self.side_m * np.array(square)
         near = ((offset >= -margin_m) & (offset < self.side_m + margin_m)).all(axis=1)

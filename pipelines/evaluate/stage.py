@@ -28,11 +28,12 @@ from pipelines.core.stages import BY_NAME
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.evaluate.asprs import few_points
-from pipelines.evaluate.cautions import cautions_of_prediction, dependent_check_points
 from pipelines.evaluate.check_points import (
+    cautions_of_prediction,
     check_points_on_surface,
     control_residuals,
     cross_validate,
+    dependent_check_points,
     fix_residuals,
     rms_sigma,
     triangulated_check_points,
@@ -45,15 +46,17 @@ from pipelines.evaluate.reference import (
     cautions_of_reference,
     compare_with_reference,
     draw_reference,
-    open_reference,
 )
+from pipelines.evaluate.reference_distances import require_py4dgeo
 from pipelines.geodesy.crs import PointCrs
 from pipelines.geodesy.enu import Origin, ecef_from_enu, lla_from_ecef
 from pipelines.report.plots.maps import MapCoordinates, MapPoints, SigmaRaster, write_accuracy_map
 from pipelines.report.plots.plans import NamedPlaces
 from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.surface.measured_cloud import CloudReader
 from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey.headline import headline
+from pipelines.survey.options import CloudCrs
 from pipelines.survey.photographs import write_render
 from pipelines.survey.report import (
     AccuracySummary,
@@ -230,7 +233,11 @@ def evaluate(
 
 
 def _rendered(stage: StageRun, trained: TrainedSurvey, posterior: Posterior, options: EvaluateOptions) -> Rendered:
-    files, progress = open_reference(options), stage.progress
+    files, progress = None, stage.progress
+    if options.reference is not None:  # refused before work starts: a file without a CRS, and a missing library
+        require_py4dgeo()
+        stated = CloudCrs(options.reference_crs, options.reference_vertical, "--reference")
+        files = CloudReader(options.reference, stated)
     images = photographs(trained.sfm, trained.survey, stage.workspace, trained.model.max_image_size)
     images.build(progress)
     renderer = ModelRenderer(trained, images, rasterizer(options.backend, progress))

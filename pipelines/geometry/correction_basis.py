@@ -35,7 +35,6 @@ class CorrectionBasis:
     """
 
     matrix: FloatArray  # (n, 6, k), rows (δω, δc), k = 6 n − 7
-    sigma_px: float  # σ of an image coordinate, estimated from the residuals
     lens_matrix: FloatArray  # (L, k)
 
 
@@ -59,7 +58,7 @@ def correction_basis(bundle: BundleInformation, *, lens_follows: bool = True) ->
     poses = len(bundle.unit)
     through_lens = bundle.followed[:, poses:] @ follows if lens_follows else 0.0
     held = flat - bundle.similarity_modes @ ((bundle.followed[:, :poses] + through_lens) @ flat)
-    return CorrectionBasis(held.reshape(-1, 6, flat.shape[1]), bundle.sigma_px, follows @ flat)
+    return CorrectionBasis(held.reshape(-1, 6, flat.shape[1]), follows @ flat)
 
 
 def coordinates_of(bundle: BundleInformation, correction: FloatArray) -> FloatArray:

@@ -23,7 +23,6 @@ class TwoGroups:
 
     second: BoolArray  # (n,) the smaller group
     apart: FloatArray  # (d,) middle of the smaller group minus that of the larger
-    scatter: float  # robust σ per axis about the middle of the wider group
 
 
 def scatter_about_median(offsets: ArrayLike) -> float:
@@ -74,7 +73,7 @@ def two_groups(offsets: ArrayLike) -> TwoGroups | None:
     within = max(scatter_about_median(array[mask]) for mask in (~second, second))
     if np.linalg.norm(apart) < _APART * within:
         return None
-    return TwoGroups(second, apart, within)
+    return TwoGroups(second, apart)
 
 
 def blunders_among(offsets: ArrayLike, sigma: float) -> BoolArray | None:

@@ -58,11 +58,6 @@ class RigEstimate(Product):
             )
         return self
 
-    @property
-    def usable(self) -> bool:
-        """Whether every component is observable."""
-        return all(self.observable)
-
 
 class RigCalibration(Product):
     """Product of `calibrate`: estimates of the rig, divided into those that `load_survey` applies and the others.

@@ -13,11 +13,11 @@ from pipelines.core.products import load_json
 from pipelines.deliver.options import ExportSpzOptions
 from pipelines.deliver.spz import run
 from pipelines.formats.georef_sidecar import GeorefSidecar, sidecar_path
-from pipelines.formats.spz import read_spz
 from pipelines.geodesy.enu import enu_from_ecef
 from pipelines.geometry.similarity import covariance_at
 from pipelines.splat.sh import evaluate_sh
 from tests.delivered_scenes import GEO_FROM_MODEL, ORIGIN, covariance, splat_arrays, true_ecef, write_trained
+from tests.oracles import read_spz
 from tests.refusals import numbers, refused
 
 

@@ -132,10 +132,12 @@ def test_readjusted_cameras_differ_by_unit_variance() -> None:
     for seed in range(30):
         network = noisy(exact, np.random.default_rng(seed))
         change = solve @ (network.obs_xy_px - exact.obs_xy_px).ravel()
-        basis = basis_of(readjusted(network, change))
-        white = np.linalg.lstsq(complete(basis.matrix, exact), change[:36] / units(exact), rcond=None)[0][:29]
+        bundle = bundle_information(readjusted(network, change))
+        white = np.linalg.lstsq(
+            complete(correction_basis(bundle).matrix, exact), change[:36] / units(exact), rcond=None
+        )[0][:29]
         squared.append(white @ white)
-        sigmas.append(basis.sigma_px)
+        sigmas.append(bundle.sigma_px)
     # 720 coordinates and 220 unknowns: σ̂ is good to 3 % a run, the mean of 30 χ²₂₉ / 29 to 5 %.
     assert np.mean(sigmas) == pytest.approx(SIGMA_PX, rel=0.03)
     assert np.mean(squared) / 29 == pytest.approx(1.0, rel=0.12)
