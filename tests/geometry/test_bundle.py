@@ -156,10 +156,10 @@ def test_outlying_observations_cost_little() -> None:
     wrong = rng.choice(len(network.obs_xy_px), len(network.obs_xy_px) // 20, replace=False)
     spoilt = network.obs_xy_px.copy()
     spoilt[wrong] += rng.normal(0, 30.0, (len(wrong), 2))
-    clean, hit = basis_of(network), basis_of(replace(network, obs_xy_px=spoilt))
+    clean, hit = bundle_information(network), bundle_information(replace(network, obs_xy_px=spoilt))
     # 5 % of the observations at 60 σ: least squares would find 13 times the σ.
     assert hit.sigma_px < 1.4 * clean.sigma_px
-    assert np.linalg.norm(hit.matrix) < 1.5 * np.linalg.norm(clean.matrix)
+    assert np.linalg.norm(correction_basis(hit).matrix) < 1.5 * np.linalg.norm(correction_basis(clean).matrix)
 
 
 def test_too_few_observations_are_refused() -> None:
