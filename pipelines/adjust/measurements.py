@@ -21,7 +21,7 @@ from pipelines.adjust.system import Problem
 from pipelines.adjust.terms import Attitudes, ControlPoints, Fixes, Planes, Term, root_information
 from pipelines.core.errors import InputError
 from pipelines.core.sentences import listed
-from pipelines.core.types import BoolArray, FloatArray, IntArray
+from pipelines.core.types import BoolArray, FloatArray, IntArray, vector3
 from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.adjustment import InitialSimilarity
@@ -324,8 +324,8 @@ def _common_errors(survey: Survey, fixes: Fixes) -> list[SystematicError]:
     for session in np.unique(fixes.session) if survey.sessions else ():
         sigma = np.array(survey.sessions[session].sigma_common_m)
         if sigma.any():
-            east, north, up = np.maximum(sigma, _LEAST_SIGMA_COMMON_M).tolist()
-            blocks.append(SystematicError("bias", (east, north, up), int(session)))
+            at_least = vector3(np.maximum(sigma, _LEAST_SIGMA_COMMON_M))
+            blocks.append(SystematicError("bias", at_least, int(session)))
     return blocks
 
 

@@ -53,17 +53,11 @@ class Slopes:
 
 
 class Term(Rows, ABC):
-    """M observations of one kind.
+    """M observations of one kind."""
 
-    Attributes:
-        kind: name in normal equations, tests and products.
-        dimension: d, of a residual.
-        root_information: (M, d, d), W with WᵀW = Σ⁻¹.
-    """
-
-    kind: ClassVar[str]
-    dimension: ClassVar[int] = 3
-    root_information: FloatArray
+    kind: ClassVar[str]  # name in normal equations, tests and products
+    dimension: ClassVar[int] = 3  # d, of a residual
+    root_information: FloatArray  # (M, d, d), W with WᵀW = Σ⁻¹
 
     @abstractmethod
     def residuals(self, at: At) -> FloatArray:

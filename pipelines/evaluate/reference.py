@@ -26,14 +26,16 @@ from pipelines.core.types import FloatArray
 from pipelines.evaluate.options import EvaluateOptions
 from pipelines.evaluate.reference_distances import (
     CLASSES,
+    THRESHOLDS_M,
     Box,
     ComparisonSettings,
     CorePoints,
+    DistanceTally,
     TiledPoints,
     compare_square,
+    level_of_detection,
     plane_normals,
 )
-from pipelines.evaluate.reference_figures import THRESHOLDS_M, DistanceTally, level_of_detection
 from pipelines.geodesy.enu import Origin
 from pipelines.geometry.footprints import first_of_voxels
 from pipelines.geometry.similarity import Similarity

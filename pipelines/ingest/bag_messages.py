@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pipelines.core.types import FloatArray, Quaternion, Vector3
+from pipelines.core.types import FloatArray, Quaternion, Vector3, vector3
 from pipelines.geometry.rotations import ENU_FROM_NED, matrix_from_quat_xyzw, quat_xyzw_from_matrix
 from pipelines.geometry.trajectory import Trajectory
 
@@ -114,10 +114,9 @@ def _local(position: Any, message: Any, frame: str = "", covariance: Any = None)
     variance = np.zeros(3) if covariance is None else np.asarray(covariance, dtype=np.float64)[[0, 7, 14]]
     if str(message.header.frame_id).lower().endswith("_ned"):
         values, variance = ENU_FROM_NED @ values, np.abs(ENU_FROM_NED) @ variance
-    x, y, z = (float(value) for value in values)
     problem = "" if np.isfinite(values).all() else "position is NaN"
     world = message.header.frame_id or "odom"
-    return PositionSample((x, y, z), _sigmas(variance), frame or BASE, world=world, problem=problem)
+    return PositionSample(vector3(values), _sigmas(variance), frame or BASE, world=world, problem=problem)
 
 
 def _px4_local(message: Any) -> PositionSample:
@@ -127,8 +126,7 @@ def _px4_local(message: Any) -> PositionSample:
     else:  # px4_msgs up to release 1.13: the upper triangle of a 6×6 covariance, row by row
         ned = np.array([message.x, message.y, message.z], dtype=np.float64)
         variance = np.asarray(message.pose_covariance, dtype=np.float64)[[0, 6, 11]]
-    east, north, up = ENU_FROM_NED @ ned
-    place = (float(east), float(north), float(up))
+    place = vector3(ENU_FROM_NED @ ned)
     problem = "" if _px4_is_ned(message) else "its frame is not North-East-Down"
     if not all(map(math.isfinite, place)):
         problem = "position is NaN"
@@ -141,8 +139,7 @@ def _sigmas(variance: Any) -> Vector3:
     values = np.asarray(variance, dtype=np.float64)
     if not (np.isfinite(values).all() and (values > 0).all() and (values < _LARGEST_SIGMA_M**2).all()):
         return _NAN3
-    x, y, z = np.sqrt(values)
-    return float(x), float(y), float(z)
+    return vector3(np.sqrt(values))
 
 
 def _eph_epv(message: Any) -> Vector3:

@@ -18,13 +18,15 @@ from pipelines.evaluate.reference_distances import (
     CONFIDENCE_95,
     ComparisonSettings,
     CorePoints,
+    DistanceTally,
     SquareDistances,
     TiledPoints,
     compare_square,
     kinds_of,
+    level_of_detection,
+    m3c2_figures,
     plane_normals,
 )
-from pipelines.evaluate.reference_figures import DistanceTally, level_of_detection, m3c2_figures
 from pipelines.geometry.similarity import perturbation
 from pipelines.surface.registration import fit_alignment
 from pipelines.surface.visibility import SeenSurface, Viewpoints, seen_surface
