@@ -280,10 +280,6 @@ class Alignment:
     layout: Literal["volume", "plane", "line"]
 
     @property
-    def attitude_used(self) -> bool:
-        return self.layout == "line"
-
-    @property
     def geo_from_local(self) -> Similarity:
         return self.solution.state.geo_from_local
 

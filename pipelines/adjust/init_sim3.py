@@ -251,7 +251,7 @@ def _aligned_product(
         },
         condition_number=solution.condition_number,
         layout=alignment.layout,
-        attitude_used=alignment.attitude_used,
+        attitude_used=alignment.layout == "line",
     )
 
 

@@ -37,7 +37,7 @@ from pipelines.survey.trained_model import Adjustment
 class IntersectionJacobian:
     """Effect of poses, lens and marks on N intersected points, to first order."""
 
-    # (3 N, 6 n) sparse, metres by (δω, δc) of each camera as in `geometry.correction_basis.CorrectionBasis`
+    # (3 N, 6 n) sparse, metres by (δω, δc) of each camera as in `geometry.bundle.CorrectionBasis`
     by_poses: csr_matrix
     by_lens: FloatArray  # (N, 3, L) metres by the lens parameters, in the order of `CorrectionBasis`
     # (N, 3, 3) m², from the σ of the marks; NaN for a point that its rays do not determine
@@ -49,12 +49,8 @@ def intersection_jacobian(
 ) -> IntersectionJacobian:
     """Return the derivatives by poses and lens of the points of a network, each intersected from its own marks.
 
-    The derivatives are taken at the projections of the points; the pixels of the marks do not enter. Marks of
-    points behind their camera do not count.
-
-    Args:
-        sigma_px: (M,) σ of the marks.
-        surveyed: (N, 3, 3) information on the points beyond their marks, 1/m²; None: there is none.
+    The derivatives are taken at the projections of the points; of the marks their σ (M,) enter, and not the pixels.
+    Marks of points behind their camera do not count. Points may have information (N, 3, 3) beyond these, in 1/m².
     """
     sigma_px, marks = sigma_px[has_positive_depth(marks)], with_positive_depths(marks)
     lin, count = linearise_bundle(marks), len(marks.point_in_world)

@@ -124,7 +124,9 @@ def _statement(
     count: int, tested: TotalRmse | None, vegetated: VegetatedAccuracy | None, area_km2: float | None
 ) -> AsprsStatement:
     """Return the classes that `count` check points outside vegetation meet, and a sentence with their number."""
-    least = least_points(area_km2)
+    least, under = least_points(area_km2), ""
+    if vegetated is not None:
+        under = f"RMSE_V {100 * vegetated.rmse_v_m:.1f} cm at {vegetated.count} points under vegetation (VVA)"
     asprs = AsprsStatement(
         points=count,
         horizontal_class=None,
@@ -134,13 +136,10 @@ def _statement(
         area_km2=area_km2,
         least_points=least,
         enough_points=count >= least,
-        statement=None,
+        statement=under or None,
     )
-    under = ""
-    if vegetated is not None:
-        under = f"RMSE_V {100 * vegetated.rmse_v_m:.1f} cm at {vegetated.count} points under vegetation (VVA)"
     if tested is None:
-        return asprs.model_copy(update={"statement": under or None})
+        return asprs
     classes_of = classes_cm(tested.rmse_h_m, tested.rmse_v_m, tested.rmse_3d_m)
     horizontal, vertical, class_3d = (f"{class_cm} cm" for class_cm in classes_of)
     sample = f"tested on {count} check points: " if asprs.enough_points else f"{few_points(asprs)} "

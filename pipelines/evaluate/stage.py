@@ -180,7 +180,11 @@ def run(stage: StageRun, options: EvaluateOptions) -> Summary:
         rendered = _rendered(stage, solved, posterior, options)
     else:
         rendered = None
-        _refuse_what_needs_gaussians(stage, options)
+        for flag, value in (("--reference", options.reference), ("--lpips-weights", options.lpips_weights)):
+            if value is not None:
+                command = stage.workspace.command_of(BY_NAME["train"])
+                message = f"needs a trained model; run `{command}` first, or leave the option out"
+                raise InputError("not-trained", message, field=flag)
     report = evaluate(solved, posterior, options, crs=crs, rendered=rendered)
     if posterior.grid is not None:
         write_csv(posterior.grid, solved.survey.origin, stage.out / "accuracy.csv")
@@ -253,14 +257,3 @@ def _rendered(stage: StageRun, trained: TrainedSurvey, posterior: Posterior, opt
     save_render = partial(write_render, renders)
     test = compare_test_views(renderer, options.lpips_weights, save_render, progress, saved=options.renders)
     return Rendered(Photometric(test=test), points, reference)
-
-
-def _refuse_what_needs_gaussians(stage: StageRun, options: EvaluateOptions) -> None:
-    for flag, value in (("--reference", options.reference), ("--lpips-weights", options.lpips_weights)):
-        if value is not None:
-            command = stage.workspace.command_of(BY_NAME["train"])
-            raise InputError(
-                "not-trained",
-                f"needs a trained model; run `{command}` first, or leave the option out",
-                field=flag,
-            )

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, solve_triangular
 from scipy.sparse import bsr_matrix, csr_matrix
 from scipy.special import exp1
 
@@ -132,7 +132,7 @@ def sparse_jacobian(blocks: FloatArray, column_block: IntArray, count: int) -> c
 def similarity_modes(cam_center_in_world: FloatArray) -> FloatArray:
     """Return the movements (n, 6, 7) of the cameras under an infinitesimal similarity about their mean centre.
 
-    Rows (δω, δc) as in `geometry.correction_basis.CorrectionBasis`, columns (ln s, rotation, translation).
+    Rows (δω, δc) as in `CorrectionBasis`, columns (ln s, rotation, translation).
     """
     arm = cam_center_in_world - cam_center_in_world.mean(axis=0)
     modes = np.zeros((len(arm), 6, 7))
@@ -172,13 +172,13 @@ class BundleInformation:
 
     The points are eliminated: the observations, which SfM has left at their minimum, cost
     ½ (x, ℓ)ᵀ [poses, cross; crossᵀ, lens] (x, ℓ).
-    Axes and signs of (δω, δc) are those of `geometry.correction_basis.CorrectionBasis`, the order of ℓ that of
+    Axes and signs of (δω, δc) are those of `CorrectionBasis`, the order of ℓ that of
     `geometry.cameras.Lenses`. The points follow cameras and lens; `followed` is their mean similarity, weighted by
     their information.
     """
 
     sums: EliminatedPoints  # the information
-    similarity_modes: FloatArray  # (6 n, 7) as `geometry.bundle.similarity_modes`
+    similarity_modes: FloatArray  # (6 n, 7) as `similarity_modes`
     unit: FloatArray  # (6 n,) corrections that count as one metre at the scene
     loosest_sigma_m: float  # σ in these units that the prior gives even a camera without observations
     sigma_px: float  # σ of an image coordinate, estimated from the residuals
@@ -272,11 +272,9 @@ def eliminate_points(
 ) -> EliminatedPoints:
     """Return the normal equations of poses and lens of a network, chunk by chunk of its points.
 
-    Args:
-        network: N points and M observations, each in front of its camera; at least one.
-        root_weight: (M,) inverse σ of the observations, 1/px.
-        surveyed: (N, 3, 3) information on the points beyond their observations, 1/m²; None: there is none.
-        ridge: added to the information on a point, relative to its trace, for a point that its rays leave open.
+    Each of M ≥ 1 observations lies in front of its camera, and has an inverse σ (M,) in 1/px. Points may have
+    information (N, 3, 3) beyond their observations, in 1/m². The ridge, relative to the trace of the information on
+    a point, is for a point that its rays leave open.
     """
     total: EliminatedPoints | None = None
     for part, points, rows in chunks_of_points(network, _CHUNK):
@@ -348,3 +346,66 @@ def _blocks(blocks: FloatArray, row: IntArray, column: IntArray, shape: tuple[in
     matrix = bsr_matrix((blocks[order], column[order], pointer), shape=size)
     matrix.sum_duplicates()
     return matrix
+
+
+_COPIES = 4  # information, its factor, the basis, and a Jacobian or a normal matrix of the same size
+
+
+def predicted_basis_bytes(cameras: int) -> int:
+    """Return the peak of memory of a dense basis and of the normal equations in it."""
+    return _COPIES * 8 * (6 * cameras) ** 2
+
+
+@dataclass(frozen=True)
+class CorrectionBasis:
+    """Whitened corrections: (δω, δc) of all cameras = matrix @ z, with z ~ N(0, I) a posteriori.
+
+    A correction that costs the observations χ² = 1 has length one, and a similarity of the whole does not exist.
+
+    `δω` [rad] turns a camera about its centre, axes of the world: `R' = R Exp(−δω)`; `δc` [m] moves the centre.
+
+    The lens parameters correlate with the poses. Their error, (L,) in the order of `geometry.cameras.Lenses`, is
+    lens_matrix @ z plus an error that is independent of z.
+    """
+
+    matrix: FloatArray  # (n, 6, k), rows (δω, δc), k = 6 n − 7
+    lens_matrix: FloatArray  # (L, k)
+
+
+def correction_basis(bundle: BundleInformation, *, lens_follows: bool = True) -> CorrectionBasis:
+    """Return whitened, gauge-free coordinates of the camera corrections of a bundle at its minimum.
+
+    The points define the gauge. Under each correction the points follow the cameras and their lens; the mean
+    similarity of this movement, weighted by the information of each point, is zero.
+
+    The uncertainty of the similarity is therefore that of the scene, not that of the cameras' mean. A wrong focal
+    length or principal point shows as a common shift of the cameras against a scene that stays. That shift costs
+    the images little, and fixes reveal it. Cost O((6 n)³).
+
+    Unless the caller moves the lens by `lens_matrix` with the cameras (`lens_follows`), the lens is frozen, and the
+    points follow the cameras alone.
+    """
+    follows, _ = bundle.lens_elimination
+    root, complement = _root(bundle)
+    flat = solve_triangular(root, complement.T, lower=True).T * bundle.unit[:, None]
+    poses = len(bundle.unit)
+    through_lens = bundle.followed[:, poses:] @ follows if lens_follows else 0.0
+    held = flat - bundle.similarity_modes @ ((bundle.followed[:, :poses] + through_lens) @ flat)
+    return CorrectionBasis(held.reshape(-1, 6, flat.shape[1]), follows @ flat)
+
+
+def coordinates_of(bundle: BundleInformation, correction: FloatArray) -> FloatArray:
+    """Return the coordinates z (k,) of corrections (n, 6) in the basis; their common similarity is dropped."""
+    root, complement = _root(bundle)
+    return np.asarray(root.T @ (complement.T @ (correction.ravel() / bundle.unit)))
+
+
+def _root(bundle: BundleInformation) -> tuple[FloatArray, FloatArray]:
+    """Return the Cholesky root (k, k) of the information orthogonal to the similarities, and its axes (6 n, k)."""
+    follows, lens = bundle.lens_elimination
+    information = bundle.sums.poses.toarray() - follows.T @ lens @ follows
+    scaled = (information + information.T) / 2 * bundle.unit[:, None] * bundle.unit
+    complement = np.linalg.qr(bundle.similarity_modes / bundle.unit[:, None], mode="complete")[0][:, 7:]
+    reduced = complement.T @ scaled @ complement
+    reduced += np.eye(len(reduced)) / bundle.loosest_sigma_m**2
+    return np.asarray(np.linalg.cholesky(reduced)), complement

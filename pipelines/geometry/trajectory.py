@@ -149,12 +149,10 @@ class Rig:
 def with_rig(antenna: FloatArray, frame_from_body: FloatArray, rig: Rig) -> tuple[FloatArray, FloatArray]:
     """Return camera centres (N, 3) and rotations frame ← camera (N, 3, 3), from the navigation of N photographs.
 
-    Where the lever arm is not known, the antenna stands for the camera. A lever arm without an attitude gives no
-    centre, because the arm could point anywhere; no mount or no attitude gives no rotation: both are NaN.
-
-    Args:
-        antenna: (N, 3) metres in any Cartesian frame, or in one for each photograph.
-        frame_from_body: (N, 3, 3) attitudes of the body, forward-right-down, in that frame.
+    The antennas (N, 3) are metres in any Cartesian frame, or in one for each photograph; the attitudes (N, 3, 3) of
+    the body, forward-right-down, are in that frame. Where the lever arm is not known, the antenna stands for the
+    camera. A lever arm without an attitude gives no centre, because the arm could point anywhere; no mount or no
+    attitude gives no rotation: both are NaN.
     """
     mounts, arms = rig.of_each(len(antenna))
     arms = np.nan_to_num(arms)

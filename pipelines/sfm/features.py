@@ -39,7 +39,6 @@ def select_pairs(position: FloatArray, axis: FloatArray, max_neighbors: int) -> 
     Args:
         position: (N, 3) metres in geo, NaN where unknown.
         axis: (N, 3) unit vectors of the optical axes in geo, NaN where unknown.
-        max_neighbors: limit of the neighbours in steps 1 and 2.
     """
     count = len(position)
     located = np.flatnonzero(np.isfinite(position).all(axis=1))

@@ -42,10 +42,6 @@ class TargetCrs:
             return self.crs.horizontal_unit * SEMI_MAJOR_M
         return self.crs.horizontal_unit
 
-    @property
-    def height_unit_m(self) -> float:
-        return self.crs.height_unit_m
-
     def xyz_from_geo(self, points: ArrayLike) -> FloatArray:
         """Return points (N, 3) in the CRS, easting or longitude first, of points (N, 3) in `geo`.
 

@@ -15,7 +15,7 @@ from pipelines.core.errors import InputError
 from pipelines.core.products import Remark, load_json
 from pipelines.core.progress import SILENT
 from pipelines.core.stages import SURVEY
-from pipelines.geometry.correction_basis import correction_basis
+from pipelines.geometry.bundle import correction_basis
 from pipelines.report.accuracy import ninety_percent
 from pipelines.report.cameras import bias_of, cameras_facts, lenses_facts, mean_by_region
 from pipelines.report.place import links_of, overlap_facts, photographs_that_see, ties_of
