@@ -286,9 +286,8 @@ class VarianceComponent:
 
     used: BoolArray  # (M,) mask of the observations that count
     agree: bool  # whether most agree with each other, so that the others are outliers
-    # squares and redundancy: q and r of those that count
-    squares: float
-    redundancy: float
+    squares: float  # q of those that count
+    redundancy: float  # r of those that count
 
     @property
     def factor(self) -> float | None:

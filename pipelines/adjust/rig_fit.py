@@ -57,7 +57,7 @@ class RigData:
     """Cameras of n images by navigation and by SfM, and c control points."""
 
     positions: Trajectory  # of the antenna in geo, on the navigation's clock
-    # rotations of the body in geo, on the same clock; at most one sample if none were recorded
+    # Rotations of the body in geo, on the same clock; at most one sample if none were recorded
     attitudes: Trajectory
     time_s: FloatArray  # (n,) camera clock
     center_in_local: FloatArray  # (n, 3) projection centres of SfM

@@ -41,9 +41,8 @@ class Slopes:
     """Residuals of M observations near a state, and their derivatives."""
 
     residual: FloatArray  # (M, d), predicted minus measured, in metres or radians
-    # row and camera: (E,) observation and camera of each block
-    row: IntArray
-    camera: IntArray
+    row: IntArray  # (E,) observation of each block
+    camera: IntArray  # (E,) camera of each block
     by_pose: FloatArray  # (E, d, 6) by the corrections (δω, δc) of that camera
     by_lens: FloatArray  # (M, d, L)
     by_errors: FloatArray  # (M, d, p)

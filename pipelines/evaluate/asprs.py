@@ -40,8 +40,7 @@ class Assessment:
     stats: ErrorStats  # figures of all errors, blunders and points under vegetation included
     # RMSE of the check points' own survey (RMSE_H2, RMSE_V2 of the standard); None without points
     survey: Rmse | None
-    # Errors and survey in quadrature, the accuracy after the standard; None without points. Both are of the points
-    # outside vegetation.
+    # Errors and survey in quadrature, the accuracy after the standard; both are of the points outside vegetation
     with_survey: TotalRmse | None
     asprs: AsprsStatement  # classes that `with_survey` meets, and the accuracy under vegetation
     # (N,) mask of the errors beyond three times the class that the other points meet; none is under vegetation

@@ -30,13 +30,12 @@ class DroneTags:
     height: int
     focal_px: float
     stamp_ns: int  # UTC, nanoseconds since 1970
-    # lat_deg, lon_deg and alt_m: WGS84, ellipsoidal
     lat_deg: float
     lon_deg: float
-    alt_m: float
+    alt_m: float  # ellipsoidal, WGS84
     relative_alt_m: float  # above the place of take-off
-    yaw_pitch_roll_deg: tuple[float, float, float]  # the gimbal's; `body_yaw_pitch_roll_deg`: the aircraft's
-    body_yaw_pitch_roll_deg: tuple[float, float, float]
+    yaw_pitch_roll_deg: tuple[float, float, float]  # of the gimbal
+    body_yaw_pitch_roll_deg: tuple[float, float, float]  # of the aircraft
     # σ that the receiver states; None: a plain receiver, which states no σ
     sigma_enu_m: tuple[float, float, float] | None
 

@@ -71,9 +71,9 @@ class GroundPoints:
     marks: tuple[ListedMark, ...] = ()  # of these points; a file of another kind may have them
     crs_text: str | None = None  # CRS that the file states; None: it states none
     crs_line: int = 1
-    # whether the file calls its columns longitude and latitude; None if the CRS alone decides
+    # Whether the file calls its columns longitude and latitude; None if the CRS alone decides
     geographic: bool | None = None
-    # whether the coordinates are in the order of the axes of the CRS; else the easting is first
+    # Whether the coordinates are in the order of the axes of the CRS; else the easting is first
     in_order_of_crs: bool = False
     unknown_columns: tuple[str, ...] = ()  # names in the header that mean nothing here
     left_out: tuple[str, ...] = ()  # places of marks that the file itself does not count as made by a person

@@ -30,11 +30,10 @@ class TopicReport:
     use: str  # what `ingest` would take from it, or ""
     messages: int  # that could be read
     rate_hz: float | None  # by the median step between stamps; None for fewer than two messages
-    # first_s and last_s: time span; `longest_gap_s`: in it; `gaps`: steps of more than three times the median
     first_s: float | None
     last_s: float | None
     longest_gap_s: float | None
-    gaps: int
+    gaps: int  # steps of more than three times the median
     backwards: int  # stamps that are not later than the one before
     clock: str  # "stamp", or "recording" where messages have none
     frame: str  # of the first message, and its child frame

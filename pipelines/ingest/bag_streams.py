@@ -128,18 +128,18 @@ class TopicSamples:
     topic: str
     type: str
     width: int = 0
-    # nanoseconds of the message's own clock; 0 where it has none
+    # Nanoseconds of the message's own clock; 0 where it has none
     stamps: array[int] = field(default_factory=lambda: array("q"))
     bag_times: array[int] = field(default_factory=lambda: array("q"))  # nanoseconds of the recorder's clock
     values: array[float] = field(default_factory=lambda: array("d"))  # `width` numbers a sample
     receivers: list[str] = field(default_factory=list)  # the kind of receiver of each sample
-    frame: str = ""  # of the first sample; `world`: its local frame; `axes`: of the frame
-    world: str = ""
-    axes: Axes = "flu"
+    frame: str = ""  # of the first sample
+    world: str = ""  # local frame of the first sample
+    axes: Axes = "flu"  # of the frame
     problems: Counter[str] = field(default_factory=Counter)  # how many messages were left out, by reason
-    # (N,) seconds on the clock of all topics, once all are read; `usable`: (N,) which of them are
+    # (N,) seconds on the clock of all topics, once all are read
     time_s: FloatArray = field(default_factory=lambda: np.empty(0))
-    usable: BoolArray = field(default_factory=lambda: np.empty(0, dtype=bool))
+    usable: BoolArray = field(default_factory=lambda: np.empty(0, dtype=bool))  # (N,) which samples are
 
     def add(self, stamp: int | None, bag_ns: int, values: tuple[float, ...] = (), receiver: str = "") -> None:
         """Append a sample."""

@@ -54,7 +54,7 @@ class ImagePoses:
     source: str  # of the positions, with their CRS and the datum that their heights counted from
     crs_name: str
     vertical: VerticalDatum
-    # the Earth-centred trajectory that images were matched with by time, None where it was by name
+    # The Earth-centred trajectory that images were matched with by time, None where it was by name
     recorded: Trajectory | None = None
 
     @property

@@ -189,8 +189,7 @@ def check_options(options: IngestOptions, frames: Path | None) -> None:
         raise InputError(
             "events-need-antenna-track",
             "--events needs the antenna's --trajectory with times, and has the lever arm itself. Give "
-            "--trajectory, and remove --lever-arm. "
-            "A .MRK without a trajectory is given by --trajectory.",
+            "--trajectory, and remove --lever-arm. A .MRK without a trajectory is given by --trajectory.",
             field="--events",
         )
     for name in ("marks", "gcp_crs"):

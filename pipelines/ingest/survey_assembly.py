@@ -302,8 +302,7 @@ def _note_default(kind: str, count: int, options: IngestOptions, remarks: Remark
         remarks.assume(
             "default-common-sigma",
             f"The error that the {count} positions of a session share has a σ of {', '.join(defaults.values())} "
-            f"({kind}). "
-            f"State it with {' and '.join(defaults)}.",
+            f"({kind}). State it with {' and '.join(defaults)}.",
         )
 
 
@@ -379,7 +378,6 @@ def _vertical(poses: ImagePoses, files: Sequence[GroundFile], remarks: Remarks) 
         remarks.warn(
             "vertical-datums-mixed",
             f"The vertical datum of {', '.join(stated)} is stated, that of {', '.join(assumed)} only assumed. "
-            "They may differ by a "
-            "geoid's height, up to 100 m. State both with --vertical.",
+            "They may differ by a geoid's height, up to 100 m. State both with --vertical.",
         )
     return next(iter(datums.values()))

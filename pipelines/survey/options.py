@@ -26,7 +26,7 @@ class CloudCrs:
 
     crs: str | None = None  # text of the CRS, for files without one
     vertical: VerticalChoice | None = None  # datum of the heights, where the CRS has no vertical part
-    # option that named the clouds, for errors: `--lidar` has `--lidar-crs` and `--lidar-vertical`
+    # Option that named the clouds, for errors: `--lidar` has `--lidar-crs` and `--lidar-vertical`
     flag: str = "--lidar"
 
 

@@ -37,8 +37,7 @@ class Scene:
     sparse: SparseModel  # the SfM model (frame `local`)
     model_from_local: Similarity  # similarity that stays fixed
     geo_from_model: Similarity  # initial estimate, a pure shift
-    # train and test: indices of the cameras in each split
-    train: IntArray
+    train: IntArray  # indices of cameras
     test: IntArray
 
     @cached_property
