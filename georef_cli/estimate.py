@@ -76,7 +76,7 @@ def estimate_run(
     Raises:
         GeorefError: the run would be refused for its options, a missing file or a missing extra.
     """
-    from pipelines.sfm.stage import reconstructor_of
+    from pipelines.sfm.reconstructor import reconstructor_of
     from pipelines.train.estimate import estimate_training
 
     planned = plan(workspace, stages, flags, force=force)

@@ -1,4 +1,4 @@
-"""Stage `sfm`: structure from motion by an engine: COLMAP, or the import of a model.
+"""Stage `sfm`: structure from motion by an engine (`reconstructor.py`): COLMAP, or the import of a model.
 
 Reads `ingest/survey.json` and the photographs. Writes `sfm/sparse/` (a COLMAP model that COLMAP itself opens) and
 `sfm/database.db` (features and matches). The model's frame is `local`: similar to the scene, with an arbitrary
@@ -11,7 +11,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from pipelines.core.child import run_in_child
 from pipelines.core.errors import CrashError, DamagedPartialError, DegenerateGeometryError
@@ -20,11 +20,9 @@ from pipelines.core.products import Remark, load_json
 from pipelines.core.progress import Progress
 from pipelines.core.stages import SURVEY
 from pipelines.core.workspace import StageRun, Summary
-from pipelines.sfm.colmap_reconstruction import ColmapReconstructor
-from pipelines.sfm.estimate import ReconstructionEstimate
 from pipelines.sfm.features import SfmJob
-from pipelines.sfm.imported_model import ImportedModel
 from pipelines.sfm.options import SfmOptions
+from pipelines.sfm.reconstructor import reconstructor_of
 from pipelines.survey.survey import Survey
 
 _FEW_REGISTERED = 0.8
@@ -103,41 +101,3 @@ def _summarise(model: Any, survey: Survey) -> Summary:
     }
     figure = f"{registered} of {total} registered, {model.num_points3D()} points, {error_px:.2f} px"
     return Summary(figure, values, tuple(warnings))
-
-
-class Reconstructor(Protocol):
-    """Engine of structure from motion: photographs, pairs to match and options in, a model out.
-
-    The product of every engine is a COLMAP model, which the later stages read as a `SparseModel`.
-    """
-
-    @property
-    def remedy(self) -> str:
-        """What to do after a crash."""
-
-    def estimate(
-        self, photographs: int, photo_px: tuple[int, int], options: SfmOptions
-    ) -> ReconstructionEstimate | None:
-        """Return the estimate for photographs whose largest has so many pixels; None: nothing is to be computed."""
-
-    def prepare(self, stage: StageRun, survey: Survey, options: SfmOptions) -> bool:
-        """Do what comes before `reconstruct` in the process of the stage, which can start jobs.
-
-        Return whether `reconstruct` continues what an interrupted run has left, and may fail because of that.
-
-        Raises:
-            ResourceError: the reconstruction would not fit into the memory.
-            GeorefError: a job has failed.
-        """
-
-    def reconstruct(self, job: SfmJob, progress: Progress) -> Any:
-        """Write the largest model into the folder `job.sparse`, in a child process; return its `Reconstruction`.
-
-        Raises:
-            GeorefError: photographs or imported model are not those of the survey, or no model was found.
-        """
-
-
-def reconstructor_of(options: SfmOptions) -> Reconstructor:
-    """Return the engine that the options ask for."""
-    return ColmapReconstructor() if options.import_model is None else ImportedModel(options.import_model)

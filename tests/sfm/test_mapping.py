@@ -20,7 +20,7 @@ from pipelines.sfm.estimate import chunk_peak_bytes, peak_bytes, why_too_large
 from pipelines.sfm.features import SfmJob
 from pipelines.sfm.mapping import chosen_mapper, map_database
 from pipelines.sfm.options import SfmOptions
-from pipelines.sfm.stage import reconstructor_of
+from pipelines.sfm.reconstructor import reconstructor_of
 from tests.refusals import numbers, refused
 from tests.sfm_scenes import CONFIG, HEIGHT, WIDTH, survey_of
 
