@@ -6,13 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipelines.geometry.bundle import Network
+from pipelines.geometry.bundle import BundleInformation, Network, bundle_information, eliminate_points
 from pipelines.geometry.cameras import Camera, project
 from pipelines.geometry.rotations import exp_so3
 from tests.scenes import looking_at
 
 LENS = Camera("SIMPLE_RADIAL", 600, 450, np.array([500.0, 300.0, 225.0, -0.05]))
 SIGMA_PX = 0.5
+
+
+def stated_information(network: Network, sigma_px: np.ndarray) -> BundleInformation:
+    """Return the information of observations with stated σ (M,), all of them in front of their cameras."""
+    return replace(bundle_information(network), sums=eliminate_points(network, 1.0 / sigma_px), sigma_px=1.0)
 
 
 def adjuster(network: Network) -> np.ndarray:

@@ -2,10 +2,25 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from pipelines.formats.splat_ply import SplatArrays
+from pipelines.formats.spz import decode_spz
 from pipelines.geometry.intersection import UncertainCameras
+
+
+def read_spz(path: Path) -> SplatArrays:
+    return decode_spz(path.read_bytes(), path)
+
+
+def map_from_cam(omega_phi_kappa_deg: np.ndarray | list[float]) -> np.ndarray:
+    """Rotations (..., 3, 3) camera → map axes of ω, φ, κ (..., 3) in degrees: inverts `omega_phi_kappa_deg`."""
+    angles = np.asarray(omega_phi_kappa_deg, dtype=np.float64)
+    turned = Rotation.from_euler("XYZ", angles.reshape(-1, 3), degrees=True).as_matrix()
+    return turned.reshape(*angles.shape[:-1], 3, 3) @ np.diag([1.0, -1.0, -1.0])
 
 
 def intersect_one(xy: np.ndarray, views: list[int], of: UncertainCameras) -> tuple[np.ndarray, np.ndarray]:

@@ -108,7 +108,7 @@ def picked_errors_m(
     true_in_geo = np.array([point.position_in_geo for point in points])[rays.point]
     centres, geo_from_model = gaussians.means.numpy().astype(np.float64), trained.geo_from_model
     opaque = torch.sigmoid(gaussians.logit_opacities).numpy() >= LEAST_OPACITY
-    errors = np.full((len(rules), len(rays), 3), np.nan)
+    errors = np.full((len(rules), len(rays.point), 3), np.nan)
     for camera in np.unique(rays.camera):
         turn, center = trained.poses.cam_from_model[camera], trained.poses.cam_center_in_model[camera]
         in_cam = (centres - center) @ turn.T
@@ -139,7 +139,7 @@ def surface_errors_m(trained: TrainedSurvey, rays: MarkRays, workspace: Workspac
     renderer, poses = ModelRenderer(trained, images, rasterizer("auto")), trained.poses
     true_in_geo = np.array([point.position_in_geo for point in trained.survey.check_points])[rays.point]
     true_in_model = trained.geo_from_model.inverse().apply(true_in_geo)
-    errors = np.full(len(rays), np.nan)
+    errors = np.full(len(rays.point), np.nan)
     for mark, (camera, xy) in enumerate(zip(rays.camera, rays.xy, strict=True)):
         depth_m = depth_around(renderer, int(camera), xy).depth_at(xy)
         true_m = (poses.cam_from_model[camera] @ (true_in_model[mark] - poses.cam_center_in_model[camera]))[2]

@@ -32,24 +32,17 @@ _SIGMA = ("sigma_e_m", "sigma_n_m", "sigma_u_m", "sigma_h_m", "sigma_v_m")
 
 @dataclass(frozen=True)
 class AccuracyGrid:
-    """Predicted σ at C cells of a grid over the scene, of `shape` columns and rows and sides of `size_m` metres.
-
-    Attributes:
-        position_in_geo: (C, 3) middle of each cell, at the height of the scene there.
-        cov_m2: (C, 3, 3) covariance in m², east, north, up.
-        cell: (C, 2) column from the west and row from the south.
-        corner_in_geo: (2,) east and north of the south-western corner.
-    """
+    """Predicted σ at C cells of a grid over the scene, of `shape` columns and rows and sides of `size_m` metres."""
 
     NO_ARRAYS: ClassVar[Mapping[str, FloatArray]] = {
         f"grid_{name}": np.zeros(0) for name in ("position", "cov_m2", "cell", "place")
     }
 
-    position_in_geo: FloatArray
-    cov_m2: FloatArray
-    cell: IntArray
+    position_in_geo: FloatArray  # (C, 3) middle of each cell, at the height of the scene there
+    cov_m2: FloatArray  # (C, 3, 3) covariance in m², east, north, up
+    cell: IntArray  # (C, 2) column from the west and row from the south
     size_m: float
-    corner_in_geo: FloatArray
+    corner_in_geo: FloatArray  # (2,) east and north of the south-western corner
     shape: tuple[int, int]
 
     def arrays(self) -> dict[str, FloatArray | IntArray]:

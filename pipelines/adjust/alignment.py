@@ -24,7 +24,7 @@ Fixes against control points:
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from itertools import compress
 from typing import Literal
 
@@ -32,7 +32,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from pipelines.core.errors import DegenerateGeometryError
-from pipelines.core.types import BoolArray, FloatArray
+from pipelines.core.types import BoolArray, FloatArray, Rows, joined_rows, rows_of
 from pipelines.geometry.rotations import exp_so3, log_so3
 from pipelines.geometry.similarity import Similarity, jacobian_at, perturbation, umeyama
 from pipelines.robust.statistics import (
@@ -59,37 +59,22 @@ _ADVICE = (
 
 
 @dataclass(frozen=True)
-class Correspondences:
-    """n points known in both frames.
-
-    Attributes:
-        control: (n,) control point (True) or camera centre (False).
-        in_local: (n, 3), in units of local.
-        cov_in_local: (n, 3, 3), in squared units of local.
-        in_geo: (n, 3) metres, as measured.
-        cov_in_geo: (n, 3, 3) m².
-    """
+class Correspondences(Rows):
+    """n points known in both frames."""
 
     name: tuple[str, ...]
-    control: BoolArray
-    in_local: FloatArray
-    cov_in_local: FloatArray
-    in_geo: FloatArray
-    cov_in_geo: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.name)
+    control: BoolArray  # (n,) control point (True) or camera centre (False)
+    in_local: FloatArray  # (n, 3), in units of local
+    cov_in_local: FloatArray  # (n, 3, 3), in squared units of local
+    in_geo: FloatArray  # (n, 3) metres, as measured
+    cov_in_geo: FloatArray  # (n, 3, 3) m²
 
     def part(self, chosen: BoolArray) -> Correspondences:
         """Return the correspondences that a mask (n,) selects."""
-        arrays = (getattr(self, each.name)[chosen] for each in fields(self)[1:])
-        return Correspondences(tuple(compress(self.name, chosen)), *arrays)
+        return replace(rows_of(self, chosen), name=tuple(compress(self.name, chosen)))
 
     def joined(self, other: Correspondences) -> Correspondences:
-        arrays = (
-            np.concatenate([getattr(self, each.name), getattr(other, each.name)]) for each in fields(self)[1:]
-        )
-        return Correspondences(self.name + other.name, *arrays)
+        return replace(joined_rows([self, other]), name=self.name + other.name)
 
 
 @dataclass(frozen=True)
@@ -121,24 +106,17 @@ class SimilarityState:
 
 @dataclass(frozen=True)
 class AdjustedSimilarity:
-    """Solution of the adjustment, with its covariance, residuals and cost.
-
-    Attributes:
-        covariance: (7, 7) about `pivot`, (3,) in geo; see `SimilarityRecord`.
-        response: (n, 7, 3) change of the parameters per metre of error of each measured position.
-        residual: (n, 3) metres, measured (less bias) minus mapped.
-        cost: −2 ln likelihood, with outliers at the cost of the gate; compares solutions of the same data.
-        condition_number: of the normal matrix, with angles and ln s scaled by the size of the layout.
-    """
+    """Solution of the adjustment, with its covariance, residuals and cost."""
 
     state: SimilarityState
-    covariance: FloatArray
+    covariance: FloatArray  # (7, 7) about `pivot`, (3,) in geo; see `SimilarityRecord`
     pivot: FloatArray
+    # (n, 7, 3) change of the parameters per metre of error of each measured position
     response: FloatArray = field(repr=False)
-    residual: FloatArray = field(repr=False)
+    residual: FloatArray = field(repr=False)  # (n, 3) metres, measured (less bias) minus mapped
     squared: FloatArray = field(repr=False)
-    cost: float
-    condition_number: float
+    cost: float  # −2 ln likelihood, with outliers at the cost of the gate; compares solutions of the same data
+    condition_number: float  # of the normal matrix, with angles and ln s scaled by the size of the layout
 
     @property
     def rotation_sigma_rad(self) -> float:
@@ -296,18 +274,10 @@ def _excess(data: Correspondences, state: SimilarityState, members: BoolArray, r
 
 @dataclass(frozen=True)
 class Alignment:
-    """Similarity, with the layout that determines it and the attitude in use.
-
-    The layout is that of the correspondences used; "line" if the mean of the attitudes resolved the rotation.
-    """
+    """Similarity, with the layout of the correspondences used; "line" if the attitudes resolved the rotation."""
 
     solution: AdjustedSimilarity
     layout: Literal["volume", "plane", "line"]
-    attitude: RotationPrior | None
-
-    @property
-    def attitude_used(self) -> bool:
-        return self.attitude is not None
 
     @property
     def geo_from_local(self) -> Similarity:
@@ -346,7 +316,7 @@ def align(data: Correspondences, rng: np.random.Generator, *, attitude: Rotation
     # A bias of the fixes costs as much as an outlier. Where both explain a single control point, rounding must not
     # decide: it is the outlier.
     best = min(firm, key=lambda one: one.cost + 1.001 * OUTLIER_GATE * (one.state.fix_bias_in_geo is not None))
-    return Alignment(best, "line" if prior else layout_of(data.in_local[best.state.inlier]), prior)
+    return Alignment(best, "line" if prior else layout_of(data.in_local[best.state.inlier]))
 
 
 def layout_of(positions: FloatArray) -> Literal["volume", "plane"]:

@@ -74,7 +74,7 @@ def calibrate(
     found = _estimates(fit, track)
     estimates = [found[name] for name in wanted]
     to_apply = survey.estimate if options.apply is None else wanted if options.apply else ()
-    applied = tuple(estimate for estimate in estimates if estimate.usable and estimate.name in to_apply)
+    applied = tuple(estimate for estimate in estimates if all(estimate.observable) and estimate.name in to_apply)
     attitude = fit.rms_attitude_deg
     return RigCalibration(
         wanted=wanted,
@@ -158,7 +158,7 @@ def _key_figure(calibration: RigCalibration) -> str:
         sigma = ", ".join(f"{number:.3f}" for number in estimate.sigma)
         unit = {"s": " s", "deg": "°", "m": " m"}[estimate.unit]
         remark = "" if estimate in calibration.applied else " (not applied)"
-        remark = remark if estimate.usable else " (not observable, not applied)"
+        remark = remark if all(estimate.observable) else " (not observable, not applied)"
         parts.append(f"{estimate.name} {value} ± {sigma}{unit}{remark}")
     return "; ".join(parts) or "nothing of the rig is observable"
 
@@ -177,7 +177,7 @@ def _warnings(calibration: RigCalibration, survey: Survey) -> tuple[Remark, ...]
             f"{estimate.unit}): the value that `georef ingest` set stays.",
         )
         for estimate in calibration.estimates
-        if not estimate.usable
+        if not all(estimate.observable)
     ]
     missed = [name for name in survey.estimate if name not in calibration.wanted]
     if missed:

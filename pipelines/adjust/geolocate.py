@@ -156,7 +156,7 @@ def _warnings(
             f"{listed(sorted(rejected))}."
         )
         warnings.append(Remark(code="fixes-inconsistent", sentence=sentence))
-    if prior is not None and not alignment.attitude_used:
+    if prior is not None and alignment.layout != "line":
         turn = turn_against(prior, alignment.geo_from_local)
         sigma = np.hypot(np.sqrt(prior.cov_rad2[0, 0]), alignment.solution.rotation_sigma_rad)
         if turn > 4 * sigma:

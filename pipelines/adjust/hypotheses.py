@@ -26,8 +26,16 @@ from pipelines.geodesy.enu import Origin, ecef_from_enu, ecef_from_lla, enu_from
 from pipelines.geodesy.vertical import FOOT_M
 from pipelines.geometry.similarity import Similarity, umeyama
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.robust.patterns import blunders_among, scatter_about_median, two_groups
-from pipelines.robust.statistics import RansacOptions, median_chi2, outlier_gate, ransac, typical_sigma
+from pipelines.robust.statistics import (
+    RansacOptions,
+    blunders_among,
+    median_chi2,
+    outlier_gate,
+    ransac,
+    scatter_about_median,
+    two_groups,
+    typical_sigma,
+)
 from pipelines.survey.survey import Survey
 
 # A hypothesis explains an inconsistency if it lowers the scatter by so much.
@@ -47,41 +55,27 @@ _UPSIDE_DOWN = -0.2
 
 
 class StatedFixes:
-    """Fixes of a survey's n registered photographs as stated, against the SfM model.
-
-    Attributes:
-        center_in_local: (n, 3) projection centres.
-        position_in_geo: (n, 3) metres.
-        time_s: (n,) times of the photographs, NaN where unknown.
-        sigma_m: typical σ per axis; NaN without fixes.
-    """
+    """Fixes of a survey's n registered photographs as stated, against the SfM model."""
 
     def __init__(self, survey: Survey, model: SparseModel) -> None:
         fixes = fix_correspondences(survey, model)
         times = {image.name: image.timestamp_s for image in survey.images}
         self.model, self.origin, self.name = model, survey.origin, fixes.name
-        self.center_in_local, self.position_in_geo = fixes.in_local, fixes.in_geo
-        self.time_s = np.array([times[name] for name in fixes.name], dtype=np.float64)
-        self.sigma_m = typical_sigma(fixes.cov_in_geo) if len(fixes) else np.nan
+        self.center_in_local, self.position_in_geo = fixes.in_local, fixes.in_geo  # (n, 3), and (n, 3) in metres
+        self.time_s = np.array([times[name] for name in fixes.name], dtype=np.float64)  # (n,), NaN where unknown
+        self.sigma_m = typical_sigma(fixes.cov_in_geo) if len(fixes) else np.nan  # per axis
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A mistake that would explain the measurements, and what to do.
-
-    Attributes:
-        scatter_m: robust scatter per axis of the corrected fixes about the SfM model.
-        geo_from_local: similarity of the corrected fixes.
-        distance_m: (n,) of the corrected fixes from the SfM model; NaN where the hypothesis says nothing.
-        price: of the unknowns that it adds, in units of −2 ln likelihood.
-    """
+    """A mistake that would explain the measurements, and what to do."""
 
     code: str
     sentence: str
-    scatter_m: float
-    geo_from_local: Similarity
-    distance_m: FloatArray
-    price: float = 0.0
+    scatter_m: float  # robust scatter per axis of the corrected fixes about the SfM model
+    geo_from_local: Similarity  # of the corrected fixes
+    distance_m: FloatArray  # (n,) of the corrected fixes from the SfM model; NaN where the hypothesis says nothing
+    price: float = 0.0  # of the unknowns that it adds, in units of −2 ln likelihood
 
 
 # Code, sentence, fixes (n, 3) without the mistake, and price of its unknowns.
@@ -243,7 +237,7 @@ def _drifts(fixes: StatedFixes, price: float) -> Iterator[_Change]:
     if not np.isfinite(since).all() or count < 2 * _LEAST or since.max() <= 0:
         return
     changed, slope = _without(fixes, since / since.max())
-    sentence = f"The fixes drift by {_vector(slope)} m east, north, up from the first photograph to the last."
+    sentence = f"The fixes drift by {vector_text(slope)} m east, north, up from the first photograph to the last."
     yield "drift", sentence, changed, 3.0 * price
     steps = []
     for first in range(_LEAST, count - _LEAST + 1, max(1, count // 24)):
@@ -255,7 +249,7 @@ def _drifts(fixes: StatedFixes, price: float) -> Iterator[_Change]:
     if steps:
         _, shifted, step, changed = min(steps, key=lambda one: one[0])
         sentence = (
-            f"The last {shifted} of {count} fixes are shifted by {_vector(step)} m east, north, up against the "
+            f"The last {shifted} of {count} fixes are shifted by {vector_text(step)} m east, north, up against the "
             "others. Check base station and datum."
         )
         yield "step", sentence, changed, 4.0 * price
@@ -275,7 +269,7 @@ def _groups(fixes: StatedFixes, start: Similarity, price: float) -> Iterator[_Ch
         return
     shifted = listed([fixes.name[row] for row in np.flatnonzero(second)])
     sentence = (
-        f"{int(second.sum())} of {count} fixes are shifted by {_vector(apart)} m east, north, up against the "
+        f"{int(second.sum())} of {count} fixes are shifted by {vector_text(apart)} m east, north, up against the "
         f"others ({shifted}). Check base station, datum and receiver."
     )
     yield "mixture", sentence, changed, price + _MEMBER * count
@@ -294,7 +288,7 @@ def _without(fixes: StatedFixes, shape: FloatArray) -> tuple[FloatArray, FloatAr
     return changed, total
 
 
-def _vector(values: FloatArray) -> str:
+def vector_text(values: FloatArray) -> str:
     return "(" + ", ".join(f"{value:+.2f}" for value in values) + ")"
 
 

@@ -22,6 +22,7 @@ from pipelines.adjust.hypotheses import (
     fit,
     hangs_upside_down,
     mirrored,
+    vector_text,
 )
 from pipelines.adjust.joint import JointAdjustment
 from pipelines.adjust.measurements import (
@@ -38,8 +39,7 @@ from pipelines.core.types import FloatArray
 from pipelines.geodesy.vertical import FOOT_M, MOST_GEOID_M
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.robust.patterns import median_spacing
-from pipelines.robust.statistics import outlier_gate, typical_sigma
+from pipelines.robust.statistics import median_spacing, outlier_gate, typical_sigma
 from pipelines.survey.report_parts import Group, VarianceFactor
 from pipelines.survey.survey import Survey
 
@@ -256,10 +256,9 @@ def _constant_shift(residual: FloatArray) -> FloatArray | None:
 
 
 def _apart(shift_m: FloatArray, survey: Survey, *, ends: bool) -> _Finding:
-    values = ", ".join(f"{value:+.2f}" for value in shift_m)
     sentence = (
-        f"Control points and fixes are apart by a constant shift of ({values}) m east, north, up. Check "
-        f"{_cause_of_shift(shift_m, survey)}."
+        f"Control points and fixes are apart by a constant shift of {vector_text(shift_m)} m east, north, up. "
+        f"Check {_cause_of_shift(shift_m, survey)}."
     )
     return _Finding("control-shifted", sentence, ends)
 

@@ -16,7 +16,15 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pipelines.adjust.alignment import AdjustedSimilarity, Alignment, Correspondences, RotationPrior, align
+from pipelines.adjust.alignment import (
+    OUTLIER_GATE,
+    AdjustedSimilarity,
+    Alignment,
+    Correspondences,
+    align,
+    covariance_of,
+    layout_of,
+)
 from pipelines.adjust.inconsistencies import cautions_of, marks_that_do_not_meet, mistake_in_marks, unadjustable
 from pipelines.adjust.joint import JointAdjustment, Start, adjust_jointly, component_of, in_own_frame
 from pipelines.adjust.measurements import (
@@ -30,13 +38,6 @@ from pipelines.adjust.measurements import (
     start_of,
 )
 from pipelines.adjust.options import EstimatedErrorName, InitSim3Options
-from pipelines.adjust.paper import (
-    agreeing_points,
-    counts_of,
-    residuals_of,
-    residuals_of_points,
-    similarity_by_paper,
-)
 from pipelines.adjust.posterior import Posterior, save_posterior
 from pipelines.adjust.solution import adjusted
 from pipelines.adjust.system import minimise
@@ -45,13 +46,13 @@ from pipelines.core.errors import ConvergenceError, DegenerateGeometryError, Inc
 from pipelines.core.products import NOT_CHECKED, Remark, save_json, union
 from pipelines.core.sentences import listed
 from pipelines.core.stages import ADJUSTMENT, POINTS, SIM3, SIM3_POSTERIOR, SPARSE
+from pipelines.core.types import BoolArray, FloatArray
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.formats.colmap import read_sparse
-from pipelines.geometry.rotations import quat_xyzw_from_matrix
-from pipelines.geometry.similarity import SimilarityRecord
+from pipelines.geometry.similarity import Similarity, SimilarityRecord, jacobian_at, spread_ratio_similarity
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.robust.statistics import residual_stats
-from pipelines.survey.adjustment import AttitudeRecord, GeolocatedPoints, InitialSimilarity
+from pipelines.robust.statistics import ResidualStats, residual_stats, squared_mahalanobis
+from pipelines.survey.adjustment import GeolocatedPoints, InitialSimilarity
 from pipelines.survey.calibrated import load_survey
 from pipelines.survey.scene import initial_scene
 from pipelines.survey.survey import Survey
@@ -250,17 +251,8 @@ def _aligned_product(
         },
         condition_number=solution.condition_number,
         layout=alignment.layout,
-        attitude_used=alignment.attitude_used,
-        attitude=_attitude(alignment.attitude),
+        attitude_used=alignment.layout == "line",
     )
-
-
-def _attitude(prior: RotationPrior | None) -> AttitudeRecord | None:
-    if prior is None:
-        return None
-    x, y, z, w = quat_xyzw_from_matrix(prior.rotation).tolist()
-    first, second, third = (tuple(row) for row in prior.cov_rad2.tolist())
-    return AttitudeRecord(quat_xyzw=(x, y, z, w), cov_rad2=(first, second, third))
 
 
 def _starts(data: Correspondences, aligned: InitialSimilarity, seed: int) -> Iterator[Start]:
@@ -339,3 +331,65 @@ def _joint_product(
             "variance_factors": tuple(joint.factors.values()),
         }
     ), tuple(warnings)
+
+
+def similarity_by_paper(model: SparseModel, points: GeolocatedPoints, data: Correspondences) -> InitialSimilarity:
+    """Return the paper's similarity (eqs 16–21) of the geolocated points, with equal weights.
+
+    The paper gives no covariance. Here the covariance follows from the scatter of the points, counted as only one
+    point for each image, because the points share the errors of the images.
+
+    Raises:
+        DegenerateGeometryError: fewer than three points.
+    """
+    good = points.inlier
+    if good.sum() < 3:
+        raise DegenerateGeometryError(
+            "too-few-geolocated-points",
+            f"--method paper needs at least three geolocated points; there are {good.sum()}. Use --method robust.",
+        )
+    local, geo = model.point_in_local[good], points.position_in_geo[good]
+    similarity = spread_ratio_similarity(local, geo)
+    mapped = similarity.apply(local)
+    pivot = mapped.mean(axis=0)
+    variance = float(((geo - mapped) ** 2).mean()) * max(len(local) / len(model.image_name), 1.0)
+    unit = np.ones(7)
+    unit[:4] = ((mapped - pivot) ** 2).sum(axis=1).mean() ** -0.5
+    covariance = covariance_of(jacobian_at(mapped, pivot).reshape(-1, 7), unit)
+    return InitialSimilarity(
+        geo_from_local=similarity.to_record("local", "geo", covariance=variance * covariance, pivot=pivot),
+        method="paper",
+        correspondences=counts_of(data.control[:0], good),
+        inliers=counts_of(data.control[:0], good),
+        residuals={
+            **residuals_of(data, data.in_geo - similarity.apply(data.in_local)),
+            "points": residuals_of_points(model, points, similarity),
+        },
+        condition_number=float(np.linalg.cond(covariance / np.outer(unit, unit))),
+        layout=layout_of(local),
+        attitude_used=points.rotation_source == "recorded",
+    )
+
+
+def counts_of(control: BoolArray, points: BoolArray) -> dict[str, int]:
+    """Return the numbers of camera centres and control points, from the mask of the latter, and of points."""
+    return {"gnss": int((~control).sum()), "gcp": int(control.sum()), "points": int(points.sum())}
+
+
+def agreeing_points(model: SparseModel, points: GeolocatedPoints, similarity: Similarity) -> BoolArray:
+    """Return the mask (N,) of the geolocated points that agree with a similarity within their covariance."""
+    good = points.inlier.copy()
+    missed = points.position_in_geo[good] - similarity.apply(model.point_in_local[good])
+    good[good] = squared_mahalanobis(missed, points.cov_in_geo[good]) <= OUTLIER_GATE
+    return np.asarray(good)
+
+
+def residuals_of_points(model: SparseModel, points: GeolocatedPoints, similarity: Similarity) -> ResidualStats:
+    """Return the figures of the geolocated points' residuals."""
+    good = points.inlier
+    return residual_stats(points.position_in_geo[good] - similarity.apply(model.point_in_local[good]))
+
+
+def residuals_of(data: Correspondences, missed: FloatArray) -> dict[str, ResidualStats]:
+    """Return the figures of residuals (n, 3) of camera centres and control points."""
+    return {"gnss": residual_stats(missed[~data.control]), "gcp": residual_stats(missed[data.control])}

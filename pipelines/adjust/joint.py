@@ -56,25 +56,17 @@ _NO_REDUNDANCY = 0.5
 
 @dataclass(frozen=True)
 class JointAdjustment:
-    """Solution, and what the measurements say of each other.
+    """Solution, and what the measurements say of each other."""
 
-    Attributes:
-        survey: with the variance factors in its covariances.
-        normal: equations at `state`, the minimum of `problem`, which has all measurements.
-        at_stated: tests of fixes and control points by kind, under the stated σ.
-        components: the same under the applied factors.
-        cost: −2 ln likelihood at the stated σ; compares solutions from different starts.
-    """
-
-    survey: Survey
+    survey: Survey  # with the variance factors in its covariances
     scene: Scene
     problem: Problem
     state: State
-    normal: NormalMatrix
-    at_stated: dict[str, VarianceComponent]
-    components: dict[str, VarianceComponent]
+    normal: NormalMatrix  # equations at `state`, the minimum of `problem`, which has all measurements
+    at_stated: dict[str, VarianceComponent]  # tests of fixes and control points by kind, under the stated σ
+    components: dict[str, VarianceComponent]  # the same under the applied factors
     factors: dict[Group, VarianceFactor]
-    cost: float
+    cost: float  # −2 ln likelihood at the stated σ; compares solutions from different starts
 
     @property
     def is_consistent(self) -> bool:
@@ -237,7 +229,7 @@ def _marks(survey: Survey, scene: Scene) -> list[VarianceFactor]:
     """Test the σ of the control points' marks: how well their rays meet in the SfM model."""
     rays = mark_rays(survey.control_points, scene.sparse)
     rays = rays.of_points(rays.marks_of_point >= 2)
-    if not len(rays):
+    if not len(rays.point):
         return []
     poses = scene.poses
     solved = intersect_marks(rays, poses.cam_from_model, poses.cam_center_in_model, RayErrors(_EXACT, _EXACT))
@@ -290,18 +282,12 @@ def _ties(scene: Scene) -> VarianceFactor:
 
 @dataclass(frozen=True)
 class VarianceComponent:
-    """Test of the σ of M observations of one kind.
+    """Test of the σ of M observations of one kind."""
 
-    Attributes:
-        used: (M,) mask of the observations that count.
-        agree: whether most agree with each other, so that the others are outliers.
-        squares, redundancy: q and r of those that count.
-    """
-
-    used: BoolArray
-    agree: bool
-    squares: float
-    redundancy: float
+    used: BoolArray  # (M,) mask of the observations that count
+    agree: bool  # whether most agree with each other, so that the others are outliers
+    squares: float  # q of those that count
+    redundancy: float  # r of those that count
 
     @property
     def factor(self) -> float | None:

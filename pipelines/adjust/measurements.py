@@ -21,7 +21,7 @@ from pipelines.adjust.system import Problem
 from pipelines.adjust.terms import Attitudes, ControlPoints, Fixes, Planes, Term, root_information
 from pipelines.core.errors import InputError
 from pipelines.core.sentences import listed
-from pipelines.core.types import BoolArray, FloatArray, IntArray
+from pipelines.core.types import BoolArray, FloatArray, IntArray, vector3
 from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.adjustment import InitialSimilarity
@@ -38,35 +38,23 @@ _LEAST_SIGMA_COMMON_M = 1e-4  # of an axis without a common error, where another
 
 @dataclass(frozen=True)
 class RecordedRotations:
-    """Recorded attitudes of k registered images, without the images that disagree with the SfM model.
+    """Recorded attitudes of k registered images, without the images that disagree with the SfM model."""
 
-    Attributes:
-        image: (k,) index into the model's images.
-        geo_from_cam: (k, 3, 3).
-        sigma_rad: (k,) per axis.
-        inconsistent: names of the images left out.
-    """
-
-    image: IntArray
-    geo_from_cam: FloatArray
-    sigma_rad: FloatArray
-    inconsistent: tuple[str, ...]
+    image: IntArray  # (k,) index into the model's images
+    geo_from_cam: FloatArray  # (k, 3, 3)
+    sigma_rad: FloatArray  # (k,) per axis
+    inconsistent: tuple[str, ...]  # names of the images left out
 
 
 @dataclass(frozen=True)
 class UnusedControlPoint:
-    """Control point that its marks do not determine.
-
-    Attributes:
-        unregistered: names of the images with marks that are not in the SfM model.
-        registered: names of the images with usable marks.
-        residual_px: angles between these marks and the point that most of them agree on, else their least-squares
-            point, in pixels; infinite: the rays are parallel.
-    """
+    """Control point that its marks do not determine."""
 
     name: str
-    unregistered: tuple[str, ...]
-    registered: tuple[str, ...]
+    unregistered: tuple[str, ...]  # names of the images with marks that are not in the SfM model
+    registered: tuple[str, ...]  # names of the images with usable marks
+    # Angles between these marks and the point that most of them agree on, else their least-squares point, in
+    # pixels; infinite: the rays are parallel
     residual_px: tuple[float, ...] = ()
 
     @property
@@ -222,7 +210,6 @@ def problem_of(
     """Return the problem of all cameras under the survey's measurements.
 
     Args:
-        scene: cameras and points as SfM left them.
         survey: the measurements in use, with the variance factors in their covariances.
         estimate: further systematic errors to estimate, beside the common error of the fixes.
         with_attitudes: whether the attitudes take part, where positions leave the rotation open.
@@ -337,8 +324,8 @@ def _common_errors(survey: Survey, fixes: Fixes) -> list[SystematicError]:
     for session in np.unique(fixes.session) if survey.sessions else ():
         sigma = np.array(survey.sessions[session].sigma_common_m)
         if sigma.any():
-            east, north, up = np.maximum(sigma, _LEAST_SIGMA_COMMON_M).tolist()
-            blocks.append(SystematicError("bias", (east, north, up), int(session)))
+            at_least = vector3(np.maximum(sigma, _LEAST_SIGMA_COMMON_M))
+            blocks.append(SystematicError("bias", at_least, int(session)))
     return blocks
 
 

@@ -13,11 +13,11 @@ from pipelines.survey.survey import RigParameters
 EstimatedErrorName = Literal["lever-arm", "boresight"]
 
 
-def _error_names(text: str) -> tuple[str, ...]:
-    return () if text == "none" else listed_names(text, get_args(EstimatedErrorName), "; or none")
-
-
-EstimatedErrorNames = Annotated[tuple[EstimatedErrorName, ...], from_text(_error_names), WRITTEN]
+EstimatedErrorNames = Annotated[
+    tuple[EstimatedErrorName, ...],
+    from_text(lambda text: () if text == "none" else listed_names(text, get_args(EstimatedErrorName), "; or none")),
+    WRITTEN,
+]
 
 
 class CalibrateOptions(StageOptions):

@@ -19,7 +19,7 @@ from pipelines.adjust.system import NormalMatrix
 from pipelines.core.errors import InputError
 from pipelines.core.files import read_npz
 from pipelines.core.products import save_npz
-from pipelines.core.types import FloatArray, IntArray
+from pipelines.core.types import FloatArray, IntArray, rows_of
 from pipelines.geometry.bundle import (
     Network,
     has_positive_depth,
@@ -35,17 +35,12 @@ from pipelines.survey.trained_model import Adjustment
 
 @dataclass(frozen=True)
 class IntersectionJacobian:
-    """Effect of poses, lens and marks on N intersected points, to first order.
+    """Effect of poses, lens and marks on N intersected points, to first order."""
 
-    Attributes:
-        by_poses: (3 N, 6 n) sparse, metres by (δω, δc) of each camera as in
-            `geometry.correction_basis.CorrectionBasis`.
-        by_lens: (N, 3, L) metres by the lens parameters, in the order of `CorrectionBasis`.
-        cov_of_marks: (N, 3, 3) m², from the σ of the marks; NaN for a point that its rays do not determine.
-    """
-
+    # (3 N, 6 n) sparse, metres by (δω, δc) of each camera as in `geometry.bundle.CorrectionBasis`
     by_poses: csr_matrix
-    by_lens: FloatArray
+    by_lens: FloatArray  # (N, 3, L) metres by the lens parameters, in the order of `CorrectionBasis`
+    # (N, 3, 3) m², from the σ of the marks; NaN for a point that its rays do not determine
     cov_of_marks: FloatArray
 
 
@@ -54,12 +49,8 @@ def intersection_jacobian(
 ) -> IntersectionJacobian:
     """Return the derivatives by poses and lens of the points of a network, each intersected from its own marks.
 
-    The derivatives are taken at the projections of the points; the pixels of the marks do not enter. Marks of
-    points behind their camera do not count.
-
-    Args:
-        sigma_px: (M,) σ of the marks.
-        surveyed: (N, 3, 3) information on the points beyond their marks, 1/m²; None: there is none.
+    The derivatives are taken at the projections of the points; of the marks their σ (M,) enter, and not the pixels.
+    Marks of points behind their camera do not count. Points may have information (N, 3, 3) beyond these, in 1/m².
     """
     sigma_px, marks = sigma_px[has_positive_depth(marks)], with_positive_depths(marks)
     lin, count = linearise_bundle(marks), len(marks.point_in_world)
@@ -81,31 +72,22 @@ def intersection_jacobian(
 
 @dataclass(frozen=True)
 class Posterior:
-    """Covariances of a solved survey.
-
-    Attributes:
-        sparse: the SfM model with the solved lenses.
-        normal: matrix of the normal equations, in `model`.
-        followed: (7, 6 n + L) mean similarity of the SfM points by corrections of cameras and lens.
-        lens: (ℓ,) lens parameters among the unknowns, of L in the order of `geometry.cameras.Lenses`.
-        camera_cov: (n, 6, 6) of (δθ [rad], δc [m]) of the cameras, along the axes of `geo`.
-        grid: σ over the scene; None: the scene has too few points.
-    """
+    """Covariances of a solved survey."""
 
     solution: Adjustment
-    sparse: SparseModel
-    normal: NormalMatrix
-    followed: FloatArray
-    lens: IntArray
-    camera_cov: FloatArray
-    grid: AccuracyGrid | None = None
+    sparse: SparseModel  # with the solved lenses
+    normal: NormalMatrix  # in `model`
+    followed: FloatArray  # (7, 6 n + L) mean similarity of the SfM points by corrections of cameras and lens
+    lens: IntArray  # (ℓ,) lens parameters among the unknowns, of L in the order of `geometry.cameras.Lenses`
+    camera_cov: FloatArray  # (n, 6, 6) of (δθ [rad], δc [m]) of the cameras, along the axes of `geo`
+    grid: AccuracyGrid | None = None  # σ over the scene; None: the scene has too few points
 
     def of_marked_points(self, point_in_geo: FloatArray, rays: MarkRays) -> FloatArray:
         """Return covariances (J, 3, 3) in m² of points (J, 3) intersected from their marks, with the marks' errors.
 
         NaN for a point that is NaN, or that its marks do not determine.
         """
-        rays = rays.part(np.flatnonzero(np.isfinite(point_in_geo[rays.point]).all(axis=1)))
+        rays = rows_of(rays, np.flatnonzero(np.isfinite(point_in_geo[rays.point]).all(axis=1)))
         return self._intersected(np.nan_to_num(point_in_geo), rays.point, rays.camera, rays.sigma_px)
 
     def jointly_of_marked_points(self, point_in_geo: FloatArray, rays: MarkRays) -> FloatArray:

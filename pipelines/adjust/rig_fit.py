@@ -54,31 +54,19 @@ _NOT_OBSERVABLE = (
 
 @dataclass(frozen=True)
 class RigData:
-    """Cameras of n images by navigation and by SfM, and c control points.
+    """Cameras of n images by navigation and by SfM, and c control points."""
 
-    Attributes:
-        positions: trajectory of the antenna in geo, on the navigation's clock.
-        attitudes: rotations of the body in geo, on the same clock; at most one sample if none were recorded.
-        time_s: (n,) camera clock.
-        center_in_local: (n, 3) projection centres of SfM.
-        cam_from_local: (n, 3, 3) rotations of SfM.
-        cam_from_body: (n, 3, 3) mount, NaN where unknown.
-        antenna_in_body: (n, 3) lever arm to start from, metres.
-        control: control points, intersected from their marks and as surveyed.
-        pixel_rad: angle of a pixel.
-        footprint_in_local: width of a pixel at the distance of the scene.
-    """
-
-    positions: Trajectory
+    positions: Trajectory  # of the antenna in geo, on the navigation's clock
+    # Rotations of the body in geo, on the same clock; at most one sample if none were recorded
     attitudes: Trajectory
-    time_s: FloatArray
-    center_in_local: FloatArray
-    cam_from_local: FloatArray
-    cam_from_body: FloatArray
-    antenna_in_body: FloatArray
-    control: Correspondences
-    pixel_rad: float
-    footprint_in_local: float
+    time_s: FloatArray  # (n,) camera clock
+    center_in_local: FloatArray  # (n, 3) projection centres of SfM
+    cam_from_local: FloatArray  # (n, 3, 3) rotations of SfM
+    cam_from_body: FloatArray  # (n, 3, 3) mount, NaN where unknown
+    antenna_in_body: FloatArray  # (n, 3) lever arm to start from, metres
+    control: Correspondences  # control points, intersected from their marks and as surveyed
+    pixel_rad: float  # angle of a pixel
+    footprint_in_local: float  # width of a pixel at the distance of the scene
 
     @property
     def has_attitudes(self) -> bool:
@@ -87,19 +75,12 @@ class RigData:
 
 @dataclass(frozen=True)
 class RigState:
-    """Values of the unknowns.
-
-    Attributes:
-        geo_from_local: the similarity.
-        offset_s: navigation clock minus camera clock.
-        boresight: (3, 3) nominal ← true camera.
-        arm: (3,) metres, added to `RigData.antenna_in_body`.
-    """
+    """Values of the unknowns."""
 
     geo_from_local: Similarity
-    offset_s: float
-    boresight: FloatArray
-    arm: FloatArray
+    offset_s: float  # navigation clock minus camera clock
+    boresight: FloatArray  # (3, 3) nominal ← true camera
+    arm: FloatArray  # (3,) metres, added to `RigData.antenna_in_body`
 
     def moved(self, step: FloatArray, pivot: FloatArray) -> RigState:
         """Return the state after a step (14,), with the pivot (3,) in geo of the similarity's parameters."""
@@ -122,18 +103,15 @@ class FitOptions:
 
 @dataclass(frozen=True)
 class RigFit:
-    """Result of the adjustment.
-
-    Attributes:
-        sigma: (14,) σ: of the similarity (7), offset in s, boresight in rad (3), lever arm in m (3). A small error
-            of SfM's lens tilts all cameras alike, or shifts them along their view, without any residual. The σ of
-            boresight and lever arm therefore include one pixel: its angle, and its width at the scene.
-        rms_position_m, rms_attitude_deg: robust σ of the residuals per axis; attitude NaN without any.
-    """
+    """Result of the adjustment."""
 
     state: RigState
+    # (14,) σ: of the similarity (7), offset in s, boresight in rad (3), lever arm in m (3). A small error of SfM's
+    # lens tilts all cameras alike, or shifts them along their view, without any residual. The σ of boresight and
+    # lever arm therefore include one pixel: its angle, and its width at the scene.
     sigma: FloatArray
     images: int
+    # rms_position_m and rms_attitude_deg: robust σ of the residuals per axis; attitude NaN without any
     rms_position_m: float
     rms_attitude_deg: float
 

@@ -34,12 +34,8 @@ def adjusted(
 ) -> Posterior:
     """Return a state as the solution of a survey, with its covariances.
 
-    Args:
-        scene: cameras as SfM left them.
-        problem: the measurements in use.
-        state: values of all unknowns.
-        initial: its verdict on each measurement stands; its factors and cautions are carried on.
-        rejected: problem of the measurements that were rejected.
+    `problem` has the measurements in use. The verdict of `initial` on each measurement stands, and its factors and
+    cautions are carried on.
 
     Raises:
         DegenerateGeometryError: the measurements leave the similarity open.

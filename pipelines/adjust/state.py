@@ -87,18 +87,13 @@ class SystematicErrors:
 
 @dataclass(frozen=True)
 class State:
-    """Values of all unknowns.
-
-    Attributes:
-        correction: (n, 6) corrections (δω, δc) of the cameras in `model`, rad and m: R' = R Exp(−δω), c' = c + δc.
-        lens: (L,) change of the lens parameters; L = 0: the lens stays.
-        errors: (p,) systematic errors, m and rad.
-    """
+    """Values of all unknowns."""
 
     geo_from_model: Similarity
+    # (n, 6) corrections (δω, δc) of the cameras in `model`, rad and m: R' = R Exp(−δω), c' = c + δc
     correction: FloatArray
-    lens: FloatArray
-    errors: FloatArray = field(default_factory=lambda: np.zeros(0))
+    lens: FloatArray  # (L,) change of the lens parameters; L = 0: the lens stays
+    errors: FloatArray = field(default_factory=lambda: np.zeros(0))  # (p,) systematic errors, m and rad
 
     def poses(self, base: CameraPoses) -> CameraPoses:
         turned = base.cam_from_model @ exp_so3(-self.correction[:, :3])

@@ -119,34 +119,22 @@ class Problem:
 
 @dataclass(frozen=True)
 class Rows:
-    """M whitened observations of one kind near a state.
+    """M whitened observations of one kind near a state."""
 
-    Attributes:
-        residual: (M, d) at the state.
-        by_poses: (M d, 6 n) sparse derivative by the corrections of the cameras.
-        by_border: (M d, b) derivative by the border: lens, systematic errors, similarity of the points if any.
-    """
-
-    residual: FloatArray
-    by_poses: csr_matrix
+    residual: FloatArray  # (M, d) at the state
+    by_poses: csr_matrix  # (M d, 6 n) sparse derivative by the corrections of the cameras
+    # (M d, b) derivative by the border: lens, systematic errors, similarity of the points if any
     by_border: FloatArray
 
 
 @dataclass(frozen=True)
 class NormalMatrix:
-    """Matrix of the normal equations: the information of all measurements on all unknowns.
+    """Matrix of the normal equations: the information of all measurements on all unknowns."""
 
-    Attributes:
-        poses: (6 n, 6 n) N, sparse in blocks (6, 6).
-        border: (b, 6 n) B.
-        corner: (b, b) C.
-        position: (n, 3) of the cameras; decides the cost of the factorisation, not its result.
-    """
-
-    poses: bsr_matrix
-    border: FloatArray
-    corner: FloatArray
-    position: FloatArray
+    poses: bsr_matrix  # (6 n, 6 n) N, sparse in blocks (6, 6)
+    border: FloatArray  # (b, 6 n) B
+    corner: FloatArray  # (b, b) C
+    position: FloatArray  # (n, 3) of the cameras; decides the cost of the factorisation, not its result
 
     @cached_property
     def factor(self) -> SparseCholesky:
@@ -324,11 +312,10 @@ class Linearised:
 
 @dataclass(frozen=True)
 class Minimum:
-    """Minimum of a problem: the state there, −2 ln likelihood, and equations that were factorised near by."""
+    """Minimum of a problem: the state there, and −2 ln likelihood."""
 
     state: State
     cost: float
-    normal: NormalMatrix
 
 
 def linearised(problem: Problem, state: State) -> Linearised:
@@ -385,7 +372,7 @@ def minimise(problem: Problem, start: State, normal: NormalMatrix | None = None)
             raise _not_converged(change)
         state, residuals, cost = moved, new, reached
         if change < _STILL:
-            return Minimum(state, cost, normal)
+            return Minimum(state, cost)
         if halving or change > _NEW_FACTOR * last:
             normal = None
         whole = change / (stretch * 0.5**halving)
@@ -413,15 +400,13 @@ def _moved(problem: Problem, state: State, step: tuple[FloatArray, FloatArray], 
 def _slope_of_bundle(problem: Problem, state: State) -> tuple[FloatArray, FloatArray]:
     """Return the slope (6 n,), (L,) of half the cost of the image observations."""
     sums, x, lens = problem.bundle.sums, state.correction.ravel(), state.lens
-    by_poses = problem.poses @ x + sums.cross @ lens + sums.pose_slope
-    return np.asarray(by_poses), np.asarray(sums.cross.T @ x + sums.lens @ lens + sums.lens_slope)
+    return np.asarray(problem.poses @ x + sums.cross @ lens), np.asarray(sums.cross.T @ x + sums.lens @ lens)
 
 
 def cost_at(problem: Problem, state: State, residuals: Residuals) -> float:
     """Return −2 ln likelihood of a state: Cauchy's cost of the residuals, and that of the image observations."""
     by_poses, by_lens = _slope_of_bundle(problem, state)
-    x, sums = state.correction.ravel(), problem.bundle.sums
-    of_bundle = x @ (by_poses + sums.pose_slope) + state.lens @ (by_lens + sums.lens_slope)
+    of_bundle = state.correction.ravel() @ by_poses + state.lens @ by_lens
     return float(of_bundle) + sum(
         float(cauchy_loss((rows**2).sum(axis=1), rows.shape[1]).sum()) for rows in residuals.values()
     )

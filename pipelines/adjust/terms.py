@@ -14,30 +14,22 @@ from typing import ClassVar
 import numpy as np
 
 from pipelines.adjust.state import SystematicErrors
-from pipelines.core.types import FloatArray, IntArray
+from pipelines.core.types import FloatArray, IntArray, Rows
 from pipelines.geometry.rotations import exp_so3, log_so3, right_jacobian_inverse_so3, skew
 from pipelines.geometry.similarity import Similarity, jacobian_at
 
 
 @dataclass(frozen=True)
 class At:
-    """Estimate that measurements are compared with.
+    """Estimate that measurements are compared with."""
 
-    Attributes:
-        cam_from_model: (n, 3, 3) corrected rotations.
-        center: (n, 3) corrected projection centres in `model`.
-        lens: (L,) change of the lens.
-        vector: (p,) values of the systematic errors.
-        turn_by_correction: (n, 3, 3) change of the rotation Exp(δω) by δω: its right Jacobian.
-    """
-
-    cam_from_model: FloatArray
-    center: FloatArray
+    cam_from_model: FloatArray  # (n, 3, 3) corrected rotations
+    center: FloatArray  # (n, 3) corrected projection centres in `model`
     geo_from_model: Similarity
-    lens: FloatArray
+    lens: FloatArray  # (L,) change of the lens
     errors: SystematicErrors
-    vector: FloatArray
-    turn_by_correction: FloatArray
+    vector: FloatArray  # (p,) values of the systematic errors
+    turn_by_correction: FloatArray  # (n, 3, 3) change of the rotation Exp(δω) by δω: its right Jacobian
 
     def geo_from_cam(self, camera: IntArray) -> FloatArray:
         """Return the rotations geo ← cam (K, 3, 3) of cameras (K,)."""
@@ -46,39 +38,25 @@ class At:
 
 @dataclass(frozen=True)
 class Slopes:
-    """Residuals of M observations near a state, and their derivatives.
+    """Residuals of M observations near a state, and their derivatives."""
 
-    Attributes:
-        residual: (M, d), predicted minus measured, in metres or radians.
-        row, camera: (E,) observation and camera of each block.
-        by_pose: (E, d, 6) by the corrections (δω, δc) of that camera.
-        by_lens: (M, d, L).
-        by_errors: (M, d, p).
-        by_similarity: (M, d, 7) by the mean similarity, in `model`, of the points that follow the cameras; None:
-            the observations do not depend on these points.
-    """
-
-    residual: FloatArray
-    row: IntArray
-    camera: IntArray
-    by_pose: FloatArray
-    by_lens: FloatArray
-    by_errors: FloatArray
+    residual: FloatArray  # (M, d), predicted minus measured, in metres or radians
+    row: IntArray  # (E,) observation of each block
+    camera: IntArray  # (E,) camera of each block
+    by_pose: FloatArray  # (E, d, 6) by the corrections (δω, δc) of that camera
+    by_lens: FloatArray  # (M, d, L)
+    by_errors: FloatArray  # (M, d, p)
+    # (M, d, 7) by the mean similarity, in `model`, of the points that follow the cameras; None: the observations do
+    # not depend on these points
     by_similarity: FloatArray | None = None
 
 
-class Term(ABC):
-    """M observations of one kind.
+class Term(Rows, ABC):
+    """M observations of one kind."""
 
-    Attributes:
-        kind: name in normal equations, tests and products.
-        dimension: d, of a residual.
-        root_information: (M, d, d), W with WᵀW = Σ⁻¹.
-    """
-
-    kind: ClassVar[str]
-    dimension: ClassVar[int] = 3
-    root_information: FloatArray
+    kind: ClassVar[str]  # name in normal equations, tests and products
+    dimension: ClassVar[int] = 3  # d, of a residual
+    root_information: FloatArray  # (M, d, d), W with WᵀW = Σ⁻¹
 
     @abstractmethod
     def residuals(self, at: At) -> FloatArray:
@@ -88,9 +66,6 @@ class Term(ABC):
     def slopes(self, at: At) -> Slopes:
         """Return the residuals with their derivatives."""
 
-    def __len__(self) -> int:
-        return len(self.root_information)
-
     def whitened(self, at: At) -> FloatArray:
         """Return the residuals (M, d) in units of their σ."""
         return (self.root_information @ self.residuals(at)[:, :, None])[:, :, 0]
@@ -98,22 +73,15 @@ class Term(ABC):
 
 @dataclass(frozen=True)
 class Fixes(Term):
-    """Measured positions of F cameras: the term L_abs.
-
-    Attributes:
-        camera: (F,) index into the cameras.
-        position_in_geo: (F, 3) metres.
-        root_information: (F, 3, 3) of the fixes' own errors, in 1/m.
-        session: (F,) session of each fix, whose common error they share.
-    """
+    """Measured positions of F cameras: the term L_abs."""
 
     kind: ClassVar[str] = "fixes"
 
     name: tuple[str, ...]
-    camera: IntArray
-    position_in_geo: FloatArray
-    root_information: FloatArray
-    session: IntArray
+    camera: IntArray  # (F,) index into the cameras
+    position_in_geo: FloatArray  # (F, 3) metres
+    root_information: FloatArray  # (F, 3, 3) of the fixes' own errors, in 1/m
+    session: IntArray  # (F,) session of each fix, whose common error they share
 
     def residuals(self, at: At) -> FloatArray:
         """Return S(c_i) + lever arm + bias − C_i (F, 3) in metres."""
@@ -148,28 +116,18 @@ class Fixes(Term):
 
 @dataclass(frozen=True)
 class ControlPoints(Term):
-    """Control points against the intersections of their image marks: the term L_gcp; J points, K marks in all.
-
-    Attributes:
-        point: (K,) index into the points.
-        camera: (K,) index into the cameras.
-        bearing_in_cam: (K, 3) unit vectors.
-        sigma_rad: (K,) angular σ of a mark.
-        bearing_by_lens: (K, 3, L) derivative of the bearings by the lens parameters.
-        position_in_geo: (J, 3) metres, surveyed.
-        root_information: (J, 3, 3) of survey and intersection together, in 1/m.
-    """
+    """Control points against the intersections of their image marks: the term L_gcp; J points, K marks in all."""
 
     kind: ClassVar[str] = "control points"
 
     name: tuple[str, ...]
-    point: IntArray
-    camera: IntArray
-    bearing_in_cam: FloatArray
-    sigma_rad: FloatArray
-    bearing_by_lens: FloatArray
-    position_in_geo: FloatArray
-    root_information: FloatArray
+    point: IntArray  # (K,) index into the points
+    camera: IntArray  # (K,) index into the cameras
+    bearing_in_cam: FloatArray  # (K, 3) unit vectors
+    sigma_rad: FloatArray  # (K,) angular σ of a mark
+    bearing_by_lens: FloatArray  # (K, 3, L) derivative of the bearings by the lens parameters
+    position_in_geo: FloatArray  # (J, 3) metres, surveyed
+    root_information: FloatArray  # (J, 3, 3) of survey and intersection together, in 1/m
 
     def residuals(self, at: At) -> FloatArray:
         """Return S(x_j) − X_j (J, 3) in metres, with x_j the intersection of the marks of point j."""
@@ -224,20 +182,14 @@ class ControlPoints(Term):
 
 @dataclass(frozen=True)
 class Attitudes(Term):
-    """Recorded rotations of A cameras: the term L_att.
-
-    Attributes:
-        camera: (A,) index into the cameras.
-        geo_from_cam: (A, 3, 3), of the nominal camera axes.
-        root_information: (A, 3, 3), in 1/rad.
-    """
+    """Recorded rotations of A cameras: the term L_att."""
 
     kind: ClassVar[str] = "attitudes"
 
     name: tuple[str, ...]
-    camera: IntArray
-    geo_from_cam: FloatArray
-    root_information: FloatArray
+    camera: IntArray  # (A,) index into the cameras
+    geo_from_cam: FloatArray  # (A, 3, 3), of the nominal camera axes
+    root_information: FloatArray  # (A, 3, 3), in 1/rad
 
     def residuals(self, at: At) -> FloatArray:
         """Return Log(R_iᵀ G_i B) (A, 3) in radians, from a camera to its recorded axes, with the boresight B."""
@@ -276,21 +228,15 @@ class Planes(Term):
 
     The LiDAR may be shifted as a whole: that shift is a systematic error. The surface moves with the mean of the
     SfM points.
-
-    Attributes:
-        point_in_model: (M, 3) metres, on the surface of the photographs.
-        position_in_geo: (M, 3) metres, on the plane of the LiDAR.
-        normal_in_geo: (M, 3) unit normals of the planes.
-        root_information: (M, 1, 1), in 1/m, of the distance between both along the normal.
     """
 
     kind: ClassVar[str] = "lidar"
     dimension: ClassVar[int] = 1
 
-    point_in_model: FloatArray
-    position_in_geo: FloatArray
-    normal_in_geo: FloatArray
-    root_information: FloatArray
+    point_in_model: FloatArray  # (M, 3) metres, on the surface of the photographs
+    position_in_geo: FloatArray  # (M, 3) metres, on the plane of the LiDAR
+    normal_in_geo: FloatArray  # (M, 3) unit normals of the planes
+    root_information: FloatArray  # (M, 1, 1), in 1/m, of the distance between both along the normal
 
     def residuals(self, at: At) -> FloatArray:
         """Return n · (S(x) + shift − p) (M, 1) in metres."""

@@ -1,6 +1,6 @@
 """Array and tuple types that all rooms share, and rows of records of arrays.
 
-Arrays are numpy's. Their shapes, units and frames are stated in the docstrings of the functions and classes.
+Arrays are numpy's. Their shapes, units and frames are stated in docstrings, and beside the fields of classes.
 """
 
 from __future__ import annotations
@@ -33,6 +33,13 @@ def vector3(values: FloatArray) -> Vector3:
 
 
 RecordT = TypeVar("RecordT")
+
+
+class Rows:
+    """Base of dataclasses of arrays, and as long as the first of these."""
+
+    def __len__(self) -> int:
+        return len(next(iter(vars(self).values())))
 
 
 def rows_of(record: RecordT, rows: IntArray | BoolArray) -> RecordT:

@@ -79,7 +79,7 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
     for path in mosaic.write(stage.out, sidecar, stage.progress):
         write_sidecar(sidecar, path)
     if options.hillshade:
-        _write_pictures(stage.out, target.horizontal_unit_m / target.height_unit_m)
+        _write_pictures(stage.out, target.horizontal_unit_m / target.crs.height_unit_m)
     lines = _write_contours(stage.out, frame, options.contours) if options.contours else 0
     covered = mosaic.covered()
     source.views.close()

@@ -149,7 +149,7 @@ def plan_splats(
         axes = geo_from_model.scale * geo_from_model.rotation @ axes
         axes = np.asarray(derivative_at(mean_in_geo[part])).reshape(-1, 3, 3) @ axes
         cov[part] = axes @ np.swapaxes(axes, 1, 2)
-    metric = np.array([1.0, 1.0, target.height_unit_m / (frame.step_x * target.horizontal_unit_m)])
+    metric = np.array([1.0, 1.0, target.crs.height_unit_m / (frame.step_x * target.horizontal_unit_m)])
     reach = _MOST_REACH * np.sqrt(cov[:, 2, 2])
     level = float((xyz[:, 2] + reach).max()) + _ABOVE
     column = (xyz[:, 0] - frame.west) / frame.step_x

@@ -149,7 +149,7 @@ def render_window(source: RasterSource, frame: RasterFrame, column: int, row: in
         dilation_px2=dilation_cells2(source.training_px) * inner**2,
     )
     # The mean of one surface is less noisy than the median.
-    limit = _ONE_SURFACE_GSD * source.training_gsd_m / source.target.height_unit_m
+    limit = _ONE_SURFACE_GSD * source.training_gsd_m / source.target.crs.height_unit_m
     one_surface = (view.depth_variance < limit**2) & (view.median_depth > 0)
     depth = np.where(one_surface, view.expected_depth, view.median_depth)
     middle = inner // 2

@@ -35,25 +35,17 @@ _MOST_ROUNDS = 20
 
 @dataclass(frozen=True)
 class Assessment:
-    """Accuracy of a product at N check points.
+    """Accuracy of a product at N check points."""
 
-    Attributes:
-        stats: figures of all errors, blunders and points under vegetation included.
-        survey: RMSE of the check points' own survey (RMSE_H2, RMSE_V2 of the standard); None without points.
-        with_survey: errors and survey in quadrature, the accuracy after the standard; None without points. Both are
-            of the points outside vegetation.
-        asprs: classes that `with_survey` meets, and the accuracy under vegetation.
-        blunder: (N,) mask of the errors beyond three times the class that the other points meet; none is under
-            vegetation.
-        without_blunders: figures of the other points; None without blunders.
-    """
-
-    stats: ErrorStats
+    stats: ErrorStats  # figures of all errors, blunders and points under vegetation included
+    # RMSE of the check points' own survey (RMSE_H2, RMSE_V2 of the standard); None without points
     survey: Rmse | None
+    # Errors and survey in quadrature, the accuracy after the standard; both are of the points outside vegetation
     with_survey: TotalRmse | None
-    asprs: AsprsStatement
+    asprs: AsprsStatement  # classes that `with_survey` meets, and the accuracy under vegetation
+    # (N,) mask of the errors beyond three times the class that the other points meet; none is under vegetation
     blunder: BoolArray
-    without_blunders: ErrorStats | None
+    without_blunders: ErrorStats | None  # figures of the other points; None without blunders
 
 
 def assess(
@@ -70,7 +62,7 @@ def assess(
         error_in_geo: (N, 3) metres.
         cov_survey: (N, 3, 3) m², of the surveyed positions.
         vegetated: (N,) mask of the points under vegetation; None: none is.
-        area_km2: area of the project; None: not known, and taken for a small one.
+        area_km2: of the project; None: not known, and taken for a small one.
     """
     error = np.asarray(error_in_geo, dtype=np.float64).reshape(-1, 3)
     variance = np.diagonal(np.asarray(cov_survey, dtype=np.float64).reshape(-1, 3, 3), axis1=1, axis2=2)
@@ -131,7 +123,9 @@ def _statement(
     count: int, tested: TotalRmse | None, vegetated: VegetatedAccuracy | None, area_km2: float | None
 ) -> AsprsStatement:
     """Return the classes that `count` check points outside vegetation meet, and a sentence with their number."""
-    least = least_points(area_km2)
+    least, under = least_points(area_km2), ""
+    if vegetated is not None:
+        under = f"RMSE_V {100 * vegetated.rmse_v_m:.1f} cm at {vegetated.count} points under vegetation (VVA)"
     asprs = AsprsStatement(
         points=count,
         horizontal_class=None,
@@ -141,13 +135,10 @@ def _statement(
         area_km2=area_km2,
         least_points=least,
         enough_points=count >= least,
-        statement=None,
+        statement=under or None,
     )
-    under = ""
-    if vegetated is not None:
-        under = f"RMSE_V {100 * vegetated.rmse_v_m:.1f} cm at {vegetated.count} points under vegetation (VVA)"
     if tested is None:
-        return asprs.model_copy(update={"statement": under or None})
+        return asprs
     classes_of = classes_cm(tested.rmse_h_m, tested.rmse_v_m, tested.rmse_3d_m)
     horizontal, vertical, class_3d = (f"{class_cm} cm" for class_cm in classes_of)
     sample = f"tested on {count} check points: " if asprs.enough_points else f"{few_points(asprs)} "

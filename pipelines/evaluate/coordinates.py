@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.core.files import replace_text
-from pipelines.core.types import FloatArray, Vector3
+from pipelines.core.types import FloatArray, Vector3, vector3
 from pipelines.formats.tables import table_text
 from pipelines.geodesy.crs import PointCrs, parse_crs
 from pipelines.geodesy.enu import ecef_from_enu, lla_from_ecef, lla_of
@@ -51,11 +51,11 @@ def coordinates_in(crs: PointCrs, checkpoints: CheckPoints, survey: Survey) -> C
         heights=crs.vertical.name,
         operation=operation.name,
         operation_accuracy_m=operation.accuracy_m,
-        origin=_vector(xyz[0]),
+        origin=vector3(xyz[0]),
         points=tuple(
             PointCoordinates(
                 name=point.name,
-                surveyed=_vector(surveyed_xyz),
+                surveyed=vector3(surveyed_xyz),
                 triangulated=_measured(triangulated_xyz),
                 surface=_measured(surface_xyz),
             )
@@ -75,12 +75,7 @@ def _errors(checkpoints: CheckPointErrors | None, surveyed: FloatArray) -> Float
 
 
 def _measured(xyz: FloatArray) -> Vector3 | None:
-    return _vector(xyz) if np.isfinite(xyz).all() else None
-
-
-def _vector(xyz: FloatArray) -> Vector3:
-    x, y, z = xyz.tolist()
-    return x, y, z
+    return vector3(xyz) if np.isfinite(xyz).all() else None
 
 
 _NAME = ("name", "use", "measured", "rays")
@@ -108,9 +103,7 @@ def write_point_table(path: Path, report: EvaluationReport, survey: Survey) -> N
 def write_camera_sigma(path: Path, names: Sequence[str], cov: FloatArray) -> None:
     """Write one line for each camera: σ of its position and of its rotations, along east, north and up.
 
-    Args:
-        names: n photographs.
-        cov: (n, 6, 6) of (δθ [rad], δc [m]).
+    The covariance (n, 6, 6) is of (δθ [rad], δc [m]).
     """
     sigma = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
     header = ("name", *(f"sigma_{axis}_m" for axis in "enu"), *(f"sigma_rotation_{axis}_deg" for axis in "enu"))

@@ -90,10 +90,6 @@ def compare_test_views(
     `psnr_covered` leaves out ground that fewer than two training views show: at the rim of a flight, a render is a
     guess.
 
-    Args:
-        lpips_weights: NPZ file; None: no LPIPS.
-        save_render: saves the first views side by side with their photographs.
-
     Raises:
         InputError: a photograph or the weights cannot be read.
     """

@@ -26,15 +26,16 @@ from pipelines.core.types import FloatArray
 from pipelines.evaluate.options import EvaluateOptions
 from pipelines.evaluate.reference_distances import (
     CLASSES,
+    THRESHOLDS_M,
     Box,
     ComparisonSettings,
     CorePoints,
+    DistanceTally,
     TiledPoints,
     compare_square,
+    level_of_detection,
     plane_normals,
-    require_py4dgeo,
 )
-from pipelines.evaluate.reference_figures import THRESHOLDS_M, DistanceTally, level_of_detection
 from pipelines.geodesy.enu import Origin
 from pipelines.geometry.footprints import first_of_voxels
 from pipelines.geometry.similarity import Similarity
@@ -44,7 +45,6 @@ from pipelines.surface.measured_cloud import CloudReader, MeasuredCloud, Thinnin
 from pipelines.surface.registration import fit_alignment
 from pipelines.surface.surface_views import ModelRenderer, SurfaceViews
 from pipelines.surface.visibility import SeenSurface, Viewpoints, seen_surface
-from pipelines.survey.options import CloudCrs
 from pipelines.survey.report_parts import ReferenceComparison, ReferenceShift
 from pipelines.survey.trained_survey import TrainedSurvey, scene_points
 
@@ -65,20 +65,6 @@ class ComparedReference:
     assumptions: tuple[Remark, ...]
 
 
-def open_reference(options: EvaluateOptions) -> CloudReader | None:
-    """Return the reference of `--reference`, its headers and CRS checked; None without that option.
-
-    Raises:
-        BackendUnavailableError: py4dgeo is not installed.
-        InputError: an unreadable file, or no CRS.
-    """
-    if options.reference is None:
-        return None
-    require_py4dgeo()
-    stated = CloudCrs(options.reference_crs, options.reference_vertical, "--reference")
-    return CloudReader(options.reference, stated)
-
-
 def compare_with_reference(
     renderer: ModelRenderer,
     files: CloudReader,
@@ -90,10 +76,8 @@ def compare_with_reference(
 ) -> ComparedReference:
     """Return the comparison of a trained survey with a reference.
 
-    Args:
-        grid: predicted σ of the georeference; None: not known.
-        options: of the stage, with `reference`.
-        scratch: folder for depth maps and sorted points; removed at the end.
+    Without `grid`, the σ of the georeference is not known. The folder `scratch` holds depth maps and sorted points,
+    and is removed at the end.
 
     Raises:
         InputError: a damaged file, a missing grid, a reference of another place, or no room on the disk.
@@ -122,7 +106,7 @@ def compare_with_reference(
         points=tally.points,
         seen=tally.seen / max(tally.points, 1),
         spacing_m=spacing_m,
-        model_points=len(model),
+        model_points=sum(model.count.values()),
         model_spacing_m=fusion.spacing_m,
         sigma_m=options.reference_sigma,
         georeference_sigma_m=None if sigma_m is None or not len(sigma_m) else float(np.median(sigma_m)),
@@ -142,7 +126,7 @@ def _compare(
     settings: ComparisonSettings,
     progress: Progress,
 ) -> DistanceTally:
-    tally, squares = DistanceTally(), sorted(reference.squares | model.squares)
+    tally, squares = DistanceTally(), sorted({*reference.count, *model.count})
     with progress.task("squares of the reference", len(squares)) as task:
         for square in squares:
             tally.add(compare_square(square, reference, model, seen, settings))
@@ -163,7 +147,7 @@ def _model(
         delivered.append(square.position, square.normal, None)
         sample.append(square.position[first_of_voxels(square.position, 2 * _OVERVIEW_M)])
     views.close()
-    if not len(delivered):
+    if not delivered.count:
         raise DegenerateGeometryError(
             "surface-not-seen",
             "No point of the surface has the same depth in three training views. Train longer.",
@@ -181,7 +165,7 @@ def _model(
         )
     similarity, shift = found
     moved = TiledPoints(scratch / "moved", delivered.side_m)
-    for name in sorted(delivered.squares):
+    for name in sorted(delivered.count):
         rows, own = delivered.around(name, 0.0)
         moved.append(similarity.apply(rows["position"][own]), rows["normal"][own] @ similarity.rotation.T, None)
     return moved, settings, shift, similarity
@@ -212,7 +196,7 @@ def _sorted_reference(
 
 def _spacing(reference: TiledPoints) -> float:
     """Return the median distance between neighbours, in the square with the most points."""
-    rows, own = max((reference.around(square, 0.0) for square in reference.squares), key=lambda part: len(part[0]))
+    rows, own = max((reference.around(square, 0.0) for square in reference.count), key=lambda part: len(part[0]))
     place = rows["position"][own]
     place = place[first_of_voxels(place, min(THRESHOLDS_M) / 2)]
     chosen = np.random.default_rng(0).permutation(len(place))[:_SAMPLE]

@@ -28,11 +28,12 @@ from pipelines.core.stages import BY_NAME
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.evaluate.asprs import few_points
-from pipelines.evaluate.cautions import cautions_of_prediction, dependent_check_points
 from pipelines.evaluate.check_points import (
+    cautions_of_prediction,
     check_points_on_surface,
     control_residuals,
     cross_validate,
+    dependent_check_points,
     fix_residuals,
     rms_sigma,
     triangulated_check_points,
@@ -45,15 +46,17 @@ from pipelines.evaluate.reference import (
     cautions_of_reference,
     compare_with_reference,
     draw_reference,
-    open_reference,
 )
+from pipelines.evaluate.reference_distances import require_py4dgeo
 from pipelines.geodesy.crs import PointCrs
 from pipelines.geodesy.enu import Origin, ecef_from_enu, lla_from_ecef
 from pipelines.report.plots.maps import MapCoordinates, MapPoints, SigmaRaster, write_accuracy_map
 from pipelines.report.plots.plans import NamedPlaces
 from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.surface.measured_cloud import CloudReader
 from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey.headline import headline
+from pipelines.survey.options import CloudCrs
 from pipelines.survey.photographs import write_render
 from pipelines.survey.report import (
     AccuracySummary,
@@ -177,7 +180,11 @@ def run(stage: StageRun, options: EvaluateOptions) -> Summary:
         rendered = _rendered(stage, solved, posterior, options)
     else:
         rendered = None
-        _refuse_what_needs_gaussians(stage, options)
+        for flag, value in (("--reference", options.reference), ("--lpips-weights", options.lpips_weights)):
+            if value is not None:
+                command = stage.workspace.command_of(BY_NAME["train"])
+                message = f"needs a trained model; run `{command}` first, or leave the option out"
+                raise InputError("not-trained", message, field=flag)
     report = evaluate(solved, posterior, options, crs=crs, rendered=rendered)
     if posterior.grid is not None:
         write_csv(posterior.grid, solved.survey.origin, stage.out / "accuracy.csv")
@@ -197,11 +204,7 @@ def evaluate(
     crs: PointCrs | None = None,
     rendered: Rendered | None = None,
 ) -> EvaluationReport:
-    """Return the report on a solved survey.
-
-    Args:
-        crs: CRS in which the report lists the check points too; None: none.
-        rendered: what the Gaussians show; None: nothing is trained yet.
+    """Return the report on a solved survey; `crs` lists the check points, without `rendered` nothing is trained.
 
     Raises:
         InputError: a point lies outside the CRS's domain.
@@ -234,7 +237,11 @@ def evaluate(
 
 
 def _rendered(stage: StageRun, trained: TrainedSurvey, posterior: Posterior, options: EvaluateOptions) -> Rendered:
-    files, progress = open_reference(options), stage.progress
+    files, progress = None, stage.progress
+    if options.reference is not None:  # refused before work starts: a file without a CRS, and a missing library
+        require_py4dgeo()
+        stated = CloudCrs(options.reference_crs, options.reference_vertical, "--reference")
+        files = CloudReader(options.reference, stated)
     images = photographs(trained.sfm, trained.survey, stage.workspace, trained.model.max_image_size)
     images.build(progress)
     renderer = ModelRenderer(trained, images, rasterizer(options.backend, progress))
@@ -250,14 +257,3 @@ def _rendered(stage: StageRun, trained: TrainedSurvey, posterior: Posterior, opt
     save_render = partial(write_render, renders)
     test = compare_test_views(renderer, options.lpips_weights, save_render, progress, saved=options.renders)
     return Rendered(Photometric(test=test), points, reference)
-
-
-def _refuse_what_needs_gaussians(stage: StageRun, options: EvaluateOptions) -> None:
-    for flag, value in (("--reference", options.reference), ("--lpips-weights", options.lpips_weights)):
-        if value is not None:
-            command = stage.workspace.command_of(BY_NAME["train"])
-            raise InputError(
-                "not-trained",
-                f"needs a trained model; run `{command}` first, or leave the option out",
-                field=flag,
-            )

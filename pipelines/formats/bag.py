@@ -56,14 +56,7 @@ class RawMessage:
 
 
 class Bag:
-    """Open bag; see `open_bag`.
-
-    Attributes:
-        path: file or folder.
-        topics: by name.
-        damage: reason why reading ended before the end of the bag; None if it did not.
-        fallback_types: types decoded by a definition that the bag itself does not have.
-    """
+    """Open bag; see `open_bag`."""
 
     def __init__(self, path: Path, reader: Any, ros2: bool) -> None:
         self.path, self._reader, self._ros2 = path, reader, ros2
@@ -73,8 +66,8 @@ class Bag:
         links = [link for part in _parts(reader) for link in part.connections] + self._connections
         self._definitions = {link.msgtype: link.msgdef for link in links if link.msgdef.data}
         self._stores: dict[str, Any] = {}
-        self.damage: str | None = None
-        self.fallback_types: set[str] = set()
+        self.damage: str | None = None  # reason why reading ended before the end of the bag
+        self.fallback_types: set[str] = set()  # decoded by a definition that the bag itself does not have
         counts: dict[tuple[str, str], int] = {}
         for link in self._connections:
             key = (link.topic, link.msgtype)

@@ -33,52 +33,34 @@ _TYPES = {
 
 @dataclass(frozen=True)
 class BagCamera:
-    """Camera in the terms of `CameraInfo`.
-
-    Attributes:
-        center_px: principal point, the centre of the top-left pixel being (0.5, 0.5).
-        distortion: (k1, k2, p1, p2, k3), model plumb_bob.
-        cam_from_body: (3, 3) nominal mounting, body forward-right-down.
-    """
+    """Camera in the terms of `CameraInfo`."""
 
     width: int
     height: int
     focal_px: float
-    center_px: tuple[float, float]
-    distortion: tuple[float, float, float, float, float]
-    cam_from_body: FloatArray
+    center_px: tuple[float, float]  # principal point, the centre of the top-left pixel being (0.5, 0.5)
+    distortion: tuple[float, float, float, float, float]  # (k1, k2, p1, p2, k3), model plumb_bob
+    cam_from_body: FloatArray  # (3, 3) nominal mounting, body forward-right-down
 
 
 @dataclass(frozen=True)
 class BagFlight:
-    """Records of a flight. Stamps are nanoseconds since 1970, each sensor's on its own clock.
-
-    Attributes:
-        image_stamp_ns: (N,) of the N JPEG files.
-        fix_stamp_ns: (M,).
-        fix_lla: (M, 3) degrees and ellipsoidal metres.
-        fix_sigma_enu_m: (3,) σ that the receiver states.
-        fix_status: `NavSatStatus.status` of all fixes.
-        antenna_in_body: (3,) metres, forward-right-down.
-        imu_stamp_ns: (K,).
-        imu_enu_from_body: (K, 3, 3), body forward-right-down.
-        imu_rate, imu_force: (K, 3) angular rate in rad/s, specific force in m/s²; forward-right-down.
-        imu_sigma_deg: σ of the attitude per axis.
-    """
+    """Records of a flight. Stamps are nanoseconds since 1970, each sensor's on its own clock."""
 
     camera: BagCamera
-    image_stamp_ns: IntArray
+    image_stamp_ns: IntArray  # (N,) of the N JPEG files
     image_paths: tuple[Path, ...]
-    fix_stamp_ns: IntArray
-    fix_lla: FloatArray
-    fix_sigma_enu_m: FloatArray
-    fix_status: int
-    antenna_in_body: FloatArray
-    imu_stamp_ns: IntArray
-    imu_enu_from_body: FloatArray
+    fix_stamp_ns: IntArray  # (M,)
+    fix_lla: FloatArray  # (M, 3) degrees and ellipsoidal metres
+    fix_sigma_enu_m: FloatArray  # (3,) σ that the receiver states
+    fix_status: int  # `NavSatStatus.status` of all fixes
+    antenna_in_body: FloatArray  # (3,) metres, forward-right-down
+    imu_stamp_ns: IntArray  # (K,)
+    imu_enu_from_body: FloatArray  # (K, 3, 3), body forward-right-down
+    # imu_rate and imu_force: (K, 3) angular rate in rad/s, specific force in m/s²; forward-right-down
     imu_rate: FloatArray
     imu_force: FloatArray
-    imu_sigma_deg: float
+    imu_sigma_deg: float  # σ of the attitude per axis
 
 
 def write_bag(path: Path, storage: Literal["mcap", "sqlite3"], flight: BagFlight) -> int:

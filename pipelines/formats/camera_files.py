@@ -108,26 +108,16 @@ def write_transforms(path: Path, frames: Sequence[Frame], lenses: Sequence[Lens]
 
 @dataclass(frozen=True)
 class CameraTable:
-    """Cameras of n photographs.
-
-    Attributes:
-        split: of each, `train` or `test`.
-        position: (n, 3) in a CRS: easting, northing, height, or longitude, latitude, height.
-        geographic: whether the first two are degrees.
-        omega_phi_kappa_deg: (n, 3) against the axes of the CRS.
-        yaw_pitch_roll_deg: (n, 3) against true north and the vertical.
-        sigma_enu_m: (n, 3) along true east, north, up; NaN: not known.
-        sigma_angles_deg: (n, 3) of ω, φ, κ; NaN: not known.
-    """
+    """Cameras of n photographs."""
 
     name: tuple[str, ...]
-    split: tuple[str, ...]
-    position: FloatArray
-    geographic: bool
-    omega_phi_kappa_deg: FloatArray
-    yaw_pitch_roll_deg: FloatArray
-    sigma_enu_m: FloatArray
-    sigma_angles_deg: FloatArray
+    split: tuple[str, ...]  # of each, `train` or `test`
+    position: FloatArray  # (n, 3) in a CRS: easting, northing, height, or longitude, latitude, height
+    geographic: bool  # whether the first two are degrees
+    omega_phi_kappa_deg: FloatArray  # (n, 3) against the axes of the CRS
+    yaw_pitch_roll_deg: FloatArray  # (n, 3) against true north and the vertical
+    sigma_enu_m: FloatArray  # (n, 3) along true east, north, up; NaN: not known
+    sigma_angles_deg: FloatArray  # (n, 3) of ω, φ, κ; NaN: not known
 
 
 def write_camera_table(path: Path, table: CameraTable) -> None:

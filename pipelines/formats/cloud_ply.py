@@ -17,30 +17,19 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 
 from pipelines.core.errors import InputError
-from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray
+from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, Rows
 from pipelines.formats.splat_ply import PLY_TYPES, ply_header
 
 
 @dataclass(frozen=True)
-class CloudChunk:
-    """P points of a file.
+class CloudChunk(Rows):
+    """P points of a file."""
 
-    Attributes:
-        position: (P, 3) in the file's CRS, easting or longitude first.
-        classification: (P,) class of LAS; 0: never classified.
-        overlap: (P,) whether another strip covers the place better.
-        withheld: (P,) whether the producer has withdrawn the point.
-        gps_time_s: (P,) time as the file has it; None: the file has none.
-    """
-
-    position: FloatArray
-    classification: ByteArray
-    overlap: BoolArray
-    withheld: BoolArray
-    gps_time_s: FloatArray | None
-
-    def __len__(self) -> int:
-        return len(self.position)
+    position: FloatArray  # (P, 3) in the file's CRS, easting or longitude first
+    classification: ByteArray  # (P,) class of LAS; 0: never classified
+    overlap: BoolArray  # (P,) whether another strip covers the place better
+    withheld: BoolArray  # (P,) whether the producer has withdrawn the point
+    gps_time_s: FloatArray | None  # (P,) time as the file has it; None: the file has none
 
 
 class CloudFile(Protocol):
@@ -147,20 +136,13 @@ def _vertices(path: Path, lines: list[list[str]]) -> tuple[int, list[tuple[str, 
 
 
 @dataclass(frozen=True)
-class CloudPoints:
-    """P points in a CRS.
+class CloudPoints(Rows):
+    """P points in a CRS."""
 
-    Attributes:
-        position: (P, 3), easting or longitude first.
-        normal: (P, 3) unit vectors along the axes of the CRS.
-        rgb: (P, 3).
-        cov_m2: (P, 3, 3) covariance in m², axes east, north, up; NaN: unknown.
-    """
-
-    position: FloatArray
-    normal: Float32Array
-    rgb: ByteArray
-    cov_m2: Float32Array
+    position: FloatArray  # (P, 3), easting or longitude first
+    normal: Float32Array  # (P, 3) unit vectors along the axes of the CRS
+    rgb: ByteArray  # (P, 3)
+    cov_m2: Float32Array  # (P, 3, 3) covariance in m², axes east, north, up; NaN: unknown
 
     @property
     def sigma_h_m(self) -> Float32Array:
@@ -171,9 +153,6 @@ class CloudPoints:
     def sigma_v_m(self) -> Float32Array:
         """Vertical σ (P,) in metres; NaN: unknown."""
         return np.asarray(np.sqrt(self.cov_m2[:, 2, 2]))
-
-    def __len__(self) -> int:
-        return len(self.position)
 
 
 _VERTEX = [

@@ -37,18 +37,12 @@ TimeSource = Literal["offset", "gps", "assumed UTC"]
 
 @dataclass(frozen=True)
 class DjiTags:
-    """DJI's tags; None if absent.
+    """DJI's tags; None if absent."""
 
-    Attributes:
-        gimbal_yaw_pitch_roll_deg: Z-Y-X from North-East-Down.
-        rtk_flag: 50 fixed, 34 float, 16 single point, 0 none.
-        absolute_altitude_m: above the same reference as `GPSAltitude`.
-    """
-
-    gimbal_yaw_pitch_roll_deg: Vector3 | None = None
-    rtk_flag: int | None = None
+    gimbal_yaw_pitch_roll_deg: Vector3 | None = None  # Z-Y-X from North-East-Down
+    rtk_flag: int | None = None  # 50 fixed, 34 float, 16 single point, 0 none
     rtk_sigma_enu_m: Vector3 | None = None
-    absolute_altitude_m: float | None = None
+    absolute_altitude_m: float | None = None  # above the same reference as `GPSAltitude`
 
 
 @dataclass(frozen=True)
@@ -64,41 +58,28 @@ class GpsTag:
 
 @dataclass(frozen=True)
 class LensTags:
-    """Tags of the lens; None if absent.
-
-    Attributes:
-        focal_35mm_mm: focal length of the same angle of view on 35 mm film.
-        px_per_mm: resolution of the original image, which may have been scaled since.
-        taken_width_px: longer side of the original image.
-        zoom: digital zoom, 1 without zoom.
-    """
+    """Tags of the lens; None if absent."""
 
     focal_mm: float | None = None
-    focal_35mm_mm: float | None = None
-    px_per_mm: float | None = None
-    taken_width_px: float | None = None
-    zoom: float = 1.0
+    focal_35mm_mm: float | None = None  # focal length of the same angle of view on 35 mm film
+    px_per_mm: float | None = None  # resolution of the original image, which may have been scaled since
+    taken_width_px: float | None = None  # longer side of the original image
+    zoom: float = 1.0  # digital zoom, 1 without zoom
 
 
 @dataclass(frozen=True)
 class PhotoTags:
-    """Metadata of a photograph.
-
-    Attributes:
-        orientation: 1 for upright.
-        timestamp_s: seconds since 1970 UTC; `time_source` is the source of the time zone.
-        problems: why tags were not used, one phrase each.
-    """
+    """Metadata of a photograph."""
 
     make: str = ""
     model: str = ""
-    orientation: int = 1
+    orientation: int = 1  # 1 for upright
     lens: LensTags = LensTags()
-    timestamp_s: float | None = None
+    timestamp_s: float | None = None  # seconds since 1970 UTC; `time_source` is the source of the time zone
     time_source: TimeSource | None = None
     gps: GpsTag | None = None
     dji: DjiTags | None = None
-    problems: tuple[str, ...] = ()
+    problems: tuple[str, ...] = ()  # why tags were not used, one phrase each
 
     @property
     def make_model(self) -> str:

@@ -24,26 +24,19 @@ _SEGMENT_LIMIT = 65533
 
 @dataclass(frozen=True)
 class DroneTags:
-    """Tags that a drone writes into a photograph.
-
-    Attributes:
-        stamp_ns: UTC, nanoseconds since 1970.
-        lat_deg, lon_deg, alt_m: WGS84, ellipsoidal.
-        relative_alt_m: above the place of take-off.
-        yaw_pitch_roll_deg: the gimbal's; `body_yaw_pitch_roll_deg`: the aircraft's.
-        sigma_enu_m: σ that the receiver states; None: a plain receiver, which states no σ.
-    """
+    """Tags that a drone writes into a photograph."""
 
     width: int
     height: int
     focal_px: float
-    stamp_ns: int
+    stamp_ns: int  # UTC, nanoseconds since 1970
     lat_deg: float
     lon_deg: float
-    alt_m: float
-    relative_alt_m: float
-    yaw_pitch_roll_deg: tuple[float, float, float]
-    body_yaw_pitch_roll_deg: tuple[float, float, float]
+    alt_m: float  # ellipsoidal, WGS84
+    relative_alt_m: float  # above the place of take-off
+    yaw_pitch_roll_deg: tuple[float, float, float]  # of the gimbal
+    body_yaw_pitch_roll_deg: tuple[float, float, float]  # of the aircraft
+    # σ that the receiver states; None: a plain receiver, which states no σ
     sigma_enu_m: tuple[float, float, float] | None
 
 

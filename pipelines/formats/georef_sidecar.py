@@ -19,7 +19,7 @@ from pydantic.alias_generators import to_camel
 from pipelines.core.figures import Headline
 from pipelines.core.files import replace_text
 from pipelines.core.products import Product, Remark
-from pipelines.core.types import FloatArray, Matrix4, Quaternion, Row7, Vector3
+from pipelines.core.types import Matrix4, Quaternion, Row7, Vector3, vector3
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.similarity import Similarity, covariance_at
@@ -51,7 +51,7 @@ class GeoreferenceSigma(Product):
 
 
 def _matrix_of(fields: dict[str, Any]) -> Matrix4:
-    """Return the matrix of a sidecar's similarity, row by row; sidecars of earlier versions do not hold it."""
+    """Return the matrix of a sidecar's similarity, row by row."""
     similarity = Similarity(fields["scale"], matrix_from_quat_xyzw(fields["rotation"]), np.array(fields["origin"]))
     first, second, third, last = map(tuple, similarity.matrix().tolist())
     return first, second, third, last
@@ -99,15 +99,6 @@ class GeorefSidecar(_CamelCase):
         """Return the similarity p_ecef = s R p_file + origin."""
         return Similarity(self.scale, matrix_from_quat_xyzw(self.rotation), np.array(self.origin))
 
-    def covariance_at(self, point_in_file: ArrayLike) -> FloatArray | None:
-        """Return covariances (N, 3, 3) in m² along the file's axes at points (N, 3) of the file; None if unknown.
-
-        The covariance is J C Jᵀ with J = [p, −[p]×, I]: that of the georeference, without the splat's own shape.
-        """
-        if self.covariance is None:
-            return None
-        return covariance_at(point_in_file, self.covariance, np.zeros(3))
-
 
 class SceneSigma(Product):
     """Predicted standard deviations in metres over a file's points or cells: medians, and the largest.
@@ -132,16 +123,8 @@ def median_sigma(sigma: SceneSigma | None, of: str) -> str:
 class CrsSidecar(_CamelCase):
     """Sidecar of a file whose coordinates are in a CRS; names in the file are in camelCase.
 
-    Attributes:
-        crs: as the user named it, or the default.
-        crs_wkt: WKT2:2019; without a vertical part, `vertical_datum` says what the heights count from.
-        units: of the three coordinates, easting or longitude first.
-        epoch: year of the coordinates in a dynamic datum; None: not stated.
-        operation: published operation from WGS84, and its accuracy; None: not known.
-        bounds: least and largest of each coordinate.
-        accuracy: headline of the result; None: nothing stated it when the file was written.
-        sigma: predicted σ of the file's points or cells; None: not known, or nothing checks it.
-        assumed: what the user did not state.
+    Without a vertical part in `crs_wkt`, `vertical_datum` says what the heights count from. None: not stated, not
+    known when the file was written, or, of σ, checked by nothing.
     """
 
     format: Literal["georefgs"] = "georefgs"
@@ -164,9 +147,8 @@ def georeference_sigma(covariance: ArrayLike, point_in_file: ArrayLike) -> Geore
     """Return σ of the georeference by the sidecar's covariance (7, 7), at a point (3,) of the file's frame."""
     at = np.asarray(point_in_file, dtype=np.float64)
     east, north, up = np.diagonal(covariance_at(at[None], covariance, np.zeros(3))[0]).tolist()
-    x, y, z = at.tolist()
     return GeoreferenceSigma(
-        at=(x, y, z),
+        at=vector3(at),
         sigma_e_m=math.sqrt(east),
         sigma_n_m=math.sqrt(north),
         sigma_u_m=math.sqrt(up),

@@ -75,26 +75,16 @@ _DJI_RECEIVER = {RTK_FIXED: "RTK fixed", RTK_FLOAT: "RTK float"}
 
 @dataclass(frozen=True)
 class CameraEvents:
-    """N events of a camera.
-
-    Attributes:
-        lines: (N,).
-        number: (N,) of the photograph.
-        time_s: (N,) seconds since 1970 UTC.
-        lon_lat_alt: (N, 3) of the camera, degrees and ellipsoidal metres; NaN without a position.
-        sigma_enu_m: (N, 3); NaN where unknown.
-        receiver: (N,) as of `PoseTable`.
-        camera_from_antenna_enu_m: (N, 3) from the antenna to the camera.
-    """
+    """N events of a camera."""
 
     path: Path
-    lines: IntArray
-    number: IntArray
-    time_s: FloatArray
-    lon_lat_alt: FloatArray
-    sigma_enu_m: FloatArray
-    receiver: NDArray[np.str_]
-    camera_from_antenna_enu_m: FloatArray
+    lines: IntArray  # (N,)
+    number: IntArray  # (N,) of the photograph
+    time_s: FloatArray  # (N,) seconds since 1970 UTC
+    lon_lat_alt: FloatArray  # (N, 3) of the camera, degrees and ellipsoidal metres; NaN without a position
+    sigma_enu_m: FloatArray  # (N, 3); NaN where unknown
+    receiver: NDArray[np.str_]  # (N,) as of `PoseTable`
+    camera_from_antenna_enu_m: FloatArray  # (N, 3) from the antenna to the camera
 
 
 def read_mrk(path: Path) -> CameraEvents:

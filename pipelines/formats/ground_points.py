@@ -63,29 +63,20 @@ class ListedMark:
 
 @dataclass(frozen=True)
 class GroundPoints:
-    """Surveyed points of a file.
-
-    Attributes:
-        kind: of the file, for people.
-        points: in the order of the file, names without repeats.
-        marks: of these points; a file of another kind may have them.
-        crs_text: CRS that the file states; None: it states none.
-        geographic: whether the file calls its columns longitude and latitude; None if the CRS alone decides.
-        in_order_of_crs: whether the coordinates are in the order of the axes of the CRS; else the easting is first.
-        unknown_columns: names in the header that mean nothing here.
-        left_out: places of marks that the file itself does not count as made by a person.
-    """
+    """Surveyed points of a file."""
 
     path: Path
-    kind: str
-    points: tuple[ListedPoint, ...]
-    marks: tuple[ListedMark, ...] = ()
-    crs_text: str | None = None
+    kind: str  # of the file, for people
+    points: tuple[ListedPoint, ...]  # in the order of the file, names without repeats
+    marks: tuple[ListedMark, ...] = ()  # of these points; a file of another kind may have them
+    crs_text: str | None = None  # CRS that the file states; None: it states none
     crs_line: int = 1
+    # Whether the file calls its columns longitude and latitude; None if the CRS alone decides
     geographic: bool | None = None
+    # Whether the coordinates are in the order of the axes of the CRS; else the easting is first
     in_order_of_crs: bool = False
-    unknown_columns: tuple[str, ...] = ()
-    left_out: tuple[str, ...] = ()
+    unknown_columns: tuple[str, ...] = ()  # names in the header that mean nothing here
+    left_out: tuple[str, ...] = ()  # places of marks that the file itself does not count as made by a person
 
 
 def without_repeats(points: Sequence[ListedPoint], path: Path) -> tuple[ListedPoint, ...]:

@@ -184,11 +184,8 @@ class LazFile:
     """LAZ file of single returns that is written in chunks; a context manager.
 
     Args:
-        path: of the file.
-        wkt1: CRS as WKT1.
         angular: whether the first two coordinates are angles.
         near: (3,) coordinates near the points; the file counts from these, rounded to integers.
-        software: program that writes.
         written: date in the header; None: today.
         text: description for people, in English: vertical datum, meaning of σ.
     """
@@ -270,19 +267,12 @@ class LazWriter(LazFile):
 
 @dataclass(frozen=True)
 class LidarReturns:
-    """P returns of one strip, numbered from 1.
+    """P returns of one strip, numbered from 1."""
 
-    Attributes:
-        position: (P, 3) in the CRS, easting or longitude first.
-        classification: (P,) class of LAS.
-        gps_time_s: (P,).
-        scan_angle_deg: (P,) of the beam across the strip.
-    """
-
-    position: FloatArray
-    classification: ByteArray
-    gps_time_s: FloatArray
-    scan_angle_deg: FloatArray
+    position: FloatArray  # (P, 3) in the CRS, easting or longitude first
+    classification: ByteArray  # (P,) class of LAS
+    gps_time_s: FloatArray  # (P,)
+    scan_angle_deg: FloatArray  # (P,) of the beam across the strip
     strip: int
 
 

@@ -16,7 +16,7 @@ from plyfile import PlyData, PlyElement, PlyParseError
 
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size, reading, replace_file
-from pipelines.core.types import Float32Array
+from pipelines.core.types import Float32Array, Rows
 
 _HEADER_LIMIT = 64 * 1024
 _POSITION = ("x", "y", "z")
@@ -34,25 +34,14 @@ PLY_TYPES = {
 
 
 @dataclass(frozen=True)
-class SplatArrays:
-    """N Gaussians as float32 arrays; names and shapes are those of `pipelines.splat.gaussians.Gaussians`.
-
-    Attributes:
-        means: (N, 3).
-        quats_wxyz: (N, 4).
-        log_scales: (N, 3).
-        logit_opacities: (N,).
-        sh: (N, K, 3), K = (degree + 1)².
-    """
+class SplatArrays(Rows):
+    """N Gaussians as float32 arrays; names and shapes are those of `pipelines.splat.gaussians.Gaussians`."""
 
     means: Float32Array
     quats_wxyz: Float32Array
     log_scales: Float32Array
     logit_opacities: Float32Array
     sh: Float32Array
-
-    def __len__(self) -> int:
-        return len(self.means)
 
 
 def write_splat_ply(path: Path, splat: SplatArrays) -> None:
@@ -129,11 +118,7 @@ def read_splat_ply(path: Path, rows: slice = slice(None)) -> SplatArrays:
 
 
 def read_centres(path: Path) -> Float32Array:
-    """Read the centres (N, 3) of Gaussians alone: a quarter of a gigabyte of other properties stays unread.
-
-    Raises:
-        InputError: as `read_splat_ply`.
-    """
+    """Read the centres (N, 3) of Gaussians alone, as `read_splat_ply`: the other properties stay unread."""
     return _columns(_read_rows(path), _POSITION)
 
 

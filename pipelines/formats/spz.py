@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.core.errors import InputError
-from pipelines.core.files import file_size, reading, replace_file
+from pipelines.core.files import replace_file
 from pipelines.core.types import ByteArray, Float32Array, FloatArray
 from pipelines.formats.splat_ply import SplatArrays
 
@@ -87,19 +87,6 @@ def write_spz(path: Path, splat: SplatArrays, version: SpzVersion = 3) -> None:
     replace_file(draft, path)
 
 
-def read_spz(path: Path) -> SplatArrays:
-    """Read Gaussians of version 2, 3 or 4.
-
-    Raises:
-        InputError: no such file, not an SPZ file of that form, cut off, with extensions, or a file that would
-            unpack to more than sixteen times its size (and 16 MiB).
-    """
-    file_size(path)
-    with reading(path):
-        data = path.read_bytes()
-    return decode_spz(data, path)
-
-
 def encode_spz(splat: SplatArrays, version: SpzVersion = 3, fractional_bits: int = FRACTIONAL_BITS) -> bytes:
     """Return the bytes of an SPZ file.
 
@@ -134,7 +121,12 @@ def encode_spz(splat: SplatArrays, version: SpzVersion = 3, fractional_bits: int
 
 
 def decode_spz(data: bytes, path: Path | None = None) -> SplatArrays:
-    """Return the Gaussians in the bytes of an SPZ file; raises as `read_spz`, and names the path."""
+    """Return the Gaussians in the bytes of an SPZ file of version 2, 3 or 4.
+
+    Raises:
+        InputError: not an SPZ file of that form, cut off, with extensions, or one that would unpack to more than
+            sixteen times its size (and 16 MiB); names the path.
+    """
     limit_bytes = max(_SMALL_BYTES, _MOST_UNPACKED * len(data))
     unpacked = _unpacked_gzip if data[:2] == b"\x1f\x8b" else _unpacked_zstd
     layout, body = unpacked(data, limit_bytes, path)

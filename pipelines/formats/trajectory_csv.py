@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.core.errors import InputError
-from pipelines.core.types import BoolArray, FloatArray, IntArray
+from pipelines.core.types import BoolArray, FloatArray, IntArray, rows_of
 from pipelines.formats.tables import (
     Row,
     Table,
@@ -33,56 +33,33 @@ from pipelines.geometry.rotations import geo_from_cam, quat_xyzw_from_matrix
 
 @dataclass(frozen=True)
 class PoseTable:
-    """N rows of a trajectory, all that the file has. Absent columns are None, absent cells NaN.
-
-    Attributes:
-        source: kind of file, as fixes and attitudes of the survey state it.
-        lines: (N,).
-        names: image of each row.
-        time_s: (N,) seconds since 1970; a text without a zone is read as UTC.
-        xyz: (N, 3) longitude or easting, latitude or northing, height, in the file's CRS.
-        geographic: whether the columns were called latitude and longitude; None if the CRS alone decides.
-        quat_xyzw: (N, 4) rotations camera → East-North-Up at the camera.
-        sigma_enu_m: (N, 3).
-        receiver: (N,) `RTK fixed`, `RTK float`, `single-frequency` or `unknown receiver`, as the solution has it.
-        crs_text: the CRS that the file states.
-        assumed_crs: CRS of a file that states none, where `--crs` names none either; None: WGS84 for latitude and
-            longitude, and otherwise it must be named.
-        heights_above_geoid: whether the heights are above a geoid that the file does not name.
-        zoneless_times: whether a time was a text without a zone.
-        unknown_columns: names in the header that mean nothing here.
-    """
+    """N rows of a trajectory, all that the file has. Absent columns are None, absent cells NaN."""
 
     path: Path
-    source: str
-    lines: IntArray
-    names: tuple[str, ...] | None
-    time_s: FloatArray | None
-    xyz: FloatArray
-    geographic: bool | None
-    quat_xyzw: FloatArray | None = None
-    sigma_enu_m: FloatArray | None = None
+    source: str  # kind of file, as fixes and attitudes of the survey state it
+    lines: IntArray  # (N,)
+    names: tuple[str, ...] | None  # image of each row
+    time_s: FloatArray | None  # (N,) seconds since 1970; a text without a zone is read as UTC
+    xyz: FloatArray  # (N, 3) longitude or easting, latitude or northing, height, in the file's CRS
+    geographic: bool | None  # whether the columns were called latitude and longitude; None if the CRS alone decides
+    quat_xyzw: FloatArray | None = None  # (N, 4) rotations camera → East-North-Up at the camera
+    sigma_enu_m: FloatArray | None = None  # (N, 3)
+    # (N,) `RTK fixed`, `RTK float`, `single-frequency` or `unknown receiver`, as the solution has it
     receiver: NDArray[np.str_] | None = None
-    crs_text: str | None = None
+    crs_text: str | None = None  # the CRS that the file states
     crs_line: int = 1
+    # CRS of a file that states none, where `--crs` names none either; None: WGS84 for latitude and longitude, and
+    # otherwise it must be named
     assumed_crs: str | None = None
-    heights_above_geoid: bool = False
-    zoneless_times: bool = False
-    unknown_columns: tuple[str, ...] = ()
+    heights_above_geoid: bool = False  # whether the heights are above a geoid that the file does not name
+    zoneless_times: bool = False  # whether a time was a text without a zone
+    unknown_columns: tuple[str, ...] = ()  # names in the header that mean nothing here
     header_line: int = 1
 
     def take(self, rows: IntArray | BoolArray) -> PoseTable:
         """Return the rows of an index (M,) or mask (N,)."""
-        return replace(
-            self,
-            lines=self.lines[rows],
-            names=None if self.names is None else tuple(np.array(self.names, dtype=object)[rows]),
-            time_s=None if self.time_s is None else self.time_s[rows],
-            xyz=self.xyz[rows],
-            quat_xyzw=None if self.quat_xyzw is None else self.quat_xyzw[rows],
-            sigma_enu_m=None if self.sigma_enu_m is None else self.sigma_enu_m[rows],
-            receiver=None if self.receiver is None else self.receiver[rows],
-        )
+        names = None if self.names is None else tuple(np.array(self.names, dtype=object)[rows])
+        return replace(rows_of(self, rows), names=names)
 
 
 def complete(values: FloatArray) -> BoolArray:

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from pipelines.core.files import replace_file
 from pipelines.core.types import FloatArray
-from pipelines.geometry.footprints import clipped_ring
+from pipelines.geometry.footprints import clipped_ring, ring_area
 
 Json = dict[str, Any]
 _DECIMALS = 8  # of a degree: 1 mm
@@ -66,8 +66,7 @@ def _closed(ring: FloatArray) -> list[list[float]] | None:
     if len(ring) < 3:
         return None
     rounded = np.round(ring, _DECIMALS)
-    x, y = rounded[:, 0] - rounded[0, 0], rounded[:, 1] - rounded[0, 1]
-    area = float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
+    area = ring_area(rounded)
     if area == 0.0:
         return None
     outline = rounded if area > 0 else rounded[::-1]

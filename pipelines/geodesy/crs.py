@@ -53,17 +53,11 @@ _STEP_M = 10.0  # long against the rounding of eastings and northings, short aga
 
 @dataclass(frozen=True)
 class PointCrs:
-    """CRS of the three coordinates of a file's points.
+    """CRS of the three coordinates of a file's points."""
 
-    Attributes:
-        name: as the file or option gave it, spaces tidied.
-        vertical: datum of the heights.
-        states_vertical: whether the CRS itself has that datum (compound, 3D or geocentric).
-    """
-
-    name: str
-    vertical: VerticalDatum
-    states_vertical: bool
+    name: str  # as the file or option gave it, spaces tidied
+    vertical: VerticalDatum  # datum of the heights
+    states_vertical: bool  # whether the CRS itself has that datum (compound, 3D or geocentric)
     height_unit: str
     _crs: CRS = field(repr=False)
     _height_unit_m: float = field(repr=False)

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, solve_triangular
 from scipy.sparse import bsr_matrix, csr_matrix
 from scipy.special import exp1
 
@@ -76,7 +76,7 @@ def has_positive_depth(network: Network) -> BoolArray:
 
 
 def projection_residuals(network: Network) -> FloatArray:
-    """Return the residuals (M, 2) in pixels, projected minus observed; all points lie in front of their cameras."""
+    """Return the residuals (M, 2) in pixels, projected minus observed; NaN for a point behind its camera."""
     in_cam = np.einsum("mij,mj->mi", network.cam_from_world[network.obs_image], network.rays())
     projected = project_each(network.cameras, network.camera_id[network.obs_image], in_cam)
     return np.asarray(projected - network.obs_xy_px)
@@ -132,7 +132,7 @@ def sparse_jacobian(blocks: FloatArray, column_block: IntArray, count: int) -> c
 def similarity_modes(cam_center_in_world: FloatArray) -> FloatArray:
     """Return the movements (n, 6, 7) of the cameras under an infinitesimal similarity about their mean centre.
 
-    Rows (δω, δc) as in `geometry.correction_basis.CorrectionBasis`, columns (ln s, rotation, translation).
+    Rows (δω, δc) as in `CorrectionBasis`, columns (ln s, rotation, translation).
     """
     arm = cam_center_in_world - cam_center_in_world.mean(axis=0)
     modes = np.zeros((len(arm), 6, 7))
@@ -156,10 +156,7 @@ _MEAN_WEIGHTED_SQUARE = _HALF_SCALE2 * (1 - _MEAN_WEIGHT)
 
 @dataclass(frozen=True)
 class EliminatedPoints:
-    """Normal equations of n poses and L lens parameters, with the points eliminated.
-
-    Slopes are gradients of half the weighted squares; zero where SfM left the observations at their minimum.
-    """
+    """Normal equations of n poses and L lens parameters, with the points eliminated."""
 
     poses: bsr_matrix  # (6 n, 6 n) sparse, in blocks (6, 6)
     cross: FloatArray  # (6 n, L)
@@ -167,32 +164,24 @@ class EliminatedPoints:
     pose_modes: FloatArray  # (6 n, 7) of the poses on the points' similarity
     lens_modes: FloatArray  # (L, 7) of the lens on it
     modes: FloatArray  # (7, 7) information on it
-    pose_slope: FloatArray  # (6 n,)
-    lens_slope: FloatArray  # (L,)
 
 
 @dataclass(frozen=True)
 class BundleInformation:
     """Information of the image observations on corrections x = (δω, δc) (6 n,) of cameras and ℓ (L,) of the lens.
 
-    The points are eliminated: the observations cost ½ (x, ℓ)ᵀ [poses, cross; crossᵀ, lens] (x, ℓ) + slopeᵀ (x, ℓ).
-    Axes and signs of (δω, δc) are those of `geometry.correction_basis.CorrectionBasis`, the order of ℓ that of
+    The points are eliminated: the observations, which SfM has left at their minimum, cost
+    ½ (x, ℓ)ᵀ [poses, cross; crossᵀ, lens] (x, ℓ).
+    Axes and signs of (δω, δc) are those of `CorrectionBasis`, the order of ℓ that of
     `geometry.cameras.Lenses`. The points follow cameras and lens; `followed` is their mean similarity, weighted by
     their information.
-
-    Attributes:
-        sums: the information.
-        similarity_modes: (6 n, 7) as `geometry.bundle.similarity_modes`.
-        unit: (6 n,) corrections that count as one metre at the scene.
-        loosest_sigma_m: σ in these units that the prior gives even a camera without observations.
-        sigma_px: σ of an image coordinate, estimated from the residuals, or 1 where each observation has its own.
     """
 
-    sums: EliminatedPoints
-    similarity_modes: FloatArray
-    unit: FloatArray
-    loosest_sigma_m: float
-    sigma_px: float
+    sums: EliminatedPoints  # the information
+    similarity_modes: FloatArray  # (6 n, 7) as `similarity_modes`
+    unit: FloatArray  # (6 n,) corrections that count as one metre at the scene
+    loosest_sigma_m: float  # σ in these units that the prior gives even a camera without observations
+    sigma_px: float  # σ of an image coordinate, estimated from the residuals
 
     @cached_property
     def followed(self) -> FloatArray:
@@ -201,8 +190,8 @@ class BundleInformation:
         return np.asarray(-np.linalg.solve(self.sums.modes, cross.T))
 
     @cached_property
-    def lens_elimination(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """How the lens follows the poses (L, 6 n), its information about that (L, L), and the covariance (L, L).
+    def lens_elimination(self) -> tuple[FloatArray, FloatArray]:
+        """How the lens follows the poses (L, 6 n), and its information about that (L, L).
 
         Parameters that no observation reveals have rows of zeros.
         """
@@ -211,11 +200,10 @@ class BundleInformation:
         scale = 1.0 / np.sqrt(diagonal[used])
         block = self.sums.lens[np.ix_(used, used)] * scale[:, None] * scale + 1e-9 * np.eye(len(used))
         follows = np.zeros((len(diagonal), len(self.sums.cross)))
-        information, cov = np.zeros_like(self.sums.lens), np.zeros_like(self.sums.lens)
+        information = np.zeros_like(self.sums.lens)
         follows[used] = -scale[:, None] * np.linalg.solve(block, (self.sums.cross[:, used] * scale).T)
         information[np.ix_(used, used)] = block / scale[:, None] / scale
-        cov[np.ix_(used, used)] = scale[:, None] * np.linalg.solve(block, np.eye(len(used))) * scale
-        return follows, information, cov
+        return follows, information
 
     def turned(self, new_from_old: Similarity, cam_center_in_new: FloatArray) -> BundleInformation:
         """Return the same information in another frame, whose cameras have centres (n, 3)."""
@@ -238,8 +226,6 @@ class BundleInformation:
                 pose_modes=of_poses(sums.pose_modes) @ by_similarity.T,
                 lens_modes=sums.lens_modes @ by_similarity.T,
                 modes=by_similarity @ sums.modes @ by_similarity.T,
-                pose_slope=of_poses(sums.pose_slope),
-                lens_slope=sums.lens_slope,
             ),
             similarity_modes=similarity_modes(cam_center_in_new).reshape(-1, 7),
             unit=self.unit * np.tile([1 / scale] * 3 + [1.0] * 3, count),
@@ -248,23 +234,15 @@ class BundleInformation:
         )
 
 
-def bundle_information(
-    network: Network, *, sigma_px: FloatArray | None = None, at_minimum: bool = True
-) -> BundleInformation:
+def bundle_information(network: Network) -> BundleInformation:
     """Return the information of a bundle on its cameras.
 
-    1. Cauchy's kernel weights the observations, unless their σ are stated.
+    1. Cauchy's kernel weights the observations, whose σ is estimated from the residuals.
     2. Chunks of points are eliminated one after the other, so that memory holds the derivatives of one chunk.
-
-    Args:
-        sigma_px: (M,) stated σ of the observations; None: one σ for all is estimated from the residuals.
-        at_minimum: whether SfM has left the observations at their minimum, so that their slope is zero.
 
     Raises:
         DegenerateGeometryError: fewer observations than unknowns.
     """
-    if sigma_px is not None:
-        sigma_px = sigma_px[has_positive_depth(network)]
     network = with_positive_depths(network)
     n, points, observations = len(network.camera_id), len(network.point_in_world), len(network.obs_point)
     redundancy = 2 * observations - 6 * n - 3 * points
@@ -272,17 +250,12 @@ def bundle_information(
         message = f"{observations} observations do not determine {n} cameras and {points} points."
         raise DegenerateGeometryError("network-undetermined", message)
     typical_m = float(np.median(np.linalg.norm(network.rays(), axis=1)))
-    residual, variance = projection_residuals(network), 1.0
-    if sigma_px is None:
-        length = np.linalg.norm(residual, axis=1)
-        weight = cauchy_weight((length / max(rayleigh_sigma(length), 1e-9)) ** 2, 2)
-        variance = float((weight[:, None] * residual**2).sum() / (_MEAN_WEIGHTED_SQUARE * redundancy))
-        root_weight = np.sqrt(weight / (_MEAN_WEIGHT * variance))
-    else:
-        root_weight = 1.0 / sigma_px
-    sums = eliminate_points(network, root_weight, residual=None if at_minimum else residual)
+    residual = projection_residuals(network)
+    length = np.linalg.norm(residual, axis=1)
+    weight = cauchy_weight((length / max(rayleigh_sigma(length), 1e-9)) ** 2, 2)
+    variance = float((weight[:, None] * residual**2).sum() / (_MEAN_WEIGHTED_SQUARE * redundancy))
     return BundleInformation(
-        sums=sums,
+        sums=eliminate_points(network, np.sqrt(weight / (_MEAN_WEIGHT * variance))),
         similarity_modes=similarity_modes(network.cam_center_in_world).reshape(-1, 7),
         unit=np.tile([1 / typical_m] * 3 + [1.0] * 3, n),  # rotations in metres at the scene, so that units agree
         loosest_sigma_m=_LOOSEST_RELATIVE_SIGMA * typical_m,
@@ -295,25 +268,17 @@ def eliminate_points(
     root_weight: FloatArray,
     surveyed: FloatArray | None = None,
     *,
-    residual: FloatArray | None = None,
-    surveyed_gradient: FloatArray | None = None,
     ridge: float = _RIDGE,
 ) -> EliminatedPoints:
     """Return the normal equations of poses and lens of a network, chunk by chunk of its points.
 
-    Args:
-        network: N points and M observations, each in front of its camera; at least one.
-        root_weight: (M,) inverse σ of the observations, 1/px.
-        surveyed: (N, 3, 3) information on the points beyond their observations, 1/m²; None: there is none.
-        residual: (M, 2) pixels, for the slope; None: the slope is zero.
-        surveyed_gradient: (N, 3) gradient of half the squares of `surveyed`, 1/m, for the slope; None: it is zero.
-        ridge: added to the information on a point, relative to its trace, for a point that its rays leave open.
+    Each of M ≥ 1 observations lies in front of its camera, and has an inverse σ (M,) in 1/px. Points may have
+    information (N, 3, 3) beyond their observations, in 1/m². The ridge, relative to the trace of the information on
+    a point, is for a point that its rays leave open.
     """
     total: EliminatedPoints | None = None
     for part, points, rows in chunks_of_points(network, _CHUNK):
-        known, own_gradient = (None if array is None else array[points] for array in (surveyed, surveyed_gradient))
-        left = None if residual is None else residual[rows]
-        sums = _eliminated(part, root_weight[rows], known, left, own_gradient, ridge=ridge)
+        sums = _eliminated(part, root_weight[rows], None if surveyed is None else surveyed[points], ridge)
         if total is not None:
             sums = EliminatedPoints(*map(operator.add, vars(total).values(), vars(sums).values()))
         total = sums
@@ -341,13 +306,7 @@ def chunks_of_points(network: Network, size: int) -> Iterator[tuple[Network, sli
 
 
 def _eliminated(
-    network: Network,
-    root_weight: FloatArray,
-    surveyed: FloatArray | None,
-    residual: FloatArray | None,
-    surveyed_gradient: FloatArray | None,
-    *,
-    ridge: float,
+    network: Network, root_weight: FloatArray, surveyed: FloatArray | None, ridge: float
 ) -> EliminatedPoints:
     n, points = len(network.camera_id), len(network.point_in_world)
     linearised, scaled = linearise_bundle(network), root_weight[:, None, None]
@@ -368,14 +327,6 @@ def _eliminated(
     intrinsics_point = intrinsics.T @ sparse_jacobian(white, network.obs_point, points)
     by_similarity = jacobian_at(network.point_in_world, network.cam_center_in_world.mean(axis=0))
     moved = (np.swapaxes(root, 1, 2) @ by_similarity).reshape(3 * points, 7)
-    white_residual = np.zeros(2 * len(root_weight))
-    if residual is not None:
-        white_residual = (residual * root_weight[:, None]).ravel()
-        of_points = sparse_jacobian(white, network.obs_point, points)
-        of_gradient = (
-            0.0 if surveyed_gradient is None else np.einsum("nji,nj->ni", inverse_root, surveyed_gradient).ravel()
-        )
-        white_residual = white_residual - of_points @ (of_points.T @ white_residual + of_gradient)
     return EliminatedPoints(
         own - pose_point @ pose_point.T,
         (pose.T @ intrinsics - pose_point.tocsr() @ intrinsics_point.T).toarray(),
@@ -383,8 +334,6 @@ def _eliminated(
         pose_point @ moved,
         intrinsics_point @ moved,
         moved.T @ moved,
-        np.asarray(pose.T @ white_residual),
-        np.asarray(intrinsics.T @ white_residual),
     )
 
 
@@ -397,3 +346,66 @@ def _blocks(blocks: FloatArray, row: IntArray, column: IntArray, shape: tuple[in
     matrix = bsr_matrix((blocks[order], column[order], pointer), shape=size)
     matrix.sum_duplicates()
     return matrix
+
+
+_COPIES = 4  # information, its factor, the basis, and a Jacobian or a normal matrix of the same size
+
+
+def predicted_basis_bytes(cameras: int) -> int:
+    """Return the peak of memory of a dense basis and of the normal equations in it."""
+    return _COPIES * 8 * (6 * cameras) ** 2
+
+
+@dataclass(frozen=True)
+class CorrectionBasis:
+    """Whitened corrections: (δω, δc) of all cameras = matrix @ z, with z ~ N(0, I) a posteriori.
+
+    A correction that costs the observations χ² = 1 has length one, and a similarity of the whole does not exist.
+
+    `δω` [rad] turns a camera about its centre, axes of the world: `R' = R Exp(−δω)`; `δc` [m] moves the centre.
+
+    The lens parameters correlate with the poses. Their error, (L,) in the order of `geometry.cameras.Lenses`, is
+    lens_matrix @ z plus an error that is independent of z.
+    """
+
+    matrix: FloatArray  # (n, 6, k), rows (δω, δc), k = 6 n − 7
+    lens_matrix: FloatArray  # (L, k)
+
+
+def correction_basis(bundle: BundleInformation, *, lens_follows: bool = True) -> CorrectionBasis:
+    """Return whitened, gauge-free coordinates of the camera corrections of a bundle at its minimum.
+
+    The points define the gauge. Under each correction the points follow the cameras and their lens; the mean
+    similarity of this movement, weighted by the information of each point, is zero.
+
+    The uncertainty of the similarity is therefore that of the scene, not that of the cameras' mean. A wrong focal
+    length or principal point shows as a common shift of the cameras against a scene that stays. That shift costs
+    the images little, and fixes reveal it. Cost O((6 n)³).
+
+    Unless the caller moves the lens by `lens_matrix` with the cameras (`lens_follows`), the lens is frozen, and the
+    points follow the cameras alone.
+    """
+    follows, _ = bundle.lens_elimination
+    root, complement = _root(bundle)
+    flat = solve_triangular(root, complement.T, lower=True).T * bundle.unit[:, None]
+    poses = len(bundle.unit)
+    through_lens = bundle.followed[:, poses:] @ follows if lens_follows else 0.0
+    held = flat - bundle.similarity_modes @ ((bundle.followed[:, :poses] + through_lens) @ flat)
+    return CorrectionBasis(held.reshape(-1, 6, flat.shape[1]), follows @ flat)
+
+
+def coordinates_of(bundle: BundleInformation, correction: FloatArray) -> FloatArray:
+    """Return the coordinates z (k,) of corrections (n, 6) in the basis; their common similarity is dropped."""
+    root, complement = _root(bundle)
+    return np.asarray(root.T @ (complement.T @ (correction.ravel() / bundle.unit)))
+
+
+def _root(bundle: BundleInformation) -> tuple[FloatArray, FloatArray]:
+    """Return the Cholesky root (k, k) of the information orthogonal to the similarities, and its axes (6 n, k)."""
+    follows, lens = bundle.lens_elimination
+    information = bundle.sums.poses.toarray() - follows.T @ lens @ follows
+    scaled = (information + information.T) / 2 * bundle.unit[:, None] * bundle.unit
+    complement = np.linalg.qr(bundle.similarity_modes / bundle.unit[:, None], mode="complete")[0][:, 7:]
+    reduced = complement.T @ scaled @ complement
+    reduced += np.eye(len(reduced)) / bundle.loosest_sigma_m**2
+    return np.asarray(np.linalg.cholesky(reduced)), complement

@@ -124,10 +124,7 @@ def parameter_names(camera: Camera) -> tuple[str, ...]:
 def parameters_in(camera: Camera, model: str) -> FloatArray | None:
     """Return a camera's parameters in the order of another model; None between a fisheye and other lenses.
 
-    What the other model lacks is dropped, and what it has besides is zero.
-
-    Raises:
-        InputError: as `undistort`.
+    What the other model lacks is dropped, and what it has besides is zero. Raises as `undistort`.
     """
     full = full_parameters(camera)
     if _is_fisheye(camera) != (model == "OPENCV_FISHEYE"):
@@ -154,11 +151,7 @@ def undistort(camera: Camera, xy_px: ArrayLike) -> FloatArray:
 
 
 def project(camera: Camera, point_in_cam: ArrayLike) -> FloatArray:
-    """Return pixels (…, 2) of points (…, 3) in the camera frame; NaN behind the camera.
-
-    Raises:
-        InputError: as `undistort`.
-    """
+    """Return pixels (…, 2) of points (…, 3) in the camera frame; NaN behind the camera; raises as `undistort`."""
     point = np.asarray(point_in_cam, dtype=np.float64)
     depth = np.where(point[..., 2:] > 0, point[..., 2:], np.nan)
     return distort(camera, point[..., :2] / depth)
@@ -174,11 +167,7 @@ def project_each(cameras: dict[int, Camera], camera_of: IntArray, points_in_cam:
 
 
 def distort(camera: Camera, ray: ArrayLike) -> FloatArray:
-    """Return pixels (…, 2) of rays (…, 2) given as (x/z, y/z).
-
-    Raises:
-        InputError: as `undistort`.
-    """
+    """Return pixels (…, 2) of rays (…, 2) given as (x/z, y/z); raises as `undistort`."""
     focal, center, distortion = np.split(full_parameters(camera), [2, 4])
     normalised = np.asarray(ray, dtype=np.float64)
     flat = normalised.reshape(-1, 2)
@@ -193,8 +182,7 @@ def _is_fisheye(camera: Camera) -> bool:
 def full_parameters(camera: Camera) -> FloatArray:
     """Return fx fy cx cy, then k1 k2 p1 p2 k3 k4 k5 k6 (fisheye: k1 k2 k3 k4), zero for terms that the model lacks.
 
-    Raises:
-        InputError: as `undistort`.
+    Raises as `undistort`.
     """
     layout = _LAYOUT.get(camera.model)
     if layout is None:

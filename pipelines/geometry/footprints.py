@@ -82,7 +82,7 @@ def footprint(rays: FloatArray, center: FloatArray, surface: PointSurface) -> Fo
     outline = center + depth[:, None] * ray
     if _crosses_itself(outline[:, :2]):
         outline = center + np.median(depth) * ray
-    return Footprint(outline if _area(outline) > 0 else outline[::-1], clipped)
+    return Footprint(outline if ring_area(outline) > 0 else outline[::-1], clipped)
 
 
 def ground_points(rays: FloatArray, center: FloatArray, surface: PointSurface) -> FloatArray:
@@ -155,7 +155,7 @@ def _crosses_itself(ring: FloatArray) -> bool:
     return bool((parted & parted.T).any())
 
 
-def _area(outline: FloatArray) -> float:
+def ring_area(outline: FloatArray) -> float:
     """Return the area of an outline in plan, negative if it runs clockwise."""
     x, y = outline[:, 0] - outline[0, 0], outline[:, 1] - outline[0, 1]
     return float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2

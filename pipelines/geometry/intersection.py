@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from pipelines.core.machine import thread_count
 from pipelines.core.types import BoolArray, FloatArray, IntArray
-from pipelines.geometry.bundle import Network, chunks_of_points
+from pipelines.geometry.bundle import Network, chunks_of_points, projection_residuals
 from pipelines.geometry.cameras import project_each
 from pipelines.geometry.rotations import skew
 from pipelines.robust.statistics import cauchy_loss, cauchy_weight, chi2_quantile, huber_weight
@@ -367,8 +367,7 @@ def _refine(network: Network) -> tuple[FloatArray, FloatArray]:
 
 def _residuals(network: Network) -> tuple[FloatArray, BoolArray]:
     """Return projected minus observed (M, 2), zero behind the camera, and the mask of points before theirs."""
-    in_cam = np.einsum("mij,mj->mi", network.cam_from_world[network.obs_image], network.rays())
-    residual = project_each(network.cameras, network.camera_id[network.obs_image], in_cam) - network.obs_xy_px
+    residual = projection_residuals(network)
     usable = np.asarray(np.isfinite(residual).all(axis=1))
     return np.where(usable[:, None], residual, 0.0), usable
 

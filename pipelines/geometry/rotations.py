@@ -85,7 +85,9 @@ def geo_from_cam(yaw_pitch_roll_deg: ArrayLike) -> FloatArray:
     The angles turn North-East-Down into the gimbal's forward-right-down axes, in the order Z-Y-X (yaw, pitch,
     roll). Pitch −90 looks straight down; the camera looks along the gimbal's forward axis.
     """
-    return ENU_FROM_NED @ _from_angles_deg("ZYX", yaw_pitch_roll_deg) @ _CAM_FROM_GIMBAL.T
+    angles = np.asarray(yaw_pitch_roll_deg, dtype=np.float64)
+    turned = np.asarray(Rotation.from_euler("ZYX", angles.reshape(-1, 3), degrees=True).as_matrix())
+    return np.asarray(ENU_FROM_NED @ turned.reshape(*angles.shape[:-1], 3, 3) @ _CAM_FROM_GIMBAL.T)
 
 
 def yaw_pitch_roll_deg(geo_from_cam_rotation: ArrayLike) -> FloatArray:
@@ -96,28 +98,15 @@ def yaw_pitch_roll_deg(geo_from_cam_rotation: ArrayLike) -> FloatArray:
     return _angles_deg("ZYX", ENU_FROM_NED.T @ np.asarray(geo_from_cam_rotation, np.float64) @ _CAM_FROM_GIMBAL)
 
 
-def map_from_cam(omega_phi_kappa_deg: ArrayLike) -> FloatArray:
-    """Return rotations (…, 3, 3) camera → map axes of photogrammetric angles ω, φ, κ (…, 3) in degrees.
+def omega_phi_kappa_deg(map_from_cam_rotation: ArrayLike) -> FloatArray:
+    """Return photogrammetric angles ω, φ, κ (…, 3) in degrees of rotations (…, 3, 3) camera → map axes.
 
     R_x(ω) R_y(φ) R_z(κ) turns image axes (x right, y up, z backward) into map axes (east, north, up). With
     ω = φ = κ = 0 a camera looks straight down, and the upper edge of its image faces north (Bäumker and Heimes
     2001, New calibration and computing method for direct georeferencing; PIX4D has the same angles).
-    """
-    return _from_angles_deg("XYZ", omega_phi_kappa_deg) @ _CAM_FROM_PHOTO.T
-
-
-def omega_phi_kappa_deg(map_from_cam_rotation: ArrayLike) -> FloatArray:
-    """Return ω, φ, κ (…, 3) in degrees of rotations (…, 3, 3) camera → map axes: inverts `map_from_cam`.
-
     ω and κ lie within ±180°, φ within ±90°. With φ = ±90°, ω and κ turn about the same axis: κ is then zero.
     """
     return _angles_deg("XYZ", np.asarray(map_from_cam_rotation, np.float64) @ _CAM_FROM_PHOTO)
-
-
-def _from_angles_deg(order: str, angles_deg: ArrayLike) -> FloatArray:
-    angles = np.asarray(angles_deg, dtype=np.float64)
-    matrix = np.asarray(Rotation.from_euler(order, angles.reshape(-1, 3), degrees=True).as_matrix())
-    return np.asarray(matrix.reshape(*angles.shape[:-1], 3, 3))
 
 
 def _angles_deg(order: str, rotation: FloatArray) -> FloatArray:

@@ -53,12 +53,9 @@ _solved = partial(solve_triangular, lower=True, check_finite=False)
 
 
 class SparseCholesky:
-    """Cholesky factor of a symmetric positive definite matrix of n × n blocks.
+    """Cholesky factor of a symmetric positive definite matrix of n × n blocks (w, w), given with both triangles.
 
-    Args:
-        matrix: blocks (w, w), both triangles.
-        position: (n, d) place of each block row, which the cuts divide. The result does not depend on it, only the
-            cost.
+    The cuts divide the places (n, d) of the block rows. The result does not depend on these, only the cost.
 
     Raises:
         DegenerateGeometryError: the matrix is not positive definite.

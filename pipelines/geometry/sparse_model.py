@@ -15,36 +15,21 @@ class SparseModel:
     """SfM model in its own frame `local`: n registered images, N points, M observations.
 
     Observations are sorted by point, then by image, so that the track of a point is one contiguous run.
-
-    Attributes:
-        cameras: intrinsics by COLMAP's camera id.
-        image_id: (n,) COLMAP's ids, ascending.
-        image_name: n names, relative to the image folder.
-        image_camera_id: (n,) keys of `cameras`.
-        rotation_cam_from_local: (n, 3, 3).
-        translation_cam_from_local: (n, 3), in units of `local`.
-        point_id: (N,) COLMAP's ids, ascending.
-        point_in_local: (N, 3).
-        point_rgb: (N, 3) uint8.
-        point_error_px: (N,) mean reprojection error; NaN where the model does not state it.
-        obs_point: (M,) index into the points, ascending.
-        obs_image: (M,) index into the images.
-        obs_xy_px: (M, 2) pixels, the centre of the top-left pixel being (0.5, 0.5).
     """
 
-    cameras: dict[int, Camera]
-    image_id: IntArray
-    image_name: tuple[str, ...]
-    image_camera_id: IntArray
-    rotation_cam_from_local: FloatArray
-    translation_cam_from_local: FloatArray
-    point_id: IntArray
-    point_in_local: FloatArray
-    point_rgb: ByteArray
-    point_error_px: FloatArray
-    obs_point: IntArray
-    obs_image: IntArray
-    obs_xy_px: FloatArray
+    cameras: dict[int, Camera]  # intrinsics by COLMAP's camera id
+    image_id: IntArray  # (n,) COLMAP's ids, ascending
+    image_name: tuple[str, ...]  # n names, relative to the image folder
+    image_camera_id: IntArray  # (n,) keys of `cameras`
+    rotation_cam_from_local: FloatArray  # (n, 3, 3)
+    translation_cam_from_local: FloatArray  # (n, 3), in units of `local`
+    point_id: IntArray  # (N,) COLMAP's ids, ascending
+    point_in_local: FloatArray  # (N, 3)
+    point_rgb: ByteArray  # (N, 3) uint8
+    point_error_px: FloatArray  # (N,) mean reprojection error; NaN where the model does not state it
+    obs_point: IntArray  # (M,) index into the points, ascending
+    obs_image: IntArray  # (M,) index into the images
+    obs_xy_px: FloatArray  # (M, 2) pixels, the centre of the top-left pixel being (0.5, 0.5)
 
     @property
     def cam_center_in_local(self) -> FloatArray:

@@ -18,34 +18,26 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pipelines.core.types import BoolArray, FloatArray, IntArray
+from pipelines.core.types import BoolArray, FloatArray, IntArray, Rows
 from pipelines.geometry.rotations import ENU_FROM_NED, exp_so3, geo_from_cam, log_so3
 
 _SAME_TIME_S = 1e-3
 
 
 @dataclass(frozen=True)
-class Trajectory:
+class Trajectory(Rows):
     """Samples of a motion on one clock; what was not recorded is NaN.
 
     Positions are Cartesian: degrees jump at the date line. Rotations turn axes of the moving body into the axes of
     the samples' frame, or into East-North-Up where each sample was taken.
-
-    Attributes:
-        time_s: (K,) increasing.
-        position: (K, 3) metres.
-        rotation: (K, 3, 3).
-        sigma_m: (K, 3) σ of the positions.
-        sigma_deg: (K,) σ of the rotations.
-        max_gap_s: longest time between two samples to interpolate over.
     """
 
-    time_s: FloatArray
-    position: FloatArray
-    rotation: FloatArray
-    sigma_m: FloatArray
-    sigma_deg: FloatArray
-    max_gap_s: float
+    time_s: FloatArray  # (K,) increasing
+    position: FloatArray  # (K, 3) metres
+    rotation: FloatArray  # (K, 3, 3)
+    sigma_m: FloatArray  # (K, 3) σ of the positions
+    sigma_deg: FloatArray  # (K,) σ of the rotations
+    max_gap_s: float  # longest time between two samples to interpolate over
 
     @classmethod
     def from_samples(
@@ -68,9 +60,6 @@ class Trajectory:
             np.full(count, np.nan) if sigma_deg is None else sigma_deg,
             max_gap_s,
         )
-
-    def __len__(self) -> int:
-        return len(self.time_s)
 
     def covers(self, time_s: FloatArray) -> BoolArray:
         """Return for which times (n,) there is a value, by rules 1 and 2."""
@@ -142,18 +131,13 @@ FLU_FROM_FRD = np.diag([1.0, -1.0, -1.0])
 
 @dataclass(frozen=True)
 class Rig:
-    """Mount, lever arm and boresight of one camera, or mount and lever arm of each of N photographs.
+    """Mount, lever arm and boresight of one camera, or mount and lever arm of each of N photographs."""
 
-    Attributes:
-        cam_from_body: (3, 3) or (N, 3, 3) mount; None or NaN where nothing is known of it.
-        antenna_in_body: (3,) or (N, 3) lever arm: metres from the camera's centre, forward-right-down; None or NaN
-            where nothing is known of it.
-        nominal_from_cam: (3, 3) boresight.
-    """
-
-    cam_from_body: FloatArray | None = None
+    cam_from_body: FloatArray | None = None  # (3, 3) or (N, 3, 3) mount; None or NaN where nothing is known of it
+    # (3,) or (N, 3) lever arm: metres from the camera's centre, forward-right-down; None or NaN where nothing is
+    # known of it
     antenna_in_body: FloatArray | None = None
-    nominal_from_cam: FloatArray = field(default_factory=lambda: np.eye(3))
+    nominal_from_cam: FloatArray = field(default_factory=lambda: np.eye(3))  # (3, 3) boresight
 
     def of_each(self, count: int) -> tuple[FloatArray, FloatArray]:
         """Return the mount (N, 3, 3) and the lever arm (N, 3) of each of N photographs, NaN where unknown."""
@@ -165,12 +149,10 @@ class Rig:
 def with_rig(antenna: FloatArray, frame_from_body: FloatArray, rig: Rig) -> tuple[FloatArray, FloatArray]:
     """Return camera centres (N, 3) and rotations frame ← camera (N, 3, 3), from the navigation of N photographs.
 
-    Where the lever arm is not known, the antenna stands for the camera. A lever arm without an attitude gives no
-    centre, because the arm could point anywhere; no mount or no attitude gives no rotation: both are NaN.
-
-    Args:
-        antenna: (N, 3) metres in any Cartesian frame, or in one for each photograph.
-        frame_from_body: (N, 3, 3) attitudes of the body, forward-right-down, in that frame.
+    The antennas (N, 3) are metres in any Cartesian frame, or in one for each photograph; the attitudes (N, 3, 3) of
+    the body, forward-right-down, are in that frame. Where the lever arm is not known, the antenna stands for the
+    camera. A lever arm without an attitude gives no centre, because the arm could point anywhere; no mount or no
+    attitude gives no rotation: both are NaN.
     """
     mounts, arms = rig.of_each(len(antenna))
     arms = np.nan_to_num(arms)

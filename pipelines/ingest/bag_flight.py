@@ -109,9 +109,8 @@ def _positions(streams: BagStreams, options: IngestOptions, remarks: Remarks) ->
         raise InputError(
             "local-frame-without-origin",
             f"{series.topic} has positions in the local frame {series.world!r}, whose place on Earth is unknown. "
-            "Give its zero with "
-            "--origin LAT,LON,HEIGHT (its axes are taken as East-North-Up), or a topic with latitude and "
-            "longitude with --fix-topic.",
+            "Give its zero with --origin LAT,LON,HEIGHT (its axes are taken as East-North-Up), or a topic with "
+            "latitude and longitude with --fix-topic.",
             path=streams.path,
             field="--origin",
         )
@@ -189,8 +188,7 @@ def _rig_at(time_s: FloatArray, attitudes: Trajectory, streams: BagStreams, give
         remarks.warn(
             "camera-mount-unknown",
             f"/tf does not link the frames {image_frame!r} of the camera and {body!r} of the attitudes, so that "
-            "the cameras have no attitude. "
-            "Give --camera-mount YAW,PITCH,ROLL.",
+            "the cameras have no attitude. Give --camera-mount YAW,PITCH,ROLL.",
         )
     if given.antenna_in_body is None:
         antenna = frames.between(body, streams.positions.frame, time_s) if streams.positions else None

@@ -23,32 +23,21 @@ _GAP_STEPS = 3.0
 
 @dataclass(frozen=True)
 class TopicReport:
-    """A topic.
-
-    Attributes:
-        use: what `ingest` would take from it, or "".
-        messages: that could be read.
-        rate_hz: by the median step between stamps; None for fewer than two messages.
-        first_s, last_s: time span; `longest_gap_s`: in it; `gaps`: steps of more than three times the median.
-        backwards: stamps that are not later than the one before.
-        clock: "stamp", or "recording" where messages have none.
-        frame: of the first message, and its child frame.
-        problem: why the type or its messages cannot be read.
-    """
+    """A topic."""
 
     name: str
     type: str
-    use: str
-    messages: int
-    rate_hz: float | None
+    use: str  # what `ingest` would take from it, or ""
+    messages: int  # that could be read
+    rate_hz: float | None  # by the median step between stamps; None for fewer than two messages
     first_s: float | None
     last_s: float | None
     longest_gap_s: float | None
-    gaps: int
-    backwards: int
-    clock: str
-    frame: str
-    problem: str
+    gaps: int  # steps of more than three times the median
+    backwards: int  # stamps that are not later than the one before
+    clock: str  # "stamp", or "recording" where messages have none
+    frame: str  # of the first message, and its child frame
+    problem: str  # why the type or its messages cannot be read
 
 
 @dataclass(frozen=True)

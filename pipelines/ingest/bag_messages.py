@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pipelines.core.types import FloatArray, Quaternion, Vector3
+from pipelines.core.types import FloatArray, Quaternion, Vector3, vector3
 from pipelines.geometry.rotations import ENU_FROM_NED, matrix_from_quat_xyzw, quat_xyzw_from_matrix
 from pipelines.geometry.trajectory import Trajectory
 
@@ -32,23 +32,14 @@ _POSE_FRAME_NED = 1
 
 @dataclass(frozen=True)
 class PositionSample:
-    """A position as a message states it.
+    """A position as a message states it."""
 
-    Attributes:
-        place: (latitude, longitude, height), or metres east, north, up from the local frame's origin.
-        sigma_enu_m: NaN where unknown.
-        frame: name of the frame that is at that place.
-        world: the local frame; "" for geodetic positions.
-        receiver: kind of receiver, for σ where the message has none.
-        problem: why it cannot be used, or "".
-    """
-
-    place: Vector3
-    sigma_enu_m: Vector3
-    frame: str
-    world: str = ""
-    receiver: str = "unknown receiver"
-    problem: str = ""
+    place: Vector3  # (latitude, longitude, height), or metres east, north, up from the local frame's origin
+    sigma_enu_m: Vector3  # NaN where unknown
+    frame: str  # name of the frame that is at that place
+    world: str = ""  # the local frame; "" for geodetic positions
+    receiver: str = "unknown receiver"  # kind of receiver, for σ where the message has none
+    problem: str = ""  # why it cannot be used, or ""
 
 
 @dataclass(frozen=True)
@@ -123,10 +114,9 @@ def _local(position: Any, message: Any, frame: str = "", covariance: Any = None)
     variance = np.zeros(3) if covariance is None else np.asarray(covariance, dtype=np.float64)[[0, 7, 14]]
     if str(message.header.frame_id).lower().endswith("_ned"):
         values, variance = ENU_FROM_NED @ values, np.abs(ENU_FROM_NED) @ variance
-    x, y, z = (float(value) for value in values)
     problem = "" if np.isfinite(values).all() else "position is NaN"
     world = message.header.frame_id or "odom"
-    return PositionSample((x, y, z), _sigmas(variance), frame or BASE, world=world, problem=problem)
+    return PositionSample(vector3(values), _sigmas(variance), frame or BASE, world=world, problem=problem)
 
 
 def _px4_local(message: Any) -> PositionSample:
@@ -136,8 +126,7 @@ def _px4_local(message: Any) -> PositionSample:
     else:  # px4_msgs up to release 1.13: the upper triangle of a 6×6 covariance, row by row
         ned = np.array([message.x, message.y, message.z], dtype=np.float64)
         variance = np.asarray(message.pose_covariance, dtype=np.float64)[[0, 6, 11]]
-    east, north, up = ENU_FROM_NED @ ned
-    place = (float(east), float(north), float(up))
+    place = vector3(ENU_FROM_NED @ ned)
     problem = "" if _px4_is_ned(message) else "its frame is not North-East-Down"
     if not all(map(math.isfinite, place)):
         problem = "position is NaN"
@@ -150,8 +139,7 @@ def _sigmas(variance: Any) -> Vector3:
     values = np.asarray(variance, dtype=np.float64)
     if not (np.isfinite(values).all() and (values > 0).all() and (values < _LARGEST_SIGMA_M**2).all()):
         return _NAN3
-    x, y, z = np.sqrt(values)
-    return float(x), float(y), float(z)
+    return vector3(np.sqrt(values))
 
 
 def _eph_epv(message: Any) -> Vector3:

@@ -123,31 +123,23 @@ def _pick(
 
 @dataclass
 class TopicSamples:
-    """Samples of one topic in the order of recording.
-
-    Attributes:
-        stamps: nanoseconds of the message's own clock; 0 where it has none.
-        bag_times: nanoseconds of the recorder's clock.
-        values: `width` numbers a sample.
-        receivers: the kind of receiver of each sample.
-        frame: of the first sample; `world`: its local frame; `axes`: of the frame.
-        problems: how many messages were left out, by reason.
-        time_s: (N,) seconds on the clock of all topics, once all are read; `usable`: (N,) which of them are.
-    """
+    """Samples of one topic in the order of recording."""
 
     topic: str
     type: str
     width: int = 0
+    # Nanoseconds of the message's own clock; 0 where it has none
     stamps: array[int] = field(default_factory=lambda: array("q"))
-    bag_times: array[int] = field(default_factory=lambda: array("q"))
-    values: array[float] = field(default_factory=lambda: array("d"))
-    receivers: list[str] = field(default_factory=list)
-    frame: str = ""
-    world: str = ""
-    axes: Axes = "flu"
-    problems: Counter[str] = field(default_factory=Counter)
+    bag_times: array[int] = field(default_factory=lambda: array("q"))  # nanoseconds of the recorder's clock
+    values: array[float] = field(default_factory=lambda: array("d"))  # `width` numbers a sample
+    receivers: list[str] = field(default_factory=list)  # the kind of receiver of each sample
+    frame: str = ""  # of the first sample
+    world: str = ""  # local frame of the first sample
+    axes: Axes = "flu"  # of the frame
+    problems: Counter[str] = field(default_factory=Counter)  # how many messages were left out, by reason
+    # (N,) seconds on the clock of all topics, once all are read
     time_s: FloatArray = field(default_factory=lambda: np.empty(0))
-    usable: BoolArray = field(default_factory=lambda: np.empty(0, dtype=bool))
+    usable: BoolArray = field(default_factory=lambda: np.empty(0, dtype=bool))  # (N,) which samples are
 
     def add(self, stamp: int | None, bag_ns: int, values: tuple[float, ...] = (), receiver: str = "") -> None:
         """Append a sample."""
@@ -168,21 +160,14 @@ class TopicSamples:
 
 @dataclass(frozen=True)
 class BagStreams:
-    """The small messages of a bag.
-
-    Attributes:
-        images: stamps of every message of the image topic; its frame is that of the first.
-        positions: latitude, longitude, height (or east, north, up) and their σ.
-        attitudes: quaternion xyzw frame → East-North-Up, and σ in degrees.
-        info: first `CameraInfo`, or None.
-    """
+    """The small messages of a bag."""
 
     path: Path
-    images: TopicSamples
-    positions: TopicSamples | None
-    attitudes: TopicSamples | None
+    images: TopicSamples  # stamps of every message of the image topic; its frame is that of the first
+    positions: TopicSamples | None  # latitude, longitude, height (or east, north, up) and their σ
+    attitudes: TopicSamples | None  # quaternion xyzw frame → East-North-Up, and σ in degrees
     transforms: Transforms
-    info: Any | None
+    info: Any | None  # first `CameraInfo`, or None
     info_topic: str | None
 
 

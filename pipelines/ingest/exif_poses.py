@@ -28,8 +28,7 @@ from pipelines.ingest.flight_record import ImagePoses, with_defaults
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo
 from pipelines.ingest.remarks import Remarks
-from pipelines.robust.patterns import blunders_among, median_spacing, scatter_about_median, two_groups
-from pipelines.robust.statistics import mad_sigma
+from pipelines.robust.statistics import blunders_among, mad_sigma, median_spacing, scatter_about_median, two_groups
 
 # Vertical over horizontal σ of a fix that states only the horizontal one.
 _VERTICAL_RATIO = 2.0

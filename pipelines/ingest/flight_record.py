@@ -41,32 +41,20 @@ RECEIVERS = tuple(RECEIVER_SIGMA_M)
 
 @dataclass(frozen=True)
 class ImagePoses:
-    """Measured poses of N images; NaN rows where nothing was measured.
+    """Measured poses of N images; NaN rows where nothing was measured."""
 
-    Attributes:
-        position_in_ecef: (N, 3) metres.
-        sigma_enu_m: (N, 3).
-        sigma_source: (N,) who gave σ.
-        receivers: (N,) kinds of receiver, of `RECEIVERS`, as recorded.
-        enu_from_cam: (N, 3, 3) attitude against north and up at the camera.
-        attitude_source: (N,) kinds of file, as of `survey.survey.Attitude`.
-        sigma_attitude_deg: (N,) σ that the attitudes state.
-        time_s: (N,) seconds since 1970 UTC.
-        source: of the positions, with their CRS and the datum that their heights counted from.
-        recorded: the Earth-centred trajectory that images were matched with by time, None where it was by name.
-    """
-
-    position_in_ecef: FloatArray
-    sigma_enu_m: FloatArray
-    sigma_source: tuple[SigmaSource, ...]
-    receivers: tuple[str, ...]
-    enu_from_cam: FloatArray
-    attitude_source: tuple[str, ...]
-    sigma_attitude_deg: FloatArray
-    time_s: FloatArray
-    source: str
+    position_in_ecef: FloatArray  # (N, 3) metres
+    sigma_enu_m: FloatArray  # (N, 3)
+    sigma_source: tuple[SigmaSource, ...]  # (N,) who gave σ
+    receivers: tuple[str, ...]  # (N,) kinds of receiver, of `RECEIVERS`, as recorded
+    enu_from_cam: FloatArray  # (N, 3, 3) attitude against north and up at the camera
+    attitude_source: tuple[str, ...]  # (N,) kinds of file, as of `survey.survey.Attitude`
+    sigma_attitude_deg: FloatArray  # (N,) σ that the attitudes state
+    time_s: FloatArray  # (N,) seconds since 1970 UTC
+    source: str  # of the positions, with their CRS and the datum that their heights counted from
     crs_name: str
     vertical: VerticalDatum
+    # The Earth-centred trajectory that images were matched with by time, None where it was by name
     recorded: Trajectory | None = None
 
     @property
@@ -77,24 +65,15 @@ class ImagePoses:
 
 @dataclass(frozen=True)
 class RecordedNavigation:
-    """The navigation on its own clock, and how the cameras of N photographs sit in it.
+    """The navigation on its own clock, and how the cameras of N photographs sit in it."""
 
-    Attributes:
-        positions: of the antenna, Earth-centred.
-        attitudes: rotations body → East-North-Up at the antenna, forward-right-down.
-        rig: of the N photographs, as `ingest` was told or as `/tf` has it.
-        body_known: whether the body's axes are known; where not, the camera's nominal axes stand for them.
-        image_time_s: (N,) times of the photographs on the camera's clock.
-        time_offset_s: navigation clock minus camera clock.
-    """
-
-    positions: Trajectory
-    attitudes: Trajectory
-    rig: Rig
-    body_known: bool
+    positions: Trajectory  # of the antenna, Earth-centred
+    attitudes: Trajectory  # rotations body → East-North-Up at the antenna, forward-right-down
+    rig: Rig  # of the N photographs, as `ingest` was told or as `/tf` has it
+    body_known: bool  # whether the body's axes are known; where not, the camera's nominal axes stand for them
     images: tuple[str, ...]
-    image_time_s: FloatArray
-    time_offset_s: float
+    image_time_s: FloatArray  # (N,) times of the photographs on the camera's clock
+    time_offset_s: float  # navigation clock minus camera clock
 
 
 @dataclass(frozen=True)

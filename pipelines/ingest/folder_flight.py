@@ -169,8 +169,7 @@ def _event_of_each(events: CameraEvents, photos: Sequence[Photo], remarks: Remar
         raise InputError(
             "event-numbers",
             f"The events have the numbers {events.number.min()} to {events.number.max()}, and no photograph has "
-            "such a number in its name "
-            f"(as DJI_0007.JPG has); the folder has {photos[0].name!r} …",
+            f"such a number in its name (as DJI_0007.JPG has); the folder has {photos[0].name!r} …",
             path=events.path,
         )
     if len(folders) > 1:

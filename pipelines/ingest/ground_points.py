@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -167,25 +168,16 @@ def tie_marks(
             if image is None:
                 unknown.append(f"{path.name}:{mark.line} ({mark.image})")
                 continue
-            width, height = sizes[image]
+            (width, height), fault = sizes[image], partial(InputError, path=path, line=mark.line)
             if not (0.0 <= mark.x_px <= width and 0.0 <= mark.y_px <= height):
-                raise InputError(
+                raise fault(
                     "mark-outside-image",
                     f"The mark of {mark.name} at ({mark.x_px:g}, {mark.y_px:g}) lies outside {image} "
-                    f"({width}×{height} px). "
-                    "Was it made on an image of another size?",
-                    path=path,
-                    line=mark.line,
+                    f"({width}×{height} px). Was it made on an image of another size?",
                     field="px py",
                 )
             if image in marks[mark.name]:
-                raise InputError(
-                    "mark-twice",
-                    f"{mark.name} is already marked in {image}.",
-                    path=path,
-                    line=mark.line,
-                    field="image",
-                )
+                raise fault("mark-twice", f"{mark.name} is already marked in {image}.", field="image")
             marks[mark.name][image] = Mark(image=image, x_px=mark.x_px, y_px=mark.y_px, sigma_px=sigma_px)
         if listed and len(unknown) == len(listed):
             raise InputError(

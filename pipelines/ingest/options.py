@@ -43,10 +43,6 @@ def _every(text: str) -> Every:
     return Every(float(match[1]), "s" if match[2] == "s" else "m")
 
 
-def _seconds(text: str) -> float | str:
-    return text if text == "auto" else float(text)
-
-
 def _sensible(offset: float | Literal["auto"]) -> float | Literal["auto"]:
     if offset != "auto" and not abs(offset) < 1e6:
         raise ValueError("a number of seconds, or auto")
@@ -56,7 +52,12 @@ def _sensible(offset: float | Literal["auto"]) -> float | Literal["auto"]:
 # Files of other kinds beside the photographs, such as thumbnails and logs, make nothing stale.
 PhotographFolder = Annotated[Path, InputMarker(SUFFIXES)]
 FrameDistance = Annotated[Every, from_text(_every), WRITTEN]
-TimeOffset = Annotated[float | Literal["auto"], from_text(_seconds), AfterValidator(_sensible), WRITTEN]
+TimeOffset = Annotated[
+    float | Literal["auto"],
+    from_text(lambda text: text if text == "auto" else float(text)),
+    AfterValidator(_sensible),
+    WRITTEN,
+]
 
 
 class IngestOptions(StageOptions):
@@ -188,8 +189,7 @@ def check_options(options: IngestOptions, frames: Path | None) -> None:
         raise InputError(
             "events-need-antenna-track",
             "--events needs the antenna's --trajectory with times, and has the lever arm itself. Give "
-            "--trajectory, and remove --lever-arm. "
-            "A .MRK without a trajectory is given by --trajectory.",
+            "--trajectory, and remove --lever-arm. A .MRK without a trajectory is given by --trajectory.",
             field="--events",
         )
     for name in ("marks", "gcp_crs"):

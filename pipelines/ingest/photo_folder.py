@@ -150,28 +150,18 @@ class ImageNames:
         Raises:
             InputError: it leaves the image folder, or fits several images equally well; names path and line.
         """
+        fault = partial(InputError, path=path, line=line, field="image")
         name = text.strip().replace("\\", "/").removeprefix("./")
         pure = PurePosixPath(name)
         if pure.is_absolute() or ".." in pure.parts or name[1:2] == ":":
-            raise InputError(
-                "image-outside-folder",
-                f"{text!r} leaves the image folder. Name images relative to it.",
-                path=path,
-                line=line,
-                field="image",
-            )
+            raise fault("image-outside-folder", f"{text!r} leaves the image folder. Name images relative to it.")
         if name in self._exact:
             return name
         for form, key in zip(self._forms, _keys(name), strict=True):
             candidates = form.get(key, [])
             if len(candidates) > 1:
-                raise InputError(
-                    "image-ambiguous",
-                    f"{text!r} may be {' or '.join(candidates[:3])}. Name it with its folder and suffix.",
-                    path=path,
-                    line=line,
-                    field="image",
-                )
+                several = " or ".join(candidates[:3])
+                raise fault("image-ambiguous", f"{text!r} may be {several}. Name it with its folder and suffix.")
             if candidates:
                 return candidates[0]
         return None

@@ -26,8 +26,7 @@ def crs_of_table(table: PoseTable, options: IngestOptions, remarks: Remarks) -> 
     path = table.path
     if table.crs_text is not None:
         crs = parse_crs(table.crs_text, vertical=options.vertical, path=path, line=table.crs_line)
-        _note_own_heights(crs, path, options, remarks)
-        return crs
+        return _own(crs, path, options, remarks)
     if options.crs is not None:
         crs = parse_crs(options.crs, vertical=options.vertical, field="--crs")
         if table.geographic and not crs.is_geographic:
@@ -58,9 +57,7 @@ def crs_of_table(table: PoseTable, options: IngestOptions, remarks: Remarks) -> 
         )
     what = "latitude and longitude" if table.geographic else "coordinates"
     remarks.assume("crs-assumed", f"The {what} in {path.name} are WGS84 ({assumed}).")
-    crs = parse_crs(assumed, vertical=options.vertical)
-    _note_own_heights(crs, path, options, remarks)
-    return crs
+    return _own(parse_crs(assumed, vertical=options.vertical), path, options, remarks)
 
 
 def crs_of_points(listed: GroundPoints, options: IngestOptions, remarks: Remarks) -> PointCrs:
@@ -74,8 +71,7 @@ def crs_of_points(listed: GroundPoints, options: IngestOptions, remarks: Remarks
         if options.gcp_crs is not None:
             remarks.assume("gcp-crs-unused", f"{path.name} states its CRS: --gcp-crs does not apply to it.")
         crs = parse_crs(listed.crs_text, vertical=options.vertical, path=path, line=listed.crs_line)
-        _note_own_heights(crs, path, options, remarks)
-        return crs
+        return _own(crs, path, options, remarks)
     if options.gcp_crs is not None:
         crs = parse_crs(options.gcp_crs, vertical=options.vertical, field="--gcp-crs")
     elif listed.geographic:
@@ -138,12 +134,14 @@ def note_operation(crs: PointCrs, lla: FloatArray, remarks: Remarks) -> None:
         remarks.assume("height-unit", f"Heights of {crs.name} are in {crs.height_unit}.")
 
 
-def _note_own_heights(crs: PointCrs, path: Path, options: IngestOptions, remarks: Remarks) -> None:
+def _own(crs: PointCrs, path: Path, options: IngestOptions, remarks: Remarks) -> PointCrs:
+    """Return the CRS that a file has; a `--vertical` that does not apply to its heights is noted."""
     if _contradicts(crs, options):
         remarks.assume(
             "vertical-unused",
             f"Heights of {path.name} are {crs.vertical.name}, as its CRS says: --vertical does not apply to them.",
         )
+    return crs
 
 
 def _contradicts(crs: PointCrs, options: IngestOptions) -> bool:

@@ -11,10 +11,9 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from pipelines.core.errors import InputError
-from pipelines.core.types import FloatArray, IntArray, Matrix3, Vector3
+from pipelines.core.types import FloatArray, IntArray, Matrix3, vector3
 from pipelines.geodesy.enu import (
     Origin,
     ecef_from_lla,
@@ -182,7 +181,7 @@ def _surveyed(points: Sequence[GroundPoint], origin: Origin, options: IngestOpti
     return tuple(
         SurveyedPoint(
             name=point.name,
-            position_in_geo=_vector(position[row]),
+            position_in_geo=vector3(position[row]),
             cov_in_geo=_matrix(covariance[row]),
             marks=point.marks,
             land_cover="vegetated" if point.name in options.vegetated else "open",
@@ -196,7 +195,7 @@ def _fixes(poses: ImagePoses, session_of: IntArray, origin: Origin) -> list[Fix 
     covariance = _turned(poses.sigma_enu_m, poses.position_in_ecef, origin)
     return [
         Fix(
-            position_in_geo=_vector(position[row]),
+            position_in_geo=vector3(position[row]),
             cov_in_geo=_matrix(covariance[row]),
             source=poses.source,
             sigma_source=poses.sigma_source[row],
@@ -234,13 +233,8 @@ def _attitudes(poses: ImagePoses, origin: Origin, options: IngestOptions) -> lis
     return attitudes
 
 
-def _vector(values: ArrayLike) -> Vector3:
-    x, y, z = (float(value) for value in np.asarray(values))
-    return (x, y, z)
-
-
 def _matrix(values: FloatArray) -> Matrix3:
-    return (_vector(values[0]), _vector(values[1]), _vector(values[2]))
+    return (vector3(values[0]), vector3(values[1]), vector3(values[2]))
 
 
 def fix_sessions(
@@ -308,8 +302,7 @@ def _note_default(kind: str, count: int, options: IngestOptions, remarks: Remark
         remarks.assume(
             "default-common-sigma",
             f"The error that the {count} positions of a session share has a σ of {', '.join(defaults.values())} "
-            f"({kind}). "
-            f"State it with {' and '.join(defaults)}.",
+            f"({kind}). State it with {' and '.join(defaults)}.",
         )
 
 
@@ -385,7 +378,6 @@ def _vertical(poses: ImagePoses, files: Sequence[GroundFile], remarks: Remarks) 
         remarks.warn(
             "vertical-datums-mixed",
             f"The vertical datum of {', '.join(stated)} is stated, that of {', '.join(assumed)} only assumed. "
-            "They may differ by a "
-            "geoid's height, up to 100 m. State both with --vertical.",
+            "They may differ by a geoid's height, up to 100 m. State both with --vertical.",
         )
     return next(iter(datums.values()))

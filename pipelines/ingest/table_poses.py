@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -128,7 +129,7 @@ def match_by_name(table: PoseTable, images: list[str], remarks: Remarks) -> Pose
     Raises:
         InputError: two rows for one image, a name that leaves the folder or is ambiguous, or no match at all.
     """
-    index = ImageNames(images)
+    index, fault = ImageNames(images), partial(InputError, path=table.path, field="image")
     row_of: dict[str, int] = {}
     unknown, loose = [], []
     for row, text in enumerate(table.names or ()):
@@ -138,23 +139,16 @@ def match_by_name(table: PoseTable, images: list[str], remarks: Remarks) -> Pose
             unknown.append(f"{table.path.name}:{line} ({text})")
             continue
         if name in row_of:
-            raise InputError(
-                "image-twice",
-                f"{name} already has a row, in line {int(table.lines[row_of[name]])}.",
-                path=table.path,
-                line=line,
-                field="image",
-            )
+            before = int(table.lines[row_of[name]])
+            raise fault("image-twice", f"{name} already has a row, in line {before}.", line=line)
         if Path(text.replace("\\", "/")).name != Path(name).name:
             loose.append(f"{table.path.name}:{line} ({text} for {name})")
         row_of[name] = row
     if not row_of:
-        raise InputError(
+        raise fault(
             "no-image-matched",
             f"The file names none of the images: it has {(table.names or ('nothing',))[0]!r} …, the folder "
             f"{images[0]!r} …",
-            path=table.path,
-            field="image",
         )
     remarks.warn_counted("row-of-unknown-image", unknown, "Rows name no image here")
     remarks.warn_counted("image-name-differs", loose, "Rows name their images with another case or without suffix")
@@ -170,30 +164,23 @@ def match_by_time(
     Raises:
         InputError: no row or no photograph has a time, or none of them lies within the trajectory.
     """
+    fault = partial(InputError, path=path, field="timestamp")
     if not len(trajectory):
-        raise InputError("file-without-times", "No row has a time.", path=path, field="timestamp")
+        raise fault("file-without-times", "No row has a time.")
     time_s = photo_times(photos)
     timeless = [photo.name for photo in photos if photo.tags.timestamp_s is None]
     remarks.warn_counted("image-without-time", timeless, "Images have no time in EXIF")
     if len(timeless) == len(photos):
-        raise InputError(
-            "images-without-times",
-            "The file has no column image, and no image has a time in EXIF.",
-            path=path,
-            field="timestamp",
-        )
+        raise fault("images-without-times", "The file has no column image, and no image has a time in EXIF.")
     if any(photo.tags.time_source == "assumed UTC" for photo in photos):
         remarks.assume("time-zone", "EXIF times without a zone are UTC.")
     matched = trajectory.at(time_s + options.time_offset_s)
     if not complete(matched.position).any():
-        raise InputError(
+        raise fault(
             "times-apart",
             f"The file covers {_span(trajectory.time_s)}, the images {_span(time_s)}: no image lies within it, "
-            "with gaps of at most "
-            f"{trajectory.max_gap_s:g} s. Is the camera's clock in another time zone (--time-offset)? Is "
-            "--max-gap too small?",
-            path=path,
-            field="timestamp",
+            f"with gaps of at most {trajectory.max_gap_s:g} s. Is the camera's clock in another time zone "
+            "(--time-offset)? Is --max-gap too small?",
         )
     return matched
 

@@ -264,7 +264,7 @@ def _facts(
         heads=heads_of(evaluated.crs),
         rows=tuple(rows),
         chips=sum(len(row.chips) for row in rows),
-        marks=len(group.rays),
+        marks=len(group.rays.point),
         side_px=side_px,
         surface=surface is not None,
     )

@@ -58,10 +58,7 @@ def rename_images(colmap: Any, path: Path, names: dict[str, str]) -> None:
 def copy_rows(source: Path, target: Path, tables: Iterable[str], images: Iterable[int] | None = None) -> None:
     """Copy rows of features or matches from a finished database of a survey into another; present rows stay.
 
-    Args:
-        source, target: have the same numbers of images.
-        tables: `FEATURES` or `MATCHES`.
-        images: indices of the images whose features are copied; None: all rows.
+    `tables` are `FEATURES` or `MATCHES`, `images` indices of those whose features are copied; None: all rows.
 
     Raises:
         DamagedPartialError: the source is no whole database, or one of another version of COLMAP.

@@ -19,22 +19,15 @@ _USABLE = 0.9  # of the free memory: other programs grow, too
 
 @dataclass(frozen=True)
 class ReconstructionEstimate:
-    """Estimate of a reconstruction.
-
-    Attributes:
-        chunks: of features; 1: the survey is worked in one process.
-        peak_bytes: predicted peak of the memory.
-        free_bytes: memory that is free; None: unknown.
-        refusal: reason why it would not fit; empty: it fits.
-    """
+    """Estimate of a reconstruction."""
 
     photographs: int
     mapper: MapperName
-    chunks: int
+    chunks: int  # of features; 1: the survey is worked in one process
     seconds: float
-    peak_bytes: int
-    free_bytes: int | None
-    refusal: str
+    peak_bytes: int  # predicted peak of the memory
+    free_bytes: int | None  # memory that is free; None: unknown
+    refusal: str  # reason why it would not fit; empty: it fits
 
     def sentences(self) -> list[str]:
         """Return the estimate for people: mapper, chunks, time and memory."""

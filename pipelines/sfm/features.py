@@ -39,7 +39,6 @@ def select_pairs(position: FloatArray, axis: FloatArray, max_neighbors: int) -> 
     Args:
         position: (N, 3) metres in geo, NaN where unknown.
         axis: (N, 3) unit vectors of the optical axes in geo, NaN where unknown.
-        max_neighbors: limit of the neighbours in steps 1 and 2.
     """
     count = len(position)
     located = np.flatnonzero(np.isfinite(position).all(axis=1))
@@ -80,17 +79,11 @@ _MOST_TRIALS = 2_000
 
 @dataclass(frozen=True)
 class SfmJob:
-    """Inputs of a reconstruction, or of a part of one.
+    """Inputs of a reconstruction, or of a part of one."""
 
-    Attributes:
-        survey: photographs with priors of their cameras, positions and attitudes.
-        images: folder of the photographs.
-        database: path of COLMAP's database; an existing one is continued.
-    """
-
-    survey: Survey
-    images: Path
-    database: Path
+    survey: Survey  # photographs with priors of their cameras, positions and attitudes
+    images: Path  # folder of the photographs
+    database: Path  # path of COLMAP's database; an existing one is continued
     options: SfmOptions
 
     @property

@@ -65,9 +65,7 @@ def run(stage: StageRun, options: AdjustOptions) -> Summary:
 def write_adjusted(arguments: Mapping[str, Any], progress: Progress) -> dict[str, Any]:
     """Adjust a model and write it; return the summary as a document.
 
-    Args:
-        arguments: the calibrated `survey`, paths of `model` and `out`, and `seed`.
-        progress: shows the adjustment.
+    Among the arguments are the calibrated `survey`, paths of `model` and `out`, and `seed`.
     """
     survey, path = Survey.model_validate(arguments["survey"]), Path(arguments["model"])
     out, seed = Path(arguments["out"]), int(arguments["seed"])

@@ -61,9 +61,7 @@ def run(stage: StageRun, options: SfmOptions) -> Summary:
 def write_model(arguments: Mapping[str, Any], progress: Progress) -> dict[str, Any]:
     """Reconstruct or import the model and write it; return the summary as a document.
 
-    Args:
-        arguments: paths of `survey`, `images` and `out`, and the `options` of the stage.
-        progress: shows features, matches and mapping.
+    Among the arguments are paths of `survey`, `images` and `out`, and the `options` of the stage.
     """
     survey, database = load_json(Survey, Path(arguments["survey"])), Path(arguments["out"]) / "database.db"
     options = SfmOptions.model_validate(arguments["options"])

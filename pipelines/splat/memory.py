@@ -8,8 +8,8 @@ import torch
 
 from pipelines.core.errors import ResourceError
 from pipelines.core.machine import free_main_memory_bytes
+from pipelines.geometry.bundle import predicted_basis_bytes
 from pipelines.geometry.cameras import Pinhole
-from pipelines.geometry.correction_basis import predicted_basis_bytes
 from pipelines.splat.sh import coefficient_count
 
 _FLOAT = 4

@@ -228,7 +228,7 @@ class SurfaceReader:
         maps = [
             depth_around(self.renderer, int(camera), xy) for camera, xy in zip(rays.camera, rays.xy, strict=True)
         ]
-        counted, place = _counted_hits(self._trained, rays, maps, np.arange(len(rays)))
+        counted, place = _counted_hits(self._trained, rays, maps, np.arange(len(rays.point)))
         if len(place) < LEAST_VIEWS:
             return NoSurface("fewer than two photographs show a surface behind the marks")
         middle = spatial_median(place)

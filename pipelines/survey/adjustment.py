@@ -8,19 +8,12 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.core.products import ArrayProduct, Covariance3, Product, Remark, Rotation
+from pipelines.core.products import ArrayProduct, Product, Remark
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.geometry.similarity import SimilarityRecord
 from pipelines.robust.statistics import ResidualStats
 from pipelines.survey.report_parts import VarianceFactor, applied_factors, with_variance_factors
 from pipelines.survey.survey import Survey
-
-
-class AttitudeRecord(Product):
-    """Rotation geo ← local that the recorded attitudes give, with its covariance in rad², axes of geo."""
-
-    quat_xyzw: Rotation
-    cov_rad2: Covariance3
 
 
 class InitialSimilarity(Product):
@@ -48,7 +41,6 @@ class InitialSimilarity(Product):
     condition_number: float
     layout: Literal["volume", "plane", "line"]
     attitude_used: bool
-    attitude: AttitudeRecord | None = None
     variance_factors: tuple[VarianceFactor, ...] = ()
     cautions: tuple[Remark, ...] = ()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import ClassVar, TypeVar
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from pipelines.core.errors import InputError, MissingProductError
 from pipelines.core.products import ArrayProduct, load_json
 from pipelines.core.stages import RIG, SURVEY, TRACK
-from pipelines.core.types import BoolArray, FloatArray
+from pipelines.core.types import BoolArray, FloatArray, vector3
 from pipelines.core.workspace import Workspace
 from pipelines.geometry.rotations import exp_so3, matrix_from_quat_xyzw, quat_xyzw_from_matrix
 from pipelines.geometry.trajectory import Rig, Trajectory, with_rig
@@ -113,27 +114,24 @@ def require_estimable(track: NavigationTrack | None, wanted: Sequence[RigParamet
         InputError: the navigation was not recorded by time; or attitudes, the body's axes or the mount are needed
             and unknown.
     """
+    refusal = partial(InputError, field=field)
     if track is None or len(track.position_time_s) < 2:
-        raise InputError(
+        raise refusal(
             "navigation-not-recorded",
             "needs navigation with times: a --bag, or a --trajectory without a column of image names",
-            field=field,
         )
     turned = len(track.attitude_time_s) > 1
     if "lever-arm" in wanted and not turned:
-        raise InputError("no-attitudes", "lever-arm needs attitudes, which were not recorded", field=field)
+        raise refusal("no-attitudes", "lever-arm needs attitudes, which were not recorded")
     if "lever-arm" in wanted and not track.body_known:
-        raise InputError(
-            "body-axes-unknown",
-            "lever-arm needs the axes of the body; give --camera-mount YAW,PITCH,ROLL",
-            field=field,
+        raise refusal(
+            "body-axes-unknown", "lever-arm needs the axes of the body; give --camera-mount YAW,PITCH,ROLL"
         )
     mounted = bool(np.isfinite(track.cam_from_body).all(axis=(1, 2)).any())
     if "boresight" in wanted and not (turned and mounted):
-        raise InputError(
+        raise refusal(
             "mount-unknown" if turned else "no-attitudes",
             "boresight needs recorded attitudes, and the camera's mount from /tf or --camera-mount",
-            field=field,
         )
 
 
@@ -239,8 +237,7 @@ def _filled(values: list[ValueT | None], time_s: FloatArray) -> list[ValueT | No
 def _fix(like: Fix | None, center: FloatArray) -> Fix | None:
     if like is None or not np.isfinite(center).all():
         return None
-    x, y, z = (float(value) for value in center)
-    return like.model_copy(update={"position_in_geo": (x, y, z)})
+    return like.model_copy(update={"position_in_geo": vector3(center)})
 
 
 def _attitude(like: Attitude | None, geo_from_cam: FloatArray) -> Attitude | None:

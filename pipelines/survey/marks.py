@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipelines.core.types import BoolArray, FloatArray, IntArray
+from pipelines.core.types import BoolArray, FloatArray, IntArray, rows_of
 from pipelines.geometry.cameras import bearings
 from pipelines.geometry.intersection import Intersections, Rays, UncertainCameras, intersect_rays
 from pipelines.geometry.sparse_model import SparseModel
@@ -16,28 +16,15 @@ from pipelines.survey.survey import SurveyedPoint
 
 @dataclass(frozen=True)
 class MarkRays:
-    """K image marks of J surveyed points, in registered images.
+    """K image marks of J surveyed points, in registered images."""
 
-    Attributes:
-        point_name: (J,) as in the survey.
-        point: (K,) index into the points, ascending.
-        camera: (K,) index into the images of the SfM model.
-        xy_px: (K, 2) pixels of the photograph.
-        bearing_in_cam: (K, 3) unit vectors.
-        sigma_px: (K,) σ of a mark in pixels.
-        sigma_rad: (K,) σ of a mark as an angle: `sigma_px` over the mean focal length.
-    """
-
-    point_name: tuple[str, ...]
-    point: IntArray
-    camera: IntArray
-    xy_px: FloatArray
-    bearing_in_cam: FloatArray
-    sigma_px: FloatArray
-    sigma_rad: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.point)
+    point_name: tuple[str, ...]  # (J,) as in the survey
+    point: IntArray  # (K,) index into the points, ascending
+    camera: IntArray  # (K,) index into the images of the SfM model
+    xy_px: FloatArray  # (K, 2) pixels of the photograph
+    bearing_in_cam: FloatArray  # (K, 3) unit vectors
+    sigma_px: FloatArray  # (K,) σ of a mark in pixels
+    sigma_rad: FloatArray  # (K,) σ of a mark as an angle: `sigma_px` over the mean focal length
 
     @property
     def xy(self) -> FloatArray:
@@ -49,37 +36,24 @@ class MarkRays:
         """Number of marks (J,) of each point; no two are in one image."""
         return np.bincount(self.point, minlength=len(self.point_name)).astype(np.int64)
 
-    def part(self, chosen: BoolArray | IntArray) -> MarkRays:
-        """Return the marks chosen by a mask (K,) or indices; the points stay the same."""
-        arrays = ("point", "camera", "xy_px", "bearing_in_cam", "sigma_px", "sigma_rad")
-        return replace(self, **{name: getattr(self, name)[chosen] for name in arrays})
-
     def of_points(self, chosen: BoolArray) -> MarkRays:
         """Return the marks of the points chosen by a mask (J,); the points are numbered anew."""
-        rays = self.part(chosen[self.point])
+        rays = rows_of(self, chosen[self.point])
         names = tuple(name for name, keep in zip(self.point_name, chosen, strict=True) if keep)
         return replace(rays, point_name=names, point=(np.cumsum(chosen) - 1)[rays.point])
 
 
-def mark_rays(
-    points: Sequence[SurveyedPoint], sparse: SparseModel, images: Iterable[int] | None = None
-) -> MarkRays:
-    """Return the rays of all marks in registered images.
+def mark_rays(points: Sequence[SurveyedPoint], sparse: SparseModel) -> MarkRays:
+    """Return the rays of all marks of J points, in their order, in registered images.
 
     A mark is left out if the lens maps no ray to its pixel.
-
-    Args:
-        points: J points; their order is kept.
-        sparse: cameras and lenses.
-        images: indices of the images in use; None: all.
     """
     index = sparse.image_index()
-    wanted = set(range(len(sparse.image_name))) if images is None else set(map(int, images))
     rows = [
         (j, index[mark.image], mark.x_px, mark.y_px, mark.sigma_px)
         for j, point in enumerate(points)
         for mark in point.marks
-        if index.get(mark.image) in wanted
+        if mark.image in index
     ]
     table = np.array(rows, dtype=np.float64).reshape(-1, 5)
     point, camera = table[:, 0].astype(np.int64), table[:, 1].astype(np.int64)
@@ -97,35 +71,23 @@ def mark_rays(
         table[:, 4],
         table[:, 4] / focal_px,
     )
-    return rays.part(np.isfinite(bearing).all(axis=1))
+    return rows_of(rays, np.isfinite(bearing).all(axis=1))
 
 
 @dataclass(frozen=True)
 class RayErrors:
-    """Errors of K rays, apart from those of their marks.
+    """Errors of K rays, apart from those of their marks."""
 
-    Attributes:
-        sigma_center: σ of a projection centre along each axis, in units of the cameras' frame.
-        sigma_attitude_rad: σ of a camera's attitude about each axis.
-        sigma_lens_rad: (K,) or scalar; added in quadrature to the σ of the marks.
-    """
-
-    sigma_center: float
-    sigma_attitude_rad: float
-    sigma_lens_rad: FloatArray | float = 0.0
+    sigma_center: float  # σ of a projection centre along each axis, in units of the cameras' frame
+    sigma_attitude_rad: float  # σ of a camera's attitude about each axis
+    sigma_lens_rad: FloatArray | float = 0.0  # (K,) or scalar; added in quadrature to the σ of the marks
 
 
 def intersect_marks(
     rays: MarkRays, cam_from_frame: FloatArray, center_in_frame: FloatArray, errors: RayErrors
 ) -> Intersections:
-    """Intersect the rays of each of the J points, in the frame of the cameras.
-
-    Args:
-        rays: of the marks.
-        cam_from_frame, center_in_frame: (n, 3, 3) and (n, 3), of all images.
-        errors: of cameras and lenses.
-    """
-    count = len(rays)
+    """Intersect the rays of each of the J points, in the frame of all cameras (n, 3, 3) with centres (n, 3)."""
+    count = len(rays.point)
     # One view for each mark, because marks of one image may have different σ.
     views = UncertainCameras(
         center_in_geo=center_in_frame[rays.camera],
@@ -140,12 +102,9 @@ def intersect_marks(
 def mark_angles(
     rays: MarkRays, position_in_frame: FloatArray, cam_from_frame: FloatArray, center_in_frame: FloatArray
 ) -> FloatArray:
-    """Return the angles (K,) in radians between the marks and their points; NaN for a point without position.
+    """Return the angles (K,) in radians between marks and their points (J, 3); NaN for a point without position.
 
-    Args:
-        rays: of the marks.
-        position_in_frame: (J, 3) points.
-        cam_from_frame, center_in_frame: (n, 3, 3) and (n, 3), of all images.
+    The frame is that of all cameras, of rotations (n, 3, 3) and centres (n, 3).
     """
     arm = position_in_frame[rays.point] - center_in_frame[rays.camera]
     in_cam = np.einsum("kij,kj->ki", cam_from_frame[rays.camera], arm)

@@ -22,16 +22,11 @@ CloudPath = Annotated[Path, InputMarker(CLOUD_SUFFIXES)]
 
 @dataclass(frozen=True)
 class CloudCrs:
-    """CRS of clouds as the user states it; what the files say themselves counts first.
+    """CRS of clouds as the user states it; what the files say themselves counts first."""
 
-    Attributes:
-        crs: text of the CRS, for files without one.
-        vertical: datum of the heights, where the CRS has no vertical part.
-        flag: option that named the clouds, for errors: `--lidar` has `--lidar-crs` and `--lidar-vertical`.
-    """
-
-    crs: str | None = None
-    vertical: VerticalChoice | None = None
+    crs: str | None = None  # text of the CRS, for files without one
+    vertical: VerticalChoice | None = None  # datum of the heights, where the CRS has no vertical part
+    # Option that named the clouds, for errors: `--lidar` has `--lidar-crs` and `--lidar-vertical`
     flag: str = "--lidar"
 
 

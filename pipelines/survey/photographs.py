@@ -22,7 +22,7 @@ from pipelines.core.files import replacing
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray
 from pipelines.formats.image_file import read_bytes, require_unchanged
-from pipelines.geometry.cameras import Camera, Lenses, Pinhole, distort, refit_pinhole, undistort
+from pipelines.geometry.cameras import Camera, Lenses, Pinhole, distort, full_parameters, refit_pinhole, undistort
 
 log = logging.getLogger(__name__)
 
@@ -47,9 +47,7 @@ def pinhole_of(camera: Camera, max_size_px: int) -> Pinhole:
 
     The focal length is scaled with the size. Distortion parameters are dropped.
     """
-    p = camera.params
-    one_focal = camera.model.startswith(("SIMPLE", "RADIAL"))
-    fx, fy, cx, cy = (p[0], p[0], p[1], p[2]) if one_focal else p[:4]
+    fx, fy, cx, cy = full_parameters(camera)[:4]
     return Pinhole(camera.width, camera.height, fx, fy, cx, cy).limited(max_size_px)
 
 

@@ -108,15 +108,7 @@ class VegetatedAccuracy(Product):
 
 
 class AsprsStatement(Product):
-    """Accuracy classes of the ASPRS standard, edition 2, version 2 (2024).
-
-    Attributes:
-        points: number of check points outside vegetation: horizontal, vertical (NVA) and 3-D accuracy are theirs.
-        horizontal_class, vertical_class, class_3d: smallest classes of whole centimetres that the errors meet
-            ("5 cm"); None without these points.
-        area_km2, least_points: of the scene, and the number of check points that the standard demands for it.
-        statement: sentence to quote.
-    """
+    """Classes of the ASPRS standard, edition 2, version 2 (2024), met by the points outside vegetation ("5 cm")."""
 
     points: int
     horizontal_class: str | None
@@ -193,21 +185,22 @@ PointRows = tuple[PredictedPointError | PointError, ...]
 class StatedErrors(ErrorStats):
     """Figures of errors; with σ of the points' own survey, and both in quadrature.
 
-    Points under vegetation count in the errors alone, and neither in `survey` nor in `with_survey`.
+    Points under vegetation count in the errors alone, and neither in `survey` nor in `with_survey`. None: there are
+    no blunders, or there is no prediction.
     """
 
     survey: Rmse | None
     with_survey: TotalRmse | None
-
-
-class CheckPointErrors(StatedErrors):
-    """Errors of the check points, measured in one way; None: there are no blunders, or there is no prediction."""
-
-    asprs: AsprsStatement
     without_blunders: ErrorStats | None
     blunders: tuple[str, ...]
     predicted: PredictedSigma | None
     points: PointRows
+
+
+class CheckPointErrors(StatedErrors):
+    """Errors of the check points, measured in one way."""
+
+    asprs: AsprsStatement
 
 
 class CheckPoints(Product):
@@ -229,10 +222,6 @@ class CheckPoints(Product):
 class CrossValidation(StatedErrors):
     """Errors of the control points, each measured by a solution without it; or the reason why there are none."""
 
-    without_blunders: ErrorStats | None
-    blunders: tuple[str, ...]
-    predicted: PredictedSigma | None
-    points: PointRows
     reason: str | None
 
 
@@ -317,15 +306,7 @@ class Coordinates(Product):
 
 
 class EvaluationReport(_OptionalKeys):
-    """Product of `evaluate`.
-
-    Attributes:
-        headline: accuracy of the result, as every table and file states it.
-        photometric: None: nothing is trained yet.
-        cross_validation, coordinates, reference: None without their options.
-        cameras: predicted σ of the camera positions; None: nothing checks it.
-        cautions: limits of the result: those of the model, then those that `evaluate` found.
-    """
+    """Product of `evaluate`; the cautions are those of the model, then those that `evaluate` found."""
 
     format_version: Literal[1] = 1
     headline: Headline

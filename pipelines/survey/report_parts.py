@@ -1,6 +1,6 @@
 """Parts of reports: comparison with a reference cloud, LiDAR of a training, variance factors, systematic errors.
 
-Lengths are metres.
+Lengths are metres. docs/formats.md explains the fields of what `evaluate` writes.
 """
 
 from __future__ import annotations
@@ -32,12 +32,7 @@ class SurfaceScore(Product):
 class M3c2Figures(Product):
     """Distances model minus reference along the reference's normals (M3C2), positive on the cameras' side.
 
-    Attributes:
-        core_points, measured: places on the reference that photographs saw, and those of them at which both clouds
-            have points within the cylinder.
-        nmad_m: 1.4826 times the median absolute deviation from the median.
-        abs_95_m: 95 % of the distances are shorter.
-        median_lod_m: median level of detection, 95 %; beyond it lies the share `significant` of the distances.
+    They are measured at those of the core points, which photographs saw, that have points of both clouds nearby.
     """
 
     core_points: int
@@ -80,10 +75,7 @@ class ReferenceGroup(Product):
 class ReferenceShift(Product):
     """Translation that moves the model onto the reference best, by points and planes.
 
-    Attributes:
-        enu_m, sigma_m: east, north, up; σ from the spread between parts of the scene.
-        scale_ppm, turn_deg: of the similarity; 0 for a shift.
-        reference_from_model: rows of the matrix [sR | t] in geo.
+    σ are from the spread between parts of the scene; `reference_from_model` has the rows of [sR | t] in geo.
     """
 
     enu_m: Vector3
@@ -95,17 +87,9 @@ class ReferenceShift(Product):
 
 
 class ReferenceComparison(Product):
-    """Comparison of the surface with a reference cloud.
+    """Comparison of the surface with a reference cloud, from which a shift may have been removed (`aligned`).
 
-    Attributes:
-        points, seen: of the reference within the scene, after thinning; share of them that photographs saw.
-        spacing_m: median distance between neighbours in the reference.
-        model_spacing_m: side of the voxels of the model's cloud.
-        sigma_m: stated σ of the reference.
-        georeference_sigma_m: median predicted σ of the georeference along the normals; None: not known, and the
-            level of detection does not hold it.
-        shift: of the model against the reference; `aligned` says whether it was removed before the comparison.
-        cylinder_m: radius of the cylinders of M3C2.
+    The level of detection holds `georeference_sigma_m`, but for None, which is not known.
     """
 
     name: str
@@ -197,13 +181,7 @@ SigmaSource = Literal["stated", "default"]
 class VarianceFactor(Product):
     """Test of the stated σ of one group of measurements, after a least-squares adjustment.
 
-    Attributes:
-        count, used: numbers of measurements in the group, and in the test; the others are outliers.
-        redundancy: degrees of freedom of the test.
-        estimated: estimated factor of the stated variance; None without redundancy.
-        probability: of a larger factor if the stated σ are right; 1 without redundancy.
-        applied: factor by which the variance was multiplied.
-        sigma_source: whether σ was stated, or is a default that nobody stated.
+    Without redundancy, `estimated` is None and the probability is 1.
     """
 
     group: Group

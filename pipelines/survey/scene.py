@@ -32,19 +32,12 @@ from pipelines.survey.trained_model import Adjustment
 
 @dataclass(frozen=True)
 class Scene:
-    """n registered cameras and N points in `model`.
+    """n registered cameras and N points in `model`."""
 
-    Attributes:
-        sparse: the SfM model (frame `local`).
-        model_from_local: similarity that stays fixed.
-        geo_from_model: initial estimate, a pure shift.
-        train, test: indices of the cameras in each split.
-    """
-
-    sparse: SparseModel
-    model_from_local: Similarity
-    geo_from_model: Similarity
-    train: IntArray
+    sparse: SparseModel  # the SfM model (frame `local`)
+    model_from_local: Similarity  # similarity that stays fixed
+    geo_from_model: Similarity  # initial estimate, a pure shift
+    train: IntArray  # indices of cameras
     test: IntArray
 
     @cached_property
@@ -116,8 +109,7 @@ def make_scene(sparse: SparseModel, survey: Survey, model_from_local: Similarity
 def initial_scene(sparse: SparseModel, survey: Survey, initial: InitialSimilarity) -> Scene:
     """Return the scene at the start of training, its origin at the median SfM point, rounded to a metre.
 
-    Raises:
-        DegenerateGeometryError: fewer than two registered training images.
+    Raises as `make_scene`.
     """
     geo_from_local = Similarity.from_record(initial.geo_from_local)
     shift = np.round(np.median(geo_from_local.apply(sparse.point_in_local), axis=0))
@@ -128,8 +120,7 @@ def initial_scene(sparse: SparseModel, survey: Survey, initial: InitialSimilarit
 def adjusted_scene(sparse: SparseModel, survey: Survey, adjustment: Adjustment) -> Scene:
     """Return the scene in the frame of an adjustment; `geo_from_model` is the pure shift that comes nearest to it.
 
-    Raises:
-        DegenerateGeometryError: fewer than two registered training images.
+    Raises as `make_scene`.
     """
     model_from_local = Similarity.from_record(adjustment.model_from_local)
     middle = np.median(model_from_local.apply(sparse.point_in_local), axis=0)

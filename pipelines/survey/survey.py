@@ -37,13 +37,9 @@ RigParameters = Annotated[
 
 
 class RigEstimate(Product):
-    """Parameter of the rig, estimated from the SfM cameras, by component.
+    """Parameter of the rig, estimated from the SfM cameras, by component; docs/formats.md explains the fields.
 
-    Sign and unit are those of the option of `ingest` with the same name.
-
-    Attributes:
-        start: value given to `ingest`.
-        observable: whether σ is small enough for the estimate to be used.
+    Sign and unit are those of the option of `ingest` with the same name, whose value was the start.
     """
 
     name: RigParameter
@@ -62,21 +58,11 @@ class RigEstimate(Product):
             )
         return self
 
-    @property
-    def usable(self) -> bool:
-        """Whether every component is observable."""
-        return all(self.observable)
-
 
 class RigCalibration(Product):
-    """Product of `calibrate`: estimates of the rig, divided into those applied to the survey and the others.
+    """Product of `calibrate`: estimates of the rig, divided into those that `load_survey` applies and the others.
 
-    Attributes:
-        wanted: parameters that were to be estimated.
-        applied: estimates that `load_survey` applies.
-        images, control_points: numbers in the fit.
-        rms_position_m, rms_attitude_deg: robust σ of the residuals per axis.
-        problem: reason why nothing was estimated; else empty.
+    docs/formats.md explains the fields.
     """
 
     format_version: Literal[1] = 1

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from pipelines.core.errors import InputError
 from pipelines.core.figures import Headline
 from pipelines.core.products import Remark
-from pipelines.core.types import FloatArray, Vector3
+from pipelines.core.types import FloatArray, vector3
 from pipelines.formats.georef_sidecar import CrsSidecar, SceneSigma
 from pipelines.geodesy.crs import PointCrs, parse_crs
 from pipelines.geodesy.enu import (
@@ -28,18 +28,12 @@ from pipelines.survey.options import CrsOptions
 
 @dataclass(frozen=True)
 class TargetCrs:
-    """CRS of a file, with one operation for the whole scene.
-
-    Attributes:
-        origin: of the frame `geo`.
-        lla: (M, 3) places that span the scene.
-        assumed: what the user did not state, for the user and the file; empty: nothing.
-    """
+    """CRS of a file, with one operation for the whole scene."""
 
     crs: PointCrs
-    origin: Origin
-    lla: FloatArray
-    assumed: tuple[str, ...] = ()
+    origin: Origin  # of the frame `geo`
+    lla: FloatArray  # (M, 3) places that span the scene
+    assumed: tuple[str, ...] = ()  # what the user did not state, for the user and the file; empty: nothing
 
     @property
     def horizontal_unit_m(self) -> float:
@@ -47,10 +41,6 @@ class TargetCrs:
         if self.crs.is_geographic:
             return self.crs.horizontal_unit * SEMI_MAJOR_M
         return self.crs.horizontal_unit
-
-    @property
-    def height_unit_m(self) -> float:
-        return self.crs.height_unit_m
 
     def xyz_from_geo(self, points: ArrayLike) -> FloatArray:
         """Return points (N, 3) in the CRS, easting or longitude first, of points (N, 3) in `geo`.
@@ -75,14 +65,7 @@ class TargetCrs:
         sigma: SceneSigma | None,
         cautions: tuple[Remark, ...],
     ) -> CrsSidecar:
-        """Return the sidecar of a file in this CRS.
-
-        Args:
-            bounds: (2, 3) least and largest coordinates.
-            accuracy: of the result; None: not stated.
-            sigma: predicted, of the file's points or cells; None: not known.
-            cautions: limits of the model.
-        """
+        """Return the sidecar of a file in this CRS, with bounds (2, 3): least and largest coordinates."""
         operation = self.crs.operation(self.lla)
         low, high = np.asarray(bounds, dtype=np.float64)
         return CrsSidecar(
@@ -92,7 +75,7 @@ class TargetCrs:
             units=self.crs.units,
             operation=operation.name,
             operation_accuracy_m=operation.accuracy_m,
-            bounds=(_vector(low), _vector(high)),
+            bounds=(vector3(low), vector3(high)),
             accuracy=accuracy,
             sigma=sigma,
             assumed=self.assumed,
@@ -104,8 +87,6 @@ def target_crs(options: CrsOptions, origin: Origin, scene_in_geo: ArrayLike, hei
     """Return the CRS of a deliverable.
 
     Args:
-        options: the user's CRS and datum of heights.
-        origin: of `geo`.
         scene_in_geo: (M, 3) places that span the scene, such as the corners of its bounds; M ≥ 1.
         heights: what the survey's input heights referred to: the default.
 
@@ -157,9 +138,4 @@ def _as_choice(heights: VerticalDatum) -> VerticalChoice:
     try:
         return parse_vertical(heights.name)
     except InputError:  # a datum that has no code: the ellipsoid needs none
-        return parse_vertical("ellipsoidal")
-
-
-def _vector(values: FloatArray) -> Vector3:
-    x, y, z = values.tolist()
-    return x, y, z
+        return VerticalChoice(ELLIPSOIDAL, None)

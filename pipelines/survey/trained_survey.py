@@ -7,7 +7,7 @@ and the extent of the scene that files cover: that of the SfM points, without th
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Literal, TypeVar
 
@@ -111,22 +111,13 @@ def _loaded(
 
 def _require_same_cameras(model: Adjustment, sparse: SparseModel, path: Path, advice: str) -> None:
     """Refuse a solution of another SfM model."""
+    refusal, of_another = partial(InputError, path=path), f"are not those of sfm/sparse; {advice}"
     if tuple(camera.name for camera in model.cameras) != sparse.image_name:
-        raise InputError(
-            "cameras-of-another-model",
-            f"its cameras are not those of sfm/sparse; {advice}",
-            path=path,
-            field="cameras",
-        )
+        raise refusal("cameras-of-another-model", f"its cameras {of_another}", field="cameras")
     for lens in model.lenses:
         camera = sparse.cameras.get(lens.camera_id)
         if camera is None or (camera.model, len(camera.params)) != (lens.model, len(lens.params)):
-            raise InputError(
-                "lenses-of-another-model",
-                f"its lenses are not those of sfm/sparse; {advice}",
-                path=path,
-                field="lenses",
-            )
+            raise refusal("lenses-of-another-model", f"its lenses {of_another}", field="lenses")
 
 
 def _initially_placed(model: Solution, workspace: Workspace) -> Solution:

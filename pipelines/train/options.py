@@ -73,7 +73,7 @@ class LidarOptions(StageOptions):
         return self
 
 
-# A dense basis of more cameras takes more than 2 GiB (`geometry.correction_basis`).
+# A dense basis of more cameras takes more than 2 GiB (`geometry.bundle.correction_basis`).
 MOST_JOINT_CAMERAS = 1300
 Solve = Literal["auto", "joint", "once"]
 

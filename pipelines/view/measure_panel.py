@@ -154,7 +154,7 @@ class MeasurePanel(Panel):
         rows = [PlaceRow("surveyed", np.array(point.position_in_geo), np.sqrt(np.diag(point.cov_in_geo)))]
         if np.isfinite(camera).all():
             rows.append(PlaceRow("triangulated", camera, None if cov is None else np.sqrt(np.diag(cov))))
-        title = paragraph(f"{point.name}: {len(rays)} marks; below, on the rendered surface")
+        title = paragraph(f"{point.name}: {len(rays.point)} marks; below, on the rendered surface")
         return title + place_table(self._model.target, rows)
 
     def _described(self, note: str) -> str:

@@ -81,7 +81,7 @@ class MeasuringModel:
         position = np.array([point.position_in_geo for point in points]).reshape(-1, 3)
         cov = self._joint_covariance(points)
         cov = None if cov is None else cov + block_diag(*(point.cov_of_surface for point in points))
-        height_m = np.asarray(self.target.xyz_from_geo(position)[:, 2] * self.target.height_unit_m)
+        height_m = np.asarray(self.target.xyz_from_geo(position)[:, 2] * self.target.crs.height_unit_m)
         return MeasuredPoints(position, cov, height_m)
 
     def area(self, corners: Sequence[SurfacePoint]) -> tuple[Quantity, ...]:

@@ -17,10 +17,10 @@ import cv2
 import numpy as np
 import pytest
 
-from pipelines.adjust.bundle import AdjustedBundle, SurveyedPoints, adjust_bundle
 from pipelines.geometry.bundle import Network
 from pipelines.geometry.cameras import Camera
 from pipelines.geometry.rotations import omega_phi_kappa_deg, omega_phi_kappa_jacobian
+from tests.raw_bundle import AdjustedBundle, SurveyedPoints, adjust_bundle
 
 FOLDER = Path(os.environ.get("GEOREF_DATA", "no-data")) / "dbat_sxb"
 pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="GEOREF_DATA names no folder with dbat_sxb")

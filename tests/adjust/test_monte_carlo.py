@@ -22,7 +22,7 @@ from pipelines.adjust.measurements import problem_of, start_of
 from pipelines.adjust.posterior import intersection_jacobian
 from pipelines.adjust.solution import adjusted
 from pipelines.adjust.system import linearised, minimise
-from pipelines.evaluate.cautions import chi2_caution
+from pipelines.evaluate.check_points import chi2_caution
 from pipelines.geometry.bundle import Network
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel

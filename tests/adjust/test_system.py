@@ -9,13 +9,12 @@ from functools import cached_property
 import numpy as np
 import pytest
 
-from pipelines.adjust.bundle import SurveyedPoints, adjust_bundle
 from pipelines.adjust.posterior import camera_covariances, intersection_jacobian
 from pipelines.adjust.state import State, SystematicError, SystematicErrors
 from pipelines.adjust.system import Minimum, NormalMatrix, Problem, linearised, minimise
 from pipelines.adjust.terms import Attitudes, CommonErrors, ControlPoints, Fixes, Planes, Term
 from pipelines.core.errors import DegenerateGeometryError, InputError
-from pipelines.geometry.bundle import Network, bundle_information
+from pipelines.geometry.bundle import Network
 from pipelines.geometry.cameras import CameraPoses, Lenses, bearings
 from pipelines.geometry.rotations import exp_so3, log_so3
 from pipelines.geometry.similarity import Similarity, perturbation
@@ -29,7 +28,9 @@ from tests.bundle_scenes import (
     pixels,
     readjusted,
     size,
+    stated_information,
 )
+from tests.raw_bundle import SurveyedPoints, adjust_bundle
 from tests.refusals import numbers, refused
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -121,7 +122,7 @@ def poses_of(network: Network) -> CameraPoses:
 def problem_of(
     network: Network, terms: tuple[Term, ...], errors: SystematicErrors, *, frozen: bool = False
 ) -> Problem:
-    bundle = bundle_information(network, sigma_px=np.full(len(network.obs_point), SIGMA_PX))
+    bundle = stated_information(network, np.full(len(network.obs_point), SIGMA_PX))
     return Problem(poses_of(network), bundle, terms, errors, lens_frozen=frozen)
 
 
@@ -420,7 +421,7 @@ def test_frame_of_the_cameras_does_not_matter(name: str) -> None:
         cam_center_in_world=poses.cam_center_in_model,
         point_in_world=new_from_old.apply(case.network.point_in_world),
     )
-    again = bundle_information(network, sigma_px=np.full(len(network.obs_point), SIGMA_PX))
+    again = stated_information(network, np.full(len(network.obs_point), SIGMA_PX))
     for part in ("poses", "cross", "lens", "pose_modes", "lens_modes", "modes"):
         ours, expected = (getattr(each.sums, part) for each in (bundle, again))
         dense = [each.toarray() if part == "poses" else each for each in (ours, expected)]

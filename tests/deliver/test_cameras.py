@@ -23,9 +23,10 @@ from pipelines.formats.georef_sidecar import CrsSidecar, GeorefSidecar, sidecar_
 from pipelines.formats.trajectory_csv import read_trajectory
 from pipelines.geodesy.enu import Origin, ecef_from_enu, ecef_from_lla, enu_from_ecef, geo_from_enu_at, lla_from_enu
 from pipelines.geometry.cameras import Camera, project
-from pipelines.geometry.rotations import map_from_cam, matrix_from_quat_xyzw
+from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.survey.survey import Survey
 from pipelines.survey.trained_model import TrainedModel
+from tests.oracles import map_from_cam
 from tests.scenes import TrueScene
 from tests.trained_workspaces import IMAGES, load_adjustment, scene_of, trained_workspace, untrained
 

@@ -18,13 +18,15 @@ from pipelines.evaluate.reference_distances import (
     CONFIDENCE_95,
     ComparisonSettings,
     CorePoints,
+    DistanceTally,
     SquareDistances,
     TiledPoints,
     compare_square,
     kinds_of,
+    level_of_detection,
+    m3c2_figures,
     plane_normals,
 )
-from pipelines.evaluate.reference_figures import DistanceTally, level_of_detection, m3c2_figures
 from pipelines.geometry.similarity import perturbation
 from pipelines.surface.registration import fit_alignment
 from pipelines.surface.visibility import SeenSurface, Viewpoints, seen_surface
@@ -90,7 +92,7 @@ def compared(
     settings = ComparisonSettings(0.01, 3 * SPACING_M, 1.0)
     squares = [
         compare_square(square, first, second, everything(reference), settings)
-        for square in sorted(first.squares | second.squares)
+        for square in sorted({*first.count, *second.count})
     ]
     tally = DistanceTally()
     for square in squares:
@@ -281,7 +283,7 @@ def test_no_place_where_the_reference_was_cut_is_compared(tmp_path: Path) -> Non
     distance = {}
     for cut in (None, box):
         settings = ComparisonSettings(0.01, radius_m, 1.0, cut)
-        names = sorted(clouds[0].squares | clouds[1].squares)
+        names = sorted({*clouds[0].count, *clouds[1].count})
         squares = [compare_square(name, *clouds, everything(reference), settings) for name in names]
         distance[cut is None] = np.concatenate([square.cores.distance_m for square in squares])
     # Half of a cylinder at the cut is model alone, 0.3 m lower; elsewhere both clouds are the same.

@@ -14,7 +14,8 @@ import zstandard
 
 from pipelines.core.errors import InputError
 from pipelines.formats.splat_ply import SplatArrays
-from pipelines.formats.spz import SpzVersion, decode_spz, encode_spz, read_spz, write_spz
+from pipelines.formats.spz import SpzVersion, decode_spz, encode_spz, write_spz
+from tests.oracles import read_spz
 from tests.refusals import numbers, refused
 
 

@@ -8,8 +8,13 @@ import numpy as np
 import pytest
 
 from pipelines.core.errors import DegenerateGeometryError
-from pipelines.geometry.bundle import Network, bundle_information, similarity_modes
-from pipelines.geometry.correction_basis import CorrectionBasis, correction_basis
+from pipelines.geometry.bundle import (
+    CorrectionBasis,
+    Network,
+    bundle_information,
+    correction_basis,
+    similarity_modes,
+)
 from pipelines.geometry.rotations import exp_so3
 from tests.bundle_scenes import SIGMA_PX, adjuster, exact_network, jacobian, noisy, pixels, readjusted, size, units
 from tests.refusals import numbers, refused
@@ -134,10 +139,12 @@ def test_readjusted_cameras_differ_by_unit_variance() -> None:
     for seed in range(30):
         network = noisy(exact, np.random.default_rng(seed))
         change = solve @ (network.obs_xy_px - exact.obs_xy_px).ravel()
-        basis = basis_of(readjusted(network, change))
-        white = np.linalg.lstsq(complete(basis.matrix, exact), change[:36] / units(exact), rcond=None)[0][:29]
+        bundle = bundle_information(readjusted(network, change))
+        white = np.linalg.lstsq(
+            complete(correction_basis(bundle).matrix, exact), change[:36] / units(exact), rcond=None
+        )[0][:29]
         squared.append(white @ white)
-        sigmas.append(basis.sigma_px)
+        sigmas.append(bundle.sigma_px)
     # 720 coordinates and 220 unknowns: σ̂ is good to 3 % a run, the mean of 30 χ²₂₉ / 29 to 5 %.
     assert np.mean(sigmas) == pytest.approx(SIGMA_PX, rel=0.03)
     assert np.mean(squared) / 29 == pytest.approx(1.0, rel=0.12)
@@ -156,10 +163,10 @@ def test_outlying_observations_cost_little() -> None:
     wrong = rng.choice(len(network.obs_xy_px), len(network.obs_xy_px) // 20, replace=False)
     spoilt = network.obs_xy_px.copy()
     spoilt[wrong] += rng.normal(0, 30.0, (len(wrong), 2))
-    clean, hit = basis_of(network), basis_of(replace(network, obs_xy_px=spoilt))
+    clean, hit = bundle_information(network), bundle_information(replace(network, obs_xy_px=spoilt))
     # 5 % of the observations at 60 σ: least squares would find 13 times the σ.
     assert hit.sigma_px < 1.4 * clean.sigma_px
-    assert np.linalg.norm(hit.matrix) < 1.5 * np.linalg.norm(clean.matrix)
+    assert np.linalg.norm(correction_basis(hit).matrix) < 1.5 * np.linalg.norm(correction_basis(clean).matrix)
 
 
 def test_too_few_observations_are_refused() -> None:

@@ -15,7 +15,7 @@ from pipelines.core.errors import InputError
 from pipelines.core.products import Remark, load_json
 from pipelines.core.progress import SILENT
 from pipelines.core.stages import SURVEY
-from pipelines.geometry.correction_basis import correction_basis
+from pipelines.geometry.bundle import correction_basis
 from pipelines.report.accuracy import ninety_percent
 from pipelines.report.cameras import bias_of, cameras_facts, lenses_facts, mean_by_region
 from pipelines.report.place import links_of, overlap_facts, photographs_that_see, ties_of
@@ -86,9 +86,10 @@ def test_mean_residuals_by_region_show_a_planted_pattern() -> None:
 
 def test_lens_covariance_lies_between_its_free_part_and_that_of_the_photographs(reported: Reported) -> None:
     covariance = reported.survey.posterior.of_lens()
-    basis = correction_basis(scene_of(reported.survey.solved.model, reported.survey.solved.sfm).bundle)
+    bundle = scene_of(reported.survey.solved.model, reported.survey.solved.sfm).bundle
+    by_poses, alone = correction_basis(bundle).lens_matrix, np.linalg.inv(bundle.lens_elimination[1])
     assert covariance is not None
-    from_photographs = basis.lens_matrix @ basis.lens_matrix.T + basis.lens_cov
+    from_photographs = by_poses @ by_poses.T + alone
     scale = 1 / np.sqrt(np.diag(from_photographs))
 
     def least(matrix: np.ndarray) -> float:
@@ -96,7 +97,7 @@ def test_lens_covariance_lies_between_its_free_part_and_that_of_the_photographs(
 
     assert least(from_photographs - covariance) > -1e-3  # fixes and control points add information
     # Of what no camera reveals they know little: marks of control points, as much as one tie point.
-    assert least(covariance - basis.lens_cov) > -0.1
+    assert least(covariance - alone) > -0.1
     assert np.trace(from_photographs - covariance) > 0
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.robust.patterns import blunders_among, scatter_about_median, two_groups
+from pipelines.robust.statistics import blunders_among, scatter_about_median, two_groups
 
 COUNT, SIGMA = 40, 0.02
 
@@ -22,7 +22,6 @@ def test_a_shifted_part_is_found_whatever_its_order(share: float) -> None:
     assert np.array_equal(found.second, shifted) or np.array_equal(found.second, ~shifted)
     # The medians of 8 and 32 members err by 1.25 σ/√n: 1 cm; 4 σ of that.
     assert np.abs(np.abs(found.apart) - [3.0, 1.0, 0.5]).max() < 0.04
-    assert found.scatter == pytest.approx(SIGMA, rel=0.5)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

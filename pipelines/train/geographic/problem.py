@@ -19,9 +19,8 @@ from torch import Tensor
 from pipelines.adjust import terms as adjustment
 from pipelines.adjust.state import State, SystematicErrors
 from pipelines.adjust.system import Problem
-from pipelines.geometry.bundle import bundle_information
+from pipelines.geometry.bundle import bundle_information, coordinates_of, correction_basis
 from pipelines.geometry.cameras import Pinhole
-from pipelines.geometry.correction_basis import coordinates_of, correction_basis
 from pipelines.robust.statistics import MEAN_WEIGHTED_CHI2
 from pipelines.splat.surface import depth_at
 from pipelines.survey.adjustment import GeolocatedPoints

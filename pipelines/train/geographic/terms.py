@@ -207,7 +207,7 @@ class DistanceTerm(TensorTerm):
 
     The points are fixed at their SfM positions. In the bundle, they would follow the corrections of the cameras.
     These corrections keep the points' mean position, rotation and size
-    (`geometry.correction_basis.correction_basis`). Fixed points are therefore right to first order for the scale,
+    (`geometry.bundle.correction_basis`). Fixed points are therefore right to first order for the scale,
     the only quantity that the pairs determine.
 
     Attributes:

@@ -136,7 +136,7 @@ class LearnableSimilarity(torch.nn.Module):
 class CameraCorrections(torch.nn.Module):
     """Poses = base corrected by (δω, δc) = frozen + basis · z, lens = frozen + lens basis · z, in float64.
 
-    The basis of `geometry.correction_basis.correction_basis` has these properties:
+    The basis of `geometry.bundle.correction_basis` has these properties:
 
     - |z|² is the χ² that the correction costs the image observations.
     - No z moves all cameras by a similarity: the basis holds the gauge.

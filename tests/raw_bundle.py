@@ -1,7 +1,7 @@
 """Bundle adjustment of raw image measurements: cameras and points from pixels and surveyed points alone.
 
 SfM delivers a bundle at its minimum. Measurements of another program come without that minimum: Gauss–Newton steps
-find it, with the same normal equations. The points are eliminated (`geometry.bundle`), the cameras solved
+find it, with the program's own normal equations. The points are eliminated (`geometry.bundle`), the cameras solved
 (`adjust.system.NormalMatrix`), the points follow (`adjust.posterior`). All observations have their stated weight.
 """
 
@@ -94,7 +94,7 @@ def adjust_bundle(network: Network, sigma_px: FloatArray, surveyed: SurveyedPoin
         residual = projection_residuals(network)
         apart = network.point_in_world - target
         gradient = np.einsum("nij,nj->ni", information, apart)
-        sums = eliminate_points(network, 1.0 / sigma_px, information, residual=residual, surveyed_gradient=gradient)
+        sums = eliminate_points(network, 1.0 / sigma_px, information)
         normal = NormalMatrix(
             sums.poses, np.zeros((0, sums.poses.shape[0])), np.zeros((0, 0)), network.cam_center_in_world
         )
@@ -104,11 +104,14 @@ def adjust_bundle(network: Network, sigma_px: FloatArray, surveyed: SurveyedPoin
             redundancy = observed - 6 * len(network.camera_id) - 3 * len(network.point_in_world)
             squares = float(((residual / sigma_px[:, None]) ** 2).sum() + (apart * gradient).sum())
             return AdjustedBundle(network, residual, np.sqrt(squares / redundancy), redundancy, normal, points)
-        step, _ = normal.solve(-sums.pose_slope[:, None], np.zeros((0, 1)))
-        slope = np.zeros_like(gradient)  # of half the weighted squares of the observations, by the points
-        by_point, weighted = linearise_bundle(network).jacobian_point, residual / sigma_px[:, None] ** 2
-        np.add.at(slope, network.obs_point, np.einsum("mij,mi->mj", by_point, weighted))
-        network, before = _moved(network, step[:, 0], points, gradient + slope), residual
+        # Slopes of half the weighted squares: by the points, and by the poses that the points follow.
+        lin, weighted = linearise_bundle(network), residual / sigma_px[:, None] ** 2
+        slope, pose_slope = gradient.copy(), np.zeros((len(network.camera_id), 6))
+        np.add.at(slope, network.obs_point, np.einsum("mij,mi->mj", lin.jacobian_point, weighted))
+        np.add.at(pose_slope, network.obs_image, np.einsum("mij,mi->mj", lin.jacobian_pose, weighted))
+        right = -(pose_slope.ravel() + points.by_poses.T @ slope.ravel())
+        step, _ = normal.solve(right[:, None], np.zeros((0, 1)))
+        network, before = _moved(network, step[:, 0], points, slope), residual
     raise ConvergenceError(
         "bundle-not-converged",
         f"The bundle adjustment has not converged after {_STEPS} steps. Start with better cameras and points.",
