@@ -7,7 +7,7 @@ Every residual is whitened by its covariance. Sources of information:
    errors (boresight, compass) are mostly common to a flight and do not average out. The mean of all attitudes
    therefore has the σ of one.
 
-The geolocated points are *not* a third source. Each is a function of the same few fixes and attitudes: a hundred
+The intersected points are *not* a third source. Each is a function of the same few fixes and attitudes: a hundred
 thousand points have no more information than the cameras. Counted as independent, they would claim σ of
 millimetres, and an error of the compass would outweigh RTK. They serve as a check.
 

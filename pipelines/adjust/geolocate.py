@@ -53,11 +53,11 @@ def run(stage: StageRun, options: GeolocateOptions) -> Summary:
     """Intersect the points of the workspace's model and write them."""
     survey = load_survey(stage.workspace)
     model = read_sparse(stage.workspace.path(SPARSE))
-    geolocation = geolocate(survey, model, options)
-    points, cloud = geolocation.points, stage.out / "points.ply"
+    intersected = geolocate(survey, model, options)
+    points, cloud = intersected.points, stage.out / "points.ply"
     save_npz(stage.out / "points.npz", vars(points))
-    write_point_ply(cloud, points.position_in_geo, model.point_rgb, geolocation.sigma_m, points.inlier)
-    return Summary(geolocation.key_figure, _values(points), geolocation.warnings)
+    write_point_ply(cloud, points.position_in_geo, model.point_rgb, intersected.sigma_m, points.inlier)
+    return Summary(intersected.key_figure, _values(points), intersected.warnings)
 
 
 def geolocate(survey: Survey, model: SparseModel, options: GeolocateOptions) -> Geolocation:

@@ -4,7 +4,7 @@ Reads `ingest/survey.json`, `sfm/sparse`, `geolocate/points.npz`; writes `sim3/g
 and the adjustment, `sim3/adjustment.json` and `.npz`.
 GeoRefGS section 2.4.1, eqs 16–21 (doi 10.3390/drones10030195), is `--method paper`. The default starts from a
 robust alignment of camera centres and control points, adjusts similarity, cameras and lens together, and tests the
-stated σ. `pipelines.adjust.alignment` explains why the geolocated points are no observations.
+stated σ. `pipelines.adjust.alignment` explains why the intersected points are no observations.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def estimate_similarity(
     if not np.array_equal(points.point_id, model.point_id):
         raise InputError(
             "points-of-another-model",
-            "The geolocated points belong to another SfM model. Run `georef geolocate` again.",
+            "The intersected points belong to another SfM model. Run `georef geolocate` again.",
         )
     if not options.control_points:
         survey = survey.model_copy(update={"control_points": ()})
@@ -334,7 +334,7 @@ def _joint_product(
 
 
 def similarity_by_paper(model: SparseModel, points: GeolocatedPoints, data: Correspondences) -> InitialSimilarity:
-    """Return the paper's similarity (eqs 16–21) of the geolocated points, with equal weights.
+    """Return the paper's similarity (eqs 16–21) of the intersected points, with equal weights.
 
     The paper gives no covariance. Here the covariance follows from the scatter of the points, counted as only one
     point for each image, because the points share the errors of the images.
@@ -345,8 +345,8 @@ def similarity_by_paper(model: SparseModel, points: GeolocatedPoints, data: Corr
     good = points.inlier
     if good.sum() < 3:
         raise DegenerateGeometryError(
-            "too-few-geolocated-points",
-            f"--method paper needs at least three geolocated points; there are {good.sum()}. Use --method robust.",
+            "too-few-intersected-points",
+            f"--method paper needs at least three intersected points; there are {good.sum()}. Use --method robust.",
         )
     local, geo = model.point_in_local[good], points.position_in_geo[good]
     similarity = spread_ratio_similarity(local, geo)
@@ -377,7 +377,7 @@ def counts_of(control: BoolArray, points: BoolArray) -> dict[str, int]:
 
 
 def agreeing_points(model: SparseModel, points: GeolocatedPoints, similarity: Similarity) -> BoolArray:
-    """Return the mask (N,) of the geolocated points that agree with a similarity within their covariance."""
+    """Return the mask (N,) of the intersected points that agree with a similarity within their covariance."""
     good = points.inlier.copy()
     missed = points.position_in_geo[good] - similarity.apply(model.point_in_local[good])
     good[good] = squared_mahalanobis(missed, points.cov_in_geo[good]) <= OUTLIER_GATE
@@ -385,7 +385,7 @@ def agreeing_points(model: SparseModel, points: GeolocatedPoints, similarity: Si
 
 
 def residuals_of_points(model: SparseModel, points: GeolocatedPoints, similarity: Similarity) -> ResidualStats:
-    """Return the figures of the geolocated points' residuals."""
+    """Return the figures of the intersected points' residuals."""
     good = points.inlier
     return residual_stats(points.position_in_geo[good] - similarity.apply(model.point_in_local[good]))
 

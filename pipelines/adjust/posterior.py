@@ -54,13 +54,13 @@ def intersection_jacobian(
     """
     sigma_px, marks = sigma_px[has_positive_depth(marks)], with_positive_depths(marks)
     lin, count = linearise_bundle(marks), len(marks.point_in_world)
-    pull = np.swapaxes(lin.jacobian_point, 1, 2) / (sigma_px**2)[:, None, None]
+    weighted = np.swapaxes(lin.jacobian_point, 1, 2) / (sigma_px**2)[:, None, None]
     normal = np.zeros((count, 3, 3)) if surveyed is None else surveyed.copy()
-    np.add.at(normal, marks.obs_point, pull @ lin.jacobian_point)
+    np.add.at(normal, marks.obs_point, weighted @ lin.jacobian_point)
     value, vector = np.linalg.eigh(normal)
     value[value[:, 0] <= 1e-9 * value[:, 2]] = np.nan
     cov = (vector / value[:, None, :]) @ np.swapaxes(vector, 1, 2)
-    response = -cov[marks.obs_point] @ pull  # (M, 3, 2) metres per pixel
+    response = -cov[marks.obs_point] @ weighted  # (M, 3, 2) metres per pixel
     lens = np.zeros((count, len(marks.cameras), 3, lin.jacobian_intrinsics.shape[2]))
     np.add.at(lens, (marks.obs_point, lens_slots(marks)), response @ lin.jacobian_intrinsics)
     order = np.argsort(marks.obs_point, kind="stable")
@@ -258,7 +258,7 @@ def load_posterior(path: Path, solution: Adjustment, sfm: SparseModel) -> Poster
     if not fits:
         raise InputError(
             "posterior-of-another-solution",
-            "does not belong to the solution beside it; run `georef init-sim3` (and `georef train`) again",
+            "does not belong to the solution beside it. Run `georef init-sim3` (and `georef train`) again.",
             path=path,
         )
     poses = bsr_matrix((arrays["data"], arrays["indices"], arrays["indptr"]), shape=(6 * n, 6 * n))

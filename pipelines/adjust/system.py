@@ -263,9 +263,9 @@ class Linearised:
         border = np.zeros(len(normal.corner))
         border[: len(problem.lens)] = slope_lens[problem.lens]
         for kind, rows in self.rows.items():
-            pull = (weights[kind][:, None] * rows.residual).ravel()
-            slope_poses = slope_poses + rows.by_poses.T @ pull
-            border[: self._width] += rows.by_border.T @ pull
+            weighted = (weights[kind][:, None] * rows.residual).ravel()
+            slope_poses = slope_poses + rows.by_poses.T @ weighted
+            border[: self._width] += rows.by_border.T @ weighted
         poses, found = normal.solve(-slope_poses[:, None], -border[:, None])
         moved = np.zeros(len(state.lens) + len(problem.errors))
         moved[problem.lens] = found[: len(problem.lens), 0]

@@ -207,7 +207,7 @@ def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, NDAr
     except InputError:
         raise
     except Exception as error:  # of zipfile, of its decompressors, and of Python's grammar, which reads the headers
-        raise InputError("npz-damaged", f"not a readable NPZ file: {error}", path=path) from error
+        raise InputError("npz-damaged", f"is not a readable NPZ file: {error}", path=path) from error
 
 
 def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any]:

@@ -115,7 +115,7 @@ def _rows_of_blocks(workspace: Workspace, count: int) -> tuple[slice, ...]:
     numbers = [block.training.gaussians_in_cell for block in load_json(BlockRecord, record).blocks]
     ends = np.cumsum([0, *numbers]).tolist()
     if ends[-1] != count:
-        message = f"the blocks have {ends[-1]} Gaussians, and {GAUSSIANS} has {count}; run `georef blocks` again"
+        message = f"The blocks have {ends[-1]} Gaussians, and {GAUSSIANS} has {count}. Run `georef blocks` again."
         raise InputError("blocks-mismatch", message, path=record)
     return tuple(slice(first, last) for first, last in itertools.pairwise(ends))
 

@@ -122,7 +122,7 @@ class TiledPoints:
         if shutil.disk_usage(self._folder).free < rows.nbytes + _SPARE_BYTES:
             raise InputError(
                 "disk-full",
-                "no room for the points that are compared; make room on this disk",
+                "No room for the points that are compared. Make room on this disk.",
                 path=self._folder,
             )
         rows["position"] = position

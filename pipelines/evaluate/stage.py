@@ -183,7 +183,7 @@ def run(stage: StageRun, options: EvaluateOptions) -> Summary:
         for flag, value in (("--reference", options.reference), ("--lpips-weights", options.lpips_weights)):
             if value is not None:
                 command = stage.workspace.command_of(BY_NAME["train"])
-                message = f"needs a trained model; run `{command}` first, or leave the option out"
+                message = f"needs a trained model. Run `{command}` first, or leave the option out."
                 raise InputError("not-trained", message, field=flag)
     report = evaluate(solved, posterior, options, crs=crs, rendered=rendered)
     if posterior.grid is not None:

@@ -189,14 +189,14 @@ def open_bag(path: Path) -> Iterator[Bag]:
         InputError: no bag, damaged beyond opening, or with chunks too large for memory.
     """
     if not path.exists():
-        raise InputError("bag-missing", "the bag does not exist", path=path, field="--bag")
+        raise InputError("bag-missing", "The bag does not exist.", path=path, field="--bag")
     if path.is_dir() and not (path / "metadata.yaml").exists():
         message = (
-            "the folder has no metadata.yaml: give the .mcap or .db3 file in it, or `ros2 bag reindex` the folder"
+            "The folder has no metadata.yaml: give the .mcap or .db3 file in it, or `ros2 bag reindex` the folder."
         )
         raise InputError("bag-metadata-missing", message, path=path, field="--bag")
     if not path.is_dir() and path.suffix not in (".bag", ".mcap", ".db3"):
-        message = "the file is not a bag: give a rosbag2 folder, or a .mcap, .db3 or .bag file"
+        message = "The file is not a bag: give a rosbag2 folder, or a .mcap, .db3 or .bag file."
         raise InputError("not-a-bag", message, path=path, field="--bag")
     reader = _opened(path)
     try:
@@ -206,7 +206,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
         for link in reader.connections:  # SQLite and YAML have any type in any place
             types = isinstance(link.topic, str), isinstance(link.msgtype, str), isinstance(link.msgcount, int)
             if not all(types):
-                message = f"the bag is damaged (topic {str(link.topic)[:40]!r}): {_REPAIR}"
+                message = f"The bag is damaged (topic {str(link.topic)[:40]!r}): {_REPAIR}"
                 raise InputError("bag-damaged", message, path=path)
         yield Bag(path, reader, path.suffix != ".bag")
     finally:
@@ -227,10 +227,10 @@ def _opened(path: Path) -> Any:
         raise
     except Exception as error:  # truncated and forged files make the parser raise any error
         if isinstance(error, KeyError) and error.args[0] in _FOREIGN_SCHEMAS:
-            message = f"a topic is in {error.args[0]!r}, not in ROS 2's messages: leave it out with `mcap filter`"
+            message = f"A topic is in {error.args[0]!r}, not in ROS 2's messages: leave it out with `mcap filter`."
             raise InputError("bag-foreign-schema", message, path=path) from error
         cause = f"{type(error).__name__}: {error}".rstrip(": ").rstrip(".")
-        message = f"the file is not a bag, or it is damaged ({cause}): {_REPAIR}"
+        message = f"The file is not a bag, or it is damaged ({cause}): {_REPAIR}"
         raise InputError("bag-damaged", message, path=path) from error
     return reader
 

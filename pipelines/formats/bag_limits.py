@@ -66,7 +66,7 @@ def refuse_large_chunk(path: Path, uncompressed_bytes: int) -> None:
     if uncompressed_bytes > MAX_CHUNK_BYTES:
         size = f"{uncompressed_bytes / 2**20:.0f} MiB; the limit is {MAX_CHUNK_BYTES // 2**20} MiB"
         remedy = "rewrite it with smaller ones, e.g. `mcap compress --chunk-size 4194304`"
-        raise InputError("chunk-too-large", f"the bag has a chunk of {size}: {remedy}", path=path)
+        raise InputError("chunk-too-large", f"The bag has a chunk of {size}: {remedy}", path=path)
 
 
 def unpacked(data: bytes, limit_bytes: int = MAX_CHUNK_BYTES) -> bytes:
@@ -124,7 +124,7 @@ def _check_unpacked(file: Path, size: int) -> None:
         while block := stream.read(_BLOCK_BYTES):
             total += len(block)
             if total > limit_bytes:
-                message = f"the file is forged: it unpacks to more than {limit_bytes / 2**20:.0f} MiB"
+                message = f"The file is forged: it unpacks to more than {limit_bytes / 2**20:.0f} MiB."
                 raise InputError("unpacks-too-large", message, path=file)
 
 
@@ -148,7 +148,7 @@ def _check_mcap(file: Path) -> None:
     together = _together(index.values())
     if together > _MAX_TOGETHER_BYTES:
         size = f"{together / 2**20:.0f} MiB; the limit is {_MAX_TOGETHER_BYTES // 2**20} MiB"
-        message = f"the chunks of one moment have {size}: sort the bag with `mcap sort`"
+        message = f"The chunks of one moment have {size}: sort the bag with `mcap sort`."
         raise InputError("chunks-overlap", message, path=file)
 
 

@@ -86,9 +86,9 @@ class PlyCloudFile:
         largest = float(np.nanmax(np.abs(position), initial=0.0))
         if np.isfinite(largest) and np.spacing(np.float32(largest)) / 2 > _COARSEST_M:
             step = np.spacing(np.float32(largest))
-            message = f"coordinates of {largest:.0f} m in single precision are rounded to {step:.3f} m"
-            remedy = "write the PLY with double coordinates, or LAZ"
-            raise InputError("single-precision", f"{message}: {remedy}", path=self.path)
+            message = f"Coordinates of {largest:.0f} m in single precision are rounded to {step:.3f} m."
+            remedy = "Write the PLY with double coordinates, or LAZ."
+            raise InputError("single-precision", f"{message} {remedy}", path=self.path)
 
 
 def open_cloud_ply(path: Path) -> PlyCloudFile:
@@ -100,15 +100,15 @@ def open_cloud_ply(path: Path) -> PlyCloudFile:
     lines, offset, size = ply_header(path)
     form = next((line[1] for line in lines if line[:1] == ["format"] and len(line) > 1), "")
     if form not in _ORDERS:
-        message = f"the format of the PLY is {form[:30]!r}: write it as binary_little_endian"
+        message = f"The format of the PLY is {form[:30]!r}: write it as binary_little_endian."
         raise InputError("ply-format", message, path=path)
     count, columns = _vertices(path, lines)
     dtype = np.dtype([(name, _ORDERS[form] + kind) for name, kind in columns])
     if count < 1 or offset + count * dtype.itemsize > size:
         message = (
-            f"the header promises {count} points of {dtype.itemsize} bytes, the file has {max(size - offset, 0)}"
+            f"The header promises {count} points of {dtype.itemsize} bytes, the file has {max(size - offset, 0)}."
         )
-        raise InputError("size-differs", f"{message}: it is empty, cut off or damaged", path=path)
+        raise InputError("size-differs", f"{message} It is empty, cut off or damaged.", path=path)
     return PlyCloudFile(path, count, dtype, offset)
 
 
@@ -117,20 +117,20 @@ def _vertices(path: Path, lines: list[list[str]]) -> tuple[int, list[tuple[str, 
     elements = [place for place, line in enumerate(lines) if line[:1] == ["element"]]
     first = lines[elements[0]] if elements else []
     if len(first) != 3 or first[1] != "vertex" or not first[2].isdecimal() or len(first[2]) > 15:
-        raise InputError("ply-elements", "the first element of the PLY is not a number of vertices", path=path)
+        raise InputError("ply-elements", "The first element of the PLY is not a number of vertices.", path=path)
     until = elements[1] if len(elements) > 1 else len(lines)
     columns = []
     for line in lines[elements[0] + 1 : until]:
         if line[:1] != ["property"]:
             continue
         if len(line) != 3 or line[1] not in PLY_TYPES:
-            message = f"the property {' '.join(line[1:])[:60]!r} of the vertices has no known type of fixed size"
+            message = f"The property {' '.join(line[1:])[:60]!r} of the vertices has no known type of fixed size."
             raise InputError("ply-properties", message, path=path)
         columns.append((line[2], PLY_TYPES[line[1]]))
     names = [name for name, _ in columns]
     missing = [axis for axis in "xyz" if axis not in names]
     if missing or len(set(names)) != len(names):
-        message = "the vertices have no x, y and z, or two properties of one name"
+        message = "The vertices have no x, y and z, or two properties of one name."
         raise InputError("ply-coordinates", message, path=path, field=(missing or names)[0])
     return int(first[2]), columns
 

@@ -47,11 +47,11 @@ class _CutOffError(ValueError):
 def _check_model_files(folder: Path) -> None:
     """Refuse a COLMAP model, binary or text, whose files do not hold what they state."""
     if not folder.is_dir():
-        message = "the folder does not exist: give that of a COLMAP model (cameras, images, points3D)"
+        message = "The folder does not exist: give that of a COLMAP model (cameras, images, points3D)."
         raise InputError("folder-missing", message, path=folder)
     suffix = next((s for s in (".bin", ".txt") if all((folder / (n + s)).exists() for n in _REQUIRED)), None)
     if suffix is None:
-        message = "the folder has no COLMAP model: cameras, images and points3D, all .bin or all .txt, are needed"
+        message = "The folder has no COLMAP model: cameras, images and points3D, all .bin or all .txt, are needed."
         raise InputError("not-a-colmap-model", message, path=folder)
     for name in FILES:
         file = folder / (name + suffix)
@@ -78,13 +78,13 @@ def _check_binary(file: Path, size: int, record_end: Callable[[_Bytes, int], int
             try:
                 at = record_end(record, at)
             except _CutOffError as error:
-                message = f"{cut_off} (record {number + 1} of {count})"
+                message = f"{cut_off} (record {number + 1} of {count})."
                 raise InputError("file-cut-off", message, path=file) from error
             except ValueError as error:
-                message = f"record {number + 1} of {count} is damaged: it {error}"
+                message = f"Record {number + 1} of {count} is damaged: it {error}"
                 raise InputError("file-damaged", message, path=file) from error
         if at != size:
-            message = f"the file is damaged: {size - at} bytes follow its {count} records"
+            message = f"The file is damaged: {size - at} bytes follow its {count} records."
             raise InputError("file-damaged", message, path=file)
 
 
@@ -94,7 +94,7 @@ def _check_text(file: Path) -> None:
             try:
                 line.decode("utf-8")
             except UnicodeDecodeError as error:
-                message = f"the image {_INVALID_NAME}"
+                message = f"The image {_INVALID_NAME}"
                 raise InputError("name-not-utf8", message, path=file, line=number) from error
 
 
@@ -244,7 +244,7 @@ def write_reconstruction(reconstruction: Any, folder: Path) -> None:
     except InputError:
         whole = False
     if not whole:
-        message = f"{folder}: the model could not be written whole"
+        message = f"{folder}: the model could not be written whole."
         raise storage_failure_of(folder) or StorageError("model-not-written", message)
 
 
@@ -289,13 +289,13 @@ def _check(model: SparseModel, path: Path) -> None:
     values += [("camera params", camera.params) for camera in model.cameras.values()]
     for name, numbers in values:
         if not np.isfinite(numbers).all():
-            message = "the model contains values that are not finite: reconstruct again"
+            message = "The model contains values that are not finite: reconstruct again."
             raise InputError("values-not-finite", message, path=path, field=name)
     if len(set(model.image_name)) != len(model.image_name):
-        raise InputError("image-twice", "two images have the same name", path=path, field="images")
+        raise InputError("image-twice", "Two images have the same name.", path=path, field="images")
     astray = next((name for name in model.image_name if not stays_inside(name)), None)
     if astray is not None:
-        message = f"the image name {astray!r} leaves the folder of photographs: names are relative to it"
+        message = f"The image name {astray!r} leaves the folder of photographs: names are relative to it."
         raise InputError("image-outside-folder", message, path=path, field="images")
 
 

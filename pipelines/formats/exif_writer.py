@@ -47,7 +47,7 @@ def with_tags(jpeg: bytes, tags: DroneTags) -> bytes:
         InputError: not a JPEG.
     """
     if jpeg[:2] != b"\xff\xd8":
-        raise InputError("not-a-jpeg", "EXIF can be written into a JPEG only; the image is not one")
+        raise InputError("not-a-jpeg", "EXIF can be written into a JPEG only; the image is not one.")
     exif = _segment(b"Exif\x00\x00" + _tiff(tags))
     xmp = _segment(_XMP_HEADER + _xmp(tags).encode("utf-8"))
     return jpeg[:2] + exif + xmp + jpeg[2:]
@@ -55,7 +55,7 @@ def with_tags(jpeg: bytes, tags: DroneTags) -> bytes:
 
 def _segment(payload: bytes) -> bytes:
     if len(payload) > _SEGMENT_LIMIT:
-        raise InputError("metadata-too-large", "the metadata are too large for one segment of a JPEG")
+        raise InputError("metadata-too-large", "The metadata are too large for one segment of a JPEG.")
     return b"\xff\xe1" + struct.pack(">H", len(payload) + 2) + payload
 
 

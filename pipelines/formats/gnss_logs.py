@@ -99,11 +99,11 @@ def read_mrk(path: Path) -> CameraEvents:
     for line, text in numbered_lines(path):
         match = _LINE.fullmatch(text)
         if match is None:
-            message = f"the line is not that of a DJI timestamp file: {_LAYOUT}"
+            message = f"The line is not that of a DJI timestamp file: {_LAYOUT}"
             raise InputError("line-layout", message, path=path, line=line)
         number = int(match[1])
         if number in line_of:
-            message = f"event {number} is in line {line_of[number]} already"
+            message = f"Event {number} is in line {line_of[number]} already."
             raise InputError("event-twice", message, path=path, line=line)
         line_of[number] = line
         lines.append(line)
@@ -192,7 +192,9 @@ def _header(comments: Sequence[tuple[int, str]], path: Path) -> _Header:
         if clock not in ("GPST", "UTC", "JST"):
             continue
         if "baseline" in text:
-            message = "the rows are baselines from the base station, not positions: let RTKLIB write Lat/Lon/Height"
+            message = (
+                "The rows are baselines from the base station, not positions: let RTKLIB write Lat/Lon/Height."
+            )
             raise InputError("baselines", message, path=path, line=line)
         form: _Form | None = None
         if "x-ecef" in text:
@@ -201,14 +203,14 @@ def _header(comments: Sequence[tuple[int, str]], path: Path) -> _Header:
             form = "degrees" if "(deg)" in text else "sexagesimal"
         if form is not None:
             return _Header(line, clock, form, above_geoid and form != "ecef")
-    message = "the file has no header of RTKLIB, which states clock and coordinates: switch Output Header on"
+    message = "The file has no header of RTKLIB, which states clock and coordinates: switch Output Header on."
     raise InputError("header-missing", message, path=path)
 
 
 def _numbers(cells: Sequence[str], places: int, path: Path, line: int) -> list[float]:
     """Return three coordinates, quality, satellites, three σ and three correlated σ; NaN for what is missing."""
     if len(cells) < places:
-        message = f"the line has {len(cells) + 2} cells, expected time, position, quality …"
+        message = f"The line has {len(cells) + 2} cells, expected time, position, quality …"
         raise InputError("wrong-columns", message, path=path, line=line)
     values = [number_of(text, path=path, line=line, field="position") for text in cells[:places]]
     if places == 7:
@@ -247,7 +249,7 @@ def _times(clock: str, rows: Sequence[tuple[int, list[str]]], path: Path) -> Flo
     ).T
     good = (week >= 0) & (week < 1e5) & (second >= 0) & (second <= WEEK_S)
     lines = [at for at, _ in rows]
-    message = "the time is not a GPS week and second of the week"
+    message = "The time is not a GPS week and second of the week."
     refuse_first(~good, "time-invalid", lambda _: message, path=path, lines=lines, field="time")
     return unix_from_week(week, second)
 
@@ -265,6 +267,6 @@ def _date(cells: Sequence[str], path: Path, line: int) -> float:
         if second > 60:
             raise ValueError(text)
     except ValueError:
-        message = f"{text[:40]!r} is not a time like 2024/05/01 12:00:00.000"
+        message = f"{text[:40]!r} is not a time like 2024/05/01 12:00:00.000."
         raise InputError("time-invalid", message, path=path, line=line, field="time") from None
     return start + second + float(f"0{match[7] or ''}")

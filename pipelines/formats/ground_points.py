@@ -89,7 +89,7 @@ def without_repeats(points: Sequence[ListedPoint], path: Path) -> tuple[ListedPo
     for point in points:
         other = first.setdefault(point.name, point)
         if point.xyz != other.xyz:
-            message = f"the point {point.name} has other coordinates in line {other.line}"
+            message = f"The point {point.name} has other coordinates in line {other.line}."
             raise InputError("point-twice", message, path=path, line=point.line, field="x y z")
     return tuple(first.values())
 
@@ -167,7 +167,7 @@ def _odm_table(path: Path, columns: Sequence[str]) -> Table:
     first, crs_text = lines[0]
     words = crs_text.split()
     if len(words) >= 3 and is_number(words[1], decimal_comma=False) and not crs_text.startswith("+"):
-        message = "the first line must be the CRS, e.g. EPSG:4326 or WGS84 UTM 16N; this is a row"
+        message = "The first line must be the CRS, e.g. EPSG:4326 or WGS84 UTM 16N; this is a row."
         raise InputError("crs-missing", message, path=path, line=first)
     require_rows(lines[1:], path)
     places = {name: at for at, name in enumerate(columns)}
@@ -218,7 +218,7 @@ def read_point_table(path: Path) -> GroundPoints:
         if missing or (geographic and {"x", "y"} & set(table.columns)):
             header = read_lines(path)[table.header_line - 1]
             message = (
-                f"the header must name label, z, and either x and y or longitude and latitude; it is {header!r}"
+                f"The header must name label, z, and either x and y or longitude and latitude; it is {header!r}."
             )
             raise InputError("column-missing", message[:300], path=path, line=table.header_line)
     require_rows(table.rows, path)
@@ -268,7 +268,7 @@ def _pix4d_table(
     separator = separator_of(text)
     header = split(text, separator, path=path, line=first)
     if len(header) < 4:
-        message = f"the line has {len(header)} columns, expected {expected}"
+        message = f"The line has {len(header)} columns, expected {expected}."
         raise InputError("wrong-columns", message, path=path, line=first)
     if any(map(is_number, header[numeric])):
         places = {name: at for at, name in enumerate(in_order)}

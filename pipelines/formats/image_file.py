@@ -41,7 +41,7 @@ def read_bytes(path: Path) -> bytes:
         InputError: unreadable, empty, or larger than 512 MiB.
     """
     if file_size(path, limit_bytes=MAX_BYTES, kind="photograph") == 0:
-        raise InputError("file-empty", "the file is empty", path=path)
+        raise InputError("file-empty", "The file is empty.", path=path)
     with reading(path):
         return path.read_bytes()
 
@@ -61,7 +61,7 @@ def require_unchanged(data: bytes, sha256: str, path: Path) -> None:
     """Refuse a photograph whose hash is not the recorded one of the whole file; empty: none was recorded."""
     if sha256 and hashlib.sha256(data).hexdigest() != sha256:
         remedy = "put it back, or run `georef ingest` again"
-        message = f"the photograph has changed since `georef ingest` read it: {remedy}"
+        message = f"The photograph has changed since `georef ingest` read it: {remedy}"
         raise InputError("photograph-changed", message, path=path)
 
 
@@ -75,13 +75,13 @@ def inspect_image(data: bytes, path: Path, *, decode: bool = True) -> ImageFile:
     """
     size = header_size(data)
     if size is None:
-        raise InputError("not-an-image", "the file is not a JPEG, PNG or TIFF image", path=path)
+        raise InputError("not-an-image", "The file is not a JPEG, PNG or TIFF image.", path=path)
     width, height = size
     if not (0 < width * height <= MAX_PIXELS):
-        message = f"the header states {width}×{height} pixels; the limit is {MAX_PIXELS // 10**6} million"
+        message = f"The header states {width}×{height} pixels; the limit is {MAX_PIXELS // 10**6} million."
         raise InputError("too-many-pixels", message, path=path)
     if decode and not _decodes(data):
-        message = "the photograph is damaged: it does not decode to its end"
+        message = "The photograph is damaged: it does not decode to its end."
         raise InputError("photograph-damaged", message, path=path)
     return ImageFile(width, height, hashlib.sha256(data).hexdigest())
 

@@ -77,7 +77,7 @@ class LasFile:
                 done += len(record)
                 yield _chunk(record)
         if done != self.count:
-            message = f"the header promises {self.count} points, the file holds {done}"
+            message = f"The header promises {self.count} points, the file holds {done}."
             raise InputError("size-differs", message, path=self.path)
 
 
@@ -98,8 +98,8 @@ def open_las(path: Path) -> LasFile:
             body = size - int(header.offset_to_point_data)
             least = _POINT_BITS_LEAST / 8 if header.are_points_compressed else record
             if count < 1 or body < count * least:
-                message = f"the header promises {count} points, the file has {max(body, 0)} bytes for them"
-                raise InputError("size-differs", f"{message}: it is empty, cut off or damaged", path=path)
+                message = f"The header promises {count} points, the file has {max(body, 0)} bytes for them."
+                raise InputError("size-differs", f"{message} It is empty, cut off or damaged.", path=path)
             return LasFile(path, count, _crs(header))
 
 
@@ -108,11 +108,11 @@ def _check_head(path: Path, size: int) -> None:
     with path.open("rb") as stream:
         head = stream.read(_HEADER_BYTES)
         if len(head) < _HEADER_BYTES or head[:4] != b"LASF":
-            raise InputError("not-a-las", "the file is not a LAS or LAZ file", path=path)
+            raise InputError("not-a-las", "The file is not a LAS or LAZ file.", path=path)
         offset, records = struct.unpack_from("<II", head, 96)
         point_format, record_bytes = struct.unpack_from("<BH", head, 104)
         if offset > size or records * _VLR_BYTES > offset or record_bytes == 0:
-            message = "the header is damaged: its records reach beyond the file's end"
+            message = "The header is damaged: its records reach beyond the file's end."
             raise InputError("file-damaged", message, path=path)
         if not point_format & 0x80:
             return
@@ -122,12 +122,12 @@ def _check_head(path: Path, size: int) -> None:
             stream.seek(size - 8)
             table = struct.unpack("<q", stream.read(8))[0]
         if not offset < table <= size - 8:
-            message = "the table of compressed chunks is missing: the file is cut off"
+            message = "The table of compressed chunks is missing: the file is cut off."
             raise InputError("file-cut-off", message, path=path)
         stream.seek(table)
         _, chunks = struct.unpack("<II", stream.read(8))
         if chunks > size - offset:
-            message = f"{chunks} compressed chunks do not fit into the file: it is damaged"
+            message = f"{chunks} compressed chunks do not fit into the file: it is damaged."
             raise InputError("chunk-count", message, path=path)
 
 
@@ -176,7 +176,7 @@ def _damage(path: Path) -> Iterator[None]:
     except (InputError, GeneratorExit, KeyboardInterrupt, SystemExit):
         raise
     except BaseException as error:  # the decompressor's panics are no `Exception`
-        message = f"the LAS file is damaged: {' '.join(str(error).split())[:200]}"
+        message = f"The LAS file is damaged: {' '.join(str(error).split())[:200]}"
         raise InputError("file-damaged", message, path=path) from error
 
 

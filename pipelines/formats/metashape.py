@@ -77,7 +77,7 @@ def read_markers_xml(path: Path) -> GroundPoints:
         parser.close()
     except (SAXException, DefusedXmlException, ValueError, LookupError) as error:
         message = " ".join(str(error).split())[:200]
-        raise InputError("xml-invalid", f"the file is not well-formed XML: {message}", path=path) from error
+        raise InputError("xml-invalid", f"The file is not well-formed XML: {message}", path=path) from error
     return reader.result()
 
 
@@ -293,7 +293,7 @@ def _reference(path: Path) -> tuple[Table, bool | None]:
     lines = numbered_lines(path)
     found = next(((at, text) for at, text in lines if HEADER.match(text)), None)
     if found is None:
-        raise InputError("header-missing", "no line begins with #Label", path=path)
+        raise InputError("header-missing", "No line begins with #Label.", path=path)
     header_line, header = found
     crs_line, crs_text = next(((at, crs[1]) for at, text in lines if (crs := _CRS.match(text))), (1, None))
     separator = separator_of(header)

@@ -79,7 +79,7 @@ def join_splat_plys(parts: Sequence[Path], path: Path) -> int:
     plys = [_read_rows(part) for part in parts]
     for ply in plys[1:]:
         if ply.names != plys[0].names:
-            message = f"the PLY has other properties than {parts[0]}: the two cannot be joined"
+            message = f"The PLY has other properties than {parts[0]}: the two cannot be joined."
             raise InputError("properties-differ", message, path=ply.path)
     count = sum(len(ply.rows) for ply in plys)
     draft = path.with_name(path.name + ".tmp")
@@ -103,7 +103,7 @@ def read_splat_ply(path: Path, rows: slice = slice(None)) -> SplatArrays:
     rest_count = sum(name.startswith("f_rest_") for name in ply.names)
     if rest_count not in _REST_COUNTS:
         counts = ", ".join(map(str, _REST_COUNTS))
-        message = f"the PLY has {rest_count} SH coefficients above degree 0; degrees 0 to 3 have {counts}"
+        message = f"The PLY has {rest_count} SH coefficients above degree 0; degrees 0 to 3 have {counts}."
         raise InputError("sh-coefficients", message, path=path, field="f_rest")
     higher = _columns(ply, tuple(f"f_rest_{i}" for i in range(rest_count)))
     higher = higher.reshape(len(higher), 3, rest_count // 3)
@@ -141,7 +141,7 @@ def _read_rows(path: Path, rows: slice = slice(None)) -> _PlyRows:
     try:
         vertices = PlyData.read(str(path), mmap="r")["vertex"].data
     except (PlyParseError, ValueError, OverflowError, KeyError) as error:
-        raise InputError("file-damaged", f"the PLY file is damaged: {error}", path=path) from error
+        raise InputError("file-damaged", f"The PLY file is damaged: {error}", path=path) from error
     # With one type for all columns, as the format demands, this is a view; a file of mixed types is converted.
     values = recfunctions.structured_to_unstructured(vertices[rows], dtype=np.float32)
     return _PlyRows(path, tuple(vertices.dtype.names), values)
@@ -150,7 +150,7 @@ def _read_rows(path: Path, rows: slice = slice(None)) -> _PlyRows:
 def _columns(ply: _PlyRows, names: tuple[str, ...]) -> Float32Array:
     missing = [name for name in names if name not in ply.names]
     if missing:
-        message = "the property is missing: this PLY does not hold Gaussians"
+        message = "The property is missing: this PLY does not hold Gaussians."
         raise InputError("not-gaussians", message, path=ply.path, field=missing[0])
     index = [ply.names.index(name) for name in names]
     first = index[0] if index else 0
@@ -179,7 +179,7 @@ def ply_header(path: Path) -> tuple[list[list[str]], int, int]:
     head, end, rest = start.partition(b"end_header")
     lines = [line.split() for line in head.decode("ascii", errors="replace").splitlines()]
     if not end or lines[:1] != [["ply"]]:
-        raise InputError("not-a-ply", "the file is not a PLY file", path=path)
+        raise InputError("not-a-ply", "The file is not a PLY file.", path=path)
     return lines, len(head) + len(end) + (2 if rest[:1] == b"\r" else 1), size
 
 
@@ -187,18 +187,18 @@ def _check_header(path: Path) -> None:
     """Refuse, before memory is allocated, a file whose size differs from the promise of its header."""
     lines, offset, size = ply_header(path)
     if ["format", "binary_little_endian", "1.0"] not in lines:
-        raise InputError("ply-format", "the format of the PLY is not binary_little_endian 1.0", path=path)
+        raise InputError("ply-format", "The format of the PLY is not binary_little_endian 1.0.", path=path)
     elements = [line for line in lines if line[:1] == ["element"]]
     if len(elements) != 1 or elements[0][1:2] != ["vertex"] or len(elements[0]) != 3:
-        raise InputError("ply-elements", "the PLY has elements other than one, vertex", path=path)
+        raise InputError("ply-elements", "The PLY has elements other than one, vertex.", path=path)
     properties = [line for line in lines if line[:1] == ["property"]]
     widths = [int(PLY_TYPES.get(line[1], "i0")[1]) if len(line) == 3 else 0 for line in properties]
     if not widths or 0 in widths:
-        raise InputError("ply-properties", "the PLY has no properties, or some without a fixed size", path=path)
+        raise InputError("ply-properties", "The PLY has no properties, or some without a fixed size.", path=path)
     promised = int(elements[0][2]) if elements[0][2].isdecimal() and len(elements[0][2]) < 16 else -1
     if promised < 1 or promised * sum(widths) != size - offset:
         message = (
-            f"the header promises {elements[0][2][:20]} Gaussians of {sum(widths)} bytes, the file holds "
-            f"{max(size - offset, 0)} bytes: it is empty, cut off or damaged"
+            f"The header promises {elements[0][2][:20]} Gaussians of {sum(widths)} bytes, the file holds "
+            f"{max(size - offset, 0)} bytes: it is empty, cut off or damaged."
         )
         raise InputError("size-differs", message, path=path)

@@ -136,10 +136,10 @@ def decode_spz(data: bytes, path: Path | None = None) -> SplatArrays:
 def _check_values(splat: SplatArrays, fractional_bits: int) -> None:
     for name, values in vars(splat).items():
         if not np.isfinite(values).all():
-            message = "Gaussians with values that are not finite cannot be written as SPZ"
+            message = "Gaussians with values that are not finite cannot be written as SPZ."
             raise InputError("values-not-finite", message, field=name)
     if not splat.quats_wxyz.any(axis=1).all():
-        message = "a rotation of length zero cannot be written as SPZ"
+        message = "A rotation of length zero cannot be written as SPZ."
         raise InputError("quaternion-length", message, field="quats_wxyz")
     furthest = float(np.abs(splat.means).max())
     reach = _POSITION_LIMIT / 2.0**fractional_bits
@@ -148,7 +148,7 @@ def _check_values(splat: SplatArrays, fractional_bits: int) -> None:
         outside = int((np.abs(splat.means).max(axis=1) >= reach).sum())
         message = (
             f"SPZ holds positions within ±{reach:.0f} m; {max(outside, 1)} of {len(splat)} Gaussians are farther, "
-            f"up to {furthest:.0f} m from the origin"
+            f"up to {furthest:.0f} m from the origin."
         )
         raise InputError("spz-range", message, field="means")
 
@@ -165,9 +165,9 @@ def _unpacked_gzip(data: bytes, limit_bytes: int, path: Path | None) -> tuple[_L
     if len(body) != layout.body_bytes or not stream.eof:
         held = "more" if len(body) > layout.body_bytes else "fewer"
         message = (
-            f"the header promises {layout.count} Gaussians in {layout.body_bytes} bytes, the file holds {held}"
+            f"The header promises {layout.count} Gaussians in {layout.body_bytes} bytes, the file holds {held}."
         )
-        raise InputError("size-differs", f"{message}: it is cut off or damaged", path=path)
+        raise InputError("size-differs", f"{message} It is cut off or damaged.", path=path)
     return layout, np.frombuffer(body, np.uint8)
 
 
@@ -186,7 +186,7 @@ def _unpacked_zstd(data: bytes, limit_bytes: int, path: Path | None) -> tuple[_L
     for index, width in enumerate(layout.widths):
         packed, size = _TABLE_ROW.unpack_from(data, table + index * _TABLE_ROW.size)
         if size != width * layout.count or packed > len(data) - place:
-            message = f"stream {index} has another size than the header promises: the file is cut off or damaged"
+            message = f"Stream {index} has another size than the header promises: the file is cut off or damaged."
             raise InputError("size-differs", message, path=path)
         try:
             with zstandard.ZstdDecompressor().stream_reader(data[place : place + packed]) as reader:
@@ -194,7 +194,7 @@ def _unpacked_zstd(data: bytes, limit_bytes: int, path: Path | None) -> tuple[_L
         except zstandard.ZstdError as error:
             raise _damage(f"{error}", path) from error
         if len(part) != size:
-            message = f"stream {index} unpacks to another size than the header promises: the file is damaged"
+            message = f"Stream {index} unpacks to another size than the header promises: the file is damaged."
             raise InputError("unpacked-size-differs", message, path=path)
         parts.append(part)
         place += packed
@@ -202,28 +202,28 @@ def _unpacked_zstd(data: bytes, limit_bytes: int, path: Path | None) -> tuple[_L
 
 
 def _damage(reason: str, path: Path | None) -> InputError:
-    return InputError("file-damaged", f"the SPZ file is damaged: {reason}", path=path)
+    return InputError("file-damaged", f"The SPZ file is damaged: {reason}", path=path)
 
 
 def _stated_layout(head: bytes, versions: tuple[int, ...], limit_bytes: int, path: Path | None) -> _Layout:
     if len(head) < _HEADER.size or head[:4] != struct.pack("<I", _MAGIC):
-        raise InputError("not-an-spz", "the file is not an SPZ file", path=path)
+        raise InputError("not-an-spz", "The file is not an SPZ file.", path=path)
     _, version, count, degree, fractional_bits, flags, _ = _HEADER.unpack(head)
     if version not in versions:
-        message = f"the SPZ version is {version}; versions 2, 3 and 4 are supported"
+        message = f"The SPZ version is {version}; versions 2, 3 and 4 are supported."
         raise InputError("spz-version", message, path=path)
     if degree > 3 or not 1 <= fractional_bits <= 23 or count == 0:
         message = (
-            f"the header states {count} Gaussians of degree {degree} with {fractional_bits} fractional bits, "
-            "expected at least one Gaussian, degree 0 to 3 and 1 to 23 bits"
+            f"The header states {count} Gaussians of degree {degree} with {fractional_bits} fractional bits, "
+            "expected at least one Gaussian, degree 0 to 3 and 1 to 23 bits."
         )
         raise InputError("spz-header", message, path=path)
     if flags & _HAS_EXTENSIONS:
-        raise InputError("spz-extensions", "SPZ files with extensions are not supported", path=path)
+        raise InputError("spz-extensions", "SPZ files with extensions are not supported.", path=path)
     layout = _Layout(version, count, degree, fractional_bits)
     if layout.body_bytes > limit_bytes:
         size, limit = layout.body_bytes / 2**20, limit_bytes / 2**20
-        message = f"the header promises {size:.0f} MiB; the limit for a file of this size is {limit:.0f} MiB"
+        message = f"The header promises {size:.0f} MiB; the limit for a file of this size is {limit:.0f} MiB."
         raise InputError("unpacks-too-large", message, path=path)
     return layout
 

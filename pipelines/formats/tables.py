@@ -66,20 +66,20 @@ def read_lines(path: Path) -> list[str]:
             _check_line(text, path, len(lines) + 1)
             lines.append(text.removesuffix("\n"))
     if not any(map(str.strip, lines)):
-        raise InputError("file-empty", "the file is empty", path=path)
+        raise InputError("file-empty", "The file is empty.", path=path)
     return lines
 
 
 def _check_line(text: str, path: Path, line: int) -> None:
     if line > MOST_LINES:
-        raise InputError("too-many-lines", f"the table has more than {MOST_LINES} lines, the limit", path=path)
+        raise InputError("too-many-lines", f"The table has more than {MOST_LINES} lines, the limit.", path=path)
     if len(text) > LONGEST_LINE:
-        message = f"the line is longer than {LONGEST_LINE} characters, the limit"
+        message = f"The line is longer than {LONGEST_LINE} characters, the limit."
         raise InputError("line-too-long", message, path=path, line=line)
     if _NO_UTF8.search(text):
-        raise InputError("not-utf8", "the text is not UTF-8: save the file as UTF-8", path=path, line=line)
+        raise InputError("not-utf8", "The text is not UTF-8: save the file as UTF-8.", path=path, line=line)
     if "\x00" in text:
-        message = "the file contains zero bytes: it is not text, or it is UTF-16; save it as UTF-8"
+        message = "The file contains zero bytes: it is not text, or it is UTF-16. Save it as UTF-8."
         raise InputError("not-text", message, path=path)
 
 
@@ -236,7 +236,7 @@ def split(text: str, separator: str | None, *, path: Path, line: int) -> list[st
     try:
         return next(csv.reader([text], delimiter=separator), [])
     except csv.Error as error:
-        raise InputError("not-csv", f"the line is not CSV: {error}", path=path, line=line) from error
+        raise InputError("not-csv", f"The line is not CSV: {error}", path=path, line=line) from error
 
 
 def table_rows(
@@ -273,7 +273,7 @@ def named_columns(
         if key is None:
             unknown.append(text.strip())
         elif key in columns:
-            message = f"two columns are {key}: {header[columns[key]]}, {text}"
+            message = f"Two columns are {key}: {header[columns[key]]}, {text}."
             raise InputError("column-twice", message, path=path, line=line)
         else:
             columns[key] = at
@@ -284,14 +284,14 @@ def require_columns(columns: Mapping[str, int], needed: Iterable[str], path: Pat
     """Raise an InputError that names the needed columns which the header does not have."""
     missing = [name for name in needed if name not in columns]
     if missing:
-        message = f"the header has no column {', '.join(missing)}"
+        message = f"The header has no column {', '.join(missing)}."
         raise InputError("column-missing", message, path=path, line=line)
 
 
 def require_rows(rows: Sequence[object], path: Path) -> None:
     """Raise an InputError for a table without rows."""
     if not rows:
-        raise InputError("no-rows", "the table has no rows of data", path=path)
+        raise InputError("no-rows", "The table has no rows of data.", path=path)
 
 
 def refuse_first(

@@ -120,7 +120,7 @@ def read_trajectory(path: Path) -> PoseTable:
     geographic, projected = table.has(_GEOGRAPHIC), table.has(_PROJECTED)
     if geographic == projected:
         code, which = ("columns-ambiguous", "both") if geographic else ("column-missing", "neither of")
-        message = f"the header has {which} latitude,longitude,altitude and x,y,z"
+        message = f"The header has {which} latitude,longitude,altitude and x,y,z."
         raise InputError(code, message, path=path, line=table.header_line)
     xyz = _in_range(table, _GEOGRAPHIC) if geographic else table.numbers(_PROJECTED)
     time_s, zoneless = _times(table) if "timestamp" in table.columns else (None, False)
@@ -147,7 +147,7 @@ def _read_table(path: Path) -> Table:
     header = lines[first].lstrip("# ")
     separator = separator_of(header)
     if separator is None:
-        message = "the header has one column only: separate columns by , ; or tab"
+        message = "The header has one column only: separate columns by , ; or tab."
         raise InputError("one-column", message, path=path, line=first + 1)
     names = [name.strip() for name in split(header, separator, path=path, line=first + 1)]
     columns, unknown = named_columns(
@@ -155,11 +155,11 @@ def _read_table(path: Path) -> Table:
     )
     if not columns:
         message = (
-            "the first line must be a header: image and/or timestamp, then latitude,longitude,altitude or x,y,z"
+            "The first line must be a header: image and/or timestamp, then latitude,longitude,altitude or x,y,z."
         )
         raise InputError("header-missing", message, path=path, line=first + 1)
     if "image" not in columns and "timestamp" not in columns:
-        message = "the header has no column image and no column timestamp"
+        message = "The header has no column image and no column timestamp."
         raise InputError("column-missing", message, path=path, line=first + 1)
     width = header.count(separator) + 1
     rows = []
@@ -171,12 +171,12 @@ def _read_table(path: Path) -> Table:
                 continue
             if len(cells) > width and any(cell.strip() for cell in cells[width:]):
                 hint = "; decimal commas need ; as separator" if separator == "," else ""
-                message = f"the line has {len(cells)} cells, the header has {width}{hint}"
+                message = f"The line has {len(cells)} cells, the header has {width}{hint}"
                 raise InputError("wrong-columns", message, path=path, line=line)
             rows.append(Row(path, line, cells, columns, separator != ","))
     except csv.Error as error:
         line = first + 1 + reader.line_num
-        raise InputError("not-csv", f"the line is not CSV: {error}", path=path, line=line) from error
+        raise InputError("not-csv", f"The line is not CSV: {error}", path=path, line=line) from error
     require_rows(rows, path)
     return Table(path, first + 1, columns, unknown, rows)
 
@@ -195,7 +195,7 @@ def _attitudes(table: Table) -> FloatArray | None:
     """Return rotations camera → East-North-Up (N, 4), NaN where a row has none."""
     angles, quaternion = table.has(_ANGLES), table.has(_QUATERNION)
     if angles and quaternion:
-        message = "the header has both yaw,pitch,roll and qx,qy,qz,qw"
+        message = "The header has both yaw,pitch,roll and qx,qy,qz,qw."
         raise InputError("columns-ambiguous", message, path=table.path, line=table.header_line)
     if angles:
         return camera_quaternions(_in_range(table, _ANGLES))

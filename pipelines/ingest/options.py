@@ -1,4 +1,4 @@
-"""Options of `georef ingest`; those that contradict each other are refused before anything is read."""
+"""Options of `georef ingest`; those that exclude each other are refused before anything is read."""
 
 from __future__ import annotations
 

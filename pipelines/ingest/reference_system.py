@@ -20,8 +20,8 @@ def crs_of_table(table: PoseTable, options: IngestOptions, remarks: Remarks) -> 
     """Return the CRS of a table of poses: its own, else that of `--crs`, else the one of its kind of file.
 
     Raises:
-        InputError: no CRS for x,y,z columns, heights above a geoid that nobody names, or options that contradict
-            the table or each other.
+        InputError: no CRS for x,y,z columns, heights above a geoid that nobody names, or options that do
+            not fit the table or each other.
     """
     path = table.path
     if table.crs_text is not None:
@@ -35,10 +35,10 @@ def crs_of_table(table: PoseTable, options: IngestOptions, remarks: Remarks) -> 
                 f"{path.name} has latitude and longitude, but {crs.name} has none.",
                 field="--crs",
             )
-        if _contradicts(crs, options):
+        if _excludes(crs, options):
             raise InputError(
-                "vertical-contradicts-crs",
-                f"--vertical {options.vertical} contradicts --crs {crs.name}, whose heights are "
+                "vertical-against-crs",
+                f"--vertical {options.vertical} does not fit --crs {crs.name}, whose heights are "
                 f"{crs.vertical.name}.",
                 field="--vertical",
             )
@@ -136,7 +136,7 @@ def note_operation(crs: PointCrs, lla: FloatArray, remarks: Remarks) -> None:
 
 def _own(crs: PointCrs, path: Path, options: IngestOptions, remarks: Remarks) -> PointCrs:
     """Return the CRS that a file has; a `--vertical` that does not apply to its heights is noted."""
-    if _contradicts(crs, options):
+    if _excludes(crs, options):
         remarks.assume(
             "vertical-unused",
             f"Heights of {path.name} are {crs.vertical.name}, as its CRS says: --vertical does not apply to them.",
@@ -144,7 +144,7 @@ def _own(crs: PointCrs, path: Path, options: IngestOptions, remarks: Remarks) ->
     return crs
 
 
-def _contradicts(crs: PointCrs, options: IngestOptions) -> bool:
+def _excludes(crs: PointCrs, options: IngestOptions) -> bool:
     """Return whether a CRS states another vertical datum than `--vertical`."""
     vertical = options.vertical
     return vertical is not None and crs.states_vertical and crs.vertical.name != vertical.name

@@ -36,8 +36,8 @@ def poses_from_table(
 
     Raises:
         InconsistencyError: the positions disagree with those in EXIF.
-        InputError: no row with a position, no CRS for x,y,z, contradicting options, impossible coordinates, or no
-            image matched.
+        InputError: no row with a position, no CRS for x,y,z, options that exclude each other, impossible
+            coordinates, or no image matched.
     """
     table = usable_rows(table, remarks)
     crs = crs_of_table(table, options, remarks)

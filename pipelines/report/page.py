@@ -201,7 +201,7 @@ def png_file(path: Path) -> Picture | None:
         return None
     data = read_bytes(path)
     if header_size(data) is None or not data.startswith(_PNG):
-        raise InputError("not-a-png", "is no PNG; make it again with `georef evaluate --force`", path=path)
+        raise InputError("not-a-png", "is no PNG. Make it again with `georef evaluate --force`.", path=path)
     return picture_of_png(data)
 
 
@@ -221,10 +221,14 @@ def read_picture(path: Path) -> ByteArray:
     data = read_bytes(path)
     size = header_size(data)
     if size is None or not 0 < size[0] * size[1] <= MAX_PIXELS:
-        raise InputError("not-a-picture", "is no picture that can be shown; delete it, or make it again", path=path)
+        raise InputError(
+            "not-a-picture", "is no picture that can be shown. Delete it, or make it again.", path=path
+        )
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
     if pixels is None or pixels.dtype != np.uint8:
-        raise InputError("not-a-picture", "is no picture that can be shown; delete it, or make it again", path=path)
+        raise InputError(
+            "not-a-picture", "is no picture that can be shown. Delete it, or make it again.", path=path
+        )
     if pixels.ndim == 2:
         pixels = np.repeat(pixels[..., None], 3, axis=2)
     if pixels.shape[2] == 4:

@@ -81,7 +81,7 @@ def cut_chips(
             name = sparse.image_name[image]
             pixels = decoded_photograph(folder / name, sha256.get(name, ""))
             if pixels is None:
-                message = "cannot be decoded, or has changed; restore the photograph"
+                message = "cannot be decoded, or has changed. Restore the photograph."
                 raise InputError("photograph-damaged", message, path=folder / name)
             for chip in of_image:
                 chips[chip.owner].append(_cut(pixels[..., ::-1], name, chip, side))

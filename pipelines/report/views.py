@@ -164,7 +164,7 @@ def views_facts(workspace: Workspace, test: PhotometricFigures, most: int) -> Vi
 def _view(name: str, field: str, file: Path) -> TestView:
     parts = without_labels(read_picture(file), 3)
     if not parts[0].size:
-        message = "is no render of `georef evaluate`; run `georef evaluate --force`"
+        message = "is no render of `georef evaluate`. Run `georef evaluate --force`."
         raise InputError("not-a-render", message, path=file)
     photograph, render, difference = (picture_of(limited(part, _VIEW_PX)) for part in parts)
     return TestView(name, field, photograph, render, difference)
@@ -195,7 +195,7 @@ def read_metrics(path: Path) -> list[dict[str, float]]:
                 row = {name: float(value) for name, value in json.loads(line).items()}
                 rows.append(row | {"iteration": row["iteration"]})
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
-        message = "is no row of metrics; run `georef train --force`"
+        message = "is no row of metrics. Run `georef train --force`."
         raise InputError("metrics-row", message, path=path, line=lines) from error
     return rows
 

@@ -191,7 +191,7 @@ def copy_finished(
     if not chunk.database(partial).is_file():
         raise InputError(
             "chunk-not-finished",
-            f"{chunk.name} is not finished, and its features are needed",
+            f"{chunk.name} is not finished, and its features are needed.",
             path=database,
         )
     try:
@@ -199,7 +199,7 @@ def copy_finished(
     except DamagedPartialError as error:
         remove_database(database)
         raise InputError(
-            "chunk-damaged", f"{error.message}; the file was removed: run `georef sfm` again", path=database
+            "chunk-damaged", f"{error.message}; the file was removed: run `georef sfm` again.", path=database
         ) from error
 
 
@@ -208,7 +208,7 @@ def _planned(workspace: Workspace, name: str) -> Chunk:
     if not path.is_file():
         raise InputError(
             "no-chunk-plan",
-            f"no chunks are planned; run `georef sfm {workspace.root}`",
+            f"No chunks are planned. Run `georef sfm {workspace.root}`.",
             path=path,
         )
     chunks = load_json(ChunkPlan, path).chunks
@@ -218,7 +218,7 @@ def _planned(workspace: Workspace, name: str) -> Chunk:
         raise InputError("unknown-chunk", f"{name!r} is none of the chunks {names}", field="--chunk")
     count = len(load_json(Survey, workspace.path(SURVEY)).images)
     if max((*chunk.images, *(index for pair in chunk.pairs for index in pair)), default=0) >= count:
-        message = f"{name} has more photographs than the survey; run `georef sfm {workspace.root}`"
+        message = f"{name} has more photographs than the survey. Run `georef sfm {workspace.root}`."
         raise InputError("chunk-plan-outdated", message, path=path)
     return chunk
 

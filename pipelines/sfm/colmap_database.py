@@ -70,7 +70,7 @@ def copy_rows(source: Path, target: Path, tables: Iterable[str], images: Iterabl
             connection.execute("attach database ? as source", (f"{source.absolute().as_uri()}?immutable=1",))
             versions = {connection.execute(f"pragma {name}.user_version").fetchone() for name in ("main", "source")}
             if len(versions) > 1:
-                raise DamagedPartialError("colmap-version", "was made by another version of COLMAP", path=source)
+                raise DamagedPartialError("colmap-version", "was made by another version of COLMAP.", path=source)
             connection.execute("begin immediate")
             wanted = "" if images is None else "where image_id in (select image_id from temp.wanted)"
             if images is not None:
@@ -116,7 +116,7 @@ def require_sound(database: Path) -> None:
             raise
         verdict = str(error)
     if verdict != "ok":
-        raise DamagedPartialError("database-damaged", f"the database is damaged: {verdict}", path=database)
+        raise DamagedPartialError("database-damaged", f"The database is damaged: {verdict}", path=database)
 
 
 def _write_camera(colmap: Any, database: Any, prior: CameraPrior, options: SfmOptions) -> None:
@@ -144,7 +144,7 @@ def _copy_shared_params(colmap: Any, prior: CameraPrior, camera: Any) -> None:
     except ValueError as error:
         raise InputError(
             "unknown-camera-model",
-            f"{prior.model} with {len(prior.params)} parameters is not a camera model of COLMAP",
+            f"{prior.model} with {len(prior.params)} parameters is not a camera model of COLMAP.",
             field=SURVEY,
         ) from error
     f = by_name.get("f", by_name.get("fx", 0.0))

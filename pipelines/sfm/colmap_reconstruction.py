@@ -68,8 +68,8 @@ def reconstruct(colmap: Any, job: SfmJob, progress: Progress) -> Any:
     if missing:
         raise InputError(
             "photograph-missing",
-            f"{len(missing)} photographs of the survey are missing, such as this one; restore them, or run "
-            "`georef ingest` again",
+            f"{len(missing)} photographs of the survey are missing, such as this one. Restore them, or run "
+            "`georef ingest` again.",
             path=job.images / missing[0],
         )
     colmap.set_random_seed(job.options.seed)

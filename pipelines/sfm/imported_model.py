@@ -62,7 +62,7 @@ def import_model(path: Path, survey: Survey) -> Any:
         raise InputError(
             "too-few-images-in-survey",
             f"{model.num_reg_images()} of its images are in the survey, and at least three are needed; names must "
-            "be equal",
+            "be equal.",
             path=folder,
         )
     if foreign:
@@ -99,9 +99,9 @@ def _check_cameras(model: Any, survey: Survey, folder: Path) -> None:
             cause = "undistorted copies" if undistorted else "copies of another size"
             raise InputError(
                 "undistorted-copies" if undistorted else "photograph-size",
-                f"its camera {image.camera_id} ({camera.model_name}) has {camera.width}×{camera.height} pixels, "
+                f"Its camera {image.camera_id} ({camera.model_name}) has {camera.width}×{camera.height} pixels, "
                 f"the photograph {image.name} {width}×{height}: the model was made of {cause}. Import the model of "
-                "the photographs themselves, or give the folder of the copies to `georef ingest --images`",
+                "the photographs themselves, or give the folder of the copies to `georef ingest --images`.",
                 path=folder,
             )
         if undistorted:

@@ -71,7 +71,7 @@ class Lpips:
         arrays = read_npz(weights, tuple(_shapes()))
         for name, shape in _shapes().items():
             if arrays[name].shape != shape or not np.isfinite(arrays[name]).all():
-                message = f"the weights are not finite numbers of shape {shape}"
+                message = f"The weights are not finite numbers of shape {shape}."
                 raise InputError("lpips-weights", message, path=weights, field=name)
         self._weights = {name: torch.as_tensor(array, dtype=torch.float32) for name, array in arrays.items()}
 

@@ -39,12 +39,12 @@ class ScannerTrack:
         """
         table = read_trajectory(path)
         if table.time_s is None:
-            raise InputError("no-timestamps", "has no column `timestamp`", path=path, field="--lidar-trajectory")
+            raise InputError("no-timestamps", "has no column `timestamp`.", path=path, field="--lidar-trajectory")
         text = _WGS84 if table.geographic else stated.crs
         if text is None:
             raise InputError(
                 "crs-unknown",
-                "has projected coordinates: state their CRS with --lidar-crs",
+                "has projected coordinates: state their CRS with --lidar-crs.",
                 path=path,
                 field="--lidar-trajectory",
             )
@@ -64,7 +64,7 @@ class ScannerTrack:
             raise InputError(
                 "times-outside-trajectory",
                 f"covers the times of {covered:.0%} of the points only: its clock is not that of the LiDAR, or it "
-                "belongs to another flight",
+                "belongs to another flight.",
                 field="--lidar-trajectory",
             )
         return place
@@ -138,8 +138,8 @@ def read_cloud(
     if len(cloud) <= 10 * _NEIGHBOURS:
         raise InputError(
             "no-overlap",
-            f"only {len(cloud)} points lie in the scene of the photographs: check the cloud's place and its CRS "
-            "(--lidar-crs)",
+            f"Only {len(cloud)} points lie in the scene of the photographs: check the cloud's place and its CRS "
+            "(--lidar-crs).",
             field="--lidar",
         )
     model_from_geo = scene.geo_from_model.inverse()

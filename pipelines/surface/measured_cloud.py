@@ -121,7 +121,7 @@ class CloudReader:
     def _valid(self, chunk: CloudChunk, path: Path) -> CloudChunk:
         """Return the points that count, and note the others."""
         if not np.isfinite(chunk.position).all():
-            raise InputError("not-finite", "contains coordinates that are not finite", path=path)
+            raise InputError("not-finite", "contains coordinates that are not finite.", path=path)
         noise = np.isin(chunk.classification, NOISE_CLASSES)
         keep = ~(noise | chunk.withheld | chunk.overlap)
         self.tally.read += len(chunk)
@@ -209,10 +209,10 @@ def _paths(path: Path, stated: CloudCrs) -> list[Path]:
         and not any(part[0] == "." for part in file.relative_to(path).parts)
     )
     if not files:
-        raise InputError("no-cloud-files", "no LAS, LAZ or PLY file in this folder", path=path, field=stated.flag)
+        raise InputError("no-cloud-files", "No LAS, LAZ or PLY file in this folder.", path=path, field=stated.flag)
     if len(files) > _MOST_FILES:
         raise InputError(
-            "too-many-files", f"{len(files)} files (limit {_MOST_FILES})", path=path, field=stated.flag
+            "too-many-files", f"{len(files)} files (limit {_MOST_FILES}).", path=path, field=stated.flag
         )
     return files
 
@@ -221,7 +221,7 @@ def _opened(path: Path, stated: CloudCrs) -> CloudFile:
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
         hint = " (CloudCompare and PDAL convert E57)" if path.suffix.lower() == ".e57" else ""
-        raise InputError("format-unknown", f"expected .las, .laz or .ply{hint}", path=path, field=stated.flag)
+        raise InputError("format-unknown", f"Expected .las, .laz or .ply{hint}", path=path, field=stated.flag)
     return reader(path)
 
 
@@ -231,7 +231,7 @@ def _crs_of(file: CloudFile, stated: CloudCrs) -> PointCrs:
     if stated.crs is None:
         raise InputError(
             "crs-unknown",
-            f"states no CRS: give {stated.flag}-crs EPSG:n, or EPSG:n+m with the vertical CRS",
+            f"states no CRS: give {stated.flag}-crs EPSG:n, or EPSG:n+m with the vertical CRS.",
             path=file.path,
             field=stated.flag,
         )

@@ -74,7 +74,7 @@ def registration(cloud: LidarCloud, views: DepthViews, seed: int) -> Registratio
             raise DegenerateGeometryError(
                 "no-overlap",
                 f"Only {len(matches.distance_m)} LiDAR points lie within {capture:.1%} of the camera's distance "
-                "from the surface of the photographs, too few for a comparison",
+                "from the surface of the photographs, too few for a comparison.",
             )
         values, covariance, spread = _solved(matches)
         total = total + values[:3]
@@ -115,7 +115,7 @@ def _solved(matches: PlaneMatches) -> tuple[FloatArray, FloatArray, float]:
             break
     if np.linalg.eigvalsh(normal[:3, :3])[0] * spread**2 < 1e-3 * len(matches.distance_m):
         raise DegenerateGeometryError(
-            "planes-parallel", "All planes of the LiDAR face one direction, which leaves its shift undetermined"
+            "planes-parallel", "All planes of the LiDAR face one direction, which leaves its shift undetermined."
         )
     residual = matches.distance_m - design @ value
     score = _summed_by_cell((weight * residual)[:, None] * design / spread**2, matches.point_in_model, _CLUSTER_M)

@@ -218,8 +218,8 @@ class SurfaceViews:
         if needed > free:
             raise InputError(
                 "disk-full",
-                f"the depth maps of the training views need {needed / 2**30:.1f} GiB, and "
-                f"{max(free, 0) / 2**30:.1f} GiB are free: make room on this disk",
+                f"The depth maps of the training views need {needed / 2**30:.1f} GiB, and "
+                f"{max(free, 0) / 2**30:.1f} GiB are free: make room on this disk.",
                 path=self.folder,
             )
         with ExitStack() as files, progress.task("depth maps", len(self)) as task:

@@ -22,7 +22,7 @@ class InitialSimilarity(Product):
     Attributes:
         method: `robust` or `paper`, the option of `init-sim3`; `adjusted` by the bundle adjustment of the baseline.
         correspondences, inliers: numbers by kind, of all and of those that agree with the similarity: `gnss`
-            (camera centres with fixes), `gcp` (control points), `points` (geolocated points).
+            (camera centres with fixes), `gcp` (control points), `points` (intersected points).
         gnss_outliers, control_outliers: names of the images whose fixes, and of the control points that were
             rejected, or that their marks do not determine: they enter no later solution.
         condition_number: of the normal matrix, with angles and ln s scaled by the size of the layout.

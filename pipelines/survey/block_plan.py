@@ -126,7 +126,7 @@ class BlockPlan(Product):
                 return block
         raise InputError(
             "unknown-block",
-            f"there is no block {number}; the plan has blocks 0 to {len(self.blocks) - 1}",
+            f"There is no block {number}; the plan has blocks 0 to {len(self.blocks) - 1}.",
             field="--id",
         )
 

@@ -98,8 +98,8 @@ def load_track(workspace: Workspace) -> NavigationTrack:
     except MissingProductError as error:
         raise InputError(
             "navigation-not-recorded",
-            "the survey has one position for each image, and no navigation with times; run `georef ingest` with "
-            "--bag, or with a --trajectory that has times",
+            "The survey has one position for each image, and no navigation with times. Run `georef ingest` with "
+            "--bag, or with a --trajectory that has times.",
             path=workspace.root / TRACK,
         ) from error
     return NavigationTrack.load(path)
@@ -125,7 +125,7 @@ def require_estimable(track: NavigationTrack | None, wanted: Sequence[RigParamet
         raise refusal("no-attitudes", "lever-arm needs attitudes, which were not recorded")
     if "lever-arm" in wanted and not track.body_known:
         raise refusal(
-            "body-axes-unknown", "lever-arm needs the axes of the body; give --camera-mount YAW,PITCH,ROLL"
+            "body-axes-unknown", "lever-arm needs the axes of the body. Give --camera-mount YAW,PITCH,ROLL."
         )
     mounted = bool(np.isfinite(track.cam_from_body).all(axis=(1, 2)).any())
     if "boresight" in wanted and not (turned and mounted):

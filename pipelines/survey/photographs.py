@@ -141,7 +141,7 @@ class ImageCache:
         try:
             stat = photograph.file.stat()
         except OSError as error:
-            message = f"the photograph cannot be read ({error.strerror}); restore it, or run `georef ingest` again"
+            message = f"The photograph cannot be read ({error.strerror}). Restore it, or run `georef ingest` again."
             raise InputError("photograph-missing", message, path=photograph.file) from error
         camera = photograph.camera
         key = (
@@ -154,11 +154,11 @@ class ImageCache:
         photograph, pinhole = self._photographs[index], self.pinhole(index)
         full = decoded_photograph(photograph.file, photograph.sha256)
         if full is None:
-            raise InputError("photograph-damaged", "the photograph cannot be read", path=photograph.file)
+            raise InputError("photograph-damaged", "The photograph cannot be read.", path=photograph.file)
         if (full.shape[1], full.shape[0]) != (photograph.camera.width, photograph.camera.height):
             raise InputError(
                 "photograph-size",
-                f"the photograph has {full.shape[1]}×{full.shape[0]} pixels, its camera "
+                f"The photograph has {full.shape[1]}×{full.shape[0]} pixels, its camera "
                 f"{photograph.camera.width}×{photograph.camera.height}",
                 path=photograph.file,
             )

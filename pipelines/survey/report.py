@@ -338,5 +338,5 @@ def read_report(path: Path) -> EvaluationReport:
     except InputError as error:
         if not isinstance(error.__cause__, ValueError):  # The file cannot be read: its content is not at fault.
             raise
-        message = "not a report; make it again with `georef evaluate --force`"
+        message = "is not a report. Make it again with `georef evaluate --force`."
         raise InputError("report-invalid", message, path=path, field=error.field) from error

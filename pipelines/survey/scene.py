@@ -154,8 +154,8 @@ def photographs(sparse: SparseModel, survey: Survey, workspace: Workspace, max_s
     if foreign:
         raise InputError(
             "images-not-in-survey",
-            f"{len(foreign)} images of the model are not in the survey, such as {foreign[0]!r}; import the model "
-            "with `georef sfm --import`, which leaves them out",
+            f"{len(foreign)} images of the model are not in the survey, such as {foreign[0]!r}. Import the model "
+            "with `georef sfm --import`, which leaves them out.",
             path=workspace.root / SPARSE,
         )
     folder = photograph_folder(workspace, survey.image_dir)

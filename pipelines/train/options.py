@@ -131,7 +131,7 @@ class GeographicOptions(StageOptions):
                 raise InputError(
                     "cameras-solved-once",
                     f"{value!r} changes the cameras during training, but {cameras} photographs are solved once, by "
-                    f"init-sim3: use {name} {plain}, --solve-cameras joint or --no-optimize-cameras",
+                    f"init-sim3: use {name} {plain}, --solve-cameras joint or --no-optimize-cameras.",
                     field=name,
                 )
 

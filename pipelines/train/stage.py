@@ -1,6 +1,6 @@
 """Stage `train`: joint optimisation of Gaussians, similarity and cameras (GeoRefGS, section 2.4).
 
-Reads the survey, the SfM model, the geolocated points and the adjustment of `init-sim3`, from which it starts.
+Reads the survey, the SfM model, the intersected points and the adjustment of `init-sim3`, from which it starts.
 Writes `train/gaussians.ply` (frame `model`), `train/model.json` and `train/adjustment.npz` (the adjustment at the
 end of the training), `train/metrics.jsonl` and the latest checkpoint. An interrupted run leaves a checkpoint in
 `train.partial/`, from which the next run with the same options continues. A finished training with fewer iterations

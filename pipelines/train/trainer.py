@@ -106,7 +106,7 @@ class JointTrainer:
 
     Args:
         exposures: of the photographs, optimised as well or frozen; None: all photographs have the same exposure.
-        outliers: finds pixels that contradict the model, which do not count; None: all do.
+        outliers: finds pixels that are inconsistent with the model, which do not count; None: all do.
         region: part of the scene that the Gaussians are to show; None: all of it.
     """
 
@@ -428,7 +428,7 @@ def load_checkpoint(path: Path) -> dict[str, Tensor]:
         ValueError,
     ) as error:  # torch has no complex halves, texts or foreign byte orders
         raise InputError(
-            "checkpoint-damaged", f"not a readable checkpoint ({error}): train without --resume"
+            "checkpoint-damaged", f"is not a readable checkpoint ({error}). Train without --resume."
         ) from error
 
 

@@ -138,7 +138,7 @@ class Photographs:
         if pixels is None or pixels.shape[:2] != (lens.height, lens.width):
             raise InputError(
                 "photograph-damaged",
-                "cannot be decoded, or has another size than its camera; restore the photograph",
+                "cannot be decoded, or has another size than its camera. Restore the photograph.",
                 path=file,
             )
         return np.ascontiguousarray(pixels[..., ::-1])

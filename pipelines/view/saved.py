@@ -183,14 +183,14 @@ def read_measurements(folder: Path) -> list[NamedMeasurement]:
     if not path.exists():
         return []
     if path.stat().st_size > _MOST_BYTES:
-        message = f"is larger than {_MOST_BYTES >> 20} MiB; move the file away"
+        message = f"is larger than {_MOST_BYTES >> 20} MiB; move the file away."
         raise InputError("measurements-too-large", message, path=path)
     try:
         document = json.loads(path.read_text("utf-8"))
         features = document["features"]
         measurements = [each["properties"]["georef"] for each in features]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        message = "is no file of saved measurements; move the file away"
+        message = "is no file of saved measurements; move the file away."
         raise InputError("not-measurements", message, path=path) from error
     read = []
     for number, each in enumerate(measurements):
@@ -199,7 +199,7 @@ def read_measurements(folder: Path) -> list[NamedMeasurement]:
         except ValidationError as error:
             first = error.errors()[0]
             field = f"features[{number}].properties.georef." + ".".join(map(str, first["loc"]))
-            message = f"{first['msg']}; move the file away"
+            message = f"{first['msg']}; move the file away."
             raise InputError("measurement-invalid", message, path=path, field=field) from error
     return read
 

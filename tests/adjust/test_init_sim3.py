@@ -122,7 +122,7 @@ def test_paper_method_is_coarse_but_near() -> None:
 
 def test_paper_method_without_points_says_what_to_use() -> None:
     survey, model, points = material(Noise(), Measured(fixes=False, gcps=True))
-    with refused("too-few-geolocated-points", DegenerateGeometryError):
+    with refused("too-few-intersected-points", DegenerateGeometryError):
         estimate_similarity(survey, model, points, InitSim3Options(method="paper"))
 
 

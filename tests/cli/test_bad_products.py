@@ -52,51 +52,51 @@ def test_upstream_missing(real_georef: Georef, made: Path, stage: str, gone: str
 
 
 DAMAGED = (
-    ("geolocate", SURVEY, b"{", f"{SURVEY}: Invalid JSON"),
-    ("geolocate", SURVEY, b"\xff", f"{SURVEY}: is not a UTF-8 text file"),
-    ("geolocate", SURVEY, b"{}", f"{SURVEY} [origin]: Field required"),
-    ("geolocate", f"{SPARSE}/images.bin", b"\xff" * 40, "images.bin: the file is shorter"),
-    ("geolocate", f"{SPARSE}/cameras.bin", b"", "cameras.bin: the file is shorter"),
-    ("init-sim3", POINTS, b"PK\x03\x04", f"{POINTS}: not a readable NPZ file"),
-    ("train", SIM3, b"[]", f"{SIM3}: Input should be an object"),
-    ("evaluate", MODEL, b'{"format_version": 1}', f"{MODEL} [geo_from_model]: Field required"),
-    ("export-ply", MODEL, b"nonsense", f"{MODEL}: Invalid JSON"),
+    ("geolocate", SURVEY, b"{", None),
+    ("geolocate", SURVEY, b"\xff", None),
+    ("geolocate", SURVEY, b"{}", "origin"),
+    ("geolocate", f"{SPARSE}/images.bin", b"\xff" * 40, None),
+    ("geolocate", f"{SPARSE}/cameras.bin", b"", None),
+    ("init-sim3", POINTS, b"PK\x03\x04", None),
+    ("train", SIM3, b"[]", None),
+    ("evaluate", MODEL, b'{"format_version": 1}', "geo_from_model"),
+    ("export-ply", MODEL, b"nonsense", None),
 )
 
 
 @pytest.mark.parametrize("case", DAMAGED, ids=lambda case: f"{case[0]}-{case[1]}-{case[2][:4]!r}")
-def test_damaged_product(real_georef: Georef, made: Path, case: tuple[str, str, bytes, str]) -> None:
-    stage, product, data, told = case
+def test_damaged_product(real_georef: Georef, made: Path, case: tuple[str, str, bytes, str | None]) -> None:
+    stage, product, data, field = case
     needed = [part.product for part in BY_NAME[stage].reads if not part.optional]
     absent = [read for read in needed if not (made / read).exists()]
     write_files(made, dict.fromkeys(absent, b"") | {product: data})
     result = real_georef(stage, made)
     result.assert_failed(1)
-    assert told in result.err.splitlines()[-1]
+    assert result.error is not None
+    assert (result.error["path"], result.error["field"]) == (str(made / product), field)
     assert "Traceback" not in result.err
 
 
 @pytest.mark.parametrize(
-    ("data", "told"),
+    ("data", "code"),
     [
-        (b"ply\n", "gaussians.ply: the file is not a PLY file"),
+        (b"ply\n", "not-a-ply"),
         (
             b"ply\nformat ascii 1.0\nelement vertex 1\nend_header\n",
-            "the format of the PLY is not binary_little_endian",
+            "ply-format",
         ),
         (
             b"ply\nformat binary_little_endian 1.0\nelement vertex 9999999999\nproperty float x\nend_header\n",
-            "9999999999",
+            "size-differs",
         ),
     ],
     ids=["no PLY", "text", "forged"],
 )
-def test_damaged_gaussians(real_georef: Georef, made: Path, data: bytes, told: str) -> None:
+def test_damaged_gaussians(real_georef: Georef, made: Path, data: bytes, code: str) -> None:
     save_json(trained_model(Similarity()), made / MODEL)
     write_files(made, {GAUSSIANS: data})
     result = real_georef("export-ply", made)
-    result.assert_failed(1)
-    assert told in result.err.splitlines()[-1]
+    result.assert_failed(1, code)
     assert not (made / "export").exists()
 
 
@@ -108,8 +108,8 @@ def test_report_that_was_replaced(real_georef: Georef, made: Path, content: byte
     write_files(made, dict.fromkeys(absent, b"") | {REPORT: content})
     result = real_georef("evaluate", made)
     result.assert_failed(1)
-    assert f"error: {made / REPORT}" in result.err
-    assert "not a report; make it again with `georef evaluate --force`" in result.err.splitlines()[-1]
+    assert result.error is not None and result.error["path"] == str(made / REPORT)
+    assert "`georef evaluate --force`" in result.error["message"]
     assert (made / REPORT).read_bytes() == content
 
 

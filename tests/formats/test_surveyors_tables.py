@@ -74,7 +74,7 @@ class TestMrk:
         ("text", "told"),
         [
             (MRK + "3\t1\n", ("line-layout", 3, None, "number, second")),
-            (MRK + MRK.split("\n", maxsplit=1)[0], ("event-twice", 3, None, "event 1", "line 1")),
+            (MRK + MRK.split("\n", maxsplit=1)[0], ("event-twice", 3, None, "Event 1", "line 1")),
             (MRK.replace("46.02000000", "146.0200000"), ("value-out-of-range", 1, "Lat", "146.02", "-90 … 90")),
             (MRK.replace("302418.5", "702418.5"), ("value-out-of-range", 1, "second of week")),
         ],

@@ -192,7 +192,7 @@ def test_missing_heights_are_taken_from_exif() -> None:
         (
             {},
             IngestOptions(crs="EPSG:4979", vertical="EGM96"),
-            "vertical-contradicts-crs",
+            "vertical-against-crs",
             r"\[--vertical\]: .*--crs EPSG:4979, .*ellipsoidal",
         ),
         (
@@ -203,7 +203,7 @@ def test_missing_heights_are_taken_from_exif() -> None:
         ),
     ],
 )
-def test_contradictions_about_the_crs(
+def test_statements_about_the_crs_that_exclude_each_other(
     changes: dict[str, object], options: IngestOptions, code: str, says: str
 ) -> None:
     with refused(code, InputError) as error:

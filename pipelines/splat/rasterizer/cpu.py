@@ -269,25 +269,25 @@ def _validate(gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, set
         expected = shapes.get(name, (count, (gaussians.sh_degree + 1) ** 2, 3))
         _require_shape(tensor, expected, name)
         if tensor.dtype != dtype or dtype not in (torch.float32, torch.float64):
-            message = f"the tensor is {tensor.dtype}: all must be float32, or all float64"
+            message = f"The tensor is {tensor.dtype}: all must be float32, or all float64."
             raise InputError("tensor-type", message, field=name)
         if tensor.device.type != "cpu":
-            message = f"the tensor is on {tensor.device}: the cpu backend needs it on the cpu"
+            message = f"The tensor is on {tensor.device}: the cpu backend needs it on the cpu."
             raise InputError("tensor-device", message, field=name)
     _require_shape(cam_from_model, (4, 4), "cam_from_model")
     highest = min(gaussians.sh_degree, 3)
     if not 0 <= settings.sh_degree <= highest:
-        message = f"the degree must be 0 to {highest}, it is {settings.sh_degree}"
+        message = f"The degree must be 0 to {highest}, it is {settings.sh_degree}."
         raise InputError("sh-degree", message, field="sh_degree")
     if settings.near_m <= 0:
-        raise InputError("near-plane", f"the distance of {settings.near_m} m is not positive", field="near_m")
+        raise InputError("near-plane", f"The distance of {settings.near_m} m is not positive.", field="near_m")
     image = settings.image_of(camera)
     if image.width < 1 or image.height < 1:
-        message = f"the image of {image.width} × {image.height} pixels is empty"
+        message = f"The image of {image.width} × {image.height} pixels is empty."
         raise InputError("image-empty", message, field="camera")
 
 
 def _require_shape(tensor: Tensor, expected: tuple[int, ...], name: str) -> None:
     if tuple(tensor.shape) != expected:
-        message = f"the shape is {tuple(tensor.shape)}, it must be {expected}"
+        message = f"The shape is {tuple(tensor.shape)}, it must be {expected}."
         raise InputError("tensor-shape", message, field=name)

@@ -112,7 +112,7 @@ def _driver() -> Part:
         ctypes.CDLL(_DRIVER).cuDriverGetVersion(ctypes.byref(version))
     except (OSError, AttributeError):
         remedy = (
-            f"{_DRIVER} was not found. Install NVIDIA's driver; give a container the GPU (docker run --gpus all)"
+            f"{_DRIVER} was not found. Install NVIDIA's driver. Give a container the GPU (docker run --gpus all)."
         )
         return Part(name, None, remedy)
     major, minor = version.value // 1000, version.value % 1000 // 10

@@ -201,7 +201,7 @@ def _tensors(term: adjustment.Term, *names: str) -> dict[str, Tensor]:
 
 @dataclass(frozen=True)
 class DistanceTerm(TensorTerm):
-    """Distances between P pairs of geolocated points, or of cameras with fixes: the term L_rel.
+    """Distances between P pairs of intersected points, or of cameras with fixes: the term L_rel.
 
     The distances are functions of the fixes, not independent measurements.
 
