@@ -128,7 +128,7 @@ def note_operation(crs: PointCrs, lla: FloatArray, remarks: Remarks) -> None:
         remarks.warn(
             "better-grid-missing",
             f"A better transformation of {crs.name} to WGS84 needs the PROJ grid "
-            f"{', '.join(operation.missing_grids)}.",
+            f"{', '.join(operation.missing_grids)}. `pyproj sync --file NAME` installs it.",
         )
     if crs.height_unit != "metre":
         remarks.assume("height-unit", f"Heights of {crs.name} are in {crs.height_unit}.")

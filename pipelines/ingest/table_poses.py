@@ -208,7 +208,8 @@ def _with_heights(table: PoseTable, photos: Sequence[Photo], crs: PointCrs, rema
     places = [f"{table.path.name}:{line}" for line in table.lines[~filled]]
     remarks.warn_counted("row-without-height", places, "Rows without a height are left out")
     if not filled.any():
-        raise InputError("no-heights", "The file has no heights (z), and EXIF has none either.", path=table.path)
+        message = "The file has no heights (z), and EXIF has none either. Add a column of heights."
+        raise InputError("no-heights", message, path=table.path)
     return replace(table, xyz=xyz).take(filled)
 
 

@@ -172,7 +172,8 @@ class _Table:
     def read(self, table: Any) -> _Settings:
         """Return the content of the table, or raise an InputError for an unknown key or a bad value."""
         if not isinstance(table, dict):
-            raise InputError("not-a-table", "is not a table.", path=self.path, field=self.name)
+            message = f"is not a table. Write [{self.name}], and its options below."
+            raise InputError("not-a-table", message, path=self.path, field=self.name)
         own: dict[str, str] = {}
         flags: dict[str, dict[str, Any]] = {}
         for key, value in table.items():
