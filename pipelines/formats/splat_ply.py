@@ -88,8 +88,7 @@ def join_splat_plys(parts: Sequence[Path], path: Path) -> int:
         lines += [*(f"property float {name}" for name in plys[0].names), "end_header\n"]
         stream.write("\n".join(lines).encode("ascii"))
         for ply in plys:
-            # Not `tofile`, whose error does not say why a disk takes no more.
-            stream.write(np.ascontiguousarray(_columns(ply, ply.names), dtype="<f4").data)
+            _columns(ply, ply.names).astype("<f4", copy=False).tofile(stream)
     replace_file(draft, path)
     return count
 
