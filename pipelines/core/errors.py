@@ -6,6 +6,7 @@ The command line prints a `GeorefError` as one message. Every other exception is
 from __future__ import annotations
 
 import errno
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -150,6 +151,7 @@ class DamagedPartialError(InputError):
 
 
 _SQLITE_ERRNO = {8: errno.EROFS, 10: errno.EIO, 13: errno.ENOSPC}
+_WRITTEN_IN_PART = re.compile(r"\d+ requested and \d+ written")  # numpy: a full disk
 _DISK_FAILURES = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 _NATIVE_WORDS = {
     "disk is full": errno.ENOSPC,
@@ -194,6 +196,8 @@ def storage_error(error: BaseException, place: Path | None = None) -> StorageErr
         code = cause.errno if isinstance(cause, OSError) else None
         # An error of sqlite3, known by its code: the module need not be imported for it.
         code = _SQLITE_ERRNO.get(getattr(cause, "sqlite_errorcode", 0) & 0xFF, code)
+        if isinstance(cause, OSError) and _WRITTEN_IN_PART.fullmatch(str(cause)):
+            code = errno.ENOSPC
         if code in _STORAGE_REASONS and (cause is error or code in _DISK_FAILURES):
             path = getattr(cause, "filename", None)
             return StorageError(*_storage_message(code, path or place or "workspace or output"))

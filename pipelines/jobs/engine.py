@@ -114,7 +114,7 @@ class JobLine:
                 self._outer = None
 
     def advance(self, steps: int = 1, note: str = "", left_s: float | None = None) -> None:
-        self.place = note or self.place
+        self.place = note.strip() or self.place
         self.show(steps, self.place)
 
     def show(self, steps: int, note: str) -> None:

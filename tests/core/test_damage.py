@@ -6,6 +6,7 @@ import errno
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pipelines.core import runner
@@ -123,6 +124,15 @@ def test_what_stands_where_a_stage_writes(
         runner.run_pipeline(workspace, PIPELINE, {"ingest": {"images": photos}})
     assert (elsewhere / "mine").is_dir()
     states.status(workspace)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
+def test_an_array_written_in_part_is_a_full_disk() -> None:
+    """numpy's error has no number."""
+    with Path("/dev/full").open("wb", buffering=0) as full, pytest.raises(OSError) as error:
+        np.zeros(100_000).tofile(full)
+    storage = storage_error(error.value, Path("cache"))
+    assert storage is not None and storage.code == "storage-enospc"
 
 
 def test_storage_error_behind_another_error() -> None:
