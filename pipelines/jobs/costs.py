@@ -113,13 +113,9 @@ def iteration_seconds(pixels: float, gaussians: float, *, surface: bool, crops: 
 
 @dataclass(frozen=True)
 class BlockCost:
-    """Cost of a block's training: c₀ + c₁ · pixels + c₂ · visible Gaussians + c₃ · all of them, each in millions.
+    """Cost of a training: c₀ + c₁ · pixels + c₂ · visible Gaussians + c₃ · all of them, each in millions."""
 
-    Attributes:
-        coefficients: (4,) c₀ … c₃: processor seconds of an iteration, or bytes of the process at its peak.
-    """
-
-    coefficients: FloatArray
+    coefficients: FloatArray  # (4,) c₀ … c₃: processor seconds of an iteration, or bytes of the process at its peak
 
     def of(self, pixels: float, visible: float, gaussians: float) -> float:
         """Return the cost of a block with so many pixels and visible Gaussians in a view, and Gaussians in all."""

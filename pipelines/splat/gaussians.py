@@ -23,21 +23,13 @@ from pipelines.splat import sh
 
 @dataclass
 class Gaussians:
-    """N Gaussians in the `model` frame, float32 on one device.
+    """N Gaussians in the `model` frame, float32 on one device."""
 
-    Attributes:
-        means: (N, 3) centres in metres.
-        quats_wxyz: (N, 4) rotations (model ← principal axes), not necessarily of unit length.
-        log_scales: (N, 3) natural logarithm of the standard deviations along the principal axes, in metres.
-        logit_opacities: (N,) logit of the opacity.
-        sh: (N, K, 3) spherical-harmonic coefficients, K = (degree + 1)²; colour = 0.5 + Σ SH, clamped at 0.
-    """
-
-    means: Tensor
-    quats_wxyz: Tensor
-    log_scales: Tensor
-    logit_opacities: Tensor
-    sh: Tensor
+    means: Tensor  # (N, 3) centres in metres
+    quats_wxyz: Tensor  # (N, 4) rotations (model ← principal axes), not necessarily of unit length
+    log_scales: Tensor  # (N, 3) natural logarithm of σ along the principal axes, in metres
+    logit_opacities: Tensor  # (N,) logit of the opacity
+    sh: Tensor  # (N, K, 3) spherical-harmonic coefficients, K = (degree + 1)²; colour = 0.5 + Σ SH, clamped at 0
 
     def __len__(self) -> int:
         return len(self.means)

@@ -98,24 +98,15 @@ _FIRMNESS = 9.0  # additional slope of the loss of depths that near to their poi
 
 @dataclass(frozen=True)
 class SurfaceSettings:
-    """Weights of the losses.
+    """Weights of the losses."""
 
-    Attributes:
-        depth: of the mean relative difference of depth at the points of the surface, see `depth_loss`.
-        compactness: of the logarithm that bounds the loss of haze before and behind a surface.
-        flatness: of the mean smallest standard deviation, in scene extents.
-        normals: of the depth–normal consistency,
-        normals_from: fraction of the training from which it counts,
-        normals_every: and iterations between two of its renders, by which its weight is multiplied.
-        edge: depth steps between neighbouring pixels above this fraction of the depth are edges, without a normal.
-    """
-
-    depth: float = 1.0
-    compactness: float = 0.01
-    flatness: float = 1.0
-    normals: float = 0.01
-    normals_from: float = 0.5
-    normals_every: int = 4
+    depth: float = 1.0  # of the mean relative difference of depth at the points of the surface, see `depth_loss`
+    compactness: float = 0.01  # of the logarithm that bounds the loss of haze before and behind a surface
+    flatness: float = 1.0  # of the mean smallest standard deviation, in scene extents
+    normals: float = 0.01  # of the depth–normal consistency
+    normals_from: float = 0.5  # fraction of the training from which it counts
+    normals_every: int = 4  # iterations between two of its renders, by which its weight is multiplied
+    # depth steps between neighbouring pixels above this fraction of the depth are edges, without a normal
     edge: float = 0.05
 
 

@@ -80,25 +80,15 @@ _ABOVE_M, _BELOW_M = 500.0, 500.0  # a wrong datum must show itself, not lie out
 
 @dataclass(frozen=True)
 class LidarCloud:
-    """P points.
+    """P points."""
 
-    Attributes:
-        position_in_model: (P, 3) metres, moved along the normal onto the plane through the neighbours.
-        normal_in_model: (P, 3) unit vectors of the planes through their neighbours, with an arbitrary sign.
-        roughness_m: (P,) RMS of the neighbours about that plane.
-        reach_m: (P,) distance to the furthest of these neighbours.
-        classification: (P,) class of LAS.
-        voxel_m: distance between the points, about.
-        scanner_in_model: (P, 3) the scanner's place at the time of each point; NaN where unknown. None: unknown.
-    """
-
-    position_in_model: FloatArray
-    normal_in_model: FloatArray
-    roughness_m: FloatArray
-    reach_m: FloatArray
-    classification: ByteArray
-    voxel_m: float
-    scanner_in_model: FloatArray | None = None
+    position_in_model: FloatArray  # (P, 3) metres, moved along the normal onto the plane through the neighbours
+    normal_in_model: FloatArray  # (P, 3) unit vectors of these planes, with an arbitrary sign
+    roughness_m: FloatArray  # (P,) RMS of the neighbours about that plane
+    reach_m: FloatArray  # (P,) distance to the furthest of these neighbours
+    classification: ByteArray  # (P,) class of LAS
+    voxel_m: float  # distance between the points, about
+    scanner_in_model: FloatArray | None = None  # (P, 3) its place; NaN or None: unknown
 
     def __len__(self) -> int:
         return len(self.position_in_model)

@@ -107,21 +107,15 @@ _SPARE_BYTES = 1 << 28  # of the disk, to be left free
 
 @dataclass(frozen=True)
 class SurfaceView:
-    """Surface as one training camera sees it.
+    """Surface as one training camera sees it."""
 
-    Attributes:
-        camera: index among the cameras of the trained model.
-        pinhole: at the size of the maps.
-        depth_m: (H, W) along the camera's z axis, read-only; 0: no surface.
-        rgb: (H, W, 3) colours of the render, read-only; None if they are not kept. They have no
-            exposure of a photograph, so that views meet without a seam.
-    """
-
-    camera: int
-    pinhole: Pinhole
+    camera: int  # index among the cameras of the trained model
+    pinhole: Pinhole  # at the size of the maps
     cam_from_model: FloatArray
     cam_center_in_model: FloatArray
-    depth_m: Float32Array
+    depth_m: Float32Array  # (H, W) along the camera's z axis, read-only; 0: no surface
+    # (H, W, 3) colours of the render, read-only; None if they are not kept. They have no exposure of a photograph,
+    # so that views meet without a seam
     rgb: ByteArray | None
 
     def points(self, rows: IntArray, columns: IntArray) -> FloatArray:

@@ -57,22 +57,14 @@ _LEAST_BEAMS = 3
 
 @dataclass(frozen=True)
 class ComparedLidar:
-    """Cloud of the scene, in `model`, compared with the photographs and not moved.
-
-    Attributes:
-        maps: depth maps of the training views.
-        views: the same as one set.
-        shown: (S, 3) surface that they show.
-        pixel_m: size of their pixels on the surface.
-        registration: shift of the cloud, and its record.
-    """
+    """Cloud of the scene, in `model`, compared with the photographs and not moved."""
 
     cloud: LidarCloud
-    maps: DepthMaps
-    views: DepthViews
-    shown: FloatArray
-    pixel_m: float
-    registration: Registration
+    maps: DepthMaps  # depth maps of the training views
+    views: DepthViews  # the same as one set
+    shown: FloatArray  # (S, 3) surface that they show
+    pixel_m: float  # size of their pixels on the surface
+    registration: Registration  # shift of the cloud, and its record
     record: LidarRegistration
 
 

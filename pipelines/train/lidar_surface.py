@@ -48,38 +48,24 @@ _SPARSE = 4.0  # distances between points, to the furthest neighbour on a well-s
 
 @dataclass(frozen=True)
 class ChangedArea:
-    """Area where cloud and photographs are inconsistent.
+    """Area where cloud and photographs are inconsistent."""
 
-    Attributes:
-        kind: `removed`: the photographs look through the cloud; `added`: they show a surface above it.
-        area_m2: in plan.
-        points: number of points of the cloud.
-        center_in_model: (3,) their mean.
-        cell_m: side of the area's cells in plan.
-        cells: (C, 2) their south-western corners in `model`, for maps.
-    """
-
+    # `removed`: the photographs look through the cloud; `added`: they show a surface above it
     kind: Literal["removed", "added"]
-    area_m2: float
-    points: int
-    center_in_model: FloatArray
-    cell_m: float
-    cells: FloatArray
+    area_m2: float  # in plan
+    points: int  # number of points of the cloud
+    center_in_model: FloatArray  # (3,) their mean
+    cell_m: float  # side of the area's cells in plan
+    cells: FloatArray  # (C, 2) their south-western corners in `model`, for maps
 
 
 @dataclass(frozen=True)
 class CloudVerdict:
-    """What the photographs say of a cloud.
+    """What the photographs say of a cloud."""
 
-    Attributes:
-        rejected: (P,) whether a point is inconsistent with the photographs.
-        confidence: (P,) in the points, 0 … 1; 0 where they are inconsistent with the photographs.
-        areas: that have changed, the largest first.
-    """
-
-    rejected: BoolArray
-    confidence: FloatArray
-    areas: tuple[ChangedArea, ...]
+    rejected: BoolArray  # (P,) inconsistent with the photographs
+    confidence: FloatArray  # (P,) 0 … 1; 0 where the point is inconsistent with the photographs
+    areas: tuple[ChangedArea, ...]  # that have changed, the largest first
 
 
 def verdict(

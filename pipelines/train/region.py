@@ -89,19 +89,12 @@ class SceneBox:
 
 @dataclass(frozen=True)
 class TrainingRegion:
-    """Region of a training.
+    """Region of a training."""
 
-    Attributes:
-        cell: where the Gaussians are trained, in `model`.
-        box: of the survey; far beyond it lie sky and horizon.
-        surroundings: frozen Gaussians outside the cell, on the device of the training.
-        sky: Gaussians of the cell beyond the box, to start from.
-    """
-
-    cell: BlockCell
-    box: SceneBox
-    surroundings: Gaussians
-    sky: Gaussians
+    cell: BlockCell  # where the Gaussians are trained, in `model`
+    box: SceneBox  # of the survey; far beyond it lie sky and horizon
+    surroundings: Gaussians  # frozen Gaussians outside the cell, on the device of the training
+    sky: Gaussians  # Gaussians of the cell beyond the box, to start from
     masks: RegionMasks
 
 

@@ -23,33 +23,21 @@ BACKGROUND = (0.0, 0.0, 0.0)  # RGB behind the scene
 
 @dataclass(frozen=True)
 class JointOptions:
-    """Settings of the joint optimisation.
-
-    Attributes:
-        sh_degree: degree that the spherical harmonics reach.
-        losses: weights that the user decides.
-        similarity_rate: first learning rate of the similarity and of systematic errors of the measurements, in
-            standard deviations an iteration.
-        camera_rate: first learning rate of the camera corrections, in standard deviations an iteration.
-        seed: of the order of views.
-        coarse: (factor, fraction) pairs: photographs are shrunken by a factor up to a fraction of the training.
-        coarse_least_px: lower limit of the longest side of a shrunken photograph.
-        crops: of large photographs; None: all are trained as wholes.
-        surface: weights of the surface losses; None: no surface losses.
-        finishing: whether the Gaussians are trained already, with all their harmonics.
-    """
+    """Settings of the joint optimisation."""
 
     iterations: int
-    sh_degree: int = 3
-    losses: LossOptions = field(default_factory=LossOptions)
+    sh_degree: int = 3  # that the spherical harmonics reach
+    losses: LossOptions = field(default_factory=LossOptions)  # weights that the user decides
+    # first learning rate of the similarity and of systematic errors of the measurements, in standard deviations an
+    # iteration
     similarity_rate: float = 0.1
-    camera_rate: float = 0.01
-    seed: int = 0
-    coarse: tuple[tuple[int, float], ...] = ()
-    coarse_least_px: int = 160
-    crops: Crops | None = None
-    surface: SurfaceSettings | None = None
-    finishing: bool = False
+    camera_rate: float = 0.01  # first learning rate of the camera corrections, in standard deviations an iteration
+    seed: int = 0  # of the order of views
+    coarse: tuple[tuple[int, float], ...] = ()  # (factor, fraction): shrunken up to a fraction
+    coarse_least_px: int = 160  # lower limit of the longest side of a shrunken photograph
+    crops: Crops | None = None  # of large photographs; None: none
+    surface: SurfaceSettings | None = None  # weights; None: no surface losses
+    finishing: bool = False  # the Gaussians are trained already, with all their harmonics
 
     @classmethod
     def of(cls, options: TrainOptions) -> JointOptions:

@@ -75,17 +75,11 @@ _CANDIDATES = 8  # drawn for each wanted point, so that they cover places that f
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """P points of the surface.
+    """P points of the surface."""
 
-    Attributes:
-        point_in_model: (P, 3) metres.
-        rgb: (P, 3) uint8.
-        normal_in_model: (P, 3) unit vectors with an arbitrary sign; NaN where unknown.
-    """
-
-    point_in_model: FloatArray
-    rgb: ByteArray
-    normal_in_model: FloatArray
+    point_in_model: FloatArray  # (P, 3) metres
+    rgb: ByteArray  # (P, 3) uint8
+    normal_in_model: FloatArray  # (P, 3) unit vectors with an arbitrary sign; NaN where unknown
 
 
 class SceneSurface:

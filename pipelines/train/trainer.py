@@ -57,39 +57,25 @@ _WATCHED = ("means", "quats_wxyz", "log_scales", "logit_opacities")
 
 @dataclass(frozen=True)
 class TrainingViews:
-    """Training views, with the data that their renders are compared with.
+    """Training views, with the data that their renders are compared with."""
 
-    Attributes:
-        camera: (V,) indices of the training views, into cameras and images.
-        surface: returns the points in `model`, float32, that an image shows; None: no depth loss.
-        lenses: lenses with which the images were undistorted; None: the lenses never change.
-        measured: losses of a surface that was measured.
-    """
-
-    camera: IntArray
+    camera: IntArray  # (V,) indices of the training views, into cameras and images
     images: ImageCache
+    # returns the points in `model`, float32, that an image shows; None: no depth loss
     surface: Callable[[int], ObservedPoints] | None = None
-    lenses: Lenses | None = None
-    measured: Sequence[Loss] = ()
+    lenses: Lenses | None = None  # with which the images were undistorted; None: they never change
+    measured: Sequence[Loss] = ()  # of a surface that was measured
 
 
 @dataclass(frozen=True)
 class StepReport:
-    """Figures of one iteration; the scalar tensors are still on the device, because fetching them would wait.
+    """Figures of one iteration; the scalar tensors are still on the device, because fetching them would wait."""
 
-    Attributes:
-        losses: value of each loss that the view has, by its name, not yet weighted.
-        mean_square_error: of colours from 0 to 1, over the pixels that count.
-        weight: w(t), the weight of the geographic losses.
-        visible: number of Gaussians in the view, those around a region among them.
-        pixels: of the render.
-    """
-
-    losses: dict[str, Tensor]
-    mean_square_error: Tensor
-    weight: float
-    visible: int
-    pixels: int
+    losses: dict[str, Tensor]  # not yet weighted
+    mean_square_error: Tensor  # of colours from 0 to 1, over the pixels that count
+    weight: float  # w(t), the weight of the geographic losses
+    visible: int  # number of Gaussians in the view, those around a region among them
+    pixels: int  # of the render
 
 
 class _Stateful(Protocol):

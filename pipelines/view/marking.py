@@ -34,17 +34,12 @@ _IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 @dataclass(frozen=True)
 class MarkedPoint:
-    """Point with its marks.
-
-    Attributes:
-        xyz: surveyed coordinates in the CRS; None: not surveyed.
-        marks: place in pixels of the full image, by image.
-    """
+    """Point with its marks."""
 
     name: str
-    xyz: tuple[float, float, float] | None
+    xyz: tuple[float, float, float] | None  # in the CRS; None: not surveyed
     is_check: bool = False
-    marks: dict[str, tuple[float, float]] = field(default_factory=dict)
+    marks: dict[str, tuple[float, float]] = field(default_factory=dict)  # px by image
 
     def with_mark(self, image: str, place_px: tuple[float, float] | None) -> MarkedPoint:
         """Return the point with another mark in an image; None takes the mark away."""

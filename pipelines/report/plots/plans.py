@@ -199,17 +199,11 @@ _OVERLAP_STEPS = (1, 2, 3, 4, 5, 7, 10, 15, 20)
 
 @dataclass(frozen=True)
 class NamedPlaces:
-    """Surveyed points to mark on a map.
+    """Surveyed points to mark on a map."""
 
-    Attributes:
-        place_m: (K, 2) east and north.
-        names: of the points; empty: none is written.
-        error_m: (K, 3) east, north, up, to be drawn as arrows; NaN: not measured; None: no arrows.
-    """
-
-    place_m: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
-    names: Sequence[str] = ()
-    error_m: FloatArray | None = None
+    place_m: FloatArray = field(default_factory=lambda: np.empty((0, 2)))  # (K, 2) east and north
+    names: Sequence[str] = ()  # empty: none is written
+    error_m: FloatArray | None = None  # (K, 3) east, north, up, as arrows; NaN: not measured
 
 
 NO_PLACES = NamedPlaces()

@@ -101,21 +101,13 @@ class _RenderContext:
 
 @dataclass
 class TileLists:
-    """H hits of M splats in the tiles of an image.
+    """H hits of M splats in the tiles of an image."""
 
-    Attributes:
-        hits: (H,) packed, by tile, nearest first.
-        tile_start: (tiles + 1,) into `hits`.
-        tile_end: (tiles,) hit at which blending stopped because all pixels were done.
-        splat_start: (M + 1,) into `places`.
-        places: (H,) into `hits`, by splat.
-    """
-
-    hits: _Array
-    tile_start: _Array
-    tile_end: _Array
-    splat_start: _Array
-    places: _Array
+    hits: _Array  # (H,) packed, by tile, nearest first
+    tile_start: _Array  # (tiles + 1,) into `hits`
+    tile_end: _Array  # (tiles,) hit at which blending stopped because all pixels were done
+    splat_start: _Array  # (M + 1,) into `places`
+    places: _Array  # (H,) into `hits`, by splat
 
 
 class _Rasterize(torch.autograd.Function):

@@ -39,21 +39,13 @@ _MOST_OBSERVATIONS = 6_000_000
 
 @dataclass(frozen=True)
 class ObservedSurface:
-    """P points of the surface, and their M observations in n training images.
+    """P points of the surface, and their M observations in n training images."""
 
-    Attributes:
-        point_in_model: (P, 3) metres.
-        surface: (P,) share of the survey's surface that each point stands for; sum 1.
-        obs_point: (M,) index of the point.
-        obs_image: (M,) index of the image.
-        obs_share: (M,) share of the image that the observation stands for; sum 1 in each image with observations.
-    """
-
-    point_in_model: FloatArray
-    surface: FloatArray
-    obs_point: IntArray
-    obs_image: IntArray
-    obs_share: FloatArray
+    point_in_model: FloatArray  # (P, 3) metres
+    surface: FloatArray  # (P,) share of the survey's surface that each point stands for; sum 1
+    obs_point: IntArray  # (M,) indices
+    obs_image: IntArray  # (M,) indices
+    obs_share: FloatArray  # (M,) share of the image that it stands for; sum 1 in each image with any
 
     def share_in_views(self, inside: BoolArray, images: int) -> FloatArray:
         """Return the share (n,) of each image that shows the points of a mask (P,), 0 … 1."""
