@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from pipelines.core.errors import ConvergenceError
-from pipelines.core.types import Float32Array
+from pipelines.core.types import Float32Array, Rows
 from pipelines.formats.splat_ply import SplatArrays, read_splat_ply, write_splat_ply
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.geometry.similarity import Similarity
@@ -22,7 +22,7 @@ from pipelines.splat import sh
 
 
 @dataclass
-class Gaussians:
+class Gaussians(Rows):
     """N Gaussians in the `model` frame, float32 on one device."""
 
     means: Tensor  # (N, 3) centres in metres
@@ -30,9 +30,6 @@ class Gaussians:
     log_scales: Tensor  # (N, 3) natural logarithm of σ along the principal axes, in metres
     logit_opacities: Tensor  # (N,) logit of the opacity
     sh: Tensor  # (N, K, 3) spherical-harmonic coefficients, K = (degree + 1)²; colour = 0.5 + Σ SH, clamped at 0
-
-    def __len__(self) -> int:
-        return len(self.means)
 
     @property
     def sh_degree(self) -> int:

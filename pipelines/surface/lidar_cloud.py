@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from pipelines.core.errors import InputError
 from pipelines.core.progress import SILENT, Progress
-from pipelines.core.types import ByteArray, FloatArray, IntArray
+from pipelines.core.types import ByteArray, FloatArray, IntArray, Rows
 from pipelines.formats.trajectory_csv import read_trajectory
 from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import Origin, ecef_from_lla, enu_from_ecef
@@ -79,7 +79,7 @@ _ABOVE_M, _BELOW_M = 500.0, 500.0  # a wrong datum must show itself, not lie out
 
 
 @dataclass(frozen=True)
-class LidarCloud:
+class LidarCloud(Rows):
     """P points."""
 
     position_in_model: FloatArray  # (P, 3) metres, moved along the normal onto the plane through the neighbours
@@ -89,9 +89,6 @@ class LidarCloud:
     classification: ByteArray  # (P,) class of LAS
     voxel_m: float  # distance between the points, about
     scanner_in_model: FloatArray | None = None  # (P, 3) its place; NaN or None: unknown
-
-    def __len__(self) -> int:
-        return len(self.position_in_model)
 
     def moved(self, shift: FloatArray) -> LidarCloud:
         scanner = None if self.scanner_in_model is None else self.scanner_in_model + shift
