@@ -59,15 +59,10 @@ _ONE_SURFACE = 0.003  # of the depth: largest spread of the Gaussians of one sur
 
 
 def depth_at(depth_m: Tensor, alpha: Tensor, xy: Tensor, camera: Pinhole) -> tuple[Tensor, Tensor]:
-    """Return depths (K,) at rays, and whether they count (K,), as 0 and 1.
+    """Return depths (K,) at rays, and whether they count (K,), as 0 and 1, of a render's depth and alpha (H, W).
 
-    Depths are bilinear between pixel centres, and differentiable. Rays outside the image or through pixels without
-    a surface do not count.
-
-    Args:
-        depth_m, alpha: (H, W) of a render, the depth along the camera's z axis.
-        xy: (K, 2) x/z and y/z of the rays.
-        camera: of H × W pixels.
+    The rays are x/z and y/z (K, 2) in the camera of H × W pixels. Depths are bilinear between pixel centres, and
+    differentiable. Rays outside the image or through pixels without a surface do not count.
     """
     x = (camera.fx * xy[:, 0] + camera.cx) / camera.width
     y = (camera.fy * xy[:, 1] + camera.cy) / camera.height

@@ -140,15 +140,11 @@ def read_cloud(
 def planes_of(
     position: FloatArray, classification: ByteArray, voxel_m: float, weight: IntArray | None = None
 ) -> LidarCloud:
-    """Return points (P, 3) with the plane through the neighbours of each.
+    """Return points (P, 3), P ≥ 12, in `model`, about a voxel apart, with the plane through the neighbours of each.
 
-    Args:
-        position: (P, 3) metres in `model`, P ≥ 12.
-        classification: (P,) class of LAS.
-        voxel_m: distance between the points, about.
-        weight: (P,) number of measured points that each stands for; None: 1. Where a noisy surface lies near a
-            border of voxels, the few points beyond the border have as many voxels as the many before it: with
-            equal weights the plane would lie beside the surface, by up to a third of the noise's σ.
+    Each stands for a number of measured points, its weight (P,); None: 1. Where a noisy surface lies near a border
+    of voxels, the few points beyond the border have as many voxels as the many before it: with equal weights the
+    plane would lie beside the surface, by up to a third of the noise's σ.
     """
     count = np.ones(len(position)) if weight is None else weight.astype(np.float64)
     tree = cKDTree(position)

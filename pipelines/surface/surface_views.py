@@ -182,12 +182,10 @@ class SurfaceViews:
         *,
         tolerance: float = SAME_SURFACE,
     ) -> Support:
-        """Return how far the training views agree on points; lengths in metres of `geo`.
+        """Return how far the training views agree on points (N, 3); lengths in metres of `geo`.
 
-        Args:
-            point_in_model: (N, 3) metres.
-            normal_in_model: (N, 3) unit normals with an arbitrary sign; NaN where unknown.
-            tolerance: largest difference of depths on one surface, as a part of the depth.
+        Unit normals (N, 3) have an arbitrary sign; NaN: unknown. Depths of one surface agree within the tolerance,
+        a part of the depth.
         """
         geo_from_model, poses = self._trained.geo_from_model, self._trained.poses
         rotation, center = poses.cam_from_model[self.cameras], poses.cam_center_in_model[self.cameras]

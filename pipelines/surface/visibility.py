@@ -100,13 +100,9 @@ def support(
     tolerance: float,
     normal_in_world: FloatArray | None = None,
 ) -> Support:
-    """Return the support of points by depth maps.
+    """Return the support of points (N, 3), finite, by depth maps; `up_in_world` is a unit vector.
 
-    Args:
-        point_in_world: (N, 3) metres, finite.
-        up_in_world: (3,) unit vector.
-        tolerance: largest difference of depths that agree, as a part of the depth.
-        normal_in_world: (N, 3) unit normals with an arbitrary sign; NaN where unknown.
+    Depths agree within the tolerance, a part of them. Unit normals (N, 3) have an arbitrary sign; NaN: unknown.
     """
     points = np.ascontiguousarray(point_in_world, dtype=np.float64).reshape(-1, 3)
     normals = np.full_like(points, np.nan) if normal_in_world is None else normal_in_world

@@ -76,13 +76,9 @@ def verdict(
     sigma_m: float,
     pixel_m: float,
 ) -> CloudVerdict:
-    """Return confidence and inconsistencies of the P points of a registered cloud.
+    """Return confidence and inconsistencies of the P points of a registered cloud, of a stated σ.
 
-    Args:
-        views: depth maps of the training photographs.
-        surface_in_model: (S, 3) surface that the photographs show together.
-        sigma_m: stated σ of the points.
-        pixel_m: size of a pixel of the depth maps on the surface.
+    The photographs show the depth maps, with pixels of `pixel_m` on the surface, and together the surface (S, 3).
     """
     found = support(cloud.position_in_model, views, UP, _TOLERANCE, cloud.normal_in_model)
     _, nearest = cKDTree(cloud.position_in_model).query(cloud.position_in_model, k=min(_NEIGHBOURS, len(cloud)))

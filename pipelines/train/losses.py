@@ -74,13 +74,10 @@ def training_losses(
     confined: bool = False,
     measured: Sequence[Loss] = (),
 ) -> list[Loss]:
-    """Return the losses of a training.
+    """Return the losses of a training, with those of its problem and strategy; the rasterizer renders normals.
 
-    Args:
-        problem, strategy: have losses of their own: geographic ones, and the penalty of density control.
-        rasterizer: for the render of the normals.
-        confined: whether only pixels of the mask show what is trained.
-        measured: losses of a surface that was measured, used if the options have surface losses.
+    Only pixels of the mask show what is trained if it is `confined`. The losses of a `measured` surface are used if
+    the options have surface losses.
     """
 
     def control_by_depth(view: RenderedView) -> Tensor | None:

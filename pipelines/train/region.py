@@ -109,13 +109,9 @@ def region_masks(
     maps: DepthMaps | None = None,
     progress: Progress = SILENT,
 ) -> RegionMasks:
-    """Return the pixels of each view whose surface lies in a region.
+    """Return the pixels of the views (T,) of cameras whose surface lies in a region, the cell.
 
-    Args:
-        views: (T,) indices of the cameras.
-        cell: the region.
-        stand_in: whose depth counts where the surface is not known.
-        maps: known depths; None: there are none.
+    The depth of the stand-in counts where the maps, if there are any, know none.
     """
     sparse, poses = solved.scene.sparse, solved.adjustment.poses
     pinholes = Pinholes(images, sparse.lenses, solved.adjustment.with_lenses(sparse).lenses)
@@ -133,14 +129,9 @@ def region_masks(
 def region_mask(
     pose: FloatArray, pinhole: Pinhole, cell: BlockCell, known: Float32Array | None, stand_in: Float32Array
 ) -> BoolArray:
-    """Return the pixels (H, W) of a view whose surface lies in a region.
+    """Return the pixels (H, W) of a view, cam ← model (4, 4), whose surface lies in a region, the cell.
 
-    Args:
-        pose: (4, 4) cam ← model.
-        pinhole: of H × W pixels.
-        cell: the region.
-        known: depth in metres along z at any resolution, 0 where unknown; None: unknown everywhere.
-        stand_in: depth in metres along z at any resolution, for the pixels without a known one.
+    Depths along z, in metres, are at any resolution; the stand-in's count where none is known: 0, or None for all.
     """
     size = pinhole.width, pinhole.height
     depth = cv2.resize(np.array(stand_in), size, interpolation=cv2.INTER_NEAREST)

@@ -58,12 +58,7 @@ def pyramid(
     """Return factors by which a photograph is shrunken, and the fraction of the training up to which it is.
 
     A photograph that is trained in crops is first shrunken until it is seen as a whole, and then by half of that
-    factor until density control ends.
-
-    Args:
-        width, height: of the photograph in pixels.
-        coarse: factors and fractions of photographs that are trained as wholes; empty: none is shrunken.
-        crops: of large photographs; None: there are none.
+    factor until density control ends. The others follow `coarse`.
     """
     if not coarse:
         return [(1, 1.0)]

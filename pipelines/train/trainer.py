@@ -327,9 +327,8 @@ def make_trainer(
 ) -> JointTrainer:
     """Return the trainer with initial Gaussians; a DegenerateGeometryError: fewer than two different points.
 
-    Args:
-        problem: the geographic losses, moved to the backend's device.
-        exposures: to be frozen; None: those of the training photographs are fitted, if the options say so.
+    The problem moves to the backend's device. Exposures stay frozen; None: those of the training photographs are
+    fitted, if the options say so.
     """
     effort, device = options.effort, device_of(backend)
     scene, images, surface = training.scene, training.images, training.surface
@@ -365,9 +364,7 @@ def make_finisher(
 ) -> JointTrainer:
     """Return a trainer that goes on with trained Gaussians, at a low rate, and neither adds nor removes any.
 
-    Args:
-        gaussians: on the backend's device.
-        problem: freezes the cameras.
+    The Gaussians are on the backend's device, and the problem freezes the cameras.
     """
     device, scene, iterations = device_of(backend), training.scene, options.effort.iterations
     extent_m = scene_extent(scene.poses.cam_center_in_model[scene.train])

@@ -50,8 +50,7 @@ class MarkedPoint:
 def points_to_mark(survey: Survey, xyz_of: Callable[[tuple[SurveyedPoint, ...]], FloatArray]) -> list[MarkedPoint]:
     """Return the control and check points of a survey with their marks, also those with too few marks to be used.
 
-    Args:
-        xyz_of: returns the coordinates (J, 3) of J points in the CRS.
+    `xyz_of` returns the coordinates (J, 3) of J points in the CRS.
     """
     to_mark = []
     for use, marked in (("control", survey.control_points), ("check", survey.check_points)):

@@ -97,9 +97,7 @@ class ScreenStats:
     def of_part(self, share: float, counted: Tensor | None = None) -> ScreenStats:
         """Return the statistics of a part of an image, as what it adds to those of the whole image.
 
-        Args:
-            share: factor of the gradients: of the part in the loss of the whole.
-            counted: (M,) of the Gaussians that the part counts for the whole; None: all.
+        Gradients are multiplied by the share. For the whole, the part counts Gaussians as `counted` (M,) tells.
         """
         gradient = None if self.mean_gradient is None else share * self.mean_gradient
         return ScreenStats(self.visible, gradient, counted)

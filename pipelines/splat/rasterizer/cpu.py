@@ -70,9 +70,7 @@ _HITS_PER_VISIBLE = 6.0
 def predicted_bytes(count: int, camera: Pinhole, sh_degree: int, *, visible: int | None = None) -> int:
     """Return the peak memory in bytes of one render and its backward pass, with gradients, without parameters.
 
-    Args:
-        sh_degree: of the stored spherical harmonics.
-        visible: number of Gaussians in the image; None: all.
+    Of the Gaussians, whose stored harmonics have a degree, `visible` are in the image; None: all.
     """
     gradients = count * (11 + 3 * (sh_degree + 1) ** 2) * 4 + count * 5
     splats = cpu_project.SPLAT_WIDTH + cpu_project.ELLIPSE_WIDTH

@@ -93,12 +93,8 @@ def cells_of_number(
 ) -> list[BlockCell]:
     """Return cells that divide the plane, or `cell`, with loads as equal as the points allow.
 
-    Args:
-        points: (P, 2 or more) east and north, metres.
-        load: (P,) of each point, ≥ 0.
-
-    Raises:
-        DegenerateGeometryError: the points lie at fewer places than cells are wanted.
+    The points (P, 2 or more) are east and north in metres, their loads (P,) are ≥ 0. A DegenerateGeometryError:
+    they lie at fewer places than cells are wanted.
     """
     if count == 1:
         return [cell]
@@ -112,9 +108,7 @@ def cells_that_fit(
 ) -> list[BlockCell]:
     """Return cells, at most 4096, that divide the plane, halved until each fits; a DegenerateGeometryError: none.
 
-    Args:
-        points, load: as of `cells_of_number`.
-        fits: returns whether a cell, with its extent (2,) in metres, is small enough.
+    Points and loads are as of `cells_of_number`; `fits` tells of a cell, with its extent (2,) in metres.
     """
     waiting, done = [BlockCell()], list[BlockCell]()
     while waiting:

@@ -231,12 +231,7 @@ def distance_term(
     Counted as independent measurements, hundreds of pairs would claim a σ of the scale many times below that of the
     fixes. Their purpose is to steady the scale, not to decide it. None: their share of the information is zero.
 
-    Args:
-        fixes: of the cameras; at least two.
-        points, seed: of `geolocate`, None: take the cameras; of the random pairs.
-
-    Raises:
-        InputError: `points` belongs to another model.
+    There are at least two fixes; the seed is that of the pairs. An InputError: points of another model.
     """
     if points is not None and not np.array_equal(points.point_id, scene.sparse.point_id):
         raise InputError(
@@ -342,12 +337,8 @@ def depth_residuals(
 ) -> Tensor:
     """Return T(c_i + R_iᵀ z (x, y, 1)) − X_j (K, 3) in metres, of the K marks of one camera.
 
-    Args:
-        pose: rotation cam ← model (3, 3) and centre (3,) of that camera.
-        geo_from_model: the similarity T.
-        position_in_geo: (K, 3) metres, surveyed, of each mark.
-        xy: (K, 2) x/z and y/z of the marks' rays.
-        depth_m: (K,) rendered depth along the camera's z axis at the marks.
+    T is `geo_from_model`; the pose has a rotation cam ← model (3, 3) and a centre (3,). Each mark has the surveyed
+    position (K, 3), its ray x/z and y/z (K, 2), and the rendered depth (K,) along the camera's z axis.
     """
     rotation, center = pose
     ray = torch.nn.functional.pad(xy, (0, 1), value=1.0)
