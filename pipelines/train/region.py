@@ -46,11 +46,9 @@ class RegionMasks:
     def __init__(self, masks: dict[int, BoolArray]) -> None:
         self._shape = {index: mask.shape for index, mask in masks.items()}
         self._packed: dict[int, ByteArray] = {index: np.packbits(mask) for index, mask in masks.items()}
+        # Indices of the views that show the region, ascending.
+        self.seeing = np.array(sorted(index for index, mask in masks.items() if mask.any()), dtype=np.int64)
         self.view = lru_cache(_KEPT)(self._view)
-
-    def seeing(self) -> IntArray:
-        """Return the indices of the views that show the region, ascending."""
-        return np.array(sorted(index for index, packed in self._packed.items() if packed.any()), dtype=np.int64)
 
     def _view(self, index: int, shrink: int = 1) -> RegionView:
         """Return the part of a view, at 1/`shrink` of its size, that shows the region; at least one pixel."""

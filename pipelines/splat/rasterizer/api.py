@@ -97,7 +97,7 @@ class ScreenStats:
     def of_part(self, share: float, counted: Tensor | None = None) -> ScreenStats:
         """Return the statistics of a part of an image, as what it adds to those of the whole image.
 
-        Gradients are multiplied by the share. For the whole, the part counts Gaussians as `counted` (M,) tells.
+        The share multiplies the gradients. For the whole, the part counts the `counted` (M,); None: all.
         """
         gradient = None if self.mean_gradient is None else share * self.mean_gradient
         return ScreenStats(self.visible, gradient, counted)
