@@ -32,7 +32,7 @@ class BrownLens:
     height: int
     focal_px: float
     center_px: tuple[float, float]  # principal point; the centre of the top-left pixel is (0.5, 0.5)
-    k1: float = 0.0  # radial and tangential coefficients of Brown's model, as OpenCV orders them
+    k1: float = 0.0  # k1, k2 radial, p1, p2 tangential coefficients of Brown's model, as in OpenCV
     k2: float = 0.0
     p1: float = 0.0
     p2: float = 0.0

@@ -88,7 +88,7 @@ class LidarCloud(Rows):
     reach_m: FloatArray  # (P,) distance to the furthest of these neighbours
     classification: ByteArray  # (P,) class of LAS
     voxel_m: float  # distance between the points, about
-    scanner_in_model: FloatArray | None = None  # (P, 3) its place; NaN or None: unknown
+    scanner_in_model: FloatArray | None = None  # (P, 3) at the time of each point; NaN, None: unknown
 
     def moved(self, shift: FloatArray) -> LidarCloud:
         scanner = None if self.scanner_in_model is None else self.scanner_in_model + shift

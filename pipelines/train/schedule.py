@@ -32,9 +32,9 @@ class JointOptions:
     similarity_rate: float = 0.1
     camera_rate: float = 0.01  # first learning rate of the camera corrections, in standard deviations an iteration
     seed: int = 0  # of the order of views
-    coarse: tuple[tuple[int, float], ...] = ()  # (factor, fraction): shrunken up to a fraction
+    coarse: tuple[tuple[int, float], ...] = ()  # (factor, fraction of the training that sees them shrunken)
     coarse_least_px: int = 160  # lower limit of the longest side of a shrunken photograph
-    crops: Crops | None = None  # of large photographs; None: none
+    crops: Crops | None = None  # of large photographs; None: all are trained as wholes
     surface: SurfaceSettings | None = None  # weights; None: no surface losses
     finishing: bool = False  # the Gaussians are trained already, with all their harmonics
 

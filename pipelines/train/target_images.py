@@ -105,7 +105,8 @@ class ImagePart:
     # all pixels that count
     weight: float = 1.0
     share: float = 1.0  # of the whole photograph's counting pixels, if a region is trained; else 1
-    low: tuple[float, float] = (-inf, -inf)  # corner (x, y) of the crop in px
+    # Corners (x, y) of the crop in px: the centre of each Gaussian lies between those of one crop.
+    low: tuple[float, float] = (-inf, -inf)
     high: tuple[float, float] = (inf, inf)  # infinite where no other crop follows
 
 

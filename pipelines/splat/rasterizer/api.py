@@ -72,7 +72,7 @@ class RasterSettings:
     near_m: float = 0.05  # Gaussians with a nearer centre are left out
     dilation_px2: float = 0.3  # added to the diagonal of the screen covariance, in px²
     depth: bool = False  # colour and alpha are always computed
-    median: bool = True  # training needs none, and on a GPU it costs more than all the rest
+    median: bool = True  # depth; training needs none, and on a GPU it costs more than all the rest
     window: Window | None = None  # part of the camera's image that is rendered; None: all of it
 
     def image_of(self, camera: Pinhole) -> Pinhole:
