@@ -39,33 +39,22 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class FoundPhotographs:
-    """Photographs of a survey at a glance.
-
-    Attributes:
-        size_px: width and height of the first, or of the largest camera.
-        bytes: size of the files; None: not known without reading a bag.
-    """
+    """Photographs of a survey at a glance."""
 
     count: int
-    size_px: tuple[int, int]
-    bytes: int | None
+    size_px: tuple[int, int]  # of the first, or of the largest camera
+    bytes: int | None  # size of the files; None: not known without reading a bag
 
 
 @dataclass(frozen=True)
 class RunEstimate:
-    """Estimate of a run.
-
-    Attributes:
-        photographs: of the survey; None: in a bag that was not read yet.
-        seconds: about, by stage, of those that take long.
-        reconstruction, training: None where none would run, or before a bag is read.
-    """
+    """Estimate of a run."""
 
     planned: Sequence[PlannedStage]
-    photographs: FoundPhotographs | None
-    seconds: Mapping[str, float | None]
-    reconstruction: ReconstructionEstimate | None
-    training: TrainingEstimate | None
+    photographs: FoundPhotographs | None  # None: in a bag that was not read yet
+    seconds: Mapping[str, float | None]  # about, by stage, of those that take long
+    reconstruction: ReconstructionEstimate | None  # None where none would run, or before a bag is read
+    training: TrainingEstimate | None  # likewise
 
 
 def estimate_run(

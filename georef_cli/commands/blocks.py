@@ -109,7 +109,7 @@ def _train(ctx: click.Context, parts: Parts, asked: Mapping[str, Flags], values:
         remember(workspace.root, asked)
         plan = train_blocks(parts, progress_for(ctx.obj), force=values["force"])
     if values["as_json"]:
-        print_json({"blocks": [parts.training(block).model_dump(mode="json") for block in plan.blocks]})
+        print_json({"blocks": [training.model_dump(mode="json") for training in parts.trainings(plan)]})
     else:
         print_rich(*job_tables.block_table(plan, parts.states(plan)))
 

@@ -158,7 +158,7 @@ def compare_with_exif(
                 caution.code,
                 f"{path}: {caution.sentence} Correct the wrong file, or continue with --accept-inconsistency.",
             )
-        remarks.caution(caution.code, caution.sentence)
+        remarks.cautions.append(caution)
 
 
 @dataclass(frozen=True)

@@ -161,21 +161,14 @@ BASE_BYTES = 1 << 30
 
 @dataclass(frozen=True)
 class PlannedMission:
-    """Mission with the estimate of its run.
-
-    Attributes:
-        actions: what its run would do with each stage; none where the run will be refused.
-        training_bytes: predicted peak of its training in main memory; 0 without one, or if unknown.
-        inputs: files and folders that its options name.
-        refusal: reason why the run will be refused, else empty.
-    """
+    """Mission with the estimate of its run."""
 
     mission: Mission
-    actions: Mapping[str, Action]
-    training_bytes: int = 0
+    actions: Mapping[str, Action]  # by stage; none where the run will be refused
+    training_bytes: int = 0  # predicted peak in main memory; 0 without training, or if unknown
     uses_gpu: bool = False
-    inputs: tuple[Path, ...] = ()
-    refusal: str = ""
+    inputs: tuple[Path, ...] = ()  # files and folders that its options name
+    refusal: str = ""  # reason why the run will be refused
 
     @property
     def is_current(self) -> bool:

@@ -42,12 +42,10 @@ class ReconstructionCost:
 def reconstruction_cost(
     photographs: int, megapixels: float, pairs: float, *, doubled: bool, max_features: int
 ) -> ReconstructionCost:
-    """Return the estimated seconds of one core for each step.
+    """Return the estimated seconds of one core for each step, of numbers of photographs and of pairs to match.
 
-    Args:
-        photographs, pairs: numbers of photographs, and of pairs that are matched.
-        megapixels, max_features: of each photograph at the size in which features are detected.
-        doubled: whether features are detected on twice that size, too.
+    Megapixels and most features are of each photograph at the size in which features are detected; `doubled`: on
+    twice that size, too.
     """
     detection_s = _FEATURES_MEGAPIXEL_S if doubled else _OWN_SIZE_FEATURES_MEGAPIXEL_S
     found = megapixels * (_FEATURES_MEGAPIXEL if doubled else _OWN_SIZE_FEATURES_MEGAPIXEL)
@@ -98,12 +96,9 @@ SURFACE_FACTOR = 1.9
 
 
 def iteration_seconds(pixels: float, gaussians: float, *, surface: bool, crops: int = 1) -> float:
-    """Return the seconds of one iteration on the machine of `MEASURED_ON`.
+    """Return the seconds of one iteration on the machine of `MEASURED_ON`, with surface losses or without.
 
-    Args:
-        pixels, gaussians: of the photograph, and of the whole model.
-        surface: whether surface losses are on.
-        crops: number of crops in which the photograph is seen, one at an iteration.
+    Pixels are those of the photograph, which is seen in crops, one at an iteration; Gaussians those of the model.
     """
     seen = 1 / crops  # share of the pixels, and of the Gaussians that the photograph shows
     of_gaussians = _MILLION_GAUSSIANS_S * (_UNSEEN_SHARE + (1 - _UNSEEN_SHARE) * seen)
@@ -113,13 +108,9 @@ def iteration_seconds(pixels: float, gaussians: float, *, surface: bool, crops: 
 
 @dataclass(frozen=True)
 class BlockCost:
-    """Cost of a block's training: c₀ + c₁ · pixels + c₂ · visible Gaussians + c₃ · all of them, each in millions.
+    """Cost of a training: c₀ + c₁ · pixels + c₂ · visible Gaussians + c₃ · all of them, each in millions."""
 
-    Attributes:
-        coefficients: (4,) c₀ … c₃: processor seconds of an iteration, or bytes of the process at its peak.
-    """
-
-    coefficients: FloatArray
+    coefficients: FloatArray  # (4,) c₀ … c₃: processor seconds of an iteration, or bytes of the process at its peak
 
     def of(self, pixels: float, visible: float, gaussians: float) -> float:
         """Return the cost of a block with so many pixels and visible Gaussians in a view, and Gaussians in all."""
@@ -130,9 +121,7 @@ class BlockCost:
     def fitted(sizes: FloatArray, measured: FloatArray) -> BlockCost:
         """Return the model that fits measured blocks best in relative terms, with no coefficient below zero.
 
-        Args:
-            sizes: (B, 3) pixels, visible and all Gaussians of each block.
-            measured: (B,) their cost.
+        Sizes (B, 3) are pixels, visible and all Gaussians of each block, whose cost (B,) was measured.
         """
         terms = np.column_stack([np.ones(len(sizes)), sizes / 1e6])
         return BlockCost(nnls(terms / measured[:, None], np.ones(len(measured)))[0])

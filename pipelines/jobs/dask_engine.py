@@ -44,21 +44,14 @@ _BUSY_PAUSE_S, _BUSY_PATIENCE_S = 3.0, 600.0
 
 @dataclass
 class PendingJob:
-    """Job that has not ended.
-
-    Attributes:
-        token: file that its worker must see.
-        avoided: addresses of workers on which it has failed.
-        not_before: time of the next attempt at the earliest.
-        busy_since: time since which its folder is locked by another process; None: it is not.
-    """
+    """Job that has not ended."""
 
     job: Job
-    token: str
+    token: str  # file that its worker must see
     failures: int = 0
-    avoided: set[str] = field(default_factory=set)
-    not_before: float = 0.0
-    busy_since: float | None = None
+    avoided: set[str] = field(default_factory=set)  # workers on which it has failed
+    not_before: float = 0.0  # time of the next attempt at the earliest
+    busy_since: float | None = None  # its folder is locked by another process; None: it is not
 
 
 @dataclass
@@ -73,22 +66,15 @@ class _Attempt:
 
 @dataclass
 class ClusterRun:
-    """Jobs of one call of the engine: their workers, their events, and their further attempts after failures.
-
-    Attributes:
-        waiting: jobs in the order in which they begin where resources allow.
-        at_a_time: most jobs at a time.
-        exchange: through which files go; None: they are shared.
-        progress, task: show a line for each job that runs, and count those that have ended.
-    """
+    """Jobs of one call of the engine: their workers, their events, and their further attempts after failures."""
 
     client: Client
-    waiting: list[PendingJob]
-    at_a_time: int
-    exchange: EngineExchange | None
+    waiting: list[PendingJob]  # in the order in which they begin where resources allow
+    at_a_time: int  # most jobs
+    exchange: EngineExchange | None  # through which files go; None: they are shared
     ended: Callable[[JobEnd], None]
-    progress: Progress
-    task: ProgressTask
+    progress: Progress  # shows a line for each job that runs
+    task: ProgressTask  # counts those that have ended
 
     def __post_init__(self) -> None:
         self._running: dict[str, _Attempt] = {}
@@ -292,15 +278,11 @@ class DaskEngine:
 
     A job whose worker is lost, or that fails for a reason that may belong to the machine, is tried again, on
     another worker if there is one; after three failures it has failed. Workers that join are used, also later.
-
-    Attributes:
-        at_a_time: most jobs at a time; None: as many as the workers take.
-        storage: through which the files of the jobs go; None: the workers share the folders of the jobs.
     """
 
     cluster: ClusterAddress
-    at_a_time: int | None = None
-    storage: Storage | None = None
+    at_a_time: int | None = None  # most jobs; None: as many as the workers take
+    storage: Storage | None = None  # of files; None: the workers share the folders of the jobs
 
     def together(self, jobs: Sequence[Job]) -> int:
         with connected(self.cluster) as client:

@@ -32,20 +32,14 @@ _SEND_EVERY_S = 0.25
 
 
 class JobRequest(TypedDict):
-    """Request to a worker: the arguments of `georef`, by this version, as one attempt at a job.
+    """Request to a worker: the arguments of `georef`, by this version, as one attempt at a job."""
 
-    Attributes:
-        topic: of the events that the engine reads.
-        token: file that a worker sees if it shares the folder of the job; empty: none is needed.
-        parcel: parts that come from a storage; None: the folder is shared.
-    """
-
-    topic: str
+    topic: str  # of the events that the engine reads
     attempt: str
     version: str
     arguments: list[str]
-    token: str
-    parcel: Parcel | None
+    token: str  # file that a worker sees if it shares the folder of the job; empty: none
+    parcel: Parcel | None  # parts that come from a storage; None: the folder is shared
 
 
 def run_job(request: JobRequest) -> None:

@@ -24,40 +24,26 @@ class Job:
     """Command of this program whose repetition completes an earlier, interrupted one.
 
     Only names and paths travel: a job runs on every machine that sees its paths, and leaves its result there.
-
-    Attributes:
-        name: for people, unique among the jobs of a run.
-        arguments: of `georef`.
-        peak_bytes, uses_gpu: predicted peak of the memory, and whether it takes a whole GPU.
-        folder: that its command works in, such as the workspace; a machine that does not see it cannot run the job.
-        writes: file or folder in `folder` that it changes; needed where its files go through a storage.
-        reads: further files and folders in `folder` that it needs there.
     """
 
-    name: str
-    arguments: tuple[str, ...]
-    peak_bytes: int
-    uses_gpu: bool = False
-    folder: Path | None = None
-    writes: Path | None = None
-    reads: tuple[Path, ...] = ()
+    name: str  # for people, unique among the jobs of a run
+    arguments: tuple[str, ...]  # of `georef`
+    peak_bytes: int  # predicted peak of the memory
+    uses_gpu: bool = False  # takes a whole one
+    folder: Path | None = None  # of its command; a machine that does not see it cannot run it
+    writes: Path | None = None  # in `folder`; needed where its files go through a storage
+    reads: tuple[Path, ...] = ()  # further files and folders in `folder` that it needs there
 
 
 @dataclass(frozen=True)
 class JobEnd:
-    """End of a job.
-
-    Attributes:
-        code: exit code; below zero the signal that ended the process.
-        place: step that the job was at (`train`); empty if it named none.
-        error: message of a job that failed, else empty.
-    """
+    """End of a job."""
 
     job: Job
-    code: int
+    code: int  # exit code; below zero the signal that ended the process
     seconds: float
-    place: str
-    error: str
+    place: str  # step that the job was at (`train`); empty if it named none
+    error: str  # message of a job that failed, else empty
 
     @property
     def is_done(self) -> bool:

@@ -145,16 +145,12 @@ _USABLE = 0.9  # of the free memory: other programs grow, too
 
 @dataclass(frozen=True)
 class LocalEngine:
-    """Engine that runs jobs as processes of this machine.
-
-    Attributes:
-        cores, free_bytes: that the jobs share; memory None: unknown, only the number of jobs is limited.
-        program: arguments of Python that start this program.
-    """
+    """Engine that runs jobs as processes of this machine."""
 
     at_a_time: int
-    cores: int
-    free_bytes: int | None = None
+    cores: int  # that the jobs share
+    free_bytes: int | None = None  # likewise; None: unknown, only the number of jobs is limited
+    # arguments of Python that start this program
     program: tuple[str, ...] = field(default_factory=lambda: child.THIS_PROGRAM)
 
     def together(self, jobs: Sequence[Job]) -> int:

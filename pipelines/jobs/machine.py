@@ -45,33 +45,22 @@ class BackendState:
 
 @dataclass(frozen=True)
 class Machine:
-    """What was found on this machine.
+    """What was found on this machine."""
 
-    Attributes:
-        system: operating system, its release, and the processor's architecture.
-        cores, threads: cores that this process may use, and threads that stages compute with (`--threads`).
-        memory_bytes, free_bytes: main memory; None: the system does not state it.
-        extras: optional libraries, by the extra that installs them.
-        cuda_parts: what the cuda backend needs, and what compiles its kernels.
-        cuda_kernels: place of the compiled kernels; None: the first use compiles them.
-        grid_folders, grids: where PROJ looks for grids; file names of the installed geoid models and datum shifts.
-        chromium: path of Chromium or Chrome; None: not found.
-    """
-
-    system: str
+    system: str  # name, release, and the processor's architecture
     python: str
-    cores: int
-    threads: int
-    memory_bytes: int | None
-    free_bytes: int | None
+    cores: int  # that this process may use
+    threads: int  # that stages compute with (`--threads`)
+    memory_bytes: int | None  # main memory; None: the system does not state it
+    free_bytes: int | None  # likewise
     gpus: tuple[Gpu, ...]
     backends: tuple[BackendState, ...]
-    extras: tuple[Part, ...]
-    cuda_parts: tuple[Part, ...]
-    cuda_kernels: str | None
-    grid_folders: tuple[str, ...]
-    grids: tuple[str, ...]
-    chromium: str | None
+    extras: tuple[Part, ...]  # optional libraries, by the extra that installs them
+    cuda_parts: tuple[Part, ...]  # what the cuda backend needs, and what compiles its kernels
+    cuda_kernels: str | None  # place of the compiled kernels; None: the first use compiles them
+    grid_folders: tuple[str, ...]  # where PROJ looks for grids
+    grids: tuple[str, ...]  # file names of the geoid models and datum shifts
+    chromium: str | None  # path of Chromium or Chrome; None: not found
     versions: dict[str, str]
 
 

@@ -41,22 +41,14 @@ Owners = Mapping[str, tuple[str, ...]]
 
 @dataclass(frozen=True)
 class Mission:
-    """Mission of a batch.
+    """Mission of a batch."""
 
-    Attributes:
-        name: unique in the batch, and a name of a folder.
-        workspace, place: its workspace, which may not exist yet; path of it, relative to the folder of the batch.
-        last: last stage to run; None: all.
-        deliver: names of deliverables, as for `georef run --deliver`.
-        flags: options by stage and field.
-    """
-
-    name: str
-    workspace: Workspace
-    place: str
-    last: str | None = None
-    deliver: str | None = None
-    flags: Mapping[str, Flags] = field(default_factory=dict, hash=False)
+    name: str  # unique in the batch, and a name of a folder
+    workspace: Workspace  # which may not exist yet
+    place: str  # its path, relative to the folder of the batch
+    last: str | None = None  # last stage to run; None: all
+    deliver: str | None = None  # as for `georef run --deliver`
+    flags: Mapping[str, Flags] = field(default_factory=dict, hash=False)  # by stage and field
 
     @property
     def stages(self) -> tuple[StageSpec, ...]:

@@ -29,51 +29,37 @@ _SURVEYED = ("rmse_h_m", "rmse_v_m", "rmse_3d_m")
 
 @dataclass(frozen=True)
 class NinetyPercent:
-    """Radii within which 90 % of the errors are expected, and within which 90 % of those measured are.
-
-    Attributes:
-        ce90_m, le90_m: from the RMSE; None without check points.
-        measured_h_m, measured_v_m: empirical 90 % quantile; None with fewer than ten points.
-    """
+    """Radii within which 90 % of the errors are expected, and within which 90 % of those measured are."""
 
     way: str
-    ce90_m: float | None
-    le90_m: float | None
-    measured_h_m: float | None
-    measured_v_m: float | None
+    ce90_m: float | None  # from the RMSE; None without check points
+    le90_m: float | None  # likewise
+    measured_h_m: float | None  # empirical 90 % quantile; None with fewer than ten points
+    measured_v_m: float | None  # likewise
     count: int
 
 
 @dataclass(frozen=True)
 class AccuracyFacts:
-    """Accuracy of an evaluated survey.
+    """Accuracy of an evaluated survey."""
 
-    Attributes:
-        figures, crossed_figures: of the check points, and of the control points that were left out.
-        ninety: CE90 and LE90, triangulated and on the rendered surface.
-        ways: words of the ways that have measured points; `surface`: the rendered surface may be one.
-        chart: predicted against measured σ; None: fewer than three points have both.
-        within: share of the points within 1 σ and 2 σ of the prediction, horizontal and vertical; empty likewise.
-        map, cells: of the predicted σ; None: there is none; and what is told of it, by the beginning of its fields.
-        crossed, crossed_reason: whether control points were cross-validated; why not; empty: they were not to be.
-        quantile_points: fewest points with an empirical quantile.
-    """
-
-    figures: tuple[FigureLine, ...]
-    ninety: tuple[NinetyPercent, ...]
-    ways: dict[str, str]
-    surface: bool
-    chart: Picture | None
+    figures: tuple[FigureLine, ...]  # of the check points
+    ninety: tuple[NinetyPercent, ...]  # CE90 and LE90, triangulated and on the rendered surface
+    ways: dict[str, str]  # words of the ways that have measured points
+    surface: bool  # the rendered surface may be one
+    chart: Picture | None  # predicted against measured σ; None: fewer than three points have both
+    # share of the points within 1 σ and 2 σ of the prediction, horizontal and vertical; empty likewise
     within: tuple[tuple[str, float, float], ...]
-    map: Picture | None
-    crossed: bool
-    crossed_reason: str
-    crossed_figures: tuple[FigureLine, ...]
+    map: Picture | None  # of the predicted σ; None: there is none
+    crossed: bool  # control points were cross-validated
+    crossed_reason: str  # why not; empty: they were not to be
+    crossed_figures: tuple[FigureLine, ...]  # of the control points that were left out
     check_points: int
+    # what is told of the map, by the beginning of its fields
     cells: Mapping[str, Figure] = field(default_factory=lambda: CELLS)
     ce90_factor: float = CE90_OF_AXIS_RMSE
     le90_factor: float = LE90_OF_RMSE
-    quantile_points: int = _LEAST_FOR_QUANTILE
+    quantile_points: int = _LEAST_FOR_QUANTILE  # fewest points with an empirical quantile
 
 
 def accuracy_facts(evaluated: EvaluatedSurvey) -> AccuracyFacts:

@@ -54,36 +54,25 @@ class CameraRow:
 
 @dataclass(frozen=True)
 class CamerasFacts:
-    """Positions of the photographs; a picture, factor or σ is None where there is none.
+    """Positions of the photographs; a picture, factor or σ is None where there is none."""
 
-    Attributes:
-        photographs, registered: numbers in the survey, and in the SfM model; the others are `unregistered`.
-        fixes: number of registered photographs with a fix.
-        sessions: of the fixes, without repeats, each with the σ of their common error.
-        map: adjusted positions, with arrows and ellipses, magnified.
-        no_sigma: reason why there are no ellipses; empty: there are.
-        series: residuals in time if `by_time`; otherwise, in the order of the photographs.
-        bias: of the used fixes; empty without fixes.
-        axes: names of the coordinates with their units.
-    """
-
-    photographs: int
-    registered: int
+    photographs: int  # in the survey
+    registered: int  # in the SfM model; the others are `unregistered`
     unregistered: tuple[str, ...]
-    fixes: int
-    sessions: tuple[FixSession, ...]
-    map: Picture
+    fixes: int  # registered photographs with a fix
+    sessions: tuple[FixSession, ...]  # without repeats, each with the σ of its common error
+    map: Picture  # adjusted positions, with arrows and ellipses, magnified
     arrow_factor: float | None
     ellipse_factor: float | None
-    no_sigma: str
-    series: Picture | None
+    no_sigma: str  # why there are no ellipses; empty: there are
+    series: Picture | None  # in time if `by_time`; otherwise, in the order of the photographs
     by_time: bool
-    bias: tuple[FlightBias, ...]
+    bias: tuple[FlightBias, ...]  # of the used fixes; empty without fixes
     outliers: tuple[Outlier, ...]
     median_sigma_h_m: float | None
     median_sigma_v_m: float | None
     rows: tuple[CameraRow, ...]
-    axes: Texts
+    axes: Texts  # names of the coordinates with their units
 
 
 def cameras_facts(evaluated: EvaluatedSurvey) -> CamerasFacts:
@@ -197,47 +186,32 @@ class LensParameter:
 
 @dataclass(frozen=True)
 class LensFacts:
-    """Lens of a camera.
-
-    Attributes:
-        make_model: as recorded in the photographs; may be empty.
-        photographs, observations: numbers of registered ones, and of their image observations of SfM points.
-        rmse_px: root mean square length of their residuals; None: no observations.
-        correlation: of the parameters; None: not known.
-        residuals: mean residual by image region; None beyond the first lenses, or without observations.
-        factor: magnification of its arrows; None: no arrows.
-    """
+    """Lens of a camera."""
 
     camera_id: int
-    make_model: str
+    make_model: str  # as recorded in the photographs; may be empty
     camera: Camera
-    photographs: int
-    observations: int
-    rmse_px: float | None
+    photographs: int  # registered ones
+    observations: int  # of SfM points
+    rmse_px: float | None  # length of the residuals; None: no observations
     parameters: tuple[LensParameter, ...]
-    correlation: Picture | None
-    residuals: Picture | None
-    factor: float | None
+    correlation: Picture | None  # of the parameters; None: not known
+    residuals: Picture | None  # mean by image region; None beyond the first lenses, or without any
+    factor: float | None  # magnification of its arrows; None: no arrows
 
 
 @dataclass(frozen=True)
 class LensesFacts:
-    """Lenses of a survey, of which the first `drawn` have pictures.
+    """Lenses of a survey, of which the first `drawn` have pictures."""
 
-    Attributes:
-        rmse_px: root mean square length of all residuals; None: no observations.
-        sigma_px: σ of an image coordinate that follows from the residuals of the SfM model; None: not known.
-        no_sigma: reason why σ is not known; empty if known.
-    """
-
-    rmse_px: float | None
-    sigma_px: float | None
+    rmse_px: float | None  # length of all residuals; None: no observations
+    sigma_px: float | None  # of an image coordinate, by the residuals of the SfM model; None: not known
     observations: int
     points: int
     photographs: int
     lenses: tuple[LensFacts, ...]
     drawn: int
-    no_sigma: str
+    no_sigma: str  # why σ is not known; empty if known
 
 
 def lenses_facts(evaluated: EvaluatedSurvey) -> LensesFacts:

@@ -143,30 +143,21 @@ _MOST_LINKS = 4000  # that are drawn
 
 @dataclass(frozen=True)
 class OverlapFacts:
-    """Overlap of a survey; the map and its figures are None without a scene.
-
-    Attributes:
-        median: number of photographs that see half of the cells or more.
-        enough_share: share of the cells that at least `enough` photographs see.
-        matches: graph of the photographs that share points, with the strongest `drawn_links` of the `links`.
-        tied_points: points that a pair must share to count as tied.
-        median_tied: median number of photographs that a photograph is tied to; `least_tied` has fewest.
-        parts: groups of photographs without a common point; 1: all are connected.
-    """
+    """Overlap of a survey; the map and its figures are None without a scene."""
 
     overlap: Picture | None
     cell_m: float | None
-    median: float | None
-    enough_share: float | None
+    median: float | None  # photographs that see half of the cells or more
+    enough_share: float | None  # of the cells, that at least `enough` photographs see
     enough: int
-    matches: Picture
+    matches: Picture  # photographs that share points, with the strongest `drawn_links` of `links`
     links: int
     drawn_links: int
-    tied_points: int
-    median_tied: float
+    tied_points: int  # that a pair must share to count as tied
+    median_tied: float  # photographs that one is tied to; `least_tied` has fewest
     least_tied: str
     least_tied_count: int
-    parts: int
+    parts: int  # groups of photographs without a common point; 1: all are connected
 
 
 def overlap_facts(evaluated: EvaluatedSurvey) -> OverlapFacts:

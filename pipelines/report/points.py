@@ -125,42 +125,29 @@ Kind = Literal["control", "check"]
 
 @dataclass(frozen=True)
 class PointRow:
-    """Surveyed point, with its coordinates in the CRS of the report.
-
-    Attributes:
-        field, surface_field: paths of its rows in the report of `evaluate`, triangulated and on the rendered
-            surface; None: it has none.
-        blunder, predicted: whether it is a blunder, triangulated; whether the row has predicted σ.
-        rmse_px: root mean square distance of its marks from the adjusted point; None: it is not measured.
-    """
+    """Surveyed point, with its coordinates in the CRS of the report."""
 
     name: str
     coordinates: Texts
-    field: str | None
-    blunder: bool
-    predicted: bool
-    surface_field: str | None
-    rmse_px: float | None
+    field: str | None  # path of its row in the report of `evaluate`, triangulated; None: it has none
+    blunder: bool  # triangulated
+    predicted: bool  # the row has predicted σ
+    surface_field: str | None  # likewise, on the rendered surface
+    rmse_px: float | None  # distance of its marks from the adjusted point; None: it is not measured
     chips: tuple[Chip, ...]
 
 
 @dataclass(frozen=True)
 class PointsFacts:
-    """Control or check points of a survey, with the heads of their coordinates' columns.
-
-    Attributes:
-        chips, marks: numbers of chips that are shown, and of marks in registered photographs.
-        side_px: side of a chip in pixels of the photographs.
-        surface: whether points were measured on the rendered surface.
-    """
+    """Control or check points of a survey, with the heads of their coordinates' columns."""
 
     kind: Kind
     heads: Texts
     rows: tuple[PointRow, ...]
-    chips: int
-    marks: int
-    side_px: int
-    surface: bool
+    chips: int  # number that is shown
+    marks: int  # number in registered photographs
+    side_px: int  # of a chip, in pixels of the photographs
+    surface: bool  # points were measured on the rendered surface
 
 
 def points_facts(

@@ -26,41 +26,29 @@ _REPORT = "report"
 
 @dataclass(frozen=True)
 class StageRecord:
-    """Stage as it was run; None: not recorded.
-
-    Attributes:
-        state, reason: as in `georef status`, when the report was made.
-        options: every option by flag, with its value.
-        inputs: SHA-256 by product or flag.
-    """
+    """Stage as it was run; None: not recorded."""
 
     name: str
-    state: str
-    reason: str
+    state: str  # as in `georef status`, when the report was made
+    reason: str  # likewise
     made: datetime | None
     duration_s: float | None
     key_figure: str
-    options: dict[str, str]
-    inputs: dict[str, str]
+    options: dict[str, str]  # by flag, all of them
+    inputs: dict[str, str]  # SHA-256 by product or flag
     warnings: tuple[Remark, ...]
 
 
 @dataclass(frozen=True)
 class RecordFacts:
-    """Processing of a survey: its stages in the order of the work, assumptions of `ingest`, cautions by stage.
-
-    Attributes:
-        total_s: sum of the recorded durations.
-        versions: of this package and its libraries, by name, with the stages that ran with them if not all did.
-        by_hand: stages whose product was put there by hand.
-    """
+    """Processing of a survey: its stages in the order of the work, assumptions of `ingest`, cautions by stage."""
 
     stages: tuple[StageRecord, ...]
-    total_s: float
-    versions: dict[str, str]
+    total_s: float  # sum of the recorded durations
+    versions: dict[str, str]  # by name, with the stages that ran with them if not all did
     assumptions: tuple[Remark, ...]
     cautions: dict[str, tuple[Remark, ...]]
-    by_hand: tuple[str, ...]
+    by_hand: tuple[str, ...]  # stages whose product was put there by hand
 
 
 def record_facts(workspace: Workspace, survey: Survey) -> RecordFacts:

@@ -40,31 +40,21 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Measured:
-    """Measurements that the verdicts need beside the report of `evaluate`.
-
-    Attributes:
-        enough_share: share of the ground that at least `enough` photographs see; None: no scene.
-        parts: groups of photographs that nothing ties to each other.
-        rmse_px: of the reprojection residuals; None: no observations.
-        fixes: number, of the training photographs.
-        control_points: number of used ones; the rejected are `control_outliers`.
-        stale: stages whose product is not current.
-        workspace: path, for commands.
-    """
+    """Measurements that the verdicts need beside the report of `evaluate`."""
 
     photographs: int
     registered: int
-    enough_share: float | None
+    enough_share: float | None  # of the ground, that at least `enough` photographs see; None: no scene
     enough: int
-    parts: int
-    rmse_px: float | None
-    fixes: int
+    parts: int  # groups of photographs that nothing ties to each other
+    rmse_px: float | None  # of the reprojection residuals; None: no observations
+    fixes: int  # number, of the training photographs
     fix_outliers: int
-    control_points: int
+    control_points: int  # used ones; the rejected are `control_outliers`
     control_outliers: int
     check_points: int
-    stale: tuple[str, ...]
-    workspace: str
+    stale: tuple[str, ...]  # stages whose product is not current
+    workspace: str  # path, for commands
 
 
 _Fields = tuple[Level, str, str, str]  # of a verdict without its subject, in their order

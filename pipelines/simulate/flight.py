@@ -28,35 +28,22 @@ DEFAULT_RADIUS_M = {"orbit": 85.0, "grid": 60.0, "facade": 19.0}
 
 @dataclass(frozen=True)
 class FlightPlan:
-    """Plan of a flight.
+    """Plan of a flight."""
 
-    Attributes:
-        kind: "orbit", "grid" or "facade".
-        interval_s: time between photographs; None for 2 s, or more where the aircraft would be faster than 8 m/s.
-        heights_m: above the origin, one round each.
-        radius_m: radius, half side, or distance from the facade.
-    """
-
-    kind: str
+    kind: str  # "orbit", "grid" or "facade"
     images: int
-    interval_s: float | None
-    heights_m: tuple[float, ...]
-    radius_m: float
+    interval_s: float | None  # None for 2 s, or more where the aircraft would be faster than 8 m/s
+    heights_m: tuple[float, ...]  # above the origin, one round each
+    radius_m: float  # radius, half side, or distance from the facade
 
 
 @dataclass(frozen=True)
 class TrueTrajectory:
-    """True motion of the camera. Times are seconds of the camera's clock since the first photograph.
+    """True motion of the camera. Times are seconds of the camera's clock since the first photograph."""
 
-    Attributes:
-        photo_s: (N,) times of the photographs.
-        cam_from_body: (3, 3) nominal mounting: body axes (forward, right, down) → camera.
-        position: camera centres (N, 3) in geo at times (N,); its second derivative is the acceleration in m/s².
-    """
-
-    photo_s: FloatArray
-    cam_from_body: FloatArray
-    position: CubicSpline
+    photo_s: FloatArray  # (N,)
+    cam_from_body: FloatArray  # (3, 3) nominal mounting; body axes: forward, right, down
+    position: CubicSpline  # (N, 3) camera centres in geo at times (N,); second derivative in m/s²
     _angles: PchipInterpolator
 
     @property
@@ -174,23 +161,15 @@ def _facade(
 
 @dataclass(frozen=True)
 class Receiver:
-    """Errors of a GNSS receiver, which states its white noise alone.
+    """Errors of a GNSS receiver, which states its white noise alone."""
 
-    Attributes:
-        sigma_h_m, sigma_v_m: white noise.
-        bias_m: RMS of a slow bias per axis.
-        common_error_m: systematic error of all fixes, east, north, up.
-        outlier_share: share of photographs around which the fixes are wrong.
-        outlier_m: size of these errors.
-    """
-
-    sigma_h_m: float
-    sigma_v_m: float
-    bias_m: float = 0.0
+    sigma_h_m: float  # white noise
+    sigma_v_m: float  # white noise
+    bias_m: float = 0.0  # RMS of a slow bias per axis
     bias_period_s: float = 60.0
-    common_error_m: Vector3 = (0.0, 0.0, 0.0)
-    outlier_share: float = 0.0
-    outlier_m: float = 15.0
+    common_error_m: Vector3 = (0.0, 0.0, 0.0)  # systematic error of all fixes, east, north, up
+    outlier_share: float = 0.0  # share of photographs around which the fixes are wrong
+    outlier_m: float = 15.0  # size of the wrong fixes
 
 
 RECEIVERS = {
@@ -203,53 +182,33 @@ RECEIVERS = {
 
 @dataclass(frozen=True)
 class Mounting:
-    """True arrangement of camera, antenna and clocks.
+    """True arrangement of camera, antenna and clocks."""
 
-    Attributes:
-        antenna_in_body: (3,) metres from the camera's centre, forward-right-down.
-        nominal_from_cam: (3, 3) boresight: true camera axes → nominal axes of the mounting plan.
-        clock_offset_s: navigation clock minus camera clock.
-    """
-
-    antenna_in_body: FloatArray
-    nominal_from_cam: FloatArray
-    clock_offset_s: float
+    antenna_in_body: FloatArray  # (3,) metres from the camera's centre, forward-right-down
+    nominal_from_cam: FloatArray  # (3, 3) boresight: true camera axes → nominal axes of the mounting plan
+    clock_offset_s: float  # navigation clock minus camera clock
 
 
 @dataclass(frozen=True)
 class GnssLog:
-    """Records of the receiver, and the truth behind them.
+    """Records of the receiver, and the truth behind them."""
 
-    Attributes:
-        stamp_ns: (N,) navigation clock.
-        position_in_geo, true_in_geo: (N, 3) measured and true antenna.
-        bias_amplitude_m, bias_phase_rad: (3,) bias(t) = amplitude · sin(2πt/period + phase), t from the first
-            photograph on the camera's clock.
-        wrong_photos: (M,) indices of the photographs with wrong fixes.
-    """
-
-    stamp_ns: IntArray
-    position_in_geo: FloatArray
-    true_in_geo: FloatArray
-    bias_amplitude_m: FloatArray
-    bias_phase_rad: FloatArray
-    wrong_photos: IntArray
+    stamp_ns: IntArray  # (N,) navigation clock
+    position_in_geo: FloatArray  # (N, 3) measured antenna
+    true_in_geo: FloatArray  # (N, 3) true antenna
+    bias_amplitude_m: FloatArray  # (3,) bias(t) = amplitude · sin(2πt/period + phase)
+    bias_phase_rad: FloatArray  # (3,) t from the first photograph on the camera's clock
+    wrong_photos: IntArray  # (M,) indices
 
 
 @dataclass(frozen=True)
 class ImuLog:
-    """Records of the attitude sensor; the body is forward-right-down.
+    """Records of the attitude sensor; the body is forward-right-down."""
 
-    Attributes:
-        stamp_ns: (N,) navigation clock.
-        geo_from_body: (N, 3, 3) measured.
-        rate_in_body: (N, 3) rad/s, specific_force_in_body: (N, 3) m/s².
-    """
-
-    stamp_ns: IntArray
-    geo_from_body: FloatArray
-    rate_in_body: FloatArray
-    specific_force_in_body: FloatArray
+    stamp_ns: IntArray  # (N,) navigation clock
+    geo_from_body: FloatArray  # (N, 3, 3) measured
+    rate_in_body: FloatArray  # (N, 3) rad/s
+    specific_force_in_body: FloatArray  # (N, 3) m/s²
 
 
 def record_gnss(

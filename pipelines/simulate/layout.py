@@ -171,20 +171,14 @@ def paint_yard(painter: GroundPainter, x: float, y: float, rng: np.random.Genera
 
 @dataclass(frozen=True)
 class TownStyle:
-    """Properties by which towns differ.
+    """Properties by which towns differ."""
 
-    Attributes:
-        relief_m: variation of the terrain in the town.
-        storeys: fewest and most of a building with a flat roof.
-        flat_share, built_share: share of the buildings with a flat roof, share of the plots with a building.
-    """
-
-    relief_m: float
-    storeys: tuple[int, int]
-    flat_share: float
+    relief_m: float  # variation of the terrain in the town
+    storeys: tuple[int, int]  # fewest and most of a building with a flat roof
+    flat_share: float  # of the buildings
     tower_storeys: int
     trees: int
-    built_share: float
+    built_share: float  # of the plots
 
 
 STYLES = {

@@ -25,20 +25,14 @@ _TOLERANCE = 1e-12
 
 @dataclass(frozen=True)
 class BrownLens:
-    """Lens of COLMAP's RADIAL or OPENCV kind, with one focal length.
+    """Lens of COLMAP's RADIAL or OPENCV kind, with one focal length."""
 
-    Attributes:
-        model: determines the coefficients in use.
-        center_px: principal point; the centre of the top-left pixel is (0.5, 0.5).
-        k1, k2, p1, p2: radial and tangential coefficients of Brown's model, as OpenCV orders them.
-    """
-
-    model: LensModel
+    model: LensModel  # determines the coefficients in use
     width: int
     height: int
     focal_px: float
-    center_px: tuple[float, float]
-    k1: float = 0.0
+    center_px: tuple[float, float]  # principal point; the centre of the top-left pixel is (0.5, 0.5)
+    k1: float = 0.0  # k1, k2 radial, p1, p2 tangential coefficients of Brown's model, as in OpenCV
     k2: float = 0.0
     p1: float = 0.0
     p2: float = 0.0
@@ -142,17 +136,11 @@ class Pose:
 
 @dataclass(frozen=True)
 class Sensor:
-    """Response of the sensor to light.
+    """Response of the sensor to light."""
 
-    Attributes:
-        gain: exposure of this photograph, 1 for a grey of 18 % under the sun at about mid-scale.
-        tint: (3,) white balance.
-        noise: factor of the noise; 1 is a small sensor at base sensitivity (0.4 % of full scale at mid-scale).
-    """
-
-    gain: float
-    tint: tuple[float, float, float]
-    noise: float
+    gain: float  # exposure of this photograph, 1 for a grey of 18 % under the sun at about mid-scale
+    tint: tuple[float, float, float]  # white balance
+    noise: float  # factor; 1: a small sensor at base sensitivity (0.4 % of full scale at mid-scale)
 
 
 class Renderer:

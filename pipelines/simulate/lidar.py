@@ -48,24 +48,16 @@ _TRACK_S = 0.1  # between places of the scanner's track
 
 @dataclass(frozen=True)
 class Strip:
-    """Strip of the flight, with its P returns.
+    """Strip of the flight, with its P returns."""
 
-    Attributes:
-        number: from 1.
-        position_in_geo: (P, 3) metres, as measured.
-        classification: (P,) class of LAS.
-        of_change: (P,) whether the point lies on the removed building, or at the place of the added one.
-        track_s, track_in_geo: (K,), (K, 3) times and true places of the scanner.
-    """
-
-    number: int
-    position_in_geo: FloatArray
-    classification: ByteArray
-    time_s: FloatArray
-    scan_angle_deg: FloatArray
-    of_change: BoolArray
-    track_s: FloatArray
-    track_in_geo: FloatArray
+    number: int  # from 1
+    position_in_geo: FloatArray  # (P, 3) metres, as measured
+    classification: ByteArray  # (P,) class of LAS
+    time_s: FloatArray  # (P,)
+    scan_angle_deg: FloatArray  # (P,)
+    of_change: BoolArray  # (P,) on the removed building, or at the place of the added one
+    track_s: FloatArray  # (K,)
+    track_in_geo: FloatArray  # (K, 3) true places of the scanner
 
 
 class LidarFlight:

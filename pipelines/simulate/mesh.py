@@ -30,52 +30,32 @@ class Material(IntEnum):
 
 @dataclass(frozen=True)
 class TextureParameters:
-    """Parameters of the texture of one surface: a row of the table that the textures read.
+    """Parameters of the texture of one surface: a row of the table that the textures read."""
 
-    Attributes:
-        base, accent: linear albedo.
-        style: 0 plaster, 1 masonry, 2 panels (walls only).
-        floor_m, pitch_m: height of a storey and distance between windows.
-        window_m: width and height of a window; sill_m: its height above the floor.
-        top_m: height above which there are no windows.
-        shop: whether the ground floor has shop windows.
-        shift_m: place of the surface in the noise, so that no two surfaces look alike.
-    """
-
-    base: Color
-    accent: Color = (0.5, 0.5, 0.5)
-    style: int = 0
-    floor_m: float = 3.0
-    pitch_m: float = 3.0
-    window_m: tuple[float, float] = (1.2, 1.5)
-    sill_m: float = 0.9
-    top_m: float = 0.0
-    shop: bool = False
-    shift_m: tuple[float, float] = (0.0, 0.0)
+    base: Color  # linear albedo
+    accent: Color = (0.5, 0.5, 0.5)  # linear albedo
+    style: int = 0  # 0 plaster, 1 masonry, 2 panels (walls only)
+    floor_m: float = 3.0  # height of a storey
+    pitch_m: float = 3.0  # distance between windows
+    window_m: tuple[float, float] = (1.2, 1.5)  # width and height
+    sill_m: float = 0.9  # height of a window above the floor
+    top_m: float = 0.0  # above it there are no windows
+    shop: bool = False  # the ground floor has shop windows
+    shift_m: tuple[float, float] = (0.0, 0.0)  # place in the noise, so that no two surfaces look alike
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """T triangles.
+    """T triangles."""
 
-    Attributes:
-        corners: (T, 3, 3) float64, metres in geo.
-        normals: (T, 3, 3) float32, unit normals at the corners.
-        material: (T,) uint8, a `Material`.
-        texture: (T,) int32, row of `texture_params`.
-        u_axis, v_axis: (T, 3) float32, directions of the texture's coordinates, in metres.
-        uv_shift: (T, 2) float32, added to these coordinates.
-        texture_params: (F, 16) float32, rows of `TextureParameters`.
-    """
-
-    corners: FloatArray
-    normals: Float32Array
-    material: ByteArray
-    texture: NDArray[np.int32]
-    u_axis: Float32Array
-    v_axis: Float32Array
-    uv_shift: Float32Array
-    texture_params: Float32Array
+    corners: FloatArray  # (T, 3, 3) float64, metres in geo
+    normals: Float32Array  # (T, 3, 3) float32, unit normals at the corners
+    material: ByteArray  # (T,) uint8, a `Material`
+    texture: NDArray[np.int32]  # (T,) int32, row of `texture_params`
+    u_axis: Float32Array  # (T, 3) float32, direction of the texture's coordinate, in metres
+    v_axis: Float32Array  # (T, 3) float32
+    uv_shift: Float32Array  # (T, 2) float32, added to these coordinates
+    texture_params: Float32Array  # (F, 16) float32, rows of `TextureParameters`
 
 
 class MeshBuilder:
@@ -145,17 +125,11 @@ MISS = -1
 
 @dataclass(frozen=True)
 class Hits:
-    """First hits of N rays.
+    """First hits of N rays."""
 
-    Attributes:
-        triangle: (N,) int32, or `MISS`.
-        distance: (N,) float32, in units of the direction's length.
-        barycentric: (N, 2) float32, weights of the triangle's corners 1 and 2.
-    """
-
-    triangle: NDArray[np.int32]
-    distance: Float32Array
-    barycentric: Float32Array
+    triangle: NDArray[np.int32]  # (N,) int32, or `MISS`
+    distance: Float32Array  # (N,) float32, in units of the direction's length
+    barycentric: Float32Array  # (N, 2) float32, weights of the triangle's corners 1 and 2
 
 
 class Raycaster:

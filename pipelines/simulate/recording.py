@@ -32,21 +32,14 @@ POINTS_CRS = "EPSG:4979"
 
 @dataclass(frozen=True)
 class PhotoRecords:
-    """Records of N photographs.
-
-    Attributes:
-        stamp_ns: (N,) camera clock.
-        lla: (N, 3) degrees and ellipsoidal metres of the antenna.
-        yaw_pitch_roll_deg, body_yaw_pitch_roll_deg: (N, 3) of the camera and of the aircraft.
-        sigma_enu_m: (3,) that the receiver states.
-    """
+    """Records of N photographs."""
 
     names: tuple[str, ...]
-    stamp_ns: IntArray
-    lla: FloatArray
-    yaw_pitch_roll_deg: FloatArray
-    body_yaw_pitch_roll_deg: FloatArray
-    sigma_enu_m: FloatArray
+    stamp_ns: IntArray  # (N,) camera clock
+    lla: FloatArray  # (N, 3) degrees and ellipsoidal metres of the antenna
+    yaw_pitch_roll_deg: FloatArray  # (N, 3) of the camera
+    body_yaw_pitch_roll_deg: FloatArray  # (N, 3) of the aircraft
+    sigma_enu_m: FloatArray  # (3,) that the receiver states
 
 
 def write_trajectory(path: Path, photos: PhotoRecords) -> None:
@@ -105,21 +98,15 @@ _LEAST_SIGMA_M = 0.001  # no receiver states less
 
 @dataclass(frozen=True)
 class Recording:
-    """All records of a flight.
-
-    Attributes:
-        gnss, imu: the logs; gnss_lla (M, 3) degrees and metres; imu_in_geo (K, 3) places of the attitudes.
-        truth: of the whole survey, with its P targets.
-        target_in_geo: (P, 3) places of the targets, as surveyed.
-    """
+    """All records of a flight."""
 
     photos: PhotoRecords
     gnss: GnssLog
-    gnss_lla: FloatArray
+    gnss_lla: FloatArray  # (M, 3) degrees and metres
     imu: ImuLog
-    imu_in_geo: FloatArray
-    truth: Truth
-    target_in_geo: FloatArray
+    imu_in_geo: FloatArray  # (K, 3) places of the attitudes
+    truth: Truth  # of the whole survey, with its P targets
+    target_in_geo: FloatArray  # (P, 3) places of the targets, as surveyed
 
 
 def _receiver(options: SimulateOptions) -> Receiver:

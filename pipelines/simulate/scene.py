@@ -87,24 +87,15 @@ class Building:
 
 @dataclass(frozen=True)
 class SimulatedScene:
-    """Town to photograph.
+    """Town to photograph."""
 
-    Attributes:
-        mesh: its triangles, metres in geo.
-        axes: (3, 3) rows: the town's east, north and up in geo.
-        sun: (3,) unit vector towards the sun.
-        sites: places where a survey target can be fixed.
-        complex_m: half lengths, along the town's axes, of the complex in the middle.
-        buildings: those of the complex first.
-    """
-
-    mesh: Mesh
+    mesh: Mesh  # metres in geo
     plan: GroundPlan
-    axes: FloatArray
-    sun: FloatArray
-    sites: tuple[TargetSite, ...]
-    complex_m: tuple[float, float]
-    buildings: tuple[Building, ...]
+    axes: FloatArray  # (3, 3) rows: the town's east, north and up in geo
+    sun: FloatArray  # (3,) unit vector towards the sun
+    sites: tuple[TargetSite, ...]  # places where a survey target can be fixed
+    complex_m: tuple[float, float]  # half lengths along the axes of the complex in the middle
+    buildings: tuple[Building, ...]  # those of the complex first
 
 
 def build_scene(name: str, seed: np.random.SeedSequence) -> SimulatedScene:

@@ -160,19 +160,13 @@ STYLE, FLOOR, PITCH, WINDOW_W, WINDOW_H, SILL, TOP, SHOP, SHIFT_U, SHIFT_V = ran
 
 @dataclass(frozen=True)
 class TextureSamples:
-    """N points on surfaces of one material, at which its texture is sampled.
+    """N points on surfaces of one material, at which its texture is sampled."""
 
-    Attributes:
-        u, v: (N,) texture coordinates in metres.
-        du, dv: (N,) width of a pixel along them, in metres.
-        params: (N, 16) rows of `Mesh.texture_params`.
-    """
-
-    u: Float32Array
-    v: Float32Array
-    du: Float32Array
-    dv: Float32Array
-    params: Float32Array
+    u: Float32Array  # (N,) texture coordinates in metres
+    v: Float32Array  # (N,)
+    du: Float32Array  # (N,) width of a pixel along u, in metres
+    dv: Float32Array  # (N,)
+    params: Float32Array  # (N, 16) rows of `Mesh.texture_params`
 
     @property
     def pixel(self) -> Float32Array:

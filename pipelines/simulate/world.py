@@ -36,11 +36,9 @@ _LEAST_COSINE = 0.2
 def project_targets(
     sites: Sequence[TargetSite], poses: Sequence[Pose], lens: BrownLens, raycaster: Raycaster, width_m: float
 ) -> tuple[BoolArray, FloatArray]:
-    """Project P targets of `width_m` into N photographs.
+    """Return which of N photographs see P targets of `width_m` (P, N), and their exact places (P, N, 2) in pixels.
 
-    Returns:
-        (P, N) whether the photograph sees the target: not out of view, too small or hidden (by ray casting).
-        (P, N, 2) exact projections in pixels; meaningless where not seen.
+    A target out of view, too small or hidden (by ray casting) is not seen; its place is meaningless.
     """
     positions = np.array([site.target_position for site in sites]).reshape(-1, 3)
     normals = np.array([site.normal for site in sites]).reshape(-1, 3)

@@ -102,22 +102,15 @@ class Strategy(Protocol):
 
 @dataclass(frozen=True)
 class DefaultSettings:
-    """Settings of `DefaultStrategy`; iterations count from 1.
+    """Settings of `DefaultStrategy`; iterations count from 1."""
 
-    Attributes:
-        start, stop, every: Gaussians are added after `start` and up to `stop`, at every such number of iterations.
-        reset_every: iterations between opacity resets, before `stop` (0: none).
-        gradient_threshold: mean length of ∂L/∂(centre in normalised device coordinates) from which a Gaussian is
-            cloned or split.
-        prune_scale_from: Gaussians are removed for their size after this iteration.
-    """
-
-    start: int = 500
-    stop: int = 15_000
-    every: int = 100
-    reset_every: int = 3_000
+    start: int = 500  # Gaussians are added after it
+    stop: int = 15_000  # and up to it
+    every: int = 100  # at every such number of iterations
+    reset_every: int = 3_000  # iterations between opacity resets, before `stop` (0: none)
+    # mean length of ∂L/∂(centre in normalised device coordinates) from which a Gaussian is cloned or split
     gradient_threshold: float = 2e-4
-    prune_scale_from: int = 3_000
+    prune_scale_from: int = 3_000  # Gaussians are removed for their size after this iteration
     max_gaussians: int = 1_000_000
 
     @classmethod
@@ -246,21 +239,13 @@ class DefaultStrategy:
 
 @dataclass(frozen=True)
 class FastSettings:
-    """Settings of `FastStrategy` beside those of the default one.
+    """Settings of `FastStrategy` beside those of the default one."""
 
-    Attributes:
-        views: number of views to sample for an edit.
-        high_error_px: mean over the views that see a Gaussian from which it is cloned or split.
-        least_px: a Gaussian that makes up fewer pixels in each of the views is removed,
-        least_views: if at least this number of views sees it.
-        prune_stop: last iteration that removes Gaussians, later than the last that adds them.
-    """
-
-    views: int = 10
-    high_error_px: float = 0.2
-    least_px: float = 0.2
-    least_views: int = 2
-    prune_stop: int = 25_000
+    views: int = 10  # to sample for an edit
+    high_error_px: float = 0.2  # mean over the views that see a Gaussian from which it is cloned or split
+    least_px: float = 0.2  # a Gaussian that makes up fewer pixels in each of the views is removed,
+    least_views: int = 2  # if at least this number of views sees it
+    prune_stop: int = 25_000  # last iteration that removes Gaussians, later than the last that adds them
 
 
 class FastStrategy(DefaultStrategy):

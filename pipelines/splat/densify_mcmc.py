@@ -34,19 +34,14 @@ _SIGMOID_STEEPNESS, _SIGMOID_CENTRE = 100.0, 0.995
 
 @dataclass(frozen=True)
 class McmcSettings:
-    """Settings of `McmcStrategy`; iterations count from 1.
+    """Settings of `McmcStrategy`; iterations count from 1."""
 
-    Attributes:
-        start, stop, every: Gaussians are moved and added after `start` and up to `stop`, every so many iterations.
-        growth: share of Gaussians to add at each edit.
-        noise: standard deviation of the noise, in learning rates of the centres times covariance, all in scene
-            extents. The paper's 5e5 is for scenes whose extent is about 5 units, hence the factor 5².
-    """
-
-    start: int = 500
-    stop: int = 25_000
-    every: int = 100
-    growth: float = 0.05
+    start: int = 500  # Gaussians are moved and added after it
+    stop: int = 25_000  # and up to it
+    every: int = 100  # so many iterations
+    growth: float = 0.05  # share of Gaussians to add at each edit
+    # standard deviation of the noise, in learning rates of the centres times covariance, all in scene extents. The
+    # paper's 5e5 is for scenes whose extent is about 5 units, hence the factor 5²
     noise: float = 5e5 * 5**2
     max_gaussians: int = 1_000_000
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from pipelines.core.errors import ConvergenceError
-from pipelines.core.types import Float32Array
+from pipelines.core.types import Float32Array, Rows
 from pipelines.formats.splat_ply import SplatArrays, read_splat_ply, write_splat_ply
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.geometry.similarity import Similarity
@@ -22,25 +22,14 @@ from pipelines.splat import sh
 
 
 @dataclass
-class Gaussians:
-    """N Gaussians in the `model` frame, float32 on one device.
+class Gaussians(Rows):
+    """N Gaussians in the `model` frame, float32 on one device."""
 
-    Attributes:
-        means: (N, 3) centres in metres.
-        quats_wxyz: (N, 4) rotations (model ← principal axes), not necessarily of unit length.
-        log_scales: (N, 3) natural logarithm of the standard deviations along the principal axes, in metres.
-        logit_opacities: (N,) logit of the opacity.
-        sh: (N, K, 3) spherical-harmonic coefficients, K = (degree + 1)²; colour = 0.5 + Σ SH, clamped at 0.
-    """
-
-    means: Tensor
-    quats_wxyz: Tensor
-    log_scales: Tensor
-    logit_opacities: Tensor
-    sh: Tensor
-
-    def __len__(self) -> int:
-        return len(self.means)
+    means: Tensor  # (N, 3) centres in metres
+    quats_wxyz: Tensor  # (N, 4) rotations (model ← principal axes), not necessarily of unit length
+    log_scales: Tensor  # (N, 3) natural logarithm of σ along the principal axes, in metres
+    logit_opacities: Tensor  # (N,) logit of the opacity
+    sh: Tensor  # (N, K, 3) spherical-harmonic coefficients, K = (degree + 1)²; colour = 0.5 + Σ SH, clamped at 0
 
     @property
     def sh_degree(self) -> int:

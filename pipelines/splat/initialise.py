@@ -31,17 +31,11 @@ _FAR = 50.0  # median distances from the cloud's median centre: points beyond ar
 
 @dataclass(frozen=True)
 class InitialisationOptions:
-    """Settings of the initial Gaussians.
+    """Settings of the initial Gaussians."""
 
-    Attributes:
-        sh_degree: of the harmonics, of which all but the constant start at zero.
-        opacity: of Gaussians without a normal.
-        max_gaussians: number to which a larger cloud is thinned evenly; None: no limit.
-    """
-
-    sh_degree: int = 3
-    opacity: float = 0.1
-    max_gaussians: int | None = None
+    sh_degree: int = 3  # of the harmonics, of which all but the constant start at zero
+    opacity: float = 0.1  # of Gaussians without a normal
+    max_gaussians: int | None = None  # a larger cloud is thinned evenly; None: no limit
 
 
 def gaussians_from_points(

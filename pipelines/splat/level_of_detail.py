@@ -149,21 +149,13 @@ class WriteTile(Protocol):
 
 @dataclass(frozen=True)
 class DetailTile:
-    """Tile of the tree.
+    """Tile of the tree."""
 
-    Attributes:
-        name: unique, of letters and digits.
-        count: number of Gaussians that it shows.
-        error_m: size of the details that it does not show; 0 for a leaf.
-        bounds: (2, 3) box of its Gaussians up to 3 σ, and of its children.
-        children: tiles that together replace it.
-    """
-
-    name: str
-    count: int
-    error_m: float
-    bounds: FloatArray
-    children: tuple[DetailTile, ...] = ()
+    name: str  # unique, of letters and digits
+    count: int  # Gaussians that it shows
+    error_m: float  # size of the details that it does not show; 0 for a leaf
+    bounds: FloatArray  # (2, 3) box of its Gaussians up to 3 σ, and of its children
+    children: tuple[DetailTile, ...] = ()  # together they replace it
 
     def all(self) -> Iterator[DetailTile]:
         yield self

@@ -137,17 +137,11 @@ def _check(rendered: Tensor, target: Tensor, mask: Tensor | None) -> None:
 
 @dataclass(frozen=True)
 class FreeSpace:
-    """Cells of the scene in which a scanner's beams met nothing, as a grid in `model`.
+    """Cells of the scene in which a scanner's beams met nothing, as a grid in `model`."""
 
-    Attributes:
-        low_in_model: (3,) low corner in metres.
-        cell_m: side of the cells.
-        free: (X, Y, Z) whether a cell is free.
-    """
-
-    low_in_model: FloatArray
-    cell_m: float
-    free: BoolArray
+    low_in_model: FloatArray  # (3,) low corner in metres
+    cell_m: float  # side
+    free: BoolArray  # (X, Y, Z)
 
 
 class FreeSpaceLoss:

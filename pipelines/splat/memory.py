@@ -28,20 +28,13 @@ USABLE = 0.9  # of the free memory: other programs grow, too
 
 @dataclass(frozen=True)
 class TrainingSize:
-    """Sizes on which the memory of a training depends.
+    """Sizes on which the memory of a training depends."""
 
-    Attributes:
-        gaussians: largest number.
-        camera: of the largest image that is rendered: a photograph, or a crop of it.
-        cameras: number of those whose poses training refines together.
-        photograph_px: pixels of the largest photograph at its training size; 0: no larger than `camera`.
-    """
-
-    gaussians: int
-    camera: Pinhole
+    gaussians: int  # largest number
+    camera: Pinhole  # of the largest image that is rendered: a photograph, or a crop of it
     sh_degree: int
-    cameras: int
-    photograph_px: int = 0
+    cameras: int  # those whose poses training refines together
+    photograph_px: int = 0  # of the largest photograph at its training size; 0: no larger than `camera`
 
 
 def predicted_peak_bytes(size: TrainingSize) -> int:

@@ -95,20 +95,15 @@ _CORRECTED_STEPS = 20_000  # 0.999^20000 = 2e-9: below float32's resolution of 1
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Learning rates.
+    """Learning rates."""
 
-    Attributes:
-        means, means_final: first and last rate of the centres, in scene extents.
-        sh_dc, sh_rest: rates of the constant and of the direction-dependent colour.
-    """
-
-    means: float = 1.6e-4
-    means_final: float = 1.6e-6
+    means: float = 1.6e-4  # first rate of the centres, in scene extents
+    means_final: float = 1.6e-6  # last rate
     quats_wxyz: float = 1e-3
     log_scales: float = 5e-3
     logit_opacities: float = 5e-2
-    sh_dc: float = 2.5e-3
-    sh_rest: float = 1.25e-4
+    sh_dc: float = 2.5e-3  # of the constant colour
+    sh_rest: float = 1.25e-4  # of the direction-dependent colour
 
     @classmethod
     def for_iterations(cls, iterations: int) -> LearningRates:

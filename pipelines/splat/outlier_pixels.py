@@ -30,15 +30,10 @@ _AMNESTY = 5  # all pixels count in every view with such a number
 
 @dataclass(frozen=True)
 class OutlierSettings:
-    """Settings of `OutlierPixels`.
+    """Settings of `OutlierPixels`."""
 
-    Attributes:
-        most: share of the cells of a view that are outliers at most, before those around them are added.
-        views: number of views before the first outlier.
-    """
-
-    most: float = 0.01
-    views: int = 50
+    most: float = 0.01  # share of the cells of a view, before those around them are added
+    views: int = 50  # before the first outlier
 
 
 class OutlierPixels:

@@ -59,15 +59,10 @@ _ONE_SURFACE = 0.003  # of the depth: largest spread of the Gaussians of one sur
 
 
 def depth_at(depth_m: Tensor, alpha: Tensor, xy: Tensor, camera: Pinhole) -> tuple[Tensor, Tensor]:
-    """Return depths (K,) at rays, and whether they count (K,), as 0 and 1.
+    """Return depths (K,) at rays, and whether they count (K,), as 0 and 1, of a render's depth and alpha (H, W).
 
-    Depths are bilinear between pixel centres, and differentiable. Rays outside the image or through pixels without
-    a surface do not count.
-
-    Args:
-        depth_m, alpha: (H, W) of a render, the depth along the camera's z axis.
-        xy: (K, 2) x/z and y/z of the rays.
-        camera: of H × W pixels.
+    The rays are x/z and y/z (K, 2) in the camera of H × W pixels. Depths are bilinear between pixel centres, and
+    differentiable. Rays outside the image or through pixels without a surface do not count.
     """
     x = (camera.fx * xy[:, 0] + camera.cx) / camera.width
     y = (camera.fy * xy[:, 1] + camera.cy) / camera.height
@@ -98,24 +93,15 @@ _FIRMNESS = 9.0  # additional slope of the loss of depths that near to their poi
 
 @dataclass(frozen=True)
 class SurfaceSettings:
-    """Weights of the losses.
+    """Weights of the losses."""
 
-    Attributes:
-        depth: of the mean relative difference of depth at the points of the surface, see `depth_loss`.
-        compactness: of the logarithm that bounds the loss of haze before and behind a surface.
-        flatness: of the mean smallest standard deviation, in scene extents.
-        normals: of the depth–normal consistency,
-        normals_from: fraction of the training from which it counts,
-        normals_every: and iterations between two of its renders, by which its weight is multiplied.
-        edge: depth steps between neighbouring pixels above this fraction of the depth are edges, without a normal.
-    """
-
-    depth: float = 1.0
-    compactness: float = 0.01
-    flatness: float = 1.0
-    normals: float = 0.01
-    normals_from: float = 0.5
-    normals_every: int = 4
+    depth: float = 1.0  # of the mean relative difference of depth at the points of the surface, see `depth_loss`
+    compactness: float = 0.01  # of the logarithm that bounds the loss of haze before and behind a surface
+    flatness: float = 1.0  # of the mean smallest standard deviation, in scene extents
+    normals: float = 0.01  # of the depth–normal consistency
+    normals_from: float = 0.5  # fraction of the training from which it counts
+    normals_every: int = 4  # iterations between two of its renders, by which its weight is multiplied
+    # depth steps between neighbouring pixels above this fraction of the depth are edges, without a normal
     edge: float = 0.05
 
 

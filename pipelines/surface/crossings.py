@@ -115,17 +115,10 @@ _STEP = 0.25  # of a cell's side
 def count_beams(
     end: FloatArray, start: FloatArray, low: FloatArray, cell_m: float, shape: IntArray
 ) -> NDArray[np.uint8]:
-    """Return how many beams cross each cell, 255 at most.
+    """Return how many beams cross each cell of a grid, 255 at most, from its low corner (3,), of a shape (3,).
 
-    Beams are sampled at a quarter of a cell's side, from their ends until they leave the grid: corners of cells may
-    be missed.
-
-    Args:
-        end: (P, 3) metres, ends of the beams, in the grid.
-        start: (P, 3) their starts, elsewhere than the ends.
-        low: (3,) low corner of the grid.
-        cell_m: side of its cells.
-        shape: (3,) number of cells.
+    Beams are sampled at a quarter of a cell's side, from their ends (P, 3), in the grid, until they leave it
+    towards their starts (P, 3), which lie elsewhere: corners of cells may be missed.
     """
     count = np.zeros(tuple(shape.tolist()), dtype=np.uint8)
     _cross(end, start, low, cell_m, count)

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from pipelines.core.errors import InputError
 from pipelines.core.progress import SILENT, Progress
-from pipelines.core.types import ByteArray, FloatArray, IntArray
+from pipelines.core.types import ByteArray, FloatArray, IntArray, Rows
 from pipelines.formats.trajectory_csv import read_trajectory
 from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import Origin, ecef_from_lla, enu_from_ecef
@@ -79,29 +79,16 @@ _ABOVE_M, _BELOW_M = 500.0, 500.0  # a wrong datum must show itself, not lie out
 
 
 @dataclass(frozen=True)
-class LidarCloud:
-    """P points.
+class LidarCloud(Rows):
+    """P points."""
 
-    Attributes:
-        position_in_model: (P, 3) metres, moved along the normal onto the plane through the neighbours.
-        normal_in_model: (P, 3) unit vectors of the planes through their neighbours, with an arbitrary sign.
-        roughness_m: (P,) RMS of the neighbours about that plane.
-        reach_m: (P,) distance to the furthest of these neighbours.
-        classification: (P,) class of LAS.
-        voxel_m: distance between the points, about.
-        scanner_in_model: (P, 3) the scanner's place at the time of each point; NaN where unknown. None: unknown.
-    """
-
-    position_in_model: FloatArray
-    normal_in_model: FloatArray
-    roughness_m: FloatArray
-    reach_m: FloatArray
-    classification: ByteArray
-    voxel_m: float
-    scanner_in_model: FloatArray | None = None
-
-    def __len__(self) -> int:
-        return len(self.position_in_model)
+    position_in_model: FloatArray  # (P, 3) metres, moved along the normal onto the plane through the neighbours
+    normal_in_model: FloatArray  # (P, 3) unit vectors of these planes, with an arbitrary sign
+    roughness_m: FloatArray  # (P,) RMS of the neighbours about that plane
+    reach_m: FloatArray  # (P,) distance to the furthest of these neighbours
+    classification: ByteArray  # (P,) class of LAS
+    voxel_m: float  # distance between the points, about
+    scanner_in_model: FloatArray | None = None  # (P, 3) at the time of each point; NaN, None: unknown
 
     def moved(self, shift: FloatArray) -> LidarCloud:
         scanner = None if self.scanner_in_model is None else self.scanner_in_model + shift
@@ -153,15 +140,11 @@ def read_cloud(
 def planes_of(
     position: FloatArray, classification: ByteArray, voxel_m: float, weight: IntArray | None = None
 ) -> LidarCloud:
-    """Return points (P, 3) with the plane through the neighbours of each.
+    """Return points (P, 3), P ≥ 12, in `model`, about a voxel apart, with the plane through the neighbours of each.
 
-    Args:
-        position: (P, 3) metres in `model`, P ≥ 12.
-        classification: (P,) class of LAS.
-        voxel_m: distance between the points, about.
-        weight: (P,) number of measured points that each stands for; None: 1. Where a noisy surface lies near a
-            border of voxels, the few points beyond the border have as many voxels as the many before it: with
-            equal weights the plane would lie beside the surface, by up to a third of the noise's σ.
+    Each stands for a number of measured points, its weight (P,); None: 1. Where a noisy surface lies near a border
+    of voxels, the few points beyond the border have as many voxels as the many before it: with equal weights the
+    plane would lie beside the surface, by up to a third of the noise's σ.
     """
     count = np.ones(len(position)) if weight is None else weight.astype(np.float64)
     tree = cKDTree(position)

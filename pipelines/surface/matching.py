@@ -114,12 +114,8 @@ def _mirror_ends(padded: Any, half: int) -> None:
 def _correlate_row(ring: Any, shown: Any, mean: Any, inverse_sigma: Any, total: Any, score: Any) -> None:
     """Write the correlation of a row with a neighbour into score (W,).
 
-    Args:
-        ring: (window, 3, W) sums along the rows of the window.
-        shown: (W,) the neighbour's grey levels at the row itself.
-        mean: (W,) of the reference's windows.
-        inverse_sigma: (W,) of the reference's windows.
-        total: (3, W) scratch.
+    The ring (window, 3, W) has sums along the rows of the window, `shown` (W,) the neighbour's grey levels at the
+    row itself, mean and inverse σ (W,) are those of the reference's windows, `total` (3, W) is scratch.
     """
     window, width = ring.shape[0], shown.shape[0]
     share = np.float32(1.0 / (window * window))

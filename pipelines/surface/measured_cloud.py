@@ -19,7 +19,7 @@ import numpy as np
 from pipelines.core.errors import InputError
 from pipelines.core.products import Remark
 from pipelines.core.progress import SILENT, Progress
-from pipelines.core.types import ByteArray, FloatArray, IntArray, joined_rows, rows_of
+from pipelines.core.types import ByteArray, FloatArray, IntArray, Rows, joined_rows, rows_of
 from pipelines.formats.cloud_ply import CloudChunk, CloudFile, open_cloud_ply
 from pipelines.formats.las import open_las
 from pipelines.geodesy.crs import PointCrs, parse_crs
@@ -48,7 +48,7 @@ class Thinning:
 
 
 @dataclass(frozen=True)
-class MeasuredCloud:
+class MeasuredCloud(Rows):
     """P points in geo."""
 
     position_in_geo: FloatArray  # (P, 3) metres
@@ -56,9 +56,6 @@ class MeasuredCloud:
     weight: IntArray  # (P,) int64, number of measured points in its voxel
     gps_time_s: FloatArray  # (P,) time of the file; NaN: none
     voxel_m: float  # side of the voxels at the end
-
-    def __len__(self) -> int:
-        return len(self.position_in_geo)
 
 
 @dataclass

@@ -96,13 +96,10 @@ def depth_around(renderer: ModelRenderer, camera: int, xy: FloatArray, reach_px:
 
 
 def points_on_surface(trained: TrainedSurvey, rays: MarkRays, maps: Sequence[DepthMap]) -> FloatArray:
-    """Return the points (J, 3) in `geo` at which the model's surface lies behind their marks.
+    """Return the points (J, 3) in `geo` at which the model's surface lies behind their marks, by K maps.
 
-    The result is the spatial median of the views that count; NaN for a point with fewer than two.
-
-    Args:
-        rays: K marks of J points.
-        maps: K, the depth around each mark in its view.
+    Each map is the depth around a mark in its view. The result is the spatial median of the views that count; NaN
+    for a point with fewer than two.
     """
     middle = np.full((len(rays.point_name), 3), np.nan)
     for point in range(len(middle)):

@@ -148,14 +148,8 @@ def fit_alignment(
 ) -> tuple[Similarity, ReferenceShift] | None:
     """Return the similarity reference ← model in geo, and its figures.
 
-    None: the clouds have too little in common, or nothing fixes an axis.
-
-    Args:
-        model: (M, 3) points.
-        reference: (P, 3) points.
-        normal: (P, 3) unit normals of the reference; NaN: not known.
-        spacing_m: between neighbours in the reference.
-        kind: `similarity`, or a shift.
+    None: the clouds have too little in common, or nothing fixes an axis. They are (M, 3) and (P, 3), the latter
+    with unit normals (P, 3), NaN if unknown, and a mean spacing.
     """
     planar = np.isfinite(normal).all(axis=1)
     reference, normal = reference[planar], normal[planar]

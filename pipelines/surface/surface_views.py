@@ -107,21 +107,15 @@ _SPARE_BYTES = 1 << 28  # of the disk, to be left free
 
 @dataclass(frozen=True)
 class SurfaceView:
-    """Surface as one training camera sees it.
+    """Surface as one training camera sees it."""
 
-    Attributes:
-        camera: index among the cameras of the trained model.
-        pinhole: at the size of the maps.
-        depth_m: (H, W) along the camera's z axis, read-only; 0: no surface.
-        rgb: (H, W, 3) colours of the render, read-only; None if they are not kept. They have no
-            exposure of a photograph, so that views meet without a seam.
-    """
-
-    camera: int
-    pinhole: Pinhole
+    camera: int  # index among the cameras of the trained model
+    pinhole: Pinhole  # at the size of the maps
     cam_from_model: FloatArray
     cam_center_in_model: FloatArray
-    depth_m: Float32Array
+    depth_m: Float32Array  # (H, W) along the camera's z axis, read-only; 0: no surface
+    # (H, W, 3) colours of the render, read-only; None if they are not kept. They have no exposure of a photograph,
+    # so that views meet without a seam
     rgb: ByteArray | None
 
     def points(self, rows: IntArray, columns: IntArray) -> FloatArray:
@@ -188,12 +182,10 @@ class SurfaceViews:
         *,
         tolerance: float = SAME_SURFACE,
     ) -> Support:
-        """Return how far the training views agree on points; lengths in metres of `geo`.
+        """Return how far the training views agree on points (N, 3); lengths in metres of `geo`.
 
-        Args:
-            point_in_model: (N, 3) metres.
-            normal_in_model: (N, 3) unit normals with an arbitrary sign; NaN where unknown.
-            tolerance: largest difference of depths on one surface, as a part of the depth.
+        Unit normals (N, 3) have an arbitrary sign; NaN: unknown. Depths of one surface agree within the tolerance,
+        a part of the depth.
         """
         geo_from_model, poses = self._trained.geo_from_model, self._trained.poses
         rotation, center = poses.cam_from_model[self.cameras], poses.cam_center_in_model[self.cameras]

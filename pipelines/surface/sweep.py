@@ -60,23 +60,17 @@ class NormalMap:
 
 @dataclass(frozen=True)
 class SweepResult:
-    """Best plane at each pixel of a view: its depths, by a sweep or its refinement.
-
-    Attributes:
-        normals: direction of that plane.
-        offset_m: (H, W) refined between planes by a parabola through the neighbouring scores; NaN if no plane lies
-            in front of the camera.
-        score: (H, W) correlation, −1 … 1.
-        step_m: (H, W) distance between the planes there.
-        sharpness: (H, W) 1/m², minus the second derivative of the score by the offset: small where neighbours look
-            from nearly the same place, or see little texture. The σ of the offset goes with its inverse.
-    """
+    """Best plane at each pixel of a view: its depths, by a sweep or its refinement."""
 
     camera: ViewPose
-    normals: NormalMap
+    normals: NormalMap  # direction of that plane
+    # (H, W) refined between planes by a parabola through the neighbouring scores; NaN if no plane lies in front of
+    # the camera
     offset_m: Float32Array
-    score: Float32Array
-    step_m: Float32Array
+    score: Float32Array  # (H, W) correlation, −1 … 1
+    step_m: Float32Array  # (H, W) distance between the planes there
+    # (H, W) 1/m², minus the second derivative of the score by the offset: small where neighbours look from nearly
+    # the same place, or see little texture. The σ of the offset goes with its inverse
     sharpness: Float32Array
 
     def depth(self) -> FloatArray:

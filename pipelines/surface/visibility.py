@@ -50,23 +50,14 @@ class Viewpoints:
 
 @dataclass(frozen=True)
 class DepthViews:
-    """V depth maps with their cameras, in one frame (metres).
+    """V depth maps with their cameras, in one frame (metres)."""
 
-    Attributes:
-        cam_from_world: (V, 3, 3) rotations.
-        center_in_world: (V, 3) camera centres.
-        intrinsics_px: (V, 4) fx, fy, cx, cy of pinholes; the centre of the top-left pixel is (0.5, 0.5).
-        size_px: (V, 2) width and height.
-        start: (V,) index of each map's first pixel in `depth_m`.
-        depth_m: all pixels of all maps, row by row, as one array (P,); along the camera's z axis, 0: no surface.
-    """
-
-    cam_from_world: FloatArray
-    center_in_world: FloatArray
-    intrinsics_px: FloatArray
-    size_px: IntArray
-    start: IntArray
-    depth_m: Float32Array
+    cam_from_world: FloatArray  # (V, 3, 3) rotations
+    center_in_world: FloatArray  # (V, 3) camera centres
+    intrinsics_px: FloatArray  # (V, 4) fx, fy, cx, cy; the centre of the top-left pixel is (0.5, 0.5)
+    size_px: IntArray  # (V, 2) width and height
+    start: IntArray  # (V,) each map's first pixel in `depth_m`
+    depth_m: Float32Array  # (P,) of all maps, row by row, along the camera's z axis; 0: no surface
 
     @classmethod
     def of(cls, cameras: Viewpoints, depth_m: Float32Array) -> DepthViews:
@@ -83,30 +74,18 @@ class Support:
 
     The surface of a single view is uncertain by about these RMS. Errors of the views correlate, because the same
     Gaussians cause them: the RMS does not fall with √views.
-
-    Attributes:
-        views: (N,) number of views whose surface agrees.
-        seen_through: (N,) number of views that look through the point.
-        mean_up_m: (N,) mean upward component of the residuals.
-        rms_up_m: (N,) RMS of their upward components: the height's, on level ground.
-        rms_horizontal_m: (N,) RMS of their horizontal components. On level ground most of it is the rays' slant.
-        rms_depth_m: (N,) RMS along the cameras' z axes.
-        mean_normal_m, rms_normal_m: (N,) mean and RMS along the points' normals, whatever the slant of rays and
-            surface; NaN without a normal.
-        spread_rad: (N,) RMS angle of the agreeing rays about their mean direction: 0 without parallax.
-        mean_ray: (N, 3) mean of the agreeing rays' unit vectors, from the cameras to the point.
     """
 
-    views: IntArray
-    seen_through: IntArray
-    mean_up_m: FloatArray
-    rms_up_m: FloatArray
-    rms_horizontal_m: FloatArray
-    rms_depth_m: FloatArray
-    mean_normal_m: FloatArray
-    rms_normal_m: FloatArray
-    spread_rad: FloatArray
-    mean_ray: FloatArray
+    views: IntArray  # (N,) number of views whose surface agrees
+    seen_through: IntArray  # (N,) number of views that look through the point
+    mean_up_m: FloatArray  # (N,) mean upward component of the residuals
+    rms_up_m: FloatArray  # (N,) RMS of their upward components: the height's, on level ground
+    rms_horizontal_m: FloatArray  # (N,) of horizontal components; on level ground mostly the rays' slant
+    rms_depth_m: FloatArray  # (N,) RMS along the cameras' z axes
+    mean_normal_m: FloatArray  # (N,) along the points' normals, whatever the slant; NaN without one
+    rms_normal_m: FloatArray  # (N,) likewise
+    spread_rad: FloatArray  # (N,) RMS angle of the agreeing rays about their mean direction: 0 without parallax
+    mean_ray: FloatArray  # (N, 3) mean unit vector of the agreeing rays, from the camera
 
     def scaled(self, scale: float) -> Support:
         """Return the support in a frame whose unit is 1/`scale` of this one's."""
@@ -121,13 +100,9 @@ def support(
     tolerance: float,
     normal_in_world: FloatArray | None = None,
 ) -> Support:
-    """Return the support of points by depth maps.
+    """Return the support of points (N, 3), finite, by depth maps; `up_in_world` is a unit vector.
 
-    Args:
-        point_in_world: (N, 3) metres, finite.
-        up_in_world: (3,) unit vector.
-        tolerance: largest difference of depths that agree, as a part of the depth.
-        normal_in_world: (N, 3) unit normals with an arbitrary sign; NaN where unknown.
+    Depths agree within the tolerance, a part of them. Unit normals (N, 3) have an arbitrary sign; NaN: unknown.
     """
     points = np.ascontiguousarray(point_in_world, dtype=np.float64).reshape(-1, 3)
     normals = np.full_like(points, np.nan) if normal_in_world is None else normal_in_world

@@ -28,19 +28,12 @@ from pipelines.survey.trained_model import Adjustment
 
 @dataclass(frozen=True)
 class AdjustedScene:
-    """Scene of a survey, or of some of its cameras, with their adjustment.
+    """Scene of a survey, or of some of its cameras, with their adjustment."""
 
-    Attributes:
-        initial: product of `init-sim3`; its verdict on each measurement stands.
-        survey: the measurements, with the variance factors in their covariances.
-        scene: cameras and points as SfM left them, in the frame of the adjustment.
-        adjustment: of the same cameras.
-    """
-
-    initial: InitialSimilarity
-    survey: Survey
-    scene: Scene
-    adjustment: Adjustment
+    initial: InitialSimilarity  # product of `init-sim3`; its verdict on each measurement stands
+    survey: Survey  # the measurements, with the variance factors in their covariances
+    scene: Scene  # cameras and points as SfM left them, in the frame of the adjustment
+    adjustment: Adjustment  # of the same cameras
 
     @classmethod
     def load(cls, workspace: Workspace, product: str = ADJUSTMENT) -> AdjustedScene:

@@ -66,31 +66,21 @@ _MOST_CORES = 16
 
 @dataclass(frozen=True)
 class TrainingEstimate:
-    """Estimate of a training.
-
-    Attributes:
-        photo_px: width and height of the largest photograph.
-        training_px: width and height at which it is trained.
-        crops: number of crops in which it is seen, one at an iteration, when it is not shrunken further.
-        seconds: about; None on a GPU, where nothing was measured.
-        peak_bytes: predicted peak of the memory.
-        free_bytes: memory that is free; None: unknown.
-        blocks: number that was asked for; None: as many as fit.
-    """
+    """Estimate of a training."""
 
     preset: str
     photographs: int
-    photo_px: tuple[int, int]
-    training_px: tuple[int, int]
-    crops: int
+    photo_px: tuple[int, int]  # width and height of the largest photograph
+    training_px: tuple[int, int]  # width and height at which it is trained
+    crops: int  # in which it is seen, one at an iteration, when it is not shrunken further
     iterations: int
     max_gaussians: int
     backend: str
     threads: int
-    seconds: float | None
-    peak_bytes: int
-    free_bytes: int | None
-    blocks: int | None = None
+    seconds: float | None  # about; None on a GPU, where nothing was measured
+    peak_bytes: int  # predicted
+    free_bytes: int | None  # None: unknown
+    blocks: int | None = None  # asked for; None: as many as fit
     lidar: bool = False
 
     @property

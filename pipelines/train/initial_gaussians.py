@@ -143,11 +143,8 @@ def fallback_points(
 ) -> SurfacePoints:
     """Return points, without normals, at pixels of the training views whose depth is not known.
 
-    Each lies where the ray of its pixel meets the surface through the SfM points, z up. Sky has none.
-
-    Args:
-        count: limit of the points, which are spread as evenly as the photographs resolve them.
-        inside: returns which of points (N, 3) count, as a mask (N,).
+    Each lies where the ray of its pixel meets the surface through the SfM points, z up. Sky has none. At most
+    `count` of those that are `inside` are kept, spread as evenly as the photographs resolve them.
     """
     if count < 1:
         return SurfacePoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((0, 3)))

@@ -57,22 +57,14 @@ _LEAST_BEAMS = 3
 
 @dataclass(frozen=True)
 class ComparedLidar:
-    """Cloud of the scene, in `model`, compared with the photographs and not moved.
-
-    Attributes:
-        maps: depth maps of the training views.
-        views: the same as one set.
-        shown: (S, 3) surface that they show.
-        pixel_m: size of their pixels on the surface.
-        registration: shift of the cloud, and its record.
-    """
+    """Cloud of the scene, in `model`, compared with the photographs and not moved."""
 
     cloud: LidarCloud
-    maps: DepthMaps
-    views: DepthViews
-    shown: FloatArray
-    pixel_m: float
-    registration: Registration
+    maps: DepthMaps  # depth maps of the training views
+    views: DepthViews  # the same as one set
+    shown: FloatArray  # (S, 3) surface that they show
+    pixel_m: float  # size of their pixels on the surface
+    registration: Registration  # shift of the cloud, and its record
     record: LidarRegistration
 
 
@@ -99,9 +91,7 @@ def compared_lidar(
 ) -> ComparedLidar:
     """Return the scene's cloud, compared with the photographs; an InputError: it lies elsewhere, or off by 3 σ.
 
-    Args:
-        options, files, track: of the LiDAR; None: the scanner's track is unknown.
-        georeference: initial similarity to `geo`, with covariance.
+    The georeference is the initial similarity to `geo`, with covariance. Track None: it is unknown.
     """
     pixel_m, views, surface = _pixel_size_m(maps), _depth_views(maps), SceneSurface(maps)
     cloud = read_cloud(files, maps.scene, survey, pixel_m, progress=progress, track=track)
@@ -190,11 +180,8 @@ def plane_observations(found: Registration, geo_from_model: Similarity) -> Plane
     """Return one plane for each cluster of 5 m and each direction that planes face there.
 
     The errors of neighbouring points are not independent: the median of a cluster is one observation. Its σ is the
-    robust spread of these medians about the shift.
-
-    Args:
-        found: registration, whose shift is part of the observations again.
-        geo_from_model: initial similarity, a pure shift.
+    robust spread of these medians about the shift of the registration, which is part of the observations again. The
+    initial similarity is a pure shift.
     """
     matches = found.matches
     distance = matches.distance_m - found.wall_bias_m * matches.wall
@@ -220,9 +207,7 @@ def plane_observations(found: Registration, geo_from_model: Similarity) -> Plane
 def free_space(cloud: LidarCloud, gone: BoolArray, shown: FloatArray) -> FreeSpace | None:
     """Return the cells that beams have crossed and in which nothing is seen; None: no beam is known.
 
-    Args:
-        gone: (P,) points inconsistent with the photographs: their beams do not count.
-        shown: (S, 3) surface that the photographs show; what stands there now is not free.
+    Beams of points (P,) that are `gone` do not count. Where the photographs show a surface (S, 3), nothing is free.
     """
     if cloud.scanner_in_model is None:
         return None

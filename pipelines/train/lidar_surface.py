@@ -48,38 +48,24 @@ _SPARSE = 4.0  # distances between points, to the furthest neighbour on a well-s
 
 @dataclass(frozen=True)
 class ChangedArea:
-    """Area where cloud and photographs are inconsistent.
+    """Area where cloud and photographs are inconsistent."""
 
-    Attributes:
-        kind: `removed`: the photographs look through the cloud; `added`: they show a surface above it.
-        area_m2: in plan.
-        points: number of points of the cloud.
-        center_in_model: (3,) their mean.
-        cell_m: side of the area's cells in plan.
-        cells: (C, 2) their south-western corners in `model`, for maps.
-    """
-
+    # `removed`: the photographs look through the cloud; `added`: they show a surface above it
     kind: Literal["removed", "added"]
-    area_m2: float
-    points: int
-    center_in_model: FloatArray
-    cell_m: float
-    cells: FloatArray
+    area_m2: float  # in plan
+    points: int  # number of points of the cloud
+    center_in_model: FloatArray  # (3,) their mean
+    cell_m: float  # side of the area's cells in plan
+    cells: FloatArray  # (C, 2) their south-western corners in `model`, for maps
 
 
 @dataclass(frozen=True)
 class CloudVerdict:
-    """What the photographs say of a cloud.
+    """What the photographs say of a cloud."""
 
-    Attributes:
-        rejected: (P,) whether a point is inconsistent with the photographs.
-        confidence: (P,) in the points, 0 … 1; 0 where they are inconsistent with the photographs.
-        areas: that have changed, the largest first.
-    """
-
-    rejected: BoolArray
-    confidence: FloatArray
-    areas: tuple[ChangedArea, ...]
+    rejected: BoolArray  # (P,) inconsistent with the photographs
+    confidence: FloatArray  # (P,) 0 … 1; 0 where the point is inconsistent with the photographs
+    areas: tuple[ChangedArea, ...]  # that have changed, the largest first
 
 
 def verdict(
@@ -90,13 +76,9 @@ def verdict(
     sigma_m: float,
     pixel_m: float,
 ) -> CloudVerdict:
-    """Return confidence and inconsistencies of the P points of a registered cloud.
+    """Return confidence and inconsistencies of the P points of a registered cloud, of a stated σ.
 
-    Args:
-        views: depth maps of the training photographs.
-        surface_in_model: (S, 3) surface that the photographs show together.
-        sigma_m: stated σ of the points.
-        pixel_m: size of a pixel of the depth maps on the surface.
+    The photographs show the depth maps, with pixels of `pixel_m` on the surface, and together the surface (S, 3).
     """
     found = support(cloud.position_in_model, views, UP, _TOLERANCE, cloud.normal_in_model)
     _, nearest = cKDTree(cloud.position_in_model).query(cloud.position_in_model, k=min(_NEIGHBOURS, len(cloud)))

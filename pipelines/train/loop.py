@@ -29,39 +29,25 @@ _RECOVERY_RATE = 0.3  # factor on the learning rates after a divergence
 
 @dataclass(frozen=True)
 class LoopOptions:
-    """Files of a training, and intervals of writing them.
-
-    Attributes:
-        metrics: one JSON object a line.
-        checkpoint_every: iterations between checkpoints.
-        log_every: iterations between lines of metrics.
-        resume: continue from the checkpoint, if the file exists.
-        extend: the checkpoint is that of a finished, shorter training.
-        note: receives how far the training has come, after each checkpoint (`1500 of 7000 iterations, 12 min`).
-    """
+    """Files of a training, and intervals of writing them."""
 
     checkpoint: Path
-    metrics: Path
-    checkpoint_every: int = 500
-    log_every: int = 10
-    resume: bool = False
-    extend: bool = False
+    metrics: Path  # one JSON object a line
+    checkpoint_every: int = 500  # iterations
+    log_every: int = 10  # iterations
+    resume: bool = False  # continue from the checkpoint, if the file exists
+    extend: bool = False  # the checkpoint is that of a finished, shorter training
+    # receives how far the training has come, after each checkpoint (`1500 of 7000 iterations, 12 min`)
     note: Callable[[str], None] = lambda _text: None
 
 
 @dataclass(frozen=True)
 class TrainingRecord:
-    """Time and incidents of a training.
+    """Time and incidents of a training."""
 
-    Attributes:
-        seconds: duration; of an interrupted training, the sum over its runs.
-        recovery: sentence on the value that was not finite, and on the recovery; None: all values were finite.
-        processor_s: of all processors together, for one iteration of this run; NaN where no second iteration ran.
-    """
-
-    seconds: float
-    recovery: str | None
-    processor_s: float = math.nan
+    seconds: float  # duration; of an interrupted training, the sum over its runs
+    recovery: str | None  # what value was not finite, and the recovery; None: all were finite
+    processor_s: float = math.nan  # of all processors, for one iteration; NaN where no second one ran
 
 
 def optimise(trainer: JointTrainer, options: LoopOptions, progress: Progress) -> TrainingRecord:

@@ -25,45 +25,27 @@ from pipelines.train.target_images import TargetImage
 
 @dataclass(frozen=True)
 class RenderedView:
-    """Render of a training view, beside its photograph.
-
-    Attributes:
-        index: of the view.
-        pose: (4, 4) cam ← model.
-        target: the photograph, or a crop of it.
-        gaussians: in training.
-        render: of these and of those around a region; with depths if a loss needs them.
-        stats: of the render, for the Gaussians in training alone.
-        colour: (H, W, 3) render with the exposure of the photograph.
-        counting: (H, W) bool, pixels that count; None: all.
-        points: that the photograph shows; None: unknown.
-    """
+    """Render of a training view, beside its photograph."""
 
     index: int
-    pose: Tensor
-    target: TargetImage
-    gaussians: Gaussians
-    render: Render
-    stats: ScreenStats
-    colour: Tensor
-    counting: Tensor | None = None
-    points: ObservedPoints | None = None
+    pose: Tensor  # (4, 4) cam ← model
+    target: TargetImage  # the photograph, or a crop of it
+    gaussians: Gaussians  # in training
+    render: Render  # of these and of those around a region; with depths if a loss needs them
+    stats: ScreenStats  # of the render, for the Gaussians in training alone
+    colour: Tensor  # (H, W, 3) render with the exposure of the photograph
+    counting: Tensor | None = None  # (H, W) bool; None: all pixels count
+    points: ObservedPoints | None = None  # that the photograph shows; None: unknown
 
 
 @dataclass(frozen=True)
 class Loss:
-    """One loss of a training.
+    """One loss of a training."""
 
-    Attributes:
-        name: in reports.
-        of: returns the value for a view, a scalar; None: the view has no such loss.
-        weight: at an iteration, from 1; 0: the loss is not computed.
-        share: factor of a crop, such that the mean over all crops of a photograph is its loss.
-    """
-
-    name: str
-    of: Callable[[RenderedView], Tensor | None]
-    weight: Callable[[int], float] = lambda _iteration: 1.0
+    name: str  # in reports
+    of: Callable[[RenderedView], Tensor | None]  # scalar; None: the view has no such loss
+    weight: Callable[[int], float] = lambda _iteration: 1.0  # at an iteration, from 1; 0: none
+    # factor of a crop, such that the mean over all crops of a photograph is its loss
     share: Callable[[RenderedView], Tensor | float] = lambda _view: 1.0
 
 
@@ -92,13 +74,10 @@ def training_losses(
     confined: bool = False,
     measured: Sequence[Loss] = (),
 ) -> list[Loss]:
-    """Return the losses of a training.
+    """Return the losses of a training, with those of its problem and strategy; the rasterizer renders normals.
 
-    Args:
-        problem, strategy: have losses of their own: geographic ones, and the penalty of density control.
-        rasterizer: for the render of the normals.
-        confined: whether only pixels of the mask show what is trained.
-        measured: losses of a surface that was measured, used if the options have surface losses.
+    Only pixels of the mask show what is trained if it is `confined`. The losses of a `measured` surface are used if
+    the options have surface losses.
     """
 
     def control_by_depth(view: RenderedView) -> Tensor | None:

@@ -46,11 +46,9 @@ class RegionMasks:
     def __init__(self, masks: dict[int, BoolArray]) -> None:
         self._shape = {index: mask.shape for index, mask in masks.items()}
         self._packed: dict[int, ByteArray] = {index: np.packbits(mask) for index, mask in masks.items()}
+        # Indices of the views that show the region, ascending.
+        self.seeing = np.array(sorted(index for index, mask in masks.items() if mask.any()), dtype=np.int64)
         self.view = lru_cache(_KEPT)(self._view)
-
-    def seeing(self) -> IntArray:
-        """Return the indices of the views that show the region, ascending."""
-        return np.array(sorted(index for index, packed in self._packed.items() if packed.any()), dtype=np.int64)
 
     def _view(self, index: int, shrink: int = 1) -> RegionView:
         """Return the part of a view, at 1/`shrink` of its size, that shows the region; at least one pixel."""
@@ -89,19 +87,12 @@ class SceneBox:
 
 @dataclass(frozen=True)
 class TrainingRegion:
-    """Region of a training.
+    """Region of a training."""
 
-    Attributes:
-        cell: where the Gaussians are trained, in `model`.
-        box: of the survey; far beyond it lie sky and horizon.
-        surroundings: frozen Gaussians outside the cell, on the device of the training.
-        sky: Gaussians of the cell beyond the box, to start from.
-    """
-
-    cell: BlockCell
-    box: SceneBox
-    surroundings: Gaussians
-    sky: Gaussians
+    cell: BlockCell  # where the Gaussians are trained, in `model`
+    box: SceneBox  # of the survey; far beyond it lie sky and horizon
+    surroundings: Gaussians  # frozen Gaussians outside the cell, on the device of the training
+    sky: Gaussians  # Gaussians of the cell beyond the box, to start from
     masks: RegionMasks
 
 
@@ -116,13 +107,9 @@ def region_masks(
     maps: DepthMaps | None = None,
     progress: Progress = SILENT,
 ) -> RegionMasks:
-    """Return the pixels of each view whose surface lies in a region.
+    """Return the pixels of the views (T,) of cameras whose surface lies in a region, the cell.
 
-    Args:
-        views: (T,) indices of the cameras.
-        cell: the region.
-        stand_in: whose depth counts where the surface is not known.
-        maps: known depths; None: there are none.
+    The depth of the stand-in counts where the maps, if there are any, know none.
     """
     sparse, poses = solved.scene.sparse, solved.adjustment.poses
     pinholes = Pinholes(images, sparse.lenses, solved.adjustment.with_lenses(sparse).lenses)
@@ -140,14 +127,9 @@ def region_masks(
 def region_mask(
     pose: FloatArray, pinhole: Pinhole, cell: BlockCell, known: Float32Array | None, stand_in: Float32Array
 ) -> BoolArray:
-    """Return the pixels (H, W) of a view whose surface lies in a region.
+    """Return the pixels (H, W) of a view, cam ← model (4, 4), whose surface lies in a region, the cell.
 
-    Args:
-        pose: (4, 4) cam ← model.
-        pinhole: of H × W pixels.
-        cell: the region.
-        known: depth in metres along z at any resolution, 0 where unknown; None: unknown everywhere.
-        stand_in: depth in metres along z at any resolution, for the pixels without a known one.
+    Depths along z, in metres, are at any resolution; the stand-in's count where none is known: 0, or None for all.
     """
     size = pinhole.width, pinhole.height
     depth = cv2.resize(np.array(stand_in), size, interpolation=cv2.INTER_NEAREST)

@@ -12,7 +12,6 @@ from pipelines.splat.surface import SurfaceSettings
 from pipelines.train.options import LossOptions, TrainOptions
 from pipelines.train.target_images import Crops
 
-_FINAL_RATE = 0.05  # of the geographic unknowns, relative to their first learning rate
 # Factor by which photographs are shrunken, and the fraction of the training up to which they are. A larger factor
 # would make the Gaussians smaller than a pixel, and push them off the surface that they start on.
 COARSE = ((2, 0.3),)
@@ -23,33 +22,21 @@ BACKGROUND = (0.0, 0.0, 0.0)  # RGB behind the scene
 
 @dataclass(frozen=True)
 class JointOptions:
-    """Settings of the joint optimisation.
-
-    Attributes:
-        sh_degree: degree that the spherical harmonics reach.
-        losses: weights that the user decides.
-        similarity_rate: first learning rate of the similarity and of systematic errors of the measurements, in
-            standard deviations an iteration.
-        camera_rate: first learning rate of the camera corrections, in standard deviations an iteration.
-        seed: of the order of views.
-        coarse: (factor, fraction) pairs: photographs are shrunken by a factor up to a fraction of the training.
-        coarse_least_px: lower limit of the longest side of a shrunken photograph.
-        crops: of large photographs; None: all are trained as wholes.
-        surface: weights of the surface losses; None: no surface losses.
-        finishing: whether the Gaussians are trained already, with all their harmonics.
-    """
+    """Settings of the joint optimisation."""
 
     iterations: int
-    sh_degree: int = 3
-    losses: LossOptions = field(default_factory=LossOptions)
+    sh_degree: int = 3  # that the spherical harmonics reach
+    losses: LossOptions = field(default_factory=LossOptions)  # weights that the user decides
+    # first learning rate of the similarity and of systematic errors of the measurements, in standard deviations an
+    # iteration
     similarity_rate: float = 0.1
-    camera_rate: float = 0.01
-    seed: int = 0
-    coarse: tuple[tuple[int, float], ...] = ()
-    coarse_least_px: int = 160
-    crops: Crops | None = None
-    surface: SurfaceSettings | None = None
-    finishing: bool = False
+    camera_rate: float = 0.01  # first learning rate of the camera corrections, in standard deviations an iteration
+    seed: int = 0  # of the order of views
+    coarse: tuple[tuple[int, float], ...] = ()  # (factor, fraction of the training that sees them shrunken)
+    coarse_least_px: int = 160  # lower limit of the longest side of a shrunken photograph
+    crops: Crops | None = None  # of large photographs; None: all are trained as wholes
+    surface: SurfaceSettings | None = None  # weights; None: no surface losses
+    finishing: bool = False  # the Gaussians are trained already, with all their harmonics
 
     @classmethod
     def of(cls, options: TrainOptions) -> JointOptions:
@@ -71,12 +58,7 @@ def pyramid(
     """Return factors by which a photograph is shrunken, and the fraction of the training up to which it is.
 
     A photograph that is trained in crops is first shrunken until it is seen as a whole, and then by half of that
-    factor until density control ends.
-
-    Args:
-        width, height: of the photograph in pixels.
-        coarse: factors and fractions of photographs that are trained as wholes; empty: none is shrunken.
-        crops: of large photographs; None: there are none.
+    factor until density control ends. The others follow `coarse`.
     """
     if not coarse:
         return [(1, 1.0)]
@@ -138,10 +120,6 @@ class TrainingSchedule:
         if weights.geo_schedule == "constant":
             return weights.geo_weight
         return weights.geo_weight * (1.0 - math.exp(-iteration / (_GEO_RISE * self.options.iterations)))
-
-    def geographic_rate(self, iteration: int) -> float:
-        """Return the factor on the first learning rates of the geographic unknowns."""
-        return float(_FINAL_RATE ** self.progress(iteration))
 
     def progress(self, iteration: int) -> float:
         """Return the fraction of the training that is done, 0 … 1."""

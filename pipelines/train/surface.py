@@ -26,16 +26,12 @@ _PLANE_BEND = 0.005  # limit of |z/z₁ + z/z₂ − 2| for a depth z between op
 
 
 def depth_loss_weights(rgb: ByteArray, depth_m: Float32Array) -> Float32Array:
-    """Return weights (H, W) of the depth loss, 0.3 … 12, proportional to the contrast of the photograph.
+    """Return weights (H, W) of the depth loss, 0.3 … 12, proportional to the contrast of the photograph (H, W, 3).
 
     Gaussians are blended in the order of their centres. The photometric loss therefore draws the Gaussians of a
     slanted surface behind it, with a force that grows with the contrast: most of all those of small details, such
     as windows and survey targets. Stereo is most exact at these places. Where the surface bends, or ends within
-    `_REACH_PX`, stereo is least exact, and the weight is smallest.
-
-    Args:
-        rgb: (H, W, 3) the photograph.
-        depth_m: (H, W) along the optical axis; 0: unknown.
+    `_REACH_PX`, stereo is least exact, and the weight is smallest. Depths along the optical axis are 0 if unknown.
     """
     contrast = _contrast(rgb)
     sample = contrast[::_SAMPLE, ::_SAMPLE][depth_m[::_SAMPLE, ::_SAMPLE] > 0]
@@ -75,17 +71,11 @@ _CANDIDATES = 8  # drawn for each wanted point, so that they cover places that f
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """P points of the surface.
+    """P points of the surface."""
 
-    Attributes:
-        point_in_model: (P, 3) metres.
-        rgb: (P, 3) uint8.
-        normal_in_model: (P, 3) unit vectors with an arbitrary sign; NaN where unknown.
-    """
-
-    point_in_model: FloatArray
-    rgb: ByteArray
-    normal_in_model: FloatArray
+    point_in_model: FloatArray  # (P, 3) metres
+    rgb: ByteArray  # (P, 3) uint8
+    normal_in_model: FloatArray  # (P, 3) unit vectors with an arbitrary sign; NaN where unknown
 
 
 class SceneSurface:
@@ -118,11 +108,9 @@ class SceneSurface:
     def sample(
         self, count: int, seed: int, inside: Callable[[FloatArray], BoolArray] | None = None
     ) -> SurfacePoints:
-        """Return points of the whole surface, as dense as the photographs resolve it.
+        """Return points of the whole surface, as dense as the photographs resolve it, at most `count`.
 
-        Args:
-            count, seed: limit of the points, and of their choice.
-            inside: returns which of points (N, 3) count, as a mask (N,); None: all.
+        Those that count are `inside`, which returns a mask (N,) of points (N, 3); None: all.
         """
         rng = np.random.default_rng(seed)
         share = -(-_CANDIDATES * count // max(len(self._train), 1))
@@ -169,12 +157,9 @@ class SceneSurface:
 
 
 def spread_evenly(points: FloatArray, size_m: FloatArray, count: int) -> IntArray:
-    """Return the indices of evenly spread points: one in each cube, whose side is proportional to the point's size.
+    """Return the indices of evenly spread points (P, 3), of sizes (P,) in metres, at most `count` of them.
 
-    Args:
-        points: (P, 3) metres.
-        size_m: (P,) size of each point.
-        count: limit of the result; with no more points than that, all are kept.
+    One is in each cube, whose side is proportional to the point's size. If there are no more points, all are kept.
     """
     if len(points) <= count:
         return np.arange(len(points))

@@ -31,12 +31,9 @@ class Crops:
 
     Each round of visits to a photograph shows all of its crops once, in an order by chance: each pixel is seen
     equally often.
-
-    Attributes:
-        size_px: a photograph with more pixels than a square of this side is seen in crops of so many pixels.
     """
 
-    size_px: int
+    size_px: int  # a photograph with more pixels than a square of this side is seen in crops of so many pixels
     seed: int = 0
 
     def grid(self, width: int, height: int) -> tuple[int, int]:
@@ -91,57 +88,37 @@ _PARTS = 256  # crops kept: density control samples others between an iteration 
 
 @dataclass(frozen=True)
 class ImageLook:
-    """Look at a photograph.
-
-    Attributes:
-        shrink: every pixel is the mean of shrink × shrink pixels.
-        visit: number of the visit, from 0, for the choice of a crop of a large photograph; None: all of it.
-    """
+    """Look at a photograph."""
 
     index: int
-    shrink: int = 1
-    visit: int | None = None
+    shrink: int = 1  # every pixel is the mean of shrink × shrink pixels
+    visit: int | None = None  # from 0, chooses the crop of a large photograph; None: all of it
 
 
 @dataclass(frozen=True)
 class ImagePart:
-    """Part of a photograph to train on.
+    """Part of a photograph to train on."""
 
-    Attributes:
-        window: in pixels of the whole photograph at its size; None: all of it.
-        crops: number of crops in which all that is trained of the photograph is seen, one at a visit.
-        weight: of a mean over the pixels that count in this crop: the mean of weighted means over all crops is
-            the mean over all pixels that count.
-        share: of the whole photograph's pixels that count in all crops, if a region is trained; else 1.
-        low, high: corners (x, y) of the crop in pixels, infinite on the sides where no other crop follows. The
-            centre of each Gaussian lies between the corners of one crop.
-    """
-
-    window: Window | None = None
-    crops: int = 1
+    window: Window | None = None  # of the whole photograph, in its pixels; None: all of it
+    crops: int = 1  # number in which all that is trained is seen, one at a visit
+    # of a mean over the pixels that count in this crop: the mean of weighted means over all crops is the mean over
+    # all pixels that count
     weight: float = 1.0
-    share: float = 1.0
+    share: float = 1.0  # of the whole photograph's counting pixels, if a region is trained; else 1
+    # Corners (x, y) of the crop in px: the centre of each Gaussian lies between those of one crop.
     low: tuple[float, float] = (-inf, -inf)
-    high: tuple[float, float] = (inf, inf)
+    high: tuple[float, float] = (inf, inf)  # infinite where no other crop follows
 
 
 @dataclass(frozen=True)
 class TargetImage:
-    """Photograph to compare a render with.
+    """Photograph to compare a render with."""
 
-    Attributes:
-        colour: (H, W, 3) float32, 0 … 1.
-        mask: (H, W) bool, the pixels that count; None: all.
-        camera: of H × W pixels, with the lens in use.
-        whole: camera of the whole photograph at this size.
-        part: of the whole that these pixels are.
-    """
-
-    colour: Tensor
-    mask: Tensor | None
-    camera: Pinhole
-    whole: Pinhole
-    part: ImagePart = ImagePart()
+    colour: Tensor  # (H, W, 3) float32, 0 … 1
+    mask: Tensor | None  # (H, W) bool, the pixels that count; None: all
+    camera: Pinhole  # of H × W pixels, with the lens in use
+    whole: Pinhole  # camera of the whole photograph at this size
+    part: ImagePart = ImagePart()  # of the whole that these pixels are
 
 
 class TargetImages:

@@ -49,6 +49,7 @@ from pipelines.train.schedule import BACKGROUND, JointOptions, TrainingSchedule
 from pipelines.train.target_images import ImageLook, TargetImage, TargetImages
 
 _OUTLIERS_FROM = 0.5  # of the iterations: before, the model is too coarse to tell what has moved
+_FINAL_RATE = 0.05  # of the geographic unknowns, relative to their first learning rate
 _FINISHING_RATE = 0.3  # of the rates at which a training starts
 _LENS_EVERY = 100  # iterations between two reads of the lens: each read waits for the device
 # Each non-finite gradient shows in one of these: colours pass it on to the opacities.
@@ -57,39 +58,25 @@ _WATCHED = ("means", "quats_wxyz", "log_scales", "logit_opacities")
 
 @dataclass(frozen=True)
 class TrainingViews:
-    """Training views, with the data that their renders are compared with.
+    """Training views, with the data that their renders are compared with."""
 
-    Attributes:
-        camera: (V,) indices of the training views, into cameras and images.
-        surface: returns the points in `model`, float32, that an image shows; None: no depth loss.
-        lenses: lenses with which the images were undistorted; None: the lenses never change.
-        measured: losses of a surface that was measured.
-    """
-
-    camera: IntArray
+    camera: IntArray  # (V,) indices of the training views, into cameras and images
     images: ImageCache
+    # returns the points in `model`, float32, that an image shows; None: no depth loss
     surface: Callable[[int], ObservedPoints] | None = None
-    lenses: Lenses | None = None
-    measured: Sequence[Loss] = ()
+    lenses: Lenses | None = None  # with which the images were undistorted; None: they never change
+    measured: Sequence[Loss] = ()  # of a surface that was measured
 
 
 @dataclass(frozen=True)
 class StepReport:
-    """Figures of one iteration; the scalar tensors are still on the device, because fetching them would wait.
+    """Figures of one iteration; the scalar tensors are still on the device, because fetching them would wait."""
 
-    Attributes:
-        losses: value of each loss that the view has, by its name, not yet weighted.
-        mean_square_error: of colours from 0 to 1, over the pixels that count.
-        weight: w(t), the weight of the geographic losses.
-        visible: number of Gaussians in the view, those around a region among them.
-        pixels: of the render.
-    """
-
-    losses: dict[str, Tensor]
-    mean_square_error: Tensor
-    weight: float
-    visible: int
-    pixels: int
+    losses: dict[str, Tensor]  # not yet weighted
+    mean_square_error: Tensor  # of colours from 0 to 1, over the pixels that count
+    weight: float  # w(t), the weight of the geographic losses
+    visible: int  # number of Gaussians in the view, those around a region among them
+    pixels: int  # of the render
 
 
 class _Stateful(Protocol):
@@ -165,7 +152,7 @@ class JointTrainer:
         geographic = losses["geographic"] + losses.get("control_by_depth", 0.0)
         self.watch.note(self.iteration, self._watched(losses["photometric"], geographic))
         stats = self._of_whole(self._own(view.render.stats), view.pose, view.target)
-        self._unknowns.step(self.optimizer.rate_factor * self.schedule.geographic_rate(self.iteration))
+        self._unknowns.step(self.optimizer.rate_factor * _FINAL_RATE ** self.schedule.progress(self.iteration))
         self.optimizer.step(self.iteration, stats.visible)
         if self.exposures is not None:
             self.exposures.step(self.iteration)
@@ -340,9 +327,8 @@ def make_trainer(
 ) -> JointTrainer:
     """Return the trainer with initial Gaussians; a DegenerateGeometryError: fewer than two different points.
 
-    Args:
-        problem: the geographic losses, moved to the backend's device.
-        exposures: to be frozen; None: those of the training photographs are fitted, if the options say so.
+    The problem moves to the backend's device. Exposures stay frozen; None: those of the training photographs are
+    fitted, if the options say so.
     """
     effort, device = options.effort, device_of(backend)
     scene, images, surface = training.scene, training.images, training.surface
@@ -378,9 +364,7 @@ def make_finisher(
 ) -> JointTrainer:
     """Return a trainer that goes on with trained Gaussians, at a low rate, and neither adds nor removes any.
 
-    Args:
-        gaussians: on the backend's device.
-        problem: freezes the cameras.
+    The Gaussians are on the backend's device, and the problem freezes the cameras.
     """
     device, scene, iterations = device_of(backend), training.scene, options.effort.iterations
     extent_m = scene_extent(scene.poses.cam_center_in_model[scene.train])

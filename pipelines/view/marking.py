@@ -34,17 +34,12 @@ _IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 @dataclass(frozen=True)
 class MarkedPoint:
-    """Point with its marks.
-
-    Attributes:
-        xyz: surveyed coordinates in the CRS; None: not surveyed.
-        marks: place in pixels of the full image, by image.
-    """
+    """Point with its marks."""
 
     name: str
-    xyz: tuple[float, float, float] | None
+    xyz: tuple[float, float, float] | None  # in the CRS; None: not surveyed
     is_check: bool = False
-    marks: dict[str, tuple[float, float]] = field(default_factory=dict)
+    marks: dict[str, tuple[float, float]] = field(default_factory=dict)  # px by image
 
     def with_mark(self, image: str, place_px: tuple[float, float] | None) -> MarkedPoint:
         """Return the point with another mark in an image; None takes the mark away."""
@@ -55,8 +50,7 @@ class MarkedPoint:
 def points_to_mark(survey: Survey, xyz_of: Callable[[tuple[SurveyedPoint, ...]], FloatArray]) -> list[MarkedPoint]:
     """Return the control and check points of a survey with their marks, also those with too few marks to be used.
 
-    Args:
-        xyz_of: returns the coordinates (J, 3) of J points in the CRS.
+    `xyz_of` returns the coordinates (J, 3) of J points in the CRS.
     """
     to_mark = []
     for use, marked in (("control", survey.control_points), ("check", survey.check_points)):

@@ -61,12 +61,8 @@ class Overlays:
     def hit(self, start: FloatArray, direction: FloatArray, pixel_rad: float) -> int | str | None:
         """Return the overlay that a line of sight meets, the nearest to its start; None: it meets none.
 
-        The overlay is a camera by its index, or a surveyed point by its name.
-
-        Args:
-            start: (3,) in the viewer's frame.
-            direction: (3,) unit vector.
-            pixel_rad: width of a pixel of the page.
+        The overlay is a camera by its index, or a surveyed point by its name. The line has a start (3,) in the
+        viewer's frame and a unit direction (3,); `pixel_rad` is the width of a pixel of the page.
         """
         overlays: list[tuple[FloatArray, float, int | str]] = []
         if self._groups["points"].visible:

@@ -54,20 +54,13 @@ _QUALITY_MOVING, _QUALITY_STILL = 70, 95  # of the JPEG
 
 @dataclass(frozen=True)
 class ViewerCamera:
-    """Camera of a page, in the frame of the viewer.
+    """Camera of a page, in the frame of the viewer."""
 
-    Attributes:
-        wxyz: (4,) rotation view ← camera; the camera's axes are x right, y down, z forward.
-        position: (3,).
-        fov_rad: vertical field of view.
-        width, height: of the page in pixels.
-    """
-
-    wxyz: FloatArray
-    position: FloatArray
-    fov_rad: float
-    width: int
-    height: int
+    wxyz: FloatArray  # (4,) rotation view ← camera; the camera's axes are x right, y down, z forward
+    position: FloatArray  # (3,)
+    fov_rad: float  # vertical field of view
+    width: int  # of the page in pixels
+    height: int  # likewise
 
     @property
     def rotation(self) -> FloatArray:

@@ -32,17 +32,12 @@ class Quantity:
 
 @dataclass(frozen=True)
 class MeasuredPoints:
-    """J measured points.
+    """J measured points."""
 
-    Attributes:
-        position_in_geo: (J, 3) metres.
-        cov_in_geo: (3 J, 3 J) m², joint; None: nothing states it.
-        height_m: (J,) heights in the vertical datum of the CRS, in metres. Those of `geo` depart from them by
-            d²/2R, 8 cm at a distance of 1 km.
-    """
-
-    position_in_geo: FloatArray
-    cov_in_geo: FloatArray | None
+    position_in_geo: FloatArray  # (J, 3) metres
+    cov_in_geo: FloatArray | None  # (3 J, 3 J) m², joint; None: nothing states it
+    # (J,) heights in the vertical datum of the CRS, in metres. Those of `geo` depart from them by d²/2R, 8 cm at a
+    # distance of 1 km
     height_m: FloatArray
 
 
@@ -104,22 +99,15 @@ def _unit(vector: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class SampledSurface:
-    """Surface within a polygon, sampled on a grid in plan.
+    """Surface within a polygon, sampled on a grid in plan."""
 
-    Attributes:
-        corners: of the polygon.
-        samples: N points of the surface, without covariance.
-        sigma_up_m: (N,) σ of the samples' own heights, independent of each other.
-        cov_in_geo: (3 (J + M), 3 (J + M)) m², joint, of the corners and of those M samples that `chosen` names,
-            without the samples' own errors; None: nothing states it.
-        chosen: (M,) rows of the samples in that covariance.
-    """
-
-    corners: MeasuredPoints
-    samples: FloatArray
-    sigma_up_m: FloatArray
+    corners: MeasuredPoints  # of the polygon
+    samples: FloatArray  # N points of the surface, without covariance
+    sigma_up_m: FloatArray  # (N,) σ of the samples' own heights, independent of each other
+    # (3 (J + M), 3 (J + M)) m², joint, of the corners and of those M samples that `chosen` names, without the
+    # samples' own errors; None: nothing states it
     cov_in_geo: FloatArray | None
-    chosen: IntArray
+    chosen: IntArray  # (M,) rows of the samples in that covariance
 
 
 def surface_area(surface: SampledSurface) -> Quantity:

@@ -80,7 +80,7 @@ def test_window_is_the_smallest_with_the_whole_mask(shrink: int) -> None:
     window = view.window
     assert (window.top, window.left, window.height, window.width) == tuple(v // shrink for v in (8, 30, 12, 14))
     assert view.mask.all()
-    assert masks.seeing().tolist() == [3]
+    assert masks.seeing.tolist() == [3]
     assert masks.view(3).mask.sum() == 12 * 14
 
 

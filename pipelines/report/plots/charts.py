@@ -36,19 +36,13 @@ _WIDE_RANGE = 20.0  # between the largest and the smallest bar: beyond, only a l
 
 @dataclass(frozen=True)
 class BarChart:
-    """Group of bars for each member, a bar for each series.
-
-    Attributes:
-        axis: what the bars measure, with its unit.
-        series: by name, heights of the members; None leaves a gap.
-        digits: decimals of the figures on the bars.
-    """
+    """Group of bars for each member, a bar for each series."""
 
     title: str
-    axis: str
+    axis: str  # what the bars measure, with its unit
     members: tuple[str, ...]
-    series: Mapping[str, Sequence[float | None]]
-    digits: int = 3
+    series: Mapping[str, Sequence[float | None]]  # heights of the members; None leaves a gap
+    digits: int = 3  # decimals of the figures on the bars
 
 
 def write_bars(path: Path, panels: Sequence[BarChart]) -> None:

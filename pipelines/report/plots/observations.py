@@ -39,10 +39,7 @@ def residual_field(
 ) -> tuple[bytes, float | None]:
     """Return mean reprojection residuals by image region as arrows on their RMS, and the arrows' magnification.
 
-    Args:
-        size_px: width and height of the photographs.
-        mean_px: (R, C, 2) mean residual of each region, rows from the top; NaN: too few observations.
-        rms_px: (R, C) root mean square length.
+    Means (R, C, 2), rows from the top, are NaN with too few observations; root mean square lengths are (R, C).
     """
     width, height = size_px
     rows, columns = rms_px.shape

@@ -62,13 +62,9 @@ class PlanFrame:
 def frame_around(
     *places: FloatArray, narrowest: float = _NARROWEST, margin: float = _MARGIN, least_m: float = 1.0
 ) -> PlanFrame:
-    """Return the frame around groups of places (N, 2) in metres.
+    """Return the frame around groups of places (N, 2) in metres; NaN rows do not count.
 
-    Args:
-        places: the groups; NaN rows do not count.
-        narrowest: shorter side over the longer one, at least.
-        margin: around all places, as a part of the longer side.
-        least_m: longer side, at least.
+    The shorter side is at least `narrowest` times the longer one, and that `least_m`; `margin` is a part of it.
     """
     everything = np.concatenate([np.zeros((0, 2)), *(np.asarray(group)[:, :2] for group in places)])
     everything = everything[np.isfinite(everything).all(axis=1)]
@@ -199,17 +195,11 @@ _OVERLAP_STEPS = (1, 2, 3, 4, 5, 7, 10, 15, 20)
 
 @dataclass(frozen=True)
 class NamedPlaces:
-    """Surveyed points to mark on a map.
+    """Surveyed points to mark on a map."""
 
-    Attributes:
-        place_m: (K, 2) east and north.
-        names: of the points; empty: none is written.
-        error_m: (K, 3) east, north, up, to be drawn as arrows; NaN: not measured; None: no arrows.
-    """
-
-    place_m: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
-    names: Sequence[str] = ()
-    error_m: FloatArray | None = None
+    place_m: FloatArray = field(default_factory=lambda: np.empty((0, 2)))  # (K, 2) east and north
+    names: Sequence[str] = ()  # empty: none is written
+    error_m: FloatArray | None = None  # (K, 3) east, north, up, as arrows; NaN: not measured
 
 
 NO_PLACES = NamedPlaces()
@@ -265,11 +255,8 @@ def movement_plan(
 ) -> DrawnMovement:
     """Return the plan of the cameras with arrows from measured to adjusted positions, and their error ellipses.
 
-    Args:
-        center_m: (n, 2) adjusted positions.
-        moved_m: (n, 2) adjusted minus measured; NaN: not measured.
-        covariance: (n, 2, 2) m² of the adjusted positions in plan; None: not known.
-        is_outlier: (n,) whether the solution has left the measured position out.
+    Adjusted minus measured positions (n, 2) are NaN if not measured; the covariance (n, 2, 2) of the adjusted ones
+    is in m², None: unknown. The solution has left outliers (n,) out.
     """
     from matplotlib.collections import EllipseCollection
 
@@ -320,10 +307,8 @@ def movement_plan(
 def overlap_plan(count: IntArray, corner_m: FloatArray, cell_m: float, camera_m: FloatArray) -> bytes:
     """Return the map of the number of photographs that see each cell of the ground, as PNG.
 
-    Args:
-        count: (R, C) rows from the south, columns from the west; −1: no scene.
-        corner_m: (2,) east and north of the south-western corner.
-        camera_m: (n, 2) cameras.
+    Counts (R, C) are by row from the south and column from the west; −1: no scene. Corner (2,) and cameras (n, 2)
+    are east and north.
     """
     from matplotlib import colormaps
     from matplotlib.colors import BoundaryNorm

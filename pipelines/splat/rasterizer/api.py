@@ -65,25 +65,15 @@ class Window:
 
 @dataclass(frozen=True)
 class RasterSettings:
-    """Settings of a render.
+    """Settings of a render."""
 
-    Attributes:
-        sh_degree: of the spherical harmonics in use (≤ the stored degree).
-        near_m: Gaussians with a nearer centre are left out.
-        dilation_px2: added to the diagonal of the screen covariance, in px².
-        depth: whether to compute depths (colour and alpha always are).
-        median: whether the median depth is one of them. Training does not need it, and on a GPU it costs more than
-            all the rest.
-        window: part of the camera's image to render, which is then the image; None: all of it.
-    """
-
-    sh_degree: int = 3
+    sh_degree: int = 3  # of the spherical harmonics in use (≤ the stored degree)
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    near_m: float = 0.05
-    dilation_px2: float = 0.3
-    depth: bool = False
-    median: bool = True
-    window: Window | None = None
+    near_m: float = 0.05  # Gaussians with a nearer centre are left out
+    dilation_px2: float = 0.3  # added to the diagonal of the screen covariance, in px²
+    depth: bool = False  # colour and alpha are always computed
+    median: bool = True  # depth; training needs none, and on a GPU it costs more than all the rest
+    window: Window | None = None  # part of the camera's image that is rendered; None: all of it
 
     def image_of(self, camera: Pinhole) -> Pinhole:
         return camera if self.window is None else self.window.of(camera)
@@ -91,17 +81,11 @@ class RasterSettings:
 
 @dataclass
 class ScreenStats:
-    """Statistics of one render for density control.
+    """Statistics of one render for density control."""
 
-    Attributes:
-        visible: (M,) int64 rows of the Gaussians that touched the image.
-        mean_gradient: (M, 2) float32, ∂L/∂(projected centre) in 1/pixel; filled by the backward pass.
-        counted: (M,) bool, False for Gaussians that other parts of the same image count; None: all are True.
-    """
-
-    visible: Tensor
-    mean_gradient: Tensor | None = None
-    counted: Tensor | None = None
+    visible: Tensor  # (M,) int64 rows of the Gaussians that touched the image
+    mean_gradient: Tensor | None = None  # (M, 2) float32, ∂L/∂(projected centre) in 1/px; set by the backward pass
+    counted: Tensor | None = None  # (M,) bool, False where other parts of the image count it; None: all True
 
     def of_first(self, count: int) -> ScreenStats:
         """Return the statistics of the first `count` Gaussians of a render."""
@@ -113,9 +97,7 @@ class ScreenStats:
     def of_part(self, share: float, counted: Tensor | None = None) -> ScreenStats:
         """Return the statistics of a part of an image, as what it adds to those of the whole image.
 
-        Args:
-            share: factor of the gradients: of the part in the loss of the whole.
-            counted: (M,) of the Gaussians that the part counts for the whole; None: all.
+        The share multiplies the gradients. For the whole, the part counts the `counted` (M,); None: all.
         """
         gradient = None if self.mean_gradient is None else share * self.mean_gradient
         return ScreenStats(self.visible, gradient, counted)
@@ -123,25 +105,18 @@ class ScreenStats:
 
 @dataclass
 class Render:
-    """Rendered view of H × W pixels.
+    """Rendered view of H × W pixels."""
 
-    Attributes:
-        colour: (H, W, 3), linear in the Gaussians' colours, background blended in.
-        alpha: (H, W), 1 − final transmittance.
-        stats: for densification.
-        expected_depth: (H, W), Σ w z / Σ w along the camera's z axis in metres, with each Gaussian's z at the
-            pixel; 0 where alpha is 0; or None.
-        depth_variance: (H, W), Σ w z² / Σ w − expected_depth² in m²: 0 if all Gaussians of a pixel lie on one
-            surface; or None.
-        median_depth: (H, W), z at the pixel of the Gaussian at which the transmittance falls to one half, 0 if the
-            transmittance stays higher; not differentiable; or None.
-    """
-
-    colour: Tensor
-    alpha: Tensor
-    stats: ScreenStats
+    colour: Tensor  # (H, W, 3), linear in the Gaussians' colours, background blended in
+    alpha: Tensor  # (H, W), 1 − final transmittance
+    stats: ScreenStats  # for densification
+    # (H, W), Σ w z / Σ w along the camera's z axis in metres, with each Gaussian's z at the pixel; 0 where alpha is
+    # 0; or None
     expected_depth: Tensor | None = None
+    # (H, W), Σ w z² / Σ w − expected_depth² in m²: 0 if all Gaussians of a pixel lie on one surface; or None
     depth_variance: Tensor | None = None
+    # (H, W), z at the pixel of the Gaussian at which the transmittance falls to one half, 0 if the transmittance
+    # stays higher; not differentiable; or None
     median_depth: Tensor | None = None
 
 

@@ -70,9 +70,7 @@ _HITS_PER_VISIBLE = 6.0
 def predicted_bytes(count: int, camera: Pinhole, sh_degree: int, *, visible: int | None = None) -> int:
     """Return the peak memory in bytes of one render and its backward pass, with gradients, without parameters.
 
-    Args:
-        sh_degree: of the stored spherical harmonics.
-        visible: number of Gaussians in the image; None: all.
+    Of the Gaussians, whose stored harmonics have a degree, `visible` are in the image; None: all.
     """
     gradients = count * (11 + 3 * (sh_degree + 1) ** 2) * 4 + count * 5
     splats = cpu_project.SPLAT_WIDTH + cpu_project.ELLIPSE_WIDTH
@@ -101,21 +99,13 @@ class _RenderContext:
 
 @dataclass
 class TileLists:
-    """H hits of M splats in the tiles of an image.
+    """H hits of M splats in the tiles of an image."""
 
-    Attributes:
-        hits: (H,) packed, by tile, nearest first.
-        tile_start: (tiles + 1,) into `hits`.
-        tile_end: (tiles,) hit at which blending stopped because all pixels were done.
-        splat_start: (M + 1,) into `places`.
-        places: (H,) into `hits`, by splat.
-    """
-
-    hits: _Array
-    tile_start: _Array
-    tile_end: _Array
-    splat_start: _Array
-    places: _Array
+    hits: _Array  # (H,) packed, by tile, nearest first
+    tile_start: _Array  # (tiles + 1,) into `hits`
+    tile_end: _Array  # (tiles,) hit at which blending stopped because all pixels were done
+    splat_start: _Array  # (M + 1,) into `places`
+    places: _Array  # (H,) into `hits`, by splat
 
 
 class _Rasterize(torch.autograd.Function):

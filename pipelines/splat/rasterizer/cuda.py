@@ -47,7 +47,7 @@ class CudaRasterizer:
             torch.sigmoid(gaussians.logit_opacities),
             gaussians.sh,
             cam_from_model.float()[None],
-            _intrinsics(camera, device)[None],
+            _row((camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0), device).view(1, 3, 3),
             camera.width,
             camera.height,
             near_plane=settings.near_m,
@@ -136,14 +136,9 @@ class CudaRasterizer:
 
 
 # Small constants are made once: every copy to the device waits for all work that is queued there.
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=4096)
 def _row(values: tuple[float, ...], device: torch.device) -> Tensor:
     return torch.tensor([values], device=device)
-
-
-@lru_cache(maxsize=4096)
-def _intrinsics(camera: Pinhole, device: torch.device) -> Tensor:
-    return torch.tensor([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]], device=device)
 
 
 def _depth_slope(

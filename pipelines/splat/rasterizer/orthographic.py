@@ -21,20 +21,14 @@ _LOG_ALPHA_MIN = float(np.log(ALPHA_MIN))
 
 @dataclass(frozen=True)
 class PlanSplats:
-    """N Gaussians over a map plane, float64.
+    """N Gaussians over a map plane, float64."""
 
-    Attributes:
-        mean: (N, 3) column and row in px (the centre of the first pixel is 0.5, 0.5), and depth below a level above
-            all of them, in any unit; depths are > 0.
-        cov: (N, 3, 3) covariance of the same three.
-        opacity: (N,).
-        colour: (N, 3) red, green, blue.
-    """
-
+    # (N, 3) column and row in px (the centre of the first pixel is 0.5, 0.5), and depth below a level above all of
+    # them, in any unit; depths are > 0
     mean: FloatArray
-    cov: FloatArray
-    opacity: FloatArray
-    colour: FloatArray
+    cov: FloatArray  # (N, 3, 3) covariance of the same three
+    opacity: FloatArray  # (N,)
+    colour: FloatArray  # (N, 3) red, green, blue
 
     def scaled(self, factor: float) -> PlanSplats:
         """Return the same Gaussians over pixels that are smaller by a factor; depths stay."""

@@ -67,7 +67,7 @@ def run(stage: StageRun, options: BlockTrainOptions) -> Summary:
     masks = region_masks(
         solved, train, images, backend, block.region, stand_in=scaffold, maps=maps, progress=stage.progress
     )
-    seeing = masks.seeing()
+    seeing = masks.seeing
     if len(seeing) < _LEAST_VIEWS:
         raise DegenerateGeometryError(
             "block-unseen",

@@ -148,7 +148,7 @@ class SeamViews:
 
 def merge_blocks(parts: Parts, plan: BlockPlan, folder: Path, progress: Progress) -> Summary:
     """Write the product of `train` from a plan's blocks, and return its key figures; an InputError: unreadable."""
-    trainings = [parts.training(block) for block in plan.blocks]
+    trainings = parts.trainings(plan)
     # The Gaussians of each cell, adapted to those of its neighbours.
     cells = [parts.variant().root / TRAIN_SEAMS.folder / f"{block.id}.ply" for block in plan.blocks]
     count = join_splat_plys(cells, folder / "gaussians.ply")

@@ -30,7 +30,7 @@ from pipelines.core.stages import (
 from pipelines.core.staleness import request, why_damaged, why_stale
 from pipelines.core.workspace import Workspace
 from pipelines.splat.rasterizer.backends import chosen_backend
-from pipelines.survey.block_plan import SCAFFOLD_IMAGE_PX, BlockPlan, BlockRecord, BlockTraining, PlannedBlock
+from pipelines.survey.block_plan import SCAFFOLD_IMAGE_PX, BlockPlan, BlockRecord, BlockTraining
 from pipelines.survey.options import NOT_IN_BLOCKS
 from pipelines.train.options import TrainOptions
 
@@ -71,8 +71,8 @@ class Parts:
             raise MissingProductError(f"{FOLDER}/{BLOCK_PLAN}", f"georef blocks plan {self.workspace.root}")
         return load_json(BlockPlan, path)
 
-    def training(self, block: PlannedBlock) -> BlockTraining:
-        return load_json(BlockTraining, self.variant(block.id).path(BLOCK_TRAINING))
+    def trainings(self, plan: BlockPlan) -> list[BlockTraining]:
+        return [load_json(BlockTraining, self.variant(block.id).path(BLOCK_TRAINING)) for block in plan.blocks]
 
     def flags(self, spec: StageSpec, number: int | None = None) -> dict[str, Any]:
         """Return all options of a part; `number` is that of the block, for `TRAIN_BLOCK`."""
@@ -129,7 +129,7 @@ class Parts:
             return False
         try:
             merged = load_json(BlockRecord, record).blocks
-            return [part.training for part in merged] == [self.training(block) for block in self.plan().blocks]
+            return [part.training for part in merged] == self.trainings(self.plan())
         except (MissingProductError, InputError):
             return False
 

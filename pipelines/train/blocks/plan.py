@@ -39,21 +39,13 @@ _MOST_OBSERVATIONS = 6_000_000
 
 @dataclass(frozen=True)
 class ObservedSurface:
-    """P points of the surface, and their M observations in n training images.
+    """P points of the surface, and their M observations in n training images."""
 
-    Attributes:
-        point_in_model: (P, 3) metres.
-        surface: (P,) share of the survey's surface that each point stands for; sum 1.
-        obs_point: (M,) index of the point.
-        obs_image: (M,) index of the image.
-        obs_share: (M,) share of the image that the observation stands for; sum 1 in each image with observations.
-    """
-
-    point_in_model: FloatArray
-    surface: FloatArray
-    obs_point: IntArray
-    obs_image: IntArray
-    obs_share: FloatArray
+    point_in_model: FloatArray  # (P, 3) metres
+    surface: FloatArray  # (P,) share of the survey's surface that each point stands for; sum 1
+    obs_point: IntArray  # (M,) indices
+    obs_image: IntArray  # (M,) indices
+    obs_share: FloatArray  # (M,) share of the image that it stands for; sum 1 in each image with any
 
     def share_in_views(self, inside: BoolArray, images: int) -> FloatArray:
         """Return the share (n,) of each image that shows the points of a mask (P,), 0 … 1."""
@@ -101,12 +93,8 @@ def cells_of_number(
 ) -> list[BlockCell]:
     """Return cells that divide the plane, or `cell`, with loads as equal as the points allow.
 
-    Args:
-        points: (P, 2 or more) east and north, metres.
-        load: (P,) of each point, ≥ 0.
-
-    Raises:
-        DegenerateGeometryError: the points lie at fewer places than cells are wanted.
+    The points (P, 2 or more) are east and north in metres, their loads (P,) are ≥ 0. A DegenerateGeometryError:
+    they lie at fewer places than cells are wanted.
     """
     if count == 1:
         return [cell]
@@ -120,9 +108,7 @@ def cells_that_fit(
 ) -> list[BlockCell]:
     """Return cells, at most 4096, that divide the plane, halved until each fits; a DegenerateGeometryError: none.
 
-    Args:
-        points, load: as of `cells_of_number`.
-        fits: returns whether a cell, with its extent (2,) in metres, is small enough.
+    Points and loads are as of `cells_of_number`; `fits` tells of a cell, with its extent (2,) in metres.
     """
     waiting, done = [BlockCell()], list[BlockCell]()
     while waiting:

@@ -143,7 +143,7 @@ class _SeamTrainer:
         train = np.array([index[name] for name in names if name in index], dtype=np.int64)
         everything = Gaussians.concatenate([start, surroundings]).to(device)
         masks = region_masks(self.solved, train, self.images, self.backend, strip, stand_in=everything)
-        seeing = masks.seeing()
+        seeing = masks.seeing
         if len(seeing) < _LEAST_VIEWS:
             return None
         box = SceneBox.around(scene.point_in_model)

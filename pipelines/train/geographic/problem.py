@@ -199,15 +199,12 @@ class GeoProblem(torch.nn.Module):
     def depth_loss(self, camera: int, depth_m: Tensor, alpha: Tensor, pinhole: Pinhole) -> Tensor | None:
         """Return λ_gcp L_gcp of one view for control points through the rendered depth; None: it has no marks.
 
+        The render has depths (H, W) in metres, alpha (H, W), and the pinhole of these pixels with the present lens.
+
         - The gradient reaches similarity, camera and Gaussians.
         - Each point has weight 1, whatever the number of its marks.
         - The loss of a view is scaled by the number of views: its mean over the views is the loss of all marks.
         - Marks on a nearly transparent render have weight 0: there is no surface yet.
-
-        Args:
-            depth_m: (H, W) expected depth, metres, differentiable.
-            alpha: (H, W) opacity of the render.
-            pinhole: intrinsics of these pixels, with the present lens.
         """
         marks, control = self.control_by_depth, self.term(ControlTerm)
         if marks is None or control is None or not self.sees_by_depth(camera):
@@ -254,13 +251,8 @@ def refining_problem(
 ) -> GeoProblem:
     """Return the problem of a training that refines similarity, cameras, lens and systematic errors.
 
-    With `paper` the lens stays, because plain mean squares compare no lens with the photographs.
-
-    Args:
-        points: of `geolocate`, for L_rel; None: L_rel uses the cameras and their fixes.
-
-    Raises:
-        InputError: `points` belongs to another model.
+    With `paper` the lens stays, because plain mean squares compare no lens with the photographs. L_rel uses the
+    points of `geolocate`, None: the cameras and their fixes; an InputError: points of another model.
     """
     scene, state, record = adjusted.scene, adjusted.state(measured.errors), adjusted.adjustment.geo_from_model
     terms: list[TensorTerm] = []

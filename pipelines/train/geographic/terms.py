@@ -45,22 +45,14 @@ def moved_tensors(record: RecordT, move: Callable[[Tensor], Tensor]) -> RecordT:
 
 
 class TensorTerm(ABC):
-    """M observations of one kind.
+    """M observations of one kind."""
 
-    Attributes:
-        kind: name in losses and metrics.
-        dimension: d, of a residual.
-        in_metres: whether the residuals are lengths, which plain mean squares need no whitening for.
-        root_information: (M, d, d) float64, W with WᵀW = Σ⁻¹.
-        share: weight of each observation in the loss, 0 to 1.
-    """
+    kind: ClassVar[str]  # name in losses and metrics
+    dimension: ClassVar[int] = 3  # d, of a residual
+    in_metres: ClassVar[bool] = True  # if so, plain mean squares need no whitening
 
-    kind: ClassVar[str]
-    dimension: ClassVar[int] = 3
-    in_metres: ClassVar[bool] = True
-
-    root_information: Tensor
-    share: float = 1.0
+    root_information: Tensor  # (M, d, d) float64, W with WᵀW = Σ⁻¹
+    share: float = 1.0  # weight of each observation in the loss, 0 to 1
 
     @abstractmethod
     def residuals(self, at: Estimate) -> Tensor:
@@ -209,23 +201,16 @@ class DistanceTerm(TensorTerm):
     These corrections keep the points' mean position, rotation and size
     (`geometry.bundle.correction_basis`). Fixed points are therefore right to first order for the scale,
     the only quantity that the pairs determine.
-
-    Attributes:
-        distance_in_model: (P,) float64; None: between the cameras below.
-        camera: (P, 2) int64 indices into the cameras; None: between fixed points of the scene.
-        distance_in_geo: (P,) float64 metres.
-        root_information: (P, 1, 1) float64, 1/σ of the measured distance in 1/m.
-        share: limits their information on the scale to a tenth of that of the fixes.
     """
 
     kind: ClassVar[str] = "relative"
     dimension: ClassVar[int] = 1
 
-    distance_in_model: Tensor | None
-    camera: Tensor | None
-    distance_in_geo: Tensor
-    root_information: Tensor
-    share: float = 1.0
+    distance_in_model: Tensor | None  # (P,) float64; None: between the cameras below
+    camera: Tensor | None  # (P, 2) int64 indices into the cameras; None: between fixed points
+    distance_in_geo: Tensor  # (P,) float64 metres
+    root_information: Tensor  # (P, 1, 1) float64, 1/σ of the measured distance in 1/m
+    share: float = 1.0  # limits their information on the scale to a tenth of that of the fixes
 
     def residuals(self, at: Estimate) -> Tensor:
         """Return s |x_i − x_j| − |X_i − X_j| (P, 1) in metres."""
@@ -246,12 +231,7 @@ def distance_term(
     Counted as independent measurements, hundreds of pairs would claim a σ of the scale many times below that of the
     fixes. Their purpose is to steady the scale, not to decide it. None: their share of the information is zero.
 
-    Args:
-        fixes: of the cameras; at least two.
-        points, seed: of `geolocate`, None: take the cameras; of the random pairs.
-
-    Raises:
-        InputError: `points` belongs to another model.
+    There are at least two fixes; the seed is that of the pairs. An InputError: points of another model.
     """
     if points is not None and not np.array_equal(points.point_id, scene.sparse.point_id):
         raise InputError(
@@ -296,27 +276,16 @@ def _long_pairs(place: FloatArray, seed: int) -> tuple[IntArray, IntArray]:
 
 @dataclass(frozen=True)
 class ControlByDepth:
-    """Image marks of the control points, K in all, each projected onto the rendered surface on its own.
+    """Image marks of the control points, K in all, each projected onto the rendered surface on its own."""
 
-    Attributes:
-        camera: (K,) int64 index into the cameras.
-        xy: (K, 2) float64, x/z and y/z of the marks' rays.
-        xy_by_lens: (K, 2, L) float64, derivative of `xy` by the lens parameters.
-        position_in_geo: (K, 3) float64 metres, surveyed.
-        root_information: (K, 3, 3) float64 of survey, mark and surface together, in 1/m.
-        share: (K,) float64, one over the number of marks of the same point.
-        views: number of training views, all rendered equally often.
-        rows: slice of the K marks, by camera.
-    """
-
-    camera: Tensor
-    xy: Tensor
-    xy_by_lens: Tensor
-    position_in_geo: Tensor
-    root_information: Tensor
-    share: Tensor
-    views: int
-    rows: dict[int, slice]
+    camera: Tensor  # (K,) int64 indices
+    xy: Tensor  # (K, 2) float64, x/z and y/z of the marks' rays
+    xy_by_lens: Tensor  # (K, 2, L) float64, derivative of `xy` by the lens parameters
+    position_in_geo: Tensor  # (K, 3) float64 metres, surveyed
+    root_information: Tensor  # (K, 3, 3) float64 of survey, mark and surface together, in 1/m
+    share: Tensor  # (K,) float64, one over the number of marks of the same point
+    views: int  # training views, all rendered equally often
+    rows: dict[int, slice]  # slice of the K marks, by camera
 
     def rays(self, rows: slice, lens: Tensor) -> Tensor:
         """Return the rays x/z and y/z (K', 2) of a slice of the marks, to first order in the lens change (L,)."""
@@ -368,12 +337,8 @@ def depth_residuals(
 ) -> Tensor:
     """Return T(c_i + R_iᵀ z (x, y, 1)) − X_j (K, 3) in metres, of the K marks of one camera.
 
-    Args:
-        pose: rotation cam ← model (3, 3) and centre (3,) of that camera.
-        geo_from_model: the similarity T.
-        position_in_geo: (K, 3) metres, surveyed, of each mark.
-        xy: (K, 2) x/z and y/z of the marks' rays.
-        depth_m: (K,) rendered depth along the camera's z axis at the marks.
+    T is `geo_from_model`; the pose has a rotation cam ← model (3, 3) and a centre (3,). Each mark has the surveyed
+    position (K, 3), its ray x/z and y/z (K, 2), and the rendered depth (K,) along the camera's z axis.
     """
     rotation, center = pose
     ray = torch.nn.functional.pad(xy, (0, 1), value=1.0)

@@ -62,21 +62,14 @@ class TensorSimilarity:
 
 @dataclass(frozen=True)
 class Estimate:
-    """Values of all unknowns that the measurements depend on.
+    """Values of all unknowns that the measurements depend on."""
 
-    Attributes:
-        rotation: (n, 3, 3) cam ← model.
-        center: (n, 3) projection centres in `model`, metres.
-        vector: (p,) values of the systematic errors, m and rad.
-        lens: (L,) change of the lens parameters; L = 0: none.
-    """
-
-    rotation: Tensor
-    center: Tensor
+    rotation: Tensor  # (n, 3, 3) cam ← model
+    center: Tensor  # (n, 3) projection centres in `model`, metres
     geo_from_model: TensorSimilarity
     errors: SystematicErrors
-    vector: Tensor
-    lens: Tensor
+    vector: Tensor  # (p,) values of the systematic errors, m and rad
+    lens: Tensor  # (L,) change of the lens parameters; L = 0: none
 
     def geo_from_cam(self, camera: Tensor) -> Tensor:
         """Return the rotations geo ← cam (K, 3, 3) of cameras with indices (K,)."""
