@@ -6,7 +6,6 @@ training finds them in the user's cache.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
@@ -41,9 +40,7 @@ def start_compilation() -> None:
 
 
 def compile_in_child(_arguments: Mapping[str, Any], progress: Progress) -> None:
-    """Compile as `compile_kernels`, behind all other work of the machine: task of `core.child`."""
-    if hasattr(os, "nice"):
-        os.nice(10)
+    """Compile as `compile_kernels`, at the priority of a training that may wait for it: task of `core.child`."""
     compile_kernels(progress)
 
 
