@@ -29,10 +29,10 @@ demo: setup
 		--trajectory $(DEMO)/survey/trajectory.csv --vertical ellipsoidal \
 		--gcp $(DEMO)/survey/gcp_list.txt --checkpoints $(DEMO)/survey/checkpoints.txt \
 		--sigma-gcp-h 0.01 --sigma-gcp-v 0.01 --sigma-mark 0.2 --preset fast --deliver raster,report
-	@echo "The splat:     $(DEMO)/workspace/export/splat.ply (and splat.ply.georef.json beside it)"
-	@echo "The orthophoto: $(DEMO)/workspace/raster/ortho.tif"
-	@echo "The report:    open $(DEMO)/workspace/report/report.html in a browser"
-	@echo "The viewer:    $(BIN)/georef view $(DEMO)/workspace"
+	@echo "The splat:      $(DEMO)/workspace/export/splat.ply (and splat.ply.georef.json beside it)"
+	@echo "The orthophoto: $(DEMO)/workspace/raster/orthophoto.tif"
+	@echo "The report:     open $(DEMO)/workspace/report/report.html in a browser"
+	@echo "The viewer:     $(BIN)/georef view $(DEMO)/workspace"
 
 # Mutated files for every reader, for an hour or FUZZ_SECONDS; a finding is printed with the case that repeats it.
 fuzz: setup

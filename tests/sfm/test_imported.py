@@ -61,7 +61,7 @@ def test_image_name_that_is_not_utf_8_is_refused(surveyed: tuple[SparseModel, Su
     file.write_bytes(file.read_bytes().replace(b"image_003", b"image\x85003"))
     with refused("file-damaged", InputError) as caught:
         load_reconstruction(tmp_path)
-    assert caught.value.path == file and "record 4 of 6" in caught.value.message and "UTF-8" in caught.value.message
+    assert caught.value.path == file and "Record 4 of 6" in caught.value.message and "UTF-8" in caught.value.message
 
 
 def test_unknown_camera_model_and_bytes_behind_the_records(
@@ -72,7 +72,7 @@ def test_unknown_camera_model_and_bytes_behind_the_records(
     (tmp_path / "cameras.bin").write_bytes(cameras[:12] + struct.pack("<i", 99) + cameras[16:])
     with refused("file-damaged", InputError) as caught:
         load_reconstruction(tmp_path)
-    assert "record 1 of 1" in caught.value.message and "camera model" in caught.value.message
+    assert "Record 1 of 1" in caught.value.message and "camera model" in caught.value.message
     (tmp_path / "cameras.bin").write_bytes(cameras + b"\0")
     with refused("file-damaged", InputError) as caught:
         load_reconstruction(tmp_path)
