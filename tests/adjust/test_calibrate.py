@@ -158,6 +158,7 @@ def test_run_estimates_after_sfm_and_goes_on(tmp_path: Path, command: Command) -
     assert (workspace / "logs/calibrate.log").exists()
 
 
+@pytest.mark.slow
 def test_ingest_made_again_keeps_sfm_and_is_calibrated_again(tmp_path: Path, command: Command) -> None:
     flight, workspace = Winding(count=24), tmp_path / "ws"
     inputs = flown(tmp_path, flight)
@@ -219,6 +220,7 @@ def test_calibrate_and_apply(tmp_path: Path, command: Command, capsys: pytest.Ca
     assert "lever-arm forward" in table and "control points" in table
 
 
+@pytest.mark.slow
 def test_what_ingest_asked_for_can_be_left_unapplied(tmp_path: Path, command: Command) -> None:
     inputs, workspace = flown(tmp_path, Winding(count=24)), tmp_path / "ws"
     command("run", workspace, *arguments(inputs), "--time-offset", "auto", "--to", "calibrate")
@@ -230,6 +232,7 @@ def test_what_ingest_asked_for_can_be_left_unapplied(tmp_path: Path, command: Co
     assert "time-offset" in sentence
 
 
+@pytest.mark.slow
 def test_a_comparison_reads_the_calibration_where_it_is(tmp_path: Path, command: Command) -> None:
     """Configurations share the stages up to geolocate, and are stale with what these apply."""
     inputs, workspace = flown(tmp_path, Winding(count=24)), tmp_path / "ws"

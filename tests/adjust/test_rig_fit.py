@@ -99,6 +99,7 @@ def test_lever_arm_with_control_points() -> None:
 
 
 @pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.slow
 def test_lever_arm_of_an_orbit_needs_control_points(seed: int) -> None:
     """Inwards and down it passes for another scale and height, ahead for another time: only wobble tells."""
     sigma = []
@@ -192,6 +193,7 @@ def test_hover_and_straight_line_are_refused(speed_m_s: float) -> None:
         fit_rig(data, 0.0, np.eye(3), FitOptions())
 
 
+@pytest.mark.slow
 def test_the_end_of_the_search_is_no_offset() -> None:
     data = _data(_flight("grid"))
     data = replace(data, time_s=data.time_s - 18.0)  # as GPS time and UTC differ

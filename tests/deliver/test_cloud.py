@@ -137,6 +137,7 @@ def test_a_model_without_surface_is_refused(tmp_path: Path) -> None:
     assert numbers(str(error.value)) == [8]
 
 
+@pytest.mark.slow
 def test_cloud_of_a_trained_survey_lies_on_its_ground(
     trained: list[tuple[Workspace, Workspace]], tmp_path: Path
 ) -> None:

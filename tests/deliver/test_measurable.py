@@ -133,6 +133,7 @@ def test_appearance_refinement_finds_the_colours_and_moves_nothing() -> None:
     assert error[1] < 0.1 * error[0]
 
 
+@pytest.mark.slow
 def test_command_puts_centres_on_the_surface(
     trained: list[tuple[Workspace, Workspace]], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -178,6 +179,7 @@ def test_command_puts_centres_on_the_surface(
     assert 0 > values["psnr_change_db"] > unrefined["psnr_change_db"]
 
 
+@pytest.mark.slow
 def test_too_many_discs_are_refused(
     trained: list[tuple[Workspace, Workspace]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -189,6 +191,7 @@ def test_too_many_discs_are_refused(
     assert not (root / MEASURABLE_SPLAT).exists()
 
 
+@pytest.mark.slow
 def test_a_model_without_a_surface_is_refused(trained: list[tuple[Workspace, Workspace]], tmp_path: Path) -> None:
     root = tmp_path / "ws"
     shutil.copytree(trained[0][0].root, root, symlinks=True)

@@ -232,6 +232,7 @@ def ray_of(survey: SimulatedSurvey, x: float, y: float) -> np.ndarray:
     return np.array([xy[0], xy[1], 1.0])
 
 
+@pytest.mark.slow
 def test_same_seed_same_bytes_other_seed_other_survey(tmp_path: Path) -> None:
     options: dict[str, Any] = {"images": 3, "bag": "mcap", "depth": True, "flight": "grid"}
     SimulatedSurvey(tmp_path / "a", **options)
