@@ -44,20 +44,22 @@ def compile_in_child(_arguments: Mapping[str, Any], progress: Progress) -> None:
     compile_kernels(progress)
 
 
-def compile_kernels(progress: Progress = SILENT) -> None:
-    """Compile the kernels of stereo and training that the user's cache lacks, and load the others.
+def compile_kernels(progress: Progress = SILENT, *, renders: bool = True) -> None:
+    """Compile the kernels of stereo and rendering that the user's cache lacks, and load the others.
 
-    One process compiles at a time: the others wait, and load what it has compiled.
+    Without `renders` those of stereo only: another backend than that of the CPU renders. One process
+    compiles at a time: the others wait, and load what it has compiled.
     """
-    steps = {"stereo": _match, "rendering": _render}
+    steps = {"stereo": _match, "rendering": _render} if renders else {"stereo": _match}
     with progress.task("kernels, compiled once", len(steps)) as task, _only_one():
         for name, step in steps.items():
             step()
             task.advance(note=name)
+        stamp = compilation_stamp(__name__)
         with suppress(OSError):
-            stamp = compilation_stamp(__name__)
-            stamp.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            stamp.touch()
+            if renders:
+                stamp.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+                stamp.touch()
 
 
 @contextmanager

@@ -21,12 +21,10 @@ import numpy as np
 from pipelines.adjust.posterior import Posterior, save_posterior
 from pipelines.adjust.system import minimise
 from pipelines.core.products import Remark, load_json, save_json
-from pipelines.core.progress import Progress
 from pipelines.core.stages import LIDAR, LIDAR_MAP, MODEL, POINTS, SIM3_POSTERIOR, TRAIN_POSTERIOR
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.splat.gaussians import write_gaussians
 from pipelines.splat.memory import free_memory_bytes, require_memory
-from pipelines.splat.rasterizer.api import Rasterizer
 from pipelines.splat.rasterizer.backends import device_of, rasterizer
 from pipelines.surface.depth_maps import DepthMaps
 from pipelines.surface.lidar_cloud import ScannerTrack
@@ -34,6 +32,7 @@ from pipelines.surface.measured_cloud import CloudReader
 from pipelines.survey.adjustment import GeolocatedPoints
 from pipelines.survey.calibrated import load_survey
 from pipelines.survey.options import CloudCrs
+from pipelines.survey.photographs import ImageCache
 from pipelines.survey.report_parts import EstimatedError, LidarReport
 from pipelines.survey.scene import photographs
 from pipelines.survey.trained_model import Adjustment, TrainedModel
@@ -70,7 +69,7 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
         GeorefError: a product or a photograph cannot be read, or the scene has too few points.
     """
     # First, so that `--backend cuda` without a GPU fails at once.
-    backend = _backend(options, stage.progress)
+    backend = rasterizer(options.backend, stage.progress)
     workspace = stage.workspace
     stated = CloudCrs(options.lidar_crs, options.lidar_vertical)
     clouds = None if options.lidar is None else CloudReader(options.lidar, stated)
@@ -79,10 +78,9 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     track = None if path is None else ScannerTrack.read(path, stated, survey.origin)
     options.require_trainable(len(scene.sparse.image_name))
     images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
-    free_bytes = free_memory_bytes(device_of(backend))
-    options = with_gaussian_limit(options, len(images), images.largest(), free_bytes)
-    require_memory(training_size(options, len(images), images.largest()), free_bytes)
+    options = _within_memory(options, images, free_memory_bytes(device_of(backend)))
     images.build(stage.progress)
+    compile_kernels(stage.progress, renders=backend.name == "cpu")
     surface, compared, planes, lidar = None, None, None, None
     if options.dense:
         maps = DepthMaps(workspace.cache / "surface", scene, images)
@@ -125,11 +123,11 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     return _summary(model, metrics, record, None if lidar is None else lidar.report)
 
 
-def _backend(options: TrainOptions, progress: Progress) -> Rasterizer:
-    backend = rasterizer(options.backend, progress)
-    if backend.name == "cpu":
-        compile_kernels(progress)
-    return backend
+def _within_memory(options: TrainOptions, images: ImageCache, free_bytes: int | None) -> TrainOptions:
+    """Return the options with as many Gaussians as fit into the memory, or raise a ResourceError."""
+    options = with_gaussian_limit(options, len(images), images.largest(), free_bytes)
+    require_memory(training_size(options, len(images), images.largest()), free_bytes)
+    return options
 
 
 def _write_solution(
