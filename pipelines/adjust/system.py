@@ -118,7 +118,7 @@ class Problem:
 
 
 @dataclass(frozen=True)
-class Rows:
+class WhitenedRows:
     """M whitened observations of one kind near a state."""
 
     residual: FloatArray  # (M, d) at the state
@@ -222,7 +222,7 @@ class Linearised:
 
     problem: Problem
     state: State
-    rows: dict[str, Rows]
+    rows: dict[str, WhitenedRows]
     has_points: bool
 
     @property
@@ -326,7 +326,7 @@ def linearised(problem: Problem, state: State) -> Linearised:
     return Linearised(problem, state, rows, has_points)
 
 
-def _rows(problem: Problem, root: FloatArray, slopes: Slopes, *, has_points: bool) -> Rows:
+def _rows(problem: Problem, root: FloatArray, slopes: Slopes, *, has_points: bool) -> WhitenedRows:
     """Return the observations of a term in units of σ, from its root information (M, d, d)."""
     count, d = slopes.residual.shape
     by_pose = root[slopes.row] @ slopes.by_pose
@@ -338,7 +338,7 @@ def _rows(problem: Problem, root: FloatArray, slopes: Slopes, *, has_points: boo
     column = np.broadcast_to((6 * slopes.camera)[:, None, None] + np.arange(6), by_pose.shape)
     shape = (count * d, 6 * len(problem.base.cam_center_in_model))
     by_poses = csr_matrix((by_pose.ravel(), (row.ravel(), column.ravel())), shape=shape)
-    return Rows((root @ slopes.residual[:, :, None])[:, :, 0], by_poses, by_border)
+    return WhitenedRows((root @ slopes.residual[:, :, None])[:, :, 0], by_poses, by_border)
 
 
 def minimise(problem: Problem, start: State, normal: NormalMatrix | None = None) -> Minimum:
