@@ -167,7 +167,9 @@ def test_pdf_is_printed(report: Path, tmp_path: Path) -> None:
 def test_comparison_has_the_same_frame(browser: Browser, tmp_path: Path) -> None:
     accuracy = PointAccuracy(count=3, mean_h_m=0.012, median_h_m=0.01, rmse_h_m=0.015, rmse_v_m=0.02)
     rows = (
-        ComparedRow(configuration="A", title="plain", note="as in the paper", camera=accuracy, test_psnr=25.0),
+        ComparedRow(
+            configuration="A", title="plain", note="as in the paper", triangulated=accuracy, test_psnr=25.0
+        ),
         ComparedRow(configuration="B", title=HOSTILE, note=HOSTILE, failure=f"it diverged {HOSTILE}"),
     )
     write_comparison(tmp_path, Comparison(options={"preset": "fast"}, rows=rows), "flight")
@@ -176,6 +178,8 @@ def test_comparison_has_the_same_frame(browser: Browser, tmp_path: Path) -> None
     page.show(tmp_path / PAGE)
     assert (page.asked, page.problems) == ([], [])
     assert page.page.evaluate("() => document.documentElement.scrollWidth") <= 390
-    assert page.page.locator("data[data-field='rows.0.camera.rmse_h_m']").get_attribute("data-value") == "0.015"
+    assert (
+        page.page.locator("data[data-field='rows.0.triangulated.rmse_h_m']").get_attribute("data-value") == "0.015"
+    )
     assert page.page.locator("img").count() == 1
     context.close()
