@@ -158,7 +158,7 @@ def compare_with_exif(
                 caution.code,
                 f"{path}: {caution.sentence} Correct the wrong file, or continue with --accept-inconsistency.",
             )
-        remarks.cautions.append(caution)
+        remarks.caution(caution.code, caution.sentence)
 
 
 @dataclass(frozen=True)

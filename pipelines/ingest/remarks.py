@@ -16,7 +16,7 @@ class Remarks:
 
     assumptions: list[Remark] = field(default_factory=list)
     warnings: list[Remark] = field(default_factory=list)
-    cautions: list[Remark] = field(default_factory=list)  # limits of every result of the survey
+    cautions: list[Remark] = field(default_factory=list)
 
     def assume(self, code: str, sentence: str) -> None:
         """Record what stands in for what the input does not state."""
@@ -24,6 +24,10 @@ class Remarks:
 
     def warn(self, code: str, sentence: str) -> None:
         _add(self.warnings, code, sentence)
+
+    def caution(self, code: str, sentence: str) -> None:
+        """Record a limit of every result of this survey."""
+        _add(self.cautions, code, sentence)
 
     def warn_counted(self, code: str, items: Sequence[str], fault: str) -> None:
         """Record one warning for all items (files, or places as `file:line`), with their count and the first few.

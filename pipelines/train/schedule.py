@@ -12,6 +12,7 @@ from pipelines.splat.surface import SurfaceSettings
 from pipelines.train.options import LossOptions, TrainOptions
 from pipelines.train.target_images import Crops
 
+_FINAL_RATE = 0.05  # of the geographic unknowns, relative to their first learning rate
 # Factor by which photographs are shrunken, and the fraction of the training up to which they are. A larger factor
 # would make the Gaussians smaller than a pixel, and push them off the surface that they start on.
 COARSE = ((2, 0.3),)
@@ -120,6 +121,10 @@ class TrainingSchedule:
         if weights.geo_schedule == "constant":
             return weights.geo_weight
         return weights.geo_weight * (1.0 - math.exp(-iteration / (_GEO_RISE * self.options.iterations)))
+
+    def geographic_rate(self, iteration: int) -> float:
+        """Return the factor on the first learning rates of the geographic unknowns."""
+        return float(_FINAL_RATE ** self.progress(iteration))
 
     def progress(self, iteration: int) -> float:
         """Return the fraction of the training that is done, 0 … 1."""

@@ -49,7 +49,6 @@ from pipelines.train.schedule import BACKGROUND, JointOptions, TrainingSchedule
 from pipelines.train.target_images import ImageLook, TargetImage, TargetImages
 
 _OUTLIERS_FROM = 0.5  # of the iterations: before, the model is too coarse to tell what has moved
-_FINAL_RATE = 0.05  # of the geographic unknowns, relative to their first learning rate
 _FINISHING_RATE = 0.3  # of the rates at which a training starts
 _LENS_EVERY = 100  # iterations between two reads of the lens: each read waits for the device
 # Each non-finite gradient shows in one of these: colours pass it on to the opacities.
@@ -152,7 +151,7 @@ class JointTrainer:
         geographic = losses["geographic"] + losses.get("control_by_depth", 0.0)
         self.watch.note(self.iteration, self._watched(losses["photometric"], geographic))
         stats = self._of_whole(self._own(view.render.stats), view.pose, view.target)
-        self._unknowns.step(self.optimizer.rate_factor * _FINAL_RATE ** self.schedule.progress(self.iteration))
+        self._unknowns.step(self.optimizer.rate_factor * self.schedule.geographic_rate(self.iteration))
         self.optimizer.step(self.iteration, stats.visible)
         if self.exposures is not None:
             self.exposures.step(self.iteration)

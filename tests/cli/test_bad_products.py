@@ -52,26 +52,26 @@ def test_upstream_missing(real_georef: Georef, made: Path, stage: str, gone: str
 
 
 DAMAGED = (
-    ("geolocate", SURVEY, b"{", None),
-    ("geolocate", SURVEY, b"\xff", None),
-    ("geolocate", SURVEY, b"{}", "origin"),
-    ("geolocate", f"{SPARSE}/images.bin", b"\xff" * 40, None),
-    ("geolocate", f"{SPARSE}/cameras.bin", b"", None),
-    ("init-sim3", POINTS, b"PK\x03\x04", None),
-    ("train", SIM3, b"[]", None),
-    ("evaluate", MODEL, b'{"format_version": 1}', "geo_from_model"),
-    ("export-ply", MODEL, b"nonsense", None),
+    ("geolocate", SURVEY, b"{", None, "product-invalid"),
+    ("geolocate", SURVEY, b"\xff", None, "not-utf8"),
+    ("geolocate", SURVEY, b"{}", "origin", "product-invalid"),
+    ("geolocate", f"{SPARSE}/images.bin", b"\xff" * 40, None, "file-cut-off"),
+    ("geolocate", f"{SPARSE}/cameras.bin", b"", None, "file-cut-off"),
+    ("init-sim3", POINTS, b"PK\x03\x04", None, "npz-damaged"),
+    ("train", SIM3, b"[]", None, "product-invalid"),
+    ("evaluate", MODEL, b'{"format_version": 1}', "geo_from_model", "product-invalid"),
+    ("export-ply", MODEL, b"nonsense", None, "product-invalid"),
 )
 
 
 @pytest.mark.parametrize("case", DAMAGED, ids=lambda case: f"{case[0]}-{case[1]}-{case[2][:4]!r}")
-def test_damaged_product(real_georef: Georef, made: Path, case: tuple[str, str, bytes, str | None]) -> None:
-    stage, product, data, field = case
+def test_damaged_product(real_georef: Georef, made: Path, case: tuple[str, str, bytes, str | None, str]) -> None:
+    stage, product, data, field, code = case
     needed = [part.product for part in BY_NAME[stage].reads if not part.optional]
     absent = [read for read in needed if not (made / read).exists()]
     write_files(made, dict.fromkeys(absent, b"") | {product: data})
     result = real_georef(stage, made)
-    result.assert_failed(1)
+    result.assert_failed(1, code)
     assert result.error is not None
     assert (result.error["path"], result.error["field"]) == (str(made / product), field)
     assert "Traceback" not in result.err
@@ -107,7 +107,7 @@ def test_report_that_was_replaced(real_georef: Georef, made: Path, content: byte
     absent = [product for product in products if not (made / product).exists()]
     write_files(made, dict.fromkeys(absent, b"") | {REPORT: content})
     result = real_georef("evaluate", made)
-    result.assert_failed(1)
+    result.assert_failed(1, "report-invalid")
     assert result.error is not None and result.error["path"] == str(made / REPORT)
     assert "`georef evaluate --force`" in result.error["message"]
     assert (made / REPORT).read_bytes() == content
@@ -140,19 +140,19 @@ def test_points_of_another_model(real_georef: Georef, made: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "files",
+    ("files", "code"),
     [
-        {"notes.txt": b"hello"},
-        dict.fromkeys(("cameras.bin", "images.bin", "points3D.bin"), b"\xff" * 64),
-        {"cameras.txt": b"1 PINHOLE x\n", "images.txt": b"", "points3D.txt": b""},
+        ({"notes.txt": b"hello"}, "not-a-colmap-model"),
+        (dict.fromkeys(("cameras.bin", "images.bin", "points3D.bin"), b"\xff" * 64), "file-cut-off"),
+        ({"cameras.txt": b"1 PINHOLE x\n", "images.txt": b"", "points3D.txt": b""}, "model-unreadable"),
     ],
     ids=["no model", "forged", "text without numbers"],
 )
-def test_import_of_something_else(real_georef: Georef, made: Path, files: dict[str, bytes]) -> None:
+def test_import_of_something_else(real_georef: Georef, made: Path, files: dict[str, bytes], code: str) -> None:
     write_files(made.parent / "model", files)
     before = products_in(made)
     result = real_georef("sfm", made, "--import", made.parent / "model", "--force")
-    result.assert_failed(1)
+    result.assert_failed(1, code)
     assert str(made.parent / "model") in result.err.splitlines()[-1]
     kept = {name: data for name, data in products_in(made).items() if not name.startswith("sfm.partial/")}
     assert {name: data for name, data in kept.items() if name != "requests.json"} == before

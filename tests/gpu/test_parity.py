@@ -12,10 +12,12 @@ from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.losses import photometric_loss
 from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.rasterizer.api import RasterSettings
-from pipelines.splat.rasterizer.backends import chosen_backend, rasterizer
+from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.splat.rasterizer.cuda_kernels import missing_for_cuda
 from pipelines.splat.rasterizer.reference import render_reference
 
-pytestmark = [pytest.mark.gpu, pytest.mark.skipif(chosen_backend("auto") != "cuda", reason="no GPU to test on")]
+MISSING = missing_for_cuda()
+pytestmark = [pytest.mark.gpu, pytest.mark.skipif(MISSING is not None, reason=f"no GPU to test on: {MISSING}")]
 BACKGROUND = (0.2, 0.5, 0.9)
 # float32 with the fast exponential of CUDA: some 1e-6 a contribution. Gradients sum 1e3 of them, of either sign.
 IMAGE, GRADIENT = 1e-4, 1e-3

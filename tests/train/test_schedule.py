@@ -44,7 +44,7 @@ def test_large_photographs_are_pyramids() -> None:
     assert [schedule.shrink(iteration, 1024, 768) for iteration in (30, 31)] == [2, 1]
 
 
-def test_weight_rises_or_stays_and_progress_ends_at_one() -> None:
+def test_weight_rises_or_stays_and_rates_fall() -> None:
     rising, constant = (
         TrainingSchedule(JointOptions(1000, losses=LossOptions(geo_weight=0.05, geo_schedule=kind)), VIEWS)
         for kind in ("rising", "constant")
@@ -53,7 +53,8 @@ def test_weight_rises_or_stays_and_progress_ends_at_one() -> None:
     assert rising.geographic_weight(100) == pytest.approx(0.05 * (1 - np.exp(-1)))
     assert rising.geographic_weight(1000) == pytest.approx(0.05, rel=1e-4)
     assert constant.geographic_weight(1) == 0.05
-    assert (rising.progress(0), rising.progress(1000)) == (0.0, 1.0)
+    assert rising.geographic_rate(0) == 1.0
+    assert rising.geographic_rate(1000) == pytest.approx(0.05)
 
 
 def test_extended_training_neither_shrinks_photographs_again_nor_drops_harmonics() -> None:
@@ -62,4 +63,4 @@ def test_extended_training_neither_shrinks_photographs_again_nor_drops_harmonics
     assert (schedule.shrink(120, 640, 480), schedule.sh_degree(120)) == (2, 0)
     schedule.extended_from = 100
     assert (schedule.shrink(120, 640, 480), schedule.sh_degree(120)) == (1, 3)
-    assert schedule.progress(120) == pytest.approx(0.12), "rates are those of the longer training"
+    assert schedule.geographic_rate(120) == pytest.approx(0.05**0.12), "rates are those of the longer training"

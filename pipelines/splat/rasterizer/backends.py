@@ -26,11 +26,9 @@ def chosen_backend(name: Literal["auto", "cpu", "cuda"]) -> BackendName:
         raise BackendUnavailableError("rasteriser-unknown", message)
     if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
         return "cpu"
-    from pipelines.splat.rasterizer import cuda_parts
-    from pipelines.splat.rasterizer.cuda_kernels import kernels_ready
+    from pipelines.splat.rasterizer.cuda_kernels import missing_for_cuda
 
-    compiling = () if kernels_ready() is not None else cuda_parts.compiling_parts()
-    missing = cuda_parts.lacking((*cuda_parts.running_parts(), *compiling))
+    missing = missing_for_cuda()
     if missing is None:
         return "cuda"
     if name == "cuda":

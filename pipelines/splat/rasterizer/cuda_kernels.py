@@ -34,6 +34,7 @@ from pipelines.splat.rasterizer.cuda_parts import (
     compiling_parts,
     gsplat,
     lacking,
+    running_parts,
     tool_folders,
     toolkit_home,
 )
@@ -104,6 +105,11 @@ def load_gsplat(progress: Progress = SILENT) -> ModuleType:
         raise BackendUnavailableError(
             "gsplat-unloadable", f"gsplat cannot be loaded ({error}). {remedy}"
         ) from error
+
+
+def missing_for_cuda() -> str | None:
+    """Return what the cuda backend lacks on this machine, each part with its remedy; None: nothing."""
+    return lacking(running_parts() if kernels_ready() is not None else (*running_parts(), *compiling_parts()))
 
 
 def kernels_ready() -> str | None:

@@ -17,7 +17,7 @@ from pipelines.core.errors import BackendUnavailableError, InputError
 from pipelines.core.progress import SILENT
 from pipelines.splat.rasterizer import cuda_kernels, cuda_parts
 from pipelines.splat.rasterizer.backends import chosen_backend, rasterizer
-from pipelines.splat.rasterizer.cuda_kernels import compile_gsplat, kernels_file, kernels_ready
+from pipelines.splat.rasterizer.cuda_kernels import compile_gsplat, kernels_file, kernels_ready, missing_for_cuda
 from tests.refusals import refused
 
 HEADERS = ("cuda_runtime.h", "crt/host_config.h", "cccl/cuda/std/type_traits", "cublas_v2.h", "cusolverDn.h")
@@ -89,6 +89,7 @@ def machine(tmp_path, monkeypatch):
 def test_nothing_is_missing(machine):
     parts = (*cuda_parts.running_parts(), *cuda_parts.compiling_parts())
     assert [part.name for part in parts if part.found is None] == []
+    assert missing_for_cuda() is None
     assert chosen_backend("cuda") == chosen_backend("auto") == "cuda"
     assert chosen_backend("cpu") == "cpu"
 
