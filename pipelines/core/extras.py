@@ -9,14 +9,14 @@ from typing import Literal
 
 from pipelines.core.errors import BackendUnavailableError
 
-Extra = Literal["bags", "cluster", "contours", "reference", "simulator", "viewer"]
+Extra = Literal["bags", "cluster", "reference", "simulator", "vectors", "viewer"]
 # What needs each extra, and the libraries that it installs.
 EXTRAS: dict[Extra, tuple[str, tuple[str, ...]]] = {
     "bags": ("a ROS bag (--bag, georef inspect)", ("rosbags",)),
     "cluster": ("a cluster (--cluster, georef cluster)", ("distributed", "cryptography")),
-    "contours": ("georef export-raster --contours", ("ezdxf", "pyogrio")),
     "reference": ("M3C2 (georef evaluate --reference)", ("py4dgeo",)),
     "simulator": ("georef simulate", ("embreex",)),
+    "vectors": ("contour lines and boundaries (--contours, --boundary)", ("ezdxf", "pyogrio")),
     "viewer": ("georef view", ("viser", "websockets", "msgspec")),
 }
 

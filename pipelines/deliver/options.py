@@ -71,7 +71,7 @@ class ExportRasterOptions(CrsOptions):
         description="Size of a cell in units of the CRS. Without it: the ground sample distance of the "
         "photographs.",
     )
-    contours: Annotated[float, ExtraMarker("contours")] | None = Field(
+    contours: Annotated[float, ExtraMarker("vectors")] | None = Field(
         None, gt=0, description="Interval of contour lines, in the unit of the heights."
     )
     min_views: int = Field(4, ge=2, description="Leave out cells whose surface fewer training views show.")

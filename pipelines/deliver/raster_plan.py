@@ -21,6 +21,7 @@ from pipelines.formats.geotiff import RasterFrame
 from pipelines.splat.gaussians import Gaussians, rotation_matrices
 from pipelines.splat.rasterizer.orthographic import PlanSplats
 from pipelines.splat.sh import basis
+from pipelines.survey.area import depths_of_observations
 from pipelines.survey.target_crs import TargetCrs
 from pipelines.survey.trained_survey import TrainedSurvey
 
@@ -36,19 +37,12 @@ _LARGEST_DEG = 0.01  # about a kilometre
 
 
 def ground_sampling_m(trained: TrainedSurvey) -> tuple[float, float]:
-    """Return the ground sample distances of the photographs, and at the size at which the model was trained.
-
-    They are medians over the SfM points' observations: depth over focal length.
-    """
-    sfm, poses = trained.sfm, trained.poses
-    cameras = [trained.sparse.camera_of(index) for index in range(len(sfm.image_name))]
-    focal_px = np.array([camera.mean_focal_px for camera in cameras])
+    """Return the ground sample distances of the photographs, and at the size at which the model was trained."""
+    depth_m, focal_px = depths_of_observations(trained)
+    cameras = [trained.sparse.camera_of(index) for index in range(len(trained.sfm.image_name))]
     longest_px = np.array([max(camera.width, camera.height) for camera in cameras])
-    arm = trained.point_in_model[sfm.obs_point] - poses.cam_center_in_model[sfm.obs_image]
-    depth = np.einsum("kj,kj->k", poses.cam_from_model[sfm.obs_image][:, 2], arm)
-    gsd_m = trained.geo_from_model.scale * depth / focal_px[sfm.obs_image]
-    reduced = np.maximum(longest_px / trained.model.max_image_size, 1.0)[sfm.obs_image]
-    return float(np.median(gsd_m)), float(np.median(gsd_m * reduced))
+    reduced = np.maximum(longest_px / trained.model.max_image_size, 1.0)[trained.sfm.obs_image]
+    return float(np.median(depth_m / focal_px)), float(np.median(depth_m / focal_px * reduced))
 
 
 def make_frame(

@@ -1,4 +1,4 @@
-"""Vectors as files: features as GeoJSON, and contour lines as GeoPackage and DXF.
+"""Vectors as files: features as GeoJSON, contour lines as GeoPackage and DXF, and boundaries, which are read.
 
 GeoJSON (RFC 7946) has longitude and latitude in WGS84 degrees, outer rings anticlockwise, cut at the date line.
 Contours are a line a height, with the height as attribute and as z.
@@ -11,13 +11,17 @@ import math
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import shapely
 from numpy.typing import ArrayLike
+from shapely import MultiPolygon
 
-from pipelines.core.files import replace_file
+from pipelines.core.errors import InputError
+from pipelines.core.files import file_size, replace_file
 from pipelines.core.types import FloatArray
 from pipelines.geometry.footprints import clipped_ring, ring_area
 
@@ -123,3 +127,61 @@ def write_contours_dxf(path: Path, lines: Sequence[ContourLine]) -> None:
     draft = path.with_name(path.name + ".tmp")
     document.saveas(draft)
     replace_file(draft, path)
+
+
+_MOST_BOUNDARY_BYTES = 64 * 1024 * 1024
+# By suffix: what the file begins with, white space and a byte order mark apart. GDAL opens a file by its content,
+# also one that names other files and servers.
+BOUNDARY_FORMATS: dict[str, tuple[bytes, ...]] = {
+    ".geojson": (b"{",),
+    ".json": (b"{",),
+    ".gpkg": (b"SQLite format 3\0",),
+    ".kml": (b"<?xml", b"<kml"),
+    ".dxf": (b"0", b"999", b"AutoCAD Binary DXF"),
+}
+
+
+@dataclass(frozen=True)
+class Boundary:
+    """Polygons of a file as one, easting or longitude first, and the file's CRS as text; empty: it states none."""
+
+    polygon: MultiPolygon
+    crs: str
+
+
+def read_boundary(path: Path, *, field: str) -> Boundary:
+    """Read the polygons and the closed lines of a GeoJSON, GeoPackage, KML or DXF file.
+
+    Raises:
+        InputError: not such a file, too large, damaged, or without an area; names file and option.
+    """
+    import pyogrio
+    from pyogrio.errors import DataLayerError, DataSourceError
+
+    refusal = partial(InputError, path=path, field=field)
+    file_size(path, limit_bytes=_MOST_BOUNDARY_BYTES, kind="boundary", field=field)
+    with path.open("rb") as file:
+        head = file.read(4096).lstrip(b"\xef\xbb\xbf \t\r\n")
+    begins = BOUNDARY_FORMATS.get(path.suffix.lower(), ())
+    if not head.startswith(begins) or not begins or b"<OGR" in head:
+        kinds = "GeoJSON (.geojson), GeoPackage (.gpkg), KML (.kml) or DXF (.dxf)"
+        raise refusal("boundary-format", f"is no boundary file that is known. Give {kinds}.")
+    shapes, crs = [], ""
+    try:
+        for layer, _ in pyogrio.list_layers(path).tolist():
+            meta, _, geometry, _ = pyogrio.raw.read(path, layer=layer, columns=[], force_2d=True)
+            shapes += [one for one in shapely.from_wkb(geometry, on_invalid="ignore") if one is not None]
+            crs = crs or meta["crs"] or ""
+    except (DataSourceError, DataLayerError, ValueError, OSError) as error:
+        raise refusal("boundary-unreadable", f"cannot be read: {error}. Write it again, as GeoJSON.") from error
+    parts = [part for shape in shapes for part in shapely.get_parts(shape)]
+    rings = [shapely.Polygon(part.coords) for part in parts if part.geom_type == "LineString" and part.is_ring]
+    whole = shapely.union_all(
+        shapely.make_valid([*(part for part in parts if part.geom_type == "Polygon"), *rings])
+    )
+    polygons = [part for part in shapely.get_parts(whole) if part.geom_type == "Polygon" and part.area > 0]
+    if not polygons:
+        raise refusal(
+            "boundary-without-area", f"has {len(parts)} shapes, and none is a polygon. Draw the boundary as one."
+        )
+    return Boundary(MultiPolygon(polygons), crs)

@@ -7,17 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csr_matrix, triu
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.geodesy.enu import ecef_from_enu, lla_from_ecef
 from pipelines.geodesy.operations import Operation
 from pipelines.geometry.bundle import Network
-from pipelines.geometry.cameras import project
-from pipelines.geometry.footprints import border_rays
 from pipelines.report.page import Picture, picture_of_png
 from pipelines.report.plots.plans import NamedPlaces, match_plan, overlap_plan, site_plan
 from pipelines.report.views import EvaluatedSurvey
+from pipelines.survey.area import overlap_of
 from pipelines.survey.survey import Survey, SurveyedPoint
 from pipelines.survey.target_crs import TargetCrs
 
@@ -135,9 +133,6 @@ def _axes(names: tuple[str, ...], units: tuple[str, ...], values: FloatArray) ->
 
 ENOUGH_PHOTOGRAPHS = 5
 TIED_POINTS = 15  # that two photographs share, as SfM demands of a pair
-_CELLS = 120  # along the longer side
-_RIM = 0.01  # fraction of the scene's points outside the raster on each side
-_FARTHEST_CELLS = 6.0  # distance from a point of the scene beyond which there is no scene
 _MOST_LINKS = 4000  # that are drawn
 
 
@@ -162,15 +157,17 @@ class OverlapFacts:
 
 def overlap_facts(evaluated: EvaluatedSurvey) -> OverlapFacts:
     center = evaluated.center_in_geo[:, :2]
-    raster = _overlap_of(evaluated)
-    inside = np.zeros(0) if raster is None else raster[0][raster[0] >= 0]
+    raster = overlap_of(evaluated.solved, evaluated.scene_in_geo)
+    inside = np.zeros(0) if raster is None else raster.count[raster.count >= 0]
     pairs, shared = links_of(evaluated.network)
     strongest = np.argsort(-shared, kind="stable")[:_MOST_LINKS]
     tied, parts = ties_of(len(center), pairs, shared)
     least = int(tied.argmin())
     return OverlapFacts(
-        overlap=None if raster is None else picture_of_png(overlap_plan(*raster, center)),
-        cell_m=None if raster is None else raster[2],
+        overlap=None
+        if raster is None
+        else picture_of_png(overlap_plan(raster.count, raster.corner, raster.cell_m, center)),
+        cell_m=None if raster is None else raster.cell_m,
         median=float(np.median(inside)) if len(inside) else None,
         enough_share=float((inside >= ENOUGH_PHOTOGRAPHS).mean()) if len(inside) else None,
         enough=ENOUGH_PHOTOGRAPHS,
@@ -183,55 +180,6 @@ def overlap_facts(evaluated: EvaluatedSurvey) -> OverlapFacts:
         least_tied_count=int(tied[least]),
         parts=parts,
     )
-
-
-def _overlap_of(evaluated: EvaluatedSurvey) -> tuple[IntArray, FloatArray, float] | None:
-    """Return how many photographs see each cell (R, C) of the scene, the south-western corner, and a cell's side.
-
-    Rows run from the south, columns from the west; −1 is no scene, None a survey without one. A cell is a point on
-    the surface through the SfM points. What stands before it is not asked for.
-    """
-    scene, surface = evaluated.scene_in_geo, evaluated.surface
-    if surface is None:
-        return None
-    low, high = np.quantile(scene[:, :2], [_RIM, 1 - _RIM], axis=0)
-    cell = float((high - low).max()) / _CELLS
-    if cell <= 0:
-        return None
-    columns, rows = np.maximum(np.ceil((high - low) / cell).astype(int), 1).tolist()
-    grid = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2)
-    place = low + (grid + 0.5) * cell
-    distance, _ = cKDTree(scene[:, :2]).query(place)
-    known = np.flatnonzero(distance <= _FARTHEST_CELLS * cell)
-    points = np.column_stack([place[known], surface.heights(place[known])])
-    count = np.full(rows * columns, -1, dtype=np.int64)
-    count[known] = photographs_that_see(evaluated, points)
-    return count.reshape(rows, columns), low, cell
-
-
-def photographs_that_see(evaluated: EvaluatedSurvey, point_in_geo: FloatArray) -> IntArray:
-    """Return the number (K,) of registered photographs whose frame holds points (K, 3); nothing hides a point."""
-    solved = evaluated.solved
-    in_model = solved.geo_from_model.inverse().apply(point_in_geo)
-    # Tangent of the widest angle from the axis that a camera's frame shows.
-    widest = {
-        key: float(np.linalg.norm(border_rays(camera)[:, :2], axis=1).max(initial=0.0)) * (1 + 1e-9)
-        for key, camera in solved.sparse.cameras.items()
-    }
-    count = np.zeros(len(point_in_geo), dtype=np.int64)
-    for index, (rotation, center) in enumerate(
-        zip(solved.poses.cam_from_model, solved.poses.cam_center_in_model, strict=True)
-    ):
-        camera = solved.sparse.camera_of(index)
-        in_cam = (in_model - center) @ rotation.T
-        # Beyond the widest ray of the frame, the polynomial of a lens can fold back into it.
-        ahead = np.flatnonzero(in_cam[:, 2] > 0)
-        slope = np.linalg.norm(in_cam[ahead, :2], axis=1) / in_cam[ahead, 2]
-        ahead = ahead[slope <= widest[int(solved.sparse.image_camera_id[index])]]
-        pixel = project(camera, in_cam[ahead])
-        seen = ((pixel >= 0) & (pixel <= [camera.width, camera.height])).all(axis=1)
-        count[ahead[seen]] += 1
-    return count
 
 
 def links_of(network: Network) -> tuple[IntArray, IntArray]:

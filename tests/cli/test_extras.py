@@ -78,7 +78,7 @@ def test_viewer_without_its_extra(georef: Georef, finished: Path, monkeypatch: p
 
 @pytest.mark.parametrize(
     ("extra", "stage", "option"),
-    [("contours", "export-raster", "contours"), ("reference", "evaluate", "reference")],
+    [("vectors", "export-raster", "contours"), ("reference", "evaluate", "reference")],
 )
 def test_option_without_its_extra(
     georef: Georef,

@@ -18,10 +18,11 @@ from pipelines.core.stages import SURVEY
 from pipelines.geometry.bundle import correction_basis
 from pipelines.report.accuracy import ninety_percent
 from pipelines.report.cameras import bias_of, cameras_facts, lenses_facts, mean_by_region
-from pipelines.report.place import links_of, overlap_facts, photographs_that_see, ties_of
+from pipelines.report.place import links_of, overlap_facts, ties_of
 from pipelines.report.points import cut_chips, points_facts
 from pipelines.report.verdicts import FIX_OUTLIERS, REGISTERED, Measured, level_of, verdicts
 from pipelines.report.views import read_metrics
+from pipelines.survey.area import photographs_that_see
 from pipelines.survey.report import ByAxis, PredictedSigma
 from pipelines.survey.survey import Survey
 from pipelines.survey.trained_survey import fix_differences
@@ -36,7 +37,7 @@ def test_photographs_that_see_a_point_are_those_that_observe_it(reported: Report
     scene = reported.truth.scene
     owner, _, _ = scene.pixels(scene.point_in_geo)
     true_count = np.bincount(owner, minlength=len(scene.point_in_geo))
-    seen = photographs_that_see(reported.survey, scene.point_in_geo)
+    seen = photographs_that_see(reported.survey.solved, scene.point_in_geo)
     # The scene leaves out rays beyond a slope of 0.8, which the corners of the frame reach.
     assert (seen >= true_count).all()
     assert (seen == true_count).mean() > 0.95

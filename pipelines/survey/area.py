@@ -1,0 +1,235 @@
+"""Area of interest: the user's boundary, or the ground that enough photographs see.
+
+Files are cut to it: a photograph shows far more than it measures.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import contourpy
+import numpy as np
+import shapely
+from pydantic import Field
+from scipy.spatial import cKDTree
+from shapely import MultiPolygon, Polygon
+
+from pipelines.core.errors import DegenerateGeometryError, InputError
+from pipelines.core.options import ExtraMarker, InputMarker, StageOptions
+from pipelines.core.types import BoolArray, FloatArray, IntArray
+from pipelines.formats.vector_files import BOUNDARY_FORMATS, read_boundary
+from pipelines.geodesy.crs import parse_crs
+from pipelines.geodesy.enu import Origin, ecef_from_lla, enu_from_ecef
+from pipelines.geometry.cameras import project
+from pipelines.geometry.footprints import PointSurface, border_rays
+from pipelines.survey.target_crs import TargetCrs
+from pipelines.survey.trained_survey import SolvedSurvey
+
+LEAST_PHOTOGRAPHS = 3  # that see the ground of the area: two do not check each other
+_CELLS = 120  # along the longer side of the scene
+_RIM = 0.01  # fraction of the scene's points outside the raster on each side
+_FARTHEST_CELLS = 6.0  # distance from a point of the scene beyond which there is no scene
+_COARSEST = 2.0  # largest width of a pixel on the ground over the median: the horizon is seen, and not measured
+_SMOOTHED_CELLS = 4.0  # width of tongues that are left out, and of bays that are taken in, halved
+_EDGES = 200  # pieces of a boundary's longer side, which may be bent in another CRS
+_LEAST_RAYS = 3  # of a point of the scene
+_OUTLIERS = 0.005  # fraction of the points that are taken for errors above, and below
+
+
+class AreaOptions(StageOptions):
+    """Options of everything that ends at a boundary."""
+
+    boundary: Annotated[Path, InputMarker(frozenset(BOUNDARY_FORMATS)), ExtraMarker("vectors")] | None = Field(
+        None,
+        description="Polygon of the area of interest: GeoJSON, GeoPackage, KML or DXF. Without it: the ground that "
+        f"at least {LEAST_PHOTOGRAPHS} photographs see.",
+    )
+    boundary_crs: str | None = Field(
+        None, description="CRS of the boundary where its file states none, as in DXF: EPSG:32632 or another."
+    )
+
+
+@dataclass(frozen=True)
+class Area:
+    """Area of interest in plan, east and north of `geo` in metres.
+
+    `level_m` is the height of the ground, at which its outline goes through other coordinate systems.
+    """
+
+    polygon: Polygon | MultiPolygon
+    level_m: float
+    source: str  # file of the boundary, or whence the area is known
+
+    @property
+    def hectares(self) -> float:
+        return float(self.polygon.area) / 1e4
+
+    def contains(self, points: FloatArray) -> BoolArray:
+        """Return which points (N, 2 or 3) in `geo` lie in the area."""
+        shapely.prepare(self.polygon)
+        return np.asarray(shapely.contains_xy(self.polygon, points[:, 0], points[:, 1]))
+
+    def in_crs(self, target: TargetCrs) -> Any:
+        """Return the polygon in the plan of a CRS; an InputError: it lies outside its domain."""
+
+        def moved(plan: FloatArray) -> FloatArray:
+            return target.xyz_from_geo(np.column_stack([plan, np.full(len(plan), self.level_m)]))[:, :2]
+
+        return shapely.transform(_with_short_edges(self.polygon), moved)
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """How many photographs see each cell (R, C) of the scene: rows from the south, columns from the west.
+
+    −1: no scene. `corner` is the south-western one of the first cell, in `geo`.
+    """
+
+    count: IntArray
+    corner: FloatArray
+    cell_m: float
+
+
+def area_of(options: AreaOptions, solved: SolvedSurvey) -> Area:
+    """Return the area of interest.
+
+    Raises:
+        InputError: the boundary cannot be read, states no CRS, or lies elsewhere.
+        DegenerateGeometryError: no ground is seen by enough photographs.
+    """
+    scene = scene_in_geo(solved)
+    level_m = float(np.median(scene[:, 2])) if len(scene) else 0.0
+    if options.boundary is None:
+        return Area(_seen_ground(solved, scene), level_m, f"ground that {LEAST_PHOTOGRAPHS} photographs see")
+    polygon = _boundary_in_geo(options, solved.survey.origin)
+    area = Area(polygon, level_m, options.boundary.name)
+    if not area.contains(scene).any():
+        raise InputError(
+            "boundary-elsewhere",
+            "holds no point of the survey. Check its CRS (--boundary-crs), and that it is of this place.",
+            path=options.boundary,
+            field="--boundary",
+        )
+    return area
+
+
+def _boundary_in_geo(options: AreaOptions, origin: Origin) -> MultiPolygon:
+    assert options.boundary is not None
+    boundary = read_boundary(options.boundary, field="--boundary")
+    text = boundary.crs or options.boundary_crs
+    if not text:
+        raise InputError(
+            "boundary-without-crs",
+            "states no CRS. Give --boundary-crs.",
+            path=options.boundary,
+            field="--boundary-crs",
+        )
+    crs = parse_crs(text, path=options.boundary, field="--boundary-crs")
+
+    def moved(plan: FloatArray) -> FloatArray:
+        lla = crs.lla_from_xyz(np.column_stack([plan, np.zeros(len(plan))]), path=options.boundary)
+        # At the height of the survey: a place far above another has another plan in `geo`.
+        lla[:, 2] = origin.alt_m
+        return enu_from_ecef(ecef_from_lla(lla), origin)[:, :2]
+
+    return shapely.make_valid(shapely.transform(_with_short_edges(boundary.polygon), moved))
+
+
+def _with_short_edges(polygon: Any) -> Any:
+    west, south, east, north = shapely.bounds(polygon).tolist()
+    return shapely.segmentize(polygon, max(east - west, north - south) / _EDGES)
+
+
+def scene_in_geo(solved: SolvedSurvey) -> FloatArray:
+    """Return the SfM points (N, 3) in `geo` that three photographs show, without the highest and lowest."""
+    rays = np.bincount(solved.sfm.obs_point, minlength=len(solved.sfm.point_in_local))
+    points = solved.geo_from_model.apply(solved.point_in_model[rays >= _LEAST_RAYS])
+    if not len(points):
+        return points
+    low, high = np.quantile(points[:, 2], [_OUTLIERS, 1 - _OUTLIERS])
+    return np.asarray(points[(points[:, 2] >= low) & (points[:, 2] <= high)])
+
+
+def overlap_of(solved: SolvedSurvey, scene: FloatArray, *, coarsest_m: float = np.inf) -> Overlap | None:
+    """Return the overlap of the photographs over the scene's points (N, 3); None: they span no area.
+
+    A cell is a point on the surface through these points. What stands before it is not asked for. A photograph
+    whose pixels are wider there than `coarsest_m` does not count.
+    """
+    if not len(scene):
+        return None
+    low, high = np.quantile(scene[:, :2], [_RIM, 1 - _RIM], axis=0)
+    cell = float((high - low).max()) / _CELLS
+    if cell <= 0:
+        return None
+    columns, rows = np.maximum(np.ceil((high - low) / cell).astype(int), 1).tolist()
+    grid = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2)
+    place = low + (grid + 0.5) * cell
+    distance, _ = cKDTree(scene[:, :2]).query(place)
+    known = np.flatnonzero(distance <= _FARTHEST_CELLS * cell)
+    points = np.column_stack([place[known], PointSurface(scene).heights(place[known])])
+    count = np.full(rows * columns, -1, dtype=np.int64)
+    count[known] = photographs_that_see(solved, points, coarsest_m)
+    return Overlap(count.reshape(rows, columns), low, cell)
+
+
+def _seen_ground(solved: SolvedSurvey, scene: FloatArray) -> Polygon:
+    """Return the largest part of the ground that enough photographs see, without holes, smoothly bounded."""
+    depth_m, focal_px = depths_of_observations(solved)
+    overlap = overlap_of(solved, scene, coarsest_m=_COARSEST * float(np.median(depth_m / focal_px)))
+    parts: list[Polygon] = []
+    if overlap is not None:
+        seen = np.pad(overlap.count >= LEAST_PHOTOGRAPHS, 1).astype(np.float64)
+        middle = overlap.cell_m * (np.arange(max(seen.shape)) - 0.5)
+        x, y = overlap.corner[0] + middle[: seen.shape[1]], overlap.corner[1] + middle[: seen.shape[0]]
+        rings = [Polygon(ring) for ring in contourpy.contour_generator(x, y, seen).lines(0.5)]
+        reach = _SMOOTHED_CELLS * overlap.cell_m
+        opened = shapely.union_all(shapely.make_valid(rings)).buffer(-reach).buffer(2 * reach).buffer(-reach)
+        parts = [part for part in shapely.get_parts(opened) if part.area > 0]
+    if overlap is None or not parts:
+        message = (
+            f"No ground is seen by {LEAST_PHOTOGRAPHS} photographs. Give the area of interest with --boundary, or "
+            "add photographs."
+        )
+        raise DegenerateGeometryError("no-common-ground", message)
+    largest = Polygon(max(parts, key=lambda part: float(part.area)).exterior)
+    return max(shapely.get_parts(largest.simplify(overlap.cell_m / 2)), key=lambda part: float(part.area))
+
+
+def depths_of_observations(solved: SolvedSurvey) -> tuple[FloatArray, FloatArray]:
+    """Return the depth (K,) of each observation in metres on the ground, and its camera's focal length (K,)."""
+    sfm, poses = solved.sfm, solved.poses
+    focal_px = np.array([solved.sparse.camera_of(index).mean_focal_px for index in range(len(sfm.image_name))])
+    arm = solved.point_in_model[sfm.obs_point] - poses.cam_center_in_model[sfm.obs_image]
+    depth = np.einsum("kj,kj->k", poses.cam_from_model[sfm.obs_image][:, 2], arm)
+    return solved.geo_from_model.scale * depth, focal_px[sfm.obs_image]
+
+
+def photographs_that_see(solved: SolvedSurvey, point_in_geo: FloatArray, coarsest_m: float = np.inf) -> IntArray:
+    """Return the number (K,) of registered photographs whose frame holds points (K, 3); nothing hides a point.
+
+    Photographs whose pixels are wider there than `coarsest_m` do not count.
+    """
+    in_model = solved.geo_from_model.inverse().apply(point_in_geo)
+    # Tangent of the widest angle from the axis that a camera's frame shows.
+    widest = {
+        key: float(np.linalg.norm(border_rays(camera)[:, :2], axis=1).max(initial=0.0)) * (1 + 1e-9)
+        for key, camera in solved.sparse.cameras.items()
+    }
+    count = np.zeros(len(point_in_geo), dtype=np.int64)
+    for index, (rotation, center) in enumerate(
+        zip(solved.poses.cam_from_model, solved.poses.cam_center_in_model, strict=True)
+    ):
+        camera = solved.sparse.camera_of(index)
+        in_cam = (in_model - center) @ rotation.T
+        farthest = coarsest_m * camera.mean_focal_px / solved.geo_from_model.scale
+        # Beyond the widest ray of the frame, the polynomial of a lens can fold back into it.
+        ahead = np.flatnonzero((in_cam[:, 2] > 0) & (in_cam[:, 2] <= farthest))
+        slope = np.linalg.norm(in_cam[ahead, :2], axis=1) / in_cam[ahead, 2]
+        ahead = ahead[slope <= widest[int(solved.sparse.image_camera_id[index])]]
+        pixel = project(camera, in_cam[ahead])
+        seen = ((pixel >= 0) & (pixel <= [camera.width, camera.height])).all(axis=1)
+        count[ahead[seen]] += 1
+    return count
