@@ -7,7 +7,7 @@
 The options are those of `georef simulate`: the same scene is built again, and plumb lines through the middles of
 cells are intersected with it. Cells within 0.5 m of a step of the true surface are listed apart: there, a fraction
 of a cell decides between roof and ground. `the rest` is the RMSE of the cells that are off by 1 m at most, and
-`error/σ` the root mean square of their error over the predicted σ.
+`error/σ` the root mean square of their error over the predicted σ; of interpolated cells, that of all.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import rasterio
 
 from pipelines.core.products import load_json
 from pipelines.core.types import FloatArray, IntArray
+from pipelines.deliver.raster_mosaic import MEASURED
 from pipelines.formats.georef_sidecar import CrsSidecar, sidecar_path
 from pipelines.geodesy.crs import PointCrs, parse_crs
 from pipelines.geodesy.enu import ecef_from_enu, ecef_from_lla, enu_from_ecef, lla_from_ecef
@@ -66,14 +67,18 @@ def main() -> None:
     args = parser.parse_args()
     names = ("scene", "flight", "images", "size", "seed")
     options = SimulateOptions.model_validate({name: getattr(args, name) for name in names})
-    dsm, sigma = args.workspace / "raster" / "dsm.tif", args.workspace / "raster" / "sigma_v.tif"
+    dsm, sigma, measured_mask = (
+        args.workspace / "raster" / f"{name}.tif" for name in ("dsm", "sigma_v", "measured")
+    )
     truth = TrueSurface(options, parse_crs(load_json(CrsSidecar, sidecar_path(dsm)).crs))
-    with rasterio.open(dsm) as heights, rasterio.open(sigma) as sigmas:
-        row, column = np.nonzero(heights.read_masks(1))
+    with rasterio.open(dsm) as heights, rasterio.open(sigma) as sigmas, rasterio.open(measured_mask) as masks:
+        mask = masks.read(1)
+        row, column = np.nonzero(mask)
         drawn = np.random.default_rng(0).choice(len(row), min(args.cells, len(row)), replace=False)
         row, column = row[drawn], column[drawn]
         x, y = rasterio.transform.xy(heights.transform, row, column)
         measured, sigma_v = heights.read(1)[row, column].astype(float), sigmas.read(1)[row, column].astype(float)
+        seen = mask[row, column] == MEASURED
         gsd = heights.transform.a
     xy = np.column_stack([x, y])
     true, material = truth.at(xy)
@@ -83,19 +88,23 @@ def main() -> None:
     error = measured - true
     heads = "".join(f"{head:>9s}" for head in ("cells", "bias", "RMSE", "95 %", "> 1 m", "the rest", "error/σ"))
     print(f"cells of {gsd:.3f} m; metres\n{'':20s}{heads}")
-    for name, materials in _CLASSES.items():
-        for where, chosen in (("", smooth), (", at steps", ~smooth)):
-            k = chosen & np.isin(material, materials) & np.isfinite(error)
-            if not k.any():
-                continue
-            e = error[k]
-            near = np.abs(e) <= 1
-            z = (e / sigma_v[k])[near]
-            print(
-                f"{name + where:20s}{k.sum():9d}{np.median(e):+9.3f}{np.sqrt(np.mean(e**2)):9.3f}"
-                f"{np.quantile(np.abs(e), 0.95):9.3f}{np.mean(~near):9.2%}{np.sqrt(np.mean(e[near] ** 2)):9.3f}"
-                f"{np.sqrt(np.mean(z**2)):9.2f}"
-            )
+    classes = {
+        f"{name}{where}": chosen & seen & np.isin(material, materials)
+        for name, materials in _CLASSES.items()
+        for where, chosen in (("", smooth), (", at steps", ~smooth))
+    }
+    for name, chosen in {**classes, "interpolated": ~seen}.items():
+        k = chosen & np.isfinite(error)
+        if not k.any():
+            continue
+        e = error[k]
+        near = np.abs(e) <= 1
+        z = (e / sigma_v[k])[near if name != "interpolated" else slice(None)]
+        print(
+            f"{name:20s}{k.sum():9d}{np.median(e):+9.3f}{np.sqrt(np.mean(e**2)):9.3f}"
+            f"{np.quantile(np.abs(e), 0.95):9.3f}{np.mean(~near):9.2%}{np.sqrt(np.mean(e[near] ** 2)):9.3f}"
+            f"{np.sqrt(np.mean(z**2)):9.2f}"
+        )
 
 
 if __name__ == "__main__":

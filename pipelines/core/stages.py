@@ -261,7 +261,8 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         product="raster/orthophoto.tif",
         title="Write orthophoto, surface model and their σ as rasters in a CRS.",
         resumable=True,
-        also=("raster/dsm.tif", "raster/sigma_h.tif", "raster/sigma_v.tif"),
+        also=("raster/dsm.tif", "raster/measured.tif", "raster/sigma_h.tif", "raster/sigma_v.tif"),
+        product_version=2,  # whole inside the area of interest
     ),
     StageSpec(
         name="export-cloud",

@@ -8,6 +8,7 @@ from urllib.parse import urlsplit
 from pydantic import AfterValidator, Field
 
 from pipelines.core.options import ExtraMarker, StageOptions
+from pipelines.survey.area import AreaOptions
 from pipelines.survey.options import CrsOptions
 
 # The page was tried with this version: the extensions of splats in glTF are younger than those of meshes.
@@ -62,7 +63,7 @@ class ExportSpzOptions(WebSplatOptions):
     )
 
 
-class ExportRasterOptions(CrsOptions):
+class ExportRasterOptions(CrsOptions, AreaOptions):
     """Options of the export of orthophoto, surface model, σ and contours."""
 
     gsd: float | None = Field(
@@ -136,6 +137,8 @@ DESCRIPTIONS: dict[str, str] = {
     "measurable/splat.measurable.ply": "the splat to measure in, for viewers that pick centres; many times larger",
     "raster/orthophoto.tif": "orthophoto, for GIS and CAD",
     "raster/dsm.tif": "surface model, for volumes, profiles and GIS",
+    "raster/measured.tif": "which cells are measured, and which interpolated",
+    "raster/interpolated.geojson": "outlines of the interpolated parts, for maps",
     "raster/sigma_h.tif": "horizontal σ of each cell",
     "raster/sigma_v.tif": "vertical σ of each cell",
     "raster/contours.gpkg": "contour lines, for GIS",

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from pipelines.core.errors import DegenerateGeometryError, InputError
-from pipelines.core.files import remove
+from pipelines.core.files import remove, replace_text
 from pipelines.core.products import Remark, union
 from pipelines.core.types import BoolArray, ByteArray, FloatArray
 from pipelines.core.workspace import StageRun, Summary
@@ -29,14 +29,15 @@ from pipelines.deliver.raster_window import raster_source
 from pipelines.deliver.surface import without_sigma
 from pipelines.formats.georef_sidecar import median_sigma, write_sidecar
 from pipelines.formats.geotiff import RasterFrame, read_reduced
-from pipelines.formats.vector_files import ContourLine, write_contours_dxf, write_contours_gpkg
+from pipelines.formats.vector_files import ContourLine, features_text, write_contours_dxf, write_contours_gpkg
+from pipelines.survey.area import area_of
 from pipelines.survey.headline import headline_of
 from pipelines.survey.target_crs import target_crs
 from pipelines.survey.trained_survey import corners, load_trained, scene_points
 
 _DETAIL = 1.5  # training pixels over cells, beyond which a raster shows less than its cells promise
-# Bytes of a cell on the disk at most: colours, height and two σ, as parts and as final rasters.
-_BYTES_PER_CELL = 32
+# Bytes of a cell on the disk at most: colours, height, mask and two σ, as measured, whole and final rasters.
+_BYTES_PER_CELL = 66
 _PICTURE_PX = 2000
 _SUN_AZIMUTH_DEG, _SUN_ELEVATION_DEG = 315.0, 45.0
 # Of the contour lines.
@@ -52,14 +53,17 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
     trained = load_trained(stage.workspace)
     points, (photographs_m, training_m) = scene_points(trained), ground_sampling_m(trained)
     target = target_crs(options, trained.survey.origin, corners(points), trained.survey.vertical)
-    frame = make_frame(target.xyz_from_geo(points)[:, :2], target, photographs_m, options)
+    area = area_of(options, trained)
+    polygon = area.in_crs(target)
+    frame = make_frame(polygon.bounds, target, photographs_m, options)
     size = f"{frame.columns} × {frame.rows} cells"
     needed_bytes = _BYTES_PER_CELL * frame.columns * frame.rows
     require_space(stage.out, needed_bytes, f"rasters of {size}", "give a larger --gsd")
-    source, reason = raster_source(stage, trained, target, frame, training_m, min_views=options.min_views)
-    mosaic = Mosaic(stage.out / "parts", frame, target)
+    source, reason = raster_source(
+        stage, trained, target, frame, area, training_gsd_m=training_m, min_views=options.min_views
+    )
+    mosaic = Mosaic(stage.out / "parts", frame, target, polygon)
     mosaic.render(source, stage.progress)
-    mosaic.drop_islands()
     height = mosaic.sample("dsm")
     if not len(height):
         raise DegenerateGeometryError(
@@ -68,7 +72,7 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
         )
     sigma = None
     if not reason:
-        counts = "georeference, cameras and lens; the surface's own noise between training views"
+        counts = "georeference, cameras and lens; the surface's own noise between training views; interpolation"
         sigma = scene_sigma(counts, mosaic.sample("sigma_h"), mosaic.sample("sigma_v"))
     west, south, east, north = frame.bounds
     bounds = [[west, south, height.min()], [east, north, height.max()]]
@@ -78,13 +82,18 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
     sidecar = target.sidecar(bounds, headline_of(stage.workspace), sigma, cautions)
     for path in mosaic.write(stage.out, sidecar, stage.progress):
         write_sidecar(sidecar, path)
+    holes = mosaic.interpolated_parts(stage.out / "measured.tif")
+    replace_text(stage.out / "interpolated.geojson", features_text(holes))
     if options.hillshade:
         _write_pictures(stage.out, target.horizontal_unit_m / target.crs.height_unit_m)
     lines = _write_contours(stage.out, frame, options.contours) if options.contours else 0
-    covered = mosaic.covered()
+    measured, interpolated = mosaic.shares()
     source.views.close()
     remove(mosaic.folder)
-    figure = f"{size} of {frame.step_x:g} {target.crs.units[0]} in {target.crs.name}"
+    figure = (
+        f"{size} of {frame.step_x:g} {target.crs.units[0]} in {target.crs.name}, {measured:.0%} of "
+        f"{area.hectares:.3g} ha measured, {interpolated:.0%} interpolated"
+    )
     return Summary(
         figure + median_sigma(sigma, "cells"),
         {
@@ -97,7 +106,9 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
             "heights": target.crs.vertical.name,
             "units": target.crs.units,
             "bounds": bounds,
-            "covered": covered,
+            "area_ha": area.hectares,
+            "measured": measured,
+            "interpolated": interpolated,
             **median_values(sigma, "cell"),
             "contour_lines": lines,
             "assumed": "; ".join(target.assumed),

@@ -1,43 +1,54 @@
-"""Rasters of the stage, window by window: rendered into parts, then put together."""
+"""Rasters of the stage, window by window: rendered into parts, made whole inside the area, then put together."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
 from pipelines import __version__
 from pipelines.core.progress import Progress
-from pipelines.core.types import FloatArray, IntArray
-from pipelines.deliver.raster_window import RasterSource, WindowCells, render_window
+from pipelines.core.types import BoolArray, ByteArray, FloatArray, IntArray
+from pipelines.deliver.raster_window import PAINTED, RasterSource, WindowCells, georeference_sigma, render_window
 from pipelines.formats.georef_sidecar import CrsSidecar
 from pipelines.formats.geotiff import (
-    NODATA,
     Band,
     RasterFrame,
     RasterKind,
-    read_all,
+    cells_inside,
+    outlines,
+    read_cells,
     read_reduced,
     write_mosaic,
     write_part,
+    write_vrt,
 )
+from pipelines.formats.vector_files import Json, feature
+from pipelines.surface.filling import FilledCells, fill_cells
 from pipelines.survey.target_crs import TargetCrs
 
+MEASURED, INTERPOLATED = 255, 128  # in `measured.tif`; 0: outside the area, or unknown
 _WINDOW_PX = 1536
 _SAMPLES_PX = 192  # a side of a window
 _ISLANDS_PX = 4000  # along the longer side, at which islands are looked for
 _LEAST_ISLAND = 0.01  # of the largest part of the surface
+# A hole is filled cell by cell up to `_NARROW` cells from its rim, and beyond `_REACH` at the size of `_COARSE_PX`
+# along the longer side of the raster; between, one goes over into the other.
+_NARROW, _REACH, _COARSE_PX = 16, 64, 1500
+_OUTLINES_PX = 2000  # along the longer side, at which interpolated parts are outlined
 
 _COLOURS = (
     Band("red", colour="Red"),
     Band("green", colour="Green"),
     Band("blue", colour="Blue"),
-    Band("surface seen", colour="Alpha"),
+    Band("inside the area", colour="Alpha"),
 )
 
 
@@ -50,37 +61,62 @@ class _Window:
     frame: RasterFrame
 
 
-class Mosaic:
-    """Rasters `orthophoto`, `dsm`, `sigma_h` and `sigma_v` over one frame; parts in the folder are kept."""
+@dataclass(frozen=True)
+class _Coarse:
+    """Whole raster at a smaller size, filled, with colours (H, W, 3) of its cells."""
 
-    def __init__(self, folder: Path, frame: RasterFrame, target: TargetCrs) -> None:
-        self.folder, self.frame = folder, frame
+    cells: FilledCells
+    rgb: ByteArray
+    step: float  # cells of the raster along a side
+
+
+class Mosaic:
+    """Rasters over one frame, and the area (a polygon in their CRS) outside which they are empty.
+
+    Parts in the folder are kept: `parts` of what is measured, `whole` of the rasters to deliver.
+    """
+
+    def __init__(self, folder: Path, frame: RasterFrame, target: TargetCrs, polygon: Any) -> None:
+        self.folder, self.frame, self.target, self.polygon = folder, frame, target, polygon
         height = f"height above {target.crs.vertical.name}"
         self._kinds = {
             "orthophoto": RasterKind("uint8", _COLOURS),
             "dsm": RasterKind("float32", (Band(height, target.crs.height_unit),)),
             "sigma_h": RasterKind("float32", (Band("predicted horizontal standard deviation", "metre"),)),
             "sigma_v": RasterKind("float32", (Band("predicted vertical standard deviation", "metre"),)),
+            "measured": RasterKind("uint8", (Band(f"measured {MEASURED}, interpolated {INTERPOLATED}"),)),
         }
-        folder.mkdir(exist_ok=True)
+        self._seen, self._whole = folder / "seen", folder / "whole"
+        for part in (self._seen, self._whole):
+            part.mkdir(parents=True, exist_ok=True)
 
     def render(self, source: RasterSource, progress: Progress) -> None:
-        """Render the windows whose parts are missing."""
+        """Render the windows whose parts are missing, then fill what is not measured inside the area."""
         windows = list(self._windows())
         with progress.task("windows", len(windows)) as task:
             for window in windows:
-                if not all(self._part(name, window).exists() for name in self._kinds):
+                names = ("orthophoto", "dsm", "sigma_h", "sigma_v")
+                if not all(self._part(self._seen, name, window).exists() for name in names):
                     cells = render_window(source, window.frame, window.column, window.row)
-                    for name in self._kinds:
-                        write_part(self._part(name, window), _bands(name, cells), window.frame)
+                    self._write(self._seen, window, {name: _bands(name, cells) for name in names})
+                task.advance()
+        self._drop_islands()
+        for name in ("orthophoto", "dsm"):
+            parts = [(self._part(self._seen, name, one), one.column, one.row) for one in windows]
+            write_vrt(name, parts, self.frame, self._kinds[name], {})
+        with progress.task("whole windows", len(windows)) as task:
+            for window in windows:
+                if not all(self._part(self._whole, name, window).exists() for name in self._kinds):
+                    self._write(self._whole, window, self._filled(source, window))
                 task.advance()
 
-    def drop_islands(self) -> None:
-        """Empty the cells of islands: small parts, apart from all other surface, are agreements by chance."""
+    def _drop_islands(self) -> None:
+        """Unmeasure the cells of islands: small parts, apart from all other surface, are agreements by chance."""
         step = -(-max(self.frame.columns, self.frame.rows) // _ISLANDS_PX)
         seen = np.zeros((-(-self.frame.rows // step), -(-self.frame.columns // step)), dtype=bool)
         for window in self._windows():
-            np.logical_or.at(seen, _coarse(window, step), read_all(self._part("orthophoto", window))[3] > 0)
+            alpha = read_cells(self._part(self._seen, "orthophoto", window))[3]
+            np.logical_or.at(seen, _coarse_cells(window, step), alpha == MEASURED)
         number, _ = label(seen, structure=np.ones((3, 3)))
         sizes = np.bincount(number.ravel())
         if len(sizes) < 3:
@@ -88,30 +124,136 @@ class Mosaic:
         island = sizes < _LEAST_ISLAND * sizes[1:].max()
         island[0] = False
         for window in self._windows():
-            dropped = island[number[_coarse(window, step)]]
+            dropped = island[number[_coarse_cells(window, step)]]
             if not dropped.any():
                 continue
-            for name, kind in self._kinds.items():
-                values = read_all(self._part(name, window))
-                values[:, dropped] = 0 if kind.dtype == "uint8" else NODATA
-                write_part(self._part(name, window), values, window.frame)
+            for name in ("dsm", "sigma_h", "sigma_v", "orthophoto"):
+                path = self._part(self._seen, name, window)
+                values = read_cells(path)
+                if name == "orthophoto":
+                    values[3] = np.where(dropped, np.minimum(values[3], PAINTED), values[3])
+                else:
+                    values[:, dropped] = np.nan
+                write_part(path, values, window.frame)
 
-    def sample(self, name: str) -> FloatArray:
-        """Return values (K,) of cells all over a raster that have one; enough for medians and bounds."""
-        values = [read_reduced(self._part(name, window), _SAMPLES_PX)[0][0] for window in self._windows()]
+    def _filled(self, source: RasterSource, window: _Window) -> dict[str, NDArray[Any]]:
+        """Return the bands of all rasters in a window, whole inside the area and empty outside."""
+        frame, row, column = self.frame, window.row, window.column
+        top, left = max(row - _REACH, 0), max(column - _REACH, 0)
+        rows = min(row + window.frame.rows + _REACH, frame.rows) - top
+        columns = min(column + window.frame.columns + _REACH, frame.columns) - left
+        around = frame.part(left, top, columns, rows)
+        inside = cells_inside(self.polygon, around)
+        part = slice(top, top + rows), slice(left, left + columns)
+        height = read_cells(self._seen / "dsm.vrt", part)[0].astype(np.float64)
+        rgba = read_cells(self._seen / "orthophoto.vrt", part)
+        cells = fill_cells(height, inside, _REACH)
+        own = (
+            slice(row - top, row - top + window.frame.rows),
+            slice(column - left, column - left + window.frame.columns),
+        )
+        rgb = np.where(rgba[3] > 0, rgba[:3], rgba[:3].reshape(3, -1)[:, cells.source])[:, *own]
+        measured, inside = np.isfinite(height)[own], inside[own]
+        filled, spread, distance = cells.height[own].copy(), cells.sigma[own].copy(), cells.distance[own].copy()
+        wide = inside & ~measured & ((distance > _NARROW) | np.isnan(filled))
+        if wide.any():
+            coarse = self._coarse
+            at = tuple(
+                np.minimum((first + index) / coarse.step, size - 1).astype(np.int64)
+                for first, index, size in zip((row, column), np.nonzero(wide), coarse.rgb.shape, strict=False)
+            )
+            fine = np.clip((_REACH - distance[wide]) / (_REACH - _NARROW), 0.0, 1.0)
+            fine[np.isnan(filled[wide])] = 0.0
+            for own_cells, coarse_cells in ((filled, coarse.cells.height), (spread, coarse.cells.sigma)):
+                own_cells[wide] = np.where(fine > 0, fine * own_cells[wide], 0.0) + (1 - fine) * coarse_cells[at]
+            distance[wide] = np.where(fine > 0, distance[wide], coarse.cells.distance[at] * coarse.step)
+            blank = (fine == 0) & (rgba[3][own][wide] == 0)
+            rgb[:, wide] = np.where(blank, coarse.rgb[at].T, rgb[:, wide])
+        known = inside & np.isfinite(filled)
+        sigma_h, sigma_v = (
+            read_cells(self._part(self._seen, name, window))[0].astype(np.float64)
+            for name in ("sigma_h", "sigma_v")
+        )
+        if not measured.all():
+            # The place of what lies in a hole is as uncertain as the way to its rim is long.
+            georeference_h, georeference_v = georeference_sigma(
+                source, window.frame, np.where(known, filled, np.nan)
+            )
+            step_m = window.frame.step_x * self.target.horizontal_unit_m
+            sigma_h = np.where(measured, sigma_h, np.hypot(georeference_h, distance * step_m))
+            sigma_v = np.where(measured, sigma_v, np.hypot(georeference_v, spread * self.target.crs.height_unit_m))
+        alpha = np.where(known, MEASURED, 0)
+        mask = np.where(known, np.where(measured, MEASURED, INTERPOLATED), 0)
+        values = {"dsm": filled, "sigma_h": sigma_h, "sigma_v": sigma_v}
+        return {
+            "orthophoto": (np.concatenate([rgb, alpha[None]]) * known).astype(np.uint8),
+            "measured": mask[None].astype(np.uint8),
+            **{name: np.where(known, one, np.nan)[None] for name, one in values.items()},
+        }
+
+    @cached_property
+    def _coarse(self) -> _Coarse:
+        height, _ = read_reduced(self._seen / "dsm.vrt", _COARSE_PX)
+        rgba, _ = read_reduced(self._seen / "orthophoto.vrt", _COARSE_PX)
+        rows, columns = height.shape[1:]
+        step = self.frame.columns / columns
+        frame = RasterFrame(
+            self.frame.wkt,
+            self.frame.west,
+            self.frame.north,
+            self.frame.step_x * step,
+            self.frame.step_y * self.frame.rows / rows,
+            columns,
+            rows,
+        )
+        cells = fill_cells(height[0], cells_inside(self.polygon, frame), max(rows, columns))
+        rgb = np.moveaxis(rgba[:3], 0, 2).reshape(-1, 3)[cells.source]
+        return _Coarse(cells, rgb, step)
+
+    def sample(self, name: str, *, measured: bool = False) -> FloatArray:
+        """Return values (K,) of cells all over a raster that have one; enough for medians and bounds.
+
+        `measured` leaves out the interpolated cells.
+        """
+        folder = self._seen if measured else self._whole
+        values = [read_reduced(self._part(folder, name, window), _SAMPLES_PX)[0][0] for window in self._windows()]
         flat = np.concatenate([part.ravel() for part in values])
         return np.asarray(flat[np.isfinite(flat)], dtype=np.float64)
 
-    def covered(self) -> float:
-        """Return the share of the cells that have a surface."""
-        alpha = [read_reduced(self._part("orthophoto", window), _SAMPLES_PX)[0][3] for window in self._windows()]
-        return float(np.concatenate([part.ravel() for part in alpha]).mean() / 255)
+    def shares(self) -> tuple[float, float]:
+        """Return the shares of the area that are measured, and interpolated."""
+        inside = measured = interpolated = 0
+        for window in self._windows():
+            mask = read_cells(self._part(self._whole, "measured", window))[0]
+            inside += int(cells_inside(self.polygon, window.frame).sum())
+            measured += int((mask == MEASURED).sum())
+            interpolated += int((mask == INTERPOLATED).sum())
+        return measured / max(inside, 1), interpolated / max(inside, 1)
+
+    def interpolated_parts(self, path: Path) -> list[Json]:
+        """Return the interpolated parts of the mask at a path as features in WGS84, the largest first."""
+        mask, _ = read_reduced(path, _OUTLINES_PX)
+        interpolated: BoolArray = (mask[0] > 0) & (mask[0] <= (MEASURED + INTERPOLATED) / 2)
+        metres = self.target.horizontal_unit_m**2
+
+        def in_wgs84(plan: FloatArray) -> FloatArray:
+            lla = self.target.crs.lla_from_xyz(np.column_stack([plan, np.zeros(len(plan))]))
+            return np.round(lla[:, [1, 0]], 8)
+
+        parts = sorted(outlines(interpolated, self.frame), key=lambda part: -float(part.area))
+        return [
+            feature(
+                shapely.geometry.mapping(shapely.orient_polygons(shapely.transform(part, in_wgs84))),
+                {"area_m2": round(float(part.area) * metres, 2)},
+            )
+            for part in parts
+        ]
 
     def write(self, folder: Path, sidecar: CrsSidecar, progress: Progress) -> Iterator[Path]:
         """Write each raster into a folder, with accuracy and σ of the sidecar as metadata, and yield its path."""
         with progress.task("rasters", len(self._kinds)) as task:
             for name, kind in self._kinds.items():
-                parts = [(self._part(name, window), window.column, window.row) for window in self._windows()]
+                parts = [(self._part(self._whole, name, one), one.column, one.row) for one in self._windows()]
                 path = folder / f"{name}.tif"
                 write_mosaic(path, parts, self.frame, kind, _tags(sidecar))
                 yield path
@@ -124,8 +266,12 @@ class Mosaic:
                 rows = min(_WINDOW_PX, self.frame.rows - row)
                 yield _Window(column, row, self.frame.part(column, row, columns, rows))
 
-    def _part(self, name: str, window: _Window) -> Path:
-        return self.folder / f"{name}_{window.row}_{window.column}.tif"
+    def _write(self, folder: Path, window: _Window, bands: dict[str, NDArray[Any]]) -> None:
+        for name, values in bands.items():
+            write_part(self._part(folder, name, window), values, window.frame)
+
+    def _part(self, folder: Path, name: str, window: _Window) -> Path:
+        return folder / f"{name}_{window.row}_{window.column}.tif"
 
 
 def _tags(sidecar: CrsSidecar) -> dict[str, str]:
@@ -143,7 +289,7 @@ def _tags(sidecar: CrsSidecar) -> dict[str, str]:
     return tags
 
 
-def _coarse(window: _Window, step: int) -> tuple[IntArray, IntArray]:
+def _coarse_cells(window: _Window, step: int) -> tuple[IntArray, IntArray]:
     """Return the rows (H, 1) and columns (1, W) of a window in a raster with one cell for `step` × `step`."""
     rows = (window.row + np.arange(window.frame.rows, dtype=np.int64)) // step
     columns = (window.column + np.arange(window.frame.columns, dtype=np.int64)) // step

@@ -1,6 +1,6 @@
 """Plan of the rasters: their frame of cells, and the Gaussians over the map plane.
 
-The frame has cells on whole multiples of their size, over the scene; it is checked before the work begins. Every
+The frame has cells on whole multiples of their size, over the area; it is checked before the work begins. Every
 Gaussian goes through ENU → ECEF → CRS by itself: its centre exactly, its covariance by the derivative of that way,
 which varies so slowly that it is taken from a few nodes over the scene.
 """
@@ -8,6 +8,7 @@ which varies so slowly that it is taken from a few nodes over the scene.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -32,7 +33,6 @@ _ABOVE = 1.0  # unit of the heights, between the level from which depths count a
 _MOST_REACH = 3.34  # standard deviations at which an opaque Gaussian falls below 1/255
 _VIEWS_OF_COLOUR = 4
 _DILATION_PX2 = 0.3  # of the training, in its pixels
-_MARGIN = 0.02  # of the extent, on each side
 _LARGEST_DEG = 0.01  # about a kilometre
 
 
@@ -46,12 +46,12 @@ def ground_sampling_m(trained: TrainedSurvey) -> tuple[float, float]:
 
 
 def make_frame(
-    xy: FloatArray, target: TargetCrs, default_gsd_m: float, options: ExportRasterOptions
+    bounds: Sequence[float], target: TargetCrs, default_gsd_m: float, options: ExportRasterOptions
 ) -> RasterFrame:
-    """Return the frame of the rasters over points of the scene.
+    """Return the frame of the rasters.
 
     Args:
-        xy: (P, 2) points in the CRS, easting or longitude first.
+        bounds: west, south, east, north of the area in the CRS.
         target: the CRS.
         default_gsd_m: size of a cell in metres without `--gsd`.
 
@@ -80,10 +80,9 @@ def make_frame(
             field="--gsd",
         )
     step = _readable(default_gsd_m / crs.horizontal_unit) if options.gsd is None else options.gsd
-    low, high = xy.min(axis=0), xy.max(axis=0)
-    margin = _MARGIN * (high - low)
-    west, south = np.floor((low - margin) / step)
-    east, north = np.ceil((high + margin) / step)
+    west, south, east, north = bounds
+    west, south = np.floor(west / step), np.floor(south / step)
+    east, north = np.ceil(east / step), np.ceil(north / step)
     columns, rows = int(east - west), int(north - south)
     if columns * rows > options.max_pixels:
         enough = step * math.sqrt(columns * rows / options.max_pixels)

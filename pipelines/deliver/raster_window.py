@@ -19,9 +19,11 @@ from pipelines.geometry.similarity import Similarity
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.orthographic import PlanSplats, render_orthographic
 from pipelines.surface.surface_views import SurfaceViews
+from pipelines.survey.area import Area
 from pipelines.survey.target_crs import TargetCrs
 from pipelines.survey.trained_survey import TrainedSurvey, scene_points
 
+PAINTED = 128  # alpha of a cell whose colour is known and whose height is not measured
 _SOLID = 0.5  # least opacity of a surface
 _ONE_SURFACE_GSD = 4.0  # training pixels: largest spread of the heights of the Gaussians of one surface
 _AVERAGED = 5  # checked cells on a side over which the surface's own noise is averaged
@@ -32,7 +34,7 @@ _SIGMA_PX = 0.15  # of a ray through a photograph, in training pixels: by simula
 _NODE_PX = 64  # cells between two nodes at which the georeference's σ is taken
 _NODES = 4  # nodes along each side, at which the way from the CRS to `geo` is fitted
 _LEAST_OPACITY = 1 / 255
-_AROUND = 0.1  # of the scene's extent: Gaussians further outside it, in plan, reach into no cell
+_AROUND = 0.1  # of the area's extent: Gaussians further outside it, in plan, reach into no cell
 _HAZE_VIEWS = 2  # training views that look through a Gaussian, and none that shows a surface there
 
 
@@ -64,8 +66,9 @@ def raster_source(
     trained: TrainedSurvey,
     target: TargetCrs,
     frame: RasterFrame,
-    training_gsd_m: float,
+    area: Area,
     *,
+    training_gsd_m: float,
     min_views: int,
 ) -> tuple[RasterSource, str]:
     """Return what the windows are made from, and the reason why σ is not known, or an empty text.
@@ -78,7 +81,7 @@ def raster_source(
     """
     views = surface_views(stage, trained)
     training_px = training_gsd_m / (frame.step_x * target.horizontal_unit_m)
-    splats, level = plan_splats(_seen_gaussians(trained, views), trained, target, frame, training_px)
+    splats, level = plan_splats(_seen_gaussians(trained, views, area), trained, target, frame, training_px)
     sigma, no_sigma = predicted_sigma(stage.workspace, trained)
     source = RasterSource(
         splats=splats,
@@ -94,20 +97,24 @@ def raster_source(
     return source, no_sigma
 
 
-def _seen_gaussians(trained: TrainedSurvey, views: SurfaceViews) -> Gaussians:
-    """Return the Gaussians that reach into the scene; far ones may lie outside the domain of the CRS.
+def _seen_gaussians(trained: TrainedSurvey, views: SurfaceViews, area: Area) -> Gaussians:
+    """Return the Gaussians that reach into the area; far ones may lie outside the domain of the CRS.
 
     Left out are those in the air, through which the training views look at the surface.
     """
     points, gaussians = scene_points(trained), trained.gaussians
-    low, high = points.min(axis=0), points.max(axis=0)
+    west, south, east, north = area.polygon.bounds
+    low, high = np.array([west, south, points[:, 2].min()]), np.array([east, north, points[:, 2].max()])
     around = float(np.linalg.norm(high - low)) * np.array([_AROUND, _AROUND, 1.0])  # masts stand above all points
     in_geo = trained.geo_from_model.apply(gaussians.means.numpy())
     inside = ((in_geo >= low - around) & (in_geo <= high + around)).all(axis=1)
     solid = torch.sigmoid(gaussians.logit_opacities) >= _LEAST_OPACITY
     chosen = gaussians.select(solid & torch.from_numpy(inside))
     if len(chosen) == 0:
-        message = "No opaque Gaussian lies near the SfM points. Train again with `georef train --force`."
+        message = (
+            "No opaque Gaussian lies in the area of interest. Check --boundary, or train again with "
+            "`georef train --force`."
+        )
         raise DegenerateGeometryError("no-gaussians-in-scene", message)
     support = views.support(chosen.means.double().numpy())
     haze = (support.views == 0) & (support.seen_through >= _HAZE_VIEWS)
@@ -119,9 +126,9 @@ class WindowCells:
     """Cells of a window of H × W.
 
     Attributes:
-        rgba: (4, H, W); alpha is 255 where there is a surface, else 0.
-        height: (H, W) in the CRS's unit; NaN: no surface.
-        sigma_h_m, sigma_v_m: (H, W) metres; NaN: no surface, or not known.
+        rgba: (4, H, W); alpha is 255 where the surface is measured, `PAINTED` where only a colour is known, or 0.
+        height: (H, W) in the CRS's unit; NaN: not measured.
+        sigma_h_m, sigma_v_m: (H, W) metres; NaN: not measured, or not known.
     """
 
     rgba: ByteArray
@@ -161,9 +168,10 @@ def render_window(source: RasterSource, frame: RasterFrame, column: int, row: in
     rgba = np.zeros((4, frame.rows, frame.columns), dtype=np.uint8)
     # Colours were blended over black: what is not opaque would be dark.
     rgb = np.clip(colour / np.maximum(alpha, _SOLID)[..., None], 0.0, 1.0)
-    rgba[:3] = np.where(solid, np.moveaxis(np.round(255 * rgb), 2, 0), 0)
-    rgba[3] = np.where(solid, 255, 0)
-    sigma_h, sigma_v = _georeference_sigma(source, frame, height)
+    painted = solid | (alpha > _SOLID)
+    rgba[:3] = np.where(painted, np.moveaxis(np.round(255 * rgb), 2, 0), 0)
+    rgba[3] = np.where(solid, 255, np.where(painted, PAINTED, 0))
+    sigma_h, sigma_v = georeference_sigma(source, frame, height)
     sigma_h, sigma_v = np.hypot(sigma_h, noise_h_m), np.hypot(sigma_v, noise_up_m)
     return WindowCells(rgba, height, np.where(solid, sigma_h, np.nan), np.where(solid, sigma_v, np.nan))
 
@@ -251,7 +259,7 @@ def _quadratic(x: FloatArray) -> FloatArray:
     return np.column_stack([np.ones(len(x)), x, *products])
 
 
-def _georeference_sigma(
+def georeference_sigma(
     source: RasterSource, frame: RasterFrame, height: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return σ_H and σ_V (H, W) of the georeference in metres; NaN: not known."""

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.core.files import replace_file
+from pipelines.core.types import BoolArray
 
 NODATA = -9999.0
 _CACHE_BYTES = 256 * 1024 * 1024
@@ -61,7 +62,7 @@ class Band:
 
 @dataclass(frozen=True)
 class RasterKind:
-    """Bands of a raster. Without a value, float32 rasters have `NODATA`; bytes have an alpha band instead."""
+    """Bands of a raster. Without a value, float32 rasters have `NODATA`; bytes have an alpha band, or are 0."""
 
     dtype: Literal["uint8", "float32"]
     bands: tuple[Band, ...]
@@ -70,7 +71,6 @@ class RasterKind:
 def write_part(path: Path, values: NDArray[Any], frame: RasterFrame) -> None:
     """Write cells (bands, rows, columns) of a part; NaN becomes `NODATA`. The file appears whole or not at all."""
     import rasterio
-    from rasterio.transform import from_origin
 
     if values.dtype.kind == "f":
         values = np.where(np.isfinite(values), values, NODATA).astype(np.float32)
@@ -84,7 +84,7 @@ def write_part(path: Path, values: NDArray[Any], frame: RasterFrame) -> None:
         count=len(values),
         dtype=values.dtype,
         nodata=NODATA if values.dtype.kind == "f" else None,
-        transform=from_origin(frame.west, frame.north, frame.step_x, frame.step_y),
+        transform=_transform(frame),
         tiled=True,
         blockxsize=_BLOCK_PX,
         blockysize=_BLOCK_PX,
@@ -106,8 +106,7 @@ def write_mosaic(
     import rasterio
     import rasterio.shutil
 
-    mosaic = parts[0][0].parent / f"{path.stem}.vrt"
-    mosaic.write_bytes(_vrt(parts, frame, kind, tags))
+    mosaic = write_vrt(path.stem, parts, frame, kind, tags)
     draft = path.with_name(path.name + ".tmp")
     with rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES):
         rasterio.shutil.copy(
@@ -124,12 +123,52 @@ def write_mosaic(
     replace_file(draft, path)
 
 
-def read_all(path: Path) -> NDArray[Any]:
-    """Return the bands (bands, rows, columns) of a part as they are stored."""
-    import rasterio
+def write_vrt(
+    name: str,
+    parts: Sequence[tuple[Path, int, int]],
+    frame: RasterFrame,
+    kind: RasterKind,
+    tags: Mapping[str, str],
+) -> Path:
+    """Write a file beside parts that shows them as one raster, as `write_mosaic` copies it, and return its path."""
+    mosaic = parts[0][0].parent / f"{name}.vrt"
+    mosaic.write_bytes(_vrt(parts, frame, kind, tags))
+    return mosaic
 
-    with rasterio.open(path) as part:
-        return np.asarray(part.read())
+
+def read_cells(path: Path, part: tuple[slice, slice] | None = None) -> NDArray[Any]:
+    """Return the bands (bands, rows, columns) of a raster, or of rows and columns that lie in it; NaN: no value."""
+    import rasterio
+    from rasterio.windows import Window
+
+    with rasterio.open(path) as raster:
+        values = raster.read(window=None if part is None else Window.from_slices(*part))
+    return np.where(values == NODATA, np.nan, values) if values.dtype.kind == "f" else np.asarray(values)
+
+
+def cells_inside(polygon: Any, frame: RasterFrame) -> BoolArray:
+    """Return which cells (rows, columns) have their middle in a polygon of the frame's CRS."""
+    from rasterio.features import rasterize
+
+    shape = (frame.rows, frame.columns)
+    return np.asarray(rasterize([polygon], shape, transform=_transform(frame)), dtype=bool)
+
+
+def outlines(cells: BoolArray, frame: RasterFrame) -> list[Any]:
+    """Return the parts of chosen cells (rows, columns) over a frame as polygons, holes and all."""
+    import shapely
+    from rasterio.features import shapes
+
+    step = frame.columns * frame.step_x / cells.shape[1], frame.rows * frame.step_y / cells.shape[0]
+    coarse = RasterFrame(frame.wkt, frame.west, frame.north, *step, cells.shape[1], cells.shape[0])
+    found = shapes(cells.astype(np.uint8), mask=cells, connectivity=8, transform=_transform(coarse))
+    return [shapely.make_valid(shapely.geometry.shape(part)) for part, _ in found]
+
+
+def _transform(frame: RasterFrame) -> Any:
+    from rasterio.transform import from_origin
+
+    return from_origin(frame.west, frame.north, frame.step_x, frame.step_y)
 
 
 def read_reduced(path: Path, longest_px: int) -> tuple[NDArray[Any], float]:
