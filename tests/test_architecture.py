@@ -80,6 +80,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "rasterio": ("pipelines.formats",),
     "pyogrio": ("pipelines.formats.vector_files",),
     "ezdxf": ("pipelines.formats.vector_files",),
+    "CSF": ("pipelines.surface.ground",),
     "viser": ("pipelines.view",),
     "websockets": ("pipelines.view.loopback",),
     "msgspec": ("pipelines.view.loopback",),

@@ -9,16 +9,18 @@ from typing import Literal
 
 from pipelines.core.errors import BackendUnavailableError
 
-Extra = Literal["bags", "cluster", "reference", "simulator", "vectors", "viewer"]
-# What needs each extra, and the libraries that it installs.
+Extra = Literal["bags", "cluster", "reference", "simulator", "terrain", "vectors", "viewer"]
+# What needs each extra, and the libraries that it installs, by the names of their packages.
 EXTRAS: dict[Extra, tuple[str, tuple[str, ...]]] = {
     "bags": ("a ROS bag (--bag, georef inspect)", ("rosbags",)),
     "cluster": ("a cluster (--cluster, georef cluster)", ("distributed", "cryptography")),
     "reference": ("M3C2 (georef evaluate --reference)", ("py4dgeo",)),
     "simulator": ("georef simulate", ("embreex",)),
+    "terrain": ("the ground (dtm.tif, classes of the cloud)", ("cloth-simulation-filter",)),
     "vectors": ("contour lines and boundaries (--contours, --boundary)", ("ezdxf", "pyogrio")),
     "viewer": ("georef view", ("viser", "websockets", "msgspec")),
 }
+_MODULES = {"cloth-simulation-filter": "CSF"}  # where the names differ
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,7 @@ def require(extra: Extra) -> None:
 def extra_part(extra: Extra) -> Part:
     """Return an extra with the versions of its libraries."""
     user, libraries = EXTRAS[extra]
-    missing = [name for name in libraries if find_spec(name) is None]
+    missing = [name for name in libraries if find_spec(_MODULES.get(name, name)) is None]
     if missing:
         remedy = f"{user} needs {', '.join(missing)}, which the extra {extra} installs: {installing(extra)}"
         return Part(extra, None, remedy)

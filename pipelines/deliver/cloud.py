@@ -1,7 +1,7 @@
 """Stage `export-cloud`: the surface of the trained model as a georeferenced point cloud.
 
 Reads the trained model, the survey and the initial similarity. Writes `cloud/cloud.laz` and its sidecar, and on
-request `cloud/cloud.ply` with a sidecar of its own.
+request `cloud/cloud.ply` with a sidecar of its own. Points of the ground have class 2, all others class 1.
 
 The points come from the depth maps of the training views, fused, and not from the centres of the Gaussians: those
 lie above and below the surface. They are written part by part; medians of σ are counted in classes meanwhile.
@@ -18,21 +18,24 @@ import numpy as np
 from pipelines import __version__
 from pipelines.adjust.accuracy_grid import AccuracyGrid
 from pipelines.core.errors import DegenerateGeometryError
-from pipelines.core.products import union
+from pipelines.core.products import Remark, union
 from pipelines.core.stages import CLOUD
-from pipelines.core.types import FloatArray, IntArray
+from pipelines.core.types import FloatArray, IntArray, rows_of
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import ExportCloudOptions
 from pipelines.deliver.placement import median_values
-from pipelines.deliver.surface import predicted_sigma, surface_views, without_sigma
+from pipelines.deliver.surface import ground_below, predicted_sigma, surface_views, without_sigma
 from pipelines.formats.cloud_ply import CloudPlyWriter, CloudPoints
 from pipelines.formats.georef_sidecar import CrsSidecar, SceneSigma, median_sigma, write_sidecar
 from pipelines.formats.las import LazWriter
 from pipelines.surface.fusion import SurfaceCloud, fused_squares, fusion_settings
+from pipelines.surface.ground import Terrain
+from pipelines.survey.area import Area, area_of
 from pipelines.survey.headline import headline_of
 from pipelines.survey.target_crs import TargetCrs, target_crs
 from pipelines.survey.trained_survey import corners, load_trained, scene_points
 
+GROUND, OTHER = 2, 1  # classes of LAS
 SIGMA_COUNTS = "georeference, disagreement of the training views about the surface, intersection of their rays"
 _STEP_M = 10.0  # of the differences that tell the axes of a CRS
 # Classes of the σ, 1 % wide, from 0.1 mm to 2 km: medians are known to 1 % without keeping all values.
@@ -50,9 +53,12 @@ def run(stage: StageRun, options: ExportCloudOptions) -> Summary:
     paths = (laz, laz.with_suffix(".ply")) if options.ply else (laz,)
     views = surface_views(stage, trained, colours=True)
     settings = fusion_settings(views, geo_from_model, options.min_views, options.spacing)
+    area = area_of(options, trained)
+    terrain, warnings = ground_below(views, trained, area, options, stage.progress)
     grid, no_sigma = predicted_sigma(stage.workspace, trained)
     squares = fused_squares(views, geo_from_model, settings, stage.progress)
-    points = (_points_in_crs(square, target, crs_from_geo, grid) for square in squares)
+    kept = (rows_of(square, area.contains(square.position)) for square in squares)
+    points = (_points_in_crs(square, target, crs_from_geo, grid, terrain) for square in kept)
     tally = _write_points(paths, points, target, wkt1, middle)
     if not tally.count:
         raise DegenerateGeometryError(
@@ -66,7 +72,7 @@ def run(stage: StageRun, options: ExportCloudOptions) -> Summary:
     for path in paths:
         write_sidecar(sidecar, path)
     views.close()
-    return _summary(tally.count, sidecar, settings.spacing_m)
+    return _summary(tally, sidecar, settings.spacing_m, area, warnings)
 
 
 def _middle_and_axes(target: TargetCrs, scene_in_geo: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -84,7 +90,11 @@ def _middle_and_axes(target: TargetCrs, scene_in_geo: FloatArray) -> tuple[Float
 
 
 def _points_in_crs(
-    cloud: SurfaceCloud, target: TargetCrs, crs_from_geo: FloatArray, grid: AccuracyGrid | None
+    cloud: SurfaceCloud,
+    target: TargetCrs,
+    crs_from_geo: FloatArray,
+    grid: AccuracyGrid | None,
+    terrain: Terrain | None,
 ) -> CloudPoints:
     """Return points in the CRS, with the covariance of the georeference and of the surface together.
 
@@ -93,11 +103,15 @@ def _points_in_crs(
     georeference = np.full((len(cloud.position), 3, 3), np.nan) if grid is None else grid.cov_at(cloud.position)
     # The surface is uncertain along its normal. Along itself, a surface has no place.
     across = cloud.sigma_m[:, None] * cloud.normal
+    ground = np.zeros(len(cloud.position), np.uint8)
+    if terrain is not None:
+        ground = np.where(terrain.is_ground(cloud.position), GROUND, OTHER).astype(np.uint8)
     return CloudPoints(
         target.xyz_from_geo(cloud.position),
         (cloud.normal @ crs_from_geo.T).astype(np.float32),
         cloud.rgb,
         (georeference + across[:, :, None] * across[:, None, :]).astype(np.float32),
+        ground,
     )
 
 
@@ -105,7 +119,7 @@ class Tally:
     """Figures of the points so far: count, bounds, and σ in classes."""
 
     def __init__(self) -> None:
-        self.count = 0
+        self.count = self.ground = 0
         self.bounds = np.array([[np.inf] * 3, [-np.inf] * 3])
         self._horizontal, self._vertical = (np.zeros(_CLASSES, dtype=np.int64) for _ in range(2))
         self._largest = np.zeros(2)
@@ -114,6 +128,7 @@ class Tally:
         if not len(points):
             return
         self.count += len(points)
+        self.ground += int((points.classification == GROUND).sum())
         self.bounds[0] = np.minimum(self.bounds[0], points.position.min(axis=0))
         self.bounds[1] = np.maximum(self.bounds[1], points.position.max(axis=0))
         self._horizontal += _classes(points.sigma_h_m)
@@ -176,9 +191,13 @@ def _write_points(
     return tally
 
 
-def _summary(count: int, sidecar: CrsSidecar, spacing_m: float) -> Summary:
+def _summary(
+    tally: Tally, sidecar: CrsSidecar, spacing_m: float, area: Area, warnings: tuple[Remark, ...]
+) -> Summary:
     values = {
-        "points": count,
+        "points": tally.count,
+        "ground_points": tally.ground,
+        "area_ha": area.hectares,
         "spacing_m": spacing_m,
         "crs": sidecar.crs,
         "vertical_datum": sidecar.vertical_datum.name,
@@ -186,5 +205,5 @@ def _summary(count: int, sidecar: CrsSidecar, spacing_m: float) -> Summary:
         **median_values(sidecar.sigma, "point"),
         "assumed": "; ".join(sidecar.assumed),
     }
-    figure = f"{count} points, one in {spacing_m:.3f} m, {sidecar.crs}, heights {sidecar.vertical_datum.name}"
-    return Summary(figure + median_sigma(sidecar.sigma, "points"), values, cautions=sidecar.cautions)
+    figure = f"{tally.count} points, one in {spacing_m:.3f} m, {sidecar.crs}, heights {sidecar.vertical_datum.name}"
+    return Summary(figure + median_sigma(sidecar.sigma, "points"), values, warnings, sidecar.cautions)

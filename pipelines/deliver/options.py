@@ -63,7 +63,15 @@ class ExportSpzOptions(WebSplatOptions):
     )
 
 
-class ExportRasterOptions(CrsOptions, AreaOptions):
+class TerrainOptions(AreaOptions):
+    """Options of everything that tells the ground from what stands on it, in the area of interest."""
+
+    terrain: bool = Field(
+        True, description="Tell the ground from what stands on it (dtm.tif, contours, classes of the cloud)."
+    )
+
+
+class ExportRasterOptions(CrsOptions, TerrainOptions):
     """Options of the export of orthophoto, surface model, σ and contours."""
 
     gsd: float | None = Field(
@@ -75,12 +83,15 @@ class ExportRasterOptions(CrsOptions, AreaOptions):
     contours: Annotated[float, ExtraMarker("vectors")] | None = Field(
         None, gt=0, description="Interval of contour lines, in the unit of the heights."
     )
+    contours_of: Literal["terrain", "surface"] = Field(
+        "terrain", description="Draw the contour lines of the ground, or of everything that stands on it."
+    )
     min_views: int = Field(4, ge=2, description="Leave out cells whose surface fewer training views show.")
     max_pixels: float = Field(1e9, gt=0, description="Refuse a raster with more cells.")
     hillshade: bool = Field(True, description="Draw hillshade.png and preview.png.")
 
 
-class ExportCloudOptions(CrsOptions):
+class ExportCloudOptions(CrsOptions, TerrainOptions):
     """Options of the export of the surface as a point cloud."""
 
     spacing: float | None = Field(
@@ -137,6 +148,8 @@ DESCRIPTIONS: dict[str, str] = {
     "measurable/splat.measurable.ply": "the splat to measure in, for viewers that pick centres; many times larger",
     "raster/orthophoto.tif": "orthophoto, for GIS and CAD",
     "raster/dsm.tif": "surface model, for volumes, profiles and GIS",
+    "raster/dtm.tif": "terrain model: the ground without houses, trees and cars",
+    "raster/sigma_dtm.tif": "vertical σ of the terrain model",
     "raster/measured.tif": "which cells are measured, and which interpolated",
     "raster/interpolated.geojson": "outlines of the interpolated parts, for maps",
     "raster/sigma_h.tif": "horizontal σ of each cell",

@@ -39,6 +39,7 @@ _DETAIL = 1.5  # training pixels over cells, beyond which a raster shows less th
 # Bytes of a cell on the disk at most: colours, height, mask and two σ, as measured, whole and final rasters.
 _BYTES_PER_CELL = 66
 _PICTURE_PX = 2000
+_COLOURED, _TINT = (0.01, 0.99), 0.55  # quantiles of the heights at the ends of the colours, and their strength
 _SUN_AZIMUTH_DEG, _SUN_ELEVATION_DEG = 315.0, 45.0
 # Of the contour lines.
 _EVERY_MAJOR = 5
@@ -59,10 +60,10 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
     size = f"{frame.columns} × {frame.rows} cells"
     needed_bytes = _BYTES_PER_CELL * frame.columns * frame.rows
     require_space(stage.out, needed_bytes, f"rasters of {size}", "give a larger --gsd")
-    source, reason = raster_source(
-        stage, trained, target, frame, area, training_gsd_m=training_m, min_views=options.min_views
+    source, reason, warnings = raster_source(
+        stage, trained, target, frame, area, training_gsd_m=training_m, options=options
     )
-    mosaic = Mosaic(stage.out / "parts", frame, target, polygon)
+    mosaic = Mosaic(stage.out / "parts", frame, target, polygon, has_terrain=source.terrain is not None)
     mosaic.render(source, stage.progress)
     height = mosaic.sample("dsm")
     if not len(height):
@@ -86,7 +87,9 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
     replace_text(stage.out / "interpolated.geojson", features_text(holes))
     if options.hillshade:
         _write_pictures(stage.out, target.horizontal_unit_m / target.crs.height_unit_m)
-    lines = _write_contours(stage.out, frame, options.contours) if options.contours else 0
+    of_ground = options.contours_of == "terrain" and source.terrain is not None
+    heights = stage.out / ("dtm.tif" if of_ground else "dsm.tif")
+    lines = _write_contours(heights, frame, options.contours) if options.contours else 0
     measured, interpolated = mosaic.shares()
     source.views.close()
     remove(mosaic.folder)
@@ -113,7 +116,8 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
             "contour_lines": lines,
             "assumed": "; ".join(target.assumed),
         },
-        cautions=cautions,
+        warnings,
+        cautions,
     )
 
 
@@ -137,7 +141,12 @@ def _write_pictures(folder: Path, heights_by_plan: float) -> None:
     height, cell = read_reduced(folder / "dsm.tif", _PICTURE_PX)
     grey = _hillshade(height[0], cell * heights_by_plan)
     alpha = np.where(np.isfinite(height[0]), 255, 0).astype(np.uint8)
-    cv2.imwrite(str(folder / "hillshade.png"), np.dstack([grey, grey, grey, alpha]))
+    low, high = np.nanquantile(height[0], _COLOURED)
+    level = np.clip((np.nan_to_num(height[0], nan=low) - low) / max(high - low, 1e-6), 0.0, 1.0)
+    colours = cv2.applyColorMap(np.asarray(255 * level, dtype=np.uint8), cv2.COLORMAP_TURBO)
+    # Pale colours, so that the light can be seen on them.
+    shaded = (1 - _TINT + _TINT * colours / 255.0) * grey[..., None]
+    cv2.imwrite(str(folder / "hillshade.png"), np.dstack([shaded.astype(np.uint8), alpha]))
 
 
 def _hillshade(height: FloatArray, cell: float) -> ByteArray:
@@ -152,9 +161,10 @@ def _hillshade(height: FloatArray, cell: float) -> ByteArray:
     return np.asarray(np.round(255 * np.clip(light, 0.0, 1.0)), dtype=np.uint8)
 
 
-def _write_contours(folder: Path, frame: RasterFrame, interval: float) -> int:
-    """Write `contours.gpkg` and `contours.dxf` of a folder's `dsm.tif`, and return the number of lines."""
-    height, _ = read_reduced(folder / "dsm.tif", _CONTOUR_PX)
+def _write_contours(heights: Path, frame: RasterFrame, interval: float) -> int:
+    """Write `contours.gpkg` and `contours.dxf` beside a raster of heights, and return the number of lines."""
+    height, _ = read_reduced(heights, _CONTOUR_PX)
+    folder = heights.parent
     lines = _contour_lines(height[0].astype(np.float64), frame, interval)
     write_contours_gpkg(folder / "contours.gpkg", lines, frame.wkt)
     write_contours_dxf(folder / "contours.dxf", lines)

@@ -15,8 +15,9 @@ from scipy.ndimage import label
 
 from pipelines import __version__
 from pipelines.core.progress import Progress
-from pipelines.core.types import BoolArray, ByteArray, FloatArray, IntArray
-from pipelines.deliver.raster_window import PAINTED, RasterSource, WindowCells, georeference_sigma, render_window
+from pipelines.core.types import BoolArray, FloatArray, IntArray
+from pipelines.deliver.raster_whole import INTERPOLATED, MEASURED, REACH, CoarseCells, SeenCells, whole_cells
+from pipelines.deliver.raster_window import PAINTED, RasterSource, render_window
 from pipelines.formats.georef_sidecar import CrsSidecar
 from pipelines.formats.geotiff import (
     Band,
@@ -31,17 +32,14 @@ from pipelines.formats.geotiff import (
     write_vrt,
 )
 from pipelines.formats.vector_files import Json, feature
-from pipelines.surface.filling import FilledCells, fill_cells
+from pipelines.surface.filling import fill_cells
 from pipelines.survey.target_crs import TargetCrs
 
-MEASURED, INTERPOLATED = 255, 128  # in `measured.tif`; 0: outside the area, or unknown
 _WINDOW_PX = 1536
 _SAMPLES_PX = 192  # a side of a window
 _ISLANDS_PX = 4000  # along the longer side, at which islands are looked for
 _LEAST_ISLAND = 0.01  # of the largest part of the surface
-# A hole is filled cell by cell up to `_NARROW` cells from its rim, and beyond `_REACH` at the size of `_COARSE_PX`
-# along the longer side of the raster; between, one goes over into the other.
-_NARROW, _REACH, _COARSE_PX = 16, 64, 1500
+_COARSE_PX = 1500  # along the longer side, at which wide holes are filled
 _OUTLINES_PX = 2000  # along the longer side, at which interpolated parts are outlined
 
 _COLOURS = (
@@ -61,31 +59,29 @@ class _Window:
     frame: RasterFrame
 
 
-@dataclass(frozen=True)
-class _Coarse:
-    """Whole raster at a smaller size, filled, with colours (H, W, 3) of its cells."""
-
-    cells: FilledCells
-    rgb: ByteArray
-    step: float  # cells of the raster along a side
-
-
 class Mosaic:
     """Rasters over one frame, and the area (a polygon in their CRS) outside which they are empty.
 
     Parts in the folder are kept: `parts` of what is measured, `whole` of the rasters to deliver.
     """
 
-    def __init__(self, folder: Path, frame: RasterFrame, target: TargetCrs, polygon: Any) -> None:
+    def __init__(
+        self, folder: Path, frame: RasterFrame, target: TargetCrs, polygon: Any, *, has_terrain: bool
+    ) -> None:
         self.folder, self.frame, self.target, self.polygon = folder, frame, target, polygon
         height = f"height above {target.crs.vertical.name}"
         self._kinds = {
             "orthophoto": RasterKind("uint8", _COLOURS),
-            "dsm": RasterKind("float32", (Band(height, target.crs.height_unit),)),
+            "dsm": RasterKind("float32", (Band(f"surface: {height}", target.crs.height_unit),)),
             "sigma_h": RasterKind("float32", (Band("predicted horizontal standard deviation", "metre"),)),
             "sigma_v": RasterKind("float32", (Band("predicted vertical standard deviation", "metre"),)),
             "measured": RasterKind("uint8", (Band(f"measured {MEASURED}, interpolated {INTERPOLATED}"),)),
         }
+        if has_terrain:
+            self._kinds |= {
+                "dtm": RasterKind("float32", (Band(f"ground: {height}", target.crs.height_unit),)),
+                "sigma_dtm": RasterKind("float32", (Band("predicted vertical standard deviation", "metre"),)),
+            }
         self._seen, self._whole = folder / "seen", folder / "whole"
         for part in (self._seen, self._whole):
             part.mkdir(parents=True, exist_ok=True)
@@ -97,8 +93,7 @@ class Mosaic:
             for window in windows:
                 names = ("orthophoto", "dsm", "sigma_h", "sigma_v")
                 if not all(self._part(self._seen, name, window).exists() for name in names):
-                    cells = render_window(source, window.frame, window.column, window.row)
-                    self._write(self._seen, window, {name: _bands(name, cells) for name in names})
+                    self._write(self._seen, window, _seen_bands(source, window))
                 task.advance()
         self._drop_islands()
         for name in ("orthophoto", "dsm"):
@@ -107,7 +102,10 @@ class Mosaic:
         with progress.task("whole windows", len(windows)) as task:
             for window in windows:
                 if not all(self._part(self._whole, name, window).exists() for name in self._kinds):
-                    self._write(self._whole, window, self._filled(source, window))
+                    cells = whole_cells(
+                        source, self._seen_around(window), self._coarse, (window.row, window.column)
+                    )
+                    self._write(self._whole, window, cells)
                 task.advance()
 
     def _drop_islands(self) -> None:
@@ -136,79 +134,38 @@ class Mosaic:
                     values[:, dropped] = np.nan
                 write_part(path, values, window.frame)
 
-    def _filled(self, source: RasterSource, window: _Window) -> dict[str, NDArray[Any]]:
-        """Return the bands of all rasters in a window, whole inside the area and empty outside."""
-        frame, row, column = self.frame, window.row, window.column
-        top, left = max(row - _REACH, 0), max(column - _REACH, 0)
-        rows = min(row + window.frame.rows + _REACH, frame.rows) - top
-        columns = min(column + window.frame.columns + _REACH, frame.columns) - left
-        around = frame.part(left, top, columns, rows)
-        inside = cells_inside(self.polygon, around)
-        part = slice(top, top + rows), slice(left, left + columns)
-        height = read_cells(self._seen / "dsm.vrt", part)[0].astype(np.float64)
-        rgba = read_cells(self._seen / "orthophoto.vrt", part)
-        cells = fill_cells(height, inside, _REACH)
-        own = (
-            slice(row - top, row - top + window.frame.rows),
-            slice(column - left, column - left + window.frame.columns),
+    def _seen_around(self, window: _Window) -> SeenCells:
+        row, column = window.row, window.column
+        top, left = max(row - REACH, 0), max(column - REACH, 0)
+        rows = min(row + window.frame.rows + REACH, self.frame.rows) - top
+        columns = min(column + window.frame.columns + REACH, self.frame.columns) - left
+        frame, part = (
+            self.frame.part(left, top, columns, rows),
+            (slice(top, top + rows), slice(left, left + columns)),
         )
-        rgb = np.where(rgba[3] > 0, rgba[:3], rgba[:3].reshape(3, -1)[:, cells.source])[:, *own]
-        measured, inside = np.isfinite(height)[own], inside[own]
-        filled, spread, distance = cells.height[own].copy(), cells.sigma[own].copy(), cells.distance[own].copy()
-        wide = inside & ~measured & ((distance > _NARROW) | np.isnan(filled))
-        if wide.any():
-            coarse = self._coarse
-            at = tuple(
-                np.minimum((first + index) / coarse.step, size - 1).astype(np.int64)
-                for first, index, size in zip((row, column), np.nonzero(wide), coarse.rgb.shape, strict=False)
-            )
-            fine = np.clip((_REACH - distance[wide]) / (_REACH - _NARROW), 0.0, 1.0)
-            fine[np.isnan(filled[wide])] = 0.0
-            for own_cells, coarse_cells in ((filled, coarse.cells.height), (spread, coarse.cells.sigma)):
-                own_cells[wide] = np.where(fine > 0, fine * own_cells[wide], 0.0) + (1 - fine) * coarse_cells[at]
-            distance[wide] = np.where(fine > 0, distance[wide], coarse.cells.distance[at] * coarse.step)
-            blank = (fine == 0) & (rgba[3][own][wide] == 0)
-            rgb[:, wide] = np.where(blank, coarse.rgb[at].T, rgb[:, wide])
-        known = inside & np.isfinite(filled)
-        sigma_h, sigma_v = (
-            read_cells(self._part(self._seen, name, window))[0].astype(np.float64)
-            for name in ("sigma_h", "sigma_v")
+        sigma_h, sigma_v = (read_cells(self._part(self._seen, name, window))[0] for name in ("sigma_h", "sigma_v"))
+        return SeenCells(
+            frame=frame,
+            own=(
+                slice(row - top, row - top + window.frame.rows),
+                slice(column - left, column - left + window.frame.columns),
+            ),
+            height=read_cells(self._seen / "dsm.vrt", part)[0].astype(np.float64),
+            rgba=read_cells(self._seen / "orthophoto.vrt", part),
+            sigma_h_m=sigma_h,
+            sigma_v_m=sigma_v,
+            inside=cells_inside(self.polygon, frame),
         )
-        if not measured.all():
-            # The place of what lies in a hole is as uncertain as the way to its rim is long.
-            georeference_h, georeference_v = georeference_sigma(
-                source, window.frame, np.where(known, filled, np.nan)
-            )
-            step_m = window.frame.step_x * self.target.horizontal_unit_m
-            sigma_h = np.where(measured, sigma_h, np.hypot(georeference_h, distance * step_m))
-            sigma_v = np.where(measured, sigma_v, np.hypot(georeference_v, spread * self.target.crs.height_unit_m))
-        alpha = np.where(known, MEASURED, 0)
-        mask = np.where(known, np.where(measured, MEASURED, INTERPOLATED), 0)
-        values = {"dsm": filled, "sigma_h": sigma_h, "sigma_v": sigma_v}
-        return {
-            "orthophoto": (np.concatenate([rgb, alpha[None]]) * known).astype(np.uint8),
-            "measured": mask[None].astype(np.uint8),
-            **{name: np.where(known, one, np.nan)[None] for name, one in values.items()},
-        }
 
     @cached_property
-    def _coarse(self) -> _Coarse:
+    def _coarse(self) -> CoarseCells:
         height, _ = read_reduced(self._seen / "dsm.vrt", _COARSE_PX)
         rgba, _ = read_reduced(self._seen / "orthophoto.vrt", _COARSE_PX)
         rows, columns = height.shape[1:]
-        step = self.frame.columns / columns
-        frame = RasterFrame(
-            self.frame.wkt,
-            self.frame.west,
-            self.frame.north,
-            self.frame.step_x * step,
-            self.frame.step_y * self.frame.rows / rows,
-            columns,
-            rows,
-        )
-        cells = fill_cells(height[0], cells_inside(self.polygon, frame), max(rows, columns))
+        inside = cells_inside(self.polygon, self.frame.resized(columns, rows))
+        cells = fill_cells(height[0], inside, max(rows, columns))
         rgb = np.moveaxis(rgba[:3], 0, 2).reshape(-1, 3)[cells.source]
-        return _Coarse(cells, rgb, step)
+        return CoarseCells(cells, rgb, self.frame.columns / columns)
 
     def sample(self, name: str, *, measured: bool = False) -> FloatArray:
         """Return values (K,) of cells all over a raster that have one; enough for medians and bounds.
@@ -296,9 +253,8 @@ def _coarse_cells(window: _Window, step: int) -> tuple[IntArray, IntArray]:
     return rows[:, None], columns[None, :]
 
 
-def _bands(name: str, cells: WindowCells) -> NDArray[Any]:
-    """Return the bands (B, H, W) of one raster."""
-    if name == "orthophoto":
-        return cells.rgba
+def _seen_bands(source: RasterSource, window: _Window) -> dict[str, NDArray[Any]]:
+    """Return the bands (B, H, W) of the rasters of what is measured in a window."""
+    cells = render_window(source, window.frame, window.column, window.row)
     heights = {"dsm": cells.height, "sigma_h": cells.sigma_h_m, "sigma_v": cells.sigma_v_m}
-    return heights[name][None].astype(np.float32)
+    return {"orthophoto": cells.rgba, **{name: values[None].astype(np.float32) for name, values in heights.items()}}

@@ -10,14 +10,17 @@ from scipy.ndimage import binary_closing, binary_opening, uniform_filter
 
 from pipelines.adjust.accuracy_grid import AccuracyGrid
 from pipelines.core.errors import DegenerateGeometryError
+from pipelines.core.products import Remark
 from pipelines.core.types import BoolArray, ByteArray, FloatArray
 from pipelines.core.workspace import StageRun
+from pipelines.deliver.options import ExportRasterOptions
 from pipelines.deliver.raster_plan import dilation_cells2, plan_splats, samples_per_cell
-from pipelines.deliver.surface import predicted_sigma, surface_views
+from pipelines.deliver.surface import ground_below, predicted_sigma, surface_views
 from pipelines.formats.geotiff import RasterFrame
 from pipelines.geometry.similarity import Similarity
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.orthographic import PlanSplats, render_orthographic
+from pipelines.surface.ground import Terrain
 from pipelines.surface.surface_views import SurfaceViews
 from pipelines.survey.area import Area
 from pipelines.survey.target_crs import TargetCrs
@@ -45,6 +48,7 @@ class RasterSource:
     Attributes:
         splats, level: Gaussians over the plane, and the height above them that their depths count from.
         sigma: predicted σ of the georeference over the scene; None: not known.
+        terrain: the ground; None: not known.
         training_px: size of a training pixel on the ground, in cells.
         training_gsd_m: size of a training pixel on the ground.
         min_views: least number of training views that show a cell's surface.
@@ -56,6 +60,7 @@ class RasterSource:
     geo_from_model: Similarity
     target: TargetCrs
     sigma: AccuracyGrid | None
+    terrain: Terrain | None
     training_px: float
     training_gsd_m: float
     min_views: int
@@ -69,9 +74,9 @@ def raster_source(
     area: Area,
     *,
     training_gsd_m: float,
-    min_views: int,
-) -> tuple[RasterSource, str]:
-    """Return what the windows are made from, and the reason why σ is not known, or an empty text.
+    options: ExportRasterOptions,
+) -> tuple[RasterSource, str, tuple[Remark, ...]]:
+    """Return what the windows are made from, the reason why σ is not known, or an empty text, and any warnings.
 
     The folder of the stage holds the depth maps until the stage ends.
 
@@ -79,7 +84,8 @@ def raster_source(
         InputError: a photograph cannot be read, or the depth maps do not fit on the disk.
         DegenerateGeometryError: no Gaussian lies within the scene.
     """
-    views = surface_views(stage, trained)
+    views = surface_views(stage, trained, colours=options.terrain)
+    terrain, warnings = ground_below(views, trained, area, options, stage.progress)
     training_px = training_gsd_m / (frame.step_x * target.horizontal_unit_m)
     splats, level = plan_splats(_seen_gaussians(trained, views, area), trained, target, frame, training_px)
     sigma, no_sigma = predicted_sigma(stage.workspace, trained)
@@ -90,11 +96,12 @@ def raster_source(
         geo_from_model=trained.geo_from_model,
         target=target,
         sigma=sigma,
+        terrain=terrain,
         training_px=training_px,
         training_gsd_m=training_gsd_m,
-        min_views=min_views,
+        min_views=options.min_views,
     )
-    return source, no_sigma
+    return source, no_sigma, warnings
 
 
 def _seen_gaussians(trained: TrainedSurvey, views: SurfaceViews, area: Area) -> Gaussians:
@@ -200,7 +207,7 @@ def _support(
     seen = np.zeros(checked.shape, dtype=bool)
     if len(at_row):
         cell = np.column_stack([columns[at_column], rows[at_row]]) + 0.5
-        in_geo = _in_geo(source, frame, cell, checked[at_row, at_column])
+        in_geo = places_in_geo(source, frame, cell, checked[at_row, at_column])
         support = source.views.support(source.geo_from_model.inverse().apply(in_geo))
         # All views may agree on a wrong surface where their rays meet at small angles.
         lateral_m = _SIGMA_PX * source.training_gsd_m / np.sqrt(np.maximum(support.views, 1))
@@ -238,7 +245,7 @@ def _tidied(seen: BoolArray) -> BoolArray:
     return np.asarray(wider[margin:-margin, margin:-margin])
 
 
-def _in_geo(source: RasterSource, frame: RasterFrame, cell: FloatArray, height: FloatArray) -> FloatArray:
+def places_in_geo(source: RasterSource, frame: RasterFrame, cell: FloatArray, height: FloatArray) -> FloatArray:
     """Return places (K, 3) in `geo` of cells (K, 2) and heights (K,), to a fraction of a millimetre.
 
     Within a window the way from the CRS to `geo` is a quadratic: it is fitted to exactly transformed nodes.
@@ -267,7 +274,7 @@ def georeference_sigma(
         return np.full(height.shape, np.nan), np.full(height.shape, np.nan)
     columns, rows = (np.linspace(0, size, size // _NODE_PX + 2) for size in (frame.columns, frame.rows))
     cell = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-    in_geo = _in_geo(source, frame, cell, np.full(len(cell), np.nanmedian(height)))
+    in_geo = places_in_geo(source, frame, cell, np.full(len(cell), np.nanmedian(height)))
     sigma = np.sqrt(np.diagonal(source.sigma.cov_at(in_geo), axis1=1, axis2=2))
     shape = (len(rows), len(columns))
     spread = _spread(rows, frame.rows), _spread(columns, frame.columns)

@@ -2,14 +2,30 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
+
 from pipelines.adjust.accuracy_grid import AccuracyGrid
 from pipelines.adjust.solution import posterior_of
+from pipelines.core.errors import DegenerateGeometryError
+from pipelines.core.extras import extra_part
 from pipelines.core.products import Remark, is_checked
+from pipelines.core.progress import Progress
+from pipelines.core.types import joined_rows, rows_of
 from pipelines.core.workspace import StageRun, Workspace
+from pipelines.deliver.options import TerrainOptions
 from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.surface.fusion import fused_squares, fusion_settings
+from pipelines.surface.ground import Terrain, terrain_of
 from pipelines.surface.surface_views import ModelRenderer, SurfaceViews
+from pipelines.survey.area import Area
 from pipelines.survey.scene import photographs
 from pipelines.survey.trained_survey import SolvedSurvey, TrainedSurvey
+
+_GROUND_VIEWS = 3  # that agree on a point of the ground
+_GROUND_SPACINGS = 2.0  # pixels on the surface between the points that the ground is told from
+_AROUND_M = 30.0  # around the area: a house on its rim is told from a hill by what lies outside
 
 
 def surface_views(stage: StageRun, trained: TrainedSurvey, *, colours: bool = False) -> SurfaceViews:
@@ -19,6 +35,28 @@ def surface_views(stage: StageRun, trained: TrainedSurvey, *, colours: bool = Fa
     renderer = ModelRenderer(trained, images, rasterizer("auto", stage.progress))
     folder = stage.out / "depth_maps"
     return SurfaceViews(renderer, folder, colours=colours, confirmed=True, progress=stage.progress)
+
+
+def ground_below(
+    views: SurfaceViews, trained: TrainedSurvey, area: Area, options: TerrainOptions, progress: Progress
+) -> tuple[Terrain | None, tuple[Remark, ...]]:
+    """Return the ground in and around the area, of views with colours; None, with a warning, if it is not known."""
+    if not options.terrain:
+        return None, ()
+    missing = extra_part("terrain")
+    if missing.found is None:
+        return None, (Remark(code="no-terrain", sentence=f"There is no terrain model: {missing.remedy}."),)
+    try:
+        settings = fusion_settings(views, trained.geo_from_model, _GROUND_VIEWS)
+        settings = replace(settings, spacing_m=_GROUND_SPACINGS * settings.spacing_m)
+        cloud = joined_rows(list(fused_squares(views, trained.geo_from_model, settings, progress)))
+        west, south, east, north = area.polygon.buffer(_AROUND_M).bounds
+        plan = cloud.position[:, :2]
+        inside = ((plan >= (west, south)) & (plan <= (east, north))).all(axis=1)
+        near = rows_of(cloud, np.flatnonzero(inside))
+        return terrain_of(near.position, near.normal, settings.spacing_m), ()
+    except DegenerateGeometryError as error:
+        return None, (Remark(code="no-terrain", sentence=f"There is no terrain model: {error}"),)
 
 
 def predicted_sigma(workspace: Workspace, solved: SolvedSurvey) -> tuple[AccuracyGrid | None, str]:

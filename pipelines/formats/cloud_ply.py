@@ -143,6 +143,7 @@ class CloudPoints(Rows):
     normal: Float32Array  # (P, 3) unit vectors along the axes of the CRS
     rgb: ByteArray  # (P, 3)
     cov_m2: Float32Array  # (P, 3, 3) covariance in m², axes east, north, up; NaN: unknown
+    classification: ByteArray  # (P,) class of LAS: 2 ground, 1 anything else, 0 not classified
 
     @property
     def sigma_h_m(self) -> Float32Array:
@@ -159,7 +160,7 @@ _VERTEX = [
     ("x", "<f8"), ("y", "<f8"), ("z", "<f8"),
     ("nx", "<f4"), ("ny", "<f4"), ("nz", "<f4"),
     ("red", "u1"), ("green", "u1"), ("blue", "u1"),
-    ("sigma_h", "<f4"), ("sigma_v", "<f4"),
+    ("sigma_h", "<f4"), ("sigma_v", "<f4"), ("classification", "u1"),
 ]  # fmt: skip
 _NAMES = {"<f8": "double", "<f4": "float", "u1": "uchar"}
 _COUNT_DIGITS = 20
@@ -205,6 +206,7 @@ class CloudPlyWriter:
         _set_columns(vertex, ("nx", "ny", "nz"), points.normal)
         _set_columns(vertex, _COLOURS, points.rgb)
         vertex["sigma_h"], vertex["sigma_v"] = points.sigma_h_m, points.sigma_v_m
+        vertex["classification"] = points.classification
         self._file.write(vertex.tobytes())
         self._count += len(points)
 

@@ -44,6 +44,11 @@ class RasterFrame:
         west, north = self.west + column * self.step_x, self.north - row * self.step_y
         return RasterFrame(self.wkt, west, north, self.step_x, self.step_y, columns, rows)
 
+    def resized(self, columns: int, rows: int) -> RasterFrame:
+        """Return the frame with other, larger or smaller cells."""
+        step_x, step_y = self.step_x * self.columns / columns, self.step_y * self.rows / rows
+        return RasterFrame(self.wkt, self.west, self.north, step_x, step_y, columns, rows)
+
     @property
     def bounds(self) -> tuple[float, float, float, float]:
         """West, south, east, north of the outer edge."""
@@ -159,9 +164,8 @@ def outlines(cells: BoolArray, frame: RasterFrame) -> list[Any]:
     import shapely
     from rasterio.features import shapes
 
-    step = frame.columns * frame.step_x / cells.shape[1], frame.rows * frame.step_y / cells.shape[0]
-    coarse = RasterFrame(frame.wkt, frame.west, frame.north, *step, cells.shape[1], cells.shape[0])
-    found = shapes(cells.astype(np.uint8), mask=cells, connectivity=8, transform=_transform(coarse))
+    transform = _transform(frame.resized(cells.shape[1], cells.shape[0]))
+    found = shapes(cells.astype(np.uint8), mask=cells, connectivity=8, transform=transform)
     return [shapely.make_valid(shapely.geometry.shape(part)) for part, _ in found]
 
 

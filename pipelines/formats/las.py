@@ -260,6 +260,7 @@ class LazWriter(LazFile):
         for column, name in enumerate(("nx", "ny", "nz")):
             record[name] = points.normal[:, column]
         record["sigma_h"], record["sigma_v"] = points.sigma_h_m, points.sigma_v_m
+        record["classification"] = points.classification
         for name, (row, column) in _COVARIANCE.items():
             record[name] = points.cov_m2[:, row, column]
         self._writer.write_points(record)

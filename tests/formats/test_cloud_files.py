@@ -37,6 +37,7 @@ def points(count: int, near: np.ndarray, spread: np.ndarray, seed: int = 0) -> C
         (normal / np.linalg.norm(normal, axis=1, keepdims=True)).astype(np.float32),
         rng.integers(0, 256, (count, 3), dtype=np.uint8),
         covariance(rng, count),
+        rng.integers(0, 3, count, dtype=np.uint8),
     )
 
 

@@ -56,7 +56,8 @@ def in_crs(position_in_geo: np.ndarray, crs: str = UTM) -> np.ndarray:
 def cloud_points(position: np.ndarray) -> CloudPoints:
     none = np.full((len(position), 3, 3), np.nan, np.float32)
     zeros = np.zeros((len(position), 3))
-    return CloudPoints(position, zeros.astype(np.float32), zeros.astype(np.uint8), none)
+    no_class = np.zeros(len(position), np.uint8)
+    return CloudPoints(position, zeros.astype(np.float32), zeros.astype(np.uint8), none, no_class)
 
 
 def all_points(path: Path, stated: CloudCrs = CloudCrs()) -> np.ndarray:  # noqa: B008

@@ -1,0 +1,129 @@
+"""Whole cells of one window: what is measured, and inside the area what is interpolated; and the ground below."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
+
+from pipelines.core.types import BoolArray, ByteArray, FloatArray
+from pipelines.deliver.raster_window import RasterSource, georeference_sigma, places_in_geo
+from pipelines.formats.geotiff import RasterFrame
+from pipelines.surface.filling import FilledCells, fill_cells
+from pipelines.surface.ground import Terrain
+
+MEASURED, INTERPOLATED = 255, 128  # in `measured.tif`; 0: outside the area, or unknown
+# A hole is filled cell by cell up to `_NARROW` cells from its rim, and beyond `REACH` by a coarse raster of the
+# whole; between, one goes over into the other.
+_NARROW, REACH = 16, 64
+_RIM = 2  # cells around what stands on the ground
+
+
+@dataclass(frozen=True)
+class SeenCells:
+    """What is measured in a window and up to `REACH` cells around it (H, W).
+
+    Attributes:
+        frame: of these cells.
+        own: rows and columns of the window among them.
+        height: NaN: not measured.
+        rgba: (4, H, W); alpha as in `WindowCells`.
+        sigma_h_m, sigma_v_m: of the window's own cells.
+        inside: cells in the area of interest.
+    """
+
+    frame: RasterFrame
+    own: tuple[slice, slice]
+    height: FloatArray
+    rgba: ByteArray
+    sigma_h_m: FloatArray
+    sigma_v_m: FloatArray
+    inside: BoolArray
+
+
+@dataclass(frozen=True)
+class CoarseCells:
+    """Whole raster at a smaller size, filled, with colours (H, W, 3) of its cells.
+
+    `step` is the number of cells of the raster along the side of one of these.
+    """
+
+    cells: FilledCells
+    rgb: ByteArray
+    step: float
+
+    def at(self, first: tuple[int, int], chosen: BoolArray) -> tuple[NDArray[Any], ...]:
+        """Return rows and columns (K,) in it of the chosen cells of a window that begins at a row and column."""
+        return tuple(
+            np.minimum((start + index) / self.step, size - 1).astype(np.int64)
+            for start, index, size in zip(first, np.nonzero(chosen), self.rgb.shape, strict=False)
+        )
+
+
+def whole_cells(
+    source: RasterSource, seen: SeenCells, coarse: CoarseCells, first: tuple[int, int]
+) -> dict[str, NDArray[Any]]:
+    """Return the bands of each raster in a window that begins at a row and column; empty outside the area."""
+    own, target = seen.own, source.target
+    cells = fill_cells(seen.height, seen.inside, REACH)
+    blank = seen.rgba[3][own] == 0
+    rgb = np.where(seen.rgba[3] > 0, seen.rgba[:3], seen.rgba[:3].reshape(3, -1)[:, cells.source])[:, *own]
+    measured, inside = np.isfinite(seen.height)[own], seen.inside[own]
+    height, spread, distance = cells.height[own].copy(), cells.sigma[own].copy(), cells.distance[own].copy()
+    wide = inside & ~measured & ((distance > _NARROW) | np.isnan(height))
+    if wide.any():
+        at = coarse.at(first, wide)
+        fine = np.clip((REACH - distance[wide]) / (REACH - _NARROW), 0.0, 1.0)
+        fine[np.isnan(height[wide])] = 0.0
+        for values, wider in ((height, coarse.cells.height), (spread, coarse.cells.sigma)):
+            values[wide] = np.where(fine > 0, fine * values[wide], 0.0) + (1 - fine) * wider[at]
+        distance[wide] = np.where(fine > 0, distance[wide], coarse.cells.distance[at] * coarse.step)
+        rgb[:, wide] = np.where((fine == 0) & blank[wide], coarse.rgb[at].T, rgb[:, wide])
+    known = inside & np.isfinite(height)
+    frame = seen.frame.part(own[1].start, own[0].start, known.shape[1], known.shape[0])
+    georeference_h, georeference_v = georeference_sigma(source, frame, np.where(known, height, np.nan))
+    # The place of what lies in a hole is as uncertain as the way to its rim is long.
+    away_m = distance * frame.step_x * target.horizontal_unit_m
+    heights = {
+        "dsm": height,
+        "sigma_h": np.where(measured, seen.sigma_h_m, np.hypot(georeference_h, away_m)),
+        "sigma_v": np.where(measured, seen.sigma_v_m, np.hypot(georeference_v, spread * target.crs.height_unit_m)),
+    }
+    if source.terrain is not None:
+        ground, variance_m2 = _ground(source, source.terrain, seen)
+        sigma = np.where(variance_m2[own] > 0, np.sqrt(georeference_v**2 + variance_m2[own]), seen.sigma_v_m)
+        heights |= {"dtm": ground[own], "sigma_dtm": sigma}
+    alpha, mask = np.where(known, 255, 0), np.where(measured, MEASURED, INTERPOLATED) * known
+    return {
+        "orthophoto": (np.concatenate([rgb, alpha[None]]) * known).astype(np.uint8),
+        "measured": mask[None].astype(np.uint8),
+        **{name: np.where(known, values, np.nan)[None] for name, values in heights.items()},
+    }
+
+
+def _ground(source: RasterSource, terrain: Terrain, seen: SeenCells) -> tuple[FloatArray, FloatArray]:
+    """Return heights (H, W) of the ground in the CRS, and their variance in m² where it is not the surface; else 0.
+
+    Where the surface is the ground, its cells are taken over. Elsewhere the terrain is, shifted by what the ground
+    around lies above it.
+    """
+    rows, columns = seen.height.shape
+    column, row = np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5)
+    level = source.target.xyz_from_geo(terrain.nodes())[:, 2].reshape(terrain.height.shape)
+    cell = np.column_stack([column.ravel(), row.ravel()])
+    plan = places_in_geo(source, seen.frame, cell, np.full(len(cell), np.median(level)))[:, :2]
+    height = terrain.interpolated(level, plan).reshape(rows, columns)
+    gap_m = terrain.interpolated(terrain.gap_m, plan).reshape(rows, columns)
+    above = seen.height - height
+    with np.errstate(invalid="ignore"):
+        is_ground = np.abs(above) * source.target.crs.height_unit_m <= terrain.limit_m
+    # On the rim of what stands there, cells have mixed heights.
+    is_ground &= ~binary_dilation(np.isfinite(above) & ~is_ground, iterations=_RIM)
+    around = fill_cells(np.where(is_ground, above, np.nan), seen.inside, REACH)
+    share = np.clip(1.0 - around.distance / REACH, 0.0, 1.0)
+    height = height + np.where(np.isfinite(around.height), share * around.height, 0.0)
+    variance_m2 = terrain.bridged_variance(np.maximum(gap_m, terrain.cell_m / 2))
+    return height, np.where(is_ground, 0.0, variance_m2)
