@@ -20,11 +20,21 @@ class SplatOptions(StageOptions):
     min_opacity: float = Field(0.005, ge=0, lt=1, description="Leave out Gaussians that are less opaque.")
 
 
-class ExportPlyOptions(SplatOptions):
+class PlyOptions(SplatOptions):
+    """Options of every PLY of the splat."""
+
+    up: Literal["z", "y", "-y"] = Field(
+        "z",
+        description="Axis of the file that points up; x points east. z: East-North-Up; y: as in glTF and three.js; "
+        "-y: as SuperSplat takes a PLY.",
+    )
+
+
+class ExportPlyOptions(PlyOptions):
     """Options of the export of the splat as a 3DGS PLY with its sidecar."""
 
 
-class MeasurableOptions(SplatOptions):
+class MeasurableOptions(PlyOptions):
     """Options of the export of the splat with discs on its surface, as a PLY of its own."""
 
     disc_spacing: float | None = Field(
