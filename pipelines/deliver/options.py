@@ -13,6 +13,9 @@ from pipelines.survey.options import CrsOptions
 # The page was tried with this version: the extensions of splats in glTF are younger than those of meshes.
 CESIUM = "https://cesium.com/downloads/cesiumjs/releases/1.145/Build/Cesium/"
 
+# Of the contents of tiles.
+Compression = Literal["spz", "none"]
+
 
 class SplatOptions(StageOptions):
     """Options of every file that holds the Gaussians."""
@@ -138,6 +141,12 @@ class ExportTilesOptions(WebSplatOptions, PageOptions):
     max_tile_gaussians: int = Field(
         200_000, ge=1000, le=3_000_000, description="Largest number of Gaussians in a tile."
     )
+    compression: Compression = Field(
+        "spz",
+        description="Content of the tiles: SPZ, or plain arrays of the ratified KHR_gaussian_splatting, exact and "
+        "several times larger. CesiumJS reads SPZ alone: none writes no index.html.",
+    )
+    archive: bool = Field(False, description="Write the tileset as one file tiles.3tz too, as ArcGIS takes it.")
 
 
 # By workspace path; a path without a suffix is a folder. In the order in which people look for them.
@@ -157,6 +166,7 @@ DESCRIPTIONS: dict[str, str] = {
     "spz/splat.spz": "the splat compressed, for viewers on the web",
     "tiles/tileset.json": "the splat as 3D Tiles, for web globes (CesiumJS)",
     "tiles/index.html": "page that shows the tiles on the globe",
+    "tiles/tiles.3tz": "the same 3D Tiles in one file, for desktop GIS",
     "tiles/splat.glb": "the splat in one glTF file",
     "cameras/cameras.csv": "positions, angles and σ of the photographs, for photogrammetry",
     "cameras/camera_covariances.csv": "full covariance of every photograph, for weighted solutions",
