@@ -108,6 +108,12 @@ class ExportCloudOptions(CrsOptions):
 class ExportCamerasOptions(CrsOptions):
     """Options of the export of the trained cameras."""
 
+    undistorted: bool = Field(
+        False,
+        description="Write the photographs without lens distortion too, with a COLMAP model of pinhole cameras: "
+        "input of other trainers of splats.",
+    )
+
 
 def _cesium_folder(text: str) -> str:
     address = urlsplit(text)
@@ -172,7 +178,9 @@ DESCRIPTIONS: dict[str, str] = {
     "cameras/camera_covariances.csv": "full covariance of every photograph, for weighted solutions",
     "cameras/covariances.npz": "the same as arrays, and the covariance of every tie point",
     "cameras/colmap": "adjusted cameras and points as a COLMAP model, for other trainers",
+    "cameras/undistorted": "photographs without distortion with their COLMAP model, for trainers of splats",
     "cameras/transforms.json": "adjusted cameras for nerfstudio",
+    "cameras/sparse_pc.ply": "points for nerfstudio",
     "cameras/footprints.geojson": "ground that each photograph shows, for maps",
     "report/report.html": "report to hand in: one page with accuracy, points, photographs and processing",
     "report/report.pdf": "the same report, for printing",
