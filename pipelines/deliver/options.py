@@ -152,7 +152,7 @@ class ExportTilesOptions(WebSplatOptions, PageOptions):
         description="Content of the tiles: SPZ, or plain arrays of the ratified KHR_gaussian_splatting, exact and "
         "several times larger. CesiumJS reads SPZ alone: none writes no index.html.",
     )
-    archive: bool = Field(False, description="Write the tileset as one file tiles.3tz too, as ArcGIS takes it.")
+    archive: bool = Field(False, description="Write the tileset as one file too: tiles.3tz.")
 
 
 # By workspace path; a path without a suffix is a folder. In the order in which people look for them.
