@@ -6,6 +6,7 @@ Copies of products outside the workspace are complete or absent, and never over 
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -184,6 +185,9 @@ def check_target(target: Path, spec: StageSpec, *, folder: bool, overwrite: bool
     except OSError as error:
         message = f"cannot be made: {error.strerror}. Give --to a path in another folder."
         raise InputError("target-folder", message, path=target.parent) from error
+    if not os.access(target.parent, os.W_OK):
+        message = "cannot be written. Give --to a path in another folder."
+        raise InputError("target-folder", message, path=target.parent)
 
 
 def deliver(source: Path, target: Path) -> None:
