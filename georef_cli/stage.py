@@ -6,8 +6,12 @@ Copies of products outside the workspace are complete or absent, and never over 
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -54,7 +58,8 @@ class StageCommand(Command):
             ["--to", "-o", "target"],
             type=click.Path(resolve_path=True, path_type=Path),
             metavar="FOLDER" if delivers == "folder" else "FILE",
-            help=f"Copy {what} here as well; what exists is replaced only with --force.",
+            help=f"Copy {what} here as well; what exists is replaced only with --force. A workspace that cannot be "
+            "written stays as it is.",
         )
         super().__init__(
             name,
@@ -105,36 +110,56 @@ class StageCommand(Command):
             GeorefError: the stage failed.
         """
         workspace, force, target = values["workspace"], values["force"], values.get("target")
+        if self.spec.reads:
+            must_exist(workspace)
         if target is not None:
             check_target(target, self.spec, folder=self._delivers == "folder", overwrite=force)
         flags = self._flags(ctx, values)
         if self.spec.name == "train":
             announced_seconds(workspace, (self.spec,), flags, force=force)
-        with boundary.logged_to_file(workspace, self.spec):
-            outcome = runner.run_stage(
-                workspace,
-                self.spec,
-                flags[self.spec.name],
-                force=force,
-                resume="always" if values.get("resume") else "if-same",
-                progress=progress_for(ctx.obj),
-            )
-        if target is not None:
-            with workspace.lock(self.spec.name):
-                product = workspace.path(self.spec.product)
-                if self._delivers == "folder":
-                    deliver_folder(workspace.root / self.spec.folder, target)
-                else:
-                    deliver(product, target)
+        with nullcontext(workspace) if self._delivers is None else _writable(workspace, target) as place:
+            with boundary.logged_to_file(place, self.spec):
+                outcome = runner.run_stage(
+                    place,
+                    self.spec,
+                    flags[self.spec.name],
+                    force=force,
+                    resume="always" if values.get("resume") else "if-same",
+                    progress=progress_for(ctx.obj),
+                )
+            if target is not None:
+                with place.lock(self.spec.name):
+                    made = place.written if outcome.ran else place.root
+                    if self._delivers == "folder":
+                        deliver_folder(made / self.spec.folder, target)
+                    else:
+                        deliver(made / self.spec.product, target)
         more = self._more(workspace, values)
         print_outcome(workspace, outcome, *more, as_json=values["as_json"], told=is_told(ctx.obj))
 
 
-def check_target(target: Path, spec: StageSpec, *, folder: bool, overwrite: bool) -> None:
-    """Refuse, before the work begins, a target to which the result cannot be written, or may not.
+@contextmanager
+def _writable(workspace: Workspace, target: Path | None) -> Iterator[Workspace]:
+    """Yield the workspace; one that cannot be written, with a folder beside the target that takes what is written.
 
-    Its name says another format than the stage writes; it is a folder with other content, or in a missing folder;
-    or it exists and may not be replaced.
+    Raises:
+        InputError: the workspace cannot be written, and there is no target.
+    """
+    if workspace.is_writable():
+        yield workspace
+        return
+    if target is None:
+        message = "cannot be written. Give --to: the result is made there, and the workspace stays as it is."
+        raise InputError("workspace-read-only", message, path=workspace.root)
+    with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as folder:
+        yield replace(workspace, outside=Path(folder))
+
+
+def check_target(target: Path, spec: StageSpec, *, folder: bool, overwrite: bool) -> None:
+    """Refuse, before the work begins, a target to which the result cannot be written, or may not; make its folder.
+
+    Its name says another format than the stage writes; it is a folder with other content, or in one that cannot be
+    made; or it exists and may not be replaced.
     """
     suffix = Path(spec.product).suffix
     if folder and target.is_dir() and not (target / Path(spec.product).name).exists():
@@ -153,10 +178,16 @@ def check_target(target: Path, spec: StageSpec, *, folder: bool, overwrite: bool
         message = f"is not the name of a {suffix} file, which {spec.name} writes. End the name with {suffix}."
         raise InputError("target-suffix", message, path=target)
     require_text(target)
-    if not target.parent.is_dir():
-        raise InputError("no-such-file", "does not exist. Make the folder first.", path=target.parent)
     if target.exists() and not overwrite:
         raise InputError("target-exists", "exists already. --force replaces it.", path=target)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        message = f"cannot be made: {error.strerror}. Give --to a path in another folder."
+        raise InputError("target-folder", message, path=target.parent) from error
+    if not os.access(target.parent, os.W_OK):
+        message = "cannot be written. Give --to a path in another folder."
+        raise InputError("target-folder", message, path=target.parent)
 
 
 def deliver(source: Path, target: Path) -> None:

@@ -12,8 +12,8 @@ from pipelines.deliver.options import MeasurableOptions
 
 _DOC = """Write the splat as a PLY with its place on Earth.
 
-    The PLY is in an East-North-Up frame in metres. FILE.georef.json beside it states the place of that frame on
-    Earth, and its accuracy.
+    The PLY is in an East-North-Up frame in metres; --up turns it for viewers whose y axis points up or down.
+    FILE.georef.json beside it states the place of the file's frame on Earth, and its accuracy.
 
     --measurable writes a second file beside the first, measurable/splat.measurable.ply, for viewers that measure by
     the centres of Gaussians: small discs on the surface replace the Gaussians about it. It is several times larger
@@ -23,6 +23,7 @@ _DOC = """Write the splat as a PLY with its place on Earth.
     Examples:
       georef export-ply flight
       georef export-ply flight --to splat.ply --min-opacity 0.02
+      georef export-ply flight --up -y --to supersplat.ply
       georef export-ply flight --measurable
     """
 _OF_MEASURABLE = ("disc_spacing", "appearance_passes")

@@ -14,6 +14,7 @@ command = StageCommand(
     Examples:
       georef export-tiles flight
       georef export-tiles flight --to www/flight --max-tile-gaussians 100000
+      georef export-tiles flight --compression none --archive --to plain
       georef export-tiles flight --crs EPSG:2056 --cesium Cesium/
     """,
     delivers="folder",

@@ -134,14 +134,14 @@ def run_stage(
             require_extras(asked.options)
             if not force:
                 staleness.refuse_loss(workspace, spec, asked.options, asked.inputs.hashes)
-        before = read_requests(workspace.root).get(spec.name, {})
-        remember(workspace.root, {spec.name: flags})
+        before = read_requests(workspace.written).get(spec.name, {})
+        remember(workspace.written, {spec.name: flags})
         if previous is not None:
             return Outcome(spec.name, False, _with_present_files(workspace, asked, previous))
         try:
             manifest = _execute(workspace, asked, "never" if force else resume, progress, place)
         except InputError:
-            remember(workspace.root, {spec.name: before})
+            remember(workspace.written, {spec.name: before})
             raise
         return Outcome(spec.name, True, manifest)
 
@@ -278,7 +278,7 @@ def _with_present_files(workspace: Workspace, asked: Request, manifest: Manifest
 
     Their content is the same, but their times may differ: without new records each look would read them again.
     """
-    if asked.inputs.files == manifest.input_files or not workspace.manifest(asked.spec):
+    if workspace.outside or asked.inputs.files == manifest.input_files or not workspace.manifest(asked.spec):
         return manifest
     renewed = manifest.model_copy(update={"input_files": asked.inputs.files})
     replace_text(workspace.root / asked.spec.folder / MANIFEST, f"{renewed.model_dump_json(indent=1)}\n")

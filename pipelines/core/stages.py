@@ -304,6 +304,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         also=(
             "cameras/colmap",
             "cameras/transforms.json",
+            "cameras/sparse_pc.ply",
             "cameras/footprints.geojson",
             "cameras/covariances.npz",
             "cameras/camera_covariances.csv",

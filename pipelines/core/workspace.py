@@ -16,7 +16,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal
 
-from pipelines.core.errors import InputError, MissingProductError, storage_failures
+from pipelines.core.errors import InputError, MissingProductError, WorkspaceBusyError, storage_failures
 from pipelines.core.files import remove, replace_file, replace_folder, replace_text, sync_tree
 from pipelines.core.lock import WriteLock
 from pipelines.core.manifest import MANIFEST, Manifest, Memo, damaged_files
@@ -165,12 +165,14 @@ class Workspace:
             `georef.toml`.
         lent: for a variant, stage folders outside it, by name. The variant reads them and never writes them.
         command: for a variant, the command that makes its products.
+        outside: for a workspace that cannot be written, the folder that takes all that a stage writes.
     """
 
     root: Path
     base: Workspace | None = None
     lent: Mapping[str, Path] = field(default_factory=dict, hash=False)
     command: str = ""
+    outside: Path | None = None
 
     def path(self, product: str) -> Path:
         """Return the path of a finished product; a MissingProductError names the command that makes it."""
@@ -194,14 +196,29 @@ class Workspace:
     @property
     def cache(self) -> Path:
         """Folder of files that can be made again (undistorted images)."""
-        return (self.base or self).root / "cache"
+        return (self.outside or (self.base or self).root) / "cache"
 
     @property
     def config_file(self) -> Path:
         return (self.base or self).root / CONFIG_FILE
 
+    @property
+    def written(self) -> Path:
+        """Folder that stages write into."""
+        return self.outside or self.root
+
+    def is_writable(self) -> bool:
+        """Return whether a stage could write here, or another process does."""
+        try:
+            with WriteLock(self.root).hold("look whether it can be written"):
+                return True
+        except WorkspaceBusyError:
+            return True
+        except InputError:
+            return False
+
     def log_file(self, spec: StageSpec) -> Path:
-        return self.root / "logs" / f"{spec.name}.log"
+        return self.written / "logs" / f"{spec.name}.log"
 
     def manifest(self, spec: StageSpec) -> Manifest | None:
         """Return the manifest of a finished stage, or None; an InputError: it is damaged."""
@@ -215,7 +232,7 @@ class Workspace:
 
     def partial(self, spec: StageSpec) -> Path:
         """Return the folder that a stage writes into until it is complete."""
-        return self.root / f"{spec.folder}.partial"
+        return self.written / f"{spec.folder}.partial"
 
     def partial_product(self, spec: StageSpec) -> PartialProduct:
         """Return the partial product of a stage, which may not exist."""
@@ -227,7 +244,7 @@ class Workspace:
 
         Errors as of `WriteLock.hold`; and a StorageError: the disk failed while the lock was held.
         """
-        with storage_failures(self.root), WriteLock(self.root).hold(activity):
+        with storage_failures(self.written), WriteLock(self.written).hold(activity):
             for spec in STAGES:
                 self._recover(spec)
             yield
@@ -242,7 +259,7 @@ class Workspace:
         return self.has_product() or any(path.exists() for path in begun)
 
     def _recover(self, spec: StageSpec) -> None:
-        final, old = self.root / spec.folder, self.root / f".{spec.folder}.old"
+        final, old = self.written / spec.folder, self.written / f".{spec.folder}.old"
         if (self.partial(spec) / MANIFEST).exists():  # complete: only the renames are missing
             self._swap(spec)
         elif old.exists() and not final.exists():
@@ -250,7 +267,7 @@ class Workspace:
         remove(old)
 
     def _swap(self, spec: StageSpec) -> None:
-        final, old, partial = self.root / spec.folder, self.root / f".{spec.folder}.old", self.partial(spec)
+        final, old, partial = self.written / spec.folder, self.written / f".{spec.folder}.old", self.partial(spec)
         _refuse_what_is_no_folder(final)
         for name in (TOKEN, PROGRESS):
             (partial / name).unlink(missing_ok=True)
@@ -270,7 +287,7 @@ class Workspace:
             InputError: `resume` refuses the interrupted run, or the stage's folder is a symbolic link or a file.
         """
         partial = self.partial_product(spec)
-        _refuse_what_is_no_folder(self.root / spec.folder)
+        _refuse_what_is_no_folder(self.written / spec.folder)
         if spec.resumable and resume != "never" and partial.go_on(token, insist=resume == "always"):
             return partial.folder, True
         partial.begin(token)
@@ -292,7 +309,7 @@ class Workspace:
 
     def set_aside(self, product_files: Sequence[str]) -> None:
         """Move files of a product into `damaged/`, under their workspace paths: they may be edits of the user."""
-        for name in product_files:
+        for name in product_files if self.outside is None else ():  # else nothing takes their place
             target = self.root / DAMAGED / name
             target.parent.mkdir(parents=True, exist_ok=True)
             (self.root / name).replace(target)

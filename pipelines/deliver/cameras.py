@@ -4,7 +4,8 @@ Reads survey, SfM model, initial similarity, and the adjustment: of the training
 into `cameras/` (docs/deliverables.md):
 
 - `colmap/`: cameras, images and points as a COLMAP model, in the frame of `splat.ply`;
-- `transforms.json`: the same cameras for nerfstudio, in the same frame;
+- `transforms.json`, `sparse_pc.ply`: the same cameras and points for nerfstudio, in the same frame;
+- `undistorted/`, if asked: photographs without distortion, and their model with pinhole cameras, in the same frame;
 - `cameras.csv`: positions in the CRS of the contract, angles in both conventions, σ;
 - `footprints.geojson`: the ground that each photograph shows;
 - `covariances.npz` and `camera_covariances.csv`: full covariances of cameras and tie points, in the same frame, for
@@ -14,6 +15,7 @@ into `cameras/` (docs/deliverables.md):
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -27,8 +29,9 @@ from pipelines.core.products import Remark, is_checked, save_npz, union
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import ExportCamerasOptions
-from pipelines.deliver.placement import Placement, median_values, place, scene_sigma
+from pipelines.deliver.placement import Placement, median_values, place, require_space, scene_sigma
 from pipelines.formats.camera_files import CameraTable, Frame, lens_of, write_camera_table, write_transforms
+from pipelines.formats.cloud_ply import write_point_ply
 from pipelines.formats.colmap import write_sparse
 from pipelines.formats.georef_sidecar import CrsSidecar, median_sigma, write_sidecar
 from pipelines.formats.tables import table_text
@@ -36,11 +39,14 @@ from pipelines.formats.vector_files import Json, feature, features_text, polygon
 from pipelines.geodesy.crs import grid_from_enu, parse_crs
 from pipelines.geodesy.enu import geo_from_enu_at, lla_from_ecef, lla_from_enu
 from pipelines.geometry.bundle import Network
+from pipelines.geometry.cameras import Camera, Pinhole, undistort
 from pipelines.geometry.footprints import PointSurface, border_rays, footprint
 from pipelines.geometry.intersection import refined_points
 from pipelines.geometry.rotations import omega_phi_kappa_deg, omega_phi_kappa_jacobian, yaw_pitch_roll_deg
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.headline import headline_of
+from pipelines.survey.photographs import undistorted_name, write_undistorted
+from pipelines.survey.scene import photograph_files
 from pipelines.survey.survey import Survey
 from pipelines.survey.target_crs import TargetCrs, target_crs
 from pipelines.survey.trained_survey import SolvedSurvey, TrainedSurvey, load_solved
@@ -50,6 +56,7 @@ _COMPONENTS = ("rotation_e", "rotation_n", "rotation_u", "e", "n", "u")
 _MOST_POINTS = 100_000  # with a covariance
 _LEAST_RAYS = 3  # of a point that counts as a part of the surface
 _RIM = 0.005  # fraction of the points that are taken for errors above, and below
+_JPEG_BYTES_A_PIXEL = 1  # of a detailed photograph at quality 95
 _LENS_TOLERANCE_PX = 0.01  # of a lens that nerfstudio's model replaces: below, nobody need know
 _UNKNOWN = (
     Remark(code="cameras-without-sigma", sentence="The cameras have no σ: nothing checks the σ of the positions."),
@@ -65,6 +72,10 @@ def run(stage: StageRun, options: ExportCamerasOptions) -> Summary:
     centers = solved.geo_from_model.apply(solved.poses.cam_center_in_model)
     crs = target_crs(options, solved.survey.origin, centers, solved.survey.vertical)
     _camera_table(solved, None, crs)  # a CRS that cannot hold the cameras is refused before the work begins
+    files = photograph_files(solved.sparse, solved.survey, stage.workspace) if options.undistorted else []
+    pixels = sum(photograph.camera.width * photograph.camera.height for photograph in files)
+    what = f"{len(files)} undistorted photographs"
+    require_space(stage.out, _JPEG_BYTES_A_PIXEL * pixels, what, "leave out --undistorted")
     with stage.progress.task("cameras", 5) as task:
         posterior = None
         if is_checked(solved.model.cautions):
@@ -77,11 +88,16 @@ def run(stage: StageRun, options: ExportCamerasOptions) -> Summary:
         write_sparse(model, stage.out / "colmap")
         write_sidecar(placement.sidecar(), stage.out / "colmap")
         task.advance(note="COLMAP")
-        lens_limits = _write_nerfstudio(stage.out / "transforms.json", model, placement)
+        splits = {camera.name: camera.split for camera in solved.model.cameras}
+        lens_limits = _write_nerfstudio(stage.out / "transforms.json", model, splits, placement)
         task.advance(note="nerfstudio")
         features, corner_lla = _footprints(solved.survey, model, table, placement)
         replace_text(stage.out / "footprints.geojson", features_text(features))
         task.advance(note="footprints")
+    if options.undistorted:
+        pinholes = write_undistorted(stage.out / "undistorted/images", files, stage.progress)
+        write_sparse(undistorted_model(model, pinholes), stage.out / "undistorted/sparse/0")
+        write_sidecar(placement.sidecar(), stage.out / "undistorted")
     cautions, sigma = union(solved.model.cautions, _UNKNOWN if posterior is None else ()), None
     if np.isfinite(table.sigma_enu_m).all():
         east, north, up = table.sigma_enu_m.T
@@ -200,8 +216,42 @@ def _write_covariances(folder: Path, model: SparseModel, posterior: Posterior | 
         write_sidecar(placement.sidecar(), folder / file)
 
 
-def _write_nerfstudio(path: Path, model: SparseModel, placement: Placement) -> tuple[Remark, ...]:
-    """Write the cameras in nerfstudio's form, with the sidecar, and return what that form cannot hold."""
+def undistorted_model(model: SparseModel, pinholes: Sequence[Pinhole]) -> SparseModel:
+    """Return a model of undistorted photographs: a pinhole for each camera, and its pixels.
+
+    Observations beyond the undistorted pictures are left out, and points that have no other.
+
+    Args:
+        pinholes: of each image, those of one camera equal.
+    """
+    owner = model.image_camera_id[model.obs_image]
+    xy, inside, cameras = np.empty_like(model.obs_xy_px), np.zeros(len(owner), dtype=bool), {}
+    for key, pinhole in dict(zip(model.image_camera_id.tolist(), pinholes, strict=True)).items():
+        mine = owner == key
+        xy[mine] = undistort(model.cameras[key], model.obs_xy_px[mine]) * (pinhole.fx, pinhole.fy)
+        xy[mine] += (pinhole.cx, pinhole.cy)
+        inside[mine] = pinhole.contains(xy[mine])
+        params = np.array([pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy])
+        cameras[key] = Camera("PINHOLE", pinhole.width, pinhole.height, params)
+    points = np.unique(model.obs_point[inside])
+    return replace(
+        model,
+        cameras=cameras,
+        image_name=tuple(map(undistorted_name, model.image_name)),
+        point_id=model.point_id[points],
+        point_in_local=model.point_in_local[points],
+        point_rgb=model.point_rgb[points],
+        point_error_px=model.point_error_px[points],
+        obs_point=np.searchsorted(points, model.obs_point[inside]),
+        obs_image=model.obs_image[inside],
+        obs_xy_px=xy[inside],
+    )
+
+
+def _write_nerfstudio(
+    path: Path, model: SparseModel, splits: Mapping[str, str], placement: Placement
+) -> tuple[Remark, ...]:
+    """Write the cameras in nerfstudio's form, with points and sidecars, and return what that form cannot hold."""
     lenses = {key: lens_of(camera) for key, camera in model.cameras.items()}
     owner = [lenses[int(key)] for key in model.image_camera_id]
     kind = Counter(lens.model for lens in owner).most_common(1)[0][0]
@@ -210,13 +260,17 @@ def _write_nerfstudio(path: Path, model: SparseModel, placement: Placement) -> t
     frames = [
         Frame(
             model.image_name[index],
+            splits[model.image_name[index]],
             model.camera_of(index),
             model.rotation_cam_from_local[index].T,
             centers[index],
         )
         for index in chosen
     ]
-    write_transforms(path, frames, [owner[index] for index in chosen])
+    points = path.with_name("sparse_pc.ply")
+    write_point_ply(points, model.point_in_local, model.point_rgb)
+    write_sidecar(placement.sidecar(), points)
+    write_transforms(path, frames, [owner[index] for index in chosen], points.name)
     limits = {}
     if len(chosen) < len(owner):
         limits["nerfstudio-one-camera-model"] = (

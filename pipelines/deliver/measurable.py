@@ -102,7 +102,7 @@ def run(stage: StageRun, options: MeasurableOptions) -> Summary:
     # The place is that of the trained model, whatever the discs have replaced.
     means, accuracy = trained.gaussians.means.numpy(), headline_of(stage.workspace)
     splat = placed_splat(refined, place(trained.model, trained.survey, means, accuracy), options)
-    write_ply(splat, stage.out / Path(MEASURABLE_SPLAT).name)
+    write_ply(splat, stage.out / Path(MEASURABLE_SPLAT).name, options)
     psnr_text = "" if change is None else f", PSNR {change:+.2f} dB"
     return Summary(
         f"{len(splat.gaussians)} Gaussians; {discs} discs {spacing_m:.3f} m apart{psnr_text}",

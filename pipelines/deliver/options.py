@@ -14,6 +14,9 @@ from pipelines.survey.options import CrsOptions
 # The page was tried with this version: the extensions of splats in glTF are younger than those of meshes.
 CESIUM = "https://cesium.com/downloads/cesiumjs/releases/1.145/Build/Cesium/"
 
+# Of the contents of tiles.
+Compression = Literal["spz", "none"]
+
 
 class SplatOptions(StageOptions):
     """Options of every file that holds the Gaussians."""
@@ -21,11 +24,21 @@ class SplatOptions(StageOptions):
     min_opacity: float = Field(0.005, ge=0, lt=1, description="Leave out Gaussians that are less opaque.")
 
 
-class ExportPlyOptions(SplatOptions):
+class PlyOptions(SplatOptions):
+    """Options of every PLY of the splat."""
+
+    up: Literal["z", "y", "-y"] = Field(
+        "z",
+        description="Axis of the file that points up; x points east. z: East-North-Up; y: as in glTF and three.js; "
+        "-y: as SuperSplat takes a PLY.",
+    )
+
+
+class ExportPlyOptions(PlyOptions):
     """Options of the export of the splat as a 3DGS PLY with its sidecar."""
 
 
-class MeasurableOptions(SplatOptions):
+class MeasurableOptions(PlyOptions):
     """Options of the export of the splat with discs on its surface, as a PLY of its own."""
 
     disc_spacing: float | None = Field(
@@ -107,6 +120,12 @@ class ExportCloudOptions(CrsOptions, TerrainOptions):
 class ExportCamerasOptions(CrsOptions):
     """Options of the export of the trained cameras."""
 
+    undistorted: bool = Field(
+        False,
+        description="Write the photographs without lens distortion too, with a COLMAP model of pinhole cameras: "
+        "input of other trainers of splats.",
+    )
+
 
 def _cesium_folder(text: str) -> str:
     address = urlsplit(text)
@@ -140,6 +159,12 @@ class ExportTilesOptions(WebSplatOptions, PageOptions):
     max_tile_gaussians: int = Field(
         200_000, ge=1000, le=3_000_000, description="Largest number of Gaussians in a tile."
     )
+    compression: Compression = Field(
+        "spz",
+        description="Content of the tiles: SPZ, or plain arrays of the ratified KHR_gaussian_splatting, exact and "
+        "several times larger. CesiumJS reads SPZ alone: none writes no index.html.",
+    )
+    archive: bool = Field(False, description="Write the tileset as one file too: tiles.3tz.")
 
 
 # By workspace path; a path without a suffix is a folder. In the order in which people look for them.
@@ -163,12 +188,15 @@ DESCRIPTIONS: dict[str, str] = {
     "spz/splat.spz": "the splat compressed, for viewers on the web",
     "tiles/tileset.json": "the splat as 3D Tiles, for web globes (CesiumJS)",
     "tiles/index.html": "page that shows the tiles on the globe",
+    "tiles/tiles.3tz": "the same 3D Tiles in one file, for desktop GIS",
     "tiles/splat.glb": "the splat in one glTF file",
     "cameras/cameras.csv": "positions, angles and σ of the photographs, for photogrammetry",
     "cameras/camera_covariances.csv": "full covariance of every photograph, for weighted solutions",
     "cameras/covariances.npz": "the same as arrays, and the covariance of every tie point",
     "cameras/colmap": "adjusted cameras and points as a COLMAP model, for other trainers",
+    "cameras/undistorted": "photographs without distortion with their COLMAP model, for trainers of splats",
     "cameras/transforms.json": "adjusted cameras for nerfstudio",
+    "cameras/sparse_pc.ply": "points for nerfstudio",
     "cameras/footprints.geojson": "ground that each photograph shows, for maps",
     "report/report.html": "report to hand in: one page with accuracy, points, photographs and processing",
     "report/report.pdf": "the same report, for printing",

@@ -33,6 +33,8 @@ from pipelines.geometry.similarity import Similarity, SimilarityRecord, moved_pi
 from pipelines.survey.survey import Survey
 from pipelines.survey.trained_model import Adjustment
 
+# Columns: x, y and z of a file with y up, along east, north and up: x is east, z south.
+ENU_FROM_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 _ORIGIN_DECIMALS_DEG = 6  # 0.1 m: short numbers can be copied without loss
 _ORIGIN_DECIMALS_M = 1
 

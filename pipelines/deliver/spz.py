@@ -11,26 +11,22 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from pipelines.core.errors import InputError
 from pipelines.core.stages import SPZ
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import ExportSpzOptions
+from pipelines.deliver.placement import ENU_FROM_Y_UP
 from pipelines.deliver.splat import codec_arrays, load_splat, splat_values
 from pipelines.formats.georef_sidecar import write_sidecar
 from pipelines.formats.spz import SpzVersion, write_spz
 from pipelines.geometry.similarity import Similarity
 from pipelines.splat.gaussians import transformed
 
-# Columns: the file's right, up and back, along east, north and up.
-ENU_FROM_RUB = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-
 
 def run(stage: StageRun, options: ExportSpzOptions) -> Summary:
     """Write the SPZ file and its sidecar; errors as of `load_splat`, or an InputError: too large for the format."""
     splat = load_splat(stage.workspace, options)
-    upright = transformed(splat.gaussians, Similarity(1.0, ENU_FROM_RUB.T))
+    upright = transformed(splat.gaussians, Similarity(1.0, ENU_FROM_Y_UP.T))
     path = stage.out / Path(SPZ).name
     version: SpzVersion = 3 if options.spz_version == "3" else 4
     try:
@@ -38,7 +34,7 @@ def run(stage: StageRun, options: ExportSpzOptions) -> Summary:
     except InputError as error:
         message = f"{error}. `georef export-tiles` writes scenes of any size."
         raise InputError("spz-range", message) from error
-    write_sidecar(splat.placement.sidecar(ENU_FROM_RUB), path)
+    write_sidecar(splat.placement.sidecar(ENU_FROM_Y_UP), path)
     size = path.stat().st_size
     return Summary(
         f"{len(splat.gaussians)} Gaussians, {size / 2**20:.1f} MiB",

@@ -2,8 +2,8 @@
 
 Reads `ingest/survey.json`, `train/model.json`, `train/gaussians.ply` and, of a training in blocks,
 `train/blocks.json`: the Gaussians of one block after another come into memory. Writes `tiles/tileset.json` with the
-contents in `tiles/content/`, `tiles/splat.glb`, a sidecar of each (docs/formats.md), and `tiles/index.html`, which
-shows the tiles in a browser.
+contents in `tiles/content/`, `tiles/splat.glb`, a sidecar of each (docs/formats.md), and of tiles with SPZ
+`tiles/index.html`, which shows them in a browser; if asked, `tiles/tiles.3tz`, the tileset in one file.
 
 All files are in the frame of the placement, East-North-Up; the tileset's root places it on Earth.
 """
@@ -26,14 +26,22 @@ from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import TILES_GLB
 from pipelines.core.types import FloatArray, joined_rows
 from pipelines.core.workspace import StageRun, Summary, Workspace
-from pipelines.deliver.options import ExportTilesOptions
+from pipelines.deliver.options import Compression, ExportTilesOptions
 from pipelines.deliver.placement import require_space
 from pipelines.deliver.splat import SplatParts, load_splat_parts, splat_values
 from pipelines.deliver.tiles_page import TILESET, ScenePage, scene_page, write_scene_page
 from pipelines.formats.georef_sidecar import GeorefSidecar, write_sidecar
-from pipelines.formats.gltf import SPLATS, SPZ_IN_GLTF, encode_glb, spz_in_glb
+from pipelines.formats.gltf import (
+    SPLATS,
+    SPZ_IN_GLTF,
+    decode_plain_glb,
+    encode_glb,
+    encode_plain_glb,
+    spz_in_glb,
+)
 from pipelines.formats.splat_ply import SplatArrays
 from pipelines.formats.spz import FRACTIONAL_BITS, decode_spz, encode_spz
+from pipelines.formats.tiles_archive import write_tiles_archive
 from pipelines.geodesy.vertical import ELLIPSOIDAL, parse_vertical
 from pipelines.splat.level_of_detail import DetailTile, Tiler, best_cut, build_tiles, scene_box
 from pipelines.splat.sh import coefficient_count
@@ -41,11 +49,13 @@ from pipelines.survey.calibrated import load_survey
 from pipelines.survey.target_crs import target_crs
 
 _REACH_M = 2.0 ** (23 - FRACTIONAL_BITS)  # largest coordinate that SPZ's 24 bits hold at their finest step
-_COPIES, _BYTES = 3, 17  # bytes of a Gaussian in SPZ before its compression, without harmonics above the constant
+# Bytes of a Gaussian in SPZ before its compression, or in plain arrays: without harmonics, and of each of these.
+_BYTES: dict[Compression, tuple[int, int]] = {"spz": (17, 3), "none": (48, 12)}
+_COPIES, _ARCHIVED_COPIES = 3, 2  # each Gaussian is in a leaf, in splat.glb, and merged in levels
 # A viewer draws nothing of a tileset whose own error is below its limit (16 pixels by default): with this factor,
 # the scene is shown until it is a pixel wide.
 _UNSEEN_FACTOR = 16.0
-GLB = Path(TILES_GLB).name
+GLB, ARCHIVE = Path(TILES_GLB).name, "tiles.3tz"
 # CesiumJS refuses to decode more at degree 3 (its decoder has 2 GB of memory).
 _LARGEST_GLB = 3_400_000
 
@@ -53,19 +63,24 @@ _LARGEST_GLB = 3_400_000
 def run(stage: StageRun, options: ExportTilesOptions) -> Summary:
     """Write tileset, contents, glb and sidecars, and return their key figures; errors as of `load_splat`."""
     splat = load_splat_parts(stage.workspace, options)
-    page = _page(stage.workspace, splat, options)
+    page = _page(stage.workspace, splat, options) if options.compression == "spz" else None
     count, sidecar = len(splat.center_in_file), splat.placement.sidecar()
-    # Each Gaussian is in a leaf, in splat.glb, and merged in levels.
-    needed_bytes = _COPIES * count * (_BYTES + 3 * coefficient_count(splat.sh_degree))
+    each, harmonic = _BYTES[options.compression]
+    copies = _COPIES + (_ARCHIVED_COPIES if options.archive else 0)
+    needed_bytes = copies * count * (each + harmonic * coefficient_count(splat.sh_degree))
     advice = "give a lower --sh-degree or a larger --min-opacity"
     require_space(stage.out, needed_bytes, f"tiles of {count} Gaussians", advice)
-    tiling = Tiling(scene_box(splat.center_in_file), count, options.max_tile_gaussians)
+    tiling = Tiling(scene_box(splat.center_in_file), count, options.max_tile_gaussians, options.compression)
     root = write_tiles(stage.out, splat, tiling, sidecar, stage.progress)
-    in_glb = write_whole(stage.out, splat, root, sidecar, count)
+    in_glb = write_whole(stage.out, splat, root, sidecar, count, compression=options.compression)
     for name in (TILESET, GLB):
         write_sidecar(sidecar, stage.out / name)
-    write_scene_page(page, stage.out)
+    if page is not None:
+        write_scene_page(page, stage.out)
     tiles = list(root.all())
+    if options.archive:
+        names = [TILESET, *(_content_uri(tile.name) for tile in tiles)]
+        write_tiles_archive(stage.out / ARCHIVE, stage.out, names)
     size = sum(path.stat().st_size for path in stage.out.rglob("*") if path.is_file())
     values = {
         **splat_values(splat),
@@ -114,6 +129,7 @@ class Tiling:
     extent: FloatArray
     count: int
     largest_tile: int = 200_000
+    compression: Compression = "spz"
 
 
 def write_tiles(
@@ -129,11 +145,11 @@ def write_tiles(
     with progress.task("tiles", total=tiling.count) as task:
 
         def write(name: str, content: SplatArrays, *, is_leaf: bool) -> None:
-            write_glb(folder / _content_uri(name), content)
+            write_glb(folder / _content_uri(name), content, compression=tiling.compression)
             task.advance(len(content) if is_leaf else 0, note=f"tile {name}")
 
         root = build_tiles(parts, tiling.extent, Tiler(tiling.largest_tile, write))
-    text = json.dumps(_tileset(root, sidecar), separators=(",", ":"), ensure_ascii=False)
+    text = json.dumps(_tileset(root, sidecar, tiling.compression), separators=(",", ":"), ensure_ascii=False)
     replace_text(folder / TILESET, text + "\n")
     return root
 
@@ -146,6 +162,7 @@ def write_whole(
     count: int,
     *,
     most: int = _LARGEST_GLB,
+    compression: Compression = "spz",
 ) -> int:
     """Write the whole splat as one glb, and return the number of its Gaussians.
 
@@ -155,41 +172,51 @@ def write_whole(
     if count > most:
         parts = [read_glb(folder / _content_uri(tile.name)) for tile in best_cut(root, most)]
     splat = joined_rows(list(parts))
-    write_glb(folder / GLB, splat, {"georef": sidecar.model_dump(mode="json", by_alias=True)})
+    extras = {"georef": sidecar.model_dump(mode="json", by_alias=True)}
+    write_glb(folder / GLB, splat, extras, compression=compression)
     return len(splat)
 
 
-def write_glb(path: Path, splat: SplatArrays, extras: dict[str, Any] | None = None) -> None:
+def write_glb(
+    path: Path, splat: SplatArrays, extras: dict[str, Any] | None = None, *, compression: Compression = "spz"
+) -> None:
     """Write N ≥ 1 Gaussians of an East-North-Up frame as a glb, with `extras` as its `asset.extras`.
 
-    A scene that reaches further than ±2048 m gets coarser steps of position: 0.24 mm up to ±4096 m, and so on.
+    In SPZ, a scene that reaches further than ±2048 m gets coarser steps of position: 0.24 mm up to ±4096 m, and so
+    on.
 
     Raises:
         InputError: values that are not finite.
         OSError: the file cannot be written.
     """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if compression == "none":
+        path.write_bytes(encode_plain_glb(splat, extras))
+        return
     furthest = float(np.abs(splat.means).max())
     coarser = max(0, math.ceil(math.log2((furthest + 1) / _REACH_M))) if math.isfinite(furthest) else 0
     spz = encode_spz(splat, 3, FRACTIONAL_BITS - coarser)
     low, high = splat.means.min(axis=0).tolist(), splat.means.max(axis=0).tolist()
-    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(encode_glb(spz, len(splat), math.isqrt(splat.sh.shape[1]) - 1, (low, high), extras))
 
 
 def read_glb(path: Path) -> SplatArrays:
     """Return the Gaussians of a glb that `write_glb` wrote; an InputError: it cannot be read, or is damaged."""
     file_size(path)
-    return decode_spz(spz_in_glb(path.read_bytes()), path)
+    data = path.read_bytes()
+    return decode_spz(spz_in_glb(data), path) if SPZ_IN_GLTF.encode() in data else decode_plain_glb(data, path)
 
 
-def _tileset(root: DetailTile, sidecar: GeorefSidecar) -> dict[str, Any]:
+def _tileset(root: DetailTile, sidecar: GeorefSidecar, compression: Compression) -> dict[str, Any]:
     """Return the content of `tileset.json`. Only the root has a transform: that of the frame to EPSG:4978."""
-    in_contents = [SPLATS, SPZ_IN_GLTF]
+    in_contents: dict[str, list[str]] = {"extensionsUsed": [SPLATS]}
+    if compression == "spz":
+        in_contents = {name: [SPLATS, SPZ_IN_GLTF] for name in ("extensionsUsed", "extensionsRequired")}
     diagonal = float(np.linalg.norm(root.bounds[1] - root.bounds[0]))
     return {
         "asset": {"version": "1.1", "extras": {"georef": sidecar.model_dump(mode="json", by_alias=True)}},
         "extensionsUsed": ["3DTILES_content_gltf"],
-        "extensions": {"3DTILES_content_gltf": {"extensionsUsed": in_contents, "extensionsRequired": in_contents}},
+        "extensions": {"3DTILES_content_gltf": in_contents},
         "geometricError": max(_UNSEEN_FACTOR * diagonal, 2 * root.error_m),
         "root": {"transform": sidecar.ecef_from_file().matrix().T.ravel().tolist(), **_tile(root)},
     }

@@ -3,7 +3,8 @@
 `transforms.json` (nerfstudio's documentation, "Data conventions"): a frame has `transform_matrix`, world ← camera
 with OpenGL's axes (x right, y up, z backward), and the intrinsics of its photograph in pixels, the centre of the
 top-left pixel at (0.5, 0.5). One camera model serves all frames: `OPENCV` (k1, k2, k3, p1, p2) or `OPENCV_FISHEYE`
-(k1 … k4).
+(k1 … k4). `ply_file_path` names points to begin with, in the same frame. Photographs are listed by split where
+there are test views: nerfstudio takes the lists of all three splits, or divides the photographs itself.
 
 The table has position, angles in both conventions, and σ; a σ that is not known is an empty cell. `read_trajectory`
 reads position, yaw, pitch, roll and σ back, so that a table can be the input of another survey.
@@ -38,9 +39,10 @@ _SIGMA_ANGLES = ("sigma_omega_deg", "sigma_phi_deg", "sigma_kappa_deg")
 
 @dataclass(frozen=True)
 class Frame:
-    """Photograph: its name, its lens, and its pose world ← camera (x right, y down, z forward)."""
+    """Photograph: its name and split, its lens, and its pose world ← camera (x right, y down, z forward)."""
 
     name: str
+    split: str
     camera: Camera
     world_from_cam: FloatArray
     center_in_world: FloatArray
@@ -89,8 +91,10 @@ def _polynomial(camera: Camera, focal: FloatArray, center: FloatArray) -> tuple[
     return solution.tolist(), float(np.hypot(*error).max())
 
 
-def write_transforms(path: Path, frames: Sequence[Frame], lenses: Sequence[Lens]) -> None:
+def write_transforms(path: Path, frames: Sequence[Frame], lenses: Sequence[Lens], points: str) -> None:
     """Write `transforms.json` of photographs and their lenses; the file appears whole or not at all.
+
+    `points` is the name of a PLY beside it.
 
     Raises:
         ValueError: the lenses have different models, or there is no frame.
@@ -103,7 +107,11 @@ def write_transforms(path: Path, frames: Sequence[Frame], lenses: Sequence[Lens]
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = frame.world_from_cam @ _CAM_FROM_GL, frame.center_in_world
         listed.append({"file_path": frame.name, **lens.intrinsics, "transform_matrix": matrix.tolist()})
-    replace_text(path, dump_json({"camera_model": models.pop(), "frames": listed}) + "\n")
+    names = {split: [frame.name for frame in frames if frame.split == split] for split in ("train", "test")}
+    lists = {"train": names["train"], "val": names["test"], "test": names["test"]} if names["test"] else {}
+    splits = {f"{split}_filenames": listing for split, listing in lists.items()}
+    document = {"camera_model": models.pop(), "ply_file_path": points, **splits, "frames": listed}
+    replace_text(path, dump_json(document) + "\n")
 
 
 @dataclass(frozen=True)

@@ -220,16 +220,23 @@ class CloudPlyWriter:
 
 
 def write_point_ply(
-    path: Path, position: FloatArray, rgb: ByteArray, sigma_m: FloatArray, inlier: BoolArray
+    path: Path,
+    position: FloatArray,
+    rgb: ByteArray,
+    sigma_m: FloatArray | None = None,
+    inlier: BoolArray | None = None,
 ) -> None:
     """Write points (N, 3) with their colour (N, 3), σ (N,) along the worst axis and inlier flag (N,), for viewers.
 
-    Points without a position (NaN) are left out, because viewers fail on them.
+    What is None is left out. Points without a position (NaN) are left out, because viewers fail on them.
     """
     finite = np.isfinite(position).all(axis=1)
-    vertex = np.empty(int(finite.sum()), dtype=_POINT_VERTEX)
+    further = {name: values for name, values in (("sigma", sigma_m), ("inlier", inlier)) if values is not None}
+    names = ("x", "y", "z", *_COLOURS, *further)
+    vertex = np.empty(int(finite.sum()), dtype=[column for column in _POINT_VERTEX if column[0] in names])
     _set_columns(vertex, ("x", "y", "z"), position[finite])
     _set_columns(vertex, _COLOURS, rgb[finite])
-    vertex["sigma"], vertex["inlier"] = sigma_m[finite], inlier[finite]
+    for name, values in further.items():
+        vertex[name] = values[finite]
     path.parent.mkdir(parents=True, exist_ok=True)
     PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(path))

@@ -87,7 +87,10 @@ class ContourLine:
 
 
 def write_contours_gpkg(path: Path, lines: Sequence[ContourLine], wkt: str) -> None:
-    """Write contour lines as a GeoPackage (OGC 12-128r18) with the layer `contours`."""
+    """Write contour lines as a GeoPackage 1.2 (OGC 12-128r15) with the layer `contours`.
+
+    GIS of some years ago warn of later versions, which GDAL writes by itself.
+    """
     import pyogrio
 
     draft = path.with_name(f".{path.name}")  # GDAL takes the format from the suffix
@@ -107,6 +110,7 @@ def write_contours_gpkg(path: Path, lines: Sequence[ContourLine], wkt: str) -> N
         layer="contours",
         driver="GPKG",
         geometry_type="LineString Z",
+        dataset_options={"VERSION": "1.2"},
         crs=wkt,
     )
     replace_file(draft, path)

@@ -146,6 +146,15 @@ def load_adjusted_scene(
 def photographs(sparse: SparseModel, survey: Survey, workspace: Workspace, max_size_px: int) -> ImageCache:
     """Return the cache of the registered photographs, undistorted with their longer side limited to `max_size_px`.
 
+    Raises as `photograph_files`.
+    """
+    shots = photograph_files(sparse, survey, workspace)
+    return ImageCache(workspace.cache / "undistorted", shots, max_size_px)
+
+
+def photograph_files(sparse: SparseModel, survey: Survey, workspace: Workspace) -> list[Photograph]:
+    """Return the registered photographs with the lenses of the model, in its order.
+
     Raises:
         InputError: an image of the model is not in the survey.
     """
@@ -159,8 +168,7 @@ def photographs(sparse: SparseModel, survey: Survey, workspace: Workspace, max_s
             path=workspace.root / SPARSE,
         )
     folder = photograph_folder(workspace, survey.image_dir)
-    shots = [
+    return [
         Photograph(name, folder / name, sparse.camera_of(index), known[name])
         for index, name in enumerate(sparse.image_name)
     ]
-    return ImageCache(workspace.cache / "undistorted", shots, max_size_px)

@@ -19,6 +19,11 @@ from tests.cli_runs import Georef
 STAGES = [spec.name for spec in PIPELINE]
 
 
+def everything_in(folder: Path) -> dict[str, tuple[int, int]]:
+    """Size and time of everything in a folder."""
+    return {str(path): (path.stat().st_size, path.stat().st_mtime_ns) for path in sorted(folder.rglob("*"))}
+
+
 @pytest.fixture
 def done(georef: Georef, workspace: Workspace, photos: Path) -> Path:
     """A workspace in which all stages are current."""
@@ -210,10 +215,45 @@ class TestExport:
         assert not georef("export-ply", done, "--measurable", "--json").document["ran"], "the spacing is remembered"
         assert georef("export-ply", done, "--disc-spacing", 1).code == 2
 
-    def test_missing_folder(self, georef: Georef, done: Path, tmp_path: Path) -> None:
-        result = georef("export-ply", done, "-o", tmp_path / "out" / "site.ply")
-        result.assert_failed(1, "no-such-file")
-        assert result.err.startswith(f"error: {tmp_path}/out: ")
+    def test_missing_folders_are_made(self, georef: Georef, done: Path, tmp_path: Path) -> None:
+        assert georef("export-ply", done, "-o", tmp_path / "out" / "deep" / "site.ply").code == 0
+        assert (tmp_path / "out/deep/site.ply").read_text() == "ply"
+        (tmp_path / "file").write_text("mine")
+        result = georef("export-ply", done, "-o", tmp_path / "file" / "site.ply")
+        result.assert_failed(1, "target-folder")
+        assert result.err.startswith(f"error: {tmp_path}/file: ")
+
+    def test_a_workspace_that_cannot_be_written_is_exported_from(
+        self, georef: Georef, done: Path, tmp_path: Path
+    ) -> None:
+        """Nobody can lock it: not even root opens a folder as a file. A current product is copied as it is."""
+        assert georef("report", done).code == 0
+        (done / ".lock").unlink()
+        (done / ".lock").mkdir()
+        before = everything_in(done)
+        refused = georef("export-ply", done, "--min-opacity", 0.25)
+        refused.assert_failed(1, "workspace-read-only")
+        assert "--to" in refused.err
+        target = tmp_path / "out" / "site.ply"
+        assert georef("export-ply", done, "--min-opacity", 0.25, "--to", target, "--json").document["ran"]
+        assert georef("export-tiles", done, "--to", tmp_path / "out" / "www").code == 0
+        assert sorted(path.name for path in target.parent.iterdir()) == ["site.ply", "site.ply.georef.json", "www"]
+        assert not georef("report", done, "--to", tmp_path / "report.html", "--json").document["ran"]
+        assert (tmp_path / "report.html").read_bytes() == (done / "report/report.html").read_bytes()
+        assert everything_in(done) == before
+        assert sorted(path.name for path in tmp_path.iterdir() if path.name.startswith(".")) == []
+
+    def test_a_failure_leaves_nothing_beside_the_target(self, georef: Georef, done: Path, tmp_path: Path) -> None:
+        def fail(stage: StageRun, options: object) -> Summary:
+            raise ConvergenceError("diverged-at-iteration", "diverged at iteration 7")
+
+        (done / ".lock").unlink()
+        (done / ".lock").mkdir()
+        before = everything_in(done)
+        fakes.install(export_tiles=fail)
+        georef("export-tiles", done, "--to", tmp_path / "www").assert_failed(1, "diverged-at-iteration")
+        assert everything_in(done) == before
+        assert not [path for path in tmp_path.iterdir() if "www" in path.name]
 
 
 class TestTalk:

@@ -76,8 +76,8 @@ def test_it_is_the_same_everywhere(
     runs = {"ply": ply.run, "spz": spz.run, "tiles": tiles.run, "cameras": cameras.run}
     folders = {name: made(flight, f"export-{name}", run) for name, run in runs.items()}
     sidecars = [path for folder in folders.values() for path in folder.rglob("*.georef.json")]
-    assert len(sidecars) == 10
-    assert [json.loads(path.read_text("utf-8"))["accuracy"] for path in sidecars] == [figures] * 10
+    assert len(sidecars) == 11
+    assert [json.loads(path.read_text("utf-8"))["accuracy"] for path in sidecars] == [figures] * 11
 
     # In text, to the digit that is shown.
     page = (made(flight, "report", report.run) / "report.html").read_text("utf-8")

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from pyproj import Proj, Transformer
@@ -18,14 +19,16 @@ from pipelines.core.stages import MODEL, SPARSE, SURVEY
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.deliver.cameras import run
 from pipelines.deliver.options import ExportCamerasOptions
+from pipelines.formats.cloud_ply import open_cloud_ply
 from pipelines.formats.colmap import read_sparse, write_sparse
 from pipelines.formats.georef_sidecar import CrsSidecar, GeorefSidecar, sidecar_path
 from pipelines.formats.trajectory_csv import read_trajectory
 from pipelines.geodesy.enu import Origin, ecef_from_enu, ecef_from_lla, enu_from_ecef, geo_from_enu_at, lla_from_enu
 from pipelines.geometry.cameras import Camera, project
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
+from pipelines.survey.photographs import covered_pinhole
 from pipelines.survey.survey import Survey
-from pipelines.survey.trained_model import TrainedModel
+from pipelines.survey.trained_model import TrainedLens, TrainedModel
 from tests.oracles import map_from_cam
 from tests.scenes import TrueScene
 from tests.trained_workspaces import IMAGES, load_adjustment, scene_of, trained_workspace, untrained
@@ -53,12 +56,16 @@ class Handover:
     @property
     def origin(self) -> Origin:
         """Of the frame `geo`."""
-        return load_json(Survey, self.workspace.path(SURVEY)).origin
+        return survey_origin(self.workspace)
 
     @property
     def ecef(self) -> np.ndarray:
         """True centres, Earth-centred."""
         return ecef_from_enu(self.scene.center_in_geo, self.origin)
+
+
+def survey_origin(workspace: Workspace) -> Origin:
+    return load_json(Survey, workspace.path(SURVEY)).origin
 
 
 def handed_over(workspace: Workspace, out: Path, **options: object) -> Summary:
@@ -163,6 +170,84 @@ def test_nerfstudio_projects_a_point_to_its_pixel(handover: Handover) -> None:
         expected = project(handover.scene.camera, ((point_in_geo - center) @ rotation)[None])[0]
         np.testing.assert_allclose(pixel, expected, atol=1e-5)
     assert [frame["file_path"] for frame in document["frames"]] == list(handover.scene.names)
+
+
+def test_nerfstudio_finds_points_and_splits(handover: Handover) -> None:
+    document = json.loads((handover.out / "transforms.json").read_text(encoding="utf-8"))
+    names = list(handover.scene.names)
+    assert document["test_filenames"] == document["val_filenames"] == [names[2]]
+    assert document["train_filenames"] == [*names[:2], *names[3:]]
+    (chunk,) = open_cloud_ply(handover.out / document["ply_file_path"]).chunks(1000)
+    model = read_sparse(handover.out / "colmap")
+    np.testing.assert_array_equal(chunk.position, model.point_in_local)
+
+
+def drawn_dots(scene: TrueScene, folder: Path) -> None:
+    """Draw each photograph of a scene: a blurred dot where the lens shows a point."""
+    y, x = np.mgrid[: scene.camera.height, : scene.camera.width] + 0.5
+    for name, rotation, center in zip(scene.names, scene.geo_from_cam, scene.center_in_geo, strict=True):
+        picture = np.full(x.shape, 30.0)
+        for u, v in project(scene.camera, (scene.point_in_geo - center) @ rotation):
+            if 20 < u < scene.camera.width - 20 and 20 < v < scene.camera.height - 20:
+                near = (slice(int(v) - 15, int(v) + 16), slice(int(u) - 15, int(u) + 16))
+                picture[near] += 200 * np.exp(-((x[near] - u) ** 2 + (y[near] - v) ** 2) / (2 * 2.5**2))
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(folder / name), np.clip(picture, 0, 255).astype(np.uint8), (cv2.IMWRITE_JPEG_QUALITY, 100))
+
+
+def test_points_lie_at_their_dots_in_the_undistorted_photographs(tmp_path: Path) -> None:
+    """The lens is the adjusted one: SfM's would miss the dots by pixels."""
+    scene, workspace = trained_workspace(tmp_path / "ws")
+    drawn_dots(scene, workspace.root)
+    lens = TrainedLens(camera_id=1, model=scene.camera.model, params=tuple(scene.camera.params.tolist()))
+    model = load_json(TrainedModel, workspace.path(MODEL))
+    save_json(model.model_copy(update={"lenses": (lens,)}), workspace.path(MODEL))
+    sparse = read_sparse(workspace.path(SPARSE))
+    other = replace(scene.camera, params=scene.camera.params * [1.01, 1.01, 1, 1, 0, 0, 0, 0])
+    write_sparse(replace(sparse, cameras={1: other}), workspace.path(SPARSE))
+    handed_over(workspace, tmp_path / "out", undistorted=True)
+    folder = tmp_path / "out" / "undistorted"
+    model = pycolmap.Reconstruction(str(folder / "sparse/0"))
+    assert {camera.model_name for camera in model.cameras.values()} == {"PINHOLE"}
+    file_from_ecef = load_json(GeorefSidecar, sidecar_path(folder)).ecef_from_file().inverse()
+    points = file_from_ecef.apply(ecef_from_enu(scene.point_in_geo, survey_origin(workspace)))
+    measured = []
+    for image in model.images.values():
+        picture = cv2.imread(str(folder / "images" / image.name), cv2.IMREAD_GRAYSCALE).astype(float) - 30
+        camera = model.cameras[image.camera_id]
+        assert picture.shape == (camera.height, camera.width)
+        pixels = np.array([image.project_point(point) for point in points])
+        for u, v in pixels:
+            others = np.sort(np.hypot(*(pixels - (u, v)).T))[1]
+            if others > 40 and 20 < u < camera.width - 20 and 20 < v < camera.height - 20:
+                top, left = int(v) - 10, int(u) - 10
+                cut = np.clip(picture[top : top + 21, left : left + 21] - 10, 0, None)
+                y, x = np.mgrid[:21, :21] + 0.5
+                measured.append([(cut * x).sum() / cut.sum() + left - u, (cut * y).sum() / cut.sum() + top - v])
+        # Observations follow the rays of SfM's pixels under the adjusted lens.
+        seen = [point for point in image.points2D if point.has_point3D()]
+        xy = np.array([point.xy for point in seen])
+        expected = np.array([image.project_point(model.points3D[point.point3D_id].xyz) for point in seen])
+        assert np.median(np.hypot(*(xy - expected).T)) < 1.0
+    assert len(measured) > 100
+    # The interpolation is right to 0.022 px along each axis, and quality 95 adds noise of a hundredth.
+    assert np.abs(np.mean(measured, axis=0)).max() < 0.01
+    assert np.hypot(*np.array(measured).T).max() < 0.05
+
+
+@pytest.mark.parametrize("k1", [-0.1, 0.0, 0.1])
+def test_an_undistorted_picture_shows_nothing_from_beyond_its_photograph(k1: float) -> None:
+    camera = Camera("OPENCV", 1200, 900, np.array([1000.0, 1010.0, 620.0, 440.0, k1, 0.0, 1e-3, 0.0]))
+    pinhole = covered_pinhole(camera)
+    assert (pinhole.width, pinhole.height, pinhole.cx, pinhole.cy) == (1200, 900, 620.0, 440.0)
+    pixels = np.stack(np.meshgrid(np.arange(1200) + 0.5, np.arange(900) + 0.5), axis=-1)
+    shown = project(camera, pinhole.rays(pixels))
+    assert (shown >= 0.5 - 1e-9).all() and (shown <= np.array([1199.5, 899.5]) + 1e-9).all()
+    # No larger than it must be: some pixel lies at the photograph's edge, unless nothing had to be enlarged.
+    if pinhole.fx > camera.params[0]:
+        assert min((shown - 0.5).min(), (np.array([1199.5, 899.5]) - shown).min()) < 0.01
+    else:
+        assert k1 < 0
 
 
 def test_footprints_project_back_to_the_border_of_their_photograph(handover: Handover) -> None:

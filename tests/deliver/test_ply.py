@@ -114,8 +114,29 @@ def test_frame_is_east_north_up_at_its_own_rounded_origin(stage: StageRun) -> No
     assert np.abs(np.median(means, axis=0)).max() < 0.2  # rounded to 1e-6° and 0.1 m
 
 
-def test_rendered_image_is_the_same_from_the_same_place(stage: StageRun) -> None:
-    run(stage, OPTIONS)
+@pytest.mark.parametrize(
+    ("up", "places"), [("y", [[1, 0, 0], [0, 0, 1], [0, -1, 0]]), ("-y", [[1, 0, 0], [0, 0, -1], [0, 1, 0]])]
+)
+def test_another_axis_points_up_and_every_gaussian_stays_in_its_place(
+    stage: StageRun, up: str, places: list[list[int]]
+) -> None:
+    run(stage, ExportPlyOptions(up=up))
+    ply, sidecar = stage.out / "splat.ply", load_json(GeorefSidecar, sidecar_path(stage.out / "splat.ply"))
+    positions = sidecar.ecef_from_file().apply(read_gaussians(ply).means.numpy())
+    expected = ecef_from_enu(GEO_FROM_MODEL.apply(gaussians().means.numpy()), survey().origin)
+    np.testing.assert_allclose(positions, expected, rtol=0, atol=2e-6)
+    lat, lon, alt = sidecar.origin_lla
+    in_enu = enu_from_ecef(sidecar.ecef_from_file().apply(np.eye(3)), Origin(lat_deg=lat, lon_deg=lon, alt_m=alt))
+    np.testing.assert_allclose(in_enu, places, atol=1e-8)  # of x, y and z of the file
+    # σ stay those of east, north and up, while the covariance is along the file's axes.
+    assert sidecar.georeference_sigma == placed(model(covariance())).sidecar().georeference_sigma
+    assert sidecar.covariance is not None and sidecar.georeference_sigma is not None
+    assert sidecar.georeference_sigma.sigma_v_m == pytest.approx(np.sqrt(sidecar.covariance[5][5]))
+
+
+@pytest.mark.parametrize("up", ["z", "y", "-y"])
+def test_rendered_image_is_the_same_from_the_same_place(stage: StageRun, up: str) -> None:
+    run(stage, ExportPlyOptions(up=up))
     camera = Pinhole(32, 24, 30.0, 30.0, 16.0, 12.0)
     settings = RasterSettings(sh_degree=3, background=(0.2, 0.3, 0.4), near_m=0.01)
     cam_from_model = np.eye(4)

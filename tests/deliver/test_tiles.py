@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import bisect
+import hashlib
 import json
 import shutil
 import struct
+import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +19,10 @@ from scipy.spatial import cKDTree
 from pipelines.core.errors import InputError
 from pipelines.core.products import load_json, save_json
 from pipelines.core.stages import BLOCK_RECORD, GAUSSIANS
+from pipelines.core.types import joined_rows, rows_of
 from pipelines.core.workspace import StageRun
 from pipelines.deliver.options import ExportTilesOptions
+from pipelines.deliver.splat import codec_arrays, load_splat
 from pipelines.deliver.tiles import read_glb, run, write_glb, write_whole
 from pipelines.formats.georef_sidecar import GeorefSidecar, sidecar_path
 from pipelines.formats.splat_ply import SplatArrays, write_splat_ply
@@ -166,6 +172,56 @@ def test_a_splat_too_large_for_one_file_is_shown_by_its_tiles(made: StageRun, sc
     assert root.count < count <= 1500
     assert len(read_glb(made.out / "splat.glb")) == count
     (made.out / "splat.glb").write_bytes(whole)
+
+
+def test_plain_tiles_hold_the_gaussians_exactly(tmp_path: Path, scene: SplatArrays) -> None:
+    stage = write_trained(tmp_path / "ws", scene, "tiles")
+    summary = run(stage, ExportTilesOptions(max_tile_gaussians=1000, compression="none"))
+    assert summary.values["glb_gaussians"] == COUNT
+    assert not (stage.out / "index.html").exists()  # CesiumJS fails at plain tiles
+    extensions = document(stage)["extensions"]["3DTILES_content_gltf"]
+    assert extensions == {"extensionsUsed": ["KHR_gaussian_splatting"]}
+    leaves = [tile for tile in all_tiles(document(stage)["root"]) if "children" not in tile]
+    places = np.concatenate([in_ecef(stage, stage.out / tile["content"]["uri"]) for tile in leaves])
+    distance, index = cKDTree(true_ecef(scene)).query(places)
+    np.testing.assert_array_equal(np.sort(index), np.arange(COUNT))
+    assert distance.max() < 1e-5  # float32 at 60 m from the origin, twice
+    read = joined_rows([read_glb(stage.out / tile["content"]["uri"]) for tile in leaves])
+    expected = rows_of(codec_arrays(load_splat(stage.workspace, ExportTilesOptions()).gaussians), index)
+    np.testing.assert_array_equal(read.sh, expected.sh)
+    np.testing.assert_allclose(read.log_scales, expected.log_scales, atol=1e-6)
+    np.testing.assert_allclose(read.logit_opacities, expected.logit_opacities, atol=1e-4)
+    np.testing.assert_allclose(read.quats_wxyz, expected.quats_wxyz, atol=1e-6)
+    whole = read_glb(stage.out / "splat.glb")
+    assert len(whole) == COUNT and "extensionsRequired" not in gltf_of(stage.out / "splat.glb")
+
+
+def test_every_tile_is_found_through_the_index_of_the_archive(tmp_path: Path, scene: SplatArrays) -> None:
+    """As the specification of 3TZ tells readers: hash of the path, bisection, local header, name, content."""
+    stage = write_trained(tmp_path / "ws", scene, "tiles")
+    run(stage, ExportTilesOptions(max_tile_gaussians=1000, archive=True))
+    data = (stage.out / "tiles.3tz").read_bytes()
+    with zipfile.ZipFile(stage.out / "tiles.3tz") as archive:
+        assert archive.testzip() is None
+        entries = archive.infolist()
+        index = archive.read("@3dtilesIndex1@")
+    assert entries[-1].filename == "@3dtilesIndex1@" and not entries[-1].comment
+    assert {entry.compress_type for entry in entries} == {zipfile.ZIP_STORED}
+    records = [(*struct.unpack_from("<QQ", index, at), index[at + 16 : at + 24]) for at in range(0, len(index), 24)]
+    hashes = [record[:2] for record in records]
+    assert hashes == sorted(hashes) and len(hashes) == len(entries) - 1
+    uris = [tile["content"]["uri"] for tile in all_tiles(document(stage)["root"])]
+    assert {entry.filename for entry in entries[:-1]} == {"tileset.json", *uris}
+    for name in ("tileset.json", *uris):
+        found = bisect.bisect_left(hashes, struct.unpack("<QQ", hashlib.md5(name.encode()).digest()))
+        (at,) = struct.unpack("<Q", records[found][2])
+        signature, _, flags, method, _, crc, packed, size, length, extra = struct.unpack_from(
+            "<IHHHIIIIHH", data, at
+        )
+        assert (signature, flags, method, packed) == (0x04034B50, 0, 0, size)
+        assert data[at + 30 : at + 30 + length].decode() == name
+        content = data[at + 30 + length + extra :][:size]
+        assert content == (stage.out / name).read_bytes() and zlib.crc32(content) == crc
 
 
 def test_a_large_scene_has_coarser_steps(tmp_path: Path) -> None:

@@ -1,8 +1,10 @@
-"""GeoJSON after RFC 7946: rings closed and anticlockwise, cut at the date line, and no NaN."""
+"""GeoJSON after RFC 7946: rings closed and anticlockwise, cut at the date line, no NaN; contours as GeoPackage."""
 
 from __future__ import annotations
 
+import contextlib
 import json
+import sqlite3
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipelines.core.files import replace_text
-from pipelines.formats.vector_files import feature, features_text, polygon
+from pipelines.formats.vector_files import ContourLine, feature, features_text, polygon, write_contours_gpkg
+from pipelines.geodesy.crs import parse_crs
 
 
 def area(ring: list[list[float]]) -> float:
@@ -64,3 +67,24 @@ def test_collection_is_json_without_nan(tmp_path: Path) -> None:
     assert document["features"][0]["properties"] == {"name": "Aé", "sigma_e_m": None, "clipped": True}
     assert document["features"][1] == {"type": "Feature", "geometry": None, "properties": {}}
     assert [path.name for path in tmp_path.iterdir()] == ["a.geojson"]
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:32632+3855"])
+def test_contours_are_a_geopackage_that_older_gis_know(tmp_path: Path, crs: str) -> None:
+    """Version 1.2, from which GDAL 3.6 reads without a warning, with heights and CRS as they were written."""
+    pyogrio = pytest.importorskip("pyogrio")
+    path = tmp_path / "contours.gpkg"
+    lines = [
+        ContourLine(float(height), np.array([[0.0, height], [5, 2], [9, 4]]), height == 5) for height in (4, 5)
+    ]
+    write_contours_gpkg(path, lines, parse_crs(crs).wkt)
+    with contextlib.closing(sqlite3.connect(path)) as database:
+        ((application,),) = database.execute("PRAGMA application_id")
+        ((version,),) = database.execute("PRAGMA user_version")
+    assert (application.to_bytes(4, "big"), version) == (b"GPKG", 10200)
+    meta, _, shapes, (height, major) = pyogrio.raw.read(path)
+    assert meta["geometry_type"] == "LineString Z"
+    assert (height.tolist(), major.tolist()) == ([4.0, 5.0], [False, True])
+    assert np.frombuffer(shapes[0][9:], "<f8").reshape(-1, 3)[:, 2].tolist() == [4.0] * 3
+    # Of a compound CRS GDAL reads its code, or its text where the code has two parts.
+    assert meta["crs"] == crs or "EGM2008" in meta["crs"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -61,6 +62,21 @@ def test_full_model_without_rational_terms_is_exact() -> None:
 
 def test_two_camera_models_do_not_fit_into_one_file(tmp_path: Path) -> None:
     cameras = [Camera(model, 1200, 900, np.array(PARAMETERS[model])) for model in ("OPENCV", "OPENCV_FISHEYE")]
-    frames = [Frame("a.jpg", camera, np.eye(3), np.zeros(3)) for camera in cameras]
+    frames = [Frame("a.jpg", "train", camera, np.eye(3), np.zeros(3)) for camera in cameras]
     with pytest.raises(ValueError, match="one camera model"):
-        write_transforms(tmp_path / "transforms.json", frames, [lens_of(camera) for camera in cameras])
+        write_transforms(tmp_path / "transforms.json", frames, [lens_of(camera) for camera in cameras], "a.ply")
+
+
+def test_photographs_are_listed_by_split_where_there_are_test_views(tmp_path: Path) -> None:
+    """nerfstudio demands a list of each split, or none; with an empty one it has nothing to evaluate."""
+    camera = Camera("PINHOLE", 1200, 900, np.array(PARAMETERS["PINHOLE"]))
+    for splits, expected in {
+        ("train", "test", "train"): {"train": ["0.jpg", "2.jpg"], "val": ["1.jpg"], "test": ["1.jpg"]},
+        ("train", "train"): {},
+    }.items():
+        frames = [Frame(f"{n}.jpg", split, camera, np.eye(3), np.zeros(3)) for n, split in enumerate(splits)]
+        write_transforms(tmp_path / "transforms.json", frames, [lens_of(camera)] * len(frames), "points.ply")
+        document = json.loads((tmp_path / "transforms.json").read_text(encoding="utf-8"))
+        assert document["ply_file_path"] == "points.ply"
+        lists = {name.removesuffix("_filenames"): names for name, names in document.items() if "_filenames" in name}
+        assert lists == expected
