@@ -35,7 +35,7 @@ from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import MeasurableOptions
 from pipelines.deliver.placement import place
 from pipelines.deliver.ply import write_ply
-from pipelines.deliver.splat import placed_splat, splat_values
+from pipelines.deliver.splat import crop_of, placed_splat, splat_values
 from pipelines.geometry.cameras import pose_matrix
 from pipelines.geometry.similarity import Similarity
 from pipelines.jobs.costs import iteration_seconds
@@ -101,7 +101,8 @@ def run(stage: StageRun, options: MeasurableOptions) -> Summary:
     )
     # The place is that of the trained model, whatever the discs have replaced.
     means, accuracy = trained.gaussians.means.numpy(), headline_of(stage.workspace)
-    splat = placed_splat(refined, place(trained.model, trained.survey, means, accuracy), options)
+    placement = place(trained.model, trained.survey, means, accuracy)
+    splat = placed_splat(refined, placement, options, crop_of(stage.workspace, options))
     write_ply(splat, stage.out / Path(MEASURABLE_SPLAT).name, options)
     psnr_text = "" if change is None else f", PSNR {change:+.2f} dB"
     return Summary(

@@ -7,7 +7,7 @@ from urllib.parse import urlsplit
 
 from pydantic import AfterValidator, Field
 
-from pipelines.core.options import ExtraMarker, StageOptions
+from pipelines.core.options import ExtraMarker
 from pipelines.survey.area import AreaOptions
 from pipelines.survey.options import CrsOptions
 
@@ -18,9 +18,13 @@ CESIUM = "https://cesium.com/downloads/cesiumjs/releases/1.145/Build/Cesium/"
 Compression = Literal["spz", "none"]
 
 
-class SplatOptions(StageOptions):
+class SplatOptions(AreaOptions):
     """Options of every file that holds the Gaussians."""
 
+    crop: bool = Field(
+        False, description="Leave out Gaussians outside the area of interest. --boundary implies it."
+    )
+    keep_sky: bool = Field(False, description="With a crop: keep what lies higher than all cameras.")
     min_opacity: float = Field(0.005, ge=0, lt=1, description="Leave out Gaussians that are less opaque.")
 
 

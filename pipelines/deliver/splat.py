@@ -14,22 +14,52 @@ from scipy.special import expit
 from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.products import load_json
 from pipelines.core.stages import BLOCK_RECORD, GAUSSIANS, MODEL
-from pipelines.core.types import BoolArray, Float32Array, vector3
+from pipelines.core.types import BoolArray, Float32Array, FloatArray, vector3
 from pipelines.core.workspace import Workspace
 from pipelines.deliver.options import SplatOptions, WebSplatOptions
 from pipelines.deliver.placement import Placement, place
 from pipelines.formats.splat_ply import SplatArrays, read_centres, read_logit_opacities
+from pipelines.geometry.similarity import Similarity
 from pipelines.splat.gaussians import Gaussians, read_gaussians, transformed
 from pipelines.splat.sh import coefficient_count
+from pipelines.survey.area import Area, area_of
 from pipelines.survey.block_plan import BlockRecord
 from pipelines.survey.calibrated import load_survey
 from pipelines.survey.headline import headline_of
 from pipelines.survey.trained_model import TrainedModel
+from pipelines.survey.trained_survey import load_solved
+
+
+@dataclass(frozen=True)
+class Crop:
+    """Area outside which Gaussians are left out; those higher than `sky_m` in `geo` stay."""
+
+    area: Area
+    geo_from_model: Similarity
+    sky_m: float
+
+    def keeps(self, center_in_model: FloatArray | Float32Array) -> BoolArray:
+        """Return which of Gaussians' centres (N, 3) stay."""
+        center = self.geo_from_model.apply(center_in_model)
+        return self.area.contains(center) | (center[:, 2] > self.sky_m)
+
+
+def crop_of(workspace: Workspace, options: SplatOptions) -> Crop | None:
+    """Return the crop that the options ask for; None: none. Errors as of `load_solved` and `area_of`.
+
+    The sky is what lies higher than all cameras.
+    """
+    if not options.crop and options.boundary is None:
+        return None
+    solved = load_solved(workspace)
+    cameras = solved.geo_from_model.apply(solved.poses.cam_center_in_model)
+    sky_m = float(cameras[:, 2].max()) if options.keep_sky else np.inf
+    return Crop(area_of(options, solved), solved.geo_from_model, sky_m)
 
 
 @dataclass(frozen=True)
 class PlacedSplat:
-    """Splat in the frame `file` of its placement, and the number of Gaussians that were too transparent."""
+    """Splat in the frame `file` of its placement, and the number of Gaussians that were left out."""
 
     gaussians: Gaussians
     placement: Placement
@@ -42,8 +72,8 @@ class SplatParts:
 
     Attributes:
         path, rows: file of the trained Gaussians, and a range of its rows for each part.
-        center_in_file: (N, 3) metres, of all opaque Gaussians.
-        left_out: number of Gaussians that were too transparent.
+        center_in_file: (N, 3) metres, of all Gaussians that are delivered.
+        left_out: number of those that are too transparent, or outside the crop.
         sh_degree: of the harmonics to deliver.
     """
 
@@ -54,14 +84,15 @@ class SplatParts:
     left_out: int
     sh_degree: int
     options: SplatOptions
+    crop: Crop | None
 
     def __iter__(self) -> Iterator[SplatArrays]:
-        """Yield the opaque Gaussians of each part that has any."""
+        """Yield the Gaussians of each part that are delivered, if it has any."""
         for rows in self.rows:
             gaussians = read_gaussians(self.path, rows)
-            opaque = _is_opaque(gaussians.logit_opacities.numpy(), self.options)
-            if opaque.any():
-                kept = gaussians.select(torch.from_numpy(opaque))
+            chosen = _chosen(gaussians.means.numpy(), gaussians.logit_opacities.numpy(), self.options, self.crop)
+            if chosen.any():
+                kept = gaussians.select(torch.from_numpy(chosen))
                 yield codec_arrays(transformed(kept, self.placement.file_from_model), self.sh_degree)
 
 
@@ -85,7 +116,8 @@ def load_splat(workspace: Workspace, options: SplatOptions) -> PlacedSplat:
     survey = load_survey(workspace)
     model = load_json(TrainedModel, workspace.path(MODEL))
     gaussians = read_gaussians(workspace.path(GAUSSIANS))
-    return placed_splat(gaussians, place(model, survey, gaussians.means.numpy(), headline_of(workspace)), options)
+    placement = place(model, survey, gaussians.means.numpy(), headline_of(workspace))
+    return placed_splat(gaussians, placement, options, crop_of(workspace, options))
 
 
 def load_splat_parts(workspace: Workspace, options: WebSplatOptions) -> SplatParts:
@@ -93,14 +125,15 @@ def load_splat_parts(workspace: Workspace, options: WebSplatOptions) -> SplatPar
     survey = load_survey(workspace)
     model = load_json(TrainedModel, workspace.path(MODEL))
     path = workspace.path(GAUSSIANS)
-    centers, opaque = read_centres(path), _is_opaque(read_logit_opacities(path), options)
-    _require_opaque(opaque, options)
+    centers, crop = read_centres(path), crop_of(workspace, options)
+    chosen = _chosen(centers, read_logit_opacities(path), options, crop)
+    _require_any(chosen, options)
     placement = place(model, survey, centers, headline_of(workspace))
-    center_in_file = placement.file_from_model.apply(centers[opaque]).astype(np.float32)
+    center_in_file = placement.file_from_model.apply(centers[chosen]).astype(np.float32)
     rows = _rows_of_blocks(workspace, len(centers))
     trained = read_gaussians(path, slice(0, 1)).sh_degree
     degree = trained if options.sh_degree is None else min(options.sh_degree, trained)
-    return SplatParts(path, rows, placement, center_in_file, int((~opaque).sum()), degree, options)
+    return SplatParts(path, rows, placement, center_in_file, int((~chosen).sum()), degree, options, crop)
 
 
 def _rows_of_blocks(workspace: Workspace, count: int) -> tuple[slice, ...]:
@@ -120,25 +153,32 @@ def _rows_of_blocks(workspace: Workspace, count: int) -> tuple[slice, ...]:
     return tuple(slice(first, last) for first, last in itertools.pairwise(ends))
 
 
-def placed_splat(gaussians: Gaussians, placement: Placement, options: SplatOptions) -> PlacedSplat:
-    """Return the opaque Gaussians, moved from `model` to the placement; a DegenerateGeometryError: none is."""
-    opaque = _is_opaque(gaussians.logit_opacities.numpy(), options)
-    _require_opaque(opaque, options)
-    kept = gaussians.select(torch.from_numpy(opaque))
+def placed_splat(
+    gaussians: Gaussians, placement: Placement, options: SplatOptions, crop: Crop | None = None
+) -> PlacedSplat:
+    """Return the Gaussians to deliver, moved from `model` to the placement; a DegenerateGeometryError: none is."""
+    chosen = _chosen(gaussians.means.numpy(), gaussians.logit_opacities.numpy(), options, crop)
+    _require_any(chosen, options)
+    kept = gaussians.select(torch.from_numpy(chosen))
     return PlacedSplat(transformed(kept, placement.file_from_model), placement, len(gaussians) - len(kept))
 
 
-def _is_opaque(logit_opacities: Float32Array, options: SplatOptions) -> BoolArray:
+def _chosen(
+    center_in_model: FloatArray | Float32Array,
+    logit_opacities: Float32Array,
+    options: SplatOptions,
+    crop: Crop | None,
+) -> BoolArray:
     opaque: BoolArray = expit(logit_opacities) >= options.min_opacity
-    return opaque
+    return opaque if crop is None else opaque & crop.keeps(center_in_model)
 
 
-def _require_opaque(opaque: BoolArray, options: SplatOptions) -> None:
-    if not opaque.any():
+def _require_any(chosen: BoolArray, options: SplatOptions) -> None:
+    if not chosen.any():
         raise DegenerateGeometryError(
             "no-opaque-gaussians",
-            f"None of {len(opaque)} Gaussians has an opacity of {options.min_opacity} or more. Lower "
-            "--min-opacity.",
+            f"None of {len(chosen)} Gaussians has an opacity of {options.min_opacity} or more, inside the area if "
+            "one was asked for. Lower --min-opacity, or check --boundary.",
         )
 
 
