@@ -37,6 +37,8 @@ class ViewContributions:
     high_error_px: Tensor
 
 
+# Returns which of means (N, 3) in `model` lie where Gaussians may be added.
+Growing = Callable[[Tensor], Tensor]
 # Returns the contributions to a number of different training views, drawn with the generator.
 Probe = Callable[[int, torch.Generator], list[ViewContributions]]
 
@@ -140,7 +142,11 @@ class DefaultStrategy:
     2. Transparent and oversized Gaussians are removed.
     3. Opacities are reset at intervals.
     4. Edited Gaussians are put back into spatial order.
+
+    Where `growing` is false, none are added.
     """
+
+    growing: Growing | None = None
 
     def __init__(self, settings: DefaultSettings, extent_m: float, count: int, seed: int = 0) -> None:
         self.settings = settings
@@ -171,7 +177,7 @@ class DefaultStrategy:
         if settings.start < iteration <= settings.stop and iteration % settings.every == 0:
             alive = self._alive(optimizer.gaussians.detached(), iteration)
             gradient = (self._gradient_sum / self._observations.clamp_min(1)).to(alive.device)
-            chosen = alive & (gradient >= settings.gradient_threshold)
+            chosen = self._growing(optimizer, alive & (gradient >= settings.gradient_threshold))
             edit = self._edit(optimizer, alive, self._within_room(alive, chosen, gradient))
         if settings.reset_every and iteration < settings.stop and iteration % settings.reset_every == 0:
             ceiling = math.log(_RESET_OPACITY / (1 - _RESET_OPACITY))
@@ -217,6 +223,9 @@ class DefaultStrategy:
             scale = gaussians.log_scales.amax(dim=1).exp()
             alive &= scale <= _LARGEST_SCALE * (self.extent_m + distance)
         return alive
+
+    def _growing(self, optimizer: GaussianAdam, chosen: Tensor) -> Tensor:
+        return chosen if self.growing is None else chosen & self.growing(optimizer.gaussians.means.detach())
 
     def _within_room(self, alive: Tensor, chosen: Tensor, score: Tensor) -> Tensor:
         """Reduce the mask `chosen` to the highest scores that the limit leaves room for."""
@@ -285,5 +294,5 @@ class FastStrategy(DefaultStrategy):
             score = error.sum(dim=0) / views.clamp_min(1)
             gradient = (self._gradient_sum / self._observations.clamp_min(1)).to(alive.device)
             agreed = alive & (gradient >= settings.gradient_threshold) & (score >= self.fast.high_error_px)
-            chosen = self._within_room(alive, agreed, score)
+            chosen = self._within_room(alive, self._growing(optimizer, agreed), score)
         return self._edit(optimizer, alive, chosen)

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from pipelines.geometry.cameras import Pinhole
-from pipelines.splat.densify import DensityEdit, Probe
+from pipelines.splat.densify import DensityEdit, Growing, Probe
 from pipelines.splat.gaussians import Gaussians, rotation_matrices
 from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.rasterizer.api import ScreenStats
@@ -59,7 +59,9 @@ class McmcSettings:
 
 
 class McmcStrategy:
-    """Relocation, growth and noise in a scene of size `extent_m`; see the module."""
+    """Relocation, growth and noise in a scene of size `extent_m`; none is added where `growing` is false."""
+
+    growing: Growing | None = None
 
     def __init__(self, settings: McmcSettings, extent_m: float, seed: int = 0) -> None:
         self.settings, self.extent_m, self._seed = settings, extent_m, seed
@@ -125,6 +127,8 @@ class McmcStrategy:
         relocated = len(dead) if len(dead) < count else 0
         if relocated + added == 0:
             return DensityEdit()
+        if self.growing is not None and bool((inside := self.growing(gaussians.means)).any()):
+            opacity = torch.where(inside, opacity, torch.zeros_like(opacity))
         parent = self._drawn(opacity, dead, relocated + added)
         source = torch.arange(count, device=opacity.device)
         source[dead[:relocated]] = -1

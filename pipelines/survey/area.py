@@ -6,6 +6,7 @@ Files are cut to it: a photograph shows far more than it measures.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -100,32 +101,26 @@ def area_of(options: AreaOptions, solved: SolvedSurvey) -> Area:
         DegenerateGeometryError: no ground is seen by enough photographs.
     """
     scene = scene_in_geo(solved)
+    stated = boundary_area(options, scene, solved.survey.origin)
+    if stated is not None:
+        return stated
     level_m = float(np.median(scene[:, 2])) if len(scene) else 0.0
+    return Area(_seen_ground(solved, scene), level_m, f"ground that {LEAST_PHOTOGRAPHS} photographs see")
+
+
+def boundary_area(options: AreaOptions, scene: FloatArray, origin: Origin) -> Area | None:
+    """Return the area that the user states, of a survey with points (N, 3) in `geo`; None: none is stated.
+
+    Raises:
+        InputError: the boundary cannot be read, states no CRS, or holds none of the points.
+    """
     if options.boundary is None:
-        return Area(_seen_ground(solved, scene), level_m, f"ground that {LEAST_PHOTOGRAPHS} photographs see")
-    polygon = _boundary_in_geo(options, solved.survey.origin)
-    area = Area(polygon, level_m, options.boundary.name)
-    if not area.contains(scene).any():
-        raise InputError(
-            "boundary-elsewhere",
-            "holds no point of the survey. Check its CRS (--boundary-crs), and that it is of this place.",
-            path=options.boundary,
-            field="--boundary",
-        )
-    return area
-
-
-def _boundary_in_geo(options: AreaOptions, origin: Origin) -> MultiPolygon:
-    assert options.boundary is not None
+        return None
     boundary = read_boundary(options.boundary, field="--boundary")
+    refusal = partial(InputError, path=options.boundary)
     text = boundary.crs or options.boundary_crs
     if not text:
-        raise InputError(
-            "boundary-without-crs",
-            "states no CRS. Give --boundary-crs.",
-            path=options.boundary,
-            field="--boundary-crs",
-        )
+        raise refusal("boundary-without-crs", "states no CRS. Give --boundary-crs.", field="--boundary-crs")
     crs = parse_crs(text, path=options.boundary, field="--boundary-crs")
 
     def moved(plan: FloatArray) -> FloatArray:
@@ -134,7 +129,12 @@ def _boundary_in_geo(options: AreaOptions, origin: Origin) -> MultiPolygon:
         lla[:, 2] = origin.alt_m
         return enu_from_ecef(ecef_from_lla(lla), origin)[:, :2]
 
-    return shapely.make_valid(shapely.transform(_with_short_edges(boundary.polygon), moved))
+    polygon = shapely.make_valid(shapely.transform(_with_short_edges(boundary.polygon), moved))
+    area = Area(polygon, float(np.median(scene[:, 2])) if len(scene) else 0.0, options.boundary.name)
+    if not area.contains(scene).any():
+        message = "holds no point of the survey. Check its CRS (--boundary-crs), and that it is of this place."
+        raise refusal("boundary-elsewhere", message, field="--boundary")
+    return area
 
 
 def _with_short_edges(polygon: Any) -> Any:

@@ -34,6 +34,7 @@ from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.initialise import InitialisationOptions, gaussians_from_points, gaussians_of_size
 from pipelines.splat.surface import ObservedPoints
 from pipelines.surface.depth_maps import DepthMaps
+from pipelines.survey.area import Area
 from pipelines.survey.photographs import ImageCache
 from pipelines.survey.scene import Scene
 from pipelines.train.region import TrainingRegion
@@ -261,6 +262,7 @@ def _colours(points: SurfacePoints, plane: FloatArray, seed: int) -> ByteArray:
 
 
 _SURFACE_SHARE = 0.8  # of the limit of Gaussians starts on the surface; density control places the others
+_AROUND_SHARE = 0.1  # of the limit on the surface starts around the area that must be sharp
 _MOSTLY_KNOWN = 0.6  # of the pixels: with fewer known depths, more Gaussians are needed off the surface
 _UNKNOWN_SHARE = 0.05  # of the limit starts where no depth is known, at least: density control finds corners late
 _BENEATH_SHARE = 0.02  # of the limit lies beneath the scene
@@ -274,12 +276,22 @@ _OFF_SURFACE = 3.0  # gaps between points of the surface: an SfM point nearer th
 
 @dataclass(frozen=True)
 class TrainingScene:
-    """Cameras and SfM points of a training, its undistorted photographs, and, if any, known surface and region."""
+    """Cameras and SfM points of a training, its undistorted photographs, and, if any, known surface and region.
+
+    `area` is what must be sharp; None: everything.
+    """
 
     scene: Scene
     images: ImageCache
     surface: SceneSurface | None = None
     region: TrainingRegion | None = None
+    area: Area | None = None
+
+    def in_area(self, points: FloatArray) -> BoolArray:
+        """Return which of points (N, 3) in `model` must be sharp, as a mask (N,)."""
+        if self.area is None:
+            return np.ones(len(points), dtype=bool)
+        return self.area.contains(self.scene.geo_from_model.apply(points))
 
     def in_region(self, points: FloatArray) -> BoolArray:
         """Return which of points (N, 3) in `model` are trained, as a mask (N,)."""
@@ -301,7 +313,14 @@ def initial_gaussians(training: TrainingScene, options: InitialisationOptions, m
     start = SurfacePoints(scene.point_in_model, scene.sparse.point_rgb, np.full_like(scene.point_in_model, np.nan))
     if training.surface is not None:
         share = _SURFACE_SHARE * min(1.0, training.surface.known_share() / _MOSTLY_KNOWN)
-        surface = training.surface.sample(int(share * most), seed, training.in_region)
+        surface = training.surface.sample(
+            int(share * most), seed, lambda at: training.in_region(at) & training.in_area(at)
+        )
+        if training.area is not None:
+            around = training.surface.sample(
+                int(_AROUND_SHARE * share * most), seed, lambda at: training.in_region(at) & ~training.in_area(at)
+            )
+            surface = joined_rows([surface, around])
         start = joined_rows([rows_of(start, _off_surface(start, surface)), surface])
         unknown = int(max(_SURFACE_SHARE - share, _UNKNOWN_SHARE) * most)
         fallback = fallback_points(scene, training.surface.maps, unknown, seed, training.in_region)

@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 from pipelines.core.errors import InputError
 from pipelines.core.options import InputPath, StageOptions
 from pipelines.geodesy.vertical import Vertical
+from pipelines.survey.area import AreaOptions
 from pipelines.survey.options import CloudPath
 
 
@@ -214,7 +215,7 @@ class PlanOptions(BlockOptions):
     sh_degree: int = Field(ge=0, le=3)
 
 
-class TrainOptions(LossOptions, GeographicOptions, GaussianOptions, BlockOptions, LidarOptions):
+class TrainOptions(LossOptions, GeographicOptions, GaussianOptions, BlockOptions, LidarOptions, AreaOptions):
     """Options of the joint optimisation of Gaussians, similarity and camera corrections."""
 
     checkpoint_every: int = Field(500, ge=1, description="Iterations between checkpoints.")

@@ -30,6 +30,7 @@ from pipelines.surface.depth_maps import DepthMaps
 from pipelines.surface.lidar_cloud import ScannerTrack
 from pipelines.surface.measured_cloud import CloudReader
 from pipelines.survey.adjustment import GeolocatedPoints
+from pipelines.survey.area import boundary_area
 from pipelines.survey.calibrated import load_survey
 from pipelines.survey.options import CloudCrs
 from pipelines.survey.photographs import ImageCache
@@ -112,7 +113,8 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
         surface = lidar.surface
         save_json(lidar.report, stage.out / Path(LIDAR).name)
         draw_changes(stage.out / Path(LIDAR_MAP).name, lidar, scene)
-    trainer = make_trainer(TrainingScene(scene, images, surface), problem, backend, options)
+    area = boundary_area(options, scene.geo_from_model.apply(scene.point_in_model), survey.origin)
+    trainer = make_trainer(TrainingScene(scene, images, surface, area=area), problem, backend, options)
     done = 0 if stage.extends is None else load_json(TrainedModel, stage.extends / Path(MODEL).name).iterations
     record = train_in_folder(stage, trainer, options, done)
     if refines:

@@ -341,7 +341,7 @@ def make_trainer(
     outliers = OutlierSettings(views=int(_OUTLIERS_FROM * effort.iterations))
     return JointTrainer(
         GaussianAdam(gaussians, extent_m, effort.iterations),
-        _strategy(options, extent_m, len(gaussians)),
+        _strategy(options, extent_m, len(gaussians), training),
         problem.to(device),
         TrainingViews(scene.train, images, known, scene.sparse.lenses, measured),
         rasterizer=backend,
@@ -382,15 +382,24 @@ def make_finisher(
     )
 
 
-def _strategy(options: TrainOptions, extent_m: float, count: int) -> Strategy:
+def _strategy(options: TrainOptions, extent_m: float, count: int, training: TrainingScene) -> Strategy:
     iterations, most = options.effort.iterations, options.effort.max_gaussians
+    strategy: McmcStrategy | DefaultStrategy
     if options.strategy == "mcmc":
-        return McmcStrategy(McmcSettings.for_iterations(iterations, count, most), extent_m, options.seed)
-    settings = DefaultSettings.for_iterations(iterations, most)
-    if options.strategy == "fast":
+        strategy = McmcStrategy(McmcSettings.for_iterations(iterations, count, most), extent_m, options.seed)
+    else:
+        settings = DefaultSettings.for_iterations(iterations, most)
         fast = FastSettings(prune_stop=iterations * 5 // 6)
-        return FastStrategy(settings, fast, extent_m, count, options.seed)
-    return DefaultStrategy(settings, extent_m, count, options.seed)
+        strategy = (
+            FastStrategy(settings, fast, extent_m, count, options.seed)
+            if options.strategy == "fast"
+            else DefaultStrategy(settings, extent_m, count, options.seed)
+        )
+    if training.area is not None:
+        strategy.growing = lambda means: torch.from_numpy(training.in_area(means.cpu().double().numpy())).to(
+            means.device
+        )
+    return strategy
 
 
 def save_checkpoint(path: Path, state: Mapping[str, Tensor]) -> None:

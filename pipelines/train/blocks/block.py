@@ -23,6 +23,7 @@ from pipelines.splat.gaussians import Gaussians, read_gaussians, write_gaussians
 from pipelines.splat.memory import free_memory_bytes, require_memory
 from pipelines.splat.rasterizer.backends import device_of, rasterizer
 from pipelines.surface.depth_maps import DepthMaps
+from pipelines.survey.area import boundary_area
 from pipelines.survey.block_plan import BlockPlan, BlockTraining, PlannedBlock
 from pipelines.survey.scene import photographs
 from pipelines.train.adjusted_scene import AdjustedScene
@@ -75,7 +76,9 @@ def run(stage: StageRun, options: BlockTrainOptions) -> Summary:
         )
     surface = None if maps is None else SceneSurface(maps)
     scene, region = replace(solved.scene, train=seeing), _region(block, box, scaffold, masks)
-    training, exposures = TrainingScene(scene, images, surface, region), solved.exposures(device_of(backend))
+    area = boundary_area(options, scene.geo_from_model.apply(whole.scene.point_in_model), solved.survey.origin)
+    training = TrainingScene(scene, images, surface, region, area)
+    exposures = solved.exposures(device_of(backend))
     trainer = make_trainer(training, frozen_problem(solved), backend, options, exposures)
     earlier = None if stage.extends is None else stage.extends / "record.json"
     done = load_json(BlockTraining, earlier).iterations if earlier is not None and earlier.is_file() else 0
