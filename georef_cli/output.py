@@ -106,6 +106,8 @@ def _place(result: Overview, *, brief: bool = False) -> Table:
     lines["accuracy"] = "not known yet: georef evaluate states it" if accuracy is None else accuracy.text
     if accuracy is not None and accuracy.kind != "measured":
         lines["accuracy"] += "; check points measure it (--checkpoints, --check)"
+    if result.area_ha is not None:
+        lines["area"] = f"{result.area_ha:.3g} ha"
     if result.psnr is not None:
         lines["test views"] = f"PSNR {result.psnr:.2f} dB"
     table = plain_table("", "", header=False)

@@ -24,7 +24,7 @@ from pipelines.core.stages import BY_NAME, DELIVERABLES, MODEL, PIPELINE, StageS
 from pipelines.core.staleness import must_exist
 from pipelines.core.workspace import Workspace
 from pipelines.ingest.options import IngestOptions
-from pipelines.survey.options import CrsOptions
+from pipelines.survey.options import AreaOptions, CrsOptions
 
 if TYPE_CHECKING:
     from pipelines.deliver.overview import Overview
@@ -36,6 +36,11 @@ log = logging.getLogger(__name__)
 # georef.toml, or with the stage's own command.
 _EFFORT = ("preset", "iterations", "max_image_size", "max_gaussians", "crop_size", "blocks")
 _LIDAR = ("lidar", "lidar_crs", "lidar_vertical", "lidar_trajectory", "lidar_sigma", "lidar_register")
+_IN_AREA = (
+    "train",
+    "evaluate",
+    *(f"export-{name}" for name in ("ply", "measurable", "raster", "cloud", "spz", "tiles")),
+)
 LATER: dict[str, tuple[str, ...]] = {
     "mapper": ("sfm",),
     "import_model": ("sfm",),
@@ -45,6 +50,7 @@ LATER: dict[str, tuple[str, ...]] = {
     "backend": ("train", "evaluate"),
     **dict.fromkeys(_LIDAR, ("train",)),
     "seed": ("sfm", "init-sim3", "train"),
+    **dict.fromkeys(AreaOptions.model_fields, _IN_AREA),
 }
 OWNERS: dict[str, tuple[str, ...]] = {**dict.fromkeys(IngestOptions.model_fields, ("ingest",)), **LATER}
 DELIVER = click.Option(

@@ -8,8 +8,7 @@ from urllib.parse import urlsplit
 from pydantic import AfterValidator, Field
 
 from pipelines.core.options import ExtraMarker
-from pipelines.survey.area import AreaOptions
-from pipelines.survey.options import CrsOptions
+from pipelines.survey.options import AreaOptions, CrsOptions
 
 # The page was tried with this version: the extensions of splats in glTF are younger than those of meshes.
 CESIUM = "https://cesium.com/downloads/cesiumjs/releases/1.145/Build/Cesium/"

@@ -26,7 +26,7 @@ from pipelines.geodesy.enu import ecef_from_enu, lla_from_ecef
 from pipelines.survey.calibrated import load_survey
 from pipelines.survey.headline import headline_of
 from pipelines.survey.options import CrsOptions
-from pipelines.survey.report import read_report
+from pipelines.survey.report import EvaluationReport, read_report
 from pipelines.survey.survey import Survey
 from pipelines.survey.target_crs import usable_crs
 from pipelines.survey.trained_model import TrainedModel
@@ -84,7 +84,7 @@ class Overview:
     Attributes:
         center_lla: latitude, longitude and ellipsoidal height of the middle of the scene.
         accuracy: headline of the result; None: nothing states it yet.
-        psnr: of the test views, dB; None: not known.
+        psnr, area_ha: of the test views, dB, and the area of interest in hectares; None: not known.
         files: those that there are, with their use.
         outdated: stages whose product is stale or damaged, in the order of the work.
         interrupted: by stage, what an interrupted run has left beside the product.
@@ -96,6 +96,7 @@ class Overview:
     bounds: Bounds
     accuracy: Headline | None
     psnr: float | None
+    area_ha: float | None
     files: tuple[MadeFile, ...]
     outdated: tuple[StageState, ...]
     interrupted: dict[str, str]
@@ -122,6 +123,7 @@ class Overview:
                 "assumed": bounds.assumed,
             },
             "quality": {"accuracy": self.accuracy and self.accuracy.model_dump(), "psnr": self.psnr},
+            "area_ha": self.area_ha,
             "files": [{**asdict(file), "made": file.made and file.made.isoformat()} for file in self.files],
             "further": {spec.command(self.workspace): spec.title for spec in self.further},
             "cautions": document_of_cautions(self.cautions),
@@ -138,7 +140,8 @@ def overview(workspace: Workspace, options: CrsOptions) -> Overview:
     survey = load_survey(workspace)
     means = read_centres(workspace.path(GAUSSIANS)).astype(np.float64)
     placement = place(model, survey, means, headline_of(workspace))
-    rows = status(workspace)
+    report, rows = _report(workspace), status(workspace)
+    test = None if report is None else report.test_views
     states = {BY_NAME[row.stage].folder: row for row in rows}
     return Overview(
         workspace=workspace.root,
@@ -146,7 +149,8 @@ def overview(workspace: Workspace, options: CrsOptions) -> Overview:
         center_lla=vector3(placement.origin_lla),
         bounds=_bounds(placement.geo_from_model.apply(means[:: max(1, len(means) // _MOST)]), survey, options),
         accuracy=placement.accuracy,
-        psnr=_psnr(workspace),
+        psnr=None if test is None else test.psnr,
+        area_ha=None if report is None else report.area_ha,
         files=_files(workspace, states),
         outdated=tuple(row for row in rows if row.state in ("stale", "damaged")),
         interrupted={row.stage: row.interrupted for row in rows if row.interrupted},
@@ -176,12 +180,11 @@ def _bounds(points_in_geo: FloatArray, survey: Survey, options: CrsOptions) -> B
     )
 
 
-def _psnr(workspace: Workspace) -> float | None:
+def _report(workspace: Workspace) -> EvaluationReport | None:
     try:
-        test = read_report(workspace.path(REPORT)).test_views
+        return read_report(workspace.path(REPORT))
     except GeorefError:  # not evaluated, or damaged: `georef status` tells
         return None
-    return None if test is None else test.psnr
 
 
 def _files(workspace: Workspace, states: dict[str, StageState]) -> tuple[MadeFile, ...]:

@@ -37,7 +37,7 @@ from pipelines.survey.report import (
     RmsSigma,
 )
 from pipelines.survey.survey import Survey, SurveyedPoint
-from pipelines.survey.trained_survey import SolvedSurvey, fix_differences, scene_area_km2, triangulated_points
+from pipelines.survey.trained_survey import SolvedSurvey, fix_differences, triangulated_points
 
 
 @dataclass(frozen=True)
@@ -139,15 +139,19 @@ def _predicted_sigma(measured: RemeasuredPoints) -> PredictedSigma | None:
     return PredictedSigma(**sigma.model_dump(), normalised_error_squared=normalised)
 
 
-def triangulated_check_points(solved: SolvedSurvey, posterior: Posterior) -> CheckPointErrors:
+def triangulated_check_points(
+    solved: SolvedSurvey, posterior: Posterior, area_km2: float | None = None
+) -> CheckPointErrors:
     """Return the errors of the check points as intersections of their marks' rays, with their predicted σ."""
     points, rays = solved.survey.check_points, mark_rays(solved.survey.check_points, solved.sparse)
     position = triangulated_points(solved, rays)
     cov = posterior.of_marked_points(position, rays) if points else None
-    return check_point_errors(_compared(points, position, rays, cov), scene_area_km2(solved))
+    return check_point_errors(_compared(points, position, rays, cov), area_km2)
 
 
-def check_points_on_surface(renderer: ModelRenderer, progress: Progress) -> CheckPointErrors:
+def check_points_on_surface(
+    renderer: ModelRenderer, progress: Progress, area_km2: float | None = None
+) -> CheckPointErrors:
     """Return the errors of the check points as places of the Gaussians' surface behind their marks."""
     trained = renderer.trained
     points, rays = trained.survey.check_points, mark_rays(trained.survey.check_points, trained.sparse)
@@ -157,7 +161,7 @@ def check_points_on_surface(renderer: ModelRenderer, progress: Progress) -> Chec
             maps.append(depth_around(renderer, int(camera), xy))
             task.advance()
     position = points_on_surface(trained, rays, maps)
-    return check_point_errors(_compared(points, position, rays), scene_area_km2(trained))
+    return check_point_errors(_compared(points, position, rays), area_km2)
 
 
 def cross_validate(solved: SolvedSurvey) -> CrossValidation:

@@ -6,13 +6,13 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from pipelines.core.options import ExtraMarker, InputPath, StageOptions
+from pipelines.core.options import ExtraMarker, InputPath
 from pipelines.geodesy.vertical import Vertical
-from pipelines.survey.options import CloudPath
+from pipelines.survey.options import AreaOptions, CloudPath
 from pipelines.survey.report_parts import Alignment
 
 
-class EvaluateOptions(StageOptions):
+class EvaluateOptions(AreaOptions):
     """Options of the evaluation with test views and check points."""
 
     backend: Literal["auto", "cpu", "cuda"] = Field("auto", description="Rasteriser.")

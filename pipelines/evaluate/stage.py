@@ -55,6 +55,7 @@ from pipelines.report.plots.plans import NamedPlaces
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.measured_cloud import CloudReader
 from pipelines.surface.surface_views import ModelRenderer
+from pipelines.survey.area import hectares_of
 from pipelines.survey.headline import headline
 from pipelines.survey.options import CloudCrs
 from pipelines.survey.photographs import write_render
@@ -176,8 +177,9 @@ def run(stage: StageRun, options: EvaluateOptions) -> Summary:
     solved = load_solved(stage.workspace, options.similarity)
     crs = None if options.crs is None else report_crs(options.crs, solved.survey)
     posterior = posterior_of(stage.workspace, solved.model, solved.sfm)
+    area_ha = hectares_of(options, solved)
     if isinstance(solved, TrainedSurvey):
-        rendered = _rendered(stage, solved, posterior, options)
+        rendered = _rendered(stage, solved, posterior, options, area_ha)
     else:
         rendered = None
         for flag, value in (("--reference", options.reference), ("--lpips-weights", options.lpips_weights)):
@@ -185,7 +187,7 @@ def run(stage: StageRun, options: EvaluateOptions) -> Summary:
                 command = stage.workspace.command_of(BY_NAME["train"])
                 message = f"needs a trained model. Run `{command}` first, or leave the option out."
                 raise InputError("not-trained", message, field=flag)
-    report = evaluate(solved, posterior, options, crs=crs, rendered=rendered)
+    report = evaluate(solved, posterior, options, crs=crs, rendered=rendered, area_ha=area_ha)
     if posterior.grid is not None:
         write_csv(posterior.grid, solved.survey.origin, stage.out / "accuracy.csv")
         draw_accuracy(posterior.grid, solved, report, crs, stage.out / "accuracy.png")
@@ -203,6 +205,7 @@ def evaluate(
     *,
     crs: PointCrs | None = None,
     rendered: Rendered | None = None,
+    area_ha: float | None = None,
 ) -> EvaluationReport:
     """Return the report on a solved survey; `crs` lists the check points, without `rendered` nothing is trained.
 
@@ -211,12 +214,13 @@ def evaluate(
     """
     model = solved.model
     log_scale, *_, east, north, up = np.sqrt(np.diag(model.geo_from_model.covariance)).tolist()
-    triangulated = triangulated_check_points(solved, posterior)
+    triangulated = triangulated_check_points(solved, posterior, _km2(area_ha))
     checkpoints = CheckPoints(triangulated=triangulated, surface=None if rendered is None else rendered.points)
     scene = model.accuracy or AccuracySummary(cells=0, reason="the adjustment states no σ")
     reference = None if rendered is None else rendered.reference
     return EvaluationReport(
         headline=headline(triangulated, scene, model.cautions),
+        area_ha=area_ha,
         photometric=None if rendered is None else rendered.photometric,
         checkpoints=checkpoints,
         cross_validation=cross_validate(solved) if options.cross_validate else None,
@@ -236,7 +240,13 @@ def evaluate(
     )
 
 
-def _rendered(stage: StageRun, trained: TrainedSurvey, posterior: Posterior, options: EvaluateOptions) -> Rendered:
+def _km2(area_ha: float | None) -> float | None:
+    return None if area_ha is None else area_ha / 100
+
+
+def _rendered(
+    stage: StageRun, trained: TrainedSurvey, posterior: Posterior, options: EvaluateOptions, area_ha: float | None
+) -> Rendered:
     files, progress = None, stage.progress
     if options.reference is not None:  # refused before work starts: a file without a CRS, and a missing library
         require_py4dgeo()
@@ -253,7 +263,7 @@ def _rendered(stage: StageRun, trained: TrainedSurvey, posterior: Posterior, opt
             renderer, files, posterior.grid, options, scratch=scratch, progress=progress
         )
         draw_reference(reference, stage.out)
-    points = check_points_on_surface(renderer, progress)
+    points = check_points_on_surface(renderer, progress, _km2(area_ha))
     save_render = partial(write_render, renders)
     test = compare_test_views(renderer, options.lpips_weights, save_render, progress, saved=options.renders)
     return Rendered(Photometric(test=test), points, reference)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 import struct
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -172,8 +173,11 @@ def read_boundary(path: Path, *, field: str) -> Boundary:
         raise refusal("boundary-format", f"is no boundary file that is known. Give {kinds}.")
     shapes, crs = [], ""
     try:
-        for layer, _ in pyogrio.list_layers(path).tolist():
-            meta, _, geometry, _ = pyogrio.raw.read(path, layer=layer, columns=[], force_2d=True)
+        with warnings.catch_warnings():  # of GDAL, about what does not matter here
+            warnings.simplefilter("ignore", RuntimeWarning)
+            layers = pyogrio.list_layers(path).tolist()
+            read = [pyogrio.raw.read(path, layer=layer, columns=[], force_2d=True) for layer, _ in layers]
+        for meta, _, geometry, _ in read:
             shapes += [one for one in shapely.from_wkb(geometry, on_invalid="ignore") if one is not None]
             crs = crs or meta["crs"] or ""
     except (DataSourceError, DataLayerError, ValueError, OSError) as error:

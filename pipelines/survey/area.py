@@ -7,28 +7,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import contourpy
 import numpy as np
 import shapely
-from pydantic import Field
 from scipy.spatial import cKDTree
 from shapely import MultiPolygon, Polygon
 
 from pipelines.core.errors import DegenerateGeometryError, InputError
-from pipelines.core.options import ExtraMarker, InputMarker, StageOptions
 from pipelines.core.types import BoolArray, FloatArray, IntArray
-from pipelines.formats.vector_files import BOUNDARY_FORMATS, read_boundary
+from pipelines.formats.vector_files import read_boundary
 from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import Origin, ecef_from_lla, enu_from_ecef
 from pipelines.geometry.cameras import project
 from pipelines.geometry.footprints import PointSurface, border_rays
+from pipelines.survey.options import LEAST_PHOTOGRAPHS, AreaOptions
 from pipelines.survey.target_crs import TargetCrs
 from pipelines.survey.trained_survey import SolvedSurvey
 
-LEAST_PHOTOGRAPHS = 3  # that see the ground of the area: two do not check each other
 _CELLS = 120  # along the longer side of the scene
 _RIM = 0.01  # fraction of the scene's points outside the raster on each side
 _FARTHEST_CELLS = 6.0  # distance from a point of the scene beyond which there is no scene
@@ -37,19 +34,6 @@ _SMOOTHED_CELLS = 4.0  # width of tongues that are left out, and of bays that ar
 _EDGES = 200  # pieces of a boundary's longer side, which may be bent in another CRS
 _LEAST_RAYS = 3  # of a point of the scene
 _OUTLIERS = 0.005  # fraction of the points that are taken for errors above, and below
-
-
-class AreaOptions(StageOptions):
-    """Options of everything that ends at a boundary."""
-
-    boundary: Annotated[Path, InputMarker(frozenset(BOUNDARY_FORMATS)), ExtraMarker("vectors")] | None = Field(
-        None,
-        description="Polygon of the area of interest: GeoJSON, GeoPackage, KML or DXF. Without it: the ground that "
-        f"at least {LEAST_PHOTOGRAPHS} photographs see.",
-    )
-    boundary_crs: str | None = Field(
-        None, description="CRS of the boundary where its file states none, as in DXF: EPSG:32632 or another."
-    )
 
 
 @dataclass(frozen=True)
@@ -106,6 +90,14 @@ def area_of(options: AreaOptions, solved: SolvedSurvey) -> Area:
         return stated
     level_m = float(np.median(scene[:, 2])) if len(scene) else 0.0
     return Area(_seen_ground(solved, scene), level_m, f"ground that {LEAST_PHOTOGRAPHS} photographs see")
+
+
+def hectares_of(options: AreaOptions, solved: SolvedSurvey) -> float | None:
+    """Return the area of interest in hectares, as `area_of`; None: no ground is seen by enough photographs."""
+    try:
+        return area_of(options, solved).hectares
+    except DegenerateGeometryError:
+        return None
 
 
 def boundary_area(options: AreaOptions, scene: FloatArray, origin: Origin) -> Area | None:

@@ -8,9 +8,11 @@ from typing import Annotated
 
 from pydantic import Field
 
-from pipelines.core.options import InputMarker, StageOptions
+from pipelines.core.options import ExtraMarker, InputMarker, StageOptions
 from pipelines.geodesy.vertical import Vertical, VerticalChoice
 
+BOUNDARY_SUFFIXES = frozenset({".geojson", ".json", ".gpkg", ".kml", ".dxf"})
+LEAST_PHOTOGRAPHS = 3  # that see the ground of the area of interest: two do not check each other
 CLOUD_SUFFIXES = frozenset({".las", ".laz", ".ply"})
 NOT_IN_BLOCKS = (
     "a training in blocks does not use LiDAR: its shift is estimated against the depth maps of all photographs. "
@@ -42,4 +44,17 @@ class CrsOptions(StageOptions):
         None,
         description="Datum of the heights where --crs states none: ellipsoidal, EGM96, EGM2008 or EPSG:n. Without "
         "it: that of the survey.",
+    )
+
+
+class AreaOptions(StageOptions):
+    """Options of everything that ends at a boundary."""
+
+    boundary: Annotated[Path, InputMarker(BOUNDARY_SUFFIXES), ExtraMarker("vectors")] | None = Field(
+        None,
+        description="Polygon of the area of interest: GeoJSON, GeoPackage, KML or DXF. Without it: the ground that "
+        f"at least {LEAST_PHOTOGRAPHS} photographs see.",
+    )
+    boundary_crs: str | None = Field(
+        None, description="CRS of the boundary where its file states none, as in DXF: EPSG:32632 or another."
     )

@@ -310,6 +310,7 @@ class EvaluationReport(_OptionalKeys):
 
     format_version: Literal[1] = 1
     headline: Headline
+    area_ha: float | None = None  # of interest; None: no ground is seen by enough photographs
     photometric: Photometric | None
     checkpoints: CheckPoints
     cross_validation: CrossValidation | None

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Literal, TypeVar
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
 
 from pipelines.core.errors import DegenerateGeometryError, InputError, MissingProductError
 from pipelines.core.products import load_json
@@ -186,14 +185,6 @@ def scene_points(solved: SolvedSurvey) -> FloatArray:
     points = solved.geo_from_model.apply(solved.point_in_model)
     low, high = np.quantile(points[:, :2], [_RIM, 1 - _RIM], axis=0)
     return np.asarray(points[((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)])
-
-
-def scene_area_km2(solved: SolvedSurvey) -> float | None:
-    """Return the area of the convex hull of the scene's points in plan; None: too few points, or all on a line."""
-    try:
-        return float(ConvexHull(scene_points(solved)[:, :2]).volume) / 1e6  # in the plane, the volume is the area
-    except (DegenerateGeometryError, QhullError, ValueError):
-        return None
 
 
 def corners(points: FloatArray) -> FloatArray:

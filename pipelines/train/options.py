@@ -10,8 +10,7 @@ from pydantic import Field, model_validator
 from pipelines.core.errors import InputError
 from pipelines.core.options import InputPath, StageOptions
 from pipelines.geodesy.vertical import Vertical
-from pipelines.survey.area import AreaOptions
-from pipelines.survey.options import CloudPath
+from pipelines.survey.options import AreaOptions, CloudPath
 
 
 @dataclass(frozen=True)
