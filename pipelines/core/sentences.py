@@ -51,7 +51,7 @@ _FOLDERS = re.compile(r"(?<![\w:/.\\])(?:[A-Za-z]:)?[/\\](?:[^\s/\\:;,\"'`]+[/\\
 
 
 def without_commands(text: str) -> str:
-    """Return a text for who does not sit at the terminal: without clauses that say what to type, nor folders of paths.
+    """Return a text for a client: without the clauses that say what to type, and without folders of paths.
 
     Clauses end with a full stop, a colon or a semicolon. A text of commands alone becomes empty.
     """

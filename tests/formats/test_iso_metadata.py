@@ -13,8 +13,8 @@ from pipelines.core.products import Remark
 from pipelines.formats.georef_sidecar import (
     ISO_SUFFIX,
     CrsSidecar,
-    GeorefSidecar,
     GeoreferenceSigma,
+    GeorefSidecar,
     SceneSigma,
     write_sidecar,
 )
@@ -22,15 +22,15 @@ from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.vertical import VerticalDatum
 
 GMD, GCO = "{http://www.isotc211.org/2005/gmd}", "{http://www.isotc211.org/2005/gco}"
-# Children of each type in the order of the schema `gmd` of 2007-04-17 (ISO 19139); `*` marks those that must be there.
+# Children of each type in the order of the schema `gmd` of 2007-04-17 (ISO 19139); `*`: must be there.
 ORDER = {
-    "MD_Metadata": "fileIdentifier language characterSet parentIdentifier hierarchyLevel hierarchyLevelName *contact "
-    "*dateStamp metadataStandardName metadataStandardVersion dataSetURI locale spatialRepresentationInfo "
+    "MD_Metadata": "fileIdentifier language characterSet parentIdentifier hierarchyLevel hierarchyLevelName "
+    "*contact *dateStamp metadataStandardName metadataStandardVersion dataSetURI locale spatialRepresentationInfo "
     "referenceSystemInfo metadataExtensionInfo *identificationInfo contentInfo distributionInfo dataQualityInfo",
     "MD_DataIdentification": "*citation *abstract purpose credit status pointOfContact resourceMaintenance "
     "graphicOverview resourceFormat descriptiveKeywords resourceSpecificUsage resourceConstraints aggregationInfo "
-    "spatialRepresentationType spatialResolution *language characterSet topicCategory environmentDescription extent "
-    "supplementalInformation",
+    "spatialRepresentationType spatialResolution *language characterSet topicCategory environmentDescription "
+    "extent supplementalInformation",
     "CI_Citation": "*title alternateTitle *date edition editionDate identifier citedResponsibleParty",
     "CI_Date": "*date *dateType",
     "CI_ResponsibleParty": "individualName organisationName positionName contactInfo *role",
@@ -67,7 +67,8 @@ def crs_sidecar(crs: str, accuracy: Headline | None, bounds: object = BOUNDS) ->
     parsed = parse_crs(crs)
     return CrsSidecar.model_validate({
         "crs": crs, "crs_wkt": parsed.wkt, "vertical_datum": parsed.vertical, "units": parsed.units,
-        "operation": "UTM <32>", "operation_accuracy_m": None, "bounds": bounds, "accuracy": accuracy, "sigma": SIGMA,
+        "operation": "UTM <32>", "operation_accuracy_m": None, "bounds": bounds, "accuracy": accuracy,
+        "sigma": SIGMA,
         "assumed": ("no --crs was given: the UTM zone of the scene",),
         "cautions": (Remark(code="a", sentence="Half of \x1b /home/me/x.csv is <b>. Give --gcp FILE."),),
     })  # fmt: skip
