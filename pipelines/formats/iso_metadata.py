@@ -89,99 +89,102 @@ def iso_xml(metadata: IsoMetadata, made: date | None = None) -> str:
     for prefix, space in _SPACES.items():
         register_namespace(prefix, space)
     today = (made or datetime.now(UTC).date()).isoformat()
+    processor = (
+        _text("organisationName", f"processed with GeoRefGS {__version__}"),
+        _code("role", "CI_RoleCode", "processor"),
+    )
     root = _node(
-        "gmd:MD_Metadata",
-        _text("gmd:fileIdentifier", metadata.title),
-        _code("gmd:language", "LanguageCode", "eng"),
-        _code("gmd:characterSet", "MD_CharacterSetCode", "utf8"),
-        _code("gmd:hierarchyLevel", "MD_ScopeCode", "dataset"),
-        _processor("gmd:contact"),
-        _node("gmd:dateStamp", _node("gco:Date", today)),
-        _text("gmd:metadataStandardName", "ISO 19115:2003/19139"),
-        _text("gmd:metadataStandardVersion", "1.0"),
-        *(_reference_system(*parts) for parts in _reference_systems(metadata)),
-        _node("gmd:identificationInfo", _identification(metadata, today)),
-        _node("gmd:dataQualityInfo", _quality(metadata)),
+        "MD_Metadata",
+        _text("fileIdentifier", metadata.title),
+        _code("language", "LanguageCode", "eng"),
+        _code("characterSet", "MD_CharacterSetCode", "utf8"),
+        _code("hierarchyLevel", "MD_ScopeCode", "dataset"),
+        _node("contact/CI_ResponsibleParty", *processor),
+        _node("dateStamp/gco:Date", today),
+        _text("metadataStandardName", "ISO 19115:2003/19139"),
+        _text("metadataStandardVersion", "1.0"),
+        *_reference_systems(metadata),
+        _node(
+            "identificationInfo/MD_DataIdentification",
+            _node(
+                "citation/CI_Citation",
+                _text("title", metadata.title),
+                _node(
+                    "date/CI_Date",
+                    _node("date/gco:Date", today),
+                    _code("dateType", "CI_DateTypeCode", "creation"),
+                ),
+            ),
+            _text("abstract", metadata.abstract),
+            _node("pointOfContact/CI_ResponsibleParty", *processor),
+            _code("language", "LanguageCode", "eng"),
+            _node("topicCategory/MD_TopicCategoryCode", "imageryBaseMapsEarthCover"),
+            _node("extent/EX_Extent", *_extent(metadata)),
+        ),
+        _node(
+            "dataQualityInfo/DQ_DataQuality",
+            _node("scope/DQ_Scope", _code("level", "MD_ScopeCode", "dataset")),
+            *map(_accuracy, metadata.quality),
+            _text("lineage/LI_Lineage/statement", " ".join(metadata.lineage)),
+        ),
     )
     indent(root, " ")
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + tostring(root, encoding="unicode") + "\n"
 
 
-def _identification(metadata: IsoMetadata, today: str) -> Element:
+def _extent(metadata: IsoMetadata) -> list[Element]:
     (west, south), (east, north) = metadata.west_south, metadata.east_north
     sides = {"westBoundLongitude": west, "eastBoundLongitude": east}
     sides |= {"southBoundLatitude": south, "northBoundLatitude": north}
-    box = [_node(f"gmd:{name}", _node("gco:Decimal", f"{value:.8f}")) for name, value in sides.items()]
-    extent = [_node("gmd:geographicElement", _node("gmd:EX_GeographicBoundingBox", *box))]
+    box = [_node(f"{name}/gco:Decimal", f"{value:.8f}") for name, value in sides.items()]
+    extent = [_node("geographicElement/EX_GeographicBoundingBox", *box)]
     if metadata.height_range is not None:
-        low, high = (_node("gco:Real", repr(value)) for value in metadata.height_range)
-        system = _node("gmd:verticalCRS", **{"xlink:title": metadata.heights})
-        heights = (_node("gmd:minimumValue", low), _node("gmd:maximumValue", high), system)
-        extent.append(_node("gmd:verticalElement", _node("gmd:EX_VerticalExtent", *heights)))
-    made = _node("gmd:date", _node("gco:Date", today))
-    date_of = _node("gmd:CI_Date", made, _code("gmd:dateType", "CI_DateTypeCode", "creation"))
-    citation = _node("gmd:CI_Citation", _text("gmd:title", metadata.title), _node("gmd:date", date_of))
-    return _node(
-        "gmd:MD_DataIdentification",
-        _node("gmd:citation", citation),
-        _text("gmd:abstract", metadata.abstract),
-        _processor("gmd:pointOfContact"),
-        _code("gmd:language", "LanguageCode", "eng"),
-        _node("gmd:topicCategory", _node("gmd:MD_TopicCategoryCode", "imageryBaseMapsEarthCover")),
-        _node("gmd:extent", _node("gmd:EX_Extent", *extent)),
-    )
-
-
-def _quality(metadata: IsoMetadata) -> Element:
-    reports = [_node("gmd:report", _accuracy(element)) for element in metadata.quality]
-    statement = _text("gmd:statement", " ".join(metadata.lineage))
-    return _node(
-        "gmd:DQ_DataQuality",
-        _node("gmd:scope", _node("gmd:DQ_Scope", _code("gmd:level", "MD_ScopeCode", "dataset"))),
-        *reports,
-        _node("gmd:lineage", _node("gmd:LI_Lineage", statement)),
-    )
+        low, high = metadata.height_range
+        heights = [_node("minimumValue/gco:Real", repr(low)), _node("maximumValue/gco:Real", repr(high))]
+        system = _node("verticalCRS", **{"xlink:title": metadata.heights})
+        extent.append(_node("verticalElement/EX_VerticalExtent", *heights, system))
+    return extent
 
 
 def _accuracy(element: QualityElement) -> Element:
     name, number = element.measure
-    code = _node("gmd:MD_Identifier", _text("gmd:code", number))
-    unit = _node("gmd:valueUnit", **{"xlink:href": _METRE, "xlink:title": "metre"})
-    value = _node("gmd:value", _node("gco:Record", repr(element.value_m)))
     return _node(
-        "gmd:DQ_AbsoluteExternalPositionalAccuracy",
-        _text("gmd:nameOfMeasure", name),
-        *([_node("gmd:measureIdentification", code)] if number else []),
-        _text("gmd:measureDescription", element.description),
-        _code("gmd:evaluationMethodType", "DQ_EvaluationMethodTypeCode", element.method),
-        _node("gmd:result", _node("gmd:DQ_QuantitativeResult", unit, value)),
+        "report/DQ_AbsoluteExternalPositionalAccuracy",
+        _text("nameOfMeasure", name),
+        *([_text("measureIdentification/MD_Identifier/code", number)] if number else []),
+        _text("measureDescription", element.description),
+        _code("evaluationMethodType", "DQ_EvaluationMethodTypeCode", element.method),
+        _node(
+            "result/DQ_QuantitativeResult",
+            _node("valueUnit", **{"xlink:href": _METRE, "xlink:title": "metre"}),
+            _node("value/gco:Record", repr(element.value_m)),
+        ),
     )
 
 
-def _reference_systems(metadata: IsoMetadata) -> list[tuple[str, str]]:
-    """Return code and name space of the reference systems: horizontal, or both in one, then vertical."""
+def _reference_systems(metadata: IsoMetadata) -> list[Element]:
+    """Return the horizontal reference system, or both in one, and the vertical one."""
     epsg = _EPSG.fullmatch(metadata.crs)
-    if epsg is None:
-        return [(metadata.crs, ""), (f"heights: {metadata.heights}", "")]
-    found = [(code, "EPSG") for code in epsg.groups() if code is not None]
-    return found if len(found) == 2 else [*found, (f"heights: {metadata.heights}", "")]
+    codes = [metadata.crs] if epsg is None else [code for code in epsg.groups() if code is not None]
+    space = [] if epsg is None else [_text("codeSpace", "EPSG")]
+    systems = [[_text("code", code), *space] for code in codes]
+    if len(systems) == 1:
+        systems.append([_text("code", f"heights: {metadata.heights}")])
+    place = "referenceSystemInfo/MD_ReferenceSystem/referenceSystemIdentifier/RS_Identifier"
+    return [_node(place, *system) for system in systems]
 
 
-def _reference_system(code: str, space: str) -> Element:
-    named = [_text("gmd:codeSpace", space)] if space else []
-    identifier = _node("gmd:RS_Identifier", _text("gmd:code", code), *named)
-    system = _node("gmd:MD_ReferenceSystem", _node("gmd:referenceSystemIdentifier", identifier))
-    return _node("gmd:referenceSystemInfo", system)
-
-
-def _processor(tag: str) -> Element:
-    program = _text("gmd:organisationName", f"processed with GeoRefGS {__version__}")
-    return _node(tag, _node("gmd:CI_ResponsibleParty", program, _code("gmd:role", "CI_RoleCode", "processor")))
-
-
-def _node(tag: str, *content: Element | str, **attributes: str) -> Element:
-    """Return an element of its prefixed name, with texts or elements in it."""
-    node = Element(_qualified(tag), {_qualified(name): printable(value) for name, value in attributes.items()})
+def _node(path: str, *content: Element | str, **attributes: str) -> Element:
+    """Return nested elements by their names, of `gmd` unless another is named; the innermost has the content."""
+    outer, _, inner = path.partition("/")
+    if inner:
+        node = Element(_qualified(outer))
+        node.append(_node(inner, *content, **attributes))
+        return node
+    node = Element(
+        _qualified(outer),
+        {(_qualified(name) if ":" in name else name): printable(value) for name, value in attributes.items()},
+    )
     for part in content:
         if isinstance(part, str):
             node.text = printable(part)
@@ -192,12 +195,12 @@ def _node(tag: str, *content: Element | str, **attributes: str) -> Element:
 
 def _qualified(name: str) -> str:
     prefix, _, local = name.rpartition(":")
-    return f"{{{_SPACES[prefix]}}}{local}" if prefix else local
+    return f"{{{_SPACES[prefix or 'gmd']}}}{local}"
 
 
-def _text(tag: str, value: str) -> Element:
-    return _node(tag, _node("gco:CharacterString", value))
+def _text(path: str, value: str) -> Element:
+    return _node(f"{path}/gco:CharacterString", value)
 
 
 def _code(tag: str, code_list: str, value: str) -> Element:
-    return _node(tag, _node(f"gmd:{code_list}", value, codeList=_CODES + code_list, codeListValue=value))
+    return _node(f"{tag}/{code_list}", value, codeList=_CODES + code_list, codeListValue=value)
