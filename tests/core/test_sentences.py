@@ -11,7 +11,7 @@ from pipelines.core.sentences import without_commands
     ("text", "told"),
     [
         (
-            "The σ are too large: 99 % give 1.1 to 2. They are 1.4 times the errors. State it: --sigma-mark.",
+            "The σ are too large: 99 % give 1.1 to 2. They are 1.4 times the errors. State --sigma-mark.",
             "The σ are too large: 99 % give 1.1 to 2. They are 1.4 times the errors.",
         ),
         ("marks scatter 0.15 of 1 px: state it with --sigma-mark.", "Marks scatter 0.15 of 1 px."),
