@@ -5,6 +5,7 @@ A terminal obeys escape sequences, and marks that turn the direction of writing 
 
 from __future__ import annotations
 
+import re
 import unicodedata
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -41,6 +42,29 @@ def about(seconds: float | None) -> str:
     unit = 10 if seconds < 600 else 60 if seconds < 3600 else 600
     text = duration(round(seconds / unit) * unit)
     return text.removesuffix(" 00 s")
+
+
+# What is typed in a terminal: commands of this program, its options, its file of options.
+_TYPED = re.compile(r"`?\bgeoref [a-z]|georef\.toml|(?<![\w-])--[a-z]")
+_SENTENCES, _CLAUSES = re.compile(r"(?<=[.!?])\s+(?=[^\W\d_a-z]|`)"), re.compile(r"(?<=[:;])\s+")
+_FOLDERS = re.compile(r"(?<![\w:/.\\])(?:[A-Za-z]:)?[/\\](?:[^\s/\\:;,\"'`]+[/\\])+")
+
+
+def without_commands(text: str) -> str:
+    """Return a text for a client: without the clauses that say what to type, and without folders of paths.
+
+    Clauses end with a full stop, a colon or a semicolon. A text of commands alone becomes empty.
+    """
+    told = []
+    for sentence in _SENTENCES.split(_FOLDERS.sub("", text)):
+        clauses = _CLAUSES.split(sentence)
+        kept = [clause for clause in clauses if not _TYPED.search(clause)]
+        if len(kept) < len(clauses) and kept:
+            end = "." if sentence.endswith(".") else ""
+            shown = " ".join(kept).rstrip(":;.") + end
+            kept = [shown[:1].upper() + shown[1:]]
+        told += [" ".join(kept)] if kept else []
+    return " ".join(told)
 
 
 # Control characters (ESC, and OSC and CSI of C1), marks that turn the direction of writing, lone surrogates

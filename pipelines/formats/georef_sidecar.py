@@ -2,7 +2,8 @@
 
 The sidecar is JSON beside the file (`splat.ply.georef.json`), because popular tools lose PLY comments. Its content
 mirrors SPZ_NIANTIC_georeference: p_ecef = scale · R(rotation) · p_file + origin, in float64. The same similarity
-stands there as a 4×4 matrix. docs/formats.md has every field and a worked example.
+stands there as a 4×4 matrix. docs/formats.md has every field and a worked example. `splat.ply.iso.xml` beside it
+says the same to GIS catalogues.
 """
 
 from __future__ import annotations
@@ -19,12 +20,22 @@ from pydantic.alias_generators import to_camel
 from pipelines.core.figures import Headline
 from pipelines.core.files import replace_text
 from pipelines.core.products import Product, Remark
+from pipelines.core.sentences import without_commands
 from pipelines.core.types import Matrix4, Quaternion, Row7, Vector3, vector3
+from pipelines.formats.iso_metadata import (
+    PLAN_SIGMA,
+    STANDARD_ERROR,
+    IsoMetadata,
+    QualityElement,
+    headline_quality,
+    iso_xml,
+)
+from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.similarity import Similarity, covariance_at
 
-SUFFIX = ".georef.json"
+SUFFIX, ISO_SUFFIX = ".georef.json", ".iso.xml"
 # Between the matrix and the similarity, for sidecars whose numbers somebody has rounded: 1 mm at 1 km.
 _MATRIX_TOLERANCE, _MATRIX_TOLERANCE_M = 1e-6, 1e-3
 
@@ -164,5 +175,72 @@ def sidecar_path(artefact: Path) -> Path:
 
 
 def write_sidecar(sidecar: GeorefSidecar | CrsSidecar, artefact: Path) -> None:
-    """Write the sidecar beside its file; the sidecar appears whole or not at all."""
+    """Write the sidecar and the ISO metadata beside their file; each appears whole or not at all."""
     replace_text(sidecar_path(artefact), sidecar.model_dump_json(by_alias=True, indent=1) + "\n")
+    name = artefact.name
+    metadata = _of_frame(sidecar, name) if isinstance(sidecar, GeorefSidecar) else _of_crs(sidecar, name)
+    replace_text(artefact.with_name(name + ISO_SUFFIX), iso_xml(metadata))
+
+
+def _of_frame(sidecar: GeorefSidecar, name: str) -> IsoMetadata:
+    """Return the metadata of a file in a frame, whose extent is not recorded: its place is that of the origin."""
+    lat, lon, _ = sidecar.origin_lla
+    sigma = sidecar.georeference_sigma
+    of = "the georeference alone; the model's shape is not counted"
+    lengths = () if sigma is None else ((PLAN_SIGMA, sigma.sigma_h_m), (STANDARD_ERROR, sigma.sigma_v_m))
+    return IsoMetadata(
+        title=name,
+        abstract=f"Model from photographs in a metric frame of its own, whose origin is at latitude {lat:.8f}°, "
+        f"longitude {lon:.8f}°. {name}{SUFFIX} places the frame on Earth. {_accuracy_sentence(sidecar.accuracy)}",
+        crs=sidecar.crs_id,
+        heights=sidecar.vertical_datum.name,
+        west_south=(lon, lat),
+        east_north=(lon, lat),
+        height_range=None,
+        lineage=("The place comes from an adjustment of all measurements.", *_sentences(sidecar.cautions)),
+        quality=(
+            *headline_quality(sidecar.accuracy),
+            *(QualityElement(measure, of, value_m) for measure, value_m in lengths),
+        ),
+    )
+
+
+def _of_crs(sidecar: CrsSidecar, name: str) -> IsoMetadata:
+    bounds, crs = np.array(sidecar.bounds), parse_crs(sidecar.crs_wkt)
+    corners = np.stack(np.meshgrid(*bounds.T, indexing="ij"), axis=-1).reshape(-1, 3)
+    lla = crs.lla_from_xyz(corners)
+    (south, west, _), (north, east, _) = lla.min(axis=0).tolist(), lla.max(axis=0).tolist()
+    sigma, known = sidecar.sigma, sidecar.operation_accuracy_m
+    lengths = () if sigma is None else (
+        (PLAN_SIGMA, "median", sigma.median_sigma_h_m),
+        (STANDARD_ERROR, "median", sigma.median_sigma_v_m),
+        (PLAN_SIGMA, "largest", sigma.largest_sigma_h_m),
+        (STANDARD_ERROR, "largest", sigma.largest_sigma_v_m),
+    )  # fmt: skip
+    return IsoMetadata(
+        title=name,
+        abstract=f"Product of a survey with photographs, in {sidecar.crs}. {_accuracy_sentence(sidecar.accuracy)}",
+        crs=sidecar.crs,
+        heights=sidecar.vertical_datum.name,
+        west_south=(west, south),
+        east_north=(east, north),
+        height_range=None if crs.is_geocentric else (float(bounds[0, 2]), float(bounds[1, 2])),
+        lineage=(
+            f"Coordinates by the operation {sidecar.operation}"
+            + ("." if known is None else f", whose published accuracy is {known} m."),
+            *(f"Assumed: {without_commands(text)}." for text in sidecar.assumed),
+            *_sentences(sidecar.cautions),
+        ),
+        quality=(
+            *headline_quality(sidecar.accuracy),
+            *(QualityElement(kind, f"{which} of {sigma.counts}", value) for kind, which, value in lengths if sigma),
+        ),
+    )
+
+
+def _accuracy_sentence(headline: Headline | None) -> str:
+    return "Its accuracy is not stated." if headline is None else f"Accuracy: {headline.text}."
+
+
+def _sentences(cautions: tuple[Remark, ...]) -> list[str]:
+    return [without_commands(caution.sentence) for caution in cautions]

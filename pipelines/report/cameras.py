@@ -26,6 +26,7 @@ class FlightBias:
     axis: str
     mean_m: float
     sigma_m: float
+    within: tuple[float, float, float]  # shares of the fixes within one, two, three stated σ
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,8 @@ def cameras_facts(evaluated: EvaluatedSurvey) -> CamerasFacts:
         None if covariance is None else covariance[:, :2, :2],
         is_outlier,
     )
-    series, by_time = _series(evaluated, fixes)
+    stated_m = _stated_sigma_m(evaluated, fixes)
+    series, by_time = _series(evaluated, fixes, stated_m)
     sigma_m = None if covariance is None else np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     return CamerasFacts(
         photographs=len(solved.survey.images),
@@ -103,7 +105,7 @@ def cameras_facts(evaluated: EvaluatedSurvey) -> CamerasFacts:
         no_sigma="" if checked else NOTHING_CHECKS,
         series=series,
         by_time=by_time,
-        bias=bias_of(fixes),
+        bias=bias_of(fixes, stated_m),
         outliers=tuple(
             Outlier(names[camera], float(np.linalg.norm(difference)))
             for camera, difference, left_out in zip(
@@ -118,19 +120,31 @@ def cameras_facts(evaluated: EvaluatedSurvey) -> CamerasFacts:
     )
 
 
-def bias_of(fixes: FixDifferences) -> tuple[FlightBias, ...]:
-    """Return mean and scatter of the residuals of the used fixes; empty with fewer than two."""
-    used = fixes.difference_in_geo[~fixes.is_outlier]
+def bias_of(fixes: FixDifferences, stated_m: FloatArray) -> tuple[FlightBias, ...]:
+    """Return mean and scatter of the residuals of the used fixes, and how many are within their stated σ (F, 3).
+
+    The result is empty with fewer than two.
+    """
+    used, stated = fixes.difference_in_geo[~fixes.is_outlier], stated_m[~fixes.is_outlier]
     if len(used) < 2:
         return ()
     means, scatter = used.mean(axis=0).tolist(), used.std(axis=0, ddof=1).tolist()
+    shares = np.stack([(np.abs(used) <= times * stated).mean(axis=0) for times in (1, 2, 3)], axis=1)
     return tuple(
-        FlightBias(axis, mean, sigma)
-        for axis, mean, sigma in zip(("east", "north", "up"), means, scatter, strict=True)
+        FlightBias(axis, mean, sigma, vector3(within))
+        for axis, mean, sigma, within in zip(("east", "north", "up"), means, scatter, shares, strict=True)
     )
 
 
-def _series(evaluated: EvaluatedSurvey, fixes: FixDifferences) -> tuple[Picture | None, bool]:
+def _stated_sigma_m(evaluated: EvaluatedSurvey, fixes: FixDifferences) -> FloatArray:
+    """Return the stated σ (F, 3) of fixes along east, north and up, without the error that a session shares."""
+    by_name = {image.name: image.fix for image in evaluated.solved.survey.images}
+    names = [evaluated.solved.sparse.image_name[camera] for camera in fixes.camera]
+    covariance = [fix.cov_in_geo for name in names if (fix := by_name[name]) is not None]
+    return np.asarray(np.sqrt(np.diagonal(np.array(covariance).reshape(-1, 3, 3), axis1=1, axis2=2)))
+
+
+def _series(evaluated: EvaluatedSurvey, fixes: FixDifferences, stated_m: FloatArray) -> tuple[Picture | None, bool]:
     """Return the picture of the residuals in time, and whether the times are known."""
     if not len(fixes.camera):
         return None, False
@@ -140,10 +154,8 @@ def _series(evaluated: EvaluatedSurvey, fixes: FixDifferences) -> tuple[Picture 
     known = [image.timestamp_s for image in images if image.timestamp_s is not None]
     by_time = len(known) == len(images) and len(set(known)) > 1
     abscissa = np.array(known) - min(known) if by_time else 1.0 + np.arange(len(images), dtype=np.float64)
-    covariance = np.array([image.fix.cov_in_geo for image in images if image.fix is not None])
-    sigma_m = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     title = "time since the first photograph in s" if by_time else "photograph, in order of names"
-    return picture_of_png(fix_series(abscissa, title, fixes.difference_in_geo, sigma_m, fixes.is_outlier)), by_time
+    return picture_of_png(fix_series(abscissa, title, fixes.difference_in_geo, stated_m, fixes.is_outlier)), by_time
 
 
 def _rows(

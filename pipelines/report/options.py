@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
+from pipelines.core.options import InputPath
 from pipelines.survey.options import CrsOptions
 
 
@@ -15,6 +16,12 @@ class ReportOptions(CrsOptions):
         description="CRS of the coordinates in the report: EPSG:32632, EPSG:32632+3855, a PROJ string or WKT. "
         "Without it: the UTM zone of the scene.",
     )
+    title: str | None = Field(
+        None, max_length=200, description="Title of the report. Without it: the name of the workspace's folder."
+    )
+    client: str = Field("", max_length=200, description="For whom the report is, on its cover.")
+    author: str = Field("", max_length=200, description="Who made the survey, on the cover.")
+    logo: InputPath | None = Field(None, description="PNG or JPEG file of a logo, on the cover; at most 4 MiB.")
     pdf: bool = Field(False, description="Print report.pdf too; needs Chromium or Chrome.")
-    chips: int = Field(4, ge=0, le=20, description="Number of image chips for each surveyed point.")
+    chips: int = Field(3, ge=0, le=20, description="Most image chips for each surveyed point.")
     views: int = Field(6, ge=0, le=50, description="Number of test views that are shown.")

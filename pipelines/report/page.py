@@ -25,7 +25,8 @@ import numpy as np
 
 from pipelines.core.errors import InputError
 from pipelines.core.figures import ACCURACY_H, MISSING
-from pipelines.core.sentences import duration, printable_lines
+from pipelines.core.files import file_size
+from pipelines.core.sentences import duration, printable_lines, without_commands
 from pipelines.core.types import ByteArray
 from pipelines.formats.image_file import MAX_PIXELS, header_size, read_bytes
 
@@ -96,6 +97,7 @@ def moment(value: datetime | None) -> str:
 # Filters of the templates, and the forms in which they ask for a figure of the document.
 FORMS: dict[str, Callable[..., str]] = {
     "accuracy": ACCURACY_H.with_unit,
+    "client": without_commands,
     "as_json": partial(json.dumps, allow_nan=False),  # in full, for programs that read the page
     "whole": count_text,
     "decibel": decibel,
@@ -116,19 +118,21 @@ FORMS: dict[str, Callable[..., str]] = {
 
 @dataclass(frozen=True)
 class Section:
-    """Section of a page: `template`, of the `templates/` of the page's room, shows `facts`."""
+    """Section of a page: `template`, of the `templates/` of its room, shows `facts`; folded: not on paper."""
 
     anchor: str
     title: str
     template: str
     facts: object
+    folded: bool = False
 
 
 @dataclass(frozen=True)
 class Page:
     """Content of a page: name and value of each line of its head, such as the time, then its sections.
 
-    Figures are taken from the JSON document by their path (`figure` in `macros.html`).
+    Figures are taken from the JSON document by their path (`figure` in `macros.html`). A cover, which the template
+    `cover.html` of the page's room shows, stands in place of the head and is a page of its own on paper.
     """
 
     title: str
@@ -136,6 +140,7 @@ class Page:
     about: Mapping[str, str]
     sections: Sequence[Section]
     document: Mapping[str, Any] = field(default_factory=dict)
+    cover: object = None
 
 
 def render_page(page: Page, room: str) -> str:
@@ -174,7 +179,8 @@ def value_at(document: Any, path: str) -> Any:
     return document
 
 
-_PNG = b"\x89PNG"
+_PNG, _JPEG = b"\x89PNG", b"\xff\xd8\xff"
+_MOST_LOGO_BYTES, _MOST_LOGO_PIXELS, _LOGO_PX = 4 * 1024 * 1024, 16_000_000, 600
 _QUALITY = 82
 _PAPER = 255  # behind transparent pixels
 
@@ -205,17 +211,43 @@ def png_file(path: Path) -> Picture | None:
     return picture_of_png(data)
 
 
-def picture_of(rgb: ByteArray) -> Picture:
-    """Return a photograph (H, W, 3) RGB as JPEG."""
+def picture_of(pixels: ByteArray) -> Picture:
+    """Return a photograph (H, W, 3) RGB as JPEG; with transparency (H, W, 4) as WebP, which keeps it."""
     import cv2
 
-    height, width = rgb.shape[:2]
-    _, data = cv2.imencode(".jpg", np.ascontiguousarray(rgb[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    height, width, channels = pixels.shape
+    if channels == 4:
+        bgra = cv2.cvtColor(pixels, cv2.COLOR_RGBA2BGRA)
+        _, data = cv2.imencode(".webp", bgra, [cv2.IMWRITE_WEBP_QUALITY, _QUALITY])
+        return Picture(_address("webp", data.tobytes()), width, height)
+    _, data = cv2.imencode(".jpg", np.ascontiguousarray(pixels[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
     return Picture(_address("jpeg", data.tobytes()), width, height)
 
 
+def logo_picture(path: Path) -> Picture:
+    """Return a logo at the size of a page; an InputError: unreadable, too large, or neither PNG nor JPEG."""
+    file_size(path, limit_bytes=_MOST_LOGO_BYTES, kind="logo", field="--logo")
+    data = read_bytes(path)
+    if not data.startswith((_PNG, _JPEG)):
+        raise InputError(
+            "logo-not-a-picture", "is neither PNG nor JPEG. Give another file.", path=path, field="--logo"
+        )
+    width, height = header_size(data) or (0, 0)
+    if width * height > _MOST_LOGO_PIXELS:
+        message = f"has {width} × {height} pixels; a logo has at most {_MOST_LOGO_PIXELS // 10**6} million."
+        raise InputError("too-many-pixels", message, path=path, field="--logo")
+    return picture_of(limited(read_pixels(path), _LOGO_PX))
+
+
 def read_picture(path: Path) -> ByteArray:
-    """Return a picture as (H, W, 3) RGB, transparent pixels on white; an InputError: unreadable, or too large."""
+    """Return a picture as (H, W, 3) RGB, transparent pixels on white; errors as of `read_pixels`."""
+    pixels = read_pixels(path)
+    alpha = pixels[..., 3:] / np.float32(255)
+    return np.asarray((pixels[..., :3] * alpha + _PAPER * (1 - alpha)).round().astype(np.uint8))
+
+
+def read_pixels(path: Path) -> ByteArray:
+    """Return a picture as (H, W, 4) RGBA; an InputError: unreadable, or too large."""
     import cv2
 
     data = read_bytes(path)
@@ -229,17 +261,13 @@ def read_picture(path: Path) -> ByteArray:
         raise InputError(
             "not-a-picture", "is no picture that can be shown. Delete it, or make it again.", path=path
         )
-    if pixels.ndim == 2:
-        pixels = np.repeat(pixels[..., None], 3, axis=2)
-    if pixels.shape[2] == 4:
-        alpha = pixels[..., 3:] / np.float32(255)
-        pixels = (pixels[..., :3] * alpha + _PAPER * (1 - alpha)).round().astype(np.uint8)
-    return np.asarray(pixels[..., ::-1])
+    to_rgba = {2: cv2.COLOR_GRAY2RGBA, 3: cv2.COLOR_BGR2RGBA, 4: cv2.COLOR_BGRA2RGBA}
+    return np.asarray(cv2.cvtColor(pixels, to_rgba[2 if pixels.ndim == 2 else pixels.shape[2]]))
 
 
 def preview(path: Path, longest_px: int) -> Picture | None:
     """Return a picture of the workspace, as `read_picture`, made smaller if it is larger; None: there is none."""
-    return picture_of(limited(read_picture(path), longest_px)) if path.is_file() else None
+    return picture_of(limited(read_pixels(path), longest_px)) if path.is_file() else None
 
 
 def limited(rgb: ByteArray, longest_px: int) -> ByteArray:

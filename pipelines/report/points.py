@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-import cv2
 import numpy as np
 
 from pipelines.core.errors import InputError
@@ -15,7 +14,8 @@ from pipelines.core.plan import photograph_folder
 from pipelines.core.progress import Progress
 from pipelines.core.types import ByteArray, FloatArray
 from pipelines.geometry.cameras import project
-from pipelines.report.page import Picture, picture_of
+from pipelines.geometry.sparse_model import SparseModel
+from pipelines.report.page import Picture, limited, picture_of
 from pipelines.report.place import Texts, heads_of, texts_of
 from pipelines.report.views import EvaluatedSurvey
 from pipelines.survey.marks import MarkRays, mark_rays
@@ -23,9 +23,9 @@ from pipelines.survey.photographs import decoded_photograph
 from pipelines.survey.report import PointResidual, PredictedPointError
 from pipelines.survey.survey import SurveyedPoint
 
-_SIDE_SHARE = 1 / 60  # of the longer side of the photographs
-_LEAST_SIDE_PX = 48
-_SHOWN_PX = 192  # side of a chip in the page
+_SIDE_SHARE = 1 / 30  # of the longer side of the photographs
+_LEAST_SIDE_PX = 96
+_MOST_SHOWN_PX = 288  # stored side of a chip; the page magnifies it
 
 Pixel = tuple[float, float]
 
@@ -70,8 +70,7 @@ def cut_chips(
     sparse, survey = evaluated.solved.sparse, evaluated.solved.survey
     folder = photograph_folder(evaluated.workspace, survey.image_dir)
     sha256 = {image.name: image.sha256 for image in survey.images}
-    longest = max((max(camera.width, camera.height) for camera in sparse.cameras.values()), default=0)
-    side = max(_LEAST_SIDE_PX, 2 * round(_SIDE_SHARE * longest / 2))
+    side = _side_px(sparse)
     by_image: dict[int, list[WantedChip]] = defaultdict(list)
     for chip in wanted:
         by_image[chip.image].append(chip)
@@ -89,15 +88,21 @@ def cut_chips(
     return {owner: tuple(mine) for owner, mine in chips.items()}, side
 
 
+def _side_px(sparse: SparseModel) -> int:
+    """Return the side of a chip, so that a target of a tenth of it is seen with what lies around it."""
+    longest = max((max(camera.width, camera.height) for camera in sparse.cameras.values()), default=0)
+    return max(_LEAST_SIDE_PX, 2 * round(_SIDE_SHARE * longest / 2))
+
+
 def _cut(photograph: ByteArray, name: str, wanted: WantedChip, side: int) -> Chip:
-    """Return the piece around a mark; what lies outside the photograph is black."""
-    corner = np.floor(np.array(wanted.mark) - side / 2).astype(int)
-    piece = np.zeros((side, side, 3), dtype=np.uint8)
+    """Return the piece around a mark, moved into the photograph at its rim; a smaller photograph ends in black."""
     height, width = photograph.shape[:2]
-    low, high = np.clip(corner, 0, [width, height]), np.clip(corner + side, 0, [width, height])
-    (x0, y0), (x1, y1) = low - corner, high - corner
-    piece[y0:y1, x0:x1] = photograph[low[1] : high[1], low[0] : high[0]]
-    shown = cv2.resize(piece, (_SHOWN_PX, _SHOWN_PX), interpolation=cv2.INTER_CUBIC)
+    corner = (
+        np.floor(np.array(wanted.mark) - side / 2).astype(int).clip(0, np.maximum([width, height], side) - side)
+    )
+    piece = np.zeros((side, side, 3), dtype=np.uint8)
+    part = photograph[corner[1] : corner[1] + side, corner[0] : corner[0] + side]
+    piece[: part.shape[0], : part.shape[1]] = part
 
     def inside(pixel: Pixel | None) -> Pixel | None:
         if pixel is None:
@@ -109,7 +114,7 @@ def _cut(photograph: ByteArray, name: str, wanted: WantedChip, side: int) -> Chi
     distance = None if wanted.adjusted is None else float(np.hypot(*np.subtract(wanted.adjusted, wanted.mark)))
     return Chip(
         image=name,
-        picture=picture_of(np.asarray(shown)),
+        picture=picture_of(limited(piece, _MOST_SHOWN_PX)),
         side_px=side,
         mark=(x_px, y_px),
         adjusted=inside(wanted.adjusted),
@@ -167,8 +172,7 @@ def points_facts(
     )
     total = sum(len(group.points) for group in groups)
     each = min(chips_a_point, max(1, _MOST_CHIPS // total)) if total else 0
-    images = len(evaluated.solved.sparse.image_name)
-    wanted = [chip for group in groups for chip in _wanted(group, each, images)]
+    wanted = [chip for group in groups for chip in _wanted(group, each, evaluated.solved.sparse)]
     chips, side_px = cut_chips(evaluated, wanted[:_MOST_CHIPS], progress)
     control, check = (_facts(evaluated, group, chips, side_px) for group in groups)
     return control, check
@@ -205,13 +209,16 @@ def _group(
     return _Group(kind, points, errors, field, surveyed, rays, surveyed_px, adjusted_px)
 
 
-def _wanted(group: _Group, each: int, images: int) -> list[WantedChip]:
-    """Return the chips of a group: for each point those photographs that show most marked points."""
-    rays, chips = group.rays, []
-    popular = np.bincount(rays.camera, minlength=images)
+def _wanted(group: _Group, each: int, sparse: SparseModel) -> list[WantedChip]:
+    """Return the chips of a group: whole ones first, then of photographs that show most marked points."""
+    rays, chips, margin = group.rays, [], _side_px(sparse) / 2
+    cameras = [sparse.camera_of(int(image)) for image in rays.camera]
+    size = np.array([(camera.width, camera.height) for camera in cameras]).reshape(-1, 2)
+    is_cut = np.any((rays.xy_px < margin) | (rays.xy_px > size - margin), axis=1)
+    popular = np.bincount(rays.camera, minlength=len(sparse.image_name))[rays.camera]
     for index, point in enumerate(group.points):
         marks = np.flatnonzero(rays.point == index)
-        for mark in marks[np.argsort(-popular[rays.camera[marks]], kind="stable")][:each]:
+        for mark in marks[np.lexsort((-popular[marks], is_cut[marks]))][:each]:
             x_px, y_px = rays.xy_px[mark].tolist()
             adjusted, surveyed = _pair(group.adjusted_px[mark]), _pair(group.surveyed_px[mark])
             chips.append(

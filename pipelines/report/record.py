@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
+from pathlib import Path
 from typing import Any
 
 from pipelines.core.errors import InputError
@@ -49,6 +50,11 @@ class RecordFacts:
     assumptions: tuple[Remark, ...]
     cautions: dict[str, tuple[Remark, ...]]
     by_hand: tuple[str, ...]  # stages whose product was put there by hand
+
+    @property
+    def remarks(self) -> list[tuple[str, tuple[Remark, ...]]]:
+        """Warnings and cautions, each with its stage."""
+        return [*((stage.name, stage.warnings) for stage in self.stages), *self.cautions.items()]
 
 
 def record_facts(workspace: Workspace, survey: Survey) -> RecordFacts:
@@ -104,6 +110,9 @@ def _options(spec: StageSpec, config: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _notation(value: object) -> str:
+    """Return a value as users write it; a path without its folders, which are nobody's business."""
+    if isinstance(value, Path) or (isinstance(value, str) and Path(value).is_absolute()):
+        return Path(value).name
     if value is None:
         return "not given"
     if isinstance(value, bool):

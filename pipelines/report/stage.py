@@ -1,4 +1,4 @@
-"""Report of a survey: one page with all that is known of it, for its client and for the record.
+"""Report of a survey, which a surveyor hands to a client: cover, verdicts, accuracy, and an appendix.
 
 Reads survey, SfM model, adjustment and the report of `evaluate`; trained model, test views, accuracy map, metrics
 and LiDAR of the training, and previews of the rasters where there are any. Writes `report/report.html` and, on
@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 
 from pipelines import __version__
-from pipelines.core.figures import Headline
 from pipelines.core.files import replace_text
 from pipelines.core.products import Remark, union
 from pipelines.core.stages import REPORT_PAGE
@@ -19,20 +18,16 @@ from pipelines.core.workspace import StageRun, Summary
 from pipelines.report.accuracy import accuracy_facts
 from pipelines.report.cameras import LensesFacts, cameras_facts, lenses_facts
 from pipelines.report.chromium import chromium_path, print_pdf
+from pipelines.report.cover import cover_facts
 from pipelines.report.options import ReportOptions
 from pipelines.report.page import Page, Section, moment, render_page
 from pipelines.report.place import OverlapFacts, overlap_facts, place_facts
 from pipelines.report.points import points_facts
 from pipelines.report.record import RecordFacts, lidar_facts, record_facts, reference_facts
 from pipelines.report.verdicts import Measured, Verdict, verdicts
-from pipelines.report.views import EvaluatedSurvey, load_evaluated, previews_facts, training_facts, views_facts
+from pipelines.report.views import EvaluatedSurvey, load_evaluated, training_facts, views_facts
 from pipelines.survey.trained_model import TrainedModel
 
-_NOTES = {
-    "measured": "RMSE of the triangulated check points, their survey's error included",
-    "predicted": "no check points: root mean square of the predicted σ over the scene",
-    "unknown": "neither measured nor predicted",
-}
 _ROOM = __name__.rpartition(".")[0]
 _STEPS = 8
 
@@ -77,63 +72,64 @@ def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: Stage
         task.advance(note="points")
         accuracy = accuracy_facts(evaluated)
         task.advance(note="accuracy")
-        of_gaussians = _sections_of_gaussians(evaluated, options)
+        of_gaussians, training = _sections_of_gaussians(evaluated, options)
         task.advance(note="views")
         record = record_facts(workspace, survey)
         task.advance(note="record")
     summary = summary_facts(evaluated, overlap, lenses, record)
     page = Page(
-        title=f"Survey report: {workspace.root.name}",
+        title=options.title or f"Survey report: {workspace.root.name}",
         subtitle="Georeferenced 3D Gaussian splat, with its measured and predicted accuracy"
         if of_gaussians
         else "Georeferenced cameras, with their measured and predicted accuracy",
-        about={
-            "Made": moment(datetime.now(UTC)),
-            "Program": f"GeoRefGS {__version__}",
-            "Photographs": f"{cameras.registered} of {cameras.photographs} registered",
-            "Reference system": f"{place.crs.crs.name}, heights {place.crs.crs.vertical.name}",
-        },
+        about={"Made": moment(datetime.now(UTC)), "Program": f"GeoRefGS {__version__}"},
+        cover=cover_facts(evaluated, overlap, lenses, options),
         sections=(
             Section("summary", "Summary", "summary.html", summary),
-            Section("place", "Place on Earth", "place.html", place),
             Section("accuracy", "Accuracy", "accuracy.html", accuracy),
             Section("check-points", "Check points", "points.html", check),
             Section("control-points", "Control points", "points.html", control),
+            Section("place", "Place on Earth", "place.html", place),
             Section("positions", "Positions of the photographs", "positions.html", cameras),
             Section("overlap", "Overlap and matches", "overlap.html", overlap),
             Section("lenses", "Residuals in the image, and lenses", "lenses.html", lenses),
             *of_gaussians,
-            Section("processing", "Processing", "record.html", record),
-            Section("photographs", "Photographs", "photographs.html", cameras),
+            Section("processing", "Appendix: processing", "record.html", record),
+            Section("photographs", "Appendix: photographs", "photographs.html", cameras),
+            *training,
         ),
         document=evaluated.report.model_dump(mode="json"),
     )
     return page, summary
 
 
-def _sections_of_gaussians(evaluated: EvaluatedSurvey, options: ReportOptions) -> tuple[Section, ...]:
-    """Return the sections on what the Gaussians show; none before training, or if `evaluate` has not seen them."""
+def _sections_of_gaussians(
+    evaluated: EvaluatedSurvey, options: ReportOptions
+) -> tuple[tuple[Section, ...], tuple[Section, ...]]:
+    """Return the sections on what the Gaussians show, and those of the appendix on their training.
+
+    There are none before training, or if `evaluate` has not seen the Gaussians; none on what was not compared.
+    """
     workspace, model, test = evaluated.workspace, evaluated.solved.model, evaluated.report.test_views
     if test is None or not isinstance(model, TrainedModel):
-        return ()
+        return (), ()
     views, training = views_facts(workspace, test, options.views), training_facts(workspace, model)
-    return (
-        Section("reference", "Surface against a reference", "reference.html", reference_facts(evaluated)),
-        Section("test-views", "Test views", "views.html", views),
-        Section("training", "Training", "training.html", training),
-        Section("lidar", "LiDAR in the training", "lidar.html", lidar_facts(workspace)),
-        Section("rasters", "Orthophoto and surface model", "rasters.html", previews_facts(workspace)),
-    )
+    reference, lidar = reference_facts(evaluated), lidar_facts(workspace)
+    shown = [Section("test-views", "Test views", "views.html", views)]
+    if evaluated.report.reference is not None:
+        shown.append(Section("reference", "Surface against a reference", "reference.html", reference))
+    if lidar is not None:
+        shown.append(Section("lidar", "LiDAR in the training", "lidar.html", lidar))
+    return tuple(shown), (Section("training", "Appendix: training", "training.html", training, folded=True),)
 
 
 @dataclass(frozen=True)
 class SummaryFacts:
-    """Summary of an evaluated survey: traffic lights, cautions, headline, and what the headline's figures are."""
+    """Summary of an evaluated survey: traffic lights, cautions, and the accuracy in words."""
 
     verdicts: tuple[Verdict, ...]
     cautions: tuple[Remark, ...]
-    headline: Headline
-    accuracy_note: str
+    accuracy: str
 
 
 def summary_facts(
@@ -155,11 +151,9 @@ def summary_facts(
         control_outliers=report.fit.gcp.outliers,
         check_points=len(survey.check_points),
         stale=tuple(stage.name for stage in record.stages if stage.state in ("stale", "damaged")),
-        workspace=str(evaluated.workspace.root),
     )
     return SummaryFacts(
         verdicts=verdicts(report, measured, cautions),
         cautions=cautions,
-        headline=report.headline,
-        accuracy_note=_NOTES[report.headline.kind],
+        accuracy=report.headline.text,
     )

@@ -5,7 +5,7 @@ Every rule is stated on the page. `unknown` is the verdict where nothing was mea
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -54,8 +54,10 @@ class Measured:
     control_outliers: int
     check_points: int
     stale: tuple[str, ...]  # stages whose product is not current
-    workspace: str  # path, for commands
 
+
+# What the test of the predicted σ says of the check points' errors, by the code of its caution.
+_OF_CHECK_POINTS = {"prediction-rejected": "more", "prediction-pessimistic": "less"}
 
 _Fields = tuple[Level, str, str, str]  # of a verdict without its subject, in their order
 
@@ -63,20 +65,21 @@ _Fields = tuple[Level, str, str, str]  # of a verdict without its subject, in th
 def verdicts(report: EvaluationReport, measured: Measured, cautions: Sequence[Remark]) -> tuple[Verdict, ...]:
     """Return the verdicts on a survey, in the order of the work."""
     triangulated, on_surface, test = report.checkpoints.triangulated, report.checkpoints.surface, report.test_views
+    codes = {caution.code for caution in (*cautions, *report.cautions)}
     by_subject: dict[str, _Fields] = {
         "Registered photographs": _registered(measured),
         "Overlap": _overlap(measured),
         "Reprojection": _reprojection(measured),
         "Recorded positions": _fixes(measured),
         "Control points": _control(measured),
-        "σ of the measurements": _stated_sigma(report.variance_factors),
+        "σ of the measurements": _stated_sigma(report.variance_factors, codes),
         "Check points": _check_points(measured, triangulated),
-        "Predicted against measured": _prediction(triangulated, report.cautions),
+        "Predicted against measured": _prediction(triangulated, codes),
         "Blunders": _blunders(triangulated),
         **({} if on_surface is None else {"Surface at the points": _surface(on_surface)}),
         **({} if test is None else {"Test views": _views(test.psnr, test.views)}),
-        "Cautions": _cautions(cautions),
-        "State of the products": _current(measured),
+        **({"Cautions": _cautions(cautions)} if cautions else {}),
+        **({"State of the products": _current(measured)} if measured.stale else {}),
     }
     return tuple(Verdict(subject, *fields) for subject, fields in by_subject.items())
 
@@ -154,8 +157,9 @@ def _control(measured: Measured) -> _Fields:
     return level, reading, reason, rule
 
 
-def _stated_sigma(factors: tuple[VarianceFactor, ...]) -> _Fields:
-    rule = "good if the σ of every tested group passed, fair if the data changed one"
+def _stated_sigma(factors: tuple[VarianceFactor, ...], codes: Collection[str]) -> _Fields:
+    """Return the outcome of the χ² tests of the residuals, together with what check points say of the σ."""
+    rule = "good if the residuals and the check points agree with the σ, fair if either does not"
     tested = [factor for factor in factors if factor.estimated is not None]
     if not tested:
         return "unknown", "not tested", "there is no redundancy to test them with", rule
@@ -165,8 +169,16 @@ def _stated_sigma(factors: tuple[VarianceFactor, ...]) -> _Fields:
         rejected = any(factor.sigma_source == "stated" for factor in changed)
         reason = "the χ² test rejects a stated σ" if rejected else "these σ were assumed: the data gave them"
         return "fair", reading, reason, rule
-    passed = ", ".join(factor.group for factor in tested)
-    return "good", f"passed: {passed}", "residuals agree with the σ", rule
+    passed = f"residuals agree: {', '.join(factor.group for factor in tested)}"
+    for code, words in _OF_CHECK_POINTS.items():
+        if code in codes:
+            return (
+                "fair",
+                passed,
+                f"the photographs agree with these σ, yet check points err {words} than predicted",
+                rule,
+            )
+    return "good", passed, "the residuals give no reason to doubt these σ", rule
 
 
 def _check_points(measured: Measured, errors: CheckPointErrors) -> _Fields:
@@ -176,8 +188,7 @@ def _check_points(measured: Measured, errors: CheckPointErrors) -> _Fields:
         reason = (
             "marked in too few registered photographs: mark each in two or more"
             if measured.check_points
-            else f"nothing measures the accuracy: `georef ingest {measured.workspace} --checkpoints FILE`, then "
-            f"`georef run {measured.workspace}`"
+            else "nothing measures the accuracy: surveyed points that enter no solution would"
         )
         return "poor", f"{errors.count} of {measured.check_points} measured", reason, rule
     enough = errors.asprs.enough_points
@@ -185,17 +196,22 @@ def _check_points(measured: Measured, errors: CheckPointErrors) -> _Fields:
     return "good" if enough else "fair", f"{errors.count} of {measured.check_points} measured", reason, rule
 
 
-def _prediction(errors: CheckPointErrors, cautions: Sequence[Remark]) -> _Fields:
+def _prediction(errors: CheckPointErrors, codes: Collection[str]) -> _Fields:
     """Return the outcome of the χ² test of `evaluate`, whose caution has the figures."""
     rule = (
-        f"good if the errors of at least {LEAST_TESTED} triangulated check points pass the χ² test of their "
-        "predicted σ (99 %), fair if the σ are too large, poor if they are too small"
+        f"χ² test (99 %) of {LEAST_TESTED} check points or more: good if passed, fair if the σ are too large, poor "
+        "if they are too small"
     )
-    codes, tested = {caution.code for caution in cautions}, errors.predicted
+    tested = errors.predicted
     if "prediction-rejected" in codes:
-        return "poor", "σ too small", "control points, marks or the datum may be at fault: see the caution", rule
+        return "poor", "σ too small", "control points, marks or the datum may be at fault", rule
     if "prediction-pessimistic" in codes:
-        return "fair", "σ too large", "errors are smaller than predicted: see the caution", rule
+        return (
+            "fair",
+            "σ too large",
+            "errors are smaller than predicted: the stated accuracy is on the safe side",
+            rule,
+        )
     if tested is None or tested.count < LEAST_TESTED or "prediction-of-adjusted-similarity" in codes:
         return "unknown", "not tested", f"needs {LEAST_TESTED} check points with predicted σ", rule
     return "good", f"passed at {tested.count} check points", "errors agree with the predicted σ", rule
@@ -208,7 +224,7 @@ def _blunders(errors: CheckPointErrors) -> _Fields:
     if errors.blunders:
         reason = "look at their image chips: a mark or a coordinate may be wrong"
         return "fair", listed(errors.blunders), reason, rule
-    return "good", "none", "no check point stands out", rule
+    return "good", "none", "no triangulated check point stands out", rule
 
 
 def _surface(errors: CheckPointErrors) -> _Fields:
@@ -235,16 +251,11 @@ def _views(psnr_db: float | None, count: int) -> _Fields:
 
 
 def _cautions(cautions: Sequence[Remark]) -> _Fields:
-    rule = "good with none, poor if nothing checks the positions, fair otherwise"
-    if not cautions:
-        return "good", "none", "no limit of the result is known", rule
+    rule = "poor if nothing checks the positions, fair otherwise"
     unchecked = any(caution.code == NOT_CHECKED for caution in cautions)
     return "poor" if unchecked else "fair", str(len(cautions)), "listed below the table", rule
 
 
 def _current(measured: Measured) -> _Fields:
-    rule = "good if every product is current"
-    if not measured.stale:
-        return "good", "current", "all stages belong together", rule
-    reason = f"`georef run {measured.workspace}` brings them up to date; then make this report again"
-    return "poor", f"not current: {', '.join(measured.stale)}", reason, rule
+    reason = "the input has changed since: parts of this report do not belong together"
+    return "poor", f"not current: {', '.join(measured.stale)}", reason, "poor if a product is not current"

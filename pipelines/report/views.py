@@ -1,4 +1,4 @@
-"""Evaluated survey, which all sections show; test views, curves of the training, previews of the rasters."""
+"""Evaluated survey, which all sections show; test views, and curves of the training."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pipelines.adjust.posterior import Posterior
 from pipelines.adjust.solution import posterior_of
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size
-from pipelines.core.stages import BY_NAME, HILLSHADE, METRICS, ORTHOPHOTO_PREVIEW, RENDERS, REPORT
+from pipelines.core.stages import BY_NAME, METRICS, RENDERS, REPORT
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.geometry.bundle import Network, has_positive_depth
@@ -22,7 +22,7 @@ from pipelines.geometry.cameras import project_each
 from pipelines.geometry.footprints import PointSurface
 from pipelines.geometry.intersection import refined_points
 from pipelines.report.options import ReportOptions
-from pipelines.report.page import Picture, limited, picture_of, picture_of_png, preview, read_picture
+from pipelines.report.page import Picture, limited, picture_of, picture_of_png, read_picture
 from pipelines.report.plots.charts import without_labels
 from pipelines.report.plots.observations import curves
 from pipelines.survey.photographs import DIFFERENCE_GAIN, render_name
@@ -58,12 +58,17 @@ class EvaluatedSurvey:
         return replace(network, point_in_world=refined_points(network).point_in_world)
 
     @cached_property
+    def ray_in_cam(self) -> FloatArray:
+        """Observed points (M, 3) in the frames of their cameras, in lengths of `model`."""
+        network = self.network
+        ray = network.point_in_world[network.obs_point] - network.cam_center_in_world[network.obs_image]
+        return np.asarray(np.einsum("mij,mj->mi", network.cam_from_world[network.obs_image], ray))
+
+    @cached_property
     def residual_px(self) -> FloatArray:
         """Reprojection residuals (M, 2), projected minus observed; NaN where a point lies behind its camera."""
         network = self.network
-        ray = network.point_in_world[network.obs_point] - network.cam_center_in_world[network.obs_image]
-        in_cam = np.einsum("mij,mj->mi", network.cam_from_world[network.obs_image], ray)
-        projected = project_each(network.cameras, network.camera_id[network.obs_image], in_cam)
+        projected = project_each(network.cameras, network.camera_id[network.obs_image], self.ray_in_cam)
         return np.asarray(np.where(has_positive_depth(network)[:, None], projected - network.obs_xy_px, np.nan))
 
     @cached_property
@@ -95,7 +100,7 @@ def load_evaluated(workspace: Workspace, options: ReportOptions) -> EvaluatedSur
     return EvaluatedSurvey(workspace, solved, report, posterior, crs)
 
 
-_VIEW_PX, _PREVIEW_PX = 720, 1100
+_VIEW_PX = 560
 _MOST_METRICS_BYTES = 256 * 1024 * 1024
 _MOST_ROWS = 2000  # of the metrics that are drawn
 # Curves by panel: the names in the file, and those on the page.
@@ -214,9 +219,3 @@ def _panels(rows: list[dict[str, float]]) -> dict[str, Mapping[str, tuple[FloatA
         if lines:
             panels[quantity] = lines
     return panels
-
-
-def previews_facts(workspace: Workspace) -> dict[str, Picture | None]:
-    """Return the previews of the rasters; None where they were not made."""
-    products = {"orthophoto": ORTHOPHOTO_PREVIEW, "surface": HILLSHADE}
-    return {name: preview(workspace.root / product, _PREVIEW_PX) for name, product in products.items()}

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
+import cv2
 import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, Route
@@ -59,10 +61,14 @@ OVERLAPS = """() => {
 }"""
 
 
-# Elements that are wider than the printed page: A4 within its margins, upright, or on its side for broad tables.
-CUT_ON_PAPER = """() => [...document.querySelectorAll("main table, main img, main p, main svg, main pre")]
-    .filter((node) => node.getBoundingClientRect().width > (node.closest(".broad") ? 1016 : 688))
+# Elements that leave the printed page, A4 upright within its margins.
+CUT_ON_PAPER = """() => [...document.querySelectorAll("header *, main table, main img, main p, main svg, main pre")]
+    .filter((node) => node.getBoundingClientRect().right > 689)
     .map((node) => node.outerHTML.slice(0, 80))"""
+# Tables that scroll in their box, by their class.
+SCROLLING = """() => [...document.querySelectorAll(".scroll")]
+    .filter((box) => box.scrollWidth > box.clientWidth + 1)
+    .map((box) => box.firstElementChild.className)"""
 
 
 @dataclass
@@ -138,10 +144,41 @@ def test_wide_tables_scroll_in_their_own_box(browser: Browser, report: Path) -> 
     context = browser.new_context(viewport={"width": 390, "height": 800}, offline=True)
     page = Opened(context.new_page())
     page.show(report)
-    inside = "() => [...document.querySelectorAll('.scroll')].some((box) => box.scrollWidth > box.clientWidth + 50)"
+    # Only lists of points, photographs and views are wider than a telephone: all other tables, and pictures, fit.
+    classes = page.page.evaluate(SCROLLING)
+    assert len(classes) >= 2
+    assert {name.partition(" ")[2] for name in classes} <= {"wide", "loose"}
+    inside = "() => [...document.images].every((image) => image.getBoundingClientRect().right <= innerWidth)"
     assert page.page.evaluate(inside)
+    # The name of a row stays in sight when its table is scrolled.
+    stays = """() => {
+        const box = [...document.querySelectorAll(".scroll")].find((box) => box.querySelector(".wide"));
+        box.scrollLeft = 200;
+        return box.querySelector("tbody th").getBoundingClientRect().left - box.getBoundingClientRect().left;
+    }"""
+    assert abs(page.page.evaluate(stays)) < 2
     reachable = "() => [...document.querySelectorAll('.scroll')].every((box) => box.tabIndex === 0)"
     assert page.page.evaluate(reachable)
+    context.close()
+
+
+@pytest.mark.parametrize(("scheme", "paper", "ink"), [("light", 255, 60), ("dark", 24, 150)])
+def test_drawings_have_the_paper_of_the_page(
+    browser: Browser, report: Path, scheme: Literal["light", "dark"], paper: int, ink: int
+) -> None:
+    context = browser.new_context(viewport={"width": 1280, "height": 900}, color_scheme=scheme, offline=True)
+    page = Opened(context.new_page())
+    page.show(report)
+    shot = page.page.locator("#place .chart img").screenshot()
+    grey = cv2.imdecode(np.frombuffer(shot, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert grey is not None
+    assert abs(int(np.median(grey)) - paper) <= 4
+    darkest, brightest = np.quantile(grey, [0.001, 0.999])
+    assert (darkest < ink) if scheme == "light" else (brightest > ink)  # axes and their numbers
+    # A colour with a meaning is the same in both: control points are orange.
+    colours = cv2.imdecode(np.frombuffer(shot, np.uint8), cv2.IMREAD_COLOR)
+    orange = np.abs(colours.astype(int) - [0x3B, 0x8A, 0xDD]).max(axis=2) < 12
+    assert orange.sum() > 20
     context.close()
 
 
@@ -152,6 +189,9 @@ def test_no_table_is_cut_on_paper(browser: Browser, report: Path) -> None:
     page.page.emulate_media(media="print")
     assert page.page.evaluate("() => getComputedStyle(document.querySelector('td')).display") == "table-cell"
     assert page.page.evaluate(CUT_ON_PAPER) == []
+    # Paper has no folds, and what is folded on the screen is left out.
+    folded = "() => [...document.querySelectorAll('.folded, summary')].filter((node) => node.offsetHeight).length"
+    assert page.page.evaluate(folded) == 0
     context.close()
 
 
@@ -160,7 +200,7 @@ def test_pdf_is_printed(report: Path, tmp_path: Path) -> None:
     print_pdf(report, pdf)
     data = pdf.read_bytes()
     assert data.startswith(b"%PDF-")
-    assert data.count(b"/Type /Page\n") + data.count(b"/Type /Page ") >= 5
+    assert 5 <= data.count(b"/Type /Page\n") + data.count(b"/Type /Page ") <= 12
     assert [path.name for path in tmp_path.iterdir()] == ["report.pdf"]
 
 

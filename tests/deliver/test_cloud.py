@@ -147,7 +147,7 @@ def test_cloud_of_a_trained_survey_lies_on_its_ground(
     values = run_stage(workspace, BY_NAME["export-cloud"], {"crs": "EPSG:4978", "ply": True}).manifest.values
     files = {path.name for path in (root / "cloud").iterdir()}
     pair = {"cloud.laz", "cloud.laz.georef.json", "cloud.ply", "cloud.ply.georef.json"}
-    assert files == pair | {"manifest.json"}
+    assert files == pair | {"cloud.laz.iso.xml", "cloud.ply.iso.xml", "manifest.json"}
     las, ply = laspy.read(workspace.path(CLOUD)), PlyData.read(root / "cloud/cloud.ply")["vertex"]
     assert las.header.point_count == ply.count == values["points"] > 5000
     sidecar = load_json(CrsSidecar, sidecar_path(workspace.path(CLOUD)))

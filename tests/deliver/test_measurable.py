@@ -170,6 +170,7 @@ def test_command_puts_centres_on_the_surface(
         "manifest.json",
         "splat.measurable.ply",
         "splat.measurable.ply.georef.json",
+        "splat.measurable.ply.iso.xml",
     ]
     in_geo = enu_from_ecef(sidecar.ecef_from_file().apply(after.means.numpy()), origin)
     inner = np.hypot(in_geo[:, 0], in_geo[:, 1]) < 20

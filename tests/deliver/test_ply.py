@@ -98,7 +98,11 @@ def test_files_alone_put_the_gaussians_on_earth(stage: StageRun) -> None:
     # About 10 m from the origin, float32 resolves 1e-6 m.
     np.testing.assert_allclose(positions, expected, rtol=0, atol=2e-6)
     assert summary.values["gaussians"] == 40
-    assert sorted(file.name for file in stage.out.iterdir()) == ["splat.ply", "splat.ply.georef.json"]
+    assert sorted(file.name for file in stage.out.iterdir()) == [
+        "splat.ply",
+        "splat.ply.georef.json",
+        "splat.ply.iso.xml",
+    ]
 
 
 def test_frame_is_east_north_up_at_its_own_rounded_origin(stage: StageRun) -> None:

@@ -18,12 +18,15 @@ from pipelines.core.stages import SURVEY
 from pipelines.geometry.bundle import correction_basis
 from pipelines.report.accuracy import ninety_percent
 from pipelines.report.cameras import bias_of, cameras_facts, lenses_facts, mean_by_region
+from pipelines.report.cover import cover_facts, days_of, flying_height_m, ground_sampling_m
+from pipelines.report.options import ReportOptions
 from pipelines.report.place import links_of, overlap_facts, ties_of
 from pipelines.report.points import cut_chips, points_facts
 from pipelines.report.verdicts import FIX_OUTLIERS, REGISTERED, Measured, level_of, verdicts
 from pipelines.report.views import read_metrics
 from pipelines.survey.area import photographs_that_see
 from pipelines.survey.report import ByAxis, PredictedSigma
+from pipelines.survey.report_parts import VarianceFactor
 from pipelines.survey.survey import Survey
 from pipelines.survey.trained_survey import fix_differences
 from tests.evaluated_workspaces import CHECK_POINTS, ERROR_M
@@ -108,9 +111,14 @@ def test_fix_differences_are_the_errors_of_the_fixes(reported: Reported) -> None
     found = fix_differences(reported.survey.solved)
     np.testing.assert_allclose(found.difference_in_geo, reported.truth.scene.center_in_geo - fixes, atol=1e-6)
     used = found.difference_in_geo  # also of the test view
-    assert [bias.mean_m for bias in bias_of(found)] == pytest.approx(used.mean(axis=0).tolist())
+    stated_m = np.sort(np.abs(used), axis=0)[[3]] * np.ones((len(used), 1))
+    assert [bias.mean_m for bias in bias_of(found, stated_m)] == pytest.approx(used.mean(axis=0).tolist())
+    # Four of the fixes are within σ, which is the fourth smallest residual; more σ hold more of them.
+    for bias in bias_of(found, stated_m):
+        assert bias.within[0] == 4 / len(used)
+        assert list(bias.within) == sorted(bias.within)
     outlier = replace(found, is_outlier=np.arange(len(fixes)) == 0)
-    assert bias_of(outlier)[0].mean_m == pytest.approx(used[1:, 0].mean())
+    assert bias_of(outlier, stated_m)[0].mean_m == pytest.approx(used[1:, 0].mean())
 
 
 def test_photographs_have_coordinates_and_differences(reported: Reported) -> None:
@@ -155,7 +163,7 @@ def _decoded(address: str) -> np.ndarray:
 
 def test_no_chips_are_cut_when_none_are_wanted(reported: Reported) -> None:
     chips, side_px = cut_chips(reported.survey, [], SILENT)
-    assert (chips, side_px) == ({}, 48)
+    assert (chips, side_px) == ({}, 96)
 
 
 def test_ninety_percent_factors_are_those_of_the_normal_distribution() -> None:
@@ -169,7 +177,7 @@ def test_ninety_percent_factors_are_those_of_the_normal_distribution() -> None:
 
 MEASURED = Measured(
     photographs=20, registered=20, enough_share=1.0, enough=5, parts=1, rmse_px=0.5, fixes=20, fix_outliers=0,
-    control_points=5, control_outliers=0, check_points=0, stale=(), workspace="flight",
+    control_points=5, control_outliers=0, check_points=0, stale=(),
 )  # fmt: skip
 
 
@@ -219,6 +227,64 @@ def test_verdict_on_the_prediction_is_that_of_its_test(count: int, code: str | N
     report = report_with(triangulated=check_points_with(predicted=sigma), cautions=cautions)
     found = {verdict.subject: verdict for verdict in verdicts(report, MEASURED, ())}
     assert found["Predicted against measured"].level == level
+
+
+@pytest.mark.parametrize(
+    ("code", "level", "words"),
+    [
+        (None, "good", "no reason to doubt"),
+        ("prediction-rejected", "fair", "err more than predicted"),
+        ("prediction-pessimistic", "fair", "err less than predicted"),
+    ],
+)
+def test_verdict_on_the_sigma_knows_what_the_check_points_say(code: str | None, level: str, words: str) -> None:
+    """The residuals agree with the σ: that alone is no praise where check points do not."""
+    cautions = () if code is None else (Remark(code=code, sentence="The test says so."),)
+    passed = VarianceFactor.model_validate({
+        "group": "marks", "count": 9, "used": 9, "redundancy": 9.0, "estimated": 1.0, "probability": 0.5,
+        "applied": 1.0, "sigma_source": "stated",
+    })  # fmt: skip
+    report = report_with(cautions=cautions).model_copy(update={"variance_factors": (passed,)})
+    found = {verdict.subject: verdict for verdict in verdicts(report, MEASURED, ())}
+    assert found["σ of the measurements"].level == level
+    assert words in found["σ of the measurements"].reason
+
+
+def test_verdicts_are_given_on_what_there_is() -> None:
+    subjects = {verdict.subject for verdict in verdicts(report_with(), MEASURED, ())}
+    assert not {"Cautions", "State of the products"} & subjects
+    warned = verdicts(report_with(), MEASURED, (Remark(code="x", sentence="Beware."),))
+    assert {verdict.subject: verdict.level for verdict in warned}["Cautions"] == "fair"
+
+
+def test_facts_of_the_cover_are_those_of_the_flight(reported: Reported) -> None:
+    scene, survey = reported.truth.scene, reported.survey
+    above_m = scene.center_in_geo[:, 2].mean() - np.median(scene.point_in_geo[:, 2])
+    height_m, gsd_m = flying_height_m(survey), ground_sampling_m(survey)
+    assert height_m is not None and gsd_m is not None
+    assert height_m == pytest.approx(above_m, abs=float(np.ptp(scene.point_in_geo[:, 2])))
+    owner, image, _ = scene.pixels(scene.point_in_geo)
+    away = np.linalg.norm(scene.point_in_geo[owner] - scene.center_in_geo[image], axis=1)
+    # Depth is shorter than distance, by the cosine of at most half the frame's diagonal.
+    assert 0.7 * np.median(away) < gsd_m * scene.camera.mean_focal_px <= np.median(away)
+    facts = dict(cover_facts(survey, overlap_facts(survey), lenses_facts(survey), ReportOptions()).facts)
+    assert facts["Photographs"] == "8 of 8 registered"
+    assert facts["Surveyed points"] == f"3 control points, {CHECK_POINTS} check points"
+    assert facts["Photographs of a place"] == "8 (median)"
+    assert facts["Area"].endswith(" ha")
+
+
+@pytest.mark.parametrize(
+    ("times_s", "days"),
+    [
+        ((1_700_000_000.0, None, 1_700_000_100.0), "2023-11-14"),
+        ((1_700_000_000.0, 1_700_090_000.0), "2023-11-14 to 2023-11-15"),
+        ((12.0, 15.0), "–"),  # seconds since the flight controller was started
+        ((None,), "–"),
+    ],
+)
+def test_days_of_the_photographs(times_s: tuple[float | None, ...], days: str) -> None:
+    assert days_of(times_s) == days
 
 
 def test_limits_belong_to_the_better_verdict() -> None:

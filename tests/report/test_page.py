@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import html
 import json
 import re
@@ -10,6 +11,8 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 
 from pipelines.core.errors import BackendUnavailableError, InputError, MissingProductError
@@ -18,7 +21,7 @@ from pipelines.core.progress import SILENT
 from pipelines.core.stages import ACCURACY_MAP, METRICS, RENDERS, REPORT, SURVEY
 from pipelines.core.workspace import StageRun, Workspace
 from pipelines.report.options import ReportOptions
-from pipelines.report.page import value_at
+from pipelines.report.page import logo_picture, value_at
 from pipelines.report.points import points_facts
 from pipelines.report.stage import run
 from pipelines.survey.report import read_report
@@ -135,19 +138,75 @@ def test_what_is_missing_is_said_with_what_to_do(tmp_path: Path) -> None:
     for file in (root / RENDERS).iterdir():
         file.unlink()
     assert not (root / ACCURACY_MAP).exists()
-    text = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", "", page_of(made)))
+    page = page_of(made)
+    text = text_of(page)
     for sentence in (
-        "The survey has no check points: no accuracy was measured. Give surveyed points",
+        "The survey has no check points: no accuracy was measured.",
         "The survey has no control points: the recorded positions alone place it",
         "the photographs have no times of exposure",
-        "georef ingest --test-every 8",
+        "No test views: no photograph was kept out of the training",
         "train/metrics.jsonl is not there",
-        "georef export-raster writes orthophoto",
-        "No LiDAR was used: georef train --lidar",
         "The prediction cannot be compared",
         "There is no map of the predicted σ: the scene has too few points.",
+        "nothing measures the accuracy: surveyed points that enter no solution would",
     ):
         assert sentence in text
+    # What was not made or not asked for is no section: the client cannot make it.
+    assert not {"lidar", "reference", "rasters"} & set(re.findall(r'<section id="([^"]+)"', page))
+    assert_for_client(page)
+
+
+def text_of(page: str) -> str:
+    """The text of a page, without its style."""
+    return re.sub(r"\s+", " ", re.sub(r"<[^>]+>", "", re.sub(r"<style>.*?</style>", "", page, flags=re.DOTALL)))
+
+
+def assert_for_client(page: str) -> None:
+    """Require that nothing on paper tells what to type."""
+    printed = re.sub(r'<details class="folded">.*?</details>', "", page, flags=re.DOTALL)
+    assert len(printed) < len(page)
+    assert re.search(r"georef [a-z]|(?<![\w-])--[a-z]|georef\.toml", text_of(printed)) is None
+
+
+def test_page_is_for_a_client(reported: Reported) -> None:
+    assert_for_client(reported.html)
+    root = reported.truth.workspace.root
+    assert not any(str(folder) in reported.html for folder in (root, root.parent))
+
+
+def test_names_of_the_cover_are_text_and_the_logo_is_drawn_anew(tmp_path: Path) -> None:
+    made = evaluated_workspace(tmp_path / "flight")
+    logo = np.zeros((40, 1200, 4), np.uint8)
+    logo[:, :600, 3] = 255
+    cv2.imwrite(str(tmp_path / "logo.png"), logo)
+    options = ReportOptions(title=HOSTILE, client=f"client {HOSTILE}", author="a&b", logo=tmp_path / "logo.png")
+    page = page_of(made, options)
+    head = page.partition("<nav")[0]
+    assert {f"<h1>{html.escape(HOSTILE)}</h1>", f"client {html.escape(HOSTILE)}", "a&amp;b"} <= set(
+        re.findall(r"<h1>.*?</h1>|client .*?(?=</dd>)|a&amp;b", head)
+    )
+    (address,) = re.findall(r'src="data:image/webp;base64,([^"]+)"', head)
+    drawn = cv2.imdecode(np.frombuffer(base64.b64decode(address), np.uint8), cv2.IMREAD_UNCHANGED)
+    assert drawn is not None and drawn.shape == (20, 600, 4)  # smaller, and still transparent
+    assert drawn[:, :290, 3].min() > 250 and drawn[:, 310:, 3].max() < 5
+
+
+@pytest.mark.parametrize(
+    ("content", "code"),
+    [
+        (b"<svg onload='alert(1)'/>", "logo-not-a-picture"),
+        (b"II*\x00" + bytes(100), "logo-not-a-picture"),  # TIFF
+        (b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR" + 2 * (30_000).to_bytes(4, "big") + bytes(9), "too-many-pixels"),
+        (b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR" + 2 * (30).to_bytes(4, "big") + bytes(9), "not-a-picture"),
+        (b"\xff\xd8\xff" + bytes(100), "not-a-picture"),
+        (b"\x89PNG" + bytes(5 * 2**20), "file-too-large"),
+        (b"", "file-empty"),
+    ],
+)
+def test_hostile_logo_is_refused(tmp_path: Path, content: bytes, code: str) -> None:
+    (tmp_path / "logo").write_bytes(content)
+    with refused(code, InputError):
+        logo_picture(tmp_path / "logo")
 
 
 def test_without_evaluation_the_command_is_named(tmp_path: Path) -> None:

@@ -38,7 +38,7 @@ UTM = "EPSG:32632"
 # A square of 80 m with a yard of 20 m in it.
 OUTER = np.array([(-40.0, -40), (40, -40), (40, 40), (-40, 40)])
 YARD = np.array([(-10.0, -10), (-10, 10), (10, 10), (10, -10)])
-SCENE = np.column_stack([np.random.default_rng(0).uniform(-50, 50, (300, 2)), np.zeros(300)])
+POINTS = np.column_stack([np.random.default_rng(0).uniform(-50, 50, (300, 2)), np.zeros(300)])
 
 
 def in_crs(plan: np.ndarray, crs: str) -> np.ndarray:
@@ -66,7 +66,7 @@ def written(folder: Path, suffix: str) -> Path:
 def test_a_boundary_is_the_same_ground_in_every_form(tmp_path: Path, suffix: str) -> None:
     """To a centimetre: degrees are written with seven decimals at least. A DXF has closed lines, without holes."""
     stated = {"boundary_crs": UTM} if suffix == ".dxf" else {}
-    area = boundary_area(AreaOptions(boundary=written(tmp_path, suffix), **stated), SCENE, ORIGIN)
+    area = boundary_area(AreaOptions(boundary=written(tmp_path, suffix), **stated), POINTS, ORIGIN)
     assert area is not None
     expected = 0.64 if suffix == ".dxf" else 0.64 - 0.04
     assert area.hectares == pytest.approx(expected, rel=2e-4)
@@ -98,15 +98,15 @@ def test_what_is_no_boundary_is_refused(tmp_path: Path, name: str, content: str,
     path = tmp_path / name
     path.write_text(content)
     with refused(code, InputError) as error:
-        boundary_area(AreaOptions(boundary=path), SCENE, ORIGIN)
+        boundary_area(AreaOptions(boundary=path), POINTS, ORIGIN)
     assert (error.value.path, error.value.field) == (path, "--boundary")
 
 
 def test_a_boundary_states_a_crs_and_lies_at_the_survey(tmp_path: Path) -> None:
     with refused("boundary-without-crs", InputError):
-        boundary_area(AreaOptions(boundary=written(tmp_path, ".dxf")), SCENE, ORIGIN)
+        boundary_area(AreaOptions(boundary=written(tmp_path, ".dxf")), POINTS, ORIGIN)
     with refused("boundary-elsewhere", InputError):
-        boundary_area(AreaOptions(boundary=written(tmp_path, ".gpkg")), SCENE + [500, 0, 0], ORIGIN)
+        boundary_area(AreaOptions(boundary=written(tmp_path, ".gpkg")), np.add(POINTS, [500, 0, 0]), ORIGIN)
 
 
 def solved(centers: np.ndarray) -> SolvedSurvey:
@@ -139,8 +139,8 @@ def test_default_is_the_ground_that_three_photographs_see() -> None:
     assert not area.polygon.interiors
     assert common > 0.9
     survey = solved(centers).survey
-    target = target_crs(CrsOptions(crs=UTM), survey.origin, SCENE, survey.vertical)
-    # UTM's scale is 0.9996 at its middle, and here, 1° from it, 0.9997; the survey lies 250 ppm above the ellipsoid.
+    target = target_crs(CrsOptions(crs=UTM), survey.origin, POINTS, survey.vertical)
+    # UTM's scale is 0.9997 here, and the survey lies 250 ppm above the ellipsoid.
     assert area.in_crs(target).area == pytest.approx(area.polygon.area, rel=1.5e-3)
 
 
@@ -150,4 +150,4 @@ def test_two_photographs_have_no_area() -> None:
 
 
 def test_an_area_without_extent_contains_nothing() -> None:
-    assert not Area(shapely.Polygon(), 0.0, "nothing").contains(SCENE).any()
+    assert not Area(shapely.Polygon(), 0.0, "nothing").contains(POINTS).any()

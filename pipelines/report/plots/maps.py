@@ -113,7 +113,7 @@ def _decimals(side_m: float, unit: str) -> int:
 
 
 # Of the picture, in inches: the longer side of a map, and the room around each map for what is written there.
-_MAP = 4.4
+_MAP = 3.4
 _LEFT, _RIGHT, _BELOW, _ABOVE = 1.15, 0.95, 1.2, 0.8
 _BAR_GAP, _BAR_WIDTH = 0.1, 0.16
 _LEGEND_HEIGHT, _HEADING_DEPTH = 0.2, 0.2  # above the lower edge, below the upper one

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 _AXES = ("east", "north", "up")
 _ARROW_SHARE, _ARROW_QUANTILE = 0.9, 0.95  # of a region, that an arrow of this quantile takes
-_CHART_INCHES = (6.4, 3.2)
+_CHART_INCHES = (5.6, 3.2)
 
 
 def residual_field(
@@ -43,7 +43,7 @@ def residual_field(
     """
     width, height = size_px
     rows, columns = rms_px.shape
-    scale = 6.4 / max(width, height)
+    scale = 4.6 / max(width, height)
     figure = new_figure((width * scale + 1.7, height * scale + 1.0), "constrained")
     axes = figure.subplots()
     label(axes, title, x="x in px", y="y in px")
@@ -72,7 +72,7 @@ def fix_series(
 
     The abscissa (F,), of that title, is seconds since the first, or the number of the photograph.
     """
-    figure = new_figure((7.6, 6.0), "constrained")
+    figure = new_figure((5.6, 5.6), "constrained")
     order = np.argsort(abscissa, kind="stable")
     for axis, axes in enumerate(figure.subplots(3, 1, sharex=True)):
         values, sigma = residual_m[:, axis], sigma_m[:, axis]
@@ -124,7 +124,7 @@ def correlation_matrix(names: Sequence[str], correlation: FloatArray) -> bytes:
 
 def predicted_against_measured(sigma_m: FloatArray, error_m: FloatArray) -> bytes:
     """Return predicted σ (J, 2) against measured errors (J, 2) of check points, horizontal and vertical, as PNG."""
-    figure = new_figure((7.6, 3.9), "constrained")
+    figure = new_figure((6.4, 3.6), "constrained")
     for axis, (axes, name) in enumerate(zip(figure.subplots(1, 2), ("horizontal", "vertical"), strict=True)):
         sigma, error = sigma_m[:, axis], error_m[:, axis]
         most = 1.15 * max(float(sigma.max()), 1e-6)

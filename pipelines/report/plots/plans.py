@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.transforms import Bbox
 
-LONGER_INCHES = 6.2
+LONGER_INCHES = 4.6
 _LEFT, _RIGHT, _BELOW, _ABOVE = 0.85, 0.25, 0.6, 0.4  # around the map, in inches
 _LEGEND_ROW = 0.22
 _NARROWEST = 0.45  # shorter side of a map over its longer one

@@ -25,7 +25,7 @@ LEAST, LARGEST, EMPTY = (0x44, 0x01, 0x54), (0xFD, 0xE7, 0x25), (0xE8, 0xE8, 0xE
 CONTROL = (0xDD, 0x8A, 0x3B)
 NO_POINTS = MapPoints()
 LEFT, TOP = 170, 120
-INSIDE = np.s_[TOP:640, LEFT:690]  # of half a picture of a square scene: nothing but the map
+INSIDE = np.s_[TOP:520, LEFT:560]  # of half a picture of a square scene: nothing but the map
 
 
 def raster(sigma_h_m: np.ndarray, *, corner: tuple[float, float] = (0.0, 0.0), cell_m: float = 1.0) -> SigmaRaster:

@@ -1,0 +1,106 @@
+"""Cover of the report: for whom and by whom, the result from above, and the facts that a client asks for first."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+import numpy as np
+
+from pipelines.core.figures import MISSING, Headline
+from pipelines.core.stages import HILLSHADE, ORTHOPHOTO_PREVIEW
+from pipelines.report.cameras import LensesFacts
+from pipelines.report.options import ReportOptions
+from pipelines.report.page import Picture, count_text, logo_picture, number_text, preview
+from pipelines.report.place import OverlapFacts
+from pipelines.report.views import EvaluatedSurvey
+
+_NOTES = {
+    "measured": "RMSE of the triangulated check points, their survey's error included",
+    "predicted": "no check points: root mean square of the predicted σ over the scene",
+    "unknown": "neither measured nor predicted",
+}
+_PREVIEW_PX = 900
+_EARLIEST_S = 631_152_000.0  # 1990: smaller times count from the start of a device, not from 1970
+_MOST_CAMERAS = 3
+
+
+@dataclass(frozen=True)
+class CoverFacts:
+    """Cover of a report; a picture is None where there is none, a name empty where nobody gave it."""
+
+    client: str
+    author: str
+    logo: Picture | None
+    views: tuple[tuple[str, Picture], ...]  # caption and picture of the result from above
+    facts: tuple[tuple[str, str], ...]  # name and value
+    headline: Headline
+    accuracy_note: str
+
+
+def cover_facts(
+    evaluated: EvaluatedSurvey, overlap: OverlapFacts, lenses: LensesFacts, options: ReportOptions
+) -> CoverFacts:
+    """Return the cover; an InputError: the logo is no PNG or JPEG, or too large."""
+    survey, crs, root = evaluated.solved.survey, evaluated.crs, evaluated.workspace.root
+    area_ha = evaluated.report.area_ha
+    height_m, gsd_m = flying_height_m(evaluated), ground_sampling_m(evaluated)
+    stated = "as stated" if crs.crs.vertical.stated else "assumed: nobody stated the datum"
+    previews = {"Orthophoto": ORTHOPHOTO_PREVIEW, "Surface model": HILLSHADE}
+    shown = {name: preview(root / product, _PREVIEW_PX) for name, product in previews.items()}
+    registered = f"{count_text(lenses.photographs)} of {count_text(len(survey.images))} registered"
+    control, check = (count_text(len(points)) for points in (survey.control_points, survey.check_points))
+    return CoverFacts(
+        client=options.client,
+        author=options.author,
+        logo=None if options.logo is None else logo_picture(options.logo),
+        views=tuple((name, picture) for name, picture in shown.items() if picture is not None),
+        facts=(
+            ("Area", MISSING if area_ha is None else f"{number_text(area_ha, 2)} ha"),
+            ("Photographs", registered),
+            ("Taken on", days_of(image.timestamp_s for image in survey.images)),
+            ("Camera", "; ".join(_cameras(lenses)) or MISSING),
+            ("Flying height above ground", MISSING if height_m is None else f"{number_text(height_m, 0)} m"),
+            ("Ground sample distance", MISSING if gsd_m is None else f"{number_text(100 * gsd_m, 1)} cm"),
+            ("Photographs of a place", f"{number_text(overlap.median, 0)} (median)"),
+            ("Surveyed points", f"{control} control points, {check} check points"),
+            ("Coordinate system", crs.crs.name),
+            ("Heights", f"{crs.crs.vertical.name}, {stated}"),
+        ),
+        headline=evaluated.report.headline,
+        accuracy_note=_NOTES[evaluated.report.headline.kind],
+    )
+
+
+def flying_height_m(evaluated: EvaluatedSurvey) -> float | None:
+    """Return the median height of the photographs above the surface below them; None: there is no surface."""
+    center, surface = evaluated.center_in_geo, evaluated.surface
+    return None if surface is None else float(np.median(center[:, 2] - surface.heights(center[:, :2])))
+
+
+def ground_sampling_m(evaluated: EvaluatedSurvey) -> float | None:
+    """Return the median size of a pixel at the SfM points, depth over focal length; None: no observations."""
+    solved = evaluated.solved
+    cameras = [solved.sparse.camera_of(image) for image in range(len(solved.sparse.image_name))]
+    depth = evaluated.ray_in_cam[:, 2] * solved.geo_from_model.scale
+    focal_px = np.array([camera.mean_focal_px for camera in cameras])[evaluated.network.obs_image]
+    return float(np.median(depth / focal_px)) if len(depth) else None
+
+
+def days_of(times_s: Iterable[float | None]) -> str:
+    """Return the first and the last day, in UTC, of times since 1970; a dash where none is known."""
+    known = [time_s for time_s in times_s if time_s is not None and time_s >= _EARLIEST_S]
+    days = (
+        [f"{datetime.fromtimestamp(time_s, UTC):%Y-%m-%d}" for time_s in (min(known), max(known))] if known else []
+    )
+    return " to ".join(dict.fromkeys(days)) or MISSING
+
+
+def _cameras(lenses: LensesFacts) -> list[str]:
+    texts = [
+        f"{lens.make_model or lens.camera.model}, {lens.camera.width} × {lens.camera.height} px, "
+        f"focal length {number_text(lens.camera.mean_focal_px, 0)} px"
+        for lens in lenses.lenses[:_MOST_CAMERAS]
+    ]
+    return [*texts, "…"] if len(lenses.lenses) > _MOST_CAMERAS else texts
