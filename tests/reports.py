@@ -70,6 +70,7 @@ def report_with(
     no_residuals = {**dict.fromkeys(ResidualStats.model_fields), "count": 0}
     return EvaluationReport(
         headline=headline(triangulated, scene, cautions),
+        area_ha=triangulated.asprs.area_km2 and 100 * triangulated.asprs.area_km2,
         photometric=Photometric(
             test=PhotometricFigures(**{"views": 0, **no_views, "per_view": (), **(test or {})})
         ),

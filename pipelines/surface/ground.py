@@ -89,9 +89,10 @@ def terrain_of(points: FloatArray, normal: FloatArray, spacing_m: float) -> Terr
     points = points[np.abs(normal[:, 2]) >= _LEVEL]
     on_cloth = np.zeros(len(points), dtype=bool)
     on_cloth[_on_cloth(points, cell_m, limit_m)] = True
+    message = "The surface has no ground that can be told from what stands on it."
+    no_ground = DegenerateGeometryError("no-ground", message)
     if on_cloth.sum() < 4:
-        message = "The surface has no ground that can be told from what stands on it."
-        raise DegenerateGeometryError("no-ground", message)
+        raise no_ground
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
     cell_m = max(cell_m, float(np.sqrt(np.prod(high - low) / _MOST_KNOTS)))
     columns, rows = (np.floor((high - low) / cell_m).astype(int) + 1).tolist()
@@ -101,6 +102,9 @@ def terrain_of(points: FloatArray, normal: FloatArray, spacing_m: float) -> Terr
     is_known = (count > 0) & (above == 0)
     if is_known.sum() < 4:
         is_known = count > 0
+    place = np.column_stack(np.divmod(np.flatnonzero(is_known), columns))
+    if np.linalg.matrix_rank(place - place.mean(axis=0)) < 2:
+        raise no_ground
     ground, cell, known = points[on_cloth], cell[on_cloth], np.flatnonzero(is_known)
     mean = np.column_stack([np.bincount(cell, axis, rows * columns)[known] / count[known] for axis in ground.T])
     terrain = Terrain(low, cell_m, np.zeros((rows, columns)), np.zeros((rows, columns)), limit_m, (low, low))
@@ -123,7 +127,7 @@ def _on_cloth(points: FloatArray, knot_m: float, limit_m: float) -> IntArray:
         near = ((plan >= low) & (plan <= low + _TILE_M + 2 * _MARGIN_M)).all(axis=1)
         around = np.flatnonzero(near)
         cloth = CSF.CSF()
-        cloth.params.bSloopSmooth = False
+        cloth.params.bSloopSmooth = True  # without it, one in seven ground points on a slope of 15 % is missed
         cloth.params.cloth_resolution, cloth.params.class_threshold = knot_m, limit_m
         cloth.params.rigidness, cloth.params.interations = _RIGIDNESS, _ITERATIONS
         found, others = CSF.VecInt(), CSF.VecInt()

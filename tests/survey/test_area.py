@@ -79,7 +79,7 @@ def test_suffixes_of_the_option_are_those_of_the_reader() -> None:
     assert frozenset(BOUNDARY_FORMATS) == BOUNDARY_SUFFIXES
 
 
-VRT = '<OGRVRTDataSource><OGRVRTLayer name="x"><SrcDataSource>/etc/passwd</SrcDataSource></OGRVRTLayer></OGRVRTDataSource>'
+VRT = "<OGRVRTDataSource><OGRVRTLayer name='x'><SrcDataSource>/etc/passwd</SrcDataSource></OGRVRTLayer>"
 POINT = {"type": "Feature", "properties": {}, "geometry": {"type": "Point", "coordinates": [7.75, 46.02]}}
 
 

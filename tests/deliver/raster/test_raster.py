@@ -6,6 +6,7 @@ The Gaussians are laid on the surface by hand, so that all errors are those of t
 from __future__ import annotations
 
 import shutil
+import sys
 from pathlib import Path
 
 import cv2
@@ -23,6 +24,7 @@ from pipelines.core.products import load_json, save_json, save_npz
 from pipelines.core.runner import run_stage
 from pipelines.core.stages import BY_NAME, GAUSSIANS, MODEL, POINTS, SIM3
 from pipelines.core.workspace import Workspace
+from pipelines.deliver.raster_whole import INTERPOLATED, MEASURED
 from pipelines.formats.georef_sidecar import CrsSidecar, sidecar_path
 from pipelines.geodesy.enu import lla_from_enu
 from pipelines.geometry.cameras import Camera, Pinhole
@@ -32,8 +34,11 @@ from pipelines.splat.gaussians import Gaussians, transformed, write_gaussians
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from pipelines.splat.sh import sh_from_rgb
+from pipelines.survey.area import area_of
+from pipelines.survey.options import AreaOptions
 from pipelines.survey.trained_model import TrainedCamera
-from tests.refusals import refused
+from pipelines.survey.trained_survey import load_trained
+from tests.refusals import codes, refused
 from tests.scenes import (
     Measured,
     Noise,
@@ -143,7 +148,7 @@ def _write_photographs(folder: Path, scene: TrueScene) -> None:
 @pytest.fixture(scope="module")
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
     made = write_trained(tmp_path_factory.mktemp("raster") / "ws")
-    run_stage(made, BY_NAME["export-raster"], {"crs": UTM, "gsd": GSD, "contours": 1.0})
+    run_stage(made, BY_NAME["export-raster"], {"crs": UTM, "gsd": GSD, "contours": 1.0, "contours_of": "surface"})
     return made
 
 
@@ -219,7 +224,7 @@ def _saddle(grey: np.ndarray, column: float, row: float, reach: int = 6) -> tupl
 
 
 def test_rasters_are_valid_and_say_where_they_are(workspace: Workspace) -> None:
-    for name in ("orthophoto", "dsm", "sigma_h", "sigma_v"):
+    for name in ("orthophoto", "dsm", "dtm", "sigma_h", "sigma_v", "sigma_dtm", "measured"):
         path = workspace.path(f"raster/{name}.tif")
         valid, errors, warnings = cog_validate(path)
         assert (valid, errors, warnings) == (True, [], [])
@@ -243,13 +248,68 @@ def test_sigma_is_that_of_georeference_and_surface(workspace: Workspace) -> None
     np.testing.assert_allclose(horizontal, np.hypot(expected[:, 0], expected[:, 1]), rtol=0.1)
 
 
-def test_nothing_is_invented_where_nothing_was_seen(workspace: Workspace) -> None:
+def test_rasters_are_whole_inside_the_area_and_empty_outside(workspace: Workspace) -> None:
+    import pyogrio
+    import shapely
+
+    with rasterio.open(workspace.path("raster/measured.tif")) as raster:
+        mask, cell_m2 = raster.read(1), raster.transform.a**2
     with rasterio.open(workspace.path("raster/dsm.tif")) as raster:
         known = raster.read_masks(1) > 0
     with rasterio.open(workspace.path("raster/orthophoto.tif")) as raster:
         np.testing.assert_array_equal(raster.read(4) > 0, known)
-    # Corners lie beyond the images of all but two cameras.
-    assert 0.5 < known.mean() < 0.95
+    np.testing.assert_array_equal(mask > 0, known)
+    trained = load_trained(workspace)
+    area = area_of(AreaOptions(), trained)
+    assert known.sum() * cell_m2 == pytest.approx(1e4 * area.hectares, rel=0.01)
+    # Corners lie beyond the images of all but two cameras, and most of what three see is measured.
+    assert known.mean() < 0.95
+    assert (mask == MEASURED).sum() > 0.9 * known.sum()
+    # The walls' feet: a part, in WGS84, for what is interpolated, to the cells that its outline is drawn of.
+    _, _, shapes, (area_m2,) = pyogrio.raw.read(workspace.path("raster/interpolated.geojson"))
+    assert area_m2.sum() == pytest.approx((mask == INTERPOLATED).sum() * cell_m2, rel=0.02)
+    east, north = pyproj.Transformer.from_crs("EPSG:4326", UTM, always_xy=True).transform(
+        *shapely.get_coordinates(shapely.from_wkb(shapes)).T
+    )
+    with rasterio.open(workspace.path("raster/measured.tif")) as raster:
+        assert (east >= raster.bounds.left - 1e-3).all()
+        assert (north <= raster.bounds.top + 1e-3).all()
+
+
+def test_terrain_runs_under_the_tower(workspace: Workspace) -> None:
+    """Open ground to a tenth of a cell, as the surface; under the tower, to its σ, which says so."""
+    rng = np.random.default_rng(3)
+    places = rng.uniform(-9, 9, (400, 3)) * [1, 1, 0]
+    beside = np.abs(places[:, :2]).max(axis=1)
+    for chosen, limit in ((beside > TOWER_M + 1.0, 0.1 * GSD), (beside < TOWER_M, 0.15)):
+        xyz = in_utm(places[chosen], workspace)
+        off = at(workspace.path("raster/dtm.tif"), xyz) - xyz[:, 2]
+        sigma = at(workspace.path("raster/sigma_dtm.tif"), xyz)
+        assert np.sqrt(np.mean(off**2)) < limit
+        assert np.sqrt(np.mean((off / sigma) ** 2)) < 1.4
+    assert sigma.min() > 0.1
+
+
+def test_contours_of_the_terrain_leave_the_tower_out(workspace: Workspace, tmp_path: Path) -> None:
+    import pyogrio
+
+    copy = Workspace(shutil.copytree(workspace.root, tmp_path / "ws"))
+    outcome = run_stage(copy, BY_NAME["export-raster"], {"crs": UTM, "gsd": GSD, "contours": 1.0})
+    base = in_utm(np.zeros((1, 3)), copy)[0, 2]
+    _, _, shapes, (height, _) = pyogrio.raw.read(copy.path("raster/contours.gpkg"))
+    assert len(shapes) == outcome.manifest.values["contour_lines"]
+    assert (np.abs(height - base) < 1.0).all()
+
+
+def test_without_the_library_there_is_no_terrain(
+    workspace: Workspace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copy = Workspace(shutil.copytree(workspace.root, tmp_path / "ws"))
+    monkeypatch.setitem(sys.modules, "CSF", None)
+    outcome = run_stage(copy, BY_NAME["export-raster"], {"crs": UTM, "gsd": 0.3})
+    assert codes(outcome.manifest.warnings) == ["no-terrain"]
+    assert not (copy.root / "raster/dtm.tif").exists()
+    assert run_stage(copy, BY_NAME["export-raster"], {"gsd": 0.3, "terrain": False}).manifest.warnings == ()
 
 
 def test_contours_run_around_the_tower(workspace: Workspace) -> None:
