@@ -112,7 +112,7 @@ def _ground(source: RasterSource, terrain: Terrain, seen: SeenCells) -> tuple[Fl
     """
     rows, columns = seen.height.shape
     column, row = np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5)
-    level = source.target.xyz_from_geo(terrain.nodes())[:, 2].reshape(terrain.height.shape)
+    level = source.terrain_level
     cell = np.column_stack([column.ravel(), row.ravel()])
     plan = places_in_geo(source, seen.frame, cell, np.full(len(cell), np.median(level)))[:, :2]
     height = terrain.interpolated(level, plan).reshape(rows, columns)

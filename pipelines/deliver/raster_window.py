@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -64,6 +65,12 @@ class RasterSource:
     training_px: float
     training_gsd_m: float
     min_views: int
+
+    @cached_property
+    def terrain_level(self) -> FloatArray:
+        """Heights (R, C) of the terrain's cells in the CRS's unit."""
+        assert self.terrain is not None
+        return self.target.xyz_from_geo(self.terrain.nodes())[:, 2].reshape(self.terrain.height.shape)
 
 
 def raster_source(
