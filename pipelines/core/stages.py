@@ -226,7 +226,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         reads=(MEASURED, *SOLVED, APPLIED_RIG),
         product=REPORT,
         title="Measure test views and check points.",
-        product_version=2,  # without training, and without the Cramér–Rao bound
+        product_version=3,  # with the area of interest
     ),
     StageSpec(
         name="export-ply",
