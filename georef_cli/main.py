@@ -65,6 +65,7 @@ COMMANDS: dict[str, HelpLine] = {
     "export-cloud": HelpLine(
         "export_cloud", "Deliverables", "Write the surface as a georeferenced point cloud (LAZ)."
     ),
+    "export-mesh": HelpLine("export_mesh", "Deliverables", "Write the surface as a triangle mesh with texture."),
     "export-spz": HelpLine("export_spz", "Deliverables", "Write the splat as SPZ, for viewers on the web."),
     "export-tiles": HelpLine("export_tiles", "Deliverables", "Write the splat as 3D Tiles, for web globes."),
     "export-cameras": HelpLine("export_cameras", "Deliverables", "Write the trained cameras for other programs."),

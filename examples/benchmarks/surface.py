@@ -1,4 +1,4 @@
-"""Compare the surface model of a simulated flight with the true surface.
+"""Compare surface model, point cloud and mesh of a simulated flight with the true surface.
 
     georef simulate survey --flight grid --images 40 --size 960x720 --seed 5
     georef run WORKSPACE --images survey/images … && georef export-raster WORKSPACE
@@ -8,6 +8,11 @@ The options are those of `georef simulate`: the same scene is built again, and p
 cells are intersected with it. Cells within 0.5 m of a step of the true surface are listed apart: there, a fraction
 of a cell decides between roof and ground. `the rest` is the RMSE of the cells that are off by 1 m at most, and
 `error/σ` the root mean square of their error over the predicted σ; of interpolated cells, that of all.
+
+Of `cloud.laz` and `mesh.ply`, where there are any, points are compared with points on the true surface, both drawn
+evenly: `off` is the mean distance of the file's points from the true surface, and `precision` the share of those
+that are off by 0.1 m at most; `missing` and `recall` are the same the other way round, of the true surface that
+three photographs see. Chamfer is the mean of both distances, F1 the harmonic mean of both shares.
 """
 
 from __future__ import annotations
@@ -15,18 +20,22 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+import laspy
 import numpy as np
 import rasterio
+from plyfile import PlyData
+from scipy.spatial import KDTree
 
 from pipelines.core.products import load_json
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.deliver.raster_whole import MEASURED
-from pipelines.formats.georef_sidecar import CrsSidecar, sidecar_path
+from pipelines.formats.georef_sidecar import CrsSidecar, MeshSidecar, sidecar_path
 from pipelines.geodesy.crs import PointCrs, parse_crs
-from pipelines.geodesy.enu import ecef_from_enu, ecef_from_lla, enu_from_ecef, lla_from_ecef
+from pipelines.geodesy.enu import Origin, ecef_from_enu, ecef_from_lla, enu_from_ecef, lla_from_ecef
+from pipelines.geometry.cameras import Pinhole
 from pipelines.simulate.mesh import MISS, Material, Raycaster
 from pipelines.simulate.options import SimulateOptions
-from pipelines.simulate.stage import fly_survey
+from pipelines.simulate.stage import RecordedFlight, fly_survey
 
 _ABOVE_M, _BELOW_M = 200.0, 200.0
 _AROUND_M, _STEP_M = (0.25, 0.5), 1.2
@@ -57,6 +66,95 @@ class TrueSurface:
         return np.where(known, height, np.nan), np.where(known, material, -1)
 
 
+_NEAR_M = 0.1  # of F1
+_PER_M2, _BESIDE_M = 30.0, 0.25  # points on the true surface, and how far beside each other points are one place
+_DRAWN, _TARGETS, _SEEN_BY = 400_000, 30_000, 3
+
+
+def drawn_on(corners: FloatArray, count: int, rng: np.random.Generator) -> tuple[FloatArray, IntArray]:
+    """Return points (count, 3) drawn evenly on triangles (T, 3, 3), and the triangle (count,) of each."""
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    areas = np.linalg.norm(cross, axis=1)
+    triangle = rng.choice(len(corners), count, p=areas / areas.sum())
+    weight = np.sort(rng.random((count, 2)), axis=1)
+    weights = np.column_stack([weight[:, 0], weight[:, 1] - weight[:, 0], 1 - weight[:, 1]])
+    return np.einsum("nk,nkj->nj", weights, corners[triangle]), triangle
+
+
+def file_points(workspace: Path, origin: Origin, rng: np.random.Generator) -> dict[str, FloatArray]:
+    """Return points (N, 3) in `geo` of each file that there is, drawn evenly."""
+    found, cloud, mesh = {}, workspace / "cloud" / "cloud.laz", workspace / "mesh" / "mesh.ply"
+    if cloud.is_file():
+        crs = parse_crs(load_json(CrsSidecar, sidecar_path(cloud)).crs)
+        xyz = np.asarray(laspy.read(cloud).xyz)
+        lla = crs.lla_from_xyz(xyz[rng.choice(len(xyz), min(_DRAWN, len(xyz)), replace=False)])
+        found["cloud"] = enu_from_ecef(ecef_from_lla(lla), origin)
+    if mesh.is_file():
+        ply = PlyData.read(mesh)
+        vertices = np.column_stack([ply["vertex"][axis] for axis in "xyz"]).astype(np.float64)
+        points, _ = drawn_on(vertices[np.stack(ply["face"]["vertex_indices"])], _DRAWN, rng)
+        place = load_json(MeshSidecar, sidecar_path(mesh)).ecef_from_file()
+        found["mesh"] = enu_from_ecef(place.apply(points), origin)
+    return found
+
+
+def compare_points(workspace: Path, options: SimulateOptions) -> None:
+    """Print Chamfer distance and F1 of cloud and mesh."""
+    flight, rng = fly_survey(options), np.random.default_rng(0)
+    files = file_points(workspace, flight.world.origin, rng)
+    if not files:
+        return
+    every = np.concatenate(list(files.values()))
+    low, high = np.quantile(every, [0.005, 0.995], axis=0) + np.array([[-_BESIDE_M], [_BESIDE_M]])
+    corners = flight.world.scene.mesh.corners
+    corners = corners[(corners.max(axis=1) > low).all(axis=1) & (corners.min(axis=1) < high).all(axis=1)]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    true, triangle = drawn_on(corners, int(np.linalg.norm(cross, axis=1).sum() / 2 * _PER_M2), rng)
+    normal = cross[triangle] / np.linalg.norm(cross[triangle], axis=1, keepdims=True)
+    inside = ((true > low) & (true < high)).all(axis=1)
+    true, normal = true[inside], normal[inside]
+    drawn = rng.choice(len(true), min(_TARGETS, len(true)), replace=False)
+    drawn = drawn[seen_by(flight, true[drawn]) >= _SEEN_BY]
+    tree = KDTree(true)
+    print(
+        f"{'':8s}" + "".join(f"{head:>11s}" for head in ("off", "missing", "Chamfer", "precision", "recall", "F1"))
+    )
+    for name, every_point in files.items():
+        points = every_point[((every_point > low) & (every_point < high)).all(axis=1)]
+        judged = points[rng.choice(len(points), min(_TARGETS, len(points)), replace=False)]
+        _, nearest = tree.query(judged, workers=-1)
+        off = distance_beside(judged - true[nearest], normal[nearest])
+        _, nearest = KDTree(points).query(true[drawn], workers=-1)
+        missing = distance_beside(points[nearest] - true[drawn], normal[drawn])
+        precision, recall = float(np.mean(off < _NEAR_M)), float(np.mean(missing < _NEAR_M))
+        figures = (off.mean(), missing.mean(), (off.mean() + missing.mean()) / 2, precision, recall)
+        f1 = 2 * precision * recall / max(precision + recall, 1e-9)
+        print(f"{name:8s}" + "".join(f"{value:11.3f}" for value in (*figures, f1)))
+
+
+def distance_beside(difference: FloatArray, normal: FloatArray) -> FloatArray:
+    """Return lengths (N,) of differences (N, 3), along the normal alone where points lie beside each other."""
+    along, length = np.einsum("ni,ni->n", difference, normal), np.linalg.norm(difference, axis=1)
+    return np.asarray(np.where(length**2 - along**2 < _BESIDE_M**2, np.abs(along), length))
+
+
+def seen_by(flight: RecordedFlight, points: FloatArray) -> IntArray:
+    """Return the number of photographs that see points (N, 3) in `geo` closely, their lens taken as a pinhole."""
+    truth, seen = flight.recording.truth, np.zeros(len(points), np.int64)
+    fx, fy, cx, cy = truth.lens.params[:4]
+    pinhole = Pinhole(truth.lens.width, truth.lens.height, fx, fy, cx, cy)
+    furthest_m = 2 * np.median(np.linalg.norm(np.array(truth.centers) - np.median(points, axis=0), axis=1))
+    for center, rotation in zip(np.array(truth.centers), np.array(truth.cam_from_enu), strict=True):
+        in_cam = (points - center) @ rotation.T
+        rows = np.flatnonzero(
+            (in_cam[:, 2] > 0) & (in_cam[:, 2] < furthest_m) & pinhole.contains(pinhole.project(in_cam))
+        )
+        rays = points[rows] - center
+        hits = flight.renderer.raycaster.first_hits(center, rays)
+        seen[rows] += hits.distance > 1 - 0.1 / np.linalg.norm(rays, axis=1)
+    return seen
+
+
 def main() -> None:
     """Print errors by class."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -67,6 +165,7 @@ def main() -> None:
     args = parser.parse_args()
     names = ("scene", "flight", "images", "size", "seed")
     options = SimulateOptions.model_validate({name: getattr(args, name) for name in names})
+    compare_points(args.workspace, options)
     dsm, sigma, measured_mask = (
         args.workspace / "raster" / f"{name}.tif" for name in ("dsm", "sigma_v", "measured")
     )

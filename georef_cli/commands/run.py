@@ -39,7 +39,7 @@ _LIDAR = ("lidar", "lidar_crs", "lidar_vertical", "lidar_trajectory", "lidar_sig
 _IN_AREA = (
     "train",
     "evaluate",
-    *(f"export-{name}" for name in ("ply", "measurable", "raster", "cloud", "spz", "tiles")),
+    *(f"export-{name}" for name in ("ply", "measurable", "raster", "cloud", "mesh", "spz", "tiles")),
 )
 LATER: dict[str, tuple[str, ...]] = {
     "mapper": ("sfm",),

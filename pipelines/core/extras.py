@@ -9,18 +9,19 @@ from typing import Literal
 
 from pipelines.core.errors import BackendUnavailableError
 
-Extra = Literal["bags", "cluster", "reference", "simulator", "terrain", "vectors", "viewer"]
+Extra = Literal["bags", "cluster", "mesh", "reference", "simulator", "terrain", "vectors", "viewer"]
 # What needs each extra, and the libraries that it installs, by the names of their packages.
 EXTRAS: dict[Extra, tuple[str, tuple[str, ...]]] = {
     "bags": ("a ROS bag (--bag, georef inspect)", ("rosbags",)),
     "cluster": ("a cluster (--cluster, georef cluster)", ("distributed", "cryptography")),
+    "mesh": ("georef export-mesh", ("pyfqmr", "scikit-image", "trimesh")),
     "reference": ("M3C2 (georef evaluate --reference)", ("py4dgeo",)),
     "simulator": ("georef simulate", ("embreex",)),
     "terrain": ("the ground (dtm.tif, classes of the cloud)", ("cloth-simulation-filter",)),
     "vectors": ("contour lines and boundaries (--contours, --boundary)", ("ezdxf", "pyogrio")),
     "viewer": ("georef view", ("viser", "websockets", "msgspec")),
 }
-_MODULES = {"cloth-simulation-filter": "CSF"}  # where the names differ
+_MODULES = {"cloth-simulation-filter": "CSF", "scikit-image": "skimage"}  # where the names differ
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,7 @@ SPLAT = "export/splat.ply"
 ORTHOPHOTO_PREVIEW = "raster/preview.png"
 HILLSHADE = "raster/hillshade.png"
 CLOUD = "cloud/cloud.laz"
+MESH, MESH_GLB = "mesh/mesh.ply", "mesh/mesh.glb"
 MEASURABLE_SPLAT = "measurable/splat.measurable.ply"
 SPZ = "spz/splat.spz"
 TILES = "tiles/tileset.json"
@@ -273,6 +274,17 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         product=CLOUD,
         title="Write the surface as a georeferenced point cloud (LAZ).",
         resumable=True,
+    ),
+    StageSpec(
+        name="export-mesh",
+        module="pipelines.deliver.mesh",
+        options_place="pipelines.deliver.options:ExportMeshOptions",
+        folder="mesh",
+        reads=(MEASURED, *whole_products(SPARSE, MODEL, GAUSSIANS, SIM3), APPLIED_RIG, HEADLINE),
+        product=MESH,
+        title="Write the surface as a triangle mesh with texture (PLY, glTF, OBJ).",
+        resumable=True,
+        also=(MESH_GLB,),
     ),
     StageSpec(
         name="export-spz",

@@ -120,6 +120,34 @@ class ExportCloudOptions(CrsOptions, TerrainOptions):
     ply: bool = Field(False, description="Write the same points as cloud.ply too.")
 
 
+class ExportMeshOptions(CrsOptions, AreaOptions):
+    """Options of the export of the surface as a mesh."""
+
+    crs: str | None = Field(
+        None,
+        description="Write mesh_crs.ply too, in this CRS: EPSG:32632, EPSG:32632+3855, a PROJ string or WKT.",
+    )
+    voxel: float | None = Field(
+        None,
+        ge=0.001,
+        description="Side of the voxels in metres (default: the width of a pixel of the training photographs on "
+        "the ground).",
+    )
+    min_views: int = Field(3, ge=2, description="Number of training views that must agree on a vertex.")
+    simplify_error: float | None = Field(
+        None,
+        ge=0,
+        description="Metres by which the simplification may move the surface; 0: none (default: half a voxel).",
+    )
+    least_part: float = Field(
+        0.01, ge=0, le=1, description="Leave out unconnected parts with a smaller share of the largest part's area."
+    )
+    watertight: bool = Field(
+        False, description="Close the mesh: holes by fans, outer rims by plumb walls down to a common base."
+    )
+    obj: bool = Field(False, description="Write the textured mesh as mesh.obj too, with .mtl and .png.")
+
+
 class ExportCamerasOptions(CrsOptions):
     """Options of the export of the trained cameras."""
 
@@ -188,6 +216,10 @@ DESCRIPTIONS: dict[str, str] = {
     "raster/preview.png": "picture of the orthophoto",
     "cloud/cloud.laz": "point cloud with σ, for surveying software (CloudCompare, QGIS, PDAL)",
     "cloud/cloud.ply": "the same point cloud, for viewers without LAZ",
+    "mesh/mesh.ply": "triangle mesh with coloured vertices, to measure in and to edit (CloudCompare, MeshLab)",
+    "mesh/mesh.glb": "the mesh with texture, for viewers and engines (Blender, Unity, web)",
+    "mesh/mesh.obj": "the mesh with texture, for programs without glTF",
+    "mesh/mesh_crs.ply": "the mesh in a CRS, with double coordinates, for surveying software",
     "spz/splat.spz": "the splat compressed, for viewers on the web",
     "tiles/tileset.json": "the splat as 3D Tiles, for web globes (CesiumJS)",
     "tiles/index.html": "page that shows the tiles on the globe",

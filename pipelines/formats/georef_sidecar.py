@@ -154,6 +154,33 @@ class CrsSidecar(_CamelCase):
     cautions: tuple[Remark, ...] = ()
 
 
+class MeshFigures(_CamelCase):
+    """Figures of a mesh: grid, faces, and what its simplification has moved, in metres.
+
+    The errors are distances of vertices before the simplification from the simplified mesh: RMS, and the largest.
+    """
+
+    voxel_m: float
+    texel_m: float
+    faces_before_simplification: int
+    faces: int
+    rms_simplification_error_m: float
+    largest_simplification_error_m: float
+    watertight: bool
+
+
+class MeshSidecar(GeorefSidecar):
+    """Sidecar of a mesh in a frame of its own."""
+
+    mesh: MeshFigures
+
+
+class MeshCrsSidecar(CrsSidecar):
+    """Sidecar of a mesh in a CRS."""
+
+    mesh: MeshFigures
+
+
 def georeference_sigma(covariance: ArrayLike, point_in_file: ArrayLike) -> GeoreferenceSigma:
     """Return σ of the georeference by the sidecar's covariance (7, 7), at a point (3,) of the file's frame."""
     at = np.asarray(point_in_file, dtype=np.float64)

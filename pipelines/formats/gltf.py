@@ -1,4 +1,4 @@
-"""Binary glTF (.glb) of Gaussians: `KHR_gaussian_splatting`, with an SPZ file as its only data or with plain ones.
+"""Binary glTF (.glb), and that of Gaussians: `KHR_gaussian_splatting`, with an SPZ file or with plain data.
 
 The extensions are KHR_gaussian_splatting (ratified) and KHR_gaussian_splatting_compression_spz_2 (draft). Readers
 decode an SPZ into the attributes that the primitive names; its accessors therefore have no data of their own.
@@ -188,8 +188,13 @@ def _glb(content: _Content, payload: bytes, extras: dict[str, Any] | None) -> by
         "bufferViews": content.views,
         "buffers": [{"byteLength": len(payload)}],
     }
+    return glb_of(document, payload)
+
+
+def glb_of(document: dict[str, Any], binary: bytes) -> bytes:
+    """Return a glb of a glTF document and its only buffer; a ValueError: 4 GiB or more."""
     text = json.dumps(document, separators=(",", ":")).encode()
-    chunks = [_chunk(_JSON_CHUNK, text, b" "), _chunk(_BINARY_CHUNK, payload, b"\0")]
+    chunks = [_chunk(_JSON_CHUNK, text, b" "), _chunk(_BINARY_CHUNK, binary, b"\0")]
     size = 12 + sum(map(len, chunks))
     if size > _LARGEST_FILE:
         raise ValueError("a glb has less than 4 GiB")

@@ -30,14 +30,14 @@ _MOST_CANDIDATES = 4_000_000
 _SAMPLE_PX = 8  # between the pixels from which sizes and extent are estimated
 _LEAST_VOXELS = 16  # along the side of a square
 _MARGIN = 4  # spacings around a square: fusion moves points by less, mostly
-_MOST_THROUGH = 0.5  # largest number of views that look through a point, over the number of those that agree
+MOST_THROUGH = 0.5  # largest number of views that look through a point, over the number of those that agree
 # σ of a ray through a photograph, in pixels of the training size: on simulated flights, this and the views' own
 # disagreement explain the distances to the true surface at 68 of 100 points.
 _SIGMA_PX = 0.25
 # A point is left out if its σ exceeds this part of a pixel's width: beyond, one point in five was a floater on
 # simulated flights.
 _RESOLVED = 1.0
-_COARSEST = 2.0  # largest width of a used pixel over the median: wider ones show background that few rays determine
+COARSEST = 2.0  # largest width of a used pixel over the median: wider ones show background that few rays determine
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def fusion_settings(
 ) -> FusionSettings:
     """Return the settings for a cloud; without `spacing_m`, voxels are as wide as a pixel on the surface."""
     pixel_m = pixel_on_surface_m(views, geo_from_model)
-    return FusionSettings(spacing_m or pixel_m, _COARSEST * pixel_m, min_views)
+    return FusionSettings(spacing_m or pixel_m, COARSEST * pixel_m, min_views)
 
 
 def fused_squares(
@@ -260,10 +260,10 @@ def _fuse(
     position, normal, rgb, pixel_m = _voxel_means(side_m, candidates.position, *vars(candidates).values())
     normal = _unit(normal)
     support = views.support(geo_from_model.inverse().apply(position), normal @ geo_from_model.rotation)
-    sigma_m = _sigma(support, pixel_m)
+    sigma_m = surface_sigma(support, pixel_m)
     moved = position + support.mean_normal_m[:, None] * normal
     with np.errstate(invalid="ignore"):
-        good = (support.views >= settings.min_views) & (support.seen_through <= _MOST_THROUGH * support.views)
+        good = (support.views >= settings.min_views) & (support.seen_through <= MOST_THROUGH * support.views)
         good &= (sigma_m < _RESOLVED * pixel_m) & square.covers(moved)
     rows = np.flatnonzero(good)
     position, normal, rgb, variance = _voxel_means(
@@ -272,7 +272,7 @@ def _fuse(
     return SurfaceCloud(position, _unit(normal), np.round(rgb).astype(np.uint8), np.sqrt(variance))
 
 
-def _sigma(support: Support, pixel_m: FloatArray) -> FloatArray:
+def surface_sigma(support: Support, pixel_m: FloatArray) -> FloatArray:
     """Return σ (P,) of the surface along the normal; NaN without agreeing views.
 
     1. The views disagree about the surface. Their errors have a common cause, the Gaussians: a mean over more views

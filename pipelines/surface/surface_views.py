@@ -144,7 +144,7 @@ class SurfaceViews:
         progress: Progress = SILENT,
     ) -> None:
         self.folder = folder
-        self._trained = renderer.trained
+        self._trained, self._images = renderer.trained, renderer.images
         self.cameras = renderer.trained.indices("train")
         self.pinholes = tuple(renderer.pinholes.of(index) for index in self.cameras)
         pixels = [pinhole.width * pinhole.height for pinhole in self.pinholes]
@@ -187,11 +187,26 @@ class SurfaceViews:
         Unit normals (N, 3) have an arbitrary sign; NaN: unknown. Depths of one surface agree within the tolerance,
         a part of the depth.
         """
-        geo_from_model, poses = self._trained.geo_from_model, self._trained.poses
-        rotation, center = poses.cam_from_model[self.cameras], poses.cam_center_in_model[self.cameras]
-        views = DepthViews.of(Viewpoints(rotation, center, self.pinholes), self._depth)
+        geo_from_model = self._trained.geo_from_model
         up_in_model = geo_from_model.rotation.T @ [0.0, 0.0, 1.0]
-        return support(point_in_model, views, up_in_model, tolerance, normal_in_model).scaled(geo_from_model.scale)
+        found = support(point_in_model, self.depth_views(), up_in_model, tolerance, normal_in_model)
+        return found.scaled(geo_from_model.scale)
+
+    def depth_views(self) -> DepthViews:
+        """Return the maps with their cameras in `model`, for kernels."""
+        poses = self._trained.poses
+        rotation, center = poses.cam_from_model[self.cameras], poses.cam_center_in_model[self.cameras]
+        return DepthViews.of(Viewpoints(rotation, center, self.pinholes), self._depth)
+
+    def photograph(self, number: int) -> tuple[ByteArray, FloatArray]:
+        """Return the undistorted photograph (H, W, 3) of a view, and the matrix (3, 4) that undoes its exposure.
+
+        The matrix applies to homogeneous colours of 0 … 255; it changes nothing where the exposure is not known.
+        """
+        camera = self.cameras[number]
+        photograph, exposure = self._images.image(camera), self._trained.model.cameras[camera].exposure
+        gain, offset = np.split(np.eye(3, 4) if exposure is None else np.array(exposure), [3], axis=1)
+        return photograph, np.linalg.solve(gain, np.column_stack([np.eye(3), -255 * offset]))
 
     def close(self) -> None:
         """Delete the maps."""

@@ -144,7 +144,7 @@ def _blocks(points: FloatArray) -> IntArray:
 
 
 @njit(nogil=True, error_model="numpy")
-def _in_cam(point: Any, rotation: Any, center: Any) -> tuple[float, float, float]:
+def point_in_cam(point: Any, rotation: Any, center: Any) -> tuple[float, float, float]:
     x, y, z = 0.0, 0.0, 0.0
     for k in range(3):
         d = point[k] - center[k]
@@ -155,9 +155,9 @@ def _in_cam(point: Any, rotation: Any, center: Any) -> tuple[float, float, float
 
 
 @kernel(nogil=True, error_model="numpy")
-def _sees(middle: Any, radius: float, rotation: Any, center: Any, intrinsics: Any, size: Any) -> bool:
+def sees_sphere(middle: Any, radius: float, rotation: Any, center: Any, intrinsics: Any, size: Any) -> bool:
     """Return whether a sphere may touch the frustum of a camera."""
-    x, y, z = _in_cam(middle, rotation, center)
+    x, y, z = point_in_cam(middle, rotation, center)
     if z < -radius:
         return False
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
@@ -170,7 +170,7 @@ def _sees(middle: Any, radius: float, rotation: Any, center: Any, intrinsics: An
 
 
 @njit(nogil=True, error_model="numpy")
-def _surface(depth: Any, start: int, width: int, height: int, u: float, v: float) -> float:
+def surface_at(depth: Any, start: int, width: int, height: int, u: float, v: float) -> float:
     """Return the depth of a view's surface at a place on its image; 0: none."""
     own = depth[start + int(v) * width + int(u)]
     column = min(max(int(np.floor(u - 0.5)), 0), width - 2)
@@ -195,14 +195,14 @@ def _add_view(point: Any, normal: Any, views: Any, view: int, up: Any, tolerance
     """Add one view to the sums of one point."""
     rotations, centers, intrinsics_px, sizes, starts, depth = views
     center, intrinsics, size = centers[view], intrinsics_px[view], sizes[view]
-    x, y, z = _in_cam(point, rotations[view], center)
+    x, y, z = point_in_cam(point, rotations[view], center)
     if z <= _NEAR:
         return
     u = intrinsics[0] * x / z + intrinsics[2]
     v = intrinsics[1] * y / z + intrinsics[3]
     if not (u >= 0 and u < size[0] and v >= 0 and v < size[1]):
         return
-    surface = _surface(depth, starts[view], size[0], size[1], u, v)
+    surface = surface_at(depth, starts[view], size[0], size[1], u, v)
     if surface <= 0:
         return
     difference = surface - z
@@ -243,7 +243,7 @@ def _sum_block(rows: Any, points: Any, normals: Any, views: Any, up: Any, tolera
     radius = 0.5 * np.sqrt(((high - low) ** 2).sum())
     rotations, centers, intrinsics, sizes, starts, _ = views
     for view in range(len(starts)):
-        if not _sees(middle, radius, rotations[view], centers[view], intrinsics[view], sizes[view]):
+        if not sees_sphere(middle, radius, rotations[view], centers[view], intrinsics[view], sizes[view]):
             continue
         for row in rows:
             _add_view(points[row], normals[row], views, view, up, tolerance, sums[row])
@@ -309,7 +309,9 @@ def _in_view(
     """Return pixel coordinates and depth (K, 3) of the points in a view, from blocks with middle and radius."""
     intrinsics = np.array([pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy])
     size = np.array([pinhole.width, pinhole.height])
-    near = [part for part, middle, radius in blocks if _sees(middle, radius, rotation, center, intrinsics, size)]
+    near = [
+        part for part, middle, radius in blocks if sees_sphere(middle, radius, rotation, center, intrinsics, size)
+    ]
     in_cam = (np.concatenate(near) - center) @ rotation.T if near else np.zeros((0, 3))
     in_cam = in_cam[in_cam[:, 2] > _NEAR_M]
     xy = pinhole.project(in_cam)

@@ -49,7 +49,7 @@ def surface_views(folder: Path, offset_m: np.ndarray | float = 0.0) -> SurfaceVi
         poses=poses, geo_from_model=GEO_FROM_MODEL, indices=lambda _split: list(range(len(CENTERS)))
     )
     renderer: Any = SimpleNamespace(
-        trained=trained, pinholes=SimpleNamespace(of=lambda _index: CAMERA), surface=surface
+        trained=trained, images=None, pinholes=SimpleNamespace(of=lambda _index: CAMERA), surface=surface
     )
     return SurfaceViews(renderer, folder, colours=True)
 

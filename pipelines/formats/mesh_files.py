@@ -1,0 +1,91 @@
+"""Files of triangle meshes: PLY with colours of the vertices, binary glTF and OBJ with a texture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from plyfile import PlyData, PlyElement
+
+from pipelines.core.types import ByteArray, FloatArray, IntArray
+from pipelines.formats.gltf import Y_UP_FROM_Z_UP, glb_of
+
+_FLOAT, _UNSIGNED_INT, _ARRAY, _ELEMENTS = 5126, 5125, 34962, 34963
+
+
+def write_mesh_ply(path: Path, vertices: FloatArray, faces: IntArray, rgb: ByteArray, *, double: bool) -> None:
+    """Write vertices (V, 3) with colours (V, 3) and faces (F, 3); coordinates are doubles or floats."""
+    kind = "<f8" if double else "<f4"
+    vertex = np.empty(
+        len(vertices), [*((axis, kind) for axis in "xyz"), *((c, "u1") for c in ("red", "green", "blue"))]
+    )
+    for column, axis in enumerate("xyz"):
+        vertex[axis] = vertices[:, column]
+    for column, name in enumerate(("red", "green", "blue")):
+        vertex[name] = rgb[:, column]
+    face = np.empty(len(faces), [("vertex_indices", "<i4", (3,))])
+    face["vertex_indices"] = faces
+    elements = [PlyElement.describe(vertex, "vertex"), PlyElement.describe(face, "face")]
+    PlyData(elements, byte_order="<").write(str(path))
+
+
+def png_of(image: ByteArray) -> bytes:
+    """Return an image (H, W, 3) RGB as PNG."""
+    return bytes(cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]))[1].tobytes())
+
+
+def write_mesh_glb(
+    path: Path, vertices: FloatArray, faces: IntArray, uv: FloatArray, image: ByteArray, *, extras: dict[str, Any]
+) -> None:
+    """Write vertices (V, 3) of a z-up frame with a texture (H, W, 3) as a glb, which a node turns y-up.
+
+    The material is unlit: the photographs have the light of the day.
+    """
+    position, place = vertices.astype("<f4"), uv.astype("<f4")
+    data = [position.tobytes(), place.tobytes(), faces.astype("<u4").tobytes(), png_of(image)]
+    start = np.cumsum([0, *(len(part) + -len(part) % 4 for part in data)]).tolist()
+    targets: tuple[dict[str, int], ...] = ({"target": _ARRAY}, {"target": _ARRAY}, {"target": _ELEMENTS}, {})
+    document = {
+        "asset": {"version": "2.0", "generator": "GeoRefGS", "extras": extras},
+        "extensionsUsed": ["KHR_materials_unlit"],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "matrix": list(Y_UP_FROM_Z_UP)}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "material": 0}]}],
+        "materials": [
+            {
+                "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "metallicFactor": 0},
+                "extensions": {"KHR_materials_unlit": {}},
+            }
+        ],
+        "textures": [{"source": 0, "sampler": 0}],
+        "samplers": [{"magFilter": 9729, "minFilter": 9729, "wrapS": 33071, "wrapT": 33071}],
+        "images": [{"bufferView": 3, "mimeType": "image/png"}],
+        "accessors": [
+            {
+                "bufferView": 0, "componentType": _FLOAT, "count": len(position), "type": "VEC3",
+                "min": position.min(axis=0).tolist(), "max": position.max(axis=0).tolist(),
+            },
+            {"bufferView": 1, "componentType": _FLOAT, "count": len(place), "type": "VEC2"},
+            {"bufferView": 2, "componentType": _UNSIGNED_INT, "count": faces.size, "type": "SCALAR"},
+        ],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": first, "byteLength": len(part), **target}
+            for first, part, target in zip(start, data, targets, strict=False)
+        ],
+        "buffers": [{"byteLength": start[-1]}],
+    }  # fmt: skip
+    path.write_bytes(glb_of(document, b"".join(part + bytes(-len(part) % 4) for part in data)))
+
+
+def write_mesh_obj(path: Path, vertices: FloatArray, faces: IntArray, uv: FloatArray, image: ByteArray) -> None:
+    """Write an OBJ with its material (.mtl) and texture (.png) beside it; vertices in millimetres or finer."""
+    path.with_suffix(".png").write_bytes(png_of(image))
+    path.with_suffix(".mtl").write_text(f"newmtl photographs\nKa 0 0 0\nKd 1 1 1\nmap_Kd {path.stem}.png\n")
+    with path.open("w", encoding="ascii") as file:
+        file.write(f"mtllib {path.stem}.mtl\nusemtl photographs\n")
+        np.savetxt(file, vertices, "v %.4f %.4f %.4f")
+        np.savetxt(file, np.column_stack([uv[:, 0], 1 - uv[:, 1]]), "vt %.6f %.6f")
+        np.savetxt(file, np.repeat(faces + 1, 2, axis=1), "f %d/%d %d/%d %d/%d")

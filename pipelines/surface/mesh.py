@@ -1,0 +1,215 @@
+"""Mesh of the surface: the zeros of the grid that views confirm, simplified square by square, welded and closed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+
+from pipelines.core.extras import require
+from pipelines.core.progress import SILENT, Progress
+from pipelines.core.types import BoolArray, FloatArray, IntArray
+from pipelines.geometry.similarity import Similarity
+from pipelines.surface.fusion import MOST_THROUGH, surface_sigma
+from pipelines.surface.surface_views import SurfaceViews
+from pipelines.surface.tsdf import GridSettings, Inside, RawMesh, surface_squares, welded
+
+_SAMPLED = 4  # one in so many vertices is measured against the simplified mesh
+_MOST_PASSES = 1000  # of the simplification, which ends before
+_NEAR_FACES = 4  # of those nearest a vertex whose distance is measured
+
+
+@dataclass(frozen=True)
+class SimplifiedMesh:
+    """Mesh with the errors of its simplification, metres, at a sample of the vertices before it."""
+
+    mesh: RawMesh
+    faces_before: int
+    rms_error_m: float
+    largest_error_m: float
+
+
+def surface_mesh(
+    views: SurfaceViews,
+    frame_from_model: Similarity,
+    settings: GridSettings,
+    cells: IntArray,
+    *,
+    error_m: float,
+    inside: Inside,
+    progress: Progress = SILENT,
+) -> SimplifiedMesh:
+    """Return the mesh of the surface in a frame with z up, without faces that too few views confirm.
+
+    Each square of the plan is simplified by itself; vertices on its border stay, so that squares meet.
+
+    Args:
+        error_m: bound of the simplification, see `simplified`; 0: not simplified.
+
+    Raises:
+        BackendUnavailableError: a library of the extra is missing.
+    """
+    parts, faces, squares, largest = [], 0, [np.zeros(0)], 0.0
+    for square in surface_squares(views, frame_from_model, settings, cells, progress):
+        good = _confirmed(square, views, frame_from_model, settings) & inside(square.vertices)
+        kept = compact(RawMesh(square.vertices, square.faces[good[square.faces].all(axis=1)]))
+        if not len(kept.faces):
+            continue
+        simple = simplified(kept, error_m)
+        errors = distances(kept.vertices[::_SAMPLED], simple, settings.voxel_m) if error_m > 0 else np.zeros(1)
+        squares.append(errors**2)
+        largest, faces = max(largest, float(errors.max())), faces + len(kept.faces)
+        parts.append(simple)
+    mesh = welded(parts, settings.voxel_m) if parts else RawMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+    return SimplifiedMesh(mesh, faces, float(np.sqrt(np.concatenate(squares).mean())) if parts else 0.0, largest)
+
+
+def _confirmed(
+    mesh: RawMesh, views: SurfaceViews, frame_from_model: Similarity, settings: GridSettings
+) -> BoolArray:
+    """Return which vertices views agree on, by the rules of the point cloud."""
+    model_from_frame = frame_from_model.inverse()
+    normal = vertex_normals(mesh) @ frame_from_model.rotation
+    support = views.support(model_from_frame.apply(mesh.vertices), normal)
+    with np.errstate(invalid="ignore"):
+        good = surface_sigma(support, np.full(len(normal), settings.pixel_m)) < settings.pixel_m
+    return good & (support.views >= settings.min_views) & (support.seen_through <= MOST_THROUGH * support.views)
+
+
+def vertex_normals(mesh: RawMesh) -> FloatArray:
+    """Return unit normals (V, 3): means of those of the faces, weighted by their areas."""
+    a, b, c = (mesh.vertices[mesh.faces[:, corner]] for corner in range(3))
+    cross, normal = np.cross(b - a, c - a), np.zeros_like(mesh.vertices)
+    for axis in range(3):
+        normal[:, axis] = np.bincount(mesh.faces.ravel(), np.repeat(cross[:, axis], 3), len(normal))
+    return np.asarray(normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30))
+
+
+def compact(mesh: RawMesh) -> RawMesh:
+    """Return a mesh without the vertices that no face has."""
+    used, faces = np.unique(mesh.faces, return_inverse=True)
+    return RawMesh(mesh.vertices[used], faces.reshape(-1, 3))
+
+
+def simplified(mesh: RawMesh, error_m: float) -> RawMesh:
+    """Return a mesh with fewer faces; its open borders stay.
+
+    Edges collapse as long as the distances of the new vertex from the planes of the faces that it replaces are not
+    above `error_m`, as a root of the sum of squares (Garland and Heckbert, doi 10.1145/258734.258849).
+    """
+    if error_m <= 0:
+        return mesh
+    require("mesh")
+    from pyfqmr import Simplify
+
+    work = Simplify()
+    work.setMesh(mesh.vertices, mesh.faces.astype(np.int32))
+    work.simplify_mesh_lossless(False, error_m**2, _MOST_PASSES, True)  # quietly, open borders preserved
+    vertices, faces, _ = work.getMesh()
+    return RawMesh(np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64))
+
+
+def distances(points: FloatArray, mesh: RawMesh, step_m: float) -> FloatArray:
+    """Return distances (N,) of points from a mesh, or slightly more; samples `step_m` apart find the faces."""
+    from trimesh.triangles import closest_point
+
+    corners = mesh.vertices[mesh.faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    count = np.ceil(np.maximum(2 * area / step_m**2, longest / step_m)).astype(np.int64) + 1
+    face = np.repeat(np.arange(len(corners)), count)
+    weight = np.sort(np.random.default_rng(0).random((len(face), 2)), axis=1)
+    weights = np.column_stack([weight[:, 0], weight[:, 1] - weight[:, 0], 1 - weight[:, 1]])
+    _, near = KDTree(np.einsum("nk,nkj->nj", weights, corners[face])).query(points, k=min(_NEAR_FACES, len(face)))
+    near = np.reshape(near, (len(points), -1))
+    found = [np.linalg.norm(closest_point(corners[face[column]], points) - points, axis=1) for column in near.T]
+    return np.asarray(np.min(found, axis=0))
+
+
+def without_islands(mesh: RawMesh, least_share: float) -> tuple[RawMesh, int]:
+    """Return the connected parts with at least a share of the largest part's area, and the number of the others."""
+    number, part = _parts(mesh)
+    corners = mesh.vertices[mesh.faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    areas = np.bincount(part, area, number)
+    kept = areas >= least_share * areas.max()
+    return compact(RawMesh(mesh.vertices, mesh.faces[kept[part]])), int((~kept & (areas > 0)).sum())
+
+
+def _parts(mesh: RawMesh) -> tuple[int, IntArray]:
+    """Return the number of connected parts, and that of each face (F,)."""
+    edges, size = mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2), len(mesh.vertices)
+    number, of_vertex = connected_components(coo_array((np.ones(len(edges)), tuple(edges.T)), (size, size)))
+    return number, of_vertex[mesh.faces[:, 0]]
+
+
+def closed(mesh: RawMesh, depth_m: float) -> tuple[RawMesh, int]:
+    """Return a watertight mesh, and the number of its first faces that are those of the surface.
+
+    Each part's outer rim falls plumb to a common base `depth_m` below the lowest vertex. A fan joins the rim of any
+    other hole to its middle: it follows no surface that anybody has seen. Faces at edges of more than two faces are
+    dropped before.
+    """
+    while True:
+        edge, count = _edges(mesh.faces)
+        crowded = count[edge] > 2
+        if not crowded.any():
+            break
+        mesh = compact(RawMesh(mesh.vertices, mesh.faces[~crowded.reshape(-1, 3).any(axis=1)]))
+    directed = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    loops = _cycles(directed[count[edge] == 1])
+    _, part = _parts(mesh)
+    of_vertex = np.zeros(len(mesh.vertices), np.int64)
+    of_vertex[mesh.faces[:, 0]] = of_vertex[mesh.faces[:, 1]] = of_vertex[mesh.faces[:, 2]] = part
+    reach = [float(np.linalg.norm(np.ptp(mesh.vertices[loop, :2], axis=0))) for loop in loops]
+    outer: dict[int, int] = {}
+    for number in np.argsort(reach, kind="stable"):
+        outer[int(of_vertex[loops[number][0]])] = int(number)
+    base_m = float(mesh.vertices[:, 2].min()) - depth_m
+    vertices, faces, total = [mesh.vertices], [mesh.faces], len(mesh.vertices)
+    for number, loop in enumerate(loops):
+        ring, middle = loop, mesh.vertices[loop].mean(axis=0)
+        if outer[int(of_vertex[loop[0]])] == number:
+            after, foot = np.roll(loop, -1), total + np.arange(len(loop))
+            vertices.append(np.column_stack([mesh.vertices[loop, :2], np.full(len(loop), base_m)]))
+            faces += [np.column_stack([after, loop, foot]), np.column_stack([after, foot, np.roll(foot, -1)])]
+            ring, middle, total = foot, np.array([*middle[:2], base_m]), total + len(loop)
+        vertices.append(middle[None])
+        faces.append(np.column_stack([np.roll(ring, -1), ring, np.full(len(ring), total)]))
+        total += 1
+    return RawMesh(np.concatenate(vertices), np.concatenate(faces)), len(mesh.faces)
+
+
+def _edges(faces: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the number of the edge (3F,) at each side of each face, and how many faces each edge has."""
+    sides = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    _, edge, count = np.unique(sides, axis=0, return_inverse=True, return_counts=True)
+    return edge.ravel(), count
+
+
+def _cycles(edges: IntArray) -> list[IntArray]:
+    """Return directed edges (E, 2) as cycles that visit no vertex twice."""
+    following: dict[int, list[int]] = {}
+    for first, second in edges.tolist():
+        following.setdefault(first, []).append(second)
+    cycles = []
+    for start in list(following):
+        while following[start]:
+            path, place = [start], {start: 0}
+            while True:
+                step = following[path[-1]].pop()
+                if step not in place:
+                    place[step] = len(path)
+                    path.append(step)
+                    continue
+                cycle = path[place[step] :]
+                cycles.append(np.array(cycle, dtype=np.int64))
+                for vertex in cycle[1:]:
+                    del place[vertex]
+                path = path[: place[step] + 1]
+                if len(path) == 1:
+                    break
+    return cycles
