@@ -102,7 +102,9 @@ class ExportRasterOptions(CrsOptions, TerrainOptions):
     contours_of: Literal["terrain", "surface"] = Field(
         "terrain", description="Draw the contour lines of the ground, or of everything that stands on it."
     )
-    min_views: int = Field(4, ge=2, description="Leave out cells whose surface fewer training views show.")
+    min_views: int = Field(
+        3, ge=2, description="Number of training views that must show a cell's surface; others are interpolated."
+    )
     max_pixels: float = Field(1e9, gt=0, description="Refuse a raster with more cells.")
     hillshade: bool = Field(True, description="Draw hillshade.png and preview.png.")
 

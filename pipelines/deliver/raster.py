@@ -37,7 +37,7 @@ from pipelines.survey.trained_survey import corners, load_trained, scene_points
 
 _DETAIL = 1.5  # training pixels over cells, beyond which a raster shows less than its cells promise
 # Bytes of a cell on the disk at most: colours, height, mask and two σ, as measured, whole and final rasters.
-_BYTES_PER_CELL = 66
+_BYTES_PER_CELL = 74
 _PICTURE_PX = 2000
 _COLOURED, _TINT = (0.01, 0.99), 0.55  # quantiles of the heights at the ends of the colours, and their strength
 _SUN_AZIMUTH_DEG, _SUN_ELEVATION_DEG = 315.0, 45.0

@@ -35,6 +35,7 @@ from pipelines.formats.vector_files import Json, feature
 from pipelines.surface.filling import fill_cells
 from pipelines.survey.target_crs import TargetCrs
 
+_SEEN = ("orthophoto", "dsm", "modelled", "sigma_h", "sigma_v")  # parts of what is measured
 _WINDOW_PX = 1536
 _SAMPLES_PX = 192  # a side of a window
 _ISLANDS_PX = 4000  # along the longer side, at which islands are looked for
@@ -91,14 +92,13 @@ class Mosaic:
         windows = list(self._windows())
         with progress.task("windows", len(windows)) as task:
             for window in windows:
-                names = ("orthophoto", "dsm", "sigma_h", "sigma_v")
-                if not all(self._part(self._seen, name, window).exists() for name in names):
+                if not all(self._part(self._seen, name, window).exists() for name in _SEEN):
                     self._write(self._seen, window, _seen_bands(source, window))
                 task.advance()
         self._drop_islands()
-        for name in ("orthophoto", "dsm"):
+        for name in ("orthophoto", "dsm", "modelled"):
             parts = [(self._part(self._seen, name, one), one.column, one.row) for one in windows]
-            write_vrt(name, parts, self.frame, self._kinds[name], {})
+            write_vrt(name, parts, self.frame, self._kinds["dsm" if name == "modelled" else name], {})
         with progress.task("whole windows", len(windows)) as task:
             for window in windows:
                 if not all(self._part(self._whole, name, window).exists() for name in self._kinds):
@@ -125,14 +125,12 @@ class Mosaic:
             dropped = island[number[_coarse_cells(window, step)]]
             if not dropped.any():
                 continue
-            for name in ("dsm", "sigma_h", "sigma_v", "orthophoto"):
-                path = self._part(self._seen, name, window)
-                values = read_cells(path)
-                if name == "orthophoto":
-                    values[3] = np.where(dropped, np.minimum(values[3], PAINTED), values[3])
-                else:
-                    values[:, dropped] = np.nan
-                write_part(path, values, window.frame)
+            bands = {name: read_cells(self._part(self._seen, name, window)) for name in _SEEN}
+            bands["modelled"][:, dropped] = bands["dsm"][:, dropped]
+            bands["orthophoto"][3][dropped] = PAINTED
+            for name in ("dsm", "sigma_h", "sigma_v"):
+                bands[name][:, dropped] = np.nan
+            self._write(self._seen, window, bands)
 
     def _seen_around(self, window: _Window) -> SeenCells:
         row, column = window.row, window.column
@@ -152,6 +150,7 @@ class Mosaic:
             ),
             height=read_cells(self._seen / "dsm.vrt", part)[0].astype(np.float64),
             rgba=read_cells(self._seen / "orthophoto.vrt", part),
+            modelled=read_cells(self._seen / "modelled.vrt", part)[0].astype(np.float64),
             sigma_h_m=sigma_h,
             sigma_v_m=sigma_v,
             inside=cells_inside(self.polygon, frame),
@@ -163,7 +162,8 @@ class Mosaic:
         rgba, _ = read_reduced(self._seen / "orthophoto.vrt", _COARSE_PX)
         rows, columns = height.shape[1:]
         inside = cells_inside(self.polygon, self.frame.resized(columns, rows))
-        cells = fill_cells(height[0], inside, max(rows, columns))
+        modelled, _ = read_reduced(self._seen / "modelled.vrt", _COARSE_PX)
+        cells = fill_cells(height[0], inside, max(rows, columns), modelled[0])
         rgb = np.moveaxis(rgba[:3], 0, 2).reshape(-1, 3)[cells.source]
         return CoarseCells(cells, rgb, self.frame.columns / columns)
 
@@ -201,7 +201,7 @@ class Mosaic:
         return [
             feature(
                 shapely.geometry.mapping(shapely.orient_polygons(shapely.transform(part, in_wgs84))),
-                {"area_m2": round(float(part.area) * metres, 2)},
+                {"area_m2": round(float(part.area) * metres, 4)},
             )
             for part in parts
         ]
@@ -256,5 +256,5 @@ def _coarse_cells(window: _Window, step: int) -> tuple[IntArray, IntArray]:
 def _seen_bands(source: RasterSource, window: _Window) -> dict[str, NDArray[Any]]:
     """Return the bands (B, H, W) of the rasters of what is measured in a window."""
     cells = render_window(source, window.frame, window.column, window.row)
-    heights = {"dsm": cells.height, "sigma_h": cells.sigma_h_m, "sigma_v": cells.sigma_v_m}
+    heights = dict(zip(_SEEN[1:], (cells.height, cells.modelled, cells.sigma_h_m, cells.sigma_v_m), strict=True))
     return {"orthophoto": cells.rgba, **{name: values[None].astype(np.float32) for name, values in heights.items()}}

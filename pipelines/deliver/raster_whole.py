@@ -31,6 +31,7 @@ class SeenCells:
         own: rows and columns of the window among them.
         height: NaN: not measured.
         rgba: (4, H, W); alpha as in `WindowCells`.
+        modelled: as in `WindowCells`.
         sigma_h_m, sigma_v_m: of the window's own cells.
         inside: cells in the area of interest.
     """
@@ -39,6 +40,7 @@ class SeenCells:
     own: tuple[slice, slice]
     height: FloatArray
     rgba: ByteArray
+    modelled: FloatArray
     sigma_h_m: FloatArray
     sigma_v_m: FloatArray
     inside: BoolArray
@@ -68,7 +70,7 @@ def whole_cells(
 ) -> dict[str, NDArray[Any]]:
     """Return the bands of each raster in a window that begins at a row and column; empty outside the area."""
     own, target = seen.own, source.target
-    cells = fill_cells(seen.height, seen.inside, REACH)
+    cells = fill_cells(seen.height, seen.inside, REACH, seen.modelled)
     blank = seen.rgba[3][own] == 0
     rgb = np.where(seen.rgba[3] > 0, seen.rgba[:3], seen.rgba[:3].reshape(3, -1)[:, cells.source])[:, *own]
     measured, inside = np.isfinite(seen.height)[own], seen.inside[own]
@@ -82,15 +84,22 @@ def whole_cells(
             values[wide] = np.where(fine > 0, fine * values[wide], 0.0) + (1 - fine) * wider[at]
         distance[wide] = np.where(fine > 0, distance[wide], coarse.cells.distance[at] * coarse.step)
         rgb[:, wide] = np.where((fine == 0) & blank[wide], coarse.rgb[at].T, rgb[:, wide])
+    # The model may know what no view confirms. Where it differs from what lies around, neither is sure.
+    modelled = seen.modelled[own]
+    taken = ~measured & np.isfinite(modelled) & np.isfinite(height)
+    spread[taken] = np.hypot(spread[taken], modelled[taken] - height[taken])
+    height[taken] = modelled[taken]
     known = inside & np.isfinite(height)
     frame = seen.frame.part(own[1].start, own[0].start, known.shape[1], known.shape[0])
     georeference_h, georeference_v = georeference_sigma(source, frame, np.where(known, height, np.nan))
+    # What views do not confirm to a training pixel is known no better than that.
+    spread_m = np.hypot(spread * target.crs.height_unit_m, source.training_gsd_m)
     # The place of what lies in a hole is as uncertain as the way to its rim is long.
     away_m = distance * frame.step_x * target.horizontal_unit_m
     heights = {
         "dsm": height,
         "sigma_h": np.where(measured, seen.sigma_h_m, np.hypot(georeference_h, away_m)),
-        "sigma_v": np.where(measured, seen.sigma_v_m, np.hypot(georeference_v, spread * target.crs.height_unit_m)),
+        "sigma_v": np.where(measured, seen.sigma_v_m, np.hypot(georeference_v, spread_m)),
     }
     if source.terrain is not None:
         ground, variance_m2 = _ground(source, source.terrain, seen)

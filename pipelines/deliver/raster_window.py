@@ -142,11 +142,13 @@ class WindowCells:
     Attributes:
         rgba: (4, H, W); alpha is 255 where the surface is measured, `PAINTED` where only a colour is known, or 0.
         height: (H, W) in the CRS's unit; NaN: not measured.
+        modelled: (H, W) height of the model where it is not measured; NaN: none, or measured.
         sigma_h_m, sigma_v_m: (H, W) metres; NaN: not measured, or not known.
     """
 
     rgba: ByteArray
     height: FloatArray
+    modelled: FloatArray
     sigma_h_m: FloatArray
     sigma_v_m: FloatArray
 
@@ -177,7 +179,7 @@ def render_window(source: RasterSource, frame: RasterFrame, column: int, row: in
     height = np.where(view.alpha > _SOLID, source.level - depth, np.nan)[middle::inner, middle::inner]
     colour, alpha = _reduced(view.colour, inner), _reduced(view.alpha, inner)
     seen, noise_up_m, noise_h_m = _support(source, frame, height)
-    height = np.where(seen, height, np.nan)
+    modelled, height = np.where(seen, np.nan, height), np.where(seen, height, np.nan)
     solid = np.isfinite(height)
     rgba = np.zeros((4, frame.rows, frame.columns), dtype=np.uint8)
     # Colours were blended over black: what is not opaque would be dark.
@@ -187,7 +189,7 @@ def render_window(source: RasterSource, frame: RasterFrame, column: int, row: in
     rgba[3] = np.where(solid, 255, np.where(painted, PAINTED, 0))
     sigma_h, sigma_v = georeference_sigma(source, frame, height)
     sigma_h, sigma_v = np.hypot(sigma_h, noise_h_m), np.hypot(sigma_v, noise_up_m)
-    return WindowCells(rgba, height, np.where(solid, sigma_h, np.nan), np.where(solid, sigma_v, np.nan))
+    return WindowCells(rgba, height, modelled, np.where(solid, sigma_h, np.nan), np.where(solid, sigma_v, np.nan))
 
 
 def _reduced(values: FloatArray, inner: int) -> FloatArray:

@@ -26,6 +26,11 @@ _AROUND = (
 _SOURCES = 0.25  # of the range of the heights around, by which one whose colour is taken may lie above the filled
 
 
+_AROUND = (
+    15  # cells around one whose scatter counts in its σ: on the edge of a roof, a cell decides between storeys
+)
+
+
 @dataclass(frozen=True)
 class FilledCells:
     """Cells (H, W) of a raster.
@@ -43,12 +48,15 @@ class FilledCells:
     source: IntArray
 
 
-def fill_cells(height: FloatArray, wanted: BoolArray, reach: int) -> FilledCells:
+def fill_cells(
+    height: FloatArray, wanted: BoolArray, reach: int, modelled: FloatArray | None = None
+) -> FilledCells:
     """Return heights (H, W), NaN where none was measured, filled where wanted from at most `reach` cells away.
 
     1. A cell looks in sixteen directions for the first measured height; the low quantile of these is its own.
-    2. Its variance is the mean square of their differences from it, plus the variance of the measured heights
-       nearby, plus, for the share of directions that found nothing, what heights differ by at that distance.
+    2. Its variance is the mean square of their differences from it, plus the variance of all heights nearby, those
+       that a model knows (H, W) included, plus, for the share of directions that found nothing, what heights differ
+       by at that distance.
     """
     height = np.ascontiguousarray(height, dtype=np.float64)
     empty = wanted & ~np.isfinite(height)
@@ -65,7 +73,8 @@ def fill_cells(height: FloatArray, wanted: BoolArray, reach: int) -> FilledCells
     close, far = _smoothed(filled, _SMOOTHED)[rows, columns], _smoothed(filled, _SMOOTHED_FAR)[rows, columns]
     share = np.clip(near / _FAR, 0.0, 1.0)
     filled[rows, columns] = np.where(found, (1 - share) * close + share * far, np.nan)
-    variance = square + _scatter(height)[rows, columns] + missing * np.interp(near, *_variogram(height))
+    relief = filled if modelled is None else np.where(empty & np.isfinite(modelled), modelled, filled)
+    variance = square + _scatter(relief)[rows, columns] + missing * np.interp(near, *_variogram(height))
     sigma[rows, columns], distance[rows, columns] = np.sqrt(variance), near
     own[rows, columns] = np.where(found, source, own[rows, columns])
     return FilledCells(filled, sigma, distance, own)
