@@ -20,7 +20,7 @@ from pipelines.core.progress import Progress
 from pipelines.core.types import ByteArray, FloatArray, IntArray
 from pipelines.geometry.footprints import PointSurface, ground_points
 from pipelines.report.plots.charts import labelled
-from pipelines.splat.exposure import fitted_affine, with_affine
+from pipelines.splat.exposure import fitted_affine, squared_radius, with_affine, with_vignetting
 from pipelines.splat.metrics import Lpips, psnr, ssim
 from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey.photographs import DIFFERENCE_GAIN
@@ -85,8 +85,9 @@ def compare_test_views(
 ) -> PhotometricFigures:
     """Return PSNR, SSIM and LPIPS of the test views.
 
-    `psnr` compares the render as it is. `psnr_compensated` first gives the render the exposure of the photograph,
-    by an affine change of colour fitted to that photograph. The remaining difference is not one of exposure.
+    `psnr` compares the render as the lens shows it, with its vignetting. `psnr_compensated` first gives the render
+    the exposure of the photograph, by an affine change of colour fitted to that photograph. The remaining
+    difference is not one of exposure.
     `psnr_covered` leaves out ground that fewer than two training views show: at the rim of a flight, a render is a
     guess.
 
@@ -99,7 +100,7 @@ def compare_test_views(
     with progress.task("test views", len(indices)) as task:
         for place, index in enumerate(indices):
             name = renderer.trained.sparse.image_name[index]
-            render = renderer.render(index).colour.clamp(0, 1).cpu()
+            render = _through_lens(renderer, index).clamp(0, 1)
             photo = torch.from_numpy(np.array(renderer.images.image(index))).float() / 255.0
             mask = torch.from_numpy(np.array(renderer.images.mask(index)))
             covered = coverage.covered(index)
@@ -129,6 +130,17 @@ def compare_test_views(
         lpips_reason=_NO_WEIGHTS if distance is None else None,
         per_view=tuple(views),
     )
+
+
+def _through_lens(renderer: ModelRenderer, index: int) -> Tensor:
+    colour, trained = renderer.render(index).colour.cpu(), renderer.trained
+    camera_id = int(trained.sparse.image_camera_id[index])
+    for lens in trained.model.vignetting:
+        if lens.camera_id == camera_id:
+            pinhole = renderer.pinholes.of(index)
+            radius2 = squared_radius(pinhole, pinhole, colour.device)
+            return with_vignetting(colour, radius2, torch.tensor(lens.coefficients))
+    return colour
 
 
 def _mean(values: Iterable[float | None]) -> float | None:

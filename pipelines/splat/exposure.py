@@ -1,5 +1,7 @@
 """Exposure of each photograph: an affine change of colour, fitted in training or adjusted from the points' colours.
 
+Each lens darkens its corners besides: a polynomial of the squared distance from its axis, fitted in training.
+
 Photographs of one flight differ in exposure and white balance. Without exposures, a model bakes these differences
 into the colours of Gaussians that few views see. The images cannot tell a change of all exposures from a change of
 all Gaussians: the mean over the training photographs is therefore fixed to the identity.
@@ -18,7 +20,7 @@ A weak prior keeps each exposure near the identity where a photograph has too fe
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,60 +31,100 @@ from torch import Tensor
 
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import Float32Array, FloatArray, IntArray
+from pipelines.geometry.cameras import Pinhole
 from pipelines.robust.statistics import cauchy_weight, median_chi2
 
 _FIRST_RATE, _LAST_RATE = 5e-3, 5e-4
+VIGNETTING_TERMS = 3  # of r², r⁴, r⁶
 _BETA1, _BETA2, _EPS = 0.9, 0.999, 1e-15
 
 
-class Exposures:
-    """Affine colour corrections (V, 3, 4) of V images, gain matrix and offset, and the Adam that changes them.
+class _RowsAdam:
+    """Rows of a tensor, each with an Adam of its own, whose rate falls over the iterations."""
 
-    Those of the images `train` (T,) change, with a rate that falls over the iterations; the others are identities.
-    """
+    def __init__(self, values: Tensor, iterations: int) -> None:
+        self.values, self._iterations = values, iterations
+        self._moments = torch.zeros(2, *values.shape, device=values.device)
+        self._steps = [0] * len(values)
 
-    def __init__(self, count: int, train: Tensor, iterations: int, device: torch.device) -> None:
-        self.affine = torch.eye(3, 4, device=device).repeat(count, 1, 1)
-        self._train, self._iterations = train.to(device), iterations
-        self._moments = torch.zeros(2, count, 3, 4, device=device)
-        self._steps = [0] * count
-        self._used: tuple[int, Tensor] | None = None
-
-    def apply(self, index: int, colour: Tensor) -> Tensor:
-        """Return the render (H, W, 3) with the exposure of photograph `index`; differentiable, for `step`."""
-        leaf = self.affine[index].clone().requires_grad_()
-        self._used = (index, leaf)
-        return with_affine(colour, leaf)
-
-    def step(self, iteration: int) -> None:
-        """Change the exposure that `apply` used last by an Adam step, and restore the mean over the images."""
-        if self._used is None or self._used[1].grad is None:
-            return
-        index, leaf = self._used
-        gradient, first, second = leaf.grad, self._moments[0, index], self._moments[1, index]
-        assert gradient is not None
-        self._steps[index] += 1
-        steps, progress = self._steps[index], iteration / self._iterations
+    def step(self, row: int, gradient: Tensor, iteration: int) -> None:
+        first, second = self._moments[0, row], self._moments[1, row]
+        self._steps[row] += 1
+        steps, progress = self._steps[row], iteration / self._iterations
         rate = _FIRST_RATE ** (1 - progress) * _LAST_RATE**progress
         first.lerp_(gradient, 1 - _BETA1)
         second.lerp_(gradient.square(), 1 - _BETA2)
         unbiased = (second / (1 - _BETA2**steps)).sqrt_().add_(_EPS)
-        self.affine[index] -= rate / (1 - _BETA1**steps) * first / unbiased
+        self.values[row] -= rate / (1 - _BETA1**steps) * first / unbiased
+
+    def state(self, name: str) -> dict[str, Tensor]:
+        steps = torch.tensor(self._steps, dtype=torch.int64)
+        return {name: self.values.clone(), f"{name}_moments": self._moments.clone(), f"{name}_steps": steps}
+
+    def restore(self, name: str, state: dict[str, Tensor]) -> None:
+        self.values.copy_(state[name])
+        self._moments.copy_(state[f"{name}_moments"])
+        self._steps = [int(count) for count in state[f"{name}_steps"]]
+
+
+class Exposures:
+    """Affine colour corrections (V, 3, 4) of V images, and the vignetting of their lenses, with their optimiser.
+
+    The corrections, gain matrix and offset, of the images `train` (T,) change; the others are identities. `lens`
+    (V,) tells the lens of each image by a number; None: all have one. Vignetting is that of `with_vignetting`.
+    """
+
+    def __init__(
+        self, count: int, train: Tensor, iterations: int, device: torch.device, lens: Sequence[int] | None = None
+    ) -> None:
+        numbers = [0] * count if lens is None else list(lens)
+        self.lenses = sorted(set(numbers))
+        self._lens = [self.lenses.index(number) for number in numbers]
+        self._affine = _RowsAdam(torch.eye(3, 4, device=device).repeat(count, 1, 1), iterations)
+        self._vignetting = _RowsAdam(torch.zeros(len(self.lenses), VIGNETTING_TERMS, device=device), iterations)
+        self._train = train.to(device)
+        self._used: tuple[int, Tensor, Tensor] | None = None
+
+    @property
+    def affine(self) -> Tensor:
+        return self._affine.values
+
+    @property
+    def vignetting(self) -> Tensor:
+        """Coefficients (L, terms) of `lenses`."""
+        return self._vignetting.values
+
+    def apply(self, index: int, colour: Tensor, radius2: Tensor | None = None) -> Tensor:
+        """Return the render (H, W, 3) as photograph `index` shows it; differentiable, for `step`.
+
+        `radius2` (H, W) is that of `with_vignetting`; None: the light does not fall off.
+        """
+        leaf = self.affine[index].clone().requires_grad_()
+        falloff = self.vignetting[self._lens[index]].clone().requires_grad_()
+        self._used = (index, leaf, falloff)
+        if radius2 is not None:
+            colour = with_vignetting(colour, radius2, falloff)
+        return with_affine(colour, leaf)
+
+    def step(self, iteration: int) -> None:
+        """Change the exposure and the lens that `apply` used last, and restore the mean over the images."""
+        if self._used is None or self._used[1].grad is None:
+            return
+        index, leaf, falloff = self._used
+        assert leaf.grad is not None
+        self._affine.step(index, leaf.grad, iteration)
+        if falloff.grad is not None:
+            self._vignetting.step(self._lens[index], falloff.grad, iteration)
         shift = self.affine[self._train].mean(dim=0) - torch.eye(3, 4, device=leaf.device)
         self.affine[self._train] -= shift
         self._used = None
 
     def state(self) -> dict[str, Tensor]:
-        return {
-            "affine": self.affine.clone(),
-            "moments": self._moments.clone(),
-            "steps": torch.tensor(self._steps, dtype=torch.int64),
-        }
+        return self._affine.state("affine") | self._vignetting.state("vignetting")
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        self.affine.copy_(state["affine"])
-        self._moments.copy_(state["moments"])
-        self._steps = [int(count) for count in state["steps"]]
+        self._affine.restore("affine", state)
+        self._vignetting.restore("vignetting", state)
 
 
 class FrozenExposures:
@@ -91,7 +133,7 @@ class FrozenExposures:
     def __init__(self, affine: Tensor) -> None:
         self.affine = affine
 
-    def apply(self, index: int, colour: Tensor) -> Tensor:
+    def apply(self, index: int, colour: Tensor, radius2: Tensor | None = None) -> Tensor:
         return with_affine(colour, self.affine[index])
 
     def step(self, iteration: int) -> None:
@@ -108,6 +150,35 @@ class FrozenExposures:
 def with_affine(colour: Tensor, affine: Tensor) -> Tensor:
     """Return A c + b of every colour c in (…, 3), for (A | b) in `affine` (3, 4)."""
     return colour @ affine[:, :3].T + affine[:, 3]
+
+
+def with_vignetting(colour: Tensor, radius2: Tensor, coefficients: Tensor) -> Tensor:
+    """Return colours (H, W, 3) as a lens with `coefficients` (terms,) shows them: c · (1 + r²(v₀ + r²(v₁ + …))).
+
+    `radius2` (H, W) is the squared distance from the optical axis; see `squared_radius`.
+    """
+    factor = torch.zeros_like(radius2)
+    for coefficient in reversed(coefficients.unbind()):
+        factor = radius2 * (factor + coefficient)
+    return colour * (1.0 + factor)[..., None]
+
+
+def squared_radius(camera: Pinhole, whole: Pinhole, device: torch.device) -> Tensor:
+    """Return the squared distance (H, W) of a view's pixels from the optical axis; 1 in the furthest corner.
+
+    The camera shows a part of the whole view, at the same focal length.
+    """
+
+    def squared(edges: Pinhole, x: np.ndarray, y: np.ndarray) -> FloatArray:
+        return np.asarray(((x - edges.cx) / edges.fx) ** 2 + ((y - edges.cy) / edges.fy) ** 2)
+
+    corner_x, corner_y = (
+        np.array([0.0, whole.width, 0.0, whole.width]),
+        np.array([0.0, 0.0, whole.height, whole.height]),
+    )
+    longest = squared(whole, corner_x, corner_y).max()
+    x, y = np.arange(0.5, camera.width), np.arange(0.5, camera.height)
+    return torch.from_numpy((squared(camera, x, y[:, None]) / longest).astype(np.float32)).to(device)
 
 
 def fitted_affine(rendered: Tensor, photograph: Tensor, mask: Tensor | None = None) -> Tensor:

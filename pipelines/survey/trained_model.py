@@ -120,9 +120,20 @@ class Adjustment(Product):
         return replace(sfm, cameras=sfm.cameras | solved)
 
 
+class LensVignetting(Product):
+    """Fall-off of a lens: its photographs show a colour c as c · (1 + r²(v₀ + r²(v₁ + r² v₂))).
+
+    r is the distance from the optical axis, 1 in the furthest corner of the undistorted photograph.
+    """
+
+    camera_id: int
+    coefficients: Vector3
+
+
 class TrainedModel(Adjustment):
     """Product of `train` beside the Gaussians: the solution of the training, and its settings."""
 
+    vignetting: tuple[LensVignetting, ...] = ()  # of the lenses for which it was estimated
     max_image_size: int = Field(gt=0)
     background: Vector3
     sh_degree: int

@@ -22,7 +22,9 @@ from pipelines.adjust.posterior import Posterior, save_posterior
 from pipelines.adjust.system import minimise
 from pipelines.core.products import Remark, load_json, save_json
 from pipelines.core.stages import LIDAR, LIDAR_MAP, MODEL, POINTS, SIM3_POSTERIOR, TRAIN_POSTERIOR
+from pipelines.core.types import vector3
 from pipelines.core.workspace import StageRun, Summary, Workspace
+from pipelines.splat.exposure import Exposures
 from pipelines.splat.gaussians import write_gaussians
 from pipelines.splat.memory import free_memory_bytes, require_memory
 from pipelines.splat.rasterizer.backends import device_of, rasterizer
@@ -36,7 +38,7 @@ from pipelines.survey.options import CloudCrs
 from pipelines.survey.photographs import ImageCache
 from pipelines.survey.report_parts import EstimatedError, LidarReport
 from pipelines.survey.scene import photographs
-from pipelines.survey.trained_model import Adjustment, TrainedModel
+from pipelines.survey.trained_model import Adjustment, LensVignetting, TrainedModel
 from pipelines.train.adjusted_scene import AdjustedScene, figures_of, with_exposures
 from pipelines.train.compilation import compile_kernels
 from pipelines.train.estimate import estimate_training, training_size, with_gaussian_limit
@@ -148,11 +150,18 @@ def _write_solution(
 
 def trained_model(trainer: JointTrainer, solution: Adjustment) -> TrainedModel:
     """Return the product of `train` without the Gaussians, given the solution at the end of the training."""
+    vignetting: tuple[LensVignetting, ...] = ()
     if trainer.exposures is not None:
         solution = with_exposures(solution, trainer.exposures.affine.cpu().numpy().astype(float))
+    if isinstance(trainer.exposures, Exposures):
+        fitted = zip(trainer.exposures.lenses, trainer.exposures.vignetting.tolist(), strict=True)
+        vignetting = tuple(
+            LensVignetting(camera_id=lens, coefficients=vector3(np.array(falloff))) for lens, falloff in fitted
+        )
     gaussians = trainer.optimizer.gaussians
     return TrainedModel(
         **dict(solution),
+        vignetting=vignetting,
         max_image_size=trainer.views.images.max_size_px,
         background=BACKGROUND,
         sh_degree=gaussians.sh_degree,

@@ -30,7 +30,7 @@ from pipelines.splat.densify import (
     view_contributions,
 )
 from pipelines.splat.densify_mcmc import McmcSettings, McmcStrategy
-from pipelines.splat.exposure import Exposures, FrozenExposures
+from pipelines.splat.exposure import Exposures, FrozenExposures, squared_radius
 from pipelines.splat.gaussians import FinitenessMonitor, Gaussians
 from pipelines.splat.initialise import InitialisationOptions, scene_extent
 from pipelines.splat.optimizer import GaussianAdam
@@ -175,7 +175,7 @@ class JointTrainer:
             least = 1 if self.options.crops is None else self.options.crops.shrink(camera.width, camera.height)
             shrink = max(self.schedule.shrink(self.iteration, camera.width, camera.height), least)
             target, pose = self._targets.get(ImageLook(index, shrink)), self.problem.cameras.cam_from_model(index)
-            colour = self._exposed(index, self._render(pose, target).colour)
+            colour = self._exposed(index, self._render(pose, target).colour, target)
             error = (colour - target.colour).abs().mean(dim=-1)
             error = error if target.mask is None else error * target.mask
             of_view = view_contributions(self.optimizer.gaussians, pose, target.camera, error, self.rasterizer)
@@ -216,7 +216,7 @@ class JointTrainer:
         index = self.schedule.view(self.iteration)
         pose = self.problem.cameras.cam_from_model(index)
         render = self._render(pose, target, depth=self.problem.sees_by_depth(index))
-        colour, counting = self._exposed(index, render.colour), target.mask
+        colour, counting = self._exposed(index, render.colour, target), target.mask
         if self.outliers is not None:
             longest_px = max(target.whole.width, target.whole.height)
             counting = self.outliers.inliers(colour, target.colour, counting, longest_px)
@@ -238,8 +238,10 @@ class JointTrainer:
             gaussians = Gaussians.concatenate([gaussians, self.region.surroundings])
         return self.rasterizer.render(gaussians, pose, target.whole, settings)
 
-    def _exposed(self, index: int, colour: Tensor) -> Tensor:
-        return colour if self.exposures is None else self.exposures.apply(index, colour)
+    def _exposed(self, index: int, colour: Tensor, target: TargetImage) -> Tensor:
+        if self.exposures is None:
+            return colour
+        return self.exposures.apply(index, colour, squared_radius(target.camera, target.whole, self.device))
 
     def _own(self, stats: ScreenStats) -> ScreenStats:
         """Return the statistics of the Gaussians in training, without those that surround the region."""
@@ -335,7 +337,8 @@ def make_trainer(
     gaussians = initial_gaussians(training, start, effort.max_gaussians, options.seed).to(device)
     extent_m = scene_extent(scene.poses.cam_center_in_model)
     train = torch.from_numpy(scene.train)
-    fitted = Exposures(len(images), train, effort.iterations, device) if options.exposure else None
+    lens = scene.sparse.image_camera_id.tolist()
+    fitted = Exposures(len(images), train, effort.iterations, device, lens) if options.exposure else None
     known = depth_loss_points(training, device) if options.geometry_regularisation else None
     measured = surface.losses(device) if isinstance(surface, FusedSurface) else ()
     outliers = OutlierSettings(views=int(_OUTLIERS_FROM * effort.iterations))

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from pipelines.splat.exposure import Exposures, fitted_affine, with_affine
+from pipelines.geometry.cameras import Pinhole
+from pipelines.splat.exposure import Exposures, fitted_affine, squared_radius, with_affine, with_vignetting
 
 CPU = torch.device("cpu")
 TRAIN = torch.tensor([0, 1, 3])
@@ -38,6 +39,29 @@ def test_a_common_gain_is_left_to_the_gaussians() -> None:
         exposures.step(iteration)
     # The last step moves one of three further than the others: a rate of 5e-4 at the end.
     assert float((exposures.affine - torch.eye(3, 4)).abs().max()) < 0.01
+
+
+def test_vignetting_of_each_lens_is_found_beside_the_exposures() -> None:
+    """To 1.5 % in every pixel, of up to 30 %: the mean of the exposures, and the middle, are frozen at 1."""
+    whole = Pinhole(32, 24, 30.0, 30.0, 16.5, 11.0)
+    radius2 = squared_radius(whole, whole, CPU)
+    assert 0.9 < float(radius2.max()) <= 1.0
+    part = Pinhole(8, 6, 30.0, 30.0, 16.5 - 20, 11.0 - 10)
+    torch.testing.assert_close(squared_radius(part, whole, CPU), radius2[10:16, 20:28])
+    true = {7: torch.tensor([-0.3, 0.1, -0.1]), 9: torch.tensor([-0.1, 0.0, 0.05])}
+    lens, gain, colour = [7, 7, 7, 9], {0: 1.1, 1: 0.9, 3: 1.0}, torch.rand(24, 32, 3)
+    exposures = Exposures(4, TRAIN, 1500, CPU, lens)
+    for iteration in range(1, 1501):
+        index = int(TRAIN[iteration % 3])
+        shown = exposures.apply(index, colour, radius2)
+        (shown - gain[index] * with_vignetting(colour, radius2, true[lens[index]])).square().mean().backward()
+        exposures.step(iteration)
+    grey = torch.ones(24, 32, 3)
+    for row, number in enumerate(exposures.lenses):
+        found = with_vignetting(grey, radius2, exposures.vignetting[row])
+        assert float((found - with_vignetting(grey, radius2, true[number])).abs().max()) < 0.015
+    shown = with_affine(colour, exposures.affine[0])
+    assert float((shown - gain[0] * colour).abs().max()) < 0.01
 
 
 def test_a_state_continues_exactly() -> None:
