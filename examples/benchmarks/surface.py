@@ -13,11 +13,15 @@ Of `cloud.laz` and `mesh.ply`, where there are any, points are compared with poi
 evenly: `off` is the mean distance of the file's points from the true surface, and `precision` the share of those
 that are off by 0.1 m at most; `missing` and `recall` are the same the other way round, of the true surface that
 three photographs see. Chamfer is the mean of both distances, F1 the harmonic mean of both shares.
+
+Of the terrain, cells are compared with the true ground: open, and below houses, trees and cars. Errors of type I
+are ground points of the cloud that are not told as such, errors of type II others that are.
 """
 
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import laspy
@@ -43,11 +47,15 @@ _CLASSES = {"ground": (Material.TERRAIN,), "roofs": (Material.TILES, Material.FL
 
 
 class TrueSurface:
-    """Upper surface of a simulated scene, by plumb lines."""
+    """Upper surface of a simulated scene, or its ground alone, by plumb lines."""
 
-    def __init__(self, options: SimulateOptions, crs: PointCrs) -> None:
+    def __init__(self, options: SimulateOptions, crs: PointCrs, *, ground: bool = False) -> None:
         world = fly_survey(options).world
         self._origin, self._mesh, self._crs = world.origin, world.scene.mesh, crs
+        if ground:
+            chosen = np.asarray(self._mesh.material) == Material.TERRAIN
+            rows = {name: value[chosen] for name, value in vars(self._mesh).items() if len(value) == len(chosen)}
+            self._mesh = replace(self._mesh, **rows)
         self._rays = Raycaster(self._mesh)
 
     def at(self, xy: FloatArray) -> tuple[FloatArray, IntArray]:
@@ -66,6 +74,7 @@ class TrueSurface:
         return np.where(known, height, np.nan), np.where(known, material, -1)
 
 
+_OPEN_M, _GROUND_M = 0.05, 0.5  # above the ground: of open ground, and of points that are none
 _NEAR_M = 0.1  # of F1
 _PER_M2, _BESIDE_M = 30.0, 0.25  # points on the true surface, and how far beside each other points are one place
 _DRAWN, _TARGETS, _SEEN_BY = 400_000, 30_000, 3
@@ -155,6 +164,32 @@ def seen_by(flight: RecordedFlight, points: FloatArray) -> IntArray:
     return seen
 
 
+def compare_ground(workspace: Path, options: SimulateOptions) -> None:
+    """Print the errors of the terrain model and of the classes of the cloud, where there are any."""
+    dtm, cloud = workspace / "raster" / "dtm.tif", workspace / "cloud" / "cloud.laz"
+    if dtm.is_file():
+        crs = parse_crs(load_json(CrsSidecar, sidecar_path(dtm)).crs)
+        with rasterio.open(dtm) as heights, rasterio.open(dtm.with_name("sigma_dtm.tif")) as sigmas:
+            row, column = np.nonzero(heights.read_masks(1))
+            xy = np.column_stack(rasterio.transform.xy(heights.transform, row, column))
+            height, sigma = (raster.read(1)[row, column].astype(float) for raster in (heights, sigmas))
+        ground, top = TrueSurface(options, crs, ground=True).at(xy)[0], TrueSurface(options, crs).at(xy)[0]
+        error, is_open = height - ground, top - ground < _OPEN_M
+        for name, chosen in (("open ground", is_open), ("below things", ~is_open)):
+            e, z = error[chosen & np.isfinite(error)], (error / sigma)[chosen & np.isfinite(error)]
+            print(
+                f"terrain, {name:14s}{len(e):9d} cells, bias {np.median(e):+.3f}, "
+                f"RMSE {np.sqrt(np.mean(e**2)):.3f}, error/σ {np.sqrt(np.mean(z**2)):.2f}"
+            )
+    if cloud.is_file():
+        crs, las = parse_crs(load_json(CrsSidecar, sidecar_path(cloud)).crs), laspy.read(cloud)
+        xyz = np.asarray(las.xyz)
+        above, told = xyz[:, 2] - TrueSurface(options, crs, ground=True).at(xyz[:, :2])[0], las.classification == 2
+        true = np.abs(above) < _GROUND_M
+        first, second = np.mean(~told[true]), np.mean(told[~true])
+        print(f"cloud, ground within {_GROUND_M} m: type I {first:.2%}, type II {second:.2%}")
+
+
 def main() -> None:
     """Print errors by class."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -166,6 +201,7 @@ def main() -> None:
     names = ("scene", "flight", "images", "size", "seed")
     options = SimulateOptions.model_validate({name: getattr(args, name) for name in names})
     compare_points(args.workspace, options)
+    compare_ground(args.workspace, options)
     dsm, sigma, measured_mask = (
         args.workspace / "raster" / f"{name}.tif" for name in ("dsm", "sigma_v", "measured")
     )
