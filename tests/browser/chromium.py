@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import contextlib
-import functools
 import hashlib
 import shutil
 import subprocess
@@ -28,11 +27,6 @@ from pipelines.geometry.similarity import Similarity
 from pipelines.report.chromium import NO_NETWORK, chromium_path
 
 CACHE = Path(__file__).parents[2] / "build/browser"
-CESIUM_VERSION = "1.145.0"
-CESIUM_SHA512 = (
-    "e80ce2c7c6f92cfa68552c7c5d0eb33f3b6996e2559aaf8210edd6dab396c6d7"
-    "3a6eb8ba35cf4cbc26212a64d6d4b004c1f8ac57bcb33607ee9425f0f7ce36fa"
-)
 # WebGL 2 on the CPU: the same on every machine, and no GPU is needed.
 FLAGS = (
     "--use-gl=angle",
@@ -50,36 +44,68 @@ class MissingProgramError(Exception):
     """Program that the tests need and that is not there; the message says what to install."""
 
 
-def cesium_folder() -> Path:
-    """Return the folder of CesiumJS, which npm fetches once into a folder that git ignores.
+@dataclass(frozen=True)
+class Library:
+    """Package of npm, which fetches it once into a folder that git ignores.
 
-    Raises:
-        MissingProgramError: npm is missing or cannot fetch it.
+    Attributes:
+        package: its name.
+        version: of the package.
+        sha512: hash of the archive that npm publishes.
+        part: the package's folder that is served.
     """
-    with _FETCHING:  # the server asks from many threads
-        return _cesium_folder()
 
+    package: str
+    version: str
+    sha512: str
+    part: str
 
-@functools.cache
-def _cesium_folder() -> Path:
-    folder = CACHE / f"cesium-{CESIUM_VERSION}"
-    if folder.is_dir():
+    def folder(self) -> Path:
+        """Return the folder of the part that is served.
+
+        Raises:
+            MissingProgramError: npm is missing or cannot fetch it.
+        """
+        folder = CACHE / f"{self.package.rpartition('/')[2]}-{self.version}"
+        with _FETCHING:  # the server asks from many threads
+            if not folder.is_dir():
+                self._fetch(folder)
         return folder
-    npm = shutil.which("npm")
-    if npm is None:
-        raise MissingProgramError(f"npm is missing, which fetches CesiumJS into {CACHE}: `apt-get install npm`")
-    with tempfile.TemporaryDirectory(dir=_made(CACHE)) as draft:
-        command = [npm, "pack", "--silent", f"cesium@{CESIUM_VERSION}"]
-        done = subprocess.run(command, cwd=draft, capture_output=True, text=True, check=False)
-        archive = Path(draft) / f"cesium-{CESIUM_VERSION}.tgz"
-        if done.returncode != 0 or not archive.is_file():
-            raise MissingProgramError(f"npm could not fetch CesiumJS {CESIUM_VERSION}: {done.stderr.strip()}")
-        if hashlib.sha512(archive.read_bytes()).hexdigest() != CESIUM_SHA512:
-            raise MissingProgramError(f"npm did not give the published CesiumJS {CESIUM_VERSION}")
-        with tarfile.open(archive) as package:
-            package.extractall(draft, filter="data")
-        (Path(draft) / "package/Build/Cesium").rename(folder)
-    return folder
+
+    def _fetch(self, folder: Path) -> None:
+        npm, name = shutil.which("npm"), f"{self.package}@{self.version}"
+        if npm is None:
+            raise MissingProgramError(f"npm is missing, which fetches {name} into {CACHE}: `apt-get install npm`")
+        with tempfile.TemporaryDirectory(dir=_made(CACHE)) as draft:
+            command = [npm, "pack", "--silent", name]
+            done = subprocess.run(command, cwd=draft, capture_output=True, text=True, check=False)
+            archive = next(Path(draft).glob("*.tgz"), None)
+            if done.returncode != 0 or archive is None:
+                raise MissingProgramError(f"npm could not fetch {name}: {done.stderr.strip()}")
+            if hashlib.sha512(archive.read_bytes()).hexdigest() != self.sha512:
+                raise MissingProgramError(f"npm did not give the published {name}")
+            with tarfile.open(archive) as package:
+                package.extractall(draft, filter="data")
+            (Path(draft) / "package" / self.part).rename(folder)
+
+
+# By the folder of the server in which they are.
+LIBRARIES = {
+    "Cesium": Library(
+        "cesium",
+        "1.145.0",
+        "e80ce2c7c6f92cfa68552c7c5d0eb33f3b6996e2559aaf8210edd6dab396c6d7"
+        "3a6eb8ba35cf4cbc26212a64d6d4b004c1f8ac57bcb33607ee9425f0f7ce36fa",
+        "Build/Cesium",
+    ),
+    "SuperSplat": Library(
+        "@playcanvas/supersplat-viewer",
+        "1.36.2",
+        "2fbc340656a00289d11d0839aa1683c8107cceb46d894f5082094d53791482ca"
+        "87a6890202db9ff63e0fd24c6c51a427eb5159d6a2469112ac3826eb2c20d1d3",
+        ".",
+    ),
+}
 
 
 def _made(folder: Path) -> Path:
@@ -89,16 +115,17 @@ def _made(folder: Path) -> Path:
 
 @contextlib.contextmanager
 def served(folder: Path) -> Iterator[str]:
-    """Serve a folder on loopback, with CesiumJS in `Cesium/`; gives its address.
+    """Serve a folder on loopback, with each of `LIBRARIES` in a folder of its name; gives its address.
 
     The server is that of `python -m http.server --bind 127.0.0.1`.
     """
 
     class Handler(SimpleHTTPRequestHandler):
         def translate_path(self, path: str) -> str:
-            library = path.startswith("/Cesium/")
-            self.directory = str(cesium_folder() if library else folder)
-            return super().translate_path(path.removeprefix("/Cesium") if library else path)
+            first, _, rest = path.removeprefix("/").partition("/")
+            library = LIBRARIES.get(first)
+            self.directory = str(library.folder() if library else folder)
+            return super().translate_path(f"/{rest}" if library else path)
 
         def log_message(self, format: str, *args: Any) -> None:
             pass
@@ -250,6 +277,6 @@ class Viewer:
 
 if __name__ == "__main__":
     try:
-        print(f"{chromium_path()}, CesiumJS in {cesium_folder()}")
+        print(", ".join(map(str, [chromium_path(), *(library.folder() for library in LIBRARIES.values())])))
     except (MissingProgramError, BackendUnavailableError) as error:
         sys.exit(f"browser tests: {error}")
