@@ -140,11 +140,13 @@ def _evaluated_cameras(workspace: Workspace) -> EvaluationReport | None:
     from pipelines.adjust.solution import posterior_of
     from pipelines.evaluate.options import EvaluateOptions
     from pipelines.evaluate.stage import evaluate
+    from pipelines.survey.area import hectares_of
     from pipelines.survey.trained_survey import load_solved
 
     try:
         solved = load_solved(workspace)
-        return evaluate(solved, posterior_of(workspace, solved.model, solved.sfm), EvaluateOptions())
+        posterior, options = posterior_of(workspace, solved.model, solved.sfm), EvaluateOptions()
+        return evaluate(solved, posterior, options, area_ha=hectares_of(options, solved))
     except GeorefError as error:  # The run has succeeded all the same.
         log.debug("no evaluation of the cameras: %s", error)
         return None

@@ -21,7 +21,6 @@ EXTRAS: dict[Extra, tuple[str, tuple[str, ...]]] = {
     "vectors": ("contour lines and boundaries (--contours, --boundary)", ("ezdxf", "pyogrio")),
     "viewer": ("georef view", ("viser", "websockets", "msgspec")),
 }
-_MODULES = {"cloth-simulation-filter": "CSF", "scikit-image": "skimage"}  # where the names differ
 
 
 @dataclass(frozen=True)
@@ -31,6 +30,11 @@ class Part:
     name: str
     found: str | None
     remedy: str
+
+
+def module_of(package: str) -> str:
+    """Return the module that a package of an extra installs."""
+    return {"cloth-simulation-filter": "CSF", "scikit-image": "skimage"}.get(package, package)
 
 
 def installing(extra: str) -> str:
@@ -48,7 +52,7 @@ def require(extra: Extra) -> None:
 def extra_part(extra: Extra) -> Part:
     """Return an extra with the versions of its libraries."""
     user, libraries = EXTRAS[extra]
-    missing = [name for name in libraries if find_spec(_MODULES.get(name, name)) is None]
+    missing = [name for name in libraries if find_spec(module_of(name)) is None]
     if missing:
         remedy = f"{user} needs {', '.join(missing)}, which the extra {extra} installs: {installing(extra)}"
         return Part(extra, None, remedy)

@@ -99,6 +99,9 @@ SOLVED = (
     *whole_products(ADJUSTMENT, SIM3_POSTERIOR, MODEL, TRAIN_POSTERIOR, GAUSSIANS, optional=True),
 )
 
+# The area of interest, to which splats are cropped on request.
+CROPPED_BY = whole_products(SPARSE, SIM3, optional=True)
+
 # The accuracy of the result, which every file to hand over states.
 HEADLINE = ProductPart(REPORT, fields=("headline",), optional=True)
 
@@ -234,7 +237,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         module="pipelines.deliver.ply",
         options_place="pipelines.deliver.options:ExportPlyOptions",
         folder="export",
-        reads=(MEASURED, *whole_products(SPARSE, MODEL, GAUSSIANS, SIM3), APPLIED_RIG, HEADLINE),
+        reads=(MEASURED, *whole_products(MODEL, GAUSSIANS), *CROPPED_BY, APPLIED_RIG, HEADLINE),
         product=SPLAT,
         title="Write the splat as a PLY with its place on Earth.",
     ),
@@ -291,7 +294,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         module="pipelines.deliver.spz",
         options_place="pipelines.deliver.options:ExportSpzOptions",
         folder="spz",
-        reads=(MEASURED, *whole_products(SPARSE, MODEL, GAUSSIANS, SIM3), APPLIED_RIG, HEADLINE),
+        reads=(MEASURED, *whole_products(MODEL, GAUSSIANS), *CROPPED_BY, APPLIED_RIG, HEADLINE),
         product=SPZ,
         title="Write the splat as SPZ, for viewers on the web.",
     ),
@@ -300,7 +303,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         module="pipelines.deliver.tiles",
         options_place="pipelines.deliver.options:ExportTilesOptions",
         folder="tiles",
-        reads=(MEASURED, *whole_products(SPARSE, MODEL, GAUSSIANS, SIM3), APPLIED_RIG, HEADLINE),
+        reads=(MEASURED, *whole_products(MODEL, GAUSSIANS), *CROPPED_BY, APPLIED_RIG, HEADLINE),
         product=TILES,
         title="Write the splat as 3D Tiles, for web globes.",
         also=(TILES_GLB,),

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.core.extras import EXTRAS, Extra, installing
+from pipelines.core.extras import EXTRAS, Extra, installing, module_of
 from pipelines.core.workspace import Workspace
 from tests.cli_runs import REPOSITORY, Georef, Result
 from tests.test_architecture import inside, sources
@@ -19,7 +19,7 @@ NEEDS_AN_EXTRA = ("pipelines.view.loopback",)
 
 def hide(monkeypatch: pytest.MonkeyPatch, extra: Extra) -> None:
     for library in EXTRAS[extra][1]:
-        monkeypatch.setitem(sys.modules, library, None)
+        monkeypatch.setitem(sys.modules, module_of(library), None)
 
 
 @pytest.fixture
@@ -109,7 +109,7 @@ def test_option_without_its_extra(
 
 def test_core_imports_no_extra() -> None:
     """Every file but the viewer's server is imported without the libraries of the extras, and commands answer."""
-    hidden = [*(library for _, libraries in EXTRAS.values() for library in libraries), "dask", "lz4"]
+    hidden = [*(module_of(library) for _, libraries in EXTRAS.values() for library in libraries), "dask", "lz4"]
     modules = [name for name in sources() if not any(inside(name, home) for home in NEEDS_AN_EXTRA)]
     code = f"""
 import importlib, sys

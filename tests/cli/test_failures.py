@@ -50,7 +50,7 @@ def test_missing_product_hints_at_the_command(georef: Georef, workspace: Workspa
         (["sfm", "WS", "--frobnicate"], "--frobnicate"),
         (["train", "WS", "--iterations", 0], "--iterations"),
         (["compare", "WS", "--configs", "Z"], "--configs"),
-        (["run", "WS", "--deliver", "mesh"], None),
+        (["run", "WS", "--deliver", "meshes"], None),
         (["run", "WS", "--from", "train", "--to", "sfm"], None),
         (["run", "WS", "--to", "sfm", "--preset", "fast"], None),
         (["sfm"], None),
