@@ -54,6 +54,7 @@ from pipelines.geometry.sparse_model import SparseModel
 from pipelines.robust.statistics import ResidualStats, residual_stats, squared_mahalanobis
 from pipelines.survey.adjustment import GeolocatedPoints, InitialSimilarity
 from pipelines.survey.calibrated import load_survey
+from pipelines.survey.marks import of_wrong_marks, wrong_marks
 from pipelines.survey.scene import initial_scene
 from pipelines.survey.survey import Survey
 
@@ -174,6 +175,7 @@ def robust_similarity(
         update={"control_outliers": tuple(p.name for p in survey.control_points if p.name not in control.name)}
     )
     warnings = () if mistake else _of_unused(unused)  # else the caution says why
+    warnings += of_wrong_marks(wrong_marks(survey.control_points, model))
     meeting = tuple(point for point in survey.control_points if point.name in control.name)
     meets = survey.model_copy(update={"control_points": meeting})
     try:

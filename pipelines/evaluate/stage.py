@@ -10,7 +10,7 @@ Residuals of observations that entered one are reported as a fit, not as an accu
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -57,6 +57,7 @@ from pipelines.surface.measured_cloud import CloudReader
 from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey.area import hectares_of
 from pipelines.survey.headline import headline
+from pipelines.survey.marks import of_wrong_marks, wrong_marks
 from pipelines.survey.options import CloudCrs
 from pipelines.survey.photographs import write_render
 from pipelines.survey.report import (
@@ -195,7 +196,9 @@ def run(stage: StageRun, options: EvaluateOptions) -> Summary:
     if report.cameras is not None:
         write_camera_sigma(stage.out / "cameras.csv", solved.sfm.image_name, posterior.camera_cov)
     save_json(report, stage.out / "report.json")
-    return summarise(report)
+    summary = summarise(report)
+    wrong = of_wrong_marks(wrong_marks(solved.survey.check_points, solved.sparse))
+    return replace(summary, warnings=(*summary.warnings, *wrong))
 
 
 def evaluate(

@@ -202,7 +202,7 @@ def _group(
     by_name = {row.name: row.error_m for row in errors}
     surveyed = np.array([point.position_in_geo for point in points]).reshape(-1, 3)
     error = np.array([by_name.get(point.name) or (np.nan,) * 3 for point in points]).reshape(-1, 3)
-    rays = mark_rays(points, evaluated.solved.sparse)
+    rays = mark_rays(points, evaluated.solved.sparse, wrong=True)
     surveyed_px, adjusted_px = (
         _projected(evaluated, place[rays.point], rays.camera) for place in (surveyed, surveyed + error)
     )

@@ -4,14 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
+from pipelines.core.products import Remark
 from pipelines.core.types import BoolArray, FloatArray, IntArray, rows_of
 from pipelines.geometry.cameras import bearings
 from pipelines.geometry.intersection import Intersections, Rays, UncertainCameras, intersect_rays
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.survey import SurveyedPoint
+
+_LEAST_MARKS = 4  # of a point: fewer cannot tell which of them is wrong
+_MOST_PAIRS = 200  # of a point's rays
+_LEAST_OFF_PX, _FAR_OFF = 3.0, 5.0  # least distance of a wrong mark, and in the scatter of marks and in its σ
+_RIDGE = 1e-9  # of parallel rays, which meet nowhere
 
 
 @dataclass(frozen=True)
@@ -43,11 +50,87 @@ class MarkRays:
         return replace(rays, point_name=names, point=(np.cumsum(chosen) - 1)[rays.point])
 
 
-def mark_rays(points: Sequence[SurveyedPoint], sparse: SparseModel) -> MarkRays:
-    """Return the rays of all marks of J points, in their order, in registered images.
+@dataclass(frozen=True)
+class WrongMark:
+    """Mark that the other marks of its point show to be wrong, and how far off it is."""
 
-    A mark is left out if the lens maps no ray to its pixel.
+    point: str
+    image: str
+    off_px: float
+
+
+def mark_rays(points: Sequence[SurveyedPoint], sparse: SparseModel, *, wrong: bool = False) -> MarkRays:
+    """Return the rays of the marks of J points, in their order, in registered images.
+
+    A mark is left out if the lens maps no ray to its pixel, or, without `wrong`, if the point's other marks show it
+    to be wrong.
     """
+    rays = _all_rays(points, sparse)
+    return rays if wrong else rows_of(rays, _off_px(rays, sparse) == 0)
+
+
+def wrong_marks(points: Sequence[SurveyedPoint], sparse: SparseModel) -> tuple[WrongMark, ...]:
+    """Return the marks that `mark_rays` leaves out because others of their point do not meet them."""
+    rays = _all_rays(points, sparse)
+    off_px = _off_px(rays, sparse)
+    return tuple(
+        WrongMark(rays.point_name[rays.point[row]], sparse.image_name[rays.camera[row]], float(off_px[row]))
+        for row in np.flatnonzero(off_px)
+    )
+
+
+def of_wrong_marks(wrong: Sequence[WrongMark]) -> tuple[Remark, ...]:
+    """Return the warning that names them; none without."""
+    if not wrong:
+        return ()
+    worst = [f"{mark.image} of point {mark.point} ({mark.off_px:.0f} px)" for mark in wrong]
+    sentence = (
+        f"Marks that do not meet the others of their point are left out: {', '.join(worst)}. Mark them again."
+    )
+    return (Remark(code="wrong-marks", sentence=sentence),)
+
+
+def _off_px(rays: MarkRays, sparse: SparseModel) -> FloatArray:
+    """Return how far off (K,) in pixels the wrong marks are in the SfM model, and 0 for all others.
+
+    Of the places where two rays of a point meet, the one counts that the better half of its other marks shows best
+    (least median of squares, doi 10.1080/01621459.1984.10477105). The scatter of these over all points tells what
+    is far off. Three marks cannot tell which of them is wrong, nor can half of a point's marks.
+    """
+    rotation, center = sparse.rotation_cam_from_local, sparse.cam_center_in_local
+    direction = np.einsum("kji,kj->ki", rotation[rays.camera], rays.bearing_in_cam)
+    across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
+    right = np.einsum("kij,kj->ki", across, center[rays.camera])
+    per_rad = rays.sigma_px / rays.sigma_rad
+    rows_of_point = [np.flatnonzero(rays.point == j) for j in np.flatnonzero(rays.marks_of_point >= _LEAST_MARKS)]
+
+    def residuals_px(place: FloatArray, rows: IntArray) -> FloatArray:
+        arm = place[:, None] - center[rays.camera[rows]]
+        far = np.linalg.norm(np.cross(direction[rows], arm), axis=2)
+        return np.asarray(per_rad[rows] * np.arctan2(far, np.einsum("kj,pkj->pk", direction[rows], arm)))
+
+    best, scatter = [], []
+    for rows in rows_of_point:
+        pairs = rows[np.array(list(combinations(range(len(rows)), 2))[:_MOST_PAIRS])]
+        normal = across[pairs].sum(axis=1) + _RIDGE * np.eye(3)
+        place = np.linalg.solve(normal, right[pairs].sum(axis=1)[..., None])[..., 0]
+        residual = residuals_px(place, rows)
+        others = np.where((rows == pairs[:, :1]) | (rows == pairs[:, 1:]), np.inf, residual)
+        score = np.sort(others, axis=1)[:, (len(rows) - 3) // 2]
+        best.append(residual[score.argmin()])
+        scatter.append(score.min())
+    off = np.zeros(len(rays.point))
+    limit_px = max(_LEAST_OFF_PX, _FAR_OFF * float(np.median(scatter))) if scatter else 0.0
+    for rows, residual in zip(rows_of_point, best, strict=True):
+        good = residual <= np.maximum(limit_px, _FAR_OFF * rays.sigma_px[rows])
+        if good.all() or good.sum() < 3 or 2 * good.sum() <= len(rows):
+            continue
+        place = np.linalg.solve(across[rows[good]].sum(axis=0), right[rows[good]].sum(axis=0))
+        off[rows[~good]] = residuals_px(place[None], rows[~good])[0]
+    return off
+
+
+def _all_rays(points: Sequence[SurveyedPoint], sparse: SparseModel) -> MarkRays:
     index = sparse.image_index()
     rows = [
         (j, index[mark.image], mark.x_px, mark.y_px, mark.sigma_px)

@@ -65,7 +65,7 @@ def rays_of(point: MarkedPoint, trained: TrainedSurvey) -> MarkRays:
     """Return the rays of the marks of one point in registered images, through the trained lenses."""
     marks = tuple(Mark(image=name, x_px=x, y_px=y, sigma_px=SIGMA_PX) for name, (x, y) in point.marks.items())
     surveyed = SurveyedPoint(name=point.name, position_in_geo=(0.0, 0.0, 0.0), cov_in_geo=_IDENTITY, marks=marks)
-    return mark_rays((surveyed,), trained.sparse)
+    return mark_rays((surveyed,), trained.sparse, wrong=True)
 
 
 def residuals_px(point_in_geo: FloatArray, rays: MarkRays, trained: TrainedSurvey) -> FloatArray:
