@@ -10,7 +10,7 @@ command = StageCommand(
     mesh.ply has coloured vertices, mesh.glb a texture. FILE.georef.json beside each states its place on Earth, its
     accuracy, and the error of the simplification.
 
-    \\b
+    \b
     Examples:
       georef export-mesh flight
       georef export-mesh flight --voxel 0.1 --watertight --to flight.ply
