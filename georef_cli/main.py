@@ -4,8 +4,6 @@
 validation library nor any heavier one.
 """
 
-from __future__ import annotations
-
 import importlib
 import os
 import sys

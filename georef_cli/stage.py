@@ -3,8 +3,6 @@
 Copies of products outside the workspace are complete or absent, and never over a file by accident.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import shutil

@@ -7,8 +7,6 @@ Fixes that disagree with the layout of the cameras in the SfM model give no rays
 a bad fix. The few rays of one point do not tell a bad fix from good ones.
 """
 
-from __future__ import annotations
-
 import logging
 from dataclasses import dataclass
 from typing import Any

@@ -7,8 +7,6 @@ robust alignment of camera centres and control points, adjusts similarity, camer
 stated σ. `pipelines.adjust.alignment` explains why the intersected points are no observations.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path

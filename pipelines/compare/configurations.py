@@ -3,8 +3,6 @@
 The command line reads the configurations without loading a stage.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any

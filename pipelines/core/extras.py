@@ -1,7 +1,5 @@
 """Extras: optional libraries, what needs them, whether they are installed, and the command that installs them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from importlib import metadata
 from importlib.util import find_spec

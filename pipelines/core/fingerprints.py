@@ -1,7 +1,5 @@
 """Hashes of a stage's inputs (equal hashes and options mean an equal product), and versions of its libraries."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -6,8 +6,6 @@ metres at the survey's origin, `local` the SfM model's frame, `model` the metric
 Gaussians.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path

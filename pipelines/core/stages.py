@@ -3,8 +3,6 @@
 `georef status` and `--help` read this table without importing a stage.
 """
 
-from __future__ import annotations
-
 import importlib
 from dataclasses import dataclass
 from pathlib import Path

@@ -12,8 +12,6 @@ into `cameras/` (docs/deliverables.md):
   who weights them in a solution of his own.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

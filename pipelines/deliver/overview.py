@@ -3,8 +3,6 @@
 Reads survey, trained model and the centres of its Gaussians. Writes nothing.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path

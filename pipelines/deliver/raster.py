@@ -6,8 +6,6 @@ with `--contours` also `contours.gpkg` and `contours.dxf`. The Gaussians are ren
 window: finished windows survive an interruption.
 """
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Rasters of the stage, window by window: rendered into parts, made whole inside the area, then put together."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property

@@ -8,8 +8,6 @@ contents in `tiles/content/`, `tiles/splat.glb`, a sidecar of each (docs/formats
 All files are in the frame of the placement, East-North-Up; the tileset's root places it on Earth.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Iterable

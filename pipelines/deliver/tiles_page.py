@@ -5,8 +5,6 @@ tiles and CesiumJS, and loads nothing else: no account, no imagery, no terrain. 
 runs its own script, by its hash, and CesiumJS.
 """
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import html

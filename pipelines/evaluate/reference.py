@@ -8,8 +8,6 @@
    plan.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -5,8 +5,6 @@ distribution: for them the layout of `DEFINITIONS` counts that fits the message.
 topic only.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 from collections.abc import Collection, Iterator

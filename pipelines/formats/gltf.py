@@ -11,8 +11,6 @@ knows the extension: others may draw the centres as points, in the colours of CO
 its shader takes the names of the attributes.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import struct

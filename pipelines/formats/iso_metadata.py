@@ -4,8 +4,6 @@ The elements stand in the order of the schema `gmd` of 2007-04-17. Numbers of me
 D (ISO/TS 19138 has the same). Lengths are in metres, latitude and longitude in degrees on WGS84.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -8,8 +8,6 @@ begin formulas (OWASP, CSV injection), and names of points and photographs come 
 begins with an apostrophe. Numbers stay as they are. `plain_text` gives names back as they were.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import math

@@ -5,8 +5,6 @@ until the survey's frame is known. Lever arm and boresight lead from the places 
 measured to those of the cameras.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

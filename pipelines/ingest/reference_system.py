@@ -1,7 +1,5 @@
 """Reference systems of the input files: which one a file's coordinates are in, and what is said of it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

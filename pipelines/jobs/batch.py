@@ -1,7 +1,5 @@
 """Batch of missions: each is `georef run` in a process of its own, and a table beside them follows their ends."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import logging

@@ -1,7 +1,5 @@
 """Cover of the report: for whom and by whom, the result from above, and the facts that a client asks for first."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime

@@ -9,8 +9,6 @@ gives them typed facts, figures as text (decimals that fit their size, a true mi
 exist), and pictures as data, at a size that the page needs.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 from collections.abc import Callable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Place of the survey on Earth, with coordinates as text; and the overlap of its photographs."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -3,8 +3,6 @@
 Every rule is stated on the page. `unknown` is the verdict where nothing was measured.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Literal

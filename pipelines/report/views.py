@@ -1,7 +1,5 @@
 """Evaluated survey, which all sections show; test views, and curves of the training."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

@@ -3,8 +3,6 @@
 `jobs.costs` has the constants. The largest photographs of a survey have `photo_px` pixels, width and height.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

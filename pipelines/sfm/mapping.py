@@ -11,8 +11,6 @@ at once. This is a start only. The last adjustment follows, by the photographs a
 count twice, here and where the model is placed on Earth.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import shutil

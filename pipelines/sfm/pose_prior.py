@@ -7,8 +7,6 @@ Reads `ingest/survey.json` and `sfm/sparse`; writes `adjust/sparse`, the same mo
 observations have σ = 1 px, and fixes their covariances under Cauchy's kernel. Control points do not enter.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

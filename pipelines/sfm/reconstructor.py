@@ -1,7 +1,5 @@
 """Engines of structure from motion, and the choice among them."""
 
-from __future__ import annotations
-
 from typing import Any, Protocol
 
 from pipelines.core.progress import Progress

@@ -5,8 +5,6 @@
 3. The depth map keeps the refined depths on which views agree.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor

@@ -4,8 +4,6 @@ What no photograph shows lies mostly behind something that stands above it: the 
 as in the maps of LiDAR. On simulated flights the median error is a third of that of the nearest height.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ Candidates are the pixels of the maps with their normals, where a surface is smo
 the plan, so that the candidates of one fit into the memory.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any

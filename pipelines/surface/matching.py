@@ -12,8 +12,6 @@ branches: LLVM makes vector instructions of them. Floating-point flags exclude N
 therefore keep out.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

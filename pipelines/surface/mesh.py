@@ -1,7 +1,5 @@
 """Mesh of the surface: the zeros of the grid that views confirm, simplified square by square, welded and closed."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ under a line of sight is that on which the training views agree, each read off i
 it behind the marks. The accuracy is that for a reader who intersects the rendered surface.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

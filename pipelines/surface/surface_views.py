@@ -5,8 +5,6 @@ Maps are written one after the other. The size of a file therefore tells how man
 stage goes on after those.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 from contextlib import ExitStack

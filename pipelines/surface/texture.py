@@ -5,8 +5,6 @@ connected faces of one block that look along the same axis, projected along that
 faces. Where a chart folds over itself, both layers share their texels.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

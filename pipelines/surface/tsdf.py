@@ -12,8 +12,6 @@ chunk of the grid at a time, and one square of the plan of its mesh.
 5. Marching cubes find the zeros. Neighbouring chunks share a layer of voxels, whose values agree to the last digit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any

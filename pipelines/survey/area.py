@@ -3,8 +3,6 @@
 Files are cut to it: a photograph shows far more than it measures.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from typing import Any

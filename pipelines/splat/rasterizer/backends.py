@@ -1,7 +1,5 @@
 """Rasteriser backends by name."""
 
-from __future__ import annotations
-
 import logging
 from typing import Literal
 

@@ -5,8 +5,6 @@ work. Here a child process compiles, one at a time, in a draft, and the library 
 Later runs load that library, and need no compiler.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import importlib.util
