@@ -84,7 +84,6 @@ def _data(survey: Survey, model: SparseModel, track: NavigationTrack) -> rig_fit
     registered = [index for index, name in enumerate(model.image_name) if name in row_of]
     rows = [row_of[model.image_name[index]] for index in registered]
     control, _ = control_correspondences(survey, model)
-    focal_px = np.array([model.camera_of(image).mean_focal_px for image in range(len(model.image_name))])
     distance = np.linalg.norm(
         model.point_in_local[model.obs_point] - model.cam_center_in_local[model.obs_image], axis=1
     )
@@ -97,8 +96,8 @@ def _data(survey: Survey, model: SparseModel, track: NavigationTrack) -> rig_fit
         cam_from_body=track.cam_from_body[rows],
         antenna_in_body=np.nan_to_num(track.antenna_in_body[rows]),
         control=control,
-        pixel_rad=float(1.0 / np.median(focal_px)),
-        footprint_in_local=float(np.median(distance / focal_px[model.obs_image])),
+        pixel_rad=float(1.0 / np.median(model.focal_px)),
+        footprint_in_local=float(np.median(distance / model.focal_px[model.obs_image])),
     )
 
 

@@ -4,7 +4,7 @@ The matrix is stored with the solution: whoever asks for a σ factorises it once
 quantity is described by its derivatives by cameras and lens; points follow from the rays that intersect in them.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -22,6 +22,7 @@ from pipelines.geometry import bundle
 from pipelines.geometry.similarity import jacobian_at, second_moment_at
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.marks import MarkRays
+from pipelines.survey.scene import network_of
 from pipelines.survey.trained_model import Adjustment
 
 
@@ -169,21 +170,11 @@ class Posterior:
 
         Without the σ of the rays, all of them have the same angular σ.
         """
-        sparse, poses = self.sparse, self.solution.poses
-        if sigma_px is None:
-            focal_px = np.array([sparse.camera_of(index).mean_focal_px for index in range(len(sparse.image_name))])
-            sigma_px = focal_px[camera]
-        rays = bundle.Network(
-            sparse.cameras,
-            sparse.image_camera_id,
-            poses.cam_from_model,
-            poses.cam_center_in_model,
-            self.solution.similarity.inverse().apply(point_in_geo),
-            point,
-            camera,
-            np.full((len(point), 2), np.nan),  # derivatives do not need the pixels
-        )
-        return intersection_jacobian(rays, sigma_px)
+        in_model = self.solution.similarity.inverse().apply(point_in_geo)
+        every = network_of(self.sparse, self.solution.poses, in_model)
+        no_pixels = np.full((len(point), 2), np.nan)  # derivatives do not need them
+        rays = replace(every, obs_point=point, obs_image=camera, obs_xy_px=no_pixels)
+        return intersection_jacobian(rays, self.sparse.focal_px[camera] if sigma_px is None else sigma_px)
 
     def _derivatives(self, jacobian: IntersectionJacobian) -> tuple[csr_matrix, FloatArray]:
         """Return the derivatives (3 J, 6 n), (3 J, b) of points in geo by the unknowns."""
