@@ -33,8 +33,6 @@ from pipelines.survey.scene import Scene
 
 # Layout of the cached arrays, a part of their key: files of another layout lie in another folder.
 _LAYOUT = b"coarse, fine: direction, offset, score, step, sharpness, by kernels"
-
-
 # Longest side of the photographs: in the plane sweep, whose time grows with its cube, and in refinement and maps.
 _COARSE_PX, FINE_PX = 320, 640
 _NEIGHBOURS = 10  # views that each view is compared with
