@@ -383,7 +383,6 @@ def agreeing_points(model: SparseModel, points: GeolocatedPoints, similarity: Si
 
 
 def residuals_of_points(model: SparseModel, points: GeolocatedPoints, similarity: Similarity) -> ResidualStats:
-    """Return the figures of the intersected points' residuals."""
     good = points.inlier
     return residual_stats(points.position_in_geo[good] - similarity.apply(model.point_in_local[good]))
 

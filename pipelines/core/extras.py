@@ -32,7 +32,6 @@ class Part:
 
 
 def installing(extra: str) -> str:
-    """Return the command that installs an extra."""
     return f"pip install 'georefgs[{extra}]' (in a checkout: pip install '.[{extra}]')"
 
 
@@ -44,7 +43,6 @@ def require(extra: Extra) -> None:
 
 
 def extra_part(extra: Extra) -> Part:
-    """Return an extra with the versions of its libraries."""
     user, libraries = EXTRAS[extra]
     missing = [name for name in libraries if find_spec(_MODULES.get(name, name)) is None]
     if missing:

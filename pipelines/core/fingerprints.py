@@ -141,7 +141,6 @@ def _is_empty(value: Any) -> bool:
 
 
 def _hash_listing(hashes: Mapping[str, str]) -> str:
-    """Return the hash of names and hashes of files."""
     lines = "".join(f"{name}={hashes[name]}\n" for name in sorted(hashes))
     return hashlib.sha256(lines.encode()).hexdigest()
 

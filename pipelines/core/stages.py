@@ -410,7 +410,6 @@ BY_NAME = {spec.name: spec for spec in (*PIPELINE, *DELIVERABLES)}
 
 
 def producer_of(path: str) -> StageSpec:
-    """Return the stage that writes a workspace path."""
     folder = path.split("/", maxsplit=1)[0]
     return next(spec for spec in STAGES if spec.folder == folder)
 

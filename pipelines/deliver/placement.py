@@ -57,7 +57,6 @@ class Placement:
 
     @property
     def file_from_model(self) -> Similarity:
-        """Similarity from the model's frame."""
         return self.file_from_geo @ self.geo_from_model
 
     @property

@@ -72,7 +72,6 @@ class _Layout:
 
     @property
     def body_bytes(self) -> int:
-        """Bytes of all sections."""
         return self.count * sum(self.widths)
 
 

@@ -122,7 +122,6 @@ def number_of(text: str, *, path: Path, line: int, field: str, decimal_comma: bo
 
 
 def is_number(text: str, *, decimal_comma: bool = True) -> bool:
-    """Return whether a cell is a number."""
     try:
         float(text.strip().replace(",", ".", 1) if decimal_comma else text)
     except ValueError:

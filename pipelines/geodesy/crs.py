@@ -86,7 +86,6 @@ class PointCrs:
 
     @property
     def units(self) -> tuple[str, str, str]:
-        """Names of the three coordinates' units."""
         first, second = (axis.unit_name for axis in self._plan_axes)
         return first, second, self.height_unit
 

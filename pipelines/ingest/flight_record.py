@@ -156,7 +156,6 @@ def require_enough(count: int, source: Path, field: str, remarks: Remarks) -> No
 
 
 def given_rig(options: IngestOptions) -> Rig:
-    """Return the rig that the options state."""
     return Rig(
         cam_from_body=None if options.camera_mount is None else mount(options.camera_mount),
         antenna_in_body=None if options.lever_arm is None else np.array(options.lever_arm),

@@ -77,7 +77,6 @@ class BatchTable(Product):
 
     @property
     def is_complete(self) -> bool:
-        """Whether every mission has its result."""
         return all(row.state in ("done", "current") for row in self.missions)
 
 

@@ -40,7 +40,6 @@ class ReconstructionEstimate:
 def estimate_reconstruction(
     photographs: int, photo_px: tuple[int, int], options: SfmOptions
 ) -> ReconstructionEstimate:
-    """Return the estimate of a reconstruction on this machine."""
     free_bytes = free_main_memory_bytes()
     return ReconstructionEstimate(
         photographs=photographs,

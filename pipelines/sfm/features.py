@@ -86,7 +86,6 @@ class SfmJob:
 
     @property
     def sparse(self) -> Path:
-        """Folder of the model."""
         return self.database.parent / "sparse"
 
 

@@ -59,7 +59,6 @@ class MapperRun:
 
 
 def chosen_mapper(photographs: int, options: SfmOptions) -> MapperName:
-    """Return the mapper for so many photographs."""
     if options.mapper != "auto":
         return options.mapper
     return "incremental" if photographs <= _INCREMENTAL_UP_TO else "global"

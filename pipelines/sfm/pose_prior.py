@@ -48,7 +48,6 @@ _ALIGNMENT_SLACK = 3.0
 
 
 def run(stage: StageRun, options: AdjustOptions) -> Summary:
-    """Adjust the workspace's model and write it."""
     arguments = {
         "survey": load_survey(stage.workspace).model_dump(mode="json"),
         "model": str(stage.workspace.path(SPARSE)),

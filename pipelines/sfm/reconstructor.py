@@ -46,5 +46,4 @@ class Reconstructor(Protocol):
 
 
 def reconstructor_of(options: SfmOptions) -> Reconstructor:
-    """Return the engine that the options ask for."""
     return ColmapReconstructor() if options.import_model is None else ImportedModel(options.import_model)

@@ -207,7 +207,6 @@ class SurfaceViews:
         return photograph, np.linalg.solve(gain, np.column_stack([np.eye(3), -255 * offset]))
 
     def close(self) -> None:
-        """Delete the maps."""
         del self._depth, self._rgb
         remove(self.folder)
 

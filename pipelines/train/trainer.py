@@ -426,7 +426,6 @@ def load_checkpoint(path: Path) -> dict[str, Tensor]:
 
 
 def prefixed(prefix: str, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the tensors with `prefix/name` for names."""
     return {f"{prefix}/{name}": tensor for name, tensor in state.items()}
 
 

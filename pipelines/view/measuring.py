@@ -66,7 +66,6 @@ class MeasuringModel:
         return self.target.xyz_from_geo(point.position_in_geo[None])[0], sigma_m
 
     def jointly(self, points: Sequence[SurfacePoint]) -> quantities.MeasuredPoints:
-        """Return points with their joint covariance."""
         position = np.array([point.position_in_geo for point in points]).reshape(-1, 3)
         cov = self._joint_covariance(points)
         cov = None if cov is None else cov + block_diag(*(point.cov_of_surface for point in points))

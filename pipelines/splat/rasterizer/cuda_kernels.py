@@ -146,7 +146,6 @@ def _capabilities() -> list[str]:
 
 
 def _architectures() -> list[str]:
-    """Return the compute capabilities to compile for."""
     named = os.environ.get("TORCH_CUDA_ARCH_LIST", "").replace(";", " ").split()
     found = sorted(name.removesuffix("+PTX") for name in named) or _capabilities()
     if not found:
