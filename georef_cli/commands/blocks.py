@@ -40,11 +40,8 @@ def _blocks(ctx: click.Context, **values: Any) -> None:
         raise click.UsageError("--id is for `georef blocks train`.")
     if given and (action in ("scaffold", "seams", "merge") or number is not None):
         raise click.UsageError("Options of the training belong to `georef blocks` or `georef blocks plan`.")
-    part = (
-        stages.TRAIN_BLOCK
-        if number is not None
-        else {"scaffold": stages.TRAIN_SCAFFOLD, "seams": stages.TRAIN_SEAMS}.get(action)
-    )
+    by_action = {"scaffold": stages.TRAIN_SCAFFOLD, "seams": stages.TRAIN_SEAMS}
+    part = by_action.get(action) if number is None else stages.TRAIN_BLOCK
     with asked_engine(values):
         from pipelines.train.blocks.parts import Parts
 

@@ -104,15 +104,10 @@ def _data(survey: Survey, model: SparseModel, track: NavigationTrack) -> rig_fit
 def _estimates(fit: rig_fit.RigFit, track: NavigationTrack) -> dict[RigParameter, RigEstimate]:
     start_s, start_deg = track.time_offset_s.reshape(1), np.degrees(log_so3(track.nominal_from_cam))
     start_m = np.nan_to_num(track.antenna_in_body).mean(axis=0)
+    value_s, sigma_s = np.array([fit.state.offset_s]), fit.sigma[rig_fit.OFFSET]
     value_deg, sigma_deg = np.degrees(log_so3(fit.state.boresight)), np.degrees(fit.sigma[rig_fit.BORESIGHT])
     found: dict[RigParameter, tuple[Literal["s", "deg", "m"], float, FloatArray, FloatArray, FloatArray]] = {
-        "time-offset": (
-            "s",
-            rig_fit.LIMIT_OFFSET_S,
-            np.array([fit.state.offset_s]),
-            fit.sigma[rig_fit.OFFSET],
-            start_s,
-        ),
+        "time-offset": ("s", rig_fit.LIMIT_OFFSET_S, value_s, sigma_s, start_s),
         "boresight": ("deg", rig_fit.LIMIT_BORESIGHT_DEG, value_deg, sigma_deg, start_deg),
         "lever-arm": ("m", rig_fit.LIMIT_ARM_M, start_m + fit.state.arm, fit.sigma[rig_fit.ARM], start_m),
     }

@@ -8,13 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipelines import __version__
-from pipelines.compare.table import (
-    POINT_FIGURES,
-    Comparison,
-    bar_charts,
-    markdown,
-    remarks_on,
-)
+from pipelines.compare.table import POINT_FIGURES, Comparison, bar_charts, markdown, remarks_on
 from pipelines.core.errors import InputError
 from pipelines.core.figures import ERRORS, WAYS
 from pipelines.core.files import replace_text

@@ -20,14 +20,7 @@ from pipelines.core.types import ByteArray, Float32Array
 from pipelines.geometry.cameras import Pinhole, ViewPose
 from pipelines.surface.agreement import THRESHOLDS, agreed_depth, refine, surface_prior, without_rims
 from pipelines.surface.matching import UNSEEN, MatchSettings, StereoView
-from pipelines.surface.sweep import (
-    NormalMap,
-    SweepPlanes,
-    SweepResult,
-    best_neighbours,
-    plane_sweep,
-    planes_for,
-)
+from pipelines.surface.sweep import NormalMap, SweepPlanes, SweepResult, best_neighbours, plane_sweep, planes_for
 from pipelines.survey.photographs import ImageCache, save_array
 from pipelines.survey.scene import Scene
 

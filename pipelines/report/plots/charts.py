@@ -55,14 +55,8 @@ def _draw(axes: Axes, panel: BarChart) -> None:
     axes.set_xticks(range(len(panel.members)), panel.members)
     axes.spines[["top", "right"]].set_visible(False)
     if len(panel.series) > 1:
-        below = (0.5, -0.08)
-        axes.legend(
-            frameon=False,
-            fontsize=look.TICK_POINTS,
-            loc="upper center",
-            bbox_to_anchor=below,
-            ncols=len(panel.series),
-        )
+        form = {"frameon": False, "fontsize": look.TICK_POINTS, "ncols": len(panel.series)}
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.08), **form)
 
 
 def _scale(axes: Axes, panel: BarChart) -> None:
