@@ -1,7 +1,5 @@
 """Base of all commands: the options that each of them takes, before or after its name."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Sequence
 from dataclasses import fields

@@ -1,7 +1,5 @@
 """Display of progress: bars on a terminal, a line every half minute in a log."""
 
-from __future__ import annotations
-
 import logging
 import math
 import sys

@@ -1,7 +1,5 @@
 """Tables that fit the width of the terminal, and text of others, shown literally and without escape sequences."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 from rich.console import Console, ConsoleOptions, RenderableType, RenderResult

@@ -4,8 +4,6 @@
 validation library nor any heavier one.
 """
 
-from __future__ import annotations
-
 import importlib
 import os
 import sys
@@ -29,50 +27,48 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 @dataclass(frozen=True)
 class HelpLine:
-    """Line of `georef --help` below the heading of its section; `georef_cli.commands.MODULE` defines `command`."""
+    """Line of `georef --help` below the heading of its section."""
 
-    module: str
     section: str
     help: str
 
 
 COMMANDS: dict[str, HelpLine] = {
-    "simulate": HelpLine("simulate", "Surveys", "Simulate a survey whose truth is known exactly."),
-    "inspect": HelpLine(
-        "inspect", "Surveys", "Show what a ROS bag holds, what ingest would choose, what is missing."
-    ),
-    "run": HelpLine("run", "Pipeline", "Run all stages, or some, skipping what is current."),
-    "batch": HelpLine("batch", "Pipeline", "Run many missions, and put their results into one table."),
-    "blocks": HelpLine("blocks", "Pipeline", "Train a large survey in blocks, and merge them."),
-    "cluster certificates": HelpLine(
-        "cluster_certificates", "Cluster", "Make the certificate that the machines of a cluster share."
-    ),
-    "cluster scheduler": HelpLine("cluster_scheduler", "Cluster", "Start the scheduler of a cluster."),
-    "cluster worker": HelpLine("cluster_worker", "Cluster", "Lend this machine to a cluster."),
-    "status": HelpLine("status", "Pipeline", "Show the state of every stage."),
-    "info": HelpLine("info", "Pipeline", "Show where on Earth the result is, and what each file is for."),
-    "view": HelpLine("view", "Pipeline", "See the trained model in a browser, and measure in it."),
-    "ingest": HelpLine("ingest", "Stages", "Read photographs, positions and control points into one survey."),
-    "sfm": HelpLine("sfm", "Stages", "Reconstruct cameras and points with COLMAP."),
-    "calibrate": HelpLine("calibrate", "Stages", "Estimate time offset, boresight and lever arm after sfm."),
-    "compare": HelpLine("compare", "Pipeline", "Run the ablation and put its figures into one table."),
-    "geolocate": HelpLine("geolocate", "Stages", "Intersect every SfM point on Earth."),
-    "init-sim3": HelpLine("init_sim3", "Stages", "Estimate the similarity from the SfM model to the Earth."),
-    "train": HelpLine("train", "Stages", "Train the Gaussians with the similarity and the cameras."),
-    "evaluate": HelpLine("evaluate", "Stages", "Measure test views and check points."),
-    "export-ply": HelpLine("export_ply", "Deliverables", "Write the splat as a PLY with its place on Earth."),
-    "export-raster": HelpLine("export_raster", "Deliverables", "Write orthophoto, surface model and σ as rasters."),
-    "export-cloud": HelpLine(
-        "export_cloud", "Deliverables", "Write the surface as a georeferenced point cloud (LAZ)."
-    ),
-    "export-mesh": HelpLine("export_mesh", "Deliverables", "Write the surface as a triangle mesh with texture."),
-    "export-spz": HelpLine("export_spz", "Deliverables", "Write the splat as SPZ, for viewers on the web."),
-    "export-tiles": HelpLine("export_tiles", "Deliverables", "Write the splat as 3D Tiles, for web globes."),
-    "export-cameras": HelpLine("export_cameras", "Deliverables", "Write the trained cameras for other programs."),
-    "report": HelpLine("report", "Deliverables", "Write the report: one page, and its PDF."),
-    "help": HelpLine("help", "Help", "Explain a topic, such as heights or options, or a command."),
-    "doctor": HelpLine("doctor", "Help", "Show what this machine offers: memory, GPU, backends, geoid grids."),
+    "simulate": HelpLine("Surveys", "Simulate a survey whose truth is known exactly."),
+    "inspect": HelpLine("Surveys", "Show what a ROS bag holds, what ingest would choose, what is missing."),
+    "run": HelpLine("Pipeline", "Run all stages, or some, skipping what is current."),
+    "batch": HelpLine("Pipeline", "Run many missions, and put their results into one table."),
+    "blocks": HelpLine("Pipeline", "Train a large survey in blocks, and merge them."),
+    "cluster certificates": HelpLine("Cluster", "Make the certificate that the machines of a cluster share."),
+    "cluster scheduler": HelpLine("Cluster", "Start the scheduler of a cluster."),
+    "cluster worker": HelpLine("Cluster", "Lend this machine to a cluster."),
+    "status": HelpLine("Pipeline", "Show the state of every stage."),
+    "info": HelpLine("Pipeline", "Show where on Earth the result is, and what each file is for."),
+    "view": HelpLine("Pipeline", "See the trained model in a browser, and measure in it."),
+    "ingest": HelpLine("Stages", "Read photographs, positions and control points into one survey."),
+    "sfm": HelpLine("Stages", "Reconstruct cameras and points with COLMAP."),
+    "calibrate": HelpLine("Stages", "Estimate time offset, boresight and lever arm after sfm."),
+    "compare": HelpLine("Pipeline", "Run the ablation and put its figures into one table."),
+    "geolocate": HelpLine("Stages", "Intersect every SfM point on Earth."),
+    "init-sim3": HelpLine("Stages", "Estimate the similarity from the SfM model to the Earth."),
+    "train": HelpLine("Stages", "Train the Gaussians with the similarity and the cameras."),
+    "evaluate": HelpLine("Stages", "Measure test views and check points."),
+    "export-ply": HelpLine("Deliverables", "Write the splat as a PLY with its place on Earth."),
+    "export-raster": HelpLine("Deliverables", "Write orthophoto, surface model and σ as rasters."),
+    "export-cloud": HelpLine("Deliverables", "Write the surface as a georeferenced point cloud (LAZ)."),
+    "export-mesh": HelpLine("Deliverables", "Write the surface as a triangle mesh with texture."),
+    "export-spz": HelpLine("Deliverables", "Write the splat as SPZ, for viewers on the web."),
+    "export-tiles": HelpLine("Deliverables", "Write the splat as 3D Tiles, for web globes."),
+    "export-cameras": HelpLine("Deliverables", "Write the trained cameras for other programs."),
+    "report": HelpLine("Deliverables", "Write the report: one page, and its PDF."),
+    "help": HelpLine("Help", "Explain a topic, such as heights or options, or a command."),
+    "doctor": HelpLine("Help", "Show what this machine offers: memory, GPU, backends, geoid grids."),
 }
+
+
+def module_of(name: str) -> str:
+    """Return the module in `georef_cli.commands` that defines a `command` of the table."""
+    return name.replace("-", "_").replace(" ", "_")
 
 
 class LazyGroup(click.Group):
@@ -82,10 +78,9 @@ class LazyGroup(click.Group):
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        entry = COMMANDS.get(cmd_name)
-        if entry is None:
+        if cmd_name not in COMMANDS:
             return None
-        command = importlib.import_module(f"georef_cli.commands.{entry.module}").command
+        command = importlib.import_module(f"georef_cli.commands.{module_of(cmd_name)}").command
         assert isinstance(command, Command)
         return command
 

@@ -3,8 +3,6 @@
 Copies of products outside the workspace are complete or absent, and never over a file by accident.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import shutil
@@ -163,17 +161,11 @@ def check_target(target: Path, spec: StageSpec, *, folder: bool, overwrite: bool
     """
     suffix = Path(spec.product).suffix
     if folder and target.is_dir() and not (target / Path(spec.product).name).exists():
-        raise InputError(
-            "target-not-replaced",
-            f"is a folder that {spec.name} did not write, and would be replaced. Give a new name.",
-            path=target,
-        )
+        message = f"is a folder that {spec.name} did not write, and would be replaced. Give a new name."
+        raise InputError("target-not-replaced", message, path=target)
     if folder and target.suffix and not target.is_dir():
-        raise InputError(
-            "target-suffix",
-            f"is the name of a {target.suffix} file, but {spec.name} writes a folder. Give a folder.",
-            path=target,
-        )
+        message = f"is the name of a {target.suffix} file, but {spec.name} writes a folder. Give a folder."
+        raise InputError("target-suffix", message, path=target)
     if not folder and target.suffix.lower() != suffix:
         message = f"is not the name of a {suffix} file, which {spec.name} writes. End the name with {suffix}."
         raise InputError("target-suffix", message, path=target)

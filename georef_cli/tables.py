@@ -1,7 +1,5 @@
 """Tables for people: typed products in, rich renderables out."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime

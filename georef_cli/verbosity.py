@@ -1,7 +1,5 @@
 """Verbosity of the program, the form of its log lines, and its messages for programs (`--json-progress`)."""
 
-from __future__ import annotations
-
 import logging
 import signal
 import sys

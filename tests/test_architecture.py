@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from georef_cli.main import COMMANDS
+from georef_cli.main import COMMANDS, module_of
 from pipelines.core.stages import PIPELINE
 
 REPOSITORY = Path(__file__).parents[1]
@@ -280,7 +280,7 @@ def test_core_is_light() -> None:
 
 def test_building_the_commands_imports_nothing_heavy() -> None:
     """What a stage computes with is imported when it runs: `georef --help` and `status` answer at once."""
-    modules = [f"georef_cli.commands.{entry.module}" for entry in COMMANDS.values()]
+    modules = [f"georef_cli.commands.{module_of(name)}" for name in COMMANDS]
     code = f"import importlib, sys; [importlib.import_module(name) for name in {modules}]; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=REPOSITORY)
     assert not {"torch", "pycolmap", "numba", "matplotlib", "scipy", "cv2", "pyproj"} & set(done.stdout.split())
@@ -289,7 +289,7 @@ def test_building_the_commands_imports_nothing_heavy() -> None:
 def test_table_of_commands_is_complete() -> None:
     """Every module in commands/ is a command, and every command has its module."""
     modules = {path.stem for path in (REPOSITORY / "georef_cli/commands").glob("*.py")} - {"__init__"}
-    assert modules == {entry.module for entry in COMMANDS.values()}
+    assert modules == set(map(module_of, COMMANDS))
     assert {spec.name for spec in PIPELINE} <= set(COMMANDS)
 
 

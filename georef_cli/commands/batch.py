@@ -1,7 +1,5 @@
 """Command `georef batch`."""
 
-from __future__ import annotations
-
 import logging
 from pathlib import Path
 from typing import Any

@@ -14,20 +14,9 @@ from georef_cli.display import is_told, progress_for
 from georef_cli.engines import ENGINE, asked_engine
 from georef_cli.estimate import announced_seconds
 from georef_cli.output import print_json, print_outcome, print_rich
-from pipelines.core import runner
+from pipelines.core import runner, stages
 from pipelines.core.options import remember, remembered
 from pipelines.core.products import load_json
-from pipelines.core.stages import (
-    BLOCK_RECORD,
-    BY_NAME,
-    PLAN_BLOCKS,
-    SOLVE,
-    SURVEY,
-    TRAIN_BLOCK,
-    TRAIN_SCAFFOLD,
-    TRAIN_SEAMS,
-    StageSpec,
-)
 from pipelines.core.staleness import Flags, must_exist, stage_config
 from pipelines.core.workspace import Workspace
 from pipelines.survey.survey import Survey
@@ -35,7 +24,7 @@ from pipelines.survey.survey import Survey
 if TYPE_CHECKING:
     from pipelines.train.blocks.parts import Parts
 
-TRAIN = BY_NAME["train"]
+TRAIN = stages.BY_NAME["train"]
 ACTIONS = ("plan", "scaffold", "train", "seams", "merge")
 
 
@@ -51,7 +40,8 @@ def _blocks(ctx: click.Context, **values: Any) -> None:
         raise click.UsageError("--id is for `georef blocks train`.")
     if given and (action in ("scaffold", "seams", "merge") or number is not None):
         raise click.UsageError("Options of the training belong to `georef blocks` or `georef blocks plan`.")
-    part = TRAIN_BLOCK if number is not None else {"scaffold": TRAIN_SCAFFOLD, "seams": TRAIN_SEAMS}.get(action)
+    by_action = {"scaffold": stages.TRAIN_SCAFFOLD, "seams": stages.TRAIN_SEAMS}
+    part = by_action.get(action) if number is None else stages.TRAIN_BLOCK
     with asked_engine(values):
         from pipelines.train.blocks.parts import Parts
 
@@ -75,26 +65,26 @@ def _plan(ctx: click.Context, parts: Parts, asked: Mapping[str, Flags], values: 
     workspace = parts.workspace
     with workspace.lock("blocks plan"):
         remember(workspace.root, asked)
-    with boundary.logged_to_file(parts.variant(), PLAN_BLOCKS):
-        outcome = parts.run(PLAN_BLOCKS, force=values["force"], progress=progress_for(ctx.obj))
+    with boundary.logged_to_file(parts.variant(), stages.PLAN_BLOCKS):
+        outcome = parts.run(stages.PLAN_BLOCKS, force=values["force"], progress=progress_for(ctx.obj))
     plan = parts.plan()
     if values["as_json"]:
         print_json({"stage": outcome.stage, "ran": outcome.ran, **plan.model_dump(mode="json")})
         return
     assert isinstance(parts.options, TrainOptions)
-    states, photo_px = parts.states(plan), load_json(Survey, workspace.path(SURVEY)).largest_photograph_px
+    states, photo_px = parts.states(plan), load_json(Survey, workspace.path(stages.SURVEY)).largest_photograph_px
     # On a GPU nothing was measured.
     processor_s = None if parts.on_gpu() else block_processor_s(plan, photo_px, parts.options)
     print_rich(*job_tables.block_table(plan, states, processor_s))
 
 
-def _run_part(ctx: click.Context, parts: Parts, spec: StageSpec, values: dict[str, Any]) -> None:
+def _run_part(ctx: click.Context, parts: Parts, spec: stages.StageSpec, values: dict[str, Any]) -> None:
     """Run a part as a job does: without the workspace's lock, which the process that started the job may hold."""
     number, force, progress = values["number"], values["force"], progress_for(ctx.obj)
     if number is not None:
         parts.plan().block(number)
-    elif spec is TRAIN_SCAFFOLD and (force or parts.why_missing(SOLVE)):
-        parts.run(SOLVE, force=force, progress=progress)
+    elif spec is stages.TRAIN_SCAFFOLD and (force or parts.why_missing(stages.SOLVE)):
+        parts.run(stages.SOLVE, force=force, progress=progress)
     variant = parts.variant(number)
     with boundary.logged_to_file(variant, spec):
         outcome = parts.run(spec, number, force=force, progress=progress)
@@ -129,7 +119,7 @@ def _all(
             TRAIN,
             asked[TRAIN.name],
             force=values["force"] and not only_merge,
-            renew=not parts.is_merged() and (workspace.root / BLOCK_RECORD).exists(),
+            renew=not parts.is_merged() and (workspace.root / stages.BLOCK_RECORD).exists(),
             resume="if-same",
             progress=progress_for(ctx.obj),
         )

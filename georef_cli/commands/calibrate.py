@@ -1,7 +1,5 @@
 """Command `georef calibrate`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Command `georef cluster certificates`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click

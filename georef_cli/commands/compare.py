@@ -1,7 +1,5 @@
 """Command `georef compare`."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import click

@@ -1,7 +1,5 @@
 """Command `georef evaluate`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

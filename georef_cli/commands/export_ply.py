@@ -1,7 +1,5 @@
 """Command `georef export-ply`: the splat as trained, or with --measurable a second file to measure in."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import click

@@ -1,7 +1,5 @@
 """Command `georef inspect`."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Command `georef simulate`."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from pathlib import Path

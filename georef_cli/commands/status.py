@@ -1,7 +1,5 @@
 """Command `georef status`."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Command `georef view`."""
 
-from __future__ import annotations
-
 import contextlib
 import threading
 import webbrowser

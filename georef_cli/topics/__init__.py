@@ -1,7 +1,5 @@
 """Topics of `georef help`: short texts, each a file of this package, for a terminal of 80 columns."""
 
-from __future__ import annotations
-
 from importlib import resources
 
 # Title by name, in the order in which a new user needs them.

@@ -35,16 +35,9 @@ from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import BoolArray, FloatArray, Rows, joined_rows, rows_of
 from pipelines.geometry.rotations import exp_so3, log_so3
 from pipelines.geometry.similarity import Similarity, jacobian_at, perturbation, umeyama
-from pipelines.robust.statistics import (
-    RansacOptions,
-    cauchy_weight,
-    median_chi2,
-    outlier_gate,
-    ransac,
-    squared_mahalanobis,
-)
+from pipelines.robust import statistics
 
-OUTLIER_GATE = outlier_gate(3)
+OUTLIER_GATE = statistics.outlier_gate(3)
 _LEAST_FOR_EXCESS = 5  # points of a kind; the scatter of fewer is too uncertain
 _STEPS = 12
 _OPEN = 1e-12  # eigenvalue over the largest one, below which nothing determines a direction
@@ -164,7 +157,7 @@ def residual_covariances(data: Correspondences, state: SimilarityState) -> Float
 
 
 def _gated(data: Correspondences, state: SimilarityState) -> SimilarityState:
-    squared = squared_mahalanobis(residuals(data, state), residual_covariances(data, state))
+    squared = statistics.squared_mahalanobis(residuals(data, state), residual_covariances(data, state))
     inlier = squared <= OUTLIER_GATE
     if inlier.sum() < 3:  # a similarity needs three
         inlier = squared <= np.sort(squared)[min(2, len(squared) - 1)]
@@ -184,7 +177,7 @@ def _solve(data: Correspondences, state: SimilarityState, prior: RotationPrior |
         if np.abs(step / linear.unit).max() < 1e-9:
             break
     residual, cov = residuals(data, state), residual_covariances(data, state)
-    squared = squared_mahalanobis(residual, cov)
+    squared = statistics.squared_mahalanobis(residual, cov)
     stretch = np.linalg.slogdet(cov)[1] - np.linalg.slogdet(data.cov_in_geo)[1]
     of_positions = linear.jacobian[: 3 * len(data)].reshape(len(data), 3, -1)
     return AdjustedSimilarity(
@@ -265,7 +258,7 @@ def _excess(data: Correspondences, state: SimilarityState, members: BoolArray, r
 
     def surplus(sigma: float) -> float:
         squared = (along / (variances + sigma**2)).sum(axis=1)
-        return float(np.median(squared) / median_chi2(3) if robust else squared.mean() / 3) - free
+        return float(np.median(squared) / statistics.median_chi2(3) if robust else squared.mean() / 3) - free
 
     # With the largest residual as σ, each whitened square is at most 1, and the surplus negative.
     largest = float(np.linalg.norm(residual, axis=1).max())
@@ -338,12 +331,14 @@ def mean_rotation(rotations: FloatArray, sigma_rad: FloatArray) -> RotationPrior
     weight = np.ones(len(rotations))
     for _ in range(20):
         error = log_so3(rotations @ mean.T)
-        weight = cauchy_weight((error**2).sum(axis=1) / sigma_rad**2, 3) / sigma_rad**2
+        weight = statistics.cauchy_weight((error**2).sum(axis=1) / sigma_rad**2, 3) / sigma_rad**2
         step = weight @ error / weight.sum()
         mean = exp_so3(step) @ mean
         if np.linalg.norm(step) < 1e-12:
             break
-    scatter = float(np.median(np.linalg.norm(log_so3(rotations @ mean.T), axis=1)) / np.sqrt(median_chi2(3)))
+    scatter = float(
+        np.median(np.linalg.norm(log_so3(rotations @ mean.T), axis=1)) / np.sqrt(statistics.median_chi2(3))
+    )
     return RotationPrior(mean, max(float(np.median(sigma_rad)), scatter) ** 2 * np.eye(3))
 
 
@@ -352,9 +347,9 @@ def _ransac_start(data: Correspondences, rng: np.random.Generator) -> list[Simil
     starts = []
     for factor in _GATE_FACTORS:
         # The excess scatter of SfM is not known yet: the stated σ may be far too small.
-        options = RansacOptions(3, OUTLIER_GATE * factor**2, max_draws=300)
+        options = statistics.RansacOptions(3, OUTLIER_GATE * factor**2, max_draws=300)
         try:
-            result = ransac(
+            result = statistics.ransac(
                 len(data),
                 lambda chosen: umeyama(data.in_local[chosen], data.in_geo[chosen]),
                 lambda model: _squared(data, model),
@@ -381,13 +376,13 @@ def _start_with_rotation(data: Correspondences, rotation: FloatArray, rng: np.ra
             raise DegenerateGeometryError("positions-reversed", "Two positions lie in reverse order.")
         return Similarity(scale, rotation, (p + q - scale * (a + b)) / 2)
 
-    options = RansacOptions(2, OUTLIER_GATE * _GATE_FACTORS[-1] ** 2, max_draws=300)
-    return ransac(len(data), fit, lambda model: _squared(data, model), options, rng).model
+    options = statistics.RansacOptions(2, OUTLIER_GATE * _GATE_FACTORS[-1] ** 2, max_draws=300)
+    return statistics.ransac(len(data), fit, lambda model: _squared(data, model), options, rng).model
 
 
 def _squared(data: Correspondences, model: Similarity) -> FloatArray:
     state = SimilarityState(model, np.ones(len(data), dtype=bool))
-    return squared_mahalanobis(residuals(data, state), residual_covariances(data, state))
+    return statistics.squared_mahalanobis(residuals(data, state), residual_covariances(data, state))
 
 
 def _candidates(

@@ -5,26 +5,13 @@ Reads `ingest/survey.json`, and if any parameter is to be estimated, `ingest/tra
 (`survey.calibrated.load_survey`). The SfM model stays as it is.
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np
 
+from pipelines.adjust import rig_fit
 from pipelines.adjust.measurements import control_correspondences
 from pipelines.adjust.options import CalibrateOptions
-from pipelines.adjust.rig_fit import (
-    ARM,
-    BORESIGHT,
-    LIMIT_ARM_M,
-    LIMIT_BORESIGHT_DEG,
-    LIMIT_OFFSET_S,
-    OFFSET,
-    FitOptions,
-    RigData,
-    RigFit,
-    fit_rig,
-)
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.products import Remark, load_json, save_json
 from pipelines.core.stages import SPARSE, SURVEY
@@ -66,9 +53,9 @@ def calibrate(
     wanted = _wanted(survey, options)
     require_estimable(track, wanted, "--estimate")
     data, start_s = _data(survey, model, track), float(track.time_offset_s)
-    free = FitOptions("time-offset" in wanted, "lever-arm" in wanted, options.max_offset)
+    free = rig_fit.FitOptions("time-offset" in wanted, "lever-arm" in wanted, options.max_offset)
     try:
-        fit = fit_rig(data, start_s, track.nominal_from_cam, free)
+        fit = rig_fit.fit_rig(data, start_s, track.nominal_from_cam, free)
     except DegenerateGeometryError as error:
         return RigCalibration(wanted=wanted, problem=str(error))
     found = _estimates(fit, track)
@@ -91,17 +78,16 @@ def _wanted(survey: Survey, options: CalibrateOptions) -> tuple[RigParameter, ..
     return survey.estimate if options.estimate is None else options.estimate
 
 
-def _data(survey: Survey, model: SparseModel, track: NavigationTrack) -> RigData:
+def _data(survey: Survey, model: SparseModel, track: NavigationTrack) -> rig_fit.RigData:
     """Return cameras and control points; the size of a pixel is the median over images, at the points' distance."""
     row_of = {name: row for row, name in enumerate(track.image.tolist())}
     registered = [index for index, name in enumerate(model.image_name) if name in row_of]
     rows = [row_of[model.image_name[index]] for index in registered]
     control, _ = control_correspondences(survey, model)
-    focal_px = np.array([model.camera_of(image).mean_focal_px for image in range(len(model.image_name))])
     distance = np.linalg.norm(
         model.point_in_local[model.obs_point] - model.cam_center_in_local[model.obs_image], axis=1
     )
-    return RigData(
+    return rig_fit.RigData(
         positions=track.positions,
         attitudes=track.attitudes,
         time_s=track.image_time_s[rows],
@@ -110,19 +96,20 @@ def _data(survey: Survey, model: SparseModel, track: NavigationTrack) -> RigData
         cam_from_body=track.cam_from_body[rows],
         antenna_in_body=np.nan_to_num(track.antenna_in_body[rows]),
         control=control,
-        pixel_rad=float(1.0 / np.median(focal_px)),
-        footprint_in_local=float(np.median(distance / focal_px[model.obs_image])),
+        pixel_rad=float(1.0 / np.median(model.focal_px)),
+        footprint_in_local=float(np.median(distance / model.focal_px[model.obs_image])),
     )
 
 
-def _estimates(fit: RigFit, track: NavigationTrack) -> dict[RigParameter, RigEstimate]:
+def _estimates(fit: rig_fit.RigFit, track: NavigationTrack) -> dict[RigParameter, RigEstimate]:
     start_s, start_deg = track.time_offset_s.reshape(1), np.degrees(log_so3(track.nominal_from_cam))
     start_m = np.nan_to_num(track.antenna_in_body).mean(axis=0)
-    value_deg, sigma_deg = np.degrees(log_so3(fit.state.boresight)), np.degrees(fit.sigma[BORESIGHT])
+    value_s, sigma_s = np.array([fit.state.offset_s]), fit.sigma[rig_fit.OFFSET]
+    value_deg, sigma_deg = np.degrees(log_so3(fit.state.boresight)), np.degrees(fit.sigma[rig_fit.BORESIGHT])
     found: dict[RigParameter, tuple[Literal["s", "deg", "m"], float, FloatArray, FloatArray, FloatArray]] = {
-        "time-offset": ("s", LIMIT_OFFSET_S, np.array([fit.state.offset_s]), fit.sigma[OFFSET], start_s),
-        "boresight": ("deg", LIMIT_BORESIGHT_DEG, value_deg, sigma_deg, start_deg),
-        "lever-arm": ("m", LIMIT_ARM_M, start_m + fit.state.arm, fit.sigma[ARM], start_m),
+        "time-offset": ("s", rig_fit.LIMIT_OFFSET_S, value_s, sigma_s, start_s),
+        "boresight": ("deg", rig_fit.LIMIT_BORESIGHT_DEG, value_deg, sigma_deg, start_deg),
+        "lever-arm": ("m", rig_fit.LIMIT_ARM_M, start_m + fit.state.arm, fit.sigma[rig_fit.ARM], start_m),
     }
     return {
         name: RigEstimate(

@@ -7,8 +7,6 @@ Fixes that disagree with the layout of the cameras in the SfM model give no rays
 a bad fix. The few rays of one point do not tell a bad fix from good ones.
 """
 
-from __future__ import annotations
-
 import logging
 from dataclasses import dataclass
 from typing import Any
@@ -186,7 +184,7 @@ def _views(
     center[fixed], cov[fixed] = fixes.in_geo, fixes.cov_in_geo
     usable = np.zeros(count, dtype=bool)
     usable[fixed] = True if alignment is None else alignment.solution.state.inlier
-    sigma_ray = sigma_px / np.array([model.camera_of(image).mean_focal_px for image in range(count)])
+    sigma_ray = sigma_px / model.focal_px
     rotation, sigma, common = np.tile(np.eye(3), (count, 1, 1)), np.ones(count), None
     if recorded is not None:
         rotation[recorded.image], sigma[recorded.image] = recorded.geo_from_cam, recorded.sigma_rad

@@ -26,16 +26,7 @@ from pipelines.geodesy.enu import Origin, ecef_from_enu, ecef_from_lla, enu_from
 from pipelines.geodesy.vertical import FOOT_M
 from pipelines.geometry.similarity import Similarity, umeyama
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.robust.statistics import (
-    RansacOptions,
-    blunders_among,
-    median_chi2,
-    outlier_gate,
-    ransac,
-    scatter_about_median,
-    two_groups,
-    typical_sigma,
-)
+from pipelines.robust import statistics
 from pipelines.survey.survey import Survey
 
 # A hypothesis explains an inconsistency if it lowers the scatter by so much.
@@ -46,7 +37,7 @@ _LEAST_CLOCK_S, _TURN_S = 0.01, 2.0
 _WORTH = 10.0  # times the least cost of a step, up to which a minimum between two steps is looked for
 _ROUNDS, _DRAWS = 20, 300
 _LEAST = 4
-_GATE = outlier_gate(3)
+_GATE = statistics.outlier_gate(3)
 _BLUNDER = 4.0 * _GATE  # SfM's own errors add to those of the fixes
 _MEMBER = 2.0 * np.log(2.0)  # price of saying of one fix to which of two groups it belongs
 # Median of (up component of the image's upward direction) + (down component of the view) below which cameras hang
@@ -63,7 +54,7 @@ class StatedFixes:
         self.model, self.origin, self.name = model, survey.origin, fixes.name
         self.center_in_local, self.position_in_geo = fixes.in_local, fixes.in_geo  # (n, 3), and (n, 3) in metres
         self.time_s = np.array([times[name] for name in fixes.name], dtype=np.float64)  # (n,), NaN where unknown
-        self.sigma_m = typical_sigma(fixes.cov_in_geo) if len(fixes) else np.nan  # per axis
+        self.sigma_m = statistics.typical_sigma(fixes.cov_in_geo) if len(fixes) else np.nan  # per axis
 
 
 @dataclass(frozen=True)
@@ -94,7 +85,7 @@ def fit(center_in_local: FloatArray, position_in_geo: FloatArray) -> tuple[Simil
         distance = _distances(similarity, center_in_local, position_in_geo)
         weight = 1.0 / np.maximum(distance, 1e-3 + 0.1 * float(np.median(distance)))
     redundancy = max(1.0 - 7.0 / (3.0 * len(distance)), 0.05)
-    return similarity, float(np.median(distance) / np.sqrt(median_chi2(3) * redundancy))
+    return similarity, float(np.median(distance) / np.sqrt(statistics.median_chi2(3) * redundancy))
 
 
 def _distances(similarity: Similarity, center_in_local: FloatArray, position_in_geo: FloatArray) -> FloatArray:
@@ -167,11 +158,11 @@ def clock_that_turns(fixes: StatedFixes, attitude: RotationPrior) -> tuple[float
 def _plain(fixes: StatedFixes) -> tuple[Similarity, Hypothesis]:
     """Return the similarity that the most fixes agree with, and the fit to these, or to all if most disagree."""
     center, position = fixes.center_in_local, fixes.position_in_geo
-    consensus = ransac(
+    consensus = statistics.ransac(
         len(fixes.name),
         lambda chosen: umeyama(center[chosen], position[chosen]),
         lambda found: _distances(found, center, position) ** 2 / fixes.sigma_m**2,
-        RansacOptions(3, _BLUNDER, max_draws=_DRAWS),
+        statistics.RansacOptions(3, _BLUNDER, max_draws=_DRAWS),
         np.random.default_rng(0),
     ).model
     similarity, scatter = fit(center, position)
@@ -184,10 +175,10 @@ def _plain(fixes: StatedFixes) -> tuple[Similarity, Hypothesis]:
 
 def _blunders(fixes: StatedFixes, plain: Hypothesis) -> Hypothesis | None:
     residual = fixes.position_in_geo - plain.geo_from_local.apply(fixes.center_in_local)
-    bad = blunders_among(residual, fixes.sigma_m)
+    bad = statistics.blunders_among(residual, fixes.sigma_m)
     if bad is None:
         return None
-    scatter = scatter_about_median(residual[~bad])
+    scatter = statistics.scatter_about_median(residual[~bad])
     if scatter > max(plain.scatter_m / _EXPLAINS, _BLUNDER**0.5 * fixes.sigma_m):
         return None
     distance, rows = plain.distance_m, np.flatnonzero(bad)
@@ -259,7 +250,7 @@ def _groups(fixes: StatedFixes, start: Similarity, price: float) -> Iterator[_Ch
     count, similarity = len(fixes.name), start
     second = np.zeros(count, dtype=bool)
     for _ in range(_ROUNDS):
-        found = two_groups(fixes.position_in_geo - similarity.apply(fixes.center_in_local))
+        found = statistics.two_groups(fixes.position_in_geo - similarity.apply(fixes.center_in_local))
         if found is None or np.array_equal(found.second, second):
             break
         second = found.second

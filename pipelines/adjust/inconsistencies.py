@@ -6,8 +6,6 @@ that fits is named. One inconsistency is everyday work: a constant shift of all 
 up to five metres, as an autonomous base station causes. Then the control points decide the position.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 

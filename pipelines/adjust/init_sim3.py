@@ -7,8 +7,6 @@ robust alignment of camera centres and control points, adjusts similarity, camer
 stated σ. `pipelines.adjust.alignment` explains why the intersected points are no observations.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -387,7 +385,6 @@ def agreeing_points(model: SparseModel, points: GeolocatedPoints, similarity: Si
 
 
 def residuals_of_points(model: SparseModel, points: GeolocatedPoints, similarity: Similarity) -> ResidualStats:
-    """Return the figures of the intersected points' residuals."""
     good = points.inlier
     return residual_stats(points.position_in_geo[good] - similarity.apply(model.point_in_local[good]))
 

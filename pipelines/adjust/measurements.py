@@ -1,7 +1,5 @@
 """The survey's measurements of the registered images: as arrays, and as terms of the adjustment."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 

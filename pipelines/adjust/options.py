@@ -1,7 +1,5 @@
 """Options of `georef calibrate`, `georef geolocate` and `georef init-sim3`."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal, get_args
 
 from pydantic import Field

@@ -4,9 +4,7 @@ The matrix is stored with the solution: whoever asks for a σ factorises it once
 quantity is described by its derivatives by cameras and lens; points follow from the rays that intersect in them.
 """
 
-from __future__ import annotations
-
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -20,16 +18,11 @@ from pipelines.core.errors import InputError
 from pipelines.core.files import read_npz
 from pipelines.core.products import save_npz
 from pipelines.core.types import FloatArray, IntArray, rows_of
-from pipelines.geometry.bundle import (
-    Network,
-    has_positive_depth,
-    lens_slots,
-    linearise_bundle,
-    with_positive_depths,
-)
+from pipelines.geometry import bundle
 from pipelines.geometry.similarity import jacobian_at, second_moment_at
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.marks import MarkRays
+from pipelines.survey.scene import network_of
 from pipelines.survey.trained_model import Adjustment
 
 
@@ -45,15 +38,15 @@ class IntersectionJacobian:
 
 
 def intersection_jacobian(
-    marks: Network, sigma_px: FloatArray, surveyed: FloatArray | None = None
+    marks: bundle.Network, sigma_px: FloatArray, surveyed: FloatArray | None = None
 ) -> IntersectionJacobian:
     """Return the derivatives by poses and lens of the points of a network, each intersected from its own marks.
 
     The derivatives are taken at the projections of the points; of the marks their σ (M,) enter, and not the pixels.
     Marks of points behind their camera do not count. Points may have information (N, 3, 3) beyond these, in 1/m².
     """
-    sigma_px, marks = sigma_px[has_positive_depth(marks)], with_positive_depths(marks)
-    lin, count = linearise_bundle(marks), len(marks.point_in_world)
+    sigma_px, marks = sigma_px[bundle.has_positive_depth(marks)], bundle.with_positive_depths(marks)
+    lin, count = bundle.linearise_bundle(marks), len(marks.point_in_world)
     weighted = np.swapaxes(lin.jacobian_point, 1, 2) / (sigma_px**2)[:, None, None]
     normal = np.zeros((count, 3, 3)) if surveyed is None else surveyed.copy()
     np.add.at(normal, marks.obs_point, weighted @ lin.jacobian_point)
@@ -62,7 +55,7 @@ def intersection_jacobian(
     cov = (vector / value[:, None, :]) @ np.swapaxes(vector, 1, 2)
     response = -cov[marks.obs_point] @ weighted  # (M, 3, 2) metres per pixel
     lens = np.zeros((count, len(marks.cameras), 3, lin.jacobian_intrinsics.shape[2]))
-    np.add.at(lens, (marks.obs_point, lens_slots(marks)), response @ lin.jacobian_intrinsics)
+    np.add.at(lens, (marks.obs_point, bundle.lens_slots(marks)), response @ lin.jacobian_intrinsics)
     order = np.argsort(marks.obs_point, kind="stable")
     first = np.searchsorted(marks.obs_point[order], np.arange(count + 1))
     blocks = ((response @ lin.jacobian_pose)[order], marks.obs_image[order], first)
@@ -177,21 +170,11 @@ class Posterior:
 
         Without the σ of the rays, all of them have the same angular σ.
         """
-        sparse, poses = self.sparse, self.solution.poses
-        if sigma_px is None:
-            focal_px = np.array([sparse.camera_of(index).mean_focal_px for index in range(len(sparse.image_name))])
-            sigma_px = focal_px[camera]
-        rays = Network(
-            sparse.cameras,
-            sparse.image_camera_id,
-            poses.cam_from_model,
-            poses.cam_center_in_model,
-            self.solution.similarity.inverse().apply(point_in_geo),
-            point,
-            camera,
-            np.full((len(point), 2), np.nan),  # derivatives do not need the pixels
-        )
-        return intersection_jacobian(rays, sigma_px)
+        in_model = self.solution.similarity.inverse().apply(point_in_geo)
+        every = network_of(self.sparse, self.solution.poses, in_model)
+        no_pixels = np.full((len(point), 2), np.nan)  # derivatives do not need them
+        rays = replace(every, obs_point=point, obs_image=camera, obs_xy_px=no_pixels)
+        return intersection_jacobian(rays, self.sparse.focal_px[camera] if sigma_px is None else sigma_px)
 
     def _derivatives(self, jacobian: IntersectionJacobian) -> tuple[csr_matrix, FloatArray]:
         """Return the derivatives (3 J, 6 n), (3 J, b) of points in geo by the unknowns."""

@@ -1,7 +1,5 @@
 """A solved state as a product: similarity, cameras, lens, systematic errors, measurements, posterior."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Literal

@@ -1,7 +1,5 @@
 """Unknowns of the adjustment: similarity, corrections of cameras and lens, systematic errors."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Literal
 

@@ -16,8 +16,6 @@ Terms that depend on the mean similarity g of the SfM points (planes of a LiDAR)
 constraint g = F (x, ℓ) and its multipliers: F is dense, but has seven rows.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property

@@ -5,8 +5,6 @@ cameras, the lens and the systematic errors. The similarity has no derivative of
 cameras contain it (`adjust.system`). A new kind of measurement is one subclass of `Term`.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar

@@ -3,20 +3,12 @@
 The command line reads the configurations without loading a stage.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from pipelines import __version__
-from pipelines.compare.table import (
-    POINT_FIGURES,
-    Comparison,
-    bar_charts,
-    markdown,
-    remarks_on,
-)
+from pipelines.compare.table import POINT_FIGURES, Comparison, bar_charts, markdown, remarks_on
 from pipelines.core.errors import InputError
 from pipelines.core.figures import ERRORS, WAYS
 from pipelines.core.files import replace_text

@@ -5,8 +5,6 @@ differs, and reads the folders of all other stages. As in `georef run`, current 
 ones are resumed.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext

@@ -1,7 +1,5 @@
 """Table of `georef compare`: the figures of each configuration, as Markdown and as bars."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from typing import Literal
 

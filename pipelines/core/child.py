@@ -5,8 +5,6 @@ while it works, and its failed checks abort the process. In a child both are har
 at once, and a crash becomes one error.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import json

@@ -3,8 +3,6 @@
 The command line prints a `GeorefError` as one message. Every other exception is a defect and keeps its traceback.
 """
 
-from __future__ import annotations
-
 import errno
 import re
 from collections.abc import Iterator

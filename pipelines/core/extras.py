@@ -1,7 +1,5 @@
 """Extras: optional libraries, what needs them, whether they are installed, and the command that installs them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from importlib import metadata
 from importlib.util import find_spec
@@ -38,7 +36,6 @@ def module_of(package: str) -> str:
 
 
 def installing(extra: str) -> str:
-    """Return the command that installs an extra."""
     return f"pip install 'georefgs[{extra}]' (in a checkout: pip install '.[{extra}]')"
 
 
@@ -50,7 +47,6 @@ def require(extra: Extra) -> None:
 
 
 def extra_part(extra: Extra) -> Part:
-    """Return an extra with the versions of its libraries."""
     user, libraries = EXTRAS[extra]
     missing = [name for name in libraries if find_spec(module_of(name)) is None]
     if missing:

@@ -4,8 +4,6 @@ Tables, pages and sentences take their words and decimals from here, so that one
 digits everywhere. `survey.headline` says which figure is the headline of a workspace.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

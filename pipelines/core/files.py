@@ -90,7 +90,6 @@ def replace_folder(draft: Path, folder: Path, aside: Path) -> None:
 
 
 def sync_file(path: Path) -> None:
-    """Flush a file's content to the disk."""
     with path.open("r+b" if os.access(path, os.W_OK) else "rb") as handle:
         os.fsync(handle.fileno())
 

@@ -1,7 +1,5 @@
 """Hashes of a stage's inputs (equal hashes and options mean an equal product), and versions of its libraries."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
@@ -143,7 +141,6 @@ def _is_empty(value: Any) -> bool:
 
 
 def _hash_listing(hashes: Mapping[str, str]) -> str:
-    """Return the hash of names and hashes of files."""
     lines = "".join(f"{name}={hashes[name]}\n" for name in sorted(hashes))
     return hashlib.sha256(lines.encode()).hexdigest()
 

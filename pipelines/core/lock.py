@@ -4,8 +4,6 @@ The operating system holds the lock and drops it when its holder dies: no stale 
 a file of its own, because on Windows no other process can read a locked file.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import time

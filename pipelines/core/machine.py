@@ -4,8 +4,6 @@ OpenMP, BLAS and numba read their variables when they are loaded. The limit is t
 is imported.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import sys

@@ -9,8 +9,6 @@ annotations: `from_text` parses the text of a flag, of `georef.toml` and of an e
 marks the flag as text for the command line.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

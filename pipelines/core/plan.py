@@ -1,7 +1,5 @@
 """Plan of a run: what each stage would do, with which options, and why, without doing it."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass

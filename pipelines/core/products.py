@@ -6,8 +6,6 @@ metres at the survey's origin, `local` the SfM model's frame, `model` the metric
 Gaussians.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,7 +66,6 @@ def dump_json(document: Any) -> str:
 
 
 def save_npz(path: Path, arrays: dict[str, Any]) -> None:
-    """Write arrays as an NPZ file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     np.savez(path, **{name: np.asarray(array) for name, array in arrays.items()})  # type: ignore[arg-type]
 

@@ -4,8 +4,6 @@ Library code opens a task and advances it. The command line supplies a `Progress
 The default is silent.
 """
 
-from __future__ import annotations
-
 import signal
 import sys
 import threading

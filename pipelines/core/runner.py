@@ -1,7 +1,5 @@
 """Runner of the stages in a workspace; those whose product is current are skipped."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import logging
@@ -15,17 +13,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import ValidationError
 
-from pipelines.core import staleness
-from pipelines.core.errors import (
-    ConvergenceError,
-    DamagedPartialError,
-    DegenerateGeometryError,
-    GeorefError,
-    InputError,
-    MissingProductError,
-    WorkspaceBusyError,
-    storage_failures,
-)
+from pipelines.core import errors, staleness
 from pipelines.core.files import remove, replace_text
 from pipelines.core.fingerprints import library_versions
 from pipelines.core.lock import WriteLock
@@ -52,11 +40,11 @@ def clean_up_after_refusal(workspace: Workspace) -> Iterator[None]:
     is_new = workspace.base is None and not workspace.has_begun()
     try:
         yield
-    except WorkspaceBusyError:
+    except errors.WorkspaceBusyError:
         raise
-    except GeorefError:
+    except errors.GeorefError:
         if is_new and not workspace.has_product():
-            with contextlib.suppress(OSError, GeorefError):
+            with contextlib.suppress(OSError, errors.GeorefError):
                 _clear(workspace, missing)
         raise
 
@@ -80,7 +68,7 @@ def _clear(workspace: Workspace, missing: Sequence[Path]) -> None:
 # Numbers that no matrix, no float and no product can hold.
 _WITHOUT_SOLUTION = (np.linalg.LinAlgError, OverflowError, FloatingPointError, RecursionError, ValidationError)
 # Errors that are the result of a run: to continue it would lead to them again.
-_RESULTS = (ConvergenceError, DegenerateGeometryError)
+_RESULTS = (errors.ConvergenceError, errors.DegenerateGeometryError)
 
 
 @dataclass(frozen=True)
@@ -92,7 +80,7 @@ class Outcome:
     manifest: Manifest
 
 
-@storage_failures()
+@errors.storage_failures()
 def run_stage(
     workspace: Workspace,
     spec: StageSpec,
@@ -140,13 +128,13 @@ def run_stage(
             return Outcome(spec.name, False, _with_present_files(workspace, asked, previous))
         try:
             manifest = _execute(workspace, asked, "never" if force else resume, progress, place)
-        except InputError:
+        except errors.InputError:
             remember(workspace.written, {spec.name: before})
             raise
         return Outcome(spec.name, True, manifest)
 
 
-@storage_failures()
+@errors.storage_failures()
 def run_pipeline(
     workspace: Workspace,
     stages: tuple[StageSpec, ...],
@@ -195,7 +183,7 @@ def run_pipeline(
                         place=f"stage {number} of {len(stages)}",
                     )
                 outcomes.append(outcome)
-        except (InputError, MissingProductError):
+        except (errors.InputError, errors.MissingProductError):
             done = {outcome.stage for outcome in outcomes}
             refused = [spec.name for spec in stages if spec.name not in done]
             with workspace.lock("run"):
@@ -292,7 +280,7 @@ def _run(workspace: Workspace, asked: Request, resume: Resume, progress: Progres
     extends = None if afresh else staleness.extendable_product(workspace, asked)
     log.info("%s: %s%s", spec.name, "resumed" if resumed else "started", f", {place}" if place else "")
     try:
-        with storage_failures(out):
+        with errors.storage_failures(out):
             module = importlib.import_module(spec.module)
             if spec.in_parts and module.made_in_parts(workspace, asked.options):
                 module = importlib.import_module(spec.in_parts)
@@ -300,20 +288,20 @@ def _run(workspace: Workspace, asked: Request, resume: Resume, progress: Progres
                 summary: Summary = module.run(
                     StageRun(workspace, out, progress, resumed, extends, afresh), asked.options
                 )
-            except DamagedPartialError as error:
+            except errors.DamagedPartialError as error:
                 log.warning(
                     "%s: the stage starts afresh, because its interrupted run is damaged: %s",
                     spec.name, error, extra={"code": "interrupted-run-damaged"},
                 )  # fmt: skip
                 out, _ = workspace.begin(spec, token, "never")
                 summary = module.run(StageRun(workspace, out, progress, afresh=afresh), asked.options)
-    except GeorefError as error:
+    except errors.GeorefError as error:
         workspace.partial_product(spec).fail(str(error), worthless=isinstance(error, _RESULTS))
         raise
     # Products that were edited by hand have numbers that no stage writes.
     except _WITHOUT_SOLUTION as error:
         cause = " ".join(str(error).split())[:200]
-        degenerate = DegenerateGeometryError(
+        degenerate = errors.DegenerateGeometryError(
             "no-solution",
             f"The products that {spec.name} reads lead to no solution ({cause}). If they were edited, "
             f"`georef run {workspace.root} --force` makes them again.",

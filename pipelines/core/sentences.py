@@ -3,8 +3,6 @@
 A terminal obeys escape sequences, and marks that turn the direction of writing show another name than there is.
 """
 
-from __future__ import annotations
-
 import re
 import unicodedata
 from collections.abc import Mapping, Sequence

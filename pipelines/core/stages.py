@@ -3,8 +3,6 @@
 `georef status` and `--help` read this table without importing a stage.
 """
 
-from __future__ import annotations
-
 import importlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -117,7 +115,8 @@ class StageSpec:
             be used, or the disk is too small. Its docstring names its other errors.
         options_place: `module:class` of its options.
         reads: products, or parts of them, that decide its result.
-        product: workspace path of its main product.
+        product: workspace path of its main product, whose first part is the stage's folder.
+        title: what its command makes, of a deliverable that has not been made yet.
         resumable: whether a partial product can be continued.
         growing: options of which a larger value continues the finished product.
         also: further products in its folder, besides those that the stages of the pipeline read.
@@ -132,10 +131,9 @@ class StageSpec:
     name: str
     module: str
     options_place: str
-    folder: str
     reads: tuple[ProductPart, ...]
     product: str
-    title: str
+    title: str = ""
     resumable: bool = False
     growing: tuple[str, ...] = ()
     also: tuple[str, ...] = ()
@@ -143,6 +141,10 @@ class StageSpec:
     in_parts: str = ""
     called: str = ""
     product_version: int = 1
+
+    @property
+    def folder(self) -> str:
+        return self.product.partition("/")[0]
 
     def command(self, workspace: Path) -> str:
         """Return the command that makes its product in a workspace."""
@@ -161,10 +163,8 @@ PIPELINE: tuple[StageSpec, ...] = (
         name="ingest",
         module="pipelines.ingest.stage",
         options_place="pipelines.ingest.options:IngestOptions",
-        folder="ingest",
         reads=(),
         product=SURVEY,
-        title="Read photographs, positions, attitudes and control points into one survey.",
         working=("images",),
         product_version=2,  # as `Survey.format_version`
     ),
@@ -172,10 +172,8 @@ PIPELINE: tuple[StageSpec, ...] = (
         name="sfm",
         module="pipelines.sfm.stage",
         options_place="pipelines.sfm.options:SfmOptions",
-        folder="sfm",
         reads=(PHOTOGRAPHS,),
         product=SPARSE,
-        title="Reconstruct cameras and points with COLMAP.",
         resumable=True,
         working=("database.db",),
     ),
@@ -183,28 +181,22 @@ PIPELINE: tuple[StageSpec, ...] = (
         name="calibrate",
         module="pipelines.adjust.calibrate",
         options_place="pipelines.adjust.options:CalibrateOptions",
-        folder="calibrate",
         reads=(MEASURED, *whole_products(SPARSE), ProductPart(TRACK, optional=True)),
         product=RIG,
-        title="Estimate time offset, boresight and lever arm after sfm.",
     ),
     StageSpec(
         name="geolocate",
         module="pipelines.adjust.geolocate",
         options_place="pipelines.adjust.options:GeolocateOptions",
-        folder="geolocate",
         reads=(MEASURED, *whole_products(SPARSE), APPLIED_RIG),
         product=POINTS,
-        title="Intersect every SfM point on Earth from the measured positions and attitudes.",
     ),
     StageSpec(
         name="init-sim3",
         module="pipelines.adjust.init_sim3",
         options_place="pipelines.adjust.options:InitSim3Options",
-        folder="sim3",
         reads=(MEASURED, *whole_products(SPARSE, POINTS), APPLIED_RIG),
         product=SIM3,
-        title="Estimate the similarity from the SfM model to the Earth.",
         product_version=2,  # beside the similarity, the adjustment
         also=(ADJUSTMENT, SIM3_POSTERIOR),
     ),
@@ -212,10 +204,8 @@ PIPELINE: tuple[StageSpec, ...] = (
         name="train",
         module="pipelines.train.stage",
         options_place="pipelines.train.options:TrainOptions",
-        folder="train",
         reads=(MEASURED, *whole_products(SPARSE, SIM3, ADJUSTMENT, SIM3_POSTERIOR, POINTS), APPLIED_RIG),
         product=MODEL,
-        title="Train the Gaussians together with the similarity and the cameras.",
         resumable=True,
         growing=("iterations",),
         also=(TRAIN_POSTERIOR,),
@@ -226,20 +216,16 @@ PIPELINE: tuple[StageSpec, ...] = (
         name="evaluate",
         module="pipelines.evaluate.stage",
         options_place="pipelines.evaluate.options:EvaluateOptions",
-        folder="evaluate",
         reads=(MEASURED, *SOLVED, APPLIED_RIG),
         product=REPORT,
-        title="Measure test views and check points.",
         product_version=3,  # with the area of interest
     ),
     StageSpec(
         name="export-ply",
         module="pipelines.deliver.ply",
         options_place="pipelines.deliver.options:ExportPlyOptions",
-        folder="export",
         reads=(MEASURED, *whole_products(MODEL, GAUSSIANS), *CROPPED_BY, APPLIED_RIG, HEADLINE),
         product=SPLAT,
-        title="Write the splat as a PLY with its place on Earth.",
     ),
 )
 
@@ -249,7 +235,6 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         name="export-measurable",
         module="pipelines.deliver.measurable",
         options_place="pipelines.deliver.options:MeasurableOptions",
-        folder="measurable",
         reads=(MEASURED, *whole_products(SPARSE, MODEL, GAUSSIANS, SIM3), APPLIED_RIG, HEADLINE),
         product=MEASURABLE_SPLAT,
         title="Write a second PLY whose centres lie on the surface, for viewers that measure by them.",
@@ -260,7 +245,6 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         name="export-raster",
         module="pipelines.deliver.raster",
         options_place="pipelines.deliver.options:ExportRasterOptions",
-        folder="raster",
         reads=(MEASURED, *whole_products(SPARSE, MODEL, TRAIN_POSTERIOR, GAUSSIANS, SIM3), APPLIED_RIG, HEADLINE),
         product="raster/orthophoto.tif",
         title="Write orthophoto, surface model and their σ as rasters in a CRS.",
@@ -272,7 +256,6 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         name="export-cloud",
         module="pipelines.deliver.cloud",
         options_place="pipelines.deliver.options:ExportCloudOptions",
-        folder="cloud",
         reads=(MEASURED, *whole_products(SPARSE, MODEL, TRAIN_POSTERIOR, GAUSSIANS, SIM3), APPLIED_RIG, HEADLINE),
         product=CLOUD,
         title="Write the surface as a georeferenced point cloud (LAZ).",
@@ -282,7 +265,6 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         name="export-mesh",
         module="pipelines.deliver.mesh",
         options_place="pipelines.deliver.options:ExportMeshOptions",
-        folder="mesh",
         reads=(MEASURED, *whole_products(SPARSE, MODEL, GAUSSIANS, SIM3), APPLIED_RIG, HEADLINE),
         product=MESH,
         title="Write the surface as a triangle mesh with texture (PLY, glTF, OBJ).",
@@ -293,7 +275,6 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         name="export-spz",
         module="pipelines.deliver.spz",
         options_place="pipelines.deliver.options:ExportSpzOptions",
-        folder="spz",
         reads=(MEASURED, *whole_products(MODEL, GAUSSIANS), *CROPPED_BY, APPLIED_RIG, HEADLINE),
         product=SPZ,
         title="Write the splat as SPZ, for viewers on the web.",
@@ -302,7 +283,6 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         name="export-tiles",
         module="pipelines.deliver.tiles",
         options_place="pipelines.deliver.options:ExportTilesOptions",
-        folder="tiles",
         reads=(MEASURED, *whole_products(MODEL, GAUSSIANS), *CROPPED_BY, APPLIED_RIG, HEADLINE),
         product=TILES,
         title="Write the splat as 3D Tiles, for web globes.",
@@ -312,7 +292,6 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         name="export-cameras",
         module="pipelines.deliver.cameras",
         options_place="pipelines.deliver.options:ExportCamerasOptions",
-        folder="cameras",
         reads=(MEASURED, *SOLVED, APPLIED_RIG, HEADLINE),
         product="cameras/cameras.csv",
         title="Write the adjusted cameras with their covariances for COLMAP, nerfstudio, surveyors and maps.",
@@ -329,7 +308,6 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         name="report",
         module="pipelines.report.stage",
         options_place="pipelines.report.options:ReportOptions",
-        folder="report",
         reads=(
             *whole_products(SURVEY, REPORT),
             *SOLVED,
@@ -348,10 +326,8 @@ ADJUST = StageSpec(
     name="adjust",
     module="pipelines.sfm.pose_prior",
     options_place="pipelines.sfm.options:AdjustOptions",
-    folder="adjust",
     reads=(MEASURED, *whole_products(SPARSE), APPLIED_RIG),
     product="adjust/sparse",
-    title="Adjust the bundle with the fixes as priors of the camera positions.",
     also=("adjust/geo_from_local.json", "adjust/adjustment.json", "adjust/adjustment.npz"),
 )
 
@@ -360,28 +336,22 @@ PLAN_BLOCKS = StageSpec(
     name="plan",
     module="pipelines.train.blocks.plan",
     options_place="pipelines.train.options:PlanOptions",
-    folder="plan",
     reads=(MEASURED, *whole_products(SPARSE, SIM3, ADJUSTMENT), APPLIED_RIG),
     product=BLOCK_PLAN,
-    title="Divide the survey into blocks.",
 )
 SOLVE = StageSpec(
     name="solve",
     module="pipelines.train.blocks.solution",
     options_place="pipelines.train.options:SolutionOptions",
-    folder="solution",
     reads=(MEASURED, *whole_products(SPARSE, SIM3, ADJUSTMENT), APPLIED_RIG),
     product=SOLUTION,
-    title="Take over the adjustment, and estimate the exposures, for all blocks.",
 )
 TRAIN_SCAFFOLD = StageSpec(
     name="scaffold",
     module="pipelines.train.blocks.scaffold",
     options_place="pipelines.train.options:TrainOptions",
-    folder="scaffold",
     reads=(MEASURED, *whole_products(SPARSE, SIM3, SOLUTION), APPLIED_RIG),
     product=SCAFFOLD,
-    title="Train a coarse model of the whole, which stands in for the other blocks.",
     resumable=True,
     working=("checkpoint.npz",),
 )
@@ -389,10 +359,8 @@ TRAIN_BLOCK = StageSpec(
     name="block",
     module="pipelines.train.blocks.block",
     options_place="pipelines.train.options:BlockTrainOptions",
-    folder="block",
     reads=(MEASURED, *whole_products(SPARSE, SIM3, BLOCK_PLAN, SOLUTION, SCAFFOLD), APPLIED_RIG),
     product=BLOCK_GAUSSIANS,
-    title="Train the Gaussians of one block.",
     resumable=True,
     growing=("iterations",),
     also=(BLOCK_TRAINING,),
@@ -402,10 +370,8 @@ TRAIN_SEAMS = StageSpec(
     name="seams",
     module="pipelines.train.blocks.seams",
     options_place="pipelines.train.options:SeamOptions",
-    folder="seams",
     reads=(MEASURED, *whole_products(SPARSE, SIM3, BLOCK_PLAN, SOLUTION, SCAFFOLD), APPLIED_RIG),
     product=FIRST_CELL,
-    title="Adapt the Gaussians along the seams of the blocks to each other.",
     resumable=True,
 )
 BLOCK_PARTS = (PLAN_BLOCKS, SOLVE, TRAIN_SCAFFOLD, TRAIN_BLOCK, TRAIN_SEAMS)
@@ -415,7 +381,6 @@ BY_NAME = {spec.name: spec for spec in (*PIPELINE, *DELIVERABLES)}
 
 
 def producer_of(path: str) -> StageSpec:
-    """Return the stage that writes a workspace path."""
     folder = path.split("/", maxsplit=1)[0]
     return next(spec for spec in STAGES if spec.folder == folder)
 

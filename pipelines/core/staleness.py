@@ -4,8 +4,6 @@ A product is current if its inputs and options are those of now. A stage warns o
 ones, and a request that would lose what an interrupted run has done.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 from collections.abc import Collection, Mapping, Sequence

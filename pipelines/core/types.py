@@ -3,8 +3,6 @@
 Arrays are numpy's. Their shapes, units and frames are stated in docstrings, and beside the fields of classes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import TypeVar
 

@@ -3,8 +3,6 @@
 A validator returns its argument, or raises a ValueError that names the fault; `load_json` adds file and field.
 """
 
-from __future__ import annotations
-
 import unicodedata
 from pathlib import Path, PurePosixPath
 

@@ -12,8 +12,6 @@ into `cameras/` (docs/deliverables.md):
   who weights them in a solution of his own.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -38,15 +36,15 @@ from pipelines.formats.tables import table_text
 from pipelines.formats.vector_files import Json, feature, features_text, polygon
 from pipelines.geodesy.crs import grid_from_enu, parse_crs
 from pipelines.geodesy.enu import geo_from_enu_at, lla_from_ecef, lla_from_enu
-from pipelines.geometry.bundle import Network
-from pipelines.geometry.cameras import Camera, Pinhole, undistort
+from pipelines.geometry.cameras import Camera, CameraPoses, Pinhole, undistort
 from pipelines.geometry.footprints import PointSurface, border_rays, footprint
 from pipelines.geometry.intersection import refined_points
 from pipelines.geometry.rotations import omega_phi_kappa_deg, omega_phi_kappa_jacobian, yaw_pitch_roll_deg
 from pipelines.geometry.sparse_model import SparseModel
+from pipelines.survey.area import LEAST_RAYS, without_outliers
 from pipelines.survey.headline import headline_of
 from pipelines.survey.photographs import undistorted_name, write_undistorted
-from pipelines.survey.scene import photograph_files
+from pipelines.survey.scene import network_of, photograph_files
 from pipelines.survey.survey import Survey
 from pipelines.survey.target_crs import TargetCrs, target_crs
 from pipelines.survey.trained_survey import SolvedSurvey, TrainedSurvey, load_solved
@@ -54,8 +52,6 @@ from pipelines.survey.trained_survey import SolvedSurvey, TrainedSurvey, load_so
 # Components of a camera: rotation about its centre by the axes, rad, then position of the centre, m.
 _COMPONENTS = ("rotation_e", "rotation_n", "rotation_u", "e", "n", "u")
 _MOST_POINTS = 100_000  # with a covariance
-_LEAST_RAYS = 3  # of a point that counts as a part of the surface
-_RIM = 0.005  # fraction of the points that are taken for errors above, and below
 _JPEG_BYTES_A_PIXEL = 1  # of a detailed photograph at quality 95
 _LENS_TOLERANCE_PX = 0.01  # of a lens that nerfstudio's model replaces: below, nobody need know
 _UNKNOWN = (
@@ -155,20 +151,10 @@ def _model_in_file(solved: SolvedSurvey, placement: Placement) -> SparseModel:
     file_from_model = placement.file_from_model
     rotation = solved.poses.cam_from_model @ file_from_model.rotation.T
     center = file_from_model.apply(solved.poses.cam_center_in_model)
-    sparse = solved.sparse
-    network = Network(
-        sparse.cameras,
-        sparse.image_camera_id,
-        rotation,
-        center,
-        file_from_model.apply(solved.point_in_model),
-        sparse.obs_point,
-        sparse.obs_image,
-        sparse.obs_xy_px,
-    )
-    refined = refined_points(network)
+    points = file_from_model.apply(solved.point_in_model)
+    refined = refined_points(network_of(solved.sparse, CameraPoses(rotation, center), points))
     return replace(
-        sparse,
+        solved.sparse,
         rotation_cam_from_local=rotation,
         translation_cam_from_local=-np.einsum("nij,nj->ni", rotation, center),
         point_in_local=refined.point_in_world,
@@ -331,10 +317,9 @@ def _footprints(
 def _surface_points(model: SparseModel) -> FloatArray:
     """Return the points that three photographs show, without the highest and lowest; all if none are left."""
     rays = np.bincount(model.obs_point, minlength=len(model.point_id))
-    good = rays >= _LEAST_RAYS
+    good = rays >= LEAST_RAYS
     points = model.point_in_local[good if good.any() else slice(None)]
-    low, high = np.quantile(points[:, 2], [_RIM, 1 - _RIM])
-    kept = points[(points[:, 2] >= low) & (points[:, 2] <= high)]
+    kept = without_outliers(points)
     return kept if len(kept) else points
 
 

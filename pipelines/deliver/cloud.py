@@ -7,8 +7,6 @@ The points come from the depth maps of the training views, fused, and not from t
 lie above and below the surface. They are written part by part; medians of σ are counted in classes meanwhile.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from contextlib import ExitStack
 from pathlib import Path

@@ -14,8 +14,6 @@ Reads `ingest/survey.json`, the photographs, `sfm/sparse`, `train/model.json` an
 `measurable/splat.measurable.ply` and its sidecar, beside `export/splat.ply` of `export-ply`.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterable
 from dataclasses import replace

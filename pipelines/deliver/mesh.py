@@ -4,8 +4,6 @@ Reads the trained model, the survey and the photographs. Writes `mesh/mesh.ply` 
 `mesh/mesh.glb` with a texture, on request `mesh.obj` and, in a CRS, `mesh_crs.ply`; a sidecar beside each.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

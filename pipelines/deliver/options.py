@@ -1,7 +1,5 @@
 """Options of the deliverables, and a description of each file of a workspace for those who receive it."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 from urllib.parse import urlsplit
 

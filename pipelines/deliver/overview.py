@@ -3,8 +3,6 @@
 Reads survey, trained model and the centres of its Gaussians. Writes nothing.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
@@ -188,7 +186,6 @@ def _report(workspace: Workspace) -> EvaluationReport | None:
 
 
 def _files(workspace: Workspace, states: dict[str, StageState]) -> tuple[MadeFile, ...]:
-    """Return the files that there are, with the state of the stage of their folder."""
     made = []
     for name, description in DESCRIPTIONS.items():
         path, row = workspace.root / name, states.get(name.partition("/")[0])

@@ -5,8 +5,6 @@ coordinates stay small, and "up" is the vertical at the splat, not at the start 
 the model to Earth (GeoRefGS section 2.4).
 """
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,14 +17,8 @@ from pipelines.core.figures import Headline
 from pipelines.core.products import Remark, is_checked
 from pipelines.core.types import FloatArray, Quaternion, Row7, vector3
 from pipelines.formats.georef_sidecar import GeoreferenceSigma, GeorefSidecar, SceneSigma, georeference_sigma
+from pipelines.geodesy import enu
 from pipelines.geodesy.crs import ECEF, parse_crs
-from pipelines.geodesy.enu import (
-    ecef_from_enu,
-    ecef_from_enu_rotation,
-    ecef_from_lla,
-    lla_from_ecef,
-    lla_of,
-)
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.geometry.similarity import Similarity, SimilarityRecord, moved_pivot
@@ -65,7 +57,6 @@ class Placement:
 
     @property
     def file_from_model(self) -> Similarity:
-        """Similarity from the model's frame."""
         return self.file_from_geo @ self.geo_from_model
 
     @property
@@ -109,11 +100,11 @@ def place(model: Adjustment, survey: Survey, points_in_model: ArrayLike, accurac
     """
     geo_from_model = Similarity.from_record(model.geo_from_model)
     scene_in_geo = np.median(geo_from_model.apply(points_in_model), axis=0)
-    lla = lla_from_ecef(ecef_from_enu(scene_in_geo, survey.origin))
+    lla = enu.lla_from_ecef(enu.ecef_from_enu(scene_in_geo, survey.origin))
     origin_lla = np.array([*np.round(lla[:2], _ORIGIN_DECIMALS_DEG), np.round(lla[2], _ORIGIN_DECIMALS_M)])
     ecef_from_file, ecef_from_geo = (
-        Similarity(1.0, ecef_from_enu_rotation(origin), ecef_from_lla(origin))
-        for origin in (origin_lla, lla_of(survey.origin))
+        Similarity(1.0, enu.ecef_from_enu_rotation(origin), enu.ecef_from_lla(origin))
+        for origin in (origin_lla, enu.lla_of(survey.origin))
     )
     file_from_geo = ecef_from_file.inverse() @ ecef_from_geo
     return Placement(

@@ -7,8 +7,6 @@ The file's axes are those of its viewer: Gaussians are turned as a whole, and th
 are those of the file's axes.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -6,8 +6,6 @@ with `--contours` also `contours.gpkg` and `contours.dxf`. The Gaussians are ren
 window: finished windows survive an interruption.
 """
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 
@@ -77,7 +75,11 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
         sigma = scene_sigma(counts, mosaic.sample("sigma_h"), mosaic.sample("sigma_v"))
     west, south, east, north = frame.bounds
     bounds = [[west, south, height.min()], [east, north, height.max()]]
-    coarse = _detail_of_training(training_m) if source.training_px > _DETAIL else ()
+    detail = (
+        f"The model was trained at {training_m:.3f} m a pixel on the ground, and shows no finer detail, whatever "
+    )
+    detail += "the size of a raster's cells."
+    coarse = (Remark(code="detail-of-training", sentence=detail),) if source.training_px > _DETAIL else ()
     empty = "The rasters state no σ, and sigma_h.tif and sigma_v.tif are empty"
     cautions = union(trained.model.cautions, (*coarse, *without_sigma(empty, reason)))
     sidecar = target.sidecar(bounds, headline_of(stage.workspace), sigma, cautions)
@@ -119,14 +121,6 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
         warnings,
         cautions,
     )
-
-
-def _detail_of_training(training_m: float) -> tuple[Remark, ...]:
-    sentence = (
-        f"The model was trained at {training_m:.3f} m a pixel on the ground, and shows no finer detail, whatever "
-        "the size of a raster's cells."
-    )
-    return (Remark(code="detail-of-training", sentence=sentence),)
 
 
 def _write_pictures(folder: Path, heights_by_plan: float) -> None:

@@ -1,7 +1,5 @@
 """Rasters of the stage, window by window: rendered into parts, made whole inside the area, then put together."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -167,13 +165,10 @@ class Mosaic:
         rgb = np.moveaxis(rgba[:3], 0, 2).reshape(-1, 3)[cells.source]
         return CoarseCells(cells, rgb, self.frame.columns / columns)
 
-    def sample(self, name: str, *, measured: bool = False) -> FloatArray:
-        """Return values (K,) of cells all over a raster that have one; enough for medians and bounds.
-
-        `measured` leaves out the interpolated cells.
-        """
-        folder = self._seen if measured else self._whole
-        values = [read_reduced(self._part(folder, name, window), _SAMPLES_PX)[0][0] for window in self._windows()]
+    def sample(self, name: str) -> FloatArray:
+        """Return values (K,) of cells all over a raster that have one; enough for medians and bounds."""
+        paths = (self._part(self._whole, name, window) for window in self._windows())
+        values = [read_reduced(path, _SAMPLES_PX)[0][0] for path in paths]
         flat = np.concatenate([part.ravel() for part in values])
         return np.asarray(flat[np.isfinite(flat)], dtype=np.float64)
 

@@ -5,8 +5,6 @@ Gaussian goes through ENU → ECEF → CRS by itself: its centre exactly, its co
 which varies so slowly that it is taken from a few nodes over the scene.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

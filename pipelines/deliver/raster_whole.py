@@ -1,7 +1,5 @@
 """Whole cells of one window: what is measured, and inside the area what is interpolated; and the ground below."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Cells of one window: colour, height and σ, from the view from above and from what the training views show."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

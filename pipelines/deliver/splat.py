@@ -1,7 +1,5 @@
 """The splat to deliver: the opaque Gaussians of the trained model, in the frame of the placement."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass

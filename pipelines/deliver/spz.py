@@ -7,8 +7,6 @@ Readers of SPZ take its axes for right, up and back, and turn them into their ow
 east, up and south, so that every reader sees the scene upright. The rotation of the sidecar is that of these axes.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from pipelines.core.errors import InputError

@@ -1,7 +1,5 @@
 """The surface of a trained model as rasters, point cloud and discs take it: its views, and σ over the scene."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

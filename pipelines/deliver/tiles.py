@@ -8,8 +8,6 @@ contents in `tiles/content/`, `tiles/splat.glb`, a sidecar of each (docs/formats
 All files are in the frame of the placement, East-North-Up; the tileset's root places it on Earth.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Iterable
@@ -31,14 +29,7 @@ from pipelines.deliver.placement import require_space
 from pipelines.deliver.splat import SplatParts, load_splat_parts, splat_values
 from pipelines.deliver.tiles_page import TILESET, ScenePage, scene_page, write_scene_page
 from pipelines.formats.georef_sidecar import GeorefSidecar, write_sidecar
-from pipelines.formats.gltf import (
-    SPLATS,
-    SPZ_IN_GLTF,
-    decode_plain_glb,
-    encode_glb,
-    encode_plain_glb,
-    spz_in_glb,
-)
+from pipelines.formats.gltf import SPLATS, SPZ_IN_GLTF, decode_plain_glb, encode_glb, encode_plain_glb, spz_in_glb
 from pipelines.formats.splat_ply import SplatArrays
 from pipelines.formats.spz import FRACTIONAL_BITS, decode_spz, encode_spz
 from pipelines.formats.tiles_archive import write_tiles_archive

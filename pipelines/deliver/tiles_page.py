@@ -5,8 +5,6 @@ tiles and CesiumJS, and loads nothing else: no account, no imagery, no terrain. 
 runs its own script, by its hash, and CesiumJS.
 """
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import html
@@ -55,7 +53,6 @@ _DEGREE = 3
 _EXPONENTS = tuple(powers for powers in itertools.product(range(_DEGREE + 1), repeat=3) if sum(powers) <= _DEGREE)
 _NODES = 7  # of each axis: more than the polynomial has coefficients along it
 _MOST_DECIMALS = 3
-_SHORT_UNIT = {"metre": "m", "degree": "°"}
 
 # Names come from files of other people: control characters are shown, and none turns the direction of writing.
 ShownText = Annotated[str, AfterValidator(printable)]
@@ -241,8 +238,8 @@ def fit_local_crs(crs: PointCrs, origin_lla: ArrayLike, half_extent_m: Vector3) 
     errors = np.abs(powers[len(nodes) :] @ solved - values[len(nodes) :]).max(axis=0)
     decimals = np.clip(np.floor(-np.log10(2 * errors + 1e-12)), 0, _MOST_DECIMALS + np.round(np.log10(unit_m)))
     axes = [
-        Axis(name=name, unit=_SHORT_UNIT.get(unit, unit), decimals=int(count))
-        for name, unit, count in zip(_axis_names(crs), crs.units, decimals, strict=True)
+        Axis(name=name, unit=unit, decimals=int(count))
+        for name, unit, count in zip(_axis_names(crs), crs.short_units, decimals, strict=True)
     ]
     return LocalCrs(
         axes=(axes[0], axes[1], axes[2]),

@@ -11,8 +11,6 @@ Edition 2, Version 2 (ASPRS, 2024) demands:
 5. There are at least 30 check points, and more for a project beyond 1000 km².
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

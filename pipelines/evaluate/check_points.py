@@ -4,8 +4,6 @@ Each is a section of the report, with errors, accuracy after ASPRS, and predicte
 σ that check points reject, and check points close to control points.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import compress
 from typing import Any
@@ -22,20 +20,8 @@ from pipelines.evaluate.asprs import Assessment, assess
 from pipelines.robust.statistics import chi2_quantile, residual_stats
 from pipelines.surface.picking import DepthMap, depth_around, points_on_surface
 from pipelines.surface.surface_views import ModelRenderer
+from pipelines.survey import report
 from pipelines.survey.marks import MarkRays, mark_rays
-from pipelines.survey.report import (
-    ByAxis,
-    CheckPointErrors,
-    ControlResiduals,
-    CrossValidation,
-    FixResiduals,
-    PointError,
-    PointResidual,
-    PointRows,
-    PredictedPointError,
-    PredictedSigma,
-    RmsSigma,
-)
 from pipelines.survey.survey import Survey, SurveyedPoint
 from pipelines.survey.trained_survey import SolvedSurvey, fix_differences, triangulated_points
 
@@ -55,16 +41,16 @@ class RemeasuredPoints:
         return np.asarray(np.isfinite(self.error_in_geo).all(axis=1))
 
 
-def check_point_errors(measured: RemeasuredPoints, area_km2: float | None) -> CheckPointErrors:
+def check_point_errors(measured: RemeasuredPoints, area_km2: float | None) -> report.CheckPointErrors:
     """Return the report's section on check points; the area is that of the scene, None: not known."""
     assessment = _assess(measured, area_km2)
-    return CheckPointErrors(**_figures(measured, assessment), asprs=assessment.asprs)
+    return report.CheckPointErrors(**_figures(measured, assessment), asprs=assessment.asprs)
 
 
-def _residuals(measured: RemeasuredPoints) -> tuple[PointResidual, ...]:
+def _residuals(measured: RemeasuredPoints) -> tuple[report.PointResidual, ...]:
     residual = _by_axis(measured.error_in_geo)
     return tuple(
-        PointResidual(name=point.name, rays=rays, de_m=east, dn_m=north, du_m=up)
+        report.PointResidual(name=point.name, rays=rays, de_m=east, dn_m=north, du_m=up)
         for point, rays, (east, north, up) in zip(measured.points, measured.rays.tolist(), residual, strict=True)
     )
 
@@ -91,17 +77,17 @@ def _figures(measured: RemeasuredPoints, assessment: Assessment) -> dict[str, An
     }
 
 
-def _rows(measured: RemeasuredPoints, blunder: list[bool]) -> PointRows:
+def _rows(measured: RemeasuredPoints, blunder: list[bool]) -> report.PointRows:
     """Return one row for each point, with its predicted σ if there is a prediction."""
     rows = [
-        PointError(**residual.model_dump(), blunder=is_blunder)
+        report.PointError(**residual.model_dump(), blunder=is_blunder)
         for residual, is_blunder in zip(_residuals(measured), blunder, strict=True)
     ]
     if measured.cov_in_geo is None:
         return tuple(rows)
     sigma = _by_axis(np.sqrt(np.diagonal(measured.cov_in_geo, axis1=1, axis2=2)))
     return tuple(
-        PredictedPointError(**row.model_dump(), sigma_e_m=east, sigma_n_m=north, sigma_u_m=up)
+        report.PredictedPointError(**row.model_dump(), sigma_e_m=east, sigma_n_m=north, sigma_u_m=up)
         for row, (east, north, up) in zip(rows, sigma, strict=True)
     )
 
@@ -112,16 +98,16 @@ def _by_axis(values: FloatArray) -> list[tuple[float, float, float] | tuple[None
     return [row if np.isfinite(row).all() else (None, None, None) for row in rows]
 
 
-def rms_sigma(cov: FloatArray) -> RmsSigma:
+def rms_sigma(cov: FloatArray) -> report.RmsSigma:
     """Return the root mean square of σ over the points whose covariance of (J, 3, 3) is finite."""
     known = cov[np.isfinite(cov).all(axis=(1, 2))]
     if not len(known):
-        return RmsSigma(count=0, rms_h_m=None, rms_v_m=None)
+        return report.RmsSigma(count=0, rms_h_m=None, rms_v_m=None)
     east, north, up = np.diagonal(known, axis1=1, axis2=2).mean(axis=0).tolist()
-    return RmsSigma(count=len(known), rms_h_m=float(np.sqrt(east + north)), rms_v_m=float(np.sqrt(up)))
+    return report.RmsSigma(count=len(known), rms_h_m=float(np.sqrt(east + north)), rms_v_m=float(np.sqrt(up)))
 
 
-def _predicted_sigma(measured: RemeasuredPoints) -> PredictedSigma | None:
+def _predicted_sigma(measured: RemeasuredPoints) -> report.PredictedSigma | None:
     """Return the predicted σ, and the mean of error² over variance, by axis.
 
     The variance includes the survey's. The mean is 1 on the average if both variances are true.
@@ -131,17 +117,17 @@ def _predicted_sigma(measured: RemeasuredPoints) -> PredictedSigma | None:
     cov_survey = np.array([point.cov_in_geo for point in measured.points]).reshape(-1, 3, 3)
     variance = np.diagonal(measured.cov_in_geo + cov_survey, axis1=1, axis2=2)
     known = measured.is_measured & np.isfinite(variance).all(axis=1)
-    normalised = ByAxis(e=None, n=None, u=None)
+    normalised = report.ByAxis(e=None, n=None, u=None)
     if known.any():
         east, north, up = (measured.error_in_geo[known] ** 2 / variance[known]).mean(axis=0).tolist()
-        normalised = ByAxis(e=east, n=north, u=up)
+        normalised = report.ByAxis(e=east, n=north, u=up)
     sigma = rms_sigma(measured.cov_in_geo[known])
-    return PredictedSigma(**sigma.model_dump(), normalised_error_squared=normalised)
+    return report.PredictedSigma(**sigma.model_dump(), normalised_error_squared=normalised)
 
 
 def triangulated_check_points(
     solved: SolvedSurvey, posterior: Posterior, area_km2: float | None = None
-) -> CheckPointErrors:
+) -> report.CheckPointErrors:
     """Return the errors of the check points as intersections of their marks' rays, with their predicted σ."""
     points, rays = solved.survey.check_points, mark_rays(solved.survey.check_points, solved.sparse)
     position = triangulated_points(solved, rays)
@@ -151,7 +137,7 @@ def triangulated_check_points(
 
 def check_points_on_surface(
     renderer: ModelRenderer, progress: Progress, area_km2: float | None = None
-) -> CheckPointErrors:
+) -> report.CheckPointErrors:
     """Return the errors of the check points as places of the Gaussians' surface behind their marks."""
     trained = renderer.trained
     points, rays = trained.survey.check_points, mark_rays(trained.survey.check_points, trained.sparse)
@@ -164,7 +150,7 @@ def check_points_on_surface(
     return check_point_errors(_compared(points, position, rays), area_km2)
 
 
-def cross_validate(solved: SolvedSurvey) -> CrossValidation:
+def cross_validate(solved: SolvedSurvey) -> report.CrossValidation:
     """Return the errors of the control points, each measured by a solution without that point.
 
     The adjustment has stored them. The covariance is that of the solution and the marks: the survey's own is
@@ -181,7 +167,9 @@ def cross_validate(solved: SolvedSurvey) -> CrossValidation:
     measured = RemeasuredPoints(points, error, mark_rays(points, solved.sparse).marks_of_point, cov)
     assessment = _assess(measured)  # without a class, because control points are not check points
     impossible = "no control point can be spared, or none entered the adjustment"
-    return CrossValidation(**_figures(measured, assessment), reason=None if assessment.stats.count else impossible)
+    return report.CrossValidation(
+        **_figures(measured, assessment), reason=None if assessment.stats.count else impossible
+    )
 
 
 def _compared(
@@ -191,21 +179,21 @@ def _compared(
     return RemeasuredPoints(points, position_in_geo - surveyed, rays.marks_of_point, cov)
 
 
-def control_residuals(solved: SolvedSurvey) -> ControlResiduals:
+def control_residuals(solved: SolvedSurvey) -> report.ControlResiduals:
     """Return the residuals of the control points: the fit of the solution, not its accuracy."""
     points = solved.survey.control_points
     rays = mark_rays(points, solved.sparse)
     measured = _compared(points, triangulated_points(solved, rays), rays)
     rejected = np.isin([point.name for point in points], solved.model.control_outliers)
     stats = residual_stats(measured.error_in_geo[measured.is_measured & ~rejected])
-    return ControlResiduals(**stats.model_dump(), outliers=int(rejected.sum()), points=_residuals(measured))
+    return report.ControlResiduals(**stats.model_dump(), outliers=int(rejected.sum()), points=_residuals(measured))
 
 
-def fix_residuals(solved: SolvedSurvey) -> FixResiduals:
+def fix_residuals(solved: SolvedSurvey) -> report.FixResiduals:
     """Return the residuals of the fixes without outliers: the fit of the solution, not its accuracy."""
     fixes = fix_differences(solved)
     stats = residual_stats(fixes.difference_in_geo[~fixes.is_outlier])
-    return FixResiduals(**stats.model_dump(), outliers=int(fixes.is_outlier.sum()))
+    return report.FixResiduals(**stats.model_dump(), outliers=int(fixes.is_outlier.sum()))
 
 
 _LEAST_POINTS = 3
@@ -215,7 +203,7 @@ _SINGULAR = 1e-12  # of the largest variance: directions of smaller variance are
 
 
 def cautions_of_prediction(
-    solved: SolvedSurvey, posterior: Posterior, triangulated: CheckPointErrors, *, of_initial: bool
+    solved: SolvedSurvey, posterior: Posterior, triangulated: report.CheckPointErrors, *, of_initial: bool
 ) -> tuple[Remark, ...]:
     """Return the limits of the predicted accuracy; `of_initial`: the points have the initial similarity."""
     if of_initial:

@@ -1,7 +1,5 @@
 """Positions of the report in a CRS that the user names, and its tables of points and cameras for other programs."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

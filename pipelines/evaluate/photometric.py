@@ -6,8 +6,6 @@ decides nothing here: no hole or floater in it excuses a pixel, and all configur
 the same pixels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from pathlib import Path
 

@@ -8,8 +8,6 @@
    plan.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -219,7 +217,6 @@ _SEEN = 0.05
 
 
 def cautions_of_reference(found: ComparedReference) -> tuple[Remark, ...]:
-    """Return the limits of a comparison with a reference."""
     comparison = found.comparison
     cautions = list(found.assumptions)
     fine = max(comparison.spacing_m, comparison.model_spacing_m)

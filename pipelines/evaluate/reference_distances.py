@@ -233,7 +233,6 @@ def compare_square(
     seen: SeenSurface,
     settings: ComparisonSettings,
 ) -> SquareDistances:
-    """Return the distances between two clouds in a square."""
     margin_m = FARTHEST_M + 3 * settings.core_m
     rows, own = reference.around(square, margin_m)
     every = _at_random(rows["position"])
@@ -357,7 +356,6 @@ class DistanceTally:
         self.points = self.seen = 0  # of the reference: all, and those that photographs saw
 
     def add(self, found: SquareDistances) -> None:
-        """Add a square."""
         _count(self._to_reference, found.to_reference_m, found.model_kinds)
         _count(self._to_model, found.to_model_m, found.reference_kinds)
         self.points += found.points
@@ -366,7 +364,6 @@ class DistanceTally:
             self._cores.append(found.cores)
 
     def cores(self) -> CorePoints:
-        """Return the core points of all squares."""
         parts = [_NO_CORES, *self._cores]
         return replace(joined_rows(parts), kinds=joined_rows([part.kinds for part in parts]))
 

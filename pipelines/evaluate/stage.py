@@ -7,8 +7,6 @@ cloud; `reference_map.png` and `reference_histogram.png` show the distances. Che
 Residuals of observations that entered one are reported as a fit, not as an accuracy (docs/accuracy.md).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -27,17 +25,8 @@ from pipelines.core.sentences import listed
 from pipelines.core.stages import BY_NAME
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun, Summary
+from pipelines.evaluate import check_points
 from pipelines.evaluate.asprs import few_points
-from pipelines.evaluate.check_points import (
-    cautions_of_prediction,
-    check_points_on_surface,
-    control_residuals,
-    cross_validate,
-    dependent_check_points,
-    fix_residuals,
-    rms_sigma,
-    triangulated_check_points,
-)
 from pipelines.evaluate.coordinates import coordinates_in, report_crs, write_camera_sigma, write_point_table
 from pipelines.evaluate.options import EvaluateOptions
 from pipelines.evaluate.photometric import compare_test_views
@@ -217,7 +206,7 @@ def evaluate(
     """
     model = solved.model
     log_scale, *_, east, north, up = np.sqrt(np.diag(model.geo_from_model.covariance)).tolist()
-    triangulated = triangulated_check_points(solved, posterior, _km2(area_ha))
+    triangulated = check_points.triangulated_check_points(solved, posterior, _km2(area_ha))
     checkpoints = CheckPoints(triangulated=triangulated, surface=None if rendered is None else rendered.points)
     scene = model.accuracy or AccuracySummary(cells=0, reason="the adjustment states no σ")
     reference = None if rendered is None else rendered.reference
@@ -226,18 +215,20 @@ def evaluate(
         area_ha=area_ha,
         photometric=None if rendered is None else rendered.photometric,
         checkpoints=checkpoints,
-        cross_validation=cross_validate(solved) if options.cross_validate else None,
+        cross_validation=check_points.cross_validate(solved) if options.cross_validate else None,
         accuracy=scene,
-        fit=Fit(gnss=fix_residuals(solved), gcp=control_residuals(solved)),
-        cameras=rms_sigma(posterior.camera_cov[:, 3:, 3:]) if is_checked(model.cautions) else None,
+        fit=Fit(gnss=check_points.fix_residuals(solved), gcp=check_points.control_residuals(solved)),
+        cameras=check_points.rms_sigma(posterior.camera_cov[:, 3:, 3:]) if is_checked(model.cautions) else None,
         similarity=SimilaritySigma(sigma_ln_scale=log_scale, sigma_translation_m=(east, north, up)),
         coordinates=None if crs is None else coordinates_in(crs, checkpoints, solved.survey),
         reference=None if reference is None else reference.comparison,
         variance_factors=model.variance_factors,
         cautions=union(
             model.cautions,
-            cautions_of_prediction(solved, posterior, triangulated, of_initial=options.similarity == "initial"),
-            dependent_check_points(solved.survey),
+            check_points.cautions_of_prediction(
+                solved, posterior, triangulated, of_initial=options.similarity == "initial"
+            ),
+            check_points.dependent_check_points(solved.survey),
             () if reference is None else cautions_of_reference(reference),
         ),
     )
@@ -266,7 +257,7 @@ def _rendered(
             renderer, files, posterior.grid, options, scratch=scratch, progress=progress
         )
         draw_reference(reference, stage.out)
-    points = check_points_on_surface(renderer, progress, _km2(area_ha))
+    points = check_points.check_points_on_surface(renderer, progress, _km2(area_ha))
     save_render = partial(write_render, renders)
     test = compare_test_views(renderer, options.lpips_weights, save_render, progress, saved=options.renders)
     return Rendered(Photometric(test=test), points, reference)

@@ -5,8 +5,6 @@ distribution: for them the layout of `DEFINITIONS` counts that fits the message.
 topic only.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 from collections.abc import Collection, Iterator
@@ -134,7 +132,6 @@ class Bag:
         return sec * 1_000_000_000 + nanosec or None
 
     def _store(self, message: RawMessage) -> Any:
-        """Return a typestore that has the type of `message`."""
         kind = message.type
         if kind not in self._stores:
             stated = self._definitions.get(kind)
@@ -214,7 +211,6 @@ def open_bag(path: Path) -> Iterator[Bag]:
 
 
 def _opened(path: Path) -> Any:
-    """Return the open reader of rosbags."""
     require("bags")
     from rosbags import rosbag1, rosbag2
 
@@ -245,7 +241,6 @@ def _leave_packed(reader: Any) -> bool:
 
 
 def _parts(reader: Any) -> list[Any]:
-    """Return the files of a rosbag2."""
     outer = getattr(reader, "storage", None)
     return list(getattr(outer, "storages", [] if outer is None else [outer]))
 
@@ -326,7 +321,6 @@ class ImageWriter:
         return data.tobytes(), ".png"
 
     def _pixels(self, message: Any) -> ByteArray:
-        """Return BGR or grey pixels of a raw image."""
         encoding = str(message.encoding).strip().lower()
         if encoding not in _PIXEL_BYTES:
             raise BadImageError(f"encoding {message.encoding!r} is none of {', '.join(ENCODINGS)}")

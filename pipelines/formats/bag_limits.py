@@ -8,8 +8,6 @@ px4_msgs. Fields changed between releases. The length of a message reveals its l
 `timestamp_sample` from `timestamp`.
 """
 
-from __future__ import annotations
-
 import mmap
 import struct
 import sys

@@ -3,8 +3,6 @@
 The world is East-North-Up, `base_link` Forward-Left-Up, the camera `_optical` (x right, y down, z forward).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path

@@ -10,8 +10,6 @@ The table has position, angles in both conventions, and σ; a σ that is not kno
 reads position, yaw, pitch, roll and σ back, so that a table can be the input of another survey.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -8,9 +8,9 @@ and with the vertices first; faces and other elements after these are not read.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Protocol
 
 import numpy as np
@@ -177,7 +177,7 @@ def _set_columns(vertex: np.ndarray, names: Sequence[str], values: np.ndarray) -
         vertex[name] = values[:, column]
 
 
-class CloudPlyWriter:
+class CloudPlyWriter(AbstractContextManager["CloudPlyWriter"]):
     """Writer of a binary PLY file in chunks; a context manager. Comments are for people; ASCII alone is kept."""
 
     def __init__(self, path: Path, comments: list[str]) -> None:
@@ -186,12 +186,7 @@ class CloudPlyWriter:
         self._file = path.open("wb")
         self._file.write(self._header())
 
-    def __enter__(self) -> CloudPlyWriter:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Put the number of points into the header, and close the file."""
         try:
             self._file.seek(0)
@@ -200,7 +195,6 @@ class CloudPlyWriter:
             self._file.close()
 
     def write(self, points: CloudPoints) -> None:
-        """Append points."""
         vertex = np.empty(len(points), dtype=_VERTEX)
         _set_columns(vertex, ("x", "y", "z"), points.position)
         _set_columns(vertex, ("nx", "ny", "nz"), points.normal)

@@ -6,8 +6,6 @@ its packet must be short and lie in the first or last mebibyte of a file. defuse
 types.
 """
 
-from __future__ import annotations
-
 import io
 import math
 from collections.abc import Mapping

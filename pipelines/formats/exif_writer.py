@@ -5,8 +5,6 @@ because libraries for them are unmaintained or bring a whole image library.
 Sources: CIPA DC-008 (EXIF 2.32); DJI tags of photographs of M300 and Phantom 4 RTK.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -62,7 +62,6 @@ class GeoreferenceSigma(Product):
 
 
 def _matrix_of(fields: dict[str, Any]) -> Matrix4:
-    """Return the matrix of a sidecar's similarity, row by row."""
     similarity = Similarity(fields["scale"], matrix_from_quat_xyzw(fields["rotation"]), np.array(fields["origin"]))
     first, second, third, last = map(tuple, similarity.matrix().tolist())
     return first, second, third, last

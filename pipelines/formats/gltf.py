@@ -11,13 +11,9 @@ knows the extension: others may draw the centres as points, in the colours of CO
 its shader takes the names of the attributes.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import struct
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -42,17 +38,6 @@ _CONSTANT_HARMONIC = 0.28209479177387814
 _LEAST_OPACITY = 1e-7  # whose logit is finite in float32, as is that of 1 less it
 
 
-@dataclass(frozen=True)
-class _Content:
-    """What a glb says of its Gaussians: accessors by attribute, views of its binary chunk, and the extensions."""
-
-    accessors: dict[str, dict[str, Any]]
-    views: Sequence[dict[str, Any]]
-    extensions: tuple[str, ...]
-    required: tuple[str, ...] = ()
-    of_splats: dict[str, Any] | None = None  # extensions of the extension
-
-
 def encode_glb(
     spz: bytes, count: int, sh_degree: int, bounds: tuple[Vector3, Vector3], extras: dict[str, Any] | None = None
 ) -> bytes:
@@ -72,8 +57,7 @@ def encode_glb(
     for name in names:
         kind = "VEC4" if name.endswith("ROTATION") else "VEC3"
         accessors[name] = {"componentType": _FLOAT, "count": count, "type": kind}
-    both, view = (SPLATS, SPZ_IN_GLTF), {"buffer": 0, "byteLength": len(spz)}
-    return _glb(_Content(accessors, [view], both, both, {SPZ_IN_GLTF: {"bufferView": 0}}), spz, extras)
+    return _glb(accessors, [{"buffer": 0, "byteLength": len(spz)}], spz, extras, is_spz=True)
 
 
 def encode_plain_glb(splat: SplatArrays, extras: dict[str, Any] | None = None) -> bytes:
@@ -115,7 +99,7 @@ def encode_plain_glb(splat: SplatArrays, extras: dict[str, Any] | None = None) -
     low, high = (bound.tolist() for bound in (stored["POSITION"].min(axis=0), stored["POSITION"].max(axis=0)))
     accessors["POSITION"] |= {"min": low, "max": high}
     payload = b"".join(values.tobytes() for values in stored.values())
-    return _glb(_Content(accessors, views, (SPLATS,)), payload, extras)
+    return _glb(accessors, views, payload, extras)
 
 
 def spz_in_glb(data: bytes) -> bytes:
@@ -165,27 +149,35 @@ def _harmonics(first: int, last: int) -> list[str]:
     return [f"{SPLATS}:SH_DEGREE_{band}_COEF_{k}" for band in range(first, last + 1) for k in range(2 * band + 1)]
 
 
-def _glb(content: _Content, payload: bytes, extras: dict[str, Any] | None) -> bytes:
+def _glb(
+    accessors: dict[str, dict[str, Any]],
+    views: list[dict[str, Any]],
+    payload: bytes,
+    extras: dict[str, Any] | None,
+    *,
+    is_spz: bool = False,
+) -> bytes:
+    extensions = (SPLATS, SPZ_IN_GLTF) if is_spz else (SPLATS,)
     splats: dict[str, Any] = {
         "kernel": "ellipse",
         "colorSpace": "srgb_rec709_display",
         "sortingMethod": "cameraDistance",
         "projection": "perspective",
     }
-    if content.of_splats:
-        splats["extensions"] = content.of_splats
-    attributes = {name: index for index, name in enumerate(content.accessors)}
+    if is_spz:
+        splats["extensions"] = {SPZ_IN_GLTF: {"bufferView": 0}}
+    attributes = {name: index for index, name in enumerate(accessors)}
     primitive = {"attributes": attributes, "mode": _POINTS, "extensions": {SPLATS: splats}}
     document = {
         "asset": {"version": "2.0", "generator": "GeoRefGS", **({"extras": extras} if extras else {})},
-        "extensionsUsed": content.extensions,
-        **({"extensionsRequired": content.required} if content.required else {}),
+        "extensionsUsed": extensions,
+        **({"extensionsRequired": extensions} if is_spz else {}),
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "matrix": Y_UP_FROM_Z_UP}],
         "meshes": [{"primitives": [primitive]}],
-        "accessors": list(content.accessors.values()),
-        "bufferViews": content.views,
+        "accessors": list(accessors.values()),
+        "bufferViews": views,
         "buffers": [{"byteLength": len(payload)}],
     }
     return glb_of(document, payload)

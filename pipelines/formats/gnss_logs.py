@@ -11,8 +11,6 @@ Source: RTKLIB's manual, appendix B.1.
 GPS time: weeks since 1980-01-06 and seconds, ahead of UTC by the leap seconds since then (IERS Bulletin C).
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass

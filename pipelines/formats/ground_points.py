@@ -10,8 +10,6 @@ EPSG:4326: https://support.pix4d.com/hc/en-us/articles/360038397752. The fifth c
 zoom level, by version, and is not read.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,21 +18,7 @@ import numpy as np
 
 from pipelines.core.errors import InputError
 from pipelines.core.types import Vector3
-from pipelines.formats.tables import (
-    Row,
-    Table,
-    bare_name,
-    is_number,
-    named_columns,
-    numbered_lines,
-    read_lines,
-    refuse_first,
-    require_columns,
-    require_rows,
-    separator_of,
-    split,
-    table_rows,
-)
+from pipelines.formats import tables
 from pipelines.formats.trajectory_csv import PoseTable, camera_quaternions, complete
 
 
@@ -117,7 +101,7 @@ def read_geo(path: Path) -> PoseTable:
         numbers.append([row.number(column) for column in _GEO_COLUMNS[1:]])
     values = np.array(numbers)
     angles, accuracy = values[:, 3:6] + _GIMBAL_FROM_ODM_DEG, values[:, 6:8]
-    refuse_first(
+    tables.refuse_first(
         np.any(accuracy <= 0.0, axis=1),
         "sigma-not-positive",
         lambda row: f"the accuracies {accuracy[row, 0]:g} and {accuracy[row, 1]:g} m are not both above zero",
@@ -160,21 +144,21 @@ def read_ground_points(path: Path) -> GroundPoints:
     return GroundPoints(path, ODM_POINTS, without_repeats(points, path), tuple(marks), table.crs_text)
 
 
-def _odm_table(path: Path, columns: Sequence[str]) -> Table:
+def _odm_table(path: Path, columns: Sequence[str]) -> tables.Table:
     """Return the rows below the CRS but comments, cells between spaces, with columns in an order."""
-    lines = [(at, text) for at, text in numbered_lines(path) if not text.startswith("#")]
-    require_rows(lines, path)
+    lines = [(at, text) for at, text in tables.numbered_lines(path) if not text.startswith("#")]
+    tables.require_rows(lines, path)
     first, crs_text = lines[0]
     words = crs_text.split()
-    if len(words) >= 3 and is_number(words[1], decimal_comma=False) and not crs_text.startswith("+"):
+    if len(words) >= 3 and tables.is_number(words[1], decimal_comma=False) and not crs_text.startswith("+"):
         message = "The first line must be the CRS, e.g. EPSG:4326 or WGS84 UTM 16N; this is a row."
         raise InputError("crs-missing", message, path=path, line=first)
-    require_rows(lines[1:], path)
+    tables.require_rows(lines[1:], path)
     places = {name: at for at, name in enumerate(columns)}
-    return Table(path, None, places, (), table_rows(path, lines[1:], None, places), crs_text)
+    return tables.Table(path, None, places, (), tables.table_rows(path, lines[1:], None, places), crs_text)
 
 
-def _wrong_columns(row: Row, expected: str) -> InputError:
+def _wrong_columns(row: tables.Row, expected: str) -> InputError:
     has_commas = any("," in cell or ";" in cell for cell in row.cells)
     hint = "; separate columns by spaces or tabs" if has_commas else ""
     return row.fault("wrong-columns", f"the line has {len(row.cells)} columns, expected {expected}{hint}")
@@ -216,12 +200,12 @@ def read_point_table(path: Path) -> GroundPoints:
         axes = ("longitude", "latitude") if geographic else ("x", "y")
         missing = {"label", *axes, "z"} - set(table.columns)
         if missing or (geographic and {"x", "y"} & set(table.columns)):
-            header = read_lines(path)[table.header_line - 1]
+            header = tables.read_lines(path)[table.header_line - 1]
             message = (
                 f"The header must name label, z, and either x and y or longitude and latitude; it is {header!r}."
             )
             raise InputError("column-missing", message[:300], path=path, line=table.header_line)
-    require_rows(table.rows, path)
+    tables.require_rows(table.rows, path)
     points = [
         ListedPoint(
             line=row.line,
@@ -249,8 +233,8 @@ def read_marks(path: Path) -> tuple[ListedMark, ...]:
         InputError: no rows, a column is missing, or a cell is no number.
     """
     table = _pix4d_table(path, _MARK_ALIASES, _MARK_COLUMNS, slice(2, 4), "image, label, x and y")
-    require_columns(table.columns, _MARK_COLUMNS, path, table.header_line)
-    require_rows(table.rows, path)
+    tables.require_columns(table.columns, _MARK_COLUMNS, path, table.header_line)
+    tables.require_rows(table.rows, path)
     return tuple(
         ListedMark(row.line, row.named("label"), row.text("image"), row.finite("x"), row.finite("y"))
         for row in table.rows
@@ -259,20 +243,20 @@ def read_marks(path: Path) -> tuple[ListedMark, ...]:
 
 def _pix4d_table(
     path: Path, aliases: Mapping[str, str], in_order: Sequence[str], numeric: slice, expected: str
-) -> Table:
+) -> tables.Table:
     """Return a table whose first line is a header if none of its cells `numeric` is a number."""
-    numbered = enumerate(read_lines(path), start=1)
+    numbered = enumerate(tables.read_lines(path), start=1)
     lines = [(at, text) for at, text in numbered if text.strip() and not text.lstrip().startswith("#")]
-    require_rows(lines, path)
+    tables.require_rows(lines, path)
     first, text = lines[0]
-    separator = separator_of(text)
-    header = split(text, separator, path=path, line=first)
+    separator = tables.separator_of(text)
+    header = tables.split(text, separator, path=path, line=first)
     if len(header) < 4:
         message = f"The line has {len(header)} columns, expected {expected}."
         raise InputError("wrong-columns", message, path=path, line=first)
-    if any(map(is_number, header[numeric])):
+    if any(map(tables.is_number, header[numeric])):
         places = {name: at for at, name in enumerate(in_order)}
-        return Table(path, None, places, (), table_rows(path, lines, separator, places))
-    columns, unknown = named_columns(header, aliases, path, first)
-    named = tuple(name for name in unknown if bare_name(name))
-    return Table(path, first, columns, named, table_rows(path, lines[1:], separator, columns))
+        return tables.Table(path, None, places, (), tables.table_rows(path, lines, separator, places))
+    columns, unknown = tables.named_columns(header, aliases, path, first)
+    named = tuple(name for name in unknown if tables.bare_name(name))
+    return tables.Table(path, first, columns, named, tables.table_rows(path, lines[1:], separator, columns))

@@ -3,8 +3,6 @@
 The header is read before memory is allocated, so that a file that claims a billion pixels is refused.
 """
 
-from __future__ import annotations
-
 import hashlib
 import struct
 from dataclasses import dataclass

@@ -4,12 +4,10 @@ The elements stand in the order of the schema `gmd` of 2007-04-17. Numbers of me
 D (ISO/TS 19138 has the same). Lengths are in metres, latitude and longitude in degrees on WGS84.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import UTC, date, datetime
+from datetime import UTC, datetime
 from typing import Literal
 from xml.etree.ElementTree import Element, indent, register_namespace, tostring
 
@@ -84,11 +82,11 @@ def headline_quality(headline: Headline | None) -> tuple[QualityElement, ...]:
     )
 
 
-def iso_xml(metadata: IsoMetadata, made: date | None = None) -> str:
-    """Return the XML of a file's metadata, made today unless a date is given."""
+def iso_xml(metadata: IsoMetadata) -> str:
+    """Return the XML of a file's metadata, made today."""
     for prefix, space in _SPACES.items():
         register_namespace(prefix, space)
-    today = (made or datetime.now(UTC).date()).isoformat()
+    today = datetime.now(UTC).date().isoformat()
     processor = (
         _text("organisationName", f"processed with GeoRefGS {__version__}"),
         _code("role", "CI_RoleCode", "processor"),

@@ -14,7 +14,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
@@ -225,9 +224,7 @@ class LazFile:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._writer.close()
 
     def _record(self, position: FloatArray) -> laspy.ScaleAwarePointRecord:
@@ -283,7 +280,6 @@ class LidarWriter(LazFile):
     point_format, system = 6, "simulated"
 
     def write(self, returns: LidarReturns) -> None:
-        """Append the returns."""
         record = self._record(returns.position)
         record["classification"] = returns.classification
         record["gps_time"] = returns.gps_time_s

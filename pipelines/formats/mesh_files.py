@@ -1,7 +1,5 @@
 """Files of triangle meshes: PLY with colours of the vertices, binary glTF and OBJ with a texture."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -23,19 +23,8 @@ import numpy as np
 
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size, reading
+from pipelines.formats import tables
 from pipelines.formats.ground_points import GroundPoints, ListedMark, ListedPoint, without_repeats
-from pipelines.formats.tables import (
-    Row,
-    Table,
-    bare_name,
-    named_columns,
-    numbered_lines,
-    require_columns,
-    require_rows,
-    separator_of,
-    split,
-    table_rows,
-)
 from pipelines.formats.trajectory_csv import PoseTable, camera_quaternions, complete
 
 if TYPE_CHECKING:
@@ -288,32 +277,32 @@ def read_cameras(path: Path) -> PoseTable:
     )
 
 
-def _reference(path: Path) -> tuple[Table, bool | None]:
+def _reference(path: Path) -> tuple[tables.Table, bool | None]:
     """Return a reference table, and True if its header has longitudes, else None."""
-    lines = numbered_lines(path)
+    lines = tables.numbered_lines(path)
     found = next(((at, text) for at, text in lines if HEADER.match(text)), None)
     if found is None:
         raise InputError("header-missing", "No line begins with #Label.", path=path)
     header_line, header = found
     crs_line, crs_text = next(((at, crs[1]) for at, text in lines if (crs := _CRS.match(text))), (1, None))
-    separator = separator_of(header)
-    cells = split(header.lstrip("# "), separator, path=path, line=header_line)
-    columns, unknown = named_columns(cells, _ALIASES, path, header_line)
-    require_columns(columns, ("label", "x", "y", "z"), path, header_line)
+    separator = tables.separator_of(header)
+    cells = tables.split(header.lstrip("# "), separator, path=path, line=header_line)
+    columns, unknown = tables.named_columns(cells, _ALIASES, path, header_line)
+    tables.require_columns(columns, ("label", "x", "y", "z"), path, header_line)
     kept = [(at, text) for at, text in lines if at > header_line and not text.startswith("#")]
-    named = tuple(name for name in unknown if bare_name(name) and not _RESULT.search(name))
-    listed = table_rows(path, kept, separator, columns)
-    table = Table(path, header_line, columns, named, listed, crs_text, crs_line)
-    require_rows(table.rows, path)
+    named = tuple(name for name in unknown if tables.bare_name(name) and not _RESULT.search(name))
+    listed = tables.table_rows(path, kept, separator, columns)
+    table = tables.Table(path, header_line, columns, named, listed, crs_text, crs_line)
+    tables.require_rows(table.rows, path)
     for row in table.rows:
         row.named("label")
     return table, True if "longitude" in header.lower() else None
 
 
-def _is_enabled(row: Row) -> bool:
+def _is_enabled(row: tables.Row) -> bool:
     return "enabled" not in row.columns or row.text("enabled").lower() not in _OFF
 
 
-def _sigma_m(row: Row) -> tuple[float | None, float | None]:
+def _sigma_m(row: tables.Row) -> tuple[float | None, float | None]:
     """Return σ horizontal and vertical."""
     return row.sigma_m("sigma_h") or row.sigma_m("sigma"), row.sigma_m("sigma_v") or row.sigma_m("sigma")

@@ -4,8 +4,6 @@ Properties: `x y z nx ny nz f_dc_0..2 f_rest_0.. opacity scale_0..2 rot_0..3`. O
 natural logarithms, the rotation is wxyz, `f_rest` is ordered by channel, the normals are zero.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

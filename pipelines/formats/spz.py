@@ -18,8 +18,6 @@ Readers of SPZ take its axes for right, up, back (x right, y up, z towards the v
 | harmonics of degree 2 and 3 | 1/8 | −1 … 1 |
 """
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Iterator
@@ -74,7 +72,6 @@ class _Layout:
 
     @property
     def body_bytes(self) -> int:
-        """Bytes of all sections."""
         return self.count * sum(self.widths)
 
 

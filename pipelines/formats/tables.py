@@ -8,8 +8,6 @@ begin formulas (OWASP, CSV injection), and names of points and photographs come 
 begins with an apostrophe. Numbers stay as they are. `plain_text` gives names back as they were.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import math
@@ -124,7 +122,6 @@ def number_of(text: str, *, path: Path, line: int, field: str, decimal_comma: bo
 
 
 def is_number(text: str, *, decimal_comma: bool = True) -> bool:
-    """Return whether a cell is a number."""
     try:
         float(text.strip().replace(",", ".", 1) if decimal_comma else text)
     except ValueError:

@@ -6,8 +6,6 @@ the hash, taken as two little-endian integers of 64 bits. Entries have no times:
 bytes.
 """
 
-from __future__ import annotations
-
 import hashlib
 import struct
 import zipfile

@@ -16,18 +16,7 @@ from numpy.typing import NDArray
 
 from pipelines.core.errors import InputError
 from pipelines.core.types import BoolArray, FloatArray, IntArray, rows_of
-from pipelines.formats.tables import (
-    Row,
-    Table,
-    named_columns,
-    plain_text,
-    read_lines,
-    refuse_first,
-    require_range,
-    require_rows,
-    separator_of,
-    split,
-)
+from pipelines.formats import tables
 from pipelines.geometry.rotations import geo_from_cam, quat_xyzw_from_matrix
 
 
@@ -128,7 +117,9 @@ def read_trajectory(path: Path) -> PoseTable:
         path=path,
         source="csv",
         lines=table.lines,
-        names=tuple(plain_text(row.text("image")) for row in table.rows) if "image" in table.columns else None,
+        names=tuple(tables.plain_text(row.text("image")) for row in table.rows)
+        if "image" in table.columns
+        else None,
         time_s=time_s,
         xyz=xyz,
         geographic=geographic,
@@ -140,17 +131,17 @@ def read_trajectory(path: Path) -> PoseTable:
     )
 
 
-def _read_table(path: Path) -> Table:
+def _read_table(path: Path) -> tables.Table:
     """Return the rows; unlike those of other tables, cells in quotes may hold line ends."""
-    lines = read_lines(path)
+    lines = tables.read_lines(path)
     first = next(index for index, line in enumerate(lines) if line.strip())
     header = lines[first].lstrip("# ")
-    separator = separator_of(header)
+    separator = tables.separator_of(header)
     if separator is None:
         message = "The header has one column only: separate columns by , ; or tab."
         raise InputError("one-column", message, path=path, line=first + 1)
-    names = [name.strip() for name in split(header, separator, path=path, line=first + 1)]
-    columns, unknown = named_columns(
+    names = [name.strip() for name in tables.split(header, separator, path=path, line=first + 1)]
+    columns, unknown = tables.named_columns(
         names, _CANONICAL, path, first + 1, lambda name: name.lower().replace(" ", "_")
     )
     if not columns:
@@ -173,25 +164,25 @@ def _read_table(path: Path) -> Table:
                 hint = "; decimal commas need ; as separator" if separator == "," else ""
                 message = f"The line has {len(cells)} cells, the header has {width}{hint}"
                 raise InputError("wrong-columns", message, path=path, line=line)
-            rows.append(Row(path, line, cells, columns, separator != ","))
+            rows.append(tables.Row(path, line, cells, columns, separator != ","))
     except csv.Error as error:
         line = first + 1 + reader.line_num
         raise InputError("not-csv", f"The line is not CSV: {error}", path=path, line=line) from error
-    require_rows(rows, path)
-    return Table(path, first + 1, columns, unknown, rows)
+    tables.require_rows(rows, path)
+    return tables.Table(path, first + 1, columns, unknown, rows)
 
 
-def _in_range(table: Table, columns: tuple[str, ...]) -> FloatArray:
+def _in_range(table: tables.Table, columns: tuple[str, ...]) -> FloatArray:
     """Return the numbers of columns (N, K), each in its range."""
     values = table.numbers(columns)
     for name, (low, high) in _RANGES.items():
         if name in columns:
             column = values[:, columns.index(name)]
-            require_range(column, low, high, path=table.path, lines=table.lines, field=name)
+            tables.require_range(column, low, high, path=table.path, lines=table.lines, field=name)
     return values
 
 
-def _attitudes(table: Table) -> FloatArray | None:
+def _attitudes(table: tables.Table) -> FloatArray | None:
     """Return rotations camera → East-North-Up (N, 4), NaN where a row has none."""
     angles, quaternion = table.has(_ANGLES), table.has(_QUATERNION)
     if angles and quaternion:
@@ -204,7 +195,7 @@ def _attitudes(table: Table) -> FloatArray | None:
     values = table.numbers(_QUATERNION)
     length = np.linalg.norm(values, axis=1)
     known = complete(values)
-    refuse_first(
+    tables.refuse_first(
         known & (np.abs(length - 1.0) > 0.01),
         "quaternion-length",
         lambda row: f"the quaternion has length {length[row]:g}, not 1",
@@ -215,11 +206,11 @@ def _attitudes(table: Table) -> FloatArray | None:
     return np.where(known[:, None], values / length[:, None], np.nan)
 
 
-def _times(table: Table) -> tuple[FloatArray, bool]:
+def _times(table: tables.Table) -> tuple[FloatArray, bool]:
     """Return seconds since 1970 (N,), of numbers or ISO 8601, and whether an ISO 8601 time has no zone."""
     moments = [_time(row) for row in table.rows]
     times = np.array([seconds for seconds, _ in moments])
-    refuse_first(
+    tables.refuse_first(
         np.abs(times) > _LATEST_S,
         "time-unit",
         lambda row: f"the time {times[row]:.0f} is probably in milliseconds or finer: give seconds since 1970",
@@ -230,7 +221,7 @@ def _times(table: Table) -> tuple[FloatArray, bool]:
     return times, any(zoneless for _, zoneless in moments)
 
 
-def _time(row: Row) -> tuple[float, bool]:
+def _time(row: tables.Row) -> tuple[float, bool]:
     text = row.text("timestamp")
     if text[4:5] != "-" or len(text) < 10:
         return row.number("timestamp"), False

@@ -4,8 +4,6 @@ GeoJSON (RFC 7946) has longitude and latitude in WGS84 degrees, outer rings anti
 Contours are a line a height, with the height as attribute and as z.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import struct

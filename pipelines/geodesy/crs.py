@@ -49,6 +49,7 @@ _ELLIPSOID_HEIGHT = (
 )
 _UTM = re.compile(r"WGS\s?84\s*/?\s*UTM(?:\s+zone)?\s+(\d{1,2})\s*([NS])", re.IGNORECASE)
 _STEP_M = 10.0  # long against the rounding of eastings and northings, short against the curvature of a grid
+_SHORT_UNIT = {"metre": "m", "degree": "°"}
 
 
 @dataclass(frozen=True)
@@ -86,9 +87,13 @@ class PointCrs:
 
     @property
     def units(self) -> tuple[str, str, str]:
-        """Names of the three coordinates' units."""
         first, second = (axis.unit_name for axis in self._plan_axes)
         return first, second, self.height_unit
+
+    @property
+    def short_units(self) -> tuple[str, str, str]:
+        first, second, third = (_SHORT_UNIT.get(unit, unit) for unit in self.units)
+        return first, second, third
 
     @property
     def height_unit_m(self) -> float:

@@ -5,8 +5,6 @@ a grid that a PROJ string calls optional (`+nadgrids=@file`) is a shift of zero 
 errors that name the grid.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Whether coordinates can be of a CRS: degrees in a projection, swapped axes and wrong zones are caught."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -4,8 +4,6 @@ An ellipsoidal height and one above a geoid differ by up to 100 m, so every surv
 whether that was stated or assumed.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass

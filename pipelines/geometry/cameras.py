@@ -111,7 +111,6 @@ class Camera:
 
     @property
     def mean_focal_px(self) -> float:
-        """Mean of the two focal lengths in pixels."""
         return float(full_parameters(self)[:2].mean())
 
 
@@ -292,7 +291,6 @@ class Lenses:
         return max((len(camera.params) for camera in self.cameras.values()), default=0)
 
     def of(self, image: int) -> Camera:
-        """Return the camera of an image."""
         return self.cameras[int(self.camera_id[image])]
 
     def moved(self, change: FloatArray) -> Lenses:

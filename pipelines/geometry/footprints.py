@@ -3,8 +3,6 @@
 Also functions for point sets: points by voxel, by square in plan, and rows of dataclasses of arrays.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

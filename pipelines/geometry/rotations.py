@@ -3,8 +3,6 @@
 All functions are batched over leading dimensions and work in float64. Quaternions carry their order in the name.
 """
 
-from __future__ import annotations
-
 import warnings
 
 import numpy as np

@@ -15,8 +15,6 @@ Couplings over any distance are allowed. They only enlarge the separators: a mat
 which is the dense method.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial

@@ -36,6 +36,11 @@ class SparseModel:
         """Projection centres (n, 3): −Rᵀ t."""
         return np.asarray(-np.einsum("nji,nj->ni", self.rotation_cam_from_local, self.translation_cam_from_local))
 
+    @property
+    def focal_px(self) -> FloatArray:
+        """Focal length (n,) of each image, the mean of both axes."""
+        return np.array([self.camera_of(image).mean_focal_px for image in range(len(self.image_name))])
+
     def image_index(self) -> dict[str, int]:
         return {name: index for index, name in enumerate(self.image_name)}
 

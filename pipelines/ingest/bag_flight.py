@@ -4,8 +4,6 @@ The navigation is on one clock: positions Earth-centred, attitudes against north
 body at each photograph is by the options, else by `/tf`.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

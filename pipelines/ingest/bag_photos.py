@@ -1,7 +1,5 @@
 """Photographs from a bag: the selected frames, written as files one at a time, and their lens."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path

@@ -142,7 +142,6 @@ class TopicSamples:
     usable: BoolArray = field(default_factory=lambda: np.empty(0, dtype=bool))  # (N,) which samples are
 
     def add(self, stamp: int | None, bag_ns: int, values: tuple[float, ...] = (), receiver: str = "") -> None:
-        """Append a sample."""
         self.stamps.append(stamp or 0)
         self.bag_times.append(bag_ns)
         self.values.extend(values)

@@ -4,8 +4,6 @@ EXIF is not used where a table is given. But two receivers that disagree by far 
 inconsistency that nothing later would notice: heights in feet, another zone, exchanged axes, times that are off.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

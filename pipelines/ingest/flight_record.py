@@ -5,8 +5,6 @@ until the survey's frame is known. Lever arm and boresight lead from the places 
 measured to those of the cameras.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -158,7 +156,6 @@ def require_enough(count: int, source: Path, field: str, remarks: Remarks) -> No
 
 
 def given_rig(options: IngestOptions) -> Rig:
-    """Return the rig that the options state."""
     return Rig(
         cam_from_body=None if options.camera_mount is None else mount(options.camera_mount),
         antenna_in_body=None if options.lever_arm is None else np.array(options.lever_arm),

@@ -3,8 +3,6 @@
 Events are tied to photographs by the number in a photograph's name.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import replace
@@ -22,16 +20,8 @@ from pipelines.formats.tables import beginning
 from pipelines.formats.trajectory_csv import PoseTable, read_trajectory
 from pipelines.geodesy.enu import ecef_from_enu_rotation, lla_from_ecef
 from pipelines.geometry.trajectory import Rig, Trajectory
+from pipelines.ingest import flight_record
 from pipelines.ingest.exif_poses import poses_from_tags
-from pipelines.ingest.flight_record import (
-    FlightRecord,
-    ImagePoses,
-    RecordedNavigation,
-    at_cameras,
-    body_mount,
-    given_rig,
-    require_enough,
-)
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo, camera_priors, scan_folder
 from pipelines.ingest.remarks import Remarks
@@ -44,7 +34,7 @@ _MOST_SPREAD_S = 3.0
 
 def read_folder(
     folder: Path, options: IngestOptions, remarks: Remarks, progress: Progress = SILENT, *, decode: bool = True
-) -> FlightRecord:
+) -> flight_record.FlightRecord:
     """Read photographs, and the trajectory or `geo.txt` that the options name; `decode` as of `scan_folder`.
 
     Raises:
@@ -52,7 +42,7 @@ def read_folder(
         InputError: anything wrong with the files, or too few photographs.
     """
     photos = scan_folder(folder, remarks, progress, decode=decode)
-    require_enough(len(photos), folder, "--images", remarks)
+    flight_record.require_enough(len(photos), folder, "--images", remarks)
     for problem in sorted({problem for photo in photos for problem in photo.tags.problems}):
         with_it = [photo.name for photo in photos if problem in photo.tags.problems]
         remarks.warn_counted("exif-unusable", with_it, f"Tags of images are not used, because {problem}")
@@ -69,16 +59,16 @@ def read_folder(
             "--time-offset.",
             field="--time-offset",
         )
-    rig, names = given_rig(options), [photo.name for photo in photos]
+    rig, names = flight_record.given_rig(options), [photo.name for photo in photos]
     navigation = None
     if poses.recorded is not None:
         navigation = _navigation(poses.recorded, rig, names, poses.time_s, options)
-    poses = at_cameras(poses, rig, names, remarks)
+    poses = flight_record.at_cameras(poses, rig, names, remarks)
     cameras, camera_of = camera_priors(photos, options.focal_px, remarks)
-    return FlightRecord(folder.resolve(), photos, cameras, camera_of, poses, navigation)
+    return flight_record.FlightRecord(folder.resolve(), photos, cameras, camera_of, poses, navigation)
 
 
-def _poses(photos: list[Photo], options: IngestOptions, remarks: Remarks) -> ImagePoses:
+def _poses(photos: list[Photo], options: IngestOptions, remarks: Remarks) -> flight_record.ImagePoses:
     if options.trajectory is not None:
         table = _read_positions(options.trajectory, photos, remarks)
     elif options.geo is not None:
@@ -212,15 +202,15 @@ def _refuse_other_times(events: CameraEvents, timed: Sequence[tuple[Photo, int]]
 
 def _navigation(
     recorded: Trajectory, rig: Rig, names: list[str], time_s: FloatArray, options: IngestOptions
-) -> RecordedNavigation:
+) -> flight_record.RecordedNavigation:
     """Return a table by time as navigation of the photographs that have a time (N,)."""
     timed = np.flatnonzero(np.isfinite(time_s))
     turned = np.isfinite(recorded.rotation).all(axis=(1, 2))
-    mount = body_mount(rig)
+    mount = flight_record.body_mount(rig)
     attitudes = Trajectory.from_samples(
         recorded.time_s[turned], rotation=recorded.rotation[turned] @ mount, max_gap_s=recorded.max_gap_s
     )
-    return RecordedNavigation(
+    return flight_record.RecordedNavigation(
         positions=recorded,
         attitudes=attitudes,
         rig=Rig(mount, rig.antenna_in_body, rig.nominal_from_cam),

@@ -1,7 +1,5 @@
 """Control and check points on Earth, out of files recognised by their content, with marks tied to the images."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Options of `georef ingest`; those that exclude each other are refused before anything is read."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from pathlib import Path

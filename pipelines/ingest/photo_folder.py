@@ -3,8 +3,6 @@
 Cameras are those before any reconstruction: focal length in pixels from a photograph's lens tags.
 """
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Iterable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """Reference systems of the input files: which one a file's coordinates are in, and what is said of it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -28,13 +26,7 @@ def crs_of_table(table: PoseTable, options: IngestOptions, remarks: Remarks) -> 
         crs = parse_crs(table.crs_text, vertical=options.vertical, path=path, line=table.crs_line)
         return _own(crs, path, options, remarks)
     if options.crs is not None:
-        crs = parse_crs(options.crs, vertical=options.vertical, field="--crs")
-        if table.geographic and not crs.is_geographic:
-            raise InputError(
-                "crs-not-geographic",
-                f"{path.name} has latitude and longitude, but {crs.name} has none.",
-                field="--crs",
-            )
+        crs = _given(options.crs, "--crs", table, options)
         if _excludes(crs, options):
             raise InputError(
                 "vertical-against-crs",
@@ -73,22 +65,19 @@ def crs_of_points(listed: GroundPoints, options: IngestOptions, remarks: Remarks
         crs = parse_crs(listed.crs_text, vertical=options.vertical, path=path, line=listed.crs_line)
         return _own(crs, path, options, remarks)
     if options.gcp_crs is not None:
-        crs = parse_crs(options.gcp_crs, vertical=options.vertical, field="--gcp-crs")
-    elif listed.geographic:
-        remarks.assume("crs-assumed", f"The latitude and longitude in {path.name} are WGS84 ({WGS84}).")
-        crs = parse_crs(WGS84, vertical=options.vertical)
-    else:
-        raise InputError(
-            "crs-missing",
-            f"{path.name} states no CRS. Give it, e.g. --gcp-crs EPSG:32632 or --gcp-crs EPSG:4326.",
-            field="--gcp-crs",
-        )
+        return _given(options.gcp_crs, "--gcp-crs", listed, options)
+    if not listed.geographic:
+        message = f"{path.name} states no CRS. Give it, e.g. --gcp-crs EPSG:32632 or --gcp-crs EPSG:4326."
+        raise InputError("crs-missing", message, field="--gcp-crs")
+    remarks.assume("crs-assumed", f"The latitude and longitude in {path.name} are WGS84 ({WGS84}).")
+    return parse_crs(WGS84, vertical=options.vertical)
+
+
+def _given(text: str, flag: str, listed: PoseTable | GroundPoints, options: IngestOptions) -> PointCrs:
+    crs = parse_crs(text, vertical=options.vertical, field=flag)
     if listed.geographic and not crs.is_geographic:
-        raise InputError(
-            "crs-not-geographic",
-            f"{path.name} has latitude and longitude, but {crs.name} has none.",
-            field="--gcp-crs",
-        )
+        message = f"{listed.path.name} has latitude and longitude, but {crs.name} has none."
+        raise InputError("crs-not-geographic", message, field=flag)
     return crs
 
 

@@ -1,7 +1,5 @@
 """Remarks on a survey: assumptions, warnings of what was left out, and cautions."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 

@@ -5,8 +5,6 @@ Writes: `ingest/survey.json`; `ingest/images/` with --bag or --copy; `ingest/tra
 recorded by time. See docs/inputs.md and docs/bags.md for every format and default.
 """
 
-from __future__ import annotations
-
 import logging
 import shutil
 from pathlib import Path

@@ -4,8 +4,6 @@ Images and surveyed points get their positions, attitudes and covariances in geo
 base station, a receiver or a day, form a session, with the σ of that error.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
@@ -14,25 +12,10 @@ import numpy as np
 
 from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray, IntArray, Matrix3, vector3
-from pipelines.geodesy.enu import (
-    Origin,
-    ecef_from_lla,
-    enu_from_ecef,
-    geo_from_enu_at,
-    lla_from_ecef,
-    lla_of,
-    median_lla,
-)
+from pipelines.geodesy import enu
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
-from pipelines.ingest.flight_record import (
-    LEAST_IMAGES,
-    RECEIVERS,
-    FlightRecord,
-    ImagePoses,
-    SigmaSource,
-    track_in_geo,
-)
+from pipelines.ingest import flight_record
 from pipelines.ingest.ground_points import GroundFile, GroundPoint, require_near, split_checks, unmarked_points
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.remarks import Remarks
@@ -58,7 +41,7 @@ SigmaGroup = Literal["fixes", "control points", "marks", "attitudes"]
 
 
 def assemble_survey(
-    flight: FlightRecord,
+    flight: flight_record.FlightRecord,
     control: GroundFile | None,
     check: GroundFile | None,
     options: IngestOptions,
@@ -81,14 +64,14 @@ def assemble_survey(
     unmarked = unmarked_points(controls, checks, remarks)
     located = bool(poses.located.any())
     if located:
-        middle_in_ecef = ecef_from_lla(median_lla(lla_from_ecef(poses.position_in_ecef[poses.located])))
+        middle_in_ecef = enu.ecef_from_lla(enu.median_lla(enu.lla_from_ecef(poses.position_in_ecef[poses.located])))
         for file in files:
             require_near(file, middle_in_ecef)
     origin = _origin(poses, marked)
     _note_coverage(flight, len(marked), remarks)
     if options.test_every and not _held_out(len(flight.photos), options.test_every):
         remarks.warn("no-test-images", f"{len(flight.photos)} images are too few to hold any out for testing.")
-    track = None if flight.navigation is None else track_in_geo(flight.navigation, origin)
+    track = None if flight.navigation is None else flight_record.track_in_geo(flight.navigation, origin)
     if options.estimated:
         require_estimable(track, options.estimated, "--estimate" if options.estimate else "--time-offset")
     sessions, session_of = fix_sessions(poses, options, remarks)
@@ -139,7 +122,7 @@ def _require_checks(checks: Sequence[GroundPoint], vegetated: Sequence[str]) -> 
 
 
 def _images(
-    flight: FlightRecord, session_of: IntArray, origin: Origin, options: IngestOptions
+    flight: flight_record.FlightRecord, session_of: IntArray, origin: enu.Origin, options: IngestOptions
 ) -> tuple[SurveyImage, ...]:
     """Return the photographs with fixes and attitudes in the frame at an origin, and their split."""
     poses = flight.poses
@@ -162,10 +145,12 @@ def _images(
 def _held_out(count: int, every: int) -> range:
     """Return the rows of the test images: every N-th, none where that would leave too few to train on."""
     rows = range(0, count, every) if every else range(0)
-    return rows if count - len(rows) >= LEAST_IMAGES else range(0)
+    return rows if count - len(rows) >= flight_record.LEAST_IMAGES else range(0)
 
 
-def _surveyed(points: Sequence[GroundPoint], origin: Origin, options: IngestOptions) -> tuple[SurveyedPoint, ...]:
+def _surveyed(
+    points: Sequence[GroundPoint], origin: enu.Origin, options: IngestOptions
+) -> tuple[SurveyedPoint, ...]:
     """Return ground points in the frame at an origin; σ by precedence: option, then file, then default."""
     if not points:
         return ()
@@ -176,7 +161,7 @@ def _surveyed(points: Sequence[GroundPoint], origin: Origin, options: IngestOpti
         vertical_m = (None if "sigma_gcp_v" in stated else point.sigma_v_m) or options.sigma_gcp_v
         sigma_m.append((horizontal_m, horizontal_m, vertical_m))
     position_in_ecef = np.array([point.position_in_ecef for point in points])
-    position = enu_from_ecef(position_in_ecef, origin)
+    position = enu.enu_from_ecef(position_in_ecef, origin)
     covariance = _turned(np.array(sigma_m), position_in_ecef, origin)
     return tuple(
         SurveyedPoint(
@@ -190,8 +175,8 @@ def _surveyed(points: Sequence[GroundPoint], origin: Origin, options: IngestOpti
     )
 
 
-def _fixes(poses: ImagePoses, session_of: IntArray, origin: Origin) -> list[Fix | None]:
-    position = enu_from_ecef(poses.position_in_ecef, origin)
+def _fixes(poses: flight_record.ImagePoses, session_of: IntArray, origin: enu.Origin) -> list[Fix | None]:
+    position = enu.enu_from_ecef(poses.position_in_ecef, origin)
     covariance = _turned(poses.sigma_enu_m, poses.position_in_ecef, origin)
     return [
         Fix(
@@ -207,20 +192,22 @@ def _fixes(poses: ImagePoses, session_of: IntArray, origin: Origin) -> list[Fix 
     ]
 
 
-def _turned(sigma_enu_m: FloatArray, position_in_ecef: FloatArray, origin: Origin) -> FloatArray:
+def _turned(sigma_enu_m: FloatArray, position_in_ecef: FloatArray, origin: enu.Origin) -> FloatArray:
     """Return covariances in geo (N, 3, 3) of σ (N, 3) against north and up at each place (N, 3)."""
-    geo_from_enu = geo_from_enu_at(lla_from_ecef(position_in_ecef), origin)
+    geo_from_enu = enu.geo_from_enu_at(enu.lla_from_ecef(position_in_ecef), origin)
     return geo_from_enu @ (sigma_enu_m[:, :, None] ** 2 * np.swapaxes(geo_from_enu, -1, -2))
 
 
-def _attitudes(poses: ImagePoses, origin: Origin, options: IngestOptions) -> list[Attitude | None]:
+def _attitudes(
+    poses: flight_record.ImagePoses, origin: enu.Origin, options: IngestOptions
+) -> list[Attitude | None]:
     """Return attitudes in geo; σ by precedence: option, then file, then the source's default."""
     attitudes: list[Attitude | None] = [None] * len(poses.position_in_ecef)
     rows = np.flatnonzero(np.isfinite(poses.enu_from_cam).all(axis=(1, 2))).tolist()
     # Without a position, north is the origin's: within a survey it turns by minutes of arc.
     located = poses.located[rows, None]
-    place = np.where(located, lla_from_ecef(poses.position_in_ecef[rows]), lla_of(origin))
-    geo_from_cam = geo_from_enu_at(place, origin) @ poses.enu_from_cam[rows]
+    place = np.where(located, enu.lla_from_ecef(poses.position_in_ecef[rows]), enu.lla_of(origin))
+    geo_from_cam = enu.geo_from_enu_at(place, origin) @ poses.enu_from_cam[rows]
     for row, quat in zip(rows, quat_xyzw_from_matrix(geo_from_cam), strict=True):
         x, y, z, w = (float(value) for value in quat)
         source = poses.attitude_source[row]
@@ -238,7 +225,7 @@ def _matrix(values: FloatArray) -> Matrix3:
 
 
 def fix_sessions(
-    poses: ImagePoses, options: IngestOptions, remarks: Remarks
+    poses: flight_record.ImagePoses, options: IngestOptions, remarks: Remarks
 ) -> tuple[tuple[FixSession, ...], IntArray]:
     """Return the sessions, and the session of each of N images (N,), 0 for images without a position.
 
@@ -250,7 +237,7 @@ def fix_sessions(
     sessions: list[FixSession] = []
     session_of = np.zeros(len(poses.receivers), dtype=np.int64)
     located, sigma_h_m = poses.located, poses.sigma_enu_m[:, :2].max(axis=1)
-    for receiver in RECEIVERS:
+    for receiver in flight_record.RECEIVERS:
         rows = np.flatnonzero(located & (np.array(poses.receivers) == receiver))
         by_time = _by_time(poses.time_s[rows])
         session_of[rows] = len(sessions) + by_time
@@ -258,7 +245,7 @@ def fix_sessions(
             kind = _kind(receiver, float(np.median(sigma_h_m[rows[by_time == number]])))
             horizontal_m, vertical_m = COMMON_SIGMA_M[kind]
             h_m, v_m = horizontal_m if given_h is None else given_h, vertical_m if given_v is None else given_v
-            source: SigmaSource = "default" if given_h is None and given_v is None else "option"
+            source: flight_record.SigmaSource = "default" if given_h is None and given_v is None else "option"
             sessions.append(FixSession(receiver=kind, sigma_common_m=(h_m, h_m, v_m), sigma_source=source))
     counts = np.bincount(session_of[located], minlength=len(sessions))
     for kind in COMMON_SIGMA_M:
@@ -288,7 +275,7 @@ def _kind(receiver: str, sigma_h_m: float) -> str:
         return receiver
     if sigma_h_m <= _FIXED_SIGMA_M:
         return "RTK fixed"
-    return "RTK float" if receiver == RECEIVERS[-1] and sigma_h_m <= _FLOAT_SIGMA_M else receiver
+    return "RTK float" if receiver == flight_record.RECEIVERS[-1] and sigma_h_m <= _FLOAT_SIGMA_M else receiver
 
 
 def _note_default(kind: str, count: int, options: IngestOptions, remarks: Remarks) -> None:
@@ -307,7 +294,7 @@ def _note_default(kind: str, count: int, options: IngestOptions, remarks: Remark
 
 
 def _default_sigmas(
-    poses: ImagePoses, control: Sequence[GroundPoint], options: IngestOptions
+    poses: flight_record.ImagePoses, control: Sequence[GroundPoint], options: IngestOptions
 ) -> tuple[SigmaGroup, ...]:
     """Return the groups of measurements whose σ neither a file nor an option states."""
     stated = options.model_fields_set
@@ -324,11 +311,11 @@ def _default_sigmas(
     return tuple(group for is_default, group in groups if is_default)
 
 
-def _without_far_fixes(flight: FlightRecord, remarks: Remarks) -> ImagePoses:
+def _without_far_fixes(flight: flight_record.FlightRecord, remarks: Remarks) -> flight_record.ImagePoses:
     poses = flight.poses
     if not poses.located.any():
         return poses
-    middle_in_ecef = ecef_from_lla(median_lla(lla_from_ecef(poses.position_in_ecef[poses.located])))
+    middle_in_ecef = enu.ecef_from_lla(enu.median_lla(enu.lla_from_ecef(poses.position_in_ecef[poses.located])))
     distance_m = np.linalg.norm(poses.position_in_ecef - middle_in_ecef, axis=1)
     far = distance_m > FIX_RANGE_M
     remarks.warn_counted(
@@ -339,16 +326,16 @@ def _without_far_fixes(flight: FlightRecord, remarks: Remarks) -> ImagePoses:
     return replace(poses, position_in_ecef=np.where(far[:, None], np.nan, poses.position_in_ecef))
 
 
-def _origin(poses: ImagePoses, control: Sequence[GroundPoint]) -> Origin:
-    places = lla_from_ecef(poses.position_in_ecef[poses.located])
+def _origin(poses: flight_record.ImagePoses, control: Sequence[GroundPoint]) -> enu.Origin:
+    places = enu.lla_from_ecef(poses.position_in_ecef[poses.located])
     if not len(places) and control:
-        places = lla_from_ecef([point.position_in_ecef for point in control])
+        places = enu.lla_from_ecef([point.position_in_ecef for point in control])
     require_placed(len(places) > 0)
-    lat, lon, alt = median_lla(places)
-    return Origin(lat_deg=round(float(lat), 5), lon_deg=round(float(lon), 5), alt_m=round(float(alt)))
+    lat, lon, alt = enu.median_lla(places)
+    return enu.Origin(lat_deg=round(float(lat), 5), lon_deg=round(float(lon), 5), alt_m=round(float(alt)))
 
 
-def _note_coverage(flight: FlightRecord, points: int, remarks: Remarks) -> None:
+def _note_coverage(flight: flight_record.FlightRecord, points: int, remarks: Remarks) -> None:
     located = flight.poses.located
     if flight.poses.source == "exif":
         names = [flight.photos[row].name for row in np.flatnonzero(~located).tolist()]
@@ -357,7 +344,7 @@ def _note_coverage(flight: FlightRecord, points: int, remarks: Remarks) -> None:
         remarks.warn(
             "no-positions", f"No image has a position: {points} ground control points alone georeference the model."
         )
-    elif located.sum() < LEAST_IMAGES and points < LEAST_IMAGES:
+    elif located.sum() < flight_record.LEAST_IMAGES and points < flight_record.LEAST_IMAGES:
         remarks.warn(
             "too-few-positions",
             f"There are {int(located.sum())} positions and {points} control points: at least three fixes or "
@@ -365,7 +352,7 @@ def _note_coverage(flight: FlightRecord, points: int, remarks: Remarks) -> None:
         )
 
 
-def _vertical(poses: ImagePoses, files: Sequence[GroundFile], remarks: Remarks) -> VerticalDatum:
+def _vertical(poses: flight_record.ImagePoses, files: Sequence[GroundFile], remarks: Remarks) -> VerticalDatum:
     """Return the datum of the image positions, or of the control points if there are none; note all assumptions."""
     datums = {"the images": poses.vertical} if poses.located.any() else {}
     datums |= {file.path.name: file.crs.vertical for file in files}

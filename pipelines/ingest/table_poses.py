@@ -1,7 +1,5 @@
 """Poses of images from a table: its usable rows on Earth, brought to the images by name or by time."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime

@@ -1,7 +1,5 @@
 """Batch of missions: each is `georef run` in a process of its own, and a table beside them follows their ends."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import logging
@@ -79,7 +77,6 @@ class BatchTable(Product):
 
     @property
     def is_complete(self) -> bool:
-        """Whether every mission has its result."""
         return all(row.state in ("done", "current") for row in self.missions)
 
 

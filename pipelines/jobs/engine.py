@@ -1,7 +1,5 @@
 """Jobs, their ends, their display as one line each, and the interface of the engines that run them."""
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Callable, Iterator, Sequence

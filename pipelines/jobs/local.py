@@ -5,8 +5,6 @@ of its job, and of no other. It stops when its reader is gone (`georef_cli/verbo
 killed parent for long.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import math

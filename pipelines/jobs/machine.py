@@ -1,7 +1,5 @@
 """Inspection of the machine: cores, memory, GPU, backends, grids of PROJ, Chromium, versions of the libraries."""
 
-from __future__ import annotations
-
 import platform
 from dataclasses import dataclass
 

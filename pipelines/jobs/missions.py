@@ -4,8 +4,6 @@ Input is hostile until parsed. Workspaces lie inside the folder of the file. A t
 `georef.toml` may. The first bad value is an error that names mission and key, before any work starts.
 """
 
-from __future__ import annotations
-
 import re
 import unicodedata
 from collections.abc import Iterator, Mapping, Sequence

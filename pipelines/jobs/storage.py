@@ -6,8 +6,6 @@ objects, so that an interrupted copy leaves the part as it was. Only files whose
 Engine and workers exchange the named parts of one folder, and no others.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import logging

@@ -1,7 +1,5 @@
 """Accuracy: CE90 and LE90 of the check points, predicted against measured σ, and the map of the predicted σ."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """Photographs of a survey: adjusted positions with error ellipses, residuals of fixes in time; and its lenses."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Chromium: where it is, and the PDF of a page, printed without a window and without a network."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Cover of the report: for whom and by whom, the result from above, and the facts that a client asks for first."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -82,9 +80,8 @@ def flying_height_m(evaluated: EvaluatedSurvey) -> float | None:
 def ground_sampling_m(evaluated: EvaluatedSurvey) -> float | None:
     """Return the median size of a pixel at the SfM points, depth over focal length; None: no observations."""
     solved = evaluated.solved
-    cameras = [solved.sparse.camera_of(image) for image in range(len(solved.sparse.image_name))]
     depth = evaluated.ray_in_cam[:, 2] * solved.geo_from_model.scale
-    focal_px = np.array([camera.mean_focal_px for camera in cameras])[evaluated.network.obs_image]
+    focal_px = solved.sparse.focal_px[evaluated.network.obs_image]
     return float(np.median(depth / focal_px)) if len(depth) else None
 
 

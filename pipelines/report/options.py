@@ -1,7 +1,5 @@
 """Options of the report."""
 
-from __future__ import annotations
-
 from pydantic import Field
 
 from pipelines.core.options import InputPath

@@ -9,8 +9,6 @@ gives them typed facts, figures as text (decimals that fit their size, a true mi
 exist), and pictures as data, at a size that the page needs.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -63,11 +61,6 @@ def share(value: float | None) -> str:
     return MISSING if value is None or isnan(value) else f"{number_text(100 * value, 1).removesuffix('.0')} %"
 
 
-def square_km(value: float | None) -> str:
-    """Return an area in square kilometres, with its unit."""
-    return MISSING if value is None else f"{number_text(value, 3)} km²"
-
-
 def decibel(value: float | None) -> str:
     return MISSING if value is None else f"{number_text(value, 2)} dB"
 
@@ -82,11 +75,6 @@ def parts_per_million(value: float | None) -> str:
 def count_text(value: int | None) -> str:
     """Return a whole number with thin spaces between thousands."""
     return MISSING if value is None else f"{value:,}".replace(",", "\u2009").replace("-", "−")
-
-
-def any_text(value: object) -> str:
-    """Return any value as text; a dash for None."""
-    return MISSING if value is None else str(value)
 
 
 def moment(value: datetime | None) -> str:
@@ -107,12 +95,12 @@ FORMS: dict[str, Callable[..., str]] = {
     "moment": moment,
     "number": number_text,
     "parts_per_million": parts_per_million,
-    "plain": any_text,
+    "plain": lambda value: MISSING if value is None else str(value),
     "ratio": number_text,
     "share": share,
     "signed": signed,
     "similarity": partial(number_text, decimals=4),
-    "square_km": square_km,
+    "square_km": lambda km2: MISSING if km2 is None else f"{number_text(km2, 3)} km²",
 }
 
 
@@ -251,16 +239,12 @@ def read_pixels(path: Path) -> ByteArray:
     import cv2
 
     data = read_bytes(path)
-    size = header_size(data)
-    if size is None or not 0 < size[0] * size[1] <= MAX_PIXELS:
-        raise InputError(
-            "not-a-picture", "is no picture that can be shown. Delete it, or make it again.", path=path
-        )
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    (width, height), pixels = header_size(data) or (0, 0), None
+    if 0 < width * height <= MAX_PIXELS:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
     if pixels is None or pixels.dtype != np.uint8:
-        raise InputError(
-            "not-a-picture", "is no picture that can be shown. Delete it, or make it again.", path=path
-        )
+        message = "is no picture that can be shown. Delete it, or make it again."
+        raise InputError("not-a-picture", message, path=path)
     to_rgba = {2: cv2.COLOR_GRAY2RGBA, 3: cv2.COLOR_BGR2RGBA, 4: cv2.COLOR_BGRA2RGBA}
     return np.asarray(cv2.cvtColor(pixels, to_rgba[2 if pixels.ndim == 2 else pixels.shape[2]]))
 

@@ -1,7 +1,5 @@
 """Place of the survey on Earth, with coordinates as text; and the overlap of its photographs."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,15 +17,7 @@ from pipelines.survey.area import overlap_of
 from pipelines.survey.survey import Survey, SurveyedPoint
 from pipelines.survey.target_crs import TargetCrs
 
-_SHORT_UNIT = {"metre": "m", "degree": "°"}
-
 Texts = tuple[str, str, str]
-
-
-def units_of(crs: TargetCrs) -> Texts:
-    """Return the short units of the three coordinates."""
-    first, second, third = (_SHORT_UNIT.get(unit, unit) for unit in crs.crs.units)
-    return first, second, third
 
 
 def axis_names(crs: TargetCrs) -> Texts:
@@ -37,7 +27,8 @@ def axis_names(crs: TargetCrs) -> Texts:
 
 
 def heads_of(crs: TargetCrs) -> Texts:
-    first, second, third = (f"{axis} in {unit}" for axis, unit in zip(axis_names(crs), units_of(crs), strict=True))
+    axes = zip(axis_names(crs), crs.crs.short_units, strict=True)
+    first, second, third = (f"{axis} in {unit}" for axis, unit in axes)
     return first, second, third
 
 
@@ -45,7 +36,7 @@ def texts_of(crs: TargetCrs, point_in_geo: FloatArray) -> list[Texts]:
     """Return coordinates of points (N, 3) in `geo` as text; an InputError: one is outside the domain of the CRS."""
     if not len(point_in_geo):
         return []
-    units = units_of(crs)
+    units = crs.crs.short_units
     return [
         (coordinate(x, units[0]), coordinate(y, units[1]), coordinate(z, units[2]))
         for x, y, z in crs.xyz_from_geo(point_in_geo).tolist()
@@ -99,7 +90,7 @@ def place_facts(evaluated: EvaluatedSurvey) -> PlaceFacts:
         operation=crs.crs.operation(crs.lla),
         plan=_plan(evaluated),
         geographic=_axes(("longitude", "latitude", "ellipsoidal height"), ("°", "°", "m"), lla[:, [1, 0, 2]]),
-        projected=_axes(axis_names(crs), units_of(crs), xyz),
+        projected=_axes(axis_names(crs), crs.crs.short_units, xyz),
         ground_size_m=(size[0], size[1]),
     )
 

@@ -1,7 +1,5 @@
 """Control and check points: coordinates, errors, and chips: small pieces of the photographs around their marks."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass

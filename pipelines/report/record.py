@@ -3,8 +3,6 @@
 Also what two stages have left for the page: LiDAR that the training has used, and the comparison with a reference.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime

@@ -57,7 +57,6 @@ def run(stage: StageRun, options: ReportOptions) -> Summary:
 
 
 def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: StageRun) -> tuple[Page, SummaryFacts]:
-    """Return the content of the report, and its summary."""
     workspace, survey = stage.workspace, evaluated.solved.survey
     with stage.progress.task("sections", _STEPS) as task:
         place = place_facts(evaluated)

@@ -3,8 +3,6 @@
 Every rule is stated on the page. `unknown` is the verdict where nothing was measured.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -172,12 +170,8 @@ def _stated_sigma(factors: tuple[VarianceFactor, ...], codes: Collection[str]) -
     passed = f"residuals agree: {', '.join(factor.group for factor in tested)}"
     for code, words in _OF_CHECK_POINTS.items():
         if code in codes:
-            return (
-                "fair",
-                passed,
-                f"the photographs agree with these σ, yet check points err {words} than predicted",
-                rule,
-            )
+            reason = f"the photographs agree with these σ, yet check points err {words} than predicted"
+            return "fair", passed, reason, rule
     return "good", passed, "the residuals give no reason to doubt these σ", rule
 
 
@@ -206,12 +200,8 @@ def _prediction(errors: CheckPointErrors, codes: Collection[str]) -> _Fields:
     if "prediction-rejected" in codes:
         return "poor", "σ too small", "control points, marks or the datum may be at fault", rule
     if "prediction-pessimistic" in codes:
-        return (
-            "fair",
-            "σ too large",
-            "errors are smaller than predicted: the stated accuracy is on the safe side",
-            rule,
-        )
+        reason = "errors are smaller than predicted: the stated accuracy is on the safe side"
+        return "fair", "σ too large", reason, rule
     if tested is None or tested.count < LEAST_TESTED or "prediction-of-adjusted-similarity" in codes:
         return "unknown", "not tested", f"needs {LEAST_TESTED} check points with predicted σ", rule
     return "good", f"passed at {tested.count} check points", "errors agree with the predicted σ", rule

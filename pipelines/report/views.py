@@ -1,7 +1,5 @@
 """Evaluated survey, which all sections show; test views, and curves of the training."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -25,15 +23,13 @@ from pipelines.report.options import ReportOptions
 from pipelines.report.page import Picture, limited, picture_of, picture_of_png, read_picture
 from pipelines.report.plots.charts import without_labels
 from pipelines.report.plots.observations import curves
+from pipelines.survey.area import LEAST_RAYS, without_outliers
 from pipelines.survey.photographs import DIFFERENCE_GAIN, render_name
 from pipelines.survey.report import EvaluationReport, PhotometricFigures, read_report
 from pipelines.survey.scene import network_of
 from pipelines.survey.target_crs import TargetCrs, usable_crs
 from pipelines.survey.trained_model import TrainedModel
 from pipelines.survey.trained_survey import SolvedSurvey, load_solved
-
-_LEAST_RAYS = 3  # of a point that counts as a part of the surface
-_RIM = 0.005  # fraction of the points that are taken for errors above, and below
 
 
 @dataclass(frozen=True)
@@ -76,11 +72,7 @@ class EvaluatedSurvey:
         """SfM points (N, 3) in `geo` that three photographs show, without the highest and lowest."""
         network = self.network
         points = self.solved.geo_from_model.apply(network.point_in_world)
-        points = points[np.bincount(network.obs_point, minlength=len(points)) >= _LEAST_RAYS]
-        if not len(points):
-            return points
-        low, high = np.quantile(points[:, 2], [_RIM, 1 - _RIM])
-        return np.asarray(points[(points[:, 2] >= low) & (points[:, 2] <= high)])
+        return without_outliers(points[np.bincount(network.obs_point, minlength=len(points)) >= LEAST_RAYS])
 
     @cached_property
     def surface(self) -> PointSurface | None:

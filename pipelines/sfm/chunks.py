@@ -7,8 +7,6 @@ that runs at the same time; it writes the chunk's folder only, whose lock it hol
 a chunk that was interrupted.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import logging

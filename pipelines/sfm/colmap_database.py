@@ -5,8 +5,6 @@ features and matches are therefore copied as they are. COLMAP's own `Database.me
 databases that share one, as those of matches do.
 """
 
-from __future__ import annotations
-
 import sqlite3
 from collections.abc import Iterable
 from contextlib import closing

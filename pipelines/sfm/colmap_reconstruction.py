@@ -1,7 +1,5 @@
 """Engine `colmap`: features, matches, mapping, and a final robust adjustment; a large survey in chunks."""
 
-from __future__ import annotations
-
 import logging
 from typing import Any
 

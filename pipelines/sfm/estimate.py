@@ -3,8 +3,6 @@
 `jobs.costs` has the constants. The largest photographs of a survey have `photo_px` pixels, width and height.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -42,7 +40,6 @@ class ReconstructionEstimate:
 def estimate_reconstruction(
     photographs: int, photo_px: tuple[int, int], options: SfmOptions
 ) -> ReconstructionEstimate:
-    """Return the estimate of a reconstruction on this machine."""
     free_bytes = free_main_memory_bytes()
     return ReconstructionEstimate(
         photographs=photographs,

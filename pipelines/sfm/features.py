@@ -3,8 +3,6 @@
 Pairs are chosen by positions and viewing directions. COLMAP works in small steps, which survive an interruption.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,7 +86,6 @@ class SfmJob:
 
     @property
     def sparse(self) -> Path:
-        """Folder of the model."""
         return self.database.parent / "sparse"
 
 

@@ -1,7 +1,5 @@
 """Engine `imported`: a COLMAP model that another program has made."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import dataclass
 from pathlib import Path

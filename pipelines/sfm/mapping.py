@@ -11,8 +11,6 @@ at once. This is a start only. The last adjustment follows, by the photographs a
 count twice, here and where the model is placed on Earth.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import shutil
@@ -61,7 +59,6 @@ class MapperRun:
 
 
 def chosen_mapper(photographs: int, options: SfmOptions) -> MapperName:
-    """Return the mapper for so many photographs."""
     if options.mapper != "auto":
         return options.mapper
     return "incremental" if photographs <= _INCREMENTAL_UP_TO else "global"

@@ -7,8 +7,6 @@ Reads `ingest/survey.json` and `sfm/sparse`; writes `adjust/sparse`, the same mo
 observations have σ = 1 px, and fixes their covariances under Cauchy's kernel. Control points do not enter.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -50,7 +48,6 @@ _ALIGNMENT_SLACK = 3.0
 
 
 def run(stage: StageRun, options: AdjustOptions) -> Summary:
-    """Adjust the workspace's model and write it."""
     arguments = {
         "survey": load_survey(stage.workspace).model_dump(mode="json"),
         "model": str(stage.workspace.path(SPARSE)),

@@ -1,7 +1,5 @@
 """Engines of structure from motion, and the choice among them."""
 
-from __future__ import annotations
-
 from typing import Any, Protocol
 
 from pipelines.core.progress import Progress
@@ -48,5 +46,4 @@ class Reconstructor(Protocol):
 
 
 def reconstructor_of(options: SfmOptions) -> Reconstructor:
-    """Return the engine that the options ask for."""
     return ColmapReconstructor() if options.import_model is None else ImportedModel(options.import_model)

@@ -6,8 +6,6 @@ place, rotation and scale. The positions measured by GNSS select the pairs to ma
 model before its last adjustment.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Mapping
 from pathlib import Path

@@ -3,8 +3,6 @@
 The errors of the sensors are realistic, and each of them is known.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

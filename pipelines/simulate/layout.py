@@ -3,8 +3,6 @@
 The ground is painted in metres of the town's axes.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import product
 from typing import Literal

@@ -4,8 +4,6 @@ The lens shares no code with the pipeline's camera models on purpose: a common m
 points.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

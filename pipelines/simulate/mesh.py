@@ -1,7 +1,5 @@
 """Mesh of the scene, its terrain, and ray casting against it with Embree (the sole home of embreex)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import IntEnum
 

@@ -1,7 +1,5 @@
 """Options of `georef simulate`, which belongs to no stage in a workspace."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 from pydantic import Field, field_validator

@@ -11,17 +11,7 @@ import numpy as np
 from pipelines.core.types import FloatArray, IntArray, Matrix3, vector3
 from pipelines.geodesy.enu import Origin, lla_from_enu
 from pipelines.geometry.rotations import ENU_FROM_NED, geo_from_cam, quat_xyzw_from_matrix, yaw_pitch_roll_deg
-from pipelines.simulate.flight import (
-    RECEIVERS,
-    GnssLog,
-    ImuLog,
-    Receiver,
-    attitudes_at,
-    fixes_at,
-    in_local_enu,
-    record_gnss,
-    record_imu,
-)
+from pipelines.simulate import flight
 from pipelines.simulate.mesh import Raycaster
 from pipelines.simulate.options import SimulateOptions
 from pipelines.simulate.truth import TrueLens, TrueMark, TrueNavigation, TrueTarget, Truth
@@ -101,15 +91,15 @@ class Recording:
     """All records of a flight."""
 
     photos: PhotoRecords
-    gnss: GnssLog
+    gnss: flight.GnssLog
     gnss_lla: FloatArray  # (M, 3) degrees and metres
-    imu: ImuLog
+    imu: flight.ImuLog
     imu_in_geo: FloatArray  # (K, 3) places of the attitudes
     truth: Truth  # of the whole survey, with its P targets
     target_in_geo: FloatArray  # (P, 3) places of the targets, as surveyed
 
 
-def _receiver(options: SimulateOptions) -> Receiver:
+def _receiver(options: SimulateOptions) -> flight.Receiver:
     asked: dict[str, Any] = {
         "sigma_h_m": options.sigma_h,
         "sigma_v_m": options.sigma_v,
@@ -120,14 +110,16 @@ def _receiver(options: SimulateOptions) -> Receiver:
         "outlier_m": options.outlier_size,
     }
     given = {name: value for name, value in asked.items() if value is not None}
-    return replace(RECEIVERS[options.gnss], **given)
+    return replace(flight.RECEIVERS[options.gnss], **given)
 
 
 def record(options: SimulateOptions, world: World, raycaster: Raycaster, seed: np.random.SeedSequence) -> Recording:
     gnss_seed, imu_seed, mark_seed = seed.spawn(3)
     receiver = _receiver(options)
-    gnss = record_gnss(world.trajectory, world.mounting, receiver, np.random.default_rng(gnss_seed))
-    imu = record_imu(world.trajectory, world.mounting, options.sigma_attitude, np.random.default_rng(imu_seed))
+    gnss = flight.record_gnss(world.trajectory, world.mounting, receiver, np.random.default_rng(gnss_seed))
+    imu = flight.record_imu(
+        world.trajectory, world.mounting, options.sigma_attitude, np.random.default_rng(imu_seed)
+    )
     photos = _photo_records(world, receiver, gnss, imu)
     targets, target_in_geo = _mark(options, world, photos.names, raycaster, np.random.default_rng(mark_seed))
     imu_time_s = (imu.stamp_ns - photos.stamp_ns[0]) / 1e9 - world.mounting.clock_offset_s
@@ -142,11 +134,13 @@ def record(options: SimulateOptions, world: World, raycaster: Raycaster, seed: n
     )
 
 
-def _photo_records(world: World, receiver: Receiver, gnss: GnssLog, imu: ImuLog) -> PhotoRecords:
+def _photo_records(
+    world: World, receiver: flight.Receiver, gnss: flight.GnssLog, imu: flight.ImuLog
+) -> PhotoRecords:
     """Return fix and attitude at each photograph's stamp, as a user reads them off the logs."""
     stamps = world.trajectory.stamp_ns
-    fixes = fixes_at(gnss, stamps)
-    enu_from_body = in_local_enu(attitudes_at(imu, stamps), fixes, world.origin)
+    fixes = flight.fixes_at(gnss, stamps)
+    enu_from_body = flight.in_local_enu(flight.attitudes_at(imu, stamps), fixes, world.origin)
     angles = yaw_pitch_roll_deg(enu_from_body @ world.trajectory.cam_from_body.T)
     # The aircraft's angles are those of a camera that looks along the nose.
     level_cam_from_body = geo_from_cam([0.0, 0.0, 0.0]).T @ ENU_FROM_NED
@@ -188,15 +182,15 @@ def _mark(
 def _truth(
     options: SimulateOptions,
     world: World,
-    receiver: Receiver,
-    gnss: GnssLog,
+    receiver: flight.Receiver,
+    gnss: flight.GnssLog,
     photos: PhotoRecords,
     *,
     targets: tuple[TrueTarget, ...],
 ) -> Truth:
     lens, mounting = world.lens, world.mounting
-    true_fixes = fixes_at(replace(gnss, position_in_geo=gnss.true_in_geo), photos.stamp_ns)
-    errors = fixes_at(gnss, photos.stamp_ns) - true_fixes
+    true_fixes = flight.fixes_at(replace(gnss, position_in_geo=gnss.true_in_geo), photos.stamp_ns)
+    errors = flight.fixes_at(gnss, photos.stamp_ns) - true_fixes
     return Truth(
         scene=options.scene,
         flight=options.flight,

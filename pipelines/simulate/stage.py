@@ -5,8 +5,6 @@ Reads: nothing. Writes a survey folder, not a workspace: `images/`, `trajectory.
 (docs/simulator.md).
 """
 
-from __future__ import annotations
-
 import logging
 import shutil
 from collections.abc import Iterator

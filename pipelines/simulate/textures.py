@@ -4,8 +4,6 @@ A texture that aliases gives every photograph other features at the same place. 
 width of the pixel on the surface, and filters itself: a box filter for stripes, fading for noise and random cells.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """`truth.json`: the truth that a simulated survey hides from the pipeline."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from pipelines.core.products import Product

@@ -1,7 +1,5 @@
 """World of a simulated survey: scene, lens, true motion, arrangement of the sensors, sites of survey targets."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,14 +9,7 @@ from pipelines.core.errors import InputError
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.geodesy.enu import Origin
 from pipelines.geometry.rotations import exp_so3
-from pipelines.simulate.flight import (
-    DEFAULT_HEIGHTS_M,
-    DEFAULT_RADIUS_M,
-    FlightPlan,
-    Mounting,
-    TrueTrajectory,
-    make_trajectory,
-)
+from pipelines.simulate import flight
 from pipelines.simulate.lens import BrownLens, Pose
 from pipelines.simulate.mesh import MISS, Material, Raycaster
 from pipelines.simulate.options import SimulateOptions
@@ -119,9 +110,9 @@ class World:
     sites: tuple[TargetSite, ...]
     target_m: float
     lens: BrownLens
-    trajectory: TrueTrajectory
+    trajectory: flight.TrueTrajectory
     poses: tuple[Pose, ...]
-    mounting: Mounting
+    mounting: flight.Mounting
 
 
 def make_world(options: SimulateOptions, seed: np.random.SeedSequence) -> World:
@@ -129,20 +120,20 @@ def make_world(options: SimulateOptions, seed: np.random.SeedSequence) -> World:
     scene_seed, flight_seed, target_seed = seed.spawn(3)
     lat, lon, alt = options.origin
     lens = _lens(options)
-    mounting = Mounting(
+    mounting = flight.Mounting(
         antenna_in_body=np.array(options.lever_arm),
         nominal_from_cam=exp_so3(np.radians(options.boresight)),
         clock_offset_s=options.clock_offset,
     )
     bare = build_scene(options.scene, scene_seed)
-    plan = FlightPlan(
+    plan = flight.FlightPlan(
         options.flight,
         options.images,
         options.interval,
-        options.heights or DEFAULT_HEIGHTS_M[options.flight],
-        options.radius or DEFAULT_RADIUS_M[options.flight],
+        options.heights or flight.DEFAULT_HEIGHTS_M[options.flight],
+        options.radius or flight.DEFAULT_RADIUS_M[options.flight],
     )
-    trajectory = make_trajectory(plan, bare.complex_m, bare.axes, np.random.default_rng(flight_seed))
+    trajectory = flight.make_trajectory(plan, bare.complex_m, bare.axes, np.random.default_rng(flight_seed))
     centers = trajectory.position(trajectory.photo_s)
     rotations = trajectory.geo_from_nominal_cam(trajectory.photo_s) @ mounting.nominal_from_cam
     poses = tuple(Pose(center, rotation) for center, rotation in zip(centers, rotations, strict=True))

@@ -1,7 +1,5 @@
 """Appearance refinement: colours and opacities of Gaussians are fitted to images, while their geometry stays."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -18,8 +18,6 @@ adjustment does with poses and points:
 A weak prior keeps each exposure near the identity where a photograph has too few colours to determine it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Initial Gaussians: one at each SfM point, as large as the gaps between the points."""
 
-from __future__ import annotations
-
 import logging
 import math
 from dataclasses import dataclass

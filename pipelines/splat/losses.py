@@ -12,8 +12,6 @@ confidence is eliminated: c d²/s² + c − 1 − ln c is least for c = 1/(1 + d
 Gaussian carries a further parameter, and density control has nothing to inherit.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any

@@ -1,7 +1,5 @@
 """Peak memory of a training, predicted before it starts, and compared with the free memory of the machine."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch

@@ -8,8 +8,6 @@ weights installed, these lines write the file:
     numpy.savez("lpips_vgg.npz", **{k: v.numpy() for k, v in lpips.LPIPS(net="vgg").state_dict().items()})
 """
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -12,8 +12,6 @@ Trimming by residuals, as in RobustNeRF (doi 10.48550/arXiv.2302.00833) and Spot
    only late to converge could not come back otherwise.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -4,8 +4,6 @@ Basis, order and signs are those of the 3DGS code (degree 0 to 3; Sloan, "Stupid
 2008, appendix A2): band l holds coefficients l² … (l + 1)² − 1, and a colour is 0.5 + Σ c_k Y_k(d), clamped at 0.
 """
 
-from __future__ import annotations
-
 from functools import cache
 
 import torch

@@ -4,8 +4,6 @@ The Gaussians of one view are then a few long runs of rows. Gathering them takes
 random order.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -9,8 +9,6 @@ Numbers are float32 or float64, like the images; sums over pixels are float64.
 
 # ruff: noqa: PLR0917  (kernels take arrays, not objects)
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -7,8 +7,6 @@
    doi 10.1145/3641519.3657428, eq. 14).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

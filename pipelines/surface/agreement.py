@@ -5,8 +5,6 @@ in cascaded cost volumes (Gu et al., doi 10.1109/CVPR42600.2020.00257). A window
 the roof where the roof is, and the ground where the ground is. A sweep of planes takes that ground for roof.
 """
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass, replace
 from typing import Any

@@ -10,8 +10,6 @@ Each disc hides the points behind it:
 Discs extend over silhouettes by their radius: a point close behind an edge counts as hidden.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -5,8 +5,6 @@
 3. The depth map keeps the refined depths on which views agree.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -22,21 +20,12 @@ from pipelines.core.types import ByteArray, Float32Array
 from pipelines.geometry.cameras import Pinhole, ViewPose
 from pipelines.surface.agreement import THRESHOLDS, agreed_depth, refine, surface_prior, without_rims
 from pipelines.surface.matching import UNSEEN, MatchSettings, StereoView
-from pipelines.surface.sweep import (
-    NormalMap,
-    SweepPlanes,
-    SweepResult,
-    best_neighbours,
-    plane_sweep,
-    planes_for,
-)
+from pipelines.surface.sweep import NormalMap, SweepPlanes, SweepResult, best_neighbours, plane_sweep, planes_for
 from pipelines.survey.photographs import ImageCache, save_array
 from pipelines.survey.scene import Scene
 
 # Layout of the cached arrays, a part of their key: files of another layout lie in another folder.
 _LAYOUT = b"coarse, fine: direction, offset, score, step, sharpness, by kernels"
-
-
 # Longest side of the photographs: in the plane sweep, whose time grows with its cube, and in refinement and maps.
 _COARSE_PX, FINE_PX = 320, 640
 _NEIGHBOURS = 10  # views that each view is compared with

@@ -4,8 +4,6 @@ What no photograph shows lies mostly behind something that stands above it: the 
 as in the maps of LiDAR. On simulated flights the median error is a third of that of the nearest height.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,15 +18,9 @@ _LOW = 0.1  # quantile of the heights around, weighted by their inverse squared 
 # Cells: σ of the smoothing of what is filled, near and far from the measured. Each direction would leave a streak.
 _SMOOTHED, _SMOOTHED_FAR = 2.0, 8.0
 _FAR = 24.0  # cells from the nearest measured one
-_AROUND = (
-    30  # cells around one whose scatter counts in its σ: on the edge of a roof, a cell decides between storeys
-)
 _SOURCES = 0.25  # of the range of the heights around, by which one whose colour is taken may lie above the filled
-
-
-_AROUND = (
-    15  # cells around one whose scatter counts in its σ: on the edge of a roof, a cell decides between storeys
-)
+# Cells around one whose scatter counts in its σ: on the edge of a roof, a cell decides between storeys.
+_AROUND = 15
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,6 @@ Candidates are the pixels of the maps with their normals, where a surface is smo
 the plan, so that the candidates of one fit into the memory.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -21,10 +19,10 @@ from pipelines.geometry.similarity import Similarity
 from pipelines.surface.surface_views import SurfaceView, SurfaceViews
 from pipelines.surface.visibility import Support
 
-_REACH_PX = 2  # from a pixel to those whose differences give its normal
-_BEND = 0.01  # limit of |z/z₁ + z/z₂ − 2| for a depth z between opposite neighbours z₁, z₂ on a smooth surface
+REACH_PX = 2  # from a pixel to those whose differences give its normal
+BEND = 0.01  # limit of |z/z₁ + z/z₂ − 2| for a depth z between opposite neighbours z₁, z₂ on a smooth surface
 _LOOK_PX = 8  # between the pixels that are tested for lying in a square
-_GRAZING = 0.17  # least cosine between ray and normal (80°): blurred edges bridge two surfaces along the rays
+GRAZING = 0.17  # least cosine between ray and normal (80°): blurred edges bridge two surfaces along the rays
 # Memory: candidates of one square, of about 100 bytes each, with the copies that sorting them makes.
 _MOST_CANDIDATES = 4_000_000
 _SAMPLE_PX = 8  # between the pixels from which sizes and extent are estimated
@@ -153,7 +151,7 @@ def _candidates(
     distance = np.maximum(np.linalg.norm(towards, axis=-1), np.finfo(np.float64).tiny)
     cosine = np.einsum("hwi,hwi->hw", normal, towards) / distance
     pixel_m = geo_from_model.scale * depth / view.pinhole.fx
-    chosen = known & (np.abs(cosine) > _GRAZING) & (pixel_m < settings.coarsest_m) & square.covers(point, margin_m)
+    chosen = known & (np.abs(cosine) > GRAZING) & (pixel_m < settings.coarsest_m) & square.covers(point, margin_m)
     chosen &= (row % step == step // 2) & (column % step == step // 2)
     towards_camera = normal[chosen] * np.sign(cosine[chosen])[:, None]
     return _Candidates(point[chosen], towards_camera, view.rgb[rows, columns][chosen], pixel_m[chosen])
@@ -169,7 +167,7 @@ def _window(
     inside = square.covers(geo_from_model.apply(view.points(rows, columns)), margin_m)
     if not inside.any():
         return None
-    spare = _LOOK_PX + _REACH_PX
+    spare = _LOOK_PX + REACH_PX
     top, left = max(int(rows[inside].min()) - spare, 0), max(int(columns[inside].min()) - spare, 0)
     bottom = min(int(rows[inside].max()) + spare + 1, height)
     right = min(int(columns[inside].max()) + spare + 1, width)
@@ -179,7 +177,7 @@ def _window(
 def _normals(point: FloatArray, depth: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Return unit normals (H, W, 3) with an arbitrary sign, and where they are known (H, W)."""
     normal, known = np.zeros_like(point), np.zeros(depth.shape, dtype=np.bool_)
-    reach = _REACH_PX
+    reach = REACH_PX
     if min(depth.shape) <= 2 * reach:
         return normal, known
     middle = slice(reach, -reach)
@@ -196,7 +194,7 @@ def _normals(point: FloatArray, depth: FloatArray) -> tuple[FloatArray, BoolArra
             np.abs(own / depth[before, middle] + own / depth[after, middle] - 2),
         )
         normal[middle, middle] = cross / length[..., None]
-    known[middle, middle] = (own > 0) & (length > 0) & (bend < _BEND)
+    known[middle, middle] = (own > 0) & (length > 0) & (bend < BEND)
     return normal, known
 
 
@@ -255,7 +253,6 @@ def _fuse(
     square: _Square,
     settings: FusionSettings,
 ) -> SurfaceCloud:
-    """Return the cloud of a square from the candidates in it and in its margin."""
     side_m = settings.spacing_m
     position, normal, rgb, pixel_m = _voxel_means(side_m, candidates.position, *vars(candidates).values())
     normal = _unit(normal)

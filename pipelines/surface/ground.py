@@ -4,8 +4,6 @@ After Zhang et al. (doi 10.3390/rs8060501), by the authors' library. Houses, tre
 not reach into; below them the ground is a plane through the nearest ground around.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -12,8 +12,6 @@ branches: LLVM makes vector instructions of them. Floating-point flags exclude N
 therefore keep out.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -287,12 +285,9 @@ class Matcher:
     def _filter(self, part: slice) -> cv2.ximgproc.GuidedFilter:
         """Return the guided filter of some rows; the rows of a hypothesis are mostly those of the one before."""
         if self._guided is None or self._guided[0] != part:
-            settings = self._settings
-            guide = np.ascontiguousarray(self._grey[part])
-            self._guided = (
-                part,
-                cv2.ximgproc.createGuidedFilter(guide, settings.reach_px, settings.edge_grey**2),
-            )
+            guide, settings = np.ascontiguousarray(self._grey[part]), self._settings
+            guided = cv2.ximgproc.createGuidedFilter(guide, settings.reach_px, settings.edge_grey**2)
+            self._guided = part, guided
         return self._guided[1]
 
 

@@ -6,8 +6,6 @@
    would become too many, the voxels grow.
 """
 
-from __future__ import annotations
-
 import logging
 import re
 from collections.abc import Callable, Iterator

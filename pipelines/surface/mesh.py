@@ -1,7 +1,5 @@
 """Mesh of the surface: the zeros of the grid that views confirm, simplified square by square, welded and closed."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -154,7 +152,7 @@ def closed(mesh: RawMesh, depth_m: float) -> tuple[RawMesh, int]:
     dropped before.
     """
     while True:
-        edge, count = _edges(mesh.faces)
+        edge, count = edges_of(mesh.faces)
         crowded = count[edge] > 2
         if not crowded.any():
             break
@@ -183,7 +181,7 @@ def closed(mesh: RawMesh, depth_m: float) -> tuple[RawMesh, int]:
     return RawMesh(np.concatenate(vertices), np.concatenate(faces)), len(mesh.faces)
 
 
-def _edges(faces: IntArray) -> tuple[IntArray, IntArray]:
+def edges_of(faces: IntArray) -> tuple[IntArray, IntArray]:
     """Return the number of the edge (3F,) at each side of each face, and how many faces each edge has."""
     sides = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     _, edge, count = np.unique(sides, axis=0, return_inverse=True, return_counts=True)

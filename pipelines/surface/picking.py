@@ -5,8 +5,6 @@ under a line of sight is that on which the training views agree, each read off i
 it behind the marks. The accuracy is that for a reader who intersects the rendered surface.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -285,10 +283,8 @@ class SurfaceReader:
             step = behind * (1.0 if before is None else -1.0 / min(slope, -0.1))
             if abs(step) < _NEAR * first:
                 return distance
-            before, distance = (
-                (distance, behind),
-                distance + float(np.clip(step, -_AROUND * first, _AROUND * first)),
-            )
+            limited = float(np.clip(step, -_AROUND * first, _AROUND * first))
+            before, distance = (distance, behind), distance + limited
         return None
 
     def _agreed(self, sight: Sight, counted: list[tuple[float, int]]) -> SurfacePoint | NoSurface:

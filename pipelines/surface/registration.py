@@ -12,8 +12,6 @@ A LiDAR cloud has its shift against the surface of the photographs, with its σ:
 The model has a shift or a similarity against a reference, by the reference's planes, with the same weights and σ.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

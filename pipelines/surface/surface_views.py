@@ -5,8 +5,6 @@ Maps are written one after the other. The size of a file therefore tells how man
 stage goes on after those.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 from contextlib import ExitStack
@@ -175,21 +173,14 @@ class SurfaceViews:
             rgb,
         )
 
-    def support(
-        self,
-        point_in_model: FloatArray,
-        normal_in_model: FloatArray | None = None,
-        *,
-        tolerance: float = SAME_SURFACE,
-    ) -> Support:
+    def support(self, point_in_model: FloatArray, normal_in_model: FloatArray | None = None) -> Support:
         """Return how far the training views agree on points (N, 3); lengths in metres of `geo`.
 
-        Unit normals (N, 3) have an arbitrary sign; NaN: unknown. Depths of one surface agree within the tolerance,
-        a part of the depth.
+        Unit normals (N, 3) have an arbitrary sign; NaN: unknown.
         """
         geo_from_model = self._trained.geo_from_model
         up_in_model = geo_from_model.rotation.T @ [0.0, 0.0, 1.0]
-        found = support(point_in_model, self.depth_views(), up_in_model, tolerance, normal_in_model)
+        found = support(point_in_model, self.depth_views(), up_in_model, SAME_SURFACE, normal_in_model)
         return found.scaled(geo_from_model.scale)
 
     def depth_views(self) -> DepthViews:
@@ -209,7 +200,6 @@ class SurfaceViews:
         return photograph, np.linalg.solve(gain, np.column_stack([np.eye(3), -255 * offset]))
 
     def close(self) -> None:
-        """Delete the maps."""
         del self._depth, self._rgb
         remove(self.folder)
 

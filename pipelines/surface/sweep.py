@@ -4,8 +4,6 @@ After Collins (doi 10.1109/CVPR.1996.517097) and, for planes along a scene's dom
 (doi 10.1109/CVPR.2007.383245). The SfM points that views share tell the views and planes to compare a view with.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass

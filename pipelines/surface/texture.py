@@ -5,8 +5,6 @@ connected faces of one block that look along the same axis, projected along that
 faces. Where a chart folds over itself, both layers share their texels.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +18,7 @@ from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, ByteArray, FloatArray, IntArray
 from pipelines.geometry.similarity import Similarity
 from pipelines.splat.kernel_cache import kernel
-from pipelines.surface.mesh import vertex_normals
+from pipelines.surface.mesh import edges_of, vertex_normals
 from pipelines.surface.surface_views import SAME_SURFACE, SurfaceViews
 from pipelines.surface.tsdf import RawMesh
 from pipelines.surface.visibility import point_in_cam, sees_sphere, surface_at
@@ -53,14 +51,7 @@ def colours_of(
 ) -> tuple[ByteArray, BoolArray]:
     """Return the colours (N, 3) of places (N, 3) of the frame with unit normals (N, 3), and where one is known."""
     maps, rgb = views.depth_views(), np.full((len(points), 3), _GREY, np.uint8)
-    cameras = (
-        maps.cam_from_world,
-        maps.center_in_world,
-        maps.intrinsics_px,
-        maps.size_px,
-        maps.start,
-        maps.depth_m,
-    )
+    cameras = tuple(vars(maps).values())
     known = np.zeros(len(points), dtype=bool)
     for first in range(0, len(points), _BATCH):
         part = slice(first, first + _BATCH)
@@ -185,10 +176,9 @@ def _charts(mesh: RawMesh, block_m: float) -> tuple[IntArray, IntArray]:
     block = np.floor((a + b + c) / (3 * block_m)).astype(np.int64)
     kind = np.unique(np.column_stack([block, axis, side]), axis=0, return_inverse=True)[1].ravel()
     # Faces of one kind that share an edge belong together.
-    sides = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    owner = np.repeat(np.arange(len(mesh.faces)), 3)
-    order = np.lexsort((owner, sides[:, 1], sides[:, 0]))
-    shared = (sides[order[1:]] == sides[order[:-1]]).all(axis=1)
+    edge, _ = edges_of(mesh.faces)
+    owner, order = np.repeat(np.arange(len(mesh.faces)), 3), np.argsort(edge, kind="stable")
+    shared = edge[order[1:]] == edge[order[:-1]]
     first, second = owner[order[:-1]][shared], owner[order[1:]][shared]
     same = kind[first] == kind[second]
     links = coo_array((np.ones(int(same.sum())), (first[same], second[same])), (len(owner) // 3,) * 2)

@@ -12,8 +12,6 @@ chunk of the grid at a time, and one square of the plan of its mesh.
 5. Marching cubes find the zeros. Neighbouring chunks share a layer of voxels, whose values agree to the last digit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -26,6 +24,7 @@ from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.geometry.similarity import Similarity
 from pipelines.splat.kernel_cache import kernel
+from pipelines.surface.fusion import BEND, GRAZING, REACH_PX
 from pipelines.surface.surface_views import SurfaceViews
 from pipelines.surface.visibility import point_in_cam, sees_sphere, surface_at
 
@@ -35,13 +34,9 @@ _CELL = 4  # voxels along a cell's side
 _CHUNK = 16  # cells along a chunk's side
 _SQUARE = 4  # chunks along the side of a square of the plan
 _TRUNCATION = 4.0  # in voxels or pixels, whichever is more: views of one surface differ by less (`SAME_SURFACE`)
-_REACH_PX = 2  # from a pixel to those whose differences give its plane
-_BEND = 0.01  # limit of |z/z₁ + z/z₂ − 2| for a depth z between opposite neighbours z₁, z₂ on a smooth surface
-_GRAZING = 0.17  # least cosine between ray and normal (80°)
 _FINEST = 12  # views of a cell that are averaged, those with the most pixels: a hundred agree no better
 _BITS, _ZERO = 21, 1 << 20  # of a cell's coordinate in its number
 _PENDING = 8_000_000  # numbers of cells that wait to be counted
-
 
 # Says which places (N, 3) of the mesh's frame lie in the area of interest, as a mask (N,).
 Inside = Callable[[FloatArray], BoolArray]
@@ -201,19 +196,19 @@ def _distance(point: Any, view: int, views: Any, truncation: float, coarsest: fl
     intrinsics, width, height = intrinsics_px[view], sizes[view, 0], sizes[view, 1]
     u = intrinsics[0] * x / z + intrinsics[2]
     v = intrinsics[1] * y / z + intrinsics[3]
-    if not (u >= _REACH_PX and u < width - _REACH_PX and v >= _REACH_PX and v < height - _REACH_PX):
+    if not (u >= REACH_PX and u < width - REACH_PX and v >= REACH_PX and v < height - REACH_PX):
         return 0.0, 0.0
     here = starts[view] + int(v) * width + int(u)
-    own, left, right = depth[here], depth[here - _REACH_PX], depth[here + _REACH_PX]
-    above, below = depth[here - _REACH_PX * width], depth[here + _REACH_PX * width]
+    own, left, right = depth[here], depth[here - REACH_PX], depth[here + REACH_PX]
+    above, below = depth[here - REACH_PX * width], depth[here + REACH_PX * width]
     if min(own, left, right, above, below) <= 0:
         return 0.0, 0.0
-    if max(abs(own / left + own / right - 2), abs(own / above + own / below - 2)) > _BEND:
+    if max(abs(own / left + own / right - 2), abs(own / above + own / below - 2)) > BEND:
         # A rim: what lies clearly before all of it is free, more is not known.
         nearest = min(own, left, right, above, below)
         return truncation, (intrinsics[0] / nearest) ** 2 if z < nearest - truncation else 0.0
     inverse = 1 / surface_at(depth, starts[view], width, height, u, v)
-    along_u, along_v = (1 / right - 1 / left) / (2 * _REACH_PX), (1 / below - 1 / above) / (2 * _REACH_PX)
+    along_u, along_v = (1 / right - 1 / left) / (2 * REACH_PX), (1 / below - 1 / above) / (2 * REACH_PX)
     # The plane of the surface in the camera's frame: normal · X = 1.
     ahead = inverse - (u - intrinsics[2]) * along_u - (v - intrinsics[3]) * along_v
     length = np.sqrt((intrinsics[0] * along_u) ** 2 + (intrinsics[1] * along_v) ** 2 + ahead**2)
@@ -221,7 +216,7 @@ def _distance(point: Any, view: int, views: Any, truncation: float, coarsest: fl
     cosine = z * inverse / (length * np.sqrt(x * x + y * y + z * z))
     if distance < -truncation:
         return 0.0, 0.0
-    if distance < truncation and (cosine < _GRAZING or 1 / (inverse * intrinsics[0]) > coarsest):
+    if distance < truncation and (cosine < GRAZING or 1 / (inverse * intrinsics[0]) > coarsest):
         return 0.0, 0.0
     return min(distance, truncation), cosine * (inverse * intrinsics[0]) ** 2
 

@@ -192,7 +192,6 @@ def surface_at(depth: Any, start: int, width: int, height: int, u: float, v: flo
 
 @njit(nogil=True, error_model="numpy")
 def _add_view(point: Any, normal: Any, views: Any, view: int, up: Any, tolerance: float, total: Any) -> None:
-    """Add one view to the sums of one point."""
     rotations, centers, intrinsics_px, sizes, starts, depth = views
     center, intrinsics, size = centers[view], intrinsics_px[view], sizes[view]
     x, y, z = point_in_cam(point, rotations[view], center)

@@ -1,7 +1,5 @@
 """Products of `init-sim3` and `geolocate`: similarity from the SfM model to the Earth, and SfM points on Earth."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 

@@ -3,8 +3,6 @@
 Files are cut to it: a photograph shows far more than it measures.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -32,7 +30,7 @@ _FARTHEST_CELLS = 6.0  # distance from a point of the scene beyond which there i
 _COARSEST = 1.5  # largest width of a pixel on the ground over the median: beyond, rasters would promise too much
 _SMOOTHED_CELLS = 4.0  # width of tongues that are left out, and of bays that are taken in, halved
 _EDGES = 200  # pieces of a boundary's longer side, which may be bent in another CRS
-_LEAST_RAYS = 3  # of a point of the scene
+LEAST_RAYS = 3  # of a point of the scene
 _OUTLIERS = 0.005  # fraction of the points that are taken for errors above, and below
 
 
@@ -137,7 +135,11 @@ def _with_short_edges(polygon: Any) -> Any:
 def scene_in_geo(solved: SolvedSurvey) -> FloatArray:
     """Return the SfM points (N, 3) in `geo` that three photographs show, without the highest and lowest."""
     rays = np.bincount(solved.sfm.obs_point, minlength=len(solved.sfm.point_in_local))
-    points = solved.geo_from_model.apply(solved.point_in_model[rays >= _LEAST_RAYS])
+    return without_outliers(solved.geo_from_model.apply(solved.point_in_model[rays >= LEAST_RAYS]))
+
+
+def without_outliers(points: FloatArray) -> FloatArray:
+    """Return points (N, 3), z up, without the highest and lowest."""
     if not len(points):
         return points
     low, high = np.quantile(points[:, 2], [_OUTLIERS, 1 - _OUTLIERS])
@@ -193,10 +195,9 @@ def _seen_ground(solved: SolvedSurvey, scene: FloatArray) -> Polygon:
 def depths_of_observations(solved: SolvedSurvey) -> tuple[FloatArray, FloatArray]:
     """Return the depth (K,) of each observation in metres on the ground, and its camera's focal length (K,)."""
     sfm, poses = solved.sfm, solved.poses
-    focal_px = np.array([solved.sparse.camera_of(index).mean_focal_px for index in range(len(sfm.image_name))])
     arm = solved.point_in_model[sfm.obs_point] - poses.cam_center_in_model[sfm.obs_image]
     depth = np.einsum("kj,kj->k", poses.cam_from_model[sfm.obs_image][:, 2], arm)
-    return solved.geo_from_model.scale * depth, focal_px[sfm.obs_image]
+    return solved.geo_from_model.scale * depth, solved.sparse.focal_px[sfm.obs_image]
 
 
 def photographs_that_see(solved: SolvedSurvey, point_in_geo: FloatArray, coarsest_m: float = np.inf) -> IntArray:

@@ -1,7 +1,5 @@
 """Survey with its calibrated rig: positions and attitudes recomputed from the recorded navigation."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -3,8 +3,6 @@
 Whoever states the accuracy of a result asks `headline_of`, so that terminal, pages and sidecars state the same.
 """
 
-from __future__ import annotations
-
 import contextlib
 from dataclasses import dataclass
 from typing import Literal

@@ -1,7 +1,5 @@
 """Options of clouds of other instruments, and of everything whose coordinates are in a CRS."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated

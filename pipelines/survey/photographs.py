@@ -4,8 +4,6 @@ Also their pinholes under a lens that has changed since; photographs undistorted
 and the files of the test views: photograph, render and their difference side by side in one PNG.
 """
 
-from __future__ import annotations
-
 import hashlib
 import logging
 from dataclasses import dataclass, replace

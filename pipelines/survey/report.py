@@ -4,8 +4,6 @@ Lengths are metres, axes those of `geo` (east, north, up). An error is the measu
 figure that does not exist, such as a mean over no points, is None. docs/formats.md explains every field.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, Literal
 

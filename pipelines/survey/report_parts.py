@@ -3,8 +3,6 @@
 Lengths are metres. docs/formats.md explains the fields of what `evaluate` writes.
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The CRS of a deliverable: the user's, or the UTM zone of the scene, with every point transformed by itself."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

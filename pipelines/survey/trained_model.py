@@ -1,7 +1,5 @@
 """Solution of a survey: frames, cameras, lenses, systematic errors; with the settings of `train`, its product."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Literal
 

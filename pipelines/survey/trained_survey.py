@@ -4,8 +4,6 @@ Also its surveyed points, intersected from their marks; the differences between 
 and the extent of the scene that files cover: that of the SfM points, without those at its rim.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path

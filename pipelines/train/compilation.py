@@ -4,8 +4,6 @@ A machine compiles them once. `georef run` does so in a child process while COLM
 training finds them in the user's cache.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from typing import Any

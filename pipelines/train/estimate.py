@@ -3,8 +3,6 @@
 Default limit of Gaussians: by the pixels of the photographs, within what the preset and the memory allow.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

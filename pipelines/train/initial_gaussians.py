@@ -14,8 +14,6 @@ Beside the surface, three parts of the photographs need Gaussians to start from:
   photographs decide what is there, and the plane would count as a surface.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -6,8 +6,6 @@
 3. Confidence, places that have changed, and space that beams have crossed and in which nothing stands.
 """
 
-from __future__ import annotations
-
 import logging
 from dataclasses import asdict, dataclass
 from pathlib import Path

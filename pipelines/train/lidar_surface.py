@@ -10,8 +10,6 @@
 5. Points of stereo are moved onto the planes of the LiDAR that is trusted.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal

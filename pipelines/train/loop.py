@@ -1,7 +1,5 @@
 """Training loop: iterations, metrics, checkpoints, progress, interruption, and one recovery from a divergence."""
 
-from __future__ import annotations
-
 import json
 import logging
 import math

@@ -5,8 +5,6 @@ A loss is a function of one rendered view. `training_losses` is the list; the fu
 added up: another order gives other last digits.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

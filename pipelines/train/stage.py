@@ -7,8 +7,6 @@ end of the training), `train/metrics.jsonl` and the latest checkpoint. An interr
 is extended from its last checkpoint.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import shutil

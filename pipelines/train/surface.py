@@ -4,8 +4,6 @@ Training starts from this surface, and its depth loss compares with it. On groun
 would otherwise float metres above the ground, and their renders would fit the photographs as well.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

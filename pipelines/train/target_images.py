@@ -3,8 +3,6 @@
 Crops bound the memory and time of an iteration.
 """
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass

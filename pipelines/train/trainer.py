@@ -4,8 +4,6 @@
 without pickle, replaced in one step.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -428,7 +426,6 @@ def load_checkpoint(path: Path) -> dict[str, Tensor]:
 
 
 def prefixed(prefix: str, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the tensors with `prefix/name` for names."""
     return {f"{prefix}/{name}": tensor for name, tensor in state.items()}
 
 

@@ -9,8 +9,6 @@ viser also sets any property of an element that a message names, and casts what 
 so remove an element or its callback for all pages, or leave a traceback a message. Known messages alone pass.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import hmac

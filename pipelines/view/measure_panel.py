@@ -12,24 +12,11 @@ from pipelines.geodesy.enu import lla_from_enu
 from pipelines.surface.picking import NoSurface, Sight, SurfacePoint
 from pipelines.survey.marks import mark_rays
 from pipelines.survey.survey import SurveyedPoint
+from pipelines.view import saved
 from pipelines.view.mark_panel import Panel
 from pipelines.view.measuring import MeasuringModel
 from pipelines.view.overlays import Overlays
 from pipelines.view.quantities import BaseKind, BasePlane, Quantity, distances, length
-from pipelines.view.saved import (
-    History,
-    Kind,
-    NamedMeasurement,
-    PlaceRow,
-    SavedMeasurements,
-    SavedPoint,
-    new_id,
-    paragraph,
-    place_table,
-    quantity_table,
-    quantity_text,
-    saved_table,
-)
 
 if TYPE_CHECKING:
     import viser
@@ -51,16 +38,16 @@ class MeasurePanel(Panel):
         survey = model.trained.survey
         self._surveyed = {point.name: point for point in (*survey.control_points, *survey.check_points)}
         self.points: tuple[SurfacePoint, ...] = ()
-        self._kind: Kind = "point"
+        self._kind: saved.Kind = "point"
         self._quantities: tuple[Quantity, ...] = ()
-        self._id = new_id()
+        self._id = saved.new_id()
         self._lock = threading.RLock()
-        self.saved, self._drawn = SavedMeasurements(folder), 0
-        self._history = History()
+        self.saved, self._drawn = saved.SavedMeasurements(folder), 0
+        self._history = saved.History()
         self._build(server)
         self._show_saved()
 
-    def choose(self, kind: Kind) -> None:
+    def choose(self, kind: saved.Kind) -> None:
         """Begin a measurement of a kind."""
         with self._lock:
             self.kind.value = kind  # type: ignore[misc]
@@ -68,7 +55,7 @@ class MeasurePanel(Panel):
 
     def _build(self, server: viser.ViserServer) -> None:
         gui = server.gui
-        self.kind = gui.add_dropdown("Measure", get_args(Kind), hint="What the clicks in the scene make up")
+        self.kind = gui.add_dropdown("Measure", get_args(saved.Kind), hint="What the clicks in the scene make up")
         self._base = gui.add_dropdown("Base of a volume", _BASES)
         self._add_results(gui)
         self._name = gui.add_text("Name", "")
@@ -107,14 +94,14 @@ class MeasurePanel(Panel):
         kept = () if len(self.points) >= _MOST.get(self._kind, 10_000) else self.points
         self._replace("point", self._kind, (*kept, point), note)
 
-    def _replace(self, step: str, kind: Kind, points: tuple[SurfacePoint, ...], note: str = "") -> None:
+    def _replace(self, step: str, kind: saved.Kind, points: tuple[SurfacePoint, ...], note: str = "") -> None:
         """Replace kind and points of the present measurement, as a step that can be undone under its name."""
         former_kind, former = self._kind, self.points
         if points or former:
             self._history.add(step, lambda: self._show(former_kind, former))
         self._show(kind, points, note)
 
-    def _show(self, kind: Kind, points: tuple[SurfacePoint, ...], note: str = "") -> None:
+    def _show(self, kind: saved.Kind, points: tuple[SurfacePoint, ...], note: str = "") -> None:
         self._kind, self.points = kind, points
         self.kind.value = kind  # type: ignore[misc]
         self._compute(note)
@@ -135,7 +122,7 @@ class MeasurePanel(Panel):
         self._overlays.show_measured("now", places, closed=kind in _CLOSED and len(self.points) > 2)
         self._result.content = self._described(note)
 
-    def _measured(self, kind: Kind) -> tuple[Quantity, ...]:
+    def _measured(self, kind: saved.Kind) -> tuple[Quantity, ...]:
         if kind == "distance":
             return distances(self._model.jointly(self.points))
         if kind == "polyline":
@@ -151,28 +138,28 @@ class MeasurePanel(Panel):
         """Return the coordinates of a surveyed point as surveyed and as triangulated, as HTML."""
         rays = mark_rays((point,), self._model.trained.sparse)
         camera, cov = self._model.triangulated(rays)
-        rows = [PlaceRow("surveyed", np.array(point.position_in_geo), np.sqrt(np.diag(point.cov_in_geo)))]
+        rows = [saved.PlaceRow("surveyed", np.array(point.position_in_geo), np.sqrt(np.diag(point.cov_in_geo)))]
         if np.isfinite(camera).all():
-            rows.append(PlaceRow("triangulated", camera, None if cov is None else np.sqrt(np.diag(cov))))
-        title = paragraph(f"{point.name}: {len(rays.point)} marks; below, on the rendered surface")
-        return title + place_table(self._model.target, rows)
+            rows.append(saved.PlaceRow("triangulated", camera, None if cov is None else np.sqrt(np.diag(cov))))
+        title = saved.paragraph(f"{point.name}: {len(rays.point)} marks; below, on the rendered surface")
+        return title + saved.place_table(self._model.target, rows)
 
     def _described(self, note: str) -> str:
         """Return the present measurement as HTML."""
         if not self.points:
             return note + self._hint()
         rows = [
-            PlaceRow(str(number), point.position_in_geo, self._model.place(point)[1])
+            saved.PlaceRow(str(number), point.position_in_geo, self._model.place(point)[1])
             for number, point in enumerate(self.points, start=1)
         ]
         views = ", ".join(str(len(point.cameras)) for point in self.points)
         reason = self._model.without_sigma
         return (
             note
-            + place_table(self._model.target, rows, marked="measured")
-            + paragraph(f"photographs that agree: {views}")
-            + quantity_table(self._quantities)
-            + (paragraph(f"No σ is stated: {reason}.") if reason else "")
+            + saved.place_table(self._model.target, rows, marked="measured")
+            + saved.paragraph(f"photographs that agree: {views}")
+            + saved.quantity_table(self._quantities)
+            + (saved.paragraph(f"No σ is stated: {reason}.") if reason else "")
         )
 
     def _hint(self) -> str:
@@ -182,7 +169,7 @@ class MeasurePanel(Panel):
             f"Coordinates: {crs.name}; heights: {crs.vertical.name}.",
             *(f"Assumed: {text}." for text in self._model.target.assumed),
         ]
-        return "".join(map(paragraph, lines))
+        return "".join(map(saved.paragraph, lines))
 
     def take_back(self) -> None:
         """Take the last point of the measurement back."""
@@ -198,7 +185,9 @@ class MeasurePanel(Panel):
         """Undo the last step: a point, its removal, clearing, saving, deleting; a GeorefError: it was not."""
         with self._lock:
             step = self._history.undo()
-            self._result.content = self._described(paragraph(f"Undone: {step}." if step else "Nothing to undo."))
+            self._result.content = self._described(
+                saved.paragraph(f"Undone: {step}." if step else "Nothing to undo.")
+            )
 
     def save(self) -> None:
         """Save the present measurement under its name; a GeorefError: it was not saved, and why."""
@@ -207,7 +196,7 @@ class MeasurePanel(Panel):
             if len(points) < _LEAST[kind]:
                 self._tell(f"A {kind} needs {_LEAST[kind]} points before it can be saved.")
                 return
-            measurement = NamedMeasurement(
+            measurement = saved.NamedMeasurement(
                 id=self._id,
                 name=self._name.value.strip()[:200] or f"{kind} {len(self.saved.all) + 1}",
                 kind=kind,
@@ -218,21 +207,21 @@ class MeasurePanel(Panel):
             )
             self.saved.put(measurement)
             self._history.add(f"saving of {measurement.name}", lambda: self._unsave(measurement, points))
-            self._id = new_id()
+            self._id = saved.new_id()
             self._name.value = ""  # type: ignore[misc]
             self._show(kind, ())
             self._show_saved()
 
-    def _unsave(self, measurement: NamedMeasurement, points: tuple[SurfacePoint, ...]) -> None:
+    def _unsave(self, measurement: saved.NamedMeasurement, points: tuple[SurfacePoint, ...]) -> None:
         self.saved.remove(measurement)
         self._show_saved()
         self._show(measurement.kind, points)
 
-    def _saved_point(self, point: SurfacePoint) -> SavedPoint:
+    def _saved_point(self, point: SurfacePoint) -> saved.SavedPoint:
         xyz, sigma_m = self._model.place(point)
         lla = lla_from_enu(point.position_in_geo[None], self._model.trained.survey.origin)[0]
         rows = [tuple(map(float, row)) for row in point.cov_of_surface]
-        return SavedPoint.model_validate(
+        return saved.SavedPoint.model_validate(
             {
                 "position_in_geo": point.position_in_geo.tolist(),
                 "cov_of_surface": rows,
@@ -254,7 +243,7 @@ class MeasurePanel(Panel):
             self._history.add(f"deletion of {measurement.name}", lambda: self._put_back(measurement, row))
             self._show_saved()
 
-    def _put_back(self, measurement: NamedMeasurement, row: int) -> None:
+    def _put_back(self, measurement: saved.NamedMeasurement, row: int) -> None:
         self.saved.put(measurement, row)
         self._show_saved()
 
@@ -265,13 +254,13 @@ class MeasurePanel(Panel):
         for number, measurement in enumerate(self.saved.all):
             places = np.array([point.position_in_geo for point in measurement.points])
             self._overlays.show_measured(f"saved{number}", places, closed=measurement.kind in _CLOSED)
-            values = "; ".join(quantity_text(each) for each in measurement.quantities[:3])
+            values = "; ".join(saved.quantity_text(each) for each in measurement.quantities[:3])
             older = "" if measurement.model == self._hash else " (measured in an earlier model)"
             rows.append((measurement.name, measurement.name + older, values))
         self._drawn = len(rows)
-        self._list.content = saved_table(rows)
+        self._list.content = saved.saved_table(rows)
         self._chosen.options = tuple(_title(number, each) for number, each in enumerate(self.saved.all)) or ("—",)
 
 
-def _title(number: int, measurement: NamedMeasurement) -> str:
+def _title(number: int, measurement: saved.NamedMeasurement) -> str:
     return f"{number + 1}: {measurement.name}"

@@ -1,7 +1,5 @@
 """Measuring in a trained model: points of its surface, their coordinates in a CRS, and σ of what they make up."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -18,16 +16,7 @@ from pipelines.survey.marks import MarkRays
 from pipelines.survey.options import CrsOptions
 from pipelines.survey.target_crs import TargetCrs, usable_crs
 from pipelines.survey.trained_survey import triangulated_points
-from pipelines.view.quantities import (
-    BasePlane,
-    MeasuredPoints,
-    Quantity,
-    SampledSurface,
-    grid_in_polygon,
-    plan_area,
-    surface_area,
-    volumes,
-)
+from pipelines.view import quantities
 
 _MOST_SAMPLES = 400  # of the surface in a polygon: a few seconds
 _JOINT_SAMPLES = 40  # of which so many enter the joint covariance
@@ -76,30 +65,31 @@ class MeasuringModel:
         sigma_m = None if joint.cov_in_geo is None else np.sqrt(np.diag(joint.cov_in_geo))
         return self.target.xyz_from_geo(point.position_in_geo[None])[0], sigma_m
 
-    def jointly(self, points: Sequence[SurfacePoint]) -> MeasuredPoints:
-        """Return points with their joint covariance."""
+    def jointly(self, points: Sequence[SurfacePoint]) -> quantities.MeasuredPoints:
         position = np.array([point.position_in_geo for point in points]).reshape(-1, 3)
         cov = self._joint_covariance(points)
         cov = None if cov is None else cov + block_diag(*(point.cov_of_surface for point in points))
         height_m = np.asarray(self.target.xyz_from_geo(position)[:, 2] * self.target.crs.height_unit_m)
-        return MeasuredPoints(position, cov, height_m)
+        return quantities.MeasuredPoints(position, cov, height_m)
 
-    def area(self, corners: Sequence[SurfacePoint]) -> tuple[Quantity, ...]:
+    def area(self, corners: Sequence[SurfacePoint]) -> tuple[quantities.Quantity, ...]:
         """Return the area of a polygon, in plan and on the surface."""
         sampled = self._sampled(corners)
         if sampled is None:
-            return (plan_area(self.jointly(corners)),)
+            return (quantities.plan_area(self.jointly(corners)),)
         surface, coverage = sampled
-        return plan_area(surface.corners), surface_area(surface), coverage
+        return quantities.plan_area(surface.corners), quantities.surface_area(surface), coverage
 
-    def volume(self, corners: Sequence[SurfacePoint], base: BasePlane) -> tuple[Quantity, ...]:
+    def volume(
+        self, corners: Sequence[SurfacePoint], base: quantities.BasePlane
+    ) -> tuple[quantities.Quantity, ...]:
         """Return the volume between the surface within a polygon and a base; nothing where there is no surface."""
         sampled = self._sampled(corners)
         if sampled is None:
             return ()
         surface, coverage = sampled
         lowest = int(np.argmin(surface.corners.height_m))
-        return (*volumes(surface, replace(base, lowest=lowest)), coverage)
+        return (*quantities.volumes(surface, replace(base, lowest=lowest)), coverage)
 
     def _joint_covariance(self, points: Sequence[SurfacePoint]) -> FloatArray | None:
         """Return the joint covariance (3 J, 3 J) of points without the surface's own."""
@@ -111,12 +101,14 @@ class MeasuringModel:
         cov = self.posterior.jointly_of_scene(position, number, cameras)
         return cov if np.isfinite(cov).all() else None
 
-    def _sampled(self, corners: Sequence[SurfacePoint]) -> tuple[SampledSurface, Quantity] | None:
+    def _sampled(
+        self, corners: Sequence[SurfacePoint]
+    ) -> tuple[quantities.SampledSurface, quantities.Quantity] | None:
         """Return the surface in a polygon, read along plumb lines, and how densely; None: there is none."""
         joint = self.jointly(corners)
-        area, pixel_m = plan_area(joint).value, self._pixel_m(corners)
+        area, pixel_m = quantities.plan_area(joint).value, self._pixel_m(corners)
         spacing = max(float(np.sqrt(area / _MOST_SAMPLES)), _LEAST_SPACING_PX * pixel_m)
-        grid = grid_in_polygon(joint.position_in_geo[:, :2], spacing)
+        grid = quantities.grid_in_polygon(joint.position_in_geo[:, :2], spacing)
         top = float(joint.position_in_geo[:, 2].max()) + _ABOVE_M + float(np.sqrt(area))
         model_from_geo = self.trained.geo_from_model.inverse()
         down = model_from_geo.rotation @ np.array([0.0, 0.0, -1.0])
@@ -133,7 +125,7 @@ class MeasuringModel:
         if shared is not None:
             own = [point.cov_of_surface for point in corners]
             shared = shared + block_diag(*own, *[np.zeros((3, 3))] * len(chosen))
-        surface = SampledSurface(
+        surface = quantities.SampledSurface(
             corners=joint,
             samples=np.array([point.position_in_geo for point in samples]),
             sigma_up_m=np.sqrt([point.cov_of_surface[2, 2] for point in samples]),
@@ -141,7 +133,7 @@ class MeasuringModel:
             chosen=chosen,
         )
         share = 100 * (len(samples) / len(grid))
-        return surface, Quantity(f"measured every {spacing:.2f} m, on", share, None, "% of the area")
+        return surface, quantities.Quantity(f"measured every {spacing:.2f} m, on", share, None, "% of the area")
 
     def _pixel_m(self, points: Sequence[SurfacePoint]) -> float:
         """Return the mean width of a training pixel at points."""

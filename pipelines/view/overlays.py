@@ -48,7 +48,6 @@ class Overlays:
         return (self._frame.view_from_model @ model_from_geo).apply(point_in_geo)
 
     def show(self, kind: OverlayKind, visible: bool) -> None:
-        """Show or hide the overlays of a kind."""
         self._wanted[kind] = visible
         self._groups[kind].visible = visible and not self._hidden
 
@@ -100,7 +99,6 @@ class Overlays:
             )
 
     def add_surveyed(self, points: Sequence[SurveyedPoint], kind: Literal["control", "check"]) -> None:
-        """Draw surveyed points with their names."""
         for number, point in enumerate(points):
             place = self._named[point.name] = self.place(np.array(point.position_in_geo))
             name = f"/points/{kind}{number}"
@@ -172,5 +170,4 @@ def wxyz_of(rotation: FloatArray) -> FloatArray:
 
 
 def _rgb(colour: str) -> tuple[int, int, int]:
-    """Return the numbers of a colour `#rrggbb`."""
     return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)

@@ -4,8 +4,6 @@ Points share the errors of similarity, cameras and lens. In a difference, what s
 joint covariance gives the σ of a distance.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -8,8 +8,6 @@ them, so that σ of what is made of several measurements is again the joint one.
 in the tables.
 """
 
-from __future__ import annotations
-
 import html
 import json
 import uuid

@@ -28,7 +28,7 @@ class Look:
 
     def __init__(self, root: Path, part: ProductPart) -> None:
         self.workspace = Workspace(root)
-        self.spec = StageSpec("stage", "", "", "stage", (part,), "stage/product", "")
+        self.spec = StageSpec("stage", "", "", (part,), "stage/product")
 
     def write(self, product: str, document: Any) -> None:
         path = self.workspace.root / product

@@ -10,22 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipelines.core.types import ByteArray, FloatArray
+from pipelines.report.plots import style as look
 from pipelines.report.plots.plans import add_bearings, bar_axes, frame_around, new_plan
-from pipelines.report.plots.style import (
-    BLUE,
-    DARK,
-    EMPTY_COLOUR,
-    FIGURE_POINTS,
-    GREY,
-    ORANGE,
-    SERIES_COLOURS,
-    TICK_POINTS,
-    add_scale,
-    label,
-    new_figure,
-    pixels_of,
-    write_png,
-)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -48,10 +34,10 @@ class BarChart:
 def write_bars(path: Path, panels: Sequence[BarChart]) -> None:
     """Draw the panels side by side; a file that is there is replaced when the new one is complete."""
     width, height = _PANEL_INCHES
-    figure = new_figure((width * len(panels), height), "constrained")
+    figure = look.new_figure((width * len(panels), height), "constrained")
     for axes, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
         _draw(axes, panel)
-    write_png(figure, path)
+    look.write_png(figure, path)
 
 
 def _draw(axes: Axes, panel: BarChart) -> None:
@@ -60,19 +46,17 @@ def _draw(axes: Axes, panel: BarChart) -> None:
     for position, (name, values) in enumerate(panel.series.items()):
         heights = {index: value for index, value in enumerate(values) if value is not None}
         left = [index + (position - (len(panel.series) - 1) / 2) * width for index in heights]
-        colour = SERIES_COLOURS[position]
+        colour = look.SERIES_COLOURS[position]
         bars = axes.bar(left, list(heights.values()), 0.94 * width, color=colour, label=name)
         figures = [f"{value:.{panel.digits}f}" for value in heights.values()]
         turn = 90 if len(panel.series) > 1 else 0
-        axes.bar_label(bars, figures, padding=2, fontsize=FIGURE_POINTS, rotation=turn)
-    label(axes, panel.title, y=panel.axis)
+        axes.bar_label(bars, figures, padding=2, fontsize=look.FIGURE_POINTS, rotation=turn)
+    look.label(axes, panel.title, y=panel.axis)
     axes.set_xticks(range(len(panel.members)), panel.members)
     axes.spines[["top", "right"]].set_visible(False)
     if len(panel.series) > 1:
-        below = (0.5, -0.08)
-        axes.legend(
-            frameon=False, fontsize=TICK_POINTS, loc="upper center", bbox_to_anchor=below, ncols=len(panel.series)
-        )
+        form = {"frameon": False, "fontsize": look.TICK_POINTS, "ncols": len(panel.series)}
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.08), **form)
 
 
 def _scale(axes: Axes, panel: BarChart) -> None:
@@ -89,7 +73,7 @@ def _scale(axes: Axes, panel: BarChart) -> None:
 _MOST_CELLS = 600  # along the longer side of the map
 _SCALE_QUANTILE = 0.95
 _BINS = 121
-_COLOURS = (BLUE, ORANGE, DARK, "#3a9d6e", GREY)
+_COLOURS = (look.BLUE, look.ORANGE, look.DARK, "#3a9d6e", look.GREY)
 
 
 def write_distance_map(path: Path, place_m: FloatArray, distance_m: FloatArray, size_m: float) -> None:
@@ -102,7 +86,7 @@ def write_distance_map(path: Path, place_m: FloatArray, distance_m: FloatArray, 
     raster = _medians(place_m, distance_m, frame.low, frame.high, cell_m)
     limit_m = _round_up(float(np.quantile(np.abs(distance_m), _SCALE_QUANTILE)))
     figure, axes = new_plan(frame, "Model minus reference along the normals (M3C2)", right_inches=1.0)
-    axes.set_facecolor(EMPTY_COLOUR)
+    axes.set_facecolor(look.EMPTY_COLOUR)
     rows, columns = raster.shape
     east, north = frame.low.tolist()
     image = axes.imshow(
@@ -115,9 +99,9 @@ def write_distance_map(path: Path, place_m: FloatArray, distance_m: FloatArray, 
         interpolation="nearest",
     )
     text = "m; above 0: the model lies before the reference"
-    add_scale(figure, image, text, cax=bar_axes(figure, axes), extend="both")
+    look.add_scale(figure, image, text, cax=bar_axes(figure, axes), extend="both")
     add_bearings(axes)
-    write_png(figure, path)
+    look.write_png(figure, path)
 
 
 def write_distance_histogram(path: Path, groups: Mapping[str, FloatArray], lod_m: float) -> None:
@@ -125,9 +109,9 @@ def write_distance_histogram(path: Path, groups: Mapping[str, FloatArray], lod_m
     everything = np.concatenate(list(groups.values()))
     limit_m = _round_up(max(float(np.quantile(np.abs(everything), 0.98)), 1.5 * lod_m))
     edges = np.linspace(-limit_m, limit_m, _BINS + 1)
-    figure = new_figure((6.2, 3.4), "constrained")
+    figure = look.new_figure((6.2, 3.4), "constrained")
     axes = figure.add_subplot()
-    axes.axvspan(-lod_m, lod_m, color=EMPTY_COLOUR, label="level of detection (median, 95 %)")
+    axes.axvspan(-lod_m, lod_m, color=look.EMPTY_COLOUR, label="level of detection (median, 95 %)")
     for (name, distance_m), colour in zip(groups.items(), _COLOURS, strict=False):
         count, _ = np.histogram(np.clip(distance_m, -limit_m, limit_m), edges)
         density = count / (len(distance_m) * (edges[1] - edges[0]))
@@ -135,9 +119,9 @@ def write_distance_histogram(path: Path, groups: Mapping[str, FloatArray], lod_m
         axes.axvline(float(np.median(distance_m)), color=colour, linewidth=0.8, linestyle=":")
     axes.set_ylim(bottom=0)
     axes.set_xlim(-limit_m, limit_m)
-    label(axes, "", x="model minus reference in m (dotted: median; ends hold all beyond)", y="density in 1/m")
-    axes.legend(fontsize=TICK_POINTS, frameon=False)
-    write_png(figure, path)
+    look.label(axes, "", x="model minus reference in m (dotted: median; ends hold all beyond)", y="density in 1/m")
+    axes.legend(fontsize=look.TICK_POINTS, frameon=False)
+    look.write_png(figure, path)
 
 
 def _medians(
@@ -177,7 +161,7 @@ def labelled(pictures: Sequence[ByteArray], labels: Sequence[str]) -> ByteArray:
     width = pictures[0].shape[1]
     band_px = band_height_px(width)
     letters_px = _LETTER_PART * band_px
-    figure = new_figure(
+    figure = look.new_figure(
         (strip.shape[1] / _DOTS_PER_INCH, band_px / _DOTS_PER_INCH), None, dots_per_inch=_DOTS_PER_INCH
     )
     most = max(int(width / (_LETTER_WIDTH * letters_px)), 1)
@@ -189,11 +173,11 @@ def labelled(pictures: Sequence[ByteArray], labels: Sequence[str]) -> ByteArray:
             shown,
             ha="center",
             va="center",
-            color=DARK,
+            color=look.DARK,
             parse_math=False,
             fontsize=letters_px * _POINTS_PER_INCH / _DOTS_PER_INCH,
         )
-    band = pixels_of(figure)[:band_px, : strip.shape[1]]
+    band = look.pixels_of(figure)[:band_px, : strip.shape[1]]
     return np.concatenate([band, strip], axis=0)
 
 

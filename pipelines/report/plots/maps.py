@@ -14,32 +14,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from pipelines.core.types import FloatArray
-from pipelines.report.plots.plans import (
-    NO_PLACES,
-    NamedPlaces,
-    add_bearings,
-    add_legend,
-    add_names,
-    frame_around,
-    new_plan,
-    nice_number,
-)
-from pipelines.report.plots.style import (
-    BLUE,
-    COLOUR_MAP,
-    DARK,
-    EMPTY_COLOUR,
-    GREY,
-    HEADING_POINTS,
-    LABEL_POINTS,
-    ORANGE,
-    add_arrows,
-    add_key,
-    add_scale,
-    label,
-    new_figure,
-    write_png,
-)
+from pipelines.report.plots import plans
+from pipelines.report.plots import style as look
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -86,7 +62,7 @@ def exaggeration(lengths_m: FloatArray, side_m: float) -> float | None:
     longest = 0.0 if not len(known) else min(float(known.max()), _OUTLIER * float(np.median(known)))
     if longest <= 0:
         return None
-    return nice_number(_LONGEST_ARROW * side_m / longest)
+    return plans.nice_number(_LONGEST_ARROW * side_m / longest)
 
 
 def draw_north(figure: Figure, axes: Axes) -> None:
@@ -101,9 +77,9 @@ def draw_north(figure: Figure, axes: Axes) -> None:
         xytext=(x, foot),
         xycoords="figure fraction",
         textcoords="figure fraction",
-        arrowprops={"arrowstyle": "-|>", "color": DARK, "shrinkA": 0, "shrinkB": 0, "linewidth": 1.4},
+        arrowprops={"arrowstyle": "-|>", "color": look.DARK, "shrinkA": 0, "shrinkB": 0, "linewidth": 1.4},
     )
-    figure.text(x, head, "N", ha="center", va="bottom", fontsize=LABEL_POINTS, color=DARK)
+    figure.text(x, head, "N", ha="center", va="bottom", fontsize=look.LABEL_POINTS, color=look.DARK)
 
 
 def _decimals(side_m: float, unit: str) -> int:
@@ -124,7 +100,7 @@ _MOST_TICKS = 8  # on the longer side
 
 _CAMERAS = {"marker": "X", "linewidths": 0.4, "color": "black", "edgecolors": "white"}
 _CHECK = {"marker": "o", "s": 24, "linewidths": 0.8, "color": "white", "edgecolors": "black"}
-_CONTROL = {"marker": "^", "s": 34, "linewidths": 0.8, "color": ORANGE, "edgecolors": "black"}
+_CONTROL = {"marker": "^", "s": 34, "linewidths": 0.8, "color": look.ORANGE, "edgecolors": "black"}
 # Of the sign of a camera in square points: many cameras must not hide the map.
 _LARGEST_SIGN, _SMALLEST_SIGN, _LARGE_SIGNS = 26.0, 9.0, 100
 
@@ -147,8 +123,8 @@ class MapPoints:
     """Points to mark on a map: cameras (K, 2) in metres east and north, control and check points."""
 
     cameras: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
-    control: NamedPlaces = NO_PLACES
-    check: NamedPlaces = NO_PLACES
+    control: plans.NamedPlaces = plans.NO_PLACES
+    check: plans.NamedPlaces = plans.NO_PLACES
 
 
 def write_accuracy_map(
@@ -162,12 +138,12 @@ def write_accuracy_map(
     rows, columns = raster.sigma_h_m.shape
     corners = np.stack([raster.corner_m, raster.corner_m + raster.cell_m * np.array([columns, rows])])
     places = (corners, points.cameras, points.control.place_m, points.check.place_m)
-    frame = frame_around(*places, narrowest=_NARROWEST, margin=_MARGIN, least_m=0.0)
+    frame = plans.frame_around(*places, narrowest=_NARROWEST, margin=_MARGIN, least_m=0.0)
     low, high = frame.low, frame.high
     width, height = (_MAP * (high - low) / frame.longer_m).tolist()
     size = (2 * (_LEFT + width + _RIGHT), _BELOW + height + _ABOVE)
-    figure = new_figure(size, None)
-    figure.suptitle("Predicted accuracy, 1 σ", fontsize=HEADING_POINTS, y=1 - _HEADING_DEPTH / size[1])
+    figure = look.new_figure(size, None)
+    figure.suptitle("Predicted accuracy, 1 σ", fontsize=look.HEADING_POINTS, y=1 - _HEADING_DEPTH / size[1])
     below = ["", ""]
     if coordinates is not None:
         below = [f"\n{name} in {coordinates.unit} ({coordinates.crs})" for name in coordinates.names]
@@ -182,10 +158,10 @@ def write_accuracy_map(
         axes.set_ylim(low[1], high[1])
         named = [group.place_m[: len(group.names)] for group in (points.check, points.control)]
         names = [*points.check.names, *points.control.names]
-        add_names(figure, axes, np.concatenate(named), names, points.cameras)
+        plans.add_names(figure, axes, np.concatenate(named), names, points.cameras)
         factor = _draw_errors(axes, points, errors_along, frame.longer_m)
         arrows = "" if factor is None else f"; arrows: errors × {factor:,g}"
-        label(
+        look.label(
             axes,
             f"{symbol}, {direction}{arrows}",
             x=f"east of the survey's origin in m{below[0]}",
@@ -196,8 +172,8 @@ def write_accuracy_map(
         draw_north(figure, axes)
         axes.locator_params("x", nbins=max(round(_MOST_TICKS * width / _MAP), 2))
         axes.locator_params("y", nbins=max(round(_MOST_TICKS * height / _MAP), 2))
-    add_key(figure, 3, loc="center", bbox_to_anchor=(0.5, _LEGEND_HEIGHT / figure.get_figheight()))
-    write_png(figure, path)
+    look.add_key(figure, 3, loc="center", bbox_to_anchor=(0.5, _LEGEND_HEIGHT / figure.get_figheight()))
+    look.write_png(figure, path)
 
 
 def _share(
@@ -212,16 +188,16 @@ def _draw_sigma(
 ) -> None:
     """Draw σ (R, C) between two corners (2, 2), with its scale."""
     west, east, south, north = corners.T.ravel().tolist()
-    axes.set_facecolor(EMPTY_COLOUR)
+    axes.set_facecolor(look.EMPTY_COLOUR)
     image = axes.imshow(
         np.ma.masked_invalid(sigma_m),
-        cmap=COLOUR_MAP,
+        cmap=look.COLOUR_MAP,
         origin="lower",
         extent=(west, east, south, north),
         interpolation="nearest",
         aspect="equal",
     )
-    add_scale(figure, image, text, cax=bar)
+    look.add_scale(figure, image, text, cax=bar)
     for each in (axes, bar):
         each.ticklabel_format(useOffset=False, style="plain")
 
@@ -238,7 +214,7 @@ def _mark(axes: Axes, points: MapPoints) -> None:
             axes.scatter(places[:, 0], places[:, 1], label=name, zorder=4, **style)
 
 
-def _named(name: str, points: NamedPlaces, arrow: str) -> str:
+def _named(name: str, points: plans.NamedPlaces, arrow: str) -> str:
     return name if points.error_m is None else f"{name}, with {arrow}"
 
 
@@ -253,13 +229,13 @@ def _draw_errors(axes: Axes, points: MapPoints, along: tuple[int, ...], side_m: 
         known = np.isfinite(errors_m).all(axis=1)
         plan_m = errors_m if len(along) == 2 else np.column_stack([np.zeros(len(errors_m)), errors_m])
         style = {"edgecolor": "white", "linewidth": 0.4, "width": 0.006, "zorder": 5}
-        colour = ORANGE if group is points.control else DARK
+        colour = look.ORANGE if group is points.control else look.DARK
         if known.any():
-            add_arrows(axes, group.place_m[known], (factor or 1.0) * plan_m[known], color=colour, **style)
+            look.add_arrows(axes, group.place_m[known], (factor or 1.0) * plan_m[known], color=colour, **style)
     return factor
 
 
-_COLOUR = {"removed": ORANGE, "added": BLUE}
+_COLOUR = {"removed": look.ORANGE, "added": look.BLUE}
 _MEANING = {"removed": "only in the LiDAR", "added": "only in the photographs"}
 _MOST_POINTS = 40_000
 _NAMED = 12
@@ -284,13 +260,13 @@ def write_lidar_map(path: Path, points_in_geo: FloatArray, areas: Sequence[Drawn
 
     step = max(1, len(points_in_geo) // _MOST_POINTS)
     drawn = points_in_geo[::step]
-    figure, axes = new_plan(frame_around(drawn), "LiDAR against photographs", legend_rows=1)
+    figure, axes = plans.new_plan(plans.frame_around(drawn), "LiDAR against photographs", legend_rows=1)
     low, high = np.quantile(drawn[:, 2], [0.02, 0.98])
     shade = 0.93 - 0.55 * np.clip((drawn[:, 2] - low) / max(high - low, 1e-6), 0, 1)
     axes.scatter(
         drawn[:, 0], drawn[:, 1], s=1.2, c=np.repeat(shade[:, None], 3, axis=1), linewidths=0, rasterized=True
     )
-    axes.scatter([], [], s=12, color=GREY, label="LiDAR, dark: high")
+    axes.scatter([], [], s=12, color=look.GREY, label="LiDAR, dark: high")
     square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
     for kind, meaning in _MEANING.items():
         mine = [area for area in areas if area.kind == kind]
@@ -303,7 +279,7 @@ def write_lidar_map(path: Path, points_in_geo: FloatArray, areas: Sequence[Drawn
     middles = [area.corner_in_geo.mean(axis=0) + area.cell_m / 2 for area in areas[:_NAMED]]
     if middles:
         names = [f"{area.area_m2:.0f} m²" for area in areas[:_NAMED]]
-        add_names(figure, axes, np.array(middles), names, np.zeros((0, 2)))
-    add_bearings(axes)
-    add_legend(figure)
-    write_png(figure, path)
+        plans.add_names(figure, axes, np.array(middles), names, np.zeros((0, 2)))
+    plans.add_bearings(axes)
+    plans.add_legend(figure)
+    look.write_png(figure, path)

@@ -8,23 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipelines.core.types import BoolArray, FloatArray
+from pipelines.report.plots import style as look
 from pipelines.report.plots.plans import nice_number
-from pipelines.report.plots.style import (
-    BLUE,
-    COLOUR_MAP,
-    DARK,
-    FIGURE_POINTS,
-    GREY,
-    LABEL_POINTS,
-    ORANGE,
-    TICK_POINTS,
-    add_arrows,
-    add_key,
-    add_scale,
-    label,
-    new_figure,
-    png_of,
-)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -44,13 +29,13 @@ def residual_field(
     width, height = size_px
     rows, columns = rms_px.shape
     scale = 4.6 / max(width, height)
-    figure = new_figure((width * scale + 1.7, height * scale + 1.0), "constrained")
+    figure = look.new_figure((width * scale + 1.7, height * scale + 1.0), "constrained")
     axes = figure.subplots()
-    label(axes, title, x="x in px", y="y in px")
+    look.label(axes, title, x="x in px", y="y in px")
     image = axes.imshow(
-        np.ma.masked_invalid(rms_px), cmap=COLOUR_MAP, extent=(0, width, height, 0), interpolation="nearest"
+        np.ma.masked_invalid(rms_px), cmap=look.COLOUR_MAP, extent=(0, width, height, 0), interpolation="nearest"
     )
-    add_scale(figure, image, "RMS of the residuals in px", ax=axes, fraction=0.04, pad=0.02)
+    look.add_scale(figure, image, "RMS of the residuals in px", ax=axes, fraction=0.04, pad=0.02)
     x = (np.arange(columns) + 0.5) * width / columns
     y = (np.arange(rows) + 0.5) * height / rows
     grid = np.stack(np.meshgrid(x, y), axis=-1)
@@ -61,8 +46,8 @@ def residual_field(
         factor = nice_number(_ARROW_SHARE * min(width / columns, height / rows) / longest)
         # white on black: readable on every colour
         style = {"color": "white", "edgecolor": "black", "linewidth": 0.5}
-        add_arrows(axes, grid[known], factor * mean_px[known], width=0.004, pivot="mid", **style)
-    return png_of(figure), factor
+        look.add_arrows(axes, grid[known], factor * mean_px[known], width=0.004, pivot="mid", **style)
+    return look.png_of(figure), factor
 
 
 def fix_series(
@@ -72,38 +57,40 @@ def fix_series(
 
     The abscissa (F,), of that title, is seconds since the first, or the number of the photograph.
     """
-    figure = new_figure((5.6, 5.6), "constrained")
+    figure = look.new_figure((5.6, 5.6), "constrained")
     order = np.argsort(abscissa, kind="stable")
     for axis, axes in enumerate(figure.subplots(3, 1, sharex=True)):
         values, sigma = residual_m[:, axis], sigma_m[:, axis]
-        band = {"color": GREY, "alpha": 0.3, "linewidth": 0, "label": "stated 2 σ"}
+        band = {"color": look.GREY, "alpha": 0.3, "linewidth": 0, "label": "stated 2 σ"}
         axes.fill_between(abscissa[order], -2 * sigma[order], 2 * sigma[order], **band)
-        axes.axhline(0, color=DARK, linewidth=0.6)
+        axes.axhline(0, color=look.DARK, linewidth=0.6)
         used = ~is_outlier
         if used.any():
-            axes.axhline(float(values[used].mean()), color=BLUE, linewidth=1.2, linestyle="--", label="mean (bias)")
+            axes.axhline(
+                float(values[used].mean()), color=look.BLUE, linewidth=1.2, linestyle="--", label="mean (bias)"
+            )
         for chosen, style, name in (
-            (used, {"marker": "o", "color": BLUE, "s": 11}, "used"),
-            (is_outlier, {"marker": "X", "color": ORANGE, "edgecolors": "black", "s": 34}, "outlier"),
+            (used, {"marker": "o", "color": look.BLUE, "s": 11}, "used"),
+            (is_outlier, {"marker": "X", "color": look.ORANGE, "edgecolors": "black", "s": 34}, "outlier"),
         ):
             if chosen.any():
                 axes.scatter(abscissa[chosen], values[chosen], label=name, linewidths=0.7, zorder=3, **style)
-        label(axes, "", y=f"{_AXES[axis]} in m")
+        look.label(axes, "", y=f"{_AXES[axis]} in m")
         axes.spines[["top", "right"]].set_visible(False)
-    axes.set_xlabel(title, fontsize=LABEL_POINTS)
-    add_key(figure, 4, loc="outside upper center")
-    return png_of(figure)
+    axes.set_xlabel(title, fontsize=look.LABEL_POINTS)
+    look.add_key(figure, 4, loc="outside upper center")
+    return look.png_of(figure)
 
 
 def correlation_matrix(names: Sequence[str], correlation: FloatArray) -> bytes:
     """Return correlations (P, P) of named parameters as PNG, with the figures in the cells."""
     side = 0.42 * len(names) + 1.4
-    figure = new_figure((side + 0.8, side), "constrained")
+    figure = look.new_figure((side + 0.8, side), "constrained")
     axes = figure.subplots()
     image = axes.imshow(correlation, cmap="PuOr", vmin=-1, vmax=1)
     axes.set_xticks(range(len(names)), names)
     axes.set_yticks(range(len(names)), names)
-    axes.tick_params(labelsize=TICK_POINTS, length=0)
+    axes.tick_params(labelsize=look.TICK_POINTS, length=0)
     for row, values in enumerate(correlation):
         for column, value in enumerate(values):
             dark = abs(value) > 0.65
@@ -113,52 +100,59 @@ def correlation_matrix(names: Sequence[str], correlation: FloatArray) -> bytes:
                 f"{round(float(value), 2) + 0.0:.2f}".replace("-", "−"),
                 ha="center",
                 va="center",
-                fontsize=FIGURE_POINTS - 1,
+                fontsize=look.FIGURE_POINTS - 1,
                 color="white" if dark else "black",
             )
-    label(axes, "Correlation of the lens parameters")
+    look.label(axes, "Correlation of the lens parameters")
     bar = figure.colorbar(image, ax=axes, fraction=0.04, pad=0.02)
-    bar.ax.tick_params(labelsize=TICK_POINTS)
-    return png_of(figure)
+    bar.ax.tick_params(labelsize=look.TICK_POINTS)
+    return look.png_of(figure)
 
 
 def predicted_against_measured(sigma_m: FloatArray, error_m: FloatArray) -> bytes:
     """Return predicted σ (J, 2) against measured errors (J, 2) of check points, horizontal and vertical, as PNG."""
-    figure = new_figure((6.4, 3.6), "constrained")
+    figure = look.new_figure((6.4, 3.6), "constrained")
     for axis, (axes, name) in enumerate(zip(figure.subplots(1, 2), ("horizontal", "vertical"), strict=True)):
         sigma, error = sigma_m[:, axis], error_m[:, axis]
         most = 1.15 * max(float(sigma.max()), 1e-6)
         line = np.array([0.0, most])
-        axes.fill_between(line, 0, line, color=BLUE, alpha=0.14, linewidth=0, label="within 1 σ")
-        axes.fill_between(line, line, 2 * line, color=BLUE, alpha=0.07, linewidth=0, label="within 2 σ")
-        axes.scatter(sigma, error, s=16, color=DARK, zorder=3, label="check point")
+        axes.fill_between(line, 0, line, color=look.BLUE, alpha=0.14, linewidth=0, label="within 1 σ")
+        axes.fill_between(line, line, 2 * line, color=look.BLUE, alpha=0.07, linewidth=0, label="within 2 σ")
+        axes.scatter(sigma, error, s=16, color=look.DARK, zorder=3, label="check point")
         axes.set_xlim(0, most)
         axes.set_ylim(0, 1.1 * max(float(error.max()), 2 * most))
-        label(axes, name, x="predicted σ with survey in m", y="measured error in m")
+        look.label(axes, name, x="predicted σ with survey in m", y="measured error in m")
         axes.spines[["top", "right"]].set_visible(False)
-    add_key(figure, 3, loc="outside lower center")
-    return png_of(figure)
+    look.add_key(figure, 3, loc="outside lower center")
+    return look.png_of(figure)
 
 
 def curves(abscissa_title: str, panels: Mapping[str, Mapping[str, tuple[FloatArray, FloatArray]]]) -> bytes:
     """Return curves below each other as PNG: by quantity, lines by name, abscissa (N,) and ordinate (N,)."""
     width, height = _CHART_INCHES
-    figure = new_figure((width, 0.62 * height * len(panels) + 0.5), "constrained")
+    figure = look.new_figure((width, 0.62 * height * len(panels) + 0.5), "constrained")
     all_axes = np.atleast_1d(figure.subplots(len(panels), 1, sharex=True))
     for axes, (quantity, lines) in zip(all_axes, panels.items(), strict=True):
         _draw_lines(axes, quantity, lines)
-    all_axes[-1].set_xlabel(abscissa_title, fontsize=LABEL_POINTS)
-    return png_of(figure)
+    all_axes[-1].set_xlabel(abscissa_title, fontsize=look.LABEL_POINTS)
+    return look.png_of(figure)
 
 
 def _draw_lines(axes: Axes, quantity: str, lines: Mapping[str, tuple[FloatArray, FloatArray]]) -> None:
-    styles = ((BLUE, "-"), (ORANGE, "-"), (DARK, "-"), (BLUE, "--"), (ORANGE, "--"), (DARK, "--"))
+    styles = (
+        (look.BLUE, "-"),
+        (look.ORANGE, "-"),
+        (look.DARK, "-"),
+        (look.BLUE, "--"),
+        (look.ORANGE, "--"),
+        (look.DARK, "--"),
+    )
     for (name, (x, y)), (colour, dash) in zip(lines.items(), styles, strict=False):
         axes.plot(x, y, label=name, color=colour, linestyle=dash, linewidth=1.3)
     positive = [value for _, y in lines.values() for value in y if value > 0]
     if len(lines) > 1:
         if positive and max(positive) > 100 * min(positive):
             axes.set_yscale("log")
-        axes.legend(fontsize=TICK_POINTS, frameon=False, ncols=2)
-    label(axes, "", y=quantity)
+        axes.legend(fontsize=look.TICK_POINTS, frameon=False, ncols=2)
+    look.label(axes, "", y=quantity)
     axes.spines[["top", "right"]].set_visible(False)

@@ -14,22 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipelines.core.types import BoolArray, FloatArray, IntArray
-from pipelines.report.plots.style import (
-    BLUE,
-    COLOUR_MAP,
-    DARK,
-    EMPTY_COLOUR,
-    FIGURE_POINTS,
-    GREY,
-    ORANGE,
-    TICK_POINTS,
-    add_arrows,
-    add_key,
-    add_scale,
-    label,
-    new_figure,
-    png_of,
-)
+from pipelines.report.plots import style as look
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -83,9 +68,9 @@ def new_plan(
     width, height = (LONGER_INCHES * (frame.high - frame.low) / frame.longer_m).tolist()
     below = _BELOW + _LEGEND_ROW * (legend_rows + 0.4 * bool(legend_rows))
     size = (_LEFT + width + _RIGHT + right_inches, below + height + _ABOVE)
-    figure = new_figure(size, None)
+    figure = look.new_figure(size, None)
     axes = figure.add_axes((_LEFT / size[0], below / size[1], width / size[0], height / size[1]))
-    label(axes, title, x="east of the survey's origin in m", y="north of the survey's origin in m")
+    look.label(axes, title, x="east of the survey's origin in m", y="north of the survey's origin in m")
     axes.set_xlim(frame.low[0], frame.high[0])
     axes.set_ylim(frame.low[1], frame.high[1])
     axes.set_aspect("equal")
@@ -107,7 +92,7 @@ def add_bearings(axes: Axes) -> None:
     length = nice_number(_BAR_SHARE * width)
     left, top = west + 0.03 * width, north - 0.035 * max(width, height)
     tick = 0.008 * max(width, height)
-    style: dict[str, Any] = {"color": DARK, "linewidth": 1.6, "zorder": 9, "solid_capstyle": "butt"}
+    style: dict[str, Any] = {"color": look.DARK, "linewidth": 1.6, "zorder": 9, "solid_capstyle": "butt"}
     axes.plot([left, left + length], [top, top], **style)
     for end in (left, left + length):
         axes.plot([end, end], [top - tick, top + tick], **style)
@@ -117,7 +102,7 @@ def add_bearings(axes: Axes) -> None:
         f"{length:g} m",
         ha="center",
         va="top",
-        fontsize=TICK_POINTS,
+        fontsize=look.TICK_POINTS,
         bbox=_BOX,
         zorder=9,
     )
@@ -128,17 +113,16 @@ def add_bearings(axes: Axes) -> None:
         xycoords="axes fraction",
         ha="center",
         va="center",
-        fontsize=TICK_POINTS + 1,
+        fontsize=look.TICK_POINTS + 1,
         fontweight="bold",
-        arrowprops={"arrowstyle": "-|>", "color": DARK, "linewidth": 1.4},
+        arrowprops={"arrowstyle": "-|>", "color": look.DARK, "linewidth": 1.4},
         bbox=_BOX,
         zorder=9,
     )
 
 
 def add_legend(figure: Figure, columns: int = 4) -> None:
-    """Add the legend of a plan below it."""
-    add_key(figure, columns, loc="lower center", bbox_to_anchor=(0.5, 0.04 / figure.get_figheight()))
+    look.add_key(figure, columns, loc="lower center", bbox_to_anchor=(0.5, 0.04 / figure.get_figheight()))
 
 
 def add_names(figure: Figure, axes: Axes, places: FloatArray, names: Sequence[str], others: FloatArray) -> int:
@@ -161,8 +145,8 @@ def add_names(figure: Figure, axes: Axes, places: FloatArray, names: Sequence[st
                 textcoords="offset points",
                 ha="left" if across > 0 else "right",
                 va="bottom" if along > 0 else "top",
-                fontsize=FIGURE_POINTS,
-                color=DARK,
+                fontsize=look.FIGURE_POINTS,
+                color=look.DARK,
                 zorder=8,
                 parse_math=False,  # A name may hold what is a formula elsewhere.
             )
@@ -220,19 +204,19 @@ def site_plan(
     """Return the plan of a survey with cameras (n, 2) and points as PNG; the scene (N, 2) is its ground."""
     frame = frame_around(training_m, test_m, control.place_m, check.place_m)
     figure, axes = new_plan(frame, "Photographs and surveyed points", legend_rows=1)
-    axes.scatter(scene_m[:, 0], scene_m[:, 1], s=1.5, color=GREY, alpha=0.6, linewidths=0, rasterized=True)
+    axes.scatter(scene_m[:, 0], scene_m[:, 1], s=1.5, color=look.GREY, alpha=0.6, linewidths=0, rasterized=True)
     size = float(np.clip(2600 / max(len(training_m), 1), 7, 24))
     styles: tuple[tuple[str, FloatArray, dict[str, Any]], ...] = (
-        ("photograph for training", training_m, {"marker": "x", "s": size, "color": BLUE, "linewidths": 0.9}),
+        ("photograph for training", training_m, {"marker": "x", "s": size, "color": look.BLUE, "linewidths": 0.9}),
         (
             "test view",
             test_m,
-            {"marker": "s", "s": size, "facecolors": "none", "edgecolors": BLUE, "linewidths": 0.9},
+            {"marker": "s", "s": size, "facecolors": "none", "edgecolors": look.BLUE, "linewidths": 0.9},
         ),
         (
             "control point",
             control.place_m,
-            {"marker": "^", "s": 42, "color": ORANGE, "edgecolors": "black", "linewidths": 0.8},
+            {"marker": "^", "s": 42, "color": look.ORANGE, "edgecolors": "black", "linewidths": 0.8},
         ),
         (
             "check point",
@@ -247,7 +231,7 @@ def site_plan(
     marked = np.concatenate([control.place_m, check.place_m])
     add_names(figure, axes, marked, [*control.names, *check.names], np.concatenate([training_m, test_m]))
     add_legend(figure)
-    return png_of(figure)
+    return look.png_of(figure)
 
 
 def movement_plan(
@@ -262,7 +246,7 @@ def movement_plan(
 
     frame = frame_around(center_m)
     figure, axes = new_plan(frame, "Adjusted positions of the photographs", legend_rows=2)
-    axes.scatter(center_m[:, 0], center_m[:, 1], s=5, color=DARK, zorder=3, label="adjusted position")
+    axes.scatter(center_m[:, 0], center_m[:, 1], s=5, color=look.DARK, zorder=3, label="adjusted position")
     known = np.isfinite(moved_m).all(axis=1)
     arrow_factor = ellipse_factor = None
     used = known & ~is_outlier
@@ -271,13 +255,13 @@ def movement_plan(
     if largest > 0:
         arrow_factor = nice_number(_ARROW_SHARE * frame.longer_m / largest)
         for chosen, colour, name in (
-            (known & ~is_outlier, BLUE, "from measured to adjusted"),
-            (known & is_outlier, ORANGE, "the same, left out as an outlier"),
+            (known & ~is_outlier, look.BLUE, "from measured to adjusted"),
+            (known & is_outlier, look.ORANGE, "the same, left out as an outlier"),
         ):
             if chosen.any():
                 start, arrow = center_m[chosen] - arrow_factor * moved_m[chosen], arrow_factor * moved_m[chosen]
                 text = f"{name} (× {arrow_factor:g})"
-                add_arrows(axes, start, arrow, color=colour, width=0.003, zorder=4, label=text)
+                look.add_arrows(axes, start, arrow, color=colour, width=0.003, zorder=4, label=text)
     if covariance is not None and np.isfinite(covariance).all():
         variance, axis = np.linalg.eigh(covariance)
         semi = np.sqrt(np.maximum(variance, 0.0))
@@ -294,14 +278,14 @@ def movement_plan(
                     offsets=center_m,
                     transOffset=axes.transData,
                     facecolors="none",
-                    edgecolors=DARK,
+                    edgecolors=look.DARK,
                     linewidths=0.7,
                 )
             )
-            axes.plot([], [], "o", mfc="none", mec=DARK, label=f"1 σ ellipse (× {ellipse_factor:g})")
+            axes.plot([], [], "o", mfc="none", mec=look.DARK, label=f"1 σ ellipse (× {ellipse_factor:g})")
     add_bearings(axes)
     add_legend(figure, columns=2)
-    return DrawnMovement(png_of(figure), arrow_factor, ellipse_factor)
+    return DrawnMovement(look.png_of(figure), arrow_factor, ellipse_factor)
 
 
 def overlap_plan(count: IntArray, corner_m: FloatArray, cell_m: float, camera_m: FloatArray) -> bytes:
@@ -316,24 +300,24 @@ def overlap_plan(count: IntArray, corner_m: FloatArray, cell_m: float, camera_m:
     rows, columns = count.shape
     far = corner_m + cell_m * np.array([columns, rows])
     figure, axes = new_plan(frame_around(np.stack([corner_m, far])), "Overlap", right_inches=_BAR_ROOM)
-    axes.set_facecolor(EMPTY_COLOUR)
+    axes.set_facecolor(look.EMPTY_COLOUR)
     edges = [0, *_OVERLAP_STEPS, max(_OVERLAP_STEPS[-1] + 1, int(count.max()) + 1)]
     image = axes.imshow(
         np.ma.masked_less(count, 0),
-        cmap=colormaps[COLOUR_MAP],
-        norm=BoundaryNorm(edges, colormaps[COLOUR_MAP].N),
+        cmap=colormaps[look.COLOUR_MAP],
+        norm=BoundaryNorm(edges, colormaps[look.COLOUR_MAP].N),
         origin="lower",
         extent=(corner_m[0], far[0], corner_m[1], far[1]),
         interpolation="nearest",
     )
-    axes.scatter(camera_m[:, 0], camera_m[:, 1], s=6, color="white", edgecolors=DARK, linewidths=0.5)
-    bar = add_scale(figure, image, "photographs that see the cell", cax=bar_axes(figure, axes))
+    axes.scatter(camera_m[:, 0], camera_m[:, 1], s=6, color="white", edgecolors=look.DARK, linewidths=0.5)
+    bar = look.add_scale(figure, image, "photographs that see the cell", cax=bar_axes(figure, axes))
     bar.set_ticks(
         ticks=[(low + high) / 2 for low, high in pairwise(edges)],
         labels=[str(low) if high == low + 1 else f"{low}–{high - 1}" for low, high in pairwise(edges)],
     )
     add_bearings(axes)
-    return png_of(figure)
+    return look.png_of(figure)
 
 
 def match_plan(camera_m: FloatArray, pairs: IntArray, shared: IntArray) -> bytes:
@@ -348,7 +332,7 @@ def match_plan(camera_m: FloatArray, pairs: IntArray, shared: IntArray) -> bytes
     figure, axes = new_plan(frame_around(camera_m), "Photographs that share points", right_inches=_BAR_ROOM)
     order = np.argsort(shared, kind="stable")
     most = max(int(shared.max()), 2) if len(shared) else 2
-    norm, reversed_map = LogNorm(1, most), colormaps[f"{COLOUR_MAP}_r"]
+    norm, reversed_map = LogNorm(1, most), colormaps[f"{look.COLOUR_MAP}_r"]
     strength = np.log(shared[order]) / np.log(most)
     lines = LineCollection(
         list(camera_m[pairs[order]]),
@@ -359,8 +343,10 @@ def match_plan(camera_m: FloatArray, pairs: IntArray, shared: IntArray) -> bytes
     )
     lines.set_array(shared[order])
     axes.add_collection(lines)
-    axes.scatter(camera_m[:, 0], camera_m[:, 1], s=10, color="white", edgecolors=DARK, linewidths=0.7, zorder=3)
-    bar = add_scale(figure, lines, "points that two photographs share", cax=bar_axes(figure, axes))
+    axes.scatter(
+        camera_m[:, 0], camera_m[:, 1], s=10, color="white", edgecolors=look.DARK, linewidths=0.7, zorder=3
+    )
+    bar = look.add_scale(figure, lines, "points that two photographs share", cax=bar_axes(figure, axes))
     bar.ax.yaxis.set_major_formatter("{x:g}")
     add_bearings(axes)
-    return png_of(figure)
+    return look.png_of(figure)

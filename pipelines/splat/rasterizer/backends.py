@@ -1,7 +1,5 @@
 """Rasteriser backends by name."""
 
-from __future__ import annotations
-
 import logging
 from typing import Literal
 
@@ -55,5 +53,4 @@ def rasterizer(name: Literal["auto", "cpu", "cuda"], progress: Progress = SILENT
 
 
 def device_of(backend: Rasterizer) -> torch.device:
-    """Return where the tensors of a backend live."""
     return torch.device("cuda" if backend.name == "cuda" else "cpu")

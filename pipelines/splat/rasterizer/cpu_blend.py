@@ -5,8 +5,6 @@ adds to the pixel any more, and the final value of T stays known. Forward and ba
 same direction with the same arithmetic, so that both take the same decisions at every cut-off.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -10,8 +10,6 @@ the image's dilation, the slope is q = s p, p = K⁻¹ c, c = (V D Vᵀ)_uz,vz. 
 of the centre, see `api`; it depends on C, the screen covariance with all of the dilation.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

@@ -4,8 +4,6 @@ Sums run in a fixed order whatever the number of threads, without atomic additio
 bit on every run.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -15,8 +15,6 @@ Compilation of the kernels.
 Of all flags that allow the compiler to reorder or assume, only fused multiply-add is set: results are reproducible.
 """
 
-from __future__ import annotations
-
 import operator
 from collections.abc import Callable
 from typing import Any

@@ -5,8 +5,6 @@ Its extreme rows within a column have a closed form. A tile is therefore listed 
 exactly the rows that the ellipse enters (the idea of AccuTile, doi 10.48550/arXiv.2412.00578).
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -4,8 +4,6 @@ gsplat (doi 10.48550/arXiv.2409.06765) blends by the rules of `api`, but has no 
 depth comes from blending the Gaussians' planes, the median depth from gsplat's pixel–Gaussian intersections.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import Any
 

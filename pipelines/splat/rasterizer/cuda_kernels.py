@@ -5,8 +5,6 @@ work. Here a child process compiles, one at a time, in a draft, and the library 
 Later runs load that library, and need no compiler.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import importlib.util
@@ -148,7 +146,6 @@ def _capabilities() -> list[str]:
 
 
 def _architectures() -> list[str]:
-    """Return the compute capabilities to compile for."""
     named = os.environ.get("TORCH_CUDA_ARCH_LIST", "").replace(";", " ").split()
     found = sorted(name.removesuffix("+PTX") for name in named) or _capabilities()
     if not found:

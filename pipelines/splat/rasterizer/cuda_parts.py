@@ -4,8 +4,6 @@ gsplat's wheel holds the sources of its kernels, which the first use compiles. T
 as wheels, in the version of CUDA that torch is built for. torch looks for no compiler there: `toolkit_home` does.
 """
 
-from __future__ import annotations
-
 import ctypes
 import importlib.util
 import os

@@ -4,8 +4,6 @@ Every Gaussian is evaluated at every pixel, in the dtype of the inputs, and diff
 tests and small images only: memory grows as Gaussians × pixels.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

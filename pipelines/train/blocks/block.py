@@ -5,8 +5,6 @@ Reads the survey, the SfM model, the initial similarity, the plan, the solution 
 checkpoint. The command is idempotent, and continues from the checkpoint.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

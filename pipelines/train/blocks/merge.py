@@ -5,8 +5,6 @@ rendered twice: with the Gaussians of either block, and the scaffold around it. 
 the overlap, their depths and colours are compared.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import shutil
@@ -20,19 +18,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pipelines.core import stages
 from pipelines.core.files import file_size
 from pipelines.core.products import load_json, save_json
 from pipelines.core.progress import Progress
-from pipelines.core.stages import (
-    BLOCK_GAUSSIANS,
-    MODEL,
-    SCAFFOLD,
-    SIM3_POSTERIOR,
-    SOLUTION,
-    SPARSE,
-    TRAIN_POSTERIOR,
-    TRAIN_SEAMS,
-)
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.core.workspace import Summary
 from pipelines.formats.colmap import read_sparse
@@ -92,9 +81,9 @@ class SeamViews:
         self._backend: Rasterizer = rasterizer(parts.options.backend)
         self._device = device_of(self._backend)
         self._poses = solution.poses
-        self._sfm = solution.with_lenses(read_sparse(parts.workspace.path(SPARSE)))
+        self._sfm = solution.with_lenses(read_sparse(parts.workspace.path(stages.SPARSE)))
         self._index = self._sfm.image_index()
-        self._scaffold = read_gaussians(parts.variant().path(SCAFFOLD))
+        self._scaffold = read_gaussians(parts.variant().path(stages.SCAFFOLD))
         self.model_of = lru_cache(2)(self._model_of)
 
     def seam(self, first: PlannedBlock, second: PlannedBlock) -> Seam | None:
@@ -141,7 +130,7 @@ class SeamViews:
 
     def _model_of(self, number: int) -> Gaussians:
         """Return the Gaussians of a block, with the scaffold's outside of its region, on the device."""
-        own = read_gaussians(self._parts.variant(number).path(BLOCK_GAUSSIANS))
+        own = read_gaussians(self._parts.variant(number).path(stages.BLOCK_GAUSSIANS))
         around = ~self._plan.block(number).region.contains(self._scaffold.means.double().numpy())
         return Gaussians.concatenate([own, self._scaffold.select(torch.from_numpy(around))]).to(self._device)
 
@@ -150,9 +139,9 @@ def merge_blocks(parts: Parts, plan: BlockPlan, folder: Path, progress: Progress
     """Write the product of `train` from a plan's blocks, and return its key figures; an InputError: unreadable."""
     trainings = parts.trainings(plan)
     # The Gaussians of each cell, adapted to those of its neighbours.
-    cells = [parts.variant().root / TRAIN_SEAMS.folder / f"{block.id}.ply" for block in plan.blocks]
+    cells = [parts.variant().root / stages.TRAIN_SEAMS.folder / f"{block.id}.ply" for block in plan.blocks]
     count = join_splat_plys(cells, folder / "gaussians.ply")
-    solution = load_json(Adjustment, parts.variant().path(SOLUTION))
+    solution = load_json(Adjustment, parts.variant().path(stages.SOLUTION))
     model = TrainedModel(
         **dict(solution),
         max_image_size=parts.options.effort.max_image_size,
@@ -162,9 +151,9 @@ def merge_blocks(parts: Parts, plan: BlockPlan, folder: Path, progress: Progress
         gaussians=count,
         backend=trainings[0].backend,
     )
-    save_json(model, folder / Path(MODEL).name)
+    save_json(model, folder / Path(stages.MODEL).name)
     # Blocks keep the adjustment of init-sim3, and with it the covariances.
-    shutil.copyfile(parts.workspace.path(SIM3_POSTERIOR), folder / Path(TRAIN_POSTERIOR).name)
+    shutil.copyfile(parts.workspace.path(stages.SIM3_POSTERIOR), folder / Path(stages.TRAIN_POSTERIOR).name)
     _write_metrics(parts, plan, folder / "metrics.jsonl")
     seams = compare_neighbours(parts, plan, solution, progress)
     pairs = zip(plan.blocks, trainings, strict=True)

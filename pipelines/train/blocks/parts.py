@@ -3,30 +3,16 @@
 `blocks/` holds plan, solution and scaffold, and `blocks/<number>/` one block each.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pipelines.core import stages
 from pipelines.core.errors import InputError, MissingProductError
 from pipelines.core.products import load_json
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.runner import Outcome, run_stage
-from pipelines.core.stages import (
-    BLOCK_GAUSSIANS,
-    BLOCK_PLAN,
-    BLOCK_RECORD,
-    BLOCK_TRAINING,
-    PLAN_BLOCKS,
-    SOLVE,
-    TRAIN_BLOCK,
-    TRAIN_SCAFFOLD,
-    TRAIN_SEAMS,
-    StageSpec,
-    stage_slice,
-)
 from pipelines.core.staleness import request, why_damaged, why_stale
 from pipelines.core.workspace import Workspace
 from pipelines.splat.rasterizer.backends import chosen_backend
@@ -35,7 +21,7 @@ from pipelines.survey.options import NOT_IN_BLOCKS
 from pipelines.train.options import TrainOptions
 
 FOLDER = "blocks"  # and the command
-UPSTREAM = stage_slice(None, "init-sim3")
+UPSTREAM = stages.stage_slice(None, "init-sim3")
 # The plan applies these, and a block is stale with the plan.
 _OF_PLAN = ("preset", "blocks", "block_overlap", "block_memory")
 
@@ -57,7 +43,10 @@ class Parts:
         whole = Workspace(self.workspace.root / FOLDER, self.workspace, lent, FOLDER)
         if number is None:
             return whole
-        own = {spec.folder: whole.root / spec.folder for spec in (PLAN_BLOCKS, SOLVE, TRAIN_SCAFFOLD)}
+        own = {
+            spec.folder: whole.root / spec.folder
+            for spec in (stages.PLAN_BLOCKS, stages.SOLVE, stages.TRAIN_SCAFFOLD)
+        }
         return Workspace(whole.root / str(number), self.workspace, lent | own, FOLDER)
 
     def on_gpu(self) -> bool:
@@ -66,15 +55,17 @@ class Parts:
 
     def plan(self) -> BlockPlan:
         """Return the plan; a MissingProductError: there is none; an InputError: it cannot be read."""
-        path = self.variant().root / BLOCK_PLAN
+        path = self.variant().root / stages.BLOCK_PLAN
         if not path.is_file():
-            raise MissingProductError(f"{FOLDER}/{BLOCK_PLAN}", f"georef blocks plan {self.workspace.root}")
+            raise MissingProductError(f"{FOLDER}/{stages.BLOCK_PLAN}", f"georef blocks plan {self.workspace.root}")
         return load_json(BlockPlan, path)
 
     def trainings(self, plan: BlockPlan) -> list[BlockTraining]:
-        return [load_json(BlockTraining, self.variant(block.id).path(BLOCK_TRAINING)) for block in plan.blocks]
+        return [
+            load_json(BlockTraining, self.variant(block.id).path(stages.BLOCK_TRAINING)) for block in plan.blocks
+        ]
 
-    def flags(self, spec: StageSpec, number: int | None = None) -> dict[str, Any]:
+    def flags(self, spec: stages.StageSpec, number: int | None = None) -> dict[str, Any]:
         """Return all options of a part; `number` is that of the block, for `TRAIN_BLOCK`."""
         effort = self.options.effort
         given = self.options.model_dump(mode="json") | {
@@ -83,24 +74,24 @@ class Parts:
             "max_gaussians": effort.max_gaussians,
             "id": number,
         }
-        if spec is TRAIN_SEAMS:
+        if spec is stages.TRAIN_SEAMS:
             given["trained"] = list(self._hashes())
-        if spec is SOLVE:
+        if spec is stages.SOLVE:
             given["max_image_size"] = min(effort.max_image_size, SCAFFOLD_IMAGE_PX)
-        left_out = () if spec is PLAN_BLOCKS else _OF_PLAN
+        left_out = () if spec is stages.PLAN_BLOCKS else _OF_PLAN
         return {name: given[name] for name in spec.options.model_fields if name in given and name not in left_out}
 
     def _hashes(self) -> Iterator[str]:
         """Yield the hash of each block's Gaussians; a block that is not trained is an error."""
         for block in self.plan().blocks:
-            manifest = self.variant(block.id).manifest(TRAIN_BLOCK)
+            manifest = self.variant(block.id).manifest(stages.TRAIN_BLOCK)
             if manifest is None:
                 command = f"georef blocks train {self.workspace.root} --id {block.id}"
-                raise MissingProductError(f"{FOLDER}/{block.id}/{BLOCK_GAUSSIANS}", command)
-            yield manifest.files[Path(BLOCK_GAUSSIANS).name].sha256
+                raise MissingProductError(f"{FOLDER}/{block.id}/{stages.BLOCK_GAUSSIANS}", command)
+            yield manifest.files[Path(stages.BLOCK_GAUSSIANS).name].sha256
 
     def run(
-        self, spec: StageSpec, number: int | None = None, *, force: bool = False, progress: Progress = SILENT
+        self, spec: stages.StageSpec, number: int | None = None, *, force: bool = False, progress: Progress = SILENT
     ) -> Outcome:
         """Run a part, unless it is current and not forced, and return its outcome; a GeorefError: it fails."""
         variant = self.variant(number)
@@ -108,7 +99,7 @@ class Parts:
         flags = self.flags(spec, number)
         return run_stage(variant, spec, flags, force=force, resume="if-same", progress=progress)
 
-    def why_missing(self, spec: StageSpec, number: int | None = None) -> str:
+    def why_missing(self, spec: stages.StageSpec, number: int | None = None) -> str:
         """Return why a part must run: it never has, or is stale or damaged; empty if it is current."""
         variant = self.variant(number)
         try:
@@ -124,7 +115,7 @@ class Parts:
 
     def is_merged(self) -> bool:
         """Return whether the merged model holds the blocks as they were last trained."""
-        record = self.workspace.root / BLOCK_RECORD
+        record = self.workspace.root / stages.BLOCK_RECORD
         if not record.is_file():
             return False
         try:
@@ -135,4 +126,4 @@ class Parts:
 
     def states(self, plan: BlockPlan) -> dict[int, str]:
         """Return by number of a block `trained`, or why it must be trained."""
-        return {block.id: self.why_missing(TRAIN_BLOCK, block.id) or "trained" for block in plan.blocks}
+        return {block.id: self.why_missing(stages.TRAIN_BLOCK, block.id) or "trained" for block in plan.blocks}

@@ -12,8 +12,6 @@ with the Gaussians that its views show (doi 10.48550/arXiv.2510.01767).
 3. The Gaussians of the whole are shared out among the points by their surface.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ In the training of a block its Gaussians outside the block stand in for the rest
 SfM model, the initial similarity and the solution. Writes `gaussians.ply` in `model`.
 """
 
-from __future__ import annotations
-
 from pipelines.core.stages import SOLUTION
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.splat.gaussians import write_gaussians

@@ -9,8 +9,6 @@ Reads the survey, the SfM model, the initial similarity, the plan, the solution,
 the blocks. Writes `<number>.ply` with the Gaussians of each cell. An interrupted run goes on at the next seam.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import combinations

@@ -4,8 +4,6 @@ The exposures follow from the colours that the photographs show at SfM points. R
 the adjustment. Writes `solution.json`.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -5,8 +5,6 @@ Each block is a command over the workspace whose repetition completes it. Finish
 ones continue from their checkpoints.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Sequence
 

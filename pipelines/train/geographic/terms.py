@@ -4,8 +4,6 @@
 other measurements, and control points through the rendered depth exist in training alone.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
