@@ -173,14 +173,17 @@ class SurfaceViews:
             rgb,
         )
 
-    def support(self, point_in_model: FloatArray, normal_in_model: FloatArray | None = None) -> Support:
+    def support(
+        self, point_in_model: FloatArray, normal_in_model: FloatArray | None = None, tolerance: float = SAME_SURFACE
+    ) -> Support:
         """Return how far the training views agree on points (N, 3); lengths in metres of `geo`.
 
-        Unit normals (N, 3) have an arbitrary sign; NaN: unknown.
+        Unit normals (N, 3) have an arbitrary sign; NaN: unknown. Depths of one surface agree within the tolerance,
+        a part of the depth.
         """
         geo_from_model = self._trained.geo_from_model
         up_in_model = geo_from_model.rotation.T @ [0.0, 0.0, 1.0]
-        found = support(point_in_model, self.depth_views(), up_in_model, SAME_SURFACE, normal_in_model)
+        found = support(point_in_model, self.depth_views(), up_in_model, tolerance, normal_in_model)
         return found.scaled(geo_from_model.scale)
 
     def depth_views(self) -> DepthViews:
