@@ -241,7 +241,11 @@ def test_mesh_of_a_trained_survey_lies_on_its_ground(
     values = run_stage(workspace, BY_NAME["export-mesh"], options).manifest.values
     assert {path.name for path in (root / "mesh").iterdir()} == {
         "manifest.json", "mesh.ply", "mesh.glb", "mesh.obj", "mesh.mtl", "mesh.png", "mesh_crs.ply",
-        *(f"{name}.georef.json" for name in ("mesh.ply", "mesh.glb", "mesh.obj", "mesh_crs.ply")),
+        *(
+            f"{name}{suffix}"
+            for name in ("mesh.ply", "mesh.glb", "mesh.obj", "mesh_crs.ply")
+            for suffix in (".georef.json", ".iso.xml")
+        ),
     }  # fmt: skip
     body = trimesh.load(workspace.path(MESH), force="mesh", process=False)
     assert body.is_watertight and len(body.faces) == values["faces"]
