@@ -27,7 +27,7 @@ from pipelines.formats.cloud_ply import CloudPlyWriter, CloudPoints
 from pipelines.formats.georef_sidecar import CrsSidecar, SceneSigma, median_sigma, write_sidecar
 from pipelines.formats.las import LazWriter
 from pipelines.surface.fusion import SurfaceCloud, fused_squares, fusion_settings
-from pipelines.surface.ground import Terrain
+from pipelines.surface.ground import GroundModel
 from pipelines.survey.area import Area, area_of
 from pipelines.survey.headline import headline_of
 from pipelines.survey.target_crs import TargetCrs, target_crs
@@ -92,7 +92,7 @@ def _points_in_crs(
     target: TargetCrs,
     crs_from_geo: FloatArray,
     grid: AccuracyGrid | None,
-    terrain: Terrain | None,
+    terrain: GroundModel | None,
 ) -> CloudPoints:
     """Return points in the CRS, with the covariance of the georeference and of the surface together.
 

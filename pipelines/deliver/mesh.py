@@ -11,7 +11,7 @@ import numpy as np
 from pipelines.core.errors import DegenerateGeometryError, ResourceError
 from pipelines.core.machine import free_main_memory_bytes
 from pipelines.core.stages import MESH, MESH_GLB
-from pipelines.core.types import BoolArray, FloatArray
+from pipelines.core.types import BoolArray, ByteArray, FloatArray
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import ExportMeshOptions
 from pipelines.deliver.placement import place
@@ -20,8 +20,8 @@ from pipelines.formats.georef_sidecar import MeshCrsSidecar, MeshFigures, MeshSi
 from pipelines.formats.mesh_files import write_mesh_glb, write_mesh_obj, write_mesh_ply
 from pipelines.surface.fusion import COARSEST, pixel_on_surface_m
 from pipelines.surface.mesh import closed, surface_mesh, vertex_normals, without_islands
-from pipelines.surface.texture import colours_of, textured
-from pipelines.surface.tsdf import GridSettings, occupied_cells
+from pipelines.surface.texture import TexturedMesh, colours_of, textured
+from pipelines.surface.tsdf import GridSettings, RawMesh, occupied_cells
 from pipelines.survey.area import area_of
 from pipelines.survey.headline import headline_of
 from pipelines.survey.target_crs import target_crs
@@ -87,17 +87,7 @@ def run(stage: StageRun, options: ExportMeshOptions) -> Summary:
         watertight=options.watertight,
     )
     sidecar = MeshSidecar(**dict(placement.sidecar()), mesh=figures)
-    ply, glb = folder / Path(MESH).name, folder / Path(MESH_GLB).name
-    write_mesh_ply(ply, mesh.vertices, mesh.faces, rgb, double=False)
-    extras = {"georef": sidecar.model_dump(mode="json", by_alias=True)}
-    with_texture = (shown.mesh.vertices, shown.mesh.faces, shown.uv, shown.image)
-    write_mesh_glb(glb, *with_texture, extras=extras)
-    files = [ply, glb]
-    if options.obj:
-        files.append(folder / "mesh.obj")
-        write_mesh_obj(files[-1], *with_texture)
-    for path in files:
-        write_sidecar(sidecar, path)
+    _write_in_frame(folder, mesh, rgb, shown, sidecar, obj=options.obj)
     if target is not None:
         xyz, path = target.xyz_from_geo(geo_from_file.apply(mesh.vertices)), folder / "mesh_crs.ply"
         write_mesh_ply(path, xyz, mesh.faces, rgb, double=True)
@@ -115,6 +105,22 @@ def run(stage: StageRun, options: ExportMeshOptions) -> Summary:
     key = f"{len(mesh.faces)} faces of {simple.faces_before}, voxels of {voxel_m:.3f} m, simplified by "
     key += f"{simple.rms_error_m:.3f} m RMS, {simple.largest_error_m:.3f} m at most"
     return Summary(key, values, cautions=placement.cautions)
+
+
+def _write_in_frame(
+    folder: Path, mesh: RawMesh, rgb: ByteArray, shown: TexturedMesh, sidecar: MeshSidecar, *, obj: bool
+) -> None:
+    """Write the files in the frame of the sidecar, which comes beside each."""
+    files = [folder / Path(MESH).name, folder / Path(MESH_GLB).name]
+    write_mesh_ply(files[0], mesh.vertices, mesh.faces, rgb, double=False)
+    extras = {"georef": sidecar.model_dump(mode="json", by_alias=True)}
+    with_texture = (shown.mesh.vertices, shown.mesh.faces, shown.uv, shown.image)
+    write_mesh_glb(files[1], *with_texture, extras=extras)
+    if obj:
+        files.append(folder / "mesh.obj")
+        write_mesh_obj(files[2], *with_texture)
+    for path in files:
+        write_sidecar(sidecar, path)
 
 
 def _require_memory(cells: int, voxel_m: float) -> None:

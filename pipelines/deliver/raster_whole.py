@@ -11,7 +11,7 @@ from pipelines.core.types import BoolArray, ByteArray, FloatArray
 from pipelines.deliver.raster_window import RasterSource, georeference_sigma, places_in_geo
 from pipelines.formats.geotiff import RasterFrame
 from pipelines.surface.filling import FilledCells, fill_cells
-from pipelines.surface.ground import Terrain
+from pipelines.surface.ground import GroundModel
 
 MEASURED, INTERPOLATED = 255, 128  # in `measured.tif`; 0: outside the area, or unknown
 # A hole is filled cell by cell up to `_NARROW` cells from its rim, and beyond `REACH` by a coarse raster of the
@@ -111,7 +111,7 @@ def whole_cells(
     }
 
 
-def _ground(source: RasterSource, terrain: Terrain, seen: SeenCells) -> tuple[FloatArray, FloatArray]:
+def _ground(source: RasterSource, terrain: GroundModel, seen: SeenCells) -> tuple[FloatArray, FloatArray]:
     """Return heights (H, W) of the ground in the CRS, and their variance in m² where it is not the surface; else 0.
 
     Where the surface is the ground, its cells are taken over. Elsewhere the terrain is, shifted by what the ground

@@ -19,7 +19,7 @@ from pipelines.formats.geotiff import RasterFrame
 from pipelines.geometry.similarity import Similarity
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.orthographic import PlanSplats, render_orthographic
-from pipelines.surface.ground import Terrain
+from pipelines.surface.ground import GroundModel
 from pipelines.surface.surface_views import SurfaceViews
 from pipelines.survey.area import Area
 from pipelines.survey.target_crs import TargetCrs
@@ -59,7 +59,7 @@ class RasterSource:
     geo_from_model: Similarity
     target: TargetCrs
     sigma: AccuracyGrid | None
-    terrain: Terrain | None
+    terrain: GroundModel | None
     training_px: float
     training_gsd_m: float
     min_views: int

@@ -25,7 +25,7 @@ from pipelines.survey.block_plan import BlockRecord
 from pipelines.survey.calibrated import load_survey
 from pipelines.survey.headline import headline_of
 from pipelines.survey.trained_model import TrainedModel
-from pipelines.survey.trained_survey import load_solved
+from pipelines.survey.trained_survey import load_cameras
 
 
 @dataclass(frozen=True)
@@ -43,13 +43,13 @@ class Crop:
 
 
 def crop_of(workspace: Workspace, options: SplatOptions) -> Crop | None:
-    """Return the crop that the options ask for; None: none. Errors as of `load_solved` and `area_of`.
+    """Return the crop that the options ask for; None: none. Errors as of `load_cameras` and `area_of`.
 
     The sky is what lies higher than all cameras.
     """
     if not options.crop and options.boundary is None:
         return None
-    solved = load_solved(workspace)
+    solved = load_cameras(workspace)
     cameras = solved.geo_from_model.apply(solved.poses.cam_center_in_model)
     sky_m = float(cameras[:, 2].max()) if options.keep_sky else np.inf
     return Crop(area_of(options, solved), solved.geo_from_model, sky_m)

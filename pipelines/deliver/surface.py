@@ -15,7 +15,7 @@ from pipelines.core.workspace import StageRun, Workspace
 from pipelines.deliver.options import TerrainOptions
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.fusion import fused_squares, fusion_settings
-from pipelines.surface.ground import Terrain, terrain_of
+from pipelines.surface.ground import GroundModel, terrain_of
 from pipelines.surface.surface_views import ModelRenderer, SurfaceViews
 from pipelines.survey.area import Area
 from pipelines.survey.scene import photographs
@@ -37,7 +37,7 @@ def surface_views(stage: StageRun, trained: TrainedSurvey, *, colours: bool = Fa
 
 def ground_below(
     views: SurfaceViews, trained: TrainedSurvey, area: Area, options: TerrainOptions, progress: Progress
-) -> tuple[Terrain | None, tuple[Remark, ...]]:
+) -> tuple[GroundModel | None, tuple[Remark, ...]]:
     """Return the ground in and around the area, of views with colours; None, with a warning, if it is not known."""
     if not options.terrain:
         return None, ()
@@ -47,7 +47,10 @@ def ground_below(
     try:
         settings = fusion_settings(views, trained.geo_from_model, _GROUND_VIEWS)
         settings = replace(settings, spacing_m=_GROUND_SPACINGS * settings.spacing_m)
-        cloud = joined_rows(list(fused_squares(views, trained.geo_from_model, settings, progress)))
+        squares = list(fused_squares(views, trained.geo_from_model, settings, progress))
+        if not squares:  # no view shows the surface closely: what is made of it says so
+            return None, ()
+        cloud = joined_rows(squares)
         west, south, east, north = area.polygon.buffer(_AROUND_M).bounds
         plan = cloud.position[:, :2]
         inside = ((plan >= (west, south)) & (plan <= (east, north))).all(axis=1)

@@ -20,6 +20,7 @@ A weak prior keeps each exposure near the identity where a photograph has too fe
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -34,6 +35,7 @@ from pipelines.robust.statistics import cauchy_weight, median_chi2
 
 _FIRST_RATE, _LAST_RATE = 5e-3, 5e-4
 VIGNETTING_TERMS = 3  # of r², r⁴, r⁶
+_KEPT_RADII = 8  # sizes of cameras and of their crops
 _BETA1, _BETA2, _EPS = 0.9, 0.999, 1e-15
 
 
@@ -161,22 +163,23 @@ def with_vignetting(colour: Tensor, radius2: Tensor, coefficients: Tensor) -> Te
     return colour * (1.0 + factor)[..., None]
 
 
+@lru_cache(maxsize=_KEPT_RADII)
 def squared_radius(camera: Pinhole, whole: Pinhole, device: torch.device) -> Tensor:
     """Return the squared distance (H, W) of a view's pixels from the optical axis; 1 in the furthest corner.
 
-    The camera shows a part of the whole view, at the same focal length.
+    The camera shows a part of the whole view, at the same focal length. All views of a camera share the tensor: it
+    is read only.
     """
 
-    def squared(edges: Pinhole, x: np.ndarray, y: np.ndarray) -> FloatArray:
-        return np.asarray(((x - edges.cx) / edges.fx) ** 2 + ((y - edges.cy) / edges.fy) ** 2)
+    def squared(of: Pinhole, x: Tensor, y: Tensor) -> Tensor:
+        return ((x - of.cx) / of.fx) ** 2 + ((y - of.cy) / of.fy) ** 2
 
-    corner_x, corner_y = (
-        np.array([0.0, whole.width, 0.0, whole.width]),
-        np.array([0.0, 0.0, whole.height, whole.height]),
-    )
-    longest = squared(whole, corner_x, corner_y).max()
-    x, y = np.arange(0.5, camera.width), np.arange(0.5, camera.height)
-    return torch.from_numpy((squared(camera, x, y[:, None]) / longest).astype(np.float32)).to(device)
+    def along(*places: float) -> Tensor:
+        return torch.tensor(places, dtype=torch.float64, device=device)
+
+    x, y = (torch.arange(side, dtype=torch.float64, device=device) + 0.5 for side in (camera.width, camera.height))
+    corners = squared(whole, along(0.0, whole.width), along(0.0, whole.height)[:, None])
+    return (squared(camera, x, y[:, None]) / corners.max()).float()
 
 
 def fitted_affine(rendered: Tensor, photograph: Tensor, mask: Tensor | None = None) -> Tensor:

@@ -30,7 +30,7 @@ _MOST_KNOTS = 2_000_000
 
 
 @dataclass(frozen=True)
-class Terrain:
+class GroundModel:
     """Ground over a grid in plan of `geo`: rows from the south, columns from the west.
 
     Attributes:
@@ -72,7 +72,7 @@ class Terrain:
         return np.interp(gap_m, *self.bend) + np.where(gap_m > 0, self.limit_m**2 / 3, 0.0)
 
 
-def terrain_of(points: FloatArray, normal: FloatArray, spacing_m: float) -> Terrain:
+def terrain_of(points: FloatArray, normal: FloatArray, spacing_m: float) -> GroundModel:
     """Return the ground of a surface's points (N, 3) and normals (N, 3) in `geo`, about one a `spacing_m`.
 
     Walls hold the cloth up: points on what is steep take no part, nor do cells in which something stands.
@@ -105,14 +105,14 @@ def terrain_of(points: FloatArray, normal: FloatArray, spacing_m: float) -> Terr
         raise no_ground
     ground, cell, known = points[on_cloth], cell[on_cloth], np.flatnonzero(is_known)
     mean = np.column_stack([np.bincount(cell, axis, rows * columns)[known] / count[known] for axis in ground.T])
-    terrain = Terrain(low, cell_m, np.zeros((rows, columns)), np.zeros((rows, columns)), limit_m, (low, low))
+    terrain = GroundModel(low, cell_m, np.zeros((rows, columns)), np.zeros((rows, columns)), limit_m, (low, low))
     middle = terrain.nodes()[:, :2]
     height = LinearNDInterpolator(mean[:, :2], mean[:, 2])(middle)
     outside = ~np.isfinite(height)
     height[outside] = NearestNDInterpolator(mean[:, :2], mean[:, 2])(middle[outside])
     height, is_known = height.reshape(rows, columns), is_known.reshape(rows, columns)
     gap_m = cell_m * distance_transform_edt(~is_known)
-    return Terrain(low, cell_m, height, gap_m, limit_m, _bend(np.where(is_known, height, np.nan), cell_m))
+    return GroundModel(low, cell_m, height, gap_m, limit_m, _bend(np.where(is_known, height, np.nan), cell_m))
 
 
 def _on_cloth(points: FloatArray, knot_m: float, limit_m: float) -> IntArray:

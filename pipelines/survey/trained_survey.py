@@ -78,8 +78,13 @@ def load_solved(workspace: Workspace, similarity: Literal["trained", "initial"] 
         MissingProductError: a product does not exist.
         InputError: a product is damaged, or cameras or lenses of the solution are not those of `sfm`.
     """
+    return (load_trained if workspace.has(MODEL) else load_cameras)(workspace, similarity)
+
+
+def load_cameras(workspace: Workspace, similarity: Literal["trained", "initial"] = "trained") -> SolvedSurvey:
+    """As `load_solved`, without any Gaussians, which may be larger than the memory."""
     if workspace.has(MODEL):
-        return load_trained(workspace, similarity)
+        return SolvedSurvey(*_loaded(workspace, TrainedModel, MODEL, similarity, "train again"))
     advice = "run `georef init-sim3` again"
     return SolvedSurvey(*_loaded(workspace, Adjustment, ADJUSTMENT, similarity, advice))
 

@@ -7,12 +7,14 @@ from pathlib import Path
 
 import pytest
 
+from georef_cli.commands.run import LATER
 from pipelines.core.errors import ConvergenceError
 from pipelines.core.machine import chosen_threads, thread_count
 from pipelines.core.options import read_requests
 from pipelines.core.products import Remark
 from pipelines.core.stages import BY_NAME, PIPELINE, stage_slice
 from pipelines.core.workspace import StageRun, Summary, Workspace
+from pipelines.survey.options import AreaOptions
 from tests import fakes
 from tests.cli_runs import Georef
 
@@ -329,3 +331,9 @@ class TestTalk:
         assert "warning: [i]w[/i]" in again
         assert "[bold]a" in again
         assert "[red]48[/red]" in georef("status", done).out
+
+
+def test_run_hands_a_boundary_to_every_stage_that_ends_at_it() -> None:
+    assert set(LATER["boundary"]) == {
+        name for name, spec in BY_NAME.items() if issubclass(spec.options, AreaOptions)
+    }

@@ -7,7 +7,7 @@ import pytest
 
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.surface.filling import fill_cells
-from pipelines.surface.ground import Terrain, terrain_of
+from pipelines.surface.ground import GroundModel, terrain_of
 from tests.refusals import refused
 
 SPACING_M, SIZE_M, NOISE_M = 0.25, 60.0, 0.02
@@ -43,19 +43,21 @@ def town(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def terrain() -> tuple[Terrain, np.ndarray, np.ndarray]:
+def terrain() -> tuple[GroundModel, np.ndarray, np.ndarray]:
     points, normal, on_ground = town(np.random.default_rng(0))
     return terrain_of(points, normal, SPACING_M), points, on_ground
 
 
-def test_ground_is_told_from_what_stands_on_it(terrain: tuple[Terrain, np.ndarray, np.ndarray]) -> None:
+def test_ground_is_told_from_what_stands_on_it(terrain: tuple[GroundModel, np.ndarray, np.ndarray]) -> None:
     found, points, on_ground = terrain
     told = found.is_ground(points)
     assert (on_ground & ~told).sum() < 0.05 * on_ground.sum()  # errors of type I
     assert (told & ~on_ground).sum() < 0.05 * (~on_ground).sum()  # and of type II
 
 
-def test_ground_is_where_it_is_and_its_sigma_says_how_well(terrain: tuple[Terrain, np.ndarray, np.ndarray]) -> None:
+def test_ground_is_where_it_is_and_its_sigma_says_how_well(
+    terrain: tuple[GroundModel, np.ndarray, np.ndarray],
+) -> None:
     """Open ground to the noise of a cell's mean and the bend of a metre; below houses to 0.15 m, as by its σ."""
     found, points, on_ground = terrain
     plan = points[:, :2]
