@@ -21,6 +21,7 @@ A weak prior keeps each exposure near the identity where a photograph has too fe
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import torch
@@ -171,15 +172,13 @@ def squared_radius(camera: Pinhole, whole: Pinhole, device: torch.device) -> Ten
     is read only.
     """
 
-    def squared(of: Pinhole, x: Tensor, y: Tensor) -> Tensor:
+    def squared(of: Pinhole, x: Any, y: Any) -> Any:
         return ((x - of.cx) / of.fx) ** 2 + ((y - of.cy) / of.fy) ** 2
 
-    def along(*places: float) -> Tensor:
-        return torch.tensor(places, dtype=torch.float64, device=device)
-
+    furthest = max(squared(whole, x, y) for x in (0.0, whole.width) for y in (0.0, whole.height))
     x, y = (torch.arange(side, dtype=torch.float64, device=device) + 0.5 for side in (camera.width, camera.height))
-    corners = squared(whole, along(0.0, whole.width), along(0.0, whole.height)[:, None])
-    return (squared(camera, x, y[:, None]) / corners.max()).float()
+    radius2: Tensor = squared(camera, x, y[:, None]) / furthest
+    return radius2.float()
 
 
 def fitted_affine(rendered: Tensor, photograph: Tensor, mask: Tensor | None = None) -> Tensor:
