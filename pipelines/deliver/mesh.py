@@ -113,9 +113,8 @@ def _write_in_frame(
     """Write the files in the frame of the sidecar, which comes beside each."""
     files = [folder / Path(MESH).name, folder / Path(MESH_GLB).name]
     write_mesh_ply(files[0], mesh.vertices, mesh.faces, rgb, double=False)
-    extras = {"georef": sidecar.model_dump(mode="json", by_alias=True)}
     with_texture = (shown.mesh.vertices, shown.mesh.faces, shown.uv, shown.image)
-    write_mesh_glb(files[1], *with_texture, extras=extras)
+    write_mesh_glb(files[1], *with_texture, extras={"georef": sidecar.model_dump(mode="json", by_alias=True)})
     if obj:
         files.append(folder / "mesh.obj")
         write_mesh_obj(files[2], *with_texture)
