@@ -14,8 +14,9 @@ evenly: `off` is the mean distance of the file's points from the true surface, a
 that are off by 0.1 m at most; `missing` and `recall` are the same the other way round, of the true surface that
 three photographs see. Chamfer is the mean of both distances, F1 the harmonic mean of both shares.
 
-Of the terrain, cells are compared with the true ground: open, and below houses, trees and cars. Errors of type I
-are ground points of the cloud that are not told as such, errors of type II others that are.
+Of the terrain, cells are compared with the true ground: open, below the edges (the outer metre) of houses, trees and
+cars, and below these as a whole. Errors of type I are ground points of the cloud that are not told as such, errors
+of type II others that are.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ import laspy
 import numpy as np
 import rasterio
 from plyfile import PlyData
+from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
 
 from pipelines.core.products import load_json
@@ -75,6 +77,7 @@ class TrueSurface:
 
 
 _OPEN_M, _GROUND_M = 0.05, 0.5  # above the ground: of open ground, and of points that are none
+_EDGE_M = 1.0
 _NEAR_M = 0.1  # of F1
 _PER_M2, _BESIDE_M = 30.0, 0.25  # points on the true surface, and how far beside each other points are one place
 _DRAWN, _TARGETS, _SEEN_BY = 400_000, 30_000, 3
@@ -173,9 +176,12 @@ def compare_ground(workspace: Path, options: SimulateOptions) -> None:
             row, column = np.nonzero(heights.read_masks(1))
             xy = np.column_stack(rasterio.transform.xy(heights.transform, row, column))
             height, sigma = (raster.read(1)[row, column].astype(float) for raster in (heights, sigmas))
+            grid, cell_m = np.zeros(heights.shape, dtype=bool), heights.transform.a
         ground, top = TrueSurface(options, crs, ground=True).at(xy)[0], TrueSurface(options, crs).at(xy)[0]
         error, is_open = height - ground, top - ground < _OPEN_M
-        for name, chosen in (("open ground", is_open), ("below things", ~is_open)):
+        grid[row, column] = is_open
+        at_edge = ~is_open & (cell_m * distance_transform_edt(~grid)[row, column] <= _EDGE_M)
+        for name, chosen in (("open ground", is_open), ("below edges", at_edge), ("below things", ~is_open)):
             e, z = error[chosen & np.isfinite(error)], (error / sigma)[chosen & np.isfinite(error)]
             print(
                 f"terrain, {name:14s}{len(e):9d} cells, bias {np.median(e):+.3f}, "

@@ -98,6 +98,20 @@ LIBRARIES = {
         "3a6eb8ba35cf4cbc26212a64d6d4b004c1f8ac57bcb33607ee9425f0f7ce36fa",
         "Build/Cesium",
     ),
+    "Babylon": Library(
+        "babylonjs",
+        "9.35.0",
+        "462245a71cd1c77af7da44d4e5fa2dcade15193084ba40db50fa87ca7ffb16ea"
+        "21dd18deb83792f74619bbfcba808666209a7c2000024f4ec01bddff721ca7a4",
+        ".",
+    ),
+    "BabylonLoaders": Library(
+        "babylonjs-loaders",
+        "9.28.0",
+        "15d6bbd09da39ff4493385c2b90be4815c0ba8bba8b9f481793890b645418ce3"
+        "263b774d01b4b0d4fd35b4c011fc0e04b24d205289bf41626357a8a372c84c87",
+        ".",
+    ),
     "SuperSplat": Library(
         "@playcanvas/supersplat-viewer",
         "1.36.2",
