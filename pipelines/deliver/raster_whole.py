@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
 from pipelines.core.types import BoolArray, ByteArray, FloatArray
-from pipelines.deliver.raster_window import RasterSource, georeference_sigma, places_in_geo
+from pipelines.deliver.raster_window import RasterSource, between_nodes, georeference_sigma, places_in_geo
 from pipelines.formats.geotiff import RasterFrame
 from pipelines.surface.filling import FilledCells, fill_cells
 from pipelines.surface.ground import GroundModel
@@ -117,19 +117,23 @@ def _ground(source: RasterSource, terrain: GroundModel, seen: SeenCells) -> tupl
     Where the surface is the ground, its cells are taken over. Elsewhere the terrain is, shifted by what the ground
     around lies above it.
     """
-    rows, columns = seen.height.shape
-    column, row = np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5)
+    # Twice as dense as the terrain's own cells.
+    every = max(int(terrain.cell_m / (2 * seen.frame.step_x * source.target.horizontal_unit_m)), 1)
+    nodes = tuple(np.linspace(0, size, size // every + 2) for size in seen.height.shape)
+    row, column = np.meshgrid(*nodes, indexing="ij")
     level = source.terrain_level
     cell = np.column_stack([column.ravel(), row.ravel()])
     plan = places_in_geo(source, seen.frame, cell, np.full(len(cell), np.median(level)))[:, :2]
-    height = terrain.interpolated(level, plan).reshape(rows, columns)
-    gap_m = terrain.interpolated(terrain.gap_m, plan).reshape(rows, columns)
+    height, gap_m = (
+        between_nodes(terrain.interpolated(values, plan).reshape(row.shape), nodes, seen.height.shape)
+        for values in (level, terrain.gap_m)
+    )
     above = seen.height - height
     with np.errstate(invalid="ignore"):
         is_ground = np.abs(above) * source.target.crs.height_unit_m <= terrain.limit_m
     # On the rim of what stands there, cells have mixed heights.
     is_ground &= ~binary_dilation(np.isfinite(above) & ~is_ground, iterations=_RIM)
-    around = fill_cells(np.where(is_ground, above, np.nan), seen.inside, REACH)
+    around = fill_cells(np.where(is_ground, above, np.nan), seen.inside, REACH, with_sigma=False)
     share = np.clip(1.0 - around.distance / REACH, 0.0, 1.0)
     height = height + np.where(np.isfinite(around.height), share * around.height, 0.0)
     variance_m2 = terrain.bridged_variance(np.maximum(gap_m, terrain.cell_m / 2))

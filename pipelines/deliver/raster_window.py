@@ -279,17 +279,22 @@ def georeference_sigma(
     """Return σ_H and σ_V (H, W) of the georeference in metres; NaN: not known."""
     if source.sigma is None or not np.isfinite(height).any():
         return np.full(height.shape, np.nan), np.full(height.shape, np.nan)
-    columns, rows = (np.linspace(0, size, size // _NODE_PX + 2) for size in (frame.columns, frame.rows))
+    rows, columns = (np.linspace(0, size, size // _NODE_PX + 2) for size in height.shape)
     cell = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
     in_geo = places_in_geo(source, frame, cell, np.full(len(cell), np.nanmedian(height)))
     sigma = np.sqrt(np.diagonal(source.sigma.cov_at(in_geo), axis1=1, axis2=2))
-    shape = (len(rows), len(columns))
-    spread = _spread(rows, frame.rows), _spread(columns, frame.columns)
-    horizontal, vertical = np.hypot(sigma[:, 0], sigma[:, 1]).reshape(shape), sigma[:, 2].reshape(shape)
-    return spread[0] @ horizontal @ spread[1].T, spread[0] @ vertical @ spread[1].T
+    horizontal, vertical = (
+        between_nodes(values.reshape(len(rows), len(columns)), (rows, columns), height.shape)
+        for values in (np.hypot(sigma[:, 0], sigma[:, 1]), sigma[:, 2])
+    )
+    return horizontal, vertical
 
 
-def _spread(nodes: FloatArray, cells: int) -> FloatArray:
-    """Return the weights (cells, nodes) that interpolate linearly from nodes to the middles of cells."""
-    middle = np.arange(cells) + 0.5
-    return np.stack([np.interp(middle, nodes, unit) for unit in np.eye(len(nodes))], axis=1)
+def between_nodes(values: FloatArray, nodes: tuple[FloatArray, ...], shape: tuple[int, ...]) -> FloatArray:
+    """Return values in the middles of cells, linearly between those (R, C) of nodes at rows (R,), columns (C,)."""
+    for axis, (place, size) in enumerate(zip(nodes, shape, strict=True)):
+        at = np.interp(np.arange(size) + 0.5, place, np.arange(len(place)))
+        low = np.minimum(at.astype(np.int64), len(place) - 2)
+        share = (at - low)[:, None] if axis == 0 else at - low
+        values = (1 - share) * values.take(low, axis) + share * values.take(low + 1, axis)
+    return values

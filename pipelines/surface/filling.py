@@ -6,9 +6,10 @@ as in the maps of LiDAR. On simulated flights the median error is a third of tha
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numba import prange
-from scipy.ndimage import gaussian_filter, uniform_filter
+from numpy.typing import NDArray
 
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.splat.kernel_cache import kernel
@@ -21,6 +22,7 @@ _FAR = 24.0  # cells from the nearest measured one
 _SOURCES = 0.25  # of the range of the heights around, by which one whose colour is taken may lie above the filled
 # Cells around one whose scatter counts in its σ: on the edge of a roof, a cell decides between storeys.
 _AROUND = 15
+_REFLECTED = cv2.BORDER_REFLECT
 
 
 @dataclass(frozen=True)
@@ -41,14 +43,19 @@ class FilledCells:
 
 
 def fill_cells(
-    height: FloatArray, wanted: BoolArray, reach: int, modelled: FloatArray | None = None
+    height: FloatArray,
+    wanted: BoolArray,
+    reach: int,
+    modelled: FloatArray | None = None,
+    *,
+    with_sigma: bool = True,
 ) -> FilledCells:
     """Return heights (H, W), NaN where none was measured, filled where wanted from at most `reach` cells away.
 
     1. A cell looks in sixteen directions for the first measured height; the low quantile of these is its own.
     2. Its variance is the mean square of their differences from it, plus the variance of all heights nearby, those
        that a model knows (H, W) included, plus, for the share of directions that found nothing, what heights differ
-       by at that distance.
+       by at that distance. Without σ, that of the result is 0.
     """
     height = np.ascontiguousarray(height, dtype=np.float64)
     empty = wanted & ~np.isfinite(height)
@@ -65,17 +72,27 @@ def fill_cells(
     close, far = _smoothed(filled, _SMOOTHED)[rows, columns], _smoothed(filled, _SMOOTHED_FAR)[rows, columns]
     share = np.clip(near / _FAR, 0.0, 1.0)
     filled[rows, columns] = np.where(found, (1 - share) * close + share * far, np.nan)
-    relief = filled if modelled is None else np.where(empty & np.isfinite(modelled), modelled, filled)
-    variance = square + _scatter(relief)[rows, columns] + missing * np.interp(near, *_variogram(height))
-    sigma[rows, columns], distance[rows, columns] = np.sqrt(variance), near
+    distance[rows, columns] = near
+    if with_sigma:
+        relief = filled if modelled is None else np.where(empty & np.isfinite(modelled), modelled, filled)
+        variance = square + _scatter(relief)[rows, columns] + missing * np.interp(near, *_variogram(height))
+        sigma[rows, columns] = np.sqrt(variance)
     own[rows, columns] = np.where(found, source, own[rows, columns])
     return FilledCells(filled, sigma, distance, own)
 
 
 def _smoothed(height: FloatArray, cells: float) -> FloatArray:
+    known, middle, above = _above_middle(height)
+    size = (2 * int(4 * cells + 0.5) + 1,) * 2
+    weight, total = (cv2.GaussianBlur(values, size, cells, borderType=_REFLECTED) for values in (known, above))
+    return np.asarray(middle + total / np.maximum(weight, 1e-9), dtype=np.float64)
+
+
+def _above_middle(height: FloatArray) -> tuple[NDArray[np.float32], float, NDArray[np.float32]]:
+    """Return 1 where a height is known (H, W), the median, and heights above it (H, W), 0 where not known."""
     known = np.isfinite(height)
-    weight = gaussian_filter(known.astype(np.float64), cells)
-    return np.asarray(gaussian_filter(np.where(known, height, 0.0), cells) / np.maximum(weight, 1e-9))
+    middle = float(np.median(height[known])) if known.any() else 0.0
+    return known.astype(np.float32), middle, np.where(known, height - middle, 0.0).astype(np.float32)
 
 
 def _variogram(height: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -93,10 +110,11 @@ def _variogram(height: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _scatter(height: FloatArray) -> FloatArray:
     """Return the variance (H, W) of the known heights around each cell; 0: there are none."""
-    known = np.isfinite(height)
-    middle = float(np.median(height[known])) if known.any() else 0.0
-    above = np.where(known, height - middle, 0.0)
-    share, mean, square = (uniform_filter(values, 2 * _AROUND + 1) for values in (known * 1.0, above, above**2))
+    known, _, above = _above_middle(height)
+    size = (2 * _AROUND + 1,) * 2
+    share, mean, square = (
+        cv2.boxFilter(values, cv2.CV_64F, size, borderType=_REFLECTED) for values in (known, above, above**2)
+    )
     share = np.maximum(share, 1e-6)
     return np.asarray(np.maximum(square / share - (mean / share) ** 2, 0.0))
 
