@@ -18,7 +18,10 @@ from pipelines.view.options import ViewOptions
 
 
 def _view(ctx: click.Context, workspace: Workspace, open_page: bool, as_json: bool, **_values: Any) -> None:
-    from pipelines.view.viewer import serve
+    from pipelines.core.extras import require
+
+    require("viewer")
+    from pipelines.view.server import serve
 
     must_exist(workspace)
     flags = options.given(ctx, ViewOptions.model_fields)

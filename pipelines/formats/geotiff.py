@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.core.files import replace_file
-from pipelines.core.types import BoolArray
+from pipelines.core.types import BoolArray, FloatArray
 
 NODATA = -9999.0
 _CACHE_BYTES = 256 * 1024 * 1024
@@ -149,6 +149,17 @@ def read_cells(path: Path, part: tuple[slice, slice] | None = None) -> NDArray[A
     with rasterio.open(path) as raster:
         values = raster.read(window=None if part is None else Window.from_slices(*part))
     return np.where(values == NODATA, np.nan, values) if values.dtype.kind == "f" else np.asarray(values)
+
+
+def sampled_raster(path: Path, xy: FloatArray) -> FloatArray:
+    """Return the values (N,) of a raster's first band at places (N, 2) in its CRS; NaN: none, or no such file."""
+    import rasterio
+
+    if not path.is_file():
+        return np.full(len(xy), np.nan)
+    with rasterio.open(path) as raster:
+        values = np.array([value[0] for value in raster.sample(xy)], dtype=np.float64)
+    return np.where(values == NODATA, np.nan, values)
 
 
 def cells_inside(polygon: Any, frame: RasterFrame) -> BoolArray:

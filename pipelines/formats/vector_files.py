@@ -4,6 +4,7 @@ GeoJSON (RFC 7946) has longitude and latitude in WGS84 degrees, outer rings anti
 Contours are a line a height, with the height as attribute and as z.
 """
 
+import io
 import json
 import math
 import struct
@@ -26,6 +27,7 @@ from pipelines.geometry.footprints import clipped_ring, ring_area
 
 Json = dict[str, Any]
 _DECIMALS = 8  # of a degree: 1 mm
+_MOST_CONTOUR_BYTES = 1 << 30
 _LINE_STRING_Z = 1002  # OGC 06-103r4, table 8
 _MINOR, _MAJOR = "CONTOURS", "CONTOURS_MAJOR"
 
@@ -115,6 +117,56 @@ def write_contours_gpkg(path: Path, lines: Sequence[ContourLine], wkt: str) -> N
     replace_file(draft, path)
 
 
+def write_features_gpkg(path: Path, layers: Mapping[str, Sequence[Json]]) -> None:
+    """Write features of GeoJSON as a GeoPackage 1.2 in WGS84 with heights, a layer for each kind of geometry.
+
+    Properties are numbers, texts, or None.
+    """
+    import pyogrio
+
+    draft = path.with_name(f".{path.name}")
+    draft.unlink(missing_ok=True)
+    for number, (layer, features) in enumerate(layers.items()):
+        names = list(dict.fromkeys(name for one in features for name in one["properties"]))
+        columns = [[one["properties"].get(name) for one in features] for name in names]
+        is_text = [any(isinstance(value, str) for value in column) for column in columns]
+        shapes = [shapely.from_geojson(json.dumps(one["geometry"])) for one in features]
+        pyogrio.raw.write(
+            draft,
+            geometry=np.array(shapely.to_wkb(shapes, output_dimension=3), dtype=object),
+            field_data=[
+                np.array(column, dtype=object if text else np.float64)
+                for column, text in zip(columns, is_text, strict=True)
+            ],
+            fields=names,
+            layer=layer,
+            driver="GPKG",
+            geometry_type=f"{shapes[0].geom_type} Z",
+            append=number > 0,
+            dataset_options={"VERSION": "1.2"} if number == 0 else None,
+            crs="EPSG:4979",
+        )
+    replace_file(draft, path)
+
+
+def read_contours(path: Path) -> tuple[str, list[ContourLine]]:
+    """Return the CRS as WKT and the lines of a file that `write_contours_gpkg` wrote; an InputError: damaged."""
+    import pyogrio
+    from pyogrio.errors import DataLayerError, DataSourceError
+
+    file_size(path, limit_bytes=_MOST_CONTOUR_BYTES, kind="contours")
+    try:
+        meta, _, shapes, (height, major) = pyogrio.raw.read(path, layer="contours", columns=["height", "major"])
+        lines = [
+            ContourLine(float(h), shapely.get_coordinates(shapely.from_wkb(shape)), bool(m))
+            for shape, h, m in zip(shapes, height, major, strict=True)
+        ]
+    except (DataSourceError, DataLayerError, ValueError, OSError) as error:
+        message = f"cannot be read: {error}. Write it again with `georef export-raster --contours`."
+        raise InputError("contours-unreadable", message, path=path) from error
+    return meta["crs"], lines
+
+
 def write_contours_dxf(path: Path, lines: Sequence[ContourLine]) -> None:
     """Write contour lines as DXF (R2010) polylines with their height as elevation, every fifth on its own layer."""
     from ezdxf.filemanagement import new
@@ -130,6 +182,19 @@ def write_contours_dxf(path: Path, lines: Sequence[ContourLine]) -> None:
     draft = path.with_name(path.name + ".tmp")
     document.saveas(draft)
     replace_file(draft, path)
+
+
+def drawing(lines: Sequence[tuple[str, int, FloatArray]]) -> bytes:
+    """Return lines as a DXF (R2010): the layer of each, its colour by AutoCAD's index, and places (K, 2)."""
+    from ezdxf.filemanagement import new
+
+    document, text = new("R2010"), io.StringIO()
+    for layer, colour, places in lines:
+        if layer not in document.layers:
+            document.layers.add(layer, color=colour)
+        document.modelspace().add_lwpolyline(places.tolist(), dxfattribs={"layer": layer})
+    document.write(text)
+    return text.getvalue().encode(document.output_encoding, errors="replace")
 
 
 _MOST_BOUNDARY_BYTES = 64 * 1024 * 1024

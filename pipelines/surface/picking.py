@@ -21,7 +21,7 @@ from pipelines.survey.trained_survey import TrainedSurvey
 
 REACH_PX = 1  # around the pixel of a mark
 LEAST_VIEWS = 2  # that must show a point
-_EDGE_STEP = 0.04  # of the depth; on ground seen under 30° the depth changes by 0.6 % within the reach
+EDGE_STEP = 0.04  # of the depth; on ground seen under 30° the depth changes by 0.6 % within the reach
 _SAME_SURFACE = 0.01  # of the depth: largest difference between pixels of one surface
 
 
@@ -68,7 +68,7 @@ class DepthMap:
     def is_at_edge(self, xy: FloatArray) -> bool:
         """Return whether the depth around a ray (2,) changes by more than on a slope."""
         around = self.around(*self._pixel(xy))
-        return bool(around.size == 0 or around.max() > (1 + _EDGE_STEP) * around.min())
+        return bool(around.size == 0 or around.max() > (1 + EDGE_STEP) * around.min())
 
     def _pixel(self, xy: FloatArray) -> tuple[float, float]:
         camera = self.pinhole
@@ -130,11 +130,11 @@ def _counted_hits(
     return rows[counted], position[counted]
 
 
-_MOST_VIEWS = 12  # that read a point: the most detailed of those that hold its place
+MOST_VIEWS = 12  # that read a point: the most detailed of those that hold its place
 _WINDOW_PX = 8  # around the first guess, to each side
 _AROUND = 0.04  # of the depth: a view that differs more looks at something before or behind the point
 _AGREEMENT = 0.01  # of the depth, between the views of one surface (`surface.surface_views.SAME_SURFACE`)
-_MOST_THROUGH = 0.5  # of the number of views that agree
+MOST_THROUGH = 0.5  # of the number of views that agree
 _SIGMA_PX = 0.15  # of a view's surface across its rays; calibrated by simulated flights (docs/deliverables.md)
 _STEPS, _NEAR = 12, 1e-6  # of the search along a line, and the step that ends it, as a part of the distance
 _HALF_PX = 500  # of the image around a line of sight
@@ -211,7 +211,7 @@ class SurfaceReader:
         if isinstance(point, SurfacePoint):
             place = self._trained.geo_from_model.inverse().apply(point.position_in_geo[None])[0]
             through = sum(self._looks_through(view, camera, place) for camera, view in views.items())
-            if through > _MOST_THROUGH * len(point.cameras):
+            if through > MOST_THROUGH * len(point.cameras):
                 return NoSurface(f"{through} photographs look through this place, {len(point.cameras)} show it")
         return point
 
@@ -250,7 +250,7 @@ class SurfaceReader:
             in_cam = self._in_cam(camera, place)
             if pinhole.contains(pinhole.project(in_cam)):
                 detail.append((float(in_cam[2]) / pinhole.fx, camera))
-        return [camera for _, camera in sorted(detail)[:_MOST_VIEWS]]
+        return [camera for _, camera in sorted(detail)[:MOST_VIEWS]]
 
     def _in_cam(self, camera: int, place: FloatArray) -> FloatArray:
         poses = self._trained.poses
@@ -304,12 +304,18 @@ class SurfaceReader:
         )
 
     def _variance_of_rays(self, place: FloatArray, cameras: IntArray) -> float:
-        """Return the variance in m² along the views that 0.15 px across their rays amount to."""
         arm = place - self._trained.poses.cam_center_in_model[cameras]
-        length = np.linalg.norm(arm, axis=1)
-        ray = arm / length[:, None]
-        mean = ray.mean(axis=0) / np.linalg.norm(ray.mean(axis=0))
-        spread_rad = float(np.sqrt(np.mean(np.arccos(np.clip(ray @ mean, -1.0, 1.0)) ** 2)))
-        focal = np.array([self.renderer.pinholes.of(int(camera)).fx for camera in cameras])
-        across = _SIGMA_PX * float(np.mean(length / focal)) / np.sqrt(len(cameras))
-        return float((across / max(spread_rad, 1e-6)) ** 2)
+        return variance_of_rays(arm, np.array([self.renderer.pinholes.of(int(camera)).fx for camera in cameras]))
+
+
+def variance_of_rays(arm: FloatArray, focal_px: FloatArray) -> float:
+    """Return the variance along views that 0.15 px across their rays amount to, in the square of the arms' unit.
+
+    The arms (V, 3) lead from the cameras to the place.
+    """
+    length = np.linalg.norm(arm, axis=1)
+    ray = arm / length[:, None]
+    mean = ray.mean(axis=0) / np.linalg.norm(ray.mean(axis=0))
+    spread_rad = float(np.sqrt(np.mean(np.arccos(np.clip(ray @ mean, -1.0, 1.0)) ** 2)))
+    across = _SIGMA_PX * float(np.mean(length / focal_px)) / np.sqrt(len(arm))
+    return float((across / max(spread_rad, 1e-6)) ** 2)

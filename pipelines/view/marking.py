@@ -23,7 +23,7 @@ from pipelines.geometry.cameras import project
 from pipelines.survey.marks import MarkRays, mark_angles, mark_rays
 from pipelines.survey.survey import Mark, Survey, SurveyedPoint
 from pipelines.survey.trained_survey import TrainedSurvey
-from pipelines.view.saved import History, changing
+from pipelines.view.saved import changing
 
 CONTROL, CHECK, MARKS = "gcp_list.txt", "checkpoints.txt", "marks.json"
 SIGMA_PX = 0.5  # of a mark that somebody sets with care; the survey's own marks keep theirs
@@ -63,9 +63,13 @@ def points_to_mark(survey: Survey, xyz_of: Callable[[tuple[SurveyedPoint, ...]],
 
 def rays_of(point: MarkedPoint, trained: TrainedSurvey) -> MarkRays:
     """Return the rays of the marks of one point in registered images, through the trained lenses."""
+    return mark_rays((surveyed_marks(point),), trained.sparse, wrong=True)
+
+
+def surveyed_marks(point: MarkedPoint) -> SurveyedPoint:
+    """Return the point as one of a survey, for its marks alone."""
     marks = tuple(Mark(image=name, x_px=x, y_px=y, sigma_px=SIGMA_PX) for name, (x, y) in point.marks.items())
-    surveyed = SurveyedPoint(name=point.name, position_in_geo=(0.0, 0.0, 0.0), cov_in_geo=_IDENTITY, marks=marks)
-    return mark_rays((surveyed,), trained.sparse, wrong=True)
+    return SurveyedPoint(name=point.name, position_in_geo=(0.0, 0.0, 0.0), cov_in_geo=_IDENTITY, marks=marks)
 
 
 def residuals_px(point_in_geo: FloatArray, rays: MarkRays, trained: TrainedSurvey) -> FloatArray:
@@ -151,7 +155,6 @@ class KeptMarks:
     Attributes:
         points: all points, those of the survey first.
         is_written: whether the files for `--gcp` have all changes.
-        history: steps of this viewer that can be undone.
     """
 
     def __init__(
@@ -163,13 +166,15 @@ class KeptMarks:
     ) -> None:
         self._folder, self._lla_of, self._xyz_of = folder, lla_of, xyz_of
         self._surveyed = {point.name: point for point in surveyed}
-        self.history = History()
+        self.read()
+
+    def read(self) -> None:
+        """Read the file again, which another viewer may have changed."""
         self._take(*self._read())
 
     def set_mark(self, point: str, image: str, place_px: tuple[float, float] | None) -> None:
         """Set the mark of a point in an image, or remove it (None); a GeorefError: nothing was changed, and why."""
-        step = f"{'removal of the mark' if place_px is None else 'mark'} of {point} in {image}"
-        self._step({(point, image): KeptMark(point=point, image=image, place_px=place_px)}, step)
+        self._change({(point, image): KeptMark(point=point, image=image, place_px=place_px)})
 
     def set_point(self, name: str, xyz: tuple[float, float, float] | None, *, is_check: bool) -> None:
         """Make a point, or change its place in the CRS (None: not) and use; a GeorefError: nothing was changed."""
@@ -182,7 +187,7 @@ class KeptMarks:
         if xyz is not None:
             lat, lon, height = self._lla_of(np.array([xyz]))[0].tolist()
             lla = (lat, lon, height)
-        self._step({(name, None): KeptPoint(point=name, lla=lla, is_check=is_check)}, f"point {name}")
+        self._change({(name, None): KeptPoint(point=name, lla=lla, is_check=is_check)})
 
     def remove_point(self, name: str) -> None:
         """Remove a point that was made here, with its marks; a GeorefError: nothing was changed, and why."""
@@ -191,7 +196,7 @@ class KeptMarks:
                 "point-of-survey",
                 f"{name} is a point of the survey. Remove its marks, or run `georef ingest` without the point.",
             )
-        self._step(dict.fromkeys(key for key in self._records if key[0] == name), f"removal of {name}")
+        self._change(dict.fromkeys(key for key in self._records if key[0] == name))
 
     def write(self, crs: str) -> list[Path]:
         """Write points and marks for `--gcp` and `--checkpoints`; return the files. A GeorefError: not written."""
@@ -202,18 +207,14 @@ class KeptMarks:
                 self._save(self._records, is_written=True, others=texts)
         return list(texts)
 
-    def _step(self, wanted: Mapping[Key, Record | None], step: str) -> None:
-        former = self._change(wanted)
-        self.history.add(step, lambda: self._change(former))
-
-    def _change(self, wanted: Mapping[Key, Record | None]) -> Mapping[Key, Record | None]:
-        """Set records of the file or drop them (None), and return the former ones, None where there was none."""
+    def _change(self, wanted: Mapping[Key, Record | None]) -> None:
+        """Set records of the file, or drop them (None)."""
         with changing(self._folder):
             records, _ = self._read()
-            former = {key: records.pop(key, None) for key in wanted}
+            for key in wanted:
+                records.pop(key, None)
             records |= {key: record for key, record in wanted.items() if record is not None}
             self._save(records, is_written=False)
-        return former
 
     def _save(
         self, records: dict[Key, Record], *, is_written: bool, others: Mapping[Path, str] | None = None

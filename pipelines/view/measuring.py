@@ -1,16 +1,21 @@
 """Measuring in a trained model: points of its surface, their coordinates in a CRS, and σ of what they make up."""
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from scipy.linalg import block_diag
 
 from pipelines.adjust.solution import posterior_of
-from pipelines.core.products import is_checked
-from pipelines.core.types import FloatArray
+from pipelines.core.errors import InputError
+from pipelines.core.products import is_checked, load_json
+from pipelines.core.types import FloatArray, IntArray
 from pipelines.core.workspace import Workspace
-from pipelines.surface.picking import Sight, SurfacePoint, SurfaceReader
+from pipelines.formats.georef_sidecar import CrsSidecar, sidecar_path
+from pipelines.formats.geotiff import sampled_raster
+from pipelines.surface.picking import SurfacePoint, SurfaceReader
+from pipelines.surface.plan_heights import cameras_of, heights_in_plan
 from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey.marks import MarkRays
 from pipelines.survey.options import CrsOptions
@@ -18,11 +23,33 @@ from pipelines.survey.target_crs import TargetCrs, usable_crs
 from pipelines.survey.trained_survey import triangulated_points
 from pipelines.view import quantities
 
-_MOST_SAMPLES = 400  # of the surface in a polygon: a few seconds
-_JOINT_SAMPLES = 40  # of which so many enter the joint covariance
+# Rasters of the workspace that may be the base of a volume, with those of their σ.
+BASE_RASTERS = {"dtm.tif": "sigma_dtm.tif", "dsm.tif": "sigma_v.tif"}
+_JOINT_SAMPLES = 40  # of the surface in a polygon, that enter the joint covariance
 _LEAST_SPACING_PX = 4.0  # between samples: closer ones would show the surface's noise, not its shape
-_ABOVE_M = 30.0  # of the start of a plumb line above the highest corner, at least
-_PLUMB_PX_RAD = 1e-3
+_PROFILE_REACH_PX = 1.5  # around a place of a profile
+_LEAST_COVERED = 0.9  # of a polygon, by a base
+
+
+@dataclass(frozen=True)
+class WantedBase:
+    """Base of a volume: of the polygon's rim, a height in the CRS, or a raster of the workspace."""
+
+    kind: Literal["plane", "mean", "lowest", "height", "raster"] = "plane"
+    height: float = 0.0
+    raster: str = ""
+
+
+@dataclass(frozen=True)
+class Fineness:
+    """Number of places and of views that read each; `advance` is called with the share that is done."""
+
+    places: int = 2000
+    views: int = 12
+    advance: Callable[[float], None] = lambda _share: None
+
+
+ESTIMATE = Fineness(300, 3)  # a first answer in a second
 
 
 class MeasuringModel:
@@ -38,6 +65,7 @@ class MeasuringModel:
     """
 
     def __init__(self, workspace: Workspace, renderer: ModelRenderer, crs: CrsOptions) -> None:
+        self._workspace = workspace
         self.trained, self.reader = renderer.trained, SurfaceReader(renderer)
         survey = self.trained.survey
         centers = self.trained.geo_from_model.apply(self.trained.poses.cam_center_in_model)
@@ -67,72 +95,128 @@ class MeasuringModel:
 
     def jointly(self, points: Sequence[SurfacePoint]) -> quantities.MeasuredPoints:
         position = np.array([point.position_in_geo for point in points]).reshape(-1, 3)
-        cov = self._joint_covariance(points)
+        cov = self._joint_covariance([*position], [point.cameras for point in points])
         cov = None if cov is None else cov + block_diag(*(point.cov_of_surface for point in points))
         height_m = np.asarray(self.target.xyz_from_geo(position)[:, 2] * self.target.crs.height_unit_m)
         return quantities.MeasuredPoints(position, cov, height_m)
 
-    def area(self, corners: Sequence[SurfacePoint]) -> tuple[quantities.Quantity, ...]:
+    def area(self, corners: Sequence[SurfacePoint], fineness: Fineness) -> tuple[quantities.Quantity, ...]:
         """Return the area of a polygon, in plan and on the surface."""
-        sampled = self._sampled(corners)
+        sampled = self._sampled(corners, fineness)
         if sampled is None:
             return (quantities.plan_area(self.jointly(corners)),)
         surface, coverage = sampled
         return quantities.plan_area(surface.corners), quantities.surface_area(surface), coverage
 
     def volume(
-        self, corners: Sequence[SurfacePoint], base: quantities.BasePlane
+        self, corners: Sequence[SurfacePoint], base: WantedBase, fineness: Fineness
     ) -> tuple[quantities.Quantity, ...]:
-        """Return the volume between the surface within a polygon and a base; nothing where there is no surface."""
-        sampled = self._sampled(corners)
+        """Return the volume between the surface within a polygon and a base; nothing where there is no surface.
+
+        Raises:
+            InputError: the raster of the base cannot be read, or does not cover the polygon.
+        """
+        sampled = self._sampled(corners, fineness)
         if sampled is None:
             return ()
         surface, coverage = sampled
-        lowest = int(np.argmin(surface.corners.height_m))
-        return (*quantities.volumes(surface, replace(base, lowest=lowest)), coverage)
+        return (*quantities.volumes(surface, self._base(base, surface)), coverage)
 
-    def _joint_covariance(self, points: Sequence[SurfacePoint]) -> FloatArray | None:
-        """Return the joint covariance (3 J, 3 J) of points without the surface's own."""
-        if self.posterior is None or not points:
+    def profile(self, corners: Sequence[SurfacePoint], fineness: Fineness) -> quantities.Profile:
+        """Return the surface along a line."""
+        positions = np.array([point.position_in_geo for point in corners])
+        pixel_m = self._pixel_m(corners)
+        length_m = float(np.linalg.norm(np.diff(positions[:, :2], axis=0), axis=1).sum())
+        plan, along_m = quantities.along_line(positions[:, :2], max(length_m / fineness.places, pixel_m))
+        reach_m = max(float(along_m[1]) / 2, _PROFILE_REACH_PX * pixel_m)
+        found = heights_in_plan(
+            self.reader.renderer, plan, float(np.median(positions[:, 2])), reach_m,
+            most_views=fineness.views, advance=fineness.advance,
+        )  # fmt: skip
+        in_geo = np.column_stack([plan, np.where(found.known, found.height_m, np.median(positions[:, 2]))])
+        xyz = self.target.xyz_from_geo(in_geo)
+        sigma_m = np.full(len(plan), np.nan)
+        if self.posterior is not None and self.posterior.grid is not None:
+            sigma_m = np.hypot(np.sqrt(self.posterior.grid.cov_at(in_geo)[:, 2, 2]), found.sigma_m)
+        return quantities.Profile(along_m, np.where(found.known, xyz[:, 2], np.nan), sigma_m, xyz[:, :2])
+
+    def rasters(self) -> list[str]:
+        """Return the rasters of heights in the workspace that may be the base of a volume."""
+        return [name for name in BASE_RASTERS if (self._workspace.root / "raster" / name).is_file()]
+
+    def _base(self, base: WantedBase, surface: quantities.SampledSurface) -> quantities.VolumeBase:
+        places, corners = surface.samples, surface.corners.position_in_geo
+        if base.kind in ("plane", "mean", "lowest"):
+            return quantities.rim_base(base.kind, corners, places[:, :2])
+        none = np.zeros((len(places), len(corners)))
+        level = self.target.xyz_from_geo(places)[:, 2]
+        if base.kind == "height":
+            wanted, sigma_m = np.full(len(places), base.height), 0.0
+        else:
+            wanted, sigma_m = self._raster_heights(base.raster, places)
+        # `geo` departs from heights of the CRS by the same at a place's surface and at its base.
+        below_m = (level - wanted) * self.target.crs.height_unit_m
+        return quantities.VolumeBase(places[:, 2] - below_m, none, sigma_m)
+
+    def _raster_heights(self, name: str, places: FloatArray) -> tuple[FloatArray, float]:
+        """Return heights (N,) of a raster below places (N, 3) in `geo`, in the viewer's CRS, and their mean σ."""
+        path = self._workspace.root / "raster" / name
+        if name not in BASE_RASTERS or not path.is_file():
+            raise InputError("no-base-raster", f"There is no raster/{name}. Make it with `georef export-raster`.")
+        sidecar = load_json(CrsSidecar, sidecar_path(path))
+        other = usable_crs(
+            CrsOptions(crs=sidecar.crs), self.trained.survey.origin, places, self.trained.survey.vertical
+        )
+        xyz = other.xyz_from_geo(places)
+        height, sigma = (sampled_raster(path.with_name(file), xyz[:, :2]) for file in (name, BASE_RASTERS[name]))
+        known = np.isfinite(height)
+        if known.mean() < _LEAST_COVERED:
+            raise InputError(
+                "base-not-covered", f"raster/{name} does not cover the polygon. Draw it inside the raster."
+            )
+        height[~known] = np.median(height[known])
+        in_geo = other.geo_from_xyz(np.column_stack([xyz[:, :2], height]))
+        return self.target.xyz_from_geo(in_geo)[:, 2], float(np.nan_to_num(np.nanmean(sigma)))
+
+    def _joint_covariance(self, positions: Sequence[FloatArray], cameras: Sequence[IntArray]) -> FloatArray | None:
+        """Return the joint covariance (3 J, 3 J) of J points, seen by cameras, without the surface's own."""
+        if self.posterior is None or not positions:
             return None
-        position = np.array([point.position_in_geo for point in points])
-        number = np.repeat(np.arange(len(points)), [len(point.cameras) for point in points])
-        cameras = np.concatenate([point.cameras for point in points])
-        cov = self.posterior.jointly_of_scene(position, number, cameras)
+        number = np.repeat(np.arange(len(positions)), [len(each) for each in cameras])
+        cov = self.posterior.jointly_of_scene(np.array(positions), number, np.concatenate(cameras))
         return cov if np.isfinite(cov).all() else None
 
     def _sampled(
-        self, corners: Sequence[SurfacePoint]
+        self, corners: Sequence[SurfacePoint], fineness: Fineness
     ) -> tuple[quantities.SampledSurface, quantities.Quantity] | None:
-        """Return the surface in a polygon, read along plumb lines, and how densely; None: there is none."""
+        """Return the surface in a polygon, and how densely it was read; None: there is none."""
         joint = self.jointly(corners)
         area, pixel_m = quantities.plan_area(joint).value, self._pixel_m(corners)
-        spacing = max(float(np.sqrt(area / _MOST_SAMPLES)), _LEAST_SPACING_PX * pixel_m)
+        spacing = max(float(np.sqrt(area / fineness.places)), _LEAST_SPACING_PX * pixel_m)
         grid = quantities.grid_in_polygon(joint.position_in_geo[:, :2], spacing)
-        top = float(joint.position_in_geo[:, 2].max()) + _ABOVE_M + float(np.sqrt(area))
-        model_from_geo = self.trained.geo_from_model.inverse()
-        down = model_from_geo.rotation @ np.array([0.0, 0.0, -1.0])
-        samples = []
-        for east, north in grid:
-            start = model_from_geo.apply(np.array([[east, north, top]]))[0]
-            point = self.reader.under(Sight(start, down, _PLUMB_PX_RAD))
-            if isinstance(point, SurfacePoint):
-                samples.append(point)
-        if not samples:
+        if not len(grid):
             return None
-        chosen = np.unique(np.linspace(0, len(samples) - 1, _JOINT_SAMPLES).astype(np.int64))
-        shared = self._joint_covariance([*corners, *(samples[row] for row in chosen)])
+        found = heights_in_plan(
+            self.reader.renderer, grid, float(np.median(joint.position_in_geo[:, 2])), spacing / np.sqrt(2),
+            most_views=fineness.views, advance=fineness.advance,
+        )  # fmt: skip
+        rows = np.flatnonzero(found.known)
+        if not len(rows):
+            return None
+        samples = np.column_stack([grid[rows], found.height_m[rows]])
+        chosen = np.unique(np.linspace(0, len(rows) - 1, _JOINT_SAMPLES).astype(np.int64))
+        shared = self._joint_covariance(
+            [*(point.position_in_geo for point in corners), *samples[chosen]],
+            [*(point.cameras for point in corners), *cameras_of(found, rows[chosen])],
+        )
         if shared is not None:
             own = [point.cov_of_surface for point in corners]
             shared = shared + block_diag(*own, *[np.zeros((3, 3))] * len(chosen))
         surface = quantities.SampledSurface(
-            corners=joint,
-            samples=np.array([point.position_in_geo for point in samples]),
-            sigma_up_m=np.sqrt([point.cov_of_surface[2, 2] for point in samples]),
-            cov_in_geo=shared,
-            chosen=chosen,
-        )
-        share = 100 * (len(samples) / len(grid))
+            corners=joint, samples=samples, sigma_up_m=found.sigma_m[rows], cov_in_geo=shared, chosen=chosen,
+            pixel_m=pixel_m,
+        )  # fmt: skip
+        share = 100 * (len(rows) / len(grid))
         return surface, quantities.Quantity(f"measured every {spacing:.2f} m, on", share, None, "% of the area")
 
     def _pixel_m(self, points: Sequence[SurfacePoint]) -> float:

@@ -18,5 +18,4 @@ class ViewOptions(CrsOptions):
     port: int = Field(
         8080, ge=1024, le=65000, description="Port on this machine; if it is taken, the next free one."
     )
-    dark: bool = Field(False, description="Draw the panel light on dark.")
     backend: Literal["auto", "cpu", "cuda"] = Field("auto", description="Rasteriser that draws the pictures.")

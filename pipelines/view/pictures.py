@@ -1,77 +1,62 @@
-"""Pictures of the viewer: renders of the trained model, with a photograph blended over them where one was taken.
+"""Pictures of the viewer: renders of the trained model, photographs over them, and false colours.
 
 The machine that holds the model draws them, with the rasteriser that trained it: what is seen is what is measured,
 colours that depend on the direction included, and a page without a graphics card shows millions of Gaussians.
 
-The viewer's depth images end at 167 units. Its frame is therefore a small copy of the scene around its middle, with
-the axes of `geo`: east, north, up. Each page has a loop, which draws small pictures
-while its camera moves, and a full one when it stands.
+The viewer's frame is `geo` moved to the middle of the scene: metres, east, north, up.
 """
 
 from __future__ import annotations
 
-import logging
 import threading
-import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import Literal
 
 import cv2
 import numpy as np
+import torch
 
-from pipelines.core.errors import GeorefError, InputError
+from pipelines.adjust.accuracy_grid import AccuracyGrid
+from pipelines.core.errors import InputError
 from pipelines.core.plan import photograph_folder
 from pipelines.core.types import ByteArray, Float32Array, FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.geometry.cameras import Camera, Pinhole, ViewPose, distort, undistort
-from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.similarity import Similarity
+from pipelines.report.plots.style import colours_of
 from pipelines.splat.surface import measured_depth
 from pipelines.surface.picking import Sight
 from pipelines.surface.surface_views import ModelRenderer
+from pipelines.survey.area import photographs_that_see
 from pipelines.survey.photographs import decoded_photograph
 from pipelines.survey.trained_survey import TrainedSurvey
 
-if TYPE_CHECKING:
-    import viser
-
-log = logging.getLogger(__name__)
-
-_RADIUS = 10.0  # of the scene, in units of the viewer
+Colouring = Literal["photographs", "height", "sigma", "views"]
+Box = tuple[float, float, float, float, float, float]  # west, south, low, east, north, high
 _RIM = 0.02  # share of the SfM points outside the scene, on each side
 _KEPT_PHOTOGRAPHS = 3  # at full size, in memory
 _SAME_PLACE = 1e-4  # of the scene's radius: a camera this near to a photograph's sees what it saw
 _EDGE_POINTS = 9  # on each side of a photograph
-_FARTHEST = 150.0  # units of the viewer, for what has no surface
-_MOVING_S = 0.12  # of drawing one picture while the camera moves
-_STILL_S = 0.2  # without movement until the full picture is drawn
-_LEAST_PX, _MOST_PX = 160, 1920  # of the longer side
-_DEPTH_PX = 480  # of the longer side of the depth: it only decides which overlays are hidden
-_QUALITY_MOVING, _QUALITY_STILL = 70, 95  # of the JPEG
+_DEPTH_PX = 200  # of the longer side of the depth that a page gets
+_TINT = 0.7  # of false colours
+_COARSE_PX = 8  # pixels of one false colour that is not of the height
 
 
 @dataclass(frozen=True)
 class ViewerCamera:
     """Camera of a page, in the frame of the viewer."""
 
-    wxyz: FloatArray  # (4,) rotation view ← camera; the camera's axes are x right, y down, z forward
+    rotation: FloatArray  # (3, 3) camera ← view; the camera's axes are x right, y down, z forward
     position: FloatArray  # (3,)
     fov_rad: float  # vertical field of view
     width: int  # of the page in pixels
     height: int  # likewise
 
-    @property
-    def rotation(self) -> FloatArray:
-        """Rotation (3, 3) view ← camera."""
-        w, x, y, z = self.wxyz
-        return matrix_from_quat_xyzw([x, y, z, w])
-
-    def pinhole(self, width: int, height: int) -> Pinhole:
-        """Return the camera with another number of pixels."""
-        focal = height / 2 / np.tan(self.fov_rad / 2)
-        return Pinhole(width, height, focal, focal, width / 2, height / 2)
+    def pinhole(self) -> Pinhole:
+        focal = self.height / 2 / np.tan(self.fov_rad / 2)
+        return Pinhole(self.width, self.height, focal, focal, self.width / 2, self.height / 2)
 
 
 @dataclass(frozen=True)
@@ -79,20 +64,23 @@ class ViewFrame:
     """Frame of the viewer, and the radius of the scene."""
 
     view_from_model: Similarity
+    middle_in_geo: FloatArray  # (3,)
     radius_m: float
 
-    def pose(self, camera: ViewerCamera, width: int, height: int) -> ViewPose:
-        """Return a page's camera in `model`, with its own number of pixels."""
-        cam_from_model = camera.rotation.T @ self.view_from_model.rotation
+    def pose(self, camera: ViewerCamera) -> ViewPose:
+        """Return a page's camera in `model`."""
         center = self.view_from_model.inverse().apply(camera.position[None])[0]
-        return ViewPose(camera.pinhole(width, height), cam_from_model, center)
+        return ViewPose(camera.pinhole(), camera.rotation @ self.view_from_model.rotation, center)
 
-    def sight(self, camera: ViewerCamera, start: FloatArray, direction: FloatArray) -> Sight:
-        """Return a line of sight in `model` of one in the viewer's frame: start (3,) and direction (3,)."""
-        model_from_view = self.view_from_model.inverse()
-        turned = model_from_view.rotation @ direction
-        pixel_rad = 1.0 / camera.pinhole(camera.width, camera.height).fx
-        return Sight(model_from_view.apply(start[None])[0], turned / np.linalg.norm(turned), pixel_rad)
+    def sight(self, camera: ViewerCamera, x: float, y: float) -> Sight:
+        """Return the line of sight in `model` through a pixel of a page."""
+        pose = self.pose(camera)
+        direction = pose.cam_from_model.T @ pose.pinhole.rays(np.array([[x, y]]))[0]
+        return Sight(pose.center_in_model, direction / np.linalg.norm(direction), 1.0 / pose.pinhole.fx)
+
+    def place(self, point_in_geo: FloatArray) -> FloatArray:
+        """Return places (…, 3) in the viewer's frame."""
+        return np.asarray(point_in_geo - self.middle_in_geo)
 
 
 def frame_of(trained: TrainedSurvey) -> ViewFrame:
@@ -101,16 +89,8 @@ def frame_of(trained: TrainedSurvey) -> ViewFrame:
     in_geo = trained.geo_from_model.apply(points)
     low, high = np.quantile(in_geo, [_RIM, 1 - _RIM], axis=0)
     radius_m = max(float(np.linalg.norm(high - low)) / 2, 1e-3)
-    view_from_geo = Similarity(_RADIUS / radius_m, np.eye(3), -(low + high) / 2 * _RADIUS / radius_m)
-    return ViewFrame(view_from_geo @ trained.geo_from_model, radius_m)
-
-
-@dataclass(frozen=True)
-class PageView:
-    """Picture (H, W, 3) of a page, and depth (H, W) along the camera's z axis, in units of the viewer."""
-
-    rgb: ByteArray
-    depth: Float32Array
+    middle = (low + high) / 2
+    return ViewFrame(Similarity(1.0, np.eye(3), -middle) @ trained.geo_from_model, middle, radius_m)
 
 
 class Photographs:
@@ -138,54 +118,127 @@ class Photographs:
 
 
 @dataclass(frozen=True)
-class Blend:
-    """Photograph over the picture: a camera of the trained model, and its share 0 … 1."""
+class Wanted:
+    """What a picture is to show.
 
-    camera: int
-    share: float
+    Attributes:
+        photograph: camera of the trained model whose photograph lies over the picture; None: none.
+        share: of the photograph, 0 … 1.
+        background: (3,) colour 0 … 1 where there is no Gaussian.
+        box: of which the Gaussians are shown, in the viewer's frame; None: all.
+    """
+
+    photograph: int | None = None
+    share: float = 1.0
+    colouring: Colouring = "photographs"
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    box: Box | None = None
+
+
+@dataclass(frozen=True)
+class PageView:
+    """Picture (H, W, 3) of a page, depth (h, w) along the camera's z axis in metres, and what its colours mean.
+
+    The depth is smaller than the picture; 0: nothing there. `scale` has the values of the darkest and the brightest
+    colour, where colours are false.
+    """
+
+    rgb: ByteArray
+    depth: Float32Array
+    scale: tuple[float, float] | None = None
 
 
 class Painter:
     """Painter of the pictures of pages."""
 
-    def __init__(self, renderer: ModelRenderer, photographs: Photographs, frame: ViewFrame) -> None:
-        self._renderer, self._photographs, self._frame = renderer, photographs, frame
+    def __init__(
+        self,
+        renderer_of: Callable[[TrainedSurvey], ModelRenderer],
+        photographs: Photographs,
+        trained: TrainedSurvey,
+        frame: ViewFrame,
+        grid: AccuracyGrid | None,
+    ) -> None:
+        self._trained, self._photographs, self._frame, self._grid = trained, photographs, frame, grid
+        self._renderer_of = lru_cache(2)(lambda box: renderer_of(self._clipped(box)))
+        self._making = threading.Lock()
 
-    def paint(self, camera: ViewerCamera, width: int, height: int, blend: Blend | None = None) -> PageView:
-        """Return the picture of a page's camera; a photograph blended over it shows only from its own place.
+    def paint(self, camera: ViewerCamera, wanted: Wanted) -> PageView:
+        """Return the picture of a page's camera; a photograph over it shows only from its own place.
 
         Raises:
             InputError: the photograph cannot be read.
         """
-        pose = self._frame.pose(camera, width, height)
-        render = self._renderer.render(pose, depth=True)
-        depth = measured_depth(render).cpu().numpy()
-        rgb = (255 * render.colour.clamp(0, 1)).round().byte().cpu().numpy()
-        scaled = depth * self._frame.view_from_model.scale
-        if blend is not None and blend.share > 0:
-            apart = self._renderer.trained.poses.cam_center_in_model[blend.camera] - pose.center_in_model
+        pose = self._frame.pose(camera)
+        with self._making:
+            renderer = self._renderer_of(wanted.box)
+        render = renderer.render(pose, depth=True)
+        depth = measured_depth(render).cpu().numpy() * self._frame.view_from_model.scale
+        behind = torch.tensor(wanted.background) - torch.tensor(self._trained.model.background)
+        colour = render.colour.cpu() + (1 - render.alpha.cpu())[..., None] * behind
+        rgb, scale = (255 * colour.clamp(0, 1)).round().byte().numpy(), None
+        if wanted.colouring != "photographs":
+            rgb, scale = self._false_colours(rgb, depth, camera, wanted.colouring)
+        if wanted.photograph is not None and wanted.share > 0:
+            apart = self._trained.poses.cam_center_in_model[wanted.photograph] - pose.center_in_model
             if float(np.linalg.norm(apart)) < _SAME_PLACE * self._frame.radius_m:
-                rgb = self._blended(rgb, blend, pose)
-        return PageView(rgb, np.where(scaled > 0, np.minimum(scaled, _FARTHEST), _FARTHEST).astype(np.float32))
+                rgb = self._blended(rgb, wanted, pose)
+        small = _shrunk(depth.shape[1], depth.shape[0], _DEPTH_PX)
+        return PageView(rgb, cv2.resize(depth.astype(np.float32), small, interpolation=cv2.INTER_NEAREST), scale)
 
-    def _blended(self, rgb: ByteArray, blend: Blend, pose: ViewPose) -> ByteArray:
+    def _clipped(self, box: Box | None) -> TrainedSurvey:
+        if box is None:
+            return self._trained
+        places = self._frame.view_from_model.apply(self._trained.gaussians.means.double().numpy())
+        inside = ((places >= box[:3]) & (places <= box[3:])).all(axis=1)
+        return replace(self._trained, gaussians=self._trained.gaussians.select(torch.from_numpy(inside)))
+
+    def _false_colours(
+        self, rgb: ByteArray, depth: FloatArray, camera: ViewerCamera, colouring: Colouring
+    ) -> tuple[ByteArray, tuple[float, float] | None]:
+        """Return a picture tinted by height, predicted σ, or number of photographs, and the range of the values."""
+        step = 1 if colouring == "height" else _COARSE_PX
+        rows, columns = np.arange(step // 2, depth.shape[0], step), np.arange(step // 2, depth.shape[1], step)
+        z = depth[np.ix_(rows, columns)]
+        pixel = np.stack(np.meshgrid(columns + 0.5, rows + 0.5), axis=-1)
+        place = (z[..., None] * camera.pinhole().rays(pixel)) @ camera.rotation + camera.position
+        known = z > 0
+        values = np.zeros(z.shape)
+        if not known.any() or (colouring == "sigma" and self._grid is None):
+            return rgb, None
+        in_geo = place[known] + self._frame.middle_in_geo
+        if colouring == "height":
+            values[known] = in_geo[:, 2]
+        elif colouring == "sigma" and self._grid is not None:
+            values[known] = np.sqrt(np.trace(self._grid.cov_at(in_geo), axis1=1, axis2=2))
+        else:
+            values[known] = photographs_that_see(self._trained, in_geo)
+        low, high = np.quantile(values[known], [0.02, 0.98]).tolist()
+        tint = colours_of(values.ravel(), low, high).reshape(*values.shape, 3)
+        whole = cv2.resize(np.ascontiguousarray(tint), rgb.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+        grey = cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2GRAY)[..., None]
+        mixed = np.where((depth > 0)[..., None], _TINT * whole + (1 - _TINT) * grey, rgb)
+        return np.asarray(mixed, dtype=np.uint8), (low, high)
+
+    def _blended(self, rgb: ByteArray, wanted: Wanted, pose: ViewPose) -> ByteArray:
         """Return a picture with the photograph over it, as the photograph's lens shows the picture's rays."""
-        trained = self._renderer.trained
+        trained, camera = self._trained, wanted.photograph
+        assert camera is not None
         height, width = rgb.shape[:2]
         pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
-        turn = trained.poses.cam_from_model[blend.camera] @ pose.cam_from_model.T
+        turn = trained.poses.cam_from_model[camera] @ pose.cam_from_model.T
         own = pose.pinhole.rays(pixels) @ turn.T
         ahead = own[..., 2] > 0
         slope = own[..., :2] / np.where(ahead, own[..., 2], 1.0)[..., None]
-        lens = trained.sparse.camera_of(blend.camera)
+        lens = trained.sparse.camera_of(camera)
         place = np.asarray(distort(lens, slope)) - 0.5
         # Beyond its fold a lens polynomial leads back into the picture, to the pixel of another ray.
         ahead &= np.linalg.norm(slope, axis=-1) < _widest_slope(lens)
         inside = ahead & ((place > -0.5) & (place < np.array([lens.width, lens.height]) - 0.5)).all(axis=-1)
         source = np.where(inside[..., None], place, -1.0).astype(np.float32)
-        full = self._photographs.full(blend.camera)
+        full = self._photographs.full(camera)
         photograph = cv2.remap(full, source[..., 0], source[..., 1], cv2.INTER_LINEAR)
-        share = np.where(inside, blend.share, 0.0)[..., None]
+        share = np.where(inside, wanted.share, 0.0)[..., None]
         return np.asarray(np.round(share * photograph + (1 - share) * rgb), dtype=np.uint8)
 
 
@@ -194,77 +247,6 @@ def _widest_slope(lens: Camera) -> float:
     across, down = np.linspace(0, lens.width, _EDGE_POINTS), np.linspace(0, lens.height, _EDGE_POINTS)
     edge = [(x, y) for x in across for y in (0, lens.height)] + [(x, y) for x in (0, lens.width) for y in down]
     return float(np.nanmax(np.linalg.norm(undistort(lens, edge), axis=-1))) * (1 + 1e-3)
-
-
-class PictureLoop:
-    """Loop of one page, on a thread of its own.
-
-    Args:
-        blend: returns the photograph to blend over the picture, or None.
-        drawn: called after each picture at full size.
-    """
-
-    def __init__(
-        self,
-        client: viser.ClientHandle,
-        painter: Painter,
-        blend: Callable[[], Blend | None],
-        drawn: Callable[[], None],
-    ) -> None:
-        self._client, self._painter, self._blend, self._told = client, painter, blend, drawn
-        self.changed, self._ended = threading.Event(), threading.Event()
-        self._moving_px = 480.0
-        self.drawn = 0  # pictures at full size
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        client.camera.on_update(lambda _: self.changed.set())
-        self._thread.start()
-        self.changed.set()
-
-    def end(self) -> None:
-        self._ended.set()
-        self.changed.set()
-
-    def _run(self) -> None:
-        while True:
-            self.changed.wait()
-            if self._ended.is_set():
-                return
-            self.changed.clear()
-            try:
-                began = time.monotonic()
-                self._draw(int(self._moving_px), _QUALITY_MOVING)
-                factor = np.clip(np.sqrt(_MOVING_S / max(time.monotonic() - began, 1e-3)), 0.5, 1.3)
-                self._moving_px = float(np.clip(self._moving_px * factor, _LEAST_PX, _MOST_PX))
-                if not self.changed.wait(_STILL_S):
-                    self._draw(_MOST_PX, _QUALITY_STILL)
-                    self.drawn += 1
-                    self._told()
-            except GeorefError as error:
-                self._client.add_notification("No picture", str(error), color="red")
-            except Exception:  # the page is gone, or the picture cannot be drawn: the next one may
-                if self._ended.is_set():
-                    return
-                log.exception("the picture could not be drawn")
-
-    def _draw(self, longer_px: int, quality: int) -> None:
-        camera = camera_of(self._client)
-        if camera is None:
-            return
-        width, height = _shrunk(camera.width, camera.height, longer_px)
-        picture = self._painter.paint(camera, width, height, self._blend())
-        depth = cv2.resize(picture.depth, _shrunk(width, height, _DEPTH_PX), interpolation=cv2.INTER_NEAREST)
-        self._client.scene.set_background_image(picture.rgb, format="jpeg", jpeg_quality=quality, depth=depth)
-        self._client.flush()
-
-
-def camera_of(client: viser.ClientHandle) -> ViewerCamera | None:
-    """Return the camera of a page; None before the page has told it."""
-    handle = client.camera
-    if handle._state.update_timestamp == 0.0 or not handle.image_width or not handle.image_height:
-        return None
-    return ViewerCamera(
-        np.array(handle.wxyz), np.array(handle.position), float(handle.fov), handle.image_width, handle.image_height
-    )
 
 
 def _shrunk(width: int, height: int, longer_px: int) -> tuple[int, int]:

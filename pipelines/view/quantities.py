@@ -13,7 +13,7 @@ from scipy.spatial import Delaunay
 
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 
-BaseKind = Literal["plane through the corners", "level of the lowest corner"]
+RimBase = Literal["plane", "mean", "lowest"]
 
 
 @dataclass(frozen=True)
@@ -106,6 +106,7 @@ class SampledSurface:
     # samples' own errors; None: nothing states it
     cov_in_geo: FloatArray | None
     chosen: IntArray  # (M,) rows of the samples in that covariance
+    pixel_m: float  # width of a training pixel
 
 
 def surface_area(surface: SampledSurface) -> Quantity:
@@ -121,36 +122,62 @@ def surface_area(surface: SampledSurface) -> Quantity:
 
 
 @dataclass(frozen=True)
-class BasePlane:
-    """Base of a volume: the plane that fits the corners best, or the level of the lowest one."""
+class VolumeBase:
+    """Base of a volume at N samples, as heights in `geo`.
 
-    kind: BaseKind = "plane through the corners"
-    lowest: int = 0
+    Attributes:
+        height_m: (N,) heights; NaN: the base is not known there.
+        by_corner: (N, J) their derivatives by the heights of the corners.
+        sigma_m: σ that all of these heights share, beside that of the corners.
+    """
+
+    height_m: FloatArray
+    by_corner: FloatArray
+    sigma_m: float = 0.0
 
 
-def volumes(surface: SampledSurface, base: BasePlane) -> tuple[Quantity, ...]:
-    """Return the volume between surface and base plane: above, below, and their difference.
+def rim_base(kind: RimBase, corners: FloatArray, places: FloatArray) -> VolumeBase:
+    """Return the base that the corners (J, 3) of a polygon give at places (N, 2), east and north."""
+    if kind == "plane":
+        middle = corners[:, :2].mean(axis=0)
+        design = np.column_stack([np.ones(len(corners)), corners[:, :2] - middle])
+        by_corner = np.column_stack([np.ones(len(places)), places - middle]) @ np.linalg.pinv(design)
+    else:
+        share = np.full(len(corners), 1 / len(corners))
+        if kind == "lowest":
+            share = np.eye(len(corners))[int(np.argmin(corners[:, 2]))]
+        by_corner = np.tile(share, (len(places), 1))
+    return VolumeBase(by_corner @ corners[:, 2], by_corner)
 
-    σ is that of the difference: of corners and samples jointly, and of the sampling, which is half the difference
-    between the volumes of the white and of the black samples of the grid, if that is a chequerboard.
+
+# Training pixels by which the surface as a whole may stand too high or too low: on simulated flights
+_SURFACE_BIAS_PX = 0.1
+
+
+def volumes(surface: SampledSurface, base: VolumeBase) -> tuple[Quantity, ...]:
+    """Return the volume between surface and base: above, below, and their difference.
+
+    σ is that of the difference: of corners and samples jointly, of the surface as a whole, and of the sampling,
+    which is half the difference between the volumes of the white and of the black samples of the grid, if that is a
+    chequerboard.
     """
     area, area_gradient = _area(surface.corners)
-    weights = _base_weights(base, surface.corners.position_in_geo[:, :2], surface.samples[:, :2])
-    above = surface.samples[:, 2] - weights @ surface.corners.position_in_geo[:, 2]
+    above = surface.samples[:, 2] - base.height_m
     count, corners = len(above), len(surface.corners.position_in_geo)
     gradient = np.zeros((corners + len(surface.chosen), 3))
-    gradient[:corners, 2] = -area * weights.mean(axis=0)
+    gradient[:corners, 2] = -area * base.by_corner.mean(axis=0)
     gradient[:corners] += area_gradient * float(above.mean())
     gradient[corners:, 2] = area / len(surface.chosen)
     of_points = propagated(gradient, surface.cov_in_geo)
     sigma = None
     if of_points is not None:
         of_noise = area / count * float(np.linalg.norm(surface.sigma_up_m))
+        of_whole = area * float(np.hypot(_SURFACE_BIAS_PX * surface.pixel_m, base.sigma_m))
         white = _is_white(surface.samples[:, :2])
         of_sampling = 0.0
         if white.any() and not white.all():
             of_sampling = area * abs(float(above[white].mean() - above[~white].mean())) / 2
-        sigma = float(np.sqrt(of_points**2 + of_noise**2 + of_sampling**2))
+        sigma = float(np.sqrt(of_points**2 + of_noise**2 + of_whole**2 + of_sampling**2))
     cut, fill = area * float(np.maximum(above, 0).mean()), area * float(np.maximum(-above, 0).mean())
     return (
         Quantity("volume above the base", cut, None, "m³"),
@@ -159,15 +186,29 @@ def volumes(surface: SampledSurface, base: BasePlane) -> tuple[Quantity, ...]:
     )
 
 
-def _base_weights(base: BasePlane, corners: FloatArray, places: FloatArray) -> FloatArray:
-    """Return the weights (N, J) of the heights of corners (J, 2) in the base at places (N, 2), east and north."""
-    if base.kind == "level of the lowest corner":
-        weights = np.zeros((len(places), len(corners)))
-        weights[:, base.lowest] = 1.0
-        return weights
-    middle = corners.mean(axis=0)
-    design = np.column_stack([np.ones(len(corners)), corners - middle])
-    return np.asarray(np.column_stack([np.ones(len(places)), places - middle]) @ np.linalg.pinv(design))
+@dataclass(frozen=True)
+class Profile:
+    """Surface along a line: N places from its beginning on.
+
+    Attributes:
+        along_m: (N,) distance in plan from the beginning.
+        height: (N,) in the unit of the CRS's heights; NaN: not measured.
+        sigma_m: (N,) of georeference and surface; NaN: not known.
+        xy: (N, 2) in the CRS.
+    """
+
+    along_m: FloatArray
+    height: FloatArray
+    sigma_m: FloatArray
+    xy: FloatArray
+
+
+def along_line(corners: FloatArray, spacing_m: float) -> tuple[FloatArray, FloatArray]:
+    """Return places (N, 2) on a line through corners (J, 2), and their distance (N,) from its beginning."""
+    legs = np.linalg.norm(np.diff(corners, axis=0), axis=1)
+    end = np.concatenate([[0.0], np.cumsum(legs)])
+    along = np.linspace(0.0, end[-1], max(round(float(end[-1]) / spacing_m), 1) + 1)
+    return np.column_stack([np.interp(along, end, axis) for axis in corners.T]), along
 
 
 def grid_in_polygon(corners: FloatArray, spacing: float) -> FloatArray:

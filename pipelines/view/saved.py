@@ -1,4 +1,4 @@
-"""What the user saves in the viewer: its files, its measurements as GeoJSON and CSV, and the panels' tables.
+"""What the user saves in the viewer: measurements as GeoJSON, GeoPackage, and a table for each kind.
 
 Several viewers may show one workspace. Each change reads the file again, changes the records that it is about, and
 writes the file whole: nothing is lost of what another viewer has saved meanwhile. One writer at a time.
@@ -8,13 +8,10 @@ them, so that σ of what is made of several measurements is again the joint one.
 in the tables.
 """
 
-import html
 import json
 import uuid
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,25 +19,32 @@ import numpy as np
 from pydantic import Field, ValidationError
 
 from pipelines.core.errors import InputError, storage_failures
+from pipelines.core.extras import extra_part
 from pipelines.core.files import replace_texts
 from pipelines.core.lock import WriteLock
 from pipelines.core.products import ImageName, Product
-from pipelines.core.types import FloatArray, Matrix3, Vector3
+from pipelines.core.types import Matrix3, Vector3
 from pipelines.formats.tables import table_text
-from pipelines.formats.vector_files import Json, feature, features_text
-from pipelines.survey.target_crs import TargetCrs
+from pipelines.formats.vector_files import Json, feature, features_text, write_features_gpkg
 from pipelines.view.quantities import Quantity
 
 FOLDER = "view"  # of the workspace: what the user saves in the viewer
 _PATIENCE_S = 5.0  # for another viewer, which holds the folder for the time of one write
-_MOST_STEPS = 100
-MEASUREMENTS, TABLE = "measurements.geojson", "measurements.csv"
-Kind = Literal["point", "distance", "polyline", "area", "volume"]
+MEASUREMENTS = "measurements.geojson"
+Kind = Literal["point", "distance", "polyline", "area", "volume", "profile"]
+CLOSED: tuple[Kind, ...] = ("area", "volume")
+TABLES: dict[Kind, str] = {
+    "point": "points.csv",
+    "distance": "distances.csv",
+    "polyline": "polylines.csv",
+    "area": "areas.csv",
+    "volume": "volumes.csv",
+    "profile": "profiles.csv",
+}
+PACKAGE = "measurements.gpkg"  # where the extra `vectors` is installed
+FILES = (MEASUREMENTS, PACKAGE, *TABLES.values())
 _MOST_BYTES = 64 << 20
-_COLUMNS = ("name", "kind", "vertex", "x", "y", "z", "crs", "sigma_e_m", "sigma_n_m", "sigma_u_m")
-_TEXT = "font-size:0.85em;margin:0.4em 0.8em"
-_ALARM = "padding:0.4em 0.6em;border-left:0.3em solid #d33;background:rgba(221,51,51,0.12);font-weight:600"
-_TABLE = "width:100%;font-size:0.8em;border-spacing:0.3em 0.1em;font-variant-numeric:tabular-nums;text-align:right"
+_PLACE = ("x", "y", "z", "sigma_e_m", "sigma_n_m", "sigma_u_m")
 
 
 @contextmanager
@@ -59,26 +63,6 @@ def changing(folder: Path) -> Iterator[None]:
         except OSError as error:
             error.filename = error.filename or str(folder)
             raise
-
-
-class History:
-    """Steps that can be undone, the last one first."""
-
-    def __init__(self) -> None:
-        self._steps: deque[tuple[str, Callable[[], object]]] = deque(maxlen=_MOST_STEPS)
-
-    def add(self, step: str, undo: Callable[[], object]) -> None:
-        """Add a step that was taken, in words, with its undoing; one that fails can be repeated."""
-        self._steps.append((step, undo))
-
-    def undo(self) -> str | None:
-        """Undo the last step and return it in words; None: there is none."""
-        if not self._steps:
-            return None
-        step, undo = self._steps[-1]
-        undo()
-        self._steps.pop()
-        return step
 
 
 def new_id() -> str:
@@ -129,7 +113,11 @@ class SavedMeasurements:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self.all: tuple[NamedMeasurement, ...] = tuple(read_measurements(folder))
+        self.read()
+
+    def read(self) -> None:
+        """Read the file again, which another viewer may have changed."""
+        self.all: tuple[NamedMeasurement, ...] = tuple(read_measurements(self._folder))
 
     def put(self, measurement: NamedMeasurement, row: int | None = None) -> None:
         """Save a measurement, in the place of its id, else in a row, else last; a GeorefError: it was not."""
@@ -151,28 +139,74 @@ class SavedMeasurements:
     def _change(self, changed: Callable[[list[NamedMeasurement]], list[NamedMeasurement]]) -> None:
         with changing(self._folder):
             measurements = changed(read_measurements(self._folder))
-            replace_texts(
-                {
-                    self._folder / MEASUREMENTS: features_text([_feature(each) for each in measurements]),
-                    self._folder / TABLE: _table(measurements),
-                }
-            )
+            texts = {
+                MEASUREMENTS: features_text([_feature(each) for each in measurements]),
+                **tables_of(measurements),
+            }
+            replace_texts({self._folder / name: text for name, text in texts.items()})
+            for file in set(TABLES.values()) - set(texts):
+                (self._folder / file).unlink(missing_ok=True)
+            _write_package(self._folder / PACKAGE, measurements)
         self.all = tuple(measurements)
 
 
-def _table(measurements: Sequence[NamedMeasurement]) -> str:
-    points = (
-        (each.name, each.kind, vertex, *point.xyz, each.crs, *(point.sigma_m or ("", "", "")))
-        for each in measurements
-        for vertex, point in enumerate(each.points, start=1)
-    )
-    quantities = (
-        (each.name, each.kind, found.name, found.value, found.unit, "" if found.sigma is None else found.sigma)
-        for each in measurements
-        for found in each.quantities
-    )
-    named = ("name", "kind", "quantity", "value", "unit", "sigma")
-    return table_text((_COLUMNS, *points, (), named, *quantities))
+def _write_package(path: Path, measurements: Sequence[NamedMeasurement]) -> None:
+    """Write a GeoPackage with a layer for each kind, where the extra `vectors` is installed."""
+    if extra_part("vectors").found is None or not measurements:
+        path.unlink(missing_ok=True)
+        return
+    layers: dict[str, list[Json]] = {}
+    for each in measurements:
+        one = _feature(each)
+        layers.setdefault(TABLES[each.kind].removesuffix(".csv"), []).append(
+            {**one, "properties": {name: value for name, value in one["properties"].items() if name != "georef"}}
+        )
+    write_features_gpkg(path, layers)
+
+
+def tables_of(measurements: Sequence[NamedMeasurement]) -> dict[str, str]:
+    """Return a table for each kind of measurement that there is, by file: a line each, with its geometry as WKT.
+
+    Geometry and coordinates are in the CRS of the measurement, which a column names.
+    """
+    tables = {}
+    for kind, file in TABLES.items():
+        rows = [each for each in measurements if each.kind == kind]
+        names = list(dict.fromkeys(quantity.name for each in rows for quantity in each.quantities))
+        if not rows:
+            continue
+        heads = [f"{name}{part}" for name in names for part in ("", " sigma", " unit")]
+        lines: list[Sequence[object]] = [["name", "wkt", "crs", *_PLACE, *heads]]
+        for each in rows:
+            first = each.points[0]
+            place = (*first.xyz, *(first.sigma_m or ("", "", ""))) if kind == "point" else ("",) * 6
+            found = {quantity.name: quantity for quantity in each.quantities}
+            values = [
+                value
+                for name in names
+                for value in _cells(found.get(name))
+            ]  # fmt: skip
+            lines.append([each.name, _wkt(each), each.crs, *place, *values])
+        tables[file] = table_text(lines)
+    return tables
+
+
+def _cells(quantity: Quantity | None) -> tuple[object, object, object]:
+    if quantity is None:
+        return "", "", ""
+    return quantity.value, "" if quantity.sigma is None else quantity.sigma, quantity.unit
+
+
+def _wkt(measurement: NamedMeasurement) -> str:
+    places = [
+        " ".join(f"{value:.9g}" if abs(value) < 400 else f"{value:.4f}" for value in point.xyz)
+        for point in measurement.points
+    ]
+    if len(places) == 1:
+        return f"POINT Z ({places[0]})"
+    if measurement.kind in CLOSED and len(places) > 2:
+        return f"POLYGON Z (({', '.join([*places, places[0]])}))"
+    return f"LINESTRING Z ({', '.join(places)})"
 
 
 def read_measurements(folder: Path) -> list[NamedMeasurement]:
@@ -208,7 +242,7 @@ def _feature(measurement: NamedMeasurement) -> Json:
     geometry: dict[str, Any]
     if len(lon_lat_h) == 1:
         geometry = {"type": "Point", "coordinates": lon_lat_h[0]}
-    elif measurement.kind in ("area", "volume") and len(lon_lat_h) > 2:
+    elif measurement.kind in CLOSED and len(lon_lat_h) > 2:
         geometry = {"type": "Polygon", "coordinates": [_anticlockwise(lon_lat_h)]}
     else:
         geometry = {"type": "LineString", "coordinates": lon_lat_h}
@@ -223,85 +257,3 @@ def _anticlockwise(ring: list[list[float]]) -> list[list[float]]:
     area = float((x - x[0]) @ np.roll(y - y[0], -1) - (y - y[0]) @ np.roll(x - x[0], -1))
     turned = ring if area > 0 else ring[::-1]
     return [*turned, turned[0]]
-
-
-@dataclass(frozen=True)
-class PlaceRow:
-    """Place (3,) in `geo` with σ (3,) east, north, up in metres, or None."""
-
-    name: str
-    position_in_geo: FloatArray
-    sigma_m: FloatArray | None
-
-
-def paragraph(text: str, mark: str = "note") -> str:
-    """Return a paragraph; `data-…` of the name `mark` lets scripts find it."""
-    return f'<p data-{mark}="yes" style="{_TEXT}">{html.escape(text)}</p>'
-
-
-def failure(text: str) -> str:
-    """Return a paragraph that stands out."""
-    return f'<p data-failed="yes" role="alert" style="{_TEXT};{_ALARM}">{html.escape(text)}</p>'
-
-
-def place_table(target: TargetCrs, rows: Sequence[PlaceRow], marked: str = "place") -> str:
-    """Return places with their coordinates in the CRS; `data-…` of the name `marked` has metres in `geo`."""
-    crs = target.crs
-    names = ("longitude", "latitude", "height") if crs.is_geographic else ("easting", "northing", "height")
-    heads = "".join(f"<th>{name} ({html.escape(unit)})</th>" for name, unit in zip(names, crs.units, strict=True))
-    decimals = (8, 8, 3) if crs.is_geographic else (3, 3, 3)
-    lines = []
-    for row in rows:
-        xyz = target.xyz_from_geo(row.position_in_geo[None])[0]
-        cells = "".join(f"<td>{value:.{digits}f}</td>" for value, digits in zip(xyz, decimals, strict=True))
-        data = ",".join(f"{value:.6f}" for value in row.position_in_geo)
-        lines.append(f'<tr data-{marked}="{data}"><th>{html.escape(row.name)}</th>{cells}</tr>')
-        if row.sigma_m is not None:
-            cells = "".join(f"<td>±{value:.3f}</td>" for value in row.sigma_m)
-            lines.append(f"<tr><th>σ E, N, U (m)</th>{cells}</tr>")
-    return _html_table(f"<tr><th></th>{heads}</tr>{''.join(lines)}")
-
-
-def quantity_text(quantity: Quantity) -> str:
-    """Return a quantity with its σ and unit in one line."""
-    sigma = "" if quantity.sigma is None else f" ± {quantity.sigma:.3f}"
-    return f"{quantity.name} {quantity.value:.3f}{sigma} {quantity.unit}"
-
-
-def quantity_table(quantities: Sequence[Quantity]) -> str:
-    """Return quantities with their σ; empty without any."""
-    rows = []
-    for each in quantities:
-        sigma = "" if each.sigma is None else f"±{each.sigma:.3f}"
-        data = f'data-quantity="{html.escape(each.name)}" data-value="{each.value:.6f}"'
-        data += "" if each.sigma is None else f' data-sigma="{each.sigma:.6f}"'
-        cells = f"<td>{each.value:.3f}</td><td>{sigma}</td><td>{html.escape(each.unit)}</td>"
-        rows.append(f"<tr {data}><th>{html.escape(each.name)}</th>{cells}</tr>")
-    return _html_table("".join(rows)) if rows else ""
-
-
-def saved_table(rows: Sequence[tuple[str, str, str]]) -> str:
-    """Return saved measurements: name, what is shown of it, values."""
-    if not rows:
-        return "<p>Nothing saved yet.</p>"
-    lines = [
-        f'<tr data-saved="{html.escape(name)}"><th>{html.escape(shown)}</th><td>{html.escape(values)}</td></tr>'
-        for name, shown, values in rows
-    ]
-    return _html_table("".join(lines))
-
-
-def mark_table(marks: Mapping[str, tuple[float, float]], residual_px: Mapping[str, float]) -> str:
-    """Return the marks of a point by image, with their residuals where the point is determined."""
-    lines = []
-    for image, (x, y) in marks.items():
-        residual = f"{residual_px[image]:.2f}" if image in residual_px else ""
-        name = html.escape(image)
-        cells = f"<td>{x:.2f}</td><td>{y:.2f}</td><td>{residual}</td>"
-        lines.append(f'<tr data-mark="{name}" data-px="{x:.3f},{y:.3f}"><th>{name}</th>{cells}</tr>')
-    heads = "<tr><th>mark in</th><th>x (px)</th><th>y (px)</th><th>residual (px)</th></tr>"
-    return _html_table(heads + "".join(lines))
-
-
-def _html_table(rows: str) -> str:
-    return f'<table style="{_TABLE}">{rows}</table>'

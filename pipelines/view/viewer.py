@@ -1,256 +1,599 @@
-"""The viewer: a trained model in the browser, on loopback, with what measures in it."""
+"""The viewer's answers: what a page shows of a trained model, measures in it, saves and marks.
+
+A page has its own state. The viewer has the model, the saved measurements and the marks, which all pages share.
+"""
 
 from __future__ import annotations
 
-import contextlib
-import logging
 import threading
-from collections.abc import Callable
-from pathlib import Path
-from typing import TYPE_CHECKING, Literal, get_args
+from collections.abc import Iterator
+from dataclasses import asdict
+from typing import Any
 
+import cv2
 import numpy as np
+import shapely
 
 from pipelines.adjust.accuracy_grid import AccuracyGrid
-from pipelines.core.errors import GeorefError
-from pipelines.core.extras import require
+from pipelines.core.errors import GeorefError, InputError
 from pipelines.core.manifest import hash_file
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import GAUSSIANS, MODEL, REPORT
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
+from pipelines.formats.vector_files import read_contours
+from pipelines.geodesy.enu import lla_from_enu
+from pipelines.report.plots.plans import nice_number
+from pipelines.report.plots.style import colours_of
 from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.surface.picking import NoSurface, SurfacePoint
 from pipelines.surface.surface_views import ModelRenderer
+from pipelines.survey.area import area_of
 from pipelines.survey.headline import headline_of
+from pipelines.survey.marks import mark_rays, wrong_marks
+from pipelines.survey.options import AreaOptions, CrsOptions
 from pipelines.survey.report import EvaluationReport, read_report
 from pipelines.survey.scene import photographs
-from pipelines.survey.trained_survey import load_trained
-from pipelines.view.mark_panel import MarkPanel
-from pipelines.view.measure_panel import MeasurePanel
-from pipelines.view.measuring import MeasuringModel
+from pipelines.survey.survey import SurveyedPoint
+from pipelines.survey.target_crs import usable_crs
+from pipelines.survey.trained_survey import TrainedSurvey, load_trained
+from pipelines.view import requests
+from pipelines.view.mark_views import epipolar_lines, proposals
+from pipelines.view.marking import (
+    KeptMarks,
+    MarkedPoint,
+    appears_in,
+    points_to_mark,
+    rays_of,
+    residuals_px,
+    surveyed_marks,
+)
+from pipelines.view.measuring import ESTIMATE, Fineness, MeasuringModel
 from pipelines.view.options import ViewOptions
-from pipelines.view.overlays import OverlayKind, Overlays, PointColour
-from pipelines.view.photo_view import PhotoView
-from pipelines.view.pictures import Painter, Photographs, PictureLoop, ViewFrame, camera_of, frame_of
-from pipelines.view.saved import FOLDER, paragraph
+from pipelines.view.pictures import PageView, Painter, Photographs, frame_of
+from pipelines.view.quantities import Profile, Quantity, distances, length
+from pipelines.view.saved import FOLDER, NamedMeasurement, SavedMeasurements, SavedPoint, new_id
+from pipelines.view.work import Job, Jobs
 
-if TYPE_CHECKING:
-    import viser
-
-log = logging.getLogger(__name__)
-
-_WATCH_S = 2.0
-_FIRST_S = 20.0  # in which a page is expected to be opened
-_FOV_RAD = 0.9
-ClickMode = Literal["looks", "measures", "marks in the photograph"]
+Json = dict[str, Any]
+_MOST_POINTS = 30_000  # SfM points that a page draws
+_MOST_CONTOUR_PLACES = 200_000
+_LENGTH = 0.07  # of the scene's radius: the longest error arrow
+_PIXEL_MARGIN = 0.02  # of a photograph: nearer to its rim a place is seen badly
+_MOST_SEEN = 24  # photographs in the strip
+_CONTOURS = "raster/contours.gpkg"
 
 
 class Viewer:
     """Viewer of a workspace, until the model changes.
-
-    Attributes:
-        click_mode: what a click in the scene does.
-        loops: of the open pages, by the number of the page.
 
     Raises:
         MissingProductError: there is no trained model; names the command that makes it.
         GeorefError: a product is damaged, or the CRS cannot be used.
     """
 
-    def __init__(
-        self, server: viser.ViserServer, workspace: Workspace, options: ViewOptions, progress: Progress = SILENT
-    ) -> None:
-        self._server = server
+    def __init__(self, workspace: Workspace, options: ViewOptions, progress: Progress = SILENT) -> None:
         self.stamp = model_stamp(workspace)
+        self._workspace = workspace
         with progress.task("reading the model", 2) as task:
             trained = load_trained(workspace)
             task.advance()
             images = photographs(trained.sfm, trained.survey, workspace, trained.model.max_image_size)
-            self._renderer = ModelRenderer(trained, images, rasterizer(options.backend, progress))
-            self.model = MeasuringModel(workspace, self._renderer, options)
+            backend = rasterizer(options.backend, progress)
+            renderer = ModelRenderer(trained, images, backend)
+            self.model = MeasuringModel(workspace, renderer, options)
             task.advance()
-        self.frame: ViewFrame = frame_of(trained)
-        self.painter = Painter(self._renderer, Photographs(workspace, trained), self.frame)
-        self.loops: dict[int, PictureLoop] = {}
-        self._lock, self._first_drawn = threading.Lock(), threading.Event()
-        self.overlays = Overlays(server, trained, self.frame)
-        self.photo = PhotoView(server, trained, self.frame, self.overlays, self.wake)
-        self._build(workspace, workspace.root / FOLDER)
-        server.scene.on_click()(self._clicked)
-
-        def prepare_clicks() -> None:
-            """Sort the Gaussians after the first picture, so that neither it nor the first click waits."""
-            self._first_drawn.wait(_FIRST_S)
-            _ = self._renderer.blocks
-
-        threading.Thread(target=prepare_clicks, daemon=True).start()
-        server.on_client_connect(self._connected)
-        server.on_client_disconnect(self._left)
-        for client in server.get_clients().values():
-            self._connected(client)
-
-    def _build(self, workspace: Workspace, folder: Path) -> None:
-        gui, trained = self._server.gui, self.model.trained
-        self._notice = gui.add_html("")
-        gui.add_html(accuracy_html(workspace))
-        self.click_mode = gui.add_dropdown("A click", get_args(ClickMode), hint="What a click in the scene does")
-        tabs = gui.add_tab_group()
-        with tabs.add_tab("See"):
-            self._build_look(workspace)
-        with tabs.add_tab("Measure"):
-            self.measuring = MeasurePanel(
-                self._server, self.model, self.overlays, folder, hash_file(workspace.path(MODEL), {})
-            )
-        with tabs.add_tab("Mark"):
-            self.marking = MarkPanel(self._server, self.model, self.photo, folder)
-            gui.add_button("Measure with the marked point").on_click(lambda _: self._take_marked())
-        survey = trained.survey
-        self.overlays.add_cameras()
-        self.overlays.add_surveyed(survey.control_points, "control")
-        self.overlays.add_surveyed(survey.check_points, "check")
-        self._colour_points()
-
-    def _build_look(self, workspace: Workspace) -> None:
-        gui = self._server.gui
-        names = self.model.trained.sparse.image_name
-        self._photo = gui.add_dropdown("Photograph", names, hint="Or click on a camera")
-        gui.add_button("Fly there").on_click(lambda _: self.photo.show(names.index(self._photo.value)))
-        share = gui.add_slider("Photograph over splat", 0.0, 1.0, 0.05, 1.0)
-        gui.add_button("Leave the photograph").on_click(lambda _: self._leave())
-        switches: tuple[tuple[str, OverlayKind, bool], ...] = (
-            ("Cameras", "cameras", True),
-            ("Control and check points", "points", True),
-            ("Errors of the points", "errors", True),
-            ("SfM points", "tie points", False),
-        )
-        for label, kind, visible in switches:
-            self._add_switch(label, kind, visible)
-        self._colour = gui.add_dropdown("Colour of the SfM points", get_args(PointColour))
-        self._legend = gui.add_html(self._errors(workspace))
-        self._colour.on_update(lambda _: self._colour_points())
-
-        def blend() -> None:
-            self.photo.share = float(share.value)
-            self.wake()
-
-        share.on_update(lambda _: blend())
-
-    def _add_switch(self, label: str, kind: OverlayKind, visible: bool) -> None:
-        box = self._server.gui.add_checkbox(label, visible)
-        box.on_update(lambda _: self.overlays.show(kind, box.value))
-        self.overlays.show(kind, visible)
-
-    def _errors(self, workspace: Workspace) -> str:
-        """Draw the errors of control and check points, and return a sentence about the arrows."""
-        try:
-            report = read_report(workspace.path(REPORT))
-        except GeorefError:
-            return paragraph("No errors are shown: `georef evaluate` measures them.")
-        errors = _point_errors(self.model, report)
-        if not errors:
-            return paragraph("No control or check point has an error to show.")
-        enlarged = self.overlays.add_errors(errors)
-        return paragraph(f"Arrows: triangulated error, × {enlarged:g}. Orange: control points and test views.")
-
-    def _colour_points(self) -> None:
-        grid: AccuracyGrid | None = None
-        if self._colour.value != "of the photographs" and self.model.posterior is not None:
-            grid = self.model.posterior.grid
-        limits = self.overlays.add_points(self._colour.value, grid)
-        if limits is not None:
-            low, high = limits
-            self._legend.content = paragraph(
-                f"predicted σ of the SfM points: dark {low:.3f} m, bright {high:.3f} m"
-            )
-
-    def _leave(self) -> None:
-        self.photo.leave()
-        for client in self._server.get_clients().values():
-            self._stand_above(client)
-
-    def _take_marked(self) -> None:
-        point = self.marking.measured()
-        if point is not None:
-            self.measuring.add_point(point)
-
-    def wake(self) -> None:
-        """Draw the pictures of all pages anew."""
-        for loop in tuple(self.loops.values()):
-            loop.changed.set()
-
-    def _connected(self, client: viser.ClientHandle) -> None:
-        with self._lock:
-            if client.client_id in self.loops:
-                return
-            self._stand_above(client)
-            self.loops[client.client_id] = PictureLoop(
-                client, self.painter, lambda: self.photo.blend, self._first_drawn.set
-            )
-
-    def _left(self, client: viser.ClientHandle) -> None:
-        with self._lock:
-            loop = self.loops.pop(client.client_id, None)
-        if loop is not None:
-            loop.end()
-
-    def _stand_above(self, client: viser.ClientHandle) -> None:
-        """Put a page's camera in the south of the scene, looking down on it."""
-        with client.atomic():
-            client.camera.fov = _FOV_RAD
-            client.camera.up_direction = (0.0, 0.0, 1.0)
-            client.camera.position = (0.0, -14.0, 12.0)
-            client.camera.look_at = (0.0, 0.0, 0.0)
-
-    def _clicked(self, event: viser.SceneClickEvent) -> None:
-        camera = camera_of(event.client)
-        if camera is None:
-            return
-        start, direction = np.array(event.ray_origin), np.array(event.ray_direction)
-        direction /= np.linalg.norm(direction)
-        if self.click_mode.value == "marks in the photograph":
-            self._mark(event.client, direction)
-            return
-        sight = self.frame.sight(camera, start, direction)
-        hit = self.overlays.hit(start, direction, sight.pixel_rad)
-        if isinstance(hit, int) and self.click_mode.value == "looks":
-            self._photo.value = self.model.trained.sparse.image_name[hit]  # type: ignore[misc]
-            self.photo.show(hit)
-        elif isinstance(hit, str):
-            self.measuring.add_surveyed(hit)
-        elif self.click_mode.value == "measures":
-            self.measuring.add_sight(sight)
-
-    def _mark(self, client: viser.ClientHandle, direction: np.ndarray) -> None:
-        """Come closer at the first click in a photograph, and mark at the second."""
-        if self.photo.camera is None or not self.photo.is_at(client):
-            self.marking.turn(0 if self.photo.camera is not None else 1)
-        elif not self.photo.come_closer(client, direction):
-            self.marking.add(self.photo.camera, self.photo.in_cam(direction))
-
-    def tell_change(self, read_again: Callable[[], None]) -> None:
-        """Tell all pages that the model has changed, and offer to read it again."""
-        sentence = "The model has changed since it was read: measurements are those of the old one."
-        self._notice.content = paragraph(sentence, mark="notice")
-        self._server.gui.add_button("Read the model again").on_click(lambda _: read_again())
+        self.trained, self.frame = trained, frame_of(trained)
+        self.photographs = Photographs(workspace, trained)
+        grid = None if self.model.posterior is None else self.model.posterior.grid
+        self._painter = Painter(
+            lambda shown: renderer if shown is trained else ModelRenderer(shown, images, backend),
+            self.photographs, trained, self.frame, grid,
+        )  # fmt: skip
+        self._grid = grid
+        self._hash, self.jobs, self._lock = hash_file(workspace.path(MODEL), {}), Jobs(), threading.RLock()
+        folder = workspace.root / FOLDER
+        self.saved = SavedMeasurements(folder)
+        self.marks = KeptMarks(
+            folder, points_to_mark(trained.survey, self._xyz_of), self.model.target.crs.lla_from_xyz,
+            self.model.target.crs.xyz_from_lla,
+        )  # fmt: skip
+        self._surveyed = {p.name: p for p in (*trained.survey.control_points, *trained.survey.check_points)}
+        self._scene = self._described_scene()
+        # The Gaussians are sorted now, so that the first click does not wait.
+        threading.Thread(target=lambda: renderer.blocks, daemon=True).start()
 
     def close(self) -> None:
-        """End the pictures, and empty the pages."""
-        for loop in tuple(self.loops.values()):
-            loop.end()
-        self._server.scene.remove_click_callback("all")
-        self._server.scene.reset()
-        self._server.gui.reset()
+        self.jobs.close()
+
+    # What is seen
+
+    def picture(self, request: requests.PictureRequest) -> PageView:
+        """Return a picture; an InputError: there is no such photograph, or it cannot be read."""
+        if request.photograph is not None:
+            self._known(request.photograph)
+        return self._painter.paint(request.camera(), request.wanted())
+
+    def scene(self) -> Json:
+        """Return all that a page needs once: frame, cameras, points, outlines, what may be measured."""
+        return self._scene
+
+    def photograph(self, camera: int, part: tuple[float, float, float] | None, longest_px: int) -> bytes:
+        """Return a photograph as JPEG, whole or a square around a pixel: x, y, half a side."""
+        self._known(camera)
+        image = self.photographs.full(camera)
+        if part is not None:
+            x, y, half = part
+            matrix = np.array([[1.0, 0.0, x - half - 0.5], [0.0, 1.0, y - half - 0.5]])
+            side = max(int(2 * half), 1)
+            image = np.asarray(cv2.warpAffine(image, matrix, (side, side), flags=cv2.WARP_INVERSE_MAP), np.uint8)
+        scale = min(1.0, longest_px / max(image.shape[:2]))
+        if scale < 1:
+            size = max(round(image.shape[1] * scale), 1), max(round(image.shape[0] * scale), 1)
+            image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+        return jpeg_of(image, 88)
+
+    def seen_by(self, request: requests.SeenRequest) -> list[Json]:
+        """Return the photographs that see a place, the best first: fine pixels, and away from their rim."""
+        place, found = request.place(), []
+        for camera, pixel in appears_in(place, self.trained):
+            lens = self.trained.sparse.camera_of(camera)
+            center = self._center(camera)
+            size = np.array([lens.width, lens.height])
+            gsd_m = float(np.linalg.norm(place - center)) / lens.mean_focal_px
+            rim = float(np.min(np.minimum(pixel, size - pixel) / size))
+            down_deg = float(
+                np.degrees(np.arccos(np.clip((center - place)[2] / np.linalg.norm(center - place), -1, 1)))
+            )
+            own = {"camera": camera, "image": self.name_of(camera), "px": pixel.tolist(), "gsd_m": gsd_m}
+            found.append((gsd_m * (2.0 if rim < _PIXEL_MARGIN else 1.0), {**own, "angle_deg": down_deg}))
+        return [each for _, each in sorted(found, key=lambda each: each[0])[:_MOST_SEEN]]
+
+    def name_of(self, camera: int) -> str:
+        return self.trained.sparse.image_name[camera]
+
+    def _known(self, camera: int) -> None:
+        if camera >= len(self.trained.sparse.image_name):
+            raise InputError("no-such-photograph", f"There is no photograph {camera}. Load the page again.")
+
+    def _center(self, camera: int) -> FloatArray:
+        return np.asarray(
+            self.trained.geo_from_model.apply(self.trained.poses.cam_center_in_model[camera][None])[0]
+        )
+
+    # Measuring
+
+    def pick(self, request: requests.PickRequest) -> Json:
+        """Return the surface under a pixel of a page, or the reason why there is none."""
+        return self._measured(self.model.reader.under(self.frame.sight(request.camera(), request.x, request.y)))
+
+    def surveyed(self, name: str) -> Json:
+        """Return a surveyed point as its marks show it on the rendered surface, with its surveyed place."""
+        point = self._surveyed.get(name)
+        if point is None:
+            raise InputError("no-such-point", f"There is no surveyed point {name!r}. Load the page again.")
+        rays = mark_rays((point,), self.trained.sparse)
+        found = self._measured(self.model.reader.behind_marks(rays))
+        return {**found, "surveyed": self.model.target.xyz_from_geo(np.array([point.position_in_geo]))[0].tolist()}
+
+    def marked(self, name: str) -> Json:
+        """Return a marked point, triangulated."""
+        rays = rays_of(self._point(name), self.trained)
+        place, cov = self.model.triangulated(rays)
+        if not np.isfinite(place).all():
+            return {"reason": f"{name} has fewer than two marks"}
+        return self._measured(SurfacePoint(place, np.zeros((3, 3)) if cov is None else cov, rays.camera))
+
+    def _measured(self, point: SurfacePoint | NoSurface) -> Json:
+        if isinstance(point, NoSurface):
+            return {"reason": point.reason}
+        xyz, sigma_m = self.model.place(point)
+        return {
+            "point": {
+                "position_in_geo": point.position_in_geo.tolist(),
+                "cov_of_surface": point.cov_of_surface.tolist(),
+                "cameras": [int(camera) for camera in point.cameras],
+            },
+            "xyz": xyz.tolist(),
+            "sigma_m": None if sigma_m is None else sigma_m.tolist(),
+        }
+
+    def measure(self, request: requests.MeasureRequest) -> Job:
+        """Begin a measurement; its answer has quantities, and of a profile the heights."""
+        for camera in {camera for place in request.points for camera in place.cameras}:
+            self._known(camera)
+        return self.jobs.begin(request, lambda job: self._answers(job, request))
+
+    def _answers(self, job: Job, request: requests.MeasureRequest) -> Iterator[Json]:
+        points, kind = [place.point() for place in request.points], request.kind
+        if kind == "point":
+            yield {"quantities": []}
+        elif kind in ("distance", "polyline"):
+            joint = self.model.jointly(points)
+            yield _answer(distances(joint) if kind == "distance" else length(joint))
+        else:
+            for fineness in (
+                Fineness(ESTIMATE.places, ESTIMATE.views, lambda share: job.advance(0.25 * share)),
+                Fineness(advance=lambda share: job.advance(0.25 + 0.75 * share)),
+            ):
+                if kind == "area":
+                    yield _answer(self.model.area(points, fineness))
+                elif kind == "volume":
+                    yield _answer(self.model.volume(points, request.base.wanted(), fineness))
+                else:
+                    joint, line = self.model.jointly(points), self.model.profile(points, fineness)
+                    yield {**_answer(length(joint)), "profile": profile_json(line)}
+
+    def save(self, request: requests.SaveRequest) -> list[Json]:
+        """Save the measurement of a finished job; return all. A GeorefError: it was not saved, and why."""
+        job = self.jobs.find(request.job)
+        if job is None or job.state != "done" or not isinstance(job.request, requests.MeasureRequest):
+            raise InputError(
+                "measurement-unfinished", "The measurement is not finished. Measure it again, then save."
+            )
+        quantities = tuple(Quantity(**each) for each in job.answer["quantities"])
+        with self._lock:
+            self.saved.put(
+                NamedMeasurement(
+                    id=new_id(),
+                    name=request.name.strip() or job.request.kind,
+                    kind=job.request.kind,
+                    crs=self.model.target.crs.name,
+                    model=self._hash,
+                    points=tuple(self._saved_point(place.point()) for place in job.request.points),
+                    quantities=quantities,
+                )
+            )
+        return self.measurements()
+
+    def _saved_point(self, point: SurfacePoint) -> SavedPoint:
+        xyz, sigma_m = self.model.place(point)
+        lla = lla_from_enu(point.position_in_geo[None], self.trained.survey.origin)[0]
+        return SavedPoint.model_validate(
+            {
+                "position_in_geo": point.position_in_geo.tolist(),
+                "cov_of_surface": [tuple(map(float, row)) for row in point.cov_of_surface],
+                "images": [self.name_of(int(camera)) for camera in point.cameras],
+                "xyz": xyz.tolist(),
+                "sigma_m": None if sigma_m is None else sigma_m.tolist(),
+                "lla": lla.tolist(),
+            }
+        )
+
+    def measurements(self) -> list[Json]:
+        """Return the saved measurements, also those of other viewers."""
+        number = {name: camera for camera, name in enumerate(self.trained.sparse.image_name)}
+        with self._lock:
+            self.saved.read()
+            return [
+                {
+                    **each.model_dump(mode="json"),
+                    "older": each.model != self._hash,
+                    "cameras": [[number[name] for name in point.images if name in number] for point in each.points],
+                }
+                for each in self.saved.all
+            ]
+
+    def rename(self, identity: str, request: requests.NamedRequest) -> list[Json]:
+        with self._lock:
+            self.saved.put(self._saved(identity).model_copy(update={"name": request.name}))
+        return self.measurements()
+
+    def remove(self, identity: str) -> list[Json]:
+        with self._lock:
+            self.saved.remove(self._saved(identity))
+        return self.measurements()
+
+    def put_back(self, measurement: NamedMeasurement) -> list[Json]:
+        """Save a measurement again that was removed."""
+        with self._lock:
+            self.saved.put(measurement)
+        return self.measurements()
+
+    def saved_file(self, name: str) -> bytes:
+        """Return a file of saved measurements; an InputError: there is none."""
+        path = self._workspace.root / FOLDER / name
+        if not path.is_file():
+            raise InputError("nothing-saved", f"There is no {name} yet. Save a measurement first.")
+        return path.read_bytes()
+
+    def _saved(self, identity: str) -> NamedMeasurement:
+        found = [each for each in self.saved.all if each.id == identity]
+        if not found:
+            raise InputError("no-such-measurement", "The measurement was removed meanwhile. Load the page again.")
+        return found[0]
+
+    # Marking
+
+    def _xyz_of(self, points: tuple[SurveyedPoint, ...]) -> FloatArray:
+        position = np.array([point.position_in_geo for point in points]).reshape(-1, 3)
+        return self.model.target.xyz_from_geo(position) if len(position) else position
+
+    def points(self) -> Json:
+        """Return all points with their marks, residuals, and which marks disagree with the others."""
+        with self._lock:
+            self.marks.read()
+            points = self.marks.points
+        wrong = {
+            (mark.point, mark.image): mark.off_px
+            for mark in wrong_marks([surveyed_marks(point) for point in points], self.trained.sparse)
+        }
+        return {
+            "is_written": self.marks.is_written,
+            "points": [self._described_point(point, wrong) for point in points],
+        }
+
+    def _described_point(self, point: MarkedPoint, wrong: dict[tuple[str, str], float]) -> Json:
+        good = MarkedPoint(point.name, point.xyz, point.is_check, {
+            image: place for image, place in point.marks.items() if (point.name, image) not in wrong
+        })  # fmt: skip
+        place, cov = self.model.triangulated(rays_of(good, self.trained))
+        rays, off = rays_of(point, self.trained), {}
+        if np.isfinite(place).all():
+            errors = residuals_px(place, rays, self.trained)
+            off = {
+                self.name_of(int(camera)): float(error) for camera, error in zip(rays.camera, errors, strict=True)
+            }
+        expected = self.expected(good)
+        return {
+            "name": point.name,
+            "xyz": point.xyz,
+            "is_check": point.is_check,
+            "own": point.name not in self._surveyed,
+            "place_in_geo": None if expected is None else expected.tolist(),
+            "triangulated": self.model.target.xyz_from_geo(place[None])[0].tolist() if off else None,
+            "sigma_m": None if cov is None or not off else np.sqrt(np.diag(cov)).tolist(),
+            "marks": [
+                {
+                    "image": image,
+                    "px": place_px,
+                    "residual_px": wrong.get((point.name, image), off.get(image)),
+                    "wrong": (point.name, image) in wrong,
+                }
+                for image, place_px in point.marks.items()
+            ],
+        }
+
+    def expected(self, point: MarkedPoint) -> FloatArray | None:
+        """Return where a point must be (3,) in `geo`: by its marks, or by its survey; None: neither tells."""
+        by_marks, _ = self.model.triangulated(rays_of(point, self.trained))
+        if np.isfinite(by_marks).all():
+            return by_marks
+        if point.xyz is None:
+            return None
+        return np.asarray(self.model.target.geo_from_xyz(np.array([point.xyz]))[0])
+
+    def _point(self, name: str) -> MarkedPoint:
+        point = next((point for point in self.marks.points if point.name == name), None)
+        if point is None:
+            raise InputError("no-such-point", f"There is no point {name!r} any more. Load the page again.")
+        return point
+
+    def in_photographs(self, name: str) -> list[Json]:
+        """Return the photographs that must show a point, the nearest first; all, where nothing tells its place."""
+        point = self._point(name)
+        place = self.expected(point)
+        if place is None:
+            shown: list[tuple[int, Any]] = [(camera, None) for camera in range(len(self.trained.sparse.image_name))]
+        else:
+            shown = [(camera, pixel.tolist()) for camera, pixel in appears_in(place, self.trained)]
+        return [
+            {
+                "camera": camera,
+                "image": self.name_of(camera),
+                "px": pixel,
+                "mark": point.marks.get(self.name_of(camera)),
+                "size": [self.trained.sparse.camera_of(camera).width, self.trained.sparse.camera_of(camera).height],
+            }
+            for camera, pixel in shown
+        ]
+
+    def lines(self, name: str, camera: int) -> list[Json]:
+        """Return the epipolar lines of a point's marks in a photograph."""
+        self._known(camera)
+        point = self._point(name)
+        lines = epipolar_lines(self.trained, point, camera, self.expected(point))
+        return [{"image": image, "px": np.round(line, 2).tolist()} for image, line in lines]
+
+    def set_mark(self, request: requests.MarkRequest) -> Json:
+        """Set or remove a mark; an InputError: it is outside its photograph."""
+        names = self.trained.sparse.image_name
+        if request.place_px is not None:
+            if request.image not in names:
+                raise InputError(
+                    "no-such-photograph", f"The model has no photograph {request.image}. Load the page again."
+                )
+            lens = self.trained.sparse.camera_of(names.index(request.image))
+            x, y = request.place_px
+            if not (0 <= x <= lens.width and 0 <= y <= lens.height):
+                raise InputError("mark-outside", "This place is outside the photograph.")
+        with self._lock:
+            self.marks.set_mark(request.point, request.image, request.place_px)
+        return self.points()
+
+    def set_point(self, request: requests.PointRequest) -> Json:
+        with self._lock:
+            self.marks.set_point(request.name.strip(), request.xyz, is_check=request.is_check)
+        return self.points()
+
+    def remove_point(self, request: requests.NamedRequest) -> Json:
+        with self._lock:
+            self.marks.remove_point(request.name)
+        return self.points()
+
+    def write_marks(self) -> Json:
+        """Write the files for `--gcp` and `--checkpoints`."""
+        with self._lock:
+            files = self.marks.write(self.model.target.crs.name)
+        if not files:
+            raise InputError("nothing-to-write", "No point has both coordinates and marks: nothing to write.")
+        return {"files": [str(file) for file in files], "heights": self.model.target.crs.vertical.name}
+
+    def propose(self, request: requests.ProposalRequest) -> Job:
+        """Begin the search for marks of a point in further photographs."""
+        point = self._point(request.point)
+
+        def work(job: Job) -> Iterator[list[Json]]:
+            place = self.expected(point)
+            if place is None or not point.marks:
+                raise InputError(
+                    "no-marks", f"{point.name} needs a mark, and its coordinates or a second mark, first."
+                )
+            found: list[Json] = []
+            yield found
+            for each in proposals(self.trained, point, place, self.photographs.full, job.advance):
+                found = [*found, asdict(each)]
+                yield found
+
+        return self.jobs.begin(request, work)
+
+    # What a page needs once
+
+    def _described_scene(self) -> Json:
+        trained, frame, target = self.trained, self.frame, self.model.target
+        crs, headline = target.crs, headline_of(self._workspace)
+        points, colours, sigma = self._tie_points()
+        xyz = target.xyz_from_geo((frame.middle_in_geo + np.vstack([np.zeros(3), np.eye(3)])).reshape(-1, 3))
+        return {
+            "name": self._workspace.root.name,
+            "accuracy": "" if headline is None else f"The {headline.sentence}.",
+            "crs": {
+                "name": crs.name,
+                "heights": crs.vertical.name,
+                "units": crs.units,
+                "axes": ["longitude", "latitude"] if crs.is_geographic else ["easting", "northing"],
+                "assumed": list(target.assumed),
+                # Coordinates under the cursor: those of the middle, and how they change along east, north, up.
+                "middle": xyz[0].tolist(),
+                "by_view": (xyz[1:] - xyz[0]).T.tolist(),
+            },
+            "without_sigma": self.model.without_sigma,
+            "middle_in_geo": frame.middle_in_geo.tolist(),
+            "radius_m": frame.radius_m,
+            "cameras": [self._described_camera(camera) for camera in range(len(trained.sparse.image_name))],
+            "surveyed": [
+                {"name": point.name, "kind": kind, "at": frame.place(np.array(point.position_in_geo)).tolist()}
+                for kind, found in (
+                    ("control", trained.survey.control_points),
+                    ("check", trained.survey.check_points),
+                )
+                for point in found
+            ],
+            "errors": self._errors(),
+            "tie_points": {
+                "at": np.round(points, 3).ravel().tolist(),
+                "rgb": colours.ravel().tolist(),
+                "sigma": sigma,
+            },
+            "boundary": self._boundary(),
+            "contours": self._contours(),
+            "rasters": self.model.rasters(),
+            "has_sigma": self._grid is not None,
+        }
+
+    def _described_camera(self, camera: int) -> Json:
+        trained = self.trained
+        lens = trained.sparse.camera_of(camera)
+        model_from_view = self.frame.view_from_model.inverse()
+        rotation = trained.poses.cam_from_model[camera] @ model_from_view.rotation
+        at = self.frame.view_from_model.apply(trained.poses.cam_center_in_model[camera][None])[0]
+        return {
+            "name": self.name_of(camera),
+            "split": trained.model.cameras[camera].split,
+            "at": at.tolist(),
+            "rotation": rotation.ravel().tolist(),
+            "half": [lens.width / 2 / lens.mean_focal_px, lens.height / 2 / lens.mean_focal_px],
+            "size": [lens.width, lens.height],
+        }
+
+    def _errors(self) -> Json | None:
+        """Return arrows of the errors of surveyed points, enlarged so that they are seen; None: no errors."""
+        try:
+            errors = _point_errors(self.trained, read_report(self._workspace.path(REPORT)))
+        except GeorefError:
+            return None
+        if not errors:
+            return None
+        longest = max(float(np.linalg.norm(measured - surveyed)) for surveyed, measured in errors)
+        enlarged = nice_number(max(_LENGTH * self.frame.radius_m / max(longest, 1e-12), 1.0))
+        arrows = [[surveyed, surveyed + enlarged * (measured - surveyed)] for surveyed, measured in errors]
+        return {"enlarged": enlarged, "arrows": self.frame.place(np.array(arrows)).tolist()}
+
+    def _tie_points(self) -> tuple[FloatArray, Any, Json | None]:
+        """Return SfM points (N, 3) in the viewer's frame, colours (N, 3), and their colours by predicted σ."""
+        point = self.trained.point_in_model
+        every = max(1, -(-len(point) // _MOST_POINTS))
+        point, rgb = point[::every], self.trained.sfm.point_rgb[::every]
+        sigma = None
+        if self._grid is not None and len(point):
+            sigma = _sigma_colours(self._grid, self.trained.geo_from_model.apply(point))
+        return self.frame.view_from_model.apply(point), rgb, sigma
+
+    def _boundary(self) -> list[list[list[float]]]:
+        try:
+            area = area_of(AreaOptions(), self.trained)
+        except GeorefError:
+            return []
+        rings = [ring for part in shapely.get_parts(area.polygon) for ring in (part.exterior, *part.interiors)]
+        level = area.level_m - self.frame.middle_in_geo[2]
+        return [
+            [[x - self.frame.middle_in_geo[0], y - self.frame.middle_in_geo[1], level] for x, y in ring.coords]
+            for ring in rings
+        ]
+
+    def _contours(self) -> list[Json]:
+        """Return the contour lines that export-raster drew; none: there are none."""
+        path = self._workspace.root / _CONTOURS
+        if not path.is_file():
+            return []
+        survey, found, places = self.trained.survey, [], 0
+        try:
+            wkt, lines = read_contours(path)
+            middle = self._center(0)[None]
+            crs = usable_crs(CrsOptions(crs=wkt), survey.origin, middle, survey.vertical)
+        except GeorefError:
+            return []
+        for line in lines:
+            places += len(line.xy)
+            if places > _MOST_CONTOUR_PLACES:
+                break
+            in_geo = crs.geo_from_xyz(np.column_stack([line.xy, np.full(len(line.xy), line.height)]))
+            at = np.round(self.frame.place(in_geo), 2).tolist()
+            found.append({"height": line.height, "major": line.is_major, "at": at})
+        return found
 
 
-def accuracy_html(workspace: Workspace) -> str:
-    """Return the accuracy of the result as HTML; empty where nothing states it."""
-    headline = headline_of(workspace)
-    return "" if headline is None else paragraph(f"The {headline.sentence}.", mark="accuracy")
+def _sigma_colours(grid: AccuracyGrid, in_geo: FloatArray) -> Json:
+    cov = grid.cov_at(in_geo)
+    sigma = np.sqrt(np.trace(cov, axis1=1, axis2=2))
+    low, high = np.quantile(sigma, [0.02, 0.98]).tolist()
+    return {"rgb": colours_of(sigma, low, high).ravel().tolist(), "scale": [low, high]}
 
 
-def _point_errors(model: MeasuringModel, report: EvaluationReport) -> list[tuple[FloatArray, FloatArray]]:
+def _answer(quantities: tuple[Quantity, ...]) -> Json:
+    return {"quantities": [asdict(each) for each in quantities]}
+
+
+def profile_json(line: Profile) -> Json:
+    def listed(values: FloatArray) -> list[float | None]:
+        return [None if not np.isfinite(value) else round(float(value), 5) for value in values]
+
+    return {
+        "along_m": np.round(line.along_m, 4).tolist(),
+        "height": listed(line.height),
+        "sigma_m": listed(line.sigma_m),
+        "xy": line.xy.tolist(),
+    }
+
+
+def jpeg_of(rgb: Any, quality: int) -> bytes:
+    _, encoded = cv2.imencode(".jpg", np.ascontiguousarray(rgb[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return encoded.tobytes()
+
+
+def _point_errors(trained: TrainedSurvey, report: EvaluationReport) -> list[tuple[FloatArray, FloatArray]]:
     """Return the surveyed and the triangulated place (3,) in `geo` of control and check points."""
-    survey = model.trained.survey
+    survey = trained.survey
     place = {p.name: np.array(p.position_in_geo) for p in (*survey.control_points, *survey.check_points)}
     rows = [*report.checkpoints.triangulated.points, *report.fit.gcp.points]
     return [
@@ -263,46 +606,3 @@ def _point_errors(model: MeasuringModel, report: EvaluationReport) -> list[tuple
 def model_stamp(workspace: Workspace) -> tuple[int, ...]:
     """Return what changes when the model is trained again; a MissingProductError: there is no trained model."""
     return tuple(workspace.path(product).stat().st_mtime_ns for product in (MODEL, GAUSSIANS))
-
-
-def serve(
-    workspace: Workspace,
-    options: ViewOptions,
-    ready: Callable[[str], None],
-    ended: threading.Event,
-    progress: Progress = SILENT,
-) -> None:
-    """Serve the viewer of a workspace until `ended` is set.
-
-    `ready` is called with the address, its key included, when the pages can be opened.
-
-    Raises:
-        BackendUnavailableError: viser is not installed.
-        MissingProductError: there is no trained model; names the command that makes it.
-        GeorefError: a product is damaged, no port is free, or the CRS cannot be used.
-    """
-    require("viewer")
-    from pipelines.view.loopback import start_server, stop_server
-
-    model_stamp(workspace)
-    server, address = start_server(options.port, f"georef view {workspace.root.name}", dark=options.dark)
-    try:
-        viewer = Viewer(server, workspace, options, progress)
-        ready(address)
-        again = threading.Event()
-        told = False
-        while not ended.wait(_WATCH_S):
-            if again.is_set():
-                again.clear()
-                viewer.close()
-                viewer, told = Viewer(server, workspace, options, progress), False
-            changed = False
-            with contextlib.suppress(GeorefError, OSError):  # between the old model and the new one
-                changed = model_stamp(workspace) != viewer.stamp
-            if changed and not told:
-                told = True
-                text = "The model was trained again. The page shows the old one until it is loaded anew there."
-                log.warning(text, extra={"code": "model-changed"})
-                viewer.tell_change(again.set)
-    finally:
-        stop_server(server)

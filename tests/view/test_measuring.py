@@ -15,9 +15,8 @@ from pipelines.core.workspace import Workspace
 from pipelines.surface.picking import NoSurface, Sight, SurfacePoint, depth_around, points_on_surface
 from pipelines.survey.marks import mark_rays
 from pipelines.survey.options import CrsOptions
-from pipelines.view import measuring
-from pipelines.view.measuring import MeasuringModel
-from pipelines.view.quantities import BasePlane, distances
+from pipelines.view.measuring import ESTIMATE, Fineness, MeasuringModel, WantedBase
+from pipelines.view.quantities import along_line, distances
 from tests.splat_scenes import ground_height
 from tests.view_scenes import renderer_of
 
@@ -94,11 +93,9 @@ def corners(model: MeasuringModel, half: float) -> list[SurfacePoint]:
     return [point for point in points if isinstance(point, SurfacePoint)]
 
 
-@pytest.mark.slow
-def test_areas_and_volume_of_the_hill(model: MeasuringModel, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(measuring, "_MOST_SAMPLES", 49)
+def test_areas_volumes_and_a_profile_of_the_hill(model: MeasuringModel) -> None:
     square = corners(model, 10.0)
-    plan, surface, coverage = model.area(square)
+    plan, surface, coverage = model.area(square, Fineness())
     # The corners lie on lines of sight from the middle: an error of the height moves them out by a part of it.
     assert plan.value == pytest.approx(400.0, rel=0.01)
     axis = np.linspace(-10, 10, 201)
@@ -106,16 +103,29 @@ def test_areas_and_volume_of_the_hill(model: MeasuringModel, monkeypatch: pytest
     height = ground_height(east, north)
     by_north, by_east = np.gradient(height, axis, axis)
     stretch = float(np.sqrt(1 + by_east**2 + by_north**2).mean())
-    # The samples are 3 m apart, and the hill bends within that.
+    # The samples are 2 m apart, and the hill bends within that.
     assert surface.value / plan.value == pytest.approx(stretch, rel=0.02)
     assert coverage.value == pytest.approx(100.0, abs=3)
-    base = float(ground_height(np.array(10.0), np.array(10.0)))
-    above, _, volume, _ = model.volume(square, BasePlane())
-    expected = float((height - base).mean()) * 400.0
-    assert volume.value == pytest.approx(expected, rel=0.03)
-    assert above.value == pytest.approx(expected, rel=0.03)
-    assert volume.sigma is not None
-    assert abs(volume.value - expected) < 4 * volume.sigma
+    corner = float(ground_height(np.array(10.0), np.array(10.0)))
+    level = model.target.xyz_from_geo(np.array([[10.0, 10.0, corner]]))[0, 2]
+    expected = float((height - corner).mean()) * 400.0
+    # A tenth of a pixel of 0.5 m over the area is 5 % of the volume; the corners are such measurements, too.
+    bases = (WantedBase("plane"), WantedBase("mean"), WantedBase("height", height=level))
+    for base, fineness, off in [*((base, Fineness(), 0.04) for base in bases), (bases[0], ESTIMATE, 0.08)]:
+        above, _, volume, _ = model.volume(square, base, fineness)
+        assert volume.value == pytest.approx(expected, rel=off)
+        assert above.value == pytest.approx(expected, rel=off)
+        assert volume.sigma is not None
+        assert 0.002 * expected < volume.sigma and abs(volume.value - expected) < 3 * volume.sigma
+    line = model.profile(square[:3], Fineness())
+    places, along_m = along_line(np.array([corner.position_in_geo[:2] for corner in square[:3]]), line.along_m[1])
+    np.testing.assert_allclose(line.along_m, along_m)
+    known = np.isfinite(line.height)
+    assert known.mean() > 0.98
+    truth = np.column_stack([places, ground_height(*places.T)])
+    error = (line.height - model.target.xyz_from_geo(truth)[:, 2])[known]
+    assert np.max(np.abs(error)) < 0.5 * PIXEL_M
+    assert 0.1 < np.sqrt(np.mean((error / line.sigma_m[known]) ** 2)) < 2  # a model without errors
 
 
 def test_shared_errors_cancel_in_distances(model: MeasuringModel) -> None:

@@ -8,12 +8,13 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from pipelines.view.quantities import (
-    BasePlane,
     MeasuredPoints,
     SampledSurface,
+    VolumeBase,
     grid_in_polygon,
     length,
     plan_area,
+    rim_base,
     volumes,
 )
 
@@ -51,21 +52,29 @@ def test_areas_of_known_polygons() -> None:
     assert not ((np.abs(grid[:, 0] - 3) < 0.5) & (grid[:, 1] > 4)).any()
 
 
-@pytest.mark.parametrize(
-    ("kind", "expected"), [("plane through the corners", 50.0), ("level of the lowest corner", 70.0)]
-)
-def test_volume_over_either_base(kind, expected: float) -> None:
+@pytest.mark.parametrize(("kind", "expected"), [("plane", 50.0), ("mean", 50.0), ("lowest", 70.0)])
+def test_volume_over_each_base(kind, expected: float) -> None:
     # A slab 0.5 m above a sloping square of 10 m; its lowest side lies 0.2 m below the middle.
     corners = np.array([[0.0, 0, 0], [10, 0, 0.4], [10, 10, 0.4], [0, 10, 0]])
     grid = grid_in_polygon(corners[:, :2], 0.5)
     samples = np.column_stack([grid, 0.04 * grid[:, 0] + 0.5])
     chosen = np.arange(0, len(samples), 40)
     cov = 1e-4 * np.eye(3 * (4 + len(chosen)))
-    surface = SampledSurface(exact(corners, cov[:12, :12]), samples, np.zeros(len(samples)), cov, chosen)
-    above, below, volume = volumes(surface, BasePlane(kind, lowest=0))
+    none = np.zeros(len(samples))
+    surface = SampledSurface(exact(corners, cov[:12, :12]), samples, none, cov, chosen, pixel_m=0.0)
+    above, below, volume = volumes(surface, rim_base(kind, corners, grid))
     assert volume.value == pytest.approx(expected)
     assert (above.value, below.value) == (pytest.approx(expected), 0.0)
     assert volume.sigma is not None
     # 100 m² over the mean of four corners, each ± 1 cm (or of one), with that of the chosen samples.
-    of_base = 1.0 / np.sqrt(4) if kind == "plane through the corners" else 1.0
-    assert volume.sigma == pytest.approx(np.hypot(of_base, 1.0 / np.sqrt(len(chosen))), rel=0.1)
+    of_base = 1.0 if kind == "lowest" else 1.0 / np.sqrt(4)
+    of_sampling = volumes_of_chequers(samples, surface, rim_base(kind, corners, grid))
+    expected_sigma = np.sqrt(of_base**2 + 1.0 / len(chosen) + of_sampling**2)
+    assert volume.sigma == pytest.approx(expected_sigma, rel=0.1)
+
+
+def volumes_of_chequers(samples: np.ndarray, surface: SampledSurface, base: VolumeBase) -> float:
+    """Return half the difference between the volumes over the white and the black cells of the grid."""
+    column, row = (np.unique(np.round(samples[:, axis], 3), return_inverse=True)[1] for axis in (0, 1))
+    above, white = samples[:, 2] - base.height_m, (column + row) % 2 == 0
+    return float(plan_area(surface.corners).value * abs(above[white].mean() - above[~white].mean()) / 2)

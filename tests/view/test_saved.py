@@ -7,15 +7,19 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pyogrio
 import pytest
+import shapely
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pipelines.core.errors import InputError
+from pipelines.view import saved
 from pipelines.view.quantities import Quantity
 from pipelines.view.saved import (
     MEASUREMENTS,
-    TABLE,
+    PACKAGE,
+    TABLES,
     Kind,
     NamedMeasurement,
     SavedMeasurements,
@@ -48,7 +52,7 @@ POINTS = st.builds(saved_point, st.tuples(*3 * (st.floats(-100, 100),)), LLA, st
 MEASUREMENT = st.builds(
     NamedMeasurement,
     name=NAMES,
-    kind=st.sampled_from(["point", "distance", "polyline", "area", "volume"]),
+    kind=st.sampled_from(["point", "distance", "polyline", "area", "volume", "profile"]),
     crs=NAMES,
     model=NAMES,
     points=st.lists(POINTS, min_size=1, max_size=3).map(tuple),
@@ -61,22 +65,33 @@ MEASUREMENT = st.builds(
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(measurements=st.lists(MEASUREMENT, max_size=3))
 def test_what_is_saved_comes_back(tmp_path: Path, measurements: list[NamedMeasurement]) -> None:
-    saved = SavedMeasurements(tmp_path)
-    for old in saved.all:  # of the example before
-        saved.remove(old)
+    kept = SavedMeasurements(tmp_path)
+    for old in kept.all:  # of the example before
+        kept.remove(old)
     assert read_measurements(tmp_path) == []
     for measurement in measurements:
-        saved.put(measurement)
-    assert read_measurements(tmp_path) == measurements == list(saved.all)
+        kept.put(measurement)
+    assert read_measurements(tmp_path) == measurements == list(kept.all)
     if not measurements:
         return
     document = json.loads((tmp_path / MEASUREMENTS).read_text("utf-8"))
     for feature, measurement in zip(document["features"], measurements, strict=True):
         assert feature["properties"]["name"] == measurement.name
         assert feature["geometry"]["type"] in ("Point", "LineString", "Polygon")
-    with (tmp_path / TABLE).open(encoding="utf-8", newline="") as handle:
-        rows = list(csv.reader(handle))
-    assert sum(len(each.points) for each in measurements) == rows.index([]) - 1
+    for kind, file in TABLES.items():
+        own = [each for each in measurements if each.kind == kind]
+        assert (tmp_path / file).exists() == bool(own)
+        if own:
+            with (tmp_path / file).open(encoding="utf-8", newline="") as handle:
+                rows = list(csv.DictReader(handle))
+            assert len(rows) == len(own)
+            for row, each in zip(rows, own, strict=True):
+                shape = shapely.from_wkt(row["wkt"])
+                places = shapely.get_coordinates(shape, include_z=True)[: len(each.points)]
+                np.testing.assert_allclose(places, [point.xyz for point in each.points], rtol=1e-7, atol=1e-4)
+    layers = [layer for layer, _ in pyogrio.list_layers(tmp_path / PACKAGE)]
+    assert set(layers) == {TABLES[each.kind].removesuffix(".csv") for each in measurements}
+    assert sum(pyogrio.read_info(tmp_path / PACKAGE, layer)["features"] for layer in layers) == len(measurements)
 
 
 def test_without_a_file_nothing_is_saved(tmp_path: Path) -> None:
@@ -134,7 +149,6 @@ def test_two_viewers_keep_what_the_other_saves(tmp_path: Path) -> None:
     assert ((tmp_path / MEASUREMENTS).read_text("utf-8"), len(one.all)) == ("{", 3)
 
 
-def test_kinds_are_those_of_the_panel() -> None:
-    from pipelines.view.measure_panel import _LEAST
-
-    assert set(_LEAST) == set(Kind.__args__)
+def test_kinds_are_those_of_the_page() -> None:
+    page = (Path(saved.__file__).parent / "page" / "measure.js").read_text("utf-8")
+    assert all(f"{kind}: [" in page for kind in Kind.__args__)
