@@ -7,6 +7,7 @@ Readout times are measurements that OpenDroneMap collects (github.com/OpenDroneM
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from pipelines.core.types import FloatArray, vector3
 from pipelines.geometry.trajectory import Trajectory
@@ -53,8 +54,8 @@ def with_velocities(
 ) -> tuple[SurveyImage, ...]:
     """Return the images with the velocity of each camera that has a rolling shutter.
 
-    The `track` of positions in geo, on the navigation's clock, gives velocities; without one, the positions of the
-    photographs before and after give them.
+    The `track` of positions in geo, on the navigation's clock, gives velocities; without one, a spline through the
+    positions of the photographs.
     """
     rolling = {camera.camera_id for camera in cameras if camera.readout_s > 0}
     if not any(image.camera_id in rolling for image in images):
@@ -84,19 +85,13 @@ def with_velocities(
 
 
 def _between_photographs(time_s: FloatArray, position: FloatArray) -> FloatArray:
-    """Return velocities (N, 3), NaN where unknown: slopes of the parabola through the photographs beside each.
-
-    The first and the last of a line have the velocity to their only neighbour.
-    """
+    """Return velocities (N, 3), NaN where unknown: slopes of a spline through photographs without a long gap."""
     velocity = np.full((len(time_s), 3), np.nan)
     known = np.flatnonzero(np.isfinite(time_s) & np.isfinite(position).all(axis=1))
     clock_s, first = np.unique(time_s[known], return_index=True)
     rows = known[first]
-    step_s = np.diff(clock_s)
-    slope = np.where(step_s[:, None] <= _LONGEST_GAP_S, np.diff(position[rows], axis=0) / step_s[:, None], np.nan)
-    edge = np.full((1, 3), np.nan)
-    before, after = np.concatenate([edge, slope]), np.concatenate([slope, edge])
-    weight = np.concatenate([[1.0], step_s, [1.0]])[:, None]  # the nearer neighbour tells more
-    both = (before * weight[1:] + after * weight[:-1]) / (weight[1:] + weight[:-1])
-    velocity[rows] = np.where(np.isfinite(both), both, np.where(np.isfinite(before), before, after))
+    for leg in np.split(np.arange(len(rows)), np.flatnonzero(np.diff(clock_s) > _LONGEST_GAP_S) + 1):
+        if len(leg) > 1:
+            spline = CubicSpline(clock_s[leg], position[rows[leg]], bc_type="natural")
+            velocity[rows[leg]] = spline(clock_s[leg], 1)
     return velocity
