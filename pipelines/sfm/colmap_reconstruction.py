@@ -50,7 +50,8 @@ class ColmapReconstructor:
             else:
                 require_sound(job.database)
                 model = reconstruct(colmap, job, progress)
-            shutter = correct_tie_points(model, job.survey, partial(_adjust, colmap, job, model, progress))
+            adjust = partial(_adjust, colmap, job, progress=progress)
+            model, shutter = correct_tie_points(model, job.survey, adjust)
             write_reconstruction(model, job.sparse)
             if shutter is not None:
                 save_json(shutter, job.sparse / ROLLING_SHUTTER)

@@ -4,6 +4,7 @@ Positions and times give the velocity of each camera (`ingest`), the model gives
 both. Marks and photographs are corrected later, by the motion that lies beside the model.
 """
 
+import logging
 from collections.abc import Callable
 from typing import Any
 
@@ -16,34 +17,50 @@ from pipelines.geometry.sparse_model import SparseModel
 from pipelines.sfm.mapping import alignment_with
 from pipelines.survey.survey import Survey
 
+log = logging.getLogger(__name__)
+
+_WORSE = 1.01  # ratio of reprojection errors; a lens absorbs the motion of parallel lines, at the same error
 _ROUNDS = 2  # the second moves tie points by hundredths of a pixel
 _LEAST_PX = 0.05  # largest motion of a row in the image that is worth a correction
 
 
-def correct_tie_points(model: Any, survey: Survey, adjust: Callable[[], None]) -> RollingShutter | None:
-    """Move the observations of a `pycolmap.Reconstruction`, and `adjust` it; return the motion of its cameras.
+def correct_tie_points(
+    model: Any, survey: Survey, adjust: Callable[[Any], None]
+) -> tuple[Any, RollingShutter | None]:
+    """Return a `pycolmap.Reconstruction` with corrected observations, adjusted, and the motion of its cameras.
 
-    None: no camera has a rolling shutter and a known velocity, or none moved by as much as a twentieth of a pixel.
+    None, and the model as it is: no camera has a rolling shutter and a known velocity, none moved by as much as a
+    twentieth of a pixel, or the corrected observations fit worse. Then readout time or velocities are wrong, such
+    as those of an aircraft that stops for each photograph.
     """
     flat = flatten(model)
     travel = _travel_in_cam(flat, survey)
     if travel is None or _largest_px(flat, travel) < _LEAST_PX:
-        return None
-    seen = _observed(model)
+        return model, None
+    corrected = type(model)(model)
+    seen = _observed(corrected)
     for _ in range(_ROUNDS):
         for place, (image_id, (rows, xy_px)) in enumerate(seen.items()):
-            image = model.images[image_id]
-            points = np.array([model.points3D[image.points2D[row].point3D_id].xyz for row in rows.tolist()])
+            image = corrected.images[image_id]
+            points = np.array([corrected.points3D[image.points2D[row].point3D_id].xyz for row in rows.tolist()])
             depth = points @ flat.rotation_cam_from_local[place, 2] + flat.translation_cam_from_local[place, 2]
             moved = in_global_shutter(flat.camera_of(place), xy_px, depth, travel[place])
             for row, xy in zip(rows.tolist(), np.where(np.isfinite(moved), moved, xy_px), strict=True):
                 image.points2D[row].xy = xy
-        adjust()
-        flat = flatten(model)
+        adjust(corrected)
+        flat = flatten(corrected)
         travel = _travel_in_cam(flat, survey)
         assert travel is not None
+    before_px, after_px = (each.compute_mean_reprojection_error() for each in (model, corrected))
+    if after_px > _WORSE * before_px:
+        log.warning(
+            "The rolling shutter is not corrected: tie points would fit worse (%.3f px, %.3f px without). "
+            "Check --rolling-shutter and the times of the photographs.",
+            after_px, before_px, extra={"code": "rolling-shutter-refused"},
+        )  # fmt: skip
+        return model, None
     motion = zip(flat.image_name, travel, strict=True)
-    return RollingShutter(travel_in_cam={name: vector3(along) for name, along in motion})
+    return corrected, RollingShutter(travel_in_cam={name: vector3(along) for name, along in motion})
 
 
 def _observed(model: Any) -> dict[int, tuple[IntArray, FloatArray]]:

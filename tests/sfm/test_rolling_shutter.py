@@ -118,11 +118,16 @@ def test_tie_points_marks_and_photographs_of_a_fast_flight(tmp_path: Path) -> No
 
     still = [replace(pose, travel=np.zeros(3)) for pose in poses]
     write_sparse(true_model(still, points), tmp_path / "still")
-    raw, model, global_ = (load_reconstruction(folder) for folder in (tmp_path, tmp_path, tmp_path / "still"))
+    raw, global_ = (load_reconstruction(folder) for folder in (tmp_path, tmp_path / "still"))
     adjust_finally(pycolmap, raw, threads=1)
     adjust_finally(pycolmap, global_, threads=1)
-    shutter = correct_tie_points(model, survey, lambda: adjust_finally(pycolmap, model, threads=1))
+    model, shutter = correct_tie_points(raw, survey, lambda each: adjust_finally(pycolmap, each, threads=1))
     assert shutter is not None
+    # Velocities of the other sign make the observations worse, and are refused.
+    back = [each.model_copy(update={"velocity_in_geo": tuple(-np.array(each.velocity_in_geo))}) for each in images]
+    wrong = survey.model_copy(update={"images": tuple(back)})
+    kept, none = correct_tie_points(raw, wrong, lambda each: adjust_finally(pycolmap, each, threads=1))
+    assert kept is raw and none is None
     # Rows are off by up to 2 px; what is left are the marks' own tenth of a pixel, and the drift of the model.
     assert rms_m(model, poses, points) < 1.2 * rms_m(global_, poses, points) < 0.4 * rms_m(raw, poses, points)
 
