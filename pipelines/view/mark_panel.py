@@ -11,8 +11,9 @@ import numpy as np
 
 from pipelines.core.errors import GeorefError, StorageError
 from pipelines.core.types import FloatArray
-from pipelines.geometry.cameras import bearings, distort
+from pipelines.geometry.cameras import distort
 from pipelines.surface.picking import SurfacePoint
+from pipelines.survey.marks import bearings_at
 from pipelines.survey.survey import SurveyedPoint
 from pipelines.view.marking import KeptMarks, MarkedPoint, appears_in, points_to_mark, rays_of, residuals_px
 from pipelines.view.measuring import MeasuringModel
@@ -244,7 +245,7 @@ class MarkPanel(Panel):
             return None, None, []
         mark, own = None, point.marks.get(self.names[camera])
         if own is not None:
-            mark = bearings(trained.sparse.camera_of(camera), np.array([own]))[0]
+            mark = bearings_at(trained.sparse, camera, np.array([own]))[0]
         place = self._expected(point)
         expected = None
         if place is not None:
