@@ -65,7 +65,11 @@ HOMES: dict[str, tuple[str, ...]] = {
     "pycolmap": ("pipelines.sfm", "pipelines.formats"),
     "numba": ("pipelines.splat", "pipelines.surface"),
     "gsplat": ("pipelines.splat.rasterizer.cuda_kernels",),
-    "torch": ("pipelines.splat", "pipelines.survey", "pipelines.surface", "pipelines.jobs.machine", *STAGE_ROOMS),
+    "torch": (
+        *("pipelines.splat", "pipelines.survey", "pipelines.surface"),
+        *("pipelines.jobs.machine", "pipelines.jobs.calibration"),
+        *STAGE_ROOMS,
+    ),
     "filelock": ("pipelines.core",),
     "laspy": ("pipelines.formats",),
     "py4dgeo": ("pipelines.evaluate.reference_distances",),

@@ -14,9 +14,9 @@ evenly: `off` is the mean distance of the file's points from the true surface, a
 that are off by 0.1 m at most; `missing` and `recall` are the same the other way round, of the true surface that
 three photographs see. Chamfer is the mean of both distances, F1 the harmonic mean of both shares.
 
-Of the terrain, cells are compared with the true ground: open, below the edges (the outer metre) of houses, trees and
-cars, and below these as a whole. Errors of type I are ground points of the cloud that are not told as such, errors
-of type II others that are.
+Of the terrain, cells are compared with the true ground: open, below the edges (the outer metre) of houses, trees
+and cars, and below these as a whole. Errors of type I are ground points of the cloud that are not told as such,
+errors of type II others that are.
 """
 
 from __future__ import annotations

@@ -73,8 +73,8 @@ def whole_products(*products: str, optional: bool = False) -> tuple[ProductPart,
 # Photographs count by content, wherever their folder lies. Messages to the user change no result, and points
 # without marks enter none.
 MEASURED = ProductPart(SURVEY, without=("image_dir", "assumptions", "warnings", "unmarked_points"))
-# The photographs, and the positions and attitudes by which `sfm` chooses the pairs to match. Control points, σ and
-# the split of a survey do not make an SfM model stale.
+# The photographs, positions and attitudes, by which `sfm` chooses the pairs to match, and velocities, by which it
+# corrects a rolling shutter. Control points, σ and the split of a survey do not make an SfM model stale.
 PHOTOGRAPHS = ProductPart(
     SURVEY,
     fields=(
@@ -84,6 +84,7 @@ PHOTOGRAPHS = ProductPart(
         "images.sha256",
         "images.fix.position_in_geo",
         "images.attitude.quat_xyzw",
+        "images.velocity_in_geo",
     ),
 )
 # The estimates that are applied to the survey when the survey is read, and the navigation that they are applied to.

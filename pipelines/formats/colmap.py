@@ -13,20 +13,22 @@ import struct
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.core.errors import InputError, StorageError
 from pipelines.core.files import file_size, storage_failure_of
-from pipelines.core.types import FloatArray, IntArray
+from pipelines.core.products import ImageName, Product, load_json
+from pipelines.core.types import FloatArray, IntArray, Vector3
 from pipelines.core.validators import stays_inside
 from pipelines.geometry.cameras import Camera
 from pipelines.geometry.sparse_model import SparseModel
 
+ROLLING_SHUTTER = "rolling_shutter.json"
 FILES = ("rigs", "cameras", "frames", "images", "points3D")
 _REQUIRED = ("cameras", "images", "points3D")
 _OBSERVATION_BYTES, _TRACK_BYTES, _FRAME_DATA_BYTES = 24, 8, 16
@@ -38,6 +40,19 @@ _INVALID_NAME = "has a name that is not UTF-8"
 # COLMAP logs a line for each step; only its errors are of use here.
 _COLMAP_ERRORS_ONLY = 2
 _INVALID_POINT = np.uint64(2**64 - 1)
+
+
+class RollingShutter(Product):
+    """Motion of cameras from the readout of the first row to that of the last, beside a model: a file of our own.
+
+    The observations of such a model lie where a global shutter would have shown them.
+
+    Attributes:
+        travel_in_cam: by name of the image, in the axes of the camera and units of the model.
+    """
+
+    format_version: Literal[1] = 1
+    travel_in_cam: dict[ImageName, Vector3]
 
 
 class _CutOffError(ValueError):
@@ -158,12 +173,17 @@ _RECORDS: dict[str, Callable[[_Bytes, int], int]] = {
 def read_sparse(path: Path) -> SparseModel:
     """Read the COLMAP model (cameras, images, points3D as .bin or .txt) in a folder.
 
-    Images without a pose and observations without a point are left out.
+    Images without a pose and observations without a point are left out. The motion of the cameras comes from the
+    file beside the model, if there is one.
 
     Raises:
         InputError: unreadable, inconsistent, or with values that are not finite.
     """
     model = flatten(load_reconstruction(path))
+    if (path / ROLLING_SHUTTER).exists():
+        travel = load_json(RollingShutter, path / ROLLING_SHUTTER).travel_in_cam
+        moved = np.array([travel.get(name, (0.0, 0.0, 0.0)) for name in model.image_name])
+        model = replace(model, travel_in_cam=moved)
     _check(model, path)
     return model
 

@@ -30,6 +30,9 @@ class SparseModel:
     obs_point: IntArray  # (M,) index into the points, ascending
     obs_image: IntArray  # (M,) index into the images
     obs_xy_px: FloatArray  # (M, 2) pixels, the centre of the top-left pixel being (0.5, 0.5)
+    # (n, 3) motion of the cameras while their rows were read (`rolling_shutter.py`), by which the observations are
+    # already corrected; None: none
+    travel_in_cam: FloatArray | None = None
 
     @property
     def cam_center_in_local(self) -> FloatArray:
@@ -76,4 +79,5 @@ class SparseModel:
             obs_point=np.searchsorted(points, self.obs_point[kept]),
             obs_image=place[self.obs_image[kept]],
             obs_xy_px=self.obs_xy_px[kept],
+            travel_in_cam=None if self.travel_in_cam is None else self.travel_in_cam[rows],
         )

@@ -143,6 +143,13 @@ class IngestOptions(StageOptions):
     sigma_mark: float = Field(0.5, gt=0, description="σ of an image mark in pixels.")
     max_gap: float = Field(1.0, gt=0, description="Longest gap to interpolate over in the trajectory, in seconds.")
     focal_px: float | None = Field(None, gt=0, description="Focal length in pixels, instead of the one from EXIF.")
+    rolling_shutter: float | None = Field(
+        None,
+        ge=0,
+        le=1,
+        description="Readout time of a photograph in seconds, from its first row to its last; 0: a global or "
+        "mechanical shutter (default: by camera model, else 0).",
+    )
     accept_inconsistency: bool = Field(
         False, description="Go on where the table of positions disagrees with EXIF, with a caution."
     )

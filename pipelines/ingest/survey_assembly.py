@@ -19,6 +19,7 @@ from pipelines.ingest import flight_record
 from pipelines.ingest.ground_points import GroundFile, GroundPoint, require_near, split_checks, unmarked_points
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.remarks import Remarks
+from pipelines.ingest.rolling_shutter import with_readouts, with_velocities
 from pipelines.survey.calibrated import FIX_RANGE_M, NavigationTrack, require_estimable
 from pipelines.survey.survey import Attitude, Fix, FixSession, Survey, SurveyedPoint, SurveyImage, UnmarkedPoint
 
@@ -75,13 +76,15 @@ def assemble_survey(
     if options.estimated:
         require_estimable(track, options.estimated, "--estimate" if options.estimate else "--time-offset")
     sessions, session_of = fix_sessions(poses, options, remarks)
+    cameras = with_readouts(flight.cameras, options, remarks)
+    images = _images(flight, session_of, origin, options)
     survey = Survey(
         origin=origin,
         source_crs=poses.crs_name if located or control is None else control.crs.name,
         vertical=_vertical(poses, files, remarks),
         image_dir=str(flight.folder),
-        cameras=flight.cameras,
-        images=_images(flight, session_of, origin, options),
+        cameras=cameras,
+        images=with_velocities(images, cameras, None if track is None else track.positions, options, remarks),
         sessions=sessions,
         control_points=_surveyed(marked, origin, options),
         check_points=_surveyed(marked_checks, origin, options),

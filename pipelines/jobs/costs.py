@@ -15,9 +15,9 @@ from scipy.optimize import nnls
 
 from pipelines.core.types import FloatArray
 
+MEASURED_CORES = 2
 # Four reconstructions of 18, 48, 48 and 40 photographs took 61, 134, 148 and 175 s, on 2 cores of an AMD EPYC
 # beside other programs, 2026-11-22. This model says 49, 147, 125 and 103 s.
-_MEASURED_CORES = 2
 _FEATURES_MEGAPIXEL_S, _PAIR_S, _MAPPING_S = 1.2, 0.12, 0.8  # mapping: of a photograph
 # Of photographs that are not doubled: one of 0.8 megapixels takes 0.72 s on one core, doubled 2.15 s.
 _OWN_SIZE_FEATURES_MEGAPIXEL_S = 0.45
@@ -51,9 +51,9 @@ def reconstruction_cost(
     found = megapixels * (_FEATURES_MEGAPIXEL if doubled else _OWN_SIZE_FEATURES_MEGAPIXEL)
     compared = (min(found, max_features) / _PAIR_FEATURES) ** 2
     return ReconstructionCost(
-        features_s=_MEASURED_CORES * photographs * detection_s * megapixels,
-        matching_s=_MEASURED_CORES * _PAIR_S * pairs * compared,
-        mapping_s=_MEASURED_CORES * photographs * _MAPPING_S,
+        features_s=MEASURED_CORES * photographs * detection_s * megapixels,
+        matching_s=MEASURED_CORES * _PAIR_S * pairs * compared,
+        mapping_s=MEASURED_CORES * photographs * _MAPPING_S,
     )
 
 
@@ -87,7 +87,6 @@ def mapping_peak_bytes(photographs: int, max_features: int) -> int:
 # Fitted to one whole iteration of docs/benchmarks.md: 10 000 … 1 000 000 Gaussians, 0.25 … 1.2 megapixels, a third
 # of the Gaussians in view. 2 cores of an AMD EPYC (AVX-512), CPU backend, 2026-11-21.
 MEASURED_ON = "2 cores of an AMD EPYC"
-MEASURED_CORES = 2
 _FIXED_S, _MEGAPIXEL_S, _MILLION_GAUSSIANS_S = 0.003, 0.092, 0.367
 # Part of a Gaussian's time that does not depend on whether an iteration sees it.
 _UNSEEN_SHARE = 0.3

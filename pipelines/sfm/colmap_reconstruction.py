@@ -1,20 +1,22 @@
 """Engine `colmap`: features, matches, mapping, and a final robust adjustment; a large survey in chunks."""
 
 import logging
+from functools import partial
 from typing import Any
 
 from pipelines.core.errors import DegenerateGeometryError, InputError, ResourceError
 from pipelines.core.machine import chosen_threads, free_main_memory_bytes
-from pipelines.core.products import load_json
+from pipelines.core.products import load_json, save_json
 from pipelines.core.progress import Progress
 from pipelines.core.workspace import StageRun
-from pipelines.formats.colmap import quiet_colmap, write_reconstruction
+from pipelines.formats.colmap import ROLLING_SHUTTER, quiet_colmap, write_reconstruction
 from pipelines.sfm.chunks import PLAN, ChunkPlan, join_chunks, remove_chunks, work_in_chunks
 from pipelines.sfm.colmap_database import require_sound
 from pipelines.sfm.estimate import estimate_reconstruction, why_too_large
 from pipelines.sfm.features import SfmJob, candidate_pairs, extract_features, match_features
 from pipelines.sfm.mapping import adjust_finally, map_database, remove_drift
 from pipelines.sfm.options import SfmOptions
+from pipelines.sfm.rolling_shutter import correct_tie_points
 from pipelines.survey.survey import Survey
 
 log = logging.getLogger(__name__)
@@ -48,7 +50,11 @@ class ColmapReconstructor:
             else:
                 require_sound(job.database)
                 model = reconstruct(colmap, job, progress)
+            adjust = partial(_adjust, colmap, job, progress=progress)
+            model, shutter = correct_tie_points(model, job.survey, adjust)
             write_reconstruction(model, job.sparse)
+            if shutter is not None:
+                save_json(shutter, job.sparse / ROLLING_SHUTTER)
         remove_chunks(out)
         return model
 
@@ -93,5 +99,10 @@ def map_matches(colmap: Any, job: SfmJob, progress: Progress) -> Any:
     if len(job.survey.images) > _DRIFTLESS_UP_TO:
         fixes = {image.name: image.fix.position_in_geo for image in job.survey.images if image.fix is not None}
         remove_drift(colmap, model, fixes, threads, progress)
-    adjust_finally(colmap, model, principal_point=job.options.principal_point, threads=threads, progress=progress)
+    _adjust(colmap, job, model, progress)
     return model
+
+
+def _adjust(colmap: Any, job: SfmJob, model: Any, progress: Progress) -> None:
+    threads = chosen_threads(job.options.threads)
+    adjust_finally(colmap, model, principal_point=job.options.principal_point, threads=threads, progress=progress)

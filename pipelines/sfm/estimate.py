@@ -6,9 +6,15 @@
 import math
 from dataclasses import dataclass
 
-from pipelines.core.machine import chosen_threads, free_main_memory_bytes, thread_count
+from pipelines.core.machine import chosen_threads, free_main_memory_bytes
 from pipelines.core.sentences import about
-from pipelines.jobs.costs import ReconstructionCost, features_peak_bytes, mapping_peak_bytes, reconstruction_cost
+from pipelines.jobs.costs import (
+    MEASURED_CORES,
+    ReconstructionCost,
+    features_peak_bytes,
+    mapping_peak_bytes,
+    reconstruction_cost,
+)
 from pipelines.sfm.mapping import MapperName, chosen_mapper
 from pipelines.sfm.options import SfmOptions
 
@@ -40,12 +46,14 @@ class ReconstructionEstimate:
 def estimate_reconstruction(
     photographs: int, photo_px: tuple[int, int], options: SfmOptions
 ) -> ReconstructionEstimate:
+    from pipelines.jobs.calibration import machine_factor  # and torch, which a reconstruction does not need
+
     free_bytes = free_main_memory_bytes()
     return ReconstructionEstimate(
         photographs=photographs,
         mapper=chosen_mapper(photographs, options),
         chunks=max(math.ceil(photographs / options.chunk_size), 1),
-        seconds=estimated_cost(photographs, photo_px, options).total_s / thread_count(),
+        seconds=estimated_cost(photographs, photo_px, options).total_s / MEASURED_CORES * machine_factor(),
         peak_bytes=peak_bytes(photographs, photo_px, options),
         free_bytes=free_bytes,
         refusal=why_too_large(photographs, photo_px, options, free_bytes) or "",

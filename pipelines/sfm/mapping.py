@@ -29,7 +29,7 @@ from pipelines.core.progress import SILENT, Progress, ProgressTask
 from pipelines.core.types import FloatArray, Vector3
 from pipelines.formats.colmap import flatten
 from pipelines.geometry.cameras import project_each
-from pipelines.geometry.similarity import umeyama
+from pipelines.geometry.similarity import Similarity, umeyama
 from pipelines.robust.statistics import CAUCHY_95, CAUCHY_SCALE2, cauchy_weight, median_chi2, rayleigh_sigma
 from pipelines.sfm.features import SfmJob
 from pipelines.sfm.options import SfmOptions
@@ -317,7 +317,7 @@ def remove_drift(
     if extent[1] < _LEAST_SPREAD * extent[0]:
         return None
     center = np.array([image.projection_center() for image in images])
-    sigma_m = max(_sigma_m(center, position), _LEAST_SIGMA * float(extent[0]))
+    sigma_m = max(alignment_with(center, position)[1], _LEAST_SIGMA * float(extent[0]))
     covariance = sigma_m**2 * np.eye(3)
     positions = [(image, place, covariance) for image, place in zip(images, position, strict=True)]
     gate_m = _ALIGNMENT_GATE * sigma_m
@@ -331,14 +331,15 @@ def remove_drift(
     return sigma_m
 
 
-def _sigma_m(center: FloatArray, position: FloatArray) -> float:
-    """Return σ along one axis of the positions (N, 3), after a robust alignment of the camera centres."""
+def alignment_with(center: FloatArray, position: FloatArray) -> tuple[Similarity, float]:
+    """Return the robust alignment of camera centres (N, 3) with positions (N, 3), and σ of these along one axis."""
     weights = np.ones(len(center))
     sigma_m = 0.0
     for _ in range(_ALIGNMENT_ROUNDS):
-        squared = ((umeyama(center, position, weights).apply(center) - position) ** 2).sum(1)
+        aligned = umeyama(center, position, weights)
+        squared = ((aligned.apply(center) - position) ** 2).sum(1)
         sigma_m = math.sqrt(float(np.median(squared)) / median_chi2(3))
         if sigma_m == 0.0:
             break
         weights = cauchy_weight(squared / sigma_m**2, 3)
-    return sigma_m
+    return aligned, sigma_m

@@ -18,9 +18,11 @@ from pipelines.core.products import Remark, load_json
 from pipelines.core.progress import Progress
 from pipelines.core.stages import SURVEY
 from pipelines.core.workspace import StageRun, Summary
+from pipelines.formats.colmap import quiet_colmap
 from pipelines.sfm.features import SfmJob
 from pipelines.sfm.options import SfmOptions
 from pipelines.sfm.reconstructor import reconstructor_of
+from pipelines.sfm.unregistered import unregistered
 from pipelines.survey.survey import Survey
 
 _FEW_REGISTERED = 0.8
@@ -66,8 +68,13 @@ def write_model(arguments: Mapping[str, Any], progress: Progress) -> dict[str, A
     job = SfmJob(survey, Path(arguments["images"]), database, options)
     if job.sparse.exists():
         shutil.rmtree(job.sparse)
-    summary = _summarise(reconstructor_of(options).reconstruct(job, progress), survey)
-    return {**vars(summary), "warnings": [warning.model_dump() for warning in summary.warnings]}
+    model = reconstructor_of(options).reconstruct(job, progress)
+    summary = _summarise(model, survey)
+    warnings = list(summary.warnings)
+    if database.is_file():
+        with quiet_colmap() as colmap:
+            warnings += unregistered(colmap, database, model)
+    return {**vars(summary), "warnings": [warning.model_dump() for warning in warnings]}
 
 
 def _summarise(model: Any, survey: Survey) -> Summary:

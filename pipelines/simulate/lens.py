@@ -4,7 +4,7 @@ The lens shares no code with the pipeline's camera models on purpose: a common m
 points.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -121,15 +121,22 @@ _ZENITH = np.array([0.24, 0.42, 0.75], dtype=np.float32)
 _BOUNCE = np.array([0.22, 0.20, 0.17], dtype=np.float32)
 _HAZE_M = 1300.0
 _SHADOW_LIFT_M = 0.02  # of a shadow ray's start above the surface, which would hide the sun otherwise
-_VIGNETTING = 0.22  # loss of light in the corners
+_ROLLING_ROWS = 4  # of a moving camera that are rendered at once: it moves by a hundredth of its travel meanwhile
 
 
 @dataclass(frozen=True)
 class Pose:
-    """Camera pose: centre (3,) in geo and rotation (3, 3) camera → geo."""
+    """Camera pose: centre (3,) in geo, as the middle row is read, and rotation (3, 3) camera → geo."""
 
     center: FloatArray
     geo_from_cam: FloatArray
+    # (3,) metres in geo from the first row's readout to the last's
+    travel: FloatArray = field(default_factory=lambda: np.zeros(3))
+
+    def at_row(self, share: ArrayLike) -> FloatArray:
+        """Return the centres (N, 3) or (3,) at rows, given as shares of the height."""
+        moved = np.asarray(share, dtype=np.float64)[..., None] - 0.5
+        return np.asarray(self.center + moved * self.travel)
 
 
 @dataclass(frozen=True)
@@ -139,6 +146,7 @@ class Sensor:
     gain: float  # exposure of this photograph, 1 for a grey of 18 % under the sun at about mid-scale
     tint: tuple[float, float, float]  # white balance
     noise: float  # factor; 1: a small sensor at base sensitivity (0.4 % of full scale at mid-scale)
+    vignetting: float = 0.22  # loss of light in the corners
 
 
 class Renderer:
@@ -146,10 +154,10 @@ class Renderer:
     threads.
     """
 
-    def __init__(self, scene: SimulatedScene, lens: BrownLens, samples: int) -> None:
+    def __init__(self, scene: SimulatedScene, lens: BrownLens, samples: int, *, rolling: bool = False) -> None:
         self._scene, self._lens, self._samples = scene, lens, samples
         self.raycaster = Raycaster(scene.mesh)
-        rows = max(1, _CHUNK // (lens.width * samples))
+        rows = min(max(1, _CHUNK // (lens.width * samples)), _ROLLING_ROWS if rolling else lens.height)
         self._bands = [(top, min(top + rows, lens.height)) for top in range(0, lens.height, rows)]
         # Rays are kept for all photographs if they fit; rays of large photographs are made anew for each.
         keep = lens.width * lens.height * samples <= _RAYS_KEPT
@@ -159,7 +167,7 @@ class Renderer:
         light = self.radiance(pose)
         height, width = light.shape[:2]
         across, down = np.linspace(-1, 1, width), np.linspace(-1, 1, height)
-        falloff = (1 - _VIGNETTING / 2 * (across**2 + down[:, None] ** 2)).astype(np.float32)
+        falloff = (1 - sensor.vignetting / 2 * (across**2 + down[:, None] ** 2)).astype(np.float32)
         exposed = light * (falloff[..., None] * np.float32(sensor.gain)) * np.array(sensor.tint, dtype=np.float32)
         # Photon noise grows with the root of the signal; the constant term is read-out noise.
         spread = np.float32(sensor.noise) * np.sqrt(np.float32(6e-5) * np.maximum(exposed, 0) + np.float32(2.5e-6))
@@ -172,7 +180,7 @@ class Renderer:
         parts = []
         for k, band in enumerate(self._bands):
             rays = self._kept[k] if self._kept else _rays(self._lens, band, self._samples).astype(np.float32)
-            light = self._shade(pose, rays @ rotation.T, rotation)
+            light = self._shade(self._of_band(pose, band), rays @ rotation.T, rotation)
             # Samples are clipped before the mean: a highlight inside a pixel must not outshine its other samples.
             light = np.minimum(light, np.float32(1.5)).reshape(-1, self._lens.width, self._samples, 3)
             # The sum is taken slice by slice: numpy's mean over such a short axis takes four times as long.
@@ -183,12 +191,15 @@ class Renderer:
         """Return depth (H, W) in metres along the camera's z axis at the pixel centres; 0 for the sky."""
         parts = []
         for band in self._bands:
-            directions = _rays(self._lens, band, 1) @ pose.geo_from_cam.T
-            hits = self.raycaster.first_hits(pose.center, directions)
+            directions, center = _rays(self._lens, band, 1) @ pose.geo_from_cam.T, self._of_band(pose, band).center
+            hits = self.raycaster.first_hits(center, directions)
             # The directions have z = 1 in the camera, so that the distance along them is the depth.
-            distance = self.raycaster.exact_distance(pose.center, directions, hits)
+            distance = self.raycaster.exact_distance(center, directions, hits)
             parts.append(np.nan_to_num(distance, nan=0.0).astype(np.float32).reshape(-1, self._lens.width))
         return np.concatenate(parts)
+
+    def _of_band(self, pose: Pose, band: tuple[int, int]) -> Pose:
+        return replace(pose, center=pose.at_row(sum(band) / 2 / self._lens.height))
 
     def _shade(self, pose: Pose, rays: Float32Array, rotation: Float32Array) -> Float32Array:
         """Return the linear light (N, 3) that comes along rays (N, 3) of depth 1."""

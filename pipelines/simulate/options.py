@@ -88,6 +88,13 @@ class SimulateOptions(LidarFlightOptions):
     p1: float = Field(0.0004, ge=-0.02, le=0.02, description="Tangential distortion (opencv).")
     p2: float = Field(-0.0003, ge=-0.02, le=0.02, description="Tangential distortion (opencv).")
     exposure: float = Field(0.08, ge=0, le=0.5, description="Variation of the exposure (σ of its logarithm).")
+    white_balance: float = Field(
+        0.012, ge=0, le=0.5, description="Variation of the white balance (σ of its logarithm a channel)."
+    )
+    vignetting: float = Field(0.22, ge=0, le=0.9, description="Loss of light in the corners.")
+    rolling_shutter: float = Field(
+        0.0, ge=0, le=0.5, description="Readout time of a photograph in seconds, from its first to its last row."
+    )
     noise: float = Field(1.0, ge=0, le=20, description="Sensor noise; 1 is a small sensor at base sensitivity.")
     samples: Literal["1", "4", "9", "16"] = Field("4", description="Rays per pixel (anti-aliasing).")
     quality: int = Field(95, ge=50, le=100, description="JPEG quality.")

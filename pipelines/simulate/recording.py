@@ -200,6 +200,7 @@ def _truth(
         images=photos.names,
         stamp_ns=tuple(int(stamp) for stamp in photos.stamp_ns),
         centers=tuple(vector3(pose.center) for pose in world.poses),
+        travels=tuple(vector3(pose.travel) for pose in world.poses),
         cam_from_enu=tuple(_matrix(pose.geo_from_cam.T) for pose in world.poses),
         fix_errors=tuple(vector3(error) for error in errors),
         navigation=TrueNavigation(

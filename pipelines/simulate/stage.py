@@ -79,7 +79,7 @@ def fly_survey(options: SimulateOptions) -> RecordedFlight:
     """
     world_seed, record_seed, photo_seed, lidar_seed = np.random.SeedSequence(options.seed).spawn(4)
     world = make_world(options, world_seed)
-    renderer = Renderer(world.scene, world.lens, int(options.samples))
+    renderer = Renderer(world.scene, world.lens, int(options.samples), rolling=options.rolling_shutter > 0)
     check_clearance(world, renderer.raycaster)
     recording = record(options, world, renderer.raycaster, record_seed)
     return RecordedFlight(world, renderer, recording, photo_seed, lidar_seed)
@@ -188,8 +188,11 @@ def _write_photographs(options: SimulateOptions, flight: RecordedFlight, folder:
     if options.depth:
         (folder / "depth").mkdir()
     gains = 1.1 * np.exp(rng.normal(0, options.exposure, count))
-    tints = np.exp(rng.normal(0, 0.15 * options.exposure, (count, 3)))
-    sensors = [Sensor(float(gain), vector3(tint), options.noise) for gain, tint in zip(gains, tints, strict=True)]
+    tints = np.exp(rng.normal(0, options.white_balance, (count, 3)))
+    sensors = [
+        Sensor(float(gain), vector3(tint), options.noise, options.vignetting)
+        for gain, tint in zip(gains, tints, strict=True)
+    ]
     streams = rng.spawn(count)
 
     def write(i: int) -> None:

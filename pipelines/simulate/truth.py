@@ -92,7 +92,8 @@ class Truth(Product):
     """Truth of a survey. Lists run parallel to `images`; the geo frame is East-North-Up at `origin`.
 
     Attributes:
-        centers: camera centres in geo.
+        centers: camera centres in geo, as the middle row is read.
+        travels: their motion while all rows are read.
         cam_from_enu: rotations geo → camera.
         stamp_ns: camera clock.
         fix_errors: recorded minus true position of the antenna at the same stamp of the navigation clock.
@@ -109,6 +110,7 @@ class Truth(Product):
     images: tuple[str, ...]
     stamp_ns: tuple[int, ...]
     centers: tuple[Vector3, ...]
+    travels: tuple[Vector3, ...] = ()
     cam_from_enu: tuple[Matrix3, ...]
     fix_errors: tuple[Vector3, ...]
     navigation: TrueNavigation

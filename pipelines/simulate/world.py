@@ -22,6 +22,7 @@ _APART_M: dict[SiteKind, float] = {"ground": 5.0, "roof": 4.0, "wall": 2.2}
 _MARGIN_PX = 4.0
 _LEAST_PX = 3.0
 _LEAST_COSINE = 0.2
+_ROW_STEPS = 3  # of the row that sees a target while the camera moves: each leaves a hundredth of the error
 
 
 def project_targets(
@@ -41,6 +42,9 @@ def project_targets(
         distance = np.linalg.norm(towards, axis=1)
         cosine = -np.einsum("pi,pi->p", towards, normals) / distance
         pixels[:, j] = lens.project(towards @ pose.geo_from_cam)
+        for _ in range(_ROW_STEPS if pose.travel.any() else 0):
+            share = np.clip(np.nan_to_num(pixels[:, j, 1] / lens.height), 0.0, 1.0)
+            pixels[:, j] = lens.project((positions - pose.at_row(share)) @ pose.geo_from_cam)
         inside = ((pixels[:, j] > _MARGIN_PX) & (pixels[:, j] < limit)).all(axis=1)
         size = lens.focal_px * width_m / distance * np.sqrt(np.maximum(cosine, 0.0))
         maybe = np.nonzero(inside & (cosine > _LEAST_COSINE) & (size > _LEAST_PX))[0]
@@ -136,7 +140,10 @@ def make_world(options: SimulateOptions, seed: np.random.SeedSequence) -> World:
     trajectory = flight.make_trajectory(plan, bare.complex_m, bare.axes, np.random.default_rng(flight_seed))
     centers = trajectory.position(trajectory.photo_s)
     rotations = trajectory.geo_from_nominal_cam(trajectory.photo_s) @ mounting.nominal_from_cam
-    poses = tuple(Pose(center, rotation) for center, rotation in zip(centers, rotations, strict=True))
+    travels = options.rolling_shutter * trajectory.position(trajectory.photo_s, 1)
+    poses = tuple(
+        Pose(center, rotation, travel) for center, rotation, travel in zip(centers, rotations, travels, strict=True)
+    )
     distance_m = float(np.median(np.linalg.norm(centers, axis=1)))
     width_m = options.target_size or max(0.3, _TARGET_PX * distance_m / lens.focal_px)
     sites: list[TargetSite] = []

@@ -2,7 +2,9 @@
 
 Each lens darkens its corners besides: a polynomial of the squared distance from its axis, fitted in training.
 
-Photographs of one flight differ in exposure and white balance. Without exposures, a model bakes these differences
+Photographs of one flight differ in exposure and white balance: gains of the three channels, and what a camera's
+processing mixes between them. Light changes slowly: a weak prior draws each photograph towards the mean of those
+before and after it, which decides where its own colours do not. Without exposures, a model bakes these differences
 into the colours of Gaussians that few views see. The images cannot tell a change of all exposures from a change of
 all Gaussians: the mean over the training photographs is therefore fixed to the identity.
 
@@ -21,6 +23,7 @@ A weak prior keeps each exposure near the identity where a photograph has too fe
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -36,6 +39,9 @@ from pipelines.robust.statistics import cauchy_weight, median_chi2
 
 _FIRST_RATE, _LAST_RATE = 5e-3, 5e-4
 VIGNETTING_TERMS = 3  # of r², r⁴, r⁶
+# Weight of the prior: it decides what the colours leave open. One of 0.1 cost 0.1 dB of the test views, where gains
+# differed by 10 % from photograph to photograph.
+_TIE = 0.003
 _KEPT_RADII = 8  # sizes of cameras and of their crops
 _BETA1, _BETA2, _EPS = 0.9, 0.999, 1e-15
 
@@ -72,7 +78,8 @@ class Exposures:
     """Affine colour corrections (V, 3, 4) of V images, and the vignetting of their lenses, with their optimiser.
 
     The corrections, gain matrix and offset, of the images `train` (T,) change; the others are identities. `lens`
-    (V,) tells the lens of each image by a number; None: all have one. Vignetting is that of `with_vignetting`.
+    (V,) tells the lens of each image by a number; None: all have one. Vignetting is that of `with_vignetting`. The
+    order of the training images of a lens is that of their time.
     """
 
     def __init__(
@@ -84,6 +91,7 @@ class Exposures:
         self._affine = _RowsAdam(torch.eye(3, 4, device=device).repeat(count, 1, 1), iterations)
         self._vignetting = _RowsAdam(torch.zeros(len(self.lenses), VIGNETTING_TERMS, device=device), iterations)
         self._train = train.to(device)
+        self._beside = _neighbours(train.tolist(), self._lens)
         self._used: tuple[int, Tensor, Tensor] | None = None
 
     @property
@@ -113,7 +121,10 @@ class Exposures:
             return
         index, leaf, falloff = self._used
         assert leaf.grad is not None
-        self._affine.step(index, leaf.grad, iteration)
+        gradient = leaf.grad
+        if beside := self._beside.get(index):
+            gradient = gradient + _TIE * (self.affine[index] - self.affine[beside].mean(dim=0))
+        self._affine.step(index, gradient, iteration)
         if falloff.grad is not None:
             self._vignetting.step(self._lens[index], falloff.grad, iteration)
         shift = self.affine[self._train].mean(dim=0) - torch.eye(3, 4, device=leaf.device)
@@ -126,6 +137,16 @@ class Exposures:
     def restore(self, state: dict[str, Tensor]) -> None:
         self._affine.restore("affine", state)
         self._vignetting.restore("vignetting", state)
+
+
+def _neighbours(images: Sequence[int], lens: Sequence[int]) -> dict[int, list[int]]:
+    """Return the images before and after each, of the same lens."""
+    beside: dict[int, list[int]] = {image: [] for image in images}
+    for number in set(lens):
+        for before, after in pairwise(image for image in images if lens[image] == number):
+            beside[before].append(after)
+            beside[after].append(before)
+    return beside
 
 
 class FrozenExposures:

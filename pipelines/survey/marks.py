@@ -12,6 +12,7 @@ from pipelines.core.products import Remark
 from pipelines.core.types import BoolArray, FloatArray, IntArray, rows_of
 from pipelines.geometry.cameras import bearings
 from pipelines.geometry.intersection import Intersections, Rays, UncertainCameras, intersect_rays
+from pipelines.geometry.rolling_shutter import depths_at, in_global_shutter
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.survey import SurveyedPoint
 
@@ -130,6 +131,18 @@ def _off_px(rays: MarkRays, sparse: SparseModel) -> FloatArray:
     return off
 
 
+def bearings_at(sparse: SparseModel, image: int, xy_px: FloatArray) -> FloatArray:
+    """Return unit vectors (K, 3) in the camera towards pixels (K, 2) of a photograph; NaN where no ray leads there.
+
+    Pixels of a rolling shutter have the depth of the tie points around them.
+    """
+    lens = sparse.camera_of(image)
+    if sparse.travel_in_cam is not None and sparse.travel_in_cam[image].any():
+        depth = depths_at(sparse, image, xy_px)
+        xy_px = in_global_shutter(lens, xy_px, depth, sparse.travel_in_cam[image])
+    return bearings(lens, xy_px)
+
+
 def _all_rays(points: Sequence[SurveyedPoint], sparse: SparseModel) -> MarkRays:
     index = sparse.image_index()
     rows = [
@@ -143,8 +156,8 @@ def _all_rays(points: Sequence[SurveyedPoint], sparse: SparseModel) -> MarkRays:
     bearing, focal_px = np.full((len(table), 3), np.nan), np.ones(len(table))
     for image in np.unique(camera):
         mine = camera == image
-        lens = sparse.camera_of(int(image))
-        bearing[mine], focal_px[mine] = bearings(lens, table[mine, 2:4]), lens.mean_focal_px
+        bearing[mine] = bearings_at(sparse, int(image), table[mine, 2:4])
+        focal_px[mine] = sparse.camera_of(int(image)).mean_focal_px
     rays = MarkRays(
         tuple(point.name for point in points),
         point,

@@ -6,6 +6,7 @@ and the files of the test views: photograph, render and their difference side by
 
 import hashlib
 import logging
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -34,12 +35,22 @@ _BAND_PX = 1_000_000  # pixels whose distortion is computed at once, in two hund
 
 @dataclass(frozen=True)
 class Photograph:
-    """Photograph to undistort: its name, its file, its camera at full size, and the survey's hash of the file."""
+    """Photograph to undistort: its name, its file, its camera at full size, and the survey's hash of the file.
+
+    `shift` (h, w, 2) is a grid over a photograph of a rolling shutter: how far in pixels of the full size from its
+    place under a global shutter each of its pixels lies. None: a global shutter.
+    """
 
     name: str
     file: Path
     camera: Camera
     sha256: str = ""
+    shift: Float32Array | None = None
+
+    @property
+    def margin(self) -> float:
+        """Largest shift, as a share of the photograph's height."""
+        return 0.0 if self.shift is None else float(np.abs(self.shift).max()) / self.camera.height
 
 
 def pinhole_of(camera: Camera, max_size_px: int) -> Pinhole:
@@ -119,13 +130,22 @@ class ImageCache:
         """Return the mask (H, W) of the pixels that the photograph covers, mapped from disk."""
         path = self._folder / f"{self.mask_key(index)}.mask.npy"
         if not path.exists():
-            save_array(path, self._map(index)[1])
+            mask, edge = self._map(index)[1], self._moved_edge_px(index)
+            if edge:  # pixels from beyond the photograph come in at its edges
+                square = np.ones((2 * edge + 1, 2 * edge + 1), np.uint8)
+                shrunken = cv2.erode(mask.astype(np.uint8), square, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+                mask = np.asarray(shrunken, dtype=bool)
+            save_array(path, mask)
         return _mapped(path)
 
+    def _moved_edge_px(self, index: int) -> int:
+        return math.ceil(self._photographs[index].margin * self.pinhole(index).height)
+
     def mask_key(self, index: int) -> str:
-        """Return the key of a mask, which all photographs of one camera share."""
-        camera = self._photographs[index].camera
+        """Return the key of a mask, which all photographs of one camera share but for rolling shutters."""
+        camera, edge = self._photographs[index].camera, self._moved_edge_px(index)
         key = f"{camera.model}|{camera.width}x{camera.height}|{camera.params.tobytes().hex()}|{self.max_size_px}"
+        key += f"|{edge}" if edge else ""
         return hashlib.sha256(key.encode()).hexdigest()[:32]
 
     def _path(self, index: int) -> Path:
@@ -148,6 +168,8 @@ class ImageCache:
             f"{photograph.name}|{stat.st_size}|{stat.st_mtime_ns}|{camera.model}|{camera.width}x{camera.height}|"
             f"{camera.params.tobytes().hex()}|{self.max_size_px}|{photograph.sha256}"
         )
+        if photograph.shift is not None:
+            key += f"|{photograph.shift.tobytes().hex()}"
         return hashlib.sha256(key.encode()).hexdigest()[:32]
 
     def _write(self, index: int) -> None:
@@ -156,9 +178,10 @@ class ImageCache:
 
     def _map(self, index: int) -> tuple[Float32Array, BoolArray]:
         """Return the place (H, W, 2) of each undistorted pixel in the shrunken photograph, and the mask (H, W)."""
-        key = self.mask_key(index)
+        camera = self._photographs[index].camera
+        key = f"{camera.model}|{camera.width}x{camera.height}|{camera.params.tobytes().hex()}"
         if self._last_map is None or self._last_map[0] != key:
-            self._last_map = (key, *_distortion_map(self._photographs[index].camera, self.pinhole(index)))
+            self._last_map = (key, *_distortion_map(camera, self.pinhole(index)))
         return self._last_map[1:]
 
 
@@ -194,8 +217,22 @@ def _undistorted(
             path=photograph.file,
         )
     small = cv2.resize(full, (pinhole.width, pinhole.height), interpolation=cv2.INTER_AREA)
+    if photograph.shift is not None:
+        source = source + _shift_at(photograph, source)
     flat = cv2.remap(small, source[..., 0], source[..., 1], interpolation, borderMode=cv2.BORDER_REFLECT)
     return np.asarray(flat, dtype=np.uint8)
+
+
+def _shift_at(photograph: Photograph, source: Float32Array) -> Float32Array:
+    """Return the shift (H, W, 2) of a rolling shutter at places (H, W, 2) in the shrunken photograph."""
+    assert photograph.shift is not None
+    height, width = source.shape[:2]
+    cells = np.array(photograph.shift.shape[1::-1]) / (width, height)
+    place = ((source + 0.5) * cells - 0.5).astype(np.float32)
+    shift = cv2.remap(
+        photograph.shift, place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    return np.asarray(shift * (width / photograph.camera.width), dtype=np.float32)
 
 
 def covered_pinhole(camera: Camera) -> Pinhole:

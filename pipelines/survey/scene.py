@@ -16,11 +16,12 @@ from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.plan import photograph_folder
 from pipelines.core.products import load_json
 from pipelines.core.stages import ADJUSTMENT, SIM3, SPARSE
-from pipelines.core.types import FloatArray, IntArray
+from pipelines.core.types import Float32Array, FloatArray, IntArray
 from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.bundle import BundleInformation, Network, bundle_information
 from pipelines.geometry.cameras import CameraPoses
+from pipelines.geometry.rolling_shutter import depths_at, in_rolling_shutter
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.adjustment import InitialSimilarity
@@ -28,6 +29,8 @@ from pipelines.survey.calibrated import load_survey
 from pipelines.survey.photographs import ImageCache, Photograph
 from pipelines.survey.survey import Survey
 from pipelines.survey.trained_model import Adjustment
+
+_SHIFT_GRID = (48, 36)  # columns and rows: tie points are not denser
 
 
 @dataclass(frozen=True)
@@ -169,6 +172,17 @@ def photograph_files(sparse: SparseModel, survey: Survey, workspace: Workspace) 
         )
     folder = photograph_folder(workspace, survey.image_dir)
     return [
-        Photograph(name, folder / name, sparse.camera_of(index), known[name])
+        Photograph(name, folder / name, sparse.camera_of(index), known[name], _rolling_shift(sparse, index))
         for index, name in enumerate(sparse.image_name)
     ]
+
+
+def _rolling_shift(sparse: SparseModel, image: int) -> Float32Array | None:
+    """Return the shift of a photograph's pixels by its rolling shutter, as of `Photograph.shift`."""
+    if sparse.travel_in_cam is None or not sparse.travel_in_cam[image].any():
+        return None
+    camera = sparse.camera_of(image)
+    x, y = ((np.arange(cells) + 0.5) / cells for cells in _SHIFT_GRID)
+    xy_px = np.stack(np.meshgrid(x * camera.width, y * camera.height), axis=-1).reshape(-1, 2)
+    seen = in_rolling_shutter(camera, xy_px, depths_at(sparse, image, xy_px), sparse.travel_in_cam[image])
+    return np.nan_to_num(seen - xy_px).reshape(*_SHIFT_GRID[::-1], 2).astype(np.float32)

@@ -102,6 +102,7 @@ class CameraPrior(Product):
     params: tuple[float, ...]
     focal_source: Literal["exif", "option", "assumed", "calibrated"]
     make_model: str = ""
+    readout_s: float = Field(0.0, ge=0, le=1)  # of a rolling shutter, from the first row to the last; 0: global
 
 
 class Fix(Product):
@@ -152,6 +153,7 @@ class SurveyImage(Product):
     timestamp_s: float | None = None
     fix: Fix | None = None
     attitude: Attitude | None = None
+    velocity_in_geo: Vector3 | None = None  # of a camera with a rolling shutter, m/s
     split: Literal["train", "test"] = "train"
 
 

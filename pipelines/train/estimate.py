@@ -1,6 +1,6 @@
 """Estimate of a training: size, time and memory for the photographs of a survey, before it starts.
 
-Default limit of Gaussians: by the pixels of the photographs, within what the preset and the memory allow.
+Default effort: by number and pixels of the photographs, within what the memory allows.
 """
 
 from collections.abc import Callable
@@ -11,13 +11,14 @@ import torch
 from pipelines.core.machine import thread_count
 from pipelines.core.sentences import about
 from pipelines.geometry.cameras import Pinhole
+from pipelines.jobs.calibration import machine_factor
 from pipelines.jobs.costs import BLOCK_SECONDS, MEASURED_CORES, SURFACE_FACTOR, iteration_seconds
 from pipelines.splat.memory import USABLE, TrainingSize, fitting_gaussians, free_memory_bytes, predicted_peak_bytes
 from pipelines.splat.rasterizer.backends import chosen_backend
 from pipelines.surface.depth_maps import FINE_PX
 from pipelines.survey.block_plan import BlockPlan, PlannedBlock
 from pipelines.survey.options import NOT_IN_BLOCKS
-from pipelines.train.options import PRESETS, TrainOptions
+from pipelines.train.options import PRESET_PHOTOGRAPHS, PRESETS, TrainOptions
 from pipelines.train.schedule import COARSE, pyramid
 from pipelines.train.target_images import Crops
 
@@ -32,17 +33,18 @@ def training_size(options: TrainOptions, photographs: int, largest: Pinhole, bes
     return TrainingSize(gaussians, crop, options.sh_degree, cameras, whole_px)
 
 
-def with_gaussian_limit(
-    options: TrainOptions, photographs: int, largest: Pinhole, free_bytes: int | None
-) -> TrainOptions:
-    """Return options that state the limit of Gaussians; they are unchanged if the user states one.
+def with_effort(options: TrainOptions, photographs: int, largest: Pinhole, free_bytes: int | None) -> TrainOptions:
+    """Return options that state iterations and the limit of Gaussians, unless the user states them.
 
-    1. Photographs of the preset's size have the preset's limit.
-    2. Larger ones have more, in proportion to their pixels, as far as all photographs together have 40 pixels for
-       each, and as far as they fit into `free_bytes` of memory; None: unknown.
+    1. Up to a hundred photographs of the preset's size have the preset's effort.
+    2. More photographs have more of both, in proportion: each is seen as often, and shows a place of its own.
+    3. Larger ones have more Gaussians, in proportion to their pixels, as far as all photographs together have 40
+       pixels for each, and as far as they fit into `free_bytes` of memory; None: unknown.
     """
-    preset = PRESETS[options.preset]
-    enlarged = max(largest.width, largest.height) / preset.max_image_size
+    preset, more = PRESETS[options.preset], max(photographs / PRESET_PHOTOGRAPHS, 1.0)
+    if options.iterations is None and more > 1:
+        options = options.model_copy(update={"iterations": round(more * preset.iterations)})
+    enlarged = more**0.5 * max(max(largest.width, largest.height) / preset.max_image_size, 1.0)
     if options.max_gaussians is not None or enlarged <= 1:
         return options
     limits = [
@@ -58,8 +60,6 @@ def with_gaussian_limit(
 # Stereo, by photographs (the sweep has one size) and by megapixels of the depth maps: half of the processor time of
 # one thread on an Intel Xeon (AVX-512), 2026-11-22. Two threads on two idle cores were not measured.
 _STEREO_PHOTOGRAPH_S, _STEREO_MEGAPIXEL_S = 0.75, 0.6
-# Beyond so many cores the kernels gain little; not measured beyond two.
-_MOST_CORES = 16
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,9 @@ class TrainingEstimate:
 
     def sentences(self) -> list[str]:
         """Return the estimate for people: effort, size of the images, time and memory."""
-        effort = f"{self.preset}: {self.iterations} iterations, at most {self.max_gaussians} Gaussians"
+        looks = self.iterations / self.photographs
+        effort = f"{self.preset}: {self.iterations} iterations, {looks:.0f} a photograph, at most "
+        effort += f"{self.max_gaussians} Gaussians"
         (width, height), (small_width, small_height) = self.photo_px, self.training_px
         size = f"{self.photographs} photographs of {width}×{height} px are trained at {small_width}×{small_height}"
         reduction = max(self.photo_px) / max(self.training_px)
@@ -117,11 +119,11 @@ class TrainingEstimate:
 def estimate_training(photographs: int, photo_px: tuple[int, int], options: TrainOptions) -> TrainingEstimate:
     """Return the estimate of a training; a BackendUnavailableError names each missing part of `--backend cuda`.
 
-    The time is that of the machine of `MEASURED_ON`, divided by the ratio of the threads.
+    The time is that of the machine of `MEASURED_ON`, times the factor of this machine.
     """
     camera, backend = training_pinhole(photo_px, options), chosen_backend(options.backend)
     free_bytes = free_memory_bytes(torch.device(backend))
-    options = with_gaussian_limit(options, photographs, camera, free_bytes)
+    options = with_effort(options, photographs, camera, free_bytes)
     effort, size = options.effort, training_size(options, photographs, camera)
     return TrainingEstimate(
         preset=options.preset,
@@ -191,7 +193,7 @@ def _seconds(photographs: int, camera: Pinhole, options: TrainOptions) -> float:
     seconds = _of_all_iterations(camera, camera.width * camera.height, options, one)
     if options.dense:
         seconds += _stereo_s(photographs, camera)
-    return seconds * MEASURED_CORES / min(thread_count(), _MOST_CORES)
+    return seconds * machine_factor()
 
 
 def _stereo_s(photographs: int, camera: Pinhole) -> float:

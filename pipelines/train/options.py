@@ -31,6 +31,8 @@ PRESETS = {
     "standard": Preset(1_500, 800, 150_000),
     "high": Preset(2_000, 2_000, 300_000),
 }
+# Iterations and Gaussians grow with the photographs beyond this number: a place is seen as often, on a larger area.
+PRESET_PHOTOGRAPHS = 100
 # Of `georef run` with 48 photographs of a megapixel, kernels compiled, on 2 idle cores of an AMD EPYC
 # (docs/benchmarks.md, Presets).
 RUN_MINUTES = {"smoke": 1, "fast": 2, "standard": 4, "high": 10}
@@ -149,9 +151,11 @@ class GaussianOptions(StageOptions):
     """Options of the Gaussians: effort, backend, density control, exposure and surface."""
 
     preset: Literal["smoke", "fast", "standard", "high"] = Field(
-        "standard", description=f"Effort. {_EFFORTS} (for 48 photographs on 2 cores)."
+        "standard",
+        description=f"Effort. {_EFFORTS} (for 48 photographs on 2 cores). Beyond {PRESET_PHOTOGRAPHS} photographs "
+        "iterations and Gaussians grow in proportion.",
     )
-    iterations: int | None = Field(None, ge=1, description="Iterations (default: the preset's).")
+    iterations: int | None = Field(None, ge=1, description="Iterations (default: by preset and photographs).")
     max_image_size: int | None = Field(
         None, ge=32, description="Longest image side for training in pixels (default: the preset's)."
     )
@@ -161,7 +165,7 @@ class GaussianOptions(StageOptions):
         description="Side of crops in pixels: a photograph with more pixels than such a square is trained in "
         "crops of its area.",
     )
-    max_gaussians: int | None = Field(None, ge=100, description="Limit of Gaussians (default: the preset's).")
+    max_gaussians: int | None = Field(None, ge=100, description="Limit of Gaussians (default: likewise).")
     backend: Literal["auto", "cpu", "cuda"] = Field("auto", description="Rasteriser.")
     sh_degree: int = Field(3, ge=0, le=3, description="Degree of the spherical harmonics.")
     strategy: Literal["default", "mcmc", "fast"] = Field(

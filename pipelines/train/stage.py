@@ -39,7 +39,7 @@ from pipelines.survey.scene import photographs
 from pipelines.survey.trained_model import Adjustment, LensVignetting, TrainedModel
 from pipelines.train.adjusted_scene import AdjustedScene, figures_of, with_exposures
 from pipelines.train.compilation import compile_kernels
-from pipelines.train.estimate import estimate_training, training_size, with_gaussian_limit
+from pipelines.train.estimate import estimate_training, training_size, with_effort
 from pipelines.train.geographic.problem import frozen_problem, refining_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.lidar import compared_lidar, draw_changes, lidar_surface, plane_observations
@@ -127,7 +127,7 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
 
 def _within_memory(options: TrainOptions, images: ImageCache, free_bytes: int | None) -> TrainOptions:
     """Return the options with as many Gaussians as fit into the memory, or raise a ResourceError."""
-    options = with_gaussian_limit(options, len(images), images.largest(), free_bytes)
+    options = with_effort(options, len(images), images.largest(), free_bytes)
     require_memory(training_size(options, len(images), images.largest()), free_bytes)
     return options
 

@@ -38,7 +38,7 @@ def test_before_the_first_run(georef: Georef, tmp_path: Path) -> None:
     seconds = {row["stage"]: row["seconds"] for row in document["stages"]}
     assert seconds["sfm"] > 0 and seconds["train"] > 0 and seconds["evaluate"] is None
     text = georef(*words).out
-    assert "smoke: 200 iterations, at most 20000 Gaussians" in text
+    assert "smoke: 200 iterations, 40 a photograph, at most 20000 Gaussians" in text
     assert "5 of 64×48 px" in text and "Nothing was run" in text
 
 
@@ -46,7 +46,7 @@ def test_a_run_begins_with_the_estimate(georef: Georef, tmp_path: Path) -> None:
     """Ahead of the first stage, and once."""
     write_flight(tmp_path / "photos", 5, lat=46.0, lon=7.7)
     lines = georef("run", tmp_path / "ws", "--images", tmp_path / "photos", "--max-image-size", 40).err.splitlines()
-    assert lines[0] == "train: standard: 1500 iterations, at most 150000 Gaussians"
+    assert lines[0] == "train: standard: 1500 iterations, 300 a photograph, at most 150000 Gaussians"
     assert (
         lines[1] == "train: 5 photographs of 64×48 px are trained at 40×30, 1/1.6 of their side (--max-image-size)"
     )

@@ -25,6 +25,7 @@ from pipelines.sfm.features import SfmJob, candidate_pairs, extract_features
 from pipelines.sfm.imported_model import import_model
 from pipelines.sfm.options import SfmOptions
 from pipelines.sfm.stage import _summarise, run
+from pipelines.sfm.unregistered import unregistered
 from pipelines.survey.survey import Fix, Survey, SurveyedPoint
 from tests.refusals import numbers, refused, said
 from tests.sfm_scenes import CONFIG, HEIGHT, IMAGES, WIDTH, Photographs, survey_of
@@ -236,6 +237,25 @@ def test_few_registered_is_a_loud_warning_and_two_an_error(mapped: Workspace, ph
     with refused("too-few-registered", DegenerateGeometryError) as error:
         _summarise(short, survey_of(photographs.names))
     assert numbers(str(error.value)) == [2, 10]
+
+
+def test_each_photograph_that_is_not_registered_has_a_reason(mapped: Workspace, tmp_path: Path) -> None:
+    model = pycolmap.Reconstruction(mapped.path(SPARSE))
+    assert unregistered(pycolmap, mapped.path("sfm/database.db"), model) == ()
+    image = min(model.images.values(), key=lambda each: each.name)
+    name, image_id = image.name, image.image_id
+    model.deregister_frame(image.frame_id)
+    sentence = said(unregistered(pycolmap, mapped.path("sfm/database.db"), model), "photographs-not-registered")
+    assert name in sentence and "which do not agree" in sentence
+    # Its points are still those of the others: it was registered by more than COLMAP needs.
+    assert numbers(sentence.partition(": ")[2])[0] > 30
+    database = tmp_path / "database.db"
+    shutil.copy(mapped.path("sfm/database.db"), database)
+    with closing(sqlite3.connect(database)) as opened:
+        opened.execute("delete from two_view_geometries where pair_id / 2147483647 = ?", (image_id,))
+        opened.execute("delete from two_view_geometries where pair_id % 2147483647 = ?", (image_id,))
+        opened.commit()
+    assert "no verified matches" in said(unregistered(pycolmap, database, model), "photographs-not-registered")
 
 
 def test_global_mapper(mapped: Workspace, tmp_path: Path) -> None:

@@ -31,6 +31,21 @@ def test_gains_that_differ_are_found_and_their_mean_is_frozen() -> None:
     assert torch.equal(exposures.affine[2], torch.eye(3, 4))
 
 
+def test_a_photograph_without_light_has_the_gains_of_its_neighbours() -> None:
+    """Photograph 1 is black: it tells its offset alone. Those beside it are brighter than the others."""
+    gain, train = {0: 1.1, 1: 1.0, 2: 1.1, 3: 0.9, 4: 0.9}, torch.arange(5)
+    exposures, colour = Exposures(5, train, 1000, CPU), picture()
+    for iteration in range(1, 1001):
+        index = iteration % 5
+        shown = exposures.apply(index, 0 * colour if index == 1 else colour)
+        target = 0 * colour if index == 1 else gain[index] * colour
+        (shown - target).square().mean().backward()
+        exposures.step(iteration)
+    gains = torch.stack([exposures.affine[index, :, :3].diagonal() for index in range(5)])
+    assert float((gains[1] - (gains[0] + gains[2]) / 2).abs().max()) < 0.02
+    assert float((gains[0] - gains[3]).min()) > 0.15
+
+
 def test_a_common_gain_is_left_to_the_gaussians() -> None:
     exposures, colour = Exposures(4, TRAIN, 300, CPU), picture()
     for iteration in range(1, 301):
