@@ -9,8 +9,8 @@
         --preset fast --iterations 2500 --max-image-size 720
 
 `orthophoto` needs the rasters, and shows a flight with `--flight grid --images 40 --size 960x720 --seed 5`, run
-likewise. `report` needs the report of any workspace, such as that of `make demo`, and `viewer` one with four check
-points; both need Chromium.
+likewise. `report` needs the report of any workspace, such as that of `make demo`, and `viewer` any trained one;
+both need Chromium.
 """
 
 from __future__ import annotations
@@ -24,9 +24,8 @@ import numpy as np
 
 from pipelines.core.workspace import Workspace
 from pipelines.report.chromium import NO_NETWORK, chromium_path
-from pipelines.view.loopback import start_server, stop_server
 from pipelines.view.options import ViewOptions
-from pipelines.view.viewer import Viewer
+from pipelines.view.server import served
 
 IMAGES = Path(__file__).parent / "images"
 DRAWING = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", NO_NETWORK)
@@ -89,28 +88,43 @@ def parts_of_report(page: Path) -> np.ndarray:
     return sized(np.hstack([summary, between, np.vstack([right, short])]))
 
 
-def measuring(workspace: Workspace) -> np.ndarray:
-    """Return the viewer's page with a measured polygon, BGR."""
-    from playwright.sync_api import sync_playwright
+def viewer_pages(workspace: Workspace) -> dict[str, np.ndarray]:
+    """Return pages of the viewer, BGR: measuring, marking, and a profile in the dark."""
+    from playwright.sync_api import Page, sync_playwright
 
-    server, address = start_server(8080, f"georef view {workspace.root.name}")
-    viewer = Viewer(server, workspace, ViewOptions())
-    with sync_playwright() as driver:
+    pictures = {}
+
+    def settled(page: Page) -> np.ndarray:
+        time.sleep(1.0)
+        page.wait_for_selector("body[data-drawn=full]", timeout=120_000)
+        return sized(decoded(page.screenshot()))
+
+    with served(workspace, ViewOptions()) as server, sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=chromium_path(), args=list(DRAWING))
-        page = browser.new_page(viewport={"width": 1280, "height": 720})
-        page.goto(address)
-        page.get_by_role("tab", name="Measure").click()
-        viewer.measuring.choose("area")
-        for point in viewer.model.trained.survey.check_points[:4]:
-            viewer.measuring.add_surveyed(point.name)
-        page.get_by_text("area on the surface").wait_for()
-        page.locator(".mantine-Notification-closeButton").first.click()
-        time.sleep(10)  # the picture at full size
-        png = page.screenshot()
+        page = browser.new_page(viewport={"width": 1280, "height": 760})
+        page.goto(f"{server.address}#tab=measure&kind=volume&shown=points,errors,boundary")
+        page.wait_for_selector("body[data-drawn=full]", timeout=120_000)
+        for place in ((330, 420), (520, 390), (560, 520), (340, 560)):
+            page.mouse.click(*place)
+            time.sleep(1.0)
+        page.keyboard.press("Enter")
+        page.wait_for_selector("#results[data-state=done]", timeout=120_000)
+        pictures["viewer"] = settled(page)
+        page.select_option("#light", "dark", force=True)
+        page.get_by_text("profile", exact=True).click()
+        page.mouse.click(250, 470)
+        time.sleep(1.0)
+        page.mouse.dblclick(650, 470)
+        page.wait_for_selector("#results[data-state=done]", timeout=120_000)
+        pictures["profile"] = settled(page)
+        page.select_option("#light", "light", force=True)
+        page.get_by_role("tab", name="Mark").click()
+        page.keyboard.press("n")
+        page.wait_for_selector("body[data-sheet]", timeout=120_000)
+        time.sleep(2.0)
+        pictures["marking"] = sized(decoded(page.screenshot()))
         browser.close()
-    viewer.close()
-    stop_server(server)
-    return sized(decoded(png))
+    return pictures
 
 
 def decoded(png: bytes) -> np.ndarray:
@@ -133,9 +147,12 @@ def main() -> None:
     parser.add_argument("workspace", type=Path)
     parser.add_argument("--view", type=int, default=0, help="number of the test view")
     options = parser.parse_args()
+    IMAGES.mkdir(exist_ok=True)
     if options.picture == "viewer":
-        picture = measuring(Workspace(options.workspace))
-    elif options.picture == "report":
+        for name, shot in viewer_pages(Workspace(options.workspace)).items():
+            cv2.imwrite(str(IMAGES / f"{name}.jpg"), shot, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+        return
+    if options.picture == "report":
         page = options.workspace / "report" / "report.html"
         if not page.exists():
             raise SystemExit("no report there: run `georef report` on the workspace first")
@@ -148,7 +165,6 @@ def main() -> None:
         if not renders:
             raise SystemExit("no renders there: run `georef evaluate` on the workspace first")
         picture = compose(renders[options.view], options.workspace / "evaluate" / "accuracy.png")
-    IMAGES.mkdir(exist_ok=True)
     cv2.imwrite(str(IMAGES / f"{options.picture}.jpg"), picture, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
 
 

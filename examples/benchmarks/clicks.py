@@ -8,11 +8,16 @@ The options are those of `georef simulate`: the same scene is built again, and t
 with it. They start near the cameras and go in all directions through the scene: no photograph was taken along them.
 The columns count clicks by what the line of sight truly meets; `σ` is the predicted σ along the line, `error/σ` the
 root mean square of those clicks that are off by 0.5 m at most.
+
+Then squares and lines at random places, whose corners are read from above: volumes over the best plane of the rim,
+areas and profiles against those of the true surface at the same places in plan. Squares on which the true surface
+has a step of more than 3 m between neighbouring samples are left out: a fraction of a pixel decides there.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -29,12 +34,14 @@ from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey.options import CrsOptions
 from pipelines.survey.scene import photographs
 from pipelines.survey.trained_survey import load_trained
-from pipelines.view.measuring import MeasuringModel
+from pipelines.view.measuring import Fineness, MeasuringModel, WantedBase
+from pipelines.view.quantities import rim_base
 
 _NAMES = ("scene", "flight", "images", "size", "seed")
 _PIXEL_RAD = 1 / 700  # of a page of 800 px
 _SCATTER_M = 8.0  # of the starts about the cameras
 _NEAR_M = 0.5
+_INNER, _MOST_STEP_M = 25, 3.0  # true samples along a side of a square, and the largest step between them
 
 
 def sights(model: MeasuringModel, count: int) -> list[Sight]:
@@ -50,13 +57,59 @@ def sights(model: MeasuringModel, count: int) -> list[Sight]:
     return lines
 
 
+def compare_quantities(model: MeasuringModel, count: int, true_up: Callable[[FloatArray], FloatArray]) -> None:
+    """Print error/σ of areas, volumes and profiles, pooled; `true_up` returns true heights (N,) at plans (N, 2)."""
+    trained, rng = model.trained, np.random.default_rng(1)
+    low, high = np.quantile(trained.geo_from_model.apply(trained.point_in_model)[:, :2], [0.2, 0.8], axis=0)
+    model_from_geo = trained.geo_from_model.inverse()
+    ratios: dict[str, list[float]] = {"area": [], "volume": [], "profile": []}
+    down = model_from_geo.rotation @ np.array([0.0, 0.0, -1.0])
+    tried = 0
+    while len(ratios["volume"]) < count and tried < 20 * count:
+        tried += 1
+        half, turn = rng.uniform(3, 12), rng.uniform(0, np.pi / 2)
+        spin = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        plan = rng.uniform(low, high) + half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ spin.T
+        inner = np.stack(np.meshgrid(*2 * [np.linspace(-1, 1, _INNER)]), axis=-1).reshape(-1, 2)
+        places = plan.mean(axis=0) + half * (1 - 1 / _INNER) * inner @ spin.T
+        up, at_corner = true_up(places), true_up(plan)
+        grid = up.reshape(_INNER, _INNER)
+        steps = max(np.abs(np.diff(grid, axis=axis)).max() for axis in (0, 1))
+        if not np.isfinite(up).all() or not np.isfinite(at_corner).all() or steps > _MOST_STEP_M:
+            continue
+        top = np.column_stack([plan, np.full(4, np.nanmax(up) + 60.0)])
+        corners = [model.reader.under(Sight(model_from_geo.apply(start[None])[0], down, 1e-3)) for start in top]
+        points = [point for point in corners if isinstance(point, SurfacePoint)]
+        if len(points) < 4:
+            continue
+        found = {each.name: each for each in model.volume(points, WantedBase(), Fineness())}
+        area = {each.name: each for each in model.area(points, Fineness())}["horizontal area"]
+        base = rim_base("plane", np.column_stack([plan, at_corner]), places).height_m
+        true = 4 * half**2 * float((up - base).mean())
+        if "volume" not in found or found["volume"].sigma is None or area.sigma is None:
+            continue
+        ratios["volume"].append((found["volume"].value - true) / found["volume"].sigma)
+        ratios["area"].append((area.value - 4 * half**2) / area.sigma)
+        line = model.profile(points[:2], Fineness())
+        along = plan[0] + (line.along_m / line.along_m[-1])[:, None] * (plan[1] - plan[0])
+        level = model.target.xyz_from_geo(np.column_stack([along, true_up(along)]))[:, 2]
+        error = (line.height - level) / line.sigma_m
+        # A robust RMS: by the median of a chi-square.
+        ratios["profile"].append(float(np.sqrt(np.nanmedian(error**2) / 0.455)))
+    for name, values in ratios.items():
+        z = np.array(values)
+        pooled, middle = float(np.sqrt(np.mean(z**2))), float(np.median(np.abs(z)))
+        print(f"{name:8s}{len(z):4d}: error/σ {pooled:.2f}, median |error/σ| {middle:.2f}")
+
+
 def main() -> None:
-    """Print errors by material."""
+    """Print errors by material, and of quantities."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("workspace", type=Path)
     for name in _NAMES:
         parser.add_argument(f"--{name}", default=SimulateOptions.model_fields[name].default)
     parser.add_argument("--clicks", type=int, default=300)
+    parser.add_argument("--outlines", type=int, default=30)
     args = parser.parse_args()
     workspace = Workspace(args.workspace)
     trained = load_trained(workspace)
@@ -95,6 +148,14 @@ def main() -> None:
             f"{Material(int(material)).name.lower():10s}{len(error):8d}{np.median(np.abs(error)):9.3f}"
             f"{np.mean(~near):9.0%}{np.median(sigma_m):8.3f}{ratio:9.2f}"
         )
+
+    def true_up(plan: FloatArray) -> FloatArray:
+        high, deep = (in_world(np.column_stack([plan, np.full(len(plan), up)])) for up in (300.0, -300.0))
+        line = (deep - high) / np.linalg.norm(deep - high, axis=1, keepdims=True)
+        hits = rays.first_hits(high, line)
+        return np.where(hits.triangle == MISS, np.nan, 300.0 - hits.distance.astype(np.float64))
+
+    compare_quantities(model, args.outlines, true_up)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,8 @@
 """Time the viewer of a large model: python examples/benchmarks/viewing.py WORKSPACE.
 
-The workspace is copied, and its Gaussians are split into many small ones that show the same scene. First without a
-browser: the time until the viewer could send its first pictures, and until it has answered clicks. Then in headless
-Chromium, whose software rendering takes the same cores all the time: from the start of `georef view` until the page
-shows a picture, and from clicks until the page shows the measured point. Needs Chromium and the extra `dev`.
+The workspace is copied, and its Gaussians are split into many small ones that show the same scene. Then: the time
+from the start until a page in headless Chromium shows its first picture, and, without the page, of pictures,
+clicks, and the volume over 1 000 m² in the middle of the scene. Needs Chromium and the extra `dev`.
 """
 
 from __future__ import annotations
@@ -11,31 +10,28 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
-import subprocess
-import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import sync_playwright
 
 from pipelines.core.stages import GAUSSIANS, MODEL, STAGES
 from pipelines.core.workspace import Workspace
 from pipelines.report.chromium import chromium_path
 from pipelines.splat.gaussians import Gaussians, read_gaussians, write_gaussians
-from pipelines.view.loopback import start_server, stop_server
+from pipelines.surface.picking import Sight, SurfacePoint
+from pipelines.view.measuring import ESTIMATE, Fineness, WantedBase
 from pipelines.view.options import ViewOptions
-from pipelines.view.pictures import ViewerCamera
+from pipelines.view.pictures import ViewerCamera, ViewFrame, Wanted
+from pipelines.view.server import served
 from pipelines.view.viewer import Viewer
 from tests.browser.chromium import FLAGS
 
 _SIZE = {"width": 1280, "height": 800}
-_SOUTH_WXYZ = np.array([-0.4178568, 0.9085129, 0.0, 0.0])  # looking down on the scene from the south
-_PANEL_PX = 420
-_LEAST_CONTRAST = 20.0  # standard deviation of a picture, of 255
 
 
 def split(gaussians: Gaussians, count: int) -> Gaussians:
@@ -53,76 +49,41 @@ def split(gaussians: Gaussians, count: int) -> Gaussians:
     return many
 
 
-def wait_for_picture(page: Page, patience_s: float = 120.0) -> None:
-    """Wait until the page shows a picture."""
-    end = time.perf_counter() + patience_s
-    clip = {"x": 0, "y": 200, "width": _SIZE["width"] - _PANEL_PX, "height": 500}
-    while time.perf_counter() < end:
-        png = page.screenshot(clip=clip)  # type: ignore[arg-type]
-        picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE)
-        if picture is not None and picture.std() > _LEAST_CONTRAST:
-            return
-    raise TimeoutError("the page shows no picture")
+def pages_camera(frame: ViewFrame) -> ViewerCamera:
+    """Return the camera of a page that was just opened: from the south, looking down on the whole scene."""
+    pitch = np.radians(42.0)
+    forward = np.array([0.0, np.cos(pitch), -np.sin(pitch)])
+    rotation = np.stack([[1.0, 0.0, 0.0], np.cross(forward, [1.0, 0.0, 0.0]), forward])
+    return ViewerCamera(rotation, -2.2 * frame.radius_m * forward, 0.9, _SIZE["width"], _SIZE["height"])
 
 
-def clicked_s(page: Page, x: float, y: float) -> float | None:
-    """Return the time from a click to the answer; None: nothing was measured."""
-    shown = "() => document.querySelector('[data-measured]')?.getAttribute('data-measured') ?? ''"
-    before = page.evaluate(shown)
-    began = time.perf_counter()
-    page.mouse.click(x, y)
-    while time.perf_counter() < began + 3:
-        if page.evaluate(shown) not in ("", before):
-            return time.perf_counter() - began
-    return None
-
-
-def time_server(workspace: Workspace, clicks: int) -> None:
-    """Print the times of the viewer's own work, without a browser."""
-    began = time.perf_counter()
-    server, _ = start_server(8080, "benchmark")
-    viewer = Viewer(server, workspace, ViewOptions())
-    camera = ViewerCamera(_SOUTH_WXYZ, np.array([0.0, -14.0, 12.0]), 0.9, _SIZE["width"], _SIZE["height"])
-    times = [time.perf_counter()]
+def time_answers(viewer: Viewer, clicks: int) -> None:
+    """Print the times of pictures, clicks, and a volume of 1 000 m²."""
+    camera = pages_camera(viewer.frame)
     for width, height in ((480, 300), (1280, 800)):
-        viewer.painter.paint(camera, width, height)
-        times.append(time.perf_counter())
-    made, coarse, full = (each - began for each in times)
-    print(f"without a browser: read after {made:.1f} s, coarse picture {coarse:.1f} s, full picture {full:.1f} s")
-    viewer.click_mode.value = "measures"  # type: ignore[misc]
-    taken = []
-    pinhole = camera.pinhole(camera.width, camera.height)
-    for x, y in np.random.default_rng(0).uniform([400, 250], [900, 600], (clicks, 2)):
-        direction = camera.rotation @ pinhole.rays([x, y])
-        sight = viewer.frame.sight(camera, camera.position, direction / np.linalg.norm(direction))
         start = time.perf_counter()
-        viewer.measuring.add_sight(sight)
+        viewer._painter.paint(replace(camera, width=width, height=height), Wanted())
+        print(f"picture of {width}x{height}: {time.perf_counter() - start:.2f} s")
+    taken, reader = [], viewer.model.reader
+    for x, y in np.random.default_rng(0).uniform([400, 250], [900, 600], (clicks, 2)):
+        start = time.perf_counter()
+        reader.under(viewer.frame.sight(camera, x, y))
         taken.append(time.perf_counter() - start)
-    print(
-        f"without a browser: click answered in {np.median(taken):.3f} s, slowest {np.max(taken):.3f} s", flush=True
-    )
-    viewer.close()
-    stop_server(server)
-
-
-def time_viewer(process: subprocess.Popen[str], page: Page, began: float, clicks: int) -> None:
-    """Print the times of a viewer that was started at `began`."""
-    assert process.stdout is not None
-    address = ""
-    while '"address"' not in address:
-        address += process.stdout.readline()
-    served = time.perf_counter()
-    page.goto(address.split('"')[3])
-    wait_for_picture(page)
-    print(f"served after {served - began:.1f} s, picture after {time.perf_counter() - began:.1f} s", flush=True)
-    page.locator("input[aria-haspopup]:visible").first.click()
-    page.get_by_role("option", name="measures").click()
-    page.get_by_role("tab", name="Measure").click()
-    time.sleep(30)  # σ are computed beside the first pictures
-    places = np.random.default_rng(0).uniform([250, 250], [650, 600], (clicks, 2))
-    taken = [each for x, y in places if (each := clicked_s(page, x, y)) is not None]
-    median, slowest = float(np.median(taken)), float(np.max(taken))
-    print(f"{len(taken)} of {clicks} clicks measured: median {median:.3f} s, slowest {slowest:.3f} s")
+    print(f"click: median {np.median(taken):.3f} s, slowest {np.max(taken):.3f} s")
+    down = np.array([0.0, 0.0, -1.0])
+    middle, half = viewer.frame.middle_in_geo, np.sqrt(1000.0) / 2
+    model_from_geo = viewer.trained.geo_from_model.inverse()
+    corners = []
+    for x, y in ((-half, -half), (half, -half), (half, half), (-half, half)):
+        start_at = middle + np.array([x, y, 2 * viewer.frame.radius_m])
+        point = reader.under(Sight(model_from_geo.apply(start_at[None])[0], model_from_geo.rotation @ down, 1e-3))
+        assert isinstance(point, SurfacePoint), "the middle of the scene has no surface: give another workspace"
+        corners.append(point)
+    for name, fineness in (("first estimate", ESTIMATE), ("result", Fineness())):
+        start = time.perf_counter()
+        found = viewer.model.volume(corners, WantedBase(), fineness)
+        volume = next(each for each in found if each.name == "volume")
+        print(f"volume of 1000 m², {name}: {time.perf_counter() - start:.2f} s, {volume.value:.1f} m³")
 
 
 def main() -> None:
@@ -146,25 +107,16 @@ def main() -> None:
         document = json.loads((copy / MODEL).read_text("utf-8"))
         (copy / MODEL).write_text(json.dumps({**document, "gaussians": len(many)}), "utf-8")
         print(f"{len(many):,} Gaussians", flush=True)
-        time_server(Workspace(copy), args.clicks)
-        browser = driver.chromium.launch(executable_path=chromium_path(), args=list(FLAGS))
-        page = browser.new_page(viewport=_SIZE)  # type: ignore[arg-type]
-        command = [
-            sys.executable,
-            "-c",
-            "from georef_cli.main import main; main()",
-            "-q",
-            "view",
-            str(copy),
-            "--json",
-        ]
         began = time.perf_counter()
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-            try:
-                time_viewer(process, page, began, args.clicks)
-            finally:
-                process.terminate()
-        browser.close()
+        with served(Workspace(copy), ViewOptions()) as server:
+            print(f"read and served after {time.perf_counter() - began:.1f} s")
+            browser = driver.chromium.launch(executable_path=chromium_path(), args=list(FLAGS))
+            page = browser.new_page(viewport=_SIZE)  # type: ignore[arg-type]
+            page.goto(server.address)
+            page.wait_for_selector("body[data-drawn]", timeout=120_000)
+            print(f"first picture in the page after {time.perf_counter() - began:.1f} s")
+            browser.close()
+            time_answers(server.viewer, args.clicks)
 
 
 if __name__ == "__main__":

@@ -97,9 +97,9 @@ def _readers(renderer: ModelRenderer, points: FloatArray, most_views: int) -> Bo
         pixel = pinhole.project(np.where(ahead[:, None], in_cam, [0.0, 0.0, 1.0]))
         detail[:, camera] = np.where(ahead & pinhole.contains(pixel), in_cam[:, 2] / pinhole.fx, np.inf)
     if detail.shape[1] <= most_views:
-        return np.isfinite(detail)
+        return np.asarray(np.isfinite(detail))
     limit = np.partition(detail, most_views - 1, axis=1)[:, most_views - 1 : most_views]
-    return np.isfinite(detail) & (detail <= limit)
+    return np.asarray(np.isfinite(detail) & (detail <= limit))
 
 
 def _seen_points(
@@ -162,7 +162,7 @@ def _agreed(renderer: ModelRenderer, plan: FloatArray, height: FloatArray) -> Pl
 def _tolerance(plan: FloatArray, height: FloatArray, centers: FloatArray) -> FloatArray:
     """Return the largest difference (N, C) of heights of one surface."""
     plan_m = np.linalg.norm(plan[:, None] - centers[None, :, :2], axis=2)
-    return SAME_SURFACE * np.hypot(plan_m, np.nan_to_num(height - centers[None, :, 2]))
+    return np.asarray(SAME_SURFACE * np.hypot(plan_m, np.nan_to_num(height - centers[None, :, 2])))
 
 
 def cameras_of(heights: PlanHeights, rows: IntArray) -> list[IntArray]:

@@ -95,10 +95,10 @@ def proposals(
                 continue
             assert image is not None
             score = cv2.matchTemplate(_patch(image, turn, expected, half), template, cv2.TM_CCOEFF_NORMED)
-            row, column = np.unravel_index(int(score.argmax()), score.shape)
+            row, column = divmod(int(score.argmax()), score.shape[1])
             if min(row, column) == 0 or row == score.shape[0] - 1 or column == score.shape[1] - 1:
                 continue
-            off = np.array([column, row]) + _refined(score, row, column) - _SEARCH_PX
+            off = np.array([column, row]) + _refined(np.asarray(score, np.float64), row, column) - _SEARCH_PX
             found.append((float(score[row, column]), expected + turn @ off))
         if found and max(found, key=lambda each: each[0])[0] >= _LEAST_SCORE:
             best, place = max(found, key=lambda each: each[0])

@@ -184,7 +184,8 @@ class Painter:
             if float(np.linalg.norm(apart)) < _SAME_PLACE * self._frame.radius_m:
                 rgb = self._blended(rgb, wanted, pose)
         small = _shrunk(depth.shape[1], depth.shape[0], _DEPTH_PX)
-        return PageView(rgb, cv2.resize(depth.astype(np.float32), small, interpolation=cv2.INTER_NEAREST), scale)
+        coarse = cv2.resize(depth.astype(np.float32), small, interpolation=cv2.INTER_NEAREST)
+        return PageView(rgb, np.asarray(coarse, dtype=np.float32), scale)
 
     def _clipped(self, box: Box | None) -> TrainedSurvey:
         if box is None:

@@ -16,6 +16,7 @@ from pipelines.view.server import HOST, MOST_BYTES, ViewerServer, served
 
 CAMERA = {"rotation": [1, 0, 0, 0, -0.6, -0.8, 0, 0.8, -0.6], "position": [0, -40, 30], "fov": 0.9}
 CAMERA |= {"width": 320, "height": 200}
+NOWHERE = {"position_in_geo": [0, 0, 0], "cov_of_surface": [[0, 0, 0]] * 3, "cameras": []}
 PICK = {**CAMERA, "x": 160, "y": 100}
 
 
@@ -78,7 +79,7 @@ def test_no_other_file_is_sent(server: ViewerServer, path: str) -> None:
         ("pick", {**PICK, "more": 1}),
         ("picture", {**CAMERA, "box": [0, 0, 0]}),
         ("jobs", {"kind": "volume", "points": []}),
-        ("jobs", {"kind": "area", "points": [{"position_in_geo": [0, 0, 0], "cov_of_surface": [[0, 0, 0]] * 3, "cameras": []}] * 3}),
+        ("jobs", {"kind": "area", "points": [NOWHERE] * 3}),
         ("measurements", {"job": "1", "name": ""}),
         ("marks", {"point": "a", "image": "../a.jpg", "place_px": [1, 1]}),
     ],

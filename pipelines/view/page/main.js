@@ -48,11 +48,11 @@ async function showSeen(inGeo) {
 }
 
 function inGeo(at) { return at.map((value, k) => value + scene.middle_in_geo[k]); }
-clicks.see = ({ x, y }, event) => {
+clicks.see = ({ x, y }, second) => {
   const hit = overlayAt(x, y);
   if (hit?.camera !== undefined) { change({ photo: hit.camera }, { step: true }); return; }
   const found = placeUnder(x, y);
-  if (event.detail > 1 && found) { lookAt(found); return; }
+  if (second && found) { lookAt(found); return; }
   if (state.strip && found) showSeen(inGeo(found));
 };
 clicks.mark = () => mark.turnTo(1);
@@ -92,7 +92,7 @@ function pressed(event) {
   if (event.key === " ") {
     event.preventDefault();
     const { width, height } = camera();
-    clicks[state.tab]?.({ x: width / 2, y: height / 2 }, { detail: 1 });
+    clicks[state.tab]?.({ x: width / 2, y: height / 2 }, false);
     return;
   }
   const tab = { 1: "see", 2: "measure", 3: "mark" }[event.key];

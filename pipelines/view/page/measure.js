@@ -71,8 +71,8 @@ export const finish = () => {
 };
 export const clear = () => { if (now.points.length) step("clearing", []); };
 
-clicks.measure = ({ x, y }, event) => {
-  if (event.detail > 1) { picking = picking.then(finish); return; }
+clicks.measure = ({ x, y }, second) => {
+  if (second) { picking = picking.then(finish); return; }
   const hit = overlayAt(x, y);
   const request = pixelRequest(x, y);
   picking = picking.then(() => safely(async () => {

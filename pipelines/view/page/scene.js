@@ -3,13 +3,13 @@
 import { add, focal, minus, norm, ofPhotograph, orbit, placeAt, project, rounded, row } from "./geometry.js";
 import { ask, byId, change, onState, safely, state } from "./base.js";
 
-const MOVING_MS = 120, STILL_MS = 180, LEAST_PX = 160, MOST_PX = 1920, CLICK_PX = 5, SNAP_PX = 10;
+const MOVING_MS = 120, STILL_MS = 180, LEAST_PX = 160, MOST_PX = 1920, CLICK_PX = 5, SNAP_PX = 10, DOUBLE_MS = 350;
 const picture = byId("picture"), overlay = byId("overlay");
 export let scene = null;  // what the server tells once
 let shown = null;  // of the last picture: camera, depth, scale of false colours
 let wanted = 0, drawing = null, movingPx = 480, stillTimer = null;
 export const layers = [];  // functions that draw over the picture: (context, pixelOf, camera)
-export const clicks = {};  // by tab: what a click and a double click do
+export const clicks = {};  // by tab: what a click does, and whether it is the second of a double click
 
 export async function loadScene() {
   scene = await (await ask("scene")).json();
@@ -40,7 +40,7 @@ export function look() {
 }
 
 async function draw(longest, quality) {
-  const number = wanted, seen = camera();
+  const number = wanted, seen = camera(), { colouring } = state;
   const density = longest >= MOST_PX ? Math.min(devicePixelRatio, 2) : 1;
   const factor = Math.min(density, longest / Math.max(seen.width, seen.height));
   const size = { width: Math.max(Math.round(seen.width * factor), 8), height: Math.max(Math.round(seen.height * factor), 8) };
@@ -49,7 +49,7 @@ async function draw(longest, quality) {
   try {
     const body = {
       rotation: seen.rotation, position: seen.position, fov: seen.fov, ...size, quality, photograph: state.photo,
-      share: state.share, colouring: state.colouring, background: background(), box: state.box,
+      share: state.share, colouring, background: background(), box: state.box,
     };
     const data = await (await ask("picture", { method: "POST", body, signal: controller.signal })).arrayBuffer();
     const length = new DataView(data).getUint32(0, true);
@@ -59,7 +59,7 @@ async function draw(longest, quality) {
     const bitmap = await createImageBitmap(jpeg);
     Object.assign(picture, { width: bitmap.width, height: bitmap.height });
     picture.getContext("2d").drawImage(bitmap, 0, 0);
-    shown = { camera: seen, depth, columns: head.depth[0], rows: head.depth[1], scale: head.scale, full: longest >= MOST_PX && number === wanted };
+    shown = { camera: seen, depth, columns: head.depth[0], rows: head.depth[1], scale: head.scale, colouring, full: longest >= MOST_PX && number === wanted };
     if (!drawing.full) movingPx = Math.min(Math.max(movingPx * Math.min(Math.max(Math.sqrt(MOVING_MS / (performance.now() - began)), 0.5), 1.3), LEAST_PX), MOST_PX);
     paint();
   } catch (error) {
@@ -108,8 +108,8 @@ export function paint() {
   const legend = byId("legend");
   legend.hidden = !shown.scale;
   if (shown.scale) {
-    const unit = { height: "m", sigma: "m σ", views: "photographs" }[state.colouring] ?? "", digits = state.colouring === "views" ? 0 : state.colouring === "sigma" ? 3 : 1;
-    const up = state.colouring === "height" ? scene.crs.middle[2] - scene.middle_in_geo[2] : 0;
+    const unit = { height: "m", sigma: "m σ", views: "photographs" }[shown.colouring] ?? "", digits = { views: 0, sigma: 3 }[shown.colouring] ?? 1;
+    const up = shown.colouring === "height" ? scene.crs.middle[2] - scene.middle_in_geo[2] : 0;
     [legend.firstChild.textContent, legend.lastChild.textContent] = shown.scale.map((value) => `${(value + up).toFixed(digits)} ${unit}`);
   }
 }
@@ -215,7 +215,7 @@ export const pixelRequest = (x, y) => { const { rotation, position, fov, width, 
 
 // Mouse and fingers. A drag turns around the place under the pointer's first touch; two fingers move and zoom.
 const pointers = new Map();
-let moved = 0, last = null;
+let moved = 0, last = null, clicked = { time: -Infinity };
 function pointerAt(event) { const box = overlay.getBoundingClientRect(); return { x: event.clientX - box.left, y: event.clientY - box.top }; }
 
 function leavePhotograph() {
@@ -270,7 +270,10 @@ export function listen() {
   const released = (event) => {
     const wasClick = pointers.has(event.pointerId) && moved < CLICK_PX && event.type === "pointerup" && event.button === 0;
     pointers.delete(event.pointerId);
-    if (wasClick) clicks[state.tab]?.(pointerAt(event), event);
+    if (!wasClick) return;
+    const at = pointerAt(event), second = event.timeStamp - clicked.time < DOUBLE_MS && Math.hypot(at.x - clicked.x, at.y - clicked.y) < CLICK_PX;
+    clicked = second ? { time: -Infinity } : { time: event.timeStamp, ...at };
+    clicks[state.tab]?.(at, second);
   };
   overlay.addEventListener("pointerup", released);
   overlay.addEventListener("pointercancel", released);
