@@ -54,7 +54,7 @@ def pages_camera(frame: ViewFrame) -> ViewerCamera:
     pitch = np.radians(42.0)
     forward = np.array([0.0, np.cos(pitch), -np.sin(pitch)])
     rotation = np.stack([[1.0, 0.0, 0.0], np.cross(forward, [1.0, 0.0, 0.0]), forward])
-    return ViewerCamera(rotation, -2.2 * frame.radius_m * forward, 0.9, _SIZE["width"], _SIZE["height"])
+    return ViewerCamera(rotation, -1.7 * frame.radius_m * forward, 0.9, _SIZE["width"], _SIZE["height"])
 
 
 def time_answers(viewer: Viewer, clicks: int) -> None:

@@ -63,16 +63,19 @@ function stop() {
   now.job = null;
 }
 
-export const finish = () => {
-  const least = KINDS[state.kind][0];
-  if (now.closed) return;
-  if (now.points.length < least) notice(`A ${state.kind} needs ${least} points.`);
-  else step("finishing", now.points, true);
-};
+// Finishes the outline, once all clicks before are answered.
+export function finish() {
+  picking = picking.then(() => {
+    const least = KINDS[state.kind][0];
+    if (now.closed) return;
+    if (now.points.length < least) notice(`A ${state.kind} needs ${least} points.`);
+    else step("finishing", now.points, true);
+  });
+}
 export const clear = () => { if (now.points.length) step("clearing", []); };
 
 clicks.measure = ({ x, y }, second) => {
-  if (second) { picking = picking.then(finish); return; }
+  if (second) { finish(); return; }
   const hit = overlayAt(x, y);
   const request = pixelRequest(x, y);
   picking = picking.then(() => safely(async () => {

@@ -16,7 +16,7 @@ export async function loadScene() {
   if (!state.view) change({ view: home() });
   return scene;
 }
-export const home = () => ({ target: [0, 0, 0], distance: 2.2 * scene.radius_m, heading: 0, pitch: 42, fov: 0.9 });
+export const home = () => ({ target: [0, 0, 0], distance: 1.7 * scene.radius_m, heading: 0, pitch: 42, fov: 0.9 });
 
 export function camera() {
   const { clientWidth: width, clientHeight: height } = overlay;
