@@ -161,7 +161,7 @@ def _mark(
     targets, surveyed = [], []
     for i in np.nonzero(rays >= LEAST_RAYS)[0]:
         role: Literal["control", "check"] = "control" if i in control else "check"
-        name = f"{'G' if role == 'control' else 'C'}{i:02d}"
+        name = f"{'G' if role == 'control' else 'C'}{world.number[i]:02d}"
         marks = []
         for j in np.nonzero(seen[i])[0]:
             x, y = pixels[i, j]

@@ -109,6 +109,7 @@ class World:
     origin: Origin
     scene: SimulatedScene
     sites: tuple[TargetSite, ...]
+    number: IntArray  # (P,) by which the targets are named, the same in both epochs
     survey_error: FloatArray  # (P, 3) surveyed minus true places of the targets, the same in both epochs
     target_m: float
     lens: BrownLens
@@ -148,7 +149,9 @@ def make_world(options: SimulateOptions, seed: np.random.SeedSequence) -> World:
     stays = tuple(site for site, is_kept in zip(sites, kept, strict=True) if is_kept)
     scene = with_targets(bare, list(stays), width_m)
     origin = Origin(lat_deg=lat, lon_deg=lon, alt_m=alt)
-    return World(origin, scene, stays, survey_error[kept], width_m, lens, trajectory, poses, mounting)
+    return World(
+        origin, scene, stays, np.flatnonzero(kept), survey_error[kept], width_m, lens, trajectory, poses, mounting
+    )
 
 
 def _flown(
