@@ -1,7 +1,7 @@
 """Common datum of two epochs: σ of the difference that both adjustments predict, and what both share.
 
 With C₁ and C₂ the covariances of a point by both adjustments, that of the difference is C₁ + C₂ − 2 S. S is what
-both share, by axis and as a translation: the surveyed coordinates of control points in both, and on request the base.
+both share, by axis and as a translation: the surveyed coordinates of common control points, on request the base.
 Each adjustment takes of an error the share w of its source in the datum: w_c = V_f / (V_f + V_c) of the control
 points, V_c and V_f being the variances of the mean control point and of the mean fix, and 1 − w_c of the fixes.
 """

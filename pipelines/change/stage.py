@@ -30,7 +30,7 @@ from pipelines.core.errors import InputError
 from pipelines.core.files import remove, replace_text
 from pipelines.core.products import Remark, save_json, union
 from pipelines.core.workspace import StageRun, Summary, Workspace
-from pipelines.formats.geotiff import Band, RasterKind, cells_inside, outlines, write_mosaic, write_part
+from pipelines.formats.geotiff import Band, RasterKind, cells_inside, outlines, read_cells, write_mosaic, write_part
 from pipelines.formats.tables import table_text
 from pipelines.formats.vector_files import feature, features_text, read_boundary, write_polygons_gpkg
 from pipelines.geodesy.crs import PointCrs, parse_crs
@@ -73,7 +73,7 @@ def run(stage: StageRun, options: ChangeOptions) -> Summary:
     sign = _write_rasters(stage, grid, noise, registered=registered)
     given = _polygons(options.regions, "--regions", crs, options) or ()
     found = _found(sign, grid, noise, options.min_area)
-    regions, polygons = _regions(stage.out / "parts", grid, noise, found, given, sign)
+    regions, polygons = _regions(stage.out / "parts", grid, noise, found, given)
     change = Change(
         of=options.of,
         crs=after.sidecar.crs,
@@ -96,8 +96,8 @@ def _summary(change: Change, cautions: tuple[Remark, ...]) -> Summary:
     registration, warnings = change.registration, []
     if registration.contradicts:
         sentence = (
-            f"Unchanged ground lies {registration.shift_m[2]:+.3f} m apart in the epochs, more than the datum's σ of "
-            f"{registration.datum_sigma_v_m:.3f} m explains. Register with --stable FILE or --stable-auto."
+            f"Unchanged ground lies {registration.shift_m[2]:+.3f} m apart in the epochs, more than the datum's σ "
+            f"of {registration.datum_sigma_v_m:.3f} m explains. Register with --stable FILE or --stable-auto."
         )
         warnings.append(Remark(code="epochs-shifted", sentence=sentence))
     figure = f"{len(found)} regions, {cut:.1f} m³ cut, {fill:.1f} m³ fill, "
@@ -176,7 +176,6 @@ def _write_rasters(stage: StageRun, grid: CommonGrid, noise: Noise, *, registere
                 "variance": np.where(known, cells.variance_m2[own], np.nan),
             }
             for name, values in bands.items():
-                values = values.astype(np.float32) if values.dtype.kind == "f" else values
                 write_part(_part(folder, name, window), values[None], grid.part(window))
             parts.append(window)
             task.advance()
@@ -213,16 +212,9 @@ def _found(sign: NDArray[np.int8], grid: CommonGrid, noise: Noise, min_area_m2: 
 
 
 def _regions(
-    folder: Path,
-    grid: CommonGrid,
-    noise: Noise,
-    found: NDArray[np.int32],
-    given: tuple[Any, ...],
-    sign: NDArray[np.int8],
+    folder: Path, grid: CommonGrid, noise: Noise, found: NDArray[np.int32], given: tuple[Any, ...]
 ) -> tuple[tuple[ChangedRegion, ...], list[Any]]:
     """Return the regions with their volumes, and their polygons: those given first, then those beyond their σ."""
-    from pipelines.formats.geotiff import read_cells
-
     count = int(found.max(initial=0))
     totals, of_given = [Volume() for _ in range(count)], [Volume() for _ in given]
     for window in grid.windows():

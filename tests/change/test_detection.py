@@ -55,9 +55,9 @@ def test_noise_of_no_change_is_found_and_gives_few_false_alarms() -> None:
 
 
 def test_volumes_err_as_their_sigma_says_over_twenty_pairs() -> None:
-    """A heap of 0.5 m: RMS of error over σ of 20 independent pairs lies in 0.7 … 1.4, which 97 % of such samples do.
+    """A heap of 0.5 m: the RMS of error over σ of 20 independent pairs lies in 0.7 … 1.4 with 97 % probability.
 
-    The region is given, so that its volume has no bias of detection.
+    The region is given: its volume has no bias of detection.
     """
     rows, columns = np.indices((SIDE, SIDE))
     inside = (np.hypot(rows - 160, columns - 160) < 30).astype(np.int64)
