@@ -55,7 +55,7 @@ def test_noise_of_no_change_is_found_and_gives_few_false_alarms() -> None:
 
 
 def test_volumes_err_as_their_sigma_says_over_twenty_pairs() -> None:
-    """A heap of 0.5 m: the RMS of error over σ of 20 independent pairs lies in 0.7 … 1.4 with 97 % probability.
+    """A heap of 0.5 m: the RMS of error over σ of 20 independent pairs is 0.7 … 1.4, as for 97 % of samples.
 
     The region is given: its volume has no bias of detection.
     """
