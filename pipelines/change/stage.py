@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation, label
+from scipy.ndimage import binary_dilation, find_objects, label
 
 from pipelines.change.datum import load_epoch, shared_by
 from pipelines.change.detection import (
@@ -222,12 +222,13 @@ def _regions(
             read_cells(_part(folder, name, window))[0].astype(np.float64)
             for name in ("difference", "datum", "variance")
         )
-        cells = Cells(difference, variance, datum, np.zeros(0))
+        window_cells = Cells(difference, variance, datum, np.zeros(0))
         own = found[window.row : window.row + window.rows, window.column : window.column + window.columns]
-        totals = [one + two for one, two in zip(totals, volumes(own, cells, count), strict=True)]
+        totals = [one + two for one, two in zip(totals, volumes(own, window_cells, count), strict=True)]
         for place, polygon in enumerate(given):
             inside = cells_inside(polygon, grid.part(window)).astype(np.int64)
-            of_given[place] += volumes(inside, cells, 1)[0]
+            of_given[place] += volumes(inside, window_cells, 1)[0]
+    places = find_objects(found)
     regions, polygons = [], []
     for number, (volume, polygon) in enumerate(zip(of_given, given, strict=True), start=1):
         regions.append(ChangedRegion.of(f"P{number}", volume, noise, grid.cell_m2))
@@ -236,8 +237,10 @@ def _regions(
         region = ChangedRegion.of(f"R{number}", volume, noise, grid.cell_m2)
         if abs(region.net_m3) > QUANTILE_95 * region.sigma_m3:
             regions.append(region)
-            parts = outlines(found == number, grid.frame)
-            polygons.append(shapely.union_all(parts))
+            rows, columns = places[number - 1]
+            cells = found[rows, columns] == number
+            frame = grid.frame.part(columns.start, rows.start, cells.shape[1], cells.shape[0])
+            polygons.append(shapely.union_all(outlines(cells, frame)))
     return tuple(regions), polygons
 
 

@@ -30,7 +30,7 @@ def analysed(difference: FloatArray) -> tuple[Cells, Noise]:
     slope = np.random.default_rng(0).normal(0, 0.1, (*shape, 2))
     cells = Cells(difference, np.full(shape, SIGMA_M**2 / 2), np.zeros(shape), slope)
     row, column = (axis.ravel()[::7] for axis in np.indices(shape))
-    place = CELL_M * (np.stack([column, -row], axis=-1) - SIDE / 2.0)
+    place = np.asarray(CELL_M * (np.stack([column, -row], axis=-1) - SIDE / 2.0), dtype=np.float64)
     design = np.concatenate(
         [np.ones((*shape, 1)), -slope, np.zeros((*shape, 2)), np.sqrt(cells.variance_m2)[..., None]], axis=-1
     )
