@@ -61,6 +61,7 @@ COMMANDS: dict[str, HelpLine] = {
     "export-tiles": HelpLine("Deliverables", "Write the splat as 3D Tiles, for web globes."),
     "export-cameras": HelpLine("Deliverables", "Write the trained cameras for other programs."),
     "report": HelpLine("Deliverables", "Write the report: one page, and its PDF."),
+    "change": HelpLine("Deliverables", "Compare two surveys: what changed, by how much, is it real."),
     "help": HelpLine("Help", "Explain a topic, such as heights or options, or a command."),
     "doctor": HelpLine("Help", "Show what this machine offers: memory, GPU, backends, geoid grids."),
 }

@@ -37,6 +37,7 @@ class StageCommand(Command):
 
     Args:
         extra: further options.
+        before: argument before the workspace, which is an option of the stage.
         delivers: what `--to` copies: the stage's whole folder, or one file with its sidecars; None: nothing.
         more: returns what is printed below the figures, from the workspace and the values of the options.
     """
@@ -47,6 +48,7 @@ class StageCommand(Command):
         doc: str,
         extra: Sequence[click.Option] = (),
         *,
+        before: click.Argument | None = None,
         delivers: Literal["file", "folder"] | None = None,
         more: Callable[[Workspace, Mapping[str, Any]], Sequence[RenderableType]] = lambda *_: (),
     ) -> None:
@@ -62,8 +64,13 @@ class StageCommand(Command):
         super().__init__(
             name,
             params=[
+                *([] if before is None else [before]),
                 options.WORKSPACE,
-                *options.stage_options(self.spec.options),
+                *(
+                    one
+                    for one in options.stage_options(self.spec.options)
+                    if before is None or one.name != before.name
+                ),
                 *extra,
                 *([] if delivers is None else [target]),
                 options.FORGET,

@@ -34,6 +34,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ("pipelines.report",),
     ("pipelines.jobs",),
     (
+        "pipelines.change",
         "pipelines.compare",
         "pipelines.deliver",
         "pipelines.evaluate",

@@ -321,6 +321,17 @@ DELIVERABLES: tuple[StageSpec, ...] = (
     ),
 )
 
+# Compares the workspace with another, the earlier epoch, on request.
+CHANGE = StageSpec(
+    name="change",
+    module="pipelines.change.stage",
+    options_place="pipelines.change.options:ChangeOptions",
+    reads=(MEASURED, *SOLVED, *whole_products("raster/dsm.tif")),
+    product="change/change.json",
+    title="Compare with an earlier survey: what changed, by how much, is it real.",
+    also=("change/difference.tif", "change/regions.gpkg"),
+)
+
 # No part of the pipeline: `georef compare` runs this stage for the baseline, whose later stages read its folder in
 # place of those of sfm and init-sim3.
 ADJUST = StageSpec(
@@ -377,8 +388,8 @@ TRAIN_SEAMS = StageSpec(
 )
 BLOCK_PARTS = (PLAN_BLOCKS, SOLVE, TRAIN_SCAFFOLD, TRAIN_BLOCK, TRAIN_SEAMS)
 
-STAGES = (*PIPELINE, *DELIVERABLES, ADJUST, *BLOCK_PARTS)
-BY_NAME = {spec.name: spec for spec in (*PIPELINE, *DELIVERABLES)}
+STAGES = (*PIPELINE, *DELIVERABLES, CHANGE, ADJUST, *BLOCK_PARTS)
+BY_NAME = {spec.name: spec for spec in (*PIPELINE, *DELIVERABLES, CHANGE)}
 
 
 def producer_of(path: str) -> StageSpec:

@@ -162,6 +162,40 @@ def sampled_raster(path: Path, xy: FloatArray) -> FloatArray:
     return np.where(values == NODATA, np.nan, values)
 
 
+def frame_of(path: Path) -> RasterFrame:
+    """Return the place of a raster's cells."""
+    import rasterio
+
+    with rasterio.open(path) as raster:
+        at, wkt = raster.transform, raster.crs.to_wkt(version="WKT1_GDAL") if raster.crs else ""
+        return RasterFrame(wkt, at.c, at.f, at.a, -at.e, raster.width, raster.height)
+
+
+def is_same_crs(first: RasterFrame, second: RasterFrame) -> bool:
+    from rasterio.crs import CRS
+
+    return bool(CRS.from_wkt(first.wkt) == CRS.from_wkt(second.wkt))
+
+
+def read_onto(
+    path: Path, frame: RasterFrame, resampling: Literal["nearest", "bilinear", "average"]
+) -> NDArray[Any]:
+    """Return the first band (rows, columns) of a raster on the cells of a frame in its CRS; NaN or 0: no value."""
+    import rasterio
+    from rasterio.enums import Resampling
+    from rasterio.vrt import WarpedVRT
+
+    with rasterio.open(path) as raster:
+        place: dict[str, Any] = {"crs": raster.crs, "transform": _transform(frame)}
+        place |= {"width": frame.columns, "height": frame.rows, "resampling": Resampling[resampling]}
+        if raster.dtypes[0] == "uint8":
+            with WarpedVRT(raster, **place) as warped:
+                return np.asarray(warped.read(1))
+        with WarpedVRT(raster, src_nodata=NODATA, nodata=NODATA, **place) as warped:
+            values = warped.read(1)
+    return np.where(values == NODATA, np.nan, values).astype(np.float64)
+
+
 def cells_inside(polygon: Any, frame: RasterFrame) -> BoolArray:
     """Return which cells (rows, columns) have their middle in a polygon of the frame's CRS."""
     from rasterio.features import rasterize

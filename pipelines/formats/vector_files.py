@@ -167,6 +167,30 @@ def read_contours(path: Path) -> tuple[str, list[ContourLine]]:
     return meta["crs"], lines
 
 
+def write_polygons_gpkg(path: Path, layer: str, polygons: Sequence[Any], rows: Sequence[Json], wkt: str) -> None:
+    """Write polygons with a row of attributes each as a GeoPackage 1.2 of one layer."""
+    import pyogrio
+
+    draft = path.with_name(f".{path.name}")
+    draft.unlink(missing_ok=True)
+    names = list(rows[0]) if rows else []
+    pyogrio.raw.write(
+        draft,
+        geometry=np.array(
+            [shapely.to_wkb(shapely.MultiPolygon(shapely.get_parts(one))) for one in polygons] or np.zeros(0),
+            dtype=object,
+        ),
+        field_data=[np.array([row[name] for row in rows]) for name in names],
+        fields=names,
+        layer=layer,
+        driver="GPKG",
+        geometry_type="MultiPolygon",
+        dataset_options={"VERSION": "1.2"},
+        crs=wkt,
+    )
+    replace_file(draft, path)
+
+
 def write_contours_dxf(path: Path, lines: Sequence[ContourLine]) -> None:
     """Write contour lines as DXF (R2010) polylines with their height as elevation, every fifth on its own layer."""
     from ezdxf.filemanagement import new
@@ -211,10 +235,14 @@ BOUNDARY_FORMATS: dict[str, tuple[bytes, ...]] = {
 
 @dataclass(frozen=True)
 class Boundary:
-    """Polygons of a file as one, easting or longitude first, and the file's CRS as text; empty: it states none."""
+    """Polygons of a file, easting or longitude first, as one and each by itself.
+
+    `crs` is the file's CRS as text; empty: it states none.
+    """
 
     polygon: MultiPolygon
     crs: str
+    parts: tuple[Any, ...] = ()
 
 
 def read_boundary(path: Path, *, field: str) -> Boundary:
@@ -247,12 +275,11 @@ def read_boundary(path: Path, *, field: str) -> Boundary:
         raise refusal("boundary-unreadable", f"cannot be read: {error}. Write it again, as GeoJSON.") from error
     parts = [part for shape in shapes for part in shapely.get_parts(shape)]
     rings = [shapely.Polygon(part.coords) for part in parts if part.geom_type == "LineString" and part.is_ring]
-    whole = shapely.union_all(
-        shapely.make_valid([*(part for part in parts if part.geom_type == "Polygon"), *rings])
-    )
+    single = shapely.make_valid([*(part for part in parts if part.geom_type == "Polygon"), *rings])
+    whole = shapely.union_all(single)
     polygons = [part for part in shapely.get_parts(whole) if part.geom_type == "Polygon" and part.area > 0]
     if not polygons:
         raise refusal(
             "boundary-without-area", f"has {len(parts)} shapes, and none is a polygon. Draw the boundary as one."
         )
-    return Boundary(MultiPolygon(polygons), crs)
+    return Boundary(MultiPolygon(polygons), crs, tuple(part for part in single if part.area > 0))

@@ -104,6 +104,11 @@ class MeshBuilder:
             self.quad([bottom[i], bottom[j], top[j], top[i]], material, texture)
         self.quad(top, material, texture)
 
+    @property
+    def count(self) -> int:
+        """Number of triangles so far."""
+        return sum(len(corners) for corners, _, _ in self._parts)
+
     def build(self) -> Mesh:
         corners, normals, shared = (np.concatenate(part) for part in zip(*self._parts, strict=True))
         return Mesh(
@@ -178,6 +183,17 @@ _INNER_M, _CELL_M = 150.0, 2.5
 
 
 @dataclass(frozen=True)
+class Mound:
+    """Round heap on the terrain, or a pit if its height is negative: half a period of a cosine from its middle (2,)
+    in geo to its rim.
+    """
+
+    middle: FloatArray
+    radius_m: float
+    height_m: float
+
+
+@dataclass(frozen=True)
 class Terrain:
     """Terrain whose height is a sum of W waves (W, 2) in radians per metre, east and north; zero at the origin.
 
@@ -188,6 +204,7 @@ class Terrain:
     phases: FloatArray
     near_m: FloatArray
     far_m: FloatArray
+    mounds: tuple[Mound, ...] = ()
 
     def height(self, xy: ArrayLike) -> FloatArray:
         """Return heights (…,) in metres of places (…, 2)."""
@@ -195,7 +212,11 @@ class Terrain:
         raised = np.sin(place @ self.waves.T + self.phases) - np.sin(self.phases)
         distance = np.linalg.norm(place, axis=-1)
         hills = np.clip((distance - 160.0) / 500.0, 0.0, 1.0)[..., None] ** 2
-        return np.asarray((raised * (self.near_m + hills * self.far_m)).sum(axis=-1))
+        height = np.asarray((raised * (self.near_m + hills * self.far_m)).sum(axis=-1))
+        for mound in self.mounds:
+            share = np.minimum(np.linalg.norm(place - mound.middle, axis=-1) / mound.radius_m, 1.0)
+            height = height + mound.height_m * (0.5 + 0.5 * np.cos(np.pi * share))
+        return height
 
     def normal(self, xy: FloatArray) -> FloatArray:
         """Return upward unit normals (N, 3) at places (N, 2)."""

@@ -4,7 +4,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator
 
-from pipelines.core.options import EFFORT, PlaceOnEarth, StageOptions, Triple
+from pipelines.core.options import EFFORT, PlaceOnEarth, StageOptions, Triple, listed_names
+
+CHANGES = ("excavation", "heap", "new", "demolished", "growth")
 
 
 class LidarFlightOptions(StageOptions):
@@ -28,7 +30,33 @@ class LidarFlightOptions(StageOptions):
     )
 
 
-class SimulateOptions(LidarFlightOptions):
+class EpochOptions(StageOptions):
+    """Options of a second flight over the town of the same seed, with other noise and the same targets."""
+
+    epoch: Literal["1", "2"] = Field("1", description="2: a later flight over the town of this --seed.")
+    changes: str = Field(
+        ",".join(CHANGES),
+        description="Changes before the second flight, with commas: " + ", ".join(CHANGES) + ", or none.",
+    )
+    change_height: float = Field(
+        2.0, gt=0, le=10, description="Depth of the excavation and height of the heap in metres."
+    )
+    light: Literal["other", "same"] = Field("other", description="Sun of the second flight.")
+
+    @property
+    def changed(self) -> tuple[str, ...]:
+        """Changes of this epoch."""
+        return () if self.epoch == "1" or self.changes == "none" else tuple(listed_names(self.changes, CHANGES))
+
+    @field_validator("changes")
+    @classmethod
+    def _known_changes(cls, text: str) -> str:
+        if text != "none":
+            listed_names(text, CHANGES)
+        return text
+
+
+class SimulateOptions(EpochOptions, LidarFlightOptions):
     """Options of a simulated survey. Triples are written with commas: `46.02,7.75,1620`."""
 
     scene: Literal["city", "village"] = Field("city", description="Type of town.")

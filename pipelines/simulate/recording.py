@@ -161,7 +161,7 @@ def _mark(
     targets, surveyed = [], []
     for i in np.nonzero(rays >= LEAST_RAYS)[0]:
         role: Literal["control", "check"] = "control" if i in control else "check"
-        name = f"{'G' if role == 'control' else 'C'}{i:02d}"
+        name = f"{'G' if role == 'control' else 'C'}{world.number[i]:02d}"
         marks = []
         for j in np.nonzero(seen[i])[0]:
             x, y = pixels[i, j]
@@ -171,7 +171,7 @@ def _mark(
                 image=names[j], x_px=x, y_px=y, written_x_px=round(x + dx, 3), written_y_px=round(y + dy, 3)
             ))  # fmt: skip
         position = world.sites[i].target_position
-        surveyed.append(position + rng.normal(0, options.sigma_survey, 3))
+        surveyed.append(position + world.survey_error[i])
         kind, true_in_geo = world.sites[i].kind, vector3(position)
         targets.append(
             TrueTarget(name=name, role=role, surface=kind, position_in_geo=true_in_geo, marks=tuple(marks))

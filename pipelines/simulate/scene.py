@@ -16,11 +16,13 @@ from pipelines.simulate.mesh import (
     Material,
     Mesh,
     MeshBuilder,
+    Mound,
     Terrain,
     TextureParameters,
     add_terrain,
     make_terrain,
 )
+from pipelines.simulate.options import EpochOptions
 from pipelines.simulate.textures import GroundPlan
 
 SiteKind = Literal["ground", "roof", "wall"]
@@ -84,6 +86,14 @@ class Building:
 
 
 @dataclass(frozen=True)
+class SceneChange:
+    """Change of the town since the first flight: its kind, and its outline (K, 2) in geo."""
+
+    kind: str
+    outline: FloatArray
+
+
+@dataclass(frozen=True)
 class SimulatedScene:
     """Town to photograph."""
 
@@ -94,15 +104,40 @@ class SimulatedScene:
     sites: tuple[TargetSite, ...]  # places where a survey target can be fixed
     complex_m: tuple[float, float]  # half lengths along the axes of the complex in the middle
     buildings: tuple[Building, ...]  # those of the complex first
+    changes: tuple[SceneChange, ...] = ()  # since the first flight
 
 
-def build_scene(name: str, seed: np.random.SeedSequence) -> SimulatedScene:
-    """Build a town of one of the `STYLES`."""
+# Places of the changes in the town's axes, on the square around the complex, and their sizes.
+_EXCAVATION_M, _HEAP_M = ((-28.0, 4.0), 8.0), ((28.0, 4.0), 7.0)
+_NEW = BuildingPlan((-8.0, -29.0), 12.0, 8.0, 2, 2.9, "flat")
+_DEMOLISHED = 3  # index in `SimulatedScene.buildings`, of the complex
+_GROWN = 1.15
+_OUTLINE = 48  # corners of a round outline
+_TURNED_RAD, _SUN_ELEVATION_RAD = 1.9, 0.65  # of the sun of other light
+
+
+_FIRST = EpochOptions()
+
+
+def build_scene(name: str, seed: np.random.SeedSequence, options: EpochOptions = _FIRST) -> SimulatedScene:
+    """Build a town of one of the `STYLES`, as it is in the epoch of the options.
+
+    The random numbers of all that stays are the same in both epochs.
+    """
+    changed = options.changed
     style = STYLES[name]
     rng = np.random.default_rng(seed)
     turn = rng.uniform(0.15, 0.45)
     axes = np.array([[np.cos(turn), np.sin(turn), 0.0], [-np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]])
     terrain = make_terrain(style.relief_m, rng)
+    changes: list[SceneChange] = []
+    for kind, (middle, radius_m), sign in (("excavation", _EXCAVATION_M, -1), ("heap", _HEAP_M, 1)):
+        if kind in changed:
+            mound = Mound((np.array([*middle, 0.0]) @ axes)[:2], radius_m, sign * options.change_height)
+            terrain = replace(terrain, mounds=(*terrain.mounds, mound))
+            angle = np.linspace(0, 2 * np.pi, _OUTLINE, endpoint=False)
+            circle = mound.middle + radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+            changes.append(SceneChange(kind, circle))
     layout = make_town_layout(style, rng)
     builder = MeshBuilder()
     add_terrain(builder, terrain, axes, TextureParameters((0.1, 0.15, 0.05)))
@@ -111,12 +146,37 @@ def build_scene(name: str, seed: np.random.SeedSequence) -> SimulatedScene:
     on_ground = zip(positions, terrain.normal(places), strict=True)
     sites = [TargetSite(position, normal, "ground") for position, normal in on_ground]
     buildings = tuple(_building(plan, terrain, axes) for plan in layout.buildings)
-    for building in buildings:
+    gone = slice(0, 0)
+    for number, building in enumerate(buildings):
+        first = builder.count
         sites += _add_building(builder, building, rng)
-    _add_furniture(builder, layout, terrain, axes, rng)
+        if number == _DEMOLISHED and "demolished" in changed:
+            gone = slice(first, builder.count)
+            changes.append(SceneChange("demolished", _outline(building)))
+    _add_furniture(builder, layout, terrain, axes, rng, growth=_GROWN if "growth" in changed else 1.0)
     azimuth, elevation = rng.uniform(2.2, 4.1), np.radians(rng.uniform(42, 56))
+    if options.epoch == "2" and options.light == "other":
+        azimuth, elevation = azimuth - np.copysign(_TURNED_RAD, azimuth - np.pi), _SUN_ELEVATION_RAD
+    if "new" in changed:
+        building = _building(_NEW, terrain, axes)
+        _add_building(builder, building, rng)
+        buildings = (*buildings, building)
+        changes.append(SceneChange("new", _outline(building)))
     sun = np.array([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)])
-    return SimulatedScene(builder.build(), layout.plan, axes, sun, tuple(sites), (17.5, 18.5), buildings)
+    mesh = _without(builder.build(), gone)
+    return SimulatedScene(mesh, layout.plan, axes, sun, tuple(sites), (17.5, 18.5), buildings, tuple(changes))
+
+
+def _outline(building: Building) -> FloatArray:
+    return np.array(building.rectangle(building.length_m / 2, building.width_m / 2, 0.0))[:, :2]
+
+
+def _without(mesh: Mesh, gone: slice) -> Mesh:
+    kept = np.ones(len(mesh.corners), dtype=bool)
+    kept[gone] = False
+    return Mesh(
+        **{name: values if name == "texture_params" else values[kept] for name, values in vars(mesh).items()}
+    )
 
 
 def with_targets(scene: SimulatedScene, sites: list[TargetSite], width_m: float) -> SimulatedScene:
@@ -155,10 +215,16 @@ def _building(plan: BuildingPlan, terrain: Terrain, axes: FloatArray) -> Buildin
 
 
 def _add_furniture(
-    builder: MeshBuilder, layout: TownLayout, terrain: Terrain, axes: FloatArray, rng: np.random.Generator
+    builder: MeshBuilder,
+    layout: TownLayout,
+    terrain: Terrain,
+    axes: FloatArray,
+    rng: np.random.Generator,
+    *,
+    growth: float,
 ) -> None:
     for x, y, height in layout.trees:
-        _add_tree(builder, _on_ground((x, y), terrain, axes), height, rng)
+        _add_tree(builder, _on_ground((x, y), terrain, axes), growth * height, rng)
     for x, y, north in layout.cars:
         foot = _on_ground((x, y), terrain, axes)
         up = terrain.normal(foot[None, :2])[0]

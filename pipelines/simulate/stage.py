@@ -1,8 +1,8 @@
 """Simulate a survey whose truth is known exactly.
 
 Reads: nothing. Writes a survey folder, not a workspace: `images/`, `trajectory.csv`, `gnss.csv`, `imu.csv`,
-`gcp_list.txt`, `checkpoints.txt`, `truth.json`; on request `depth/`, `bag/`, `lidar.laz` and `lidar_trajectory.csv`
-(docs/simulator.md).
+`gcp_list.txt`, `checkpoints.txt`, `truth.json`; on request `depth/`, `bag/`, `lidar.laz` and
+`lidar_trajectory.csv`; of a second epoch `heights.npz` (docs/simulator.md).
 """
 
 import logging
@@ -15,6 +15,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import shapely
 
 from pipelines.core.errors import InputError
 from pipelines.core.extras import require
@@ -28,15 +29,19 @@ from pipelines.formats.exif_writer import DroneTags, with_tags
 from pipelines.simulate.flight import in_local_enu
 from pipelines.simulate.lens import Renderer, Sensor
 from pipelines.simulate.lidar import LidarFlight, lidar_files
+from pipelines.simulate.mesh import Raycaster
 from pipelines.simulate.options import SimulateOptions
 from pipelines.simulate.recording import Recording, record, write_tables
-from pipelines.simulate.truth import TrueLidar
+from pipelines.simulate.scene import SimulatedScene, build_scene
+from pipelines.simulate.truth import TrueChange, TrueLidar, TrueRegion
 from pipelines.simulate.world import WANTED_RAYS, World, check_clearance, make_world
 
 log = logging.getLogger(__name__)
 
 TRUTH = "truth.json"
+TRUE_HEIGHTS = "heights.npz"
 WANTED_CHECKS = 30
+_TRUE_REACH_M, _TRUE_CELL_M, _TRUE_SKY_M = 80.0, 0.25, 150.0  # of the true heights
 
 
 @dataclass(frozen=True)
@@ -77,7 +82,10 @@ def fly_survey(options: SimulateOptions) -> RecordedFlight:
         InputError: the options cannot be flown or photographed.
         BackendUnavailableError: the ray caster is not installed.
     """
-    world_seed, record_seed, photo_seed, lidar_seed = np.random.SeedSequence(options.seed).spawn(4)
+    world_seed, *flight_seeds = np.random.SeedSequence(options.seed).spawn(4)
+    if options.epoch == "2":
+        flight_seeds = [seed.spawn(1)[0] for seed in flight_seeds]
+    record_seed, photo_seed, lidar_seed = flight_seeds
     world = make_world(options, world_seed)
     renderer = Renderer(world.scene, world.lens, int(options.samples), rolling=options.rolling_shutter > 0)
     check_clearance(world, renderer.raycaster)
@@ -106,6 +114,8 @@ def simulate(
         truth = recording.truth
         if options.lidar:
             truth = truth.model_copy(update={"lidar": write_lidar_flight(options, flight, draft, progress)})
+        if options.epoch == "2":
+            truth = truth.model_copy(update={"change": _write_change(options, flight.world.scene, draft)})
         save_json(truth, draft / TRUTH)
         messages = _write_records(options, flight.world, recording, draft)
     check = [target for target in recording.truth.targets if target.role == "check"]
@@ -123,6 +133,35 @@ def simulate(
         log.warning("simulate: %s", warning.sentence)
     log.info("simulate: %s", summary.key_figure)
     return summary
+
+
+def _write_change(options: SimulateOptions, scene: SimulatedScene, folder: Path) -> TrueChange:
+    """Write the heights of both epochs, without targets, as `heights.npz`, and return the change between them."""
+    world_seed = np.random.SeedSequence(options.seed).spawn(1)[0]
+    first = build_scene(options.scene, world_seed.spawn(1)[0])
+    side = round(2 * _TRUE_REACH_M / _TRUE_CELL_M)
+    line = (np.arange(side) + 0.5) * _TRUE_CELL_M - _TRUE_REACH_M
+    x, y = (axis.ravel() for axis in np.meshgrid(line, line))
+    start = np.stack([x, y, np.full(len(x), _TRUE_SKY_M)], axis=1)
+    down = np.broadcast_to([0.0, 0.0, -1.0], start.shape)
+    before, after = (
+        _TRUE_SKY_M - Raycaster(one.mesh).first_hits(start, down).distance.astype(np.float64)
+        for one in (first, scene)
+    )
+    np.savez_compressed(folder / TRUE_HEIGHTS, before=before.reshape(side, side), after=after.reshape(side, side))
+    regions = []
+    for change in scene.changes:
+        inside = shapely.contains_xy(shapely.Polygon(change.outline), x, y)
+        risen = (after - before)[inside] * _TRUE_CELL_M**2
+        regions.append(
+            TrueRegion(
+                kind=change.kind,
+                outline=tuple((float(east), float(north)) for east, north in change.outline),
+                cut_m3=float(-np.minimum(risen, 0.0).sum()),
+                fill_m3=float(np.maximum(risen, 0.0).sum()),
+            )
+        )
+    return TrueChange(corner=(-_TRUE_REACH_M,) * 2, cell_m=_TRUE_CELL_M, regions=tuple(regions))
 
 
 def _check_folder(directory: Path, *, overwrite: bool) -> None:

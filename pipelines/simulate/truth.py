@@ -88,6 +88,32 @@ class TrueLidar(Product):
     changed_footprint: tuple[tuple[float, float], ...]
 
 
+class TrueRegion(Product):
+    """Region of the town that has changed since the first flight.
+
+    Attributes:
+        kind: excavation, heap, new or demolished.
+        outline: its corners in geo, east and north.
+        cut_m3, fill_m3: between the surfaces of both epochs inside it, seen from above.
+    """
+
+    kind: str
+    outline: tuple[tuple[float, float], ...]
+    cut_m3: float
+    fill_m3: float
+
+
+class TrueChange(Product):
+    """Change since the first flight, beside the heights of both epochs in `heights.npz`.
+
+    `corner` is the south-western one of their first cell, in geo; rows run north, columns east.
+    """
+
+    corner: tuple[float, float]
+    cell_m: float
+    regions: tuple[TrueRegion, ...]
+
+
 class Truth(Product):
     """Truth of a survey. Lists run parallel to `images`; the geo frame is East-North-Up at `origin`.
 
@@ -99,6 +125,7 @@ class Truth(Product):
         fix_errors: recorded minus true position of the antenna at the same stamp of the navigation clock.
         sun_in_geo: towards the sun.
         lidar: truth of the LiDAR flight; None: there is none.
+        change: change since the first flight; None: this is the first.
     """
 
     format_version: Literal[1] = 1
@@ -119,3 +146,4 @@ class Truth(Product):
     sigma_survey_m: float
     sun_in_geo: Vector3
     lidar: TrueLidar | None = None
+    change: TrueChange | None = None

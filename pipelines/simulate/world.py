@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import shapely
 
 from pipelines.core.errors import InputError
 from pipelines.core.types import BoolArray, FloatArray, IntArray
@@ -112,6 +113,8 @@ class World:
     origin: Origin
     scene: SimulatedScene
     sites: tuple[TargetSite, ...]
+    number: IntArray  # (P,) by which the targets are named, the same in both epochs
+    survey_error: FloatArray  # (P, 3) surveyed minus true places of the targets, the same in both epochs
     target_m: float
     lens: BrownLens
     trajectory: flight.TrueTrajectory
@@ -120,7 +123,10 @@ class World:
 
 
 def make_world(options: SimulateOptions, seed: np.random.SeedSequence) -> World:
-    """Build the scene, fly over it, and lay out targets that the flight sees; an InputError: the lens folds."""
+    """Build the scene, fly over it, and lay out targets that the flight sees; an InputError: the lens folds.
+
+    The second epoch has the targets that the first flight sees, but for those where the town has changed.
+    """
     scene_seed, flight_seed, target_seed = seed.spawn(3)
     lat, lon, alt = options.origin
     lens = _lens(options)
@@ -130,6 +136,31 @@ def make_world(options: SimulateOptions, seed: np.random.SeedSequence) -> World:
         clock_offset_s=options.clock_offset,
     )
     bare = build_scene(options.scene, scene_seed)
+    trajectory, poses = _flown(options, bare, mounting, np.random.default_rng(flight_seed))
+    distance_m = float(np.median([np.linalg.norm(pose.center) for pose in poses]))
+    width_m = options.target_size or max(0.3, _TARGET_PX * distance_m / lens.focal_px)
+    sites: list[TargetSite] = []
+    if options.targets:
+        seen, _ = project_targets(bare.sites, poses, lens, Raycaster(bare.mesh), width_m)
+        sites = _chosen_sites(bare.sites, seen, options.targets, np.random.default_rng(target_seed))
+    survey_error = np.random.default_rng(target_seed.spawn(1)[0]).normal(0, options.sigma_survey, (len(sites), 3))
+    kept = np.ones(len(sites), dtype=bool)
+    if options.epoch == "2":
+        bare = build_scene(options.scene, scene_seed, options)
+        trajectory, poses = _flown(options, bare, mounting, np.random.default_rng(flight_seed.spawn(1)[0]))
+        changed = shapely.union_all([shapely.Polygon(change.outline) for change in bare.changes]).buffer(width_m)
+        kept = np.array([not shapely.contains_xy(changed, *site.position[:2]) for site in sites], dtype=bool)
+    stays = tuple(site for site, is_kept in zip(sites, kept, strict=True) if is_kept)
+    scene = with_targets(bare, list(stays), width_m)
+    origin = Origin(lat_deg=lat, lon_deg=lon, alt_m=alt)
+    return World(
+        origin, scene, stays, np.flatnonzero(kept), survey_error[kept], width_m, lens, trajectory, poses, mounting
+    )
+
+
+def _flown(
+    options: SimulateOptions, scene: SimulatedScene, mounting: flight.Mounting, rng: np.random.Generator
+) -> tuple[flight.TrueTrajectory, tuple[Pose, ...]]:
     plan = flight.FlightPlan(
         options.flight,
         options.images,
@@ -137,22 +168,13 @@ def make_world(options: SimulateOptions, seed: np.random.SeedSequence) -> World:
         options.heights or flight.DEFAULT_HEIGHTS_M[options.flight],
         options.radius or flight.DEFAULT_RADIUS_M[options.flight],
     )
-    trajectory = flight.make_trajectory(plan, bare.complex_m, bare.axes, np.random.default_rng(flight_seed))
+    trajectory = flight.make_trajectory(plan, scene.complex_m, scene.axes, rng)
     centers = trajectory.position(trajectory.photo_s)
     rotations = trajectory.geo_from_nominal_cam(trajectory.photo_s) @ mounting.nominal_from_cam
     travels = options.rolling_shutter * trajectory.position(trajectory.photo_s, 1)
-    poses = tuple(
+    return trajectory, tuple(
         Pose(center, rotation, travel) for center, rotation, travel in zip(centers, rotations, travels, strict=True)
     )
-    distance_m = float(np.median(np.linalg.norm(centers, axis=1)))
-    width_m = options.target_size or max(0.3, _TARGET_PX * distance_m / lens.focal_px)
-    sites: list[TargetSite] = []
-    if options.targets:
-        seen, _ = project_targets(bare.sites, poses, lens, Raycaster(bare.mesh), width_m)
-        sites = _chosen_sites(bare.sites, seen, options.targets, np.random.default_rng(target_seed))
-    scene = with_targets(bare, sites, width_m)
-    origin = Origin(lat_deg=lat, lon_deg=lon, alt_m=alt)
-    return World(origin, scene, tuple(sites), width_m, lens, trajectory, poses, mounting)
 
 
 def _lens(options: SimulateOptions) -> BrownLens:

@@ -1,0 +1,1 @@
+"""Change between two surveys of one place: `georef change`."""

@@ -1,0 +1,281 @@
+"""Noise, level of detection and significance of a difference of heights, and the σ of volumes.
+
+Two kinds of error stay apart. That of the datum is common to all cells of a region: a volume takes all of it. That
+of the cells is correlated over a short length, which the unchanged ground shows: a volume takes the part that an
+effective number of independent cells leaves (Rolstad et al. 2009, doi:10.3189/002214309789470950).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
+
+from pipelines.core.errors import DegenerateGeometryError
+from pipelines.core.types import BoolArray, FloatArray
+from pipelines.robust.statistics import huber_weight, mad_sigma
+
+QUANTILE_95 = 1.96
+LAGS = (1, 2, 3, 5, 8, 12, 18, 27, 40, 60, 90)  # cells between the members of a pair
+STEEPEST = 1.0  # slope of ground that noise and shift are estimated on
+_CLIPPED = 3.0  # σ beyond which ground counts as changed
+_PASSES = 12
+_LEAST_STABLE = 500  # cells
+_LEAST_PAIRS = 200
+_UNCORRELATED = 0.05
+_BLOCKS = 6  # along a side, whose medians show errors of long range
+_LEAST_IN_BLOCK = 50
+_MAJORITY = 0.5  # of the neighbours that change in the same way
+_FLOOR_M2 = 1e-8
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Difference of two epochs in cells (…,), later minus earlier, in metres; NaN: not known in both.
+
+    Attributes:
+        difference_m: of the heights.
+        variance_m2: of the errors by cell.
+        datum_m: σ of the error that neighbours share.
+        slope: (…, 2) of the earlier surface, east and north.
+    """
+
+    difference_m: FloatArray
+    variance_m2: FloatArray
+    datum_m: FloatArray
+    slope: FloatArray
+
+
+@dataclass(frozen=True)
+class Samples:
+    """N cells all over the raster, and pairs of cells by their distance, as normalised differences (K, 2).
+
+    `place_m` (N, 2) counts from the middle of the raster. Pairs have the steepness of their cells (K,).
+    """
+
+    cells: Cells
+    place_m: FloatArray
+    pairs: dict[int, FloatArray]
+    pair_designs: dict[int, FloatArray]
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Errors of the difference, as the unchanged ground shows them.
+
+    Attributes:
+        shift_m: (3,) east, north, up of the later epoch against the earlier on that ground.
+        shift_cov_m2: (3, 3) its covariance.
+        tilt: (2,) rise of the later epoch to the east and to the north; zero without `with_tilt`.
+        tilt_sigma: (2,)
+        factor: of the variance of the cells.
+        correlated_m2: area over which errors of cells are one error.
+        length_m: distance at which the correlation has fallen below 5 %.
+        long_range_m: σ of the errors that vary slowly over the scene.
+        cells, share: number of sampled cells that are unchanged, and their share of the ground that counts.
+        lags_m, correlation: (L,) of the errors by distance.
+    """
+
+    shift_m: FloatArray
+    shift_cov_m2: FloatArray
+    tilt: FloatArray
+    tilt_sigma: FloatArray
+    factor: float
+    correlated_m2: float
+    length_m: float
+    long_range_m: float
+    cells: int
+    share: float
+    lags_m: FloatArray
+    correlation: FloatArray
+
+    def moved_by(self, slope: FloatArray, place_m: FloatArray) -> FloatArray:
+        """Return the part (…,) of differences that shift and tilt explain, at slopes and places (…, 2)."""
+        return np.asarray(self.shift_m[2] - slope @ self.shift_m[:2] + place_m @ self.tilt)
+
+
+def unchanged_ground(samples: Samples, cell_m: float, prior_h_m: float, *, with_tilt: bool) -> Noise:
+    """Return the errors of the difference on the ground that most of the samples show as unchanged.
+
+    The later surface, shifted by t, is z₂(x) = z₁(x − t_h) + t_v: the difference is t_v − t_h·∇z (Nuth, Kääb 2011).
+    What does not fit shift and noise has changed. `prior_h_m` keeps a horizontal shift small that no slope shows.
+
+    Raises:
+        DegenerateGeometryError: too little ground is left.
+    """
+    cells = samples.cells
+    ground = (np.linalg.norm(cells.slope, axis=1) < STEEPEST) & np.isfinite(cells.difference_m)
+    design = _design(cells.slope, samples.place_m, with_tilt=with_tilt)
+    difference, sigma = cells.difference_m, np.sqrt(cells.variance_m2)
+    prior = np.zeros(design.shape[1])
+    prior[1:3] = 1.0 / max(prior_h_m, cell_m) ** 2
+    fit, kept = np.zeros(design.shape[1]), ground
+    if ground.sum() >= _LEAST_STABLE:
+        fit[0] = np.median(difference[ground])
+    factor, normal = 1.0, np.diag(prior + 1e-12)
+    for _ in range(_PASSES):
+        residual = (difference - design @ fit) / sigma
+        scale = mad_sigma(residual[kept]) if kept.sum() >= _LEAST_STABLE else 0.0
+        kept = ground & (np.abs(residual) < _CLIPPED * scale)
+        if kept.sum() < _LEAST_STABLE:
+            raise DegenerateGeometryError(
+                "no-stable-ground",
+                f"Only {int(kept.sum())} cells of level, measured and unchanged ground are common to both epochs; "
+                f"{_LEAST_STABLE} are needed. Give polygons of unchanged ground with --stable, or smaller cells.",
+            )
+        weight = huber_weight((residual[kept] / scale) ** 2) / (scale * sigma[kept]) ** 2
+        rows = design[kept]
+        normal = rows.T @ (rows * weight[:, None]) + np.diag(prior)
+        fit = np.linalg.solve(normal, rows.T @ (weight * difference[kept]))
+        factor = scale**2
+    lags_m, correlation = _correlation(samples, fit, np.sqrt(factor), cell_m)
+    correlated_m2, length_m = _correlated(lags_m, correlation, cell_m)
+    residual_m = (difference - design @ fit)[kept]
+    extent_m2 = float(np.prod(np.ptp(samples.place_m[ground], axis=0)))
+    area_m2 = extent_m2 * kept.sum() / max(len(ground), 1)
+    # The samples are as many as they are, but hold no more than so many independent errors.
+    independent = max(min(area_m2 / correlated_m2, float(kept.sum())), 1.0)
+    covariance = np.linalg.inv(normal) * kept.sum() / independent
+    order = [1, 2, 0]
+    tilt_sigma = np.sqrt(np.diag(covariance)[3:]) if with_tilt else np.zeros(2)
+    return Noise(
+        shift_m=fit[order],
+        shift_cov_m2=covariance[np.ix_(order, order)],
+        tilt=fit[3:] if with_tilt else np.zeros(2),
+        tilt_sigma=tilt_sigma,
+        factor=factor,
+        correlated_m2=correlated_m2,
+        length_m=length_m,
+        long_range_m=_long_range(samples.place_m[kept], residual_m, correlated_m2, area_m2),
+        cells=int(kept.sum()),
+        share=float(kept.sum() / ground.sum()),
+        lags_m=lags_m,
+        correlation=correlation,
+    )
+
+
+def _design(slope: FloatArray, place_m: FloatArray, *, with_tilt: bool) -> FloatArray:
+    return np.column_stack([np.ones(len(slope)), -slope, *([place_m] if with_tilt else [])])
+
+
+def _correlation(samples: Samples, fit: FloatArray, scale: float, cell_m: float) -> tuple[FloatArray, FloatArray]:
+    """Return distances (L,) in metres, and the correlation (L,) of the errors of cells that lie so far apart.
+
+    From medians of squared differences of unchanged pairs, which few changes among them do not move.
+    """
+    lags, values = [], []
+    for lag, pairs in samples.pairs.items():
+        moved = samples.pair_designs[lag][..., : len(fit)] @ fit
+        # The last column of a design is the σ of its cell, by which all is normalised.
+        error = (pairs - moved / samples.pair_designs[lag][..., -1]) / scale
+        error = error[(np.abs(error) < _CLIPPED).all(axis=1)]
+        if len(error) < _LEAST_PAIRS:
+            continue
+        sill = mad_sigma(error.ravel()) ** 2
+        gamma = mad_sigma(error[:, 0] - error[:, 1]) ** 2 / 2
+        lags.append(lag * cell_m)
+        values.append(1.0 - gamma / sill)
+    return np.array(lags), np.array(values)
+
+
+def _correlated(lags_m: FloatArray, correlation: FloatArray, cell_m: float) -> tuple[float, float]:
+    """Return the integral of the correlation over the plane in m², at least a cell, and its length in metres."""
+    gone = np.flatnonzero(correlation < _UNCORRELATED)
+    count = int(gone[0]) if len(gone) else len(lags_m)
+    radius = np.concatenate([[0.0], lags_m[: count + 1]])
+    value = np.concatenate([[1.0], np.maximum(correlation[: count + 1], 0.0)])
+    area = float(np.trapezoid(2 * np.pi * radius * value, radius))
+    return max(area, cell_m**2), float(radius[-1]) if count else cell_m
+
+
+def _long_range(place_m: FloatArray, residual_m: FloatArray, correlated_m2: float, area_m2: float) -> float:
+    """Return the σ of slow errors: the scatter of the medians of large blocks beyond that of the noise of cells."""
+    low, size = place_m.min(axis=0), np.maximum(np.ptp(place_m, axis=0), 1e-9)
+    block = np.minimum((place_m - low) / size * _BLOCKS, _BLOCKS - 1).astype(np.int64) @ [1, _BLOCKS]
+    medians, expected = [], []
+    for one in np.unique(block):
+        inside = residual_m[block == one]
+        if len(inside) >= _LEAST_IN_BLOCK:
+            medians.append(np.median(inside))
+            independent = max(area_m2 * len(inside) / len(residual_m) / correlated_m2, 1.0)
+            expected.append(np.pi / 2 * mad_sigma(inside) ** 2 / independent)
+    if len(medians) < 4:
+        return 0.0
+    return float(np.sqrt(max(float(np.var(medians, ddof=1)) - float(np.mean(expected)), 0.0)))
+
+
+def level_of_detection(cells: Cells, factor: float) -> FloatArray:
+    """Return the 95 % level of detection of cells: of the datum and of the cell."""
+    return np.asarray(QUANTILE_95 * np.sqrt(cells.datum_m**2 + np.maximum(factor * cells.variance_m2, _FLOOR_M2)))
+
+
+def significant_change(difference_m: FloatArray, lod_m: FloatArray, reach: int) -> NDArray[np.int8]:
+    """Return −1 lowered, 1 raised, 0 neither (H, W): beyond the level of detection, as most known neighbours are.
+
+    Neighbours lie within `reach` cells. One cell in twenty is beyond its level by chance; half of its neighbours
+    hardly ever are.
+    """
+    known = np.isfinite(difference_m) & np.isfinite(lod_m)
+    size = 2 * reach + 1
+    around = np.maximum(uniform_filter(known.astype(np.float32), size, mode="constant"), 1e-6)
+    sign = np.zeros(difference_m.shape, dtype=np.int8)
+    for direction in (-1, 1):
+        beyond: BoolArray = known & (direction * np.nan_to_num(difference_m) > np.nan_to_num(lod_m, nan=np.inf))
+        share = uniform_filter(beyond.astype(np.float32), size, mode="constant") / around
+        sign[known & (share > _MAJORITY)] = direction
+    return sign
+
+
+@dataclass(frozen=True)
+class Volume:
+    """Sums over the cells of a region, from which its volumes follow: all in metres, before the cells' area."""
+
+    cells: int = 0
+    cut: float = 0.0
+    fill: float = 0.0
+    datum: float = 0.0
+    variance: float = 0.0
+    lowest: float = 0.0
+    highest: float = 0.0
+
+    def __add__(self, other: Volume) -> Volume:
+        return Volume(
+            self.cells + other.cells,
+            self.cut + other.cut,
+            self.fill + other.fill,
+            self.datum + other.datum,
+            self.variance + other.variance,
+            min(self.lowest, other.lowest),
+            max(self.highest, other.highest),
+        )
+
+    def sigma_m3(self, noise: Noise, cell_m2: float) -> float:
+        """Return the σ of the net volume: the datum's in full, and of the cells by their number that counts."""
+        joined = min(max(noise.correlated_m2 / cell_m2, 1.0), max(self.cells, 1))
+        return float(cell_m2 * np.sqrt(self.datum**2 + noise.factor * self.variance * joined))
+
+
+def volumes(number: NDArray[Any], cells: Cells, count: int) -> list[Volume]:
+    """Return the sums of regions 1 … `count`, by the number (H, W) of each cell; 0: no region."""
+    known = (number > 0) & np.isfinite(cells.difference_m)
+    of, difference = number[known], cells.difference_m[known]
+
+    def total(values: FloatArray) -> FloatArray:
+        return np.asarray(np.bincount(of, values, count + 1)[1:], dtype=np.float64)
+
+    low, high = np.zeros(count + 1), np.zeros(count + 1)
+    np.minimum.at(low, of, difference)
+    np.maximum.at(high, of, difference)
+    columns = (
+        np.bincount(of, minlength=count + 1)[1:],
+        total(np.maximum(-difference, 0.0)),
+        total(np.maximum(difference, 0.0)),
+        total(cells.datum_m[known]),
+        total(cells.variance_m2[known]),
+        low[1:],
+        high[1:],
+    )
+    return [Volume(int(one[0]), *map(float, one[1:])) for one in zip(*columns, strict=True)]

@@ -1,0 +1,299 @@
+"""Rasters of both epochs on one grid, in windows: difference, its variance, and the σ of the datum."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from scipy.ndimage import map_coordinates
+
+from pipelines.change.datum import Epoch, Shared
+from pipelines.change.detection import LAGS, STEEPEST, Cells, Samples
+from pipelines.core.errors import InputError, MissingProductError
+from pipelines.core.products import load_json
+from pipelines.core.progress import Progress
+from pipelines.core.types import BoolArray, FloatArray
+from pipelines.core.workspace import Workspace
+from pipelines.formats.georef_sidecar import CrsSidecar, sidecar_path
+from pipelines.formats.geotiff import RasterFrame, cells_inside, frame_of, is_same_crs, read_onto
+from pipelines.geodesy.crs import PointCrs, parse_crs
+
+WINDOW_PX = 1024
+MEASURED = 255  # in measured.tif
+_NODE_PX = 64
+_SAMPLES = 400_000
+_PAIRS = 40_000  # of each distance
+_FINER = 1.5  # cells of the other raster in one of the grid, from which they are averaged
+_SEED = 20260101
+
+
+@dataclass(frozen=True)
+class EpochRasters:
+    """Rasters of one epoch: heights, their σ, and what is measured; heights times `unit_m` are metres."""
+
+    folder: Path
+    of: Literal["surface", "terrain"]
+    frame: RasterFrame
+    sidecar: CrsSidecar
+    unit_m: float
+
+    @property
+    def names(self) -> tuple[str, str]:
+        return ("dsm.tif", "sigma_v.tif") if self.of == "surface" else ("dtm.tif", "sigma_dtm.tif")
+
+
+def epoch_rasters(workspace: Workspace, of: Literal["surface", "terrain"]) -> EpochRasters:
+    """Return the rasters of a workspace; a MissingProductError names the command that makes them."""
+    folder = workspace.root / "raster"
+    name = "dsm.tif" if of == "surface" else "dtm.tif"
+    path = folder / name
+    if not path.exists():
+        command = f"georef export-raster {workspace.root}" + (" --terrain" if of == "terrain" else "")
+        raise MissingProductError(f"raster/{name}", command)
+    sidecar = load_json(CrsSidecar, sidecar_path(path))
+    crs = parse_crs(sidecar.crs_wkt, path=path)
+    if crs.is_geographic:
+        message = (
+            "has cells in degrees, in which no volume can be stated. Export both with --crs of a map projection."
+        )
+        raise InputError("change-needs-projected-crs", message, path=path)
+    return EpochRasters(folder, of, frame_of(path), sidecar, crs.height_unit_m)
+
+
+@dataclass(frozen=True)
+class Window:
+    """Window of the grid by first column and row, with its cells."""
+
+    column: int
+    row: int
+    columns: int
+    rows: int
+
+
+class CommonGrid:
+    """Cells that both epochs cover, as large as the larger ones of both.
+
+    Args:
+        rasters, epochs: the earlier, then the later.
+        inside: polygon in the CRS outside which nothing counts; None: everything does.
+
+    Raises:
+        InputError: the rasters have different CRS or datums of heights, or do not overlap.
+    """
+
+    def __init__(
+        self,
+        rasters: tuple[EpochRasters, EpochRasters],
+        epochs: tuple[Epoch, Epoch],
+        shared: Shared,
+        inside: Any = None,
+    ) -> None:
+        self.rasters, self.epochs, self._shared, self._inside = rasters, epochs, shared, inside
+        self.frame = _common_frame(*rasters)
+        self.crs: PointCrs = parse_crs(rasters[1].sidecar.crs_wkt)
+        self.unit_m = self.crs.horizontal_unit
+        rows, columns = (
+            np.linspace(0, size, size // _NODE_PX + 2) for size in (self.frame.rows, self.frame.columns)
+        )
+        row, column = np.meshgrid(rows, columns, indexing="ij")
+        plan = np.column_stack(
+            [
+                self.frame.west + column.ravel() * self.frame.step_x,
+                self.frame.north - row.ravel() * self.frame.step_y,
+            ]
+        )
+        self._steps = rows[1] - rows[0], columns[1] - columns[0]
+        of_epochs = [epoch.variance_at(self.crs, plan) for epoch in epochs]
+        joint = shared.of_difference(*of_epochs)
+        self._node_variance = [one[:, 2].reshape(row.shape) for one in of_epochs]
+        self._node_datum = np.sqrt(joint[:, 2]).reshape(row.shape)
+        self._node_h = joint[:, :2].mean(axis=1).reshape(row.shape)
+        self.datum_v_m = float(np.sqrt(np.median(joint[:, 2])))
+        self.datum_h_m = float(np.sqrt(np.median(joint[:, :2])))
+
+    @property
+    def cell_m(self) -> float:
+        return float(np.sqrt(self.cell_m2))
+
+    @property
+    def cell_m2(self) -> float:
+        return self.frame.step_x * self.frame.step_y * self.unit_m**2
+
+    def windows(self) -> Iterator[Window]:
+        for row in range(0, self.frame.rows, WINDOW_PX):
+            for column in range(0, self.frame.columns, WINDOW_PX):
+                yield Window(
+                    column,
+                    row,
+                    min(WINDOW_PX, self.frame.columns - column),
+                    min(WINDOW_PX, self.frame.rows - row),
+                )
+
+    def around(self, window: Window, reach: int) -> tuple[Window, tuple[slice, slice]]:
+        """Return a window widened as far as the grid goes, and the place of the first in it."""
+        left, top = max(window.column - reach, 0), max(window.row - reach, 0)
+        columns = min(window.column + window.columns + reach, self.frame.columns) - left
+        rows = min(window.row + window.rows + reach, self.frame.rows) - top
+        own = (
+            slice(window.row - top, window.row - top + window.rows),
+            slice(window.column - left, window.column - left + window.columns),
+        )
+        return Window(left, top, columns, rows), own
+
+    def part(self, window: Window) -> RasterFrame:
+        return self.frame.part(window.column, window.row, window.columns, window.rows)
+
+    def place_m(self, window: Window) -> FloatArray:
+        """Return the places (H, W, 2) of cells, east and north of the middle of the grid."""
+        x = (window.column + np.arange(window.columns) + 0.5 - self.frame.columns / 2) * self.frame.step_x
+        y = (self.frame.rows / 2 - window.row - np.arange(window.rows) - 0.5) * self.frame.step_y
+        return np.stack(np.meshgrid(x, y), axis=-1) * self.unit_m
+
+    def heights_m(self, window: Window) -> tuple[FloatArray, FloatArray]:
+        """Return the heights (H, W) of both epochs, where both are measured; NaN elsewhere."""
+        frame = self.part(window)
+        heights = [self._read(one, one.names[0], frame) * one.unit_m for one in self.rasters]
+        known = np.isfinite(heights[0]) & np.isfinite(heights[1]) & self._counts(frame)
+        return np.where(known, heights[0], np.nan), np.where(known, heights[1], np.nan)
+
+    def cells(self, window: Window) -> Cells:
+        """Return the cells of a window, before any registration."""
+        wide, own = self.around(window, 1)
+        before, after = self.heights_m(wide)
+        # On the rim of what is known, the slope is not: such a cell counts as steep.
+        slope, later = (
+            np.where(np.isfinite(one), one, 2 * STEEPEST)[own] for one in map(self._slope, (before, after))
+        )
+        before, after = before[own], after[own]
+        frame = self.part(window)
+        # Either surface may have an edge here.
+        square = np.maximum(np.sum(slope**2, axis=-1), np.sum(later**2, axis=-1))
+        variance = np.zeros(before.shape)
+        horizontal = self._between(self._node_h, window)
+        for one, node in zip(self.rasters, self._node_variance, strict=True):
+            sigma = self._read(one, one.names[1], frame)
+            georeference = self._between(node, window)
+            variance += np.maximum(np.nan_to_num(sigma**2 - georeference), 0.0)
+            # An edge lies somewhere in its cell.
+            variance += square * one.frame.step_x * one.frame.step_y * self.unit_m**2 / 12
+        variance += square * horizontal + (0.1 * self.cell_m) ** 2
+        datum = self._between(self._node_datum, window)
+        return Cells(after - before, variance, np.where(np.isfinite(after), datum, np.nan), slope)
+
+    def _slope(self, height_m: FloatArray) -> FloatArray:
+        if min(height_m.shape) < 2:
+            return np.zeros((*height_m.shape, 2))
+        south, east = np.gradient(height_m, self.frame.step_y * self.unit_m, self.frame.step_x * self.unit_m)
+        return np.stack([east, -south], axis=-1)
+
+    def samples(self, stable: Any, progress: Progress) -> Samples:
+        """Return samples of cells, and of pairs of them; only in a polygon of stable ground, if there is one."""
+        rng = np.random.default_rng(_SEED)
+        windows = list(self.windows())
+        each = max(_SAMPLES // len(windows), 500)
+        each_pair = max(_PAIRS // len(windows), 50)
+        found: list[tuple[FloatArray, ...]] = []
+        pairs: dict[int, list[FloatArray]] = {lag: [] for lag in LAGS}
+        designs: dict[int, list[FloatArray]] = {lag: [] for lag in LAGS}
+        with progress.task("samples", len(windows)) as task:
+            for window in windows:
+                cells, place = self.cells(window), self.place_m(window)
+                counts = np.isfinite(cells.difference_m)
+                if stable is not None:
+                    counts &= cells_inside(stable, self.part(window))
+                flat = counts & (np.linalg.norm(cells.slope, axis=-1) < STEEPEST)
+                index = np.flatnonzero(counts)
+                index = rng.choice(index, min(each, len(index)), replace=False)
+                row, column = np.unravel_index(index, counts.shape)
+                columns = (cells.difference_m, cells.variance_m2, cells.datum_m, cells.slope, place)
+                found.append(tuple(values[row, column] for values in columns))
+                for lag in LAGS:
+                    one, two = _paired(flat, lag, each_pair, rng)
+                    if len(one[0]):
+                        pairs[lag].append(np.stack([_normalised(cells, one), _normalised(cells, two)], axis=1))
+                        designs[lag].append(np.stack([_row(cells, place, one), _row(cells, place, two)], axis=1))
+                task.advance()
+        difference, variance, datum, slope, places = (np.concatenate(part) for part in zip(*found, strict=True))
+        return Samples(
+            Cells(difference, variance, datum, slope),
+            places,
+            {lag: np.concatenate(part) for lag, part in pairs.items() if part},
+            {lag: np.concatenate(part) for lag, part in designs.items() if part},
+        )
+
+    def _read(self, one: EpochRasters, name: str, frame: RasterFrame) -> FloatArray:
+        finer = frame.step_x / one.frame.step_x
+        return read_onto(one.folder / name, frame, "average" if finer > _FINER else "bilinear")
+
+    def _counts(self, frame: RasterFrame) -> BoolArray:
+        """Return which cells are measured in both, of a surface, and lie in the area."""
+        counts = np.ones((frame.rows, frame.columns), dtype=bool)
+        for one in self.rasters:
+            if one.of == "surface":
+                counts &= read_onto(one.folder / "measured.tif", frame, "nearest") == MEASURED
+        return counts if self._inside is None else counts & cells_inside(self._inside, frame)
+
+    def _between(self, nodes: FloatArray, window: Window) -> FloatArray:
+        row = (window.row + np.arange(window.rows) + 0.5) / self._steps[0]
+        column = (window.column + np.arange(window.columns) + 0.5) / self._steps[1]
+        return np.asarray(map_coordinates(nodes, np.meshgrid(row, column, indexing="ij"), order=1, mode="nearest"))
+
+
+def _common_frame(before: EpochRasters, after: EpochRasters) -> RasterFrame:
+    path = before.folder / before.names[0]
+    if not is_same_crs(before.frame, after.frame):
+        message = (
+            f"is in {before.sidecar.crs}, and that of the later epoch in {after.sidecar.crs}. Export both with the "
+            "same --crs."
+        )
+        raise InputError("epochs-differ-in-crs", message, path=path)
+    datums = before.sidecar.vertical_datum.name, after.sidecar.vertical_datum.name
+    if datums[0] != datums[1]:
+        message = (
+            f"has heights above {datums[0]}, the later epoch above {datums[1]}. Export both with one --vertical."
+        )
+        raise InputError("epochs-differ-in-heights", message, path=path)
+    coarser = max(before.frame, after.frame, key=lambda frame: frame.step_x)
+    bounds = np.array([before.frame.bounds, after.frame.bounds])
+    west, south = bounds[:, :2].max(axis=0).tolist()
+    east, north = bounds[:, 2:].min(axis=0).tolist()
+    left, top = np.ceil((west - coarser.west) / coarser.step_x), np.ceil((coarser.north - north) / coarser.step_y)
+    columns = int((east - coarser.west) / coarser.step_x - left)
+    rows = int((coarser.north - south) / coarser.step_y - top)
+    if columns < 1 or rows < 1:
+        raise InputError("epochs-apart", "does not overlap the raster of the later epoch.", path=path)
+    return coarser.part(int(left), int(top), columns, rows)
+
+
+Index = tuple[Any, Any]
+
+
+def _paired(flat: BoolArray, lag: int, count: int, rng: np.random.Generator) -> tuple[Index, Index]:
+    """Return up to `count` pairs of level cells that lie `lag` cells apart, along rows and columns."""
+    ones, twos = [], []
+    for axis in (0, 1):
+        if flat.shape[axis] <= lag:
+            continue
+        near, far = (flat[:-lag], flat[lag:]) if axis == 0 else (flat[:, :-lag], flat[:, lag:])
+        row, column = np.nonzero(near & far)
+        chosen = rng.choice(len(row), min(count // 2, len(row)), replace=False)
+        row, column = row[chosen], column[chosen]
+        ones.append((row, column))
+        twos.append((row + lag, column) if axis == 0 else (row, column + lag))
+    if not ones:
+        return (np.zeros(0, int),) * 2, (np.zeros(0, int),) * 2
+    first, second = (tuple(np.concatenate(part) for part in zip(*group, strict=True)) for group in (ones, twos))
+    return (first[0], first[1]), (second[0], second[1])
+
+
+def _normalised(cells: Cells, index: Index) -> FloatArray:
+    return np.asarray(cells.difference_m[index] / np.sqrt(cells.variance_m2[index]))
+
+
+def _row(cells: Cells, place_m: FloatArray, index: Index) -> FloatArray:
+    """Return rows (K, 6) of the design of shift and tilt, and the σ of each cell."""
+    one = np.ones(len(index[0]))
+    return np.column_stack([one, -cells.slope[index], place_m[index], np.sqrt(cells.variance_m2[index])])

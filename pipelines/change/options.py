@@ -1,0 +1,45 @@
+"""Options of `georef change`."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from pipelines.core.options import ExtraMarker, InputMarker, StageOptions
+from pipelines.survey.options import BOUNDARY_SUFFIXES
+
+PolygonFile = Annotated[Path, InputMarker(BOUNDARY_SUFFIXES), ExtraMarker("vectors")]
+
+
+class ChangeOptions(StageOptions):
+    """Options of the comparison of two epochs. `before` is the folder of the earlier epoch's rasters."""
+
+    before: Annotated[Path, InputMarker(frozenset({".tif"}))] = Field(
+        Path(), description="Folder of the rasters of the earlier epoch."
+    )
+    of: Literal["surface", "terrain"] = Field(
+        "surface",
+        description="Compare surface models (DSM), or the ground alone (DTM, --terrain of export-raster).",
+    )
+    stable: PolygonFile | None = Field(
+        None,
+        description="Polygons of unchanged ground, on which the later epoch is registered. Without registration, "
+        "the datum's σ of both adjustments counts.",
+    )
+    stable_auto: bool = Field(
+        False, description="Register on the ground that most cells agree on, where it is not known."
+    )
+    tilt: bool = Field(False, description="Estimate a tilt too, with --stable or --stable-auto.")
+    same_base: bool = Field(
+        False, description="One base station with the same coordinates served both flights: its error cancels."
+    )
+    boundary: PolygonFile | None = Field(
+        None, description="Polygon of the area to compare. Without it: all that both epochs measure."
+    )
+    regions: PolygonFile | None = Field(
+        None, description="Polygons whose volumes are wanted, beside the regions that are found."
+    )
+    polygons_crs: str | None = Field(
+        None, description="CRS of the polygons where their file states none, as in DXF: EPSG:32632 or another."
+    )
+    min_area: float = Field(1.0, gt=0, description="Area of the smallest region in square metres.")
