@@ -31,7 +31,7 @@ command = StageCommand(
     """,
     before=click.Argument(
         ["before"],
-        type=click.Path(exists=True, file_okay=False, resolve_path=True, path_type=Path),
+        type=click.Path(file_okay=False, resolve_path=True, path_type=Path),
         callback=_rasters_of,
         metavar="WS1",
     ),

@@ -451,12 +451,12 @@ class Viewer:
 
     def _described_scene(self) -> Json:
         trained, frame, target = self.trained, self.frame, self.model.target
-        crs, headline = target.crs, headline_of(self._workspace)
+        crs = target.crs
         points, colours, sigma = self._tie_points()
         xyz = target.xyz_from_geo((frame.middle_in_geo + np.vstack([np.zeros(3), np.eye(3)])).reshape(-1, 3))
         return {
             "name": self._workspace.root.name,
-            "accuracy": "" if headline is None else f"The {headline.sentence}.",
+            "accuracy": accuracy_sentence(self._workspace),
             "crs": {
                 "name": crs.name,
                 "heights": crs.vertical.name,
@@ -561,6 +561,12 @@ class Viewer:
             at = np.round(self.frame.place(in_geo), 2).tolist()
             found.append({"height": line.height, "major": line.is_major, "at": at})
         return found
+
+
+def accuracy_sentence(workspace: Workspace) -> str:
+    """Return the accuracy of the result; empty where nothing states it."""
+    headline = headline_of(workspace)
+    return "" if headline is None else f"The {headline.sentence}."
 
 
 def _sigma_colours(grid: AccuracyGrid, in_geo: FloatArray) -> Json:

@@ -14,7 +14,7 @@ from tests.cli_runs import REPOSITORY, Georef, Result
 from tests.test_architecture import inside, sources
 
 # It defines the messages of the viewer's pages as classes of their library: only a running viewer imports it.
-NEEDS_AN_EXTRA = ("pipelines.view.loopback",)
+NEEDS_AN_EXTRA = ("pipelines.view.server",)
 
 
 def hide(monkeypatch: pytest.MonkeyPatch, extra: Extra) -> None:

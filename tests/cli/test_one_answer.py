@@ -26,7 +26,7 @@ from pipelines.survey.headline import headline, headline_of
 from pipelines.survey.options import CrsOptions
 from pipelines.survey.report import AccuracySummary, EvaluationReport, TotalRmse, read_report
 from pipelines.survey.survey import Survey
-from pipelines.view.viewer import accuracy_html
+from pipelines.view.viewer import accuracy_sentence
 from tests.cli_runs import Georef
 from tests.evaluated_workspaces import CHECK_POINTS, ERROR_M, evaluated_workspace
 from tests.reports import check_points_with
@@ -93,7 +93,7 @@ def test_it_is_the_same_everywhere(
         end_of_run,
         page,
         tiles_page,
-        accuracy_html(flight),
+        accuracy_sentence(flight),
     ):
         assert text in " ".join(where.split())
     write_batch(tmp_path, table)
