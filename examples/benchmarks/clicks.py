@@ -9,9 +9,10 @@ with it. They start near the cameras and go in all directions through the scene:
 The columns count clicks by what the line of sight truly meets; `σ` is the predicted σ along the line, `error/σ` the
 root mean square of those clicks that are off by 0.5 m at most.
 
-Then squares and lines at random places, whose corners are read from above: volumes over the best plane of the rim,
-areas and profiles against those of the true surface at the same places in plan. Squares on which the true surface
-has a step of more than 3 m between neighbouring samples are left out: a fraction of a pixel decides there.
+Then squares and lines at random places, whose true corners are clicked on from such places: volumes over the best
+plane of the rim, and areas, against those of the true corners and surface; profiles against the true surface below
+them. Squares on which the true surface has a step of more than 3 m between neighbouring samples are left out: a
+fraction of a pixel decides there.
 """
 
 from __future__ import annotations
@@ -42,6 +43,7 @@ _PIXEL_RAD = 1 / 700  # of a page of 800 px
 _SCATTER_M = 8.0  # of the starts about the cameras
 _NEAR_M = 0.5
 _INNER, _MOST_STEP_M = 25, 3.0  # true samples along a side of a square, and the largest step between them
+_HIDDEN_M = 1.0  # a corner that is read further off is hidden by something else
 
 
 def sights(model: MeasuringModel, count: int) -> list[Sight]:
@@ -63,7 +65,7 @@ def compare_quantities(model: MeasuringModel, count: int, true_up: Callable[[Flo
     low, high = np.quantile(trained.geo_from_model.apply(trained.point_in_model)[:, :2], [0.2, 0.8], axis=0)
     model_from_geo = trained.geo_from_model.inverse()
     ratios: dict[str, list[float]] = {"area": [], "volume": [], "profile": []}
-    down = model_from_geo.rotation @ np.array([0.0, 0.0, -1.0])
+    centers = trained.poses.cam_center_in_model
     tried = 0
     while len(ratios["volume"]) < count and tried < 20 * count:
         tried += 1
@@ -77,10 +79,13 @@ def compare_quantities(model: MeasuringModel, count: int, true_up: Callable[[Flo
         steps = max(np.abs(np.diff(grid, axis=axis)).max() for axis in (0, 1))
         if not np.isfinite(up).all() or not np.isfinite(at_corner).all() or steps > _MOST_STEP_M:
             continue
-        top = np.column_stack([plan, np.full(4, np.nanmax(up) + 60.0)])
-        corners = [model.reader.under(Sight(model_from_geo.apply(start[None])[0], down, 1e-3)) for start in top]
-        points = [point for point in corners if isinstance(point, SurfacePoint)]
-        if len(points) < 4:
+        true_corners = np.column_stack([plan, at_corner])
+        start = centers[rng.integers(len(centers))] + rng.normal(0, _SCATTER_M, 3)
+        lines = model_from_geo.apply(true_corners) - start
+        sights = [Sight(start, line / np.linalg.norm(line), _PIXEL_RAD) for line in lines]
+        points = [point for point in map(model.reader.under, sights) if isinstance(point, SurfacePoint)]
+        read = np.array([point.position_in_geo for point in points]).reshape(-1, 3)
+        if len(points) < 4 or np.linalg.norm(read - true_corners, axis=1).max() > _HIDDEN_M:
             continue
         found = {each.name: each for each in model.volume(points, WantedBase(), Fineness())}
         area = {each.name: each for each in model.area(points, Fineness())}["horizontal area"]
@@ -91,11 +96,11 @@ def compare_quantities(model: MeasuringModel, count: int, true_up: Callable[[Flo
         ratios["volume"].append((found["volume"].value - true) / found["volume"].sigma)
         ratios["area"].append((area.value - 4 * half**2) / area.sigma)
         line = model.profile(points[:2], Fineness())
-        along = plan[0] + (line.along_m / line.along_m[-1])[:, None] * (plan[1] - plan[0])
+        along = read[0, :2] + (line.along_m / line.along_m[-1])[:, None] * (read[1, :2] - read[0, :2])
         level = model.target.xyz_from_geo(np.column_stack([along, true_up(along)]))[:, 2]
-        error = (line.height - level) / line.sigma_m
-        # A robust RMS: by the median of a chi-square.
-        ratios["profile"].append(float(np.sqrt(np.nanmedian(error**2) / 0.455)))
+        error = line.height - level
+        near = np.abs(error) <= _NEAR_M
+        ratios["profile"].append(float(np.sqrt(np.mean((error[near] / line.sigma_m[near]) ** 2))))
     for name, values in ratios.items():
         z = np.array(values)
         pooled, middle = float(np.sqrt(np.mean(z**2))), float(np.median(np.abs(z)))

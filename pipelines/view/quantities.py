@@ -150,8 +150,8 @@ def rim_base(kind: RimBase, corners: FloatArray, places: FloatArray) -> VolumeBa
     return VolumeBase(by_corner @ corners[:, 2], by_corner)
 
 
-# Training pixels by which the surface as a whole may stand too high or too low: on simulated flights
-_SURFACE_BIAS_PX = 0.1
+# Training pixels by which the surface as a whole may stand too high or too low, by a simulated flight (clicks.py).
+_SURFACE_BIAS_PX = 0.02
 
 
 def volumes(surface: SampledSurface, base: VolumeBase) -> tuple[Quantity, ...]:
