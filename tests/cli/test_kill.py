@@ -123,7 +123,8 @@ def test_thirty_kills_at_random(survey: Path, whole: Workspace) -> None:
         except subprocess.TimeoutExpired:
             process.kill()
         assert _finish(process).code in (-signal.SIGKILL, 0)
-        states.status(workspace)
+        if workspace.root.is_dir():  # a slow machine may not have come that far
+            states.status(workspace)
     _assert_completes(workspace, whole, asked(survey))
 
 
