@@ -11,6 +11,7 @@ from pipelines.core.errors import GeorefError
 from pipelines.core.options import StageOptions, listed_names
 
 SURVEY = "ingest/survey.json"
+MASKS = "ingest/masks"  # of the photographs that have one
 TRACK = "ingest/track.npz"  # only for surveys with a trajectory
 SPARSE = "sfm/sparse"
 RIG = "calibrate/rig.json"
@@ -85,6 +86,7 @@ PHOTOGRAPHS = ProductPart(
         "images.fix.position_in_geo",
         "images.attitude.quat_xyzw",
         "images.velocity_in_geo",
+        "images.mask_sha256",
     ),
 )
 # The estimates that are applied to the survey when the survey is read, and the navigation that they are applied to.
@@ -166,7 +168,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         options_place="pipelines.ingest.options:IngestOptions",
         reads=(),
         product=SURVEY,
-        working=("images",),
+        working=("images", "masks"),
         product_version=2,  # as `Survey.format_version`
     ),
     StageSpec(

@@ -49,6 +49,7 @@ def _sensible(offset: float | Literal["auto"]) -> float | Literal["auto"]:
 
 # Files of other kinds beside the photographs, such as thumbnails and logs, make nothing stale.
 PhotographFolder = Annotated[Path, InputMarker(SUFFIXES)]
+MaskFolder = Annotated[Path, InputMarker(frozenset({".png"}))]
 FrameDistance = Annotated[Every, from_text(_every), WRITTEN]
 TimeOffset = Annotated[
     float | Literal["auto"],
@@ -149,6 +150,17 @@ class IngestOptions(StageOptions):
         le=1,
         description="Readout time of a photograph in seconds, from its first row to its last; 0: a global or "
         "mechanical shutter (default: by camera model, else 0).",
+    )
+    masks: MaskFolder | None = Field(
+        None,
+        description="Folder of masks, each named as its photograph with .png added: black pixels are left out of "
+        "sfm, surface, training and test.",
+    )
+    mask: InputPath | None = Field(
+        None, description="Mask for every photograph, such as of the drone's own legs: black pixels are left out."
+    )
+    mask_sky: bool = Field(
+        False, description="Leave out the sky: what is smooth and blue or white above the horizon of the attitude."
     )
     accept_inconsistency: bool = Field(
         False, description="Go on where the table of positions disagrees with EXIF, with a caution."

@@ -231,6 +231,8 @@ class SurfaceViews:
                 depth, rgb = renderer.surface(index)
                 if self._confirmed:
                     depth[~photo_consistent(rgb, renderer.images.image(index))] = 0
+                if renderer.images.is_masked(index):
+                    depth[~renderer.images.mask(index)] = 0
                 maps: tuple[NDArray[Any], ...] = depth, rgb
                 for handle, values in zip(handles, maps, strict=False):
                     handle.write(values.tobytes())

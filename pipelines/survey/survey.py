@@ -144,7 +144,8 @@ class Attitude(Product):
 class SurveyImage(Product):
     """Photograph, named by its path relative to the survey's `image_dir`; its time is the camera clock's.
 
-    `sha256` is empty in a survey written by hand: the photograph is not checked then.
+    `sha256` is empty in a survey written by hand: the photograph is not checked then. `mask_sha256` is the hash of
+    `ingest/masks/NAME.png`, where black pixels are left out; empty: all pixels count.
     """
 
     name: ImageName
@@ -154,6 +155,7 @@ class SurveyImage(Product):
     fix: Fix | None = None
     attitude: Attitude | None = None
     velocity_in_geo: Vector3 | None = None  # of a camera with a rolling shutter, m/s
+    mask_sha256: str = ""
     split: Literal["train", "test"] = "train"
 
 
