@@ -15,7 +15,7 @@ from pipelines.core.progress import SILENT, Progress
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.ingest.bag_flight import count_frames, read_bag
 from pipelines.ingest.folder_flight import read_folder
-from pipelines.ingest.ground_points import read_ground_files, tie_marks
+from pipelines.ingest.ground_points import known_distances, read_ground_files, tie_marks
 from pipelines.ingest.masks import mask_files, write_masks
 from pipelines.ingest.options import IngestOptions, check_options
 from pipelines.ingest.remarks import Remarks
@@ -104,7 +104,9 @@ def survey_and_track(
     control, check = (
         None if file is None else tie_marks(file, sizes, options.sigma_mark, remarks) for file in ground
     )
-    return assemble_survey(flight, control, check, options, remarks)
+    distances = known_distances(options, (control, check), sizes, remarks)
+    survey, track = assemble_survey(flight, control, check, options, remarks)
+    return survey.model_copy(update={"distances": distances}), track
 
 
 def _copy_images(survey: Survey, stage: StageRun) -> None:
@@ -126,12 +128,14 @@ def _summary(survey: Survey) -> Summary:
         "control_points": len(survey.control_points),
         "check_points": len(survey.check_points),
         "unmarked_points": len(survey.unmarked_points),
+        "distances": len(survey.distances),
         "masks": sum(bool(image.mask_sha256) for image in survey.images),
     }
     key_figure = (
         f"{counts['images']} images, {counts['fixes']} positions, {counts['control_points']} control and "
         f"{counts['check_points']} check points"
         + (f", {counts['unmarked_points']} unmarked" if survey.unmarked_points else "")
+        + (f", {counts['distances']} distances" if counts["distances"] else "")
         + (f", {counts['masks']} masks" if counts["masks"] else "")
     )
     values = {**counts, "origin": survey.origin.model_dump(), "vertical": survey.vertical.model_dump()}

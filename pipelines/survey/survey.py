@@ -168,27 +168,45 @@ class Mark(Product):
     sigma_px: float = Field(gt=0)
 
 
-class SurveyedPoint(Product):
-    """Control or check point: position in geo (m), 3×3 covariance (m²), marks, and what covers the ground there."""
+class MarkedPoint(Product):
+    """Point of the scene that is marked in photographs."""
 
     name: str
-    position_in_geo: Vector3
-    cov_in_geo: Covariance3
     marks: tuple[Mark, ...]
-    land_cover: Literal["open", "vegetated"] = "open"
 
     @model_validator(mode="after")
-    def _is_marked_once_an_image(self) -> SurveyedPoint:
+    def _is_marked_once_an_image(self) -> MarkedPoint:
         images = [mark.image for mark in self.marks]
         if len(set(images)) != len(images):
             raise ValueError("marks: two are in one image")
         return self
 
 
+class SurveyedPoint(MarkedPoint):
+    """Control or check point: position in geo (m), 3×3 covariance (m²), marks, and what covers the ground there."""
+
+    position_in_geo: Vector3
+    cov_in_geo: Covariance3
+    land_cover: Literal["open", "vegetated"] = "open"
+
+
 class UnmarkedPoint(SurveyedPoint):
     """Surveyed point with marks in fewer than two images: it enters nothing until it is marked."""
 
     use: Literal["control", "check"]
+
+
+class KnownDistance(Product):
+    """Measured distance between two marked points, as of a scale bar: an observation, or a check of the scale."""
+
+    ends: tuple[MarkedPoint, MarkedPoint]
+    distance_m: float = Field(gt=0)
+    sigma_m: float = Field(gt=0)
+    use: Literal["control", "check"] = "control"
+
+    @property
+    def name(self) -> str:
+        return "–".join(end.name for end in self.ends)
 
 
 class Survey(Product):
@@ -218,6 +236,7 @@ class Survey(Product):
     control_points: tuple[SurveyedPoint, ...] = ()
     check_points: tuple[SurveyedPoint, ...] = ()
     unmarked_points: tuple[UnmarkedPoint, ...] = ()
+    distances: tuple[KnownDistance, ...] = ()
     assumptions: tuple[Remark, ...] = ()
     warnings: tuple[Remark, ...] = ()
     cautions: tuple[Remark, ...] = ()
@@ -241,6 +260,7 @@ class Survey(Product):
             "control_points": [point.name for point in self.control_points],
             "check_points": [point.name for point in self.check_points],
             "unmarked_points": [point.name for point in self.unmarked_points],
+            "distances": [distance.name for distance in self.distances],
         }
         for field, of_field in names.items():
             if len(set(of_field)) != len(of_field):
