@@ -31,6 +31,7 @@ from pipelines.formats.exif import read_tags
 from pipelines.formats.georef_sidecar import GeorefSidecar, sidecar_path, write_sidecar
 from pipelines.formats.gnss_logs import read_mrk, read_pos
 from pipelines.formats.ground_points import (
+    read_distances,
     read_geo,
     read_ground_points,
     read_marks,
