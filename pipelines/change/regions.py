@@ -52,9 +52,15 @@ class Parts:
 
 @dataclass(frozen=True)
 class FoundRegions:
-    """Regions with their polygons in the CRS, those of the user first, and the sign (H, W) of cells in cores."""
+    """Regions with their polygons in the CRS, those of the user first, and the sign (H, W) of cells in cores.
+
+    `lowered`, `raised` and `every` are the sums of those that were found.
+    """
 
     regions: tuple[ChangedRegion, ...]
+    lowered: ChangedRegion
+    raised: ChangedRegion
+    every: ChangedRegion
     polygons: list[Any]
     sign: NDArray[np.int8]
 
@@ -134,8 +140,13 @@ def find_regions(
     for place, index in enumerate(kept.tolist(), start=1):
         named.append((f"R{place}", whole[index]))
         polygons.append(_outline(number, index + 1, places[index], grid))
-    regions = tuple(ChangedRegion.of(name, volume, noise, grid.cell_m2) for name, volume in named)
-    return FoundRegions(regions, polygons, np.where(np.isin(number, kept + 1), sign, 0).astype(np.int8))
+    for name, chosen in (("lowered", kept[net[kept] < 0]), ("raised", kept[net[kept] > 0]), ("every", kept)):
+        named.append((name, sum((whole[index] for index in chosen.tolist()), Volume())))
+    *regions, lowered, raised, every = (
+        ChangedRegion.of(name, volume, noise, grid.cell_m2) for name, volume in named
+    )
+    in_cores = np.where(np.isin(number, kept + 1), sign, 0).astype(np.int8)
+    return FoundRegions(tuple(regions), lowered, raised, every, polygons, in_cores)
 
 
 def _outline(number: IntArray | NDArray[np.int32], which: int, place: tuple[slice, slice], grid: CommonGrid) -> Any:

@@ -1,7 +1,8 @@
 """Stage `change`: what differs between the rasters of two epochs, by how much, and whether it is real.
 
 Reads the rasters, surveys and adjustments of both workspaces. Writes `change/` in the later one: `difference.tif`,
-`sigma.tif`, `lod.tif`, `significant.tif`, `regions.geojson`, `regions.gpkg`, `regions.csv` and `change.json`.
+`sigma.tif`, `lod.tif`, `significant.tif`, `regions.geojson`, `regions.gpkg`, `regions.csv`, `change.json` and the
+page `change.html`.
 """
 
 from dataclasses import replace
@@ -23,17 +24,22 @@ from pipelines.change.detection import (
 )
 from pipelines.change.grid import CommonGrid, Window, epoch_rasters
 from pipelines.change.options import ChangeOptions
+from pipelines.change.page import Compared, change_page
 from pipelines.change.product import Change, ChangedRegion, Registration
 from pipelines.change.regions import Parts, find_regions, reach_of
 from pipelines.core.errors import InputError
 from pipelines.core.files import remove, replace_text
 from pipelines.core.products import Remark, save_json, union
+from pipelines.core.stages import CHANGE_PAGE
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.formats.geotiff import Band, RasterKind, read_cells, write_mosaic
 from pipelines.formats.tables import table_text
 from pipelines.formats.vector_files import feature, features_text, read_boundary, write_polygons_gpkg
 from pipelines.geodesy.crs import PointCrs, parse_crs
+from pipelines.report.page import render_page
 
+_ROOM = __name__.rpartition(".")[0]
+_MOST_LEVELS = 1_000_000  # of detection, whose median is stated
 LOWERED, UNCHANGED, RAISED = 2, 1, 3  # in significant.tif; 0: not measured in both
 _KINDS = {
     "difference": RasterKind("float32", (Band("later minus earlier height", "metre"),)),
@@ -71,7 +77,7 @@ def run(stage: StageRun, options: ChangeOptions) -> Summary:
     )
     registration = Registration.of(noise, applied=registered, datum_v_m=grid.datum_v_m)
     parts = Parts(stage.out / "parts", grid)
-    sign = _write_rasters(stage, parts, noise, registered=registered)
+    sign, median_lod_m = _write_rasters(stage, parts, noise, registered=registered)
     given = _polygons(options.regions, "--regions", crs, options) or ()
     found = find_regions(parts, sign, noise, given, options.min_area)
     _write_significant(stage.out, parts, found.sign)
@@ -82,13 +88,23 @@ def run(stage: StageRun, options: ChangeOptions) -> Summary:
         registration=registration,
         shared_control_points=shared.control,
         shared_sigma_v_m=float(np.sqrt(shared.by_control_m2[2] + shared.by_base_m2[2])),
+        median_lod_m=median_lod_m,
         significant_share=float((found.sign != 0).mean()),
+        lowered=found.lowered,
+        raised=found.raised,
+        found=found.every,
         regions=found.regions,
     )
     save_json(change, stage.out / "change.json")
     _write_vectors(stage.out, change, found.polygons, grid)
     remove(parts.folder)
-    return _summary(change, union(*(one.cautions for one in epochs)))
+    summary = _summary(change, union(*(one.cautions for one in epochs)))
+    compared = Compared(stage.out, change, found.polygons, grid, workspaces)
+    remarks = (*summary.warnings, *summary.cautions)
+    replace_text(
+        stage.out / Path(CHANGE_PAGE).name, render_page(change_page(compared, remarks, stage.progress), _ROOM)
+    )
+    return summary
 
 
 def _summary(change: Change, cautions: tuple[Remark, ...]) -> Summary:
@@ -144,12 +160,14 @@ def _registered(cells: Cells, grid: CommonGrid, window: Window, noise: Noise, *,
     return replace(cells, difference_m=cells.difference_m - moved, datum_m=np.full(cells.difference_m.shape, datum))
 
 
-def _write_rasters(stage: StageRun, parts: Parts, noise: Noise, *, registered: bool) -> NDArray[np.int8]:
-    """Write the rasters, keep their parts, and return the sign of the significant change of all cells."""
+def _write_rasters(
+    stage: StageRun, parts: Parts, noise: Noise, *, registered: bool
+) -> tuple[NDArray[np.int8], float]:
+    """Write the rasters, keep their parts, and return the sign of all changes and the median level of detection."""
     grid, reach = parts.grid, reach_of(parts.grid, noise)
     parts.folder.mkdir(exist_ok=True)
     sign = np.zeros((grid.frame.rows, grid.frame.columns), dtype=np.int8)
-    windows = list(grid.windows())
+    windows, levels = list(grid.windows()), []
     with stage.progress.task("windows", len(windows)) as task:
         for window in windows:
             wide, own = grid.around(window, reach)
@@ -168,10 +186,12 @@ def _write_rasters(stage: StageRun, parts: Parts, noise: Noise, *, registered: b
             }
             for name, values in bands.items():
                 parts.write(name, window, values)
+            certain = lod[own][cells.is_certain[own]]
+            levels.append(certain[:: max(len(certain) * len(windows) // _MOST_LEVELS, 1)])
             task.advance()
     for name in ("difference", "sigma", "lod"):
         _write_mosaic(stage.out, parts, name)
-    return sign
+    return sign, float(np.median(np.concatenate(levels)))
 
 
 def _write_significant(folder: Path, parts: Parts, sign: NDArray[np.int8]) -> None:
