@@ -40,6 +40,7 @@ _BEYOND, _LEAST_BEYOND_M = 0.3, 2.0  # of a profile on each side of its region: 
 _UNCOVERED = 205.0  # grey of what an orthophoto does not show
 _SIMPLIFIED = 0.6  # pixels
 _BAR_SHARE = 0.25
+_FULL_COLOUR = 0.5  # quantile of the significant differences that has full colour
 _STEPS = 4
 
 
@@ -77,13 +78,13 @@ class Compared:
 
 @dataclass(frozen=True)
 class SummaryFacts:
-    """Figures at the top, and what limits them."""
+    """Figures at the top, and what limits them: of which epoch, or of none, and a sentence."""
 
     names: tuple[str, str]
     applied: bool
     found: int
     given: int
-    remarks: tuple[Remark, ...]
+    remarks: tuple[tuple[str, str], ...]
 
 
 @dataclass(frozen=True)
@@ -127,8 +128,13 @@ class PairFacts:
     about: str
 
 
-def change_page(compared: Compared, remarks: tuple[Remark, ...], progress: Progress) -> Page:
-    """Return the page of a comparison, with its warnings and cautions; errors as of `load_trained`."""
+def change_page(
+    compared: Compared, warnings: tuple[Remark, ...], cautions: tuple[tuple[Remark, ...], ...], progress: Progress
+) -> Page:
+    """Return the page of a comparison, with its warnings, and with the cautions of each epoch.
+
+    Raises as `load_trained`.
+    """
     change = compared.change
     with progress.task("page", _STEPS) as task:
         seen = map_facts(compared)
@@ -142,7 +148,13 @@ def change_page(compared: Compared, remarks: tuple[Remark, ...], progress: Progr
         task.advance(note="renders")
     before, after = compared.names
     given = sum(region.name.startswith("P") for region in change.regions)
-    summary = SummaryFacts(compared.names, change.registration.applied, len(change.regions) - given, given, remarks)
+    remarks = [("", remark.sentence) for remark in warnings]
+    remarks += [
+        (f"{name}: ", remark.sentence) for name, own in zip(compared.names, cautions, strict=True) for remark in own
+    ]
+    summary = SummaryFacts(
+        compared.names, change.registration.applied, len(change.regions) - given, given, tuple(remarks)
+    )
     return Page(
         title=f"Change: {before} to {after}",
         subtitle=f"Difference of two {'surfaces' if change.of == 'surface' else 'terrain models'}, its level of "
@@ -176,7 +188,9 @@ def map_facts(compared: Compared) -> MapFacts:
     difference = read_onto(compared.folder / "difference.tif", frame, "average")
     significant = read_onto(compared.folder / "significant.tif", frame, "nearest") > 1
     beyond = np.abs(difference[significant & np.isfinite(difference)])
-    limit_m = round_up(float(np.quantile(beyond, 0.9)) if len(beyond) else 3 * compared.change.median_lod_m)
+    limit_m = round_up(
+        float(np.quantile(beyond, _FULL_COLOUR)) if len(beyond) else 3 * compared.change.median_lod_m
+    )
     pixels = change_picture(height, difference, significant, cell_m, limit_m)
     outlines = tuple(
         _outline(compared.change.regions[index].name, compared.polygons[index], frame)

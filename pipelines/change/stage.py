@@ -98,12 +98,11 @@ def run(stage: StageRun, options: ChangeOptions) -> Summary:
     save_json(change, stage.out / "change.json")
     _write_vectors(stage.out, change, found.polygons, grid)
     remove(parts.folder)
-    summary = _summary(change, union(*(one.cautions for one in epochs)))
+    cautions = tuple(one.cautions for one in epochs)
+    summary = _summary(change, union(*cautions))
     compared = Compared(stage.out, change, found.polygons, grid, workspaces)
-    remarks = (*summary.warnings, *summary.cautions)
-    replace_text(
-        stage.out / Path(CHANGE_PAGE).name, render_page(change_page(compared, remarks, stage.progress), _ROOM)
-    )
+    page = change_page(compared, summary.warnings, cautions, stage.progress)
+    replace_text(stage.out / Path(CHANGE_PAGE).name, render_page(page, _ROOM))
     return summary
 
 

@@ -109,6 +109,7 @@ FORMS: dict[str, Callable[..., str]] = {
     "duration": lambda seconds: duration(seconds) or MISSING,
     "in_metres": in_metres,
     "metres": metres,
+    "millimetre_fine": partial(number_text, decimals=3),
     "moment": moment,
     "number": number_text,
     "parts_per_million": parts_per_million,

@@ -111,8 +111,10 @@ def profile_chart(profile: Profile, names: tuple[str, str]) -> bytes:
         names, (look.BLUE, look.ORANGE), profile.height_m, profile.sigma_m, strict=True
     ):
         band = 1.96 * np.nan_to_num(sigma)
-        axes.fill_between(profile.distance_m, height - band, height + band, color=colour, alpha=0.3, linewidth=0)
-        axes.plot(profile.distance_m, height, color=colour, linewidth=1.5, label=name)
+        axes.fill_between(profile.distance_m, height - band, height + band, color=colour, alpha=0.12, linewidth=0)
+        for side in (-1, 1):  # lines keep their colour in the dark, where a pale area becomes a dark one
+            axes.plot(profile.distance_m, height + side * band, color=colour, linewidth=0.6, linestyle="--")
+        axes.plot(profile.distance_m, height, color=colour, linewidth=1.7, label=name)
     _limit_heights(axes, profile)
     look.label(axes, "", x="distance along the line in m", y="height in m")
     axes.ticklabel_format(useOffset=False, style="plain")
