@@ -36,6 +36,7 @@ SPZ = "spz/splat.spz"
 TILES = "tiles/tileset.json"
 TILES_GLB = "tiles/splat.glb"
 REPORT_PAGE = "report/report.html"
+CHANGE_PAGE = "change/change.html"
 LIDAR, LIDAR_MAP = "train/lidar.json", "train/lidar.png"  # only of a training with LiDAR
 BLOCK_RECORD = "train/blocks.json"  # only of a model that was trained in blocks
 BLOCK_PLAN = "plan/plan.json"
@@ -328,10 +329,25 @@ CHANGE = StageSpec(
     name="change",
     module="pipelines.change.stage",
     options_place="pipelines.change.options:ChangeOptions",
-    reads=(MEASURED, *SOLVED, *whole_products("raster/dsm.tif")),
+    reads=(
+        MEASURED,
+        *SOLVED,
+        *whole_products("raster/dsm.tif", "raster/sigma_v.tif", "raster/measured.tif"),
+        *whole_products("raster/dtm.tif", "raster/sigma_dtm.tif", "raster/orthophoto.tif", optional=True),
+    ),
     product="change/change.json",
     title="Compare with an earlier survey: what changed, by how much, is it real.",
-    also=("change/difference.tif", "change/regions.gpkg"),
+    also=(
+        "change/difference.tif",
+        "change/sigma.tif",
+        "change/lod.tif",
+        "change/significant.tif",
+        "change/regions.gpkg",
+        "change/regions.geojson",
+        "change/regions.csv",
+        CHANGE_PAGE,
+    ),
+    product_version=2,  # with the page
 )
 
 # No part of the pipeline: `georef compare` runs this stage for the baseline, whose later stages read its folder in
