@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -399,6 +400,17 @@ def test_minimum_and_covariances_are_those_of_the_plain_adjustment(name: str) ->
     moved = intersection_jacobian(seeing(network, CONTROL + 1.0), np.ones(IMAGES * len(CONTROL)))
     by_unknowns = np.concatenate([moved.by_poses.toarray(), moved.by_lens.reshape(-1, LENSES)], axis=1)
     close_in_sigma(of_linear(normal, problem, by_unknowns), by_unknowns @ outer @ by_unknowns.T)
+
+
+def test_threads_may_share_a_normal_matrix() -> None:
+    """LAPACK's wrapper of SciPy changes the pivots that it is given while it solves."""
+    case = case_of(next(name for name, (_, errors, _) in CASES.items() if errors))
+    normal = linearised(case.problem, case.start).normal(ones(case.problem))
+    lens, errors = len(case.problem.lens), len(case.problem.errors)
+    alone = normal.of_errors(lens, errors)
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda _: normal.of_errors(lens, errors), range(2000)))
+    assert all(np.array_equal(each, alone) for each in found)
 
 
 def of_linear(normal: NormalMatrix, problem: Problem, by_unknowns: np.ndarray) -> np.ndarray:
