@@ -51,6 +51,7 @@ def _sensible(offset: float | Literal["auto"]) -> float | Literal["auto"]:
 PhotographFolder = Annotated[Path, InputMarker(SUFFIXES)]
 MaskFolder = Annotated[Path, InputMarker(frozenset({".png"}))]
 FrameDistance = Annotated[Every, from_text(_every), WRITTEN]
+DictionaryNames = Annotated[tuple[str, ...], from_text(lambda text: tuple(text.split(","))), WRITTEN]
 TimeOffset = Annotated[
     float | Literal["auto"],
     from_text(lambda text: text if text == "auto" else float(text)),
@@ -119,6 +120,11 @@ class IngestOptions(StageOptions):
         None,
         description="Measured distances between marked points, as of scale bars: CSV with from, to, distance, and "
         "optionally sigma and use (control or check).",
+    )
+    targets: DictionaryNames = Field(
+        (),
+        description="Dictionaries of the tags on the ground, as OpenCV names them (with commas): tags are found in "
+        "the photographs and mark the points whose names end in their number, e.g. DICT_APRILTAG_36h11.",
     )
     gcp_crs: str | None = Field(
         None, description="CRS of ground points whose file states none, e.g. EPSG:32632 or EPSG:4326+5773."
@@ -217,9 +223,9 @@ def check_options(options: IngestOptions, frames: Path | None) -> None:
             "--trajectory, and remove --lever-arm. A .MRK without a trajectory is given by --trajectory.",
             field="--events",
         )
-    for name in ("marks", "gcp_crs"):
+    for name in ("marks", "gcp_crs", "targets"):
         needed = (options.gcp, options.checkpoints, options.distances if name == "marks" else None)
-        if getattr(options, name) is not None and not any(needed):
+        if getattr(options, name) and not any(needed):
             flag = flag_name(IngestOptions, name)
             raise InputError(
                 "needs-ground-points", f"{flag} needs ground points. Give --gcp or --checkpoints.", field=flag

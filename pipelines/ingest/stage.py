@@ -1,8 +1,9 @@
 """Stage `ingest`: photographs, positions, attitudes and ground points into one survey in one frame.
 
 Reads: a folder of photographs or a ROS bag; optionally a table of positions, control and check points, marks.
-Writes: `ingest/survey.json`; `ingest/images/` with --bag or --copy; `ingest/masks/` with masks; `ingest/track.npz`
-where the navigation was recorded by time. See docs/inputs.md and docs/bags.md for every format and default.
+Writes: `ingest/survey.json`; `ingest/images/` with --bag or --copy; `ingest/masks/` with masks;
+`ingest/targets.csv` and `.png` with targets; `ingest/track.npz` where the navigation was recorded by time. See
+docs/inputs.md and docs/bags.md for every format and default.
 """
 
 import logging
@@ -20,6 +21,7 @@ from pipelines.ingest.masks import mask_files, write_masks
 from pipelines.ingest.options import IngestOptions, check_options
 from pipelines.ingest.remarks import Remarks
 from pipelines.ingest.survey_assembly import assemble_survey, require_placed
+from pipelines.ingest.targets import list_targets, mark_targets
 from pipelines.survey.calibrated import NavigationTrack
 from pipelines.survey.survey import Survey
 
@@ -33,7 +35,7 @@ def run(stage: StageRun, options: IngestOptions) -> Summary:
         InputError: anything wrong with the inputs; names file, line and field.
     """
     _refuse_inside_photographs(stage.workspace, options)
-    survey, track = survey_and_track(options, stage.out / "images", stage.progress)
+    survey, track = survey_and_track(options, stage.out / "images", stage.progress, listing=stage.out)
     survey = write_masks(survey, options, Path(survey.image_dir), stage.out / "masks", stage.progress)
     if options.copy_images and options.bag is None:
         _copy_images(survey, stage)
@@ -76,12 +78,18 @@ def _refuse_inside_photographs(workspace: Workspace, options: IngestOptions) -> 
 
 
 def survey_and_track(
-    options: IngestOptions, frames: Path | None, progress: Progress = SILENT, *, decode: bool = True
+    options: IngestOptions,
+    frames: Path | None,
+    progress: Progress = SILENT,
+    *,
+    decode: bool = True,
+    listing: Path | None = None,
 ) -> tuple[Survey, NavigationTrack | None]:
     """Return the survey, and the navigation in the same frame where it was recorded by time; raises as `run`.
 
     Photographs of a bag are written into `frames`; without a bag, nothing is. Photographs are decoded to their end,
-    as their hashes need; without `decode`, their heads are read.
+    as their hashes need; without `decode`, their heads are read, and no targets are looked for. Targets that are
+    found are listed in the folder `listing`.
     """
     remarks = Remarks()
     check_options(options, frames)
@@ -104,6 +112,10 @@ def survey_and_track(
     control, check = (
         None if file is None else tie_marks(file, sizes, options.sigma_mark, remarks) for file in ground
     )
+    if options.targets and decode:
+        (control, check), found = mark_targets((control, check), flight, options.targets, remarks, progress)
+        if listing is not None:
+            list_targets(found, listing)
     distances = known_distances(options, (control, check), sizes, remarks)
     survey, track = assemble_survey(flight, control, check, options, remarks)
     return survey.model_copy(update={"distances": distances}), track
