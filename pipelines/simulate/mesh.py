@@ -24,6 +24,7 @@ class Material(IntEnum):
     CAR = 6
     SOLAR = 7
     TARGET = 8
+    TAG = 9
 
 
 @dataclass(frozen=True)
@@ -32,14 +33,15 @@ class TextureParameters:
 
     base: Color  # linear albedo
     accent: Color = (0.5, 0.5, 0.5)  # linear albedo
-    style: int = 0  # 0 plaster, 1 masonry, 2 panels (walls only)
+    style: int = 0  # of walls: 0 plaster, 1 masonry, 2 panels; of tags: their dictionary
     floor_m: float = 3.0  # height of a storey
     pitch_m: float = 3.0  # distance between windows
     window_m: tuple[float, float] = (1.2, 1.5)  # width and height
     sill_m: float = 0.9  # height of a window above the floor
     top_m: float = 0.0  # above it there are no windows
     shop: bool = False  # the ground floor has shop windows
-    shift_m: tuple[float, float] = (0.0, 0.0)  # place in the noise, so that no two surfaces look alike
+    # Place in the noise, so that no two surfaces look alike; of tags: their number, and 0
+    shift_m: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from pydantic import Field, field_validator
 
 from pipelines.core.options import EFFORT, PlaceOnEarth, StageOptions, Triple, listed_names
 
+TargetKind = Literal["quarters", "aruco", "apriltag"]
 CHANGES = ("excavation", "heap", "new", "demolished", "growth")
 
 
@@ -127,8 +128,17 @@ class SimulateOptions(EpochOptions, LidarFlightOptions):
     samples: Literal["1", "4", "9", "16"] = Field("4", description="Rays per pixel (anti-aliasing).")
     quality: int = Field(95, ge=50, le=100, description="JPEG quality.")
     targets: int = Field(60, ge=0, le=500, description="Survey targets to lay out.")
+    target_kind: TargetKind = Field(
+        "quarters",
+        description="Targets: black and white quarters, or tags, numbered as the points (DICT_4X4_250, "
+        "DICT_APRILTAG_36h11).",
+    )
     target_size: float | None = Field(
-        None, gt=0.05, le=20, description="Width of a target in metres (default: five pixels)."
+        None,
+        gt=0.05,
+        le=20,
+        description="Width of a target in metres, of a tag without its white margin (default: five pixels, of "
+        "tags 30).",
     )
     control: int = Field(
         8, ge=0, description="Targets to use as control points, a third at the most; the others are check points."

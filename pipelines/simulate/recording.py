@@ -14,6 +14,7 @@ from pipelines.geometry.rotations import ENU_FROM_NED, geo_from_cam, quat_xyzw_f
 from pipelines.simulate import flight
 from pipelines.simulate.mesh import Raycaster
 from pipelines.simulate.options import SimulateOptions
+from pipelines.simulate.scene import target_corners
 from pipelines.simulate.truth import TrueLens, TrueMark, TrueNavigation, TrueTarget, Truth
 from pipelines.simulate.world import LEAST_RAYS, World, choose_control, project_targets
 
@@ -172,9 +173,17 @@ def _mark(
             ))  # fmt: skip
         position = world.sites[i].target_position
         surveyed.append(position + world.survey_error[i])
-        kind, true_in_geo = world.sites[i].kind, vector3(position)
+        a, b, c, d = map(vector3, target_corners(world.scene, world.sites[i], world.target_m))
         targets.append(
-            TrueTarget(name=name, role=role, surface=kind, position_in_geo=true_in_geo, marks=tuple(marks))
+            TrueTarget(
+                name=name,
+                number=int(world.number[i]),
+                role=role,
+                surface=world.sites[i].kind,
+                position_in_geo=vector3(position),
+                corners_in_geo=(a, b, c, d),
+                marks=tuple(marks),
+            )
         )
     return tuple(targets), np.array(surveyed).reshape(-1, 3)
 
@@ -219,6 +228,7 @@ def _truth(
             cam_from_body=_matrix(world.trajectory.cam_from_body),
             clock_offset_s=mounting.clock_offset_s,
         ),
+        target_kind=options.target_kind,
         targets=targets,
         sigma_mark_px=options.sigma_mark,
         sigma_survey_m=options.sigma_survey,

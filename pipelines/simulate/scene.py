@@ -9,7 +9,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.core.types import FloatArray
+from pipelines.core.types import FloatArray, IntArray
+from pipelines.formats.fiducials import tag_modules
 from pipelines.simulate.layout import STYLES, BuildingPlan, Roof, TownLayout, make_town_layout
 from pipelines.simulate.mesh import (
     Color,
@@ -22,8 +23,8 @@ from pipelines.simulate.mesh import (
     add_terrain,
     make_terrain,
 )
-from pipelines.simulate.options import EpochOptions
-from pipelines.simulate.textures import GroundPlan
+from pipelines.simulate.options import EpochOptions, TargetKind
+from pipelines.simulate.textures import TAG_DICTIONARIES, GroundPlan
 
 SiteKind = Literal["ground", "roof", "wall"]
 _TARGET_LIFT_M = 0.03
@@ -179,20 +180,40 @@ def _without(mesh: Mesh, gone: slice) -> Mesh:
     )
 
 
-def with_targets(scene: SimulatedScene, sites: list[TargetSite], width_m: float) -> SimulatedScene:
-    """Return the scene with a black and white board of `width_m` at every site."""
+def target_axes(scene: SimulatedScene, site: TargetSite) -> tuple[FloatArray, FloatArray]:
+    """Return the directions (3,) right and up on the face of a target, in geo."""
+    side = np.array([0.0, 0.0, 1.0]) if site.kind == "wall" else scene.axes[1]
+    u_axis = np.cross(side, site.normal)
+    u_axis /= np.linalg.norm(u_axis)
+    return u_axis, np.cross(site.normal, u_axis)
+
+
+def target_corners(scene: SimulatedScene, site: TargetSite, width_m: float) -> FloatArray:
+    """Return the corners (4, 3) of a square on the face of a target, clockwise from the upper left one."""
+    axes = np.stack(target_axes(scene, site))
+    return site.target_position + width_m / 2 * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]]) @ axes
+
+
+def with_targets(
+    scene: SimulatedScene, sites: list[TargetSite], width_m: float, kind: TargetKind, number: IntArray
+) -> SimulatedScene:
+    """Return the scene with a target of `width_m` at every site, quarters or a tag of a number (P,) on a board."""
     if not sites:
         return scene
     builder = MeshBuilder()
-    texture = builder.add_texture(TextureParameters((0.5, 0.5, 0.5), pitch_m=width_m))
-    for site in sites:
-        side = np.array([0.0, 0.0, 1.0]) if site.kind == "wall" else scene.axes[1]
-        u_axis = np.cross(side, site.normal)
-        u_axis /= np.linalg.norm(u_axis)
-        v_axis = np.cross(site.normal, u_axis)
-        middle, half = site.target_position, width_m / 2
-        a, b, c, d = (middle + half * (i * u_axis + j * v_axis) for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1)))
-        builder.triangles(np.array([[a, b, c], [a, c, d]]), Material.TARGET, texture, (middle, u_axis, v_axis))
+    is_tag = kind != "quarters"
+    style = int(kind == "apriltag")
+    quarters = builder.add_texture(TextureParameters((0.5, 0.5, 0.5), pitch_m=width_m))
+    modules = len(tag_modules(TAG_DICTIONARIES[style], 0))
+    board_m = width_m * (modules + 2) / modules if is_tag else width_m  # a module of white around
+    for site, its_number in zip(sites, number.tolist(), strict=True):
+        texture = quarters
+        if is_tag:
+            shown = TextureParameters((0.5, 0.5, 0.5), style=style, pitch_m=width_m, shift_m=(its_number, 0.0))
+            texture = builder.add_texture(shown)
+        material, frame = Material.TAG if is_tag else Material.TARGET, target_axes(scene, site)
+        d, c, b, a = target_corners(scene, site, board_m)
+        builder.triangles(np.array([[a, b, c], [a, c, d]]), material, texture, (site.target_position, *frame))
     return replace(scene, mesh=joined(scene.mesh, builder.build()))
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipelines.core.types import ByteArray, Float32Array, rows_of
+from pipelines.formats.fiducials import tag_modules
 from pipelines.simulate.mesh import Material
 
 _LATTICE, _UPSAMPLE = 128, 4
@@ -312,6 +313,27 @@ def target(s: TextureSamples) -> Float32Array:
     return np.repeat((np.float32(0.03) + np.float32(0.75) * white)[:, None], 3, axis=1)
 
 
+# Dictionaries of tags by the style of their texture. Those of 50, 100 and 250 tags are the beginning of that of 1000.
+TAG_DICTIONARIES = ("DICT_4X4_1000", "DICT_APRILTAG_36h11")
+
+
+def tag(s: TextureSamples) -> Float32Array:
+    """Return ArUco or AprilTags about the origin of the coordinates, `PITCH` wide, on white boards."""
+    white = np.ones(len(s.u), dtype=np.float32)
+    for style, number in np.unique(s.params[:, [STYLE, SHIFT_U]], axis=0).astype(int):
+        own = np.nonzero((s.params[:, STYLE] == style) & (s.params[:, SHIFT_U] == number))[0]
+        modules = tag_modules(TAG_DICTIONARIES[style], int(number)).astype(np.float32)
+        part, count = rows_of(s, own), len(modules)
+        edges = part.params[:, PITCH, None] * np.linspace(-0.5, 0.5, count + 1, dtype=np.float32)
+        across, up = (
+            band(x[:, None], edges[:, :-1], edges[:, 1:], width[:, None])
+            for x, width in ((part.u, part.du), (part.v, part.dv))
+        )
+        beside = 1 - across.sum(axis=1) * up.sum(axis=1)
+        white[own] = beside + np.einsum("ni,ij,nj->n", up[:, ::-1], modules, across, optimize=True)
+    return np.repeat((np.float32(0.03) + np.float32(0.75) * white)[:, None], 3, axis=1)
+
+
 def ground(s: TextureSamples, plan: GroundPlan) -> Float32Array:
     """Return the painted plan with the grain of grass, paving and asphalt, and fields beyond."""
     # The plan is sampled sharper than the pixel: supersampling completes the filter.
@@ -374,6 +396,7 @@ _TEXTURES: dict[Material, Callable[[TextureSamples], Float32Array]] = {
     Material.CAR: car,
     Material.SOLAR: solar,
     Material.TARGET: target,
+    Material.TAG: tag,
 }
 
 

@@ -27,12 +27,19 @@ class TrueMark(Product):
 
 
 class TrueTarget(Product):
-    """Survey target with its exact centre in geo."""
+    """Survey target with its exact centre in geo.
+
+    Attributes:
+        number: of its tag, where targets are tags.
+        corners_in_geo: of its face, of a tag without the white margin, clockwise from the upper left one.
+    """
 
     name: str
+    number: int
     role: Literal["control", "check"]
     surface: Literal["ground", "roof", "wall"]
     position_in_geo: Vector3
+    corners_in_geo: tuple[Vector3, Vector3, Vector3, Vector3]
     marks: tuple[TrueMark, ...]
 
 
@@ -141,6 +148,7 @@ class Truth(Product):
     cam_from_enu: tuple[Matrix3, ...]
     fix_errors: tuple[Vector3, ...]
     navigation: TrueNavigation
+    target_kind: Literal["quarters", "aruco", "apriltag"] = "quarters"
     targets: tuple[TrueTarget, ...]
     sigma_mark_px: float
     sigma_survey_m: float

@@ -103,7 +103,7 @@ def choose_control(sites: Sequence[TargetSite], rays: IntArray, count: int) -> l
 
 
 _CLEARANCE_M = 2.0
-_TARGET_PX = 5.0
+_TARGET_PX, _TAG_PX = 5.0, 30.0
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,8 @@ def make_world(options: SimulateOptions, seed: np.random.SeedSequence) -> World:
     bare = build_scene(options.scene, scene_seed)
     trajectory, poses = _flown(options, bare, mounting, np.random.default_rng(flight_seed))
     distance_m = float(np.median([np.linalg.norm(pose.center) for pose in poses]))
-    width_m = options.target_size or max(0.3, _TARGET_PX * distance_m / lens.focal_px)
+    width_px = _TARGET_PX if options.target_kind == "quarters" else _TAG_PX
+    width_m = options.target_size or max(0.3, width_px * distance_m / lens.focal_px)
     sites: list[TargetSite] = []
     if options.targets:
         seen, _ = project_targets(bare.sites, poses, lens, Raycaster(bare.mesh), width_m)
@@ -151,10 +152,11 @@ def make_world(options: SimulateOptions, seed: np.random.SeedSequence) -> World:
         changed = shapely.union_all([shapely.Polygon(change.outline) for change in bare.changes]).buffer(width_m)
         kept = np.array([not shapely.contains_xy(changed, *site.position[:2]) for site in sites], dtype=bool)
     stays = tuple(site for site, is_kept in zip(sites, kept, strict=True) if is_kept)
-    scene = with_targets(bare, list(stays), width_m)
+    number = np.flatnonzero(kept)
+    scene = with_targets(bare, list(stays), width_m, options.target_kind, number)
     origin = Origin(lat_deg=lat, lon_deg=lon, alt_m=alt)
     return World(
-        origin, scene, stays, np.flatnonzero(kept), survey_error[kept], width_m, lens, trajectory, poses, mounting
+        origin, scene, stays, number, survey_error[kept], width_m, lens, trajectory, poses, mounting
     )
 
 
