@@ -90,7 +90,6 @@ HOMES: dict[str, tuple[str, ...]] = {
     "ezdxf": ("pipelines.formats.vector_files",),
     "CSF": ("pipelines.surface.ground",),
     "tornado": ("pipelines.view.server",),
-    "threadpoolctl": ("pipelines.view.server",),
     "dask": ("pipelines.jobs",),
     "distributed": ("pipelines.jobs",),
     "cryptography": ("pipelines.jobs.cluster",),

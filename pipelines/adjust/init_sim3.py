@@ -39,7 +39,7 @@ from pipelines.adjust.options import EstimatedErrorName, InitSim3Options
 from pipelines.adjust.posterior import Posterior, save_posterior
 from pipelines.adjust.solution import adjusted
 from pipelines.adjust.system import minimise
-from pipelines.adjust.terms import ControlPoints, Fixes
+from pipelines.adjust.terms import ControlPoints, Distances, Fixes
 from pipelines.core.errors import ConvergenceError, DegenerateGeometryError, InconsistencyError, InputError
 from pipelines.core.products import NOT_CHECKED, Remark, save_json, union
 from pipelines.core.sentences import listed
@@ -56,6 +56,7 @@ from pipelines.survey.marks import of_wrong_marks, wrong_marks
 from pipelines.survey.scene import initial_scene
 from pipelines.survey.survey import Survey
 
+_DISAGREE = 3.5  # σ by which a distance misses the solution; one in two thousand does by chance
 _LEVEL = 0.01  # of the χ² test of σ where no joint adjustment is possible
 
 
@@ -320,6 +321,21 @@ def _joint_product(
             sentence = f"{len(bad)} of {len(names)} {group} are outliers, and are not used: {listed(sizes)}."
             warnings.append(Remark(code=code, sentence=sentence))
         rejected[kind] = tuple(name for name, _ in bad)
+    names, missed, used = joint.residuals(Distances.kind)
+    wrong = [
+        f"{name} ({float(miss[0]):+.3f} m)"
+        for name, miss, good in zip(names, missed, used, strict=True)
+        if not good
+    ]
+    if wrong:
+        sentence = (
+            f"{len(wrong)} of {len(names)} distances disagree with the others, and are not used: {listed(wrong)}."
+        )
+        warnings.append(Remark(code="distance-outliers", sentence=sentence))
+    elif names and np.abs(joint.problem.residuals(joint.state)[Distances.kind]).max() > _DISAGREE:
+        sizes = [f"{name} ({float(miss[0]):+.3f} m)" for name, miss in zip(names, missed, strict=True)]
+        sentence = f"Distances miss each other or the positions by more than their σ: {listed(sizes)}."
+        warnings.append(Remark(code="distances-disagree", sentence=sentence))
     pivot = np.array(aligned.geo_from_local.pivot)
     return aligned.model_copy(
         update={
@@ -327,6 +343,7 @@ def _joint_product(
             "inliers": inliers,
             "gnss_outliers": rejected["gnss"],
             "control_outliers": aligned.control_outliers + rejected["gcp"],
+            "distance_outliers": tuple(name for name, good in zip(names, used, strict=True) if not good),
             "residuals": residuals,
             "variance_factors": tuple(joint.factors.values()),
         }

@@ -22,7 +22,7 @@ from pipelines.adjust.measurements import onto_control, problem_of, recorded_rot
 from pipelines.adjust.options import EstimatedErrorName
 from pipelines.adjust.state import State
 from pipelines.adjust.system import Linearised, NormalMatrix, Problem, linearised, minimise, posterior_weights
-from pipelines.adjust.terms import ControlPoints, Fixes
+from pipelines.adjust.terms import ControlPoints, Distances, Fixes
 from pipelines.core.errors import ConvergenceError, DegenerateGeometryError
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.geometry.rotations import log_so3
@@ -88,9 +88,9 @@ class JointAdjustment:
         return tuple(estimate for estimate in estimates if estimate.name == "bias")
 
     def residuals(self, kind: str) -> tuple[tuple[str, ...], FloatArray, BoolArray]:
-        """Return names, residuals (M, 3) in metres, measured minus predicted, and the mask (M,) of the inliers."""
+        """Return names, residuals (M, d) in metres, measured minus predicted, and the mask (M,) of the inliers."""
         term = self.problem.term(kind)
-        if not isinstance(term, (Fixes, ControlPoints)):
+        if not isinstance(term, (Fixes, ControlPoints, Distances)):
             return (), np.empty((0, 3)), np.empty(0, dtype=bool)
         return term.name, -term.residuals(self.problem.at(self.state)), self.components[kind].used
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from pipelines.adjust.state import (
     SystematicErrors,
 )
 from pipelines.adjust.system import Problem
-from pipelines.adjust.terms import Attitudes, ControlPoints, Fixes, Planes, Term, root_information
+from pipelines.adjust.terms import At, Attitudes, ControlPoints, Distances, Fixes, Planes, Term, root_information
 from pipelines.core.errors import InputError
 from pipelines.core.sentences import listed
 from pipelines.core.types import BoolArray, FloatArray, IntArray, vector3
@@ -236,7 +237,7 @@ def problem_of(
         blocks.append(SystematicError("common", (sigma,) * 3))
     if planes is not None:
         blocks.append(SystematicError("lidar-shift", (SIGMA_LIDAR_M,) * 3))
-    every: tuple[Term | None, ...] = (fixes, control, attitudes, planes)
+    every: tuple[Term | None, ...] = (fixes, control, distances_of(scene, survey), attitudes, planes)
     measured = tuple(term for term in every if term is not None)
     return Problem(scene.poses, scene.bundle, measured, SystematicErrors(tuple(blocks)))
 
@@ -282,6 +283,44 @@ def control_of(scene: Scene, survey: Survey) -> ControlPoints | None:
         position_in_geo=position,
         root_information=root_information(of_survey + _mark_covariance(scene, rays, position)),
     )
+
+
+def distances_of(scene: Scene, survey: Survey, *, use: Literal["control", "check"] = "control") -> Distances | None:
+    """Return the distances of a use whose ends have marks in two or more registered images; None: there is none."""
+    wanted = [distance for distance in survey.distances if distance.use == use]
+    rays = mark_rays([end for distance in wanted for end in distance.ends], scene.sparse)
+    whole: BoolArray = np.asarray((rays.marks_of_point.reshape(-1, 2) >= 2).all(axis=1))
+    if not whole.any():
+        return None
+    rays = rays.of_points(np.repeat(whole, 2))
+    wanted = [distance for distance, is_whole in zip(wanted, whole, strict=True) if is_whole]
+    measured_m = np.array([distance.distance_m for distance in wanted])
+    exact = Distances(
+        name=tuple(distance.name for distance in wanted),
+        point=rays.point,
+        camera=rays.camera,
+        bearing_in_cam=rays.bearing_in_cam,
+        sigma_rad=rays.sigma_rad,
+        bearing_by_lens=scene.sparse.lenses.bearing_jacobian(rays.camera, rays.xy_px),
+        distance_m=measured_m,
+        root_information=np.ones((len(wanted), 1, 1)),
+    )
+    sfm = At(
+        scene.poses.cam_from_model,
+        scene.poses.cam_center_in_model,
+        scene.geo_from_model,
+        np.zeros(exact.bearing_by_lens.shape[2]),
+        SystematicErrors(),
+        np.zeros(0),
+        np.tile(np.eye(3), (len(scene.poses.cam_from_model), 1, 1)),
+    )
+    place = exact.places(sfm)
+    apart = place[::2] - place[1::2]
+    along = apart / np.linalg.norm(apart, axis=1, keepdims=True)
+    of_marks = _mark_covariance(scene, rays, place).reshape(-1, 2, 3, 3).sum(axis=1)
+    variance = np.einsum("di,dij,dj->d", along, of_marks, along)
+    variance += np.array([distance.sigma_m for distance in wanted]) ** 2
+    return replace(exact, root_information=variance[:, None, None] ** -0.5)
 
 
 def attitudes_of(scene: Scene, survey: Survey) -> Attitudes | None:

@@ -92,6 +92,20 @@ class Posterior:
         joint = self.normal.covariance(*self._derivatives(jacobian)) + self._second_order(point_in_geo)
         return np.asarray(joint + block_diag(*self._cov_of_marks(jacobian)))
 
+    def of_distances(self, point_in_geo: FloatArray, rays: MarkRays) -> FloatArray:
+        """Return the variances (D,) in m² of the distances between marked points 2 i and 2 i + 1 of (2 D, 3).
+
+        A rotation of the whole changes no distance, whatever its size: there is no second-order part.
+        """
+        jacobian = self._jacobian(point_in_geo, rays.point, rays.camera, rays.sigma_px)
+        apart = (point_in_geo[::2] - point_in_geo[1::2])[:, None, :]
+        along = apart / np.linalg.norm(apart, axis=2, keepdims=True)
+        slope = block_diag(*np.concatenate([along, -along], axis=2))
+        by_poses, by_border = self._derivatives(jacobian)
+        across = self.normal.covariances(csr_matrix(slope @ by_poses), slope @ by_border, 1)[:, 0, 0]
+        of_marks = self._cov_of_marks(jacobian).reshape(-1, 2, 3, 3).sum(axis=1)
+        return np.asarray(across + (along @ of_marks @ np.swapaxes(along, 1, 2))[:, 0, 0])
+
     def of_scene(self, point_in_geo: FloatArray, point: IntArray, camera: IntArray) -> FloatArray:
         """Return the covariance (J, 3, 3) in m² of points (J, 3) of the scene, without errors of marks.
 

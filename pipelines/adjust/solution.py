@@ -10,7 +10,7 @@ from pipelines.adjust.accuracy_grid import accuracy_grid
 from pipelines.adjust.posterior import Posterior, camera_covariances, load_posterior
 from pipelines.adjust.state import State
 from pipelines.adjust.system import Linearised, NormalMatrix, Problem, linearised, posterior_weights, robust_weights
-from pipelines.adjust.terms import At, Attitudes, ControlPoints, Fixes
+from pipelines.adjust.terms import At, Attitudes, ControlPoints, Distances, Fixes
 from pipelines.core.products import union
 from pipelines.core.stages import SIM3_POSTERIOR, TRAIN_POSTERIOR
 from pipelines.core.workspace import Workspace
@@ -22,7 +22,7 @@ from pipelines.survey.report import AccuracySummary
 from pipelines.survey.scene import Scene
 from pipelines.survey.trained_model import Adjustment, Measurement, TrainedCamera, TrainedLens, TrainedModel
 
-Named = Fixes | ControlPoints | Attitudes
+Named = Fixes | ControlPoints | Distances | Attitudes
 _OPEN = 1e-9  # redundancy below which the other observations leave a direction open
 _REJECTED = "is inconsistent with the others at the 99.9 % level"
 
@@ -96,9 +96,10 @@ def _cameras(scene: Scene, poses: CameraPoses) -> tuple[TrainedCamera, ...]:
     )
 
 
-_KINDS: dict[str, Literal["fix", "control point", "attitude"]] = {
+_KINDS: dict[str, Literal["fix", "control point", "distance", "attitude"]] = {
     Fixes.kind: "fix",
     ControlPoints.kind: "control point",
+    Distances.kind: "distance",
     Attitudes.kind: "attitude",
 }
 

@@ -164,8 +164,9 @@ class NormalMatrix:
         size = np.linalg.svd(scaled, compute_uv=False)
         if size[-1] <= _OPEN * size[0]:
             raise DegenerateGeometryError("similarity-open", _ADVICE)
-        factors = lu_factor(scaled)
-        return lambda right: np.asarray(lu_solve(factors, right * scale[:, None]) * scale[:, None])
+        lu, pivots = lu_factor(scaled)
+        # SciPy counts the pivots up and down in place: threads that share them would damage memory.
+        return lambda right: np.asarray(lu_solve((lu, pivots.copy()), right * scale[:, None]) * scale[:, None])
 
     def solve(self, poses: FloatArray, border: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the unknowns (6 n, m) and (b, m) for right sides of the same shapes."""

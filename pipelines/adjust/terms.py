@@ -113,10 +113,10 @@ class Fixes(Term):
 
 
 @dataclass(frozen=True)
-class ControlPoints(Term):
-    """Control points against the intersections of their image marks: the term L_gcp; J points, K marks in all."""
+class MarkedTerm(Term):
+    """Observations of J points that are the intersections of their image marks, K in all."""
 
-    kind: ClassVar[str] = "control points"
+    per_observation: ClassVar[int] = 1  # points, in their order
 
     name: tuple[str, ...]
     point: IntArray  # (K,) index into the points
@@ -124,20 +124,22 @@ class ControlPoints(Term):
     bearing_in_cam: FloatArray  # (K, 3) unit vectors
     sigma_rad: FloatArray  # (K,) angular σ of a mark
     bearing_by_lens: FloatArray  # (K, 3, L) derivative of the bearings by the lens parameters
-    position_in_geo: FloatArray  # (J, 3) metres, surveyed
-    root_information: FloatArray  # (J, 3, 3) of survey and intersection together, in 1/m
 
-    def residuals(self, at: At) -> FloatArray:
-        """Return S(x_j) − X_j (J, 3) in metres, with x_j the intersection of the marks of point j."""
-        return at.geo_from_model.apply(self._intersected(at)[0]) - self.position_in_geo
+    def places(self, at: At) -> FloatArray:
+        """Return the points (J, 3) in metres of geo."""
+        return at.geo_from_model.apply(self._intersected(at)[0])
 
-    def slopes(self, at: At) -> Slopes:
+    def place_slopes(self, at: At) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the points (J, 3) in geo, and derivatives (K, 3, 6) by each mark's pose and (K, 3, L) by the lens.
+
+        A point's derivative by the lens is the sum over its marks.
+        """
         position, weight, direction, bearing_scale = self._intersected(at)
         arm = position[self.point] - at.center[self.camera]
         along = np.einsum("ki,ki->k", direction, arm)
         across = arm - along[:, None] * direction
         projector = _projector(direction)
-        normal = np.zeros((len(self), 3, 3))
+        normal = np.zeros((len(position), 3, 3))
         np.add.at(normal, self.point, weight[:, None, None] * projector)
         # N dx = Σ w (P dc − dP (x − c)), and −dP (x − c) = (ρ I + d eᵀ) dd with x − c = ρ d + e.
         by_center = np.linalg.solve(normal, np.eye(3))[self.point] * weight[:, None, None]
@@ -146,13 +148,10 @@ class ControlPoints(Term):
         by_turn = by_direction @ -skew(direction) @ at.turn_by_correction[self.camera]
         by_pose = to_geo @ np.concatenate([by_turn, by_center @ projector], axis=2)
         turn = np.swapaxes(at.cam_from_model[self.camera], 1, 2)
-        by_bearing = to_geo @ by_direction @ projector @ turn @ self.bearing_by_lens / bearing_scale[:, None, None]
-        by_lens = np.zeros((len(self), 3, len(at.lens)))
+        by_lens = np.zeros((len(self.point), 3, len(at.lens)))
         if len(at.lens):
-            np.add.at(by_lens, self.point, by_bearing)
-        by_errors = np.zeros((len(self), 3, len(at.vector)))
-        residual = at.geo_from_model.apply(position) - self.position_in_geo
-        return Slopes(residual, self.point, self.camera, by_pose, by_lens, by_errors)
+            by_lens = to_geo @ by_direction @ projector @ turn @ self.bearing_by_lens / bearing_scale[:, None, None]
+        return at.geo_from_model.apply(position), by_pose, by_lens
 
     def _intersected(self, at: At) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Return the points (J, 3) in `model` nearest to the rays of their marks, with weights and directions (K).
@@ -167,15 +166,69 @@ class ControlPoints(Term):
         center = at.center[self.camera]
         direction = np.einsum("kji,kj->ki", at.cam_from_model[self.camera], bearing / length[:, None])
         projector = _projector(direction)
-        position, weight = np.zeros((len(self), 3)), np.asarray(1.0 / self.sigma_rad**2)
+        count = self.per_observation * len(self)
+        position, weight = np.zeros((count, 3)), np.asarray(1.0 / self.sigma_rad**2)
         for _ in range(2):  # the first pass gives the distances, and so the weights
-            normal, right = np.zeros((len(self), 3, 3)), np.zeros((len(self), 3))
+            normal, right = np.zeros((count, 3, 3)), np.zeros((count, 3))
             np.add.at(normal, self.point, weight[:, None, None] * projector)
             np.add.at(right, self.point, weight[:, None] * np.einsum("kij,kj->ki", projector, center))
             position = np.asarray(np.linalg.solve(normal, right[:, :, None])[:, :, 0])
             distance = np.linalg.norm(position[self.point] - center, axis=1)
             weight = 1.0 / (self.sigma_rad * distance) ** 2
         return position, weight, direction, length
+
+
+@dataclass(frozen=True)
+class ControlPoints(MarkedTerm):
+    """Control points against the intersections of their image marks: the term L_gcp."""
+
+    kind: ClassVar[str] = "control points"
+
+    position_in_geo: FloatArray  # (J, 3) metres, surveyed
+    root_information: FloatArray  # (J, 3, 3) of survey and intersection together, in 1/m
+
+    def residuals(self, at: At) -> FloatArray:
+        """Return S(x_j) − X_j (J, 3) in metres, with x_j the intersection of the marks of point j."""
+        return self.places(at) - self.position_in_geo
+
+    def slopes(self, at: At) -> Slopes:
+        place, by_pose, by_lens_of_mark = self.place_slopes(at)
+        by_lens = np.zeros((len(self), 3, len(at.lens)))
+        np.add.at(by_lens, self.point, by_lens_of_mark)
+        by_errors = np.zeros((len(self), 3, len(at.vector)))
+        return Slopes(place - self.position_in_geo, self.point, self.camera, by_pose, by_lens, by_errors)
+
+
+@dataclass(frozen=True)
+class Distances(MarkedTerm):
+    """Measured distances between marked points, such as of scale bars: D, between points 2 i and 2 i + 1."""
+
+    kind: ClassVar[str] = "distances"
+    dimension: ClassVar[int] = 1
+    per_observation: ClassVar[int] = 2
+
+    distance_m: FloatArray  # (D,) measured
+    root_information: FloatArray  # (D, 1, 1) of measurement and intersections together, in 1/m
+
+    def residuals(self, at: At) -> FloatArray:
+        """Return |S(x_a) − S(x_b)| − d (D, 1) in metres."""
+        return self._compared(self.places(at))[0]
+
+    def slopes(self, at: At) -> Slopes:
+        place, by_pose, by_lens_of_mark = self.place_slopes(at)
+        residual, along = self._compared(place)
+        row, sign = np.divmod(self.point, 2)
+        onto = (np.where(sign == 0, 1.0, -1.0)[:, None] * along[row])[:, None, :]
+        by_lens = np.zeros((len(self), 1, len(at.lens)))
+        np.add.at(by_lens, row, onto @ by_lens_of_mark)
+        by_errors = np.zeros((len(self), 1, len(at.vector)))
+        return Slopes(residual, row, self.camera, onto @ by_pose, by_lens, by_errors)
+
+    def _compared(self, place: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the residuals (D, 1) of points (2 D, 3), and the unit vectors (D, 3) between them."""
+        apart = place[::2] - place[1::2]
+        length = np.linalg.norm(apart, axis=1, keepdims=True)
+        return length - self.distance_m[:, None], apart / length
 
 
 @dataclass(frozen=True)

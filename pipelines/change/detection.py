@@ -1,8 +1,9 @@
 """Noise, level of detection and significance of a difference of heights, and the σ of volumes.
 
-Two kinds of error stay apart. That of the datum is common to all cells of a region: a volume takes all of it. That
-of the cells is correlated over a short length, which the unchanged ground shows: a volume takes the part that an
-effective number of independent cells leaves (Rolstad et al. 2009, doi:10.3189/002214309789470950).
+Three kinds of error stay apart. That of the datum is common to all cells of a region: a volume takes all of it.
+That of the cells is correlated over a short length, which the unchanged ground shows: a volume takes the part that
+an effective number of independent cells leaves (Rolstad et al. 2009, doi:10.3189/002214309789470950). That of a
+height step is the place of a wall within its neighbourhood, common to the cells along the wall.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import label, uniform_filter
 
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import BoolArray, FloatArray
@@ -29,6 +30,7 @@ _UNCORRELATED = 0.05
 _BLOCKS = 6  # along a side, whose medians show errors of long range
 _LEAST_IN_BLOCK = 50
 _MAJORITY = 0.5  # of the neighbours that change in the same way
+_LEAST_VOTERS = 0.1  # of the neighbours
 _FLOOR_M2 = 1e-8
 
 
@@ -41,12 +43,22 @@ class Cells:
         variance_m2: of the errors by cell.
         datum_m: σ of the error that neighbours share.
         slope: (…, 2) of the earlier surface, east and north.
+        step_m2: variance of cells beside height steps and of interpolated ones; 0: others.
+        is_measured: whether both epochs have measured the cell; else one of them has interpolated it.
     """
 
     difference_m: FloatArray
     variance_m2: FloatArray
     datum_m: FloatArray
     slope: FloatArray
+    step_m2: FloatArray
+    is_measured: BoolArray
+
+    @property
+    def is_certain(self) -> BoolArray:
+        """Whether (…,) a cell tells a change by itself: it is measured, and no step near it decides its error."""
+        known = np.isfinite(self.difference_m) & self.is_measured
+        return np.asarray(known & (self.step_m2 <= self.variance_m2))
 
 
 @dataclass(frozen=True)
@@ -107,7 +119,7 @@ def unchanged_ground(samples: Samples, cell_m: float, prior_h_m: float, *, with_
         DegenerateGeometryError: too little ground is left.
     """
     cells = samples.cells
-    ground = (np.linalg.norm(cells.slope, axis=1) < STEEPEST) & np.isfinite(cells.difference_m)
+    ground = (np.linalg.norm(cells.slope, axis=1) < STEEPEST) & cells.is_certain
     design = _design(cells.slope, samples.place_m, with_tilt=with_tilt)
     difference, sigma = cells.difference_m, np.sqrt(cells.variance_m2)
     prior = np.zeros(design.shape[1])
@@ -208,36 +220,46 @@ def _long_range(place_m: FloatArray, residual_m: FloatArray, correlated_m2: floa
 
 
 def level_of_detection(cells: Cells, factor: float) -> FloatArray:
-    """Return the 95 % level of detection of cells: of the datum and of the cell."""
-    return np.asarray(QUANTILE_95 * np.sqrt(cells.datum_m**2 + np.maximum(factor * cells.variance_m2, _FLOOR_M2)))
+    """Return the 95 % level of detection of cells: of the datum, of the cell and of a height step beside it."""
+    noise_m2 = np.maximum(factor * cells.variance_m2, _FLOOR_M2)
+    return np.asarray(QUANTILE_95 * np.sqrt(cells.datum_m**2 + noise_m2 + cells.step_m2))
 
 
-def significant_change(difference_m: FloatArray, lod_m: FloatArray, reach: int) -> NDArray[np.int8]:
-    """Return −1 lowered, 1 raised, 0 neither (H, W): beyond the level of detection, as most known neighbours are.
+def significant_change(cells: Cells, factor: float, reach: int) -> NDArray[np.int8]:
+    """Return −1 lowered, 1 raised, 0 neither (H, W): beyond the level of detection, as most certain neighbours are.
 
     Neighbours lie within `reach` cells. One cell in twenty is beyond its level by chance; half of its neighbours
-    hardly ever are.
+    hardly ever are. Cells beside a height step have no vote: they follow their neighbours, if they differ too.
+    Interpolated cells have neither.
     """
-    known = np.isfinite(difference_m) & np.isfinite(lod_m)
+    certain = cells.is_certain
+    noise_m = QUANTILE_95 * np.sqrt(cells.datum_m**2 + np.maximum(factor * cells.variance_m2, _FLOOR_M2))
+    level, noise = np.nan_to_num(level_of_detection(cells, factor), nan=np.inf), np.nan_to_num(noise_m, nan=np.inf)
     size = 2 * reach + 1
-    around = np.maximum(uniform_filter(known.astype(np.float32), size, mode="constant"), 1e-6)
-    sign = np.zeros(difference_m.shape, dtype=np.int8)
+    voters = uniform_filter(certain.astype(np.float32), size, mode="constant")
+    sign = np.zeros(certain.shape, dtype=np.int8)
     for direction in (-1, 1):
-        beyond: BoolArray = known & (direction * np.nan_to_num(difference_m) > np.nan_to_num(lod_m, nan=np.inf))
-        share = uniform_filter(beyond.astype(np.float32), size, mode="constant") / around
-        sign[known & (share > _MAJORITY)] = direction
+        change = direction * np.nan_to_num(cells.difference_m)
+        beyond: BoolArray = certain & (change > level)
+        share = uniform_filter(beyond.astype(np.float32), size, mode="constant") / np.maximum(voters, 1e-6)
+        may = certain | (cells.is_measured & (change > noise))
+        sign[may & (voters > _LEAST_VOTERS) & (share > _MAJORITY)] = direction
     return sign
 
 
 @dataclass(frozen=True)
 class Volume:
-    """Sums over the cells of a region, from which its volumes follow: all in metres, before the cells' area."""
+    """Sums over the cells of a region, from which its volumes follow: all in metres, before the cells' area.
+
+    `steps` is the variance of the sum that the places of walls and the interpolated parts leave.
+    """
 
     cells: int = 0
     cut: float = 0.0
     fill: float = 0.0
     datum: float = 0.0
     variance: float = 0.0
+    steps: float = 0.0
     lowest: float = 0.0
     highest: float = 0.0
 
@@ -248,6 +270,7 @@ class Volume:
             self.fill + other.fill,
             self.datum + other.datum,
             self.variance + other.variance,
+            self.steps + other.steps,
             min(self.lowest, other.lowest),
             max(self.highest, other.highest),
         )
@@ -255,17 +278,25 @@ class Volume:
     def sigma_m3(self, noise: Noise, cell_m2: float) -> float:
         """Return the σ of the net volume: the datum's in full, and of the cells by their number that counts."""
         joined = min(max(noise.correlated_m2 / cell_m2, 1.0), max(self.cells, 1))
-        return float(cell_m2 * np.sqrt(self.datum**2 + noise.factor * self.variance * joined))
+        return float(cell_m2 * np.sqrt(self.datum**2 + noise.factor * self.variance * joined + self.steps))
 
 
 def volumes(number: NDArray[Any], cells: Cells, count: int) -> list[Volume]:
-    """Return the sums of regions 1 … `count`, by the number (H, W) of each cell; 0: no region."""
+    """Return the sums of regions 1 … `count`, by the number (H, W) of each cell; 0: no region.
+
+    A wall lies in the neighbourhood of the cells on both of its sides: its error in a volume is half their sum, and
+    one along a connected row of such cells.
+    """
     known = (number > 0) & np.isfinite(cells.difference_m)
     of, difference = number[known], cells.difference_m[known]
 
     def total(values: FloatArray) -> FloatArray:
         return np.asarray(np.bincount(of, values, count + 1)[1:], dtype=np.float64)
 
+    wall, walls = label(known & (cells.step_m2 > 0), structure=np.ones((3, 3)), output=np.int32)
+    pair, member = np.unique(of.astype(np.int64) * (walls + 1) + wall[known], return_inverse=True)
+    moved = np.bincount(member, np.sqrt(cells.step_m2[known]), len(pair)) / 2
+    steps = np.bincount(pair // (walls + 1), moved**2, count + 1)[1:]
     low, high = np.zeros(count + 1), np.zeros(count + 1)
     np.minimum.at(low, of, difference)
     np.maximum.at(high, of, difference)
@@ -275,6 +306,7 @@ def volumes(number: NDArray[Any], cells: Cells, count: int) -> list[Volume]:
         total(np.maximum(difference, 0.0)),
         total(cells.datum_m[known]),
         total(cells.variance_m2[known]),
+        steps,
         low[1:],
         high[1:],
     )

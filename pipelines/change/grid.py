@@ -1,14 +1,19 @@
-"""Rasters of both epochs on one grid, in windows: difference, its variance, and the σ of the datum."""
+"""Rasters of both epochs on one grid, in windows: difference, its variance, and the σ of the datum.
+
+The height of a cell beside a wall is that of either side, by a small error in the plan. Its error is therefore as
+large as the relief of its neighbourhood, and so is that of a cell whose height is interpolated between a roof and
+the ground. Such cells have a variance of their own (`step_variance`).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import label, map_coordinates, maximum, maximum_filter, minimum, minimum_filter
 
 from pipelines.change.datum import Epoch, Shared
 from pipelines.change.detection import LAGS, STEEPEST, Cells, Samples
@@ -28,6 +33,9 @@ _SAMPLES = 400_000
 _PAIRS = 40_000  # of each distance
 _FINER = 1.5  # cells of the other raster in one of the grid, from which they are averaged
 _SEED = 20260101
+_MARGIN = 24  # cells around a window, in which an interpolated part is seen whole
+_MOST_REACH = 4  # cells, of an error in the plan
+_NOISE_RANGE = 6.0  # σ between the highest and the lowest of a neighbourhood of level cells, at most
 
 
 @dataclass(frozen=True)
@@ -71,6 +79,11 @@ class Window:
     row: int
     columns: int
     rows: int
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Rows and columns of the grid."""
+        return slice(self.row, self.row + self.rows), slice(self.column, self.column + self.columns)
 
 
 class CommonGrid:
@@ -153,35 +166,41 @@ class CommonGrid:
         return np.stack(np.meshgrid(x, y), axis=-1) * self.unit_m
 
     def heights_m(self, window: Window) -> tuple[FloatArray, FloatArray]:
-        """Return the heights (H, W) of both epochs, where both are measured; NaN elsewhere."""
+        """Return the heights (H, W) of both epochs, where both have some, measured or not; NaN elsewhere."""
         frame = self.part(window)
         heights = [self._read(one, one.names[0], frame) * one.unit_m for one in self.rasters]
-        known = np.isfinite(heights[0]) & np.isfinite(heights[1]) & self._counts(frame)
+        known = np.isfinite(heights[0]) & np.isfinite(heights[1])
+        if self._inside is not None:
+            known &= cells_inside(self._inside, frame)
         return np.where(known, heights[0], np.nan), np.where(known, heights[1], np.nan)
 
     def cells(self, window: Window) -> Cells:
         """Return the cells of a window, before any registration."""
-        wide, own = self.around(window, 1)
-        before, after = self.heights_m(wide)
-        # On the rim of what is known, the slope is not: such a cell counts as steep.
-        slope, later = (
-            np.where(np.isfinite(one), one, 2 * STEEPEST)[own] for one in map(self._slope, (before, after))
-        )
-        before, after = before[own], after[own]
-        frame = self.part(window)
-        # Either surface may have an edge here.
-        square = np.maximum(np.sum(slope**2, axis=-1), np.sum(later**2, axis=-1))
-        variance = np.zeros(before.shape)
-        horizontal = self._between(self._node_h, window)
-        for one, node in zip(self.rasters, self._node_variance, strict=True):
-            sigma = self._read(one, one.names[1], frame)
-            georeference = self._between(node, window)
-            variance += np.maximum(np.nan_to_num(sigma**2 - georeference), 0.0)
-            # An edge lies somewhere in its cell.
+        wide, own = self.around(window, _MARGIN)
+        heights = self.heights_m(wide)
+        reach = int(np.clip(np.ceil(2 * self.datum_h_m / self.cell_m), 1, _MOST_REACH))
+        variance, step = np.zeros(heights[0][own].shape), np.zeros(heights[0][own].shape)
+        slopes, both = [], np.ones(step.shape, dtype=bool)
+        for one, node, height in zip(self.rasters, self._node_variance, heights, strict=True):
+            sigma = self._read(one, one.names[1], self.part(wide))
+            noise = np.maximum(np.nan_to_num(sigma**2 - self._between(node, wide)), 0.0)
+            measured = self._measured(one, self.part(wide))
+            beside = step_variance(height, measured, np.where(measured, np.sqrt(noise), 0.0), self.cell_m, reach)
+            # The σ of an interpolated cell is that of its interpolation.
+            step = np.maximum(step, np.where(measured, beside, np.maximum(beside, noise))[own])
+            variance += np.where(measured, noise, 0.0)[own]
+            both &= measured[own]
+            # On the rim of what is known, the slope is not: such a cell counts as steep.
+            slope = self._slope(height)[own]
+            slopes.append(np.where(np.isfinite(slope), slope, 2 * STEEPEST))
+        # Either surface may be steep here. What is steeper yet is a step.
+        square = np.minimum(np.maximum(*(np.sum(slope**2, axis=-1) for slope in slopes)), STEEPEST**2)
+        for one in self.rasters:  # A height lies somewhere in its cell.
             variance += square * one.frame.step_x * one.frame.step_y * self.unit_m**2 / 12
-        variance += square * horizontal + (0.1 * self.cell_m) ** 2
-        datum = self._between(self._node_datum, window)
-        return Cells(after - before, variance, np.where(np.isfinite(after), datum, np.nan), slope)
+        variance += square * self._between(self._node_h, window) + (0.1 * self.cell_m) ** 2
+        difference = (heights[1] - heights[0])[own]
+        datum = np.where(np.isfinite(difference), self._between(self._node_datum, window), np.nan)
+        return Cells(difference, variance, datum, slopes[0], step, both)
 
     def _slope(self, height_m: FloatArray) -> FloatArray:
         if min(height_m.shape) < 2:
@@ -201,24 +220,24 @@ class CommonGrid:
         with progress.task("samples", len(windows)) as task:
             for window in windows:
                 cells, place = self.cells(window), self.place_m(window)
-                counts = np.isfinite(cells.difference_m)
+                counts = cells.is_certain
                 if stable is not None:
                     counts &= cells_inside(stable, self.part(window))
                 flat = counts & (np.linalg.norm(cells.slope, axis=-1) < STEEPEST)
                 index = np.flatnonzero(counts)
                 index = rng.choice(index, min(each, len(index)), replace=False)
                 row, column = np.unravel_index(index, counts.shape)
-                columns = (cells.difference_m, cells.variance_m2, cells.datum_m, cells.slope, place)
-                found.append(tuple(values[row, column] for values in columns))
+                columns = [getattr(cells, one.name) for one in fields(cells)]
+                found.append(tuple(values[row, column] for values in (*columns, place)))
                 for lag in LAGS:
                     one, two = _paired(flat, lag, each_pair, rng)
                     if len(one[0]):
                         pairs[lag].append(np.stack([_normalised(cells, one), _normalised(cells, two)], axis=1))
                         designs[lag].append(np.stack([_row(cells, place, one), _row(cells, place, two)], axis=1))
                 task.advance()
-        difference, variance, datum, slope, places = (np.concatenate(part) for part in zip(*found, strict=True))
+        *columns, places = (np.concatenate(part) for part in zip(*found, strict=True))
         return Samples(
-            Cells(difference, variance, datum, slope),
+            Cells(*columns),
             places,
             {lag: np.concatenate(part) for lag, part in pairs.items() if part},
             {lag: np.concatenate(part) for lag, part in designs.items() if part},
@@ -228,18 +247,50 @@ class CommonGrid:
         finer = frame.step_x / one.frame.step_x
         return read_onto(one.folder / name, frame, "average" if finer > _FINER else "bilinear")
 
-    def _counts(self, frame: RasterFrame) -> BoolArray:
-        """Return which cells are measured in both, of a surface, and lie in the area."""
-        counts = np.ones((frame.rows, frame.columns), dtype=bool)
-        for one in self.rasters:
-            if one.of == "surface":
-                counts &= read_onto(one.folder / "measured.tif", frame, "nearest") == MEASURED
-        return counts if self._inside is None else counts & cells_inside(self._inside, frame)
+    def _measured(self, one: EpochRasters, frame: RasterFrame) -> BoolArray:
+        """Return which cells an epoch has measured; of the ground below a surface, all count."""
+        if one.of == "terrain":
+            return np.ones((frame.rows, frame.columns), dtype=bool)
+        return np.asarray(read_onto(one.folder / "measured.tif", frame, "nearest") == MEASURED)
 
     def _between(self, nodes: FloatArray, window: Window) -> FloatArray:
         row = (window.row + np.arange(window.rows) + 0.5) / self._steps[0]
         column = (window.column + np.arange(window.columns) + 0.5) / self._steps[1]
         return np.asarray(map_coordinates(nodes, np.meshgrid(row, column, indexing="ij"), order=1, mode="nearest"))
+
+
+def step_variance(
+    height_m: FloatArray, measured: BoolArray, sigma_m: FloatArray, cell_m: float, reach: int
+) -> FloatArray:
+    """Return the variance (H, W) in m² of heights beside steps, and of interpolated ones; 0: elsewhere.
+
+    An error of up to `reach` cells in the plan changes a height by any value up to the relief of its neighbourhood:
+    the variance is that of the uniform distribution. What the slope and the noise explain is no relief. The
+    neighbourhood of an interpolated cell is the connected part with its rim.
+
+    Args:
+        height_m: (H, W); NaN: not known.
+        measured: (H, W) whether the height is; else it is interpolated.
+        sigma_m: (H, W) noise of the heights.
+    """
+    known = np.isfinite(height_m)
+    low, high = np.where(known, height_m, np.inf), np.where(known, height_m, -np.inf)
+    size = 2 * reach + 1
+    relief = maximum_filter(high, size) - minimum_filter(low, size)
+    # Along an axis, a slope explains what both neighbours agree on; beyond 45° it is a step.
+    explained = np.zeros(height_m.shape)
+    for axis in (0, 1):
+        rise = np.diff(height_m, axis=axis, prepend=np.nan), np.diff(height_m, axis=axis, append=np.nan)
+        least = np.minimum(*np.abs(np.nan_to_num(rise)))
+        explained += np.where(rise[0] * rise[1] > 0, np.minimum(least, STEEPEST * cell_m), 0.0)
+    relief = np.maximum(relief - 2 * reach * explained - _NOISE_RANGE * sigma_m, 0.0)
+    hole, count = label(known & ~measured, structure=np.ones((3, 3)), output=np.int32)
+    if count:
+        numbers = np.arange(count + 1)
+        highest = np.asarray(maximum(maximum_filter(high, 3), hole, numbers))
+        lowest = np.asarray(minimum(minimum_filter(low, 3), hole, numbers))
+        relief = np.where(hole > 0, np.maximum(highest - lowest, 2 * cell_m)[hole], relief)
+    return np.asarray(np.where(known, np.nan_to_num(relief, posinf=0.0, neginf=0.0) ** 2 / 3, 0.0))
 
 
 def _common_frame(before: EpochRasters, after: EpochRasters) -> RasterFrame:

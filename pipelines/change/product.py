@@ -84,14 +84,25 @@ class ChangedRegion(Product):
 
 
 class Change(Product):
-    """Change between two epochs; `shared_sigma_v_m` is of the vertical error that both have in common."""
+    """Change between two epochs.
 
-    format_version: Literal[1] = 1
+    Attributes:
+        shared_sigma_v_m: σ of the vertical error that both have in common.
+        median_lod_m: level of detection of the cells that both have measured.
+        significant_share: of all cells.
+        lowered, raised, found: sums of the found regions that lost, that gained, and of all.
+    """
+
+    format_version: Literal[2] = 2
     of: Literal["surface", "terrain"]
     crs: str
     cell_m: float
     registration: Registration
     shared_control_points: tuple[str, ...]
     shared_sigma_v_m: float
+    median_lod_m: float
     significant_share: float
+    lowered: ChangedRegion
+    raised: ChangedRegion
+    found: ChangedRegion
     regions: tuple[ChangedRegion, ...]

@@ -1,48 +1,54 @@
 """Stage `change`: what differs between the rasters of two epochs, by how much, and whether it is real.
 
 Reads the rasters, surveys and adjustments of both workspaces. Writes `change/` in the later one: `difference.tif`,
-`sigma.tif`, `lod.tif`, `significant.tif`, `regions.geojson`, `regions.gpkg`, `regions.csv` and `change.json`.
+`sigma.tif`, `lod.tif`, `significant.tif`, `regions.geojson`, `regions.gpkg`, `regions.csv`, `change.json` and the
+page `change.html`.
 """
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation, find_objects, label
 
 from pipelines.change.datum import load_epoch, shared_by
 from pipelines.change.detection import (
     QUANTILE_95,
     Cells,
     Noise,
-    Volume,
     level_of_detection,
     significant_change,
     unchanged_ground,
-    volumes,
 )
 from pipelines.change.grid import CommonGrid, Window, epoch_rasters
 from pipelines.change.options import ChangeOptions
+from pipelines.change.page import Compared, change_page
 from pipelines.change.product import Change, ChangedRegion, Registration
+from pipelines.change.regions import Parts, find_regions, reach_of
 from pipelines.core.errors import InputError
 from pipelines.core.files import remove, replace_text
 from pipelines.core.products import Remark, save_json, union
+from pipelines.core.stages import CHANGE_PAGE
 from pipelines.core.workspace import StageRun, Summary, Workspace
-from pipelines.formats.geotiff import Band, RasterKind, cells_inside, outlines, read_cells, write_mosaic, write_part
+from pipelines.formats.geotiff import Band, RasterKind, read_cells, write_mosaic
 from pipelines.formats.tables import table_text
 from pipelines.formats.vector_files import feature, features_text, read_boundary, write_polygons_gpkg
 from pipelines.geodesy.crs import PointCrs, parse_crs
+from pipelines.report.page import render_page
 
-LOWERED, UNCHANGED, RAISED = 2, 1, 3  # in significant.tif; 0: not known
+_ROOM = __name__.rpartition(".")[0]
+_MOST_LEVELS = 1_000_000  # of detection, whose median is stated
+LOWERED, UNCHANGED, RAISED = 2, 1, 3  # in significant.tif; 0: not measured in both
 _KINDS = {
     "difference": RasterKind("float32", (Band("later minus earlier height", "metre"),)),
     "sigma": RasterKind("float32", (Band("standard deviation of the difference", "metre"),)),
     "lod": RasterKind("float32", (Band("level of detection at 95 %", "metre"),)),
-    "significant": RasterKind("uint8", (Band("1 no significant change, 2 lowered, 3 raised; 0 not known"),)),
+    "significant": RasterKind(
+        "uint8", (Band("1 no significant change, 2 lowered, 3 raised; 0 not measured in both"),)
+    ),
 }
-_LEAST_REACH, _MOST_REACH = 2, 10  # cells
 
 
 def run(stage: StageRun, options: ChangeOptions) -> Summary:
@@ -70,10 +76,11 @@ def run(stage: StageRun, options: ChangeOptions) -> Summary:
         grid.samples(ground, stage.progress), grid.cell_m, grid.datum_h_m, with_tilt=options.tilt
     )
     registration = Registration.of(noise, applied=registered, datum_v_m=grid.datum_v_m)
-    sign = _write_rasters(stage, grid, noise, registered=registered)
+    parts = Parts(stage.out / "parts", grid)
+    sign, median_lod_m = _write_rasters(stage, parts, noise, registered=registered)
     given = _polygons(options.regions, "--regions", crs, options) or ()
-    found = _found(sign, grid, noise, options.min_area)
-    regions, polygons = _regions(stage.out / "parts", grid, noise, found, given)
+    found = find_regions(parts, sign, noise, given, options.min_area)
+    _write_significant(stage.out, parts, found.sign)
     change = Change(
         of=options.of,
         crs=after.sidecar.crs,
@@ -81,13 +88,22 @@ def run(stage: StageRun, options: ChangeOptions) -> Summary:
         registration=registration,
         shared_control_points=shared.control,
         shared_sigma_v_m=float(np.sqrt(shared.by_control_m2[2] + shared.by_base_m2[2])),
-        significant_share=float((sign != 0).mean()),
-        regions=regions,
+        median_lod_m=median_lod_m,
+        significant_share=float((found.sign != 0).mean()),
+        lowered=found.lowered,
+        raised=found.raised,
+        found=found.every,
+        regions=found.regions,
     )
     save_json(change, stage.out / "change.json")
-    _write_vectors(stage.out, change, polygons, grid)
-    remove(stage.out / "parts")
-    return _summary(change, union(*(one.cautions for one in epochs)))
+    _write_vectors(stage.out, change, found.polygons, grid)
+    remove(parts.folder)
+    cautions = tuple(one.cautions for one in epochs)
+    summary = _summary(change, union(*cautions))
+    compared = Compared(stage.out, change, found.polygons, grid, workspaces)
+    page = change_page(compared, summary.warnings, cautions, stage.progress)
+    replace_text(stage.out / Path(CHANGE_PAGE).name, render_page(page, _ROOM))
+    return summary
 
 
 def _summary(change: Change, cautions: tuple[Remark, ...]) -> Summary:
@@ -137,111 +153,58 @@ def _polygons(path: Path | None, field: str, crs: PointCrs, options: ChangeOptio
 def _registered(cells: Cells, grid: CommonGrid, window: Window, noise: Noise, *, registered: bool) -> Cells:
     """Return cells after the registration, with the σ that their neighbours share."""
     if not registered:
-        return Cells(
-            cells.difference_m, cells.variance_m2, np.maximum(cells.datum_m, noise.long_range_m), cells.slope
-        )
+        return replace(cells, datum_m=np.maximum(cells.datum_m, noise.long_range_m))
     moved = noise.moved_by(cells.slope, grid.place_m(window))
     datum = np.hypot(np.sqrt(noise.shift_cov_m2[2, 2]), noise.long_range_m)
-    return Cells(
-        cells.difference_m - moved, cells.variance_m2, np.full(cells.difference_m.shape, datum), cells.slope
-    )
+    return replace(cells, difference_m=cells.difference_m - moved, datum_m=np.full(cells.difference_m.shape, datum))
 
 
-def _reach(grid: CommonGrid, noise: Noise) -> int:
-    return int(np.clip(round(noise.length_m / grid.cell_m), _LEAST_REACH, _MOST_REACH))
-
-
-def _write_rasters(stage: StageRun, grid: CommonGrid, noise: Noise, *, registered: bool) -> NDArray[np.int8]:
-    """Write the rasters, keep their parts, and return the sign of the significant change of all cells."""
-    folder, reach = stage.out / "parts", _reach(grid, noise)
-    folder.mkdir(exist_ok=True)
+def _write_rasters(
+    stage: StageRun, parts: Parts, noise: Noise, *, registered: bool
+) -> tuple[NDArray[np.int8], float]:
+    """Write the rasters, keep their parts, and return the sign of all changes and the median level of detection."""
+    grid, reach = parts.grid, reach_of(parts.grid, noise)
+    parts.folder.mkdir(exist_ok=True)
     sign = np.zeros((grid.frame.rows, grid.frame.columns), dtype=np.int8)
-    windows, parts = list(grid.windows()), []
+    windows, levels = list(grid.windows()), []
     with stage.progress.task("windows", len(windows)) as task:
         for window in windows:
             wide, own = grid.around(window, reach)
             cells = _registered(grid.cells(wide), grid, wide, noise, registered=registered)
             lod = level_of_detection(cells, noise.factor)
-            change = significant_change(cells.difference_m, lod, reach)[own]
-            rows = slice(window.row, window.row + window.rows)
-            sign[rows, window.column : window.column + window.columns] = change
+            sign[window.slices] = significant_change(cells, noise.factor, reach)[own]
             known = np.isfinite(cells.difference_m[own])
-            classes = np.select([~known, change < 0, change > 0], [0, LOWERED, RAISED], UNCHANGED)
             bands = {
                 "difference": cells.difference_m[own],
                 "sigma": np.where(known, lod[own] / QUANTILE_95, np.nan),
                 "lod": np.where(known, lod[own], np.nan),
-                "significant": classes.astype(np.uint8),
                 "datum": np.where(known, cells.datum_m[own], np.nan),
                 "variance": np.where(known, cells.variance_m2[own], np.nan),
+                "step": cells.step_m2[own],
+                "measured": (known & cells.is_measured[own]).astype(np.uint8),
             }
             for name, values in bands.items():
-                write_part(_part(folder, name, window), values[None], grid.part(window))
-            parts.append(window)
+                parts.write(name, window, values)
+            certain = lod[own][cells.is_certain[own]]
+            levels.append(certain[:: max(len(certain) * len(windows) // _MOST_LEVELS, 1)])
             task.advance()
-    for name, kind in _KINDS.items():
-        places = [(_part(folder, name, one), one.column, one.row) for one in parts]
-        write_mosaic(stage.out / f"{name}.tif", places, grid.frame, kind, {})
-    return sign
+    for name in ("difference", "sigma", "lod"):
+        _write_mosaic(stage.out, parts, name)
+    return sign, float(np.median(np.concatenate(levels)))
 
 
-def _part(folder: Path, name: str, window: Window) -> Path:
-    return folder / f"{name}_{window.row}_{window.column}.tif"
+def _write_significant(folder: Path, parts: Parts, sign: NDArray[np.int8]) -> None:
+    for window in parts.grid.windows():
+        change = sign[window.slices]
+        known = read_cells(parts.path("measured", window))[0] > 0
+        classes = np.select([~known, change < 0, change > 0], [0, LOWERED, RAISED], UNCHANGED)
+        parts.write("significant", window, classes.astype(np.uint8))
+    _write_mosaic(folder, parts, "significant")
 
 
-def _found(sign: NDArray[np.int8], grid: CommonGrid, noise: Noise, min_area_m2: float) -> NDArray[np.int32]:
-    """Return the number of the region of each cell, 0 for none: connected, of one sign, not too small.
-
-    A region includes a rim, in which a change fades below the level of detection.
-    """
-    reach = _reach(grid, noise)
-    every = np.zeros(sign.shape, dtype=np.int32)
-    count = 0
-    for direction in (-1, 1):
-        number, parts = label(sign == direction, structure=np.ones((3, 3)), output=np.int32)
-        size = np.bincount(number.ravel(), minlength=parts + 1)
-        kept = size * grid.cell_m2 >= min_area_m2
-        kept[0] = False
-        wide, parts = label(
-            binary_dilation(kept[number], iterations=reach, mask=sign != -direction), output=np.int32
-        )
-        free = (every == 0) & (wide > 0)
-        every[free] = wide[free] + count
-        count += parts
-    return every
-
-
-def _regions(
-    folder: Path, grid: CommonGrid, noise: Noise, found: NDArray[np.int32], given: tuple[Any, ...]
-) -> tuple[tuple[ChangedRegion, ...], list[Any]]:
-    """Return the regions with their volumes, and their polygons: those given first, then those beyond their σ."""
-    count = int(found.max(initial=0))
-    totals, of_given = [Volume() for _ in range(count)], [Volume() for _ in given]
-    for window in grid.windows():
-        difference, datum, variance = (
-            read_cells(_part(folder, name, window))[0].astype(np.float64)
-            for name in ("difference", "datum", "variance")
-        )
-        window_cells = Cells(difference, variance, datum, np.zeros(0))
-        own = found[window.row : window.row + window.rows, window.column : window.column + window.columns]
-        totals = [one + two for one, two in zip(totals, volumes(own, window_cells, count), strict=True)]
-        for place, polygon in enumerate(given):
-            inside = cells_inside(polygon, grid.part(window)).astype(np.int64)
-            of_given[place] += volumes(inside, window_cells, 1)[0]
-    places = find_objects(found)
-    regions, polygons = [], []
-    for number, (volume, polygon) in enumerate(zip(of_given, given, strict=True), start=1):
-        regions.append(ChangedRegion.of(f"P{number}", volume, noise, grid.cell_m2))
-        polygons.append(polygon)
-    for number, volume in enumerate(totals, start=1):
-        region = ChangedRegion.of(f"R{number}", volume, noise, grid.cell_m2)
-        if abs(region.net_m3) > QUANTILE_95 * region.sigma_m3:
-            regions.append(region)
-            rows, columns = places[number - 1]
-            cells = found[rows, columns] == number
-            frame = grid.frame.part(columns.start, rows.start, cells.shape[1], cells.shape[0])
-            polygons.append(shapely.union_all(outlines(cells, frame)))
-    return tuple(regions), polygons
+def _write_mosaic(folder: Path, parts: Parts, name: str) -> None:
+    places = [(parts.path(name, window), window.column, window.row) for window in parts.grid.windows()]
+    write_mosaic(folder / f"{name}.tif", places, parts.grid.frame, _KINDS[name], {})
 
 
 def _write_vectors(folder: Path, change: Change, polygons: list[Any], grid: CommonGrid) -> None:

@@ -17,7 +17,7 @@ EXTRAS: dict[Extra, tuple[str, tuple[str, ...]]] = {
     "simulator": ("georef simulate", ("embreex",)),
     "terrain": ("the ground (dtm.tif, classes of the cloud)", ("cloth-simulation-filter",)),
     "vectors": ("contour lines and boundaries (--contours, --boundary)", ("ezdxf", "pyogrio")),
-    "viewer": ("georef view", ("tornado", "threadpoolctl")),
+    "viewer": ("georef view", ("tornado",)),
 }
 
 

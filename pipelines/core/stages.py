@@ -11,6 +11,7 @@ from pipelines.core.errors import GeorefError
 from pipelines.core.options import StageOptions, listed_names
 
 SURVEY = "ingest/survey.json"
+MASKS = "ingest/masks"  # of the photographs that have one
 TRACK = "ingest/track.npz"  # only for surveys with a trajectory
 SPARSE = "sfm/sparse"
 RIG = "calibrate/rig.json"
@@ -35,6 +36,7 @@ SPZ = "spz/splat.spz"
 TILES = "tiles/tileset.json"
 TILES_GLB = "tiles/splat.glb"
 REPORT_PAGE = "report/report.html"
+CHANGE_PAGE = "change/change.html"
 LIDAR, LIDAR_MAP = "train/lidar.json", "train/lidar.png"  # only of a training with LiDAR
 BLOCK_RECORD = "train/blocks.json"  # only of a model that was trained in blocks
 BLOCK_PLAN = "plan/plan.json"
@@ -85,6 +87,7 @@ PHOTOGRAPHS = ProductPart(
         "images.fix.position_in_geo",
         "images.attitude.quat_xyzw",
         "images.velocity_in_geo",
+        "images.mask_sha256",
     ),
 )
 # The estimates that are applied to the survey when the survey is read, and the navigation that they are applied to.
@@ -166,7 +169,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         options_place="pipelines.ingest.options:IngestOptions",
         reads=(),
         product=SURVEY,
-        working=("images",),
+        working=("images", "masks"),
         product_version=2,  # as `Survey.format_version`
     ),
     StageSpec(
@@ -326,10 +329,25 @@ CHANGE = StageSpec(
     name="change",
     module="pipelines.change.stage",
     options_place="pipelines.change.options:ChangeOptions",
-    reads=(MEASURED, *SOLVED, *whole_products("raster/dsm.tif")),
+    reads=(
+        MEASURED,
+        *SOLVED,
+        *whole_products("raster/dsm.tif", "raster/sigma_v.tif", "raster/measured.tif"),
+        *whole_products("raster/dtm.tif", "raster/sigma_dtm.tif", "raster/orthophoto.tif", optional=True),
+    ),
     product="change/change.json",
     title="Compare with an earlier survey: what changed, by how much, is it real.",
-    also=("change/difference.tif", "change/regions.gpkg"),
+    also=(
+        "change/difference.tif",
+        "change/sigma.tif",
+        "change/lod.tif",
+        "change/significant.tif",
+        "change/regions.gpkg",
+        "change/regions.geojson",
+        "change/regions.csv",
+        CHANGE_PAGE,
+    ),
+    product_version=2,  # with the page
 )
 
 # No part of the pipeline: `georef compare` runs this stage for the baseline, whose later stages read its folder in

@@ -19,7 +19,7 @@ from pipelines.core.manifest import MANIFEST, Manifest, Memo
 from pipelines.core.options import StageOptions, as_flags, decisive_fields, load_toml, read_requests, resolve
 from pipelines.core.products import Remark, union
 from pipelines.core.progress import SILENT, Progress
-from pipelines.core.stages import BY_NAME, DELIVERABLES, PIPELINE, StageSpec, producer_of, products_of
+from pipelines.core.stages import BY_NAME, CHANGE, DELIVERABLES, PIPELINE, StageSpec, producer_of, products_of
 from pipelines.core.validators import require_text
 from pipelines.core.workspace import Workspace
 
@@ -199,7 +199,7 @@ def status(workspace: Workspace, memo: Memo | None = None, before: StageSpec | N
     requests, writer = read_requests(workspace.root), WriteLock(workspace.root).activity()
     begun = [
         spec
-        for spec in (DELIVERABLES if before is None else ())
+        for spec in ((*DELIVERABLES, CHANGE) if before is None else ())
         if (workspace.root / spec.folder).exists() or workspace.partial(spec).exists()
     ]
     rows: list[StageState] = []

@@ -196,6 +196,37 @@ def fix_residuals(solved: SolvedSurvey) -> report.FixResiduals:
     return report.FixResiduals(**stats.model_dump(), outliers=int(fixes.is_outlier.sum()))
 
 
+def distance_errors(solved: SolvedSurvey, posterior: Posterior) -> tuple[report.DistanceError, ...]:
+    """Return the known distances of the survey, measured between the intersections of their ends' marks."""
+    known = solved.survey.distances
+    rays = mark_rays([end for distance in known for end in distance.ends], solved.sparse)
+    place = triangulated_points(solved, rays)
+    rejected = {row.name for row in solved.model.measurements if row.kind == "distance" and not row.used}
+    rows = []
+    for index, distance in enumerate(known):
+        ends = np.arange(len(place)) // 2 == index
+        measured: dict[str, float | None] = dict.fromkeys(("measured_m", "error_m", "sigma_m"))
+        if np.isfinite(place[ends]).all():
+            length_m = float(np.linalg.norm(np.subtract(*place[ends])))
+            sigma_m = float(np.sqrt(posterior.of_distances(place[ends], rays.of_points(ends))[0]))
+            measured = {
+                "measured_m": length_m,
+                "error_m": length_m - distance.distance_m,
+                "sigma_m": sigma_m,
+            }
+        rows.append(
+            report.DistanceError(
+                name=distance.name,
+                use=distance.use,
+                rejected=distance.name in rejected,
+                distance_m=distance.distance_m,
+                stated_sigma_m=distance.sigma_m,
+                **measured,
+            )
+        )
+    return tuple(rows)
+
+
 _LEAST_POINTS = 3
 _RANGE = (0.005, 0.995)  # probabilities of χ²: 99 % of true predictions lie within
 _NEAR_M = 1.0

@@ -75,6 +75,8 @@ def summarise(report: EvaluationReport) -> Summary:
     for way, errors in report.checkpoints.by_way.items():
         figures = ("count", "mean_h_m", "rmse_h_m", "rmse_v_m", "rmse_3d_m")
         values |= {f"{way}_{name}": getattr(errors, name) for name in figures}
+    if report.distances:
+        values["distances"] = [distance.model_dump() for distance in report.distances]
     key_figure = f"{report.headline.sentence}; {_test_views(test)}"
     return Summary(key_figure, values, _warnings(report), report.cautions)
 
@@ -222,6 +224,7 @@ def evaluate(
         similarity=SimilaritySigma(sigma_ln_scale=log_scale, sigma_translation_m=(east, north, up)),
         coordinates=None if crs is None else coordinates_in(crs, checkpoints, solved.survey),
         reference=None if reference is None else reference.comparison,
+        distances=check_points.distance_errors(solved, posterior),
         variance_factors=model.variance_factors,
         cautions=union(
             model.cautions,

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.core.files import replace_file
-from pipelines.core.types import BoolArray, FloatArray
+from pipelines.core.types import BoolArray, ByteArray, FloatArray
 
 NODATA = -9999.0
 _CACHE_BYTES = 256 * 1024 * 1024
@@ -194,6 +194,19 @@ def read_onto(
         with WarpedVRT(raster, src_nodata=NODATA, nodata=NODATA, **place) as warped:
             values = warped.read(1)
     return np.where(values == NODATA, np.nan, values).astype(np.float64)
+
+
+def read_colours_onto(path: Path, frame: RasterFrame) -> ByteArray:
+    """Return the colours (rows, columns, bands) of a raster of bytes, averaged on the cells of a frame."""
+    import rasterio
+    from rasterio.enums import Resampling
+    from rasterio.vrt import WarpedVRT
+
+    with rasterio.open(path) as raster:
+        place: dict[str, Any] = {"crs": raster.crs, "transform": _transform(frame)}
+        place |= {"width": frame.columns, "height": frame.rows, "resampling": Resampling.average}
+        with WarpedVRT(raster, **place) as warped:
+            return np.ascontiguousarray(np.moveaxis(warped.read(), 0, -1), dtype=np.uint8)
 
 
 def cells_inside(polygon: Any, frame: RasterFrame) -> BoolArray:

@@ -183,6 +183,14 @@ _MARK_ALIASES = {
     **dict.fromkeys(("x", "pixelx", "xpx", "px", "u", "imageu"), "x"),
     **dict.fromkeys(("y", "pixely", "ypx", "py", "v", "imagev"), "y"),
 }
+_DISTANCE_ALIASES = {
+    **dict.fromkeys(("from", "a", "point1", "first", "start"), "from"),
+    **dict.fromkeys(("to", "b", "point2", "second", "end"), "to"),
+    **dict.fromkeys(("distance", "distancem", "length", "lengthm", "d"), "distance"),
+    **dict.fromkeys(("sigma", "sigmam", "accuracy", "accuracym"), "sigma"),
+    **dict.fromkeys(("use", "type", "role"), "use"),
+}
+_DISTANCE_COLUMNS = ("from", "to", "distance", "sigma", "use")
 _POINT_COLUMNS = ("label", "first", "second", "z", "sigma_h", "sigma_v")
 _MARK_COLUMNS = ("image", "label", "x", "y")
 
@@ -241,6 +249,46 @@ def read_marks(path: Path) -> tuple[ListedMark, ...]:
     )
 
 
+@dataclass(frozen=True)
+class ListedDistance:
+    """Measured distance between two marked points; `is_check`: it enters no solution."""
+
+    line: int
+    ends: tuple[str, str]
+    distance_m: float
+    sigma_m: float | None
+    is_check: bool
+
+
+def read_distances(path: Path) -> tuple[ListedDistance, ...]:
+    """Read distances between marked points: columns from, to, distance, and optionally σ and use, in metres.
+
+    Raises:
+        InputError: no rows, a column is missing, a distance or σ is not above zero, both ends are one point, a pair
+            is listed twice, or a use is neither control nor check.
+    """
+    table = _pix4d_table(path, _DISTANCE_ALIASES, _DISTANCE_COLUMNS, slice(2, 3), "from, to and distance")
+    tables.require_columns(table.columns, _DISTANCE_COLUMNS[:3], path, table.header_line)
+    tables.require_rows(table.rows, path)
+    distances: list[ListedDistance] = []
+    seen: dict[frozenset[str], int] = {}
+    for row in table.rows:
+        ends = (row.named("from"), row.named("to"))
+        use = row.text("use").lower() if "use" in row.columns else ""
+        distance_m = row.finite("distance")
+        if distance_m <= 0:
+            raise row.fault("distance-not-positive", f"the distance is {distance_m:g} m", "distance")
+        if ends[0] == ends[1]:
+            raise row.fault("distance-of-one-point", f"both ends are {ends[0]}", "to")
+        if use not in ("", "control", "check"):
+            raise row.fault("unknown-use", f"the use {use!r} is neither control nor check", "use")
+        first = seen.setdefault(frozenset(ends), row.line)
+        if first != row.line:
+            raise row.fault("distance-twice", f"line {first} has the same two points", "to")
+        distances.append(ListedDistance(row.line, ends, distance_m, row.sigma_m("sigma"), use == "check"))
+    return tuple(distances)
+
+
 def _pix4d_table(
     path: Path, aliases: Mapping[str, str], in_order: Sequence[str], numeric: slice, expected: str
 ) -> tables.Table:
@@ -251,7 +299,7 @@ def _pix4d_table(
     first, text = lines[0]
     separator = tables.separator_of(text)
     header = tables.split(text, separator, path=path, line=first)
-    if len(header) < 4:
+    if len(header) < numeric.stop:
         message = f"The line has {len(header)} columns, expected {expected}."
         raise InputError("wrong-columns", message, path=path, line=first)
     if any(map(tables.is_number, header[numeric])):

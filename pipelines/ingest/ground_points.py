@@ -19,7 +19,7 @@ from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import ImageNames
 from pipelines.ingest.reference_system import crs_of_points, east_first, note_operation
 from pipelines.ingest.remarks import Remarks, shortened
-from pipelines.survey.survey import Mark
+from pipelines.survey.survey import KnownDistance, Mark, MarkedPoint
 
 _LEAST_MARKS = 2
 # Two names at one place are one point; a point this far from the cameras is in another country.
@@ -73,6 +73,8 @@ def read_ground_files(options: IngestOptions, remarks: Remarks) -> tuple[GroundF
         return control, check
     marks = ground_points.read_marks(options.marks)
     known = {point.name for file in (control, check) if file is not None for point in file.points}
+    if options.distances is not None:
+        known |= {name for distance in ground_points.read_distances(options.distances) for name in distance.ends}
     remarks.warn_counted(
         "mark-of-unknown-point",
         [f"{options.marks.name}:{mark.line} ({mark.name})" for mark in marks if mark.name not in known],
@@ -157,9 +159,21 @@ def tie_marks(
     Raises:
         InputError: two marks of a point in one image, a mark outside its image, or no mark in any image here.
     """
+    marks = _tied([point.name for point in file.points], file.listed_marks, sizes, sigma_px, remarks)
+    return replace(file, points=tuple(replace(point, marks=marks[point.name]) for point in file.points))
+
+
+def _tied(
+    points: Sequence[str],
+    listed_marks: Sequence[tuple[Path, Sequence[ListedMark]]],
+    sizes: Mapping[str, tuple[int, int]],
+    sigma_px: float,
+    remarks: Remarks,
+) -> dict[str, tuple[Mark, ...]]:
+    """Return the marks of points by name; raises as `tie_marks`."""
     names = ImageNames(sizes)
-    marks: dict[str, dict[str, Mark]] = {point.name: {} for point in file.points}
-    for path, listed in file.listed_marks:
+    marks: dict[str, dict[str, Mark]] = {name: {} for name in points}
+    for path, listed in listed_marks:
         unknown = []
         for mark in listed:
             image = names.find(mark.image, path=path, line=mark.line)
@@ -185,8 +199,58 @@ def tie_marks(
                 field="image",
             )
         remarks.warn_counted("mark-in-unknown-image", unknown, "Marks are in images that are not here")
-    points = tuple(replace(point, marks=tuple(marks[point.name].values())) for point in file.points)
-    return replace(file, points=points)
+    return {name: tuple(of_point.values()) for name, of_point in marks.items()}
+
+
+def known_distances(
+    options: IngestOptions,
+    files: Sequence[GroundFile | None],
+    sizes: Mapping[str, tuple[int, int]],
+    remarks: Remarks,
+) -> tuple[KnownDistance, ...]:
+    """Return the measured distances of `--distances`, whose ends are points of files with marks, or of `--marks`.
+
+    Raises:
+        InputError: a malformed file, or an end with marks in fewer than two images.
+    """
+    if options.distances is None:
+        return ()
+    listed = ground_points.read_distances(options.distances)
+    marks = {point.name: point.marks for file in files if file is not None for point in file.points}
+    others = sorted({name for distance in listed for name in distance.ends} - marks.keys())
+    if others and options.marks is not None:
+        own = tuple(mark for mark in ground_points.read_marks(options.marks) if mark.name in others)
+        marks |= _tied(others, [(options.marks, own)], sizes, options.sigma_mark, remarks)
+    for distance in listed:
+        for field, name in zip(("from", "to"), distance.ends, strict=True):
+            if len(marks.get(name, ())) < _LEAST_MARKS:
+                raise InputError(
+                    "distance-end-unmarked",
+                    f"{name} has marks in {len(marks.get(name, ()))} images. Mark it in two or more: --marks.",
+                    path=options.distances,
+                    line=distance.line,
+                    field=field,
+                )
+    silent = sum(distance.sigma_m is None for distance in listed)
+    if silent:
+        remarks.assume(
+            "default-distance-sigma",
+            f"{silent} distances have a σ of {options.sigma_distance:g} m. State it in the file, or with "
+            "--sigma-distance.",
+        )
+    return tuple(
+        KnownDistance(
+            ends=(_marked(distance.ends[0], marks), _marked(distance.ends[1], marks)),
+            distance_m=distance.distance_m,
+            sigma_m=distance.sigma_m or options.sigma_distance,
+            use="check" if distance.is_check else "control",
+        )
+        for distance in listed
+    )
+
+
+def _marked(name: str, marks: Mapping[str, tuple[Mark, ...]]) -> MarkedPoint:
+    return MarkedPoint(name=name, marks=marks[name])
 
 
 def split_checks(

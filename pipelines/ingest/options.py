@@ -49,6 +49,7 @@ def _sensible(offset: float | Literal["auto"]) -> float | Literal["auto"]:
 
 # Files of other kinds beside the photographs, such as thumbnails and logs, make nothing stale.
 PhotographFolder = Annotated[Path, InputMarker(SUFFIXES)]
+MaskFolder = Annotated[Path, InputMarker(frozenset({".png"}))]
 FrameDistance = Annotated[Every, from_text(_every), WRITTEN]
 TimeOffset = Annotated[
     float | Literal["auto"],
@@ -114,6 +115,11 @@ class IngestOptions(StageOptions):
     marks: InputPath | None = Field(
         None, description="PIX4D's CSV of image marks: image, point, x, y; for points whose file has none."
     )
+    distances: InputPath | None = Field(
+        None,
+        description="Measured distances between marked points, as of scale bars: CSV with from, to, distance, and "
+        "optionally sigma and use (control or check).",
+    )
     gcp_crs: str | None = Field(
         None, description="CRS of ground points whose file states none, e.g. EPSG:32632 or EPSG:4326+5773."
     )
@@ -141,6 +147,9 @@ class IngestOptions(StageOptions):
     sigma_gcp_h: float = Field(0.02, gt=0, description="Horizontal σ of surveyed points in metres.")
     sigma_gcp_v: float = Field(0.03, gt=0, description="Vertical σ of surveyed points in metres.")
     sigma_mark: float = Field(0.5, gt=0, description="σ of an image mark in pixels.")
+    sigma_distance: float = Field(
+        0.002, gt=0, description="σ of a distance in metres, where --distances states none."
+    )
     max_gap: float = Field(1.0, gt=0, description="Longest gap to interpolate over in the trajectory, in seconds.")
     focal_px: float | None = Field(None, gt=0, description="Focal length in pixels, instead of the one from EXIF.")
     rolling_shutter: float | None = Field(
@@ -149,6 +158,17 @@ class IngestOptions(StageOptions):
         le=1,
         description="Readout time of a photograph in seconds, from its first row to its last; 0: a global or "
         "mechanical shutter (default: by camera model, else 0).",
+    )
+    masks: MaskFolder | None = Field(
+        None,
+        description="Folder of masks, each named as its photograph with .png added: black pixels are left out of "
+        "sfm, surface, training and test.",
+    )
+    mask: InputPath | None = Field(
+        None, description="Mask for every photograph, such as of the drone's own legs: black pixels are left out."
+    )
+    mask_sky: bool = Field(
+        False, description="Leave out the sky: what is smooth and blue or white above the horizon of the attitude."
     )
     accept_inconsistency: bool = Field(
         False, description="Go on where the table of positions disagrees with EXIF, with a caution."
@@ -198,7 +218,8 @@ def check_options(options: IngestOptions, frames: Path | None) -> None:
             field="--events",
         )
     for name in ("marks", "gcp_crs"):
-        if getattr(options, name) is not None and options.gcp is None and options.checkpoints is None:
+        needed = (options.gcp, options.checkpoints, options.distances if name == "marks" else None)
+        if getattr(options, name) is not None and not any(needed):
             flag = flag_name(IngestOptions, name)
             raise InputError(
                 "needs-ground-points", f"{flag} needs ground points. Give --gcp or --checkpoints.", field=flag

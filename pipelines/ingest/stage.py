@@ -1,8 +1,8 @@
 """Stage `ingest`: photographs, positions, attitudes and ground points into one survey in one frame.
 
 Reads: a folder of photographs or a ROS bag; optionally a table of positions, control and check points, marks.
-Writes: `ingest/survey.json`; `ingest/images/` with --bag or --copy; `ingest/track.npz` where the navigation was
-recorded by time. See docs/inputs.md and docs/bags.md for every format and default.
+Writes: `ingest/survey.json`; `ingest/images/` with --bag or --copy; `ingest/masks/` with masks; `ingest/track.npz`
+where the navigation was recorded by time. See docs/inputs.md and docs/bags.md for every format and default.
 """
 
 import logging
@@ -15,7 +15,8 @@ from pipelines.core.progress import SILENT, Progress
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.ingest.bag_flight import count_frames, read_bag
 from pipelines.ingest.folder_flight import read_folder
-from pipelines.ingest.ground_points import read_ground_files, tie_marks
+from pipelines.ingest.ground_points import known_distances, read_ground_files, tie_marks
+from pipelines.ingest.masks import mask_files, write_masks
 from pipelines.ingest.options import IngestOptions, check_options
 from pipelines.ingest.remarks import Remarks
 from pipelines.ingest.survey_assembly import assemble_survey, require_placed
@@ -33,6 +34,7 @@ def run(stage: StageRun, options: IngestOptions) -> Summary:
     """
     _refuse_inside_photographs(stage.workspace, options)
     survey, track = survey_and_track(options, stage.out / "images", stage.progress)
+    survey = write_masks(survey, options, Path(survey.image_dir), stage.out / "masks", stage.progress)
     if options.copy_images and options.bag is None:
         _copy_images(survey, stage)
     if options.copy_images or options.bag is not None:
@@ -52,7 +54,9 @@ def check_inputs(workspace: Workspace, options: IngestOptions, progress: Progres
     """
     _refuse_inside_photographs(workspace, options)
     if options.bag is None:
-        return _summary(survey_and_track(options, None, progress, decode=False)[0])
+        survey = survey_and_track(options, None, progress, decode=False)[0]
+        mask_files(options, [image.name for image in survey.images], Remarks())
+        return _summary(survey)
     remarks = Remarks()
     check_options(options, workspace.root)
     read_ground_files(options, remarks)
@@ -100,7 +104,9 @@ def survey_and_track(
     control, check = (
         None if file is None else tie_marks(file, sizes, options.sigma_mark, remarks) for file in ground
     )
-    return assemble_survey(flight, control, check, options, remarks)
+    distances = known_distances(options, (control, check), sizes, remarks)
+    survey, track = assemble_survey(flight, control, check, options, remarks)
+    return survey.model_copy(update={"distances": distances}), track
 
 
 def _copy_images(survey: Survey, stage: StageRun) -> None:
@@ -122,11 +128,15 @@ def _summary(survey: Survey) -> Summary:
         "control_points": len(survey.control_points),
         "check_points": len(survey.check_points),
         "unmarked_points": len(survey.unmarked_points),
+        "distances": len(survey.distances),
+        "masks": sum(bool(image.mask_sha256) for image in survey.images),
     }
     key_figure = (
         f"{counts['images']} images, {counts['fixes']} positions, {counts['control_points']} control and "
         f"{counts['check_points']} check points"
         + (f", {counts['unmarked_points']} unmarked" if survey.unmarked_points else "")
+        + (f", {counts['distances']} distances" if counts["distances"] else "")
+        + (f", {counts['masks']} masks" if counts["masks"] else "")
     )
     values = {**counts, "origin": survey.origin.model_dump(), "vertical": survey.vertical.model_dump()}
     return Summary(key_figure, values, survey.warnings)

@@ -1,8 +1,9 @@
 """Pages for people: a frame with style, contents and sections, which every report of the package shares.
 
-A page is one file. It holds its style and its pictures, has no script, and loads nothing: its own policy forbids
-both. Texts of users (names of points, of photographs, of workspaces) enter through the escaping of jinja2 only, and
-their control characters are written as escapes.
+A page is one file. It holds its style and its pictures, and loads nothing: its own policy forbids that, and every
+script but the page's own, whose hash it states. Most pages have none. Texts of users (names of points, of
+photographs, of workspaces) enter through the escaping of jinja2 only, and their control characters are written as
+escapes.
 
 A room that makes a page has a folder `templates/` with one template a section. The templates hold all HTML; Python
 gives them typed facts, figures as text (decimals that fit their size, a true minus, a dash for what does not
@@ -10,6 +11,7 @@ exist), and pictures as data, at a size that the page needs.
 """
 
 import base64
+import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -77,6 +79,21 @@ def count_text(value: int | None) -> str:
     return MISSING if value is None else f"{value:,}".replace(",", "\u2009").replace("-", "−")
 
 
+def volume(value: float | None) -> str:
+    """Return cubic or square metres without their unit, with three figures at least: `1 059.9`, `0.52`."""
+    if value is None or isnan(value):
+        return MISSING
+    decimals = 2 if abs(value) < 9.995 else 1 if abs(value) < 9999.95 else 0
+    return f"{float(number_text(value, decimals).replace('−', '-')):,.{decimals}f}".replace(",", "\u2009").replace(
+        "-", "−"
+    )
+
+
+def signed_volume(value: float | None) -> str:
+    text = volume(value)
+    return text if text == MISSING or text.startswith("−") else f"+{text}"
+
+
 def moment(value: datetime | None) -> str:
     """Return a time in UTC, to the minute."""
     return MISSING if value is None else f"{value:%Y-%m-%d %H:%M} UTC"
@@ -92,6 +109,7 @@ FORMS: dict[str, Callable[..., str]] = {
     "duration": lambda seconds: duration(seconds) or MISSING,
     "in_metres": in_metres,
     "metres": metres,
+    "millimetre_fine": partial(number_text, decimals=3),
     "moment": moment,
     "number": number_text,
     "parts_per_million": parts_per_million,
@@ -99,7 +117,9 @@ FORMS: dict[str, Callable[..., str]] = {
     "ratio": number_text,
     "share": share,
     "signed": signed,
+    "signed_volume": signed_volume,
     "similarity": partial(number_text, decimals=4),
+    "volume": volume,
     "square_km": lambda km2: MISSING if km2 is None else f"{number_text(km2, 3)} km²",
 }
 
@@ -120,7 +140,8 @@ class Page:
     """Content of a page: name and value of each line of its head, such as the time, then its sections.
 
     Figures are taken from the JSON document by their path (`figure` in `macros.html`). A cover, which the template
-    `cover.html` of the page's room shows, stands in place of the head and is a page of its own on paper.
+    `cover.html` of the page's room shows, stands in place of the head and is a page of its own on paper. `script`
+    is written as it is: it holds no text of users.
     """
 
     title: str
@@ -129,6 +150,16 @@ class Page:
     sections: Sequence[Section]
     document: Mapping[str, Any] = field(default_factory=dict)
     cover: object = None
+    script: str = ""
+
+    @property
+    def policy(self) -> str:
+        """Content policy: pictures and style in the file, and the script by its hash."""
+        policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+        if not self.script:
+            return policy
+        digest = base64.b64encode(hashlib.sha256(self.script.encode()).digest()).decode("ascii")
+        return f"{policy}; script-src 'sha256-{digest}'"
 
 
 def render_page(page: Page, room: str) -> str:

@@ -43,7 +43,7 @@ from pipelines.sfm.colmap_database import (
     write_frame,
 )
 from pipelines.sfm.estimate import chunk_peak_bytes
-from pipelines.sfm.features import SfmJob, candidate_pairs, extract_features, match_features
+from pipelines.sfm.features import SfmJob, candidate_pairs, extract_features, masks_beside, match_features
 from pipelines.sfm.options import SfmOptions
 from pipelines.survey.survey import Survey
 
@@ -160,7 +160,9 @@ def write_chunk(arguments: Mapping[str, Any], progress: Progress) -> None:
     except DamagedPartialError as error:
         log.warning("%s starts afresh: %s", chunk.name, error)
         remove_database(draft)
-    job = SfmJob(load_json(Survey, Path(arguments["survey"])), Path(arguments["images"]), draft, plan.options)
+    survey = load_json(Survey, Path(arguments["survey"]))
+    masks = masks_beside(arguments["survey"], survey)
+    job = SfmJob(survey, Path(arguments["images"]), draft, plan.options, masks)
     with quiet_colmap() as colmap:
         colmap.set_random_seed(plan.options.seed)
         if chunk.kind == "features":

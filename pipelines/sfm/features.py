@@ -13,12 +13,13 @@ from scipy.spatial import cKDTree
 
 from pipelines.core.machine import chosen_threads
 from pipelines.core.progress import Progress
+from pipelines.core.stages import MASKS
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.formats.image_file import read_bytes, require_unchanged
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.sfm.colmap_database import rename_images, write_frame
 from pipelines.sfm.options import SfmOptions
-from pipelines.survey.survey import Survey
+from pipelines.survey.survey import Survey, SurveyImage
 
 # Between views that differ by a larger angle SIFT finds hardly any matches.
 _MAX_ANGLE_DEG = 60.0
@@ -83,10 +84,17 @@ class SfmJob:
     images: Path  # folder of the photographs
     database: Path  # path of COLMAP's database; an existing one is continued
     options: SfmOptions
+    masks: Path | None = None  # folder of masks, NAME.png; None: no photograph has one
 
     @property
     def sparse(self) -> Path:
         return self.database.parent / "sparse"
+
+
+def masks_beside(survey_file: str, survey: Survey) -> Path | None:
+    """Return the folder of the masks that `ingest` has written beside its survey; None: it has written none."""
+    masked = any(image.mask_sha256 for image in survey.images)
+    return Path(survey_file).parent / Path(MASKS).name if masked else None
 
 
 def candidate_pairs(survey: Survey, options: SfmOptions) -> IntArray:
@@ -124,13 +132,18 @@ def extract_features(colmap: Any, job: SfmJob, images: Sequence[int], progress: 
     write_frame(colmap, job.database, job.survey, images, job.options)
     size = {prior.camera_id: (prior.width, prior.height) for prior in job.survey.cameras}
     with progress.task("features", len(images)) as task:
-        for camera_id in sorted({job.survey.images[index].camera_id for index in images}):
+        # COLMAP refuses photographs without a mask where it reads masks: these are read apart.
+        alike: dict[tuple[int, bool], list[SurveyImage]] = {}
+        for index in images:
+            image = job.survey.images[index]
+            alike.setdefault((image.camera_id, bool(image.mask_sha256)), []).append(image)
+        for (camera_id, masked), of_kind in sorted(alike.items()):
             reader = colmap.ImageReaderOptions()
             reader.existing_camera_id = camera_id
+            if masked and job.masks is not None:
+                reader.mask_path = job.masks
             options.sift.first_octave = -1 if job.options.doubles(size[camera_id]) else 0
-            of_camera = [job.survey.images[index] for index in images]
-            of_camera = [image for image in of_camera if image.camera_id == camera_id]
-            for step in _steps(of_camera, _IMAGES_PER_STEP):
+            for step in _steps(of_kind, _IMAGES_PER_STEP):
                 for image in step:
                     path = job.images / image.name
                     require_unchanged(read_bytes(path), image.sha256, path)

@@ -19,7 +19,7 @@ from pipelines.core.progress import Progress
 from pipelines.core.stages import SURVEY
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.formats.colmap import quiet_colmap
-from pipelines.sfm.features import SfmJob
+from pipelines.sfm.features import SfmJob, masks_beside
 from pipelines.sfm.options import SfmOptions
 from pipelines.sfm.reconstructor import reconstructor_of
 from pipelines.sfm.unregistered import unregistered
@@ -65,7 +65,7 @@ def write_model(arguments: Mapping[str, Any], progress: Progress) -> dict[str, A
     """
     survey, database = load_json(Survey, Path(arguments["survey"])), Path(arguments["out"]) / "database.db"
     options = SfmOptions.model_validate(arguments["options"])
-    job = SfmJob(survey, Path(arguments["images"]), database, options)
+    job = SfmJob(survey, Path(arguments["images"]), database, options, masks_beside(arguments["survey"], survey))
     if job.sparse.exists():
         shutil.rmtree(job.sparse)
     model = reconstructor_of(options).reconstruct(job, progress)

@@ -179,6 +179,8 @@ class DepthMaps:
             digest.update(np.ascontiguousarray(array).tobytes())
         for index in range(len(sparse.image_name)):
             digest.update(self.images.key(index).encode())
+            if self.images.is_masked(index):
+                digest.update(self.images.mask_key(index).encode())
         digest.update(repr((_COARSE_PX, FINE_PX, _NEIGHBOURS, MATCHING, REFINING, THRESHOLDS)).encode())
         return digest.hexdigest()[:32]
 

@@ -90,10 +90,13 @@ class ModelRenderer:
         return np.asarray(measured_depth(self.render(view, depth=True, window=window)).cpu().numpy())
 
     def surface(self, index: int) -> tuple[Float32Array, ByteArray]:
-        """Return the depth (H, W) of camera `index` as `depth_m` does, and the colours (H, W, 3) of its render."""
+        """Return the depth (H, W) of camera `index`, 0 where masked, and the colours (H, W, 3) of its render."""
         view = self.render(index, depth=True)
         rgb = (255 * view.colour.clamp(0, 1)).round().to(torch.uint8)
-        return measured_depth(view).cpu().numpy().astype(np.float32), rgb.cpu().numpy()
+        depth = measured_depth(view).cpu().numpy().astype(np.float32)
+        if self.images.is_masked(index):
+            depth[~self.images.mask(index)] = 0
+        return depth, rgb.cpu().numpy()
 
 
 # The trained surface of a simulated flight departs from the true one by less than 0.5 % of the depth at nine of ten

@@ -35,6 +35,7 @@ class InitialSimilarity(Product):
     inliers: dict[str, int]
     gnss_outliers: tuple[str, ...] = ()
     control_outliers: tuple[str, ...] = ()
+    distance_outliers: tuple[str, ...] = ()
     residuals: dict[str, ResidualStats]
     condition_number: float
     layout: Literal["volume", "plane", "line"]
@@ -48,7 +49,11 @@ class InitialSimilarity(Product):
 
     def rejected(self, survey: Survey) -> Survey | None:
         """Return a survey with the rejected measurements alone; None: there are none."""
-        return self.in_use(survey, used=False) if self.gnss_outliers or self.control_outliers else None
+        return self.in_use(survey, used=False) if self._has_outliers else None
+
+    @property
+    def _has_outliers(self) -> bool:
+        return bool(self.gnss_outliers or self.control_outliers or self.distance_outliers)
 
     def in_use(self, survey: Survey, *, used: bool = True) -> Survey:
         """Return a survey without the measurements that were rejected, or else with these alone."""
@@ -58,7 +63,13 @@ class InitialSimilarity(Product):
             for image in survey.images
         )
         control = tuple(point for point in survey.control_points if (point.name not in bad_points) == used)
-        return survey.model_copy(update={"images": images, "control_points": control})
+        bad_distances = set(self.distance_outliers)
+        distances = tuple(
+            distance
+            for distance in survey.distances
+            if distance.use == "check" or (distance.name not in bad_distances) == used
+        )
+        return survey.model_copy(update={"images": images, "control_points": control, "distances": distances})
 
 
 @dataclass(frozen=True)

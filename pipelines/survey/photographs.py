@@ -27,6 +27,7 @@ log = logging.getLogger(__name__)
 
 # Width of the edge that the mask leaves out: interpolation there needs pixels from beyond the photograph.
 _EDGE_PX = 0.5
+_WHOLLY = 0.999  # of an interpolated mask: no part of the pixel is left out
 _SAME_RAY = 1e-6  # of normalised coordinates
 _ZOOM_STEP, _MOST_ZOOM, _BISECTIONS = 1.1, 4.0, 20
 _JPEG_QUALITY = 95
@@ -39,6 +40,7 @@ class Photograph:
 
     `shift` (h, w, 2) is a grid over a photograph of a rolling shutter: how far in pixels of the full size from its
     place under a global shutter each of its pixels lies. None: a global shutter.
+    `mask` is a picture of the photograph's size, black where it does not count. None: all of it counts.
     """
 
     name: str
@@ -46,6 +48,8 @@ class Photograph:
     camera: Camera
     sha256: str = ""
     shift: Float32Array | None = None
+    mask: Path | None = None
+    mask_sha256: str = ""
 
     @property
     def margin(self) -> float:
@@ -66,7 +70,7 @@ class ImageCache:
     """Undistorted images on disk: uint8 RGB arrays, made once and mapped into memory on access.
 
     Memory does not grow with their number. Only the last distortion map stays in memory, until all images are
-    built. Masks, one for each camera, and shrunken images are stored beside the images.
+    built. Masks, one for each camera or masked photograph, and shrunken images are stored beside the images.
     """
 
     def __init__(self, folder: Path, photographs: list[Photograph], max_size_px: int) -> None:
@@ -127,7 +131,11 @@ class ImageCache:
             return _mapped(path)
 
     def mask(self, index: int) -> BoolArray:
-        """Return the mask (H, W) of the pixels that the photograph covers, mapped from disk."""
+        """Return the mask (H, W) of the pixels that the photograph covers and that count, mapped from disk.
+
+        Raises:
+            InputError: the photograph's own mask does not exist, or is not that of the survey.
+        """
         path = self._folder / f"{self.mask_key(index)}.mask.npy"
         if not path.exists():
             mask, edge = self._map(index)[1], self._moved_edge_px(index)
@@ -135,17 +143,44 @@ class ImageCache:
                 square = np.ones((2 * edge + 1, 2 * edge + 1), np.uint8)
                 shrunken = cv2.erode(mask.astype(np.uint8), square, borderType=cv2.BORDER_CONSTANT, borderValue=0)
                 mask = np.asarray(shrunken, dtype=bool)
-            save_array(path, mask)
+            save_array(path, mask & self._own_mask(index))
         return _mapped(path)
+
+    def is_masked(self, index: int) -> bool:
+        """Return whether a photograph has a mask of its own."""
+        return self._photographs[index].mask is not None
+
+    def _own_mask(self, index: int) -> BoolArray:
+        """Return the undistorted mask (H, W) of a photograph: pixels that no black pixel of it touches."""
+        photograph, pinhole = self._photographs[index], self.pinhole(index)
+        if photograph.mask is None:
+            return np.ones((pinhole.height, pinhole.width), dtype=bool)
+        data = read_bytes(photograph.mask)
+        require_unchanged(data, photograph.mask_sha256, photograph.mask)
+        full = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+        if full is None or full.shape != (photograph.camera.height, photograph.camera.width):
+            message = "The mask is not that of the photograph. Run `georef ingest` again."
+            raise InputError("mask-damaged", message, path=photograph.mask)
+        counts = np.where(full > 0, np.float32(1), np.float32(0))
+        small = cv2.resize(counts, (pinhole.width, pinhole.height), interpolation=cv2.INTER_AREA)
+        source = self._map(index)[0]
+        if photograph.shift is not None:
+            source = source + _shift_at(photograph, source)
+        flat = cv2.remap(small, source[..., 0], source[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+        return np.asarray(flat > _WHOLLY)
 
     def _moved_edge_px(self, index: int) -> int:
         return math.ceil(self._photographs[index].margin * self.pinhole(index).height)
 
     def mask_key(self, index: int) -> str:
-        """Return the key of a mask, which all photographs of one camera share but for rolling shutters."""
-        camera, edge = self._photographs[index].camera, self._moved_edge_px(index)
+        """Return the key of a mask. Photographs of a camera share it but for rolling shutters and own masks."""
+        photograph = self._photographs[index]
+        camera, edge = photograph.camera, self._moved_edge_px(index)
         key = f"{camera.model}|{camera.width}x{camera.height}|{camera.params.tobytes().hex()}|{self.max_size_px}"
         key += f"|{edge}" if edge else ""
+        if photograph.mask is not None:
+            key += f"|{photograph.mask_sha256}"
+            key += "" if photograph.shift is None else f"|{photograph.shift.tobytes().hex()}"
         return hashlib.sha256(key.encode()).hexdigest()[:32]
 
     def _path(self, index: int) -> Path:

@@ -262,6 +262,23 @@ class Fit(Product):
     gcp: ControlResiduals
 
 
+class DistanceError(Product):
+    """Distance between two marked points, measured in the solution; None: its ends are not measured.
+
+    `sigma_m` is the predicted σ of the measured distance, `stated_sigma_m` that of the given one. A control
+    distance entered the solution: its error is a residual, unless `rejected`.
+    """
+
+    name: str
+    use: Literal["control", "check"]
+    rejected: bool
+    distance_m: float
+    stated_sigma_m: float
+    measured_m: float | None
+    error_m: float | None
+    sigma_m: float | None
+
+
 class SimilaritySigma(Product):
     """σ of the trained similarity: of ln(scale), and of the translation along east, north, up."""
 
@@ -318,6 +335,7 @@ class EvaluationReport(_OptionalKeys):
     similarity: SimilaritySigma
     coordinates: Coordinates | None = None
     reference: ReferenceComparison | None = None
+    distances: tuple[DistanceError, ...] = ()
     variance_factors: tuple[VarianceFactor, ...] = ()
     cautions: tuple[Remark, ...] = ()
 

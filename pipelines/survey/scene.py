@@ -15,7 +15,7 @@ import numpy as np
 from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.plan import photograph_folder
 from pipelines.core.products import load_json
-from pipelines.core.stages import ADJUSTMENT, SIM3, SPARSE
+from pipelines.core.stages import ADJUSTMENT, MASKS, SIM3, SPARSE
 from pipelines.core.types import Float32Array, FloatArray, IntArray
 from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import read_sparse
@@ -161,7 +161,7 @@ def photograph_files(sparse: SparseModel, survey: Survey, workspace: Workspace) 
     Raises:
         InputError: an image of the model is not in the survey.
     """
-    known = {image.name: image.sha256 for image in survey.images}
+    known = {image.name: image for image in survey.images}
     foreign = [name for name in sparse.image_name if name not in known]
     if foreign:
         raise InputError(
@@ -171,10 +171,14 @@ def photograph_files(sparse: SparseModel, survey: Survey, workspace: Workspace) 
             path=workspace.root / SPARSE,
         )
     folder = photograph_folder(workspace, survey.image_dir)
-    return [
-        Photograph(name, folder / name, sparse.camera_of(index), known[name], _rolling_shift(sparse, index))
-        for index, name in enumerate(sparse.image_name)
-    ]
+    shots = []
+    for index, name in enumerate(sparse.image_name):
+        shift, hashed = _rolling_shift(sparse, index), known[name].mask_sha256
+        mask = workspace.path(f"{MASKS}/{name}.png") if hashed else None
+        shots.append(
+            Photograph(name, folder / name, sparse.camera_of(index), known[name].sha256, shift, mask, hashed)
+        )
+    return shots
 
 
 def _rolling_shift(sparse: SparseModel, image: int) -> Float32Array | None:

@@ -144,7 +144,8 @@ class Attitude(Product):
 class SurveyImage(Product):
     """Photograph, named by its path relative to the survey's `image_dir`; its time is the camera clock's.
 
-    `sha256` is empty in a survey written by hand: the photograph is not checked then.
+    `sha256` is empty in a survey written by hand: the photograph is not checked then. `mask_sha256` is the hash of
+    `ingest/masks/NAME.png`, where black pixels are left out; empty: all pixels count.
     """
 
     name: ImageName
@@ -154,6 +155,7 @@ class SurveyImage(Product):
     fix: Fix | None = None
     attitude: Attitude | None = None
     velocity_in_geo: Vector3 | None = None  # of a camera with a rolling shutter, m/s
+    mask_sha256: str = ""
     split: Literal["train", "test"] = "train"
 
 
@@ -166,27 +168,45 @@ class Mark(Product):
     sigma_px: float = Field(gt=0)
 
 
-class SurveyedPoint(Product):
-    """Control or check point: position in geo (m), 3×3 covariance (m²), marks, and what covers the ground there."""
+class MarkedPoint(Product):
+    """Point of the scene that is marked in photographs."""
 
     name: str
-    position_in_geo: Vector3
-    cov_in_geo: Covariance3
     marks: tuple[Mark, ...]
-    land_cover: Literal["open", "vegetated"] = "open"
 
     @model_validator(mode="after")
-    def _is_marked_once_an_image(self) -> SurveyedPoint:
+    def _is_marked_once_an_image(self) -> MarkedPoint:
         images = [mark.image for mark in self.marks]
         if len(set(images)) != len(images):
             raise ValueError("marks: two are in one image")
         return self
 
 
+class SurveyedPoint(MarkedPoint):
+    """Control or check point: position in geo (m), 3×3 covariance (m²), marks, and what covers the ground there."""
+
+    position_in_geo: Vector3
+    cov_in_geo: Covariance3
+    land_cover: Literal["open", "vegetated"] = "open"
+
+
 class UnmarkedPoint(SurveyedPoint):
     """Surveyed point with marks in fewer than two images: it enters nothing until it is marked."""
 
     use: Literal["control", "check"]
+
+
+class KnownDistance(Product):
+    """Measured distance between two marked points, as of a scale bar: an observation, or a check of the scale."""
+
+    ends: tuple[MarkedPoint, MarkedPoint]
+    distance_m: float = Field(gt=0)
+    sigma_m: float = Field(gt=0)
+    use: Literal["control", "check"] = "control"
+
+    @property
+    def name(self) -> str:
+        return "–".join(end.name for end in self.ends)
 
 
 class Survey(Product):
@@ -216,6 +236,7 @@ class Survey(Product):
     control_points: tuple[SurveyedPoint, ...] = ()
     check_points: tuple[SurveyedPoint, ...] = ()
     unmarked_points: tuple[UnmarkedPoint, ...] = ()
+    distances: tuple[KnownDistance, ...] = ()
     assumptions: tuple[Remark, ...] = ()
     warnings: tuple[Remark, ...] = ()
     cautions: tuple[Remark, ...] = ()
@@ -239,6 +260,7 @@ class Survey(Product):
             "control_points": [point.name for point in self.control_points],
             "check_points": [point.name for point in self.check_points],
             "unmarked_points": [point.name for point in self.unmarked_points],
+            "distances": [distance.name for distance in self.distances],
         }
         for field, of_field in names.items():
             if len(set(of_field)) != len(of_field):

@@ -47,18 +47,18 @@ class Measurement(Product):
     Attributes:
         used: whether it takes part; what was rejected stays rejected in every later stage.
         reason: why it was rejected; empty: it is used.
-        residual: predicted minus measured, metres or radians.
+        residual: predicted minus measured, metres or radians; of a distance one number, else three.
         normalised: length of the residual in units of its σ.
         left_out_error_m: of a control point: error of the solution of all other measurements, east, north, up;
             None: they leave the point open.
         left_out_cov_m2: covariance of that error, of solution, marks and survey.
     """
 
-    kind: Literal["fix", "control point", "attitude", "systematic error"]
+    kind: Literal["fix", "control point", "distance", "attitude", "systematic error"]
     name: str
     used: bool
     reason: str = ""
-    residual: Vector3
+    residual: tuple[float] | Vector3
     normalised: float
     left_out_error_m: Vector3 | None = None
     left_out_cov_m2: Covariance3 | None = None

@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
-from threadpoolctl import threadpool_limits
 from tornado.httpserver import HTTPServer
 from tornado.netutil import bind_sockets
 from tornado.web import Application, HTTPError, RequestHandler
@@ -348,19 +347,12 @@ def _job_json(job: Job) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def served(workspace: Workspace, options: ViewOptions, progress: Progress = SILENT) -> Iterator[ViewerServer]:
-    """Serve the viewer of a workspace, meanwhile with one thread of BLAS for each thread of the viewer.
-
-    OpenBLAS damages memory where several threads use its own threads at once.
+    """Serve the viewer of a workspace.
 
     Raises:
         MissingProductError: there is no trained model; names the command that makes it.
         GeorefError: a product is damaged, no port is free, the CRS cannot be used, or strangers would be answered.
     """
-    with threadpool_limits(1, user_api="blas"):
-        yield from _served(workspace, options, progress)
-
-
-def _served(workspace: Workspace, options: ViewOptions, progress: Progress) -> Iterator[ViewerServer]:
     server = ViewerServer(Viewer(workspace, options, progress), lambda: Viewer(workspace, options), options.port)
     try:
         if not server.refuses_strangers():

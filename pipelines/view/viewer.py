@@ -101,10 +101,12 @@ class Viewer:
         self._surveyed = {p.name: p for p in (*trained.survey.control_points, *trained.survey.check_points)}
         self._scene = self._described_scene()
         # The Gaussians are sorted now, so that the first click does not wait.
-        threading.Thread(target=lambda: renderer.blocks, daemon=True).start()
+        self._sorting = threading.Thread(target=lambda: renderer.blocks)
+        self._sorting.start()
 
     def close(self) -> None:
         self.jobs.close()
+        self._sorting.join()  # torch ends the whole process where Python's end takes a thread away from it
 
     # What is seen
 

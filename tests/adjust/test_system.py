@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -12,7 +13,16 @@ import pytest
 from pipelines.adjust.posterior import camera_covariances, intersection_jacobian
 from pipelines.adjust.state import State, SystematicError, SystematicErrors
 from pipelines.adjust.system import Minimum, NormalMatrix, Problem, linearised, minimise
-from pipelines.adjust.terms import Attitudes, CommonErrors, ControlPoints, Fixes, Planes, Term
+from pipelines.adjust.terms import (
+    Attitudes,
+    CommonErrors,
+    ControlPoints,
+    Distances,
+    Fixes,
+    MarkedTerm,
+    Planes,
+    Term,
+)
 from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.geometry.bundle import Network
 from pipelines.geometry.cameras import CameraPoses, Lenses, bearings
@@ -79,7 +89,19 @@ def measured(
         normal / np.linalg.norm(normal, axis=1, keepdims=True),
         np.full((10, 1, 1), 1 / 0.03),
     )
-    terms = (fixes, control_points(network, geo_from_model, rng, part), attitudes, planes)
+    control = control_points(network, geo_from_model, rng, part)
+    pairs = len(CONTROL) // 2
+    apart = geo_from_model.apply(CONTROL[: 2 * pairs]).reshape(-1, 2, 3)
+    true_m = np.linalg.norm(apart[:, 0] - apart[:, 1], axis=1)
+    ends = control.point < 2 * pairs
+    distances = Distances(
+        tuple(map(str, range(pairs))),
+        *(getattr(control, of_mark)[ends] for of_mark in ("point", "camera", "bearing_in_cam", "sigma_rad")),
+        control.bearing_by_lens[ends],
+        true_m + part * 0.005 * rng.normal(size=pairs),
+        np.full((pairs, 1, 1), 1 / 0.01),
+    )
+    terms = (fixes, control, distances, attitudes, planes)
     return {term.kind: term for term in terms}
 
 
@@ -159,7 +181,7 @@ def at_a_random_state(kind: str, seed: int) -> tuple[Problem, State, Term]:
     problem = problem_of(EXACT, tuple(term for name, term in of_kind.items() if name == kind), ERRORS)
     term = problem.term(kind)
     assert term is not None
-    if isinstance(term, ControlPoints):  # whose rays meet: the weights of the rays are those of the distances there
+    if isinstance(term, MarkedTerm):  # whose rays meet: the weights of the rays are those of the distances there
         poses = state.poses(problem.base)
         ray = CONTROL[term.point] - poses.cam_center_in_model[term.camera]
         bearing = np.einsum("kij,kj->ki", poses.cam_from_model[term.camera], ray)
@@ -169,7 +191,9 @@ def at_a_random_state(kind: str, seed: int) -> tuple[Problem, State, Term]:
 
 
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("kind", [t.kind for t in (Fixes, ControlPoints, Attitudes, Planes, CommonErrors)])
+@pytest.mark.parametrize(
+    "kind", [t.kind for t in (Fixes, ControlPoints, Distances, Attitudes, Planes, CommonErrors)]
+)
 def test_slopes_are_the_derivatives_of_the_residuals(kind: str, seed: int) -> None:
     problem, state, term = at_a_random_state(kind, seed)
     slopes = term.slopes(problem.at(state))
@@ -304,6 +328,7 @@ CASES: dict[str, tuple[tuple[str, ...], SystematicErrors, bool]] = {
     "two sessions": ((Fixes.kind, ControlPoints.kind), of_kinds("bias"), False),
     "lever arm": ((Fixes.kind, ControlPoints.kind), of_kinds("bias", "lever-arm"), False),
     "attitudes": ((Fixes.kind, Attitudes.kind), of_kinds("boresight", "common"), False),
+    "distances": ((Fixes.kind, Distances.kind), of_kinds("bias"), False),
     "lidar": ((Fixes.kind, Planes.kind), of_kinds("lidar-shift"), False),
     "frozen lens": ((Fixes.kind, ControlPoints.kind), of_kinds("bias"), True),
     "frozen lens, fixes": ((Fixes.kind,), of_kinds(), True),
@@ -377,6 +402,17 @@ def test_minimum_and_covariances_are_those_of_the_plain_adjustment(name: str) ->
     close_in_sigma(of_linear(normal, problem, by_unknowns), by_unknowns @ outer @ by_unknowns.T)
 
 
+def test_threads_may_share_a_normal_matrix() -> None:
+    """LAPACK's wrapper of SciPy changes the pivots that it is given while it solves."""
+    case = case_of(next(name for name, (_, errors, _) in CASES.items() if errors))
+    normal = linearised(case.problem, case.start).normal(ones(case.problem))
+    lens, errors = len(case.problem.lens), len(case.problem.errors)
+    alone = normal.of_errors(lens, errors)
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda _: normal.of_errors(lens, errors), range(2000)))
+    assert all(np.array_equal(each, alone) for each in found)
+
+
 def of_linear(normal: NormalMatrix, problem: Problem, by_unknowns: np.ndarray) -> np.ndarray:
     """Covariance of quantities with derivatives (m, 6 n + L)."""
     n = 6 * IMAGES
@@ -400,7 +436,7 @@ def on_earth(problem: Problem, state: State) -> tuple[np.ndarray, np.ndarray]:
 def close_in_sigma(found: np.ndarray, expected: np.ndarray) -> None:
     """Compare covariances relative to their σ."""
     sigma = np.sqrt(np.diag(expected))
-    np.testing.assert_allclose(found / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=3e-4)
+    np.testing.assert_allclose(found / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=6e-4)
 
 
 # Frames.

@@ -1,5 +1,7 @@
 """Noise, significance and volumes of a difference of heights, on rasters whose noise and change are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
@@ -9,7 +11,6 @@ from pipelines.change.detection import (
     Cells,
     Noise,
     Samples,
-    level_of_detection,
     significant_change,
     unchanged_ground,
     volumes,
@@ -24,11 +25,17 @@ def correlated_noise(rng: np.random.Generator) -> FloatArray:
     return np.asarray(SIGMA_M * noise / noise.std())
 
 
+def level_cells(difference: FloatArray, variance: FloatArray, datum: FloatArray, slope: FloatArray) -> Cells:
+    """Measured cells without any height step beside them."""
+    shape = difference.shape
+    return Cells(difference, variance, datum, slope, np.zeros(shape), np.ones(shape, dtype=bool))
+
+
 def analysed(difference: FloatArray) -> tuple[Cells, Noise]:
     """Cells of a level raster whose variance is stated as half of what it is, and their noise."""
     shape = difference.shape
     slope = np.random.default_rng(0).normal(0, 0.1, (*shape, 2))
-    cells = Cells(difference, np.full(shape, SIGMA_M**2 / 2), np.zeros(shape), slope)
+    cells = level_cells(difference, np.full(shape, SIGMA_M**2 / 2), np.zeros(shape), slope)
     row, column = (axis.ravel()[::7] for axis in np.indices(shape))
     place = np.asarray(CELL_M * (np.stack([column, -row], axis=-1) - SIDE / 2.0), dtype=np.float64)
     design = np.concatenate(
@@ -39,7 +46,9 @@ def analysed(difference: FloatArray) -> tuple[Cells, Noise]:
     designs = {
         lag: np.stack([design[:, :-lag].reshape(-1, 6), design[:, lag:].reshape(-1, 6)], 1)[::5] for lag in LAGS
     }
-    picked = Cells(difference[row, column], cells.variance_m2[row, column], np.zeros(len(row)), slope[row, column])
+    picked = level_cells(
+        difference[row, column], cells.variance_m2[row, column], np.zeros(len(row)), slope[row, column]
+    )
     return cells, unchanged_ground(Samples(picked, place, pairs, designs), CELL_M, 0.05, with_tilt=False)
 
 
@@ -49,8 +58,8 @@ def test_noise_of_no_change_is_found_and_gives_few_false_alarms() -> None:
     assert noise.factor == pytest.approx(2.0, rel=0.15)
     assert noise.correlated_m2 == pytest.approx(4 * np.pi * 9 * CELL_M**2, rel=0.35)
     assert abs(noise.shift_m[2] - SHIFT_M) < 3 * np.sqrt(noise.shift_cov_m2[2, 2])
-    centred = Cells(cells.difference_m - noise.shift_m[2], cells.variance_m2, cells.datum_m, cells.slope)
-    sign = significant_change(centred.difference_m, level_of_detection(centred, noise.factor), 4)
+    centred = replace(cells, difference_m=cells.difference_m - noise.shift_m[2])
+    sign = significant_change(centred, noise.factor, 4)
     assert (sign != 0).mean() < 0.05
 
 
@@ -66,10 +75,10 @@ def test_volumes_err_as_their_sigma_says_over_twenty_pairs() -> None:
         truth = 0.5 * inside
         cells, noise = analysed(SHIFT_M + truth + correlated_noise(np.random.default_rng(100 + seed)))
         moved = np.full((SIDE, SIDE), np.sqrt(noise.shift_cov_m2[2, 2]))
-        centred = Cells(cells.difference_m - noise.shift_m[2], cells.variance_m2, moved, cells.slope)
+        centred = replace(cells, difference_m=cells.difference_m - noise.shift_m[2], datum_m=moved)
         (volume,) = volumes(inside, centred, 1)
         found_m3, true_m3 = (volume.fill - volume.cut) * CELL_M**2, truth.sum() * CELL_M**2
         ratios.append((found_m3 - true_m3) / volume.sigma_m3(noise, CELL_M**2))
     assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.4
-    sign = significant_change(centred.difference_m, level_of_detection(centred, noise.factor), 4)
+    sign = significant_change(centred, noise.factor, 4)
     assert (sign[inside == 1] == 1).mean() > 0.95

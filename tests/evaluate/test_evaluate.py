@@ -22,7 +22,7 @@ from pipelines.core.staleness import status
 from pipelines.core.workspace import Workspace
 from pipelines.evaluate.asprs import few_points
 from pipelines.survey.report import AsprsStatement
-from pipelines.survey.survey import Mark, Survey
+from pipelines.survey.survey import KnownDistance, Mark, Survey
 from pipelines.survey.trained_model import TrainedModel
 from tests.evaluate.conftest import solve
 from tests.refusals import codes, numbers, refused, said
@@ -256,7 +256,13 @@ def test_points_are_written_and_printed(
 def test_every_field_of_the_report_is_described(altered: Workspace, rendered: Rendered) -> None:
     survey = rendered.survey
     far = survey.check_points[0].model_copy(update={"position_in_geo": (9.0, 9.0, 9.0)})
-    change_survey(altered, control_points=survey.check_points[1:4], check_points=(far, *survey.check_points[1:]))
+    bar = KnownDistance(ends=survey.check_points[1:3], distance_m=9.0, sigma_m=0.01, use="check")
+    change_survey(
+        altered,
+        control_points=survey.check_points[1:4],
+        check_points=(far, *survey.check_points[1:]),
+        distances=(bar,),
+    )
     run_stage(altered, EVALUATE, {"renders": 0, "cross_validate": True, "crs": "EPSG:4978"})
     text = (Path(__file__).parents[2] / "docs" / "formats.md").read_text(encoding="utf-8")
     missing = {name for name in names_in(report_of(altered)) if f"`{name}`" not in text}

@@ -30,7 +30,13 @@ from pipelines.formats.colmap import pycolmap_module, read_sparse
 from pipelines.formats.exif import read_tags
 from pipelines.formats.georef_sidecar import GeorefSidecar, sidecar_path, write_sidecar
 from pipelines.formats.gnss_logs import read_mrk, read_pos
-from pipelines.formats.ground_points import read_geo, read_ground_points, read_marks, read_point_table
+from pipelines.formats.ground_points import (
+    read_distances,
+    read_geo,
+    read_ground_points,
+    read_marks,
+    read_point_table,
+)
 from pipelines.formats.image_file import inspect_image, read_bytes
 from pipelines.formats.metashape import read_cameras, read_markers, read_markers_xml
 from pipelines.formats.splat_ply import SplatArrays, read_splat_ply, write_splat_ply
@@ -381,9 +387,12 @@ READERS: dict[str, Reader] = {
     "reference": Reader(_write(reference=REFERENCE), _each(read_markers, read_cameras)),
     "pix4d": Reader(
         _write(
-            a="label,x,y,z,sigma_h\nP,4e5,5e6,9,0.1\n", b="P,46,7,9,0.1,0.2\nQ,47,8,9\n", c="a.jpg,P,1.5,2.5,1\n"
+            a="label,x,y,z,sigma_h\nP,4e5,5e6,9,0.1\n",
+            b="P,46,7,9,0.1,0.2\nQ,47,8,9\n",
+            c="a.jpg,P,1.5,2.5,1\n",
+            d="from,to,distance,sigma,use\nP,Q,2.5,0.01,check\n",
         ),
-        _each(read_point_table, read_marks),
+        _each(read_point_table, read_marks, read_distances),
     ),
     "mrk": Reader(_write(mrk=MRK), _each(read_mrk)),
     "pos": Reader(

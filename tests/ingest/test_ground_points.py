@@ -12,6 +12,7 @@ from pipelines.core.errors import InputError
 from pipelines.geodesy.enu import ecef_from_lla
 from pipelines.ingest.ground_points import (
     GroundFile,
+    known_distances,
     read_ground_files,
     require_near,
     split_checks,
@@ -20,6 +21,7 @@ from pipelines.ingest.ground_points import (
 )
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.remarks import Remarks
+from pipelines.survey.survey import KnownDistance
 from tests.refusals import codes, refused, said
 
 SIZES = {"a.jpg": (64, 48), "b.jpg": (64, 48)}
@@ -104,3 +106,55 @@ def test_points_in_another_country_are_refused(tmp_path: Path) -> None:
     with refused("point-far-away", InputError) as error:
         require_near(_read(tmp_path, G1), ecef_from_lla([7.75, 46.02, 1620.0]))
     assert re.search(r"gcp_list\.txt:2: G1 is \d+ km", str(error.value))
+
+
+MARKS = "image,label,x,y\na.jpg,T1,5,6\nb.jpg,T1,7,8\na.jpg,T2,9,9\nb.jpg,T2,8,9\na.jpg,G2,1,1\n"
+
+
+def _distances(tmp_path: Path, rows: str, remarks: Remarks) -> tuple[KnownDistance, ...]:
+    (tmp_path / "bars.csv").write_text(rows)
+    (tmp_path / "marks.csv").write_text(MARKS)
+    (tmp_path / "gcp_list.txt").write_text("EPSG:4979\n" + G1)
+    options = IngestOptions(
+        gcp=tmp_path / "gcp_list.txt", marks=tmp_path / "marks.csv", distances=tmp_path / "bars.csv"
+    )
+    control, check = read_ground_files(options, remarks)
+    assert control is not None
+    tied = tie_marks(control, SIZES, options.sigma_mark, remarks)
+    return known_distances(options, (tied, check), SIZES, remarks)
+
+
+@pytest.mark.parametrize("header", ["", "from,to,distance (m),use,sigma\n"])
+def test_distances_between_control_points_and_targets(header: str, tmp_path: Path) -> None:
+    remarks = Remarks()
+    rows = "T1,T2,1.5,0.001\nG1,T1,20.25\n" if not header else "T1,T2,1.5,check,0.001\nG1,T1,20.25,,\n"
+    bar, taped = _distances(tmp_path, header + rows, remarks)
+    assert (bar.name, bar.distance_m, bar.sigma_m, bar.use) == (
+        "T1–T2",
+        1.5,
+        0.001,
+        "check" if header else "control",
+    )
+    assert (taped.sigma_m, taped.use) == (0.002, "control")
+    assert [(mark.image, mark.x_px) for mark in bar.ends[0].marks] == [("a.jpg", 5.0), ("b.jpg", 7.0)]
+    assert [mark.x_px for mark in taped.ends[0].marks] == [10.5, 11.5]
+    assert "1 distances" in said(remarks.assumptions, "default-distance-sigma")
+    assert "G2" in said(remarks.warnings, "mark-of-unknown-point")
+
+
+@pytest.mark.parametrize(
+    ("row", "code", "field"),
+    [
+        ("T1,T9,1.5,0.001", "distance-end-unmarked", "to"),
+        ("T1,T2,0,0.001", "distance-not-positive", "distance"),
+        ("T1,T1,1.5,0.001", "distance-of-one-point", "to"),
+        ("T1,T2,1.5,0.001,scale", "unknown-use", "use"),
+        ("T1,T2,1.5,0.001\nT2,T1,1.5,0.001", "distance-twice", "to"),
+        ("T1,T2,1.5,-1", "sigma-not-positive", "sigma"),
+    ],
+)
+def test_unusable_distances_are_refused(row: str, code: str, field: str, tmp_path: Path) -> None:
+    with refused(code, InputError) as error:
+        _distances(tmp_path, row + "\n", Remarks())
+    assert (error.value.path, error.value.field) == (tmp_path / "bars.csv", field)
+    assert error.value.line == 1 + row.count("\n")

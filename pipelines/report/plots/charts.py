@@ -84,7 +84,7 @@ def write_distance_map(path: Path, place_m: FloatArray, distance_m: FloatArray, 
     frame = frame_around(place_m)
     cell_m = max(size_m, frame.longer_m / _MOST_CELLS)
     raster = _medians(place_m, distance_m, frame.low, frame.high, cell_m)
-    limit_m = _round_up(float(np.quantile(np.abs(distance_m), _SCALE_QUANTILE)))
+    limit_m = round_up(float(np.quantile(np.abs(distance_m), _SCALE_QUANTILE)))
     figure, axes = new_plan(frame, "Model minus reference along the normals (M3C2)", right_inches=1.0)
     axes.set_facecolor(look.EMPTY_COLOUR)
     rows, columns = raster.shape
@@ -107,7 +107,7 @@ def write_distance_map(path: Path, place_m: FloatArray, distance_m: FloatArray, 
 def write_distance_histogram(path: Path, groups: Mapping[str, FloatArray], lod_m: float) -> None:
     """Write the densities of signed distances by group, none empty, and the median level of detection."""
     everything = np.concatenate(list(groups.values()))
-    limit_m = _round_up(max(float(np.quantile(np.abs(everything), 0.98)), 1.5 * lod_m))
+    limit_m = round_up(max(float(np.quantile(np.abs(everything), 0.98)), 1.5 * lod_m))
     edges = np.linspace(-limit_m, limit_m, _BINS + 1)
     figure = look.new_figure((6.2, 3.4), "constrained")
     axes = figure.add_subplot()
@@ -140,7 +140,7 @@ def _medians(
     return raster
 
 
-def _round_up(value: float) -> float:
+def round_up(value: float) -> float:
     """Return the next 1, 2 or 5 times a power of ten that is not below a value; 0.01 at the least."""
     power = 10.0 ** np.floor(np.log10(max(value, 0.01)))
     return float(next(step * power for step in (1, 2, 5, 10) if step * power >= max(value, 0.01) * (1 - 1e-9)))

@@ -84,24 +84,16 @@ class FixTerm(TensorTerm):
 
 
 @dataclass(frozen=True)
-class ControlTerm(TensorTerm):
-    """L_gcp, `adjust.terms.ControlPoints`, in float64; J points, K marks in all.
+class MarkedTerm(TensorTerm):
+    """Observations of J points that their marks place, `adjust.terms.MarkedTerm`, in float64; K marks in all."""
 
-    The root information of control points through the rendered depth holds the surface's σ, too.
-    """
-
-    kind: ClassVar[str] = "control"
+    per_observation: ClassVar[int] = 1
 
     point: Tensor
     camera: Tensor
     bearing_in_cam: Tensor
     sigma_rad: Tensor
     bearing_by_lens: Tensor
-    position_in_geo: Tensor
-    root_information: Tensor
-
-    def residuals(self, at: Estimate) -> Tensor:
-        return at.geo_from_model.apply(self._intersected(at)) - self.position_in_geo
 
     def _intersected(self, at: Estimate) -> Tensor:
         """Return the points (J, 3) in `model` nearest to the rays of their marks."""
@@ -124,8 +116,42 @@ class ControlTerm(TensorTerm):
         return point
 
     def _sum_by_point(self, values: Tensor) -> Tensor:
-        total = torch.zeros((len(self), *values.shape[1:]), dtype=values.dtype, device=values.device)
+        shape = (self.per_observation * len(self), *values.shape[1:])
+        total = torch.zeros(shape, dtype=values.dtype, device=values.device)
         return total.index_add(0, self.point, values)
+
+
+@dataclass(frozen=True)
+class ControlTerm(MarkedTerm):
+    """L_gcp, `adjust.terms.ControlPoints`, in float64.
+
+    The root information of control points through the rendered depth holds the surface's σ, too.
+    """
+
+    kind: ClassVar[str] = "control"
+
+    position_in_geo: Tensor
+    root_information: Tensor
+
+    def residuals(self, at: Estimate) -> Tensor:
+        return at.geo_from_model.apply(self._intersected(at)) - self.position_in_geo
+
+
+@dataclass(frozen=True)
+class KnownDistanceTerm(MarkedTerm):
+    """`adjust.terms.Distances` in float64."""
+
+    kind: ClassVar[str] = "distances"
+    dimension: ClassVar[int] = 1
+    per_observation: ClassVar[int] = 2
+
+    distance_m: Tensor
+    root_information: Tensor
+
+    def residuals(self, at: Estimate) -> Tensor:
+        place = at.geo_from_model.apply(self._intersected(at))
+        length: Tensor = (place[::2] - place[1::2]).norm(dim=1)
+        return (length - self.distance_m)[:, None]
 
 
 @dataclass(frozen=True)
@@ -178,6 +204,8 @@ def tensor_term(term: adjustment.Term, errors: SystematicErrors) -> TensorTerm:
             return FixTerm(**_tensors(term, "camera", "position_in_geo", "root_information"), bias=of_errors)
         case adjustment.ControlPoints():
             return ControlTerm(**_tensors(term, *(field.name for field in fields(ControlTerm))))
+        case adjustment.Distances():
+            return KnownDistanceTerm(**_tensors(term, *(field.name for field in fields(KnownDistanceTerm))))
         case adjustment.Attitudes():
             return AttitudeTerm(**_tensors(term, *(field.name for field in fields(AttitudeTerm))))
         case adjustment.Planes():

@@ -15,6 +15,7 @@ from pipelines.adjust.system import Problem
 from pipelines.adjust.terms import Planes, Term
 from pipelines.geometry.similarity import perturbation
 from pipelines.survey.scene import Scene, initial_scene
+from pipelines.survey.survey import KnownDistance
 from pipelines.train.geographic.terms import tensor_term
 from pipelines.train.geographic.unknowns import CameraCorrections, Estimate, LearnableSimilarity
 from tests.scenes import initial, material, session_of
@@ -31,7 +32,9 @@ def every() -> tuple[Scene, Problem]:
         for index, image in enumerate(survey.images)
         if image.fix is not None
     )
-    survey = survey.model_copy(update={"images": images, "sessions": (session_of(0.02), session_of(2.0))})
+    bar = KnownDistance(ends=survey.control_points[:2], distance_m=20.0, sigma_m=0.01)
+    sessions = (session_of(0.02), session_of(2.0))
+    survey = survey.model_copy(update={"images": images, "sessions": sessions, "distances": (bar,)})
     scene, rng = initial_scene(sparse, survey, initial()), np.random.default_rng(1)
     normal = rng.normal(size=(20, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -68,7 +71,7 @@ def residuals_of(problem: Problem, term: Term, state: State) -> Callable[[Tensor
 
 
 @pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("kind", ["fixes", "control points", "attitudes", "lidar"])
+@pytest.mark.parametrize("kind", ["fixes", "control points", "distances", "attitudes", "lidar"])
 def test_residuals_and_slopes_are_those_of_the_adjustment(
     every: tuple[Scene, Problem], kind: str, seed: int
 ) -> None:
@@ -83,9 +86,10 @@ def test_residuals_and_slopes_are_those_of_the_adjustment(
     for row, camera, block in zip(slopes.row, slopes.camera, slopes.by_pose, strict=True):
         by_pose[row, :, camera] += block
     # The slopes of an intersection hold the weights of its rays one pass later than the tensors do.
-    tolerance = 5e-3 if kind == "control points" else 1e-6
+    of_marks = kind in ("control points", "distances")
+    tolerance = 5e-3 if of_marks else 1e-6
     for found, wanted in ((by_correction, by_pose), (by_lens, slopes.by_lens), (by_errors, slopes.by_errors)):
         np.testing.assert_allclose(found.detach(), wanted, atol=tolerance * (1e-3 + np.abs(wanted).max(initial=0)))
     assert by_pose.any() or kind == "lidar"
-    assert by_errors.any() or kind == "control points"
-    assert by_lens.any() == (kind == "control points")
+    assert by_errors.any() or of_marks
+    assert by_lens.any() == of_marks

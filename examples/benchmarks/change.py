@@ -1,0 +1,186 @@
+"""Change between two simulated surveys against the truth: `python examples/benchmarks/change.py OUT --help`.
+
+For each seed, three flights over one town are simulated and reconstructed: the first, a later one after changes,
+and a later one without any. Prints, for the changed pair, precision and recall of the significant cells, and the
+volumes with their errors; for the unchanged pair the false alarms. What stands in OUT already is not made again.
+
+A cell has truly changed if its height differs by more than `--least`. Cells that both epochs measure count.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from scipy.ndimage import map_coordinates
+
+from pipelines.change.product import Change
+from pipelines.core.products import load_json
+from pipelines.core.types import FloatArray
+from pipelines.formats.geotiff import frame_of, read_cells
+from pipelines.formats.vector_files import feature, features_text
+from pipelines.geodesy.crs import parse_crs
+from pipelines.geodesy.enu import ecef_from_enu, ecef_from_lla, enu_from_ecef, lla_from_ecef
+from pipelines.simulate.stage import TRUE_HEIGHTS, TRUTH
+from pipelines.simulate.truth import TrueChange, Truth
+
+EPOCHS: dict[str, Sequence[str]] = {
+    "first": (),
+    "changed": ("--epoch", "2"),
+    "same": ("--epoch", "2", "--changes", "none"),
+}
+_RIM_M = 1.5  # of the given polygons around the true outlines, beyond every error of a wall
+
+
+@dataclass(frozen=True)
+class VolumeError:
+    """Net volume of a region, and the true one in its polygon; `name` R: found, P: given."""
+
+    name: str
+    kind: str
+    net_m3: float
+    true_m3: float
+    sigma_m3: float
+
+    @property
+    def normalised(self) -> float:
+        return (self.net_m3 - self.true_m3) / self.sigma_m3
+
+
+@dataclass(frozen=True)
+class PairFigures:
+    """Figures of a seed; shares of one."""
+
+    seed: int
+    cell_m: float
+    precision: float
+    recall: float
+    false_alarms: float
+    regions_of_no_change: int
+    volumes: tuple[VolumeError, ...]
+
+
+def main() -> None:
+    """Print a line a seed, and one a volume."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--seeds", default="5", help="seeds of the towns, with commas")
+    parser.add_argument("--images", default="24", help="photographs of each flight")
+    parser.add_argument("--size", default="480x360", help="of the photographs")
+    parser.add_argument("--train", default="--preset fast --iterations 1200", help="options of georef run")
+    parser.add_argument("--change", default="--stable-auto", help="options of georef change")
+    parser.add_argument("--least", type=float, default=0.1, help="height in metres from which a cell has changed")
+    parser.add_argument("--json", type=Path, help="file that keeps the figures")
+    args = parser.parse_args()
+    every = []
+    for seed in map(int, args.seeds.split(",")):
+        figures = measured_pair(args, seed, args.out / f"seed_{seed}")
+        every.append(asdict(figures))
+        print(
+            f"seed {seed}, cells of {figures.cell_m:.2f} m: precision {figures.precision:.3f}, recall "
+            f"{figures.recall:.3f}; without change {figures.false_alarms:.2%} false alarms, "
+            f"{figures.regions_of_no_change} regions"
+        )
+        for one in figures.volumes:
+            print(
+                f"  {one.name} {one.kind}: {one.net_m3:.1f} ± {one.sigma_m3:.1f} m³, true {one.true_m3:.1f} m³, "
+                f"error/σ {one.normalised:+.1f}"
+            )
+    if args.json:
+        args.json.write_text(json.dumps(every, indent=1) + "\n", "utf-8")
+
+
+def measured_pair(args: argparse.Namespace, seed: int, folder: Path) -> PairFigures:
+    """Make what is missing in a folder, and return the figures of its pairs."""
+    for name, epoch in EPOCHS.items():
+        survey, workspace = folder / f"survey_{name}", folder / name
+        if not survey.exists():
+            flight = ["--flight", "grid", "--images", args.images, "--size", args.size, "--seed", str(seed)]
+            _georef("simulate", survey, *flight, *epoch)
+        _georef(
+            *("run", workspace, "--images", survey / "images", "--trajectory", survey / "trajectory.csv"),
+            *("--vertical", "ellipsoidal", "--gcp", survey / "gcp_list.txt"),
+            *(*args.train.split(), "--deliver", "raster"),
+        )
+    truth = load_json(Truth, folder / "survey_changed" / TRUTH)
+    assert truth.change is not None
+    polygons = folder / "polygons.geojson"
+    polygons.write_text(features_text(_true_polygons(truth, truth.change)), "utf-8")
+    _georef("change", folder / "first", folder / "changed", "--regions", polygons, *args.change.split())
+    _georef("change", folder / "first", folder / "same", *args.change.split())
+    classes = read_cells(folder / "changed/change/significant.tif")[0]
+    risen = true_difference(truth, truth.change, folder)
+    counts = (classes > 0) & np.isfinite(risen)
+    marked, changed = (classes > 1) & counts, np.abs(risen) > args.least
+    change = load_json(Change, folder / "changed/change/change.json")
+    still = read_cells(folder / "same/change/significant.tif")[0]
+    return PairFigures(
+        seed=seed,
+        cell_m=change.cell_m,
+        precision=float(changed[marked].mean()),
+        recall=float(marked[counts & changed].mean()),
+        false_alarms=float((still[still > 0] > 1).mean()),
+        regions_of_no_change=len(load_json(Change, folder / "same/change/change.json").regions),
+        volumes=tuple(_volume_errors(truth, truth.change, change, folder)),
+    )
+
+
+def true_difference(truth: Truth, change: TrueChange, folder: Path) -> FloatArray:
+    """Return the true later minus earlier height (H, W) in metres of the cells of a comparison; NaN: not known."""
+    frame = frame_of(folder / "changed/change/difference.tif")
+    crs = parse_crs(frame.wkt)
+    column, row = np.meshgrid(np.arange(frame.columns) + 0.5, np.arange(frame.rows) + 0.5)
+    plan = [frame.west + column.ravel() * frame.step_x, frame.north - row.ravel() * frame.step_y]
+    lla = crs.lla_from_xyz(np.column_stack([*plan, np.zeros(column.size)]))
+    lla[:, 2] = truth.origin.alt_m
+    geo = enu_from_ecef(ecef_from_lla(lla), truth.origin)
+    heights = np.load(folder / "survey_changed" / TRUE_HEIGHTS)
+    place = [(geo[:, axis] - change.corner[axis]) / change.cell_m - 0.5 for axis in (1, 0)]
+    risen = map_coordinates(heights["after"] - heights["before"], place, order=0, cval=np.nan)
+    return np.asarray(risen.reshape(frame.rows, frame.columns), dtype=np.float64)
+
+
+def _true_polygons(truth: Truth, change: TrueChange) -> list[dict[str, Any]]:
+    """Return the outlines of the true changes with a rim, as features in WGS84."""
+    found = []
+    for region in change.regions:
+        ring = np.array(shapely.Polygon(region.outline).buffer(_RIM_M).exterior.coords)
+        lla = lla_from_ecef(ecef_from_enu(np.column_stack([ring, np.zeros(len(ring))]), truth.origin))
+        shape = shapely.geometry.mapping(shapely.Polygon(lla[:, [1, 0]]))
+        found.append(feature(shape, {"kind": region.kind}))
+    return found
+
+
+def _volume_errors(truth: Truth, change: TrueChange, found: Change, folder: Path) -> list[VolumeError]:
+    """Return the volumes of all regions; that of a region beside every true change should be zero."""
+    regions = json.loads((folder / "changed/change/regions.geojson").read_text("utf-8"))["features"]
+    outlines = [shapely.Polygon(region.outline).buffer(_RIM_M) for region in change.regions]
+    errors = []
+    for one, region in zip(regions, found.regions, strict=True):
+        middle = shapely.geometry.shape(one["geometry"]).representative_point()
+        lla = np.array([[middle.y, middle.x, truth.origin.alt_m]])
+        geo = enu_from_ecef(ecef_from_lla(lla), truth.origin)[0]
+        match = [
+            index for index, outline in enumerate(outlines) if outline.contains(shapely.Point(*geo[:2].tolist()))
+        ]
+        true = change.regions[match[0]] if match else None
+        net = 0.0 if true is None else true.fill_m3 - true.cut_m3
+        kind = "no change" if true is None else true.kind
+        errors.append(VolumeError(region.name, kind, region.net_m3, net, region.sigma_m3))
+    return errors
+
+
+def _georef(*words: object) -> None:
+    subprocess.run([sys.executable, "-m", "georef_cli", *map(str, words)], check=True, stdout=subprocess.DEVNULL)
+
+
+if __name__ == "__main__":
+    main()

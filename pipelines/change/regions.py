@@ -1,0 +1,156 @@
+"""Regions that have changed: connected cells, their test, their volumes and their outlines.
+
+A region is found by its core, the cells that change significantly. Its volume includes a rim, in which a change
+fades below the level of detection, and the uncertain cells of walls and of interpolated parts. It is real if the
+net volume of its core exceeds its σ by more than chance gives among as many places as the scene has independent
+errors, and that of the whole exceeds 1.96 σ.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation, find_objects, label
+from scipy.special import erfc
+
+from pipelines.change.detection import QUANTILE_95, Cells, Noise, Volume, volumes
+from pipelines.change.grid import CommonGrid, Window
+from pipelines.change.product import ChangedRegion
+from pipelines.core.types import BoolArray, FloatArray, IntArray
+from pipelines.formats.geotiff import cells_inside, outlines, read_cells, write_part
+
+CELLS = ("difference", "datum", "variance", "step")  # parts that volumes are made of
+_LEAST_REACH, _MOST_REACH = 2, 10  # cells
+_CHANCE = 0.05  # that noise alone makes a region anywhere
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Parts of the rasters, one a window, in a scratch folder."""
+
+    folder: Path
+    grid: CommonGrid
+
+    def path(self, name: str, window: Window) -> Path:
+        return self.folder / f"{name}_{window.row}_{window.column}.tif"
+
+    def write(self, name: str, window: Window, values: NDArray[Any]) -> None:
+        write_part(self.path(name, window), values[None], self.grid.part(window))
+
+    def cells(self, window: Window) -> Cells:
+        """Return the cells of a window after the registration, as volumes need them."""
+        difference, datum, variance, step = (
+            read_cells(self.path(name, window))[0].astype(np.float64) for name in CELLS
+        )
+        return Cells(difference, variance, datum, np.zeros(0), step, np.isfinite(difference))
+
+
+@dataclass(frozen=True)
+class FoundRegions:
+    """Regions with their polygons in the CRS, those of the user first, and the sign (H, W) of cells in cores.
+
+    `lowered`, `raised` and `every` are the sums of those that were found.
+    """
+
+    regions: tuple[ChangedRegion, ...]
+    lowered: ChangedRegion
+    raised: ChangedRegion
+    every: ChangedRegion
+    polygons: list[Any]
+    sign: NDArray[np.int8]
+
+
+def reach_of(grid: CommonGrid, noise: Noise) -> int:
+    """Return how far in cells neighbours of a cell lie."""
+    return int(np.clip(round(noise.length_m / grid.cell_m), _LEAST_REACH, _MOST_REACH))
+
+
+def candidates(
+    sign: NDArray[np.int8], measured: BoolArray, cell_m2: float, reach: int, min_area_m2: float
+) -> NDArray[np.int32]:
+    """Return the number of the region of each cell, 0 for none: connected, of one sign, not too small, with a rim.
+
+    The rim is `reach` cells wide where both epochs have measured (H, W), and two where one has interpolated.
+    """
+    every = np.zeros(sign.shape, dtype=np.int32)
+    count = 0
+    for direction in (-1, 1):
+        number, parts = label(sign == direction, structure=np.ones((3, 3)), output=np.int32)
+        size = np.bincount(number.ravel(), minlength=parts + 1)
+        kept = size * cell_m2 >= min_area_m2
+        kept[0] = False
+        others = sign != -direction
+        core = binary_dilation(kept[number], iterations=_LEAST_REACH, mask=others)
+        wide = binary_dilation(core, iterations=reach - _LEAST_REACH + 1, mask=(others & measured) | core)
+        wide, parts = label(wide, output=np.int32)
+        free = (every == 0) & (wide > 0)
+        every[free] = wide[free] + count
+        count += parts
+    return every
+
+
+def is_real(net_m3: FloatArray, sigma_m3: FloatArray, places: float) -> BoolArray:
+    """Return which of the net volumes (R,) are no chance: in 95 % of scenes with so many places, none is false."""
+    beyond = np.abs(net_m3) / np.maximum(sigma_m3, 1e-12)
+    return np.asarray(erfc(beyond / np.sqrt(2)) * max(places, 1.0) <= _CHANCE)
+
+
+def find_regions(
+    parts: Parts, sign: NDArray[np.int8], noise: Noise, given: tuple[Any, ...], min_area_m2: float
+) -> FoundRegions:
+    """Return the regions of the given polygons, then those found in significant cells of `sign` (H, W)."""
+    grid = parts.grid
+    measured = np.zeros(sign.shape, dtype=bool)
+    for window in grid.windows():
+        measured[window.slices] = read_cells(parts.path("measured", window))[0] > 0
+    number = candidates(sign, measured, grid.cell_m2, reach_of(grid, noise), min_area_m2)
+    count = int(number.max(initial=0))
+    whole, cores, of_given = ([Volume() for _ in range(size)] for size in (count, count, len(given)))
+    for window in grid.windows():
+        cells = parts.cells(window)
+        inside = number[window.slices]
+        core = np.where(sign[window.slices] != 0, inside, 0)
+        of_window = volumes(inside, cells, count), volumes(core, cells, count)
+        whole, cores = (
+            [one + two for one, two in zip(sums, more, strict=True)]
+            for sums, more in zip((whole, cores), of_window, strict=True)
+        )
+        for place, polygon in enumerate(given):
+            of_given[place] += volumes(cells_inside(polygon, grid.part(window)).astype(np.int64), cells, 1)[0]
+    named = [(f"P{place}", volume) for place, volume in enumerate(of_given, start=1)]
+    polygons = list(given)
+    net, sigma, net_of_core, sigma_of_core = (
+        np.array(values)
+        for sums in (whole, cores)
+        for values in (
+            [(one.fill - one.cut) * grid.cell_m2 for one in sums],
+            [one.sigma_m3(noise, grid.cell_m2) for one in sums],
+        )
+    )
+    # A region is as large as its errors at least, so that more of them are no further chance.
+    errors = float(measured.sum()) * grid.cell_m2 / max(noise.correlated_m2, min_area_m2)
+    kept = np.flatnonzero(is_real(net_of_core, sigma_of_core, errors) & (np.abs(net) > QUANTILE_95 * sigma))
+    kept = kept[np.argsort(-np.abs(net[kept]), kind="stable")]
+    places = find_objects(number)
+    for place, index in enumerate(kept.tolist(), start=1):
+        named.append((f"R{place}", whole[index]))
+        polygons.append(_outline(number, index + 1, places[index], grid))
+    for name, chosen in (("lowered", kept[net[kept] < 0]), ("raised", kept[net[kept] > 0]), ("every", kept)):
+        named.append((name, sum((whole[index] for index in chosen.tolist()), Volume())))
+    *regions, lowered, raised, every = (
+        ChangedRegion.of(name, volume, noise, grid.cell_m2) for name, volume in named
+    )
+    in_cores = np.where(np.isin(number, kept + 1), sign, 0).astype(np.int8)
+    return FoundRegions(tuple(regions), lowered, raised, every, polygons, in_cores)
+
+
+def _outline(number: IntArray | NDArray[np.int32], which: int, place: tuple[slice, slice], grid: CommonGrid) -> Any:
+    rows, columns = place
+    cells = number[rows, columns] == which
+    frame = grid.frame.part(columns.start, rows.start, cells.shape[1], cells.shape[0])
+    return shapely.union_all(outlines(cells, frame))

@@ -1,0 +1,81 @@
+"""Walls, rims and interpolated cells: no change by themselves, and in a volume with their σ."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipelines.change.grid import step_variance
+from pipelines.change.options import ChangeOptions
+from pipelines.change.product import Change
+from pipelines.change.regions import is_real
+from pipelines.change.stage import run
+from pipelines.core.products import load_json
+from pipelines.core.workspace import StageRun
+from pipelines.formats.geotiff import read_cells
+from tests.change_pairs import CELL_M, TownPair, town_pair
+
+
+def compared(pair: TownPair, out: Path) -> tuple[NDArray[np.uint8], Change]:
+    """Classes (H, W) and product of a comparison that is registered on unchanged ground."""
+    out.mkdir()
+    before, after = pair.workspaces
+    run(StageRun(after, out), ChangeOptions(before=before.root / "raster", stable_auto=True))
+    return read_cells(out / "significant.tif")[0], load_json(Change, out / "change.json")
+
+
+def test_displaced_walls_are_no_change(tmp_path: Path) -> None:
+    """Walls half a cell apart, as far as a raster can tell them: every second of their cells differs by metres."""
+    pair = town_pair(tmp_path, changed=False)
+    classes, change = compared(pair, tmp_path / "out")
+    assert (classes > 1).mean() <= 0.05
+    assert change.regions == ()
+    assert (classes == 0).mean() < 0.03  # the interpolated cells
+
+
+def test_changes_are_found_between_displaced_walls(tmp_path: Path) -> None:
+    pair = town_pair(tmp_path, changed=True)
+    classes, change = compared(pair, tmp_path / "out")
+    changed, marked = np.abs(pair.risen_m), classes > 1
+    assert (changed[marked] > 0.05).mean() >= 0.95
+    assert marked[(changed > 0.2) & (classes > 0)].mean() >= 0.9
+    # A house gone, a new one, a pit and a heap, of which each is one region with its volume.
+    risen = pair.risen_m * CELL_M**2
+    sides = np.split(np.arange(risen.shape[0]), [180, 325])
+    house_gone, house_new = risen[sides[0]].sum(), risen[sides[1]].sum()
+    pit, heap = (risen[sides[2]][:, columns].sum() for columns in (slice(None, 155), slice(155, None)))
+    found = sorted(region.net_m3 for region in change.regions)
+    assert found == pytest.approx(sorted([house_gone, house_new, pit, heap]), rel=0.05)
+    for region, true in zip(
+        sorted(change.regions, key=lambda one: one.net_m3), sorted([house_gone, house_new, pit, heap]), strict=True
+    ):
+        assert abs(region.net_m3 - true) < 2.5 * region.sigma_m3
+
+
+def test_a_wall_has_the_variance_of_its_relief() -> None:
+    """A wall of 6 m between two cells: both may be of either height. A slope of 30° and noise are no relief."""
+    row, column = np.indices((40, 60), dtype=np.float64)
+    wall = np.where(column >= 30, 6.0, 0.0)
+    measured, sigma = np.ones(wall.shape, dtype=bool), np.full(wall.shape, 0.02)
+    variance = step_variance(wall, measured, sigma, 0.25, 1)
+    assert variance[:, 29:31] == pytest.approx((6.0 - 0.12) ** 2 / 3)
+    assert not variance[:, :29].any()
+    assert not variance[:, 31:].any()
+    slope = np.tan(np.radians(30)) * 0.25 * (0.8 * column + 0.6 * row)
+    noisy = slope + np.random.default_rng(0).normal(0, 0.02, slope.shape)
+    assert (step_variance(noisy, measured, sigma, 0.25, 1) > 0.06**2)[1:-1, 1:-1].mean() < 0.1
+    # Interpolated between roof and ground, cells may have any height between.
+    hole = (column > 25) & (column < 30)
+    ramp = np.where(hole, 6.0 * (column - 25) / 5, wall)
+    assert step_variance(ramp, ~hole, sigma, 0.25, 1)[hole] == pytest.approx(6.0**2 / 3)
+    assert not step_variance(np.full(wall.shape, np.nan), measured, sigma, 0.25, 1).any()
+
+
+def test_noise_makes_a_region_in_one_of_twenty_scenes() -> None:
+    places, rng = 200, np.random.default_rng(0)
+    scenes = [is_real(rng.normal(0, 2.0, places), np.full(places, 2.0), places).any() for _ in range(2000)]
+    assert 0.03 < np.mean(scenes) < 0.07
+    assert is_real(np.array([-20.0]), np.array([2.0]), places).all()
