@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from pipelines.core.errors import InputError
-from pipelines.formats.fiducials import find_tags, tag_modules
 from pipelines.geometry.cameras import Pinhole
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.stage import survey_and_track
@@ -153,37 +152,3 @@ def test_numbers_that_fit_nobody_or_two(flown: tuple[RecordedFlight, Path], tmp_
     points.write_text("\n".join([head, *rows[:4]]) + "\n", "utf-8")
     few = surveyed(folder, gcp=points)
     assert "target-of-no-point" in codes(few.warnings)
-
-
-def photograph_of(number: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return a noisy picture (H, W) of a tag seen obliquely, and the place of its middle."""
-    modules = np.pad(tag_modules(TAGS, number), 1, constant_values=1)
-    fine = np.kron(modules, np.full((40, 40), 1.0)) * 150 + 50
-    side, middle = rng.uniform(28, 80), rng.uniform(90, 110, 2)
-    turn, squeeze = rng.uniform(0, 2 * np.pi), rng.uniform(0.5, 1.0)
-    axes = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ np.diag([side, squeeze * side])
-    corners = (
-        np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2 * len(modules) / (len(modules) - 2) @ axes.T + middle
-    )
-    full = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * len(fine)
-    scale = 8  # rendered finely and averaged: the grey of a pixel is that of its square
-    matrix = cv2.getPerspectiveTransform(
-        (full - 0.5).astype(np.float32), (scale * corners - 0.5).astype(np.float32)
-    )
-    large = cv2.warpPerspective(fine, matrix, (200 * scale, 200 * scale), borderValue=120.0, flags=cv2.INTER_LINEAR)
-    grey = cv2.GaussianBlur(cv2.resize(large, (200, 200), interpolation=cv2.INTER_AREA), (0, 0), 0.6)
-    return np.clip(grey + rng.normal(0, 3, grey.shape), 0, 255).astype(np.uint8), middle
-
-
-def test_centres_of_tags_with_their_sigma() -> None:
-    rng = np.random.default_rng(5)
-    errors, sigmas, wrong = [], [], 0
-    for number in range(80):
-        grey, middle = photograph_of(number, rng)
-        for tag in find_tags(grey, (TAGS,)):
-            wrong += tag.number != number
-            errors.append(tag.center_px - middle)
-            sigmas.append(tag.sigma_px)
-    assert wrong == 0 and len(errors) >= 76
-    assert np.sqrt(np.mean(np.square(errors))) < 0.05
-    assert 0.6 < np.sqrt(np.mean((np.array(errors) / np.array(sigmas)[:, None]) ** 2)) < 1.5
