@@ -1,4 +1,4 @@
-"""The report in a browser: without a network, at two widths, light and dark, on paper."""
+"""The report and the page of a change in a browser: without a network, at two widths, light and dark, on paper."""
 
 from __future__ import annotations
 
@@ -12,12 +12,16 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, Route
 
+from pipelines.change.options import ChangeOptions
+from pipelines.change.stage import run as run_change
 from pipelines.compare.configurations import PAGE, write_comparison
 from pipelines.compare.table import ComparedRow, Comparison, PointAccuracy
+from pipelines.core.stages import CHANGE_PAGE
 from pipelines.core.workspace import StageRun
 from pipelines.report.chromium import print_pdf
 from pipelines.report.options import ReportOptions
 from pipelines.report.stage import run
+from tests.change_pairs import town_pair
 from tests.evaluated_workspaces import evaluated_workspace
 
 pytestmark = pytest.mark.browser
@@ -222,4 +226,67 @@ def test_comparison_has_the_same_frame(browser: Browser, tmp_path: Path) -> None
         page.page.locator("data[data-field='rows.0.triangulated.rmse_h_m']").get_attribute("data-value") == "0.015"
     )
     assert page.page.locator("img").count() == 1
+    context.close()
+
+
+@pytest.fixture(scope="module")
+def change_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Page of a town at two dates, where a house is gone, another is new, and there are a pit and a heap."""
+    before, after = town_pair(tmp_path_factory.mktemp("change"), changed=True).workspaces
+    (out := after.root / "change").mkdir()
+    run_change(StageRun(after, out), ChangeOptions(before=before.root / "raster", stable_auto=True))
+    return out / Path(CHANGE_PAGE).name
+
+
+@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (1280, "dark"), (390, "light"), (390, "dark")])
+def test_change_page_is_whole_and_legible(
+    browser: Browser, change_page: Path, width: int, scheme: Literal["light", "dark"]
+) -> None:
+    context = browser.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme, offline=True)
+    opened = Opened(context.new_page())
+    opened.show(change_page)
+    page = opened.page
+    assert (opened.asked, opened.problems) == ([], [])
+    assert page.evaluate("() => document.documentElement.scrollWidth") <= width
+    assert page.evaluate("() => [...document.images].every((image) => image.complete && image.naturalWidth)")
+    assert page.evaluate("() => [...document.images].every((i) => i.getBoundingClientRect().right <= innerWidth)")
+    assert np.array(page.evaluate(CONTRASTS)).min() >= 4.5
+    # Four regions, on the map, in the table and with a profile each.
+    for place in ("#regions tbody tr", ".map svg path"):
+        assert page.locator(place).count() == 4
+    assert page.locator("#profiles img").count() >= 4
+    context.close()
+
+
+def test_slider_of_a_change_moves_by_mouse_and_by_keys(browser: Browser, change_page: Path) -> None:
+    context = browser.new_context(viewport={"width": 1000, "height": 900}, offline=True)
+    opened = Opened(context.new_page())
+    opened.show(change_page)
+    figure = opened.page.locator(".compare").first
+    figure.scroll_into_view_if_needed()
+
+    def shown() -> np.ndarray:
+        picture = cv2.imdecode(np.frombuffer(figure.locator(".over").screenshot(), np.uint8), cv2.IMREAD_COLOR)
+        assert picture is not None
+        return picture[40:-40].astype(float)  # the names stand on the rim
+
+    slider = figure.locator("input")
+    pictures = []
+    for value in ("0", "100"):
+        slider.evaluate(f"(node) => {{ node.value = {value}; node.dispatchEvent(new Event('input')); }}")
+        pictures.append(shown())
+    later, earlier = pictures
+    assert np.abs(later - earlier).mean() > 1
+    slider.focus()
+    for _ in range(50):
+        opened.page.keyboard.press("ArrowLeft")
+    assert slider.input_value() == "50"
+    half = shown()
+    middle = half.shape[1] // 2
+    assert np.abs(half - earlier)[:, : middle - 20].mean() < 0.5
+    assert np.abs(half - later)[:, middle + 20 :].mean() < 0.5
+    box = slider.bounding_box()
+    assert box is not None
+    opened.page.mouse.click(box["x"] + 0.8 * box["width"], box["y"] + box["height"] / 2)
+    assert abs(int(slider.input_value()) - 80) <= 2
     context.close()
