@@ -160,21 +160,25 @@ def _true_polygons(truth: Truth, change: TrueChange) -> list[dict[str, Any]]:
 
 
 def _volume_errors(truth: Truth, change: TrueChange, found: Change, folder: Path) -> list[VolumeError]:
-    """Return the volumes of all regions; that of a region beside every true change should be zero."""
+    """Return the volumes of all regions, and the true ones within their outlines."""
     regions = json.loads((folder / "changed/change/regions.geojson").read_text("utf-8"))["features"]
-    outlines = [shapely.Polygon(region.outline).buffer(_RIM_M) for region in change.regions]
+    heights = np.load(folder / "survey_changed" / TRUE_HEIGHTS)
+    risen = heights["after"] - heights["before"]
+    row, column = np.indices(risen.shape) + 0.5
+    east, north = change.corner[0] + column * change.cell_m, change.corner[1] + row * change.cell_m
     errors = []
     for one, region in zip(regions, found.regions, strict=True):
-        middle = shapely.geometry.shape(one["geometry"]).representative_point()
-        lla = np.array([[middle.y, middle.x, truth.origin.alt_m]])
-        geo = enu_from_ecef(ecef_from_lla(lla), truth.origin)[0]
-        match = [
-            index for index, outline in enumerate(outlines) if outline.contains(shapely.Point(*geo[:2].tolist()))
-        ]
-        true = change.regions[match[0]] if match else None
-        net = 0.0 if true is None else true.fill_m3 - true.cut_m3
-        kind = "no change" if true is None else true.kind
-        errors.append(VolumeError(region.name, kind, region.net_m3, net, region.sigma_m3))
+        in_geo = shapely.transform(
+            shapely.geometry.shape(one["geometry"]),
+            lambda lon_lat: enu_from_ecef(
+                ecef_from_lla(np.column_stack([lon_lat[:, ::-1], np.full(len(lon_lat), truth.origin.alt_m)])),
+                truth.origin,
+            )[:, :2],
+        )
+        true_m3 = float(np.nansum(risen[shapely.contains_xy(in_geo, east, north)])) * change.cell_m**2
+        kinds = [each.kind for each in change.regions if shapely.Polygon(each.outline).intersects(in_geo)]
+        kind = " and ".join(kinds) or "no change"
+        errors.append(VolumeError(region.name, kind, region.net_m3, true_m3, region.sigma_m3))
     return errors
 
 
