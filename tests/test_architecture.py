@@ -73,7 +73,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     ),
     "filelock": ("pipelines.core",),
     "laspy": ("pipelines.formats",),
-    "py4dgeo": ("pipelines.evaluate.reference_distances",),
+    "py4dgeo": ("pipelines.surface.m3c2",),
     "plyfile": ("pipelines.formats",),
     "exifread": ("pipelines.formats",),
     "defusedxml": ("pipelines.formats",),

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from pipelines.adjust.accuracy_grid import AccuracyGrid
 from pipelines.core.errors import DegenerateGeometryError
@@ -29,16 +28,15 @@ from pipelines.evaluate.reference_distances import (
     ComparisonSettings,
     CorePoints,
     DistanceTally,
-    TiledPoints,
     compare_square,
     level_of_detection,
-    plane_normals,
 )
 from pipelines.geodesy.enu import Origin
 from pipelines.geometry.footprints import first_of_voxels
 from pipelines.geometry.similarity import Similarity
 from pipelines.report.plots.charts import write_distance_histogram, write_distance_map
 from pipelines.surface.fusion import FusionSettings, fused_squares, fusion_settings
+from pipelines.surface.m3c2 import TiledPoints, plane_normals, spacing_of
 from pipelines.surface.measured_cloud import CloudReader, MeasuredCloud, Thinning, read_thinned
 from pipelines.surface.registration import fit_alignment
 from pipelines.surface.surface_views import ModelRenderer, SurfaceViews
@@ -50,7 +48,6 @@ _SQUARE_M = 32.0  # two million points of the reference at the most, in voxels o
 _OVERVIEW_M, _MOST_OVERVIEW = 0.25, 10_000_000
 _MARGIN_M, _MARGIN_UP_M = 10.0, 100.0  # around the SfM points: heights of a wrong datum are off by up to 100 m
 _LEAST_VIEWS = 3  # that agree on a point of the model, as in `export-cloud`
-_SAMPLE = 20_000  # points of the reference that tell its spacing
 
 
 @dataclass(frozen=True)
@@ -91,7 +88,7 @@ def compare_with_reference(
     model, fusion, shift, moved = _model(renderer, overview, options, scratch, progress)
     seen = seen_surface(_viewpoints(renderer, moved), overview.position_in_geo, overview.voxel_m, progress)
     reference = _sorted_reference(files, trained.survey.origin, box, scratch / "reference", progress)
-    spacing_m = _spacing(reference)
+    spacing_m = spacing_of(reference, min(THRESHOLDS_M) / 2)
     settings = ComparisonSettings.of_spacings(spacing_m, fusion.spacing_m, min(THRESHOLDS_M), box)
     tally = _compare(reference, model, seen, settings, progress)
     cores = tally.cores()
@@ -190,17 +187,6 @@ def _sorted_reference(
         inside = ((place >= low) & (place <= high)).all(axis=1)
         reference.append(place[inside], None, chunk.classification[inside])
     return reference
-
-
-def _spacing(reference: TiledPoints) -> float:
-    """Return the median distance between neighbours, in the square with the most points."""
-    rows, own = max((reference.around(square, 0.0) for square in reference.count), key=lambda part: len(part[0]))
-    place = rows["position"][own]
-    place = place[first_of_voxels(place, min(THRESHOLDS_M) / 2)]
-    chosen = np.random.default_rng(0).permutation(len(place))[:_SAMPLE]
-    if len(place) < 2:
-        return _SQUARE_M
-    return float(np.median(cKDTree(place).query(place[chosen], k=2)[0][:, 1]))
 
 
 def _georeference_sigma(

@@ -1,158 +1,23 @@
 """Distances between the model's cloud and the reference in one square of the plan, and the figures of all squares.
 
 Figures are exact counts below thresholds, and quantiles to the millimetre.
-Distances along the normals of the reference are M3C2 (Lague, Brodu and Leroux 2013,
-doi 10.1016/j.isprsjprs.2013.04.009), by py4dgeo.
+Distances along the normals of the reference are M3C2.
 """
 
 from __future__ import annotations
 
-import logging
-import shutil
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pipelines.core.errors import InputError
-from pipelines.core.extras import require
-from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray, joined_rows, rows_of
-from pipelines.geometry.footprints import first_of_voxels, rows_by_square
+from pipelines.core.types import BoolArray, FloatArray, IntArray, joined_rows, rows_of
+from pipelines.geometry.footprints import first_of_voxels
+from pipelines.surface.m3c2 import CONFIDENCE_95, Square, TiledPoints, at_random, m3c2, oriented_normals
 from pipelines.surface.visibility import SeenSurface
 from pipelines.survey.report_parts import CloudDistances, M3c2Figures, ReferenceGroup, SurfaceScore
-
-LEAST_POINTS = 4  # in the cylinder, of each cloud
-CONFIDENCE_95 = 1.96
-
-
-def m3c2(
-    first: FloatArray,
-    second: FloatArray,
-    core: FloatArray,
-    normal: FloatArray,
-    *,
-    radius_m: float,
-    reach_m: float,
-) -> tuple[FloatArray, FloatArray]:
-    """Return the distances of two clouds at core points (C, 3), and their σ (C,) from the roughness of both clouds.
-
-    Distances count from the first cloud (P, 3) to the second (Q, 3) along unit normals (C, 3); NaN where one has
-    too few points in a cylinder. `reach_m` is half the length of a cylinder: the largest distance that is found.
-    """
-    nothing = np.full(len(core), np.nan)
-    if not (len(core) and len(first) and len(second)):
-        return nothing, nothing.copy()
-    py4dgeo = require_py4dgeo()
-    middle = core.mean(axis=0)
-    algorithm = py4dgeo.M3C2(
-        epochs=(py4dgeo.Epoch(first - middle), py4dgeo.Epoch(second - middle)),
-        corepoints=np.ascontiguousarray(core - middle),
-        corepoint_normals=np.ascontiguousarray(normal, dtype=np.float64),
-        cyl_radius=radius_m,
-        max_distance=reach_m,
-    )
-    distance, uncertainty = algorithm.run()
-    known = (uncertainty["num_samples1"] >= LEAST_POINTS) & (uncertainty["num_samples2"] >= LEAST_POINTS)
-    known &= np.isfinite(distance)
-    with np.errstate(invalid="ignore"):
-        noise = uncertainty["lodetection"] / CONFIDENCE_95
-    return np.where(known, distance, np.nan), np.where(known, noise, np.nan)
-
-
-def require_py4dgeo() -> Any:
-    """Import py4dgeo; its absence is to be told before work starts.
-
-    Raises:
-        BackendUnavailableError: py4dgeo is not installed.
-    """
-    require("reference")
-    import py4dgeo
-
-    # It logs to stdout, which belongs to our results, and into a file of the current folder.
-    log = logging.getLogger("py4dgeo")
-    for handler in list(log.handlers):
-        log.removeHandler(handler)
-    log.setLevel(logging.WARNING)
-    return py4dgeo
-
-
-_NEIGHBOURS = 16
-_FARTHEST = 6.0  # spacings: a point whose neighbours lie further off stands alone
-
-
-def plane_normals(position: FloatArray, spacing_m: float) -> FloatArray:
-    """Return unit normals (P, 3), upwards, of planes through neighbours `spacing_m` apart; NaN for lone points."""
-    count = min(_NEIGHBOURS, len(position))
-    if count < 4:
-        return np.full(position.shape, np.nan)
-    distance, row = cKDTree(position).query(position, k=count)
-    arm = position[row] - position[row].mean(axis=1, keepdims=True)
-    _, axes = np.linalg.eigh(np.einsum("pki,pkj->pij", arm, arm))
-    normal = axes[:, :, 0] * np.where(axes[:, 2:, 0] < 0, -1.0, 1.0)
-    lone = distance[:, count // 2] > _FARTHEST * spacing_m
-    return np.where(lone[:, None], np.nan, normal)
-
-
-Square = tuple[int, int]
-_ROW = np.dtype([("position", "<f8", 3), ("normal", "<f4", 3), ("classification", "u1")])
-_SPARE_BYTES = 1 << 28  # of the disk, to be left free
-
-
-class TiledPoints:
-    """Points in `geo` with a normal and a class, in a file a square of the plan, in a scratch folder."""
-
-    def __init__(self, folder: Path, side_m: float) -> None:
-        self.side_m = side_m
-        self._folder = folder
-        self.count: dict[Square, int] = {}  # points, of squares that hold some
-        folder.mkdir(parents=True, exist_ok=True)
-
-    def append(
-        self, position: FloatArray, normal: FloatArray | Float32Array | None, classification: ByteArray | None
-    ) -> None:
-        """Append points (P, 3) with normals (P, 3), unknown ones written as zeros, and classes (P,) of LAS, or 0.
-
-        Raises:
-            InputError: the disk is full.
-        """
-        rows = np.zeros(len(position), dtype=_ROW)
-        if shutil.disk_usage(self._folder).free < rows.nbytes + _SPARE_BYTES:
-            raise InputError(
-                "disk-full",
-                "No room for the points that are compared. Make room on this disk.",
-                path=self._folder,
-            )
-        rows["position"] = position
-        if normal is not None:
-            rows["normal"] = normal
-        if classification is not None:
-            rows["classification"] = classification
-        for square, part in rows_by_square(position, self.side_m):
-            with self._path(square).open("ab") as file:
-                file.write(rows[part].tobytes())
-            self.count[square] = self.count.get(square, 0) + len(part)
-
-    def around(self, square: Square, margin_m: float) -> tuple[NDArray[np.void], NDArray[np.bool_]]:
-        """Return the rows in a square and its margin, and which of them lie in the square itself."""
-        reach = int(np.ceil(margin_m / self.side_m))
-        names = [
-            (square[0] + across, square[1] + along)
-            for across in range(-reach, reach + 1)
-            for along in range(-reach, reach + 1)
-        ]
-        parts = [np.fromfile(self._path(name), dtype=_ROW) for name in names if name in self.count]
-        rows = np.concatenate([np.empty(0, dtype=_ROW), *parts])
-        offset = rows["position"][:, :2] - self.side_m * np.array(square)
-        near = ((offset >= -margin_m) & (offset < self.side_m + margin_m)).all(axis=1)
-        rows, offset = rows[near], offset[near]
-        return rows, np.asarray(((offset >= 0) & (offset < self.side_m)).all(axis=1))
-
-    def _path(self, square: Square) -> Path:
-        return self._folder / f"{square[0]}_{square[1]}.points"
-
 
 CLASSES = ("other", "ground", "roof", "wall", "vegetation")
 SLOPES = ("0–15°", "15–45°", "45–75°", "75–90°")
@@ -161,7 +26,6 @@ _WALL_DEG = 60.0  # a steeper part of a building is no roof
 _GROUND, _BUILDING, _VEGETATION = (2,), (6,), (3, 4, 5)  # classes of LAS
 FARTHEST_M = 2.0  # of the nearest points that are looked for
 _REACH_M = 1.0  # of the cylinders
-_MOST_POINTS = 2_000_000  # of a cloud in a square, for M3C2: seconds
 Box = tuple[FloatArray, FloatArray]
 _CORE_SPACINGS = 3.0  # between core points: a cylinder of this radius holds about 28 points of a surface
 
@@ -235,7 +99,7 @@ def compare_square(
 ) -> SquareDistances:
     margin_m = FARTHEST_M + 3 * settings.core_m
     rows, own = reference.around(square, margin_m)
-    every = _at_random(rows["position"])
+    every = at_random(rows["position"])
     kept = first_of_voxels(rows["position"], settings.voxel_m)
     rows, own = rows[kept], own[kept]
     model_rows, model_own = model.around(square, margin_m)
@@ -247,7 +111,7 @@ def compare_square(
     to_reference, nearest = _nearest(model_rows["position"][covered], place)
     usable = np.flatnonzero(is_seen & np.isfinite(normal[:, 0]) & settings.uncut(place))
     cores = usable[first_of_voxels(place[usable], settings.core_m)]
-    model_every = _at_random(model_rows["position"])
+    model_every = at_random(model_rows["position"])
     distance_m, noise_m = m3c2(
         every, model_every, place[cores], normal[cores], radius_m=settings.core_m, reach_m=_REACH_M
     )
@@ -288,27 +152,9 @@ def _surface(
     place = rows["position"]
     if not len(place):
         return np.zeros((0, 3)), kinds_of(rows["classification"], np.zeros((0, 3)))
-    # Neighbours of a normal are half a core apart: noise would turn the normals of closer ones.
-    spacing_m = settings.core_m / 2
-    sparse = first_of_voxels(place, spacing_m)
-    normal = plane_normals(place[sparse], spacing_m)
-    if len(model_rows):
-        towards = model_rows["normal"][cKDTree(model_rows["position"]).query(place[sparse])[1]].astype(np.float64)
-        against = np.einsum("ni,ni->n", normal, towards) < 0
-        normal = np.where(against[:, None], -normal, normal)
-    normal = normal[cKDTree(place[sparse]).query(place)[1]]
+    towards = model_rows["position"], model_rows["normal"].astype(np.float64)
+    normal = oriented_normals(place, settings.core_m / 2, *towards)
     return normal, kinds_of(rows["classification"], normal)
-
-
-def _at_random(position: FloatArray) -> FloatArray:
-    """Return points (P, 3), or as many of them as M3C2 takes.
-
-    One point a voxel would not do: where a noisy surface lies near a border of voxels, the few points beyond that
-    border would count as much as the many before it, which shifts the mean by up to one σ.
-    """
-    if len(position) <= _MOST_POINTS:
-        return position
-    return position[np.sort(np.random.default_rng(0).choice(len(position), _MOST_POINTS, replace=False))]
 
 
 def _nearest(position: FloatArray, others: FloatArray) -> tuple[FloatArray, IntArray]:

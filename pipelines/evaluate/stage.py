@@ -36,12 +36,12 @@ from pipelines.evaluate.reference import (
     compare_with_reference,
     draw_reference,
 )
-from pipelines.evaluate.reference_distances import require_py4dgeo
 from pipelines.geodesy.crs import PointCrs
 from pipelines.geodesy.enu import Origin, ecef_from_enu, lla_from_ecef
 from pipelines.report.plots.maps import MapCoordinates, MapPoints, SigmaRaster, write_accuracy_map
 from pipelines.report.plots.plans import NamedPlaces
 from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.surface.m3c2 import require_py4dgeo
 from pipelines.surface.measured_cloud import CloudReader
 from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey.area import hectares_of

@@ -15,19 +15,17 @@ from pipelines.core.stages import BY_NAME, CLOUD, REFERENCE_HISTOGRAM, REFERENCE
 from pipelines.core.workspace import Workspace
 from pipelines.evaluate.reference_distances import (
     CLASSES,
-    CONFIDENCE_95,
     ComparisonSettings,
     CorePoints,
     DistanceTally,
     SquareDistances,
-    TiledPoints,
     compare_square,
     kinds_of,
     level_of_detection,
     m3c2_figures,
-    plane_normals,
 )
 from pipelines.geometry.similarity import perturbation
+from pipelines.surface.m3c2 import CONFIDENCE_95, TiledPoints, plane_normals
 from pipelines.surface.registration import fit_alignment
 from pipelines.surface.visibility import SeenSurface, Viewpoints, seen_surface
 from pipelines.survey.report import read_report
