@@ -127,6 +127,14 @@ class CommonGrid:
         self.datum_v_m = float(np.sqrt(np.median(joint[:, 2])))
         self.datum_h_m = float(np.sqrt(np.median(joint[:, :2])))
 
+    def epoch_variance(self, epoch: int, plan: FloatArray) -> FloatArray:
+        """Return the variances (N, 3) east, north, up in m² of the datum of an epoch, 0 or 1, at places (N, 2)."""
+        return self.epochs[epoch].variance_at(self.crs, plan)
+
+    def datum_variance(self, plan: FloatArray) -> FloatArray:
+        """Return the variances (N, 3) of the difference of both datums."""
+        return self._shared.of_difference(*(self.epoch_variance(epoch, plan) for epoch in (0, 1)))
+
     @property
     def cell_m(self) -> float:
         return float(np.sqrt(self.cell_m2))

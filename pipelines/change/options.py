@@ -42,4 +42,9 @@ class ChangeOptions(StageOptions):
     polygons_crs: str | None = Field(
         None, description="CRS of the polygons where their file states none, as in DXF: EPSG:32632 or another."
     )
+    along_normals: bool = Field(
+        False,
+        description="Measure change along the normals too, for walls and slopes (M3C2), from the clouds of both.",
+    )
+    reach: float = Field(1.0, gt=0, le=50, description="Largest change along a normal that is found, in metres.")
     min_area: float = Field(1.0, gt=0, description="Area of the smallest region in square metres.")

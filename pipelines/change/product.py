@@ -83,6 +83,24 @@ class ChangedRegion(Product):
         )
 
 
+class AlongNormals(Product):
+    """Change along the normals of the earlier surface, at points of its cloud.
+
+    Attributes:
+        points, measured: number of core points, and of those near which both clouds have enough points.
+        cylinder_m: radius of the cylinders, and distance of the core points.
+        reach_m: largest distance that is found.
+        median_lod_m, significant_share: of the measured; None: there are none.
+    """
+
+    points: int
+    measured: int
+    cylinder_m: float
+    reach_m: float
+    median_lod_m: float | None
+    significant_share: float | None
+
+
 class Change(Product):
     """Change between two epochs.
 
@@ -91,6 +109,7 @@ class Change(Product):
         median_lod_m: level of detection of the cells that both have measured.
         significant_share: of all cells.
         lowered, raised, found: sums of the found regions that lost, that gained, and of all.
+        along_normals: of the clouds, on request.
     """
 
     format_version: Literal[2] = 2
@@ -106,3 +125,4 @@ class Change(Product):
     raised: ChangedRegion
     found: ChangedRegion
     regions: tuple[ChangedRegion, ...]
+    along_normals: AlongNormals | None = None

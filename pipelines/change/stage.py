@@ -2,7 +2,7 @@
 
 Reads the rasters, surveys and adjustments of both workspaces. Writes `change/` in the later one: `difference.tif`,
 `sigma.tif`, `lod.tif`, `significant.tif`, `regions.geojson`, `regions.gpkg`, `regions.csv`, `change.json` and the
-page `change.html`.
+page `change.html`; on request `along_normals.laz`.
 """
 
 from dataclasses import replace
@@ -13,6 +13,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from pipelines.change.along_normals import Datum, change_along_normals, require_clouds
 from pipelines.change.datum import load_epoch, shared_by
 from pipelines.change.detection import (
     QUANTILE_95,
@@ -61,6 +62,8 @@ def run(stage: StageRun, options: ChangeOptions) -> Summary:
     workspaces = Workspace(options.before.parent), stage.workspace
     before, after = (epoch_rasters(one, options.of) for one in workspaces)
     epochs = load_epoch(workspaces[0]), load_epoch(workspaces[1])
+    if options.along_normals:
+        require_clouds(workspaces)
     registered = options.stable is not None or options.stable_auto
     for one, workspace in zip(epochs, workspaces, strict=True):
         if one.grid is None and not registered:
@@ -81,6 +84,10 @@ def run(stage: StageRun, options: ChangeOptions) -> Summary:
     given = _polygons(options.regions, "--regions", crs, options) or ()
     found = find_regions(parts, sign, noise, given, options.min_area)
     _write_significant(stage.out, parts, found.sign)
+    moved = None
+    if options.along_normals:
+        datum = Datum(grid, noise, registered)
+        moved = change_along_normals(workspaces, datum, options.reach, stage.out, stage.progress)
     change = Change(
         of=options.of,
         crs=after.sidecar.crs,
@@ -94,6 +101,7 @@ def run(stage: StageRun, options: ChangeOptions) -> Summary:
         raised=found.raised,
         found=found.every,
         regions=found.regions,
+        along_normals=moved,
     )
     save_json(change, stage.out / "change.json")
     _write_vectors(stage.out, change, found.polygons, grid)

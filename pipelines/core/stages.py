@@ -333,7 +333,7 @@ CHANGE = StageSpec(
         MEASURED,
         *SOLVED,
         *whole_products("raster/dsm.tif", "raster/sigma_v.tif", "raster/measured.tif"),
-        *whole_products("raster/dtm.tif", "raster/sigma_dtm.tif", "raster/orthophoto.tif", optional=True),
+        *whole_products(*("raster/dtm.tif", "raster/sigma_dtm.tif", "raster/orthophoto.tif", CLOUD), optional=True),
     ),
     product="change/change.json",
     title="Compare with an earlier survey: what changed, by how much, is it real.",

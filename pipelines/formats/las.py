@@ -263,6 +263,69 @@ class LazWriter(LazFile):
         self._writer.write_points(record)
 
 
+def read_surface(path: Path, size: int) -> Iterator[CloudPoints]:
+    """Yield the points of a surface as `LazWriter` writes them, in chunks of at most `size`.
+
+    Raises:
+        InputError: no such file, a damaged one, or one without normals and covariances.
+    """
+    import laspy
+
+    open_las(path)
+    with _damage(path), laspy.open(path, read_evlrs=False, laz_backend=laspy.LazBackend.Lazrs) as file:
+        lacking = (_EXTRA.keys() | _COVARIANCE.keys()) - set(file.header.point_format.dimension_names)
+        if lacking:
+            raise InputError(
+                "cloud-without-sigma",
+                f"The cloud has no {', '.join(sorted(lacking))}. Make it with `georef export-cloud`.",
+                path=path,
+            )
+        for record in file.chunk_iterator(size):
+            cov = np.empty((len(record), 3, 3), dtype=np.float32)
+            for name, (row, column) in _COVARIANCE.items():
+                cov[:, row, column] = cov[:, column, row] = record[name]
+            yield CloudPoints(
+                np.column_stack([record.x, record.y, record.z]).astype(np.float64),
+                np.column_stack([record[name] for name in ("nx", "ny", "nz")]).astype(np.float32),
+                (np.column_stack([record.red, record.green, record.blue]) // _RGB16).astype(np.uint8),
+                cov,
+                np.asarray(record.classification, dtype=np.uint8),
+            )
+
+
+@dataclass(frozen=True)
+class MovedPoints:
+    """P points of a surface, and how far another surface lies from them along their normals."""
+
+    position: FloatArray  # (P, 3) in the CRS, easting or longitude first
+    normal: FloatArray  # (P, 3)
+    distance_m: FloatArray  # (P,) NaN: not measured
+    sigma_m: FloatArray  # (P,)
+    lod_m: FloatArray  # (P,) level of detection at 95 %
+
+
+class MovedWriter(LazFile):
+    """Writer of a LAZ file of change along normals; see `LazFile`."""
+
+    point_format, system = 6, "photogrammetry"
+    extra: ClassVar[Mapping[str, str]] = {
+        **{name: _EXTRA[name] for name in ("nx", "ny", "nz")},
+        "distance": "later minus earlier in metres",
+        "sigma": "sigma of distance in metres",
+        "lod": "level of detection 95 % in m",
+        "significant": "1 if beyond it",
+    }
+
+    def write(self, points: MovedPoints) -> None:
+        """Append points; errors as of `LazWriter.write`."""
+        record = self._record(points.position)
+        for column, name in enumerate(("nx", "ny", "nz")):
+            record[name] = points.normal[:, column]
+        record["distance"], record["sigma"], record["lod"] = points.distance_m, points.sigma_m, points.lod_m
+        record["significant"] = np.abs(points.distance_m) > points.lod_m
+        self._writer.write_points(record)
+
+
 @dataclass(frozen=True)
 class LidarReturns:
     """P returns of one strip, numbered from 1."""

@@ -1,7 +1,5 @@
 """Coded targets on the ground (ArUco, AprilTag), found in the photographs and taken as marks of surveyed points."""
 
-import csv
-import io
 import re
 from collections import Counter, defaultdict
 from collections.abc import Sequence
@@ -18,6 +16,7 @@ from pipelines.core.machine import thread_count
 from pipelines.core.progress import Progress
 from pipelines.core.types import ByteArray
 from pipelines.formats.fiducials import FoundTag, dictionary_named, dictionary_names, find_tags, tag_count
+from pipelines.formats.tables import table_text
 from pipelines.ingest.flight_record import FlightRecord
 from pipelines.ingest.ground_points import GroundFile, GroundPoint
 from pipelines.ingest.remarks import Remarks, shortened
@@ -28,6 +27,7 @@ LISTING, SHEET = "targets.csv", "targets.png"
 _NUMBER = re.compile(r"(\d+)\s*$")
 _OFF_SIGMAS, _OFF_PX = 3.0, 1.0  # from a mark by hand: both must be exceeded for a warning
 _CHIP_PX, _TEXT_PX, _ACROSS, _MOST_CHIPS = 96, 26, 12, 600
+_COLUMNS = ("point", "image", "x_px", "y_px", "sigma_px", "side_px", "dictionary", "number", "outcome")
 _USED = "used"
 
 
@@ -189,17 +189,14 @@ def _chip(pixels: ByteArray, tag: FoundTag) -> ByteArray:
 def list_targets(found: Sequence[TargetMark], folder: Path) -> None:
     """Write what was found as a table and as one picture of chips, those of a point beside each other."""
     ordered = sorted(found, key=lambda each: (each.point, each.tag.number, each.image))
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(["point", "image", "x_px", "y_px", "sigma_px", "side_px", "dictionary", "number", "outcome"])
+    rows: list[list[object]] = [list(_COLUMNS)]
     for each in ordered:
         tag = each.tag
         numbers = [f"{value:.3f}" for value in (*tag.center_px, tag.sigma_px)]
-        table.writerow(
-            [each.point, each.image, *numbers, f"{tag.side_px:.1f}", tag.dictionary, tag.number, each.outcome]
-        )
+        side, kind = f"{tag.side_px:.1f}", (tag.dictionary, tag.number)
+        rows.append([each.point, each.image, *numbers, side, *kind, each.outcome])
     folder.mkdir(parents=True, exist_ok=True)
-    replace_text(folder / LISTING, text.getvalue())
+    replace_text(folder / LISTING, table_text(rows))
     shown = ordered[:_MOST_CHIPS]
     if not shown:
         return
