@@ -167,6 +167,25 @@ def read_contours(path: Path) -> tuple[str, list[ContourLine]]:
     return meta["crs"], lines
 
 
+def read_polygons_gpkg(path: Path, columns: Sequence[str]) -> tuple[str, list[Any], list[tuple[Any, ...]]]:
+    """Return the CRS as WKT, polygons and some columns of a file that `write_polygons_gpkg` wrote.
+
+    Raises:
+        InputError: it is damaged, or has not these columns.
+    """
+    import pyogrio
+    from pyogrio.errors import DataLayerError, DataSourceError
+
+    file_size(path, limit_bytes=_MOST_CONTOUR_BYTES, kind="polygons")
+    try:
+        meta, _, shapes, values = pyogrio.raw.read(path, columns=list(columns))
+        order = [list(meta["fields"]).index(name) for name in columns]
+        rows = list(zip(*(values[at].tolist() for at in order), strict=True))
+        return str(meta["crs"]), [shapely.from_wkb(shape) for shape in shapes], rows
+    except (DataSourceError, DataLayerError, ValueError, OSError, shapely.errors.ShapelyError) as error:
+        raise InputError("polygons-unreadable", f"cannot be read: {error}. Write it again.", path=path) from error
+
+
 def write_polygons_gpkg(path: Path, layer: str, polygons: Sequence[Any], rows: Sequence[Json], wkt: str) -> None:
     """Write polygons with a row of attributes each as a GeoPackage 1.2 of one layer."""
     import pyogrio

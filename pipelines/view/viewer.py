@@ -12,31 +12,24 @@ from typing import Any
 
 import cv2
 import numpy as np
-import shapely
 
 from pipelines.adjust.accuracy_grid import AccuracyGrid
-from pipelines.core.errors import GeorefError, InputError
+from pipelines.core.errors import InputError
 from pipelines.core.manifest import hash_file
 from pipelines.core.progress import SILENT, Progress
-from pipelines.core.stages import GAUSSIANS, MODEL, REPORT
+from pipelines.core.stages import GAUSSIANS, MODEL
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
-from pipelines.formats.vector_files import read_contours
 from pipelines.geodesy.enu import lla_from_enu
-from pipelines.report.plots.plans import nice_number
 from pipelines.report.plots.style import colours_of
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.picking import NoSurface, SurfacePoint
 from pipelines.surface.surface_views import ModelRenderer
-from pipelines.survey.area import area_of
 from pipelines.survey.headline import headline_of
 from pipelines.survey.marks import mark_rays, wrong_marks
-from pipelines.survey.options import AreaOptions, CrsOptions
-from pipelines.survey.report import EvaluationReport, read_report
 from pipelines.survey.scene import photographs
 from pipelines.survey.survey import SurveyedPoint
-from pipelines.survey.target_crs import usable_crs
-from pipelines.survey.trained_survey import TrainedSurvey, load_trained
+from pipelines.survey.trained_survey import load_trained
 from pipelines.view import requests
 from pipelines.view.mark_views import epipolar_lines, proposals
 from pipelines.view.marking import (
@@ -50,6 +43,7 @@ from pipelines.view.marking import (
 )
 from pipelines.view.measuring import ESTIMATE, Fineness, MeasuringModel
 from pipelines.view.options import ViewOptions
+from pipelines.view.overlays import boundary_rings, changed_regions, contour_lines, error_arrows
 from pipelines.view.pictures import PageView, Painter, Photographs, frame_of
 from pipelines.view.quantities import Profile, Quantity, distances, length
 from pipelines.view.saved import FOLDER, NamedMeasurement, SavedMeasurements, SavedPoint, new_id
@@ -57,11 +51,8 @@ from pipelines.view.work import Job, Jobs
 
 Json = dict[str, Any]
 _MOST_POINTS = 30_000  # SfM points that a page draws
-_MOST_CONTOUR_PLACES = 200_000
-_LENGTH = 0.07  # of the scene's radius: the longest error arrow
 _PIXEL_MARGIN = 0.02  # of a photograph: nearer to its rim a place is seen badly
 _MOST_SEEN = 24  # photographs in the strip
-_CONTOURS = "raster/contours.gpkg"
 
 
 class Viewer:
@@ -481,14 +472,15 @@ class Viewer:
                 )
                 for point in found
             ],
-            "errors": self._errors(),
+            "errors": error_arrows(self._workspace, trained, frame),
             "tie_points": {
                 "at": np.round(points, 3).ravel().tolist(),
                 "rgb": colours.ravel().tolist(),
                 "sigma": sigma,
             },
-            "boundary": self._boundary(),
-            "contours": self._contours(),
+            "boundary": boundary_rings(trained, frame),
+            "contours": contour_lines(self._workspace, trained, frame),
+            "changes": changed_regions(self._workspace, trained, frame),
             "rasters": self.model.rasters(),
             "has_sigma": self._grid is not None,
         }
@@ -508,19 +500,6 @@ class Viewer:
             "size": [lens.width, lens.height],
         }
 
-    def _errors(self) -> Json | None:
-        """Return arrows of the errors of surveyed points, enlarged so that they are seen; None: no errors."""
-        try:
-            errors = _point_errors(self.trained, read_report(self._workspace.path(REPORT)))
-        except GeorefError:
-            return None
-        if not errors:
-            return None
-        longest = max(float(np.linalg.norm(measured - surveyed)) for surveyed, measured in errors)
-        enlarged = nice_number(max(_LENGTH * self.frame.radius_m / max(longest, 1e-12), 1.0))
-        arrows = [[surveyed, surveyed + enlarged * (measured - surveyed)] for surveyed, measured in errors]
-        return {"enlarged": enlarged, "arrows": self.frame.place(np.array(arrows)).tolist()}
-
     def _tie_points(self) -> tuple[FloatArray, Any, Json | None]:
         """Return SfM points (N, 3) in the viewer's frame, colours (N, 3), and their colours by predicted σ."""
         point = self.trained.point_in_model
@@ -530,39 +509,6 @@ class Viewer:
         if self._grid is not None and len(point):
             sigma = _sigma_colours(self._grid, self.trained.geo_from_model.apply(point))
         return self.frame.view_from_model.apply(point), rgb, sigma
-
-    def _boundary(self) -> list[list[list[float]]]:
-        try:
-            area = area_of(AreaOptions(), self.trained)
-        except GeorefError:
-            return []
-        rings = [ring for part in shapely.get_parts(area.polygon) for ring in (part.exterior, *part.interiors)]
-        level = area.level_m - self.frame.middle_in_geo[2]
-        return [
-            [[x - self.frame.middle_in_geo[0], y - self.frame.middle_in_geo[1], level] for x, y in ring.coords]
-            for ring in rings
-        ]
-
-    def _contours(self) -> list[Json]:
-        """Return the contour lines that export-raster drew; none: there are none."""
-        path = self._workspace.root / _CONTOURS
-        if not path.is_file():
-            return []
-        survey, found, places = self.trained.survey, [], 0
-        try:
-            wkt, lines = read_contours(path)
-            middle = self._center(0)[None]
-            crs = usable_crs(CrsOptions(crs=wkt), survey.origin, middle, survey.vertical)
-        except GeorefError:
-            return []
-        for line in lines:
-            places += len(line.xy)
-            if places > _MOST_CONTOUR_PLACES:
-                break
-            in_geo = crs.geo_from_xyz(np.column_stack([line.xy, np.full(len(line.xy), line.height)]))
-            at = np.round(self.frame.place(in_geo), 2).tolist()
-            found.append({"height": line.height, "major": line.is_major, "at": at})
-        return found
 
 
 def accuracy_sentence(workspace: Workspace) -> str:
@@ -597,18 +543,6 @@ def profile_json(line: Profile) -> Json:
 def jpeg_of(rgb: Any, quality: int) -> bytes:
     _, encoded = cv2.imencode(".jpg", np.ascontiguousarray(rgb[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality])
     return encoded.tobytes()
-
-
-def _point_errors(trained: TrainedSurvey, report: EvaluationReport) -> list[tuple[FloatArray, FloatArray]]:
-    """Return the surveyed and the triangulated place (3,) in `geo` of control and check points."""
-    survey = trained.survey
-    place = {p.name: np.array(p.position_in_geo) for p in (*survey.control_points, *survey.check_points)}
-    rows = [*report.checkpoints.triangulated.points, *report.fit.gcp.points]
-    return [
-        (place[row.name], place[row.name] + np.array([row.de_m, row.dn_m, row.du_m]))
-        for row in rows
-        if row.name in place and row.de_m is not None and row.dn_m is not None and row.du_m is not None
-    ]
 
 
 def model_stamp(workspace: Workspace) -> tuple[int, ...]:

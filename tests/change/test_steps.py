@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
 from numpy.typing import NDArray
 
 from pipelines.change.grid import step_variance
@@ -16,6 +17,9 @@ from pipelines.change.stage import run
 from pipelines.core.products import load_json
 from pipelines.core.workspace import StageRun
 from pipelines.formats.geotiff import read_cells
+from pipelines.survey.trained_survey import load_trained
+from pipelines.view.overlays import changed_regions
+from pipelines.view.pictures import frame_of
 from tests.change_pairs import CELL_M, TownPair, town_pair
 
 
@@ -53,6 +57,25 @@ def test_changes_are_found_between_displaced_walls(tmp_path: Path) -> None:
         sorted(change.regions, key=lambda one: one.net_m3), sorted([house_gone, house_new, pit, heap]), strict=True
     ):
         assert abs(region.net_m3 - true) < 2.5 * region.sigma_m3
+
+
+def test_the_viewer_draws_regions_on_the_surface(tmp_path: Path) -> None:
+    pair = town_pair(tmp_path, changed=True)
+    before, after = pair.workspaces
+    (after.root / "change").mkdir()
+    run(StageRun(after, after.root / "change"), ChangeOptions(before=before.root / "raster", stable_auto=True))
+    change = load_json(Change, after.root / "change" / "change.json")
+    trained = load_trained(after)
+    frame = frame_of(trained)
+    drawn = changed_regions(after, trained, frame)
+    assert [each["text"].partition(":")[0] for each in drawn] == [region.name for region in change.regions]
+    for each, region in zip(drawn, change.regions, strict=True):
+        assert each["raised"] == (region.net_m3 > 0)
+        plan = np.array(each["at"])[:, :2]
+        assert shapely.Polygon(plan).area == pytest.approx(region.area_m2, rel=0.3)  # between the cells that count
+    height = np.concatenate([np.array(each["at"])[:, 2] for each in drawn]) + frame.middle_in_geo[2]
+    lowest, highest = pair.after.min() - trained.survey.origin.alt_m, pair.after.max() - trained.survey.origin.alt_m
+    assert ((height > lowest - 1) & (height < highest + 1)).all()
 
 
 def test_a_wall_has_the_variance_of_its_relief() -> None:

@@ -5,7 +5,7 @@ import { camera, clicks, home, inView, layers, leavePhotograph, listen, loadScen
 import * as measure from "./measure.js";
 import * as mark from "./mark.js";
 
-const OVERLAYS = { cameras: "cameras", points: "control and check points", errors: "their errors", "tie points": "SfM points", "points by σ": "SfM points by σ", boundary: "area of interest", contours: "contour lines", saved: "saved measurements" };
+const OVERLAYS = { cameras: "cameras", points: "control and check points", errors: "their errors", "tie points": "SfM points", "points by σ": "SfM points by σ", boundary: "area of interest", contours: "contour lines", changes: "changed regions", saved: "saved measurements" };
 const SIDES = ["west", "south", "low", "east", "north", "high"];
 let place = null;  // whose photographs are shown
 
@@ -108,8 +108,8 @@ function build() {
   byId("name").textContent = document.title = scene.name;
   byId("accuracy").textContent = [scene.accuracy, `Coordinates: ${scene.crs.name}; heights: ${scene.crs.heights}.`, ...scene.crs.assumed.map((text) => `Assumed: ${text}.`)].join(" ");
   for (const [name, title] of Object.entries(OVERLAYS)) {
-    const nothing = { errors: !scene.errors, contours: !scene.contours.length, boundary: !scene.boundary.length, "points by σ": !scene.tie_points.sigma }[name];
-    const text = name === "errors" && scene.errors ? `${title} × ${scene.errors.enlarged}` : name === "contours" && nothing ? `${title} (georef export-raster --contours)` : title;
+    const nothing = { errors: !scene.errors, contours: !scene.contours.length, changes: !scene.changes.length, boundary: !scene.boundary.length, "points by σ": !scene.tie_points.sigma }[name];
+    const text = name === "errors" && scene.errors ? `${title} × ${scene.errors.enlarged}` : nothing && { contours: `${title} (georef export-raster --contours)`, changes: `${title} (georef change)` }[name] || title;
     byId("overlays").append(element("label", { class: "check" }, element("input", { type: "checkbox", value: name, disabled: nothing, onchange: (event) => {
       const kept = new Set(state.shown);
       kept[event.target.checked ? "add" : "delete"](name);

@@ -1,0 +1,122 @@
+"""What a page draws over the picture: errors of points, area of interest, contour lines, regions that have changed.
+
+What cannot be read is not drawn: the commands that write it say what is wrong.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import shapely
+
+from pipelines.core.errors import GeorefError
+from pipelines.core.stages import REPORT
+from pipelines.core.types import FloatArray
+from pipelines.core.workspace import Workspace
+from pipelines.formats.geotiff import sampled_raster
+from pipelines.formats.vector_files import read_contours, read_polygons_gpkg
+from pipelines.report.plots.plans import nice_number
+from pipelines.survey.area import area_of
+from pipelines.survey.options import AreaOptions, CrsOptions
+from pipelines.survey.report import EvaluationReport, read_report
+from pipelines.survey.target_crs import TargetCrs, usable_crs
+from pipelines.survey.trained_survey import TrainedSurvey
+from pipelines.view.pictures import ViewFrame
+
+Json = dict[str, Any]
+_MOST_PLACES = 200_000  # of contour lines, and of regions
+_LENGTH = 0.07  # of the scene's radius: the longest error arrow
+_CONTOURS, _REGIONS, _SURFACE = "raster/contours.gpkg", "change/regions.gpkg", "raster/dsm.tif"
+
+
+def error_arrows(workspace: Workspace, trained: TrainedSurvey, frame: ViewFrame) -> Json | None:
+    """Return arrows of the errors of surveyed points, enlarged so that they are seen; None: no errors."""
+    try:
+        errors = _point_errors(trained, read_report(workspace.path(REPORT)))
+    except GeorefError:
+        return None
+    if not errors:
+        return None
+    longest = max(float(np.linalg.norm(measured - surveyed)) for surveyed, measured in errors)
+    enlarged = nice_number(max(_LENGTH * frame.radius_m / max(longest, 1e-12), 1.0))
+    arrows = [[surveyed, surveyed + enlarged * (measured - surveyed)] for surveyed, measured in errors]
+    return {"enlarged": enlarged, "arrows": frame.place(np.array(arrows)).tolist()}
+
+
+def _point_errors(trained: TrainedSurvey, report: EvaluationReport) -> list[tuple[FloatArray, FloatArray]]:
+    """Return the surveyed and the triangulated place (3,) in `geo` of control and check points."""
+    survey = trained.survey
+    place = {p.name: np.array(p.position_in_geo) for p in (*survey.control_points, *survey.check_points)}
+    rows = [*report.checkpoints.triangulated.points, *report.fit.gcp.points]
+    return [
+        (place[row.name], place[row.name] + np.array([row.de_m, row.dn_m, row.du_m]))
+        for row in rows
+        if row.name in place and row.de_m is not None and row.dn_m is not None and row.du_m is not None
+    ]
+
+
+def boundary_rings(trained: TrainedSurvey, frame: ViewFrame) -> list[list[list[float]]]:
+    """Return the rings of the area of interest."""
+    try:
+        area = area_of(AreaOptions(), trained)
+    except GeorefError:
+        return []
+    rings = [ring for part in shapely.get_parts(area.polygon) for ring in (part.exterior, *part.interiors)]
+    places = [np.column_stack([np.array(ring.coords), np.full(len(ring.coords), area.level_m)]) for ring in rings]
+    return [frame.place(place).tolist() for place in places]
+
+
+def contour_lines(workspace: Workspace, trained: TrainedSurvey, frame: ViewFrame) -> list[Json]:
+    """Return the contour lines that export-raster drew; none: there are none."""
+    path = workspace.root / _CONTOURS
+    if not path.is_file():
+        return []
+    found, places = [], 0
+    try:
+        wkt, lines = read_contours(path)
+        crs = _crs(wkt, trained)
+    except GeorefError:
+        return []
+    for line in lines:
+        places += len(line.xy)
+        if places > _MOST_PLACES:
+            break
+        in_geo = crs.geo_from_xyz(np.column_stack([line.xy, np.full(len(line.xy), line.height)]))
+        at = np.round(frame.place(in_geo), 2).tolist()
+        found.append({"height": line.height, "major": line.is_major, "at": at})
+    return found
+
+
+def changed_regions(workspace: Workspace, trained: TrainedSurvey, frame: ViewFrame) -> list[Json]:
+    """Return the regions that `georef change` found, on the surface; none: there are none."""
+    path, surface = workspace.root / _REGIONS, workspace.root / _SURFACE
+    if not path.is_file() or not surface.is_file():
+        return []
+    found: list[Json] = []
+    places = 0
+    try:
+        wkt, polygons, rows = read_polygons_gpkg(path, ("name", "net_m3", "sigma_m3"))
+        crs = _crs(wkt, trained)
+        for polygon, (name, net_m3, sigma_m3) in zip(polygons, rows, strict=True):
+            text = f"{name}: {net_m3:+.1f} ± {sigma_m3:.1f} m³"
+            for part in shapely.get_parts(polygon):
+                xy = np.array(part.exterior.coords)
+                places += len(xy)
+                if places > _MOST_PLACES:
+                    return found
+                height = sampled_raster(surface, xy)
+                if not np.isfinite(height).any():
+                    continue
+                height = np.where(np.isfinite(height), height, np.nanmedian(height))
+                at = frame.place(crs.geo_from_xyz(np.column_stack([xy, height])))
+                found.append({"text": text, "raised": net_m3 > 0, "at": np.round(at, 2).tolist()})
+                text = ""
+    except GeorefError:
+        return []
+    return found
+
+
+def _crs(wkt: str, trained: TrainedSurvey) -> TargetCrs:
+    middle = trained.geo_from_model.apply(trained.poses.cam_center_in_model[:1])
+    return usable_crs(CrsOptions(crs=wkt), trained.survey.origin, middle, trained.survey.vertical)
