@@ -268,3 +268,48 @@ def _date(cells: Sequence[str], path: Path, line: int) -> float:
         message = f"{text[:40]!r} is not a time like 2024/05/01 12:00:00.000."
         raise InputError("time-invalid", message, path=path, line=line, field="time") from None
     return start + second + float(f"0{match[7] or ''}")
+
+
+@dataclass(frozen=True)
+class Subtitles:
+    """Positions that a drone wrote into the subtitles of a video."""
+
+    path: Path
+    lines: IntArray  # (N,) of the file
+    time_s: FloatArray  # (N,) since the beginning of the video, rising
+    lon_lat_height: FloatArray  # (N, 3) degrees and metres above sea level; NaN without a fix
+
+
+_FROM_TO = re.compile(r"(\d{1,3}):(\d\d):(\d\d)[,.](\d{3})\s*-->.*")
+_NUMBER_AFTER = r"\s*:\s*(-?\d{1,7}(?:\.\d{1,12})?)"
+_LATITUDE, _LONGITUDE, _HEIGHT = (
+    re.compile(rf"\b{name}{_NUMBER_AFTER}") for name in ("latitude", "long?t?itude", "abs_alt")
+)
+
+
+def read_subtitles(path: Path) -> Subtitles:
+    """Read the `.SRT` that DJI's drones write beside a video: `[latitude: …] [longitude: …] [… abs_alt: …]`.
+
+    Raises:
+        InputError: no subtitle has a position, or a coordinate is out of range.
+    """
+    lines: list[int] = []
+    values: list[list[float]] = []
+    time_s = 0.0
+    for line, text in numbered_lines(path):
+        if begins := _FROM_TO.fullmatch(text.strip()):
+            hours, minutes, seconds, thousandths = map(int, begins.groups())
+            time_s = 3600 * hours + 60 * minutes + seconds + thousandths / 1000
+            continue
+        found = [pattern.search(text) for pattern in (_LONGITUDE, _LATITUDE, _HEIGHT)]
+        if all(found) and (not values or time_s > values[-1][0]):
+            lines.append(line)
+            values.append([time_s, *(float(match[1]) for match in found if match)])
+    if not values:
+        message = "No subtitle has latitude, longitude and abs_alt, as DJI's drones write them."
+        raise InputError("subtitles-without-positions", message, path=path)
+    table = np.array(values)
+    for column, limit, field in ((1, 180.0, "longitude"), (2, 90.0, "latitude")):
+        require_range(table[:, column], -limit, limit, path=path, lines=lines, field=field)
+    has_fix = (table[:, 1:3] != 0).any(axis=1, keepdims=True)
+    return Subtitles(path, np.array(lines), table[:, 0], np.where(has_fix, table[:, 1:], np.nan))

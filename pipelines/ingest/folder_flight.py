@@ -33,9 +33,17 @@ _MOST_SPREAD_S = 3.0
 
 
 def read_folder(
-    folder: Path, options: IngestOptions, remarks: Remarks, progress: Progress = SILENT, *, decode: bool = True
+    folder: Path,
+    options: IngestOptions,
+    remarks: Remarks,
+    progress: Progress = SILENT,
+    *,
+    decode: bool = True,
+    table: PoseTable | None = None,
 ) -> flight_record.FlightRecord:
     """Read photographs, and the trajectory or `geo.txt` that the options name; `decode` as of `scan_folder`.
+
+    `table` has positions of the photographs by name, in place of their tags.
 
     Raises:
         InconsistencyError: the files are inconsistent.
@@ -51,7 +59,7 @@ def read_folder(
         [photo.name for photo in photos if photo.tags.orientation != 1],
         "Images have an EXIF orientation, which is ignored: pixels are read as stored",
     )
-    poses = _poses(photos, options, remarks)
+    poses = _poses(photos, options, remarks) if table is None else poses_from_table(table, photos, options, remarks)
     if options.time_offset_s and poses.recorded is None:
         raise InputError(
             "time-offset-without-times",

@@ -67,11 +67,17 @@ class IngestOptions(StageOptions):
     bag: InputPath | None = Field(
         None, description="ROS bag with photographs and navigation: rosbag2 folder, .mcap, .db3 or ROS 1 .bag."
     )
+    video: InputPath | None = Field(
+        None,
+        description="Video to take photographs from: the sharpest frame of every --every (default: 1s). Positions "
+        "come from DJI's .SRT beside it.",
+    )
     image_topic: str | None = Field(None, description="Topic of the photographs in the bag (default: by rule).")
     fix_topic: str | None = Field(None, description="Topic of the positions in the bag (default: by rule).")
     attitude_topic: str | None = Field(None, description="Topic of the attitudes in the bag (default: by rule).")
     every: FrameDistance | None = Field(
-        None, description="Take a frame of the bag every 2s, or every 5m flown (default: all)."
+        None,
+        description="Take a frame of the bag every 2s, or every 5m flown (default: all); of a video, every 2s.",
     )
     skip_blurred: bool = Field(False, description="Leave out blurred frames of the bag.")
     origin: PlaceOnEarth | None = Field(
@@ -184,6 +190,11 @@ class IngestOptions(StageOptions):
     )
 
     @property
+    def writes_photographs(self) -> bool:
+        """Whether photographs are taken out of a bag or a video, into the workspace."""
+        return self.bag is not None or self.video is not None
+
+    @property
     def time_offset_s(self) -> float:
         """Seconds; zero while the offset is still to be estimated."""
         return 0.0 if self.time_offset == "auto" else self.time_offset
@@ -195,6 +206,7 @@ class IngestOptions(StageOptions):
 
 
 _BAG_ONLY = ("image_topic", "fix_topic", "attitude_topic", "every", "origin")
+_BESIDE_VIDEO = ("images", "bag", "geo", "events")  # what --video excludes
 
 
 def check_options(options: IngestOptions, frames: Path | None) -> None:
@@ -203,9 +215,11 @@ def check_options(options: IngestOptions, frames: Path | None) -> None:
         _check_bag(options, frames)
     else:
         for name in _BAG_ONLY:
-            if getattr(options, name) is not None:
+            if getattr(options, name) is not None and not (name == "every" and options.video is not None):
                 flag = flag_name(IngestOptions, name)
                 raise InputError("needs-bag", f"{flag} needs a --bag, which is not given.", field=flag)
+    if options.video is not None:
+        _check_video(options, frames)
     if options.trajectory is not None and options.geo is not None:
         raise InputError(
             "two-position-files", "--trajectory and --geo are both given. Remove one of them.", field="--geo"
@@ -238,6 +252,17 @@ def check_options(options: IngestOptions, frames: Path | None) -> None:
             "--test-every 1 leaves no image to train on. Give 0, or 2 and more.",
             field="--test-every",
         )
+
+
+def _check_video(options: IngestOptions, frames: Path | None) -> None:
+    if frames is None:
+        raise InputError(
+            "video-without-workspace", "A video needs a workspace for its photographs.", field="--video"
+        )
+    for name in _BESIDE_VIDEO:
+        if getattr(options, name) is not None:
+            flag = flag_name(IngestOptions, name)
+            raise InputError("video-and-other-source", f"{flag} and --video exclude each other.", field="--video")
 
 
 def _check_bag(options: IngestOptions, frames: Path | None) -> None:

@@ -16,7 +16,15 @@ from pipelines.core.errors import InputError
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.validators import stays_inside
 from pipelines.formats.exif import PhotoTags, read_tags
-from pipelines.formats.image_file import SUFFIXES, ImageFile, header_size, inspect_image, read_bytes, read_head
+from pipelines.formats.image_file import (
+    SUFFIXES,
+    VIDEO_SUFFIXES,
+    ImageFile,
+    header_size,
+    inspect_image,
+    read_bytes,
+    read_head,
+)
 from pipelines.ingest.remarks import Remarks
 from pipelines.survey.survey import CameraPrior
 
@@ -55,7 +63,10 @@ def scan_folder(root: Path, remarks: Remarks, progress: Progress = SILENT, *, de
         "Images with names that are not text are left out",
     )
     if not usable:
-        raise InputError("no-images", "The folder has no JPEG, PNG or TIFF image.", path=root, field="--images")
+        videos = sorted(path.name for path in root.iterdir() if path.suffix.lower() in VIDEO_SUFFIXES)
+        hint = f" Take photographs from a video by --video {root / videos[0]}." if videos else ""
+        message = f"The folder has no JPEG, PNG or TIFF image.{hint}"
+        raise InputError("no-images", message, path=root, field="--images")
     photos: list[Photo] = []
     damaged: list[str] = []
     inspected = partial(_inspect, root=root, decode=decode)

@@ -1,7 +1,7 @@
 """Stage `ingest`: photographs, positions, attitudes and ground points into one survey in one frame.
 
-Reads: a folder of photographs or a ROS bag; optionally a table of positions, control and check points, marks.
-Writes: `ingest/survey.json`; `ingest/images/` with --bag or --copy; `ingest/masks/` with masks;
+Reads: a folder of photographs, a ROS bag or a video; optionally positions, control and check points, marks.
+Writes: `ingest/survey.json`; `ingest/images/` with --bag, --video or --copy; `ingest/masks/` with masks;
 `ingest/targets.csv` and `.png` with targets; `ingest/track.npz` where the navigation was recorded by time. See
 docs/inputs.md and docs/bags.md for every format and default.
 """
@@ -22,6 +22,7 @@ from pipelines.ingest.options import IngestOptions, check_options
 from pipelines.ingest.remarks import Remarks
 from pipelines.ingest.survey_assembly import assemble_survey, require_placed
 from pipelines.ingest.targets import list_targets, mark_targets
+from pipelines.ingest.video_frames import frame_positions, seconds_apart, subtitles_of, video_length, write_frames
 from pipelines.survey.calibrated import NavigationTrack
 from pipelines.survey.survey import Survey
 
@@ -37,9 +38,9 @@ def run(stage: StageRun, options: IngestOptions) -> Summary:
     _refuse_inside_photographs(stage.workspace, options)
     survey, track = survey_and_track(options, stage.out / "images", stage.progress, listing=stage.out)
     survey = write_masks(survey, options, Path(survey.image_dir), stage.out / "masks", stage.progress)
-    if options.copy_images and options.bag is None:
+    if options.copy_images and not options.writes_photographs:
         _copy_images(survey, stage)
-    if options.copy_images or options.bag is not None:
+    if options.copy_images or options.writes_photographs:
         survey = survey.model_copy(update={"image_dir": "ingest/images"})
     save_json(survey, stage.out / "survey.json")
     if track is not None:
@@ -55,6 +56,12 @@ def check_inputs(workspace: Workspace, options: IngestOptions, progress: Progres
     Of photographs, sizes and tags are read: damage behind them is found by `run`. Of a bag, all but the pixels.
     """
     _refuse_inside_photographs(workspace, options)
+    if options.video is not None:
+        remarks = Remarks()
+        check_options(options, workspace.root)
+        read_ground_files(options, remarks)
+        count = int(video_length(options.video) / seconds_apart(options))
+        return Summary(f"a video of which {count} frames are taken", {}, tuple(remarks.warnings))
     if options.bag is None:
         survey = survey_and_track(options, None, progress, decode=False)[0]
         mask_files(options, [image.name for image in survey.images], Remarks())
@@ -102,11 +109,18 @@ def survey_and_track(
     ground = read_ground_files(options, remarks)  # ahead of the photographs, which take minutes
     if options.bag is not None and frames is not None:
         flight = read_bag(options.bag, options, frames, remarks, progress)
+    elif options.video is not None and frames is not None:
+        names, time_s = write_frames(options.video, options, frames, remarks, progress)
+        log = None if options.trajectory is not None else subtitles_of(options.video)
+        table = None if log is None else frame_positions(log, names, time_s)
+        flight = read_folder(frames, options, remarks, progress, table=table)
     elif options.images is not None:
         flight = read_folder(options.images, options, remarks, progress, decode=decode)
     else:
         raise InputError(
-            "no-photographs-given", "Photographs are missing. Give their folder, or a --bag.", field="--images"
+            "no-photographs-given",
+            "Photographs are missing. Give their folder, a --bag or a --video.",
+            field="--images",
         )
     sizes = {photo.name: (photo.file.width, photo.file.height) for photo in flight.photos}
     control, check = (

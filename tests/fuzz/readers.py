@@ -29,7 +29,7 @@ from pipelines.formats.bag import COMPRESSED, IMAGE, BadImageError, ImageWriter,
 from pipelines.formats.colmap import pycolmap_module, read_sparse
 from pipelines.formats.exif import read_tags
 from pipelines.formats.georef_sidecar import GeorefSidecar, sidecar_path, write_sidecar
-from pipelines.formats.gnss_logs import read_mrk, read_pos
+from pipelines.formats.gnss_logs import read_mrk, read_pos, read_subtitles
 from pipelines.formats.ground_points import (
     read_distances,
     read_geo,
@@ -376,6 +376,12 @@ def _attempt(read: Callable[[], Any]) -> Any:
         return None
 
 
+SUBTITLES = (
+    "1\n00:00:00,000 --> 00:00:00,033\n2026-05-01 12:00:00.123\n[iso: 100] [latitude: 46.020000] "
+    "[longitude: 7.750000] [rel_alt: 50.000 abs_alt: 1670.000]\n\n2\n00:00:00,033 --> 00:00:00,066\n"
+    "[latitude: 46.020001] [longitude: 7.750000] [rel_alt: 50.100 abs_alt: 1670.100]\n"
+)
+
 READERS: dict[str, Reader] = {
     "photographs": Reader(_photographs, _read_photographs),
     "trajectory": Reader(
@@ -395,6 +401,7 @@ READERS: dict[str, Reader] = {
         _each(read_point_table, read_marks, read_distances),
     ),
     "mrk": Reader(_write(mrk=MRK), _each(read_mrk)),
+    "subtitles": Reader(_write(srt=SUBTITLES), _each(read_subtitles)),
     "pos": Reader(
         _write(
             a=DEGREES.format(clock="GPST") + f"2024/05/01 12:00:18.000 46.02 7.75 1620.25{TAIL}",

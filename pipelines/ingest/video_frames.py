@@ -1,0 +1,160 @@
+"""Photographs out of a video: the sharpest frame of each interval, and their positions from DJI's subtitles."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from pipelines.core.errors import InputError
+from pipelines.core.progress import SILENT, Progress
+from pipelines.core.types import ByteArray, FloatArray
+from pipelines.formats.gnss_logs import read_subtitles
+from pipelines.formats.image_file import MAX_PIXELS
+from pipelines.formats.trajectory_csv import PoseTable
+from pipelines.ingest.options import Every, IngestOptions
+from pipelines.ingest.remarks import Remarks
+
+_EVERY = Every(1.0, "s")
+_MOST_FRAMES = 20_000  # to be written
+_JPEG_QUALITY = 95
+_SMALL_PX = 960  # longer side at which sharpness is judged
+_LONGEST_GAP_S = 1.0  # between a frame and its subtitle
+
+
+def write_frames(
+    video: Path, options: IngestOptions, folder: Path, remarks: Remarks, progress: Progress = SILENT
+) -> tuple[list[str], FloatArray]:
+    """Write the sharpest frame of each interval as `NAME_nnnnn.jpg`; return names and times (N,) in seconds.
+
+    Raises:
+        InputError: no such file, not a video that OpenCV's FFmpeg reads, too large frames, or too many of them.
+    """
+    step_s = seconds_apart(options)
+    folder.mkdir(parents=True, exist_ok=True)
+    names: list[str] = []
+    times: list[float] = []
+    for number, (time_s, pixels) in enumerate(_sharpest(video, step_s, progress)):
+        names.append(f"{video.stem}_{number:05d}.jpg")
+        times.append(time_s)
+        jpeg = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1]
+        (folder / names[-1]).write_bytes(jpeg.tobytes())
+    if options.every is None:
+        remarks.assume(
+            "video-every", f"The sharpest frame of every {_EVERY} of {video.name} is a photograph (--every)."
+        )
+    return names, np.array(times)
+
+
+def seconds_apart(options: IngestOptions) -> float:
+    """Return the length of an interval in seconds; an InputError: it is stated in metres."""
+    every = options.every or _EVERY
+    if every.unit != "s":
+        raise InputError(
+            "video-every-in-metres",
+            f"--every {every} counts metres, and a video has times alone. Give seconds, such as 1s.",
+            field="--every",
+        )
+    return every.step
+
+
+def video_length(video: Path) -> float:
+    """Return the length of a video in seconds by its header; errors as of `write_frames`."""
+    capture = _opened(video)
+    try:
+        return float(capture.get(cv2.CAP_PROP_FRAME_COUNT) / max(capture.get(cv2.CAP_PROP_FPS), 1e-3))
+    finally:
+        capture.release()
+
+
+def _opened(video: Path) -> cv2.VideoCapture:
+    if not video.is_file():
+        raise InputError("no-video", "The video does not exist.", path=video, field="--video")
+    capture = cv2.VideoCapture(str(video), cv2.CAP_FFMPEG)
+    width, height = capture.get(cv2.CAP_PROP_FRAME_WIDTH), capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
+    if not capture.isOpened() or not width * height:
+        capture.release()
+        raise InputError("not-a-video", "The file is no video that can be read.", path=video, field="--video")
+    if width * height > MAX_PIXELS:
+        capture.release()
+        raise InputError(
+            "image-too-large",
+            f"Frames have {width:.0f}×{height:.0f} pixels, too many.",
+            path=video,
+            field="--video",
+        )
+    return capture
+
+
+def _sharpest(video: Path, step_s: float, progress: Progress) -> Iterator[tuple[float, ByteArray]]:
+    """Yield time and pixels (H, W, 3) BGR of the sharpest frame of each interval, in order."""
+    capture = _opened(video)
+    rate = max(capture.get(cv2.CAP_PROP_FPS), 1e-3)
+    count = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
+    if count / rate / step_s > _MOST_FRAMES:
+        capture.release()
+        raise InputError(
+            "too-many-frames",
+            f"{count / rate / step_s:.0f} frames are due, {_MOST_FRAMES} at the most. Give a longer --every.",
+            path=video,
+            field="--every",
+        )
+    best: tuple[float, float, ByteArray] | None = None
+    interval, read = 0, 0
+    try:
+        with progress.task("video", count) as task:
+            while True:
+                known, frame = capture.read()
+                if not known:
+                    break
+                time_s = read / rate  # of a constant rate, as drones record
+                read += 1
+                task.advance()
+                if int(time_s / step_s + 1e-9) != interval:
+                    if best is not None:
+                        yield best[1], best[2]
+                    best, interval = None, int(time_s / step_s + 1e-9)
+                pixels = np.asarray(frame, dtype=np.uint8)
+                shrink = max(1, math.ceil(max(pixels.shape) / _SMALL_PX))
+                size = (pixels.shape[1] // shrink, pixels.shape[0] // shrink)
+                grey = cv2.cvtColor(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2GRAY)
+                score = float(cv2.Laplacian(grey, cv2.CV_64F).var())
+                if best is None or score > best[0]:
+                    best = score, time_s, pixels
+            if best is not None:
+                yield best[1], best[2]
+    finally:
+        capture.release()
+    if not read:
+        raise InputError("not-a-video", "No frame of the video can be decoded.", path=video, field="--video")
+
+
+def subtitles_of(video: Path) -> Path | None:
+    """Return the subtitles beside a video; None: there are none."""
+    return next((path for path in (video.with_suffix(".SRT"), video.with_suffix(".srt")) if path.is_file()), None)
+
+
+def frame_positions(path: Path, names: list[str], time_s: FloatArray) -> PoseTable:
+    """Return the positions of frames at times (N,) in the video, between those of the subtitles.
+
+    Raises:
+        InputError: as of `read_subtitles`.
+    """
+    log = read_subtitles(path)
+    at = np.clip(np.searchsorted(log.time_s, time_s), 1, max(len(log.time_s) - 1, 1)) - 1
+    xyz = np.column_stack([np.interp(time_s, log.time_s, log.lon_lat_height[:, axis]) for axis in range(3)])
+    apart = np.min([np.abs(log.time_s[np.clip(at + k, 0, len(log.time_s) - 1)] - time_s) for k in (0, 1)], axis=0)
+    xyz[apart > _LONGEST_GAP_S] = np.nan
+    return PoseTable(
+        path=path,
+        source="video subtitles",
+        lines=log.lines[np.clip(at, 0, len(log.lines) - 1)],
+        names=tuple(names),
+        time_s=None,
+        xyz=xyz,
+        geographic=True,
+        heights_above_geoid=True,
+    )
