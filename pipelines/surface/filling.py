@@ -54,8 +54,8 @@ def fill_cells(
 
     1. A cell looks in sixteen directions for the first measured height; the low quantile of these is its own.
     2. Its variance is the mean square of their differences from it, plus the variance of all heights nearby, those
-       that a model knows (H, W) included, plus what measured heights differ by so far away as these, on average: a
-       wide hole may hide what nothing around shows. Without σ, that of the result is 0.
+       that a model knows (H, W) included, plus, for the share of directions that found nothing, what heights differ
+       by at that distance. Without σ, that of the result is 0.
     """
     height = np.ascontiguousarray(height, dtype=np.float64)
     empty = wanted & ~np.isfinite(height)
@@ -66,8 +66,7 @@ def fill_cells(
         return FilledCells(height, sigma, distance, own)
     angle = 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
     directions = np.column_stack([np.sin(angle), np.cos(angle)])
-    differing = np.interp(np.arange(reach + 1.0), *_variogram(height)) if with_sigma else np.zeros(reach + 1)
-    low, square, near, source = _looked(height, np.column_stack([rows, columns]), directions, differing)
+    low, square, near, missing, source = _looked(height, np.column_stack([rows, columns]), directions, reach)
     filled, found = height.copy(), np.isfinite(low)
     filled[rows, columns] = low
     close, far = _smoothed(filled, _SMOOTHED)[rows, columns], _smoothed(filled, _SMOOTHED_FAR)[rows, columns]
@@ -76,7 +75,8 @@ def fill_cells(
     distance[rows, columns] = near
     if with_sigma:
         relief = filled if modelled is None else np.where(empty & np.isfinite(modelled), modelled, filled)
-        sigma[rows, columns] = np.sqrt(square + _scatter(relief)[rows, columns])
+        variance = square + _scatter(relief)[rows, columns] + missing * np.interp(near, *_variogram(height))
+        sigma[rows, columns] = np.sqrt(variance)
     own[rows, columns] = np.where(found, source, own[rows, columns])
     return FilledCells(filled, sigma, distance, own)
 
@@ -121,15 +121,12 @@ def _scatter(height: FloatArray) -> FloatArray:
 
 @kernel(nogil=True, parallel=True, error_model="numpy")
 def _looked(
-    height: FloatArray, cells: IntArray, directions: FloatArray, differing: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
-    """Return low quantile, variance about it, distance, source.
-
-    `differing` (reach + 1,) is the mean square difference of heights so many cells apart.
-    """
-    count, reach = len(cells), len(differing) - 1
+    height: FloatArray, cells: IntArray, directions: FloatArray, reach: int
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, IntArray]:
+    """Return low quantile, mean square difference from it, distance, missing share of directions, source."""
+    count = len(cells)
     low, square = np.full(count, np.nan), np.zeros(count)
-    near, source = np.zeros(count), np.zeros(count, dtype=np.int64)
+    near, missing, source = np.zeros(count), np.ones(count), np.zeros(count, dtype=np.int64)
     for k in prange(count):
         found = 0
         value, weight = np.empty(16), np.empty(16)
@@ -147,6 +144,7 @@ def _looked(
                     break
         if found == 0:
             continue
+        missing[k] = 1.0 - found / len(directions)
         order = np.argsort(value[:found])
         total, sum_so_far = weight[:found].sum(), 0.0
         for j in order:
@@ -156,10 +154,9 @@ def _looked(
                 break
         limit = low[k] + _SOURCES * (value[order[-1]] - value[order[0]])
         near[k], nearest_low = reach, reach + 1.0
-        square[k] = (1.0 - found / len(directions)) * differing[reach]
         for j in range(found):
-            square[k] += (value[j] - low[k]) ** 2 / found + differing[int(length[j])] / len(directions)
+            square[k] += (value[j] - low[k]) ** 2 / found
             near[k] = min(near[k], length[j])
             if value[j] <= limit and length[j] < nearest_low:
                 nearest_low, source[k] = length[j], place[j]
-    return low, square, near, source
+    return low, square, near, missing, source
