@@ -121,7 +121,7 @@ def _parameters(longest_px: int) -> Any:
 
 
 def _shows(grey: ByteArray, corners: FloatArray, modules: ByteArray) -> bool:
-    """Return whether the square of corners (4, 2) shows modules (n, n): it may be hidden in part, or another one."""
+    """Return whether the square of corners (4, 2) shows modules (n, n): it may be hidden, or another one."""
     count = len(modules)
     square = np.array([[0, 0], [count, 0], [count, count], [0, count]], dtype=np.float32)
     # cv2 counts from the centre of the first pixel, and so does the grid, whose pixels are modules.
@@ -172,9 +172,10 @@ def _side_lengths(corners: FloatArray) -> FloatArray:
 def _side(
     grey: ByteArray, corners: FloatArray, modules: int
 ) -> tuple[FloatArray, FloatArray, tuple[float, float]] | None:
-    """Return the line (3,) of the first side of corners (4, 2), the covariance (2, 2) of its displacement and turn, and its bow.
+    """Return the line (3,) of the first side of corners (4, 2), its covariance (2, 2), and its bow.
 
-    The bow is how far its middle lies outward of a line through its ends, with its variance.
+    The covariance is that of displacement and turn. The bow is how far its middle lies outward of a line through
+    its ends, with its variance.
     """
     start, end = corners[:2]
     length = float(np.linalg.norm(end - start))

@@ -1,8 +1,9 @@
 """Stage `ingest`: photographs, positions, attitudes and ground points into one survey in one frame.
 
 Reads: a folder of photographs or a ROS bag; optionally a table of positions, control and check points, marks.
-Writes: `ingest/survey.json`; `ingest/images/` with --bag or --copy; `ingest/masks/` with masks; `ingest/track.npz`
-where the navigation was recorded by time. See docs/inputs.md and docs/bags.md for every format and default.
+Writes: `ingest/survey.json`; `ingest/images/` with --bag or --copy; `ingest/masks/` with masks;
+`ingest/targets.csv` and `.html` with --targets; `ingest/track.npz` where the navigation was recorded by time.
+See docs/inputs.md and docs/bags.md for every format and default.
 """
 
 import logging
@@ -15,11 +16,12 @@ from pipelines.core.progress import SILENT, Progress
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.ingest.bag_flight import count_frames, read_bag
 from pipelines.ingest.folder_flight import read_folder
-from pipelines.ingest.ground_points import known_distances, read_ground_files, tie_marks
+from pipelines.ingest.ground_points import ends_of, known_distances, read_ground_files, tie_marks
 from pipelines.ingest.masks import mask_files, write_masks
 from pipelines.ingest.options import IngestOptions, check_options
 from pipelines.ingest.remarks import Remarks
 from pipelines.ingest.survey_assembly import assemble_survey, require_placed
+from pipelines.ingest.targets import find_targets, numbers_of_points
 from pipelines.survey.calibrated import NavigationTrack
 from pipelines.survey.survey import Survey
 
@@ -33,7 +35,7 @@ def run(stage: StageRun, options: IngestOptions) -> Summary:
         InputError: anything wrong with the inputs; names file, line and field.
     """
     _refuse_inside_photographs(stage.workspace, options)
-    survey, track = survey_and_track(options, stage.out / "images", stage.progress)
+    survey, track = survey_and_track(options, stage.out / "images", stage.progress, listing=stage.out)
     survey = write_masks(survey, options, Path(survey.image_dir), stage.out / "masks", stage.progress)
     if options.copy_images and options.bag is None:
         _copy_images(survey, stage)
@@ -76,12 +78,18 @@ def _refuse_inside_photographs(workspace: Workspace, options: IngestOptions) -> 
 
 
 def survey_and_track(
-    options: IngestOptions, frames: Path | None, progress: Progress = SILENT, *, decode: bool = True
+    options: IngestOptions,
+    frames: Path | None,
+    progress: Progress = SILENT,
+    *,
+    decode: bool = True,
+    listing: Path | None = None,
 ) -> tuple[Survey, NavigationTrack | None]:
     """Return the survey, and the navigation in the same frame where it was recorded by time; raises as `run`.
 
     Photographs of a bag are written into `frames`; without a bag, nothing is. Photographs are decoded to their end,
-    as their hashes need; without `decode`, their heads are read.
+    as their hashes need; without `decode`, their heads are read, but for targets. What was found of targets is
+    written into the folder `listing`.
     """
     remarks = Remarks()
     check_options(options, frames)
@@ -92,6 +100,8 @@ def survey_and_track(
             "has estimated it after sfm.",
         )
     ground = read_ground_files(options, remarks)  # ahead of the photographs, which take minutes
+    names = {point.name for file in ground if file is not None for point in file.points} | ends_of(options)
+    numbers = numbers_of_points(names, options.targets) if options.targets else {}
     if options.bag is not None and frames is not None:
         flight = read_bag(options.bag, options, frames, remarks, progress)
     elif options.images is not None:
@@ -101,10 +111,17 @@ def survey_and_track(
             "no-photographs-given", "Photographs are missing. Give their folder, or a --bag.", field="--images"
         )
     sizes = {photo.name: (photo.file.width, photo.file.height) for photo in flight.photos}
-    control, check = (
-        None if file is None else tie_marks(file, sizes, options.sigma_mark, remarks) for file in ground
+    targets = (
+        find_targets(flight.folder, tuple(sizes), options.targets, numbers, progress) if options.targets else None
     )
-    distances = known_distances(options, (control, check), sizes, remarks)
+    control, check = (
+        None if file is None else tie_marks(file, sizes, options.sigma_mark, remarks, targets) for file in ground
+    )
+    distances = known_distances(options, (control, check), sizes, remarks, targets)
+    if targets is not None:
+        targets.note(remarks)
+        if listing is not None:
+            targets.write(listing)
     survey, track = assemble_survey(flight, control, check, options, remarks)
     return survey.model_copy(update={"distances": distances}), track
 

@@ -155,9 +155,7 @@ def make_world(options: SimulateOptions, seed: np.random.SeedSequence) -> World:
     number = np.flatnonzero(kept)
     scene = with_targets(bare, list(stays), width_m, options.target_kind, number)
     origin = Origin(lat_deg=lat, lon_deg=lon, alt_m=alt)
-    return World(
-        origin, scene, stays, number, survey_error[kept], width_m, lens, trajectory, poses, mounting
-    )
+    return World(origin, scene, stays, number, survey_error[kept], width_m, lens, trajectory, poses, mounting)
 
 
 def _flown(
