@@ -22,6 +22,7 @@ LEAST_SIDE_PX = 12.0  # of a tag that is looked for: a module of the smallest di
 _END_SHARE = 0.12
 _LEAST_PROFILES, _MOST_PROFILES = 6, 80  # grey values along normals of a side
 _REACH_MODULES, _LEAST_REACH_PX, _MOST_REACH_PX = 0.8, 1.5, 6.0  # half length of a profile
+_LEAST_MODULE_PX = 1.5  # as seen obliquely: in smaller modules a side is drawn towards the pattern within
 _STEP_PX = 0.25  # between its grey values
 _ROUNDS = 3  # of the refinement: profiles follow the sides that were found
 _LEAST_CONTRAST = 15.0  # of a profile, of 255 grey values
@@ -184,6 +185,8 @@ def _side(
     count = int(np.clip(length * (1 - 2 * _END_SHARE), _LEAST_PROFILES, _MOST_PROFILES))
     place = np.linspace(_END_SHARE - 0.5, 0.5 - _END_SHARE, count) * length
     depth = float(normal @ (start + end - corners[2] - corners[3])) / 2 / modules  # of a module, inward
+    if depth < _LEAST_MODULE_PX:
+        return None
     reach = float(np.clip(_REACH_MODULES * depth, _LEAST_REACH_PX, _MOST_REACH_PX))
     offset = np.arange(-reach, reach + _STEP_PX / 2, _STEP_PX)
     middle = (start + end) / 2
