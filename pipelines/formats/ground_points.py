@@ -43,6 +43,7 @@ class ListedMark:
     image: str
     x_px: float
     y_px: float
+    sigma_px: float | None = None
 
 
 @dataclass(frozen=True)
@@ -212,6 +213,7 @@ _MARK_ALIASES = {
     **dict.fromkeys(("label", "name", "point", "gcp", "gcplabel", "gcpname", "tiepoint"), "label"),
     **dict.fromkeys(("x", "pixelx", "xpx", "px", "u", "imageu"), "x"),
     **dict.fromkeys(("y", "pixely", "ypx", "py", "v", "imagev"), "y"),
+    **dict.fromkeys(("sigma", "sigmapx"), "sigma"),
 }
 _DISTANCE_ALIASES = {
     **dict.fromkeys(("from", "a", "point1", "first", "start"), "from"),
@@ -274,7 +276,9 @@ def read_marks(path: Path) -> tuple[ListedMark, ...]:
     tables.require_columns(table.columns, _MARK_COLUMNS, path, table.header_line)
     tables.require_rows(table.rows, path)
     return tuple(
-        ListedMark(row.line, row.named("label"), row.text("image"), row.finite("x"), row.finite("y"))
+        ListedMark(
+            row.line, row.named("label"), row.text("image"), row.finite("x"), row.finite("y"), row.sigma_m("sigma")
+        )
         for row in table.rows
     )
 

@@ -208,7 +208,9 @@ def _tied(
                 )
             if image in marks[mark.name]:
                 raise fault("mark-twice", f"{mark.name} is already marked in {image}.", field="image")
-            marks[mark.name][image] = Mark(image=image, x_px=mark.x_px, y_px=mark.y_px, sigma_px=sigma_px)
+            marks[mark.name][image] = Mark(
+                image=image, x_px=mark.x_px, y_px=mark.y_px, sigma_px=mark.sigma_px or sigma_px
+            )
         if listed and len(unknown) == len(listed):
             raise InputError(
                 "no-image-matched",
