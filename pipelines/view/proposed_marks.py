@@ -1,7 +1,7 @@
 """Marks that the adjusted cameras propose, as a table for `--marks`: no mark of the survey is among them.
 
-A point is expected where its marks meet, else where it was surveyed. A quartered target near its pixel is a mark with
-σ. Where there is none, what the nearest marked photograph shows is searched, as in the viewer.
+A point is expected where its marks meet, else where it was surveyed. A quartered target near its pixel is a mark
+with σ. Where there is none, what the nearest marked photograph shows is searched, as in the viewer.
 """
 
 from __future__ import annotations
@@ -65,9 +65,15 @@ def propose_marks(workspace: Workspace, options: ProposalOptions, progress: Prog
     solved = load_cameras(workspace)
     found, left_out = proposed_marks(solved, Photographs(workspace, solved).full, options.reach, progress)
     rows = [
-        (each.mark.image, each.point, f"{each.mark.x_px:.3f}", f"{each.mark.y_px:.3f}", f"{each.mark.sigma_px:.3f}")
-        + (each.how, f"{each.score:.3f}")
+        (
+            mark.image,
+            each.point,
+            *(f"{value:.3f}" for value in (mark.x_px, mark.y_px, mark.sigma_px)),
+            each.how,
+            f"{each.score:.3f}",
+        )
         for each in found
+        for mark in (each.mark,)
     ]
     file = workspace.root / FILE
     file.parent.mkdir(exist_ok=True)
@@ -79,7 +85,7 @@ def propose_marks(workspace: Workspace, options: ProposalOptions, progress: Prog
 def proposed_marks(
     solved: SolvedSurvey, photograph: Callable[[int], ByteArray], reach_px: float, progress: Progress = SILENT
 ) -> tuple[list[ProposedMark], tuple[str, ...]]:
-    """Return marks of surveyed points in photographs without them, and which were left out as others contradict them.
+    """Return marks of surveyed points in photographs without them, and which were left out as others contradict.
 
     Args:
         photograph: returns that of a camera (H, W, 3) RGB; a GeorefError: it has no marks.

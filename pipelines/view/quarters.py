@@ -10,23 +10,24 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from pipelines.core.types import ByteArray, FloatArray
+from pipelines.core.types import ByteArray, Float32Array, FloatArray
 
 _RADII_PX = (3.0, 4.5, 7.0, 11.0, 16.0)  # of the circles: the smallest target is eight pixels wide
 _ON_CIRCLE = 16
 _LEAST_SHARE = 0.7  # of the variation on the circle that is of two periods
-_LEAST_CONTRAST = 20.0  # amplitude of these, of 255 grey values
+_LEAST_CONTRAST = 12.0  # amplitude of these, of 255 grey values
+_LEAST_RELATIVE = 0.3  # amplitude by the mean on the circle: paint has it, and ground seldom
 _RIVAL = 0.7  # of the best response, from which another place is as likely
 _WINDOW_SHARE = 0.7  # half side of the window of the refinement, in radii of the largest circle in the target
 _MOST_MOVED_PX = 2.0  # by the refinement
-_LEAST_SIGMA_PX = 0.02
+_LEAST_SIGMA_PX, _MOST_SIGMA_PX = 0.02, 0.4  # a middle known worse is no paint, or is hidden in part
 # Neighbouring pixels share grey values by lens, sensor and compression: so many count as one.
 _PIXELS_OF_ONE = 6.0
 
 
 @dataclass(frozen=True)
 class QuarteredTarget:
-    """Middle (2,) of a quartered target in pixels, the centre of the top-left one (0.5, 0.5), with σ along an axis."""
+    """Middle (2,) of a quartered target, the centre of the top-left pixel (0.5, 0.5), with its σ along an axis."""
 
     center_px: FloatArray
     sigma_px: float
@@ -56,7 +57,7 @@ def find_quarters(grey: ByteArray, expected_px: FloatArray, reach_px: float) -> 
     if rivals.max() > _RIVAL * strongest[row, column]:
         return None
     middle = _refined(part, np.array([column, row], dtype=np.float64), max(2, round(_WINDOW_SHARE * radius)))
-    if middle is None:
+    if middle is None or middle[1] > _MOST_SIGMA_PX:
         return None
     place, sigma = middle
     return QuarteredTarget(place + low + 0.5, sigma, float(share[good[0], row, column]))
@@ -70,8 +71,8 @@ def _last_of_run(good: np.ndarray) -> int:
     return after
 
 
-def _responses(grey: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the response (R, H, W) of each pixel for each circle, 0 where it is no middle, and the share (R, H, W)."""
+def _responses(grey: Float32Array) -> tuple[FloatArray, FloatArray]:
+    """Return responses (R, H, W) of pixels for R circles, 0 where there is no middle, and shares (R, H, W)."""
     height, width = grey.shape
     angle = 2 * np.pi * np.arange(_ON_CIRCLE) / _ON_CIRCLE
     responses, shares = [], []
@@ -94,21 +95,23 @@ def _responses(grey: FloatArray) -> tuple[FloatArray, FloatArray]:
         of_two = power[2] + power[4] + power[6]
         share = of_two / np.maximum(power[1:].sum(axis=0), 1e-6)
         contrast = 2 * np.sqrt(power[2]) / _ON_CIRCLE
-        inside = np.zeros_like(grey, dtype=bool)
+        sharp = contrast >= np.maximum(_LEAST_CONTRAST, _LEAST_RELATIVE * ring.mean(axis=0))
+        inside = np.zeros(grey.shape, dtype=bool)
         rim = int(np.ceil(radius))
         inside[rim : height - rim, rim : width - rim] = True
-        is_middle = inside & (share >= _LEAST_SHARE) & (contrast >= _LEAST_CONTRAST) & (power[2] > power[4])
+        is_middle = inside & (share >= _LEAST_SHARE) & sharp
         responses.append(np.where(is_middle, contrast * share**2, 0.0))
         shares.append(share)
     return np.array(responses), np.array(shares)
 
 
-def _refined(grey: FloatArray, middle: FloatArray, half: int) -> tuple[FloatArray, float] | None:
+def _refined(grey: Float32Array, middle: FloatArray, half: int) -> tuple[FloatArray, float] | None:
     """Return the middle (2,) to a part of a pixel, and its σ: gradients are across lines that meet there.
 
     As cv2.cornerSubPix: the place to which gradients in a window are perpendicular, by least squares.
     """
-    down, right = np.gradient(cv2.GaussianBlur(grey, (0, 0), 0.7).astype(np.float64))
+    smooth = np.asarray(cv2.GaussianBlur(grey, (0, 0), 0.7), dtype=np.float64)
+    down, right = (np.asarray(np.gradient(smooth, axis=axis)) for axis in (0, 1))
     start, offset = middle, np.arange(-half, half + 1)
     for _ in range(20):
         column, row = np.rint(middle).astype(int)
@@ -132,7 +135,9 @@ def _refined(grey: FloatArray, middle: FloatArray, half: int) -> tuple[FloatArra
     # A target looks the same turned by half: what opposite pixels say together is noise, or what lies beside it.
     away = np.stack(np.meshgrid(offset, offset), axis=-1).reshape(-1, 2).astype(np.float64)
     at = (middle + away).astype(np.float32).reshape(len(offset), len(offset), 2)
-    slope = np.stack([cv2.remap(part, at, None, cv2.INTER_LINEAR).ravel() for part in (right, down)], axis=-1)
+    slope = np.stack(
+        [np.ravel(cv2.remap(part, at[..., 0], at[..., 1], cv2.INTER_LINEAR)) for part in (right, down)], axis=-1
+    )
     weight = np.exp(-(away**2).sum(axis=1) / (0.5 * half**2 + 1))
     pull = (weight * np.einsum("ki,ki->k", slope, away))[:, None] * slope
     together = pull + pull[::-1]
