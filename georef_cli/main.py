@@ -45,6 +45,7 @@ COMMANDS: dict[str, HelpLine] = {
     "status": HelpLine("Pipeline", "Show the state of every stage."),
     "info": HelpLine("Pipeline", "Show where on Earth the result is, and what each file is for."),
     "view": HelpLine("Pipeline", "See the trained model in a browser, and measure in it."),
+    "marks": HelpLine("Pipeline", "Propose marks of ground points in the photographs that lack them."),
     "ingest": HelpLine("Stages", "Read photographs, positions and control points into one survey."),
     "sfm": HelpLine("Stages", "Reconstruct cameras and points with COLMAP."),
     "calibrate": HelpLine("Stages", "Estimate time offset, boresight and lever arm after sfm."),

@@ -22,6 +22,7 @@ LEAST_SIDE_PX = 12.0  # of a tag that is looked for: a module of the smallest di
 _END_SHARE = 0.12
 _LEAST_PROFILES, _MOST_PROFILES = 6, 80  # grey values along normals of a side
 _REACH_MODULES, _LEAST_REACH_PX, _MOST_REACH_PX = 0.8, 1.5, 6.0  # half length of a profile
+_LEAST_MODULE_PX = 1.5  # as seen obliquely: in smaller modules a side is drawn towards the pattern within
 _STEP_PX = 0.25  # between its grey values
 _ROUNDS = 3  # of the refinement: profiles follow the sides that were found
 _LEAST_CONTRAST = 15.0  # of a profile, of 255 grey values
@@ -121,7 +122,7 @@ def _parameters(longest_px: int) -> Any:
 
 
 def _shows(grey: ByteArray, corners: FloatArray, modules: ByteArray) -> bool:
-    """Return whether the square of corners (4, 2) shows modules (n, n); it may be hidden in part."""
+    """Return whether the square of corners (4, 2) shows modules (n, n): it may be hidden, or another one."""
     count = len(modules)
     square = np.array([[0, 0], [count, 0], [count, count], [0, count]], dtype=np.float32)
     # cv2 counts from the centre of the first pixel, and so does the grid, whose pixels are modules.
@@ -172,9 +173,10 @@ def _side_lengths(corners: FloatArray) -> FloatArray:
 def _side(
     grey: ByteArray, corners: FloatArray, modules: int
 ) -> tuple[FloatArray, FloatArray, tuple[float, float]] | None:
-    """Return the line (3,) of the first side of corners (4, 2), the covariance (2, 2) of its displacement and turn.
+    """Return the line (3,) of the first side of corners (4, 2), its covariance (2, 2), and its bow.
 
-    And its bow, which is how far its middle lies outward of a line through its ends, with its variance.
+    The covariance is that of displacement and turn. The bow is how far its middle lies outward of a line through
+    its ends, with its variance.
     """
     start, end = corners[:2]
     length = float(np.linalg.norm(end - start))
@@ -183,6 +185,8 @@ def _side(
     count = int(np.clip(length * (1 - 2 * _END_SHARE), _LEAST_PROFILES, _MOST_PROFILES))
     place = np.linspace(_END_SHARE - 0.5, 0.5 - _END_SHARE, count) * length
     depth = float(normal @ (start + end - corners[2] - corners[3])) / 2 / modules  # of a module, inward
+    if depth < _LEAST_MODULE_PX:
+        return None
     reach = float(np.clip(_REACH_MODULES * depth, _LEAST_REACH_PX, _MOST_REACH_PX))
     offset = np.arange(-reach, reach + _STEP_PX / 2, _STEP_PX)
     middle = (start + end) / 2

@@ -197,7 +197,7 @@ def read_onto(
 
 
 def read_colours_onto(path: Path, frame: RasterFrame) -> ByteArray:
-    """Return the colours (rows, columns, bands) of a raster of bytes, averaged on the cells of a frame in its CRS."""
+    """Return the colours (rows, columns, bands) of a raster of bytes, averaged on the cells of a frame."""
     import rasterio
     from rasterio.enums import Resampling
     from rasterio.vrt import WarpedVRT

@@ -43,6 +43,7 @@ class ListedMark:
     image: str
     x_px: float
     y_px: float
+    sigma_px: float | None = None
 
 
 @dataclass(frozen=True)
@@ -144,6 +145,36 @@ def read_ground_points(path: Path) -> GroundPoints:
     return GroundPoints(path, ODM_POINTS, without_repeats(points, path), tuple(marks), table.crs_text)
 
 
+POINT_LIST = "a list of points (name x y z)"
+_LIST_COLUMNS = ("name", "x", "y", "z")
+
+
+def is_point_list(lines: Sequence[str]) -> bool:
+    """Return whether the first line without `#`, or the one after it, is a row of a list of points."""
+    rows = [line.split() for line in lines if not line.startswith("#")][:2]
+    return any(len(row) == 4 and all(tables.is_number(cell) for cell in row[1:]) for row in rows)
+
+
+def read_point_list(path: Path) -> GroundPoints:
+    """Read ground points without marks: rows `name x y z`, x the easting or longitude, below the CRS if stated.
+
+    Raises:
+        InputError: no row, a number of columns other than four, a cell that is no number, or one point at two
+            places.
+    """
+    lines = [(at, text) for at, text in tables.numbered_lines(path) if not text.startswith("#")]
+    tables.require_rows(lines, path)
+    crs_text = None if is_point_list([lines[0][1]]) else lines.pop(0)[1]
+    tables.require_rows(lines, path)
+    places = {name: at for at, name in enumerate(_LIST_COLUMNS)}
+    points = []
+    for row in tables.table_rows(path, lines, None, places):
+        if len(row.cells) != 4:
+            raise _wrong_columns(row, f"4: {' '.join(_LIST_COLUMNS)}")
+        points.append(ListedPoint(row.line, row.named("name"), (row.finite("x"), row.finite("y"), row.finite("z"))))
+    return GroundPoints(path, POINT_LIST, without_repeats(points, path), crs_text=crs_text)
+
+
 def _odm_table(path: Path, columns: Sequence[str]) -> tables.Table:
     """Return the rows below the CRS but comments, cells between spaces, with columns in an order."""
     lines = [(at, text) for at, text in tables.numbered_lines(path) if not text.startswith("#")]
@@ -182,6 +213,7 @@ _MARK_ALIASES = {
     **dict.fromkeys(("label", "name", "point", "gcp", "gcplabel", "gcpname", "tiepoint"), "label"),
     **dict.fromkeys(("x", "pixelx", "xpx", "px", "u", "imageu"), "x"),
     **dict.fromkeys(("y", "pixely", "ypx", "py", "v", "imagev"), "y"),
+    **dict.fromkeys(("sigma", "sigmapx"), "sigma"),
 }
 _DISTANCE_ALIASES = {
     **dict.fromkeys(("from", "a", "point1", "first", "start"), "from"),
@@ -244,7 +276,9 @@ def read_marks(path: Path) -> tuple[ListedMark, ...]:
     tables.require_columns(table.columns, _MARK_COLUMNS, path, table.header_line)
     tables.require_rows(table.rows, path)
     return tuple(
-        ListedMark(row.line, row.named("label"), row.text("image"), row.finite("x"), row.finite("y"))
+        ListedMark(
+            row.line, row.named("label"), row.text("image"), row.finite("x"), row.finite("y"), row.sigma_m("sigma")
+        )
         for row in table.rows
     )
 

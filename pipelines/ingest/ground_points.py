@@ -19,6 +19,7 @@ from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import ImageNames
 from pipelines.ingest.reference_system import crs_of_points, east_first, note_operation
 from pipelines.ingest.remarks import Remarks, shortened
+from pipelines.ingest.targets import Targets
 from pipelines.survey.survey import KnownDistance, Mark, MarkedPoint
 
 _LEAST_MARKS = 2
@@ -73,8 +74,7 @@ def read_ground_files(options: IngestOptions, remarks: Remarks) -> tuple[GroundF
         return control, check
     marks = ground_points.read_marks(options.marks)
     known = {point.name for file in (control, check) if file is not None for point in file.points}
-    if options.distances is not None:
-        known |= {name for distance in ground_points.read_distances(options.distances) for name in distance.ends}
+    known |= ends_of(options)
     remarks.warn_counted(
         "mark-of-unknown-point",
         [f"{options.marks.name}:{mark.line} ({mark.name})" for mark in marks if mark.name not in known],
@@ -84,6 +84,13 @@ def read_ground_files(options: IngestOptions, remarks: Remarks) -> tuple[GroundF
         None if control is None else _with_table_of_marks(control, options.marks, marks),
         None if check is None else _with_table_of_marks(check, options.marks, marks),
     )
+
+
+def ends_of(options: IngestOptions) -> set[str]:
+    """Return the names of the ends of measured distances."""
+    if options.distances is None:
+        return set()
+    return {name for distance in ground_points.read_distances(options.distances) for name in distance.ends}
 
 
 def _with_table_of_marks(file: GroundFile, path: Path, marks: Sequence[ListedMark]) -> GroundFile:
@@ -98,7 +105,8 @@ def _recognised(path: Path, remarks: Remarks) -> GroundPoints:
     1. XML: Metashape's markers.
     2. A line that begins with `#Label`: Metashape's reference.
     3. A first line of four or more cells between commas, semicolons or tabs: PIX4D's table of points.
-    4. Anything else: OpenDroneMap's `gcp_list.txt`.
+    4. A row of four cells between spaces, the last three numbers: a list of points.
+    5. Anything else: OpenDroneMap's `gcp_list.txt`.
     """
     head = beginning(path)
     lines = [line.strip() for line in head.splitlines() if line.strip()]
@@ -108,6 +116,8 @@ def _recognised(path: Path, remarks: Remarks) -> GroundPoints:
         listed = metashape.read_markers(path)
     elif _begins_a_table([line for line in lines if not line.startswith("#")], path):
         listed = ground_points.read_point_table(path)
+    elif ground_points.is_point_list(lines):
+        listed = ground_points.read_point_list(path)
     else:
         return ground_points.read_ground_points(path)
     remarks.assume("file-kind", f"{path.name} is read as {listed.kind}.")
@@ -150,16 +160,22 @@ def _placed(listed: GroundPoints, options: IngestOptions, remarks: Remarks) -> G
 
 
 def tie_marks(
-    file: GroundFile, sizes: Mapping[str, tuple[int, int]], sigma_px: float, remarks: Remarks
+    file: GroundFile,
+    sizes: Mapping[str, tuple[int, int]],
+    sigma_px: float,
+    remarks: Remarks,
+    targets: Targets | None = None,
 ) -> GroundFile:
     """Return the points of a file with their marks in the images; marks in images that are not here are noted.
 
-    `sizes` has width and height of each image by name.
+    `sizes` has width and height of each image by name. `targets` are marks where the file has none.
 
     Raises:
         InputError: two marks of a point in one image, a mark outside its image, or no mark in any image here.
     """
-    marks = _tied([point.name for point in file.points], file.listed_marks, sizes, sigma_px, remarks)
+    marks = _tied(
+        [point.name for point in file.points], file.listed_marks, sizes, sigma_px, remarks, targets=targets
+    )
     return replace(file, points=tuple(replace(point, marks=marks[point.name]) for point in file.points))
 
 
@@ -169,6 +185,8 @@ def _tied(
     sizes: Mapping[str, tuple[int, int]],
     sigma_px: float,
     remarks: Remarks,
+    *,
+    targets: Targets | None,
 ) -> dict[str, tuple[Mark, ...]]:
     """Return the marks of points by name; raises as `tie_marks`."""
     names = ImageNames(sizes)
@@ -190,7 +208,9 @@ def _tied(
                 )
             if image in marks[mark.name]:
                 raise fault("mark-twice", f"{mark.name} is already marked in {image}.", field="image")
-            marks[mark.name][image] = Mark(image=image, x_px=mark.x_px, y_px=mark.y_px, sigma_px=sigma_px)
+            marks[mark.name][image] = Mark(
+                image=image, x_px=mark.x_px, y_px=mark.y_px, sigma_px=mark.sigma_px or sigma_px
+            )
         if listed and len(unknown) == len(listed):
             raise InputError(
                 "no-image-matched",
@@ -199,7 +219,8 @@ def _tied(
                 field="image",
             )
         remarks.warn_counted("mark-in-unknown-image", unknown, "Marks are in images that are not here")
-    return {name: tuple(of_point.values()) for name, of_point in marks.items()}
+    by_hand = {name: tuple(of_point.values()) for name, of_point in marks.items()}
+    return by_hand if targets is None else {name: targets.beside(name, mine) for name, mine in by_hand.items()}
 
 
 def known_distances(
@@ -207,8 +228,9 @@ def known_distances(
     files: Sequence[GroundFile | None],
     sizes: Mapping[str, tuple[int, int]],
     remarks: Remarks,
+    targets: Targets | None = None,
 ) -> tuple[KnownDistance, ...]:
-    """Return the measured distances of `--distances`, whose ends are points of files with marks, or of `--marks`.
+    """Return the measured distances of `--distances`, whose ends are points of files, of `--marks`, or targets.
 
     Raises:
         InputError: a malformed file, or an end with marks in fewer than two images.
@@ -218,9 +240,11 @@ def known_distances(
     listed = ground_points.read_distances(options.distances)
     marks = {point.name: point.marks for file in files if file is not None for point in file.points}
     others = sorted({name for distance in listed for name in distance.ends} - marks.keys())
+    listed_marks: list[tuple[Path, Sequence[ListedMark]]] = []
     if others and options.marks is not None:
         own = tuple(mark for mark in ground_points.read_marks(options.marks) if mark.name in others)
-        marks |= _tied(others, [(options.marks, own)], sizes, options.sigma_mark, remarks)
+        listed_marks.append((options.marks, own))
+    marks |= _tied(others, listed_marks, sizes, options.sigma_mark, remarks, targets=targets)
     for distance in listed:
         for field, name in zip(("from", "to"), distance.ends, strict=True):
             if len(marks.get(name, ())) < _LEAST_MARKS:

@@ -47,16 +47,34 @@ def _sensible(offset: float | Literal["auto"]) -> float | Literal["auto"]:
     return offset
 
 
+def _known_dictionaries(names: tuple[str, ...]) -> tuple[str, ...]:
+    from pipelines.formats.fiducials import dictionary_named  # OpenCV, which no other option needs
+
+    known = []
+    for name in names:
+        spelled = dictionary_named(name.strip())
+        if spelled is None:
+            raise ValueError(
+                f"{name!r} is no dictionary of OpenCV's: give e.g. DICT_APRILTAG_36h11, DICT_4X4_50, "
+                "DICT_ARUCO_ORIGINAL"
+            )
+        known.append(spelled)
+    return tuple(dict.fromkeys(known))
+
+
 # Files of other kinds beside the photographs, such as thumbnails and logs, make nothing stale.
 PhotographFolder = Annotated[Path, InputMarker(SUFFIXES)]
 MaskFolder = Annotated[Path, InputMarker(frozenset({".png"}))]
 FrameDistance = Annotated[Every, from_text(_every), WRITTEN]
-DictionaryNames = Annotated[tuple[str, ...], from_text(lambda text: tuple(text.split(","))), WRITTEN]
 TimeOffset = Annotated[
     float | Literal["auto"],
     from_text(lambda text: text if text == "auto" else float(text)),
     AfterValidator(_sensible),
     WRITTEN,
+]
+
+TagDictionaries = Annotated[
+    tuple[str, ...], from_text(lambda text: tuple(text.split(","))), AfterValidator(_known_dictionaries), WRITTEN
 ]
 
 
@@ -122,15 +140,15 @@ class IngestOptions(StageOptions):
     marks: InputPath | None = Field(
         None, description="PIX4D's CSV of image marks: image, point, x, y; for points whose file has none."
     )
+    targets: TagDictionaries | None = Field(
+        None,
+        description="Dictionaries (with commas, named as by OpenCV: DICT_APRILTAG_36h11, DICT_4X4_50) of ArUco or "
+        "AprilTag targets, which are found in the photographs as marks of the points that have their numbers.",
+    )
     distances: InputPath | None = Field(
         None,
         description="Measured distances between marked points, as of scale bars: CSV with from, to, distance, and "
         "optionally sigma and use (control or check).",
-    )
-    targets: DictionaryNames = Field(
-        (),
-        description="Dictionaries of the tags on the ground, as OpenCV names them (with commas): tags are found in "
-        "the photographs and mark the points whose names end in their number, e.g. DICT_APRILTAG_36h11.",
     )
     gcp_crs: str | None = Field(
         None, description="CRS of ground points whose file states none, e.g. EPSG:32632 or EPSG:4326+5773."
@@ -237,9 +255,9 @@ def check_options(options: IngestOptions, frames: Path | None) -> None:
             "--trajectory, and remove --lever-arm. A .MRK without a trajectory is given by --trajectory.",
             field="--events",
         )
-    for name in ("marks", "gcp_crs", "targets"):
-        needed = (options.gcp, options.checkpoints, options.distances if name == "marks" else None)
-        if getattr(options, name) and not any(needed):
+    for name in ("marks", "targets", "gcp_crs"):
+        needed = (options.gcp, options.checkpoints, options.distances if name != "gcp_crs" else None)
+        if getattr(options, name) is not None and not any(needed):
             flag = flag_name(IngestOptions, name)
             raise InputError(
                 "needs-ground-points", f"{flag} needs ground points. Give --gcp or --checkpoints.", field=flag

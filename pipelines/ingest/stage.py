@@ -2,8 +2,8 @@
 
 Reads: a folder of photographs, a ROS bag or a video; optionally positions, control and check points, marks.
 Writes: `ingest/survey.json`; `ingest/images/` with --bag, --video or --copy; `ingest/masks/` with masks;
-`ingest/targets.csv` and `.png` with targets; `ingest/track.npz` where the navigation was recorded by time. See
-docs/inputs.md and docs/bags.md for every format and default.
+`ingest/targets.csv` and `.html` with --targets; `ingest/track.npz` where the navigation was recorded by time.
+See docs/inputs.md and docs/bags.md for every format and default.
 """
 
 import logging
@@ -16,12 +16,12 @@ from pipelines.core.progress import SILENT, Progress
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.ingest.bag_flight import count_frames, read_bag
 from pipelines.ingest.folder_flight import read_folder
-from pipelines.ingest.ground_points import known_distances, read_ground_files, tie_marks
+from pipelines.ingest.ground_points import ends_of, known_distances, read_ground_files, tie_marks
 from pipelines.ingest.masks import mask_files, write_masks
 from pipelines.ingest.options import IngestOptions, check_options
 from pipelines.ingest.remarks import Remarks
 from pipelines.ingest.survey_assembly import assemble_survey, require_placed
-from pipelines.ingest.targets import list_targets, mark_targets
+from pipelines.ingest.targets import find_targets, numbers_of_points
 from pipelines.ingest.video_frames import frame_positions, seconds_apart, subtitles_of, video_length, write_frames
 from pipelines.survey.calibrated import NavigationTrack
 from pipelines.survey.survey import Survey
@@ -95,8 +95,8 @@ def survey_and_track(
     """Return the survey, and the navigation in the same frame where it was recorded by time; raises as `run`.
 
     Photographs of a bag are written into `frames`; without a bag, nothing is. Photographs are decoded to their end,
-    as their hashes need; without `decode`, their heads are read, and no targets are looked for. Targets that are
-    found are listed in the folder `listing`.
+    as their hashes need; without `decode`, their heads are read, but for targets. What was found of targets is
+    written into the folder `listing`.
     """
     remarks = Remarks()
     check_options(options, frames)
@@ -107,12 +107,14 @@ def survey_and_track(
             "has estimated it after sfm.",
         )
     ground = read_ground_files(options, remarks)  # ahead of the photographs, which take minutes
+    names = {point.name for file in ground if file is not None for point in file.points} | ends_of(options)
+    numbers = numbers_of_points(names, options.targets) if options.targets else {}
     if options.bag is not None and frames is not None:
         flight = read_bag(options.bag, options, frames, remarks, progress)
     elif options.video is not None and frames is not None:
-        names, time_s = write_frames(options.video, options, frames, remarks, progress)
+        photographs, time_s = write_frames(options.video, options, frames, remarks, progress)
         log = None if options.trajectory is not None else subtitles_of(options.video)
-        table = None if log is None else frame_positions(log, names, time_s)
+        table = None if log is None else frame_positions(log, photographs, time_s)
         flight = read_folder(frames, options, remarks, progress, table=table)
     elif options.images is not None:
         flight = read_folder(options.images, options, remarks, progress, decode=decode)
@@ -123,14 +125,17 @@ def survey_and_track(
             field="--images",
         )
     sizes = {photo.name: (photo.file.width, photo.file.height) for photo in flight.photos}
-    control, check = (
-        None if file is None else tie_marks(file, sizes, options.sigma_mark, remarks) for file in ground
+    targets = (
+        find_targets(flight.folder, tuple(sizes), options.targets, numbers, progress) if options.targets else None
     )
-    if options.targets and decode:
-        (control, check), found = mark_targets((control, check), flight, options.targets, remarks, progress)
+    control, check = (
+        None if file is None else tie_marks(file, sizes, options.sigma_mark, remarks, targets) for file in ground
+    )
+    distances = known_distances(options, (control, check), sizes, remarks, targets)
+    if targets is not None:
+        targets.note(remarks)
         if listing is not None:
-            list_targets(found, listing)
-    distances = known_distances(options, (control, check), sizes, remarks)
+            targets.write(listing)
     survey, track = assemble_survey(flight, control, check, options, remarks)
     return survey.model_copy(update={"distances": distances}), track
 

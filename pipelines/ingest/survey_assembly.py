@@ -296,6 +296,12 @@ def _note_default(kind: str, count: int, options: IngestOptions, remarks: Remark
         )
 
 
+def _only_targets(control: Sequence[GroundPoint], options: IngestOptions) -> bool:
+    """Return whether all marks have a σ of their own, as those of targets do."""
+    marks = [mark for point in control for mark in point.marks]
+    return bool(marks) and all(mark.sigma_px != options.sigma_mark for mark in marks)
+
+
 def _default_sigmas(
     poses: flight_record.ImagePoses, control: Sequence[GroundPoint], options: IngestOptions
 ) -> tuple[SigmaGroup, ...]:
@@ -308,7 +314,7 @@ def _default_sigmas(
     groups: list[tuple[bool, SigmaGroup]] = [
         ("default" in poses.sigma_source, "fixes"),
         (not points_stated, "control points"),
-        ("sigma_mark" not in stated, "marks"),
+        ("sigma_mark" not in stated and not _only_targets(control, options), "marks"),
         (bool(attitudes) and not np.isfinite(poses.sigma_attitude_deg).any(), "attitudes"),
     ]
     return tuple(group for is_default, group in groups if is_default)

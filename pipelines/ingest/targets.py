@@ -1,213 +1,229 @@
-"""Coded targets on the ground (ArUco, AprilTag), found in the photographs and taken as marks of surveyed points."""
+"""Coded targets: tags in the photographs become marks of the surveyed points that have their numbers.
 
+A point has the number that its name is or ends in: 12, GCP12. A mark by hand always stands.
+"""
+
+import os
 import re
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from pipelines.core.errors import InputError
-from pipelines.core.files import replace_text
-from pipelines.core.machine import thread_count
-from pipelines.core.progress import Progress
+from pipelines.core.files import replace_texts
+from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import ByteArray
-from pipelines.formats.fiducials import FoundTag, dictionary_named, dictionary_names, find_tags, tag_count
+from pipelines.formats.fiducials import FoundTag, find_tags, tag_count
+from pipelines.formats.image_file import read_bytes
 from pipelines.formats.tables import table_text
-from pipelines.ingest.flight_record import FlightRecord
-from pipelines.ingest.ground_points import GroundFile, GroundPoint
 from pipelines.ingest.remarks import Remarks, shortened
-from pipelines.survey.photographs import decoded_photograph
+from pipelines.report.page import Page, Picture, Section, limited, picture_of, render_page
 from pipelines.survey.survey import Mark
 
-LISTING, SHEET = "targets.csv", "targets.png"
-_NUMBER = re.compile(r"(\d+)\s*$")
-_OFF_SIGMAS, _OFF_PX = 3.0, 1.0  # from a mark by hand: both must be exceeded for a warning
-_CHIP_PX, _TEXT_PX, _ACROSS, _MOST_CHIPS = 96, 26, 12, 600
-_COLUMNS = ("point", "image", "x_px", "y_px", "sigma_px", "side_px", "dictionary", "number", "outcome")
-_USED = "used"
+TABLE, PAGE = "targets.csv", "targets.html"
+_SAME_PX = 1.0  # tags of two dictionaries at one place are one tag: some dictionaries begin as others
+_LEAST_OFF_PX, _FAR_SIGMAS = 1.0, 3.0  # of a tag from a mark by hand
+_MOST_CHIPS, _MOST_CHIPS_OF_IMAGE = 400, 40
+_CHIP_SHARE, _CHIP_PX = 1.8, 128  # width in sides of the tag, and as stored
+_PACKAGE = __name__.rpartition(".")[0]  # its folder `templates` has the section of the page
+
+
+def numbers_of_points(names: Iterable[str], dictionaries: Sequence[str]) -> dict[int, str]:
+    """Return the name of the point of each number that a tag can have; a name without a number has no tag.
+
+    Raises:
+        InputError: two points have one number.
+    """
+    most = max(map(tag_count, dictionaries))
+    points: dict[int, str] = {}
+    for name in sorted(set(names)):
+        digits = re.search(r"[0-9]{1,9}$", name)
+        if digits is None or int(digits[0]) >= most:
+            continue
+        other = points.setdefault(int(digits[0]), name)
+        if other != name:
+            raise InputError(
+                "target-number-ambiguous",
+                f"The tag {int(digits[0])} may be point {other} or point {name}: both names end in its number. "
+                "Rename one of them.",
+                field="--targets",
+            )
+    return points
 
 
 @dataclass(frozen=True)
-class TargetMark:
-    """Tag that was found in a photograph, the point that it marks, and what became of it."""
+class SeenTag:
+    """Tag in a photograph, with a picture of it, which the first of a photograph have."""
 
     image: str
     tag: FoundTag
-    point: str
-    outcome: str
-    chip: ByteArray
+    chip: Picture | None
+
+    def mark(self) -> Mark:
+        x_px, y_px = self.tag.center_px.tolist()
+        return Mark(image=self.image, x_px=x_px, y_px=y_px, sigma_px=self.tag.sigma_px)
 
 
-def numbered_dictionaries(text: Sequence[str]) -> tuple[str, ...]:
-    """Return OpenCV's names of dictionaries.
+@dataclass
+class Targets:
+    """Tags of a survey's photographs, and the points whose numbers they have; each is used once at the most.
 
-    Raises:
-        InputError: there is none of that name.
+    Attributes:
+        seen: all tags, in the order of the photographs.
+        points: names of points by number.
+        use: by place in `seen`, what became of a tag: `yes`, or why it is no mark.
+        off: marks by hand that tags contradict, for the warning.
     """
-    found = [dictionary_named(name) for name in text]
-    if None in found:
-        unknown = text[found.index(None)]
-        raise InputError(
-            "unknown-dictionary",
-            f"{unknown!r} is no dictionary of tags. There are {', '.join(dictionary_names())}.",
-            field="--targets",
-        )
-    return tuple(dict.fromkeys(name for name in found if name))
 
+    seen: tuple[SeenTag, ...]
+    points: Mapping[int, str]
+    use: dict[int, str] = field(default_factory=dict)
+    off: list[str] = field(default_factory=list)
 
-def mark_targets(
-    files: Sequence[GroundFile | None],
-    record: FlightRecord,
-    names: Sequence[str],
-    remarks: Remarks,
-    progress: Progress,
-) -> tuple[tuple[GroundFile | None, ...], list[TargetMark]]:
-    """Return ground points with the marks of the tags that bear their numbers, and all tags that were found.
+    def beside(self, name: str, by_hand: tuple[Mark, ...]) -> tuple[Mark, ...]:
+        """Return the marks of a point: those made by hand, then those of its tags in all other photographs.
 
-    The number of a point is the one at the end of its name: tag 7 marks `7`, `GCP07` and `T-7`. A mark by hand in
-    the same photograph stays. A tag that a photograph shows twice is a mistake, and marks nothing.
-
-    Raises:
-        InputError: an unknown dictionary, or two points with the number of a tag.
-    """
-    dictionaries = numbered_dictionaries(names)
-    points = [point for file in files if file is not None for point in file.points]
-    of_number = _points_by_number(points, max(map(tag_count, dictionaries)), remarks)
-    by_hand = {(point.name, mark.image): mark for point in points for mark in point.marks}
-    found: list[TargetMark] = []
-    added: dict[str, list[Mark]] = defaultdict(list)
-    off, twice, foreign = [], [], Counter[str]()
-    for image, tags in _tags_in(record, dictionaries, progress):
-        count = Counter(tag.number for tag, _ in tags)
-        for tag, chip in tags:
-            point = of_number.get(tag.number)
-            outcome = _USED
-            if count[tag.number] > 1:
-                outcome = "twice in this photograph"
-                twice.append(f"{tag.number} in {image}")
-            elif point is None:
-                outcome = "no point has this number"
-                foreign[str(tag.number)] += 1
-            elif (mark := by_hand.get((point.name, image))) is not None:
-                away_px = float(np.hypot(*(tag.center_px - [mark.x_px, mark.y_px])))
-                outcome = f"marked by hand, {away_px:.2f} px away"
-                if away_px > max(_OFF_PX, _OFF_SIGMAS * float(np.hypot(tag.sigma_px, mark.sigma_px))):
-                    off.append(f"{point.name} in {image} ({away_px:.1f} px)")
+        Raises:
+            InputError: tags of two dictionaries have the point's number.
+        """
+        standing, marks = {mark.image: mark for mark in by_hand}, list(by_hand)
+        rows = [row for row, one in enumerate(self.seen) if self.points.get(one.tag.number) == name]
+        count = Counter(self.seen[row].image for row in rows)
+        kinds: dict[str, str] = {}
+        for row in rows:
+            one = self.seen[row]
+            mine = one.mark()
+            if count[one.image] > 1:
+                self.use[row] = "twice in the photograph"
+            elif one.image in standing:
+                self.use[row] = "marked by hand"
+                hand = standing[one.image]
+                off_px = float(np.hypot(hand.x_px - mine.x_px, hand.y_px - mine.y_px))
+                far_px = max(_LEAST_OFF_PX, _FAR_SIGMAS * float(np.hypot(hand.sigma_px, mine.sigma_px)))
+                if off_px > far_px:
+                    self.off.append(f"{name} in {one.image} ({off_px:.1f} px)")
             else:
-                x_px, y_px = tag.center_px.tolist()
-                added[point.name].append(Mark(image=image, x_px=x_px, y_px=y_px, sigma_px=tag.sigma_px))
-            found.append(TargetMark(image, tag, point.name if point else "", outcome, chip))
-    remarks.warn_counted(
-        "target-off-mark", off, "Tags lie elsewhere than the marks by hand, which stay; look at both"
-    )
-    remarks.warn_counted("target-twice", twice, "Tags are in one photograph more than once and mark nothing")
-    remarks.warn_counted(
-        "target-of-no-point",
-        [f"{number} ({times} times)" for number, times in sorted(foreign.items())],
-        "Tags were found whose number ends no point's name",
-    )
-    if not added:
-        remarks.warn(
-            "no-target-found", f"No tag of {', '.join(dictionaries)} was found that has the number of a point."
-        )
-    marked = tuple(
-        file
-        and replace(
-            file, points=tuple(replace(each, marks=(*each.marks, *added[each.name])) for each in file.points)
-        )
-        for file in files
-    )
-    return marked, found
-
-
-def _points_by_number(points: Sequence[GroundPoint], count: int, remarks: Remarks) -> dict[int, GroundPoint]:
-    by_number: dict[int, GroundPoint] = {}
-    without = []
-    for point in points:
-        match = _NUMBER.search(point.name)
-        if match is None or int(match[1]) >= count:
-            without.append(point.name)
-            continue
-        other = by_number.setdefault(int(match[1]), point)
-        if other is not point and other.name != point.name:
+                self.use[row] = "yes"
+                kinds.setdefault(one.tag.dictionary, one.image)
+                marks.append(mine)
+        if len(kinds) > 1:
+            places = " and ".join(f"{kind} ({image})" for kind, image in kinds.items())
             raise InputError(
-                "target-number-twice",
-                f"{other.name} and {point.name} both end in {int(match[1])}, the number of one tag. Rename one.",
+                "target-in-two-dictionaries",
+                f"Tags of {places} have the number of point {name}. Give --targets the one that was laid out.",
                 field="--targets",
             )
-    if not by_number:
-        raise InputError(
-            "no-numbered-point",
-            f"No ground point's name ends in the number of a tag, 0 to {count - 1}: {shortened(without)}. Name "
-            "each point by its tag, e.g. GCP7, in --gcp or --checkpoints.",
-            field="--targets",
+        return tuple(marks)
+
+    def note(self, remarks: Remarks) -> None:
+        """Record how many marks are those of tags, and which tags are none."""
+        used = [row for row, use in self.use.items() if use == "yes"]
+        if not self.seen:
+            remarks.warn(
+                "no-target-found",
+                "No photograph shows a tag of --targets. Is it another dictionary, or are the tags less than 20 "
+                "pixels wide?",
+            )
+        else:
+            names = {self.points[self.seen[row].tag.number] for row in used}
+            remarks.assume(
+                "marks-of-targets",
+                f"{len(used)} marks of {len(names)} points are those of tags; σ of each is measured ({TABLE}).",
+            )
+        remarks.warn_counted(
+            "target-not-where-marked", self.off, "Tags lie elsewhere than marks made by hand, which are kept"
         )
-    remarks.warn_counted("point-without-tag-number", without, "Points have no number of a tag in their name")
-    return by_number
+        twice = [self._title(row) for row, use in self.use.items() if use.startswith("twice")]
+        remarks.warn_counted(
+            "target-twice", twice, "Tags that a photograph shows more than once are not used there"
+        )
+        strange = Counter(one.tag.number for one in self.seen if one.tag.number not in self.points)
+        remarks.warn_counted(
+            "target-of-no-point",
+            [f"{number} in {count} photographs" for number, count in sorted(strange.items())],
+            "Numbers of tags that no point has",
+        )
+
+    def _title(self, row: int) -> str:
+        return f"{self.seen[row].tag.number} in {self.seen[row].image}"
+
+    def write(self, folder: Path) -> None:
+        """Write the list of all tags and the page with their pictures into a folder."""
+        rows: list[tuple[object, ...]] = [
+            ("point", "image", "x_px", "y_px", "sigma_px", "side_px", "dictionary", "number", "used")
+        ]
+        for row, one in enumerate(self.seen):
+            tag = one.tag
+            decimal = (f"{value:.3f}" for value in (*tag.center_px, tag.sigma_px, tag.side_px))
+            point = self.points.get(tag.number, "")
+            rows.append((point, one.image, *decimal, tag.dictionary, tag.number, self.use.get(row, "no point")))
+        folder.mkdir(parents=True, exist_ok=True)
+        page = render_page(self._page(), _PACKAGE)
+        replace_texts({folder / TABLE: table_text(rows), folder / PAGE: page})
+
+    def _page(self) -> Page:
+        by_point: dict[str, list[tuple[SeenTag, str]]] = defaultdict(list)
+        for row, one in enumerate(self.seen):
+            if one.chip is not None:
+                by_point[self.points[one.tag.number]].append((one, self.use.get(row, "no point")))
+        each = max(1, _MOST_CHIPS // max(1, len(by_point)))
+        chips = [(name, *chip) for name, mine in sorted(by_point.items()) for chip in mine[:each]][:_MOST_CHIPS]
+        about = {
+            "tags": f"{len(self.seen)}, of which {sum(use == 'yes' for use in self.use.values())} are marks",
+            "points": f"{len(by_point)} with tags: {shortened(sorted(by_point))}" if by_point else "none with tags",
+        }
+        facts = {"chips": chips, "count": len(self.seen), "table": TABLE}
+        return Page("Targets", "Tags in the photographs", about, [Section("tags", "Tags", "targets.html", facts)])
 
 
-def _tags_in(
-    record: FlightRecord, dictionaries: Sequence[str], progress: Progress
-) -> list[tuple[str, list[tuple[FoundTag, ByteArray]]]]:
-    """Return the tags of each photograph with a picture of each, several photographs at once."""
-
-    def found(name: str, sha256: str) -> list[tuple[FoundTag, ByteArray]]:
-        pixels = decoded_photograph(record.folder / name, sha256)
-        if pixels is None:
-            return []
-        grey = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
-        return [(tag, _chip(pixels, tag)) for tag in find_tags(grey, dictionaries)]
-
-    every = []
-    with progress.task("targets", len(record.photos)) as task, ThreadPoolExecutor(thread_count()) as pool:
-        work = [(photo.name, pool.submit(found, photo.name, photo.file.sha256)) for photo in record.photos]
-        try:
-            for name, future in work:
-                every.append((name, future.result()))
-                task.advance()
-        finally:
-            pool.shutdown(cancel_futures=True)
-    return every
+def find_targets(
+    folder: Path,
+    images: Sequence[str],
+    dictionaries: Sequence[str],
+    points: Mapping[int, str],
+    progress: Progress = SILENT,
+) -> Targets:
+    """Return the tags of some dictionaries in the photographs of a folder; one that does not decode shows none."""
+    look = partial(_tags_in, folder=folder, dictionaries=dictionaries, points=points)
+    seen: list[SeenTag] = []
+    with progress.task("targets", len(images)) as task, ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
+        for found in pool.map(look, images):
+            seen += found
+            task.advance()
+    return Targets(tuple(seen), points)
 
 
-def _chip(pixels: ByteArray, tag: FoundTag) -> ByteArray:
-    """Return the surroundings of a tag (96, 96, 3) with a cross at its centre."""
-    reach = max(1.2 * float(np.abs(tag.corners_px - tag.center_px).max()), 8.0)
-    zoom = _CHIP_PX / 2 / reach
-    place = np.array(
-        [[zoom, 0, _CHIP_PX / 2 - zoom * tag.center_px[0]], [0, zoom, _CHIP_PX / 2 - zoom * tag.center_px[1]]]
-    )
-    chip = cv2.warpAffine(pixels, place, (_CHIP_PX, _CHIP_PX), flags=cv2.INTER_AREA)
-    cv2.drawMarker(chip, (_CHIP_PX // 2, _CHIP_PX // 2), (0, 60, 255), cv2.MARKER_CROSS, 14, 1)
-    return np.asarray(chip, dtype=np.uint8)
+def _tags_in(image: str, folder: Path, dictionaries: Sequence[str], points: Mapping[int, str]) -> list[SeenTag]:
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+    pixels = cv2.imdecode(np.frombuffer(read_bytes(folder / image), np.uint8), flags)
+    if pixels is None:
+        return []
+    grey = np.asarray(pixels, dtype=np.uint8)
+    kept: list[FoundTag] = []
+    for tag in find_tags(grey, dictionaries):
+        same = (one.number == tag.number and np.abs(one.center_px - tag.center_px).max() < _SAME_PX for one in kept)
+        if not any(same):
+            kept.append(tag)
+    seen = []
+    for place, tag in enumerate(kept):
+        shown = place < _MOST_CHIPS_OF_IMAGE and tag.number in points
+        seen.append(SeenTag(image, tag, _chip(grey, tag) if shown else None))
+    return seen
 
 
-def list_targets(found: Sequence[TargetMark], folder: Path) -> None:
-    """Write what was found as a table and as one picture of chips, those of a point beside each other."""
-    ordered = sorted(found, key=lambda each: (each.point, each.tag.number, each.image))
-    rows: list[list[object]] = [list(_COLUMNS)]
-    for each in ordered:
-        tag = each.tag
-        numbers = [f"{value:.3f}" for value in (*tag.center_px, tag.sigma_px)]
-        side, kind = f"{tag.side_px:.1f}", (tag.dictionary, tag.number)
-        rows.append([each.point, each.image, *numbers, side, *kind, each.outcome])
-    folder.mkdir(parents=True, exist_ok=True)
-    replace_text(folder / LISTING, table_text(rows))
-    shown = ordered[:_MOST_CHIPS]
-    if not shown:
-        return
-    cell = np.full((len(shown), _CHIP_PX + _TEXT_PX, _CHIP_PX + 4, 3), 255, dtype=np.uint8)
-    for place, each in zip(cell, shown, strict=True):
-        place[:_CHIP_PX, :_CHIP_PX] = each.chip
-        colour = (30, 30, 30) if each.outcome == _USED else (0, 0, 200)
-        for row, words in enumerate((each.point or f"tag {each.tag.number}", Path(each.image).name[-16:])):
-            corner = (1, _CHIP_PX + 11 * (row + 1))
-            cv2.putText(place, words, corner, cv2.FONT_HERSHEY_SIMPLEX, 0.33, colour, 1, cv2.LINE_AA)
-    cell = np.concatenate([cell, np.full((-len(shown) % _ACROSS, *cell.shape[1:]), 255, dtype=np.uint8)])
-    height, width = cell.shape[1:3]
-    sheet = cell.reshape(-1, _ACROSS, height, width, 3).transpose(0, 2, 1, 3, 4).reshape(-1, _ACROSS * width, 3)
-    (folder / SHEET).write_bytes(cv2.imencode(".png", sheet)[1].tobytes())
+def _chip(grey: ByteArray, tag: FoundTag) -> Picture:
+    """Return a square cut of a photograph with a tag's centre in its middle; grey beyond the rim."""
+    half = int(np.ceil(_CHIP_SHARE / 2 * np.ptp(tag.corners_px, axis=0).max()))
+    x, y = np.floor(tag.center_px).astype(int)
+    square = np.full((2 * half, 2 * half), 127, dtype=np.uint8)
+    top, left = max(0, y - half), max(0, x - half)
+    part = grey[top : y + half, left : x + half]
+    row, column = top - (y - half), left - (x - half)
+    square[row : row + part.shape[0], column : column + part.shape[1]] = part
+    return picture_of(limited(np.repeat(square[..., None], 3, axis=2), _CHIP_PX))

@@ -313,7 +313,7 @@ def target(s: TextureSamples) -> Float32Array:
     return np.repeat((np.float32(0.03) + np.float32(0.75) * white)[:, None], 3, axis=1)
 
 
-# Dictionaries of tags by the style of their texture. That of 250 tags is the beginning of that of 1000.
+# Dictionaries of tags by the style of their texture. Those of 50, 100 and 250 tags begin that of 1000.
 TAG_DICTIONARIES = ("DICT_4X4_1000", "DICT_APRILTAG_36h11")
 
 

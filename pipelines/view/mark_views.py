@@ -11,7 +11,7 @@ import numpy as np
 from pipelines.core.errors import GeorefError
 from pipelines.core.types import ByteArray, FloatArray
 from pipelines.geometry.cameras import project
-from pipelines.survey.trained_survey import TrainedSurvey
+from pipelines.survey.trained_survey import SolvedSurvey
 from pipelines.view.marking import MarkedPoint, appears_in, rays_of
 
 _LINE_PLACES = 60  # of an epipolar line
@@ -23,7 +23,7 @@ _LEAST_CONTRAST = 6.0  # standard deviation of the template's grey values, of 25
 
 
 def epipolar_lines(
-    trained: TrainedSurvey, point: MarkedPoint, camera: int, place_in_geo: FloatArray | None
+    trained: SolvedSurvey, point: MarkedPoint, camera: int, place_in_geo: FloatArray | None
 ) -> list[tuple[str, FloatArray]]:
     """Return the lines of sight of a point's marks in other photographs, as pixels (K, 2) of one photograph."""
     rays, poses = rays_of(point, trained), trained.poses
@@ -60,7 +60,7 @@ class Proposal:
 
 
 def proposals(
-    trained: TrainedSurvey,
+    trained: SolvedSurvey,
     point: MarkedPoint,
     place_in_geo: FloatArray,
     photograph: Callable[[int], ByteArray],
@@ -106,7 +106,7 @@ def proposals(
         advance((number + 1) / len(wanted))
 
 
-def _planes(trained: TrainedSurvey, source: int, place_in_geo: FloatArray) -> Iterator[FloatArray]:
+def _planes(trained: SolvedSurvey, source: int, place_in_geo: FloatArray) -> Iterator[FloatArray]:
     """Yield two axes (2, 3) in `geo` of each plane through a point that is tried."""
     yield np.eye(3)[:2]
     center = trained.geo_from_model.apply(trained.poses.cam_center_in_model[source][None])[0]
@@ -117,7 +117,7 @@ def _planes(trained: TrainedSurvey, source: int, place_in_geo: FloatArray) -> It
 
 
 def _affine(
-    trained: TrainedSurvey, source: int, camera: int, place_in_geo: FloatArray, axes: FloatArray
+    trained: SolvedSurvey, source: int, camera: int, place_in_geo: FloatArray, axes: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the matrix (2, 2) from pixels of one photograph to those of another, where the point is at (2,)."""
     center = trained.geo_from_model.apply(trained.poses.cam_center_in_model[source][None])[0]

@@ -22,7 +22,7 @@ from pipelines.core.types import FloatArray, Vector3
 from pipelines.geometry.cameras import project
 from pipelines.survey.marks import MarkRays, mark_angles, mark_rays
 from pipelines.survey.survey import Mark, Survey, SurveyedPoint
-from pipelines.survey.trained_survey import TrainedSurvey
+from pipelines.survey.trained_survey import SolvedSurvey
 from pipelines.view.saved import changing
 
 CONTROL, CHECK, MARKS = "gcp_list.txt", "checkpoints.txt", "marks.json"
@@ -61,7 +61,7 @@ def points_to_mark(survey: Survey, xyz_of: Callable[[tuple[SurveyedPoint, ...]],
     return to_mark
 
 
-def rays_of(point: MarkedPoint, trained: TrainedSurvey) -> MarkRays:
+def rays_of(point: MarkedPoint, trained: SolvedSurvey) -> MarkRays:
     """Return the rays of the marks of one point in registered images, through the trained lenses."""
     return mark_rays((surveyed_marks(point),), trained.sparse, wrong=True)
 
@@ -72,14 +72,14 @@ def surveyed_marks(point: MarkedPoint) -> SurveyedPoint:
     return SurveyedPoint(name=point.name, position_in_geo=(0.0, 0.0, 0.0), cov_in_geo=_IDENTITY, marks=marks)
 
 
-def residuals_px(point_in_geo: FloatArray, rays: MarkRays, trained: TrainedSurvey) -> FloatArray:
+def residuals_px(point_in_geo: FloatArray, rays: MarkRays, trained: SolvedSurvey) -> FloatArray:
     """Return the distances (K,) in pixels between marks and the projections of a point (3,)."""
     place = trained.geo_from_model.inverse().apply(point_in_geo[None])
     angle = mark_angles(rays, place, trained.poses.cam_from_model, trained.poses.cam_center_in_model)
     return np.asarray(angle / rays.sigma_rad * rays.sigma_px)
 
 
-def appears_in(point_in_geo: FloatArray, trained: TrainedSurvey) -> list[tuple[int, FloatArray]]:
+def appears_in(point_in_geo: FloatArray, trained: SolvedSurvey) -> list[tuple[int, FloatArray]]:
     """Return the cameras whose photograph must show a point (3,), the nearest first, with its pixel (2,) there."""
     place, poses = trained.geo_from_model.inverse().apply(point_in_geo[None])[0], trained.poses
     shown = []

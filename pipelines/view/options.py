@@ -4,6 +4,7 @@ from typing import Literal
 
 from pydantic import Field
 
+from pipelines.core.options import StageOptions
 from pipelines.survey.options import CrsOptions
 
 
@@ -19,3 +20,11 @@ class ViewOptions(CrsOptions):
         8080, ge=1024, le=65000, description="Port on this machine; if it is taken, the next free one."
     )
     backend: Literal["auto", "cpu", "cuda"] = Field("auto", description="Rasteriser that draws the pictures.")
+
+
+class ProposalOptions(StageOptions):
+    """Options of proposed marks."""
+
+    reach: float = Field(
+        24.0, gt=0, le=200, description="How far from its expected pixel a target may be, in pixels."
+    )

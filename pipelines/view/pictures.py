@@ -31,7 +31,7 @@ from pipelines.surface.picking import Sight
 from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey.area import photographs_that_see
 from pipelines.survey.photographs import decoded_photograph
-from pipelines.survey.trained_survey import TrainedSurvey
+from pipelines.survey.trained_survey import SolvedSurvey, TrainedSurvey
 
 Colouring = Literal["photographs", "height", "sigma", "views"]
 Box = tuple[float, float, float, float, float, float]  # west, south, low, east, north, high
@@ -96,7 +96,7 @@ def frame_of(trained: TrainedSurvey) -> ViewFrame:
 class Photographs:
     """Photographs of the survey at full size, decoded on demand."""
 
-    def __init__(self, workspace: Workspace, trained: TrainedSurvey) -> None:
+    def __init__(self, workspace: Workspace, trained: SolvedSurvey) -> None:
         self._folder = photograph_folder(workspace, trained.survey.image_dir)
         self._trained = trained
         self.full = lru_cache(_KEPT_PHOTOGRAPHS)(self._decoded)

@@ -35,6 +35,7 @@ from pipelines.formats.ground_points import (
     read_geo,
     read_ground_points,
     read_marks,
+    read_point_list,
     read_point_table,
 )
 from pipelines.formats.image_file import inspect_image, read_bytes
@@ -397,8 +398,9 @@ READERS: dict[str, Reader] = {
             b="P,46,7,9,0.1,0.2\nQ,47,8,9\n",
             c="a.jpg,P,1.5,2.5,1\n",
             d="from,to,distance,sigma,use\nP,Q,2.5,0.01,check\n",
+            e="EPSG:4979\nP 7 46 9\nQ 7.1 46 9.5\n",
         ),
-        _each(read_point_table, read_marks, read_distances),
+        _each(read_point_table, read_marks, read_distances, read_point_list),
     ),
     "mrk": Reader(_write(mrk=MRK), _each(read_mrk)),
     "subtitles": Reader(_write(srt=SUBTITLES), _each(read_subtitles)),

@@ -1,0 +1,180 @@
+"""Marks that the adjusted cameras propose, as a table for `--marks`: no mark of the survey is among them.
+
+A point is expected where its marks meet, else where it was surveyed. A quartered target near its pixel is a mark
+with σ. Where there is none, what the nearest marked photograph shows is searched, as in the viewer.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from pipelines.core.errors import GeorefError, InputError
+from pipelines.core.files import replace_texts
+from pipelines.core.progress import SILENT, Progress
+from pipelines.core.types import ByteArray, FloatArray
+from pipelines.core.workspace import Workspace
+from pipelines.formats.tables import table_text
+from pipelines.survey.marks import wrong_marks
+from pipelines.survey.survey import Mark, SurveyedPoint
+from pipelines.survey.survey import MarkedPoint as SurveyMarks
+from pipelines.survey.trained_survey import SolvedSurvey, load_cameras, triangulated_points
+from pipelines.view.mark_views import proposals
+from pipelines.view.marking import SIGMA_PX, MarkedPoint, appears_in, rays_of
+from pipelines.view.options import ProposalOptions
+from pipelines.view.pictures import Photographs
+from pipelines.view.quarters import find_quarters
+
+FILE = "view/proposed_marks.csv"
+_CORRELATED_SIGMA_PX = 1.0  # of a place that looks like that around a mark: the mark itself and the surface count
+
+
+@dataclass(frozen=True)
+class ProposedMark:
+    """Proposed mark; `how` is `quarters` or `correlation`, `score` its likeness, 1 at the most."""
+
+    point: str
+    mark: Mark
+    how: str
+    score: float
+
+
+@dataclass(frozen=True)
+class ProposalSummary:
+    """What was proposed, and the file."""
+
+    file: Path
+    marks: int
+    points: int
+    quarters: int
+    left_out: tuple[str, ...]  # that do not meet the other marks of their point
+
+
+def propose_marks(workspace: Workspace, options: ProposalOptions, progress: Progress = SILENT) -> ProposalSummary:
+    """Write the proposed marks of a workspace.
+
+    Raises:
+        MissingProductError: `init-sim3` has not run.
+        InputError: no point was surveyed.
+    """
+    solved = load_cameras(workspace)
+    found, left_out = proposed_marks(solved, Photographs(workspace, solved).full, options.reach, progress)
+    rows = [
+        (
+            mark.image,
+            each.point,
+            *(f"{value:.3f}" for value in (mark.x_px, mark.y_px, mark.sigma_px)),
+            each.how,
+            f"{each.score:.3f}",
+        )
+        for each in found
+        for mark in (each.mark,)
+    ]
+    file = workspace.root / FILE
+    file.parent.mkdir(exist_ok=True)
+    replace_texts({file: table_text([("image", "label", "x", "y", "sigma", "how", "score"), *rows])})
+    quarters = sum(each.how == "quarters" for each in found)
+    return ProposalSummary(file, len(found), len({each.point for each in found}), quarters, left_out)
+
+
+def proposed_marks(
+    solved: SolvedSurvey, photograph: Callable[[int], ByteArray], reach_px: float, progress: Progress = SILENT
+) -> tuple[list[ProposedMark], tuple[str, ...]]:
+    """Return marks of surveyed points in photographs without them, and which were left out as others contradict.
+
+    Args:
+        photograph: returns that of a camera (H, W, 3) RGB; a GeorefError: it has no marks.
+        reach_px: how far from its expected pixel a quartered target may be.
+    """
+    survey = solved.survey
+    points = (*survey.control_points, *survey.check_points, *survey.unmarked_points)
+    if not points:
+        raise InputError("no-ground-points", "The survey has no ground points. Give `georef ingest` --gcp.")
+    places = {point.name: _place(point, solved) for point in points}
+    found: list[ProposedMark] = []
+    wanted: dict[int, list[tuple[str, FloatArray]]] = defaultdict(list)
+    for point in points:
+        marked = {mark.image for mark in point.marks}
+        for camera, pixel in appears_in(places[point.name], solved):
+            if solved.sparse.image_name[camera] not in marked:
+                wanted[camera].append((point.name, pixel))
+    with progress.task("quartered targets", len(wanted)) as task:
+        for camera, mine in wanted.items():
+            found += _quarters(solved.sparse.image_name[camera], mine, photograph, camera, reach_px)
+            task.advance()
+    found, left_out = _met(points, found, solved)
+    with progress.task("likeness", len(points)) as task:
+        for point in points:
+            of_point = [*point.marks, *(each.mark for each in found if each.point == point.name)]
+            marks = {mark.image: (mark.x_px, mark.y_px) for mark in of_point}
+            alike = proposals(
+                solved, MarkedPoint(point.name, None, marks=marks), places[point.name], photograph, lambda _: None
+            )
+            for each in alike if marks else ():
+                x_px, y_px = each.place_px
+                mark = Mark(image=each.image, x_px=x_px, y_px=y_px, sigma_px=_CORRELATED_SIGMA_PX)
+                found.append(ProposedMark(point.name, mark, "correlation", each.score))
+            task.advance()
+    found, more = _met(points, found, solved)
+    return sorted(found, key=lambda each: (each.point, each.mark.image)), (*left_out, *more)
+
+
+def _place(point: SurveyedPoint, solved: SolvedSurvey) -> FloatArray:
+    """Return where a point is expected (3,) in `geo`."""
+    marks = {mark.image: (mark.x_px, mark.y_px) for mark in point.marks}
+    by_marks = triangulated_points(solved, rays_of(MarkedPoint(point.name, None, marks=marks), solved))[0]
+    return by_marks if np.isfinite(by_marks).all() else np.array(point.position_in_geo)
+
+
+def _quarters(
+    image: str,
+    wanted: Sequence[tuple[str, FloatArray]],
+    photograph: Callable[[int], ByteArray],
+    camera: int,
+    reach_px: float,
+) -> list[ProposedMark]:
+    try:
+        grey = np.asarray(cv2.cvtColor(photograph(camera), cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+    except GeorefError:  # a photograph that cannot be read has no proposal
+        return []
+    found = []
+    for name, pixel in wanted:
+        target = find_quarters(grey, pixel, reach_px)
+        if target is not None:
+            x_px, y_px = target.center_px.tolist()
+            mark = Mark(image=image, x_px=x_px, y_px=y_px, sigma_px=target.sigma_px)
+            found.append(ProposedMark(name, mark, "quarters", target.share))
+    return found
+
+
+def _met(
+    points: Sequence[SurveyedPoint], found: Sequence[ProposedMark], solved: SolvedSurvey
+) -> tuple[list[ProposedMark], tuple[str, ...]]:
+    """Return the proposals but those that the other marks of their points do not meet, and these."""
+    by_point: dict[str, list[Mark]] = defaultdict(list)
+    for each in found:
+        by_point[each.point].append(each.mark)
+    # A mark's σ tells nothing of the cameras: none counts as better than one set by a person.
+    all_marks = [
+        SurveyMarks(
+            name=point.name,
+            marks=tuple(
+                mark.model_copy(update={"sigma_px": max(SIGMA_PX, mark.sigma_px)})
+                for mark in (*point.marks, *by_point[point.name])
+            ),
+        )
+        for point in points
+    ]
+    wrong = {(mark.point, mark.image): mark.off_px for mark in wrong_marks(all_marks, solved.sparse)}
+    kept = [each for each in found if (each.point, each.mark.image) not in wrong]
+    left_out = [
+        f"{each.point} in {each.mark.image} ({wrong[each.point, each.mark.image]:.0f} px)"
+        for each in found
+        if (each.point, each.mark.image) in wrong
+    ]
+    return kept, tuple(left_out)
