@@ -6,11 +6,6 @@ import click
 
 from georef_cli.stage import StageCommand
 
-
-def _rasters_of(_ctx: click.Context, _param: click.Parameter, root: Path) -> Path:
-    return root / "raster"
-
-
 command = StageCommand(
     "change",
     """Compare two surveys of one place: what changed, by how much, and whether it is real.
@@ -32,7 +27,6 @@ command = StageCommand(
     before=click.Argument(
         ["before"],
         type=click.Path(file_okay=False, resolve_path=True, path_type=Path),
-        callback=_rasters_of,
         metavar="WS1",
     ),
     delivers="folder",

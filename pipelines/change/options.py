@@ -6,16 +6,19 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from pipelines.core.options import ExtraMarker, InputMarker, StageOptions
+from pipelines.core.stages import CHANGE, MEASURED
 from pipelines.survey.options import BOUNDARY_SUFFIXES
 
+# Of the earlier epoch, the same products decide as of the later one.
+COMPARED = frozenset(part.product for part in CHANGE.reads if part is not MEASURED)
 PolygonFile = Annotated[Path, InputMarker(BOUNDARY_SUFFIXES), ExtraMarker("vectors")]
 
 
 class ChangeOptions(StageOptions):
-    """Options of the comparison of two epochs. `before` is the folder of the earlier epoch's rasters."""
+    """Options of the comparison of two epochs. `before` is the workspace of the earlier one."""
 
-    before: Annotated[Path, InputMarker(frozenset({".tif"}))] = Field(
-        Path(), description="Folder of the rasters of the earlier epoch."
+    before: Annotated[Path, InputMarker(only=COMPARED)] = Field(
+        Path(), description="Workspace of the earlier epoch."
     )
     of: Literal["surface", "terrain"] = Field(
         "surface",

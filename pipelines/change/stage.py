@@ -5,6 +5,7 @@ Reads the rasters, surveys and adjustments of both workspaces. Writes `change/` 
 page `change.html`; on request `along_normals.laz`.
 """
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,7 @@ from pipelines.core.errors import InputError
 from pipelines.core.files import remove, replace_text
 from pipelines.core.products import Remark, save_json, union
 from pipelines.core.stages import CHANGE_PAGE
+from pipelines.core.staleness import status
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.formats.geotiff import Band, RasterKind, read_cells, write_mosaic
 from pipelines.formats.tables import table_text
@@ -59,7 +61,7 @@ def run(stage: StageRun, options: ChangeOptions) -> Summary:
         InputError: the σ of the datum is not known, and no registration was asked for.
         DegenerateGeometryError: both epochs have too little unchanged ground in common.
     """
-    workspaces = Workspace(options.before.parent), stage.workspace
+    workspaces = Workspace(options.before), stage.workspace
     before, after = (epoch_rasters(one, options.of) for one in workspaces)
     epochs = load_epoch(workspaces[0]), load_epoch(workspaces[1])
     if options.along_normals:
@@ -107,23 +109,33 @@ def run(stage: StageRun, options: ChangeOptions) -> Summary:
     _write_vectors(stage.out, change, found.polygons, grid)
     remove(parts.folder)
     cautions = tuple(one.cautions for one in epochs)
-    summary = _summary(change, union(*cautions))
+    stale = tuple(remark for one in workspaces for remark in _stale_rasters(one))
+    summary = _summary(change, stale, union(*cautions))
     compared = Compared(stage.out, change, found.polygons, grid, workspaces)
     page = change_page(compared, summary.warnings, cautions, stage.progress)
     replace_text(stage.out / Path(CHANGE_PAGE).name, render_page(page, _ROOM))
     return summary
 
 
-def _summary(change: Change, cautions: tuple[Remark, ...]) -> Summary:
+def _stale_rasters(workspace: Workspace) -> Iterator[Remark]:
+    """Yield a warning if the rasters of an epoch are older than the survey and the adjustment beside them."""
+    for row in status(workspace):
+        if row.stage == "export-raster" and row.state in ("stale", "damaged"):
+            sentence = f"The rasters of {workspace.root.name} are {row.state} ({row.reason}). "
+            sentence += f"`georef export-raster {workspace.root}` makes them again."
+            yield Remark(code="epoch-stale", sentence=sentence)
+
+
+def _summary(change: Change, warnings: tuple[Remark, ...], cautions: tuple[Remark, ...]) -> Summary:
     found = change.regions
     cut, fill = sum(one.cut_m3 for one in found), sum(one.fill_m3 for one in found)
-    registration, warnings = change.registration, []
+    registration = change.registration
     if registration.contradicts:
         sentence = (
             f"Unchanged ground lies {registration.shift_m[2]:+.3f} m apart in the epochs, more than the datum's σ "
             f"of {registration.datum_sigma_v_m:.3f} m explains. Register with --stable FILE or --stable-auto."
         )
-        warnings.append(Remark(code="epochs-shifted", sentence=sentence))
+        warnings = (*warnings, Remark(code="epochs-shifted", sentence=sentence))
     figure = f"{len(found)} regions, {cut:.1f} m³ cut, {fill:.1f} m³ fill, "
     figure += f"shift {registration.shift_m[2]:+.3f} ± {registration.sigma_shift_m[2]:.3f} m "
     figure += "applied" if registration.applied else "seen on unchanged ground, not applied"
@@ -139,7 +151,7 @@ def _summary(change: Change, cautions: tuple[Remark, ...]) -> Summary:
         "correlated_m2": registration.correlated_m2,
         "significant_share": change.significant_share,
     }
-    return Summary(figure, values, tuple(warnings), cautions)
+    return Summary(figure, values, warnings, cautions)
 
 
 def _polygons(path: Path | None, field: str, crs: PointCrs, options: ChangeOptions) -> tuple[Any, ...] | None:

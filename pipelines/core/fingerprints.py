@@ -190,6 +190,8 @@ def _record(path: Path) -> FileRecord:
 
 def _input_files(folder: Path, workspace_root: Path, marker: InputMarker) -> dict[str, Path]:
     """Return the visible files of a folder that can matter, by name; a workspace inside the folder is left out."""
+    if marker.only:
+        return {name: folder / name for name in sorted(marker.only) if (folder / name).is_file()}
     # Resolved, because `workspace/../photos` is not in the workspace.
     place, workspace = folder.resolve(), workspace_root.resolve()
     return {

@@ -39,10 +39,12 @@ _LONG_KEY = re.compile(rf"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*
 class InputMarker:
     """Mark of a path whose content decides the stage's result: its fingerprint enters the manifest.
 
-    In a folder, files with the suffixes, in lower case, count; without any, all do.
+    In a folder, files with the suffixes, in lower case, count; without any, all do. With `only`, the files at these
+    places in the folder count, as far as there are any.
     """
 
     suffixes: frozenset[str] = frozenset()
+    only: frozenset[str] = frozenset()
 
 
 class WrittenMarker:

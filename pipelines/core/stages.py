@@ -347,7 +347,7 @@ CHANGE = StageSpec(
         "change/regions.csv",
         CHANGE_PAGE,
     ),
-    product_version=2,  # with the page
+    product_version=3,  # of whole epochs
 )
 
 # No part of the pipeline: `georef compare` runs this stage for the baseline, whose later stages read its folder in

@@ -234,7 +234,7 @@ def change_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Page of a town at two dates, where a house is gone, another is new, and there are a pit and a heap."""
     before, after = town_pair(tmp_path_factory.mktemp("change"), changed=True).workspaces
     (out := after.root / "change").mkdir()
-    run_change(StageRun(after, out), ChangeOptions(before=before.root / "raster", stable_auto=True))
+    run_change(StageRun(after, out), ChangeOptions(before=before.root, stable_auto=True))
     return out / Path(CHANGE_PAGE).name
 
 

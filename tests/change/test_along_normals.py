@@ -61,7 +61,7 @@ def write_cloud(workspace: Workspace, rng: np.random.Generator, wall_m: float) -
 def test_a_wall_has_moved_and_the_ground_has_not(tmp_path: Path) -> None:
     before, after = town_pair(tmp_path, changed=False).workspaces
     rng = np.random.default_rng(2)
-    options = ChangeOptions(before=before.root / "raster", stable_auto=True, along_normals=True)
+    options = ChangeOptions(before=before.root, stable_auto=True, along_normals=True)
     (out := tmp_path / "out").mkdir()
     with refused("missing-product", MissingProductError):
         run(StageRun(after, out), options)
@@ -95,7 +95,7 @@ def test_clouds_without_sigma_or_of_another_crs_are_refused(tmp_path: Path) -> N
     assert len(first) == 100 and np.isfinite(first.cov_m2).all()
     sidecar = load_json(CrsSidecar, sidecar_path(path))
     save_json(sidecar.model_copy(update={"crs_wkt": parse_crs("EPSG:32633").wkt}), sidecar_path(path))
-    options = ChangeOptions(before=before.root / "raster", stable_auto=True, along_normals=True)
+    options = ChangeOptions(before=before.root, stable_auto=True, along_normals=True)
     (out := tmp_path / "out").mkdir()
     with refused("epochs-differ-in-crs", InputError):
         run(StageRun(after, out), options)

@@ -14,8 +14,11 @@ from pipelines.change.options import ChangeOptions
 from pipelines.change.product import Change
 from pipelines.change.regions import is_real
 from pipelines.change.stage import run
+from pipelines.core.fingerprints import fingerprints
 from pipelines.core.products import load_json
-from pipelines.core.workspace import StageRun
+from pipelines.core.stages import CHANGE, CLOUD
+from pipelines.core.staleness import StageState, changed_inputs
+from pipelines.core.workspace import StageRun, Workspace
 from pipelines.formats.geotiff import read_cells
 from pipelines.survey.trained_survey import load_trained
 from pipelines.view.overlays import changed_regions
@@ -27,7 +30,7 @@ def compared(pair: TownPair, out: Path) -> tuple[NDArray[np.uint8], Change]:
     """Classes (H, W) and product of a comparison that is registered on unchanged ground."""
     out.mkdir()
     before, after = pair.workspaces
-    run(StageRun(after, out), ChangeOptions(before=before.root / "raster", stable_auto=True))
+    run(StageRun(after, out), ChangeOptions(before=before.root, stable_auto=True))
     return read_cells(out / "significant.tif")[0], load_json(Change, out / "change.json")
 
 
@@ -63,7 +66,7 @@ def test_the_viewer_draws_regions_on_the_surface(tmp_path: Path) -> None:
     pair = town_pair(tmp_path, changed=True)
     before, after = pair.workspaces
     (after.root / "change").mkdir()
-    run(StageRun(after, after.root / "change"), ChangeOptions(before=before.root / "raster", stable_auto=True))
+    run(StageRun(after, after.root / "change"), ChangeOptions(before=before.root, stable_auto=True))
     change = load_json(Change, after.root / "change" / "change.json")
     trained = load_trained(after)
     frame = frame_of(trained)
@@ -102,3 +105,35 @@ def test_noise_makes_a_region_in_one_of_twenty_scenes() -> None:
     scenes = [is_real(rng.normal(0, 2.0, places), np.full(places, 2.0), places).any() for _ in range(2000)]
     assert 0.03 < np.mean(scenes) < 0.07
     assert is_real(np.array([-20.0]), np.array([2.0]), places).all()
+
+
+def test_change_is_stale_after_either_epoch_is_made_anew(tmp_path: Path) -> None:
+    before, after = town_pair(tmp_path, changed=False).workspaces
+    options = ChangeOptions(before=before.root, stable_auto=True)
+
+    def known() -> dict[str, str]:
+        return fingerprints(after, CHANGE, options, {}).hashes
+
+    hashes = known()
+    (before.root / CLOUD).parent.mkdir()
+    for path in (before.root / "raster/dsm.tif", after.root / "raster/dsm.tif", before.root / CLOUD):
+        path.write_bytes((path.read_bytes() if path.exists() else b"") + b"anew")
+        earlier, hashes = hashes, known()
+        assert changed_inputs(hashes, earlier)
+    (before.root / "raster/notes.tif").touch()
+    assert known() == hashes
+
+
+def test_rasters_older_than_their_survey_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before, after = town_pair(tmp_path, changed=False).workspaces
+    (out := tmp_path / "out").mkdir()
+
+    def state(workspace: Workspace) -> list[StageState]:
+        return [StageState("export-raster", "stale" if workspace == before else "current", "init-sim3 is stale")]
+
+    monkeypatch.setattr("pipelines.change.stage.status", state)
+    summary = run(StageRun(after, out), ChangeOptions(before=before.root, stable_auto=True))
+    (told,) = summary.warnings
+    assert told.code == "epoch-stale"
+    assert told.sentence.startswith("The rasters of spring are stale (init-sim3 is stale).")
+    assert "The rasters of spring are stale" in (out / "change.html").read_text("utf-8")
