@@ -22,7 +22,6 @@ import numpy as np
 import shapely
 from scipy.ndimage import map_coordinates
 
-from pipelines.change.product import Change
 from pipelines.core.products import load_json
 from pipelines.core.types import FloatArray
 from pipelines.formats.geotiff import frame_of, read_cells
@@ -31,6 +30,7 @@ from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import ecef_from_enu, ecef_from_lla, enu_from_ecef, lla_from_ecef
 from pipelines.simulate.stage import TRUE_HEIGHTS, TRUTH
 from pipelines.simulate.truth import TrueChange, Truth
+from pipelines.survey.change_report import Change
 
 EPOCHS: dict[str, Sequence[str]] = {
     "first": (),

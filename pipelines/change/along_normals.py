@@ -22,7 +22,6 @@ from scipy.spatial import cKDTree
 from pipelines import __version__
 from pipelines.change.detection import QUANTILE_95, Noise
 from pipelines.change.grid import CommonGrid
-from pipelines.change.product import AlongNormals
 from pipelines.core.errors import InputError
 from pipelines.core.files import remove
 from pipelines.core.products import load_json
@@ -34,6 +33,7 @@ from pipelines.formats.georef_sidecar import CrsSidecar, sidecar_path
 from pipelines.formats.las import MovedPoints, MovedWriter, open_las, read_surface
 from pipelines.geometry.footprints import first_of_voxels
 from pipelines.surface.m3c2 import TiledPoints, at_random, m3c2, oriented_normals, require_py4dgeo, spacing_of
+from pipelines.survey.change_report import AlongNormals
 
 FILE = "along_normals.laz"
 _SQUARE_M, _CHUNK = 32.0, 1_000_000

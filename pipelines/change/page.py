@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from pipelines import __version__
 from pipelines.change.grid import WINDOW_PX, CommonGrid
-from pipelines.change.product import Change
 from pipelines.change.renders import render_pair
 from pipelines.core.products import Remark
 from pipelines.core.progress import Progress
@@ -32,6 +31,7 @@ from pipelines.report.plots.changes import (
 )
 from pipelines.report.plots.charts import round_up
 from pipelines.report.plots.plans import nice_number
+from pipelines.survey.change_report import Change
 
 _MAP_PX, _PROFILE_PX = 1200, 1600
 _MOST_SAMPLES = 1_000_000

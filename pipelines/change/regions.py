@@ -20,9 +20,10 @@ from scipy.special import erfc
 
 from pipelines.change.detection import QUANTILE_95, Cells, Noise, Volume, volumes
 from pipelines.change.grid import CommonGrid, Window
-from pipelines.change.product import ChangedRegion
+from pipelines.change.product import region_of
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.formats.geotiff import cells_inside, outlines, read_cells, write_part
+from pipelines.survey.change_report import ChangedRegion
 
 CELLS = ("difference", "datum", "variance", "step")  # parts that volumes are made of
 _LEAST_REACH, _MOST_REACH = 2, 10  # cells
@@ -142,9 +143,7 @@ def find_regions(
         polygons.append(_outline(number, index + 1, places[index], grid))
     for name, chosen in (("lowered", kept[net[kept] < 0]), ("raised", kept[net[kept] > 0]), ("every", kept)):
         named.append((name, sum((whole[index] for index in chosen.tolist()), Volume())))
-    *regions, lowered, raised, every = (
-        ChangedRegion.of(name, volume, noise, grid.cell_m2) for name, volume in named
-    )
+    *regions, lowered, raised, every = (region_of(name, volume, noise, grid.cell_m2) for name, volume in named)
     in_cores = np.where(np.isin(number, kept + 1), sign, 0).astype(np.int8)
     return FoundRegions(tuple(regions), lowered, raised, every, polygons, in_cores)
 

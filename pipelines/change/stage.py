@@ -27,7 +27,7 @@ from pipelines.change.detection import (
 from pipelines.change.grid import CommonGrid, Window, epoch_rasters
 from pipelines.change.options import ChangeOptions
 from pipelines.change.page import Compared, change_page
-from pipelines.change.product import Change, ChangedRegion, Registration
+from pipelines.change.product import registration_of
 from pipelines.change.regions import Parts, find_regions, reach_of
 from pipelines.core.errors import InputError
 from pipelines.core.files import remove, replace_text
@@ -40,6 +40,7 @@ from pipelines.formats.tables import table_text
 from pipelines.formats.vector_files import feature, features_text, read_boundary, write_polygons_gpkg
 from pipelines.geodesy.crs import PointCrs, parse_crs
 from pipelines.report.page import render_page
+from pipelines.survey.change_report import Change, ChangedRegion
 
 _ROOM = __name__.rpartition(".")[0]
 _MOST_LEVELS = 1_000_000  # of detection, whose median is stated
@@ -80,7 +81,7 @@ def run(stage: StageRun, options: ChangeOptions) -> Summary:
     noise = unchanged_ground(
         grid.samples(ground, stage.progress), grid.cell_m, grid.datum_h_m, with_tilt=options.tilt
     )
-    registration = Registration.of(noise, applied=registered, datum_v_m=grid.datum_v_m)
+    registration = registration_of(noise, applied=registered, datum_v_m=grid.datum_v_m)
     parts = Parts(stage.out / "parts", grid)
     sign, median_lod_m = _write_rasters(stage, parts, noise, registered=registered)
     given = _polygons(options.regions, "--regions", crs, options) or ()

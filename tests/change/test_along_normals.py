@@ -9,7 +9,6 @@ import numpy as np
 
 from pipelines.change.along_normals import FILE
 from pipelines.change.options import ChangeOptions
-from pipelines.change.product import Change
 from pipelines.change.stage import run
 from pipelines.core.errors import InputError, MissingProductError
 from pipelines.core.products import load_json, save_json
@@ -20,6 +19,7 @@ from pipelines.formats.georef_sidecar import CrsSidecar, sidecar_path
 from pipelines.formats.geotiff import frame_of
 from pipelines.formats.las import LazWriter, read_surface
 from pipelines.geodesy.crs import parse_crs
+from pipelines.survey.change_report import Change
 from tests.change_pairs import GROUND_M, town_pair
 from tests.refusals import refused
 

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from pipelines.change.grid import step_variance
 from pipelines.change.options import ChangeOptions
-from pipelines.change.product import Change
 from pipelines.change.regions import is_real
 from pipelines.change.stage import run
 from pipelines.core.fingerprints import fingerprints
@@ -20,6 +19,7 @@ from pipelines.core.stages import CHANGE, CLOUD
 from pipelines.core.staleness import StageState, changed_inputs
 from pipelines.core.workspace import StageRun, Workspace
 from pipelines.formats.geotiff import read_cells
+from pipelines.survey.change_report import Change
 from pipelines.survey.trained_survey import load_trained
 from pipelines.view.overlays import changed_regions
 from pipelines.view.pictures import frame_of
