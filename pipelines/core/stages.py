@@ -36,7 +36,7 @@ SPZ = "spz/splat.spz"
 TILES = "tiles/tileset.json"
 TILES_GLB = "tiles/splat.glb"
 REPORT_PAGE = "report/report.html"
-CHANGE_PAGE = "change/change.html"
+CHANGE_FIGURES, CHANGE_PAGE = "change/change.json", "change/change.html"
 LIDAR, LIDAR_MAP = "train/lidar.json", "train/lidar.png"  # only of a training with LiDAR
 BLOCK_RECORD = "train/blocks.json"  # only of a model that was trained in blocks
 BLOCK_PLAN = "plan/plan.json"
@@ -317,7 +317,9 @@ DELIVERABLES: tuple[StageSpec, ...] = (
             *SOLVED,
             APPLIED_RIG,
             *whole_products(RENDERS, ACCURACY_MAP, REFERENCE_MAP, REFERENCE_HISTOGRAM, optional=True),
-            *whole_products(METRICS, LIDAR, LIDAR_MAP, ORTHOPHOTO_PREVIEW, HILLSHADE, optional=True),
+            *whole_products(
+                METRICS, LIDAR, LIDAR_MAP, ORTHOPHOTO_PREVIEW, HILLSHADE, CHANGE_FIGURES, optional=True
+            ),
         ),
         product=REPORT_PAGE,
         title="Write the report of the survey: one page with all that is known of it.",
@@ -335,7 +337,7 @@ CHANGE = StageSpec(
         *whole_products("raster/dsm.tif", "raster/sigma_v.tif", "raster/measured.tif"),
         *whole_products(*("raster/dtm.tif", "raster/sigma_dtm.tif", "raster/orthophoto.tif", CLOUD), optional=True),
     ),
-    product="change/change.json",
+    product=CHANGE_FIGURES,
     title="Compare with an earlier survey: what changed, by how much, is it real.",
     also=(
         "change/difference.tif",

@@ -1,6 +1,7 @@
 """Record of the processing: stages with options, inputs, versions and times; assumptions, warnings, cautions.
 
-Also what two stages have left for the page: LiDAR that the training has used, and the comparison with a reference.
+Also what other stages have left for the page: LiDAR that the training has used, the comparison with a reference,
+and the change since an earlier survey.
 """
 
 from collections.abc import Mapping
@@ -12,11 +13,21 @@ from typing import Any
 from pipelines.core.errors import InputError
 from pipelines.core.options import flag_name, notation
 from pipelines.core.products import Remark, load_json
-from pipelines.core.stages import BY_NAME, LIDAR, LIDAR_MAP, REFERENCE_HISTOGRAM, REFERENCE_MAP, StageSpec
+from pipelines.core.stages import (
+    BY_NAME,
+    CHANGE,
+    CHANGE_FIGURES,
+    LIDAR,
+    LIDAR_MAP,
+    REFERENCE_HISTOGRAM,
+    REFERENCE_MAP,
+    StageSpec,
+)
 from pipelines.core.staleness import cautions_by_stage, status
 from pipelines.core.workspace import Workspace
 from pipelines.report.page import Picture, png_file, preview
 from pipelines.report.views import EvaluatedSurvey
+from pipelines.survey.change_report import Change, ChangedRegion
 from pipelines.survey.report_parts import LidarReport
 from pipelines.survey.survey import Survey
 
@@ -151,6 +162,30 @@ def lidar_facts(workspace: Workspace) -> LidarFacts | None:
         min(len(report.areas), _LISTED),
         preview(workspace.root / LIDAR_MAP, _MAP_PX),
     )
+
+
+@dataclass(frozen=True)
+class ChangeFacts:
+    """Change since an earlier survey, and the largest regions that changed; `change` None: it is out of date.
+
+    `listed` holds the user's polygons first; `earlier` is the name of the earlier workspace.
+    """
+
+    change: Change | None
+    earlier: str
+    listed: tuple[ChangedRegion, ...]
+
+
+def change_facts(workspace: Workspace, record: RecordFacts) -> ChangeFacts | None:
+    """Return the change since an earlier survey; None: there is none."""
+    made = next((one for one in record.stages if one.name == CHANGE.name), None)
+    if made is None or not (workspace.root / CHANGE_FIGURES).is_file():
+        return None
+    earlier = Path(made.options.get("--before", "")).name
+    if made.state != "current":
+        return ChangeFacts(None, earlier, ())
+    change = load_json(Change, workspace.root / CHANGE_FIGURES)
+    return ChangeFacts(change, earlier, change.regions[:_LISTED])
 
 
 def reference_facts(evaluated: EvaluatedSurvey) -> dict[str, Picture | None]:

@@ -1,8 +1,8 @@
 """Report of a survey, which a surveyor hands to a client: cover, verdicts, accuracy, and an appendix.
 
 Reads survey, SfM model, adjustment and the report of `evaluate`; trained model, test views, accuracy map, metrics
-and LiDAR of the training, and previews of the rasters where there are any. Writes `report/report.html` and, on
-request, `report/report.pdf`.
+and LiDAR of the training, previews of the rasters, and the change since an earlier survey, where there are any.
+Writes `report/report.html` and, on request, `report/report.pdf`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from pipelines.report.options import ReportOptions
 from pipelines.report.page import Page, Section, moment, render_page
 from pipelines.report.place import OverlapFacts, overlap_facts, place_facts
 from pipelines.report.points import points_facts
-from pipelines.report.record import RecordFacts, lidar_facts, record_facts, reference_facts
+from pipelines.report.record import RecordFacts, change_facts, lidar_facts, record_facts, reference_facts
 from pipelines.report.verdicts import Measured, Verdict, verdicts
 from pipelines.report.views import EvaluatedSurvey, load_evaluated, training_facts, views_facts
 from pipelines.survey.trained_model import TrainedModel
@@ -74,6 +74,7 @@ def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: Stage
         of_gaussians, training = _sections_of_gaussians(evaluated, options)
         task.advance(note="views")
         record = record_facts(workspace, survey)
+        change = change_facts(workspace, record)
         task.advance(note="record")
     summary = summary_facts(evaluated, overlap, lenses, record)
     page = Page(
@@ -93,6 +94,7 @@ def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: Stage
             Section("overlap", "Overlap and matches", "overlap.html", overlap),
             Section("lenses", "Residuals in the image, and lenses", "lenses.html", lenses),
             *of_gaussians,
+            *([] if change is None else [Section("change", "Change", "change.html", change)]),
             Section("processing", "Appendix: processing", "record.html", record),
             Section("photographs", "Appendix: photographs", "photographs.html", cameras),
             *training,
