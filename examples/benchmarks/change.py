@@ -75,6 +75,9 @@ def main() -> None:
     parser.add_argument("--seeds", default="5", help="seeds of the towns, with commas")
     parser.add_argument("--images", default="24", help="photographs of each flight")
     parser.add_argument("--size", default="480x360", help="of the photographs")
+    parser.add_argument("--flights", default="", help="further options of georef simulate for all flights")
+    parser.add_argument("--later", default="", help="and for the later ones, such as --common-error 0,0,0.03")
+    parser.add_argument("--no-control", action="store_true", help="reconstruct without the control points")
     parser.add_argument("--train", default="--preset fast --iterations 1200", help="options of georef run")
     parser.add_argument("--change", default="--stable-auto", help="options of georef change")
     parser.add_argument("--least", type=float, default=0.1, help="height in metres from which a cell has changed")
@@ -104,10 +107,12 @@ def measured_pair(args: argparse.Namespace, seed: int, folder: Path) -> PairFigu
         survey, workspace = folder / f"survey_{name}", folder / name
         if not survey.exists():
             flight = ["--flight", "grid", "--images", args.images, "--size", args.size, "--seed", str(seed)]
-            _georef("simulate", survey, *flight, *epoch)
+            _georef(
+                "simulate", survey, *flight, *epoch, *args.flights.split(), *(args.later.split() if epoch else ())
+            )
         _georef(
             *("run", workspace, "--images", survey / "images", "--trajectory", survey / "trajectory.csv"),
-            *("--vertical", "ellipsoidal", "--gcp", survey / "gcp_list.txt"),
+            *("--vertical", "ellipsoidal", *(() if args.no_control else ("--gcp", survey / "gcp_list.txt"))),
             *(*args.train.split(), "--deliver", "raster"),
         )
     truth = load_json(Truth, folder / "survey_changed" / TRUTH)
