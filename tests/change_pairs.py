@@ -65,8 +65,10 @@ def town_heights(*, changed: bool, half_cells: int = 0, seed: int = 4) -> tuple[
     return roofs[::2, ::2], house[::2, ::2]
 
 
-def town_pair(root: Path, *, changed: bool, half_cells: int = 1) -> TownPair:
-    """Return a town whose walls the later epoch has measured `half_cells` halves of a cell further east."""
+def town_pair(root: Path, *, changed: bool, half_cells: int = 1, shift_m: float = 0.0) -> TownPair:
+    """Return a town that the later epoch has measured `shift_m` higher, and its walls `half_cells` halves of a cell
+    further east.
+    """
     before, _ = town_heights(changed=False)
     after, _ = town_heights(changed=changed)
     seen, house = town_heights(changed=changed, half_cells=half_cells)
@@ -76,7 +78,7 @@ def town_pair(root: Path, *, changed: bool, half_cells: int = 1) -> TownPair:
     blurred = gaussian_filter(seen, HOLE_CELLS)
     rng = np.random.default_rng(1)
     first = epoch_workspace(root / "spring", before, np.ones(before.shape, dtype=bool), rng)
-    second = epoch_workspace(root / "autumn", np.where(hole, blurred, seen), ~hole, rng)
+    second = epoch_workspace(root / "autumn", np.where(hole, blurred, seen) + shift_m, ~hole, rng)
     return TownPair(before, after, (first, second))
 
 

@@ -4,8 +4,8 @@ For each seed, three flights over one town are simulated and reconstructed: the 
 and a later one without any. Prints, for the changed pair, precision and recall of the significant cells, and the
 volumes with their errors; for the unchanged pair the false alarms. What stands in OUT already is not made again.
 
-Precision is the share of the significant cells whose true height differs by more than `--least`; recall is that of the
-cells whose true difference exceeds their level of detection. Cells that both epochs measure count.
+Precision is the share of the significant cells whose true height differs by more than `--least`; recall is that of
+the cells whose true difference exceeds their level of detection. Cells that both epochs measure count.
 """
 
 from __future__ import annotations

@@ -137,3 +137,23 @@ def test_rasters_older_than_their_survey_are_told(tmp_path: Path, monkeypatch: p
     assert told.code == "epoch-stale"
     assert told.sentence.startswith("The rasters of spring are stale (init-sim3 is stale).")
     assert "The rasters of spring are stale" in (out / "change.html").read_text("utf-8")
+
+
+@pytest.mark.parametrize("shift_m", [0.03, 0.5])
+def test_a_shifted_base_is_found_or_within_sigma_or_told(tmp_path: Path, shift_m: float) -> None:
+    """A base that was set up wrong: found on unchanged ground; without registration, within the datum's σ or told."""
+    before, after = town_pair(tmp_path, changed=False, shift_m=shift_m).workspaces
+    found = {}
+    for registered in (True, False):
+        (out := tmp_path / f"registered_{registered}").mkdir()
+        summary = run(StageRun(after, out), ChangeOptions(before=before.root, stable_auto=registered))
+        change = load_json(Change, out / "change.json")
+        classes = read_cells(out / "significant.tif")[0]
+        found[registered] = change.registration, float((classes > 1).mean()), [one.code for one in summary.warnings]
+    registration, false_alarms, told = found[True]
+    assert abs(registration.shift_m[2] - shift_m) < 3 * registration.sigma_shift_m[2] < 0.02
+    assert registration.applied and false_alarms <= 0.05 and not told
+    registration, false_alarms, told = found[False]
+    within = shift_m < 1.96 * registration.datum_sigma_v_m
+    assert told == ([] if within else ["epochs-shifted"])
+    assert not within or false_alarms <= 0.05
