@@ -141,7 +141,7 @@ def test_rasters_older_than_their_survey_are_told(tmp_path: Path, monkeypatch: p
 
 @pytest.mark.parametrize("shift_m", [0.03, 0.5])
 def test_a_shifted_base_is_found_or_within_sigma_or_told(tmp_path: Path, shift_m: float) -> None:
-    """A base that was set up wrong: found on unchanged ground; without registration, within the datum's σ or told."""
+    """A wrong base: found on unchanged ground; without registration, within the datum's σ, or told."""
     before, after = town_pair(tmp_path, changed=False, shift_m=shift_m).workspaces
     found = {}
     for registered in (True, False):
