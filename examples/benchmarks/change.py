@@ -4,7 +4,8 @@ For each seed, three flights over one town are simulated and reconstructed: the 
 and a later one without any. Prints, for the changed pair, precision and recall of the significant cells, and the
 volumes with their errors; for the unchanged pair the false alarms. What stands in OUT already is not made again.
 
-A cell has truly changed if its height differs by more than `--least`. Cells that both epochs measure count.
+A cell has truly changed if its height differs by more than `--least`, and is to be found if it differs by more than
+its level of detection too. Cells that both epochs measure count.
 """
 
 from __future__ import annotations
@@ -117,6 +118,7 @@ def measured_pair(args: argparse.Namespace, seed: int, folder: Path) -> PairFigu
     _georef("change", folder / "first", folder / "changed", "--regions", polygons, *args.change.split())
     _georef("change", folder / "first", folder / "same", *args.change.split())
     classes = read_cells(folder / "changed/change/significant.tif")[0]
+    lod = read_cells(folder / "changed/change/lod.tif")[0]
     risen = true_difference(truth, truth.change, folder)
     counts = (classes > 0) & np.isfinite(risen)
     marked, changed = (classes > 1) & counts, np.abs(risen) > args.least
@@ -126,7 +128,7 @@ def measured_pair(args: argparse.Namespace, seed: int, folder: Path) -> PairFigu
         seed=seed,
         cell_m=change.cell_m,
         precision=float(changed[marked].mean()),
-        recall=float(marked[counts & changed].mean()),
+        recall=float(marked[counts & changed & (np.abs(risen) > lod)].mean()),
         false_alarms=float((still[still > 0] > 1).mean()),
         regions_of_no_change=len(load_json(Change, folder / "same/change/change.json").regions),
         volumes=tuple(_volume_errors(truth, truth.change, change, folder)),
