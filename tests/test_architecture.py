@@ -73,6 +73,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     ),
     "filelock": ("pipelines.core",),
     "laspy": ("pipelines.formats",),
+    "pillow_heif": ("pipelines.formats.heif",),
     "py4dgeo": ("pipelines.surface.m3c2",),
     "plyfile": ("pipelines.formats",),
     "exifread": ("pipelines.formats",),

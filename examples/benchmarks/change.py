@@ -4,8 +4,8 @@ For each seed, three flights over one town are simulated and reconstructed: the 
 and a later one without any. Prints, for the changed pair, precision and recall of the significant cells, and the
 volumes with their errors; for the unchanged pair the false alarms. What stands in OUT already is not made again.
 
-Precision is the share of the significant cells whose true height differs by more than `--least`; recall is that of
-the cells whose true difference exceeds their level of detection. Cells that both epochs measure count.
+A cell has truly changed if its height differs by more than `--least`, and is to be found if it differs by more than
+its level of detection too. Cells that both epochs measure count.
 """
 
 from __future__ import annotations
@@ -81,9 +81,7 @@ def main() -> None:
     parser.add_argument("--no-control", action="store_true", help="reconstruct without the control points")
     parser.add_argument("--train", default="--preset fast --iterations 1200", help="options of georef run")
     parser.add_argument("--change", default="--stable-auto", help="options of georef change")
-    parser.add_argument(
-        "--least", type=float, default=0.01, help="true difference in metres from which a cell has changed"
-    )
+    parser.add_argument("--least", type=float, default=0.1, help="height in metres from which a cell has changed")
     parser.add_argument("--json", type=Path, help="file that keeps the figures")
     args = parser.parse_args()
     every = []
@@ -125,17 +123,17 @@ def measured_pair(args: argparse.Namespace, seed: int, folder: Path) -> PairFigu
     _georef("change", folder / "first", folder / "changed", "--regions", polygons, *args.change.split())
     _georef("change", folder / "first", folder / "same", *args.change.split())
     classes = read_cells(folder / "changed/change/significant.tif")[0]
+    lod = read_cells(folder / "changed/change/lod.tif")[0]
     risen = true_difference(truth, truth.change, folder)
     counts = (classes > 0) & np.isfinite(risen)
-    lod = read_cells(folder / "changed/change/lod.tif")[0]
-    marked, beyond = (classes > 1) & counts, counts & (np.abs(risen) > lod)
+    marked, changed = (classes > 1) & counts, np.abs(risen) > args.least
     change = load_json(Change, folder / "changed/change/change.json")
     still = read_cells(folder / "same/change/significant.tif")[0]
     return PairFigures(
         seed=seed,
         cell_m=change.cell_m,
-        precision=float((np.abs(risen[marked]) > args.least).mean()),
-        recall=float(marked[beyond].mean()),
+        precision=float(changed[marked].mean()),
+        recall=float(marked[counts & changed & (np.abs(risen) > lod)].mean()),
         false_alarms=float((still[still > 0] > 1).mean()),
         regions_of_no_change=len(load_json(Change, folder / "same/change/change.json").regions),
         volumes=tuple(_volume_errors(truth, truth.change, change, folder)),

@@ -7,11 +7,12 @@ from typing import Literal
 
 from pipelines.core.errors import BackendUnavailableError
 
-Extra = Literal["bags", "cluster", "mesh", "reference", "simulator", "terrain", "vectors", "viewer"]
+Extra = Literal["bags", "cluster", "heif", "mesh", "reference", "simulator", "terrain", "vectors", "viewer"]
 # What needs each extra, and the libraries that it installs, by the names of their packages.
 EXTRAS: dict[Extra, tuple[str, tuple[str, ...]]] = {
     "bags": ("a ROS bag (--bag, georef inspect)", ("rosbags",)),
     "cluster": ("a cluster (--cluster, georef cluster)", ("distributed", "cryptography")),
+    "heif": ("HEIC photographs", ("pillow-heif",)),
     "mesh": ("georef export-mesh", ("pyfqmr", "scikit-image", "trimesh")),
     "reference": ("M3C2 (georef evaluate --reference)", ("py4dgeo",)),
     "simulator": ("georef simulate", ("embreex",)),
@@ -32,7 +33,11 @@ class Part:
 
 def module_of(package: str) -> str:
     """Return the module that a package of an extra installs."""
-    return {"cloth-simulation-filter": "CSF", "scikit-image": "skimage"}.get(package, package)
+    return {
+        "cloth-simulation-filter": "CSF",
+        "pillow-heif": "pillow_heif",
+        "scikit-image": "skimage",
+    }.get(package, package)
 
 
 def installing(extra: str) -> str:

@@ -14,6 +14,7 @@ from pipelines.core.errors import InputError
 from pipelines.core.files import file_size, reading
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff"})
+HEIF_SUFFIXES = frozenset({".heic", ".heif"})  # converted by `ingest`: see `formats.heif`
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".avi", ".mkv", ".m4v"})
 MAX_BYTES = 512 * 1024 * 1024
 MAX_PIXELS = 400_000_000

@@ -18,7 +18,7 @@ from pipelines.core.options import (
     flag_name,
     from_text,
 )
-from pipelines.formats.image_file import SUFFIXES
+from pipelines.formats.image_file import HEIF_SUFFIXES, SUFFIXES
 from pipelines.geodesy.vertical import Vertical
 from pipelines.survey.survey import RigParameter, RigParameters, in_usual_order
 
@@ -63,7 +63,7 @@ def _known_dictionaries(names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 # Files of other kinds beside the photographs, such as thumbnails and logs, make nothing stale.
-PhotographFolder = Annotated[Path, InputMarker(SUFFIXES)]
+PhotographFolder = Annotated[Path, InputMarker(SUFFIXES | HEIF_SUFFIXES)]
 MaskFolder = Annotated[Path, InputMarker(frozenset({".png"}))]
 FrameDistance = Annotated[Every, from_text(_every), WRITTEN]
 TimeOffset = Annotated[
@@ -206,11 +206,6 @@ class IngestOptions(StageOptions):
     copy_images: bool = Field(
         False, description="Copy the photographs into the workspace.", json_schema_extra={"flag": "--copy"}
     )
-
-    @property
-    def writes_photographs(self) -> bool:
-        """Whether photographs are taken out of a bag or a video, into the workspace."""
-        return self.bag is not None or self.video is not None
 
     @property
     def time_offset_s(self) -> float:

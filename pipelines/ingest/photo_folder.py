@@ -5,6 +5,7 @@ Cameras are those before any reconstruction: focal length in pixels from a photo
 
 import math
 import os
+import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -16,7 +17,9 @@ from pipelines.core.errors import InputError
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.validators import stays_inside
 from pipelines.formats.exif import PhotoTags, read_tags
+from pipelines.formats.heif import heif_size, jpeg_of_heif
 from pipelines.formats.image_file import (
+    HEIF_SUFFIXES,
     SUFFIXES,
     VIDEO_SUFFIXES,
     ImageFile,
@@ -81,6 +84,42 @@ def scan_folder(root: Path, remarks: Remarks, progress: Progress = SILENT, *, de
     return _without_duplicates(photos, remarks)
 
 
+def heif_photographs(root: Path) -> list[str]:
+    """Return the names of the HEIC photographs below `root`; none if there is no such folder."""
+    found = _files_below(root, HEIF_SUFFIXES)
+    return sorted(
+        path.relative_to(root).as_posix() for path in found if path.resolve().is_relative_to(root.resolve())
+    )
+
+
+def convert_heif(root: Path, folder: Path, remarks: Remarks, progress: Progress = SILENT) -> None:
+    """Copy the photographs below `root` into `folder`, those in HEIC as JPEG of the same name with `.jpg` added.
+
+    COLMAP and OpenCV read no HEIC. What does not decode is left out, and noted.
+
+    Raises:
+        BackendUnavailableError: the library that reads HEIC is not installed.
+    """
+    names, damaged = heif_photographs(root), []
+    others = sorted(path.relative_to(root).as_posix() for path in _candidates(root))
+    with progress.task("HEIC", len(names)) as task:
+        for name in names:
+            try:
+                jpeg = jpeg_of_heif(root / name)
+            except InputError as error:
+                damaged.append(f"{name} ({str(error).removeprefix(f'{root / name}: ')})")
+            else:
+                (target := folder / f"{name}.jpg").parent.mkdir(parents=True, exist_ok=True)
+                target.write_bytes(jpeg)
+            task.advance()
+    for name in others:
+        (target := folder / name).parent.mkdir(parents=True, exist_ok=True)
+        if (root / name).resolve().is_relative_to(root.resolve()):
+            shutil.copyfile(root / name, target)
+    remarks.warn_counted("image-unreadable", damaged, "Images cannot be read and are left out")
+    remarks.assume("heif-converted", f"{len(names) - len(damaged)} HEIC photographs are converted to JPEG.")
+
+
 def glance(root: Path) -> tuple[int, int, tuple[int, int]]:
     """Return number and bytes of the image files below `root`, and width and height of the first that is an image.
 
@@ -89,11 +128,20 @@ def glance(root: Path) -> tuple[int, int, tuple[int, int]]:
     Raises:
         InputError: no such folder, or no image in it.
     """
-    paths = sorted(_candidates(root))
-    size_px = next(filter(None, (header_size(data) for data in map(_beginning, paths))), None)
+    paths = sorted((*_candidates(root), *_files_below(root, HEIF_SUFFIXES)))
+    size_px = next(filter(None, map(_size_by_header, paths)), None)
     if size_px is None:
         raise InputError("no-images", "The folder has no JPEG, PNG or TIFF image.", path=root, field="--images")
     return len(paths), sum(path.stat().st_size for path in paths), size_px
+
+
+def _size_by_header(path: Path) -> tuple[int, int] | None:
+    if path.suffix.lower() not in HEIF_SUFFIXES:
+        return header_size(_beginning(path))
+    try:
+        return heif_size(path)
+    except InputError:
+        return None
 
 
 def _candidates(root: Path) -> Iterator[Path]:
@@ -101,10 +149,14 @@ def _candidates(root: Path) -> Iterator[Path]:
         raise InputError(
             "no-image-folder", "The folder of photographs does not exist.", path=root, field="--images"
         )
+    return _files_below(root, SUFFIXES)
+
+
+def _files_below(root: Path, suffixes: frozenset[str]) -> Iterator[Path]:
     for folder, folders, files in os.walk(root):
         folders[:] = [name for name in folders if not name.startswith(".")]
         for name in files:
-            if not name.startswith(".") and Path(name).suffix.lower() in SUFFIXES:
+            if not name.startswith(".") and Path(name).suffix.lower() in suffixes:
                 yield Path(folder) / name
 
 

@@ -11,6 +11,7 @@ import shutil
 from pathlib import Path
 
 from pipelines.core.errors import InputError
+from pipelines.core.extras import require
 from pipelines.core.products import save_json, save_npz
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.workspace import StageRun, Summary, Workspace
@@ -19,6 +20,7 @@ from pipelines.ingest.folder_flight import read_folder
 from pipelines.ingest.ground_points import ends_of, known_distances, read_ground_files, tie_marks
 from pipelines.ingest.masks import mask_files, write_masks
 from pipelines.ingest.options import IngestOptions, check_options
+from pipelines.ingest.photo_folder import convert_heif, glance, heif_photographs
 from pipelines.ingest.remarks import Remarks
 from pipelines.ingest.survey_assembly import assemble_survey, require_placed
 from pipelines.ingest.targets import find_targets, numbers_of_points
@@ -38,9 +40,9 @@ def run(stage: StageRun, options: IngestOptions) -> Summary:
     _refuse_inside_photographs(stage.workspace, options)
     survey, track = survey_and_track(options, stage.out / "images", stage.progress, listing=stage.out)
     survey = write_masks(survey, options, Path(survey.image_dir), stage.out / "masks", stage.progress)
-    if options.copy_images and not options.writes_photographs:
+    if options.copy_images and not (stage.out / "images").is_dir():
         _copy_images(survey, stage)
-    if options.copy_images or options.writes_photographs:
+    if (stage.out / "images").is_dir():
         survey = survey.model_copy(update={"image_dir": "ingest/images"})
     save_json(survey, stage.out / "survey.json")
     if track is not None:
@@ -62,6 +64,13 @@ def check_inputs(workspace: Workspace, options: IngestOptions, progress: Progres
         read_ground_files(options, remarks)
         count = int(video_length(options.video) / seconds_apart(options))
         return Summary(f"a video of which {count} frames are taken", {}, tuple(remarks.warnings))
+    if options.images is not None and (heif := heif_photographs(options.images)):
+        require("heif")
+        remarks = Remarks()
+        check_options(options, workspace.root)
+        read_ground_files(options, remarks)
+        count = glance(options.images)[0]
+        return Summary(f"{count} photographs, {len(heif)} of them HEIC", {}, tuple(remarks.warnings))
     if options.bag is None:
         survey = survey_and_track(options, None, progress, decode=False)[0]
         mask_files(options, [image.name for image in survey.images], Remarks())
@@ -117,7 +126,11 @@ def survey_and_track(
         table = None if log is None else frame_positions(log, photographs, time_s)
         flight = read_folder(frames, options, remarks, progress, table=table)
     elif options.images is not None:
-        flight = read_folder(options.images, options, remarks, progress, decode=decode)
+        folder = options.images
+        if frames is not None and heif_photographs(folder):
+            convert_heif(folder, frames, remarks, progress)
+            folder = frames
+        flight = read_folder(folder, options, remarks, progress, decode=decode)
     else:
         raise InputError(
             "no-photographs-given",

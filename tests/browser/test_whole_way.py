@@ -36,7 +36,8 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
     """A town from twelve small photographs, with rasters of its surface and terrain and contour lines."""
     folder = tmp_path_factory.mktemp("town")
     survey, workspace = folder / "survey", Workspace(folder / "ws")
-    georef("simulate", survey, "--images", 12, "--size", "320x240", "--samples", 1, "--sigma-survey", "0.01")
+    flight = ("--flight", "grid", "--height", 60, "--radius", 16, "--images", 12, "--size", "320x240")
+    georef("simulate", survey, *flight, "--samples", 1, "--sigma-survey", "0.01")
     georef(
         *("run", workspace.root, "--images", survey / "images", "--trajectory", survey / "trajectory.csv"),
         *("--gcp", survey / "gcp_list.txt", "--checkpoints", survey / "checkpoints.txt", "--preset", "smoke"),

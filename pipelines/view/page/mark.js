@@ -12,6 +12,9 @@ const colours = { mark: "#ff5a1f", expected: "#1fa0ff", line: "#ffd000" };
 const chosen = () => known.points.find(({ name }) => name === state.point) ?? null;
 const shownPhoto = () => photographs.find(({ camera }) => camera === state.photo) ?? null;
 
+let alterations = 0;
+function alter(path, body) { alterations += 1; return post(path, body); }
+
 async function take(points) {
   known = points;
   const names = known.points.map(({ name }) => name);
@@ -116,8 +119,8 @@ async function setMark(name, place, quietly = false) {
   if (!point) return;
   const former = point.marks.find(({ image: own }) => own === name)?.px ?? null, body = (px) => ({ point: point.name, image: name, place_px: px });
   await safely(async () => {
-    const points = await post("marks", body(place));
-    did("mark", `${place ? "mark" : "removal of the mark"} of ${point.name} in ${name}`, async () => take(await post("marks", body(former))));
+    const points = await alter("marks", body(place));
+    did("mark", `${place ? "mark" : "removal of the mark"} of ${point.name} in ${name}`, async () => take(await alter("marks", body(former))));
     await take(points);
     const made = chosen()?.marks.find(({ image: own }) => own === name);
     if (made?.wrong && !quietly) notice(`The mark in ${name} disagrees with the others by ${made.residual_px.toFixed(0)} px.`, { failed: true });
@@ -162,9 +165,11 @@ async function write() {
   const wrong = known.points.flatMap(({ name, marks }) => marks.filter((mark) => mark.wrong).map((mark) => `${mark.image} of ${name} (${mark.residual_px.toFixed(0)} px)`));
   if (wrong.length && !(await question(`These marks disagree with the others of their point: ${wrong.join(", ")}. Write all the same?`))) return;
   await safely(async () => {
+    const before = alterations;
     const { files, heights } = await post("points/write", {});
     byId("written").textContent = `Written: ${files.join(", ")}. Heights: ${heights}.`;
-    await take(await get("points"));
+    const points = await get("points");
+    if (alterations === before) await take(points);  // else the answer to a later change tells more
   });
 }
 
@@ -175,8 +180,8 @@ async function setPoint(event) {
   if (texts.length && (xyz.length !== 3 || !xyz.every(Number.isFinite))) { notice(`Coordinates are three numbers: ${scene.crs.axes.join(", ")}, height in ${scene.crs.name}.`, { failed: true }); return; }
   await safely(async () => {
     const fresh = !known.points.some((point) => point.name === name);
-    const points = await post("points", { name, xyz: texts.length ? xyz : null, is_check: byId("point-check").checked });
-    if (fresh) did("mark", `point ${name}`, async () => take(await post("points/remove", { name })));
+    const points = await alter("points", { name, xyz: texts.length ? xyz : null, is_check: byId("point-check").checked });
+    if (fresh) did("mark", `point ${name}`, async () => take(await alter("points/remove", { name })));
     change({ point: name });
     await take(points);
   });
@@ -213,10 +218,10 @@ export async function begin() {
   byId("point-remove").onclick = () => safely(async () => {
     const point = chosen();
     if (!point) return;
-    const points = await post("points/remove", { name: point.name });
+    const points = await alter("points/remove", { name: point.name });
     did("mark", `removal of ${point.name}`, async () => {
-      await post("points", { name: point.name, xyz: point.xyz, is_check: point.is_check });
-      for (const { image: name, px } of point.marks) await post("marks", { point: point.name, image: name, place_px: px });
+      await alter("points", { name: point.name, xyz: point.xyz, is_check: point.is_check });
+      for (const { image: name, px } of point.marks) await alter("marks", { point: point.name, image: name, place_px: px });
       change({ point: point.name });
       await take(await get("points"));
     });
