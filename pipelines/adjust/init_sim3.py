@@ -322,18 +322,14 @@ def _joint_product(
             warnings.append(Remark(code=code, sentence=sentence))
         rejected[kind] = tuple(name for name, _ in bad)
     names, missed, used = joint.residuals(Distances.kind)
-    wrong = [
-        f"{name} ({float(miss[0]):+.3f} m)"
-        for name, miss, good in zip(names, missed, used, strict=True)
-        if not good
-    ]
+    sizes = [f"{name} ({float(miss[0]):+.3f} m)" for name, miss in zip(names, missed, strict=True)]
+    wrong = [size for size, good in zip(sizes, used, strict=True) if not good]
     if wrong:
         sentence = (
             f"{len(wrong)} of {len(names)} distances disagree with the others, and are not used: {listed(wrong)}."
         )
         warnings.append(Remark(code="distance-outliers", sentence=sentence))
     elif names and np.abs(joint.problem.residuals(joint.state)[Distances.kind]).max() > _DISAGREE:
-        sizes = [f"{name} ({float(miss[0]):+.3f} m)" for name, miss in zip(names, missed, strict=True)]
         sentence = f"Distances miss each other or the positions by more than their σ: {listed(sizes)}."
         warnings.append(Remark(code="distances-disagree", sentence=sentence))
     pivot = np.array(aligned.geo_from_local.pivot)

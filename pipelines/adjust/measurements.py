@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any
 
 import numpy as np
 
@@ -275,34 +275,36 @@ def control_of(scene: Scene, survey: Survey) -> ControlPoints | None:
     of_survey = np.array([point.cov_in_geo for point in surveyed])
     return ControlPoints(
         name=rays.point_name,
-        point=rays.point,
-        camera=rays.camera,
-        bearing_in_cam=rays.bearing_in_cam,
-        sigma_rad=rays.sigma_rad,
-        bearing_by_lens=scene.sparse.lenses.bearing_jacobian(rays.camera, rays.xy_px),
+        **_of_rays(scene, rays),
         position_in_geo=position,
         root_information=root_information(of_survey + _mark_covariance(scene, rays, position)),
     )
 
 
-def distances_of(scene: Scene, survey: Survey, *, use: Literal["control", "check"] = "control") -> Distances | None:
-    """Return the distances of a use whose ends have marks in two or more registered images; None: there is none."""
-    wanted = [distance for distance in survey.distances if distance.use == use]
+def _of_rays(scene: Scene, rays: MarkRays) -> dict[str, Any]:
+    """Return the fields of a `MarkedTerm` that its marks decide."""
+    return {
+        "point": rays.point,
+        "camera": rays.camera,
+        "bearing_in_cam": rays.bearing_in_cam,
+        "sigma_rad": rays.sigma_rad,
+        "bearing_by_lens": scene.sparse.lenses.bearing_jacobian(rays.camera, rays.xy_px),
+    }
+
+
+def distances_of(scene: Scene, survey: Survey) -> Distances | None:
+    """Return the control distances whose ends have marks in two or more registered images; None: there is none."""
+    wanted = [distance for distance in survey.distances if distance.use == "control"]
     rays = mark_rays([end for distance in wanted for end in distance.ends], scene.sparse)
     whole: BoolArray = np.asarray((rays.marks_of_point.reshape(-1, 2) >= 2).all(axis=1))
     if not whole.any():
         return None
     rays = rays.of_points(np.repeat(whole, 2))
     wanted = [distance for distance, is_whole in zip(wanted, whole, strict=True) if is_whole]
-    measured_m = np.array([distance.distance_m for distance in wanted])
     exact = Distances(
         name=tuple(distance.name for distance in wanted),
-        point=rays.point,
-        camera=rays.camera,
-        bearing_in_cam=rays.bearing_in_cam,
-        sigma_rad=rays.sigma_rad,
-        bearing_by_lens=scene.sparse.lenses.bearing_jacobian(rays.camera, rays.xy_px),
-        distance_m=measured_m,
+        **_of_rays(scene, rays),
+        distance_m=np.array([distance.distance_m for distance in wanted]),
         root_information=np.ones((len(wanted), 1, 1)),
     )
     sfm = At(
@@ -315,8 +317,7 @@ def distances_of(scene: Scene, survey: Survey, *, use: Literal["control", "check
         np.tile(np.eye(3), (len(scene.poses.cam_from_model), 1, 1)),
     )
     place = exact.places(sfm)
-    apart = place[::2] - place[1::2]
-    along = apart / np.linalg.norm(apart, axis=1, keepdims=True)
+    _, along = exact.compared(place)
     of_marks = _mark_covariance(scene, rays, place).reshape(-1, 2, 3, 3).sum(axis=1)
     variance = np.einsum("di,dij,dj->d", along, of_marks, along)
     variance += np.array([distance.sigma_m for distance in wanted]) ** 2

@@ -212,11 +212,11 @@ class Distances(MarkedTerm):
 
     def residuals(self, at: At) -> FloatArray:
         """Return |S(x_a) − S(x_b)| − d (D, 1) in metres."""
-        return self._compared(self.places(at))[0]
+        return self.compared(self.places(at))[0]
 
     def slopes(self, at: At) -> Slopes:
         place, by_pose, by_lens_of_mark = self.place_slopes(at)
-        residual, along = self._compared(place)
+        residual, along = self.compared(place)
         row, sign = np.divmod(self.point, 2)
         onto = (np.where(sign == 0, 1.0, -1.0)[:, None] * along[row])[:, None, :]
         by_lens = np.zeros((len(self), 1, len(at.lens)))
@@ -224,7 +224,7 @@ class Distances(MarkedTerm):
         by_errors = np.zeros((len(self), 1, len(at.vector)))
         return Slopes(residual, row, self.camera, onto @ by_pose, by_lens, by_errors)
 
-    def _compared(self, place: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def compared(self, place: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the residuals (D, 1) of points (2 D, 3), and the unit vectors (D, 3) between them."""
         apart = place[::2] - place[1::2]
         length = np.linalg.norm(apart, axis=1, keepdims=True)

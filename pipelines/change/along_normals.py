@@ -66,14 +66,18 @@ class Datum:
         """Shift (3,) of the later epoch that is taken out."""
         return self.noise.shift_m if self.registered else np.zeros(3)
 
-    def variance(self, plan: FloatArray, normal: FloatArray) -> FloatArray:
-        """Return the variance (C,) of the difference along unit normals (C, 3) at places (C, 2)."""
+    def variance(self, normal: FloatArray, of_difference: FloatArray) -> FloatArray:
+        """Return the variance (C,) along unit normals (C, 3), from the variances (C, 3) of the difference."""
         long_range = self.noise.long_range_m**2
         if self.registered:
             of_shift = np.einsum("ci,ij,cj->c", normal, self.noise.shift_cov_m2, normal)
             return np.asarray(of_shift + long_range)
-        of_datums = (normal**2 * self.grid.datum_variance(plan)).sum(axis=1)
-        return np.asarray(np.maximum(of_datums, long_range))
+        return np.maximum(_along(normal, of_difference), long_range)
+
+
+def _along(normal: FloatArray, variance: FloatArray) -> FloatArray:
+    """Return the variances (C,) along unit normals (C, 3) from those by axis (C, 3)."""
+    return np.asarray((normal**2 * variance).sum(axis=1))
 
 
 def change_along_normals(
@@ -156,28 +160,19 @@ def _squares(
             distance_m, noise_m = m3c2(
                 at_random(place), at_random(moved), place[core], normal[core], radius_m=core_m, reach_m=reach_m
             )
-            position = place[core] / _metres(datum.grid)
-            surface = _Cores(datum.grid, position[:, :2], normal[core])
-            variance = noise_m**2 + datum.variance(position[:, :2], normal[core])
-            variance += surface.own_variance(0, rows["variance"][core])
+            position, along = place[core] / _metres(datum.grid), normal[core]
+            of_earlier, of_later, of_difference = datum.grid.datum_variances(position[:, :2])
+            variance = noise_m**2 + datum.variance(along, of_difference)
+            variance += _own_variance(rows["variance"][core], _along(along, of_earlier))
             if len(others):
-                there = place[core] + np.nan_to_num(distance_m)[:, None] * normal[core]
+                there = place[core] + np.nan_to_num(distance_m)[:, None] * along
                 nearest = cKDTree(moved).query(there)[1]
-                variance += surface.own_variance(1, others["variance"][nearest])
+                variance += _own_variance(others["variance"][nearest], _along(along, of_later))
             sigma_m = np.sqrt(variance)
-            yield MovedPoints(position, normal[core], distance_m, sigma_m, QUANTILE_95 * sigma_m)
+            yield MovedPoints(position, along, distance_m, sigma_m, QUANTILE_95 * sigma_m)
             task.advance()
 
 
-@dataclass(frozen=True)
-class _Cores:
-    """Core points at places (C, 2) in the plan, with their normals (C, 3)."""
-
-    grid: CommonGrid
-    plan: FloatArray
-    normal: FloatArray
-
-    def own_variance(self, epoch: int, stated: NDArray[np.float32]) -> FloatArray:
-        """Return the variance (C,) of an epoch's surface along the normals: the stated less the datum's."""
-        of_datum = (self.normal**2 * self.grid.epoch_variance(epoch, self.plan)).sum(axis=1)
-        return np.asarray(np.maximum(np.nan_to_num(stated.astype(np.float64)) - of_datum, 0.0))
+def _own_variance(stated: NDArray[np.float32], of_datum: FloatArray) -> FloatArray:
+    """Return the variance (C,) of a surface itself: what its points state, less that of the datum."""
+    return np.asarray(np.maximum(np.nan_to_num(stated.astype(np.float64)) - of_datum, 0.0))

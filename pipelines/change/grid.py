@@ -119,21 +119,17 @@ class CommonGrid:
             ]
         )
         self._steps = rows[1] - rows[0], columns[1] - columns[0]
-        of_epochs = [epoch.variance_at(self.crs, plan) for epoch in epochs]
-        joint = shared.of_difference(*of_epochs)
+        *of_epochs, joint = self.datum_variances(plan)
         self._node_variance = [one[:, 2].reshape(row.shape) for one in of_epochs]
         self._node_datum = np.sqrt(joint[:, 2]).reshape(row.shape)
         self._node_h = joint[:, :2].mean(axis=1).reshape(row.shape)
         self.datum_v_m = float(np.sqrt(np.median(joint[:, 2])))
         self.datum_h_m = float(np.sqrt(np.median(joint[:, :2])))
 
-    def epoch_variance(self, epoch: int, plan: FloatArray) -> FloatArray:
-        """Return the variances (N, 3) east, north, up in m² of the datum of an epoch, 0 or 1, at places (N, 2)."""
-        return self.epochs[epoch].variance_at(self.crs, plan)
-
-    def datum_variance(self, plan: FloatArray) -> FloatArray:
-        """Return the variances (N, 3) of the difference of both datums."""
-        return self._shared.of_difference(*(self.epoch_variance(epoch, plan) for epoch in (0, 1)))
+    def datum_variances(self, plan: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the variances (N, 3) east, north, up in m² of both datums and of their difference, at (N, 2)."""
+        before, after = (epoch.variance_at(self.crs, plan) for epoch in self.epochs)
+        return before, after, self._shared.of_difference(before, after)
 
     @property
     def cell_m(self) -> float:

@@ -202,29 +202,27 @@ def distance_errors(solved: SolvedSurvey, posterior: Posterior) -> tuple[report.
     rays = mark_rays([end for distance in known for end in distance.ends], solved.sparse)
     place = triangulated_points(solved, rays)
     rejected = {row.name for row in solved.model.measurements if row.kind == "distance" and not row.used}
-    rows = []
-    for index, distance in enumerate(known):
-        ends = np.arange(len(place)) // 2 == index
-        measured: dict[str, float | None] = dict.fromkeys(("measured_m", "error_m", "sigma_m"))
-        if np.isfinite(place[ends]).all():
-            length_m = float(np.linalg.norm(np.subtract(*place[ends])))
-            sigma_m = float(np.sqrt(posterior.of_distances(place[ends], rays.of_points(ends))[0]))
-            measured = {
-                "measured_m": length_m,
-                "error_m": length_m - distance.distance_m,
-                "sigma_m": sigma_m,
-            }
-        rows.append(
-            report.DistanceError(
-                name=distance.name,
-                use=distance.use,
-                rejected=distance.name in rejected,
-                distance_m=distance.distance_m,
-                stated_sigma_m=distance.sigma_m,
-                **measured,
-            )
+    length_m, sigma_m = np.linalg.norm(place[::2] - place[1::2], axis=1), np.full(len(known), np.nan)
+    if (whole := np.isfinite(length_m)).any():
+        ends = np.repeat(whole, 2)
+        sigma_m[whole] = np.sqrt(posterior.of_distances(place[ends], rays.of_points(ends)))
+
+    def stated(value: float) -> float | None:
+        return float(value) if np.isfinite(value) else None
+
+    return tuple(
+        report.DistanceError(
+            name=distance.name,
+            use=distance.use,
+            rejected=distance.name in rejected,
+            distance_m=distance.distance_m,
+            stated_sigma_m=distance.sigma_m,
+            measured_m=stated(length),
+            error_m=stated(length - distance.distance_m),
+            sigma_m=stated(sigma),
         )
-    return tuple(rows)
+        for distance, length, sigma in zip(known, length_m, sigma_m, strict=True)
+    )
 
 
 _LEAST_POINTS = 3

@@ -151,39 +151,35 @@ def write_features_gpkg(path: Path, layers: Mapping[str, Sequence[Json]]) -> Non
 
 def read_contours(path: Path) -> tuple[str, list[ContourLine]]:
     """Return the CRS as WKT and the lines of a file that `write_contours_gpkg` wrote; an InputError: damaged."""
+    wkt, shapes, rows = _read_gpkg(path, "contours", ("height", "major"), "georef export-raster --contours")
+    lines = [
+        ContourLine(float(height), shapely.get_coordinates(shape), bool(major))
+        for shape, (height, major) in zip(shapes, rows, strict=True)
+    ]
+    return wkt, lines
+
+
+def read_regions(path: Path, columns: Sequence[str]) -> tuple[str, list[Any], list[tuple[Any, ...]]]:
+    """Return the CRS as WKT, polygons and some columns of the regions of `georef change`, as `read_contours`."""
+    return _read_gpkg(path, "regions", columns, "georef change")
+
+
+def _read_gpkg(
+    path: Path, layer: str, columns: Sequence[str], command: str
+) -> tuple[str, list[Any], list[tuple[Any, ...]]]:
+    """Return the CRS as WKT, shapes and columns of a layer; an InputError names the command that wrote it."""
     import pyogrio
     from pyogrio.errors import DataLayerError, DataSourceError
 
-    file_size(path, limit_bytes=_MOST_CONTOUR_BYTES, kind="contours")
+    file_size(path, limit_bytes=_MOST_CONTOUR_BYTES, kind=layer)
     try:
-        meta, _, shapes, (height, major) = pyogrio.raw.read(path, layer="contours", columns=["height", "major"])
-        lines = [
-            ContourLine(float(h), shapely.get_coordinates(shapely.from_wkb(shape)), bool(m))
-            for shape, h, m in zip(shapes, height, major, strict=True)
-        ]
-    except (DataSourceError, DataLayerError, ValueError, OSError) as error:
-        message = f"cannot be read: {error}. Write it again with `georef export-raster --contours`."
-        raise InputError("contours-unreadable", message, path=path) from error
-    return meta["crs"], lines
-
-
-def read_polygons_gpkg(path: Path, columns: Sequence[str]) -> tuple[str, list[Any], list[tuple[Any, ...]]]:
-    """Return the CRS as WKT, polygons and some columns of a file that `write_polygons_gpkg` wrote.
-
-    Raises:
-        InputError: it is damaged, or has not these columns.
-    """
-    import pyogrio
-    from pyogrio.errors import DataLayerError, DataSourceError
-
-    file_size(path, limit_bytes=_MOST_CONTOUR_BYTES, kind="polygons")
-    try:
-        meta, _, shapes, values = pyogrio.raw.read(path, columns=list(columns))
+        meta, _, shapes, values = pyogrio.raw.read(path, layer=layer, columns=list(columns))
         order = [list(meta["fields"]).index(name) for name in columns]
         rows = list(zip(*(values[at].tolist() for at in order), strict=True))
         return str(meta["crs"]), [shapely.from_wkb(shape) for shape in shapes], rows
     except (DataSourceError, DataLayerError, ValueError, OSError, shapely.errors.ShapelyError) as error:
-        raise InputError("polygons-unreadable", f"cannot be read: {error}. Write it again.", path=path) from error
+        message = f"cannot be read: {error}. Write it again with `{command}`."
+        raise InputError(f"{layer}-unreadable", message, path=path) from error
 
 
 def write_polygons_gpkg(path: Path, layer: str, polygons: Sequence[Any], rows: Sequence[Json], wkt: str) -> None:

@@ -20,7 +20,7 @@ from pipelines.ingest.photo_folder import ImageNames
 from pipelines.ingest.reference_system import crs_of_points, east_first, note_operation
 from pipelines.ingest.remarks import Remarks, shortened
 from pipelines.ingest.targets import Targets
-from pipelines.survey.survey import KnownDistance, Mark, MarkedPoint
+from pipelines.survey.survey import KnownDistance, Mark, PointMarks
 
 _LEAST_MARKS = 2
 # Two names at one place are one point; a point this far from the cameras is in another country.
@@ -247,10 +247,10 @@ def known_distances(
     marks |= _tied(others, listed_marks, sizes, options.sigma_mark, remarks, targets=targets)
     for distance in listed:
         for field, name in zip(("from", "to"), distance.ends, strict=True):
-            if len(marks.get(name, ())) < _LEAST_MARKS:
+            if len(marks[name]) < _LEAST_MARKS:
                 raise InputError(
                     "distance-end-unmarked",
-                    f"{name} has marks in {len(marks.get(name, ()))} images. Mark it in two or more: --marks.",
+                    f"{name} has marks in {len(marks[name])} images. Mark it in two or more: --marks.",
                     path=options.distances,
                     line=distance.line,
                     field=field,
@@ -273,8 +273,8 @@ def known_distances(
     )
 
 
-def _marked(name: str, marks: Mapping[str, tuple[Mark, ...]]) -> MarkedPoint:
-    return MarkedPoint(name=name, marks=marks[name])
+def _marked(name: str, marks: Mapping[str, tuple[Mark, ...]]) -> PointMarks:
+    return PointMarks(name=name, marks=marks[name])
 
 
 def split_checks(

@@ -52,8 +52,8 @@ def scan_folder(root: Path, remarks: Remarks, progress: Progress = SILENT, *, de
     Raises:
         InputError: no such folder, or no JPEG, PNG or TIFF file in it.
     """
-    names = sorted(path.relative_to(root).as_posix() for path in _candidates(root))
-    inside = [name for name in names if (root / name).resolve().is_relative_to(root.resolve())]
+    paths = list(_candidates(root))
+    names, inside = (path.relative_to(root).as_posix() for path in paths), _inside(root, paths)
     remarks.warn_counted(
         "image-link-outside",
         sorted(set(names) - set(inside)),
@@ -84,24 +84,28 @@ def scan_folder(root: Path, remarks: Remarks, progress: Progress = SILENT, *, de
     return _without_duplicates(photos, remarks)
 
 
+def _inside(root: Path, paths: Iterable[Path]) -> list[str]:
+    """Return the names, sorted, of the files that do not lead out of a folder as links."""
+    home = root.resolve()
+    return sorted(path.relative_to(root).as_posix() for path in paths if path.resolve().is_relative_to(home))
+
+
 def heif_photographs(root: Path) -> list[str]:
     """Return the names of the HEIC photographs below `root`; none if there is no such folder."""
-    found = _files_below(root, HEIF_SUFFIXES)
-    return sorted(
-        path.relative_to(root).as_posix() for path in found if path.resolve().is_relative_to(root.resolve())
-    )
+    return _inside(root, _files_below(root, HEIF_SUFFIXES))
 
 
-def convert_heif(root: Path, folder: Path, remarks: Remarks, progress: Progress = SILENT) -> None:
-    """Copy the photographs below `root` into `folder`, those in HEIC as JPEG of the same name with `.jpg` added.
+def convert_heif(
+    root: Path, names: Sequence[str], folder: Path, remarks: Remarks, progress: Progress = SILENT
+) -> None:
+    """Copy the photographs below `root` into `folder`, those in HEIC, `names`, as JPEG with `.jpg` added.
 
     COLMAP and OpenCV read no HEIC. What does not decode is left out, and noted.
 
     Raises:
         BackendUnavailableError: the library that reads HEIC is not installed.
     """
-    names, damaged = heif_photographs(root), []
-    others = sorted(path.relative_to(root).as_posix() for path in _candidates(root))
+    damaged = []
     with progress.task("HEIC", len(names)) as task:
         for name in names:
             try:
@@ -112,10 +116,9 @@ def convert_heif(root: Path, folder: Path, remarks: Remarks, progress: Progress 
                 (target := folder / f"{name}.jpg").parent.mkdir(parents=True, exist_ok=True)
                 target.write_bytes(jpeg)
             task.advance()
-    for name in others:
+    for name in _inside(root, _candidates(root)):
         (target := folder / name).parent.mkdir(parents=True, exist_ok=True)
-        if (root / name).resolve().is_relative_to(root.resolve()):
-            shutil.copyfile(root / name, target)
+        shutil.copyfile(root / name, target)
     remarks.warn_counted("image-unreadable", damaged, "Images cannot be read and are left out")
     remarks.assume("heif-converted", f"{len(names) - len(damaged)} HEIC photographs are converted to JPEG.")
 

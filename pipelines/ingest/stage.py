@@ -58,29 +58,26 @@ def check_inputs(workspace: Workspace, options: IngestOptions, progress: Progres
     Of photographs, sizes and tags are read: damage behind them is found by `run`. Of a bag, all but the pixels.
     """
     _refuse_inside_photographs(workspace, options)
-    if options.video is not None:
-        remarks = Remarks()
-        check_options(options, workspace.root)
-        read_ground_files(options, remarks)
-        count = int(video_length(options.video) / seconds_apart(options))
-        return Summary(f"a video of which {count} frames are taken", {}, tuple(remarks.warnings))
-    if options.images is not None and (heif := heif_photographs(options.images)):
-        require("heif")
-        remarks = Remarks()
-        check_options(options, workspace.root)
-        read_ground_files(options, remarks)
-        count = glance(options.images)[0]
-        return Summary(f"{count} photographs, {len(heif)} of them HEIC", {}, tuple(remarks.warnings))
-    if options.bag is None:
+    heif = [] if options.images is None else heif_photographs(options.images)
+    if options.bag is None and options.video is None and not heif:
         survey = survey_and_track(options, None, progress, decode=False)[0]
         mask_files(options, [image.name for image in survey.images], Remarks())
         return _summary(survey)
     remarks = Remarks()
     check_options(options, workspace.root)
     read_ground_files(options, remarks)
-    frames, located = count_frames(options.bag, options, remarks, progress)
-    require_placed(located > 0 or options.gcp is not None)
-    return Summary(f"a bag with {frames} frames, {located} of them with a position", {}, tuple(remarks.warnings))
+    if options.bag is not None:
+        frames, located = count_frames(options.bag, options, remarks, progress)
+        require_placed(located > 0 or options.gcp is not None)
+        figure = f"a bag with {frames} frames, {located} of them with a position"
+    elif options.video is not None:
+        frames = int(video_length(options.video) / seconds_apart(options))
+        figure = f"a video of which {frames} frames are taken"
+    else:
+        require("heif")
+        assert options.images is not None
+        figure = f"{glance(options.images)[0]} photographs, {len(heif)} of them HEIC"
+    return Summary(figure, {}, tuple(remarks.warnings))
 
 
 def _refuse_inside_photographs(workspace: Workspace, options: IngestOptions) -> None:
@@ -103,9 +100,9 @@ def survey_and_track(
 ) -> tuple[Survey, NavigationTrack | None]:
     """Return the survey, and the navigation in the same frame where it was recorded by time; raises as `run`.
 
-    Photographs of a bag are written into `frames`; without a bag, nothing is. Photographs are decoded to their end,
-    as their hashes need; without `decode`, their heads are read, but for targets. What was found of targets is
-    written into the folder `listing`.
+    Photographs of a bag or a video, and those of a folder with HEIC, are written into `frames`. Photographs are
+    decoded to their end, as their hashes need; without `decode`, their heads are read, but for targets. What was
+    found of targets is written into the folder `listing`.
     """
     remarks = Remarks()
     check_options(options, frames)
@@ -122,13 +119,13 @@ def survey_and_track(
         flight = read_bag(options.bag, options, frames, remarks, progress)
     elif options.video is not None and frames is not None:
         photographs, time_s = write_frames(options.video, options, frames, remarks, progress)
-        log = None if options.trajectory is not None else subtitles_of(options.video)
-        table = None if log is None else frame_positions(log, photographs, time_s)
+        subtitles = None if options.trajectory is not None else subtitles_of(options.video)
+        table = None if subtitles is None else frame_positions(subtitles, photographs, time_s)
         flight = read_folder(frames, options, remarks, progress, table=table)
     elif options.images is not None:
         folder = options.images
-        if frames is not None and heif_photographs(folder):
-            convert_heif(folder, frames, remarks, progress)
+        if frames is not None and (heif := heif_photographs(folder)):
+            convert_heif(folder, heif, frames, remarks, progress)
             folder = frames
         flight = read_folder(folder, options, remarks, progress, decode=decode)
     else:

@@ -63,14 +63,13 @@ def seconds_apart(options: IngestOptions) -> float:
 
 def video_length(video: Path) -> float:
     """Return the length of a video in seconds by its header; errors as of `write_frames`."""
-    capture = _opened(video)
-    try:
-        return float(capture.get(cv2.CAP_PROP_FRAME_COUNT) / max(capture.get(cv2.CAP_PROP_FPS), 1e-3))
-    finally:
-        capture.release()
+    capture, count, rate = _opened(video)
+    capture.release()
+    return count / rate
 
 
-def _opened(video: Path) -> cv2.VideoCapture:
+def _opened(video: Path) -> tuple[cv2.VideoCapture, int, float]:
+    """Return a video with the number of its frames, as its header has it, and how many there are a second."""
     if not video.is_file():
         raise InputError("no-video", "The video does not exist.", path=video, field="--video")
     capture = cv2.VideoCapture(str(video), cv2.CAP_FFMPEG)
@@ -86,14 +85,13 @@ def _opened(video: Path) -> cv2.VideoCapture:
             path=video,
             field="--video",
         )
-    return capture
+    count = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
+    return capture, count, max(float(capture.get(cv2.CAP_PROP_FPS)), 1e-3)
 
 
 def _sharpest(video: Path, step_s: float, progress: Progress) -> Iterator[tuple[float, ByteArray]]:
     """Yield time and pixels (H, W, 3) BGR of the sharpest frame of each interval, in order."""
-    capture = _opened(video)
-    rate = max(capture.get(cv2.CAP_PROP_FPS), 1e-3)
-    count = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
+    capture, count, rate = _opened(video)
     if count / rate / step_s > _MOST_FRAMES:
         capture.release()
         raise InputError(

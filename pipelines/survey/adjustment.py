@@ -49,11 +49,8 @@ class InitialSimilarity(Product):
 
     def rejected(self, survey: Survey) -> Survey | None:
         """Return a survey with the rejected measurements alone; None: there are none."""
-        return self.in_use(survey, used=False) if self._has_outliers else None
-
-    @property
-    def _has_outliers(self) -> bool:
-        return bool(self.gnss_outliers or self.control_outliers or self.distance_outliers)
+        outliers = self.gnss_outliers or self.control_outliers or self.distance_outliers
+        return self.in_use(survey, used=False) if outliers else None
 
     def in_use(self, survey: Survey, *, used: bool = True) -> Survey:
         """Return a survey without the measurements that were rejected, or else with these alone."""

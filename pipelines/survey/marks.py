@@ -14,7 +14,7 @@ from pipelines.geometry.cameras import bearings
 from pipelines.geometry.intersection import Intersections, Rays, UncertainCameras, intersect_rays
 from pipelines.geometry.rolling_shutter import depths_at, in_global_shutter
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.survey.survey import MarkedPoint
+from pipelines.survey.survey import PointMarks
 
 _LEAST_MARKS = 4  # of a point: fewer cannot tell which of them is wrong
 _MOST_PAIRS = 200  # of a point's rays
@@ -60,7 +60,7 @@ class WrongMark:
     off_px: float
 
 
-def mark_rays(points: Sequence[MarkedPoint], sparse: SparseModel, *, wrong: bool = False) -> MarkRays:
+def mark_rays(points: Sequence[PointMarks], sparse: SparseModel, *, wrong: bool = False) -> MarkRays:
     """Return the rays of the marks of J points, in their order, in registered images.
 
     A mark is left out if the lens maps no ray to its pixel, or, without `wrong`, if the point's other marks show it
@@ -70,7 +70,7 @@ def mark_rays(points: Sequence[MarkedPoint], sparse: SparseModel, *, wrong: bool
     return rays if wrong else rows_of(rays, _off_px(rays, sparse) == 0)
 
 
-def wrong_marks(points: Sequence[MarkedPoint], sparse: SparseModel) -> tuple[WrongMark, ...]:
+def wrong_marks(points: Sequence[PointMarks], sparse: SparseModel) -> tuple[WrongMark, ...]:
     """Return the marks that `mark_rays` leaves out because others of their point do not meet them."""
     rays = _all_rays(points, sparse)
     off_px = _off_px(rays, sparse)
@@ -143,7 +143,7 @@ def bearings_at(sparse: SparseModel, image: int, xy_px: FloatArray) -> FloatArra
     return bearings(lens, xy_px)
 
 
-def _all_rays(points: Sequence[MarkedPoint], sparse: SparseModel) -> MarkRays:
+def _all_rays(points: Sequence[PointMarks], sparse: SparseModel) -> MarkRays:
     index = sparse.image_index()
     rows = [
         (j, index[mark.image], mark.x_px, mark.y_px, mark.sigma_px)

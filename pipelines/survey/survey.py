@@ -168,21 +168,21 @@ class Mark(Product):
     sigma_px: float = Field(gt=0)
 
 
-class MarkedPoint(Product):
+class PointMarks(Product):
     """Point of the scene that is marked in photographs."""
 
     name: str
     marks: tuple[Mark, ...]
 
     @model_validator(mode="after")
-    def _is_marked_once_an_image(self) -> MarkedPoint:
+    def _is_marked_once_an_image(self) -> PointMarks:
         images = [mark.image for mark in self.marks]
         if len(set(images)) != len(images):
             raise ValueError("marks: two are in one image")
         return self
 
 
-class SurveyedPoint(MarkedPoint):
+class SurveyedPoint(PointMarks):
     """Control or check point: position in geo (m), 3×3 covariance (m²), marks, and what covers the ground there."""
 
     position_in_geo: Vector3
@@ -199,7 +199,7 @@ class UnmarkedPoint(SurveyedPoint):
 class KnownDistance(Product):
     """Measured distance between two marked points, as of a scale bar: an observation, or a check of the scale."""
 
-    ends: tuple[MarkedPoint, MarkedPoint]
+    ends: tuple[PointMarks, PointMarks]
     distance_m: float = Field(gt=0)
     sigma_m: float = Field(gt=0)
     use: Literal["control", "check"] = "control"

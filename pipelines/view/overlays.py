@@ -15,7 +15,7 @@ from pipelines.core.stages import REPORT
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.formats.geotiff import sampled_raster
-from pipelines.formats.vector_files import read_contours, read_polygons_gpkg
+from pipelines.formats.vector_files import read_contours, read_regions
 from pipelines.report.plots.plans import nice_number
 from pipelines.survey.area import area_of
 from pipelines.survey.options import AreaOptions, CrsOptions
@@ -96,7 +96,7 @@ def changed_regions(workspace: Workspace, trained: TrainedSurvey, frame: ViewFra
     found: list[Json] = []
     places = 0
     try:
-        wkt, polygons, rows = read_polygons_gpkg(path, ("name", "net_m3", "sigma_m3"))
+        wkt, polygons, rows = read_regions(path, ("name", "net_m3", "sigma_m3"))
         crs = _crs(wkt, trained)
         for polygon, (name, net_m3, sigma_m3) in zip(polygons, rows, strict=True):
             text = f"{name}: {net_m3:+.1f} ± {sigma_m3:.1f} m³"

@@ -21,8 +21,7 @@ from pipelines.core.types import ByteArray, FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.formats.tables import table_text
 from pipelines.survey.marks import wrong_marks
-from pipelines.survey.survey import Mark, SurveyedPoint
-from pipelines.survey.survey import MarkedPoint as SurveyMarks
+from pipelines.survey.survey import Mark, PointMarks, SurveyedPoint
 from pipelines.survey.trained_survey import SolvedSurvey, load_cameras, triangulated_points
 from pipelines.view.mark_views import proposals
 from pipelines.view.marking import SIGMA_PX, MarkedPoint, appears_in, rays_of
@@ -161,7 +160,7 @@ def _met(
         by_point[each.point].append(each.mark)
     # A mark's σ tells nothing of the cameras: none counts as better than one set by a person.
     all_marks = [
-        SurveyMarks(
+        PointMarks(
             name=point.name,
             marks=tuple(
                 mark.model_copy(update={"sigma_px": max(SIGMA_PX, mark.sigma_px)})

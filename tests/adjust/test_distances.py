@@ -11,7 +11,7 @@ from pipelines.adjust.geolocate import geolocate
 from pipelines.adjust.init_sim3 import Estimated, estimate_similarity
 from pipelines.adjust.options import GeolocateOptions, InitSim3Options
 from pipelines.survey.marks import mark_rays
-from pipelines.survey.survey import KnownDistance, MarkedPoint, Survey, SurveyedPoint
+from pipelines.survey.survey import KnownDistance, PointMarks, Survey, SurveyedPoint
 from tests.drawn_surveys import Receiver, drawn, flight, missed, surveyed
 from tests.refusals import numbers, said
 
@@ -22,7 +22,7 @@ SIGMA_M, BARS = 0.004, 6  # the first twelve check points are the ends of bars, 
 
 
 def bar(ends: tuple[SurveyedPoint, ...], length_m: float, use: str = "control") -> KnownDistance:
-    marked = tuple(MarkedPoint(name=end.name, marks=end.marks) for end in ends)
+    marked = tuple(PointMarks(name=end.name, marks=end.marks) for end in ends)
     return KnownDistance.model_validate({"ends": marked, "distance_m": length_m, "sigma_m": SIGMA_M, "use": use})
 
 

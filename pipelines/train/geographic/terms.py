@@ -84,7 +84,7 @@ class FixTerm(TensorTerm):
 
 
 @dataclass(frozen=True)
-class MarkedTerm(TensorTerm):
+class MarkedTensorTerm(TensorTerm):
     """Observations of J points that their marks place, `adjust.terms.MarkedTerm`, in float64; K marks in all."""
 
     per_observation: ClassVar[int] = 1
@@ -122,7 +122,7 @@ class MarkedTerm(TensorTerm):
 
 
 @dataclass(frozen=True)
-class ControlTerm(MarkedTerm):
+class ControlTerm(MarkedTensorTerm):
     """L_gcp, `adjust.terms.ControlPoints`, in float64.
 
     The root information of control points through the rendered depth holds the surface's σ, too.
@@ -138,7 +138,7 @@ class ControlTerm(MarkedTerm):
 
 
 @dataclass(frozen=True)
-class KnownDistanceTerm(MarkedTerm):
+class KnownDistanceTerm(MarkedTensorTerm):
     """`adjust.terms.Distances` in float64."""
 
     kind: ClassVar[str] = "distances"
