@@ -271,13 +271,17 @@ def _date(cells: Sequence[str], path: Path, line: int) -> float:
 
 
 @dataclass(frozen=True)
-class Subtitles:
-    """Positions that a drone wrote into the subtitles of a video."""
+class VideoPositions:
+    """Positions that a camera recorded with a video."""
 
     path: Path
-    lines: IntArray  # (N,) of the file
+    source: str  # kind of record, as fixes of the survey state it
+    lines: IntArray  # (N,) of the file; of telemetry the numbers of the payloads
     time_s: FloatArray  # (N,) since the beginning of the video, rising
-    lon_lat_height: FloatArray  # (N, 3) degrees and metres above sea level; NaN without a fix
+    lon_lat_height: FloatArray  # (N, 3) degrees and metres; NaN without a fix
+    heights_above_geoid: bool  # or a datum that the file does not name
+    utc_from_video_s: float | None = None  # added to times in the video: seconds since 1970 UTC
+    receiver: str = "unknown receiver"  # as of `PoseTable`
 
 
 _FROM_TO = re.compile(r"(\d{1,3}):(\d\d):(\d\d)[,.](\d{3})\s*-->.*")
@@ -287,7 +291,7 @@ _LATITUDE, _LONGITUDE, _HEIGHT = (
 )
 
 
-def read_subtitles(path: Path) -> Subtitles:
+def read_subtitles(path: Path) -> VideoPositions:
     """Read the `.SRT` that DJI's drones write beside a video: `[latitude: …] [longitude: …] [… abs_alt: …]`.
 
     Raises:
@@ -312,4 +316,11 @@ def read_subtitles(path: Path) -> Subtitles:
     for column, limit, field in ((1, 180.0, "longitude"), (2, 90.0, "latitude")):
         require_range(table[:, column], -limit, limit, path=path, lines=lines, field=field)
     has_fix = (table[:, 1:3] != 0).any(axis=1, keepdims=True)
-    return Subtitles(path, np.array(lines), table[:, 0], np.where(has_fix, table[:, 1:], np.nan))
+    return VideoPositions(
+        path=path,
+        source="video subtitles",
+        lines=np.array(lines),
+        time_s=table[:, 0],
+        lon_lat_height=np.where(has_fix, table[:, 1:], np.nan),
+        heights_above_geoid=True,
+    )

@@ -88,7 +88,7 @@ class IngestOptions(StageOptions):
     video: InputPath | None = Field(
         None,
         description="Video to take photographs from: the sharpest frame of every --every (default: 1s). Positions "
-        "come from DJI's .SRT beside it.",
+        "come from DJI's .SRT beside it, or from a GoPro's telemetry in it.",
     )
     image_topic: str | None = Field(None, description="Topic of the photographs in the bag (default: by rule).")
     fix_topic: str | None = Field(None, description="Topic of the positions in the bag (default: by rule).")

@@ -24,7 +24,13 @@ from pipelines.ingest.photo_folder import convert_heif, glance, heif_photographs
 from pipelines.ingest.remarks import Remarks
 from pipelines.ingest.survey_assembly import assemble_survey, require_placed
 from pipelines.ingest.targets import find_targets, numbers_of_points
-from pipelines.ingest.video_frames import frame_positions, seconds_apart, subtitles_of, video_length, write_frames
+from pipelines.ingest.video_frames import (
+    frame_positions,
+    recorded_positions,
+    seconds_apart,
+    video_length,
+    write_frames,
+)
 from pipelines.survey.calibrated import NavigationTrack
 from pipelines.survey.survey import Survey
 
@@ -119,8 +125,8 @@ def survey_and_track(
         flight = read_bag(options.bag, options, frames, remarks, progress)
     elif options.video is not None and frames is not None:
         photographs, time_s = write_frames(options.video, options, frames, remarks, progress)
-        subtitles = None if options.trajectory is not None else subtitles_of(options.video)
-        table = None if subtitles is None else frame_positions(subtitles, photographs, time_s)
+        recorded = None if options.trajectory is not None else recorded_positions(options.video, remarks)
+        table = None if recorded is None else frame_positions(recorded, photographs, time_s)
         flight = read_folder(frames, options, remarks, progress, table=table)
     elif options.images is not None:
         folder = options.images

@@ -1,4 +1,4 @@
-"""Photographs out of a video: the sharpest frame of each interval, and their positions from DJI's subtitles."""
+"""Photographs out of a video: the sharpest frame of each interval, with positions from subtitles or telemetry."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ import numpy as np
 from pipelines.core.errors import InputError
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import ByteArray, FloatArray
-from pipelines.formats.gnss_logs import read_subtitles
+from pipelines.formats.gnss_logs import VideoPositions, read_subtitles
+from pipelines.formats.gopro_telemetry import read_telemetry
 from pipelines.formats.image_file import MAX_PIXELS
 from pipelines.formats.trajectory_csv import PoseTable
 from pipelines.ingest.options import Every, IngestOptions
@@ -130,29 +131,41 @@ def _sharpest(video: Path, step_s: float, progress: Progress) -> Iterator[tuple[
         raise InputError("not-a-video", "No frame of the video can be decoded.", path=video, field="--video")
 
 
-def subtitles_of(video: Path) -> Path | None:
-    """Return the subtitles beside a video; None: there are none."""
-    return next((path for path in (video.with_suffix(".SRT"), video.with_suffix(".srt")) if path.is_file()), None)
-
-
-def frame_positions(path: Path, names: list[str], time_s: FloatArray) -> PoseTable:
-    """Return the positions of frames at times (N,) in the video, between those of the subtitles.
+def recorded_positions(video: Path, remarks: Remarks) -> VideoPositions | None:
+    """Return the positions that a video was recorded with: DJI's subtitles beside it, or a GoPro's telemetry in it.
 
     Raises:
-        InputError: as of `read_subtitles`.
+        InputError: as of `read_subtitles` and `read_telemetry`.
     """
-    log = read_subtitles(path)
+    for subtitles in (video.with_suffix(".SRT"), video.with_suffix(".srt")):
+        if subtitles.is_file():
+            return read_subtitles(subtitles)
+    telemetry = read_telemetry(video)
+    if telemetry is not None:
+        lost = int(np.isnan(telemetry.lon_lat_height[:, 0]).sum())
+        if lost:
+            remarks.warn(
+                "telemetry-without-fix",
+                f"{lost} of {len(telemetry.time_s)} positions in {video.name} are left out: without a fix in three "
+                "dimensions, or with a DOP over 10.",
+            )
+    return telemetry
+
+
+def frame_positions(log: VideoPositions, names: list[str], time_s: FloatArray) -> PoseTable:
+    """Return the positions of frames at times (N,) in the video, between those that were recorded."""
     at = np.clip(np.searchsorted(log.time_s, time_s), 1, max(len(log.time_s) - 1, 1)) - 1
     xyz = np.column_stack([np.interp(time_s, log.time_s, log.lon_lat_height[:, axis]) for axis in range(3)])
     apart = np.min([np.abs(log.time_s[np.clip(at + k, 0, len(log.time_s) - 1)] - time_s) for k in (0, 1)], axis=0)
     xyz[apart > _LONGEST_GAP_S] = np.nan
     return PoseTable(
-        path=path,
-        source="video subtitles",
+        path=log.path,
+        source=log.source,
         lines=log.lines[np.clip(at, 0, len(log.lines) - 1)],
         names=tuple(names),
-        time_s=None,
+        time_s=None if log.utc_from_video_s is None else time_s + log.utc_from_video_s,
         xyz=xyz,
         geographic=True,
-        heights_above_geoid=True,
+        receiver=np.full(len(names), log.receiver),
+        heights_above_geoid=log.heights_above_geoid,
     )

@@ -30,6 +30,7 @@ from pipelines.formats.colmap import pycolmap_module, read_sparse
 from pipelines.formats.exif import read_tags
 from pipelines.formats.georef_sidecar import GeorefSidecar, sidecar_path, write_sidecar
 from pipelines.formats.gnss_logs import read_mrk, read_pos, read_subtitles
+from pipelines.formats.gopro_telemetry import read_telemetry
 from pipelines.formats.ground_points import (
     read_distances,
     read_geo,
@@ -56,7 +57,7 @@ from pipelines.survey.report import EvaluationReport
 from pipelines.survey.survey import RigCalibration, RigEstimate, Survey
 from pipelines.survey.trained_model import TrainedModel
 from pipelines.train.trainer import load_checkpoint
-from tests import bags
+from tests import bags, gopro
 from tests.formats.test_surveyors_tables import DEGREES, MRK, POS_HEAD, REFERENCE, SIGMAS, TAIL, XML
 from tests.oracles import read_spz
 from tests.photos import Exif, dji_xmp, gps_entries, jpeg
@@ -377,6 +378,12 @@ def _attempt(read: Callable[[], Any]) -> Any:
         return None
 
 
+def _telemetry(folder: Path) -> None:
+    one = gopro.Payload([gopro.Sample(46.02, 7.75, 1700.0), gopro.Sample(46.02001, 7.75, 1700.0)])
+    for name, text in (("a", gopro.gps5(one)), ("b", gopro.gps9(one))):
+        (folder / f"{name}.mp4").write_bytes(gopro.telemetry_alone([text] * 3, [1.0] * 3))
+
+
 SUBTITLES = (
     "1\n00:00:00,000 --> 00:00:00,033\n2026-05-01 12:00:00.123\n[iso: 100] [latitude: 46.020000] "
     "[longitude: 7.750000] [rel_alt: 50.000 abs_alt: 1670.000]\n\n2\n00:00:00,033 --> 00:00:00,066\n"
@@ -404,6 +411,7 @@ READERS: dict[str, Reader] = {
     ),
     "mrk": Reader(_write(mrk=MRK), _each(read_mrk)),
     "subtitles": Reader(_write(srt=SUBTITLES), _each(read_subtitles)),
+    "telemetry": Reader(_telemetry, _each(read_telemetry)),
     "pos": Reader(
         _write(
             a=DEGREES.format(clock="GPST") + f"2024/05/01 12:00:18.000 46.02 7.75 1620.25{TAIL}",

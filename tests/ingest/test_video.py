@@ -14,6 +14,7 @@ from pipelines.formats.gnss_logs import read_subtitles
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.stage import survey_and_track
 from pipelines.survey.survey import Survey
+from tests import gopro
 from tests.earth import enu_from_lla
 from tests.refusals import codes, refused
 
@@ -111,3 +112,39 @@ def test_subtitles_of_other_spellings_and_without_a_fix(tmp_path: Path) -> None:
         with pytest.raises(InputError) as caught:
             read_subtitles(path)
         assert code is None or caught.value.code == code
+
+
+def test_positions_of_a_gopro(tmp_path: Path) -> None:
+    path = tmp_path / "GX010001.MP4"
+    written = tmp_path / "a.mp4"
+    writer = cv2.VideoWriter(str(written), cv2.VideoWriter_fourcc(*"mp4v"), RATE, (WIDTH, HEIGHT))  # type: ignore[attr-defined]
+    rng = np.random.default_rng(0)
+    for _ in range(RATE * SECONDS):
+        writer.write(cv2.resize(rng.integers(0, 255, (HEIGHT // 4, WIDTH // 4, 3), np.uint8), (WIDTH, HEIGHT)))
+    writer.release()
+
+    def recorded(heights: bytes, fix: int = 3) -> None:
+        seconds = [
+            gopro.Payload([gopro.Sample(LAT + STEP_DEG * (k + j / 18), LON, HEIGHT_M, fix) for j in range(18)])
+            for k in range(SECONDS)
+        ]
+        texts = [gopro.gps5(one, clock=f"2605011200{k:02d}.000", heights=heights) for k, one in enumerate(seconds)]
+        path.write_bytes(gopro.with_telemetry(written.read_bytes(), texts, [1.0] * SECONDS))
+
+    recorded(b"")
+    survey = surveyed(path, tmp_path, vertical=None)
+    assert len(survey.images) == SECONDS and survey.images[0].timestamp_s is not None
+    seconds = np.array([image.timestamp_s for image in survey.images])
+    in_video = seconds - 1_777_636_800.0  # 2026-05-01 12:00 UTC
+    lla = np.column_stack([LAT + STEP_DEG * in_video, np.full(SECONDS, LON), np.full(SECONDS, HEIGHT_M)])
+    fixes = [image.fix for image in survey.images]
+    places = np.array([fix.position_in_geo for fix in fixes if fix is not None])
+    np.testing.assert_allclose(places, enu_from_lla(lla, survey.origin), atol=0.02)
+    assert {fix.source for fix in fixes if fix is not None} == {"video telemetry"}
+    assert {"default-position-sigma", "vertical-datum-assumed"} <= set(codes(survey.assumptions))
+    recorded(b"MSLV")
+    with refused("geoid-not-named", InputError):
+        surveyed(path, tmp_path, vertical=None)
+    recorded(b"", fix=2)
+    with refused("file-without-positions", InputError):
+        surveyed(path, tmp_path, vertical=None)
