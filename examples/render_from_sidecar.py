@@ -77,7 +77,7 @@ def main() -> None:
     for image, fix in chosen:
         index = trained.sparse.image_index()[image.name]
         rotation = geo_from_cam(image, trained, options.attitude == "recorded")
-        pose = cam_from_ply(fix, rotation, trained.survey.origin, options.splat)
+        pose = cam_from_ply(fix, rotation, trained.survey.origin_on_earth, options.splat)
         with torch.no_grad():
             render = backend.render(gaussians, pose, pinholes.of(index), RasterSettings())
         colour = render.colour.clamp(0, 1).mul(255).byte().numpy()

@@ -74,8 +74,10 @@ def size(count: int) -> str:
 
 def _headline(result: Overview) -> list[str]:
     """Return whether the result is that of the present inputs and options, its size and place, interrupted runs."""
-    lat, lon, _ = result.center_lla
-    place = f"{abs(lat):.6f}° {'S' if lat < 0 else 'N'}, {abs(lon):.6f}° {'W' if lon < 0 else 'E'}"
+    place = f"in a {result.bounds.crs}"
+    if result.center_lla is not None:
+        lat, lon, _ = result.center_lla
+        place = f"at {abs(lat):.6f}° {'S' if lat < 0 else 'N'}, {abs(lon):.6f}° {'W' if lon < 0 else 'E'}"
     state = ""
     if result.outdated:
         first, *others = result.outdated
@@ -83,7 +85,7 @@ def _headline(result: Overview) -> list[str]:
         why = shown(f"{first.stage}: {first.reason}{more}")
         state = f" is [{tables.STATE_STYLE[first.state]}]{first.state}[/] ({why})"
     return [
-        f"[bold]{shown(str(result.workspace))}[/]{state}: {result.gaussians} Gaussians at {place}",
+        f"[bold]{shown(str(result.workspace))}[/]{state}: {result.gaussians} Gaussians {place}",
         *(f"[yellow]{stage}[/]: {shown(found)}" for stage, found in result.interrupted.items()),
     ]
 
@@ -91,10 +93,14 @@ def _headline(result: Overview) -> list[str]:
 def _place(result: Overview, *, brief: bool = False) -> Table:
     """Return the lines on the place on Earth and its accuracy."""
     bounds, accuracy = result.bounds, result.accuracy
-    lines = {
-        "longitude": f"{bounds.west:.6f} … {bounds.east:.6f}°",
-        "latitude": f"{bounds.south:.6f} … {bounds.north:.6f}°",
-        "height": f"{bounds.height_m[0]:.2f} … {bounds.height_m[1]:.2f} m, ellipsoidal",
+    lines, on_earth = {}, bounds.on_earth
+    if on_earth is not None:
+        lines = {
+            "longitude": f"{on_earth.west:.6f} … {on_earth.east:.6f}°",
+            "latitude": f"{on_earth.south:.6f} … {on_earth.north:.6f}°",
+            "height": f"{on_earth.height_m[0]:.2f} … {on_earth.height_m[1]:.2f} m, ellipsoidal",
+        }
+    lines |= {
         bounds.crs: ", ".join(
             f"{low:.{decimals}f} … {high:.{decimals}f} {unit}"
             for low, high, unit in zip(bounds.low, bounds.high, bounds.units, strict=True)

@@ -125,7 +125,7 @@ def main() -> None:
     rays = Raycaster(mesh)
 
     def in_world(point_in_geo: FloatArray) -> FloatArray:
-        return enu_from_ecef(ecef_from_enu(point_in_geo, trained.survey.origin), world.origin)
+        return enu_from_ecef(ecef_from_enu(point_in_geo, trained.survey.origin_on_earth), world.origin)
 
     rows = []
     for sight in sights(model, args.clicks):

@@ -182,7 +182,7 @@ def comparison(workspace: Workspace, flight: RecordedFlight, unchanged: Path, us
         return {"shift error": round(float(np.abs(found).max()), 4), "of 0.1 m": round(float(max(off)), 4)}
     judged = lidar_surface(compared, files, survey, options, None)
     in_geo = scene.geo_from_model.apply(judged.cloud.position_in_model)
-    place = enu_from_ecef(ecef_from_enu(in_geo, survey.origin), flight.world.origin)
+    place = enu_from_ecef(ecef_from_enu(in_geo, survey.origin_on_earth), flight.world.origin)
     gap, _ = points_of(unchanged, flight).query(place, distance_upper_bound=BUILDING_M)
     building, rejected = np.isinf(gap), judged.verdict.rejected
     shares = {"building rejected": rejected[building], "others rejected": rejected[~building]}
@@ -215,7 +215,7 @@ def surface_errors(workspace: Workspace, flight: RecordedFlight, cloud: Path) ->
         place = pose.center_in_model + depth[row, column, None] * ray
         in_model = np.concatenate([pose.center_in_model[None], place])
         in_geo = trained.geo_from_model.apply(in_model)
-        true_frame = enu_from_ecef(ecef_from_enu(in_geo, trained.survey.origin), origin)
+        true_frame = enu_from_ecef(ecef_from_enu(in_geo, trained.survey.origin_on_earth), origin)
         center, place = true_frame[0], true_frame[1:]
         direction = (place - center) / np.linalg.norm(place - center, axis=1, keepdims=True)
         hits = rays.first_hits(center, direction)

@@ -64,7 +64,7 @@ def trained(arguments: argparse.Namespace, name: str, lidar: tuple[Any, ...]) ->
 
 def write_moved(workspace: Workspace, cloud: Path, path: Path) -> None:
     """Write the cloud in the place of the model, in geocentric coordinates."""
-    origin = load_json(Survey, workspace.path(SURVEY)).origin
+    origin = load_json(Survey, workspace.path(SURVEY)).origin_on_earth
     shift = read_report(workspace.path(REPORT)).reference
     assert shift is not None and shift.shift is not None
     reference_from_model = np.vstack([shift.shift.reference_from_model, [0, 0, 0, 1]])

@@ -158,14 +158,18 @@ def _seen_by(obs_point: IntArray, obs_image: IntArray, near: IntArray) -> tuple[
     return owner, np.concatenate(cameras)
 
 
-def write_csv(grid: AccuracyGrid, origin: Origin, path: Path) -> None:
-    """Write the grid as a CSV table, one line a cell, with positions in `geo` and on the ellipsoid."""
-    lla = lla_from_ecef(ecef_from_enu(grid.position_in_geo, origin))
+def write_csv(grid: AccuracyGrid, origin: Origin | None, path: Path) -> None:
+    """Write the grid as a CSV table, one line a cell, with positions in `geo` and on the ellipsoid.
+
+    Without an origin, the columns of positions on the ellipsoid are empty.
+    """
+    geodetic = [["", "", ""]] * len(grid.position_in_geo)
+    if origin is not None:
+        lla = lla_from_ecef(ecef_from_enu(grid.position_in_geo, origin)).tolist()
+        geodetic = [[f"{lat:.8f}", f"{lon:.8f}", f"{height:.3f}"] for lat, lon, height in lla]
     values = np.column_stack([grid.sigma_m, grid.sigma_h_m, grid.sigma_v_m])
     rows = (
-        [f"{value:.3f}" for value in place]
-        + [f"{geodetic[0]:.8f}", f"{geodetic[1]:.8f}", f"{geodetic[2]:.3f}"]
-        + [f"{value:.5f}" for value in sigma]
-        for place, geodetic, sigma in zip(grid.position_in_geo, lla, values, strict=True)
+        [f"{value:.3f}" for value in place] + on_ellipsoid + [f"{value:.5f}" for value in sigma]
+        for place, on_ellipsoid, sigma in zip(grid.position_in_geo, geodetic, values, strict=True)
     )
     replace_text(path, table_text(itertools.chain([_PLACE + _SIGMA], rows)))

@@ -8,7 +8,7 @@ a bad fix. The few rays of one point do not tell a bad fix from good ones.
 """
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -68,6 +68,9 @@ def geolocate(survey: Survey, model: SparseModel, options: GeolocateOptions) -> 
         InputError: the options demand `recorded` attitudes, and fewer than two images have a fix and an attitude.
     """
     fixes, index = fix_correspondences(survey, model), model.image_index()
+    if survey.origin is None:
+        figure = "nothing to do: the survey has a local frame, without a place on Earth"
+        return replace(_without_positions(model, figure), warnings=())
     if len(fixes) == 0:
         return _without_positions(model, "The survey has no fixes: control points alone georeference the model.")
     prior, recorded = attitude_prior(survey, model), recorded_rotations(survey, model)

@@ -51,7 +51,7 @@ class StatedFixes:
     def __init__(self, survey: Survey, model: SparseModel) -> None:
         fixes = fix_correspondences(survey, model)
         times = {image.name: image.timestamp_s for image in survey.images}
-        self.model, self.origin, self.name = model, survey.origin, fixes.name
+        self.model, self.survey, self.name = model, survey, fixes.name
         self.center_in_local, self.position_in_geo = fixes.in_local, fixes.in_geo  # (n, 3), and (n, 3) in metres
         self.time_s = np.array([times[name] for name in fixes.name], dtype=np.float64)  # (n,), NaN where unknown
         self.sigma_m = statistics.typical_sigma(fixes.cov_in_geo) if len(fixes) else np.nan  # per axis
@@ -199,7 +199,7 @@ def _changed_axes(fixes: StatedFixes) -> Iterator[_Change]:
     yield (
         "axis-order",
         "Latitude and longitude are exchanged.",
-        _latitude_for_longitude(position, fixes.origin),
+        _latitude_for_longitude(position, fixes.survey.origin_on_earth),
         0.0,
     )
     for code, sentence, factor in (

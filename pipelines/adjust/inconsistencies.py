@@ -400,7 +400,10 @@ def _mistake_in_map(survey: Survey, model: SparseModel) -> str | None:
     ratio = by_control.scale / by_fixes.scale
     sigma = float(np.hypot(_sigma_of_scale(fixes, fix_m), _sigma_of_scale(control, control_m)))
     causes = {
-        1.0 / np.cos(np.radians(survey.origin.lat_deg)): "Web Mercator (EPSG:3857) has this scale at this latitude",
+        1.0
+        / np.cos(
+            np.radians(survey.origin_on_earth.lat_deg)
+        ): "Web Mercator (EPSG:3857) has this scale at this latitude",
         FOOT_M: "The coordinates are in metres, although their CRS has feet",
         1.0 / FOOT_M: "The coordinates are in feet, although their CRS has metres",
     }
@@ -424,7 +427,9 @@ def _cause_of_shift(shift_m: FloatArray, survey: Survey) -> str:
 
     The sign of the shift does not matter. The survey has control points.
     """
-    height_m = survey.origin.alt_m + np.median([point.position_in_geo[2] for point in survey.control_points])
+    height_m = survey.origin_on_earth.alt_m + np.median(
+        [point.position_in_geo[2] for point in survey.control_points]
+    )
     horizontal, vertical = float(np.hypot(shift_m[0], shift_m[1])), abs(float(shift_m[2]))
     for sign in (-1.0, 1.0):
         other_m = height_m + sign * float(shift_m[2])

@@ -5,6 +5,8 @@ and the adjustment, `sim3/adjustment.json` and `.npz`.
 GeoRefGS section 2.4.1, eqs 16–21 (doi 10.3390/drones10030195), is `--method paper`. The default starts from a
 robust alignment of camera centres and control points, adjusts similarity, cameras and lens together, and tests the
 stated σ. `pipelines.adjust.alignment` explains why the intersected points are no observations.
+
+A survey without a place on Earth gets a local metric frame (`pipelines.adjust.local_frame`).
 """
 
 from collections.abc import Iterator
@@ -25,6 +27,7 @@ from pipelines.adjust.alignment import (
 )
 from pipelines.adjust.inconsistencies import cautions_of, marks_that_do_not_meet, mistake_in_marks, unadjustable
 from pipelines.adjust.joint import JointAdjustment, Start, adjust_jointly, component_of, in_own_frame
+from pipelines.adjust.local_frame import local_similarity
 from pipelines.adjust.measurements import (
     UnusedControlPoint,
     attitude_prior,
@@ -54,7 +57,7 @@ from pipelines.survey.adjustment import GeolocatedPoints, InitialSimilarity
 from pipelines.survey.calibrated import load_survey
 from pipelines.survey.marks import of_wrong_marks, wrong_marks
 from pipelines.survey.scene import initial_scene
-from pipelines.survey.survey import Survey
+from pipelines.survey.survey import LOCAL_FRAME, Survey
 
 _DISAGREE = 3.5  # σ by which a distance misses the solution; one in two thousand does by chance
 _LEVEL = 0.01  # of the χ² test of σ where no joint adjustment is possible
@@ -104,6 +107,8 @@ def estimate_similarity(
         initial = similarity_by_paper(model, points, fix_correspondences(survey, model).joined(control))
         posterior = solved(survey, model, initial, options.estimate)
         estimated = Estimated(initial, posterior, _of_unused(unused))
+    elif survey.origin is None:
+        estimated = similarity_by_distances(survey, model, points, options)
     else:
         estimated = robust_similarity(survey, model, points, options)
     _check_residual(estimated.initial, options.max_residual)
@@ -126,18 +131,22 @@ def _check_residual(initial: InitialSimilarity, limit_m: float | None) -> None:
 
 def _summary(estimated: Estimated) -> Summary:
     initial = estimated.initial
-    sigma = np.sqrt(np.diag(np.array(initial.geo_from_local.covariance)))
+    sigma = np.sqrt(np.maximum(np.diag(np.array(initial.geo_from_local.covariance)), 0.0))
     parts = [
         f"{kind} {stats.rmse_3d_m:.3f} m RMS of {stats.count}"
         for kind, stats in initial.residuals.items()
         if stats.rmse_3d_m is not None and kind != "points"
     ]
     position = float(np.linalg.norm(sigma[4:]))
+    is_local = any(caution.code == LOCAL_FRAME for caution in initial.cautions)
+    figure = f"σ of the georeference alone {position:.3f} m; residuals {', '.join(parts)}"
+    if is_local:
+        figure = f"local metric frame, σ of its scale {100 * sigma[0]:.2g} %"
     values: dict[str, Any] = {
         "scale": initial.geo_from_local.scale,
         "sigma_scale": float(sigma[0] * initial.geo_from_local.scale),
         "sigma_rotation_deg": float(np.degrees(sigma[1:4].max())),
-        "sigma_position_m": position,
+        "sigma_position_m": None if is_local else position,
         "layout": initial.layout,
         "attitude_used": initial.attitude_used,
         "condition_number": initial.condition_number,
@@ -147,7 +156,7 @@ def _summary(estimated: Estimated) -> Summary:
         "residuals": {kind: stats.model_dump() for kind, stats in initial.residuals.items()},
     }
     return Summary(
-        f"σ of the georeference alone {position:.3f} m; residuals {', '.join(parts)}",
+        figure,
         values,
         estimated.warnings,
         initial.cautions,
@@ -195,6 +204,26 @@ def robust_similarity(
     posterior = solved(survey, model, initial, options.estimate, joint)
     initial = initial.model_copy(update={"geo_from_local": posterior.solution.similarity_from_local()})
     return Estimated(initial, posterior, warnings + tuple(one for one in more if one.code not in told))
+
+
+def similarity_by_distances(
+    survey: Survey, model: SparseModel, points: GeolocatedPoints, options: InitSim3Options
+) -> Estimated:
+    """Return the similarity into a local metric frame, whose scale known distances set.
+
+    Raises:
+        DegenerateGeometryError: no distance sets the scale, or the photographs have no upward direction in common.
+    """
+    start, level = local_similarity(survey, model, options.up)
+    joint = adjust_jointly(survey, model, (Start(start),), estimate=options.estimate)
+    initial, warnings = _joint_product(model, points, start, joint)
+    initial = initial.model_copy(update={"cautions": union(survey.cautions, (level,))})
+    posterior = solved(survey, model, initial, options.estimate, joint)
+    return Estimated(
+        initial.model_copy(update={"geo_from_local": posterior.solution.similarity_from_local()}),
+        posterior,
+        warnings,
+    )
 
 
 def solved(

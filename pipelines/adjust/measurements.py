@@ -17,7 +17,17 @@ from pipelines.adjust.state import (
     SystematicErrors,
 )
 from pipelines.adjust.system import Problem
-from pipelines.adjust.terms import At, Attitudes, ControlPoints, Distances, Fixes, Planes, Term, root_information
+from pipelines.adjust.terms import (
+    At,
+    Attitudes,
+    ControlPoints,
+    Distances,
+    Fixes,
+    LocalFrame,
+    Planes,
+    Term,
+    root_information,
+)
 from pipelines.core.errors import InputError
 from pipelines.core.sentences import listed
 from pipelines.core.types import BoolArray, FloatArray, IntArray, vector3
@@ -102,7 +112,7 @@ def control_correspondences(
     points = survey.control_points
     rays = mark_rays(points, model)
     marked = rays.marks_of_point >= 2
-    position, cov, meets = _intersect_in_local(model, rays.of_points(marked))
+    position, cov, meets = intersect_in_local(model, rays.of_points(marked))
     used = marked.copy()
     used[marked] = meets
     meeting = [point for point, is_used in zip(points, used, strict=True) if is_used]
@@ -130,7 +140,7 @@ def positions_in_use(
 
 
 def _unused(survey: Survey, model: SparseModel, rays: MarkRays) -> tuple[UnusedControlPoint, ...]:
-    position, *_ = _intersect_in_local(model, rays)
+    position, *_ = intersect_in_local(model, rays)
     # Where the rays disagree, none is left: within a wide σ they meet in the least-squares point.
     wide = RayErrors(_TINY, _TINY, _WIDE_RAD)
     compromise = intersect_marks(rays, model.rotation_cam_from_local, model.cam_center_in_local, wide)
@@ -150,7 +160,7 @@ def _unused(survey: Survey, model: SparseModel, rays: MarkRays) -> tuple[UnusedC
     )
 
 
-def _intersect_in_local(model: SparseModel, rays: MarkRays) -> tuple[FloatArray, FloatArray, BoolArray]:
+def intersect_in_local(model: SparseModel, rays: MarkRays) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Return the position (J, 3), covariance (J, 3, 3) and success (J,) of points in local from their marks."""
     # The test of the marks' agreement includes the model's own error, because no lens is modelled to 0.1 px.
     own_px = float(np.nanmedian(model.point_error_px)) if np.isfinite(model.point_error_px).any() else 0.0
@@ -237,7 +247,11 @@ def problem_of(
         blocks.append(SystematicError("common", (sigma,) * 3))
     if planes is not None:
         blocks.append(SystematicError("lidar-shift", (SIGMA_LIDAR_M,) * 3))
-    every: tuple[Term | None, ...] = (fixes, control, distances_of(scene, survey), attitudes, planes)
+    frame = None
+    if survey.origin is None:
+        center = scene.poses.cam_center_in_model
+        frame = LocalFrame.fixed(float(np.linalg.norm(center - center.mean(axis=0), axis=1).max()))
+    every: tuple[Term | None, ...] = (fixes, control, distances_of(scene, survey), attitudes, planes, frame)
     measured = tuple(term for term in every if term is not None)
     return Problem(scene.poses, scene.bundle, measured, SystematicErrors(tuple(blocks)))
 

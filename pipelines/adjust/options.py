@@ -63,6 +63,11 @@ class InitSim3Options(StageOptions):
         description="Systematic errors to estimate beside the common error of the positions: lever-arm, boresight, "
         "with a comma; or none.",
     )
+    up: Literal["plane", "photographs"] = Field(
+        "plane",
+        description="Vertical of a local frame without recorded attitudes: square to the plane of the cameras, or "
+        "the mean upward direction of the photographs, as for a facade.",
+    )
     seed: int = Field(0, ge=0, description="Seed of the RANSAC.")
     accept_inconsistency: bool = Field(
         False, description="Go on where sources are inconsistent, with a caution and larger σ."

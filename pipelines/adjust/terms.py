@@ -5,6 +5,8 @@ cameras, the lens and the systematic errors. The similarity has no derivative of
 cameras contain it (`adjust.system`). A new kind of measurement is one subclass of `Term`.
 """
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar
@@ -15,6 +17,8 @@ from pipelines.adjust.state import SystematicErrors
 from pipelines.core.types import FloatArray, IntArray, Rows
 from pipelines.geometry.rotations import exp_so3, log_so3, right_jacobian_inverse_so3, skew
 from pipelines.geometry.similarity import Similarity, jacobian_at
+
+_FIXED = 2e-6  # σ of what nothing measures in a local frame: of a rotation, and of a shift over the radius
 
 
 @dataclass(frozen=True)
@@ -335,6 +339,34 @@ class CommonErrors(Term):
         by_errors = np.eye(3 * count).reshape(count, 3, 3 * count)
         no_lens = np.zeros((count, 3, len(at.lens)))
         return Slopes(self.residuals(at), none, none, np.zeros((0, 3, 6)), no_lens, by_errors)
+
+
+@dataclass(frozen=True)
+class LocalFrame(Term):
+    """Gauge of a survey without a place on Earth: two rows, rotation and shift of the mean of the SfM points.
+
+    Nothing measures them: their residuals are zero at every state, so that the adjustment leaves them as they are,
+    and covariances are relative to the frame of the mean (inner constraints).
+    """
+
+    kind: ClassVar[str] = "local frame"
+
+    root_information: FloatArray  # (2, 3, 3), in 1/rad and 1/m
+
+    @classmethod
+    def fixed(cls, radius_m: float) -> LocalFrame:
+        """Return the frame of cameras within a radius, fixed with σ below those of measurements, above rounding."""
+        return cls(np.eye(3) / (_FIXED * np.array([1.0, radius_m]))[:, None, None])
+
+    def residuals(self, at: At) -> FloatArray:
+        return np.zeros((2, 3))
+
+    def slopes(self, at: At) -> Slopes:
+        none, turn = np.zeros(0, dtype=np.int64), at.geo_from_model.rotation
+        by_similarity = np.zeros((2, 3, 7))
+        by_similarity[0, :, 1:4], by_similarity[1, :, 4:] = turn, at.geo_from_model.scale * turn
+        no_lens, no_errors = np.zeros((2, 3, len(at.lens))), np.zeros((2, 3, len(at.vector)))
+        return Slopes(self.residuals(at), none, none, np.zeros((0, 3, 6)), no_lens, no_errors, by_similarity)
 
 
 def root_information(covariance: FloatArray) -> FloatArray:

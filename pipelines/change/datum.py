@@ -38,8 +38,8 @@ class Epoch:
     def geo_from_plan(self, crs: PointCrs, plan: FloatArray) -> FloatArray:
         """Return places (N, 3) in this survey's `geo` of places (N, 2) in a CRS, at the height of its origin."""
         lla = crs.lla_from_xyz(np.column_stack([plan, np.zeros(len(plan))]))
-        lla[:, 2] = self.survey.origin.alt_m
-        return np.asarray(enu_from_ecef(ecef_from_lla(lla), self.survey.origin))
+        lla[:, 2] = self.survey.origin_on_earth.alt_m
+        return np.asarray(enu_from_ecef(ecef_from_lla(lla), self.survey.origin_on_earth))
 
     def variance_at(self, crs: PointCrs, plan: FloatArray) -> FloatArray:
         """Return the variances (N, 3) east, north and up in m² of places (N, 2) in a CRS; zeros: not known."""
@@ -80,8 +80,8 @@ def shared_by(before: Survey, after: Survey, *, same_base: bool) -> Shared:
         other = there.get(point.name)
         if other is None:
             continue
-        here = ecef_from_enu(np.array([point.position_in_geo]), after.origin)
-        apart = np.linalg.norm(here - ecef_from_enu(np.array([other.position_in_geo]), before.origin))
+        here = ecef_from_enu(np.array([point.position_in_geo]), after.origin_on_earth)
+        apart = np.linalg.norm(here - ecef_from_enu(np.array([other.position_in_geo]), before.origin_on_earth))
         if apart < _SAME_PLACE_M:
             pairs.append((other, point))
     none = np.zeros(3)

@@ -45,8 +45,8 @@ def ecef_from_geo(origin: Origin) -> Similarity:
 
 def later_from_earlier(before: TrainedSurvey, after: TrainedSurvey) -> Similarity:
     """Return the similarity from `model` of the earlier epoch to `model` of the later one."""
-    ecef_from_before = ecef_from_geo(before.survey.origin) @ before.geo_from_model
-    ecef_from_after = ecef_from_geo(after.survey.origin) @ after.geo_from_model
+    ecef_from_before = ecef_from_geo(before.survey.origin_on_earth) @ before.geo_from_model
+    ecef_from_after = ecef_from_geo(after.survey.origin_on_earth) @ after.geo_from_model
     return ecef_from_after.inverse() @ ecef_from_before
 
 
@@ -98,7 +98,7 @@ def _in_model(before: TrainedSurvey, grid: CommonGrid, plan: tuple[float, float]
     if not np.isfinite(height[0]):
         height = np.array([one.sidecar.bounds[0][2]])
     lla = grid.crs.lla_from_xyz(np.column_stack([[plan], height]))
-    in_geo = enu_from_ecef(ecef_from_lla(lla), before.survey.origin)
+    in_geo = enu_from_ecef(ecef_from_lla(lla), before.survey.origin_on_earth)
     return np.asarray(before.geo_from_model.inverse().apply(in_geo)[0])
 
 

@@ -40,6 +40,7 @@ from pipelines.geometry.cameras import Camera, CameraPoses, Pinhole, undistort
 from pipelines.geometry.footprints import PointSurface, border_rays, footprint
 from pipelines.geometry.intersection import refined_points
 from pipelines.geometry.rotations import omega_phi_kappa_deg, omega_phi_kappa_jacobian, yaw_pitch_roll_deg
+from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.area import LEAST_RAYS, without_outliers
 from pipelines.survey.headline import headline_of
@@ -87,7 +88,9 @@ def run(stage: StageRun, options: ExportCamerasOptions) -> Summary:
         splits = {camera.name: camera.split for camera in solved.model.cameras}
         lens_limits = _write_nerfstudio(stage.out / "transforms.json", model, splits, placement)
         task.advance(note="nerfstudio")
-        features, corner_lla = _footprints(solved.survey, model, table, placement)
+        features: list[Json] = []  # GeoJSON cannot state a local frame
+        if placement.ecef_from_file is not None:
+            features, corner_lla = _footprints(solved.survey, model, table, placement.ecef_from_file)
         replace_text(stage.out / "footprints.geojson", features_text(features))
         task.advance(note="footprints")
     if options.undistorted:
@@ -98,10 +101,11 @@ def run(stage: StageRun, options: ExportCamerasOptions) -> Summary:
     if np.isfinite(table.sigma_enu_m).all():
         east, north, up = table.sigma_enu_m.T
         sigma = scene_sigma("positions of the cameras: similarity, cameras and lens", np.hypot(east, north), up)
-    on_ellipsoid = TargetCrs(parse_crs("EPSG:4979"), crs.origin, corner_lla)
-    corner = corner_lla[:, [1, 0, 2]]
-    of_footprints = on_ellipsoid.sidecar([corner.min(axis=0), corner.max(axis=0)], accuracy, sigma, cautions)
-    write_sidecar(of_footprints, stage.out / "footprints.geojson")
+    if placement.ecef_from_file is not None:
+        on_ellipsoid = TargetCrs(parse_crs("EPSG:4979"), crs.origin, corner_lla)
+        corner = corner_lla[:, [1, 0, 2]]
+        of_footprints = on_ellipsoid.sidecar([corner.min(axis=0), corner.max(axis=0)], accuracy, sigma, cautions)
+        write_sidecar(of_footprints, stage.out / "footprints.geojson")
     write_camera_table(stage.out / "cameras.csv", table)
     position = table.position
     sidecar = crs.sidecar([position.min(axis=0), position.max(axis=0)], accuracy, sigma, cautions)
@@ -114,6 +118,7 @@ def _camera_table(solved: SolvedSurvey, posterior: Posterior | None, crs: Target
 
     ω, φ, κ count from the axes of the CRS at each camera: grid east, grid north, up along the ellipsoid's normal.
     In a CRS without a grid they count from true east and north, as do yaw, pitch, roll and the σ of the position.
+    In a local frame, all of them count from its axes.
 
     Raises:
         InputError: a camera lies outside the domain of the CRS, or its axes are left-handed.
@@ -123,9 +128,11 @@ def _camera_table(solved: SolvedSurvey, posterior: Posterior | None, crs: Target
     center_in_geo = similarity.apply(poses.cam_center_in_model)
     # Of (δθ [rad], δc [m]) along the axes of `geo`.
     covariance = np.full((len(cameras), 6, 6), np.nan) if posterior is None else posterior.camera_cov
-    lla = lla_from_enu(center_in_geo, crs.origin)
-    enu_from_geo = np.swapaxes(geo_from_enu_at(lla, crs.origin), 1, 2)
-    map_from_geo = grid_from_enu(crs.crs, lla) @ enu_from_geo
+    enu_from_geo = map_from_geo = np.tile(np.eye(3), (len(cameras), 1, 1))  # of a local frame
+    if crs.origin is not None:
+        lla = lla_from_enu(center_in_geo, crs.origin)
+        enu_from_geo = np.swapaxes(geo_from_enu_at(lla, crs.origin), 1, 2)
+        map_from_geo = grid_from_enu(crs.crs, lla) @ enu_from_geo
     angles = omega_phi_kappa_deg(map_from_geo @ geo_from_cam)
     by_turn = omega_phi_kappa_jacobian(angles) @ map_from_geo
     return CameraTable(
@@ -276,7 +283,7 @@ def _write_nerfstudio(
 
 
 def _footprints(
-    survey: Survey, model: SparseModel, table: CameraTable, placement: Placement
+    survey: Survey, model: SparseModel, table: CameraTable, ecef_from_file: Similarity
 ) -> tuple[list[Json], FloatArray]:
     """Return the outline of the ground that each photograph shows, with its properties, and all corners (M, 3).
 
@@ -295,7 +302,7 @@ def _footprints(
     for index, (name, center) in enumerate(zip(model.image_name, model.cam_center_in_local, strict=True)):
         in_file = rays[int(model.image_camera_id[index])] @ model.rotation_cam_from_local[index]
         found = footprint(in_file, center, surface)
-        lla = lla_from_ecef(placement.ecef_from_file.apply(found.outline))
+        lla = lla_from_ecef(ecef_from_file.apply(found.outline))
         east, north, up = table.sigma_enu_m[index].tolist()
         properties = {
             "name": name,
@@ -310,7 +317,7 @@ def _footprints(
         corners.append(lla)
     seen = np.concatenate(corners)
     if not len(seen):
-        seen = lla_from_ecef(placement.ecef_from_file.apply(model.cam_center_in_local))
+        seen = lla_from_ecef(ecef_from_file.apply(model.cam_center_in_local))
     return features, seen
 
 

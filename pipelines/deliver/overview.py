@@ -34,22 +34,28 @@ _MOST = 100_000  # Gaussians that the bounds are taken from
 
 
 @dataclass(frozen=True)
-class Bounds:
-    """Bounds of 98 % of the Gaussians along each coordinate.
-
-    Attributes:
-        west, south, east, north: WGS84 degrees; west > east across the date line.
-        height_m: least and largest ellipsoidal height.
-        crs, units, heights: name of a CRS, units of its three coordinates, and datum of its heights.
-        low, high: least and largest coordinates in it, easting or longitude first.
-        assumed: what the user did not state of it.
-    """
+class GeographicBounds:
+    """Bounds in WGS84 degrees, west > east across the date line, and least and largest ellipsoidal height."""
 
     west: float
     south: float
     east: float
     north: float
     height_m: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Bounds of 98 % of the Gaussians along each coordinate.
+
+    Attributes:
+        on_earth: on the WGS84 ellipsoid; None: the result has a local frame.
+        crs, units, heights: name of a CRS, units of its three coordinates, and datum of its heights.
+        low, high: least and largest coordinates in it, easting or longitude first.
+        assumed: what the user did not state of it.
+    """
+
+    on_earth: GeographicBounds | None
     crs: str
     units: tuple[str, str, str]
     heights: str
@@ -80,7 +86,7 @@ class Overview:
     """Result of a workspace.
 
     Attributes:
-        center_lla: latitude, longitude and ellipsoidal height of the middle of the scene.
+        center_lla: latitude, longitude and ellipsoidal height of the middle of the scene; None: of a local frame.
         accuracy: headline of the result; None: nothing states it yet.
         psnr, area_ha: of the test views, dB, and the area of interest in hectares; None: not known.
         files: those that there are, with their use.
@@ -90,7 +96,7 @@ class Overview:
 
     workspace: Path
     gaussians: int
-    center_lla: Vector3
+    center_lla: Vector3 | None
     bounds: Bounds
     accuracy: Headline | None
     psnr: float | None
@@ -102,16 +108,21 @@ class Overview:
     cautions: dict[str, tuple[Remark, ...]]
 
     def feature(self) -> Json:
-        """Return the overview as a GeoJSON feature: the bounds as geometry, all else as properties."""
-        bounds = self.bounds
-        lat, lon, height = self.center_lla
+        """Return the overview as a GeoJSON feature: the bounds as geometry, all else as properties.
+
+        Without a place on Earth, there is no geometry.
+        """
+        bounds, on_earth, center = self.bounds, self.bounds.on_earth, None
+        if self.center_lla is not None:
+            lat, lon, height = self.center_lla
+            center = {"longitude": lon, "latitude": lat, "ellipsoidal_height_m": height}
         properties = {
             "workspace": str(self.workspace),
             "outdated": [{"stage": row.stage, "state": row.state, "reason": row.reason} for row in self.outdated],
             "interrupted": self.interrupted,
             "gaussians": self.gaussians,
-            "center": {"longitude": lon, "latitude": lat, "ellipsoidal_height_m": height},
-            "ellipsoidal_height_m": bounds.height_m,
+            "center": center,
+            "ellipsoidal_height_m": None if on_earth is None else on_earth.height_m,
             "crs": {
                 "name": bounds.crs,
                 "units": bounds.units,
@@ -126,10 +137,12 @@ class Overview:
             "further": {spec.command(self.workspace): spec.title for spec in self.further},
             "cautions": document_of_cautions(self.cautions),
         }
-        west, south, north = bounds.west, bounds.south, bounds.north
-        east = bounds.east if bounds.east >= west else bounds.east + 360.0
+        if on_earth is None:
+            return feature(None, properties)
+        west, south, north = on_earth.west, on_earth.south, on_earth.north
+        east = on_earth.east if on_earth.east >= west else on_earth.east + 360.0
         rectangle = polygon([(west, south), (east, south), (east, north), (west, north)])
-        return feature(rectangle, properties, (west, south, bounds.east, north))
+        return feature(rectangle, properties, (west, south, on_earth.east, north))
 
 
 def overview(workspace: Workspace, options: CrsOptions) -> Overview:
@@ -144,7 +157,7 @@ def overview(workspace: Workspace, options: CrsOptions) -> Overview:
     return Overview(
         workspace=workspace.root,
         gaussians=len(means),
-        center_lla=vector3(placement.origin_lla),
+        center_lla=None if placement.origin_lla is None else vector3(placement.origin_lla),
         bounds=_bounds(placement.geo_from_model.apply(means[:: max(1, len(means) // _MOST)]), survey, options),
         accuracy=placement.accuracy,
         psnr=None if test is None else test.psnr,
@@ -158,17 +171,22 @@ def overview(workspace: Workspace, options: CrsOptions) -> Overview:
 
 
 def _bounds(points_in_geo: FloatArray, survey: Survey, options: CrsOptions) -> Bounds:
-    lla = lla_from_ecef(ecef_from_enu(points_in_geo, survey.origin))
-    lla[:, 1] -= 360.0 * np.round((lla[:, 1] - lla[0, 1]) / 360.0)
-    (south, west, low_m), (north, east, high_m) = (row.tolist() for row in np.quantile(lla, _WITHIN, axis=0))
+    on_earth = None
+    if survey.origin is not None:
+        lla = lla_from_ecef(ecef_from_enu(points_in_geo, survey.origin))
+        lla[:, 1] -= 360.0 * np.round((lla[:, 1] - lla[0, 1]) / 360.0)
+        (south, west, low_m), (north, east, high_m) = (row.tolist() for row in np.quantile(lla, _WITHIN, axis=0))
+        on_earth = GeographicBounds(
+            west=west - 360.0 * round(west / 360.0),
+            south=south,
+            east=east - 360.0 * round(east / 360.0),
+            north=north,
+            height_m=(low_m, high_m),
+        )
     crs = usable_crs(options, survey.origin, np.quantile(points_in_geo, _WITHIN, axis=0), survey.vertical)
     low, high = np.quantile(crs.xyz_from_geo(points_in_geo), _WITHIN, axis=0)
     return Bounds(
-        west=west - 360.0 * round(west / 360.0),
-        south=south,
-        east=east - 360.0 * round(east / 360.0),
-        north=north,
-        height_m=(low_m, high_m),
+        on_earth=on_earth,
         crs=crs.crs.name,
         units=crs.crs.units,
         heights=crs.crs.vertical.name,

@@ -1,8 +1,8 @@
-"""The one placement of a trained model on Earth, which all deliverables of a survey share, and their common words.
+"""The one placement of a trained model, which all deliverables of a survey share, and their common words.
 
 Frame-based files (PLY, SPZ, tiles) are East-North-Up at their own origin in the middle of the scene. There, float32
 coordinates stay small, and "up" is the vertical at the splat, not at the start of the survey. The similarity maps
-the model to Earth (GeoRefGS section 2.4).
+the model to Earth (GeoRefGS section 2.4). A survey without a place on Earth keeps its local frame.
 """
 
 import shutil
@@ -35,10 +35,12 @@ _ORIGIN_DECIMALS_M = 1
 class Placement:
     """Place of a model on Earth, through the East-North-Up frame `file` in the middle of the scene.
 
+    In a local metric frame, there is no place on Earth, and `file` is that frame.
+
     Attributes:
         origin_lla: (3,) latitude, longitude in degrees and ellipsoidal height of the origin of `file`, rounded:
-            these numbers define the frame exactly.
-        ecef_from_file: rigid, to the Earth-centred frame EPSG:4978.
+            these numbers define the frame exactly. None: the frame is local.
+        ecef_from_file: rigid, to the Earth-centred frame EPSG:4978; None: the frame is local.
         file_from_geo: rigid.
         geo_from_model: the trained similarity.
         covariance: (7, 7) of the similarity about the origin of `file`, along its axes; None if unknown.
@@ -46,8 +48,8 @@ class Placement:
         accuracy: headline of the result, which every file states; None: nothing states it.
     """
 
-    origin_lla: FloatArray
-    ecef_from_file: Similarity
+    origin_lla: FloatArray | None
+    ecef_from_file: Similarity | None
     file_from_geo: Similarity
     geo_from_model: Similarity
     covariance: FloatArray | None
@@ -61,8 +63,8 @@ class Placement:
 
     @property
     def georeference_sigma(self) -> GeoreferenceSigma | None:
-        """Predicted σ of the georeference alone, at the origin of `file`; None: not known, or nothing checks it."""
-        if self.covariance is None or not is_checked(self.cautions):
+        """Predicted σ of the georeference alone, at the origin of `file`; None: not known, unchecked, or local."""
+        if self.covariance is None or self.origin_lla is None or not is_checked(self.cautions):
             return None
         return georeference_sigma(self.covariance, np.zeros(3))
 
@@ -74,16 +76,18 @@ class Placement:
                 sidecar's rotation and covariance are those of its axes, σ remain those of east, north and up.
         """
         axes = np.eye(3) if file_from_axes is None else file_from_axes
-        x, y, z, w = quat_xyzw_from_matrix(self.ecef_from_file.rotation @ axes).tolist()
+        world_from_file = Similarity() if self.ecef_from_file is None else self.ecef_from_file
+        x, y, z, w = quat_xyzw_from_matrix(world_from_file.rotation @ axes).tolist()
         quaternion: Quaternion = (x, y, z, w)
         covariance = None if self.covariance is None else _turned(self.covariance, axes.T)
         return GeorefSidecar(
-            origin=vector3(self.ecef_from_file.translation),
+            crs_id=None if self.ecef_from_file is None else "EPSG:4978",
+            origin=vector3(world_from_file.translation),
             rotation=quaternion,
             scale=1.0,
-            origin_lla=vector3(self.origin_lla),
+            origin_lla=None if self.origin_lla is None else vector3(self.origin_lla),
             vertical_datum=self.vertical,
-            crs_wkt=parse_crs(ECEF).wkt,
+            crs_wkt="" if self.ecef_from_file is None else parse_crs(ECEF).wkt,
             covariance=None if covariance is None else tuple(map(_row, covariance)),
             accuracy=self.accuracy,
             georeference_sigma=self.georeference_sigma,
@@ -99,6 +103,17 @@ def place(model: Adjustment, survey: Survey, points_in_model: ArrayLike, accurac
             the middle of the scene.
     """
     geo_from_model = Similarity.from_record(model.geo_from_model)
+    if survey.origin is None:
+        return Placement(
+            origin_lla=None,
+            ecef_from_file=None,
+            file_from_geo=Similarity(),
+            geo_from_model=geo_from_model,
+            covariance=_covariance_in_file(model.geo_from_model, Similarity()),
+            vertical=survey.vertical,
+            cautions=model.cautions,
+            accuracy=accuracy,
+        )
     scene_in_geo = np.median(geo_from_model.apply(points_in_model), axis=0)
     lla = enu.lla_from_ecef(enu.ecef_from_enu(scene_in_geo, survey.origin))
     origin_lla = np.array([*np.round(lla[:2], _ORIGIN_DECIMALS_DEG), np.round(lla[2], _ORIGIN_DECIMALS_M)])

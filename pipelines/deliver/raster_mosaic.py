@@ -183,7 +183,12 @@ class Mosaic:
         return measured / max(inside, 1), interpolated / max(inside, 1)
 
     def interpolated_parts(self, path: Path) -> list[Json]:
-        """Return the interpolated parts of the mask at a path as features in WGS84, the largest first."""
+        """Return the interpolated parts of the mask at a path as features in WGS84, the largest first.
+
+        There are none in a local frame, which GeoJSON cannot state.
+        """
+        if self.target.origin is None:
+            return []
         mask, _ = read_reduced(path, _OUTLINES_PX)
         interpolated: BoolArray = (mask[0] > 0) & (mask[0] <= (MEASURED + INTERPOLATED) / 2)
         metres = self.target.horizontal_unit_m**2

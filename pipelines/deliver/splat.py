@@ -102,7 +102,7 @@ def splat_values(splat: PlacedSplat | SplatParts) -> dict[str, object]:
     return {
         "gaussians": count,
         "left_out": splat.left_out,
-        "origin_lla": vector3(placement.origin_lla),
+        "origin_lla": None if placement.origin_lla is None else vector3(placement.origin_lla),
         "stated_accuracy": None if accuracy is None else accuracy.text,
         "georeference_sigma_h_m": None if sigma is None else sigma.sigma_h_m,
         "georeference_sigma_v_m": None if sigma is None else sigma.sigma_v_m,

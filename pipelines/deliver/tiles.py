@@ -54,6 +54,12 @@ _LARGEST_GLB = 3_400_000
 def run(stage: StageRun, options: ExportTilesOptions) -> Summary:
     """Write tileset, contents, glb and sidecars, and return their key figures; errors as of `load_splat`."""
     splat = load_splat_parts(stage.workspace, options)
+    if splat.placement.ecef_from_file is None:
+        raise InputError(
+            "not-on-earth",
+            "3D Tiles need a place on Earth, and this survey has a local metric frame. `georef export-ply`, "
+            "`georef export-spz` and `georef export-mesh` write it in that frame.",
+        )
     page = _page(stage.workspace, splat, options) if options.compression == "spz" else None
     count, sidecar = len(splat.center_in_file), splat.placement.sidecar()
     each, harmonic = _BYTES[options.compression]

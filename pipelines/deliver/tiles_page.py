@@ -139,6 +139,7 @@ def scene_page(
         placement: of its frame `file`.
         center_in_file: (N, 3) centres of its Gaussians, metres.
     """
+    assert placement.origin_lla is not None  # tiles are refused before, without a place on Earth
     distance_m = np.linalg.norm(center_in_file, axis=1)
     radius = max(float(np.quantile(distance_m, _SHOWN)), _LEAST_RADIUS_M)
     box = float(np.clip(_CRS_BOX * radius, _LEAST_CRS_BOX_M, _MOST_CRS_BOX_M))
@@ -151,8 +152,8 @@ def scene_page(
         facts=_facts(placement, target),
         cautions=tuple(caution.sentence for caution in placement.cautions),
         points=(
-            *_points("control", survey.control_points, survey.origin),
-            *_points("check", survey.check_points, survey.origin),
+            *_points("control", survey.control_points, survey.origin_on_earth),
+            *_points("check", survey.check_points, survey.origin_on_earth),
         ),
         crs=fit_local_crs(target.crs, placement.origin_lla, (box, box, box)),
     )

@@ -23,7 +23,7 @@ def report_crs(text: str, survey: Survey) -> PointCrs:
         InputError: the text is not a CRS, the CRS is not for this place, or a grid that it needs is not installed.
     """
     crs = parse_crs(text, field="--crs")
-    crs.xyz_from_lla(lla_of(survey.origin))
+    crs.xyz_from_lla(lla_of(survey.origin_on_earth))
     return crs
 
 
@@ -38,7 +38,7 @@ def coordinates_in(crs: PointCrs, checkpoints: CheckPoints, survey: Survey) -> C
     # One call for all points, so that one operation transforms them all.
     in_geo = np.concatenate([np.zeros((1, 3)), surveyed, *measured])
     known = np.isfinite(in_geo).all(axis=1)
-    lla = lla_from_ecef(ecef_from_enu(in_geo[known], survey.origin))
+    lla = lla_from_ecef(ecef_from_enu(in_geo[known], survey.origin_on_earth))
     xyz = np.full(in_geo.shape, np.nan)
     xyz[known] = crs.xyz_from_lla(lla)
     operation = crs.operation(lla)
@@ -116,7 +116,7 @@ def _places(survey: Survey) -> dict[str, list[str]]:
     """Return the cells of each surveyed position, by name."""
     points = (*survey.control_points, *survey.check_points)
     in_geo = np.array([point.position_in_geo for point in points]).reshape(-1, 3)
-    lla = lla_from_ecef(ecef_from_enu(in_geo, survey.origin)) if points else in_geo
+    lla = lla_from_ecef(ecef_from_enu(in_geo, survey.origin_on_earth)) if points else in_geo
     return {
         point.name: [f"{lat:.9f}", f"{lon:.9f}", f"{alt:.4f}", *(f"{value:.4f}" for value in enu)]
         for point, (lat, lon, alt), enu in zip(points, lla.tolist(), in_geo.tolist(), strict=True)

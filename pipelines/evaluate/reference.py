@@ -84,10 +84,10 @@ def compare_with_reference(
     margin = np.array([_MARGIN_M, _MARGIN_M, _MARGIN_UP_M])  # a reference may lie above or below the scene
     box = points.min(axis=0) - margin, points.max(axis=0) + margin
     thinning = Thinning(_OVERVIEW_M, _MOST_OVERVIEW, *box)
-    overview = read_thinned(files, trained.survey.origin, thinning, progress)
+    overview = read_thinned(files, trained.survey.origin_on_earth, thinning, progress)
     model, fusion, shift, moved = _model(renderer, overview, options, scratch, progress)
     seen = seen_surface(_viewpoints(renderer, moved), overview.position_in_geo, overview.voxel_m, progress)
-    reference = _sorted_reference(files, trained.survey.origin, box, scratch / "reference", progress)
+    reference = _sorted_reference(files, trained.survey.origin_on_earth, box, scratch / "reference", progress)
     spacing_m = spacing_of(reference, min(THRESHOLDS_M) / 2)
     settings = ComparisonSettings.of_spacings(spacing_m, fusion.spacing_m, min(THRESHOLDS_M), box)
     tally = _compare(reference, model, seen, settings, progress)

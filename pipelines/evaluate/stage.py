@@ -133,8 +133,10 @@ def _named(points: Sequence[SurveyedPoint], rows: Sequence[PointResidual]) -> Na
     return NamedPlaces(place, tuple(point.name for point in points), errors.reshape(-1, 3))
 
 
-def _coordinates(origin: Origin, crs: PointCrs | None) -> MapCoordinates:
-    """Return the coordinates of places at the height of the origin."""
+def _coordinates(origin: Origin | None, crs: PointCrs | None) -> MapCoordinates | None:
+    """Return the coordinates of places at the height of the origin; None: those of a local frame are its metres."""
+    if origin is None:
+        return None
 
     served = None if crs is None or crs.is_geocentric else crs
 
@@ -207,7 +209,7 @@ def evaluate(
         InputError: a point lies outside the CRS's domain.
     """
     model = solved.model
-    log_scale, *_, east, north, up = np.sqrt(np.diag(model.geo_from_model.covariance)).tolist()
+    log_scale, *_, east, north, up = np.sqrt(np.maximum(np.diag(model.geo_from_model.covariance), 0.0)).tolist()
     triangulated = check_points.triangulated_check_points(solved, posterior, _km2(area_ha))
     checkpoints = CheckPoints(triangulated=triangulated, surface=None if rendered is None else rendered.points)
     scene = model.accuracy or AccuracySummary(cells=0, reason="the adjustment states no σ")

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from pydantic import ConfigDict, Field, field_validator, model_validator
 from pydantic.alias_generators import to_camel
 
+from pipelines.core.errors import InputError
 from pipelines.core.figures import Headline
 from pipelines.core.files import replace_text
 from pipelines.core.products import Product, Remark
@@ -30,7 +31,7 @@ from pipelines.formats.iso_metadata import (
     headline_quality,
     iso_xml,
 )
-from pipelines.geodesy.crs import parse_crs
+from pipelines.geodesy.crs import LOCAL_FRAME, parse_crs
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.similarity import Similarity, covariance_at
@@ -61,7 +62,9 @@ class GeoreferenceSigma(Product):
     sigma_3d_m: float
 
 
-def _matrix_of(fields: dict[str, Any]) -> Matrix4:
+def _matrix_of(fields: dict[str, Any]) -> Matrix4 | None:
+    if fields["crs_id"] is None:
+        return None
     similarity = Similarity(fields["scale"], matrix_from_quat_xyzw(fields["rotation"]), np.array(fields["origin"]))
     first, second, third, last = map(tuple, similarity.matrix().tolist())
     return first, second, third, last
@@ -70,6 +73,9 @@ def _matrix_of(fields: dict[str, Any]) -> Matrix4:
 class GeorefSidecar(_CamelCase):
     """Content of the sidecar; names in the file are in camelCase.
 
+    Without `crs_id`, the survey has no place on Earth: origin, rotation and scale lead to its local metric frame,
+    and there is neither `matrix` nor `origin_lla`.
+
     `matrix` (`ecefFromFile` in the file) is the similarity of `origin`, `rotation` and `scale` as a 4×4 matrix, row
     by row, for columns of homogeneous coordinates. `accuracy` is the headline of the result; None: nothing stated
     it when the file was written. `georeference_sigma` is a part of it; None: not known, or nothing checks it.
@@ -77,13 +83,13 @@ class GeorefSidecar(_CamelCase):
 
     format: Literal["georefgs"] = "georefgs"
     version: Literal[2] = 2
-    crs_id: Literal["EPSG:4978"] = "EPSG:4978"
+    crs_id: Literal["EPSG:4978"] | None = "EPSG:4978"
     origin: Vector3
     rotation: Quaternion
     scale: float = Field(gt=0)
-    matrix: Matrix4 = Field(default_factory=_matrix_of, alias="ecefFromFile")
+    matrix: Matrix4 | None = Field(default_factory=_matrix_of, alias="ecefFromFile")
     epoch: float | None = None
-    origin_lla: Vector3
+    origin_lla: Vector3 | None
     vertical_datum: VerticalDatum
     crs_wkt: str
     covariance: Covariance7 | None
@@ -100,13 +106,21 @@ class GeorefSidecar(_CamelCase):
 
     @model_validator(mode="after")
     def _agrees(self) -> GeorefSidecar:
+        if self.crs_id is None:
+            if self.matrix is not None or self.origin_lla is not None:
+                raise ValueError("crsId: there is none, but a place on Earth")
+            return self
+        if self.matrix is None or self.origin_lla is None:
+            raise ValueError("ecefFromFile, originLla: missing")
         off = np.abs(np.array(self.matrix) - self.ecef_from_file().matrix())
         if off[:, :3].max() > _MATRIX_TOLERANCE or off[:, 3].max() > _MATRIX_TOLERANCE_M:
             raise ValueError("ecefFromFile: is not the matrix of origin, rotation and scale")
         return self
 
     def ecef_from_file(self) -> Similarity:
-        """Return the similarity p_ecef = s R p_file + origin."""
+        """Return the similarity p_ecef = s R p_file + origin; an InputError: the file has no place on Earth."""
+        if self.crs_id is None:
+            raise InputError("not-on-earth", "The file is in a local metric frame, without a place on Earth.")
         return Similarity(self.scale, matrix_from_quat_xyzw(self.rotation), np.array(self.origin))
 
 
@@ -210,18 +224,23 @@ def write_sidecar(sidecar: GeorefSidecar | CrsSidecar, artefact: Path) -> None:
 
 def _of_frame(sidecar: GeorefSidecar, name: str) -> IsoMetadata:
     """Return the metadata of a file in a frame, whose extent is not recorded: its place is that of the origin."""
-    lat, lon, _ = sidecar.origin_lla
+    place, box = "without a place on Earth", None
+    if sidecar.origin_lla is not None:
+        lat, lon, _ = sidecar.origin_lla
+        place = f"whose origin is at latitude {lat:.8f}°, longitude {lon:.8f}°"
+        place += f". {name}{SUFFIX} places the frame on Earth"
+        box = lon, lat
     sigma = sidecar.georeference_sigma
     of = "the georeference alone; the model's shape is not counted"
     lengths = () if sigma is None else ((PLAN_SIGMA, sigma.sigma_h_m), (STANDARD_ERROR, sigma.sigma_v_m))
     return IsoMetadata(
         title=name,
-        abstract=f"Model from photographs in a metric frame of its own, whose origin is at latitude {lat:.8f}°, "
-        f"longitude {lon:.8f}°. {name}{SUFFIX} places the frame on Earth. {_accuracy_sentence(sidecar.accuracy)}",
-        crs=sidecar.crs_id,
+        abstract=f"Model from photographs in a metric frame of its own, {place}. "
+        f"{_accuracy_sentence(sidecar.accuracy)}",
+        crs=sidecar.crs_id or LOCAL_FRAME,
         heights=sidecar.vertical_datum.name,
-        west_south=(lon, lat),
-        east_north=(lon, lat),
+        west_south=box,
+        east_north=box,
         height_range=None,
         lineage=("The place comes from an adjustment of all measurements.", *_sentences(sidecar.cautions)),
         quality=(
@@ -232,10 +251,13 @@ def _of_frame(sidecar: GeorefSidecar, name: str) -> IsoMetadata:
 
 
 def _of_crs(sidecar: CrsSidecar, name: str) -> IsoMetadata:
-    bounds, crs = np.array(sidecar.bounds), parse_crs(sidecar.crs_wkt)
-    corners = np.stack(np.meshgrid(*bounds.T, indexing="ij"), axis=-1).reshape(-1, 3)
-    lla = crs.lla_from_xyz(corners)
-    (south, west, _), (north, east, _) = lla.min(axis=0).tolist(), lla.max(axis=0).tolist()
+    bounds, west_south, east_north, has_heights = np.array(sidecar.bounds), None, None, True
+    if sidecar.crs_wkt:  # else a local frame
+        crs = parse_crs(sidecar.crs_wkt)
+        corners = np.stack(np.meshgrid(*bounds.T, indexing="ij"), axis=-1).reshape(-1, 3)
+        lla = crs.lla_from_xyz(corners)
+        (south, west, _), (north, east, _) = lla.min(axis=0).tolist(), lla.max(axis=0).tolist()
+        west_south, east_north, has_heights = (west, south), (east, north), not crs.is_geocentric
     sigma, known = sidecar.sigma, sidecar.operation_accuracy_m
     lengths = () if sigma is None else (
         (PLAN_SIGMA, "median", sigma.median_sigma_h_m),
@@ -248,9 +270,9 @@ def _of_crs(sidecar: CrsSidecar, name: str) -> IsoMetadata:
         abstract=f"Product of a survey with photographs, in {sidecar.crs}. {_accuracy_sentence(sidecar.accuracy)}",
         crs=sidecar.crs,
         heights=sidecar.vertical_datum.name,
-        west_south=(west, south),
-        east_north=(east, north),
-        height_range=None if crs.is_geocentric else (float(bounds[0, 2]), float(bounds[1, 2])),
+        west_south=west_south,
+        east_north=east_north,
+        height_range=(float(bounds[0, 2]), float(bounds[1, 2])) if has_heights else None,
         lineage=(
             f"Coordinates by the operation {sidecar.operation}"
             + ("." if known is None else f", whose published accuracy is {known} m."),

@@ -27,8 +27,8 @@ _GDAL_TYPE = {"uint8": "Byte", "float32": "Float32"}
 class RasterFrame:
     """Place of a raster's cells: rows from the north, columns from the west.
 
-    `wkt` is the CRS as WKT1, which keeps the codes of its parts. `west`, `north` is the outer corner of the first
-    cell, in the CRS's units, and the steps are the sizes of a cell, > 0.
+    `wkt` is the CRS as WKT1, which keeps the codes of its parts; empty: none. `west`, `north` is the outer corner of
+    the first cell, in the CRS's units, and the steps are the sizes of a cell, > 0.
     """
 
     wkt: str
@@ -258,7 +258,8 @@ def _vrt(
     import rasterio
 
     root = ElementTree.Element("VRTDataset", rasterXSize=str(frame.columns), rasterYSize=str(frame.rows))
-    ElementTree.SubElement(root, "SRS").text = frame.wkt
+    if frame.wkt:
+        ElementTree.SubElement(root, "SRS").text = frame.wkt
     corner = (frame.west, frame.step_x, 0.0, frame.north, 0.0, -frame.step_y)
     ElementTree.SubElement(root, "GeoTransform").text = ", ".join(f"{value:.17g}" for value in corner)
     metadata = ElementTree.SubElement(root, "Metadata")

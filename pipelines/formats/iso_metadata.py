@@ -53,7 +53,7 @@ class IsoMetadata:
     Attributes:
         crs: as an option names it (`EPSG:32632+3855`), or any other name.
         heights: what the heights count from.
-        west_south, east_north: longitude and latitude of the box around the content.
+        west_south, east_north: longitude and latitude of the box around the content; None: of a local frame.
         height_range: least and largest height, in the file's vertical system; None: not recorded.
         lineage: sentences on how the file came about, and what limits its use.
     """
@@ -62,8 +62,8 @@ class IsoMetadata:
     abstract: str
     crs: str
     heights: str
-    west_south: tuple[float, float]
-    east_north: tuple[float, float]
+    west_south: tuple[float, float] | None
+    east_north: tuple[float, float] | None
     height_range: tuple[float, float] | None
     lineage: Sequence[str]
     quality: Sequence[QualityElement]
@@ -131,11 +131,15 @@ def iso_xml(metadata: IsoMetadata) -> str:
 
 
 def _extent(metadata: IsoMetadata) -> list[Element]:
-    (west, south), (east, north) = metadata.west_south, metadata.east_north
-    sides = {"westBoundLongitude": west, "eastBoundLongitude": east}
-    sides |= {"southBoundLatitude": south, "northBoundLatitude": north}
-    box = [_node(f"{name}/gco:Decimal", f"{value:.8f}") for name, value in sides.items()]
-    extent = [_node("geographicElement/EX_GeographicBoundingBox", *box)]
+    extent: list[Element] = []
+    if metadata.west_south is None or metadata.east_north is None:
+        extent.append(_text("description", "local metric frame, without a place on Earth"))
+    else:
+        (west, south), (east, north) = metadata.west_south, metadata.east_north
+        sides = {"westBoundLongitude": west, "eastBoundLongitude": east}
+        sides |= {"southBoundLatitude": south, "northBoundLatitude": north}
+        box = [_node(f"{name}/gco:Decimal", f"{value:.8f}") for name, value in sides.items()]
+        extent.append(_node("geographicElement/EX_GeographicBoundingBox", *box))
     if metadata.height_range is not None:
         low, high = metadata.height_range
         heights = [_node("minimumValue/gco:Real", repr(low)), _node("maximumValue/gco:Real", repr(high))]

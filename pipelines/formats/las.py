@@ -211,7 +211,8 @@ class LazFile:
         header.offsets = np.round(np.asarray(near, dtype=np.float64))
         header.generating_software, header.system_identifier = software, self.system
         header.creation_date = written or date.today()
-        header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(wkt1))
+        if wkt1:  # else a local frame
+            header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(wkt1))
         header.global_encoding.wkt = True
         if text:
             header.vlrs.append(laspy.VLR(*_TEXT_AREA, "Text Area Description", text.encode("utf-8") + b"\0"))

@@ -112,7 +112,7 @@ def write_contours_gpkg(path: Path, lines: Sequence[ContourLine], wkt: str) -> N
         driver="GPKG",
         geometry_type="LineString Z",
         dataset_options={"VERSION": "1.2"},
-        crs=wkt,
+        crs=wkt or None,
     )
     replace_file(draft, path)
 
@@ -201,7 +201,7 @@ def write_polygons_gpkg(path: Path, layer: str, polygons: Sequence[Any], rows: S
         driver="GPKG",
         geometry_type="MultiPolygon",
         dataset_options={"VERSION": "1.2"},
-        crs=wkt,
+        crs=wkt or None,
     )
     replace_file(draft, path)
 

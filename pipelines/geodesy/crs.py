@@ -48,6 +48,11 @@ _ELLIPSOID_HEIGHT = (
     'AXIS["Up",UP]]'
 )
 _UTM = re.compile(r"WGS\s?84\s*/?\s*UTM(?:\s+zone)?\s+(\d{1,2})\s*([NS])", re.IGNORECASE)
+LOCAL_FRAME = "local metric frame, not on Earth"
+_LOCAL = (
+    'ENGCRS["{name}",EDATUM["local"],CS[Cartesian,3],AXIS["x",east],AXIS["y",north],AXIS["z",up],'
+    'LENGTHUNIT["metre",1]]'
+)
 _STEP_M = 10.0  # long against the rounding of eastings and northings, short against the curvature of a grid
 _SHORT_UNIT = {"metre": "m", "degree": "°"}
 
@@ -211,6 +216,41 @@ class PointCrs:
             return self._chosen
         request = OperationRequest(self._crs, self.name, self._three_dimensional, path)
         return best_operation(request, lon, lat)
+
+
+class _LocalFrame(PointCrs):
+    """Coordinates of a local metric frame: no CRS, so that no file with them claims a place on Earth."""
+
+    @property
+    def wkt(self) -> str:
+        return ""
+
+    @property
+    def wkt1(self) -> str:
+        return ""
+
+    def lla_from_xyz(
+        self, xyz: ArrayLike, *, path: Path | str | None = None, lines: Sequence[int] | None = None
+    ) -> FloatArray:
+        raise InputError(
+            "not-on-earth", f"The coordinates are in a {self.name}: they have no latitude and longitude."
+        )
+
+    def xyz_from_lla(self, lla: ArrayLike) -> FloatArray:
+        raise InputError("not-on-earth", f"The survey is in a {self.name}: no place on Earth can be shown in it.")
+
+
+def local_frame() -> PointCrs:
+    """Return what stands for the CRS of a local metric frame: names and units, without a text for files."""
+    return _LocalFrame(
+        name=LOCAL_FRAME,
+        vertical=VerticalDatum(name="heights above the origin of the local frame", stated=True),
+        states_vertical=True,
+        height_unit="metre",
+        _crs=CRS.from_wkt(_LOCAL.format(name=LOCAL_FRAME)),
+        _height_unit_m=1.0,
+        _three_dimensional=True,
+    )
 
 
 def _inverse(

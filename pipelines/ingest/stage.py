@@ -74,7 +74,7 @@ def check_inputs(workspace: Workspace, options: IngestOptions, progress: Progres
     read_ground_files(options, remarks)
     if options.bag is not None:
         frames, located = count_frames(options.bag, options, remarks, progress)
-        require_placed(located > 0 or options.gcp is not None)
+        require_placed(located > 0 or options.gcp is not None or options.distances is not None)
         figure = f"a bag with {frames} frames, {located} of them with a position"
     elif options.video is not None:
         frames = int(video_length(options.video) / seconds_apart(options))
@@ -152,8 +152,7 @@ def survey_and_track(
         targets.note(remarks)
         if listing is not None:
             targets.write(listing)
-    survey, track = assemble_survey(flight, control, check, options, remarks)
-    return survey.model_copy(update={"distances": distances}), track
+    return assemble_survey(flight, control, check, options, remarks, distances=distances)
 
 
 def _copy_images(survey: Survey, stage: StageRun) -> None:
@@ -185,5 +184,8 @@ def _summary(survey: Survey) -> Summary:
         + (f", {counts['distances']} distances" if counts["distances"] else "")
         + (f", {counts['masks']} masks" if counts["masks"] else "")
     )
-    values = {**counts, "origin": survey.origin.model_dump(), "vertical": survey.vertical.model_dump()}
+    if survey.origin is None:
+        key_figure += ", in a local metric frame"
+    origin = None if survey.origin is None else survey.origin.model_dump()
+    values = {**counts, "origin": origin, "vertical": survey.vertical.model_dump()}
     return Summary(key_figure, values, survey.warnings)

@@ -12,7 +12,7 @@ import numpy as np
 
 from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray, IntArray, Matrix3, vector3
-from pipelines.geodesy import enu
+from pipelines.geodesy import crs, enu
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.ingest import flight_record
@@ -21,7 +21,17 @@ from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.remarks import Remarks
 from pipelines.ingest.rolling_shutter import with_readouts, with_velocities
 from pipelines.survey.calibrated import FIX_RANGE_M, NavigationTrack, require_estimable
-from pipelines.survey.survey import Attitude, Fix, FixSession, Survey, SurveyedPoint, SurveyImage, UnmarkedPoint
+from pipelines.survey.survey import (
+    LOCAL_FRAME,
+    Attitude,
+    Fix,
+    FixSession,
+    KnownDistance,
+    Survey,
+    SurveyedPoint,
+    SurveyImage,
+    UnmarkedPoint,
+)
 
 SIGMA_GIMBAL_DEG = 2.0
 SIGMA_TABLE_ATTITUDE_DEG = 1.0
@@ -38,6 +48,11 @@ SESSION_GAP_S = 4 * 3600.0
 # Median horizontal σ up to which fixes without a stated solution count as RTK fixed, or as RTK float.
 _FIXED_SIGMA_M, _FLOAT_SIGMA_M = 0.1, 1.0
 
+_LOCAL_CAUTION = (
+    "The result is in a local metric frame and has no place on Earth: no image has a position, and there are no "
+    "control points. Known distances ({count}) set its scale; its vertical and heading are assumed."
+)
+
 SigmaGroup = Literal["fixes", "control points", "marks", "attitudes"]
 
 
@@ -47,15 +62,18 @@ def assemble_survey(
     check: GroundFile | None,
     options: IngestOptions,
     remarks: Remarks,
+    *,
+    distances: tuple[KnownDistance, ...] = (),
 ) -> tuple[Survey, NavigationTrack | None]:
     """Return the survey, and the navigation in the same frame where it was recorded by time.
 
     The origin is the median of the image positions (of the control points if there are none), rounded to 10⁻⁵
-    degrees and a metre. Every `test_every`-th image by name is held out, beginning with the first.
+    degrees and a metre. Without both, known distances make a survey in a local metric frame. Every `test_every`-th
+    image by name is held out, beginning with the first.
 
     Raises:
-        InputError: nothing has a position, points that are nowhere near the images or of both kinds, or a rig to
-            estimate without the navigation for it.
+        InputError: nothing has a position, and no distance is known; points that are nowhere near the images or of
+            both kinds, or a rig to estimate without the navigation for it.
     """
     flight = replace(flight, poses=_without_far_fixes(flight, remarks))
     poses, files = flight.poses, [file for file in (control, check) if file is not None]
@@ -68,11 +86,20 @@ def assemble_survey(
         middle_in_ecef = enu.ecef_from_lla(enu.median_lla(enu.lla_from_ecef(poses.position_in_ecef[poses.located])))
         for file in files:
             require_near(file, middle_in_ecef)
-    origin = _origin(poses, marked)
-    _note_coverage(flight, len(marked), remarks)
+    control_distances = sum(distance.use == "control" for distance in distances)
+    origin = None
+    if located or files or not control_distances:
+        origin = _origin(poses, marked)
+        _note_coverage(flight, len(marked), remarks)
+    else:
+        remarks.caution(LOCAL_FRAME, _LOCAL_CAUTION.format(count=control_distances))
     if options.test_every and not _held_out(len(flight.photos), options.test_every):
         remarks.warn("no-test-images", f"{len(flight.photos)} images are too few to hold any out for testing.")
-    track = None if flight.navigation is None else flight_record.track_in_geo(flight.navigation, origin)
+    track = (
+        None
+        if flight.navigation is None or origin is None
+        else flight_record.track_in_geo(flight.navigation, origin)
+    )
     if options.estimated:
         require_estimable(track, options.estimated, "--estimate" if options.estimate else "--time-offset")
     sessions, session_of = fix_sessions(poses, options, remarks)
@@ -80,8 +107,8 @@ def assemble_survey(
     images = _images(flight, session_of, origin, options)
     survey = Survey(
         origin=origin,
-        source_crs=poses.crs_name if located or control is None else control.crs.name,
-        vertical=_vertical(poses, files, remarks),
+        source_crs=_source_crs(poses, control) if origin is not None else crs.LOCAL_FRAME,
+        vertical=crs.local_frame().vertical if origin is None else _vertical(poses, files, remarks),
         image_dir=str(flight.folder),
         cameras=cameras,
         images=with_velocities(images, cameras, None if track is None else track.positions, options, remarks),
@@ -93,6 +120,7 @@ def assemble_survey(
             for use, points in unmarked.items()
             for record in _surveyed(points, origin, options)
         ),
+        distances=distances,
         assumptions=tuple(remarks.assumptions),
         warnings=tuple(remarks.warnings),
         cautions=tuple(remarks.cautions),
@@ -107,8 +135,14 @@ def require_placed(placed: bool) -> None:
     if not placed:
         raise InputError(
             "no-positions",
-            "No image has a position, and there are no ground control points. Give --trajectory, --geo or --gcp.",
+            "No image has a position, and there are no ground control points. Give --trajectory, --geo or --gcp; "
+            "or, for a result in a local metric frame without a place on Earth, known --distances between marked "
+            "points.",
         )
+
+
+def _source_crs(poses: flight_record.ImagePoses, control: GroundFile | None) -> str:
+    return poses.crs_name if poses.located.any() or control is None else control.crs.name
 
 
 def _require_checks(checks: Sequence[GroundPoint], vegetated: Sequence[str]) -> None:
@@ -125,7 +159,7 @@ def _require_checks(checks: Sequence[GroundPoint], vegetated: Sequence[str]) -> 
 
 
 def _images(
-    flight: flight_record.FlightRecord, session_of: IntArray, origin: enu.Origin, options: IngestOptions
+    flight: flight_record.FlightRecord, session_of: IntArray, origin: enu.Origin | None, options: IngestOptions
 ) -> tuple[SurveyImage, ...]:
     """Return the photographs with fixes and attitudes in the frame at an origin, and their split."""
     poses = flight.poses
@@ -152,10 +186,10 @@ def _held_out(count: int, every: int) -> range:
 
 
 def _surveyed(
-    points: Sequence[GroundPoint], origin: enu.Origin, options: IngestOptions
+    points: Sequence[GroundPoint], origin: enu.Origin | None, options: IngestOptions
 ) -> tuple[SurveyedPoint, ...]:
     """Return ground points in the frame at an origin; σ by precedence: option, then file, then default."""
-    if not points:
+    if not points or origin is None:
         return ()
     stated = options.model_fields_set
     sigma_m = []
@@ -178,7 +212,9 @@ def _surveyed(
     )
 
 
-def _fixes(poses: flight_record.ImagePoses, session_of: IntArray, origin: enu.Origin) -> list[Fix | None]:
+def _fixes(poses: flight_record.ImagePoses, session_of: IntArray, origin: enu.Origin | None) -> list[Fix | None]:
+    if origin is None:
+        return [None] * len(poses.position_in_ecef)
     position = enu.enu_from_ecef(poses.position_in_ecef, origin)
     covariance = _turned(poses.sigma_enu_m, poses.position_in_ecef, origin)
     return [
@@ -202,15 +238,17 @@ def _turned(sigma_enu_m: FloatArray, position_in_ecef: FloatArray, origin: enu.O
 
 
 def _attitudes(
-    poses: flight_record.ImagePoses, origin: enu.Origin, options: IngestOptions
+    poses: flight_record.ImagePoses, origin: enu.Origin | None, options: IngestOptions
 ) -> list[Attitude | None]:
     """Return attitudes in geo; σ by precedence: option, then file, then the source's default."""
     attitudes: list[Attitude | None] = [None] * len(poses.position_in_ecef)
     rows = np.flatnonzero(np.isfinite(poses.enu_from_cam).all(axis=(1, 2))).tolist()
-    # Without a position, north is the origin's: within a survey it turns by minutes of arc.
-    located = poses.located[rows, None]
-    place = np.where(located, enu.lla_from_ecef(poses.position_in_ecef[rows]), enu.lla_of(origin))
-    geo_from_cam = enu.geo_from_enu_at(place, origin) @ poses.enu_from_cam[rows]
+    geo_from_cam = poses.enu_from_cam[rows]
+    if origin is not None:
+        # Without a position, north is the origin's: within a survey it turns by minutes of arc.
+        located = poses.located[rows, None]
+        place = np.where(located, enu.lla_from_ecef(poses.position_in_ecef[rows]), enu.lla_of(origin))
+        geo_from_cam = enu.geo_from_enu_at(place, origin) @ geo_from_cam
     for row, quat in zip(rows, quat_xyzw_from_matrix(geo_from_cam), strict=True):
         x, y, z, w = (float(value) for value in quat)
         source = poses.attitude_source[row]

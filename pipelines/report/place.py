@@ -22,8 +22,8 @@ Texts = tuple[str, str, str]
 
 def axis_names(crs: TargetCrs) -> Texts:
     """Return the names of the three coordinates, easting or longitude first."""
-    first, second = ("longitude", "latitude") if crs.crs.is_geographic else ("easting", "northing")
-    return first, second, f"height ({crs.crs.vertical.name})"
+    first, second = crs.axes
+    return first, second, "z" if crs.origin is None else f"height ({crs.crs.vertical.name})"
 
 
 def heads_of(crs: TargetCrs) -> Texts:
@@ -65,6 +65,8 @@ class AxisExtent:
 class PlaceFacts:
     """Place of a survey; its extent is that of scene and cameras, on the WGS84 ellipsoid and in the CRS.
 
+    In a local metric frame, the extent on the ellipsoid is empty.
+
     The operation is that between WGS84 and the CRS; the ground size is that of the scene along east and north.
     """
 
@@ -80,16 +82,20 @@ class PlaceFacts:
 def place_facts(evaluated: EvaluatedSurvey) -> PlaceFacts:
     survey, crs = evaluated.solved.survey, evaluated.crs
     everything = np.concatenate([evaluated.scene_in_geo, evaluated.center_in_geo])
-    lla = lla_from_ecef(ecef_from_enu(everything, survey.origin))
-    lla[:, 1] -= 360.0 * np.round((lla[:, 1] - lla[0, 1]) / 360.0)
+    geographic: tuple[AxisExtent, ...] = ()
+    if survey.origin is not None:
+        lla = lla_from_ecef(ecef_from_enu(everything, survey.origin))
+        lla[:, 1] -= 360.0 * np.round((lla[:, 1] - lla[0, 1]) / 360.0)
+        names = ("longitude", "latitude", "ellipsoidal height")
+        geographic = _axes(names, ("°", "°", "m"), lla[:, [1, 0, 2]])
     xyz = crs.xyz_from_geo(everything)
     size = np.ptp(evaluated.scene_in_geo, axis=0).tolist() if len(evaluated.scene_in_geo) else [0.0, 0.0, 0.0]
     return PlaceFacts(
         survey=survey,
         crs=crs,
-        operation=crs.crs.operation(crs.lla),
+        operation=crs.operation(),
         plan=_plan(evaluated),
-        geographic=_axes(("longitude", "latitude", "ellipsoidal height"), ("°", "°", "m"), lla[:, [1, 0, 2]]),
+        geographic=geographic,
         projected=_axes(axis_names(crs), crs.crs.short_units, xyz),
         ground_size_m=(size[0], size[1]),
     )

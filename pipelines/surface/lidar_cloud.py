@@ -121,7 +121,7 @@ def read_cloud(
     low, high = np.quantile(in_geo, [_SCENE_SHARE, 1 - _SCENE_SHARE], axis=0)
     margin = _MARGIN * float((high - low)[:2].max())
     low, high = low - np.array([margin, margin, _BELOW_M]), high + np.array([margin, margin, _ABOVE_M])
-    cloud = read_thinned(files, survey.origin, Thinning(pixel_m, _MOST_POINTS, low, high), progress)
+    cloud = read_thinned(files, survey.origin_on_earth, Thinning(pixel_m, _MOST_POINTS, low, high), progress)
     if len(cloud) <= 10 * _NEIGHBOURS:
         raise InputError(
             "no-overlap",

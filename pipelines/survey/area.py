@@ -98,14 +98,18 @@ def hectares_of(options: AreaOptions, solved: SolvedSurvey) -> float | None:
         return None
 
 
-def boundary_area(options: AreaOptions, scene: FloatArray, origin: Origin) -> Area | None:
+def boundary_area(options: AreaOptions, scene: FloatArray, origin: Origin | None) -> Area | None:
     """Return the area that the user states, of a survey with points (N, 3) in `geo`; None: none is stated.
 
     Raises:
-        InputError: the boundary cannot be read, states no CRS, or holds none of the points.
+        InputError: the boundary cannot be read, states no CRS, or holds none of the points; or the survey has no
+            place on Earth.
     """
     if options.boundary is None:
         return None
+    if origin is None:
+        message = "The survey has a local metric frame, in which a boundary has no place. Remove --boundary."
+        raise InputError("not-on-earth", message, field="--boundary")
     boundary = read_boundary(options.boundary, field="--boundary")
     refusal = partial(InputError, path=options.boundary)
     text = boundary.crs or options.boundary_crs

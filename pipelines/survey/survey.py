@@ -1,6 +1,7 @@
 """Measurements of a survey, product of `ingest`; estimates of its rig, product of `calibrate`.
 
-All positions are in the frame `geo`: East-North-Up metres at the survey's origin.
+All positions are in the frame `geo`: East-North-Up metres at the survey's origin. Without an origin, `geo` is a
+local metric frame, z up, with no place on Earth.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import AfterValidator, Field, model_validator
 
+from pipelines.core.errors import InputError
 from pipelines.core.options import WRITTEN, from_text, listed_names
 from pipelines.core.products import Covariance3, ImageName, Product, Remark, Rotation
 from pipelines.core.types import Vector3
@@ -17,6 +19,7 @@ from pipelines.core.validators import image_dir
 from pipelines.geodesy.enu import Origin
 from pipelines.geodesy.vertical import VerticalDatum
 
+LOCAL_FRAME = "local-frame"  # code of the caution that a survey has no place on Earth
 RigParameter = Literal["time-offset", "boresight", "lever-arm"]
 RIG_PARAMETERS: tuple[RigParameter, ...] = get_args(RigParameter)
 _COMPONENTS: dict[RigParameter, int] = {"time-offset": 1, "boresight": 3, "lever-arm": 3}
@@ -216,6 +219,7 @@ class Survey(Product):
     replaces that rig by the estimates of `calibrate`.
 
     Attributes:
+        origin: of the frame `geo`; None: the frame is local, because nothing places the survey on Earth.
         image_dir: folder of photographs, absolute or inside the workspace.
         sessions: groups of fixes with one common error each; empty: no common error is modelled.
         check_points: points that enter no solution.
@@ -226,7 +230,7 @@ class Survey(Product):
     """
 
     format_version: Literal[2] = 2
-    origin: Origin
+    origin: Origin | None
     source_crs: str
     vertical: VerticalDatum
     image_dir: Annotated[str, AfterValidator(image_dir)]
@@ -276,6 +280,17 @@ class Survey(Product):
                 f"images: {stray[0].name} has session {stray[1].session}, which is not among the sessions"
             )
         return self
+
+    @property
+    def origin_on_earth(self) -> Origin:
+        """Return the origin; an InputError: the survey has none."""
+        if self.origin is None:
+            raise InputError(
+                "not-on-earth",
+                "The survey has a local metric frame and no place on Earth, which this needs. Run `georef ingest` "
+                "with positions or control points.",
+            )
+        return self.origin
 
     @property
     def largest_photograph_px(self) -> tuple[int, int]:

@@ -1,4 +1,7 @@
-"""The CRS of a deliverable: the user's, or the UTM zone of the scene, with every point transformed by itself."""
+"""The CRS of a deliverable: the user's, or the UTM zone of the scene, with every point transformed by itself.
+
+A survey without a place on Earth has none: its coordinates are those of its local metric frame.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -10,7 +13,7 @@ from pipelines.core.figures import Headline
 from pipelines.core.products import Remark
 from pipelines.core.types import FloatArray, vector3
 from pipelines.formats.georef_sidecar import CrsSidecar, SceneSigma
-from pipelines.geodesy.crs import PointCrs, parse_crs
+from pipelines.geodesy.crs import PointCrs, local_frame, parse_crs
 from pipelines.geodesy.enu import (
     SEMI_MAJOR_M,
     Origin,
@@ -20,6 +23,7 @@ from pipelines.geodesy.enu import (
     lla_from_ecef,
     median_lla,
 )
+from pipelines.geodesy.operations import Operation
 from pipelines.geodesy.vertical import ELLIPSOIDAL, VerticalChoice, VerticalDatum, parse_vertical
 from pipelines.survey.options import CrsOptions
 
@@ -29,9 +33,16 @@ class TargetCrs:
     """CRS of a file, with one operation for the whole scene."""
 
     crs: PointCrs
-    origin: Origin  # of the frame `geo`
-    lla: FloatArray  # (M, 3) places that span the scene
+    origin: Origin | None  # of the frame `geo`; None: the frame is local, and so are the coordinates
+    lla: FloatArray  # (M, 3) places that span the scene; none in a local frame
     assumed: tuple[str, ...] = ()  # what the user did not state, for the user and the file; empty: nothing
+
+    @property
+    def axes(self) -> tuple[str, str]:
+        """Names of the horizontal coordinates."""
+        if self.origin is None:
+            return "x", "y"
+        return ("longitude", "latitude") if self.crs.is_geographic else ("easting", "northing")
 
     @property
     def horizontal_unit_m(self) -> float:
@@ -46,6 +57,8 @@ class TargetCrs:
         Raises:
             InputError: a point lies outside the domain of the CRS.
         """
+        if self.origin is None:
+            return np.array(points, dtype=np.float64).reshape(-1, 3)
         return self.crs.xyz_from_lla(lla_from_ecef(ecef_from_enu(points, self.origin)))
 
     def geo_from_xyz(self, points: ArrayLike) -> FloatArray:
@@ -54,7 +67,15 @@ class TargetCrs:
         Raises:
             InputError: a point lies outside the domain of the CRS.
         """
+        if self.origin is None:
+            return np.array(points, dtype=np.float64).reshape(-1, 3)
         return enu_from_ecef(ecef_from_lla(self.crs.lla_from_xyz(points)), self.origin)
+
+    def operation(self) -> Operation:
+        """Return the transformation from WGS84; of a local frame there is none."""
+        if self.origin is None:
+            return Operation("none: the coordinates are those of the local frame", None, ())
+        return self.crs.operation(self.lla)
 
     def sidecar(
         self,
@@ -64,7 +85,7 @@ class TargetCrs:
         cautions: tuple[Remark, ...],
     ) -> CrsSidecar:
         """Return the sidecar of a file in this CRS, with bounds (2, 3): least and largest coordinates."""
-        operation = self.crs.operation(self.lla)
+        operation = self.operation()
         low, high = np.asarray(bounds, dtype=np.float64)
         return CrsSidecar(
             crs=self.crs.name,
@@ -81,16 +102,28 @@ class TargetCrs:
         )
 
 
-def target_crs(options: CrsOptions, origin: Origin, scene_in_geo: ArrayLike, heights: VerticalDatum) -> TargetCrs:
+def target_crs(
+    options: CrsOptions, origin: Origin | None, scene_in_geo: ArrayLike, heights: VerticalDatum
+) -> TargetCrs:
     """Return the CRS of a deliverable.
 
     Args:
+        origin: of the frame `geo`; None: the frame is local.
         scene_in_geo: (M, 3) places that span the scene, such as the corners of its bounds; M ≥ 1.
         heights: what the survey's input heights referred to: the default.
 
     Raises:
-        InputError: not a CRS, not for this place, or a grid that it needs is not installed.
+        InputError: not a CRS, not for this place, a grid that it needs is not installed, or the frame is local.
     """
+    if origin is None:
+        if options.crs is not None or options.vertical is not None:
+            raise InputError(
+                "not-on-earth",
+                "The survey has a local metric frame and no place on Earth: a CRS does not apply to it. Remove "
+                "--crs and --vertical, or run `georef ingest` with positions or control points.",
+                field="--vertical" if options.crs is None else "--crs",
+            )
+        return TargetCrs(local_frame(), None, np.zeros((0, 3)))
     lla = lla_from_ecef(ecef_from_enu(scene_in_geo, origin)).reshape(-1, 3)
     text = options.crs or utm_zone(lla)
     vertical = options.vertical or _as_choice(heights)
@@ -104,7 +137,9 @@ def target_crs(options: CrsOptions, origin: Origin, scene_in_geo: ArrayLike, hei
     return TargetCrs(crs.serving(lla), origin, lla, tuple(assumed))
 
 
-def usable_crs(options: CrsOptions, origin: Origin, scene_in_geo: ArrayLike, heights: VerticalDatum) -> TargetCrs:
+def usable_crs(
+    options: CrsOptions, origin: Origin | None, scene_in_geo: ArrayLike, heights: VerticalDatum
+) -> TargetCrs:
     """Return the CRS in which a result is shown: `target_crs`, or one with ellipsoidal heights.
 
     Only the default gives way, where the survey's datum needs a grid that is not installed: a user who names a CRS

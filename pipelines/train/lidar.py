@@ -282,7 +282,7 @@ def _listed_areas(judged: CloudVerdict, scene: Scene, survey: Survey) -> tuple[L
     areas = []
     for area in judged.areas[:_MOST_LISTED]:
         center = scene.geo_from_model.apply(area.center_in_model)
-        lat, lon, _ = lla_from_enu(center, survey.origin)
+        lat, lon, _ = lla_from_enu(center, survey.origin_on_earth)
         areas.append(
             LidarArea(
                 kind=area.kind,

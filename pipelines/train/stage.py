@@ -76,7 +76,7 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     clouds = None if options.lidar is None else CloudReader(options.lidar, stated)
     adjusted, path = AdjustedScene.load(workspace), options.lidar_trajectory
     survey, scene = adjusted.survey, adjusted.scene
-    track = None if path is None else ScannerTrack.read(path, stated, survey.origin)
+    track = None if path is None else ScannerTrack.read(path, stated, survey.origin_on_earth)
     options.require_trainable(len(scene.sparse.image_name))
     images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
     options = _within_memory(options, images, free_memory_bytes(device_of(backend)))

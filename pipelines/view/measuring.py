@@ -165,7 +165,10 @@ class MeasuringModel:
             raise InputError("no-base-raster", f"There is no raster/{name}. Make it with `georef export-raster`.")
         sidecar = load_json(CrsSidecar, sidecar_path(path))
         other = usable_crs(
-            CrsOptions(crs=sidecar.crs), self.trained.survey.origin, places, self.trained.survey.vertical
+            CrsOptions(crs=sidecar.crs if sidecar.crs_wkt else None),
+            self.trained.survey.origin,
+            places,
+            self.trained.survey.vertical,
         )
         xyz = other.xyz_from_geo(places)
         height, sigma = (sampled_raster(path.with_name(file), xyz[:, :2]) for file in (name, BASE_RASTERS[name]))

@@ -78,7 +78,7 @@ class SavedPoint(Product):
         images: names of the photographs that show it.
         xyz: in the CRS.
         sigma_m: east, north, up; None: not known.
-        lla: latitude and longitude in degrees, ellipsoidal height in metres.
+        lla: latitude and longitude in degrees, ellipsoidal height in metres; None: in a local frame.
     """
 
     position_in_geo: Vector3
@@ -86,7 +86,7 @@ class SavedPoint(Product):
     images: tuple[ImageName, ...]
     xyz: Vector3
     sigma_m: Vector3 | None
-    lla: Vector3
+    lla: Vector3 | None
 
 
 class NamedMeasurement(Product):
@@ -237,10 +237,15 @@ def read_measurements(folder: Path) -> list[NamedMeasurement]:
 
 
 def _feature(measurement: NamedMeasurement) -> Json:
-    """Return the feature: a Point, a LineString or a Polygon in longitude, latitude and ellipsoidal height."""
-    lon_lat_h = [[point.lla[1], point.lla[0], point.lla[2]] for point in measurement.points]
-    geometry: dict[str, Any]
-    if len(lon_lat_h) == 1:
+    """Return the feature: a Point, a LineString or a Polygon in longitude, latitude and ellipsoidal height.
+
+    The geometry is null in a local frame, which GeoJSON cannot state.
+    """
+    lon_lat_h = [[lla[1], lla[0], lla[2]] for point in measurement.points if (lla := point.lla) is not None]
+    geometry: dict[str, Any] | None
+    if not lon_lat_h:  # in a local frame
+        geometry = None
+    elif len(lon_lat_h) == 1:
         geometry = {"type": "Point", "coordinates": lon_lat_h[0]}
     elif measurement.kind in CLOSED and len(lon_lat_h) > 2:
         geometry = {"type": "Polygon", "coordinates": [_anticlockwise(lon_lat_h)]}

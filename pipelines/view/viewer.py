@@ -241,7 +241,8 @@ class Viewer:
 
     def _saved_point(self, point: SurfacePoint) -> SavedPoint:
         xyz, sigma_m = self.model.place(point)
-        lla = lla_from_enu(point.position_in_geo[None], self.trained.survey.origin)[0]
+        origin = self.trained.survey.origin
+        lla = None if origin is None else lla_from_enu(point.position_in_geo[None], origin)[0].tolist()
         return SavedPoint.model_validate(
             {
                 "position_in_geo": point.position_in_geo.tolist(),
@@ -249,7 +250,7 @@ class Viewer:
                 "images": [self.name_of(int(camera)) for camera in point.cameras],
                 "xyz": xyz.tolist(),
                 "sigma_m": None if sigma_m is None else sigma_m.tolist(),
-                "lla": lla.tolist(),
+                "lla": lla,
             }
         )
 
@@ -454,7 +455,7 @@ class Viewer:
                 "name": crs.name,
                 "heights": crs.vertical.name,
                 "units": crs.units,
-                "axes": ["longitude", "latitude"] if crs.is_geographic else ["easting", "northing"],
+                "axes": target.axes,
                 "assumed": list(target.assumed),
                 # Coordinates under the cursor: those of the middle, and how they change along east, north, up.
                 "middle": xyz[0].tolist(),

@@ -42,12 +42,16 @@ def ecef(scene: TrueScene, workspace: Workspace) -> np.ndarray:
 def test_bounds_are_those_of_the_points_in_the_coordinates_of_proj(made: tuple[TrueScene, Workspace]) -> None:
     scene, workspace = made
     bounds = overview(workspace, CrsOptions(crs="EPSG:2056")).bounds
+    geographic = bounds.on_earth
+    assert geographic is not None
     from_ecef = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
     lon, lat, height = from_ecef.transform(*ecef(scene, workspace).T)
     # Float32 means of a frame 100 m away: 1e-5 m, or 1e-10°.
     expected = np.quantile(np.column_stack([lon, lat]), [0.01, 0.99], axis=0)
-    np.testing.assert_allclose([[bounds.west, bounds.south], [bounds.east, bounds.north]], expected, atol=1e-9)
-    np.testing.assert_allclose(bounds.height_m, np.quantile(height, [0.01, 0.99]), atol=1e-4)
+    np.testing.assert_allclose(
+        [[geographic.west, geographic.south], [geographic.east, geographic.north]], expected, atol=1e-9
+    )
+    np.testing.assert_allclose(geographic.height_m, np.quantile(height, [0.01, 0.99]), atol=1e-4)
     swiss = Transformer.from_crs("EPSG:4326", "EPSG:2056", always_xy=True).transform(lon, lat)
     np.testing.assert_allclose(bounds.low[:2], np.quantile(swiss, 0.01, axis=1), atol=1e-2)
     np.testing.assert_allclose(bounds.high[:2], np.quantile(swiss, 0.99, axis=1), atol=1e-2)
@@ -59,6 +63,7 @@ def test_without_a_crs_the_zone_of_the_scene_is_said(made: tuple[TrueScene, Work
     assert (result.bounds.crs, result.bounds.heights) == ("EPSG:32632", "ellipsoidal")
     assert "EPSG:32632" in result.bounds.assumed[0]
     assert result.gaussians == 80
+    assert result.center_lla is not None
     assert result.center_lla[:2] == pytest.approx((46.0, 7.75), abs=1e-3)
 
 
@@ -104,7 +109,8 @@ def test_feature_is_the_rectangle_with_all_the_rest(copied: Workspace) -> None:
     (copied.root / "cameras/colmap/cameras.bin").write_bytes(bytes(1500))
     result = overview(copied, CrsOptions())
     document = result.feature()
-    bounds = result.bounds
+    bounds = result.bounds.on_earth
+    assert bounds is not None
     assert document["bbox"] == [bounds.west, bounds.south, bounds.east, bounds.north]
     ring = np.array(document["geometry"]["coordinates"][0])
     assert ring.min(axis=0) == pytest.approx([bounds.west, bounds.south], abs=1e-8)
@@ -115,7 +121,9 @@ def test_feature_is_the_rectangle_with_all_the_rest(copied: Workspace) -> None:
 
 def test_rectangle_across_the_date_line_has_two_parts(made: tuple[TrueScene, Workspace]) -> None:
     result = overview(made[1], CrsOptions())
-    across = replace(result, bounds=replace(result.bounds, west=179.9, east=-179.8))
+    assert result.bounds.on_earth is not None
+    on_earth = replace(result.bounds.on_earth, west=179.9, east=-179.8)
+    across = replace(result, bounds=replace(result.bounds, on_earth=on_earth))
     geometry = across.feature()["geometry"]
     assert geometry is not None
     assert geometry["type"] == "MultiPolygon"

@@ -258,6 +258,8 @@ def refining_problem(
     terms: list[TensorTerm] = []
     by_depth = None
     for term in measured.measured:
+        if isinstance(term, adjustment.LocalFrame):
+            continue  # the gauge: no loss depends on it, so that nothing moves it
         if isinstance(term, adjustment.ControlPoints) and options.gcp_mode == "depth":
             by_depth, on_surface = control_by_depth(scene, adjusted.survey, term)
             terms.append(tensor_term(on_surface, measured.errors))
