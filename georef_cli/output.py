@@ -110,7 +110,7 @@ def _place(result: Overview, *, brief: bool = False) -> Table:
     if not brief:
         lines[""] = f"heights {bounds.heights}" + "".join(f"; {text}" for text in bounds.assumed)
     lines["accuracy"] = "not known yet: georef evaluate states it" if accuracy is None else accuracy.text
-    if accuracy is not None and accuracy.kind != "measured":
+    if accuracy is not None and accuracy.kind != "measured" and on_earth is not None:
         lines["accuracy"] += "; check points measure it (--checkpoints, --check)"
     if result.area_ha is not None:
         lines["area"] = f"{result.area_ha:.3g} ha"

@@ -50,6 +50,13 @@ IMAGE_COLUMNS = {
     "ssim": "SSIM",
     "lpips": "LPIPS",
 }
+DISTANCES = {
+    "distance_m": "known",
+    "stated_sigma_m": "σ",
+    "measured_m": "measured",
+    "error_m": "error",
+    "sigma_m": "predicted σ",
+}
 DISTANCE_COLUMNS = {
     "measured": "places",
     "median_m": "median",
@@ -214,11 +221,20 @@ def report(document: EvaluationReport) -> list[Renderable]:
         if crossed is None or crossed.reason is None
         else Group(f"\n[bold]{_CROSSED}[/]", f"not possible: {shown(crossed.reason)}"),
         *_against_reference(document.reference),
+        _rows("Known distances, metres", _distances(document), DISTANCES),
         _rows("Predicted σ, metres", {} if cameras is None else {"cameras": dict(cameras)}, SIGMA_COLUMNS),
         _rows("Residuals of the fit (not an accuracy), metres", fit, POINT_COLUMNS),
         _rows("Variance factors: estimated over stated variance (tie points: in px²)", factors, FACTOR_COLUMNS),
     )
     return [table for table in tables if table is not None]
+
+
+def _distances(document: EvaluationReport) -> dict[str, dict[str, Any]]:
+    """Return the known distances by name and use: those that entered the solution, and those that check it."""
+    return {
+        f"{distance.name} ({'rejected' if distance.rejected else distance.use})": dict(distance)
+        for distance in document.distances
+    }
 
 
 def _against_reference(reference: ReferenceComparison | None) -> list[Group | None]:

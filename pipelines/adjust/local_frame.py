@@ -54,7 +54,7 @@ def local_similarity(survey: Survey, model: SparseModel, up: Up) -> tuple[Initia
         attitude_used=False,
     )
     sentence = (
-        f"The local frame has the middle of the cameras as its origin, and its vertical is {source}. σ of the "
+        f"The local frame has the middle of the cameras as its origin, and its vertical is {source} σ of the "
         "result are those of the shape and the scale in this frame."
     )
     return initial, Remark(code="local-frame-level", sentence=sentence)
@@ -85,17 +85,20 @@ def _level(survey: Survey, model: SparseModel, up: Up) -> tuple[FloatArray, str]
     """Return the rotation (3, 3) geo ← local, and where its vertical comes from."""
     recorded = attitude_prior(survey, model)
     if recorded is not None:
-        return recorded.rotation, "that of the recorded attitudes"
+        return recorded.rotation, "that of the recorded attitudes."
     rotation, center = model.rotation_cam_from_local, model.cam_center_in_local
     upward = -(rotation[:, 1] + rotation[:, 2]).mean(axis=0)  # upward in the photographs, and against their views
     if up == "photographs":
-        vertical, source = -rotation[:, 1].mean(axis=0), "the mean upward direction of the photographs (assumed)"
+        vertical, source = (
+            -rotation[:, 1].mean(axis=0),
+            "assumed to be the mean upward direction of the photographs.",
+        )
     else:
         across, away = rotation[:, 0], center - center.mean(axis=0)
         spread = across.T @ across / len(across) + away.T @ away / max(float((away**2).sum()), 1e-300)
         vertical = np.linalg.eigh(spread)[1][:, 0]
         vertical = vertical * np.where(vertical @ upward < 0, -1.0, 1.0)
-        source = "square to the plane of the cameras (assumed; else --up photographs)"
+        source = "assumed to be square to the plane of the cameras. For a facade, give --up photographs."
     length = float(np.linalg.norm(vertical))
     if length < _LEAST_UP:
         raise DegenerateGeometryError(

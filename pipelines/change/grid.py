@@ -62,6 +62,9 @@ def epoch_rasters(workspace: Workspace, of: Literal["surface", "terrain"]) -> Ep
         command = f"georef export-raster {workspace.root}" + (" --terrain" if of == "terrain" else "")
         raise MissingProductError(f"raster/{name}", command)
     sidecar = load_json(CrsSidecar, sidecar_path(path))
+    if not sidecar.crs_wkt:
+        message = "is in a local metric frame, without a place on Earth that two epochs could share."
+        raise InputError("not-on-earth", message, path=path)
     crs = parse_crs(sidecar.crs_wkt, path=path)
     if crs.is_geographic:
         message = (

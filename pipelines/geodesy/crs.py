@@ -244,7 +244,7 @@ def local_frame() -> PointCrs:
     """Return what stands for the CRS of a local metric frame: names and units, without a text for files."""
     return _LocalFrame(
         name=LOCAL_FRAME,
-        vertical=VerticalDatum(name="heights above the origin of the local frame", stated=True),
+        vertical=VerticalDatum(name="local frame", stated=True),
         states_vertical=True,
         height_unit="metre",
         _crs=CRS.from_wkt(_LOCAL.format(name=LOCAL_FRAME)),

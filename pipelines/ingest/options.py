@@ -148,7 +148,7 @@ class IngestOptions(StageOptions):
     distances: InputPath | None = Field(
         None,
         description="Measured distances between marked points, as of scale bars: CSV with from, to, distance, and "
-        "optionally sigma and use (control or check).",
+        "optionally sigma and use (control or check). Without positions and ground points: a local metric frame.",
     )
     gcp_crs: str | None = Field(
         None, description="CRS of ground points whose file states none, e.g. EPSG:32632 or EPSG:4326+5773."

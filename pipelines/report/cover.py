@@ -44,7 +44,7 @@ def cover_facts(
     survey, crs, root = evaluated.solved.survey, evaluated.crs, evaluated.workspace.root
     area_ha = evaluated.report.area_ha
     height_m, gsd_m = flying_height_m(evaluated), ground_sampling_m(evaluated)
-    stated = "as stated" if crs.crs.vertical.stated else "assumed: nobody stated the datum"
+    stated = ", as stated" if crs.crs.vertical.stated else ", assumed: nobody stated the datum"
     previews = {"Orthophoto": ORTHOPHOTO_PREVIEW, "Surface model": HILLSHADE}
     shown = {name: preview(root / product, _PREVIEW_PX) for name, product in previews.items()}
     registered = f"{count_text(lenses.photographs)} of {count_text(len(survey.images))} registered"
@@ -64,7 +64,7 @@ def cover_facts(
             ("Photographs of a place", f"{number_text(overlap.median, 0)} (median)"),
             ("Surveyed points", f"{control} control points, {check} check points"),
             ("Coordinate system", crs.crs.name),
-            ("Heights", f"{crs.crs.vertical.name}, {stated}"),
+            ("Heights", crs.crs.vertical.name + ("" if crs.origin is None else stated)),
         ),
         headline=evaluated.report.headline,
         accuracy_note=_NOTES[evaluated.report.headline.kind],

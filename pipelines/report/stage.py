@@ -76,12 +76,13 @@ def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: Stage
         record = record_facts(workspace, survey)
         change = change_facts(workspace, record)
         task.advance(note="record")
+    what = "3D Gaussian splat" if of_gaussians else "cameras"
     summary = summary_facts(evaluated, overlap, lenses, record)
     page = Page(
         title=options.title or f"Survey report: {workspace.root.name}",
-        subtitle="Georeferenced 3D Gaussian splat, with its measured and predicted accuracy"
-        if of_gaussians
-        else "Georeferenced cameras, with their measured and predicted accuracy",
+        subtitle=f"{what} in a local metric frame, not on Earth, with predicted accuracy"
+        if survey.origin is None
+        else f"Georeferenced {what}, with measured and predicted accuracy",
         about={"Made": moment(datetime.now(UTC)), "Program": f"GeoRefGS {__version__}"},
         cover=cover_facts(evaluated, overlap, lenses, options),
         sections=(
@@ -89,7 +90,7 @@ def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: Stage
             Section("accuracy", "Accuracy", "accuracy.html", accuracy),
             Section("check-points", "Check points", "points.html", check),
             Section("control-points", "Control points", "points.html", control),
-            Section("place", "Place on Earth", "place.html", place),
+            Section("place", "Local frame" if survey.origin is None else "Place on Earth", "place.html", place),
             Section("positions", "Positions of the photographs", "positions.html", cameras),
             Section("overlap", "Overlap and matches", "overlap.html", overlap),
             Section("lenses", "Residuals in the image, and lenses", "lenses.html", lenses),

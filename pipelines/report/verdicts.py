@@ -3,6 +3,7 @@
 Every rule is stated on the page. `unknown` is the verdict where nothing was measured.
 """
 
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -10,8 +11,9 @@ from typing import Literal
 from pipelines.core.products import NOT_CHECKED, Remark
 from pipelines.core.sentences import listed
 from pipelines.report.page import decibel, number_text, share
-from pipelines.survey.report import CheckPointErrors, EvaluationReport
+from pipelines.survey.report import CheckPointErrors, DistanceError, EvaluationReport
 from pipelines.survey.report_parts import VarianceFactor
+from pipelines.survey.survey import LOCAL_FRAME
 
 Level = Literal["good", "fair", "poor", "unknown"]
 
@@ -22,6 +24,7 @@ REPROJECTION_PX = (1.0, 2.0)
 FIX_OUTLIERS = (0.05, 0.20)  # share of the fixes
 CONTROL_POINTS = (4, 3)
 LEAST_TESTED = 3  # check points, from which `evaluate` tests the predicted σ
+_LEAST_DISTANCES, _DISTANCE_SIGMAS = 3, 3.0
 TEST_PSNR_DB = (22.0, 18.0)
 
 
@@ -64,17 +67,21 @@ def verdicts(report: EvaluationReport, measured: Measured, cautions: Sequence[Re
     """Return the verdicts on a survey, in the order of the work."""
     triangulated, on_surface, test = report.checkpoints.triangulated, report.checkpoints.surface, report.test_views
     codes = {caution.code for caution in (*cautions, *report.cautions)}
-    by_subject: dict[str, _Fields] = {
-        "Registered photographs": _registered(measured),
-        "Overlap": _overlap(measured),
-        "Reprojection": _reprojection(measured),
-        "Recorded positions": _fixes(measured),
-        "Control points": _control(measured),
-        "σ of the measurements": _stated_sigma(report.variance_factors, codes),
+    is_local = LOCAL_FRAME in codes  # without positions and ground points
+    of_place = {"Recorded positions": _fixes(measured), "Control points": _control(measured)}
+    of_points = {
         "Check points": _check_points(measured, triangulated),
         "Predicted against measured": _prediction(triangulated, codes),
         "Blunders": _blunders(triangulated),
         **({} if on_surface is None else {"Surface at the points": _surface(on_surface)}),
+    }
+    by_subject: dict[str, _Fields] = {
+        "Registered photographs": _registered(measured),
+        "Overlap": _overlap(measured),
+        "Reprojection": _reprojection(measured),
+        **({"Known distances": _distances(report.distances)} if is_local else of_place),
+        "σ of the measurements": _stated_sigma(report.variance_factors, codes),
+        **({} if is_local else of_points),
         **({} if test is None else {"Test views": _views(test.psnr, test.views)}),
         **({"Cautions": _cautions(cautions)} if cautions else {}),
         **({"State of the products": _current(measured)} if measured.stale else {}),
@@ -153,6 +160,28 @@ def _control(measured: Measured) -> _Fields:
     rule = f"good from {CONTROL_POINTS[0]}, fair from {CONTROL_POINTS[1]} or with none (positions only)"
     reading = f"{count} used, {measured.control_outliers} rejected" if measured.control_outliers else str(count)
     return level, reading, reason, rule
+
+
+def _distances(distances: Sequence[DistanceError]) -> _Fields:
+    """Return the verdict on the distances that alone set the scale, by those that check it."""
+    rule = (
+        f"good from {_LEAST_DISTANCES} distances in the solution and one check within {_DISTANCE_SIGMAS:g} σ, poor "
+        "if a check is not, fair otherwise"
+    )
+    used = sum(distance.use == "control" and not distance.rejected for distance in distances)
+    ratios = [
+        abs(distance.error_m) / math.hypot(distance.sigma_m, distance.stated_sigma_m)
+        for distance in distances
+        if distance.use == "check" and distance.error_m is not None and distance.sigma_m is not None
+    ]
+    reading = f"{used} set the scale, {len(ratios)} check it"
+    if ratios and max(ratios) > _DISTANCE_SIGMAS:
+        return "poor", reading, f"a check misses by {max(ratios):.1f} σ: check its marks and its length", rule
+    if not ratios:
+        return "fair", reading, "nothing tests the scale: measure a further distance, of use check", rule
+    if used < _LEAST_DISTANCES:
+        return "fair", reading, "few distances do not reveal a wrong one", rule
+    return "good", reading, "the checks agree with the predicted σ", rule
 
 
 def _stated_sigma(factors: tuple[VarianceFactor, ...], codes: Collection[str]) -> _Fields:

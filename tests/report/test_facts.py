@@ -25,9 +25,9 @@ from pipelines.report.points import cut_chips, points_facts
 from pipelines.report.verdicts import FIX_OUTLIERS, REGISTERED, Measured, level_of, verdicts
 from pipelines.report.views import read_metrics
 from pipelines.survey.area import photographs_that_see
-from pipelines.survey.report import ByAxis, PredictedSigma
+from pipelines.survey.report import ByAxis, DistanceError, PredictedSigma
 from pipelines.survey.report_parts import VarianceFactor
-from pipelines.survey.survey import Survey
+from pipelines.survey.survey import LOCAL_FRAME, Survey
 from pipelines.survey.trained_survey import fix_differences
 from tests.evaluated_workspaces import CHECK_POINTS, ERROR_M
 from tests.refusals import refused
@@ -313,3 +313,22 @@ def test_map_of_the_overlap_covers_the_scene(reported: Reported) -> None:
     assert facts.parts == 1
     assert facts.enough_share is not None
     assert facts.enough_share > 0.95
+
+
+@pytest.mark.parametrize(
+    ("controls", "errors_m", "level"),
+    [(3, [0.01], "good"), (3, [], "fair"), (2, [0.01], "fair"), (3, [0.2], "poor")],
+)
+def test_in_a_local_frame_distances_take_the_place_of_ground_points(
+    controls: int, errors_m: list[float], level: str
+) -> None:
+    known = {"rejected": False, "distance_m": 5.0, "stated_sigma_m": 0.003, "measured_m": 5.0, "sigma_m": 0.004}
+    distances = (
+        *(DistanceError(name=f"a{k}", use="control", error_m=0.0, **known) for k in range(controls)),
+        *(DistanceError(name=f"b{k}", use="check", error_m=error, **known) for k, error in enumerate(errors_m)),
+    )
+    local = (Remark(code=LOCAL_FRAME, sentence="Not on Earth."),)
+    report = report_with().model_copy(update={"distances": distances, "cautions": local})
+    found = {verdict.subject: verdict for verdict in verdicts(report, MEASURED, local)}
+    assert found["Known distances"].level == level
+    assert not {"Control points", "Recorded positions", "Check points"} & found.keys()
