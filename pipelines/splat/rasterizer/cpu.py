@@ -92,8 +92,7 @@ class _RenderContext:
     view: cpu_gaussian.View = field(init=False)
     stats: ScreenStats = field(init=False)
     visible: _Array = field(init=False)  # (M,) rows of the visible Gaussians, ascending
-    rank: _Array = field(init=False)  # (M,) their places in the order of depth
-    table: _Array = field(init=False)  # (M, SPLAT_WIDTH) splats in the order of depth
+    table: _Array = field(init=False)  # (M, SPLAT_WIDTH) their splats
     lists: TileLists = field(init=False)
 
 
@@ -135,7 +134,7 @@ class _Rasterize(torch.autograd.Function):
         saved = [_array(tensor) for tensor in ctx.saved_tensors]
         *parameters, pose, center = saved[:7]
         grads = tuple(_array(grad) for grad in grad_outputs[:4])
-        outputs = [np.empty_like(parameter) for parameter in parameters]
+        outputs = [np.zeros_like(parameter) for parameter in parameters]
         table, lists = context.table, context.lists
         hit_gradient = np.empty(len(lists.hits) * cpu_blend.HIT_GRADIENT_WIDTH, dtype=table.dtype)
         with KERNEL_LOCK:
@@ -171,46 +170,42 @@ def _project(context: _RenderContext, parameters: list[_Array], pose: _Array, ce
     is_visible, depth = np.empty(every, dtype=np.bool_), np.empty(every, dtype=dtype)
     cpu_project.find_visible(*parameters[:4], pose, view, is_visible, depth, context.workers)
     context.visible = np.flatnonzero(is_visible)
-    context.rank = _depth_rank(depth[context.visible])
     count = len(context.visible)
     context.table = np.empty((count, cpu_project.SPLAT_WIDTH), dtype=dtype)
     ellipses = np.empty((count, cpu_project.ELLIPSE_WIDTH), dtype=dtype)
     cpu_project.project_visible(
         *(*parameters, pose, center, view, context.settings.sh_degree),
-        *(context.visible, context.rank, context.table, ellipses, context.workers),
+        *(context.visible, context.table, ellipses, context.workers),
     )
     image = context.settings.image_of(context.camera)
-    context.lists = list_tiles(ellipses, image.width, image.height)
+    context.lists = list_tiles(ellipses, _depth_order(depth[context.visible]), image.width, image.height)
     context.stats = ScreenStats(torch.from_numpy(context.visible))
 
 
-def _depth_rank(depth: _Array) -> _Array:
-    """Return the place of each Gaussian in the order of depth; equal depths keep their order."""
-    if depth.dtype == np.float32:
-        # Positive floats sort like their bits. One sort of whole keys is several times faster than an argsort.
-        keys = depth.view(np.uint32).astype(np.uint64) << np.uint64(32) | np.arange(len(depth), dtype=np.uint64)
-        keys.sort()
-        order = (keys & np.uint64(0xFFFFFFFF)).astype(np.int64)
-    else:
-        order = np.argsort(depth, kind="stable")
-    rank = np.empty(len(depth), dtype=np.int64)
-    rank[order] = np.arange(len(depth))
-    return rank
+def _depth_order(depth: _Array) -> _Array:
+    """Return the permutation (M,) int64 that sorts depths, nearest first; equal depths keep their order."""
+    if depth.dtype != np.float32:
+        return np.argsort(depth, kind="stable")
+    # Positive floats sort like their bits. One sort of whole keys is several times faster than an argsort.
+    keys = depth.view(np.uint32).astype(np.uint64) << np.uint64(32) | np.arange(len(depth), dtype=np.uint64)
+    keys.sort()
+    order: _Array = (keys & np.uint64(0xFFFFFFFF)).astype(np.int64)
+    return order
 
 
-def list_tiles(ellipses: _Array, width: int, height: int) -> TileLists:
-    """Return the hits of ellipses (M, ELLIPSE_WIDTH), nearest first, on the tiles of an image."""
+def list_tiles(ellipses: _Array, order: _Array, width: int, height: int) -> TileLists:
+    """Return the hits of ellipses (M, ELLIPSE_WIDTH), whose `order` (M,) is nearest first, on the tiles of an image."""
     columns, rows = cpu_project.tile_grid(width, height)
     tiles = columns * rows
     per_tile = np.empty((cpu_project.RUNS, tiles), dtype=np.int64)
     splat_start = np.zeros(len(ellipses) + 1, dtype=np.int64)
-    cpu_project.count_hits(ellipses, width, height, per_tile, splat_start[1:])
+    cpu_project.count_hits(ellipses, order, width, height, per_tile, splat_start[1:])
     np.cumsum(splat_start, out=splat_start)
     tile_start = np.empty(tiles + 1, dtype=np.int64)
     cpu_project.starts_from_counts(per_tile, tile_start)
     hits = np.empty(splat_start[-1], dtype=np.int64)
     places = np.empty(splat_start[-1], dtype=np.int64)
-    cpu_project.list_hits(ellipses, width, height, per_tile, splat_start, hits, places)
+    cpu_project.list_hits(ellipses, order, width, height, per_tile, splat_start, hits, places)
     return TileLists(hits, tile_start, np.empty(tiles, dtype=np.int64), splat_start, places)
 
 
@@ -220,7 +215,7 @@ def blend_tiles(
     """Return colour, alpha, Σ w z, Σ w z² and median depth, the last three of size (0, 0) without `depth`.
 
     Args:
-        table: (M, SPLAT_WIDTH) splats, nearest first.
+        table: (M, SPLAT_WIDTH) splats.
         lists: their hits; `tile_end` is written.
         size: height and width of the image.
         background: (3,) float64.
@@ -243,7 +238,7 @@ def _gaussian_gradients(
     camera = np.empty((blocks, cpu_gradients.CAMERA_WIDTH), dtype=np.float64)
     g_screen = np.empty((len(context.visible), 2), dtype=np.float32)
     cpu_gradients.gaussian_gradients(
-        *(*parameters, pose, center, context.view, context.settings.sh_degree, context.visible, context.rank),
+        *(*parameters, pose, center, context.view, context.settings.sh_degree, context.visible),
         *(hit_gradient, context.lists.splat_start, context.lists.places, block_start),
         *(*outputs, camera, g_screen, context.workers),
     )

@@ -183,7 +183,7 @@ def blend(
     """Blend the splats of all tiles into images.
 
     Args:
-        table: (M, SPLAT_WIDTH) splats, nearest first.
+        table: (M, SPLAT_WIDTH) splats.
         hits: (H,) packed hits by tile, nearest first.
         tile_start: (tiles + 1,) into `hits`.
         background: (3,) float64.

@@ -209,48 +209,37 @@ CAMERA_WIDTH = 15
 
 
 @jit
-def _sum_hits(gradient: Any, places: Any, first: int, last: int, sums: Any) -> None:
-    for k in range(HIT_GRADIENT_WIDTH):
-        sums[k] = 0.0
-    for slot in range(first, last):
-        start = places[slot] * HIT_GRADIENT_WIDTH
+def _sum_hits(gradient: Any, places: Any, splat_start: Any, first: int, last: int, sums: Any) -> None:
+    """Write the sums (last − first, HIT_GRADIENT_WIDTH) of the hits of some splats.
+
+    Hits lie by tile: nearly each is a cache miss. A loop that does nothing else has many of them under way.
+    """
+    for m in range(first, last):
+        row = sums[m - first]
         for k in range(HIT_GRADIENT_WIDTH):
-            sums[k] += gradient[start + k]
-
-
-@jit
-def _clear_rows(
-    first: int, last: int, g_means: Any, g_quats: Any, g_log_scales: Any, g_logits: Any, g_sh: Any
-) -> None:
-    for i in range(first, last):
-        g_logits[i] = 0
-        for k in range(3):
-            g_means[i, k] = 0
-            g_log_scales[i, k] = 0
-        for k in range(4):
-            g_quats[i, k] = 0
-        for k in range(g_sh.shape[1]):
-            g_sh[i, k, 0], g_sh[i, k, 1], g_sh[i, k, 2] = 0, 0, 0
+            row[k] = 0.0
+        for slot in range(splat_start[m], splat_start[m + 1]):
+            start = places[slot] * HIT_GRADIENT_WIDTH
+            for k in range(HIT_GRADIENT_WIDTH):
+                row[k] += gradient[start + k]
 
 
 @worker_jit
 def _gaussian_gradients(
     means: Any, quats: Any, log_scales: Any, logit_opacities: Any, sh: Any, pose: Any, center: Any, view: View,
-    degree: int, visible: Any, rank: Any, gradient: Any, splat_start: Any, places: Any, block_start: Any,
+    degree: int, visible: Any, gradient: Any, splat_start: Any, places: Any, block_start: Any,
     g_means: Any, g_quats: Any, g_log_scales: Any, g_logits: Any, g_sh: Any, camera: Any, g_screen: Any,
     worker: int, workers: int,
 ) -> None:  # fmt: skip
-    sums, share = np.empty(HIT_GRADIENT_WIDTH), np.empty(CAMERA_WIDTH)
+    block_sums, share = np.empty((BLOCK, HIT_GRADIENT_WIDTH)), np.empty(CAMERA_WIDTH)
     basis, weight = np.empty(MAX_COEFFICIENTS), np.empty(MAX_COEFFICIENTS)
     for block in range(worker, block_start.shape[0] - 1, workers):
         for k in range(CAMERA_WIDTH):
             share[k] = 0.0
-        _clear_rows(
-            block * BLOCK, min((block + 1) * BLOCK, means.shape[0]), g_means, g_quats, g_log_scales, g_logits, g_sh
-        )
-        for m in range(block_start[block], block_start[block + 1]):
-            i, row = visible[m], rank[m]
-            _sum_hits(gradient, places, splat_start[row], splat_start[row + 1], sums)
+        first, last = block_start[block], block_start[block + 1]
+        _sum_hits(gradient, places, splat_start, first, last, block_sums)
+        for m in range(first, last):
+            i, sums = visible[m], block_sums[m - first]
             mean = gaussian.row3(means, i)
             (px, py, pz), (g_screen[m, 0], g_screen[m, 1]) = geometry_gradient(
                 quats, log_scales, i, mean, pose, view, sums, share, g_quats, g_log_scales
@@ -274,26 +263,26 @@ def _gaussian_gradients(
 @parallel_jit
 def gaussian_gradients(
     means: Any, quats: Any, log_scales: Any, logit_opacities: Any, sh: Any, pose: Any, center: Any, view: View,
-    degree: int, visible: Any, rank: Any, gradient: Any, splat_start: Any, places: Any, block_start: Any,
+    degree: int, visible: Any, gradient: Any, splat_start: Any, places: Any, block_start: Any,
     g_means: Any, g_quats: Any, g_log_scales: Any, g_logits: Any, g_sh: Any, camera: Any, g_screen: Any,
     workers: int,
 ) -> None:  # fmt: skip
     """Sum the gradients of hits by Gaussian, and propagate them back through the projection and the colours.
 
     Args:
-        means, quats, log_scales, logit_opacities, sh, pose, center, view, degree, visible, rank: as in
+        means, quats, log_scales, logit_opacities, sh, pose, center, view, degree, visible: as in
             `project_visible`.
         gradient: (H · HIT_GRADIENT_WIDTH,) of the hits by tile.
         splat_start, places: of the hits of each splat, see `list_hits`.
         block_start: (blocks + 1,) into `visible`: the blocks of BLOCK Gaussians each.
-        g_means, g_quats, g_log_scales, g_logits, g_sh: gradients of the N Gaussians, written; zero for the
-            invisible.
+        g_means, g_quats, g_log_scales, g_logits, g_sh: gradients of the N Gaussians, zero at first; the rows of the
+            visible are written.
         camera: (blocks, CAMERA_WIDTH) each block's share of ∂L/∂ pose and centre, written.
         g_screen: (M, 2) ∂L/∂ screen mean, written.
     """
     for worker in prange(workers):
         _gaussian_gradients(
-            means, quats, log_scales, logit_opacities, sh, pose, center, view, degree, visible, rank, gradient,
-            splat_start, places, block_start, g_means, g_quats, g_log_scales, g_logits, g_sh, camera, g_screen,
-            np.int64(worker), workers,
+            means, quats, log_scales, logit_opacities, sh, pose, center, view, degree, visible, gradient, splat_start,
+            places, block_start, g_means, g_quats, g_log_scales, g_logits, g_sh, camera, g_screen, np.int64(worker),
+            workers,
         )  # fmt: skip

@@ -58,7 +58,7 @@ def render_orthographic(
     """Return the view of a part of the plane, `width` × `height` px from a corner (column, row), from above."""
     table, ellipses = _tables(splats, width, height, corner, dilation_px2)
     with KERNEL_LOCK:
-        lists = list_tiles(ellipses, width, height)
+        lists = list_tiles(ellipses, np.arange(len(ellipses)), width, height)
         colour, alpha, depth_sum, square_sum, median = blend_tiles(
             table, lists, (height, width), np.zeros(3), depth=True, workers=numba.get_num_threads()
         )
