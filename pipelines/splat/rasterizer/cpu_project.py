@@ -1,9 +1,10 @@
 """Numba kernels that find the visible Gaussians, fill the tables for blending, and list the splats of each tile.
 
-The lists are a parallel counting sort, nearest first. Tables stay in the order of the Gaussians: neighbours in
-memory are mostly neighbours in the image, and the splats of a tile lie together. An ellipse is cut into the columns of tiles that it crosses.
-Its extreme rows within a column have a closed form. A tile is therefore listed only if the ellipse enters it, with
-exactly the rows that the ellipse enters (the idea of AccuTile, doi 10.48550/arXiv.2412.00578).
+Tables are in the order of the Gaussians: neighbours in memory are mostly neighbours in the image, and the splats of
+a tile lie together. The lists are a parallel counting sort, nearest first. An ellipse is cut into the columns of
+tiles that it crosses. Its extreme rows within a column have a closed form. A tile is therefore listed only if the
+ellipse enters it, with exactly the rows that the ellipse enters (the idea of AccuTile, doi
+10.48550/arXiv.2412.00578).
 """
 
 import math
@@ -133,7 +134,7 @@ def _write_splat(splats: Any, ellipses: Any, row: int, center: Any, cov: Any, lo
 @worker_jit
 def _project_visible(
     means: Any, quats: Any, log_scales: Any, logit_opacities: Any, sh: Any, pose: Any, center: Any, view: View,
-    degree: int, visible: Any, splats: Any, ellipses: Any, worker: int, workers: int,
+    degree: int, visible: Any, splats: Any, ellipses: Any, normals: Any, worker: int, workers: int,
 ) -> None:  # fmt: skip
     basis = np.empty(MAX_COEFFICIENTS)
     count = visible.shape[0]
@@ -151,12 +152,17 @@ def _project_visible(
             splats[row, BLUE] = max(blue, 0.0)
             splats[row, DEPTH] = z
             splats[row, SLOPE_X], splats[row, SLOPE_Y] = slope
+            if normals.shape[0] > 0:
+                turn = gaussian.rotation(gaussian.unit_quat(quats, i)[0])
+                axis = gaussian.shortest_axis(log_scales, i)
+                normal, _ = gaussian.facing_normal(turn, axis, direction)
+                normals[row, 0], normals[row, 1], normals[row, 2] = normal
 
 
 @parallel_jit
 def project_visible(
     means: Any, quats: Any, log_scales: Any, logit_opacities: Any, sh: Any, pose: Any, center: Any, view: View,
-    degree: int, visible: Any, splats: Any, ellipses: Any, workers: int,
+    degree: int, visible: Any, splats: Any, ellipses: Any, normals: Any, workers: int,
 ) -> None:  # fmt: skip
     """Fill the tables of the M visible Gaussians.
 
@@ -167,11 +173,12 @@ def project_visible(
         degree: of the spherical harmonics in use.
         visible: (M,) rows of the Gaussians, ascending.
         splats, ellipses: (M, SPLAT_WIDTH), (M, ELLIPSE_WIDTH) in the order of `visible`, written.
+        normals: (M, 3), see `Render.normal`, written; (0, 3): not wanted.
     """
     for worker in prange(workers):
         _project_visible(
             means, quats, log_scales, logit_opacities, sh, pose, center, view, degree, visible, splats, ellipses,
-            np.int64(worker), workers,
+            normals, np.int64(worker), workers,
         )  # fmt: skip
 
 
@@ -260,7 +267,7 @@ def _count_hits(
 
 @parallel_jit
 def count_hits(ellipses: Any, order: Any, width: int, height: int, per_tile: Any, per_splat: Any) -> None:
-    """Count the tiles of splats (M, ELLIPSE_WIDTH), whose `order` (M,) is nearest first, in an image of some pixels.
+    """Count the tiles of splats (M, ELLIPSE_WIDTH), nearest first in `order` (M,), in an image of some pixels.
 
     Hits of each run in each tile (RUNS, tiles), and hits of each splat (M,), are written.
     """
