@@ -219,7 +219,7 @@ NORMAL_WIDTH = 4  # of ∂L/∂ normal of a hit, with a zero behind it
 def _start_tile_gradient(scratch: Any, tile_x: int, tile_y: int, background: Any, images: Any, grads: Any) -> None:
     """Fill the scratch planes with the gradient of each pixel's colour, alpha and depth.
 
-    With v_i = g·c_i + g_z z_i + g_zz z_i² + g_n·n_i − (g·background − g_alpha) the loss is Σ w_i v_i and a constant.
+    With v_i = g·c_i + g_z z_i + g_zz z_i² + g_n·n_i − (g·background − g_alpha) the loss is Σ w_i v_i + constant.
     Background and alpha therefore need no further term. `REMAINING` starts as the whole sum.
     """
     colour, alpha, depth, depth2, _, normal = images
