@@ -17,8 +17,8 @@ from torch.nn import functional
 from pipelines.core.types import ByteArray, FloatArray
 from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
-from pipelines.splat.gaussians import Gaussians, rotation_matrices
-from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Render
+from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.rasterizer.api import Render
 from pipelines.splat.sh import coefficient_count, sh_from_rgb
 
 # In spacings. Wider discs hide more of the places behind them, so that a reader of depths meets a centre too near.
@@ -98,7 +98,7 @@ class SurfaceSettings:
     flatness: float = 1.0  # of the mean smallest standard deviation, in scene extents
     normals: float = 0.01  # of the depth–normal consistency
     normals_from: float = 0.5  # fraction of the training from which it counts
-    normals_every: int = 4  # iterations between two of its renders, by which its weight is multiplied
+    normals_every: int = 4  # iterations between two that count it, by which its weight is multiplied
     # depth steps between neighbouring pixels above this fraction of the depth are edges, without a normal
     edge: float = 0.05
 
@@ -151,15 +151,6 @@ def flatness_loss(gaussians: Gaussians, visible: Tensor, extent_m: float) -> Ten
     return smallest.sum() / (max(len(visible), 1) * extent_m)
 
 
-def disc_normals(gaussians: Gaussians, center_in_model: Tensor) -> Tensor:
-    """Return normals (N, 3) in `model`: the shortest principal axes, on the side of a camera centre (3,)."""
-    axis = gaussians.log_scales.argmin(dim=1)
-    rotation = rotation_matrices(gaussians.quats_wxyz)
-    normal = rotation.gather(2, axis[:, None, None].expand(-1, 3, 1))[:, :, 0]
-    away = (normal * (gaussians.means - center_in_model)).sum(dim=1, keepdim=True) > 0
-    return torch.where(away, -normal, normal)
-
-
 def depth_normals(depth_m: Tensor, camera: Pinhole) -> Tensor:
     """Return normals (H − 1, W − 1, 3) in `cam`, towards the camera, of a depth map (H, W) along z."""
     v, u = torch.meshgrid(
@@ -173,29 +164,14 @@ def depth_normals(depth_m: Tensor, camera: Pinhole) -> Tensor:
     return functional.normalize(torch.linalg.cross(down, right), dim=-1)
 
 
-def normal_loss(
-    gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, rasterizer: Rasterizer, edge: float
-) -> Tensor:
+def normal_loss(render: Render, cam_from_model: Tensor, camera: Pinhole, edge: float) -> Tensor:
     """Return the mean of α · (1 − n · n_depth) over the pixels that are not at a depth edge.
 
-    The loss takes a render of its own, whose colours are the normals of the discs, with expected depth.
+    The render has depth and normals; the pose (4, 4) gets no gradient by the turn of its normals.
     """
-    rotation = cam_from_model[:3, :3]
-    center = (-rotation.T @ cam_from_model[:3, 3]).detach()
-    normal = disc_normals(gaussians, center) @ rotation.detach().T
-    # Colours are clamped at zero: the components of a normal are moved to 0 … 1, and back after blending.
-    painted = Gaussians(
-        gaussians.means,
-        gaussians.quats_wxyz,
-        gaussians.log_scales,
-        gaussians.logit_opacities,
-        sh_from_rgb(0.5 + 0.5 * normal)[:, None],
-    )
-    settings = RasterSettings(sh_degree=0, depth=True, median=False)
-    render = rasterizer.render(painted, cam_from_model.detach(), camera, settings)
-    assert render.expected_depth is not None
     depth, alpha = render.expected_depth, render.alpha
-    blended = (2 * render.colour - alpha[..., None])[:-1, :-1]
+    assert depth is not None and render.normal is not None
+    blended = render.normal[:-1, :-1] @ cam_from_model[:3, :3].detach().T.to(depth.dtype)
     # Pixels that lie on one surface with their neighbours to the right and below.
     z, solid = depth.detach(), alpha.detach() > _SOLID
     step = torch.maximum((z[:-1, 1:] - z[:-1, :-1]).abs(), (z[1:, :-1] - z[:-1, :-1]).abs())

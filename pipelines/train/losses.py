@@ -14,7 +14,7 @@ from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.densify import Strategy
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.losses import photometric_loss
-from pipelines.splat.rasterizer.api import Rasterizer, Render, ScreenStats
+from pipelines.splat.rasterizer.api import Render, ScreenStats
 from pipelines.splat.surface import ObservedPoints, compactness_loss, depth_loss, flatness_loss, normal_loss
 from pipelines.train.geographic.problem import GeoProblem
 from pipelines.train.schedule import TrainingSchedule
@@ -66,13 +66,12 @@ def training_losses(
     problem: GeoProblem,
     strategy: Strategy,
     schedule: TrainingSchedule,
-    rasterizer: Rasterizer,
     *,
     extent_m: float,
     confined: bool = False,
     measured: Sequence[Loss] = (),
 ) -> list[Loss]:
-    """Return the losses of a training, with those of its problem and strategy; the rasterizer renders normals.
+    """Return the losses of a training, with those of its problem and strategy.
 
     Only pixels of the mask show what is trained if it is `confined`. The losses of a `measured` surface are used if
     the options have surface losses.
@@ -109,13 +108,9 @@ def training_losses(
         Loss("geographic", lambda _view: problem.loss(), schedule.geographic_weight),
         Loss("density control", lambda view: strategy.penalty(view.gaussians, view.stats)),
     ]
-    settings, iterations = schedule.options.surface, schedule.options.iterations
+    settings = schedule.options.surface
     if settings is None:
         return losses
-
-    def weight_of_normals(iteration: int) -> float:
-        due = iteration > settings.normals_from * iterations and iteration % settings.normals_every == 0
-        return settings.normals_every * settings.normals if due else 0.0
 
     return [
         *losses,
@@ -129,8 +124,8 @@ def training_losses(
         *measured,
         Loss(
             "normals",
-            lambda view: normal_loss(view.gaussians, view.pose, view.target.camera, rasterizer, settings.edge),
-            weight_of_normals,
+            lambda view: normal_loss(view.render, view.pose, view.target.camera, settings.edge),
+            schedule.weight_of_normals,
             _by_pixels,
         ),
     ]

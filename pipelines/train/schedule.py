@@ -126,6 +126,13 @@ class TrainingSchedule:
         """Return the factor on the first learning rates of the geographic unknowns."""
         return float(_FINAL_RATE ** self.progress(iteration))
 
+    def weight_of_normals(self, iteration: int) -> float:
+        """Return the weight of the consistency of depth and normals; 0: the render needs no normals."""
+        surface = self.options.surface
+        if surface is None or self.progress(iteration) <= surface.normals_from or iteration % surface.normals_every:
+            return 0.0
+        return surface.normals_every * surface.normals
+
     def progress(self, iteration: int) -> float:
         """Return the fraction of the training that is done, 0 … 1."""
         return iteration / self.options.iterations

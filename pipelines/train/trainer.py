@@ -121,7 +121,6 @@ class JointTrainer:
             problem,
             strategy,
             self.schedule,
-            rasterizer,
             extent_m=optimizer.extent_m,
             confined=region is not None,
             measured=views.measured,
@@ -228,6 +227,7 @@ class JointTrainer:
             sh_degree=self.schedule.sh_degree(self.iteration),
             background=BACKGROUND,
             depth=depth or self.options.surface is not None,
+            normal=self.schedule.weight_of_normals(self.iteration) > 0,
             median=False,
             window=target.part.window,
         )

@@ -11,12 +11,12 @@ from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.api import RasterSettings, Render
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
+from pipelines.splat.rasterizer.reference import facing_normals
 from pipelines.splat.surface import (
     ObservedPoints,
     compactness_loss,
     depth_loss,
     depth_normals,
-    disc_normals,
     flatness_loss,
     normal_loss,
 )
@@ -42,17 +42,21 @@ def wall(tilt_rad: float, thickness_m: float = 0.01, disc_tilt_rad: float | None
 @pytest.mark.parametrize("tilt", [0.0, 0.5, -0.8])
 def test_normals_of_a_plane_are_those_of_its_depth_and_of_its_discs(tilt: float) -> None:
     true = torch.tensor([-math.sin(tilt), 0.0, -math.cos(tilt)])
-    assert float((disc_normals(wall(tilt), torch.zeros(3)) - true).abs().max()) < 1e-5
+    assert float((facing_normals(wall(tilt), POSE) - true).abs().max()) < 1e-5
     v, u = torch.meshgrid(torch.arange(36) + 0.5, torch.arange(48) + 0.5, indexing="ij")
     ray = torch.stack([(u - 24) / 40, (v - 18) / 40, torch.ones_like(u)], dim=-1)
     depth = 5 * math.cos(tilt) / (ray @ -true)
     assert float((depth_normals(depth, CAMERA) - true).abs().max()) < 1e-3
 
 
+def loss_of_normals(gaussians: Gaussians, edge: float) -> torch.Tensor:
+    settings = RasterSettings(sh_degree=0, depth=True, normal=True, median=False)
+    return normal_loss(CpuRasterizer().render(gaussians, POSE, CAMERA, settings), POSE, CAMERA, edge)
+
+
 def test_discs_in_their_plane_cost_nothing_and_turned_ones_do() -> None:
-    backend = CpuRasterizer()
-    true = float(normal_loss(wall(0.4), POSE, CAMERA, backend, 0.1))
-    turned = float(normal_loss(wall(0.4, disc_tilt_rad=0.0), POSE, CAMERA, backend, 0.1))
+    true = float(loss_of_normals(wall(0.4), 0.1))
+    turned = float(loss_of_normals(wall(0.4, disc_tilt_rad=0.0), 0.1))
     # 1 − cos 0.4 = 0.079 for normals that are off by 0.4 rad; blending over thick edges leaves some thousandths.
     assert true < 0.01
     assert turned > 0.04
@@ -62,10 +66,10 @@ def test_the_gradient_turns_the_discs_into_the_plane() -> None:
     gaussians = wall(0.4, disc_tilt_rad=0.2)
     gaussians.quats_wxyz.requires_grad_()
     optimizer = torch.optim.Adam([gaussians.quats_wxyz], lr=0.01)
-    first = float(normal_loss(gaussians, POSE, CAMERA, CpuRasterizer(), 0.1).detach())
+    first = float(loss_of_normals(gaussians, 0.1).detach())
     for _ in range(15):
         optimizer.zero_grad()
-        loss = normal_loss(gaussians, POSE, CAMERA, CpuRasterizer(), 0.1)
+        loss = loss_of_normals(gaussians, 0.1)
         loss.backward()
         optimizer.step()
     assert float(loss.detach()) < 0.5 * first
@@ -77,7 +81,7 @@ def test_depth_edges_do_not_count() -> None:
     near.means[:, 2] -= 2.0
     both = Gaussians.concatenate([near, far])
     # Two parallel walls behind each other have one normal; the step between them has none.
-    assert float(normal_loss(both, POSE, CAMERA, CpuRasterizer(), 0.02)) < 0.02
+    assert float(loss_of_normals(both, 0.02)) < 0.02
 
 
 def test_flatness_is_the_smallest_standard_deviation_of_what_is_visible() -> None:

@@ -171,9 +171,7 @@ def test_crops_add_up_to_the_surface_losses_of_the_photograph(images: ImageCache
     for settings in (SurfaceSettings(1.0, 0, 0, 0), SurfaceSettings(0, 1.0, 0, 0)):
         schedule = TrainingSchedule(JointOptions(10, surface=settings), np.arange(len(images)))
         trainer = tiny.trainer(images, schedule.options)
-        every = training_losses(
-            trainer.problem, trainer.strategy, schedule, CpuRasterizer(), extent_m=tiny.EXTENT_M
-        )
+        every = training_losses(trainer.problem, trainer.strategy, schedule, extent_m=tiny.EXTENT_M)
         losses = [loss for loss in every if loss.name in ("flatness", "compactness", "depth", "normals")]
         values = []
         for targets, looks in (

@@ -59,7 +59,7 @@ class Window:
     def cut(self, view: Render) -> Render:
         """Return the part of a render of the whole image; its statistics stay those of the whole."""
         depths = (view.expected_depth, view.depth_variance, view.median_depth)
-        parts = (None if image is None else image[self.slices] for image in depths)
+        parts = (None if image is None else image[self.slices] for image in (*depths, view.normal))
         return Render(view.colour[self.slices], view.alpha[self.slices], view.stats, *parts)
 
 
@@ -72,6 +72,7 @@ class RasterSettings:
     near_m: float = 0.05  # Gaussians with a nearer centre are left out
     dilation_px2: float = 0.3  # added to the diagonal of the screen covariance, in px²
     depth: bool = False  # colour and alpha are always computed
+    normal: bool = False
     median: bool = True  # depth; training needs none, and on a GPU it costs more than all the rest
     window: Window | None = None  # part of the camera's image that is rendered; None: all of it
 
@@ -118,6 +119,9 @@ class Render:
     # (H, W), z at the pixel of the Gaussian at which the transmittance falls to one half, 0 if the transmittance
     # stays higher; not differentiable; or None
     median_depth: Tensor | None = None
+    # (H, W, 3), Σ w n in `model`, with n the unit vector along the shortest principal axis, towards the camera; or
+    # None
+    normal: Tensor | None = None
 
 
 class Rasterizer(Protocol):

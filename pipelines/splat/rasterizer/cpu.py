@@ -51,16 +51,18 @@ class CpuRasterizer:
         center_in_model = -torch.linalg.solve(pose[:, :3], pose[:, 3])
         with _threads_for(settings.image_of(camera)):
             context = _RenderContext(camera, settings)
-            colour, alpha, depth_sum, square_sum, median = _Rasterize.apply(
+            colour, alpha, depth_sum, square_sum, median, normal = _Rasterize.apply(
                 *gaussians.tensors().values(), pose, center_in_model, context
             )
+        normal = normal if settings.normal else None
         if not settings.depth:
-            return Render(colour, alpha, context.stats)
+            return Render(colour, alpha, context.stats, normal=normal)
         opaque = alpha > 0
         total = torch.where(opaque, alpha, 1.0)
         expected = torch.where(opaque, depth_sum / total, 0.0)
         variance = (square_sum / total - expected.square()).clamp_min(0.0)
-        return Render(colour, alpha, context.stats, expected, variance, median if settings.median else None)
+        median = median if settings.median else None
+        return Render(colour, alpha, context.stats, expected, variance, median, normal)
 
 
 # Tiles (16 × 32 px) that a visible Gaussian touches on average: 3 to 6 in trained models.
@@ -76,8 +78,8 @@ def predicted_bytes(count: int, camera: Pinhole, sh_degree: int, *, visible: int
     splats = cpu_project.SPLAT_WIDTH + cpu_project.ELLIPSE_WIDTH
     in_view = count if visible is None else visible
     hits = in_view * _HITS_PER_VISIBLE * (16 + 4 * cpu_blend.HIT_GRADIENT_WIDTH)
-    # Colour, alpha, Σ w z, Σ w z² and median depth, and the gradients of all but the median.
-    images = camera.width * camera.height * 13 * 4
+    # Colour, alpha, Σ w z, Σ w z², median depth and normal, and the gradients of all but the median.
+    images = camera.width * camera.height * 19 * 4
     return int(gradients + in_view * (4 * splats + 48) + hits + images)
 
 
@@ -92,8 +94,8 @@ class _RenderContext:
     view: cpu_gaussian.View = field(init=False)
     stats: ScreenStats = field(init=False)
     visible: _Array = field(init=False)  # (M,) rows of the visible Gaussians, ascending
-    rank: _Array = field(init=False)  # (M,) their places in the order of depth
-    table: _Array = field(init=False)  # (M, SPLAT_WIDTH) splats in the order of depth
+    table: _Array = field(init=False)  # (M, SPLAT_WIDTH) their splats
+    normals: _Array = field(init=False)  # (M, 3) their normals, at least one row; (0, 3): not wanted
     lists: TileLists = field(init=False)
 
 
@@ -109,7 +111,7 @@ class TileLists:
 
 
 class _Rasterize(torch.autograd.Function):
-    """Raw parameters, pose (3, 4) and centre (3,) in; colour, alpha, Σ w z, Σ w z² and median depth out."""
+    """Raw parameters, pose (3, 4) and centre (3,) in; colour, alpha, Σ w z, Σ w z², median depth and normal out."""
 
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, ...]:
@@ -120,7 +122,13 @@ class _Rasterize(torch.autograd.Function):
             image, depth = context.settings.image_of(context.camera), context.settings.depth
             size, workers = (image.height, image.width), context.workers
             images = blend_tiles(
-                context.table, context.lists, size, context.background, depth=depth, workers=workers
+                context.table,
+                context.normals,
+                context.lists,
+                size,
+                context.background,
+                depth=depth,
+                workers=workers,
             )
         outputs = tuple(torch.from_numpy(image) for image in images)
         ctx.context = context
@@ -134,16 +142,17 @@ class _Rasterize(torch.autograd.Function):
         context: _RenderContext = ctx.context
         saved = [_array(tensor) for tensor in ctx.saved_tensors]
         *parameters, pose, center = saved[:7]
-        grads = tuple(_array(grad) for grad in grad_outputs[:4])
-        outputs = [np.empty_like(parameter) for parameter in parameters]
-        table, lists = context.table, context.lists
+        grads = tuple(_array(grad) for grad in (*grad_outputs[:4], grad_outputs[5]))
+        outputs = [np.zeros_like(parameter) for parameter in parameters]
+        table, normals, lists = context.table, context.normals, context.lists
         hit_gradient = np.empty(len(lists.hits) * cpu_blend.HIT_GRADIENT_WIDTH, dtype=table.dtype)
+        of_normals = np.empty(len(lists.hits) * cpu_blend.NORMAL_WIDTH * bool(len(normals)), dtype=table.dtype)
         with KERNEL_LOCK:
             cpu_blend.blend_gradient(
-                *(table, lists.hits, lists.tile_start, lists.tile_end, context.background),
-                *(tuple(saved[7:]), grads, hit_gradient, context.workers),
+                *(table, normals, lists.hits, lists.tile_start, lists.tile_end, context.background),
+                *(tuple(saved[7:]), grads, hit_gradient, of_normals, context.workers),
             )
-            camera = _gaussian_gradients(context, [*parameters, pose, center], hit_gradient, outputs)
+            camera = _gaussian_gradients(context, [*parameters, pose, center], (hit_gradient, of_normals), outputs)
         gradients = [*outputs, camera[:12].reshape(3, 4), camera[12:]]
         return (*(torch.from_numpy(gradient) for gradient in gradients), None)
 
@@ -171,70 +180,69 @@ def _project(context: _RenderContext, parameters: list[_Array], pose: _Array, ce
     is_visible, depth = np.empty(every, dtype=np.bool_), np.empty(every, dtype=dtype)
     cpu_project.find_visible(*parameters[:4], pose, view, is_visible, depth, context.workers)
     context.visible = np.flatnonzero(is_visible)
-    context.rank = _depth_rank(depth[context.visible])
     count = len(context.visible)
     context.table = np.empty((count, cpu_project.SPLAT_WIDTH), dtype=dtype)
     ellipses = np.empty((count, cpu_project.ELLIPSE_WIDTH), dtype=dtype)
+    context.normals = np.empty((max(count, 1) if context.settings.normal else 0, 3), dtype=dtype)
     cpu_project.project_visible(
         *(*parameters, pose, center, view, context.settings.sh_degree),
-        *(context.visible, context.rank, context.table, ellipses, context.workers),
+        *(context.visible, context.table, ellipses, context.normals, context.workers),
     )
     image = context.settings.image_of(context.camera)
-    context.lists = list_tiles(ellipses, image.width, image.height)
+    context.lists = list_tiles(ellipses, _depth_order(depth[context.visible]), image.width, image.height)
     context.stats = ScreenStats(torch.from_numpy(context.visible))
 
 
-def _depth_rank(depth: _Array) -> _Array:
-    """Return the place of each Gaussian in the order of depth; equal depths keep their order."""
-    if depth.dtype == np.float32:
-        # Positive floats sort like their bits. One sort of whole keys is several times faster than an argsort.
-        keys = depth.view(np.uint32).astype(np.uint64) << np.uint64(32) | np.arange(len(depth), dtype=np.uint64)
-        keys.sort()
-        order = (keys & np.uint64(0xFFFFFFFF)).astype(np.int64)
-    else:
-        order = np.argsort(depth, kind="stable")
-    rank = np.empty(len(depth), dtype=np.int64)
-    rank[order] = np.arange(len(depth))
-    return rank
+def _depth_order(depth: _Array) -> _Array:
+    """Return the permutation (M,) int64 that sorts depths, nearest first; equal depths keep their order."""
+    if depth.dtype != np.float32:
+        return np.argsort(depth, kind="stable")
+    # Positive floats sort like their bits. One sort of whole keys is several times faster than an argsort.
+    keys = depth.view(np.uint32).astype(np.uint64) << np.uint64(32) | np.arange(len(depth), dtype=np.uint64)
+    keys.sort()
+    order: _Array = (keys & np.uint64(0xFFFFFFFF)).astype(np.int64)
+    return order
 
 
-def list_tiles(ellipses: _Array, width: int, height: int) -> TileLists:
-    """Return the hits of ellipses (M, ELLIPSE_WIDTH), nearest first, on the tiles of an image."""
+def list_tiles(ellipses: _Array, order: _Array, width: int, height: int) -> TileLists:
+    """Return the hits of ellipses (M, ELLIPSE_WIDTH), nearest first in `order` (M,), on the tiles of an image."""
     columns, rows = cpu_project.tile_grid(width, height)
     tiles = columns * rows
     per_tile = np.empty((cpu_project.RUNS, tiles), dtype=np.int64)
     splat_start = np.zeros(len(ellipses) + 1, dtype=np.int64)
-    cpu_project.count_hits(ellipses, width, height, per_tile, splat_start[1:])
+    cpu_project.count_hits(ellipses, order, width, height, per_tile, splat_start[1:])
     np.cumsum(splat_start, out=splat_start)
     tile_start = np.empty(tiles + 1, dtype=np.int64)
     cpu_project.starts_from_counts(per_tile, tile_start)
     hits = np.empty(splat_start[-1], dtype=np.int64)
     places = np.empty(splat_start[-1], dtype=np.int64)
-    cpu_project.list_hits(ellipses, width, height, per_tile, splat_start, hits, places)
+    cpu_project.list_hits(ellipses, order, width, height, per_tile, splat_start, hits, places)
     return TileLists(hits, tile_start, np.empty(tiles, dtype=np.int64), splat_start, places)
 
 
 def blend_tiles(
-    table: _Array, lists: TileLists, size: tuple[int, int], background: _Array, *, depth: bool, workers: int
-) -> tuple[_Array, ...]:
-    """Return colour, alpha, Σ w z, Σ w z² and median depth, the last three of size (0, 0) without `depth`.
+    table: _Array, normals: _Array, lists: TileLists, size: tuple[int, int], background: _Array, *, depth: bool,
+    workers: int,
+) -> tuple[_Array, ...]:  # fmt: skip
+    """Return colour, alpha, Σ w z, Σ w z², median depth and normal; without pixels what is not wanted.
 
     Args:
-        table: (M, SPLAT_WIDTH) splats, nearest first.
+        table: (M, SPLAT_WIDTH) splats.
+        normals: (M, 3) of the splats; (0, 3): not wanted.
         lists: their hits; `tile_end` is written.
         size: height and width of the image.
         background: (3,) float64.
         workers: number of threads.
     """
-    depth_size = size if depth else (0, 0)
-    shapes: tuple[tuple[int, ...], ...] = ((*size, 3), size, *3 * (depth_size,))
+    depth_size, normal_size = size if depth else (0, 0), size if len(normals) else (0, 0)
+    shapes: tuple[tuple[int, ...], ...] = ((*size, 3), size, *3 * (depth_size,), (*normal_size, 3))
     images = tuple(np.empty(shape, dtype=table.dtype) for shape in shapes)
-    cpu_blend.blend(table, lists.hits, lists.tile_start, background, images, lists.tile_end, workers)
+    cpu_blend.blend(table, normals, lists.hits, lists.tile_start, background, images, lists.tile_end, workers)
     return images
 
 
 def _gaussian_gradients(
-    context: _RenderContext, inputs: list[_Array], hit_gradient: _Array, outputs: list[_Array]
+    context: _RenderContext, inputs: list[_Array], of_hits: tuple[_Array, _Array], outputs: list[_Array]
 ) -> _Array:
     """Fill `outputs`, and return the gradient (15,) of pose and centre."""
     *parameters, pose, center = inputs
@@ -243,8 +251,8 @@ def _gaussian_gradients(
     camera = np.empty((blocks, cpu_gradients.CAMERA_WIDTH), dtype=np.float64)
     g_screen = np.empty((len(context.visible), 2), dtype=np.float32)
     cpu_gradients.gaussian_gradients(
-        *(*parameters, pose, center, context.view, context.settings.sh_degree, context.visible, context.rank),
-        *(hit_gradient, context.lists.splat_start, context.lists.places, block_start),
+        *(*parameters, pose, center, context.view, context.settings.sh_degree, context.visible),
+        *(*of_hits, context.lists.splat_start, context.lists.places, block_start),
         *(*outputs, camera, g_screen, context.workers),
     )
     context.stats.mean_gradient = torch.from_numpy(g_screen)

@@ -48,8 +48,8 @@ TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
 HITS_PER_CHECK = 16
 
 # Planes of a tile's scratch memory.
-T, R, G, B, D, D2, MEDIAN = range(7)
-FORWARD_PLANES = 7
+T, R, G, B, D, D2, MEDIAN, N_X, N_Y, N_Z = range(10)
+FORWARD_PLANES = 10
 
 
 @jit
@@ -98,8 +98,8 @@ def alive_rows(scratch: Any, top: int, bottom: int) -> Any:
 
 
 @jit
-def _blend_tile(table: Any, hits: Any, first: int, last: int, tile_x: int, tile_y: int, depth: bool, scratch: Any,
-                lane_x: Any) -> int:  # fmt: skip
+def _blend_tile(table: Any, normals: Any, hits: Any, first: int, last: int, tile_x: int, tile_y: int, depth: bool,
+                scratch: Any, lane_x: Any) -> int:  # fmt: skip
     """Blend hits first … last − 1 into the tile's scratch planes; return the hit after the last one used."""
     number = table.dtype.type
     zero, one, half = splat(number(0.0)), splat(number(1.0)), splat(number(0.5))
@@ -137,12 +137,16 @@ def _blend_tile(table: Any, hits: Any, first: int, last: int, tile_x: int, tile_
                 median = load(scratch, MEDIAN * TILE_PIXELS + at)
                 crossed = where_greater(t, half, where_greater(t_next, half, median, z), median)
                 store(scratch, MEDIAN * TILE_PIXELS + at, crossed)
+            if normals.shape[0] > 0:
+                for axis in range(3):
+                    plane = (N_X + axis) * TILE_PIXELS + at
+                    store(scratch, plane, load(scratch, plane) + weight * splat(normals[index, axis]))
     return last
 
 
 @jit
 def _finish_tile(scratch: Any, tile_x: int, tile_y: int, background: Any, images: Any) -> None:
-    colour, alpha, depth, depth2, median = images
+    colour, alpha, depth, depth2, median, normal = images
     for row in range(min(TILE_HEIGHT, colour.shape[0] - tile_y)):
         for column in range(min(TILE_WIDTH, colour.shape[1] - tile_x)):
             at = row * TILE_WIDTH + column
@@ -156,12 +160,16 @@ def _finish_tile(scratch: Any, tile_x: int, tile_y: int, background: Any, images
                 depth[y, x] = scratch[D * TILE_PIXELS + at]
                 depth2[y, x] = scratch[D2 * TILE_PIXELS + at]
                 median[y, x] = scratch[MEDIAN * TILE_PIXELS + at]
+            if normal.shape[0] > 0:
+                for axis in range(3):
+                    normal[y, x, axis] = scratch[(N_X + axis) * TILE_PIXELS + at]
 
 
 @worker_jit
 def _blend(
-    table: Any, hits: Any, tile_start: Any, background: Any, images: Any, tile_end: Any, worker: int, workers: int
-) -> None:
+    table: Any, normals: Any, hits: Any, tile_start: Any, background: Any, images: Any, tile_end: Any, worker: int,
+    workers: int,
+) -> None:  # fmt: skip
     height, width = images[1].shape
     columns = (width + TILE_WIDTH - 1) // TILE_WIDTH
     depth = images[2].shape[0] > 0
@@ -171,50 +179,51 @@ def _blend(
         x, y = tile % columns * TILE_WIDTH, tile // columns * TILE_HEIGHT
         start_tile(scratch, x, y, width, height)
         tile_end[tile] = _blend_tile(
-            table, hits, tile_start[tile], tile_start[tile + 1], x, y, depth, scratch, lane_x
+            table, normals, hits, tile_start[tile], tile_start[tile + 1], x, y, depth, scratch, lane_x
         )
         _finish_tile(scratch, x, y, background, images)
 
 
 @parallel_jit
 def blend(
-    table: Any, hits: Any, tile_start: Any, background: Any, images: Any, tile_end: Any, workers: int
+    table: Any, normals: Any, hits: Any, tile_start: Any, background: Any, images: Any, tile_end: Any, workers: int
 ) -> None:
     """Blend the splats of all tiles into images.
 
     Args:
-        table: (M, SPLAT_WIDTH) splats, nearest first.
+        table, normals: (M, SPLAT_WIDTH) and (M or 0, 3) of the splats.
         hits: (H,) packed hits by tile, nearest first.
         tile_start: (tiles + 1,) into `hits`.
         background: (3,) float64.
-        images: colour (H, W, 3), alpha (H, W), Σ w z (H, W), Σ w z² (H, W), median depth (H, W), written; the
-            depths may be of size (0, 0).
+        images: colour (H, W, 3), alpha (H, W), Σ w z (H, W), Σ w z² (H, W), median depth (H, W), normal (H, W, 3),
+            written; depths and normal may have no pixels.
         tile_end: (tiles,) hit after the last one used, written.
         workers: number of threads.
     """
     for worker in prange(workers):
-        _blend(table, hits, tile_start, background, images, tile_end, np.int64(worker), workers)
+        _blend(table, normals, hits, tile_start, background, images, tile_end, np.int64(worker), workers)
 
 
 # Planes of a tile's scratch memory beside `T`.
-G_RED, G_GREEN, G_BLUE, G_DEPTH, G_DEPTH2, G_REST, REMAINING = 1, 2, 3, 4, 5, 6, 7
-BACKWARD_PLANES = 8
+G_RED, G_GREEN, G_BLUE, G_DEPTH, G_DEPTH2, G_REST, REMAINING, G_NX, G_NY, G_NZ = range(1, 11)
+BACKWARD_PLANES = 11
 
 # Places in the gradient of one hit: Σ q and its moments in dx and dy, where q = ∂L/∂(exponent) at each pixel, and
 # ∂L/∂ depth, its slopes and colour. The order is in fours, because sums are formed in fours.
 Q, Q_X, Q_Y, Q_YY, Q_XX, Q_XY, D_DEPTH, D_SLOPE_X, D_RED, D_GREEN, D_BLUE, D_SLOPE_Y = range(12)
 HIT_GRADIENT_WIDTH = 12
+NORMAL_WIDTH = 4  # of ∂L/∂ normal of a hit, with a zero behind it
 
 
 @jit
 def _start_tile_gradient(scratch: Any, tile_x: int, tile_y: int, background: Any, images: Any, grads: Any) -> None:
     """Fill the scratch planes with the gradient of each pixel's colour, alpha and depth.
 
-    With v_i = g·c_i + g_z z_i + g_zz z_i² − (g·background − g_alpha) the loss is Σ w_i v_i plus a constant.
+    With v_i = g·c_i + g_z z_i + g_zz z_i² + g_n·n_i − (g·background − g_alpha) the loss is Σ w_i v_i + constant.
     Background and alpha therefore need no further term. `REMAINING` starts as the whole sum.
     """
-    colour, alpha, depth, depth2, _ = images
-    g_colour, g_alpha, g_depth, g_depth2 = grads
+    colour, alpha, depth, depth2, _, normal = images
+    g_colour, g_alpha, g_depth, g_depth2, g_normal = grads
     for row in range(min(TILE_HEIGHT, colour.shape[0] - tile_y)):
         for column in range(min(TILE_WIDTH, colour.shape[1] - tile_x)):
             at = row * TILE_WIDTH + column
@@ -231,6 +240,10 @@ def _start_tile_gradient(scratch: Any, tile_x: int, tile_y: int, background: Any
                 scratch[G_DEPTH * TILE_PIXELS + at] = g_depth[y, x]
                 scratch[G_DEPTH2 * TILE_PIXELS + at] = g_depth2[y, x]
                 whole += g_depth[y, x] * depth[y, x] + g_depth2[y, x] * depth2[y, x]
+            if normal.shape[0] > 0:
+                for axis in range(3):
+                    scratch[(G_NX + axis) * TILE_PIXELS + at] = g_normal[y, x, axis]
+                    whole += g_normal[y, x, axis] * normal[y, x, axis]
             scratch[REMAINING * TILE_PIXELS + at] = whole
 
 
@@ -246,8 +259,10 @@ def _store_hit_gradient(gradient: Any, place: int, dx: Any, moments: Any, colour
 
 
 @jit
-def _blend_tile_gradient(table: Any, hits: Any, first: int, last: int, tile_x: int, tile_y: int, depth: bool,
-                         scratch: Any, lane_x: Any, gradient: Any) -> None:  # fmt: skip
+def _blend_tile_gradient(  # noqa: PLR0915  (one loop, whose sums stay in registers)
+    table: Any, normals: Any, hits: Any, first: int, last: int, tile_x: int, tile_y: int, depth: bool, scratch: Any,
+    lane_x: Any, gradient: Any, normal_gradient: Any,
+) -> None:  # fmt: skip
     """Write the gradient of hits first … last − 1; `scratch` as `start_tile` and `_start_tile_gradient` left it.
 
     ∂L/∂α_i = T_i v_i − (Σ_{j>i} w_j v_j) / (1 − α_i), and q_i = ∂L/∂ln α_i = α_i ∂L/∂α_i.
@@ -263,8 +278,8 @@ def _blend_tile_gradient(table: Any, hits: Any, first: int, last: int, tile_x: i
         index, first_row, last_row = unpack_hit(hits[place])
         red, green, blue = splat(table[index, RED]), splat(table[index, GREEN]), splat(table[index, BLUE])
         dx = pixel_x - splat(table[index, X])
-        q_sum, qy_sum, qyy_sum, red_sum, green_sum, blue_sum, depth_sum, slope_y_sum = (
-            zero, zero, zero, zero, zero, zero, zero, zero,
+        q_sum, qy_sum, qyy_sum, red_sum, green_sum, blue_sum, depth_sum, slope_y_sum, nx_sum, ny_sum, nz_sum = (
+            zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero,
         )  # fmt: skip
         for row in range(max(first_row, top), min(last_row, bottom) + 1):
             at = row * TILE_WIDTH
@@ -293,6 +308,13 @@ def _blend_tile_gradient(table: Any, hits: Any, first: int, last: int, tile_x: i
                 g_depth = weight * (g_depth + g_depth2)
                 depth_sum = depth_sum + g_depth
                 slope_y_sum = slope_y_sum + g_depth * splat(dy)
+            if normals.shape[0] > 0:
+                g_nx = load(scratch, G_NX * TILE_PIXELS + at)
+                g_ny = load(scratch, G_NY * TILE_PIXELS + at)
+                g_nz = load(scratch, G_NZ * TILE_PIXELS + at)
+                value = value + g_nx * splat(normals[index, 0]) + g_ny * splat(normals[index, 1])
+                value = value + g_nz * splat(normals[index, 2])
+                nx_sum, ny_sum, nz_sum = nx_sum + weight * g_nx, ny_sum + weight * g_ny, nz_sum + weight * g_nz
             part = weight * value
             remaining = load(scratch, REMAINING * TILE_PIXELS + at) - part
             store(scratch, REMAINING * TILE_PIXELS + at, remaining)
@@ -306,12 +328,14 @@ def _blend_tile_gradient(table: Any, hits: Any, first: int, last: int, tile_x: i
             blue_sum = blue_sum + weight * g_blue
         colour_and_depth = (red_sum, green_sum, blue_sum, depth_sum, slope_y_sum)
         _store_hit_gradient(gradient, place, dx, (q_sum, qy_sum, qyy_sum), colour_and_depth)
+        if normals.shape[0] > 0:
+            store_totals(normal_gradient, place * NORMAL_WIDTH, nx_sum, ny_sum, nz_sum, zero)
 
 
 @worker_jit
 def _blend_gradient(
-    table: Any, hits: Any, tile_start: Any, tile_end: Any, background: Any, images: Any, grads: Any, gradient: Any,
-    worker: int, workers: int,
+    table: Any, normals: Any, hits: Any, tile_start: Any, tile_end: Any, background: Any, images: Any, grads: Any,
+    gradient: Any, normal_gradient: Any, worker: int, workers: int,
 ) -> None:  # fmt: skip
     height, width = images[1].shape
     columns = (width + TILE_WIDTH - 1) // TILE_WIDTH
@@ -322,25 +346,31 @@ def _blend_gradient(
         x, y = tile % columns * TILE_WIDTH, tile // columns * TILE_HEIGHT
         start_tile(scratch, x, y, width, height)
         _start_tile_gradient(scratch, x, y, background, images, grads)
-        _blend_tile_gradient(table, hits, tile_start[tile], tile_end[tile], x, y, depth, scratch, lane_x, gradient)
+        _blend_tile_gradient(table, normals, hits, tile_start[tile], tile_end[tile], x, y, depth, scratch, lane_x,
+                             gradient, normal_gradient)  # fmt: skip
         for k in range(tile_end[tile] * HIT_GRADIENT_WIDTH, tile_start[tile + 1] * HIT_GRADIENT_WIDTH):
             gradient[k] = 0
+        if normals.shape[0] > 0:
+            for k in range(tile_end[tile] * NORMAL_WIDTH, tile_start[tile + 1] * NORMAL_WIDTH):
+                normal_gradient[k] = 0
 
 
 @parallel_jit
 def blend_gradient(
-    table: Any, hits: Any, tile_start: Any, tile_end: Any, background: Any, images: Any, grads: Any, gradient: Any,
-    workers: int,
+    table: Any, normals: Any, hits: Any, tile_start: Any, tile_end: Any, background: Any, images: Any, grads: Any,
+    gradient: Any, normal_gradient: Any, workers: int,
 ) -> None:  # fmt: skip
     """Write the derivative of `blend`.
 
     Args:
-        table, hits, tile_start, tile_end, background, images: arguments and results of `blend`.
-        grads: ∂L/∂ colour (H, W, 3), alpha (H, W), Σ w z and Σ w z² (H, W or 0, 0).
-        gradient: (H · HIT_GRADIENT_WIDTH,) of the hits in their order, written.
+        table, normals, hits, tile_start, tile_end, background, images: arguments and results of `blend`.
+        grads: ∂L/∂ colour (H, W, 3), alpha (H, W), Σ w z and Σ w z² (H, W or 0, 0), normal (H, W, 3 or 0, 0, 3).
+        gradient, normal_gradient: (H · HIT_GRADIENT_WIDTH,) and (H · NORMAL_WIDTH or 0,) of the hits in order,
+            written.
         workers: number of threads.
     """
     for worker in prange(workers):
         _blend_gradient(
-            table, hits, tile_start, tile_end, background, images, grads, gradient, np.int64(worker), workers
-        )
+            table, normals, hits, tile_start, tile_end, background, images, grads, gradient, normal_gradient,
+            np.int64(worker), workers,
+        )  # fmt: skip

@@ -244,6 +244,25 @@ def rotation(quat: Any) -> Any:
 
 
 @jit
+def shortest_axis(log_scales: Any, i: int) -> int:
+    a, b, c = row3(log_scales, i)
+    shortest = 1 if b < a else 0
+    return 2 if c < min(a, b) else shortest
+
+
+@jit
+def facing_normal(turn: Any, axis: int, ray: Any) -> Any:
+    """Return a column of a rotation matrix (9), and the sign that it is multiplied by to point against a ray."""
+    x, y, z = turn[0], turn[3], turn[6]
+    if axis == 1:
+        x, y, z = turn[1], turn[4], turn[7]
+    elif axis == 2:
+        x, y, z = turn[2], turn[5], turn[8]
+    sign = -1.0 if x * ray[0] + y * ray[1] + z * ray[2] > 0.0 else 1.0
+    return (sign * x, sign * y, sign * z), sign
+
+
+@jit
 def variances(log_scales: Any, i: int) -> Any:
     a, b, c = row3(log_scales, i)
     return math.exp(2 * a), math.exp(2 * b), math.exp(2 * c)

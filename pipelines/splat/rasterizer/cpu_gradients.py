@@ -19,6 +19,7 @@ from pipelines.splat.rasterizer.cpu_blend import (
     D_SLOPE_X,
     D_SLOPE_Y,
     HIT_GRADIENT_WIDTH,
+    NORMAL_WIDTH,
     Q_X,
     Q_XX,
     Q_XY,
@@ -89,11 +90,27 @@ def _transposed_times(w: Any, v: Any, i: int, k: int) -> float:
 
 
 @jit
-def _quat_gradient(quat: Any, scale: float, w: Any, v: Any) -> Any:
-    """Return ∂L/∂ quaternion (4) before normalisation, with ∂L/∂R = Wᵀ ∂L/∂V."""
-    r00, r01, r02 = _transposed_times(w, v, 0, 0), _transposed_times(w, v, 0, 1), _transposed_times(w, v, 0, 2)
-    r10, r11, r12 = _transposed_times(w, v, 1, 0), _transposed_times(w, v, 1, 1), _transposed_times(w, v, 1, 2)
-    r20, r21, r22 = _transposed_times(w, v, 2, 0), _transposed_times(w, v, 2, 1), _transposed_times(w, v, 2, 2)
+def _turn_gradient(w: Any, v: Any, axis: int, normal: Any) -> Any:
+    """Return ∂L/∂R (9) = Wᵀ ∂L/∂V, plus the gradient (3) of the column `axis` as a normal."""
+    nx, ny, nz = normal
+    first, second, third = 1.0 if axis == 0 else 0.0, 1.0 if axis == 1 else 0.0, 1.0 if axis == 2 else 0.0
+    return (
+        _transposed_times(w, v, 0, 0) + first * nx,
+        _transposed_times(w, v, 0, 1) + second * nx,
+        _transposed_times(w, v, 0, 2) + third * nx,
+        _transposed_times(w, v, 1, 0) + first * ny,
+        _transposed_times(w, v, 1, 1) + second * ny,
+        _transposed_times(w, v, 1, 2) + third * ny,
+        _transposed_times(w, v, 2, 0) + first * nz,
+        _transposed_times(w, v, 2, 1) + second * nz,
+        _transposed_times(w, v, 2, 2) + third * nz,
+    )
+
+
+@jit
+def _quat_gradient(quat: Any, scale: float, turn: Any) -> Any:
+    """Return ∂L/∂ quaternion (4) before normalisation, given ∂L/∂R (9)."""
+    r00, r01, r02, r10, r11, r12, r20, r21, r22 = turn
     qw, qx, qy, qz = quat
     gw = 2 * (qx * (r21 - r12) + qy * (r02 - r20) + qz * (r10 - r01))
     gx = 2 * (qw * (r21 - r12) + qy * (r01 + r10) + qz * (r02 + r20) - 2 * qx * (r11 + r22))
@@ -181,8 +198,8 @@ def unnormalised(direction: Any, scale: float, gradient: Any) -> Any:
 
 
 @jit
-def geometry_gradient(quats: Any, log_scales: Any, i: int, mean: Any, pose: Any, view: View, sums: Any,
-                       camera: Any, g_quats: Any, g_log_scales: Any) -> Any:  # fmt: skip
+def geometry_gradient(quats: Any, log_scales: Any, i: int, mean: Any, direction: Any, pose: Any, view: View,
+                      sums: Any, g_normal: Any, camera: Any, g_quats: Any, g_log_scales: Any) -> Any:  # fmt: skip
     """Write row i of ∂L/∂ quaternion and log scales, add to ∂L/∂ pose; return ∂L/∂ point and screen mean."""
     point = gaussian.point_in_cam(pose, mean)
     quat, scale = gaussian.unit_quat(quats, i)
@@ -194,7 +211,10 @@ def geometry_gradient(quats: Any, log_scales: Any, i: int, mean: Any, pose: Any,
     g_axes = _axes_gradient(axes, variance, g_cov, g_c)
     turn_back = (turn[0], turn[3], turn[6], turn[1], turn[4], turn[7], turn[2], turn[5], turn[8])
     g_w = gaussian.times_rotation(g_axes, turn_back)
-    g_quats[i, 0], g_quats[i, 1], g_quats[i, 2], g_quats[i, 3] = _quat_gradient(quat, scale, w, g_axes)
+    axis = gaussian.shortest_axis(log_scales, i)
+    _, sign = gaussian.facing_normal(turn, axis, direction)
+    g_turn = _turn_gradient(w, g_axes, axis, (sign * g_normal[0], sign * g_normal[1], sign * g_normal[2]))
+    g_quats[i, 0], g_quats[i, 1], g_quats[i, 2], g_quats[i, 3] = _quat_gradient(quat, scale, g_turn)
     # Scaling a principal axis means scaling its column of V.
     g_log_scales[i, 0] = _transposed_times(axes, g_axes, 0, 0)
     g_log_scales[i, 1] = _transposed_times(axes, g_axes, 1, 1)
@@ -209,56 +229,49 @@ CAMERA_WIDTH = 15
 
 
 @jit
-def _sum_hits(gradient: Any, places: Any, first: int, last: int, sums: Any) -> None:
-    for k in range(HIT_GRADIENT_WIDTH):
-        sums[k] = 0.0
-    for slot in range(first, last):
-        start = places[slot] * HIT_GRADIENT_WIDTH
-        for k in range(HIT_GRADIENT_WIDTH):
-            sums[k] += gradient[start + k]
+def _sum_hits(gradient: Any, width: int, places: Any, splat_start: Any, first: int, last: int, sums: Any) -> None:
+    """Write the sums (last − first, width) of the hits of some splats.
 
-
-@jit
-def _clear_rows(
-    first: int, last: int, g_means: Any, g_quats: Any, g_log_scales: Any, g_logits: Any, g_sh: Any
-) -> None:
-    for i in range(first, last):
-        g_logits[i] = 0
-        for k in range(3):
-            g_means[i, k] = 0
-            g_log_scales[i, k] = 0
-        for k in range(4):
-            g_quats[i, k] = 0
-        for k in range(g_sh.shape[1]):
-            g_sh[i, k, 0], g_sh[i, k, 1], g_sh[i, k, 2] = 0, 0, 0
+    Hits lie by tile: nearly each is a cache miss. A loop that does nothing else has many of them under way.
+    """
+    for m in range(first, last):
+        row = sums[m - first]
+        for k in range(width):
+            row[k] = 0.0
+        for slot in range(splat_start[m], splat_start[m + 1]):
+            start = places[slot] * width
+            for k in range(width):
+                row[k] += gradient[start + k]
 
 
 @worker_jit
 def _gaussian_gradients(
     means: Any, quats: Any, log_scales: Any, logit_opacities: Any, sh: Any, pose: Any, center: Any, view: View,
-    degree: int, visible: Any, rank: Any, gradient: Any, splat_start: Any, places: Any, block_start: Any,
-    g_means: Any, g_quats: Any, g_log_scales: Any, g_logits: Any, g_sh: Any, camera: Any, g_screen: Any,
-    worker: int, workers: int,
+    degree: int, visible: Any, gradient: Any, normal_gradient: Any, splat_start: Any, places: Any,
+    block_start: Any, g_means: Any, g_quats: Any, g_log_scales: Any, g_logits: Any, g_sh: Any, camera: Any,
+    g_screen: Any, worker: int, workers: int,
 ) -> None:  # fmt: skip
-    sums, share = np.empty(HIT_GRADIENT_WIDTH), np.empty(CAMERA_WIDTH)
+    block_sums, share = np.empty((BLOCK, HIT_GRADIENT_WIDTH)), np.empty(CAMERA_WIDTH)
     basis, weight = np.empty(MAX_COEFFICIENTS), np.empty(MAX_COEFFICIENTS)
+    block_normals = np.zeros((BLOCK, NORMAL_WIDTH))
     for block in range(worker, block_start.shape[0] - 1, workers):
         for k in range(CAMERA_WIDTH):
             share[k] = 0.0
-        _clear_rows(
-            block * BLOCK, min((block + 1) * BLOCK, means.shape[0]), g_means, g_quats, g_log_scales, g_logits, g_sh
-        )
-        for m in range(block_start[block], block_start[block + 1]):
-            i, row = visible[m], rank[m]
-            _sum_hits(gradient, places, splat_start[row], splat_start[row + 1], sums)
+        first, last = block_start[block], block_start[block + 1]
+        _sum_hits(gradient, HIT_GRADIENT_WIDTH, places, splat_start, first, last, block_sums)
+        if normal_gradient.shape[0] > 0:
+            _sum_hits(normal_gradient, NORMAL_WIDTH, places, splat_start, first, last, block_normals)
+        for m in range(first, last):
+            i, sums = visible[m], block_sums[m - first]
             mean = gaussian.row3(means, i)
+            direction, scale = gaussian.unit_direction(mean, center)
             (px, py, pz), (g_screen[m, 0], g_screen[m, 1]) = geometry_gradient(
-                quats, log_scales, i, mean, pose, view, sums, share, g_quats, g_log_scales
-            )
+                quats, log_scales, i, mean, direction, pose, view, sums, block_normals[m - first], share, g_quats,
+                g_log_scales,
+            )  # fmt: skip
             # ln α = ln σ(logit) + exponent, and ∂ ln σ/∂logit = 1 − σ(logit) = σ(−logit).
             logit = float(logit_opacities[i])
             g_logits[i] = sums[Q] * math.exp(gaussian.log_sigmoid(logit) - logit)
-            direction, scale = gaussian.unit_direction(mean, center)
             g_direction = colour_gradient(sh, i, direction, degree, sums, basis, weight, g_sh)
             dx, dy, dz = unnormalised(direction, scale, g_direction)
             g_means[i, 0] = pose[0, 0] * px + pose[1, 0] * py + pose[2, 0] * pz + dx
@@ -274,26 +287,26 @@ def _gaussian_gradients(
 @parallel_jit
 def gaussian_gradients(
     means: Any, quats: Any, log_scales: Any, logit_opacities: Any, sh: Any, pose: Any, center: Any, view: View,
-    degree: int, visible: Any, rank: Any, gradient: Any, splat_start: Any, places: Any, block_start: Any,
-    g_means: Any, g_quats: Any, g_log_scales: Any, g_logits: Any, g_sh: Any, camera: Any, g_screen: Any,
-    workers: int,
+    degree: int, visible: Any, gradient: Any, normal_gradient: Any, splat_start: Any, places: Any,
+    block_start: Any, g_means: Any, g_quats: Any, g_log_scales: Any, g_logits: Any, g_sh: Any, camera: Any,
+    g_screen: Any, workers: int,
 ) -> None:  # fmt: skip
     """Sum the gradients of hits by Gaussian, and propagate them back through the projection and the colours.
 
     Args:
-        means, quats, log_scales, logit_opacities, sh, pose, center, view, degree, visible, rank: as in
+        means, quats, log_scales, logit_opacities, sh, pose, center, view, degree, visible: as in
             `project_visible`.
-        gradient: (H · HIT_GRADIENT_WIDTH,) of the hits by tile.
+        gradient, normal_gradient: of the hits by tile, see `blend_gradient`.
         splat_start, places: of the hits of each splat, see `list_hits`.
         block_start: (blocks + 1,) into `visible`: the blocks of BLOCK Gaussians each.
-        g_means, g_quats, g_log_scales, g_logits, g_sh: gradients of the N Gaussians, written; zero for the
-            invisible.
+        g_means, g_quats, g_log_scales, g_logits, g_sh: gradients of the N Gaussians, zero at first; the rows of the
+            visible are written.
         camera: (blocks, CAMERA_WIDTH) each block's share of ∂L/∂ pose and centre, written.
         g_screen: (M, 2) ∂L/∂ screen mean, written.
     """
     for worker in prange(workers):
         _gaussian_gradients(
-            means, quats, log_scales, logit_opacities, sh, pose, center, view, degree, visible, rank, gradient,
-            splat_start, places, block_start, g_means, g_quats, g_log_scales, g_logits, g_sh, camera, g_screen,
-            np.int64(worker), workers,
+            means, quats, log_scales, logit_opacities, sh, pose, center, view, degree, visible, gradient,
+            normal_gradient, splat_start, places, block_start, g_means, g_quats, g_log_scales, g_logits, g_sh,
+            camera, g_screen, np.int64(worker), workers,
         )  # fmt: skip

@@ -1,8 +1,10 @@
 """Numba kernels that find the visible Gaussians, fill the tables for blending, and list the splats of each tile.
 
-The lists are a parallel counting sort, nearest first. An ellipse is cut into the columns of tiles that it crosses.
-Its extreme rows within a column have a closed form. A tile is therefore listed only if the ellipse enters it, with
-exactly the rows that the ellipse enters (the idea of AccuTile, doi 10.48550/arXiv.2412.00578).
+Tables are in the order of the Gaussians: neighbours in memory are mostly neighbours in the image, and the splats of
+a tile lie together. The lists are a parallel counting sort, nearest first. An ellipse is cut into the columns of
+tiles that it crosses. Its extreme rows within a column have a closed form. A tile is therefore listed only if the
+ellipse enters it, with exactly the rows that the ellipse enters (the idea of AccuTile, doi
+10.48550/arXiv.2412.00578).
 """
 
 import math
@@ -132,13 +134,13 @@ def _write_splat(splats: Any, ellipses: Any, row: int, center: Any, cov: Any, lo
 @worker_jit
 def _project_visible(
     means: Any, quats: Any, log_scales: Any, logit_opacities: Any, sh: Any, pose: Any, center: Any, view: View,
-    degree: int, visible: Any, rank: Any, splats: Any, ellipses: Any, worker: int, workers: int,
+    degree: int, visible: Any, splats: Any, ellipses: Any, normals: Any, worker: int, workers: int,
 ) -> None:  # fmt: skip
     basis = np.empty(MAX_COEFFICIENTS)
     count = visible.shape[0]
     for block in range(worker, (count + BLOCK - 1) // BLOCK, workers):
-        for m in range(block * BLOCK, min((block + 1) * BLOCK, count)):
-            i, row = visible[m], rank[m]
+        for row in range(block * BLOCK, min((block + 1) * BLOCK, count)):
+            i = visible[row]
             (x, y, z), cov, slope = _ellipse(means, quats, log_scales, pose, view, i)
             on_screen = (view.fx * x / z + view.cx, view.fy * y / z + view.cy)
             _write_splat(splats, ellipses, row, on_screen, cov, gaussian.log_sigmoid(float(logit_opacities[i])))
@@ -150,12 +152,17 @@ def _project_visible(
             splats[row, BLUE] = max(blue, 0.0)
             splats[row, DEPTH] = z
             splats[row, SLOPE_X], splats[row, SLOPE_Y] = slope
+            if normals.shape[0] > 0:
+                turn = gaussian.rotation(gaussian.unit_quat(quats, i)[0])
+                axis = gaussian.shortest_axis(log_scales, i)
+                normal, _ = gaussian.facing_normal(turn, axis, direction)
+                normals[row, 0], normals[row, 1], normals[row, 2] = normal
 
 
 @parallel_jit
 def project_visible(
     means: Any, quats: Any, log_scales: Any, logit_opacities: Any, sh: Any, pose: Any, center: Any, view: View,
-    degree: int, visible: Any, rank: Any, splats: Any, ellipses: Any, workers: int,
+    degree: int, visible: Any, splats: Any, ellipses: Any, normals: Any, workers: int,
 ) -> None:  # fmt: skip
     """Fill the tables of the M visible Gaussians.
 
@@ -165,13 +172,13 @@ def project_visible(
         view: camera.
         degree: of the spherical harmonics in use.
         visible: (M,) rows of the Gaussians, ascending.
-        rank: (M,) places of the visible Gaussians in the order of depth.
-        splats, ellipses: (M, SPLAT_WIDTH), (M, ELLIPSE_WIDTH) by rank, written.
+        splats, ellipses: (M, SPLAT_WIDTH), (M, ELLIPSE_WIDTH) in the order of `visible`, written.
+        normals: (M, 3), see `Render.normal`, written; (0, 3): not wanted.
     """
     for worker in prange(workers):
         _project_visible(
-            means, quats, log_scales, logit_opacities, sh, pose, center, view, degree, visible, rank, splats,
-            ellipses, np.int64(worker), workers,
+            means, quats, log_scales, logit_opacities, sh, pose, center, view, degree, visible, splats, ellipses,
+            normals, np.int64(worker), workers,
         )  # fmt: skip
 
 
@@ -238,13 +245,15 @@ def _row_span(ellipses: Any, splat: int, column: int, height: int) -> Any:
 
 
 @worker_jit
-def _count_hits(ellipses: Any, width: int, height: int, per_tile: Any, per_splat: Any, run: int) -> None:
-    splats = ellipses.shape[0]
+def _count_hits(
+    ellipses: Any, order: Any, width: int, height: int, per_tile: Any, per_splat: Any, run: int
+) -> None:
+    splats = order.shape[0]
     columns = (width + TILE_WIDTH - 1) // TILE_WIDTH
     for tile in range(per_tile.shape[1]):
         per_tile[run, tile] = 0
-    for splat in range(splats * run // RUNS, splats * (run + 1) // RUNS):
-        hits = 0
+    for rank in range(splats * run // RUNS, splats * (run + 1) // RUNS):
+        splat, hits = order[rank], 0
         first_column, last_column = _column_span(ellipses, splat, width)
         for column in range(first_column, last_column + 1):
             first, last = _row_span(ellipses, splat, column, height)
@@ -257,13 +266,13 @@ def _count_hits(ellipses: Any, width: int, height: int, per_tile: Any, per_splat
 
 
 @parallel_jit
-def count_hits(ellipses: Any, width: int, height: int, per_tile: Any, per_splat: Any) -> None:
-    """Count the tiles of M splats, nearest first, in an image of some pixels.
+def count_hits(ellipses: Any, order: Any, width: int, height: int, per_tile: Any, per_splat: Any) -> None:
+    """Count the tiles of splats (M, ELLIPSE_WIDTH), nearest first in `order` (M,), in an image of some pixels.
 
     Hits of each run in each tile (RUNS, tiles), and hits of each splat (M,), are written.
     """
     for run in prange(RUNS):
-        _count_hits(ellipses, width, height, per_tile, per_splat, np.int64(run))
+        _count_hits(ellipses, order, width, height, per_tile, per_splat, np.int64(run))
 
 
 @kernel_jit
@@ -281,11 +290,13 @@ def starts_from_counts(per_tile: Any, tile_start: Any) -> None:
 
 @worker_jit
 def _list_hits(
-    ellipses: Any, width: int, height: int, next_place: Any, splat_start: Any, hits: Any, places: Any, run: int
-) -> None:
-    splats = ellipses.shape[0]
+    ellipses: Any, order: Any, width: int, height: int, next_place: Any, splat_start: Any, hits: Any, places: Any,
+    run: int,
+) -> None:  # fmt: skip
+    splats = order.shape[0]
     columns = (width + TILE_WIDTH - 1) // TILE_WIDTH
-    for splat in range(splats * run // RUNS, splats * (run + 1) // RUNS):
+    for rank in range(splats * run // RUNS, splats * (run + 1) // RUNS):
+        splat = order[rank]
         slot = splat_start[splat]
         first_column, last_column = _column_span(ellipses, splat, width)
         for column in range(first_column, last_column + 1):
@@ -303,15 +314,15 @@ def _list_hits(
 
 @parallel_jit
 def list_hits(
-    ellipses: Any, width: int, height: int, next_place: Any, splat_start: Any, hits: Any, places: Any
+    ellipses: Any, order: Any, width: int, height: int, next_place: Any, splat_start: Any, hits: Any, places: Any
 ) -> None:
     """List the splats of each tile, nearest first, and the places of each splat in those lists.
 
     Args:
-        ellipses, width, height: as in `count_hits`.
+        ellipses, order, width, height: as in `count_hits`.
         next_place: (RUNS, tiles) from `starts_from_counts`, overwritten.
         splat_start: (M + 1,) start of each splat in `places`.
         hits, places: (H,) packed hits by tile, and places in `hits` by splat, written.
     """
     for run in prange(RUNS):
-        _list_hits(ellipses, width, height, next_place, splat_start, hits, places, np.int64(run))
+        _list_hits(ellipses, order, width, height, next_place, splat_start, hits, places, np.int64(run))

@@ -15,7 +15,7 @@ from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.api import ALPHA_MAX, BackendName, RasterSettings, Render, ScreenStats
 from pipelines.splat.rasterizer.cuda_kernels import load_gsplat
-from pipelines.splat.rasterizer.reference import depth_slopes, projected_axes
+from pipelines.splat.rasterizer.reference import depth_slopes, facing_normals, projected_axes
 
 _EVERY_BATCH = 2**31 - 1
 
@@ -59,6 +59,9 @@ class CudaRasterizer:
             slope = _depth_slope(gaussians, cam_from_model, camera, meta, settings.dilation_px2)
             view.expected_depth, view.depth_variance = self._depth_moments(meta, slope, camera, view.alpha)
             view.median_depth = self._median_depth(meta, slope, camera) if settings.median else None
+        if settings.normal:
+            normals = facing_normals(gaussians.select(meta["gaussian_ids"].long()), cam_from_model)
+            view.normal = self._blended(meta, normals, camera)
         return view if settings.window is None else settings.window.cut(view)
 
     def _depth_moments(
@@ -73,10 +76,21 @@ class CudaRasterizer:
         z = meta["depths"] + (slope * (middle - meta["means2d"])).sum(dim=-1)
         by_u, by_v = slope.unbind(-1)
         of_square = (z * z, 2 * z * by_u, 2 * z * by_v, by_u * by_u, 2 * by_u * by_v, by_v * by_v)
-        planes, _ = self._gsplat.rasterize_to_pixels(
+        planes = self._blended(meta, torch.stack([z, by_u, by_v, *of_square], dim=-1), camera)
+        u = torch.arange(camera.width, device=slope.device) + 0.5 * (1 - camera.width)
+        v = (torch.arange(camera.height, device=slope.device) + 0.5 * (1 - camera.height))[:, None]
+        z, by_u, by_v, zz, zu, zv, uu, uv, vv = planes.unbind(-1)
+        total = alpha.clamp(min=1e-10)
+        mean = (z + by_u * u + by_v * v) / total
+        square = (zz + zu * u + zv * v + uu * u * u + uv * u * v + vv * v * v) / total
+        return mean, (square - mean.square()).clamp_min(0.0)
+
+    def _blended(self, meta: dict[str, Any], values: Tensor, camera: Pinhole) -> Tensor:
+        """Return values (M, C) of the visible Gaussians, blended to (H, W, C) with the weights of the render."""
+        image, _ = self._gsplat.rasterize_to_pixels(
             meta["means2d"],
             meta["conics"],
-            torch.stack([z, by_u, by_v, *of_square], dim=-1),
+            values,
             meta["opacities"],
             camera.width,
             camera.height,
@@ -85,13 +99,8 @@ class CudaRasterizer:
             meta["flatten_ids"],
             packed=True,
         )
-        u = torch.arange(camera.width, device=slope.device) + 0.5 * (1 - camera.width)
-        v = (torch.arange(camera.height, device=slope.device) + 0.5 * (1 - camera.height))[:, None]
-        z, by_u, by_v, zz, zu, zv, uu, uv, vv = planes[0].unbind(-1)
-        total = alpha.clamp(min=1e-10)
-        mean = (z + by_u * u + by_v * v) / total
-        square = (zz + zu * u + zv * v + uu * u * u + uv * u * v + vv * v * v) / total
-        return mean, (square - mean.square()).clamp_min(0.0)
+        blended: Tensor = image[0]
+        return blended
 
     @torch.no_grad()
     def _median_depth(self, meta: dict[str, Any], slope: Tensor, camera: Pinhole) -> Tensor:

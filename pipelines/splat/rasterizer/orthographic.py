@@ -58,9 +58,11 @@ def render_orthographic(
     """Return the view of a part of the plane, `width` × `height` px from a corner (column, row), from above."""
     table, ellipses = _tables(splats, width, height, corner, dilation_px2)
     with KERNEL_LOCK:
-        lists = list_tiles(ellipses, width, height)
-        colour, alpha, depth_sum, square_sum, median = blend_tiles(
-            table, lists, (height, width), np.zeros(3), depth=True, workers=numba.get_num_threads()
+        lists = list_tiles(ellipses, np.arange(len(ellipses)), width, height)
+        colour, alpha, depth_sum, square_sum, median, _ = blend_tiles(
+            *(table, np.empty((0, 3)), lists, (height, width), np.zeros(3)),
+            depth=True,
+            workers=numba.get_num_threads(),
         )
     total = np.where(alpha > 0, alpha, 1.0)
     expected = np.where(alpha > 0, depth_sum / total, 0.0)

@@ -68,8 +68,11 @@ def render_reference(
         if settings.median:
             crossing = counted & (before > 0.5) & (after <= 0.5)
             median = torch.where(crossing, depth.detach(), 0.0).sum(dim=0).view(size)
+    normal = None
+    if settings.normal:
+        normal = torch.einsum("gp,gc->pc", weight, facing_normals(sorted_gaussians, pose)).view(*size, 3)
     stats = _screen_stats(front, mean_px, cov_px2, sorted_gaussians.logit_opacities, camera)
-    view = Render(colour.view(*size, 3), (1 - final).view(size), stats, expected, variance, median)
+    view = Render(colour.view(*size, 3), (1 - final).view(size), stats, expected, variance, median, normal)
     return view if settings.window is None else settings.window.cut(view)
 
 
@@ -131,6 +134,16 @@ def view_colours(gaussians: Gaussians, cam_from_model: Tensor, sh_degree: int) -
     """Return colours (N, 3) of the Gaussians seen from the camera's centre, not negative."""
     center_in_model = -torch.linalg.solve(cam_from_model[:3, :3], cam_from_model[:3, 3])
     return (sh.evaluate_sh(gaussians.sh, gaussians.means - center_in_model, sh_degree) + 0.5).clamp_min(0.0)
+
+
+def facing_normals(gaussians: Gaussians, cam_from_model: Tensor) -> Tensor:
+    """Return unit normals (N, 3) in `model`: the shortest principal axes, on the side of the camera's centre."""
+    pose = cam_from_model.detach().to(gaussians.means)
+    shortest = gaussians.log_scales.argmin(dim=1)
+    rotation = rotation_matrices(gaussians.quats_wxyz)
+    normal = rotation.gather(2, shortest[:, None, None].expand(-1, 3, 1))[:, :, 0]
+    ray = gaussians.means.detach() + pose[:3, :3].T @ pose[:3, 3]
+    return torch.where(((normal * ray).sum(dim=1) > 0)[:, None], -normal, normal)
 
 
 def _alpha(offset_px: Tensor, cov_px2: Tensor, opacity: Tensor) -> Tensor:

@@ -49,7 +49,7 @@ def weighted_loss(render: Render, *, seed: int = 0) -> Tensor:
     """Return a loss to which every pixel of every differentiable image contributes with its own random weight."""
     random = torch.Generator().manual_seed(seed)
     loss = torch.zeros((), dtype=torch.float64)
-    for image in (render.colour, render.alpha, render.expected_depth, render.depth_variance):
+    for image in (render.colour, render.alpha, render.expected_depth, render.depth_variance, render.normal):
         if image is not None:
             loss = loss + (image * torch.randn(image.shape, generator=random, dtype=torch.float64)).sum()
     return loss

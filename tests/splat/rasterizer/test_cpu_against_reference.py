@@ -21,20 +21,26 @@ BACKGROUND = (0.2, 0.5, 0.9)
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize(
-    # Number of Gaussians, logarithm of their size, degree of the harmonics, with depth or without.
+    # Number of Gaussians, logarithm of their size, degree of the harmonics, with depth and normals or without.
     "case",
-    [(150, -2.0, 3, True), (150, -1.0, 2, True), (400, -3.0, 1, False), (60, 0.3, 0, True)],
+    [
+        (150, -2.0, 3, True, True),
+        (150, -1.0, 2, True, False),
+        (400, -3.0, 1, False, True),
+        (60, 0.3, 0, True, True),
+        (200, -2.0, 1, False, False),
+    ],
 )
 def test_images_and_gradients(make_scene, leaves, loss_of, camera, dtype, case):
-    count, log_scale, degree, depth = case
+    count, log_scale, degree, depth, normal = case
     scene = make_scene(count, seed=count, log_scale=log_scale)
-    settings = RasterSettings(sh_degree=degree, background=BACKGROUND, depth=depth)
+    settings = RasterSettings(sh_degree=degree, background=BACKGROUND, depth=depth, normal=normal)
     (expected_gaussians, expected_pose), (gaussians, pose) = leaves(scene, torch.float64), leaves(scene, dtype)
     expected = render_reference(expected_gaussians, expected_pose, camera, settings)
     render = CpuRasterizer().render(gaussians, pose, camera, settings)
 
     image_error, gradient_error = TOLERANCE[dtype]
-    for name in ("colour", "alpha", "expected_depth", "depth_variance", "median_depth"):
+    for name in ("colour", "alpha", "expected_depth", "depth_variance", "median_depth", "normal"):
         ours, theirs = getattr(render, name), getattr(expected, name)
         assert (ours is None) == (theirs is None)
         if ours is not None:
@@ -59,11 +65,11 @@ def test_images_and_gradients(make_scene, leaves, loss_of, camera, dtype, case):
 def test_window_is_a_part_of_the_image(make_scene, leaves, camera, window):
     # Off the middle, where the limit of the linear projection would move if the window were a camera of its own.
     gaussians, pose = make_scene(300, seed=4, log_scale=-1.0)
-    settings = RasterSettings(sh_degree=3, background=BACKGROUND, depth=True)
+    settings = RasterSettings(sh_degree=3, background=BACKGROUND, depth=True, normal=True)
     whole = render_reference(gaussians, pose, camera, settings)
     render = CpuRasterizer().render(gaussians, pose, camera, replace(settings, window=window))
     rows, columns = slice(window.top, window.top + window.height), slice(window.left, window.left + window.width)
-    for name in ("colour", "alpha", "expected_depth", "median_depth"):
+    for name in ("colour", "alpha", "expected_depth", "median_depth", "normal"):
         torch.testing.assert_close(getattr(render, name), getattr(whole, name)[rows, columns], rtol=0, atol=1e-11)
 
 
@@ -85,9 +91,9 @@ def test_gradcheck(make_scene, degree, seed, log_scale):
     )
 
     def images(*inputs):
-        settings = RasterSettings(sh_degree=degree, background=BACKGROUND, depth=True)
+        settings = RasterSettings(sh_degree=degree, background=BACKGROUND, depth=True, normal=True)
         render = CpuRasterizer().render(Gaussians(*inputs[:5]), inputs[5], camera, settings)
-        return render.colour, render.alpha, render.expected_depth
+        return render.colour, render.alpha, render.expected_depth, render.normal
 
     inputs = [tensor.requires_grad_() for tensor in (*gaussians.tensors().values(), pose)]
     assert torch.autograd.gradcheck(images, inputs, check_undefined_grad=False)
