@@ -3,8 +3,6 @@
 A stage's options are derived from its class of options (names, types, meaning, defaults): each is defined once.
 """
 
-from __future__ import annotations
-
 import types
 from collections.abc import Iterable
 from pathlib import Path

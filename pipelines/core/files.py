@@ -164,12 +164,8 @@ def file_size(path: Path, *, limit_bytes: int | None = None, kind: str = "file",
         raise InputError("not-a-file", f"cannot be read: it is {other}. Give a file.", path=path, field=field)
     if limit_bytes is not None and status.st_size > limit_bytes:
         size, limit = status.st_size / 2**20, limit_bytes / 2**20
-        raise InputError(
-            "file-too-large",
-            f"is too large for a {kind}: {size:.0f} MiB (limit {limit:.0f} MiB).",
-            path=path,
-            field=field,
-        )
+        message = f"is too large for a {kind}: {size:.0f} MiB (limit {limit:.0f} MiB)."
+        raise InputError("file-too-large", message, path=path, field=field)
     return status.st_size
 
 

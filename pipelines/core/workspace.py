@@ -96,11 +96,10 @@ class PartialProduct:
             (self.folder / FAILURE).unlink(missing_ok=True)
             return True
         if insist:
-            raise InputError(
-                "interrupted-run-differs",
-                "holds an interrupted run with other inputs or options. Give those, or start afresh with --force.",
-                path=self.folder,
+            message = (
+                "holds an interrupted run with other inputs or options. Give those, or start afresh with --force."
             )
+            raise InputError("interrupted-run-differs", message, path=self.folder)
         return False
 
 
@@ -317,12 +316,11 @@ class Workspace:
 
 def _refuse_what_is_no_folder(folder: Path) -> None:
     if folder.is_symlink():
-        raise InputError(
-            "stage-folder-is-link",
+        message = (
             "is a symbolic link, and a stage replaces its folder as a whole. Put the folder itself there, or the "
-            "whole workspace on the other disk.",
-            path=folder,
+            "whole workspace on the other disk."
         )
+        raise InputError("stage-folder-is-link", message, path=folder)
     if folder.exists() and not folder.is_dir():
         raise InputError(
             "stage-folder-is-file", "is a file where the stage's folder belongs. Move it away.", path=folder

@@ -65,10 +65,8 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
     mosaic.render(source, stage.progress)
     height = mosaic.sample("dsm")
     if not len(height):
-        raise DegenerateGeometryError(
-            "no-raster-cells",
-            f"No cell is seen by {options.min_views} training views or more. Lower --min-views.",
-        )
+        message = f"No cell is seen by {options.min_views} training views or more. Lower --min-views."
+        raise DegenerateGeometryError("no-raster-cells", message)
     sigma = None
     if not reason:
         counts = "georeference, cameras and lens; the surface's own noise between training views; interpolation"
@@ -179,11 +177,10 @@ def _contour_lines(height: FloatArray, frame: RasterFrame, interval: float) -> l
     low, high = np.nanquantile(height, [0.0005, 0.9995])
     levels = interval * np.arange(math.ceil(low / interval), math.floor(high / interval) + 1)
     if len(levels) > _MOST_LEVELS:
-        raise InputError(
-            "contour-interval",
-            f"The interval makes {len(levels)} contour heights, more than {_MOST_LEVELS}. Give a larger interval.",
-            field="--contours",
+        message = (
+            f"The interval makes {len(levels)} contour heights, more than {_MOST_LEVELS}. Give a larger interval."
         )
+        raise InputError("contour-interval", message, field="--contours")
     west, south, east, north = frame.bounds
     step = (east - west) / height.shape[1], (north - south) / height.shape[0]
     x = west + (np.arange(height.shape[1]) + 0.5) * step[0]

@@ -5,8 +5,6 @@ its display. Programs that keep float32 coordinates need the LAZ. A PLY has no C
 and with the vertices first; faces and other elements after these are not read.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass

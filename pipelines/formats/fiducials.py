@@ -5,8 +5,6 @@ begin at the top left of the pattern and go clockwise. Places are pixels, the ce
 (0.5, 0.5).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache

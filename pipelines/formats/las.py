@@ -275,11 +275,8 @@ def read_surface(path: Path, size: int) -> Iterator[CloudPoints]:
     with _damage(path), laspy.open(path, read_evlrs=False, laz_backend=laspy.LazBackend.Lazrs) as file:
         lacking = (_EXTRA.keys() | _COVARIANCE.keys()) - set(file.header.point_format.dimension_names)
         if lacking:
-            raise InputError(
-                "cloud-without-sigma",
-                f"The cloud has no {', '.join(sorted(lacking))}. Make it with `georef export-cloud`.",
-                path=path,
-            )
+            message = f"The cloud has no {', '.join(sorted(lacking))}. Make it with `georef export-cloud`."
+            raise InputError("cloud-without-sigma", message, path=path)
         for record in file.chunk_iterator(size):
             cov = np.empty((len(record), 3, 3), dtype=np.float32)
             for name, (row, column) in _COVARIANCE.items():

@@ -1,7 +1,5 @@
 """A profile as CSV and DXF."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

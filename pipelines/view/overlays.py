@@ -3,8 +3,6 @@
 What cannot be read is not drawn: the commands that write it say what is wrong.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -6,8 +6,6 @@ colours that depend on the direction included, and a page without a graphics car
 The viewer's frame is `geo` moved to the middle of the scene: metres, east, north, up.
 """
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -109,11 +107,8 @@ class Photographs:
         pixels = decoded_photograph(file, sha256.get(name, ""))
         lens = self._trained.sparse.camera_of(camera)
         if pixels is None or pixels.shape[:2] != (lens.height, lens.width):
-            raise InputError(
-                "photograph-damaged",
-                "cannot be decoded, or has another size than its camera. Restore the photograph.",
-                path=file,
-            )
+            message = "cannot be decoded, or has another size than its camera. Restore the photograph."
+            raise InputError("photograph-damaged", message, path=file)
         return np.ascontiguousarray(pixels[..., ::-1])
 
 

@@ -4,8 +4,6 @@ A point is expected where its marks meet, else where it was surveyed. A quartere
 with σ. Where there is none, what the nearest marked photograph shows is searched, as in the viewer.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 On a circle around the middle of such a target the grey values rise and fall twice, however obliquely it is seen.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

@@ -1,7 +1,5 @@
 """What a page may ask: bodies of requests, checked before anything is done with them."""
 
-from __future__ import annotations
-
 import math
 from typing import Annotated, Literal, Self
 

@@ -5,8 +5,6 @@ looked at, and could pretend to come from here by a name that resolves to 127.0.
 Another program of this machine could send both, and lacks the key that is the beginning of each path.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import hmac

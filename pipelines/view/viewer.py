@@ -3,8 +3,6 @@
 A page has its own state. The viewer has the model, the saved measurements and the marks, which all pages share.
 """
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from dataclasses import asdict
