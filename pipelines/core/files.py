@@ -36,10 +36,14 @@ def replace_file(draft: Path, path: Path) -> None:
 
 
 @contextmanager
-def replacing(path: Path, draft: Path) -> Iterator[None]:
-    """Rename a draft to `path` when it was written; one that cannot be completed keeps no room on a full disk."""
+def replacing(path: Path, draft: Path | None = None) -> Iterator[Path]:
+    """Yield a draft, by default `NAME.tmp` beside `path`, and rename it to `path` when it was written.
+
+    One that cannot be completed keeps no room on a full disk.
+    """
+    draft = draft or path.with_name(f"{path.name}.tmp")
     try:
-        yield
+        yield draft
         replace_file(draft, path)
     except BaseException:
         with contextlib.suppress(OSError):

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import AfterValidator, Field
 
-from pipelines.core.files import replace_file
+from pipelines.core.files import replace_text
 from pipelines.core.products import Product
 from pipelines.core.sentences import printable
 from pipelines.core.stages import TILES
@@ -161,12 +161,10 @@ def scene_page(
 def write_scene_page(page: ScenePage, folder: Path) -> None:
     """Write the page into a folder, whole or not at all; an OSError: it cannot be written."""
     program = resources.files(__package__).joinpath("templates", "tiles.html").read_text(encoding="utf-8")
-    draft = folder / f"{PAGE}.tmp"
     program = program.replace(_POLICY, html.escape(_policy(program, page.cesium)), 1)
     # No name in the JSON can break out of an HTML script element: `<` only occurs escaped.
     scene = re.sub("[<>&\u2028\u2029]", lambda found: f"\\u{ord(found[0]):04x}", page.model_dump_json())
-    draft.write_text(program.replace(_PLACEHOLDER, scene, 1), encoding="utf-8")
-    replace_file(draft, folder / PAGE)
+    replace_text(folder / PAGE, program.replace(_PLACEHOLDER, scene, 1))
 
 
 def _policy(program: str, cesium: str) -> str:

@@ -75,8 +75,14 @@ def _check_model_files(folder: Path) -> None:
         size = file_size(file)
         if suffix == ".bin":
             _check_binary(file, size, _RECORDS[name])
-        elif name == "images":
-            _check_text(file)
+            continue
+        with file.open("rb") as stream:
+            for number, line in enumerate(stream if name == "images" else (), start=1):
+                try:
+                    line.decode("utf-8")
+                except UnicodeDecodeError as error:
+                    message = f"The image {_INVALID_NAME}"
+                    raise InputError("name-not-utf8", message, path=file, line=number) from error
 
 
 def _check_binary(file: Path, size: int, record_end: Callable[[_Bytes, int], int]) -> None:
@@ -101,16 +107,6 @@ def _check_binary(file: Path, size: int, record_end: Callable[[_Bytes, int], int
         if at != size:
             message = f"The file is damaged: {size - at} bytes follow its {count} records."
             raise InputError("file-damaged", message, path=file)
-
-
-def _check_text(file: Path) -> None:
-    with file.open("rb") as stream:
-        for number, line in enumerate(stream, start=1):
-            try:
-                line.decode("utf-8")
-            except UnicodeDecodeError as error:
-                message = f"The image {_INVALID_NAME}"
-                raise InputError("name-not-utf8", message, path=file, line=number) from error
 
 
 @dataclass(frozen=True)

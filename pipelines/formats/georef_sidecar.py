@@ -211,8 +211,7 @@ def write_sidecar(sidecar: GeorefSidecar | CrsSidecar, artefact: Path) -> None:
 def _of_frame(sidecar: GeorefSidecar, name: str) -> IsoMetadata:
     """Return the metadata of a file in a frame, whose extent is not recorded: its place is that of the origin."""
     lat, lon, _ = sidecar.origin_lla
-    sigma = sidecar.georeference_sigma
-    of = "the georeference alone; the model's shape is not counted"
+    sigma, of = sidecar.georeference_sigma, "the georeference alone; the model's shape is not counted"
     lengths = () if sigma is None else ((PLAN_SIGMA, sigma.sigma_h_m), (STANDARD_ERROR, sigma.sigma_v_m))
     return IsoMetadata(
         title=name,

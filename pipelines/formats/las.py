@@ -151,20 +151,17 @@ def _chunk(record: Any) -> CloudChunk:
 
 def _crs(header: Any) -> str | None:
     """Return the CRS as WKT or as EPSG codes; None where the file states none that stands alone."""
-    for record in header.vlrs:
-        if record.user_id == "LASF_Projection" and record.record_id == 2112:
-            text = getattr(record, "string", "").strip("\0 ")
-            if text:
-                return str(text)
-    for record in header.vlrs:
-        if record.user_id == "LASF_Projection" and record.record_id == 34735:
-            codes = {key.id: key.value_offset for key in record.geo_keys if key.tiff_tag_location == 0}
-            horizontal = codes.get(_PROJECTED, codes.get(_GEOGRAPHIC, _USER_DEFINED))
-            vertical = codes.get(_VERTICAL, 0)
-            if horizontal in (0, _USER_DEFINED) or vertical == _USER_DEFINED:
-                return None
-            return f"EPSG:{horizontal}+{vertical}" if vertical else f"EPSG:{horizontal}"
-    return None
+    found = [record for record in header.vlrs if record.user_id == "LASF_Projection"]
+    texts = (getattr(record, "string", "").strip("\0 ") for record in found if record.record_id == 2112)
+    if text := next(filter(None, texts), ""):
+        return str(text)
+    keys = next((record.geo_keys for record in found if record.record_id == 34735), ())
+    codes = {key.id: key.value_offset for key in keys if key.tiff_tag_location == 0}
+    horizontal = codes.get(_PROJECTED, codes.get(_GEOGRAPHIC, _USER_DEFINED))
+    vertical = codes.get(_VERTICAL, 0)
+    if horizontal in (0, _USER_DEFINED) or vertical == _USER_DEFINED:
+        return None
+    return f"EPSG:{horizontal}+{vertical}" if vertical else f"EPSG:{horizontal}"
 
 
 @contextmanager
@@ -232,10 +229,8 @@ class LazFile:
         import laspy
 
         record = laspy.ScaleAwarePointRecord.zeros(len(position), header=self._header)
-        for column, name in enumerate(("x", "y", "z")):
-            setattr(record, name, position[:, column])
-        record["return_number"][:] = 1
-        record["number_of_returns"][:] = 1
+        record[["x", "y", "z"]] = position
+        record["return_number"][:] = record["number_of_returns"][:] = 1
         return record
 
 
@@ -252,10 +247,8 @@ class LazWriter(LazFile):
             OverflowError: a coordinate is further from `near` than the file's integers reach (2147 km or 2.1°).
         """
         record = self._record(points.position)
-        for column, name in enumerate(("red", "green", "blue")):
-            setattr(record, name, points.rgb[:, column].astype(np.uint16) * _RGB16)
-        for column, name in enumerate(("nx", "ny", "nz")):
-            record[name] = points.normal[:, column]
+        record[["red", "green", "blue"]] = points.rgb.astype(np.uint16) * _RGB16
+        record[["nx", "ny", "nz"]] = points.normal
         record["sigma_h"], record["sigma_v"] = points.sigma_h_m, points.sigma_v_m
         record["classification"] = points.classification
         for name, (row, column) in _COVARIANCE.items():
@@ -316,8 +309,7 @@ class MovedWriter(LazFile):
     def write(self, points: MovedPoints) -> None:
         """Append points; errors as of `LazWriter.write`."""
         record = self._record(points.position)
-        for column, name in enumerate(("nx", "ny", "nz")):
-            record[name] = points.normal[:, column]
+        record[["nx", "ny", "nz"]] = points.normal
         record["distance"], record["sigma"], record["lod"] = points.distance_m, points.sigma_m, points.lod_m
         record["significant"] = np.abs(points.distance_m) > points.lod_m
         self._writer.write_points(record)

@@ -8,6 +8,7 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 
 from pipelines.core.types import ByteArray, FloatArray, IntArray
+from pipelines.formats.cloud_ply import COLOURS, set_columns
 from pipelines.formats.gltf import Y_UP_FROM_Z_UP, glb_of
 
 _FLOAT, _UNSIGNED_INT, _ARRAY, _ELEMENTS = 5126, 5125, 34962, 34963
@@ -16,13 +17,9 @@ _FLOAT, _UNSIGNED_INT, _ARRAY, _ELEMENTS = 5126, 5125, 34962, 34963
 def write_mesh_ply(path: Path, vertices: FloatArray, faces: IntArray, rgb: ByteArray, *, double: bool) -> None:
     """Write vertices (V, 3) with colours (V, 3) and faces (F, 3); coordinates are doubles or floats."""
     kind = "<f8" if double else "<f4"
-    vertex = np.empty(
-        len(vertices), [*((axis, kind) for axis in "xyz"), *((c, "u1") for c in ("red", "green", "blue"))]
-    )
-    for column, axis in enumerate("xyz"):
-        vertex[axis] = vertices[:, column]
-    for column, name in enumerate(("red", "green", "blue")):
-        vertex[name] = rgb[:, column]
+    vertex = np.empty(len(vertices), [*((axis, kind) for axis in "xyz"), *((colour, "u1") for colour in COLOURS)])
+    set_columns(vertex, "xyz", vertices)
+    set_columns(vertex, COLOURS, rgb)
     face = np.empty(len(faces), [("vertex_indices", "<i4", (3,))])
     face["vertex_indices"] = faces
     elements = [PlyElement.describe(vertex, "vertex"), PlyElement.describe(face, "face")]
