@@ -117,14 +117,10 @@ def compare_test_views(
             if place < saved:
                 save_render(name, _side_by_side(photo, render, figures))
             task.advance()
+    means = ("psnr", "psnr_compensated", "ssim", "psnr_covered", "covered_share", "lpips")
     return PhotometricFigures(
         views=len(views),
-        psnr=_mean(view.psnr for view in views),
-        psnr_compensated=_mean(view.psnr_compensated for view in views),
-        ssim=_mean(view.ssim for view in views),
-        psnr_covered=_mean(view.psnr_covered for view in views),
-        covered_share=_mean(view.covered_share for view in views),
-        lpips=_mean(view.lpips for view in views),
+        **{name: _mean(getattr(view, name) for view in views) for name in means},
         lpips_reason=_NO_WEIGHTS if distance is None else None,
         per_view=tuple(views),
     )
@@ -132,13 +128,11 @@ def compare_test_views(
 
 def _through_lens(renderer: ModelRenderer, index: int) -> Tensor:
     colour, trained = renderer.render(index).colour.cpu(), renderer.trained
-    camera_id = int(trained.sparse.image_camera_id[index])
-    for lens in trained.model.vignetting:
-        if lens.camera_id == camera_id:
-            pinhole = renderer.pinholes.of(index)
-            radius2 = squared_radius(pinhole, pinhole, colour.device)
-            return with_vignetting(colour, radius2, torch.tensor(lens.coefficients))
-    return colour
+    camera_id, pinhole = int(trained.sparse.image_camera_id[index]), renderer.pinholes.of(index)
+    lens = next((lens for lens in trained.model.vignetting if lens.camera_id == camera_id), None)
+    if lens is None:
+        return colour
+    return with_vignetting(colour, squared_radius(pinhole, pinhole, colour.device), torch.tensor(lens.coefficients))
 
 
 def _mean(values: Iterable[float | None]) -> float | None:

@@ -40,7 +40,7 @@ from pipelines.surface.m3c2 import TiledPoints, plane_normals, spacing_of
 from pipelines.surface.measured_cloud import CloudReader, MeasuredCloud, Thinning, read_thinned
 from pipelines.surface.registration import fit_alignment
 from pipelines.surface.surface_views import ModelRenderer, SurfaceViews
-from pipelines.surface.visibility import SeenSurface, Viewpoints, seen_surface
+from pipelines.surface.visibility import Viewpoints, seen_surface
 from pipelines.survey.report_parts import ReferenceComparison, ReferenceShift
 from pipelines.survey.trained_survey import TrainedSurvey, scene_points
 
@@ -90,7 +90,11 @@ def compare_with_reference(
     reference = _sorted_reference(files, trained.survey.origin, box, scratch / "reference", progress)
     spacing_m = spacing_of(reference, min(THRESHOLDS_M) / 2)
     settings = ComparisonSettings.of_spacings(spacing_m, fusion.spacing_m, min(THRESHOLDS_M), box)
-    tally = _compare(reference, model, seen, settings, progress)
+    tally, squares = DistanceTally(), sorted({*reference.count, *model.count})
+    with progress.task("squares of the reference", len(squares)) as task:
+        for square in squares:
+            tally.add(compare_square(square, reference, model, seen, settings))
+            task.advance()
     cores = tally.cores()
     sigma_m = _georeference_sigma(cores.position, cores.normal, trained, grid)
     known = np.zeros(len(cores.position)) if sigma_m is None or moved is not None else sigma_m
@@ -112,21 +116,6 @@ def compare_with_reference(
     )
     remove(scratch)
     return ComparedReference(comparison, cores, lod_m, files.assumptions)
-
-
-def _compare(
-    reference: TiledPoints,
-    model: TiledPoints,
-    seen: SeenSurface,
-    settings: ComparisonSettings,
-    progress: Progress,
-) -> DistanceTally:
-    tally, squares = DistanceTally(), sorted({*reference.count, *model.count})
-    with progress.task("squares of the reference", len(squares)) as task:
-        for square in squares:
-            tally.add(compare_square(square, reference, model, seen, settings))
-            task.advance()
-    return tally
 
 
 def _model(
@@ -238,7 +227,5 @@ def draw_reference(found: ComparedReference, folder: Path) -> None:
     if len(groups) == 1:
         groups = {"all": distance_m}
     place, size_m = cores.position[known], found.comparison.cylinder_m
-    write_distance_map(folder / REFERENCE_MAP.rpartition("/")[2], place[:, :2], distance_m, size_m)
-    write_distance_histogram(
-        folder / REFERENCE_HISTOGRAM.rpartition("/")[2], groups, float(np.median(lod_m[known]))
-    )
+    write_distance_map(folder / Path(REFERENCE_MAP).name, place[:, :2], distance_m, size_m)
+    write_distance_histogram(folder / Path(REFERENCE_HISTOGRAM).name, groups, float(np.median(lod_m[known])))
