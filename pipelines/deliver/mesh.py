@@ -102,8 +102,10 @@ def run(stage: StageRun, options: ExportMeshOptions) -> Summary:
         "texture_px": len(shown.image),
         "crs": None if target is None else target.crs.name,
     }
-    key = f"{len(mesh.faces)} faces of {simple.faces_before}, voxels of {voxel_m:.3f} m, simplified by "
-    key += f"{simple.rms_error_m:.3f} m RMS, {simple.largest_error_m:.3f} m at most"
+    key = (
+        f"{len(mesh.faces)} faces of {simple.faces_before}, voxels of {voxel_m:.3f} m, simplified by "
+        f"{simple.rms_error_m:.3f} m RMS, {simple.largest_error_m:.3f} m at most"
+    )
     return Summary(key, values, cautions=placement.cautions)
 
 

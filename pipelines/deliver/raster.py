@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter
 from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.files import remove, replace_text
 from pipelines.core.products import Remark, union
-from pipelines.core.types import BoolArray, ByteArray, FloatArray
+from pipelines.core.types import ByteArray, FloatArray
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import ExportRasterOptions
 from pipelines.deliver.placement import median_values, require_space, scene_sigma
@@ -75,8 +75,8 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
     bounds = [[west, south, height.min()], [east, north, height.max()]]
     detail = (
         f"The model was trained at {training_m:.3f} m a pixel on the ground, and shows no finer detail, whatever "
+        "the size of a raster's cells."
     )
-    detail += "the size of a raster's cells."
     coarse = (Remark(code="detail-of-training", sentence=detail),) if source.training_px > _DETAIL else ()
     empty = "The rasters state no σ, and sigma_h.tif and sigma_v.tif are empty"
     cautions = union(trained.model.cautions, (*coarse, *without_sigma(empty, reason)))
@@ -89,7 +89,12 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
         _write_pictures(stage.out, target.horizontal_unit_m / target.crs.height_unit_m)
     of_ground = options.contours_of == "terrain" and source.terrain is not None
     heights = stage.out / ("dtm.tif" if of_ground else "dsm.tif")
-    lines = _write_contours(heights, frame, options.contours) if options.contours else 0
+    lines: list[ContourLine] = []
+    if options.contours:
+        height, _ = read_reduced(heights, _CONTOUR_PX)
+        lines = _contour_lines(height[0].astype(np.float64), frame, options.contours)
+        write_contours_gpkg(stage.out / "contours.gpkg", lines, frame.wkt)
+        write_contours_dxf(stage.out / "contours.dxf", lines)
     measured, interpolated = mosaic.shares()
     source.views.close()
     remove(mosaic.folder)
@@ -113,7 +118,7 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
             "measured": measured,
             "interpolated": interpolated,
             **median_values(sigma, "cell"),
-            "contour_lines": lines,
+            "contour_lines": len(lines),
             "assumed": "; ".join(target.assumed),
         },
         warnings,
@@ -153,16 +158,6 @@ def _hillshade(height: FloatArray, cell: float) -> ByteArray:
     return np.asarray(np.round(255 * np.clip(light, 0.0, 1.0)), dtype=np.uint8)
 
 
-def _write_contours(heights: Path, frame: RasterFrame, interval: float) -> int:
-    """Write `contours.gpkg` and `contours.dxf` beside a raster of heights, and return the number of lines."""
-    height, _ = read_reduced(heights, _CONTOUR_PX)
-    folder = heights.parent
-    lines = _contour_lines(height[0].astype(np.float64), frame, interval)
-    write_contours_gpkg(folder / "contours.gpkg", lines, frame.wkt)
-    write_contours_dxf(folder / "contours.dxf", lines)
-    return len(lines)
-
-
 def _contour_lines(height: FloatArray, frame: RasterFrame, interval: float) -> list[ContourLine]:
     """Return contour lines of a surface, lowest first, no short ones; an InputError: the interval is too small.
 
@@ -185,7 +180,10 @@ def _contour_lines(height: FloatArray, frame: RasterFrame, interval: float) -> l
     step = (east - west) / height.shape[1], (north - south) / height.shape[0]
     x = west + (np.arange(height.shape[1]) + 0.5) * step[0]
     y = north - (np.arange(height.shape[0]) + 0.5) * step[1]
-    generator = contourpy.contour_generator(x, y, np.ma.masked_invalid(_smoothed(height, known)))
+    weight = gaussian_filter(known.astype(np.float64), _SMOOTHED, mode="constant")
+    total = gaussian_filter(np.where(known, height, 0.0), _SMOOTHED, mode="constant")
+    smooth = np.ma.masked_where(~known, total / np.maximum(weight, 1e-9))
+    generator = contourpy.contour_generator(x, y, smooth)
     lines = []
     for level in levels:
         for xy in generator.lines(float(level)):
@@ -194,10 +192,3 @@ def _contour_lines(height: FloatArray, frame: RasterFrame, interval: float) -> l
             if length >= _LEAST_CELLS * step[0]:
                 lines.append(ContourLine(float(level), points, round(level / interval) % _EVERY_MAJOR == 0))
     return lines
-
-
-def _smoothed(height: FloatArray, known: BoolArray) -> FloatArray:
-    """Return heights (H, W), smoothed over what is known; NaN elsewhere."""
-    weight = gaussian_filter(known.astype(np.float64), _SMOOTHED, mode="constant")
-    total = gaussian_filter(np.where(known, height, 0.0), _SMOOTHED, mode="constant")
-    return np.where(known, total / np.maximum(weight, 1e-9), np.nan)

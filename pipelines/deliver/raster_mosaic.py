@@ -91,7 +91,10 @@ class Mosaic:
         with progress.task("windows", len(windows)) as task:
             for window in windows:
                 if not all(self._part(self._seen, name, window).exists() for name in _SEEN):
-                    self._write(self._seen, window, _seen_bands(source, window))
+                    cells = render_window(source, window.frame, window.column, window.row)
+                    heights = (cells.height, cells.modelled, cells.sigma_h_m, cells.sigma_v_m)
+                    bands = [cells.rgba, *(values[None].astype(np.float32) for values in heights)]
+                    self._write(self._seen, window, dict(zip(_SEEN, bands, strict=True)))
                 task.advance()
         self._drop_islands()
         for name in ("orthophoto", "dsm", "modelled"):
@@ -100,10 +103,8 @@ class Mosaic:
         with progress.task("whole windows", len(windows)) as task:
             for window in windows:
                 if not all(self._part(self._whole, name, window).exists() for name in self._kinds):
-                    cells = whole_cells(
-                        source, self._seen_around(window), self._coarse, (window.row, window.column)
-                    )
-                    self._write(self._whole, window, cells)
+                    seen, first = self._seen_around(window), (window.row, window.column)
+                    self._write(self._whole, window, whole_cells(source, seen, self._coarse, first))
                 task.advance()
 
     def _drop_islands(self) -> None:
@@ -135,10 +136,8 @@ class Mosaic:
         top, left = max(row - REACH, 0), max(column - REACH, 0)
         rows = min(row + window.frame.rows + REACH, self.frame.rows) - top
         columns = min(column + window.frame.columns + REACH, self.frame.columns) - left
-        frame, part = (
-            self.frame.part(left, top, columns, rows),
-            (slice(top, top + rows), slice(left, left + columns)),
-        )
+        frame = self.frame.part(left, top, columns, rows)
+        part = (slice(top, top + rows), slice(left, left + columns))
         sigma_h, sigma_v = (read_cells(self._part(self._seen, name, window))[0] for name in ("sigma_h", "sigma_v"))
         return SeenCells(
             frame=frame,
@@ -246,10 +245,3 @@ def _coarse_cells(window: _Window, step: int) -> tuple[IntArray, IntArray]:
     rows = (window.row + np.arange(window.frame.rows, dtype=np.int64)) // step
     columns = (window.column + np.arange(window.frame.columns, dtype=np.int64)) // step
     return rows[:, None], columns[None, :]
-
-
-def _seen_bands(source: RasterSource, window: _Window) -> dict[str, NDArray[Any]]:
-    """Return the bands (B, H, W) of the rasters of what is measured in a window."""
-    cells = render_window(source, window.frame, window.column, window.row)
-    heights = dict(zip(_SEEN[1:], (cells.height, cells.modelled, cells.sigma_h_m, cells.sigma_v_m), strict=True))
-    return {"orthophoto": cells.rgba, **{name: values[None].astype(np.float32) for name, values in heights.items()}}

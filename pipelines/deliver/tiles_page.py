@@ -10,7 +10,7 @@ import hashlib
 import html
 import itertools
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Literal
@@ -29,7 +29,6 @@ from pipelines.deliver.placement import Placement
 from pipelines.geodesy.crs import PointCrs
 from pipelines.geodesy.enu import (
     SEMI_MAJOR_M,
-    Origin,
     ecef_from_enu,
     ecef_from_enu_rotation,
     ecef_from_lla,
@@ -65,11 +64,14 @@ class Fact(Product):
     value: ShownText
 
 
+PointKind = Literal["control", "check"]
+
+
 class PagePoint(Product):
     """Control or check point with its surveyed place in EPSG:4978."""
 
     name: ShownText
-    kind: Literal["control", "check"]
+    kind: PointKind
     ecef: Vector3
 
 
@@ -139,6 +141,10 @@ def scene_page(
         placement: of its frame `file`.
         center_in_file: (N, 3) centres of its Gaussians, metres.
     """
+    kinds: dict[PointKind, Sequence[SurveyedPoint]] = {
+        "control": survey.control_points,
+        "check": survey.check_points,
+    }
     distance_m = np.linalg.norm(center_in_file, axis=1)
     radius = max(float(np.quantile(distance_m, _SHOWN)), _LEAST_RADIUS_M)
     box = float(np.clip(_CRS_BOX * radius, _LEAST_CRS_BOX_M, _MOST_CRS_BOX_M))
@@ -150,9 +156,10 @@ def scene_page(
         radius_m=radius,
         facts=_facts(placement, target),
         cautions=tuple(caution.sentence for caution in placement.cautions),
-        points=(
-            *_points("control", survey.control_points, survey.origin),
-            *_points("check", survey.check_points, survey.origin),
+        points=tuple(
+            PagePoint(name=point.name, kind=kind, ecef=vector3(ecef_from_enu(point.position_in_geo, survey.origin)))
+            for kind, points in kinds.items()
+            for point in points
         ),
         crs=fit_local_crs(target.crs, placement.origin_lla, (box, box, box)),
     )
@@ -192,26 +199,17 @@ def _policy(program: str, cesium: str) -> str:
     )
 
 
-def _points(
-    kind: Literal["control", "check"], points: Sequence[SurveyedPoint], origin: Origin
-) -> Iterator[PagePoint]:
-    for point in points:
-        ecef = ecef_from_enu(point.position_in_geo, origin)
-        yield PagePoint(name=point.name, kind=kind, ecef=vector3(ecef))
-
-
 def _facts(placement: Placement, target: TargetCrs) -> tuple[Fact, ...]:
-    accuracy = "not known: nothing states it yet (georef evaluate)"
-    if placement.accuracy is not None:
-        accuracy = placement.accuracy.text
+    accuracy = placement.accuracy
     input_heights = placement.vertical.name + ("" if placement.vertical.stated else " (assumed)")
     facts = (
-        Fact(name="CRS", value=target.crs.name),
-        Fact(name="Heights", value=f"{target.crs.vertical.name}; of the survey's input: {input_heights}"),
-        Fact(name="h", value="height above the WGS84 ellipsoid; labels stand at it, too"),
-        Fact(name="Accuracy", value=accuracy),
+        ("CRS", target.crs.name),
+        ("Heights", f"{target.crs.vertical.name}; of the survey's input: {input_heights}"),
+        ("h", "height above the WGS84 ellipsoid; labels stand at it, too"),
+        ("Accuracy", "not known: nothing states it yet (georef evaluate)" if accuracy is None else accuracy.text),
+        *(("Assumed", sentence) for sentence in target.assumed),
     )
-    return facts + tuple(Fact(name="Assumed", value=sentence) for sentence in target.assumed)
+    return tuple(Fact(name=name, value=value) for name, value in facts)
 
 
 def fit_local_crs(crs: PointCrs, origin_lla: ArrayLike, half_extent_m: Vector3) -> LocalCrs:

@@ -95,9 +95,8 @@ def _side_px(sparse: SparseModel) -> int:
 def _cut(photograph: ByteArray, name: str, wanted: WantedChip, side: int) -> Chip:
     """Return the piece around a mark, moved into the photograph at its rim; a smaller photograph ends in black."""
     height, width = photograph.shape[:2]
-    corner = (
-        np.floor(np.array(wanted.mark) - side / 2).astype(int).clip(0, np.maximum([width, height], side) - side)
-    )
+    last = np.maximum([width, height], side) - side
+    corner = np.floor(np.array(wanted.mark) - side / 2).astype(int).clip(0, last)
     piece = np.zeros((side, side, 3), dtype=np.uint8)
     part = photograph[corner[1] : corner[1] + side, corner[0] : corner[0] + side]
     piece[: part.shape[0], : part.shape[1]] = part
@@ -158,15 +157,10 @@ def points_facts(
 ) -> tuple[PointsFacts, PointsFacts]:
     """Return the control and check points of an evaluated survey, with 240 chips at most."""
     survey, report = evaluated.solved.survey, evaluated.report
+    checked = report.checkpoints.triangulated.points
     groups = (
         _group(evaluated, "control", survey.control_points, report.fit.gcp.points, "fit.gcp.points"),
-        _group(
-            evaluated,
-            "check",
-            survey.check_points,
-            report.checkpoints.triangulated.points,
-            "checkpoints.triangulated.points",
-        ),
+        _group(evaluated, "check", survey.check_points, checked, "checkpoints.triangulated.points"),
     )
     total = sum(len(group.points) for group in groups)
     each = min(chips_a_point, max(1, _MOST_CHIPS // total)) if total else 0

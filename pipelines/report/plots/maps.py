@@ -42,7 +42,9 @@ def write_ticks(axes: Axes, coordinates: MapCoordinates) -> None:
     from matplotlib.ticker import FuncFormatter
 
     (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
-    decimals = _decimals(min(east - west, north - south), coordinates.unit)
+    # As many decimals as state a coordinate to a hundredth of the map's side, or better.
+    step = min(east - west, north - south) / 100 / (_METRES_PER_DEGREE if coordinates.unit == "°" else 1.0)
+    decimals = max(0, math.ceil(-math.log10(step)))
 
     def text(value: float, axis: int) -> str:
         place = np.array([[value, south]] if axis == 0 else [[west, value]])
@@ -80,12 +82,6 @@ def draw_north(figure: Figure, axes: Axes) -> None:
         arrowprops={"arrowstyle": "-|>", "color": look.DARK, "shrinkA": 0, "shrinkB": 0, "linewidth": 1.4},
     )
     figure.text(x, head, "N", ha="center", va="bottom", fontsize=look.LABEL_POINTS, color=look.DARK)
-
-
-def _decimals(side_m: float, unit: str) -> int:
-    """Return the decimals that state a coordinate to a hundredth of a map's side, or better."""
-    step = side_m / 100 / (_METRES_PER_DEGREE if unit == "°" else 1.0)
-    return max(0, math.ceil(-math.log10(step)))
 
 
 # Of the picture, in inches: the longer side of a map, and the room around each map for what is written there.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -139,15 +140,8 @@ def curves(abscissa_title: str, panels: Mapping[str, Mapping[str, tuple[FloatArr
 
 
 def _draw_lines(axes: Axes, quantity: str, lines: Mapping[str, tuple[FloatArray, FloatArray]]) -> None:
-    styles = (
-        (look.BLUE, "-"),
-        (look.ORANGE, "-"),
-        (look.DARK, "-"),
-        (look.BLUE, "--"),
-        (look.ORANGE, "--"),
-        (look.DARK, "--"),
-    )
-    for (name, (x, y)), (colour, dash) in zip(lines.items(), styles, strict=False):
+    styles = itertools.product(("-", "--"), look.SERIES_COLOURS)
+    for (name, (x, y)), (dash, colour) in zip(lines.items(), styles, strict=False):
         axes.plot(x, y, label=name, color=colour, linestyle=dash, linewidth=1.3)
     positive = [value for _, y in lines.values() for value in y if value > 0]
     if len(lines) > 1:

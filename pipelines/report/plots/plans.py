@@ -19,7 +19,6 @@ from pipelines.report.plots import style as look
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.transforms import Bbox
 
 LONGER_INCHES = 4.6
 _LEFT, _RIGHT, _BELOW, _ABOVE = 0.85, 0.25, 0.6, 0.4  # around the map, in inches
@@ -151,19 +150,15 @@ def add_names(figure: Figure, axes: Axes, places: FloatArray, names: Sequence[st
                 parse_math=False,  # A name may hold what is a formula elsewhere.
             )
             box = text.get_window_extent(renderer)
-            free = not any(box.overlaps(other) for other in taken) and not _holds_any(box, symbols)
+            around = box.padded(_SIGN_DOTS)
+            on_sign = ((symbols > around.min) & (symbols < around.max)).all(axis=1).any()
+            free = not on_sign and not any(box.overlaps(other) for other in taken)
             if free and inside.contains(box.x0, box.y0) and inside.contains(box.x1, box.y1):
                 taken.append(box)
                 written += 1
                 break
             text.remove()
     return written
-
-
-def _holds_any(box: Bbox, places: FloatArray) -> bool:
-    """Return whether a sign at places (N, 2) in dots touches a box."""
-    low, high = np.array([box.x0, box.y0]) - _SIGN_DOTS, np.array([box.x1, box.y1]) + _SIGN_DOTS
-    return bool(((places > low) & (places < high)).all(axis=1).any())
 
 
 def nice_number(most: float) -> float:
