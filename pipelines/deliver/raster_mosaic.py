@@ -93,7 +93,10 @@ class Mosaic:
                 if not all(self._part(self._seen, name, window).exists() for name in _SEEN):
                     cells = render_window(source, window.frame, window.column, window.row)
                     heights = (cells.height, cells.modelled, cells.sigma_h_m, cells.sigma_v_m)
-                    bands = [cells.rgba, *(values[None].astype(np.float32) for values in heights)]
+                    bands: list[NDArray[Any]] = [
+                        cells.rgba,
+                        *(values[None].astype(np.float32) for values in heights),
+                    ]
                     self._write(self._seen, window, dict(zip(_SEEN, bands, strict=True)))
                 task.advance()
         self._drop_islands()

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.ndimage import median
 
 from pipelines.core.types import ByteArray, FloatArray
 from pipelines.report.plots import style as look
@@ -125,6 +124,8 @@ def _medians(
     place_m: FloatArray, values: FloatArray, low: FloatArray, high: FloatArray, cell_m: float
 ) -> FloatArray:
     """Return the medians (R, C) of values in cells, rows from the south; NaN: none."""
+    from scipy.ndimage import median
+
     columns, rows = (np.ceil((high - low) / cell_m).astype(int)).tolist()
     raster = np.full((rows, columns), np.nan)
     cell = np.floor((place_m - low) / cell_m).astype(np.int64)
