@@ -39,11 +39,7 @@ class DroneTags:
 
 
 def with_tags(jpeg: bytes, tags: DroneTags) -> bytes:
-    """Return the JPEG with an EXIF and an XMP segment at its start.
-
-    Raises:
-        InputError: not a JPEG.
-    """
+    """Return the JPEG with an EXIF and an XMP segment at its start; an InputError: not a JPEG."""
     if jpeg[:2] != b"\xff\xd8":
         raise InputError("not-a-jpeg", "EXIF can be written into a JPEG only; the image is not one.")
     exif = _segment(_exif(tags))

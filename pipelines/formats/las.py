@@ -62,11 +62,7 @@ class LasFile:
     crs: str | None
 
     def chunks(self, size: int) -> Iterator[CloudChunk]:
-        """Yield all points in chunks of at most `size`.
-
-        Raises:
-            InputError: the file is damaged.
-        """
+        """Yield all points in chunks of at most `size`; an InputError: the file is damaged."""
         import laspy
 
         done = 0

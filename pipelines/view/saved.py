@@ -13,9 +13,9 @@ import uuid
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-import numpy as np
+import shapely
 from pydantic import Field, ValidationError
 
 from pipelines.core.errors import InputError, storage_failures
@@ -181,20 +181,14 @@ def tables_of(measurements: Sequence[NamedMeasurement]) -> dict[str, str]:
             first = each.points[0]
             place = (*first.xyz, *(first.sigma_m or ("", "", ""))) if kind == "point" else ("",) * 6
             found = {quantity.name: quantity for quantity in each.quantities}
-            values = [
-                value
-                for name in names
-                for value in _cells(found.get(name))
-            ]  # fmt: skip
+            values: list[object] = []
+            for one in map(found.get, names):
+                values += (
+                    ["", "", ""] if one is None else [one.value, "" if one.sigma is None else one.sigma, one.unit]
+                )
             lines.append([each.name, _wkt(each), each.crs, *place, *values])
         tables[file] = table_text(lines)
     return tables
-
-
-def _cells(quantity: Quantity | None) -> tuple[object, object, object]:
-    if quantity is None:
-        return "", "", ""
-    return quantity.value, "" if quantity.sigma is None else quantity.sigma, quantity.unit
 
 
 def _wkt(measurement: NamedMeasurement) -> str:
@@ -238,22 +232,14 @@ def read_measurements(folder: Path) -> list[NamedMeasurement]:
 
 def _feature(measurement: NamedMeasurement) -> Json:
     """Return the feature: a Point, a LineString or a Polygon in longitude, latitude and ellipsoidal height."""
-    lon_lat_h = [[point.lla[1], point.lla[0], point.lla[2]] for point in measurement.points]
-    geometry: dict[str, Any]
+    lon_lat_h = [(point.lla[1], point.lla[0], point.lla[2]) for point in measurement.points]
     if len(lon_lat_h) == 1:
-        geometry = {"type": "Point", "coordinates": lon_lat_h[0]}
+        shape = shapely.Point(lon_lat_h[0])
     elif measurement.kind in CLOSED and len(lon_lat_h) > 2:
-        geometry = {"type": "Polygon", "coordinates": [_anticlockwise(lon_lat_h)]}
+        shape = shapely.orient_polygons(shapely.Polygon(lon_lat_h))
     else:
-        geometry = {"type": "LineString", "coordinates": lon_lat_h}
+        shape = shapely.LineString(lon_lat_h)
     values = {quantity.name: quantity.value for quantity in measurement.quantities}
     sigmas = {f"sigma of {quantity.name}": quantity.sigma for quantity in measurement.quantities}
     own = {"name": measurement.name, "kind": measurement.kind, **values, **sigmas}
-    return feature(geometry, {**own, "georef": measurement.model_dump(mode="json")})
-
-
-def _anticlockwise(ring: list[list[float]]) -> list[list[float]]:
-    x, y = (np.array([point[axis] for point in ring]) for axis in (0, 1))
-    area = float((x - x[0]) @ np.roll(y - y[0], -1) - (y - y[0]) @ np.roll(x - x[0], -1))
-    turned = ring if area > 0 else ring[::-1]
-    return [*turned, turned[0]]
+    return feature(shapely.geometry.mapping(shape), {**own, "georef": measurement.model_dump(mode="json")})

@@ -338,9 +338,7 @@ class _BadRequestError(Exception):
 
 
 def _job_json(job: Job) -> dict[str, Any]:
-    return {
-        "number": job.number, "state": job.state, "share": job.share, "answer": job.answer, "failure": job.failure
-    }  # fmt: skip
+    return {name: getattr(job, name) for name in ("number", "state", "share", "answer", "failure")}
 
 
 @contextlib.contextmanager
