@@ -127,7 +127,7 @@ def _write_in_frame(
 def _require_memory(cells: int, voxel_m: float) -> None:
     """Refuse a mesh that the memory would not hold, by the number of cells with surface."""
     needed, free = _FIXED_BYTES + _CELL_BYTES * cells, free_main_memory_bytes()
-    if free is not None and needed > free:
+    if needed > free:
         raise ResourceError(
             "mesh-memory",
             f"The mesh with voxels of {voxel_m:.3f} m may need {needed / 2**30:.1f} GiB of memory; "
