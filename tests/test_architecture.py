@@ -72,6 +72,8 @@ HOMES: dict[str, tuple[str, ...]] = {
         *STAGE_ROOMS,
     ),
     "filelock": ("pipelines.core",),
+    "psutil": ("pipelines.core.machine",),
+    "PIL": ("pipelines.formats.exif_writer",),
     "laspy": ("pipelines.formats",),
     "pillow_heif": ("pipelines.formats.heif",),
     "py4dgeo": ("pipelines.surface.m3c2",),
