@@ -100,7 +100,7 @@ HOMES: dict[str, tuple[str, ...]] = {
 }
 # The entry point of a process whose log records go to its parent.
 CHILD = "pipelines.core.child"
-CORE_LIBRARIES = {"filelock", "numpy", "pydantic"}
+CORE_LIBRARIES = {"filelock", "numpy", "psutil", "pydantic"}
 
 
 def inside(module: str, room: str) -> bool:
