@@ -84,7 +84,9 @@ def guarded(group: click.Group, arguments: Sequence[str] | None) -> int:
     words = sys.argv[1:] if arguments is None else arguments
     as_json, tells_progress = "--json" in words, "--json-progress" in words
     try:
-        _escape_on_stdout()
+        if isinstance(sys.stdout, io.TextIOWrapper):
+            # As on stderr, characters that the encoding lacks are escaped: a pipe on Windows has no σ.
+            sys.stdout.reconfigure(errors="backslashreplace")
         with _signals_interrupt():
             code = group.main(args=arguments, prog_name=group.name, standalone_mode=False)
             sys.stdout.flush()
@@ -127,12 +129,6 @@ def _drop_stdout() -> None:
 def safe_traceback(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
     """Print the traceback of an exception that nobody foresaw, as Python does, but safe for a terminal."""
     _say(printable_lines("".join(tracebacks.format_exception(kind, error, traceback)).rstrip("\n")))
-
-
-def _escape_on_stdout() -> None:
-    """Make stdout escape characters that its encoding lacks, as stderr does: a pipe on Windows has no σ."""
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")
 
 
 @contextmanager

@@ -71,7 +71,10 @@ def stage_option(options_type: type[StageOptions], name: str) -> click.Option:
     help_text = " ".join(filter(None, [info.description, _default_and_range(info)]))
     if WRITTEN in marks_of(info):
         return click.Option([flag, name], type=click.STRING, default=None, help=help_text)
-    kind = _bare_type(info.annotation)
+    kind: Any = info.annotation
+    if get_origin(kind) in (Union, types.UnionType):
+        (kind,) = [member for member in get_args(kind) if member is not type(None)]
+    kind = get_args(kind)[0] if get_origin(kind) is Annotated else kind
     if kind is bool:
         return click.Option(
             [f"{flag}/--no-{flag.removeprefix('--')}", name], is_flag=True, default=None, help=help_text
@@ -93,13 +96,6 @@ def given(ctx: click.Context, names: Iterable[str]) -> dict[str, Any]:
         for name in names
         if name in ctx.params and ctx.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE
     }
-
-
-def _bare_type(annotation: Any) -> Any:
-    """Return the type without `| None` and `Annotated`."""
-    if get_origin(annotation) in (Union, types.UnionType):
-        (annotation,) = [member for member in get_args(annotation) if member is not type(None)]
-    return get_args(annotation)[0] if get_origin(annotation) is Annotated else annotation
 
 
 def _click_type(kind: Any) -> click.ParamType[Any]:

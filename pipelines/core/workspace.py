@@ -245,7 +245,12 @@ class Workspace:
         """
         with storage_failures(self.written), WriteLock(self.written).hold(activity):
             for spec in STAGES:
-                self._recover(spec)
+                final, old = self.written / spec.folder, self.written / f".{spec.folder}.old"
+                if (self.partial(spec) / MANIFEST).exists():  # complete: only the renames are missing
+                    self._swap(spec)
+                elif old.exists() and not final.exists():
+                    old.rename(final)
+                remove(old)
             yield
 
     def has_product(self) -> bool:
@@ -256,14 +261,6 @@ class Workspace:
         """Return whether a command has been at work here."""
         begun = (self.root / REQUESTS, *(self.partial(spec) for spec in STAGES))
         return self.has_product() or any(path.exists() for path in begun)
-
-    def _recover(self, spec: StageSpec) -> None:
-        final, old = self.written / spec.folder, self.written / f".{spec.folder}.old"
-        if (self.partial(spec) / MANIFEST).exists():  # complete: only the renames are missing
-            self._swap(spec)
-        elif old.exists() and not final.exists():
-            old.rename(final)
-        remove(old)
 
     def _swap(self, spec: StageSpec) -> None:
         final, old, partial = self.written / spec.folder, self.written / f".{spec.folder}.old", self.partial(spec)

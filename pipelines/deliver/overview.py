@@ -143,7 +143,13 @@ def overview(workspace: Workspace, options: CrsOptions) -> Overview:
     with contextlib.suppress(GeorefError):  # not evaluated, or damaged: `georef status` tells
         report = read_report(workspace.path(REPORT))
     test = None if report is None else report.test_views
-    states = {BY_NAME[row.stage].folder: row for row in rows}
+    states, made = {BY_NAME[row.stage].folder: row for row in rows}, []
+    for name, description in DESCRIPTIONS.items():
+        path, row = workspace.root / name, states.get(name.partition("/")[0])
+        if row is not None and path.exists():
+            inside = path.rglob("*") if path.is_dir() else (path,)
+            size = sum(file.stat().st_size for file in inside if file.is_file())
+            made.append(MadeFile(name, description, size, row.finished, row.state))
     return Overview(
         workspace=workspace.root,
         gaussians=len(means),
@@ -152,7 +158,7 @@ def overview(workspace: Workspace, options: CrsOptions) -> Overview:
         accuracy=placement.accuracy,
         psnr=None if test is None else test.psnr,
         area_ha=None if report is None else report.area_ha,
-        files=_files(workspace, states),
+        files=tuple(made),
         outdated=tuple(row for row in rows if row.state in ("stale", "damaged")),
         interrupted={row.stage: row.interrupted for row in rows if row.interrupted},
         further=tuple(spec for spec in DELIVERABLES if not (workspace.root / spec.product).exists()),
@@ -179,14 +185,3 @@ def _bounds(points_in_geo: FloatArray, survey: Survey, options: CrsOptions) -> B
         high=vector3(high),
         assumed=crs.assumed,
     )
-
-
-def _files(workspace: Workspace, states: dict[str, StageState]) -> tuple[MadeFile, ...]:
-    made = []
-    for name, description in DESCRIPTIONS.items():
-        path, row = workspace.root / name, states.get(name.partition("/")[0])
-        if row is not None and path.exists():
-            inside = path.rglob("*") if path.is_dir() else (path,)
-            size = sum(file.stat().st_size for file in inside if file.is_file())
-            made.append(MadeFile(name, description, size, row.finished, row.state))
-    return tuple(made)

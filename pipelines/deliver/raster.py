@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter
 from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.files import remove, replace_text
 from pipelines.core.products import Remark, union
-from pipelines.core.types import ByteArray, FloatArray
+from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import ExportRasterOptions
 from pipelines.deliver.placement import median_values, require_space, scene_sigma
@@ -135,27 +135,21 @@ def _write_pictures(folder: Path, heights_by_plan: float) -> None:
     """
     rgba, _ = read_reduced(folder / "orthophoto.tif", _PICTURE_PX)
     cv2.imwrite(str(folder / "preview.png"), np.ascontiguousarray(np.moveaxis(rgba, 0, 2)[..., [2, 1, 0, 3]]))
-    height, cell = read_reduced(folder / "dsm.tif", _PICTURE_PX)
-    grey = _hillshade(height[0], cell * heights_by_plan)
-    alpha = np.where(np.isfinite(height[0]), 255, 0).astype(np.uint8)
-    low, high = np.nanquantile(height[0], _COLOURED)
-    level = np.clip((np.nan_to_num(height[0], nan=low) - low) / max(high - low, 1e-6), 0.0, 1.0)
+    bands, cell = read_reduced(folder / "dsm.tif", _PICTURE_PX)
+    height, known = bands[0], np.isfinite(bands[0])
+    alpha = np.where(known, 255, 0).astype(np.uint8)
+    # Light of a sun in the north-west on rows from the north.
+    south, east = np.gradient(np.where(known, height, np.nanmedian(height)), cell * heights_by_plan)
+    azimuth, elevation = np.radians(_SUN_AZIMUTH_DEG), np.radians(_SUN_ELEVATION_DEG)
+    sun = np.array([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)])
+    light = (sun[2] - sun[0] * east + sun[1] * south) / np.sqrt(1.0 + east**2 + south**2)
+    grey = np.round(255 * np.clip(light, 0.0, 1.0))
+    low, high = np.nanquantile(height, _COLOURED)
+    level = np.clip((np.nan_to_num(height, nan=low) - low) / max(high - low, 1e-6), 0.0, 1.0)
     colours = cv2.applyColorMap(np.asarray(255 * level, dtype=np.uint8), cv2.COLORMAP_TURBO)
     # Pale colours, so that the light can be seen on them.
     shaded = (1 - _TINT + _TINT * colours / 255.0) * grey[..., None]
     cv2.imwrite(str(folder / "hillshade.png"), np.dstack([shaded.astype(np.uint8), alpha]))
-
-
-def _hillshade(height: FloatArray, cell: float) -> ByteArray:
-    """Return the light (H, W), 0 … 255, of a sun in the north-west at 45° on heights (H, W), rows from the north.
-
-    NaN: no surface. The size of a cell is in the unit of the heights.
-    """
-    south, east = np.gradient(np.where(np.isfinite(height), height, np.nanmedian(height)), cell)
-    azimuth, elevation = np.radians(_SUN_AZIMUTH_DEG), np.radians(_SUN_ELEVATION_DEG)
-    sun = np.array([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)])
-    light = (sun[2] - sun[0] * east + sun[1] * south) / np.sqrt(1.0 + east**2 + south**2)
-    return np.asarray(np.round(255 * np.clip(light, 0.0, 1.0)), dtype=np.uint8)
 
 
 def _contour_lines(height: FloatArray, frame: RasterFrame, interval: float) -> list[ContourLine]:

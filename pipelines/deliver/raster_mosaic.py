@@ -205,11 +205,22 @@ class Mosaic:
 
     def write(self, folder: Path, sidecar: CrsSidecar, progress: Progress) -> Iterator[Path]:
         """Write each raster into a folder, with accuracy and σ of the sidecar as metadata, and yield its path."""
+        tags = {
+            "TIFFTAG_SOFTWARE": f"GeoRefGS {__version__}",
+            "GEOREF_CRS": sidecar.crs,
+            "GEOREF_VERTICAL_DATUM": sidecar.vertical_datum.name,
+            "GEOREF_EPOCH": "not stated",
+        }
+        if sidecar.accuracy is not None:
+            tags["GEOREF_ACCURACY"] = sidecar.accuracy.text
+        if sidecar.sigma is not None:
+            tags["GEOREF_MEDIAN_CELL_SIGMA_H_M"] = f"{sidecar.sigma.median_sigma_h_m:.4f}"
+            tags["GEOREF_MEDIAN_CELL_SIGMA_V_M"] = f"{sidecar.sigma.median_sigma_v_m:.4f}"
         with progress.task("rasters", len(self._kinds)) as task:
             for name, kind in self._kinds.items():
                 parts = [(self._part(self._whole, name, one), one.column, one.row) for one in self._windows()]
                 path = folder / f"{name}.tif"
-                write_mosaic(path, parts, self.frame, kind, _tags(sidecar))
+                write_mosaic(path, parts, self.frame, kind, tags)
                 yield path
                 task.advance(note=path.name)
 
@@ -226,21 +237,6 @@ class Mosaic:
 
     def _part(self, folder: Path, name: str, window: _Window) -> Path:
         return folder / f"{name}_{window.row}_{window.column}.tif"
-
-
-def _tags(sidecar: CrsSidecar) -> dict[str, str]:
-    tags = {
-        "TIFFTAG_SOFTWARE": f"GeoRefGS {__version__}",
-        "GEOREF_CRS": sidecar.crs,
-        "GEOREF_VERTICAL_DATUM": sidecar.vertical_datum.name,
-        "GEOREF_EPOCH": "not stated",
-    }
-    if sidecar.accuracy is not None:
-        tags["GEOREF_ACCURACY"] = sidecar.accuracy.text
-    if sidecar.sigma is not None:
-        tags["GEOREF_MEDIAN_CELL_SIGMA_H_M"] = f"{sidecar.sigma.median_sigma_h_m:.4f}"
-        tags["GEOREF_MEDIAN_CELL_SIGMA_V_M"] = f"{sidecar.sigma.median_sigma_v_m:.4f}"
-    return tags
 
 
 def _coarse_cells(window: _Window, step: int) -> tuple[IntArray, IntArray]:

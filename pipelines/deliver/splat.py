@@ -111,23 +111,20 @@ def splat_values(splat: PlacedSplat | SplatParts) -> dict[str, object]:
 
 def load_splat(workspace: Workspace, options: SplatOptions) -> PlacedSplat:
     """Return the splat of a workspace, placed on Earth; a DegenerateGeometryError: no Gaussian is opaque enough."""
+    survey, model = load_survey(workspace), load_json(TrainedModel, workspace.path(MODEL))
     gaussians = read_gaussians(workspace.path(GAUSSIANS))
-    placement = _placement(workspace, gaussians.means.numpy())
+    placement = place(model, survey, gaussians.means.numpy(), headline_of(workspace))
     return placed_splat(gaussians, placement, options, crop_of(workspace, options))
-
-
-def _placement(workspace: Workspace, centers_in_model: Float32Array) -> Placement:
-    model = load_json(TrainedModel, workspace.path(MODEL))
-    return place(model, load_survey(workspace), centers_in_model, headline_of(workspace))
 
 
 def load_splat_parts(workspace: Workspace, options: WebSplatOptions) -> SplatParts:
     """Return the splat of a workspace, placed on Earth, to be read part by part; a GeorefError: as `load_splat`."""
+    survey, model = load_survey(workspace), load_json(TrainedModel, workspace.path(MODEL))
     path = workspace.path(GAUSSIANS)
     centers, crop = read_centres(path), crop_of(workspace, options)
     chosen = _chosen(centers, read_logit_opacities(path), options, crop)
     _require_any(chosen, options)
-    placement = _placement(workspace, centers)
+    placement = place(model, survey, centers, headline_of(workspace))
     center_in_file = placement.file_from_model.apply(centers[chosen]).astype(np.float32)
     rows = _rows_of_blocks(workspace, len(centers))
     trained = read_gaussians(path, slice(0, 1)).sh_degree

@@ -24,7 +24,7 @@ from pipelines.core.files import replace_text
 from pipelines.core.products import Product
 from pipelines.core.sentences import printable
 from pipelines.core.stages import TILES
-from pipelines.core.types import Float32Array, FloatArray, Vector3, vector3
+from pipelines.core.types import Float32Array, Vector3, vector3
 from pipelines.deliver.placement import Placement
 from pipelines.geodesy.crs import PointCrs
 from pipelines.geodesy.enu import (
@@ -228,7 +228,11 @@ def fit_local_crs(crs: PointCrs, origin_lla: ArrayLike, half_extent_m: Vector3) 
     plan_m = crs.horizontal_unit * (SEMI_MAJOR_M if crs.is_geographic else 1.0)
     unit_m = np.array([plan_m, plan_m, crs.height_unit_m])
     places = np.vstack([nodes, checks])
-    values = _coordinates(crs, origin_lla, places * half_extent_m)
+    enu = places * half_extent_m
+    lla = lla_from_ecef(ecef_from_lla(origin_lla) + enu @ ecef_from_enu_rotation(origin_lla).T)
+    values = crs.serving(lla).xyz_from_lla(lla)
+    if crs.is_geographic:  # a polynomial cannot jump at the date line
+        values[:, 0] -= 360.0 * np.round((values[:, 0] - values[0, 0]) / 360.0)
     powers = np.stack([np.prod(places ** np.array(exponents), axis=1) for exponents in _EXPONENTS], axis=1)
     solved = np.linalg.lstsq(powers[: len(nodes)], values[: len(nodes)], rcond=None)[0]
     errors = np.abs(powers[len(nodes) :] @ solved - values[len(nodes) :]).max(axis=0)
@@ -244,14 +248,6 @@ def fit_local_crs(crs: PointCrs, origin_lla: ArrayLike, half_extent_m: Vector3) 
         coefficients=tuple((x, y, z) for x, y, z in solved.tolist()),
         error_m=float((errors * unit_m).max()),
     )
-
-
-def _coordinates(crs: PointCrs, origin_lla: ArrayLike, enu: FloatArray) -> FloatArray:
-    lla = lla_from_ecef(ecef_from_lla(origin_lla) + enu @ ecef_from_enu_rotation(origin_lla).T)
-    xyz = crs.serving(lla).xyz_from_lla(lla)
-    if crs.is_geographic:  # a polynomial cannot jump at the date line
-        xyz[:, 0] -= 360.0 * np.round((xyz[:, 0] - xyz[0, 0]) / 360.0)
-    return xyz
 
 
 def _axis_names(crs: PointCrs) -> tuple[str, str, str]:

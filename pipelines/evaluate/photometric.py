@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from pipelines.core.progress import Progress
-from pipelines.core.types import ByteArray, FloatArray, IntArray
+from pipelines.core.types import ByteArray
 from pipelines.geometry.footprints import PointSurface, ground_points
 from pipelines.report.plots.charts import labelled
 from pipelines.splat.exposure import fitted_affine, squared_radius, with_affine, with_vignetting
@@ -51,20 +51,13 @@ class TrainingCoverage:
         grid = np.stack(np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5), axis=-1).reshape(-1, 2)
         rays = pose.pinhole.rays(grid * [width / columns, height / rows]) @ pose.cam_from_model
         ground = ground_points(rays, pose.center_in_model, self._surface)
-        enough = (self._views_of(ground, apart_from=index) >= ENOUGH_VIEWS).reshape(rows, columns)
+        count = np.zeros(len(ground), dtype=np.int64)  # of the training views whose image contains the ground
+        for other in map(self._renderer.pose, (train for train in self._train if train != index)):
+            in_cam = (ground - other.center_in_model) @ other.cam_from_model.T
+            count += other.pinhole.contains(other.pinhole.project(in_cam))
+        enough = (count >= ENOUGH_VIEWS).reshape(rows, columns)
         share = cv2.resize(enough.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
         return torch.from_numpy(share >= 0.5)
-
-    def _views_of(self, points: FloatArray, *, apart_from: int) -> IntArray:
-        """Return the number (K,) of training views whose image contains each of the points (K, 3) in `model`."""
-        count = np.zeros(len(points), dtype=np.int64)
-        for index in self._train:
-            if index == apart_from:
-                continue
-            pose = self._renderer.pose(index)
-            in_cam = (points - pose.center_in_model) @ pose.cam_from_model.T
-            count += pose.pinhole.contains(pose.pinhole.project(in_cam))
-        return count
 
 
 # Saves, for a test view, RGB: the photograph, its render, their difference, side by side with labels.

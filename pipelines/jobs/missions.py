@@ -163,7 +163,12 @@ class _Table:
             if key in _OWN_KEYS:
                 own[key] = self._own(key, value)
             elif key in BY_NAME:
-                flags.setdefault(key, {}).update(self._stage(key, value))
+                if not isinstance(value, dict):
+                    raise self._error("not-a-table", key, "is not a table of options.")
+                given = {
+                    name: self._value(BY_NAME[key], name, each, f"{key}.{name}") for name, each in value.items()
+                }
+                flags.setdefault(key, {}).update(given)
             elif key in self.owners:
                 for owner in self.owners[key]:
                     flags.setdefault(owner, {})[key] = self._value(BY_NAME[owner], key, value, key)
@@ -189,11 +194,6 @@ class _Table:
             code = "path-leaves-folder" if key == "workspace" else "option-invalid"
             raise self._error(code, key, str(error)) from error
         return value
-
-    def _stage(self, stage: str, table: Any) -> dict[str, Any]:
-        if not isinstance(table, dict):
-            raise self._error("not-a-table", stage, "is not a table of options.")
-        return {key: self._value(BY_NAME[stage], key, value, f"{stage}.{key}") for key, value in table.items()}
 
     def _value(self, spec: StageSpec, option: str, value: Any, key: str) -> Any:
         """Return the value of an option, with paths relative to the file made absolute."""
