@@ -13,6 +13,7 @@ from pydantic.fields import FieldInfo
 
 from pipelines.core.options import (
     WRITTEN,
+    OptionsT,
     StageOptions,
     flag_name,
     input_markers,
@@ -20,21 +21,28 @@ from pipelines.core.options import (
     names_of_flags,
     notation,
     parse_toml,
+    resolve,
 )
 from pipelines.core.stages import StageSpec
 from pipelines.core.workspace import Workspace
 
 _BOUNDS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
+FILE, FOLDER = (click.Path(file_okay=is_file, resolve_path=True, path_type=Path) for is_file in (True, False))
+
+
+def flag(*names: str, text: str) -> click.Option:
+    """Return an option without a value; `text` is its help."""
+    return click.Option(names, is_flag=True, help=text)
 
 
 WORKSPACE = click.Argument(
     ["workspace"],
-    type=click.Path(file_okay=False, resolve_path=True, path_type=Path),
+    type=FOLDER,
     callback=lambda _ctx, _param, root: Workspace(root),
     metavar="WS",
 )
-JSON = click.Option(["--json", "as_json"], is_flag=True, help="Print the result as one JSON document.")
-DRY_RUN = click.Option(["--dry-run"], is_flag=True, help="Show what would be run, why, and how long; run nothing.")
+JSON = flag("--json", "as_json", text="Print the result as one JSON document.")
+DRY_RUN = flag("--dry-run", text="Show what would be run, why, and how long; run nothing.")
 FORGET = click.Option(
     ["--forget"],
     multiple=True,
@@ -86,6 +94,11 @@ def stage_option(options_type: type[StageOptions], name: str) -> click.Option:
     return click.Option([flag, name], type=_click_type(kind), default=None, help=help_text)
 
 
+def resolved(ctx: click.Context, options_type: type[OptionsT], toml: Path) -> OptionsT:
+    """Return the options of a command that is no stage: default < flags; `toml` is named in errors."""
+    return resolve(options_type, {}, given(ctx, options_type.model_fields), toml)
+
+
 def given(ctx: click.Context, names: Iterable[str]) -> dict[str, Any]:
     """Return the values that the user gave; `georef.toml` and the defaults determine all others.
 
@@ -102,7 +115,7 @@ def _click_type(kind: Any) -> click.ParamType[Any]:
     if get_origin(kind) is Literal:
         return click.Choice(get_args(kind))
     if kind is Path:
-        return click.Path(resolve_path=True, path_type=Path)
+        return FILE
     known: dict[type, click.ParamType[Any]] = {int: click.INT, float: click.FLOAT, str: click.STRING}
     return known[kind]
 
