@@ -50,24 +50,17 @@ def exit_of(error: BaseException) -> Exit | None:
     if isinstance(error, click.Abort | KeyboardInterrupt):
         return Exit(INTERRUPTED, "interrupted", _document("interrupted", "interrupted"))
     if isinstance(error, click.ClickException):
-        return _of_click(error)
+        text, context, param = io.StringIO(), getattr(error, "ctx", None), getattr(error, "param", None)
+        error.show(text)
+        field = param.opts[-1] if isinstance(param, click.Option) else getattr(error, "option_name", None)
+        document = _document("usage" if error.exit_code == USAGE else "failed", error.format_message())
+        document |= {"field": field, "hint": None if context is None else f"{context.command_path} --help"}
+        return Exit(error.exit_code, printable_lines(text.getvalue().rstrip("\n")), document)
     known = error if isinstance(error, GeorefError) else storage_error(error)
     if known is None:
         return None
     usage = isinstance(known, InputError) and known.is_usage
     return Exit(USAGE if usage else FAILED, f"error: {printable(str(known))}", known.document())
-
-
-def _of_click(error: click.ClickException) -> Exit:
-    text = io.StringIO()
-    error.show(text)
-    context = getattr(error, "ctx", None)
-    param = getattr(error, "param", None)
-    field = param.opts[-1] if isinstance(param, click.Option) else None
-    document = _document("usage" if error.exit_code == USAGE else "failed", error.format_message())
-    document["field"] = field or getattr(error, "option_name", None)
-    document["hint"] = None if context is None else f"{context.command_path} --help"
-    return Exit(error.exit_code, printable_lines(text.getvalue().rstrip("\n")), document)
 
 
 def _document(kind: str, message: str) -> ErrorDocument:

@@ -95,8 +95,6 @@ _MARGIN = 0.04  # of the longer side, around everything that is shown
 _MOST_TICKS = 8  # on the longer side
 
 _CAMERAS = {"marker": "X", "linewidths": 0.4, "color": "black", "edgecolors": "white"}
-_CHECK = {"marker": "o", "s": 24, "linewidths": 0.8, "color": "white", "edgecolors": "black"}
-_CONTROL = {"marker": "^", "s": 34, "linewidths": 0.8, "color": look.ORANGE, "edgecolors": "black"}
 # Of the sign of a camera in square points: many cameras must not hide the map.
 _LARGEST_SIGN, _SMALLEST_SIGN, _LARGE_SIGNS = 26.0, 9.0, 100
 
@@ -200,18 +198,18 @@ def _draw_sigma(
 
 def _mark(axes: Axes, points: MapPoints) -> None:
     size = min(max(_LARGEST_SIGN * _LARGE_SIGNS / max(len(points.cameras), 1), _SMALLEST_SIGN), _LARGEST_SIGN)
+
+    def named(name: str, places: plans.NamedPlaces, arrow: str) -> str:
+        return name if places.error_m is None else f"{name}, with {arrow}"
+
     kinds: tuple[tuple[str, FloatArray, Mapping[str, Any]], ...] = (
         ("camera", points.cameras, {**_CAMERAS, "s": size}),
-        (_named("check point", points.check, "its triangulated error"), points.check.place_m, _CHECK),
-        (_named("control point", points.control, "its residual"), points.control.place_m, _CONTROL),
+        (named("check point", points.check, "its triangulated error"), points.check.place_m, plans.CHECK_SIGN),
+        (named("control point", points.control, "its residual"), points.control.place_m, plans.CONTROL_SIGN),
     )
     for name, places, style in kinds:
         if len(places):
             axes.scatter(places[:, 0], places[:, 1], label=name, zorder=4, **style)
-
-
-def _named(name: str, points: plans.NamedPlaces, arrow: str) -> str:
-    return name if points.error_m is None else f"{name}, with {arrow}"
 
 
 def _draw_errors(axes: Axes, points: MapPoints, along: tuple[int, ...], side_m: float) -> float | None:

@@ -99,8 +99,7 @@ def correlation_matrix(names: Sequence[str], correlation: FloatArray) -> bytes:
                 color="white" if dark else "black",
             )
     look.label(axes, "Correlation of the lens parameters")
-    bar = figure.colorbar(image, ax=axes, fraction=0.04, pad=0.02)
-    bar.ax.tick_params(labelsize=look.TICK_POINTS)
+    look.add_scale(figure, image, "", ax=axes, fraction=0.04, pad=0.02)
     return look.png_of(figure)
 
 
