@@ -199,7 +199,7 @@ class Viewer:
                 if kind == "area":
                     yield _answer(self.model.area(points, fineness))
                 elif kind == "volume":
-                    yield _answer(self.model.volume(points, request.base.wanted(), fineness))
+                    yield _answer(self.model.volume(points, request.base, fineness))
                 else:
                     joint, line = self.model.jointly(points), self.model.profile(points, fineness)
                     yield {**_answer(length(joint)), "profile": profile_json(line)}
