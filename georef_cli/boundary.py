@@ -50,24 +50,17 @@ def exit_of(error: BaseException) -> Exit | None:
     if isinstance(error, click.Abort | KeyboardInterrupt):
         return Exit(INTERRUPTED, "interrupted", _document("interrupted", "interrupted"))
     if isinstance(error, click.ClickException):
-        return _of_click(error)
+        text, context, param = io.StringIO(), getattr(error, "ctx", None), getattr(error, "param", None)
+        error.show(text)
+        field = param.opts[-1] if isinstance(param, click.Option) else getattr(error, "option_name", None)
+        document = _document("usage" if error.exit_code == USAGE else "failed", error.format_message())
+        document |= {"field": field, "hint": None if context is None else f"{context.command_path} --help"}
+        return Exit(error.exit_code, printable_lines(text.getvalue().rstrip("\n")), document)
     known = error if isinstance(error, GeorefError) else storage_error(error)
     if known is None:
         return None
     usage = isinstance(known, InputError) and known.is_usage
     return Exit(USAGE if usage else FAILED, f"error: {printable(str(known))}", known.document())
-
-
-def _of_click(error: click.ClickException) -> Exit:
-    text = io.StringIO()
-    error.show(text)
-    context = getattr(error, "ctx", None)
-    param = getattr(error, "param", None)
-    field = param.opts[-1] if isinstance(param, click.Option) else None
-    document = _document("usage" if error.exit_code == USAGE else "failed", error.format_message())
-    document["field"] = field or getattr(error, "option_name", None)
-    document["hint"] = None if context is None else f"{context.command_path} --help"
-    return Exit(error.exit_code, printable_lines(text.getvalue().rstrip("\n")), document)
 
 
 def _document(kind: str, message: str) -> ErrorDocument:
@@ -84,7 +77,9 @@ def guarded(group: click.Group, arguments: Sequence[str] | None) -> int:
     words = sys.argv[1:] if arguments is None else arguments
     as_json, tells_progress = "--json" in words, "--json-progress" in words
     try:
-        _escape_on_stdout()
+        if isinstance(sys.stdout, io.TextIOWrapper):
+            # As on stderr, characters that the encoding lacks are escaped: a pipe on Windows has no σ.
+            sys.stdout.reconfigure(errors="backslashreplace")
         with _signals_interrupt():
             code = group.main(args=arguments, prog_name=group.name, standalone_mode=False)
             sys.stdout.flush()
@@ -127,12 +122,6 @@ def _drop_stdout() -> None:
 def safe_traceback(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
     """Print the traceback of an exception that nobody foresaw, as Python does, but safe for a terminal."""
     _say(printable_lines("".join(tracebacks.format_exception(kind, error, traceback)).rstrip("\n")))
-
-
-def _escape_on_stdout() -> None:
-    """Make stdout escape characters that its encoding lacks, as stderr does: a pipe on Windows has no σ."""
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")
 
 
 @contextmanager

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from georef_cli.options import FOLDER, flag
 from pipelines.core.machine import free_main_memory_bytes, thread_count
 from pipelines.jobs.engine import Engine
 from pipelines.jobs.local import LocalEngine, chosen_engine
@@ -23,15 +24,14 @@ log = logging.getLogger(__name__)
 CERTIFICATES = (
     click.Option(
         ["--certificates"],
-        type=click.Path(file_okay=False, resolve_path=True, path_type=Path),
+        type=FOLDER,
         metavar="DIR",
         help="Folder with the certificate of the cluster, from `georef cluster certificates` (default: yours, "
         "which the first scheduler or worker on 127.0.0.1 makes).",
     ),
-    click.Option(
-        ["--insecure"],
-        is_flag=True,
-        help="Use no certificate. Every program of this machine, of any user, can then run programs as you.",
+    flag(
+        "--insecure",
+        text="Use no certificate. Every program of this machine, of any user, can then run programs as you.",
     ),
 )
 ENGINE = (

@@ -3,8 +3,6 @@
 A stage's options are derived from its class of options (names, types, meaning, defaults): each is defined once.
 """
 
-from __future__ import annotations
-
 import types
 from collections.abc import Iterable
 from pathlib import Path
@@ -15,6 +13,7 @@ from pydantic.fields import FieldInfo
 
 from pipelines.core.options import (
     WRITTEN,
+    OptionsT,
     StageOptions,
     flag_name,
     input_markers,
@@ -22,21 +21,28 @@ from pipelines.core.options import (
     names_of_flags,
     notation,
     parse_toml,
+    resolve,
 )
 from pipelines.core.stages import StageSpec
 from pipelines.core.workspace import Workspace
 
 _BOUNDS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
+FILE, FOLDER = (click.Path(file_okay=is_file, resolve_path=True, path_type=Path) for is_file in (True, False))
+
+
+def flag(*names: str, text: str) -> click.Option:
+    """Return an option without a value; `text` is its help."""
+    return click.Option(names, is_flag=True, help=text)
 
 
 WORKSPACE = click.Argument(
     ["workspace"],
-    type=click.Path(file_okay=False, resolve_path=True, path_type=Path),
+    type=FOLDER,
     callback=lambda _ctx, _param, root: Workspace(root),
     metavar="WS",
 )
-JSON = click.Option(["--json", "as_json"], is_flag=True, help="Print the result as one JSON document.")
-DRY_RUN = click.Option(["--dry-run"], is_flag=True, help="Show what would be run, why, and how long; run nothing.")
+JSON = flag("--json", "as_json", text="Print the result as one JSON document.")
+DRY_RUN = flag("--dry-run", text="Show what would be run, why, and how long; run nothing.")
 FORGET = click.Option(
     ["--forget"],
     multiple=True,
@@ -73,7 +79,10 @@ def stage_option(options_type: type[StageOptions], name: str) -> click.Option:
     help_text = " ".join(filter(None, [info.description, _default_and_range(info)]))
     if WRITTEN in marks_of(info):
         return click.Option([flag, name], type=click.STRING, default=None, help=help_text)
-    kind = _bare_type(info.annotation)
+    kind: Any = info.annotation
+    if get_origin(kind) in (Union, types.UnionType):
+        (kind,) = [member for member in get_args(kind) if member is not type(None)]
+    kind = get_args(kind)[0] if get_origin(kind) is Annotated else kind
     if kind is bool:
         return click.Option(
             [f"{flag}/--no-{flag.removeprefix('--')}", name], is_flag=True, default=None, help=help_text
@@ -83,6 +92,11 @@ def stage_option(options_type: type[StageOptions], name: str) -> click.Option:
             [flag, name], multiple=True, type=_click_type(get_args(kind)[0]), help=help_text + "  [repeatable]"
         )
     return click.Option([flag, name], type=_click_type(kind), default=None, help=help_text)
+
+
+def resolved(ctx: click.Context, options_type: type[OptionsT], toml: Path) -> OptionsT:
+    """Return the options of a command that is no stage: default < flags; `toml` is named in errors."""
+    return resolve(options_type, {}, given(ctx, options_type.model_fields), toml)
 
 
 def given(ctx: click.Context, names: Iterable[str]) -> dict[str, Any]:
@@ -97,18 +111,11 @@ def given(ctx: click.Context, names: Iterable[str]) -> dict[str, Any]:
     }
 
 
-def _bare_type(annotation: Any) -> Any:
-    """Return the type without `| None` and `Annotated`."""
-    if get_origin(annotation) in (Union, types.UnionType):
-        (annotation,) = [member for member in get_args(annotation) if member is not type(None)]
-    return get_args(annotation)[0] if get_origin(annotation) is Annotated else annotation
-
-
 def _click_type(kind: Any) -> click.ParamType[Any]:
     if get_origin(kind) is Literal:
         return click.Choice(get_args(kind))
     if kind is Path:
-        return click.Path(resolve_path=True, path_type=Path)
+        return FILE
     known: dict[type, click.ParamType[Any]] = {int: click.INT, float: click.FLOAT, str: click.STRING}
     return known[kind]
 

@@ -129,6 +129,14 @@ def print_json(document: Any) -> None:
     click.echo(dump_json(document))
 
 
+def print_result(document: Any, *parts: RenderableType, as_json: bool) -> None:
+    """Print the result of a command in one of its two forms."""
+    if as_json:
+        print_json(document)
+    else:
+        print_rich(*parts)
+
+
 def print_rich(*parts: RenderableType) -> None:
     """Print renderables: in colour on a terminal, plain elsewhere."""
     console = Console(

@@ -56,7 +56,7 @@ class StageCommand(Command):
         what = "the folder" if delivers == "folder" else "the file and its sidecar"
         target = click.Option(
             ["--to", "-o", "target"],
-            type=click.Path(resolve_path=True, path_type=Path),
+            type=options.FILE,
             metavar="FOLDER" if delivers == "folder" else "FILE",
             help=f"Copy {what} here as well; what exists is replaced only with --force. A workspace that cannot be "
             "written stays as it is.",
@@ -75,7 +75,7 @@ class StageCommand(Command):
                 *([] if delivers is None else [target]),
                 options.FORGET,
                 options.DRY_RUN,
-                click.Option(["--force"], is_flag=True, help="Run even if the product is current."),
+                options.flag("--force", text="Run even if the product is current."),
                 options.JSON,
             ],
             help=doc,

@@ -72,6 +72,8 @@ HOMES: dict[str, tuple[str, ...]] = {
         *STAGE_ROOMS,
     ),
     "filelock": ("pipelines.core",),
+    "psutil": ("pipelines.core.machine",),
+    "PIL": ("pipelines.formats.exif_writer",),
     "laspy": ("pipelines.formats",),
     "pillow_heif": ("pipelines.formats.heif",),
     "py4dgeo": ("pipelines.surface.m3c2",),
@@ -98,7 +100,7 @@ HOMES: dict[str, tuple[str, ...]] = {
 }
 # The entry point of a process whose log records go to its parent.
 CHILD = "pipelines.core.child"
-CORE_LIBRARIES = {"filelock", "numpy", "pydantic"}
+CORE_LIBRARIES = {"filelock", "numpy", "psutil", "pydantic"}
 
 
 def inside(module: str, room: str) -> bool:

@@ -1,7 +1,6 @@
 """Command `georef batch`."""
 
 import logging
-from pathlib import Path
 from typing import Any
 
 import click
@@ -13,7 +12,7 @@ from georef_cli.display import progress_for
 from georef_cli.engines import ENGINE, engine_for
 from georef_cli.estimate import RunEstimate, checked_inputs, estimate_run
 from georef_cli.options import SET, settings
-from georef_cli.output import print_json, print_rich
+from georef_cli.output import print_json, print_result, print_rich
 from pipelines.core.errors import GeorefError
 from pipelines.core.options import input_paths, remembered
 from pipelines.core.plan import plan
@@ -47,10 +46,8 @@ def _batch(ctx: click.Context, **values: Any) -> int:
             print_rich(*job_tables.dry_run(rows, together))
         return FAILED if any(row.refusal for row in planned) else 0
     table = run_batch(listed, planned, engine, progress)
-    if values["as_json"]:
-        print_json(table.model_dump(mode="json"))
-    else:
-        print_rich(*job_tables.batch(table, page_file(listed.folder, listed.name)))
+    shown = job_tables.batch(table, page_file(listed.folder, listed.name))
+    print_result(table.model_dump(mode="json"), *shown, as_json=values["as_json"])
     return 0 if table.is_complete else FAILED
 
 
@@ -80,7 +77,7 @@ def _planned(mission: Mission, *, check: bool, progress: Progress) -> tuple[Plan
 command = Command(
     "batch",
     params=[
-        click.Argument(["missions"], type=click.Path(resolve_path=True, path_type=Path)),
+        click.Argument(["missions"], type=options.FILE),
         click.Option(
             ["--at-a-time"],
             type=click.IntRange(min=1),

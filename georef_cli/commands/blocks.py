@@ -13,7 +13,7 @@ from georef_cli.command import Command
 from georef_cli.display import is_told, progress_for
 from georef_cli.engines import ENGINE, asked_engine
 from georef_cli.estimate import announced_seconds
-from georef_cli.output import print_json, print_outcome, print_rich
+from georef_cli.output import print_json, print_outcome, print_result, print_rich
 from pipelines.core import runner, stages
 from pipelines.core.options import remember, remembered
 from pipelines.core.products import load_json
@@ -98,10 +98,8 @@ def _train(ctx: click.Context, parts: Parts, asked: Mapping[str, Flags], values:
     with workspace.lock("blocks train"):
         remember(workspace.root, asked)
         plan = train_blocks(parts, progress_for(ctx.obj), force=values["force"])
-    if values["as_json"]:
-        print_json({"blocks": [training.model_dump(mode="json") for training in parts.trainings(plan)]})
-    else:
-        print_rich(*job_tables.block_table(plan, parts.states(plan)))
+    document = {"blocks": [training.model_dump(mode="json") for training in parts.trainings(plan)]}
+    print_result(document, *job_tables.block_table(plan, parts.states(plan)), as_json=values["as_json"])
 
 
 def _all(
@@ -133,7 +131,7 @@ command = Command(
         click.Option(["--id", "number"], type=click.IntRange(min=0), help="Train this block only."),
         *options.stage_options(TRAIN.options),
         *ENGINE,
-        click.Option(["--force"], is_flag=True, help="Run even what is current, and start afresh."),
+        options.flag("--force", text="Run even what is current, and start afresh."),
         options.JSON,
     ],
     callback=click.pass_context(_blocks),

@@ -20,33 +20,26 @@ def _tables(workspace: Workspace, values: Mapping[str, Any]) -> tuple[Renderable
     if values["as_json"]:
         return ()
     calibration = load_json(RigCalibration, workspace.path(RIG))
-    return (_estimates(calibration), _residuals(calibration)) if calibration.estimates else ()
+    if not calibration.estimates:
+        return ()
+    parts = [] if calibration.rms_position_m is None else [f"{calibration.rms_position_m:.3f} m an axis"]
+    parts += [] if calibration.rms_attitude_deg is None else [f"{calibration.rms_attitude_deg:.2f}°"]
+    images, points = calibration.images, calibration.control_points
+    left_over = f"left over: {', '.join(parts)} ({images} images, {points} control points)"
+    return _estimates(calibration), shown(left_over)
 
 
 def _estimates(calibration: RigCalibration) -> Table:
     table = plain_table("", "estimated", "± σ", "ingest", "unit", "", right=(1, 2, 3))
     for estimate in calibration.estimates:
         applied = "applied" if estimate in calibration.applied else "[dim]not applied[/]"
-        components = zip(
-            _COMPONENTS[estimate.name],
-            estimate.value,
-            estimate.sigma,
-            estimate.start,
-            estimate.observable,
-            strict=True,
-        )
+        columns = (estimate.value, estimate.sigma, estimate.start, estimate.observable)
+        components = zip(_COMPONENTS[estimate.name], *columns, strict=True)
         for component, value, sigma, start, observable in components:
             name = f"{estimate.name} {component}".strip()
             remark = applied if observable else "[yellow]not observable in this flight[/]"
             table.add_row(name, f"{value:.4f}", f"{sigma:.4f}", f"{start:.4f}", estimate.unit, remark)
     return table
-
-
-def _residuals(calibration: RigCalibration) -> str:
-    parts = [] if calibration.rms_position_m is None else [f"{calibration.rms_position_m:.3f} m an axis"]
-    parts += [] if calibration.rms_attitude_deg is None else [f"{calibration.rms_attitude_deg:.2f}°"]
-    images, points = calibration.images, calibration.control_points
-    return shown(f"left over: {', '.join(parts)} ({images} images, {points} control points)")
 
 
 command = StageCommand(

@@ -1,9 +1,8 @@
 """Command `georef change`."""
 
-from pathlib import Path
-
 import click
 
+from georef_cli.options import FOLDER
 from georef_cli.stage import StageCommand
 
 command = StageCommand(
@@ -24,10 +23,6 @@ command = StageCommand(
       georef change spring autumn --stable roads.geojson --regions stockpiles.gpkg
       georef change spring autumn --stable-auto --of terrain
     """,
-    before=click.Argument(
-        ["before"],
-        type=click.Path(file_okay=False, resolve_path=True, path_type=Path),
-        metavar="WS1",
-    ),
+    before=click.Argument(["before"], type=FOLDER, metavar="WS1"),
     delivers="folder",
 )

@@ -7,28 +7,22 @@ import click
 from georef_cli import options
 from georef_cli.command import Command
 from georef_cli.layout import shown
-from georef_cli.output import print_json, print_rich
+from georef_cli.output import print_result
 
 
 def _certificates(folder: Path, as_json: bool) -> None:
     from pipelines.jobs.cluster import CERTIFICATE, KEY, make_certificates
 
     make_certificates(folder)
-    if as_json:
-        print_json({"certificate": str(folder / CERTIFICATE), "key": str(folder / KEY)})
-    else:
-        print_rich(
-            f"{shown(str(folder))} has {CERTIFICATE} and {KEY}. Copy the folder to every machine of the cluster, "
-            "and to nobody else."
-        )
+    text = f"has {CERTIFICATE} and {KEY}. Copy the folder to every machine of the cluster, and to nobody else."
+    document = {"certificate": str(folder / CERTIFICATE), "key": str(folder / KEY)}
+    print_result(document, f"{shown(str(folder))} {text}", as_json=as_json)
 
 
 command = Command(
     "cluster certificates",
     params=[
-        click.Argument(
-            ["folder"], type=click.Path(file_okay=False, resolve_path=True, path_type=Path), metavar="DIR"
-        ),
+        click.Argument(["folder"], type=options.FOLDER, metavar="DIR"),
         options.JSON,
     ],
     callback=_certificates,

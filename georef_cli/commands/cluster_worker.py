@@ -8,7 +8,6 @@ from georef_cli import options
 from georef_cli.command import Command
 from georef_cli.engines import CERTIFICATES, cluster_address
 from georef_cli.output import print_json
-from pipelines.core.errors import ResourceError
 from pipelines.core.machine import free_main_memory_bytes, thread_count
 
 _USABLE = 0.9  # of the free memory: other programs grow, too
@@ -28,10 +27,7 @@ def _worker(
     from pipelines.jobs.dask_task import run_worker
 
     scheduler = cluster_address(address, values, "ADDRESS", is_node=True)
-    free = free_main_memory_bytes()
-    if memory_gib is None and free is None:
-        raise ResourceError("free-memory-unknown", "The system does not state its free memory. Give --memory.")
-    memory_bytes = int(memory_gib * _GIB) if memory_gib is not None else int(_USABLE * (free or 0))
+    memory_bytes = int(_USABLE * free_main_memory_bytes() if memory_gib is None else memory_gib * _GIB)
     if gpus is None:
         from pipelines.jobs.machine import inspect_machine
 

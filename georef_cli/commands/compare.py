@@ -7,7 +7,7 @@ import click
 from georef_cli import boundary, options, tables
 from georef_cli.command import Command
 from georef_cli.display import progress_for
-from georef_cli.output import document_of, print_json, print_rich
+from georef_cli.output import document_of, print_result
 from pipelines.compare.configurations import BY_CONFIGURATION, COMMON_TRAIN_OPTIONS, select_configurations
 from pipelines.train.options import TrainOptions
 
@@ -25,11 +25,9 @@ def _compare(ctx: click.Context, **values: Any) -> None:
         progress=progress_for(ctx.obj),
         around=boundary.logged_to_file,
     )
-    if values["as_json"]:
-        stages = [{"configuration": stage.configuration, **document_of(stage.outcome)} for stage in finished]
-        print_json({"workspace": str(workspace.root), **table.model_dump(mode="json"), "stages": stages})
-    else:
-        print_rich(*tables.comparison(table))
+    stages = [{"configuration": stage.configuration, **document_of(stage.outcome)} for stage in finished]
+    document = {"workspace": str(workspace.root), **table.model_dump(mode="json"), "stages": stages}
+    print_result(document, *tables.comparison(table), as_json=values["as_json"])
 
 
 command = Command(
@@ -42,11 +40,7 @@ command = Command(
             help=f"Configurations to compare, with commas. [default: {','.join(BY_CONFIGURATION)}]",
         ),
         *options.stage_options(TrainOptions, COMMON_TRAIN_OPTIONS),
-        click.Option(
-            ["--force"],
-            is_flag=True,
-            help="Run the stages of the configurations even if their products are current.",
-        ),
+        options.flag("--force", text="Run the stages of the configurations even if their products are current."),
         options.JSON,
     ],
     callback=click.pass_context(_compare),

@@ -80,10 +80,9 @@ command = Command(
     "doctor",
     params=[
         options.JSON,
-        click.Option(
-            ["--compile-cuda"],
-            is_flag=True,
-            help="First compile the kernels of the cuda backend, which its first use would; this needs no GPU.",
+        options.flag(
+            "--compile-cuda",
+            text="First compile the kernels of the cuda backend, which its first use would; this needs no GPU.",
         ),
     ],
     callback=_doctor,

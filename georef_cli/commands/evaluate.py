@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 from typing import Any
 
-import click
 from rich.console import Group
 
+from georef_cli.options import flag
 from georef_cli.stage import StageCommand
 from georef_cli.tables import coordinate_tables, error_tables
 from pipelines.core.stages import REPORT
@@ -38,6 +38,6 @@ command = StageCommand(
       georef evaluate flight --cross-validate
       georef evaluate flight --reference scan.laz --reference-sigma 0.02
     """,
-    extra=[click.Option(["--points"], is_flag=True, help="Print the errors of every check and control point.")],
+    extra=[flag("--points", text="Print the errors of every check and control point.")],
     more=_tables,
 )

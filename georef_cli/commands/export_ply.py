@@ -44,10 +44,9 @@ command = PlyCommand(
     "export-ply",
     _DOC,
     extra=[
-        click.Option(
-            ["--measurable"],
-            is_flag=True,
-            help="Write splat.measurable.ply, with discs on the surface, for viewers that measure by centres.",
+        options.flag(
+            "--measurable",
+            text="Write splat.measurable.ply, with discs on the surface, for viewers that measure by centres.",
         ),
         *options.stage_options(MeasurableOptions, _OF_MEASURABLE),
     ],

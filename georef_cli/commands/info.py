@@ -6,8 +6,7 @@ import click
 
 from georef_cli import options
 from georef_cli.command import Command
-from georef_cli.output import overview_text, print_json, print_rich
-from pipelines.core.options import resolve
+from georef_cli.output import overview_text, print_result
 from pipelines.core.staleness import must_exist
 from pipelines.core.workspace import Workspace
 from pipelines.survey.options import CrsOptions
@@ -17,12 +16,8 @@ def _info(ctx: click.Context, workspace: Workspace, as_json: bool, **_values: An
     from pipelines.deliver.overview import overview
 
     must_exist(workspace)
-    flags = options.given(ctx, CrsOptions.model_fields)
-    result = overview(workspace, resolve(CrsOptions, {}, flags, workspace.config_file))
-    if as_json:
-        print_json(result.feature())
-    else:
-        print_rich(*overview_text(result))
+    result = overview(workspace, options.resolved(ctx, CrsOptions, workspace.config_file))
+    print_result(result.feature(), *overview_text(result), as_json=as_json)
 
 
 command = Command(

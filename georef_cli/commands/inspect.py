@@ -9,7 +9,7 @@ from georef_cli import options, tables
 from georef_cli.command import Command
 from georef_cli.display import progress_for
 from georef_cli.layout import shown
-from georef_cli.output import print_json, print_rich
+from georef_cli.output import print_result
 
 
 def _inspect(ctx: click.Context, bag: Path, as_json: bool) -> None:
@@ -17,20 +17,15 @@ def _inspect(ctx: click.Context, bag: Path, as_json: bool) -> None:
 
     report = inspect_bag(bag, progress_for(ctx.obj))
     document = dataclasses.asdict(report)
-    if as_json:
-        print_json(document)
-        return
-    print_rich(tables.topics(document["topics"]))
-    for text in report.remarks:
-        print_rich(f"[dim]chosen:[/] {shown(text)}")
-    for text in report.missing:
-        print_rich(f"[yellow]missing:[/] {shown(text)}")
+    remarks = [f"[dim]chosen:[/] {shown(text)}" for text in report.remarks]
+    remarks += [f"[yellow]missing:[/] {shown(text)}" for text in report.missing]
+    print_result(document, tables.topics(document["topics"]), *remarks, as_json=as_json)
 
 
 command = Command(
     "inspect",
     params=[
-        click.Argument(["bag"], type=click.Path(resolve_path=True, path_type=Path), metavar="BAG"),
+        click.Argument(["bag"], type=options.FILE, metavar="BAG"),
         options.JSON,
     ],
     callback=click.pass_context(_inspect),

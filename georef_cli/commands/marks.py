@@ -9,8 +9,7 @@ from georef_cli import options
 from georef_cli.command import Command
 from georef_cli.display import progress_for
 from georef_cli.layout import shown
-from georef_cli.output import print_json, print_rich
-from pipelines.core.options import resolve
+from georef_cli.output import print_result
 from pipelines.core.staleness import must_exist
 from pipelines.core.workspace import Workspace
 from pipelines.view.options import ProposalOptions
@@ -20,18 +19,12 @@ def _marks(ctx: click.Context, workspace: Workspace, as_json: bool, **_values: A
     from pipelines.view.proposed_marks import propose_marks
 
     must_exist(workspace)
-    flags = options.given(ctx, ProposalOptions.model_fields)
-    wanted = resolve(ProposalOptions, {}, flags, workspace.config_file)
+    wanted = options.resolved(ctx, ProposalOptions, workspace.config_file)
     found = propose_marks(workspace, wanted, progress_for(ctx.obj))
-    if as_json:
-        print_json({**dataclasses.asdict(found), "file": str(found.file)})
-        return
-    for text in found.left_out:
-        print_rich(f"[yellow]left out, other marks contradict it:[/] {shown(text)}")
-    print_rich(
-        f"{found.marks} marks of {found.points} points, {found.quarters} of them quartered targets, in "
-        f"{shown(str(found.file))}"
-    )
+    left_out = [f"[yellow]left out, other marks contradict it:[/] {shown(text)}" for text in found.left_out]
+    counts = f"{found.marks} marks of {found.points} points, {found.quarters} of them quartered targets, in "
+    document = {**dataclasses.asdict(found), "file": str(found.file)}
+    print_result(document, *left_out, counts + shown(str(found.file)), as_json=as_json)
 
 
 command = Command(

@@ -205,7 +205,7 @@ command = Command(
         SET,
         options.FORGET,
         options.DRY_RUN,
-        click.Option(["--force"], is_flag=True, help="Run the stages even if their products are current."),
+        options.flag("--force", text="Run the stages even if their products are current."),
         options.JSON,
     ],
     callback=click.pass_context(_run),

@@ -11,8 +11,8 @@ from georef_cli import options
 from georef_cli.command import Command
 from georef_cli.display import progress_for
 from georef_cli.layout import shown
-from georef_cli.output import print_json, print_rich
-from pipelines.core.options import CONFIG_FILE, resolve
+from georef_cli.output import print_result
+from pipelines.core.options import CONFIG_FILE
 from pipelines.core.sentences import duration
 from pipelines.simulate.options import SimulateOptions
 
@@ -20,26 +20,21 @@ from pipelines.simulate.options import SimulateOptions
 def _simulate(ctx: click.Context, **values: Any) -> None:
     from pipelines.simulate.stage import simulate
 
-    survey_options = resolve(
-        SimulateOptions, {}, options.given(ctx, SimulateOptions.model_fields), Path(CONFIG_FILE)
-    )
+    survey_options = options.resolved(ctx, SimulateOptions, Path(CONFIG_FILE))
     started = time.monotonic()
     summary = simulate(survey_options, values["directory"], progress_for(ctx.obj), overwrite=values["force"])
-    if values["as_json"]:
-        print_json({**dataclasses.asdict(summary), "directory": str(summary.directory)})
-        return
     took = duration(time.monotonic() - started)
-    print_rich(f"[bold]simulate[/]: {shown(f'{summary.key_figure} in {summary.directory} ({took})')}")
+    text = f"[bold]simulate[/]: {shown(f'{summary.key_figure} in {summary.directory} ({took})')}"
+    document = {**dataclasses.asdict(summary), "directory": str(summary.directory)}
+    print_result(document, text, as_json=values["as_json"])
 
 
 command = Command(
     "simulate",
     params=[
-        click.Argument(
-            ["directory"], type=click.Path(file_okay=False, resolve_path=True, path_type=Path), metavar="DIR"
-        ),
+        click.Argument(["directory"], type=options.FOLDER, metavar="DIR"),
         *options.stage_options(SimulateOptions),
-        click.Option(["--force"], is_flag=True, help="Replace an earlier simulation in DIR."),
+        options.flag("--force", text="Replace an earlier simulation in DIR."),
         options.JSON,
     ],
     callback=click.pass_context(_simulate),

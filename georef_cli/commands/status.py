@@ -3,8 +3,6 @@
 import dataclasses
 from typing import Any
 
-import click
-
 from georef_cli import options, tables
 from georef_cli.command import Command
 from georef_cli.output import print_json, print_rich
@@ -40,10 +38,10 @@ command = Command(
     "status",
     params=[
         options.WORKSPACE,
-        click.Option(
-            ["--options", "with_options"],
-            is_flag=True,
-            help="Show the changed options too: remembered from earlier commands, or of georef.toml.",
+        options.flag(
+            "--options",
+            "with_options",
+            text="Show the changed options too: remembered from earlier commands, or of georef.toml.",
         ),
         options.JSON,
     ],

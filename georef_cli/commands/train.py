@@ -1,7 +1,6 @@
 """Command `georef train`."""
 
-import click
-
+from georef_cli.options import flag
 from georef_cli.stage import StageCommand
 
 command = StageCommand(
@@ -19,5 +18,5 @@ command = StageCommand(
       georef train flight --iterations 4000
       georef train flight --iterations 5000 --max-image-size 800 --backend cpu
     """,
-    extra=[click.Option(["--resume"], is_flag=True, help="Continue the interrupted run; refuse other options.")],
+    extra=[flag("--resume", text="Continue the interrupted run; refuse other options.")],
 )

@@ -10,8 +10,7 @@ import click
 from georef_cli import options
 from georef_cli.command import Command
 from georef_cli.display import progress_for
-from georef_cli.output import print_json, print_rich
-from pipelines.core.options import resolve
+from georef_cli.output import print_result
 from pipelines.core.staleness import must_exist
 from pipelines.core.workspace import Workspace
 from pipelines.view.options import ViewOptions
@@ -24,14 +23,10 @@ def _view(ctx: click.Context, workspace: Workspace, open_page: bool, as_json: bo
     from pipelines.view.server import serve
 
     must_exist(workspace)
-    flags = options.given(ctx, ViewOptions.model_fields)
-    wanted = resolve(ViewOptions, {}, flags, workspace.config_file)
+    wanted = options.resolved(ctx, ViewOptions, workspace.config_file)
 
     def ready(address: str) -> None:
-        if as_json:
-            print_json({"address": address})
-        else:
-            print_rich(f"{address}   (Ctrl-C ends the viewer)")
+        print_result({"address": address}, f"{address}   (Ctrl-C ends the viewer)", as_json=as_json)
         if open_page:
             webbrowser.open(address)
 

@@ -18,14 +18,12 @@ TOPICS = {
 
 def topic_text(name: str) -> str:
     text = resources.files(__name__).joinpath(f"{name}.txt").read_text(encoding="utf-8")
-    return text.replace("PRESETS", _presets()) if name == "presets" else text
-
-
-def _presets() -> str:
+    if name != "presets":
+        return text
     from pipelines.train.options import PRESETS, RUN_MINUTES
 
     rows = [f"  {'':10}{'iterations':>10}{'longest side':>15}{'Gaussians':>12}{'time':>12}"]
-    for name, preset in PRESETS.items():
+    for preset_name, preset in PRESETS.items():
         effort = f"{preset.iterations:>10}{preset.max_image_size:>12} px{preset.max_gaussians:>12}"
-        rows.append(f"  {name:10}{effort}{RUN_MINUTES[name]:>8} min")
-    return "\n".join(rows)
+        rows.append(f"  {preset_name:10}{effort}{RUN_MINUTES[preset_name]:>8} min")
+    return text.replace("PRESETS", "\n".join(rows))

@@ -22,16 +22,6 @@ from pathlib import Path
 from typing import IO, Any, TextIO
 
 from pipelines.core import errors
-from pipelines.core.errors import (
-    CrashError,
-    GeorefError,
-    InputError,
-    MissingProductError,
-    ResourceError,
-    StorageError,
-    storage_error,
-    storage_error_in,
-)
 from pipelines.core.files import storage_failure_of
 from pipelines.core.progress import SILENT, Progress, ProgressTask
 
@@ -179,7 +169,7 @@ def run_in_child(
             storage = _storage_failure(native_log, writes)
             raise storage or crash from None
         except RuntimeError as defect:
-            storage = storage_error_in(str(defect), writes) if writes is not None else None
+            storage = errors.storage_error_in(str(defect), writes) if writes is not None else None
             raise storage or _storage_failure(native_log, writes) or defect from None
         finally:
             process.kill()
@@ -197,7 +187,7 @@ def start_in_child(task: str) -> None:
     """
 
     def run() -> None:
-        with contextlib.suppress(GeorefError, RuntimeError, OSError):
+        with contextlib.suppress(errors.GeorefError, RuntimeError, OSError):
             run_in_child(task, {}, "")
 
     threading.Thread(target=run, daemon=True).start()
@@ -227,50 +217,46 @@ def _follow(process: subprocess.Popen[str], arguments: Mapping[str, Any], progre
     raise EOFError
 
 
-def _storage_failure(native_log: IO[str], folder: Path | None) -> StorageError | None:
+def _storage_failure(native_log: IO[str], folder: Path | None) -> errors.StorageError | None:
     """Return why native code could not write into a folder, by its messages or by trial; None: it could."""
     if folder is None:
         return None
     native_log.seek(0)
-    return storage_error_in(native_log.read(), folder) or storage_failure_of(folder)
+    return errors.storage_error_in(native_log.read(), folder) or storage_failure_of(folder)
 
 
 def _error(message: Mapping[str, Any]) -> Exception:
     if message["kind"] != "error":
         return RuntimeError(f"in a child process:\n{message['text']}")
-    kind = getattr(errors, message["type"], GeorefError)
-    if issubclass(kind, InputError):
+    kind = getattr(errors, message["type"], errors.GeorefError)
+    if issubclass(kind, errors.InputError):
         where = {name: message[name] for name in ("path", "line", "field", "hint")}
         return kind(message["code"], message["message"], **where)
-    kind = GeorefError if kind is MissingProductError else kind
-    error: GeorefError = kind(message["code"], message["message"])
+    kind = errors.GeorefError if kind is errors.MissingProductError else kind
+    error: errors.GeorefError = kind(message["code"], message["message"])
     error.hint = message["hint"]
     return error
 
 
-def _content(error: GeorefError) -> dict[str, Any]:
+def _content(error: errors.GeorefError) -> dict[str, Any]:
     """Return what a message tells of an error; its own kind is another."""
     return {name: value for name, value in error.document().items() if name != "kind"}
 
 
-def _crash(code: int, native_log: IO[str], remedy: str) -> GeorefError:
+def _crash(code: int, native_log: IO[str], remedy: str) -> errors.GeorefError:
     native_log.seek(0)
     lines = [line.strip() for line in native_log if line.strip()]
     for line in lines[-50:]:
         log.debug("the child process wrote: %s", line)
     if code == -signal.SIGKILL:
-        return ResourceError(
-            "out-of-memory",
-            f"The system killed the computation, as it does when memory is short. {remedy}",
-        )
+        message = f"The system killed the computation, as it does when memory is short. {remedy}"
+        return errors.ResourceError("out-of-memory", message)
     end = signal.Signals(-code).name if code < 0 else f"exit code {code}"
     # glog begins the line of a failed check with F and the date; the first line is the cause of those below.
     checks = [line for line in lines if line[:1] == "F" and line[1:5].isdigit()]
     cause = (checks or lines[-1:] or ["no message"])[0].rpartition("] ")[2]
-    return CrashError(
-        "library-crashed",
-        f"A native library crashed ({end}: {cause[:_MOST_OF_A_LINE]}). {remedy}",
-    )
+    message = f"A native library crashed ({end}: {cause[:_MOST_OF_A_LINE]}). {remedy}"
+    return errors.CrashError("library-crashed", message)
 
 
 def _main(task: str, parent: str) -> None:
@@ -288,13 +274,13 @@ def _main(task: str, parent: str) -> None:
     try:
         result = getattr(importlib.import_module(module), name)(document["arguments"], messages)
         messages.send("result", result=result)
-    except GeorefError as error:
+    except errors.GeorefError as error:
         messages.send("error", type=type(error).__name__, **_content(error))
     except MemoryError:
         text = "The memory of this machine is too small: use smaller or fewer photographs."
-        messages.send("error", type="ResourceError", **_content(ResourceError("out-of-memory", text)))
+        messages.send("error", type="ResourceError", **_content(errors.ResourceError("out-of-memory", text)))
     except Exception as error:
-        storage = storage_error(error)
+        storage = errors.storage_error(error)
         if storage is not None:
             messages.send("error", type="StorageError", **_content(storage))
         else:

@@ -36,10 +36,14 @@ def replace_file(draft: Path, path: Path) -> None:
 
 
 @contextmanager
-def replacing(path: Path, draft: Path) -> Iterator[None]:
-    """Rename a draft to `path` when it was written; one that cannot be completed keeps no room on a full disk."""
+def replacing(path: Path, draft: Path | None = None) -> Iterator[Path]:
+    """Yield a draft, by default `NAME.tmp` beside `path`, and rename it to `path` when it was written.
+
+    One that cannot be completed keeps no room on a full disk.
+    """
+    draft = draft or path.with_name(f"{path.name}.tmp")
     try:
-        yield
+        yield draft
         replace_file(draft, path)
     except BaseException:
         with contextlib.suppress(OSError):
@@ -164,12 +168,8 @@ def file_size(path: Path, *, limit_bytes: int | None = None, kind: str = "file",
         raise InputError("not-a-file", f"cannot be read: it is {other}. Give a file.", path=path, field=field)
     if limit_bytes is not None and status.st_size > limit_bytes:
         size, limit = status.st_size / 2**20, limit_bytes / 2**20
-        raise InputError(
-            "file-too-large",
-            f"is too large for a {kind}: {size:.0f} MiB (limit {limit:.0f} MiB).",
-            path=path,
-            field=field,
-        )
+        message = f"is too large for a {kind}: {size:.0f} MiB (limit {limit:.0f} MiB)."
+        raise InputError("file-too-large", message, path=path, field=field)
     return status.st_size
 
 

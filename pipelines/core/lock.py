@@ -62,11 +62,8 @@ class WriteLock:
                 self.folder.mkdir(parents=True, exist_ok=True)
                 handle = (self.folder / LOCK).open("ab")
             except OSError as error:
-                raise InputError(
-                    "workspace-unusable",
-                    f"cannot be used as a workspace: {error.strerror}.",
-                    path=self.folder,
-                ) from error
+                message = f"cannot be used as a workspace: {error.strerror}."
+                raise InputError("workspace-unusable", message, path=self.folder) from error
             try:
                 locked = _lock(handle, patience_s)
             except OSError as error:
@@ -78,10 +75,8 @@ class WriteLock:
                 return handle
             handle.close()
             if not locked:
-                raise WorkspaceBusyError(
-                    "workspace-busy",
-                    f"{self.folder} is being written by {self._holder()}. Wait for it, or stop it.",
-                )
+                message = f"{self.folder} is being written by {self._holder()}. Wait for it, or stop it."
+                raise WorkspaceBusyError("workspace-busy", message)
 
     def _is_current(self, handle: BinaryIO) -> bool:
         """Return whether the open file still has its name: another process may have discarded it."""

@@ -4,7 +4,7 @@ OpenMP, BLAS and numba read their variables when they are loaded. The limit is t
 is imported.
 """
 
-import ctypes
+import contextlib
 import os
 import sys
 from pathlib import Path
@@ -39,63 +39,35 @@ def available_cores() -> int:
     return os.cpu_count() or 1
 
 
-def free_main_memory_bytes() -> int | None:
-    """Return the memory that programs may still take; None if the system does not state it."""
-    known = [free for free in (_free_in_system(), _free_in_group(Path("/sys/fs/cgroup"))) if free is not None]
-    return min(known) if known else None
+def free_main_memory_bytes() -> int:
+    """Return the memory that programs may still take."""
+    import psutil
+
+    free = int(psutil.virtual_memory().available)
+    in_group = _free_in_group(Path("/sys/fs/cgroup"))
+    return free if in_group is None else min(free, in_group)
+
+
+def total_main_memory_bytes() -> int:
+    """Return the memory of the machine."""
+    import psutil
+
+    return int(psutil.virtual_memory().total)
 
 
 def peak_memory_bytes() -> int | None:
     """Return the most main memory that this process has held so far; None if the system does not state it."""
     # First Linux's own line: `ru_maxrss` of a new process starts there at what its parent had.
-    if (kib := _kib_of(Path("/proc/self/status"), "VmHWM:")) is not None:
-        return 1024 * kib
+    with contextlib.suppress(OSError, ValueError):
+        for line in Path("/proc/self/status").read_text(encoding="utf-8", errors="replace").splitlines():
+            if line.startswith("VmHWM:"):
+                return 1024 * int(line.split()[1])
     try:
         import resource
     except ImportError:  # Windows
         return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else 1024 * peak
-
-
-def _kib_of(table: Path, name: str) -> int | None:
-    try:
-        lines = table.read_text(encoding="utf-8", errors="replace").splitlines()
-        return next((int(line.split()[1]) for line in lines if line.startswith(name)), None)
-    except (OSError, ValueError):
-        return None
-
-
-def _free_in_system() -> int | None:
-    if sys.platform == "win32":
-        status = _WindowsMemory(length=ctypes.sizeof(_WindowsMemory))
-        return status.free_bytes if ctypes.windll.kernel32.GlobalMemoryStatusEx(ctypes.byref(status)) else None
-    kib = _kib_of(Path("/proc/meminfo"), "MemAvailable:")
-    return total_main_memory_bytes() if kib is None else 1024 * kib
-
-
-def total_main_memory_bytes() -> int | None:
-    """Return the memory of the machine; None if the system does not state it."""
-    try:
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError, OSError):
-        return None
-
-
-class _WindowsMemory(ctypes.Structure):
-    """MEMORYSTATUSEX of the Windows API."""
-
-    _fields_ = (
-        ("length", ctypes.c_uint32),
-        ("load_percent", ctypes.c_uint32),
-        ("total_bytes", ctypes.c_uint64),
-        ("free_bytes", ctypes.c_uint64),
-        ("paging", ctypes.c_uint64 * 2),
-        ("address_space", ctypes.c_uint64 * 3),
-    )
-
-    length: int
-    free_bytes: int
 
 
 def _free_in_group(root: Path) -> int | None:

@@ -437,8 +437,6 @@ def stage_slice(first: str | None, last: str | None) -> tuple[StageSpec, ...]:
     begin = names.index(first) if first else 0
     end = names.index(last) if last else len(names) - 1
     if begin > end:
-        raise GeorefError(
-            "stage-order",
-            f"--from {first} comes after --to {last}. The order is {', '.join(names)}.",
-        )
+        message = f"--from {first} comes after --to {last}. The order is {', '.join(names)}."
+        raise GeorefError("stage-order", message)
     return PIPELINE[begin : end + 1]

@@ -318,12 +318,11 @@ def refuse_damaged_inputs(workspace: Workspace, spec: StageSpec, memo: Memo) -> 
     for producer in producers(spec):
         damage = why_damaged(finding(workspace, producer, memo, by_content=True).damaged)
         if damage:
-            raise InputError(
-                "product-damaged",
+            message = (
                 f"{damage}. `georef run {(workspace.base or workspace).root}` makes it again. To "
-                f"keep it as it is, delete {producer.folder}/{MANIFEST}.",
-                path=workspace.root,
+                f"keep it as it is, delete {producer.folder}/{MANIFEST}."
             )
+            raise InputError("product-damaged", message, path=workspace.root)
 
 
 def extendable_product(workspace: Workspace, asked: Request) -> Path | None:
@@ -361,13 +360,11 @@ def refuse_loss(
     if reason:
         command = continuing_command(workspace, spec)
         how = "" if reason.startswith("option") else " with the former input"
-        raise InputError(
-            "interrupted-run-lost",
+        message = (
             f"holds an interrupted run of {spec.name} ({found_interrupted(workspace, spec)}), which would be lost, "
-            f"because {reason}. `{command}`{how} continues it; --force drops it.",
-            path=partial.folder,
-            hint=f"{command}, or --force",
+            f"because {reason}. `{command}`{how} continues it; --force drops it."
         )
+        raise InputError("interrupted-run-lost", message, path=partial.folder, hint=f"{command}, or --force")
 
 
 def refuse_loss_by_options(workspace: Workspace, spec: StageSpec, options: StageOptions) -> None:

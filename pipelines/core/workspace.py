@@ -96,11 +96,10 @@ class PartialProduct:
             (self.folder / FAILURE).unlink(missing_ok=True)
             return True
         if insist:
-            raise InputError(
-                "interrupted-run-differs",
-                "holds an interrupted run with other inputs or options. Give those, or start afresh with --force.",
-                path=self.folder,
+            message = (
+                "holds an interrupted run with other inputs or options. Give those, or start afresh with --force."
             )
+            raise InputError("interrupted-run-differs", message, path=self.folder)
         return False
 
 
@@ -246,7 +245,12 @@ class Workspace:
         """
         with storage_failures(self.written), WriteLock(self.written).hold(activity):
             for spec in STAGES:
-                self._recover(spec)
+                final, old = self.written / spec.folder, self.written / f".{spec.folder}.old"
+                if (self.partial(spec) / MANIFEST).exists():  # complete: only the renames are missing
+                    self._swap(spec)
+                elif old.exists() and not final.exists():
+                    old.rename(final)
+                remove(old)
             yield
 
     def has_product(self) -> bool:
@@ -257,14 +261,6 @@ class Workspace:
         """Return whether a command has been at work here."""
         begun = (self.root / REQUESTS, *(self.partial(spec) for spec in STAGES))
         return self.has_product() or any(path.exists() for path in begun)
-
-    def _recover(self, spec: StageSpec) -> None:
-        final, old = self.written / spec.folder, self.written / f".{spec.folder}.old"
-        if (self.partial(spec) / MANIFEST).exists():  # complete: only the renames are missing
-            self._swap(spec)
-        elif old.exists() and not final.exists():
-            old.rename(final)
-        remove(old)
 
     def _swap(self, spec: StageSpec) -> None:
         final, old, partial = self.written / spec.folder, self.written / f".{spec.folder}.old", self.partial(spec)
@@ -317,12 +313,11 @@ class Workspace:
 
 def _refuse_what_is_no_folder(folder: Path) -> None:
     if folder.is_symlink():
-        raise InputError(
-            "stage-folder-is-link",
+        message = (
             "is a symbolic link, and a stage replaces its folder as a whole. Put the folder itself there, or the "
-            "whole workspace on the other disk.",
-            path=folder,
+            "whole workspace on the other disk."
         )
+        raise InputError("stage-folder-is-link", message, path=folder)
     if folder.exists() and not folder.is_dir():
         raise InputError(
             "stage-folder-is-file", "is a file where the stage's folder belongs. Move it away.", path=folder

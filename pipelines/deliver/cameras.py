@@ -295,12 +295,17 @@ def _footprints(
         model: cameras and points in the frame of the placement, z up.
         table: the same cameras, with split and σ.
     """
-    surface = PointSurface(_surface_points(model))
+    # Points that three photographs show, without the highest and lowest; all if none are left.
+    rays = np.bincount(model.obs_point, minlength=len(model.point_id))
+    good = rays >= LEAST_RAYS
+    points = model.point_in_local[good if good.any() else slice(None)]
+    kept = without_outliers(points)
+    surface = PointSurface(kept if len(kept) else points)
     times = {image.name: image.timestamp_s for image in survey.images}
-    rays = {key: border_rays(camera) for key, camera in model.cameras.items()}
+    borders = {key: border_rays(camera) for key, camera in model.cameras.items()}
     features, corners = [], []
     for index, (name, center) in enumerate(zip(model.image_name, model.cam_center_in_local, strict=True)):
-        in_file = rays[int(model.image_camera_id[index])] @ model.rotation_cam_from_local[index]
+        in_file = borders[int(model.image_camera_id[index])] @ model.rotation_cam_from_local[index]
         found = footprint(in_file, center, surface)
         lla = lla_from_ecef(ecef_from_file.apply(found.outline))
         east, north, up = table.sigma_enu_m[index].tolist()
@@ -319,15 +324,6 @@ def _footprints(
     if not len(seen):
         seen = lla_from_ecef(ecef_from_file.apply(model.cam_center_in_local))
     return features, seen
-
-
-def _surface_points(model: SparseModel) -> FloatArray:
-    """Return the points that three photographs show, without the highest and lowest; all if none are left."""
-    rays = np.bincount(model.obs_point, minlength=len(model.point_id))
-    good = rays >= LEAST_RAYS
-    points = model.point_in_local[good if good.any() else slice(None)]
-    kept = without_outliers(points)
-    return kept if len(kept) else points
 
 
 def _iso(seconds: float | None) -> str | None:

@@ -16,7 +16,7 @@ import numpy as np
 from pipelines import __version__
 from pipelines.adjust.accuracy_grid import AccuracyGrid
 from pipelines.core.errors import DegenerateGeometryError
-from pipelines.core.products import Remark, union
+from pipelines.core.products import union
 from pipelines.core.stages import CLOUD
 from pipelines.core.types import FloatArray, IntArray, rows_of
 from pipelines.core.workspace import StageRun, Summary
@@ -24,11 +24,11 @@ from pipelines.deliver.options import ExportCloudOptions
 from pipelines.deliver.placement import median_values
 from pipelines.deliver.surface import ground_below, predicted_sigma, surface_views, without_sigma
 from pipelines.formats.cloud_ply import CloudPlyWriter, CloudPoints
-from pipelines.formats.georef_sidecar import CrsSidecar, SceneSigma, median_sigma, write_sidecar
+from pipelines.formats.georef_sidecar import SceneSigma, median_sigma, write_sidecar
 from pipelines.formats.las import LazWriter
 from pipelines.surface.fusion import SurfaceCloud, fused_squares, fusion_settings
 from pipelines.surface.ground import GroundModel
-from pipelines.survey.area import Area, area_of
+from pipelines.survey.area import area_of
 from pipelines.survey.headline import headline_of
 from pipelines.survey.target_crs import TargetCrs, target_crs
 from pipelines.survey.trained_survey import corners, load_trained, scene_points
@@ -70,7 +70,20 @@ def run(stage: StageRun, options: ExportCloudOptions) -> Summary:
     for path in paths:
         write_sidecar(sidecar, path)
     views.close()
-    return _summary(tally, sidecar, settings.spacing_m, area, warnings)
+    values = {
+        "points": tally.count,
+        "ground_points": tally.ground,
+        "area_ha": area.hectares,
+        "spacing_m": settings.spacing_m,
+        "crs": sidecar.crs,
+        "vertical_datum": sidecar.vertical_datum.name,
+        "bounds": sidecar.bounds,
+        **median_values(sidecar.sigma, "point"),
+        "assumed": "; ".join(sidecar.assumed),
+    }
+    figure = f"{tally.count} points, one in {settings.spacing_m:.3f} m, {sidecar.crs}, heights "
+    figure += sidecar.vertical_datum.name + median_sigma(sidecar.sigma, "points")
+    return Summary(figure, values, warnings, sidecar.cautions)
 
 
 def _middle_and_axes(target: TargetCrs, scene_in_geo: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -187,21 +200,3 @@ def _write_points(
             for writer in writers:
                 writer.write(points)
     return tally
-
-
-def _summary(
-    tally: Tally, sidecar: CrsSidecar, spacing_m: float, area: Area, warnings: tuple[Remark, ...]
-) -> Summary:
-    values = {
-        "points": tally.count,
-        "ground_points": tally.ground,
-        "area_ha": area.hectares,
-        "spacing_m": spacing_m,
-        "crs": sidecar.crs,
-        "vertical_datum": sidecar.vertical_datum.name,
-        "bounds": sidecar.bounds,
-        **median_values(sidecar.sigma, "point"),
-        "assumed": "; ".join(sidecar.assumed),
-    }
-    figure = f"{tally.count} points, one in {spacing_m:.3f} m, {sidecar.crs}, heights {sidecar.vertical_datum.name}"
-    return Summary(figure + median_sigma(sidecar.sigma, "points"), values, warnings, sidecar.cautions)

@@ -167,8 +167,7 @@ def _in_views(gaussians: Gaussians, views: SurfaceViews, backend: Rasterizer, pr
         for number in range(len(views)):
             view = views.view(number)
             no_error = torch.zeros(view.pinhole.height, view.pinhole.width)
-            pose = torch.from_numpy(pose_matrix(view.cam_from_model, view.cam_center_in_model)).float()
-            shown = view_contributions(gaussians, pose, view.pinhole, no_error, backend)
+            shown = view_contributions(gaussians, _pose(view), view.pinhole, no_error, backend)
             most_px = torch.maximum(most_px, shown.weight_px.cpu())
             task.advance()
     return most_px >= _LEAST_SHOWN_PX
@@ -206,8 +205,11 @@ def _collected(squares: Iterable[SurfaceCloud], views: SurfaceViews, trained: Tr
 def _shown(view: SurfaceView) -> ShownView:
     assert view.rgb is not None
     colour = torch.from_numpy(np.array(view.rgb)).float() / 255
-    pose = torch.from_numpy(pose_matrix(view.cam_from_model, view.cam_center_in_model)).float()
-    return ShownView(pose, view.pinhole, colour)
+    return ShownView(_pose(view), view.pinhole, colour)
+
+
+def _pose(view: SurfaceView) -> Tensor:
+    return torch.from_numpy(pose_matrix(view.cam_from_model, view.cam_center_in_model)).float()
 
 
 def _psnr_change_db(before: ModelRenderer, after: ModelRenderer, progress: Progress) -> float | None:

@@ -102,8 +102,10 @@ def run(stage: StageRun, options: ExportMeshOptions) -> Summary:
         "texture_px": len(shown.image),
         "crs": None if target is None else target.crs.name,
     }
-    key = f"{len(mesh.faces)} faces of {simple.faces_before}, voxels of {voxel_m:.3f} m, simplified by "
-    key += f"{simple.rms_error_m:.3f} m RMS, {simple.largest_error_m:.3f} m at most"
+    key = (
+        f"{len(mesh.faces)} faces of {simple.faces_before}, voxels of {voxel_m:.3f} m, simplified by "
+        f"{simple.rms_error_m:.3f} m RMS, {simple.largest_error_m:.3f} m at most"
+    )
     return Summary(key, values, cautions=placement.cautions)
 
 
@@ -125,7 +127,7 @@ def _write_in_frame(
 def _require_memory(cells: int, voxel_m: float) -> None:
     """Refuse a mesh that the memory would not hold, by the number of cells with surface."""
     needed, free = _FIXED_BYTES + _CELL_BYTES * cells, free_main_memory_bytes()
-    if free is not None and needed > free:
+    if needed > free:
         raise ResourceError(
             "mesh-memory",
             f"The mesh with voxels of {voxel_m:.3f} m may need {needed / 2**30:.1f} GiB of memory; "

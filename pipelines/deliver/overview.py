@@ -3,6 +3,7 @@
 Reads survey, trained model and the centres of its Gaussians. Writes nothing.
 """
 
+import contextlib
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
@@ -20,11 +21,11 @@ from pipelines.deliver.options import DESCRIPTIONS
 from pipelines.deliver.placement import place
 from pipelines.formats.splat_ply import read_centres
 from pipelines.formats.vector_files import Json, feature, polygon
-from pipelines.geodesy.enu import ecef_from_enu, lla_from_ecef
+from pipelines.geodesy.enu import lla_from_enu
 from pipelines.survey.calibrated import load_survey
 from pipelines.survey.headline import headline_of
 from pipelines.survey.options import CrsOptions
-from pipelines.survey.report import EvaluationReport, read_report
+from pipelines.survey.report import read_report
 from pipelines.survey.survey import Survey
 from pipelines.survey.target_crs import usable_crs
 from pipelines.survey.trained_model import TrainedModel
@@ -151,9 +152,17 @@ def overview(workspace: Workspace, options: CrsOptions) -> Overview:
     survey = load_survey(workspace)
     means = read_centres(workspace.path(GAUSSIANS)).astype(np.float64)
     placement = place(model, survey, means, headline_of(workspace))
-    report, rows = _report(workspace), status(workspace)
+    report, rows = None, status(workspace)
+    with contextlib.suppress(GeorefError):  # not evaluated, or damaged: `georef status` tells
+        report = read_report(workspace.path(REPORT))
     test = None if report is None else report.test_views
-    states = {BY_NAME[row.stage].folder: row for row in rows}
+    states, made = {BY_NAME[row.stage].folder: row for row in rows}, []
+    for name, description in DESCRIPTIONS.items():
+        path, row = workspace.root / name, states.get(name.partition("/")[0])
+        if row is not None and path.exists():
+            inside = path.rglob("*") if path.is_dir() else (path,)
+            size = sum(file.stat().st_size for file in inside if file.is_file())
+            made.append(MadeFile(name, description, size, row.finished, row.state))
     return Overview(
         workspace=workspace.root,
         gaussians=len(means),
@@ -162,7 +171,7 @@ def overview(workspace: Workspace, options: CrsOptions) -> Overview:
         accuracy=placement.accuracy,
         psnr=None if test is None else test.psnr,
         area_ha=None if report is None else report.area_ha,
-        files=_files(workspace, states),
+        files=tuple(made),
         outdated=tuple(row for row in rows if row.state in ("stale", "damaged")),
         interrupted={row.stage: row.interrupted for row in rows if row.interrupted},
         further=tuple(spec for spec in DELIVERABLES if not (workspace.root / spec.product).exists()),
@@ -173,7 +182,7 @@ def overview(workspace: Workspace, options: CrsOptions) -> Overview:
 def _bounds(points_in_geo: FloatArray, survey: Survey, options: CrsOptions) -> Bounds:
     on_earth = None
     if survey.origin is not None:
-        lla = lla_from_ecef(ecef_from_enu(points_in_geo, survey.origin))
+        lla = lla_from_enu(points_in_geo, survey.origin)
         lla[:, 1] -= 360.0 * np.round((lla[:, 1] - lla[0, 1]) / 360.0)
         (south, west, low_m), (north, east, high_m) = (row.tolist() for row in np.quantile(lla, _WITHIN, axis=0))
         on_earth = GeographicBounds(
@@ -194,21 +203,3 @@ def _bounds(points_in_geo: FloatArray, survey: Survey, options: CrsOptions) -> B
         high=vector3(high),
         assumed=crs.assumed,
     )
-
-
-def _report(workspace: Workspace) -> EvaluationReport | None:
-    try:
-        return read_report(workspace.path(REPORT))
-    except GeorefError:  # not evaluated, or damaged: `georef status` tells
-        return None
-
-
-def _files(workspace: Workspace, states: dict[str, StageState]) -> tuple[MadeFile, ...]:
-    made = []
-    for name, description in DESCRIPTIONS.items():
-        path, row = workspace.root / name, states.get(name.partition("/")[0])
-        if row is not None and path.exists():
-            inside = path.rglob("*") if path.is_dir() else (path,)
-            size = sum(file.stat().st_size for file in inside if file.is_file())
-            made.append(MadeFile(name, description, size, row.finished, row.state))
-    return tuple(made)

@@ -21,7 +21,7 @@ from pipelines.geodesy import enu
 from pipelines.geodesy.crs import ECEF, parse_crs
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
-from pipelines.geometry.similarity import Similarity, SimilarityRecord, moved_pivot
+from pipelines.geometry.similarity import Similarity, moved_pivot
 from pipelines.survey.survey import Survey
 from pipelines.survey.trained_model import Adjustment
 
@@ -96,50 +96,35 @@ class Placement:
 
 
 def place(model: Adjustment, survey: Survey, points_in_model: ArrayLike, accuracy: Headline | None) -> Placement:
-    """Return the placement of a solved model on Earth.
+    """Return the placement of a solved model, on Earth unless its frame is local.
 
     Args:
         points_in_model: (N, 3) centres of all its Gaussians, or without any its SfM points, N ≥ 1; their median is
             the middle of the scene.
     """
     geo_from_model = Similarity.from_record(model.geo_from_model)
-    if survey.origin is None:
-        return Placement(
-            origin_lla=None,
-            ecef_from_file=None,
-            file_from_geo=Similarity(),
-            geo_from_model=geo_from_model,
-            covariance=_covariance_in_file(model.geo_from_model, Similarity()),
-            vertical=survey.vertical,
-            cautions=model.cautions,
-            accuracy=accuracy,
+    origin_lla, ecef_from_file, file_from_geo = None, None, Similarity()
+    if survey.origin is not None:
+        scene_in_geo = np.median(geo_from_model.apply(points_in_model), axis=0)
+        lla = enu.lla_from_ecef(enu.ecef_from_enu(scene_in_geo, survey.origin))
+        origin_lla = np.array([*np.round(lla[:2], _ORIGIN_DECIMALS_DEG), np.round(lla[2], _ORIGIN_DECIMALS_M)])
+        ecef_from_file, ecef_from_geo = (
+            Similarity(1.0, enu.ecef_from_enu_rotation(origin), enu.ecef_from_lla(origin))
+            for origin in (origin_lla, enu.lla_of(survey.origin))
         )
-    scene_in_geo = np.median(geo_from_model.apply(points_in_model), axis=0)
-    lla = enu.lla_from_ecef(enu.ecef_from_enu(scene_in_geo, survey.origin))
-    origin_lla = np.array([*np.round(lla[:2], _ORIGIN_DECIMALS_DEG), np.round(lla[2], _ORIGIN_DECIMALS_M)])
-    ecef_from_file, ecef_from_geo = (
-        Similarity(1.0, enu.ecef_from_enu_rotation(origin), enu.ecef_from_lla(origin))
-        for origin in (origin_lla, enu.lla_of(survey.origin))
-    )
-    file_from_geo = ecef_from_file.inverse() @ ecef_from_geo
+        file_from_geo = ecef_from_file.inverse() @ ecef_from_geo
+    covariance, pivot = np.array(model.geo_from_model.covariance), model.geo_from_model.pivot
+    about_origin = moved_pivot(covariance, pivot, file_from_geo.inverse().translation)
     return Placement(
         origin_lla=origin_lla,
         ecef_from_file=ecef_from_file,
         file_from_geo=file_from_geo,
         geo_from_model=geo_from_model,
-        covariance=_covariance_in_file(model.geo_from_model, file_from_geo),
+        covariance=_turned(about_origin, file_from_geo.rotation) if about_origin.any() else None,
         vertical=survey.vertical,
         cautions=model.cautions,
         accuracy=accuracy,
     )
-
-
-def _covariance_in_file(geo_from_model: SimilarityRecord, file_from_geo: Similarity) -> FloatArray | None:
-    covariance = np.array(geo_from_model.covariance)
-    if not covariance.any():
-        return None
-    about_origin = moved_pivot(covariance, geo_from_model.pivot, file_from_geo.inverse().translation)
-    return _turned(about_origin, file_from_geo.rotation)
 
 
 def _turned(covariance: FloatArray, to_from_from: FloatArray) -> FloatArray:

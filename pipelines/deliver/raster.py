@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter
 from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.files import remove, replace_text
 from pipelines.core.products import Remark, union
-from pipelines.core.types import BoolArray, ByteArray, FloatArray
+from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import ExportRasterOptions
 from pipelines.deliver.placement import median_values, require_space, scene_sigma
@@ -65,10 +65,8 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
     mosaic.render(source, stage.progress)
     height = mosaic.sample("dsm")
     if not len(height):
-        raise DegenerateGeometryError(
-            "no-raster-cells",
-            f"No cell is seen by {options.min_views} training views or more. Lower --min-views.",
-        )
+        message = f"No cell is seen by {options.min_views} training views or more. Lower --min-views."
+        raise DegenerateGeometryError("no-raster-cells", message)
     sigma = None
     if not reason:
         counts = "georeference, cameras and lens; the surface's own noise between training views; interpolation"
@@ -77,8 +75,8 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
     bounds = [[west, south, height.min()], [east, north, height.max()]]
     detail = (
         f"The model was trained at {training_m:.3f} m a pixel on the ground, and shows no finer detail, whatever "
+        "the size of a raster's cells."
     )
-    detail += "the size of a raster's cells."
     coarse = (Remark(code="detail-of-training", sentence=detail),) if source.training_px > _DETAIL else ()
     empty = "The rasters state no σ, and sigma_h.tif and sigma_v.tif are empty"
     cautions = union(trained.model.cautions, (*coarse, *without_sigma(empty, reason)))
@@ -91,7 +89,12 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
         _write_pictures(stage.out, target.horizontal_unit_m / target.crs.height_unit_m)
     of_ground = options.contours_of == "terrain" and source.terrain is not None
     heights = stage.out / ("dtm.tif" if of_ground else "dsm.tif")
-    lines = _write_contours(heights, frame, options.contours) if options.contours else 0
+    lines: list[ContourLine] = []
+    if options.contours:
+        height, _ = read_reduced(heights, _CONTOUR_PX)
+        lines = _contour_lines(height[0].astype(np.float64), frame, options.contours)
+        write_contours_gpkg(stage.out / "contours.gpkg", lines, frame.wkt)
+        write_contours_dxf(stage.out / "contours.dxf", lines)
     measured, interpolated = mosaic.shares()
     source.views.close()
     remove(mosaic.folder)
@@ -115,7 +118,7 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
             "measured": measured,
             "interpolated": interpolated,
             **median_values(sigma, "cell"),
-            "contour_lines": lines,
+            "contour_lines": len(lines),
             "assumed": "; ".join(target.assumed),
         },
         warnings,
@@ -132,37 +135,21 @@ def _write_pictures(folder: Path, heights_by_plan: float) -> None:
     """
     rgba, _ = read_reduced(folder / "orthophoto.tif", _PICTURE_PX)
     cv2.imwrite(str(folder / "preview.png"), np.ascontiguousarray(np.moveaxis(rgba, 0, 2)[..., [2, 1, 0, 3]]))
-    height, cell = read_reduced(folder / "dsm.tif", _PICTURE_PX)
-    grey = _hillshade(height[0], cell * heights_by_plan)
-    alpha = np.where(np.isfinite(height[0]), 255, 0).astype(np.uint8)
-    low, high = np.nanquantile(height[0], _COLOURED)
-    level = np.clip((np.nan_to_num(height[0], nan=low) - low) / max(high - low, 1e-6), 0.0, 1.0)
+    bands, cell = read_reduced(folder / "dsm.tif", _PICTURE_PX)
+    height, known = bands[0], np.isfinite(bands[0])
+    alpha = np.where(known, 255, 0).astype(np.uint8)
+    # Light of a sun in the north-west on rows from the north.
+    south, east = np.gradient(np.where(known, height, np.nanmedian(height)), cell * heights_by_plan)
+    azimuth, elevation = np.radians(_SUN_AZIMUTH_DEG), np.radians(_SUN_ELEVATION_DEG)
+    sun = np.array([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)])
+    light = (sun[2] - sun[0] * east + sun[1] * south) / np.sqrt(1.0 + east**2 + south**2)
+    grey = np.round(255 * np.clip(light, 0.0, 1.0))
+    low, high = np.nanquantile(height, _COLOURED)
+    level = np.clip((np.nan_to_num(height, nan=low) - low) / max(high - low, 1e-6), 0.0, 1.0)
     colours = cv2.applyColorMap(np.asarray(255 * level, dtype=np.uint8), cv2.COLORMAP_TURBO)
     # Pale colours, so that the light can be seen on them.
     shaded = (1 - _TINT + _TINT * colours / 255.0) * grey[..., None]
     cv2.imwrite(str(folder / "hillshade.png"), np.dstack([shaded.astype(np.uint8), alpha]))
-
-
-def _hillshade(height: FloatArray, cell: float) -> ByteArray:
-    """Return the light (H, W), 0 … 255, of a sun in the north-west at 45° on heights (H, W), rows from the north.
-
-    NaN: no surface. The size of a cell is in the unit of the heights.
-    """
-    south, east = np.gradient(np.where(np.isfinite(height), height, np.nanmedian(height)), cell)
-    azimuth, elevation = np.radians(_SUN_AZIMUTH_DEG), np.radians(_SUN_ELEVATION_DEG)
-    sun = np.array([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)])
-    light = (sun[2] - sun[0] * east + sun[1] * south) / np.sqrt(1.0 + east**2 + south**2)
-    return np.asarray(np.round(255 * np.clip(light, 0.0, 1.0)), dtype=np.uint8)
-
-
-def _write_contours(heights: Path, frame: RasterFrame, interval: float) -> int:
-    """Write `contours.gpkg` and `contours.dxf` beside a raster of heights, and return the number of lines."""
-    height, _ = read_reduced(heights, _CONTOUR_PX)
-    folder = heights.parent
-    lines = _contour_lines(height[0].astype(np.float64), frame, interval)
-    write_contours_gpkg(folder / "contours.gpkg", lines, frame.wkt)
-    write_contours_dxf(folder / "contours.dxf", lines)
-    return len(lines)
 
 
 def _contour_lines(height: FloatArray, frame: RasterFrame, interval: float) -> list[ContourLine]:
@@ -179,16 +166,18 @@ def _contour_lines(height: FloatArray, frame: RasterFrame, interval: float) -> l
     low, high = np.nanquantile(height, [0.0005, 0.9995])
     levels = interval * np.arange(math.ceil(low / interval), math.floor(high / interval) + 1)
     if len(levels) > _MOST_LEVELS:
-        raise InputError(
-            "contour-interval",
-            f"The interval makes {len(levels)} contour heights, more than {_MOST_LEVELS}. Give a larger interval.",
-            field="--contours",
+        message = (
+            f"The interval makes {len(levels)} contour heights, more than {_MOST_LEVELS}. Give a larger interval."
         )
+        raise InputError("contour-interval", message, field="--contours")
     west, south, east, north = frame.bounds
     step = (east - west) / height.shape[1], (north - south) / height.shape[0]
     x = west + (np.arange(height.shape[1]) + 0.5) * step[0]
     y = north - (np.arange(height.shape[0]) + 0.5) * step[1]
-    generator = contourpy.contour_generator(x, y, np.ma.masked_invalid(_smoothed(height, known)))
+    weight = gaussian_filter(known.astype(np.float64), _SMOOTHED, mode="constant")
+    total = gaussian_filter(np.where(known, height, 0.0), _SMOOTHED, mode="constant")
+    smooth = np.ma.masked_where(~known, total / np.maximum(weight, 1e-9))
+    generator = contourpy.contour_generator(x, y, smooth)
     lines = []
     for level in levels:
         for xy in generator.lines(float(level)):
@@ -197,10 +186,3 @@ def _contour_lines(height: FloatArray, frame: RasterFrame, interval: float) -> l
             if length >= _LEAST_CELLS * step[0]:
                 lines.append(ContourLine(float(level), points, round(level / interval) % _EVERY_MAJOR == 0))
     return lines
-
-
-def _smoothed(height: FloatArray, known: BoolArray) -> FloatArray:
-    """Return heights (H, W), smoothed over what is known; NaN elsewhere."""
-    weight = gaussian_filter(known.astype(np.float64), _SMOOTHED, mode="constant")
-    total = gaussian_filter(np.where(known, height, 0.0), _SMOOTHED, mode="constant")
-    return np.where(known, total / np.maximum(weight, 1e-9), np.nan)

@@ -91,7 +91,13 @@ class Mosaic:
         with progress.task("windows", len(windows)) as task:
             for window in windows:
                 if not all(self._part(self._seen, name, window).exists() for name in _SEEN):
-                    self._write(self._seen, window, _seen_bands(source, window))
+                    cells = render_window(source, window.frame, window.column, window.row)
+                    heights = (cells.height, cells.modelled, cells.sigma_h_m, cells.sigma_v_m)
+                    bands: list[NDArray[Any]] = [
+                        cells.rgba,
+                        *(values[None].astype(np.float32) for values in heights),
+                    ]
+                    self._write(self._seen, window, dict(zip(_SEEN, bands, strict=True)))
                 task.advance()
         self._drop_islands()
         for name in ("orthophoto", "dsm", "modelled"):
@@ -100,10 +106,8 @@ class Mosaic:
         with progress.task("whole windows", len(windows)) as task:
             for window in windows:
                 if not all(self._part(self._whole, name, window).exists() for name in self._kinds):
-                    cells = whole_cells(
-                        source, self._seen_around(window), self._coarse, (window.row, window.column)
-                    )
-                    self._write(self._whole, window, cells)
+                    seen, first = self._seen_around(window), (window.row, window.column)
+                    self._write(self._whole, window, whole_cells(source, seen, self._coarse, first))
                 task.advance()
 
     def _drop_islands(self) -> None:
@@ -135,10 +139,8 @@ class Mosaic:
         top, left = max(row - REACH, 0), max(column - REACH, 0)
         rows = min(row + window.frame.rows + REACH, self.frame.rows) - top
         columns = min(column + window.frame.columns + REACH, self.frame.columns) - left
-        frame, part = (
-            self.frame.part(left, top, columns, rows),
-            (slice(top, top + rows), slice(left, left + columns)),
-        )
+        frame = self.frame.part(left, top, columns, rows)
+        part = (slice(top, top + rows), slice(left, left + columns))
         sigma_h, sigma_v = (read_cells(self._part(self._seen, name, window))[0] for name in ("sigma_h", "sigma_v"))
         return SeenCells(
             frame=frame,
@@ -208,11 +210,22 @@ class Mosaic:
 
     def write(self, folder: Path, sidecar: CrsSidecar, progress: Progress) -> Iterator[Path]:
         """Write each raster into a folder, with accuracy and σ of the sidecar as metadata, and yield its path."""
+        tags = {
+            "TIFFTAG_SOFTWARE": f"GeoRefGS {__version__}",
+            "GEOREF_CRS": sidecar.crs,
+            "GEOREF_VERTICAL_DATUM": sidecar.vertical_datum.name,
+            "GEOREF_EPOCH": "not stated",
+        }
+        if sidecar.accuracy is not None:
+            tags["GEOREF_ACCURACY"] = sidecar.accuracy.text
+        if sidecar.sigma is not None:
+            tags["GEOREF_MEDIAN_CELL_SIGMA_H_M"] = f"{sidecar.sigma.median_sigma_h_m:.4f}"
+            tags["GEOREF_MEDIAN_CELL_SIGMA_V_M"] = f"{sidecar.sigma.median_sigma_v_m:.4f}"
         with progress.task("rasters", len(self._kinds)) as task:
             for name, kind in self._kinds.items():
                 parts = [(self._part(self._whole, name, one), one.column, one.row) for one in self._windows()]
                 path = folder / f"{name}.tif"
-                write_mosaic(path, parts, self.frame, kind, _tags(sidecar))
+                write_mosaic(path, parts, self.frame, kind, tags)
                 yield path
                 task.advance(note=path.name)
 
@@ -231,30 +244,8 @@ class Mosaic:
         return folder / f"{name}_{window.row}_{window.column}.tif"
 
 
-def _tags(sidecar: CrsSidecar) -> dict[str, str]:
-    tags = {
-        "TIFFTAG_SOFTWARE": f"GeoRefGS {__version__}",
-        "GEOREF_CRS": sidecar.crs,
-        "GEOREF_VERTICAL_DATUM": sidecar.vertical_datum.name,
-        "GEOREF_EPOCH": "not stated",
-    }
-    if sidecar.accuracy is not None:
-        tags["GEOREF_ACCURACY"] = sidecar.accuracy.text
-    if sidecar.sigma is not None:
-        tags["GEOREF_MEDIAN_CELL_SIGMA_H_M"] = f"{sidecar.sigma.median_sigma_h_m:.4f}"
-        tags["GEOREF_MEDIAN_CELL_SIGMA_V_M"] = f"{sidecar.sigma.median_sigma_v_m:.4f}"
-    return tags
-
-
 def _coarse_cells(window: _Window, step: int) -> tuple[IntArray, IntArray]:
     """Return the rows (H, 1) and columns (1, W) of a window in a raster with one cell for `step` × `step`."""
     rows = (window.row + np.arange(window.frame.rows, dtype=np.int64)) // step
     columns = (window.column + np.arange(window.frame.columns, dtype=np.int64)) // step
     return rows[:, None], columns[None, :]
-
-
-def _seen_bands(source: RasterSource, window: _Window) -> dict[str, NDArray[Any]]:
-    """Return the bands (B, H, W) of the rasters of what is measured in a window."""
-    cells = render_window(source, window.frame, window.column, window.row)
-    heights = dict(zip(_SEEN[1:], (cells.height, cells.modelled, cells.sigma_h_m, cells.sigma_v_m), strict=True))
-    return {"orthophoto": cells.rgba, **{name: values[None].astype(np.float32) for name, values in heights.items()}}

@@ -58,25 +58,20 @@ def make_frame(
     """
     crs = target.crs
     if crs.is_geocentric:
-        raise InputError(
-            "crs-geocentric",
-            f"{crs.name} is geocentric and has no map plane. Give a projected CRS, such as EPSG:32632.",
-            field="--crs",
-        )
+        message = f"{crs.name} is geocentric and has no map plane. Give a projected CRS, such as EPSG:32632."
+        raise InputError("crs-geocentric", message, field="--crs")
     if crs.is_geographic and options.gsd is None:
-        raise InputError(
-            "gsd-in-degrees",
+        message = (
             f"{crs.name} has coordinates in {crs.units[0]}s. Give the cell size in that unit, such as "
-            "--gsd 0.000001, or a projected CRS.",
-            field="--gsd",
+            "--gsd 0.000001, or a projected CRS."
         )
+        raise InputError("gsd-in-degrees", message, field="--gsd")
     if crs.is_geographic and options.gsd is not None and options.gsd > _LARGEST_DEG:
-        raise InputError(
-            "gsd-too-large",
+        message = (
             f"The unit of {crs.name} is the {crs.units[0]}, not the metre, and {options.gsd:g} {crs.units[0]}s are "
-            "more than a kilometre. Give the cell size in that unit, such as --gsd 0.000001.",
-            field="--gsd",
+            "more than a kilometre. Give the cell size in that unit, such as --gsd 0.000001."
         )
+        raise InputError("gsd-too-large", message, field="--gsd")
     step = _readable(default_gsd_m / crs.horizontal_unit) if options.gsd is None else options.gsd
     west, south, east, north = bounds
     west, south = np.floor(west / step), np.floor(south / step)
@@ -84,13 +79,12 @@ def make_frame(
     columns, rows = int(east - west), int(north - south)
     if columns * rows > options.max_pixels:
         enough = step * math.sqrt(columns * rows / options.max_pixels)
-        raise InputError(
-            "too-many-cells",
+        message = (
             f"A cell size of {step:g} {crs.units[0]} makes {columns} × {rows} = {columns * rows:.3g} cells, more "
             f"than --max-pixels {options.max_pixels:.3g}. Give --gsd {enough:.2g} or larger, or "
-            "a larger --max-pixels.",
-            field="--gsd",
+            "a larger --max-pixels."
         )
+        raise InputError("too-many-cells", message, field="--gsd")
     return RasterFrame(crs.wkt1, west * step, north * step, step, step, columns, rows)
 
 

@@ -111,8 +111,7 @@ def splat_values(splat: PlacedSplat | SplatParts) -> dict[str, object]:
 
 def load_splat(workspace: Workspace, options: SplatOptions) -> PlacedSplat:
     """Return the splat of a workspace, placed on Earth; a DegenerateGeometryError: no Gaussian is opaque enough."""
-    survey = load_survey(workspace)
-    model = load_json(TrainedModel, workspace.path(MODEL))
+    survey, model = load_survey(workspace), load_json(TrainedModel, workspace.path(MODEL))
     gaussians = read_gaussians(workspace.path(GAUSSIANS))
     placement = place(model, survey, gaussians.means.numpy(), headline_of(workspace))
     return placed_splat(gaussians, placement, options, crop_of(workspace, options))
@@ -120,8 +119,7 @@ def load_splat(workspace: Workspace, options: SplatOptions) -> PlacedSplat:
 
 def load_splat_parts(workspace: Workspace, options: WebSplatOptions) -> SplatParts:
     """Return the splat of a workspace, placed on Earth, to be read part by part; a GeorefError: as `load_splat`."""
-    survey = load_survey(workspace)
-    model = load_json(TrainedModel, workspace.path(MODEL))
+    survey, model = load_survey(workspace), load_json(TrainedModel, workspace.path(MODEL))
     path = workspace.path(GAUSSIANS)
     centers, crop = read_centres(path), crop_of(workspace, options)
     chosen = _chosen(centers, read_logit_opacities(path), options, crop)

@@ -10,7 +10,7 @@ import hashlib
 import html
 import itertools
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Literal
@@ -20,16 +20,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import AfterValidator, Field
 
-from pipelines.core.files import replace_file
+from pipelines.core.files import replace_text
 from pipelines.core.products import Product
 from pipelines.core.sentences import printable
 from pipelines.core.stages import TILES
-from pipelines.core.types import Float32Array, FloatArray, Vector3, vector3
+from pipelines.core.types import Float32Array, Vector3, vector3
 from pipelines.deliver.placement import Placement
 from pipelines.geodesy.crs import PointCrs
 from pipelines.geodesy.enu import (
     SEMI_MAJOR_M,
-    Origin,
     ecef_from_enu,
     ecef_from_enu_rotation,
     ecef_from_lla,
@@ -65,11 +64,14 @@ class Fact(Product):
     value: ShownText
 
 
+PointKind = Literal["control", "check"]
+
+
 class PagePoint(Product):
     """Control or check point with its surveyed place in EPSG:4978."""
 
     name: ShownText
-    kind: Literal["control", "check"]
+    kind: PointKind
     ecef: Vector3
 
 
@@ -140,6 +142,11 @@ def scene_page(
         center_in_file: (N, 3) centres of its Gaussians, metres.
     """
     assert placement.origin_lla is not None  # tiles are refused before, without a place on Earth
+    kinds: dict[PointKind, Sequence[SurveyedPoint]] = {
+        "control": survey.control_points,
+        "check": survey.check_points,
+    }
+    origin = survey.origin_on_earth
     distance_m = np.linalg.norm(center_in_file, axis=1)
     radius = max(float(np.quantile(distance_m, _SHOWN)), _LEAST_RADIUS_M)
     box = float(np.clip(_CRS_BOX * radius, _LEAST_CRS_BOX_M, _MOST_CRS_BOX_M))
@@ -151,9 +158,10 @@ def scene_page(
         radius_m=radius,
         facts=_facts(placement, target),
         cautions=tuple(caution.sentence for caution in placement.cautions),
-        points=(
-            *_points("control", survey.control_points, survey.origin_on_earth),
-            *_points("check", survey.check_points, survey.origin_on_earth),
+        points=tuple(
+            PagePoint(name=point.name, kind=kind, ecef=vector3(ecef_from_enu(point.position_in_geo, origin)))
+            for kind, points in kinds.items()
+            for point in points
         ),
         crs=fit_local_crs(target.crs, placement.origin_lla, (box, box, box)),
     )
@@ -162,12 +170,10 @@ def scene_page(
 def write_scene_page(page: ScenePage, folder: Path) -> None:
     """Write the page into a folder, whole or not at all; an OSError: it cannot be written."""
     program = resources.files(__package__).joinpath("templates", "tiles.html").read_text(encoding="utf-8")
-    draft = folder / f"{PAGE}.tmp"
     program = program.replace(_POLICY, html.escape(_policy(program, page.cesium)), 1)
     # No name in the JSON can break out of an HTML script element: `<` only occurs escaped.
     scene = re.sub("[<>&\u2028\u2029]", lambda found: f"\\u{ord(found[0]):04x}", page.model_dump_json())
-    draft.write_text(program.replace(_PLACEHOLDER, scene, 1), encoding="utf-8")
-    replace_file(draft, folder / PAGE)
+    replace_text(folder / PAGE, program.replace(_PLACEHOLDER, scene, 1))
 
 
 def _policy(program: str, cesium: str) -> str:
@@ -195,26 +201,17 @@ def _policy(program: str, cesium: str) -> str:
     )
 
 
-def _points(
-    kind: Literal["control", "check"], points: Sequence[SurveyedPoint], origin: Origin
-) -> Iterator[PagePoint]:
-    for point in points:
-        ecef = ecef_from_enu(point.position_in_geo, origin)
-        yield PagePoint(name=point.name, kind=kind, ecef=vector3(ecef))
-
-
 def _facts(placement: Placement, target: TargetCrs) -> tuple[Fact, ...]:
-    accuracy = "not known: nothing states it yet (georef evaluate)"
-    if placement.accuracy is not None:
-        accuracy = placement.accuracy.text
+    accuracy = placement.accuracy
     input_heights = placement.vertical.name + ("" if placement.vertical.stated else " (assumed)")
     facts = (
-        Fact(name="CRS", value=target.crs.name),
-        Fact(name="Heights", value=f"{target.crs.vertical.name}; of the survey's input: {input_heights}"),
-        Fact(name="h", value="height above the WGS84 ellipsoid; labels stand at it, too"),
-        Fact(name="Accuracy", value=accuracy),
+        ("CRS", target.crs.name),
+        ("Heights", f"{target.crs.vertical.name}; of the survey's input: {input_heights}"),
+        ("h", "height above the WGS84 ellipsoid; labels stand at it, too"),
+        ("Accuracy", "not known: nothing states it yet (georef evaluate)" if accuracy is None else accuracy.text),
+        *(("Assumed", sentence) for sentence in target.assumed),
     )
-    return facts + tuple(Fact(name="Assumed", value=sentence) for sentence in target.assumed)
+    return tuple(Fact(name=name, value=value) for name, value in facts)
 
 
 def fit_local_crs(crs: PointCrs, origin_lla: ArrayLike, half_extent_m: Vector3) -> LocalCrs:
@@ -233,7 +230,11 @@ def fit_local_crs(crs: PointCrs, origin_lla: ArrayLike, half_extent_m: Vector3) 
     plan_m = crs.horizontal_unit * (SEMI_MAJOR_M if crs.is_geographic else 1.0)
     unit_m = np.array([plan_m, plan_m, crs.height_unit_m])
     places = np.vstack([nodes, checks])
-    values = _coordinates(crs, origin_lla, places * half_extent_m)
+    enu = places * half_extent_m
+    lla = lla_from_ecef(ecef_from_lla(origin_lla) + enu @ ecef_from_enu_rotation(origin_lla).T)
+    values = crs.serving(lla).xyz_from_lla(lla)
+    if crs.is_geographic:  # a polynomial cannot jump at the date line
+        values[:, 0] -= 360.0 * np.round((values[:, 0] - values[0, 0]) / 360.0)
     powers = np.stack([np.prod(places ** np.array(exponents), axis=1) for exponents in _EXPONENTS], axis=1)
     solved = np.linalg.lstsq(powers[: len(nodes)], values[: len(nodes)], rcond=None)[0]
     errors = np.abs(powers[len(nodes) :] @ solved - values[len(nodes) :]).max(axis=0)
@@ -249,14 +250,6 @@ def fit_local_crs(crs: PointCrs, origin_lla: ArrayLike, half_extent_m: Vector3) 
         coefficients=tuple((x, y, z) for x, y, z in solved.tolist()),
         error_m=float((errors * unit_m).max()),
     )
-
-
-def _coordinates(crs: PointCrs, origin_lla: ArrayLike, enu: FloatArray) -> FloatArray:
-    lla = lla_from_ecef(ecef_from_lla(origin_lla) + enu @ ecef_from_enu_rotation(origin_lla).T)
-    xyz = crs.serving(lla).xyz_from_lla(lla)
-    if crs.is_geographic:  # a polynomial cannot jump at the date line
-        xyz[:, 0] -= 360.0 * np.round((xyz[:, 0] - xyz[0, 0]) / 360.0)
-    return xyz
 
 
 def _axis_names(crs: PointCrs) -> tuple[str, str, str]:

@@ -10,9 +10,9 @@ from pipelines.core.files import replace_text
 from pipelines.core.types import FloatArray, Vector3, vector3
 from pipelines.formats.tables import table_text
 from pipelines.geodesy.crs import PointCrs, parse_crs
-from pipelines.geodesy.enu import ecef_from_enu, lla_from_ecef, lla_of
+from pipelines.geodesy.enu import lla_from_enu, lla_of
 from pipelines.survey.headline import PointLine, point_lines
-from pipelines.survey.report import CheckPointErrors, CheckPoints, Coordinates, EvaluationReport, PointCoordinates
+from pipelines.survey.report import CheckPoints, Coordinates, EvaluationReport, PointCoordinates, PointResidual
 from pipelines.survey.survey import Survey
 
 
@@ -34,11 +34,13 @@ def coordinates_in(crs: PointCrs, checkpoints: CheckPoints, survey: Survey) -> C
         InputError: a point lies outside the CRS's domain.
     """
     surveyed = np.array([point.position_in_geo for point in survey.check_points]).reshape(-1, 3)
-    measured = [surveyed + _errors(way, surveyed) for way in (checkpoints.triangulated, checkpoints.surface)]
+    unmeasured = np.full_like(surveyed, np.nan)
+    ways = (checkpoints.triangulated, checkpoints.surface)
+    measured = [surveyed + (unmeasured if way is None else error_array(way.points)) for way in ways]
     # One call for all points, so that one operation transforms them all.
     in_geo = np.concatenate([np.zeros((1, 3)), surveyed, *measured])
     known = np.isfinite(in_geo).all(axis=1)
-    lla = lla_from_ecef(ecef_from_enu(in_geo[known], survey.origin_on_earth))
+    lla = lla_from_enu(in_geo[known], survey.origin_on_earth)
     xyz = np.full(in_geo.shape, np.nan)
     xyz[known] = crs.xyz_from_lla(lla)
     operation = crs.operation(lla)
@@ -64,11 +66,9 @@ def coordinates_in(crs: PointCrs, checkpoints: CheckPoints, survey: Survey) -> C
     )
 
 
-def _errors(checkpoints: CheckPointErrors | None, surveyed: FloatArray) -> FloatArray:
-    """Return the errors (J, 3), measured minus surveyed, in metres; NaN: not measured."""
-    if checkpoints is None:
-        return np.full_like(surveyed, np.nan)
-    errors = [(row.de_m, row.dn_m, row.du_m) for row in checkpoints.points]
+def error_array(rows: Sequence[PointResidual]) -> FloatArray:
+    """Return errors (J, 3), measured minus surveyed, in metres; NaN: not measured."""
+    errors = [(row.de_m, row.dn_m, row.du_m) for row in rows]
     return np.array(errors, dtype=np.float64).reshape(-1, 3)  # None becomes NaN
 
 
@@ -87,8 +87,13 @@ def write_point_table(path: Path, report: EvaluationReport, survey: Survey) -> N
 
     Columns latitude to up have the surveyed position. With `--crs`, check points have coordinates in it too.
     """
-    place = _places(survey)
-    in_crs = report.coordinates
+    points, in_crs = (*survey.control_points, *survey.check_points), report.coordinates
+    in_geo = np.array([point.position_in_geo for point in points]).reshape(-1, 3)
+    lla = lla_from_enu(in_geo, survey.origin_on_earth) if points else in_geo
+    place = {
+        point.name: (f"{lat:.9f}", f"{lon:.9f}", f"{alt:.4f}", *(f"{value:.4f}" for value in enu))
+        for point, (lat, lon, alt), enu in zip(points, lla.tolist(), in_geo.tolist(), strict=True)
+    }
     header = (*_NAME, *_PLACE, *_ERROR, *(_IN_CRS if in_crs is not None else ()))
     rows = (
         (row.name, line.use, line.way, row.rays, *place[row.name], *_error(line), *_crs_cells(in_crs, line))
@@ -110,17 +115,6 @@ def write_camera_sigma(path: Path, names: Sequence[str], cov: FloatArray) -> Non
         for name, of_camera in zip(names, sigma, strict=True)
     )
     replace_text(path, table_text((header, *rows)))
-
-
-def _places(survey: Survey) -> dict[str, list[str]]:
-    """Return the cells of each surveyed position, by name."""
-    points = (*survey.control_points, *survey.check_points)
-    in_geo = np.array([point.position_in_geo for point in points]).reshape(-1, 3)
-    lla = lla_from_ecef(ecef_from_enu(in_geo, survey.origin_on_earth)) if points else in_geo
-    return {
-        point.name: [f"{lat:.9f}", f"{lon:.9f}", f"{alt:.4f}", *(f"{value:.4f}" for value in enu)]
-        for point, (lat, lon, alt), enu in zip(points, lla.tolist(), in_geo.tolist(), strict=True)
-    }
 
 
 def _error(line: PointLine) -> list[str]:

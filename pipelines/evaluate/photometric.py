@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from pipelines.core.progress import Progress
-from pipelines.core.types import ByteArray, FloatArray, IntArray
+from pipelines.core.types import ByteArray
 from pipelines.geometry.footprints import PointSurface, ground_points
 from pipelines.report.plots.charts import labelled
 from pipelines.splat.exposure import fitted_affine, squared_radius, with_affine, with_vignetting
@@ -51,20 +51,13 @@ class TrainingCoverage:
         grid = np.stack(np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5), axis=-1).reshape(-1, 2)
         rays = pose.pinhole.rays(grid * [width / columns, height / rows]) @ pose.cam_from_model
         ground = ground_points(rays, pose.center_in_model, self._surface)
-        enough = (self._views_of(ground, apart_from=index) >= ENOUGH_VIEWS).reshape(rows, columns)
+        count = np.zeros(len(ground), dtype=np.int64)  # of the training views whose image contains the ground
+        for other in map(self._renderer.pose, (train for train in self._train if train != index)):
+            in_cam = (ground - other.center_in_model) @ other.cam_from_model.T
+            count += other.pinhole.contains(other.pinhole.project(in_cam))
+        enough = (count >= ENOUGH_VIEWS).reshape(rows, columns)
         share = cv2.resize(enough.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
         return torch.from_numpy(share >= 0.5)
-
-    def _views_of(self, points: FloatArray, *, apart_from: int) -> IntArray:
-        """Return the number (K,) of training views whose image contains each of the points (K, 3) in `model`."""
-        count = np.zeros(len(points), dtype=np.int64)
-        for index in self._train:
-            if index == apart_from:
-                continue
-            pose = self._renderer.pose(index)
-            in_cam = (points - pose.center_in_model) @ pose.cam_from_model.T
-            count += pose.pinhole.contains(pose.pinhole.project(in_cam))
-        return count
 
 
 # Saves, for a test view, RGB: the photograph, its render, their difference, side by side with labels.
@@ -117,14 +110,10 @@ def compare_test_views(
             if place < saved:
                 save_render(name, _side_by_side(photo, render, figures))
             task.advance()
+    means = ("psnr", "psnr_compensated", "ssim", "psnr_covered", "covered_share", "lpips")
     return PhotometricFigures(
         views=len(views),
-        psnr=_mean(view.psnr for view in views),
-        psnr_compensated=_mean(view.psnr_compensated for view in views),
-        ssim=_mean(view.ssim for view in views),
-        psnr_covered=_mean(view.psnr_covered for view in views),
-        covered_share=_mean(view.covered_share for view in views),
-        lpips=_mean(view.lpips for view in views),
+        **{name: _mean(getattr(view, name) for view in views) for name in means},
         lpips_reason=_NO_WEIGHTS if distance is None else None,
         per_view=tuple(views),
     )
@@ -132,13 +121,11 @@ def compare_test_views(
 
 def _through_lens(renderer: ModelRenderer, index: int) -> Tensor:
     colour, trained = renderer.render(index).colour.cpu(), renderer.trained
-    camera_id = int(trained.sparse.image_camera_id[index])
-    for lens in trained.model.vignetting:
-        if lens.camera_id == camera_id:
-            pinhole = renderer.pinholes.of(index)
-            radius2 = squared_radius(pinhole, pinhole, colour.device)
-            return with_vignetting(colour, radius2, torch.tensor(lens.coefficients))
-    return colour
+    camera_id, pinhole = int(trained.sparse.image_camera_id[index]), renderer.pinholes.of(index)
+    lens = next((lens for lens in trained.model.vignetting if lens.camera_id == camera_id), None)
+    if lens is None:
+        return colour
+    return with_vignetting(colour, squared_radius(pinhole, pinhole, colour.device), torch.tensor(lens.coefficients))
 
 
 def _mean(values: Iterable[float | None]) -> float | None:

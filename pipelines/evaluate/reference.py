@@ -40,7 +40,7 @@ from pipelines.surface.m3c2 import TiledPoints, plane_normals, spacing_of
 from pipelines.surface.measured_cloud import CloudReader, MeasuredCloud, Thinning, read_thinned
 from pipelines.surface.registration import fit_alignment
 from pipelines.surface.surface_views import ModelRenderer, SurfaceViews
-from pipelines.surface.visibility import SeenSurface, Viewpoints, seen_surface
+from pipelines.surface.visibility import Viewpoints, seen_surface
 from pipelines.survey.report_parts import ReferenceComparison, ReferenceShift
 from pipelines.survey.trained_survey import TrainedSurvey, scene_points
 
@@ -90,7 +90,11 @@ def compare_with_reference(
     reference = _sorted_reference(files, trained.survey.origin_on_earth, box, scratch / "reference", progress)
     spacing_m = spacing_of(reference, min(THRESHOLDS_M) / 2)
     settings = ComparisonSettings.of_spacings(spacing_m, fusion.spacing_m, min(THRESHOLDS_M), box)
-    tally = _compare(reference, model, seen, settings, progress)
+    tally, squares = DistanceTally(), sorted({*reference.count, *model.count})
+    with progress.task("squares of the reference", len(squares)) as task:
+        for square in squares:
+            tally.add(compare_square(square, reference, model, seen, settings))
+            task.advance()
     cores = tally.cores()
     sigma_m = _georeference_sigma(cores.position, cores.normal, trained, grid)
     known = np.zeros(len(cores.position)) if sigma_m is None or moved is not None else sigma_m
@@ -114,21 +118,6 @@ def compare_with_reference(
     return ComparedReference(comparison, cores, lod_m, files.assumptions)
 
 
-def _compare(
-    reference: TiledPoints,
-    model: TiledPoints,
-    seen: SeenSurface,
-    settings: ComparisonSettings,
-    progress: Progress,
-) -> DistanceTally:
-    tally, squares = DistanceTally(), sorted({*reference.count, *model.count})
-    with progress.task("squares of the reference", len(squares)) as task:
-        for square in squares:
-            tally.add(compare_square(square, reference, model, seen, settings))
-            task.advance()
-    return tally
-
-
 def _model(
     renderer: ModelRenderer, overview: MeasuredCloud, options: EvaluateOptions, scratch: Path, progress: Progress
 ) -> tuple[TiledPoints, FusionSettings, ReferenceShift | None, Similarity | None]:
@@ -143,10 +132,8 @@ def _model(
         sample.append(square.position[first_of_voxels(square.position, 2 * _OVERVIEW_M)])
     views.close()
     if not delivered.count:
-        raise DegenerateGeometryError(
-            "surface-not-seen",
-            "No point of the surface has the same depth in three training views. Train longer.",
-        )
+        message = "No point of the surface has the same depth in three training views. Train longer."
+        raise DegenerateGeometryError("surface-not-seen", message)
     sparse = overview.position_in_geo[first_of_voxels(overview.position_in_geo, 2 * _OVERVIEW_M)]
     normal, kind = plane_normals(sparse, 2 * _OVERVIEW_M), options.reference_align
     found = fit_alignment(np.concatenate(sample), sparse, normal, 2 * _OVERVIEW_M, kind)
@@ -240,7 +227,5 @@ def draw_reference(found: ComparedReference, folder: Path) -> None:
     if len(groups) == 1:
         groups = {"all": distance_m}
     place, size_m = cores.position[known], found.comparison.cylinder_m
-    write_distance_map(folder / REFERENCE_MAP.rpartition("/")[2], place[:, :2], distance_m, size_m)
-    write_distance_histogram(
-        folder / REFERENCE_HISTOGRAM.rpartition("/")[2], groups, float(np.median(lod_m[known]))
-    )
+    write_distance_map(folder / Path(REFERENCE_MAP).name, place[:, :2], distance_m, size_m)
+    write_distance_histogram(folder / Path(REFERENCE_HISTOGRAM).name, groups, float(np.median(lod_m[known])))

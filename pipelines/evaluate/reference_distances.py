@@ -128,19 +128,14 @@ def compare_square(
 def kinds_of(classification: NDArray[np.uint8], normal: FloatArray) -> Kinds:
     """Return the kinds of points, by classes (P,) of LAS and unit normals (P, 3), NaN where not known."""
     slope = np.degrees(np.arccos(np.clip(np.abs(normal[:, 2]), 0, 1)))
-    steep = slope > _WALL_DEG
     building = np.isin(classification, _BUILDING)
-    index = {name: place for place, name in enumerate(CLASSES)}
-    of_class = np.select(
-        [
-            np.isin(classification, _GROUND),
-            building & steep,
-            building,
-            np.isin(classification, _VEGETATION),
-        ],
-        [index["ground"], index["wall"], index["roof"], index["vegetation"]],
-        index["other"],
-    )
+    masks = {
+        "ground": np.isin(classification, _GROUND),
+        "wall": building & (slope > _WALL_DEG),
+        "roof": building,
+        "vegetation": np.isin(classification, _VEGETATION),
+    }
+    of_class = np.select([*masks.values()], [CLASSES.index(name) for name in masks], CLASSES.index("other"))
     of_slope = np.where(np.isfinite(slope), np.searchsorted(_SLOPE_LIMITS_DEG, slope), len(SLOPES))
     return Kinds(of_class.astype(np.int64), of_slope.astype(np.int64))
 
@@ -183,13 +178,8 @@ THRESHOLDS_M = (0.05, 0.1, 0.3)
 _STEP_M = 1e-3
 _BINS = round(FARTHEST_M / _STEP_M) + 2  # 0, then one for each millimetre, then all beyond
 _NMAD = 1.4826
-_NO_CORES = CorePoints(
-    np.zeros((0, 3)),
-    np.zeros((0, 3)),
-    np.zeros(0),
-    np.zeros(0),
-    Kinds(np.zeros(0, np.int64), np.zeros(0, np.int64)),
-)
+_NO_KINDS = Kinds(np.zeros(0, np.int64), np.zeros(0, np.int64))
+_NO_CORES = CorePoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0), _NO_KINDS)
 
 
 class DistanceTally:

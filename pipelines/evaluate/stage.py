@@ -27,7 +27,13 @@ from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.evaluate import check_points
 from pipelines.evaluate.asprs import few_points
-from pipelines.evaluate.coordinates import coordinates_in, report_crs, write_camera_sigma, write_point_table
+from pipelines.evaluate.coordinates import (
+    coordinates_in,
+    error_array,
+    report_crs,
+    write_camera_sigma,
+    write_point_table,
+)
 from pipelines.evaluate.options import EvaluateOptions
 from pipelines.evaluate.photometric import compare_test_views
 from pipelines.evaluate.reference import (
@@ -37,7 +43,7 @@ from pipelines.evaluate.reference import (
     draw_reference,
 )
 from pipelines.geodesy.crs import PointCrs
-from pipelines.geodesy.enu import Origin, ecef_from_enu, lla_from_ecef
+from pipelines.geodesy.enu import Origin, lla_from_enu
 from pipelines.report.plots.maps import MapCoordinates, MapPoints, SigmaRaster, write_accuracy_map
 from pipelines.report.plots.plans import NamedPlaces
 from pipelines.splat.rasterizer.backends import rasterizer
@@ -129,8 +135,7 @@ def draw_accuracy(
 
 def _named(points: Sequence[SurveyedPoint], rows: Sequence[PointResidual]) -> NamedPlaces:
     place = np.array([point.position_in_geo for point in points]).reshape(-1, 3)[:, :2]
-    errors = np.array([(row.de_m, row.dn_m, row.du_m) for row in rows], dtype=np.float64)  # None becomes NaN
-    return NamedPlaces(place, tuple(point.name for point in points), errors.reshape(-1, 3))
+    return NamedPlaces(place, tuple(point.name for point in points), error_array(rows))
 
 
 def _coordinates(origin: Origin | None, crs: PointCrs | None) -> MapCoordinates | None:
@@ -141,7 +146,7 @@ def _coordinates(origin: Origin | None, crs: PointCrs | None) -> MapCoordinates 
     served = None if crs is None or crs.is_geocentric else crs
 
     def coordinates(place: FloatArray) -> FloatArray:
-        lla = lla_from_ecef(ecef_from_enu(np.column_stack([place, np.zeros(len(place))]), origin))
+        lla = lla_from_enu(np.column_stack([place, np.zeros(len(place))]), origin)
         return lla[:, [1, 0]] if served is None else served.xyz_from_lla(lla)[:, :2]
 
     if served is None:
@@ -210,7 +215,8 @@ def evaluate(
     """
     model = solved.model
     log_scale, *_, east, north, up = np.sqrt(np.maximum(np.diag(model.geo_from_model.covariance), 0.0)).tolist()
-    triangulated = check_points.triangulated_check_points(solved, posterior, _km2(area_ha))
+    area_km2 = None if area_ha is None else area_ha / 100
+    triangulated = check_points.triangulated_check_points(solved, posterior, area_km2)
     checkpoints = CheckPoints(triangulated=triangulated, surface=None if rendered is None else rendered.points)
     scene = model.accuracy or AccuracySummary(cells=0, reason="the adjustment states no σ")
     reference = None if rendered is None else rendered.reference
@@ -239,10 +245,6 @@ def evaluate(
     )
 
 
-def _km2(area_ha: float | None) -> float | None:
-    return None if area_ha is None else area_ha / 100
-
-
 def _rendered(
     stage: StageRun, trained: TrainedSurvey, posterior: Posterior, options: EvaluateOptions, area_ha: float | None
 ) -> Rendered:
@@ -262,7 +264,8 @@ def _rendered(
             renderer, files, posterior.grid, options, scratch=scratch, progress=progress
         )
         draw_reference(reference, stage.out)
-    points = check_points.check_points_on_surface(renderer, progress, _km2(area_ha))
+    area_km2 = None if area_ha is None else area_ha / 100
+    points = check_points.check_points_on_surface(renderer, progress, area_km2)
     save_render = partial(write_render, renders)
     test = compare_test_views(renderer, options.lpips_weights, save_render, progress, saved=options.renders)
     return Rendered(Photometric(test=test), points, reference)

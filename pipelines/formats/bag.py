@@ -324,12 +324,18 @@ class ImageWriter:
         encoding = str(message.encoding).strip().lower()
         if encoding not in _PIXEL_BYTES:
             raise BadImageError(f"encoding {message.encoding!r} is none of {', '.join(ENCODINGS)}")
-        raw = _rows(message, _PIXEL_BYTES[encoding])
+        width, height, step = int(message.width), int(message.height), int(message.step)
+        data, used = np.asarray(message.data, dtype=np.uint8), width * _PIXEL_BYTES[encoding]
+        if not 0 < width * height <= MAX_PIXELS:
+            raise BadImageError(f"claims {width}×{height} pixels")
+        if step < used or len(data) < step * height:
+            raise BadImageError(f"{len(data)} bytes in rows of {step} are too few for {width}×{height} pixels")
+        raw: ByteArray = np.ascontiguousarray(data[: step * height].reshape(height, step)[:, :used])
         if encoding.endswith("16"):
             pixels: NDArray[np.uint16] = raw.view(">u2" if message.is_bigendian else "<u2")
             if self.bits is None:
-                used = int(pixels.max(initial=1)).bit_length()
-                self.bits = next(bits for bits in (8, 10, 12, 14, 16) if used <= bits)
+                needed = int(pixels.max(initial=1)).bit_length()
+                self.bits = next(bits for bits in (8, 10, 12, 14, 16) if needed <= bits)
             raw = np.minimum(pixels >> (self.bits - 8), 255).astype(np.uint8)
             encoding = encoding[:-2] + "8"
         return _to_bgr(raw, encoding)
@@ -357,18 +363,6 @@ def _compressed(message: Any) -> tuple[bytes, str]:
     if size is None or not 0 < size[0] * size[1] <= MAX_PIXELS:
         raise BadImageError("has a damaged header")
     return data, suffix
-
-
-def _rows(message: Any, pixel_bytes: int) -> ByteArray:
-    """Return the bytes (height, width · pixel_bytes) of a raw image without the padding of its rows."""
-    width, height, step = int(message.width), int(message.height), int(message.step)
-    data = np.asarray(message.data, dtype=np.uint8)
-    if not 0 < width * height <= MAX_PIXELS:
-        raise BadImageError(f"claims {width}×{height} pixels")
-    if step < width * pixel_bytes or len(data) < step * height:
-        raise BadImageError(f"{len(data)} bytes in rows of {step} are too few for {width}×{height} pixels")
-    rows = data[: step * height].reshape(height, step)[:, : width * pixel_bytes]
-    return np.ascontiguousarray(rows)
 
 
 def _to_bgr(raw: ByteArray, encoding: str) -> ByteArray:

@@ -68,11 +68,7 @@ def refuse_large_chunk(path: Path, uncompressed_bytes: int) -> None:
 
 
 def unpacked(data: bytes, limit_bytes: int = MAX_CHUNK_BYTES) -> bytes:
-    """Return the content of zstd frames.
-
-    Raises:
-        ValueError: damaged, or more than `limit_bytes`.
-    """
+    """Return the content of zstd frames; a ValueError: damaged, or more than `limit_bytes`."""
     zstd, parts, total = _zstd(), [], 0
     while data:
         decompressor = zstd.ZstdDecompressor()

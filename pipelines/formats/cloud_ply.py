@@ -5,8 +5,6 @@ its display. Programs that keep float32 coordinates need the LAZ. A PLY has no C
 and with the vertices first; faces and other elements after these are not read.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -164,7 +162,7 @@ _VERTEX = [
 ]  # fmt: skip
 _NAMES = {"<f8": "double", "<f4": "float", "u1": "uchar"}
 _COUNT_DIGITS = 20
-_COLOURS = ("red", "green", "blue")
+COLOURS = ("red", "green", "blue")
 _POINT_VERTEX = [
     ("x", "<f8"), ("y", "<f8"), ("z", "<f8"),
     ("red", "u1"), ("green", "u1"), ("blue", "u1"),
@@ -172,7 +170,7 @@ _POINT_VERTEX = [
 ]  # fmt: skip
 
 
-def _set_columns(vertex: np.ndarray, names: Sequence[str], values: np.ndarray) -> None:
+def set_columns(vertex: np.ndarray, names: Sequence[str], values: np.ndarray) -> None:
     for column, name in enumerate(names):
         vertex[name] = values[:, column]
 
@@ -196,9 +194,9 @@ class CloudPlyWriter(AbstractContextManager["CloudPlyWriter"]):
 
     def write(self, points: CloudPoints) -> None:
         vertex = np.empty(len(points), dtype=_VERTEX)
-        _set_columns(vertex, ("x", "y", "z"), points.position)
-        _set_columns(vertex, ("nx", "ny", "nz"), points.normal)
-        _set_columns(vertex, _COLOURS, points.rgb)
+        set_columns(vertex, ("x", "y", "z"), points.position)
+        set_columns(vertex, ("nx", "ny", "nz"), points.normal)
+        set_columns(vertex, COLOURS, points.rgb)
         vertex["sigma_h"], vertex["sigma_v"] = points.sigma_h_m, points.sigma_v_m
         vertex["classification"] = points.classification
         self._file.write(vertex.tobytes())
@@ -226,10 +224,10 @@ def write_point_ply(
     """
     finite = np.isfinite(position).all(axis=1)
     further = {name: values for name, values in (("sigma", sigma_m), ("inlier", inlier)) if values is not None}
-    names = ("x", "y", "z", *_COLOURS, *further)
+    names = ("x", "y", "z", *COLOURS, *further)
     vertex = np.empty(int(finite.sum()), dtype=[column for column in _POINT_VERTEX if column[0] in names])
-    _set_columns(vertex, ("x", "y", "z"), position[finite])
-    _set_columns(vertex, _COLOURS, rgb[finite])
+    set_columns(vertex, ("x", "y", "z"), position[finite])
+    set_columns(vertex, COLOURS, rgb[finite])
     for name, values in further.items():
         vertex[name] = values[finite]
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -75,8 +75,14 @@ def _check_model_files(folder: Path) -> None:
         size = file_size(file)
         if suffix == ".bin":
             _check_binary(file, size, _RECORDS[name])
-        elif name == "images":
-            _check_text(file)
+            continue
+        with file.open("rb") as stream:
+            for number, line in enumerate(stream if name == "images" else (), start=1):
+                try:
+                    line.decode("utf-8")
+                except UnicodeDecodeError as error:
+                    message = f"The image {_INVALID_NAME}"
+                    raise InputError("name-not-utf8", message, path=file, line=number) from error
 
 
 def _check_binary(file: Path, size: int, record_end: Callable[[_Bytes, int], int]) -> None:
@@ -101,16 +107,6 @@ def _check_binary(file: Path, size: int, record_end: Callable[[_Bytes, int], int
         if at != size:
             message = f"The file is damaged: {size - at} bytes follow its {count} records."
             raise InputError("file-damaged", message, path=file)
-
-
-def _check_text(file: Path) -> None:
-    with file.open("rb") as stream:
-        for number, line in enumerate(stream, start=1):
-            try:
-                line.decode("utf-8")
-            except UnicodeDecodeError as error:
-                message = f"The image {_INVALID_NAME}"
-                raise InputError("name-not-utf8", message, path=file, line=number) from error
 
 
 @dataclass(frozen=True)
@@ -331,17 +327,9 @@ def write_sparse(model: SparseModel, path: Path) -> None:
         reconstruction.add_camera_with_trivial_rig(
             pycolmap.Camera(camera_id=camera_id, model=camera.model, params=camera.params, **size)
         )
-    rank = _add_images(reconstruction, model)
-    _add_points(reconstruction, model, rank)
-    write_reconstruction(reconstruction, path)
-
-
-def _add_images(reconstruction: Any, model: SparseModel) -> IntArray:
-    """Add the images with their pixels; return the place of each observation in its image's list."""
-    pycolmap = pycolmap_module()
     by_image = np.argsort(model.obs_image, kind="stable")
     bounds = np.searchsorted(model.obs_image[by_image], np.arange(len(model.image_name) + 1))
-    rank = np.empty(len(by_image), dtype=np.int64)
+    rank = np.empty(len(by_image), dtype=np.int64)  # place of each observation in its image's list
     rank[by_image] = np.arange(len(by_image)) - bounds[model.obs_image[by_image]]
     for index, name in enumerate(model.image_name):
         pixels = model.obs_xy_px[by_image[bounds[index] : bounds[index + 1]]]
@@ -350,11 +338,6 @@ def _add_images(reconstruction: Any, model: SparseModel) -> IntArray:
         rotation = pycolmap.Rotation3d(model.rotation_cam_from_local[index])
         pose = pycolmap.Rigid3d(rotation, model.translation_cam_from_local[index])
         reconstruction.add_image_with_trivial_frame(image, pose)
-    return rank
-
-
-def _add_points(reconstruction: Any, model: SparseModel, rank: IntArray) -> None:
-    pycolmap = pycolmap_module()
     starts = np.searchsorted(model.obs_point, np.arange(len(model.point_id) + 1))
     observer = model.image_id[model.obs_image]
     for index, point_id in enumerate(model.point_id):
@@ -367,3 +350,4 @@ def _add_points(reconstruction: Any, model: SparseModel, rank: IntArray) -> None
             for image_id, place in zip(observer[run], rank[run], strict=True)
         ]
         reconstruction.add_point3D_with_id(int(point_id), point)
+    write_reconstruction(reconstruction, path)

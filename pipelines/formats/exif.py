@@ -6,11 +6,12 @@ its packet must be short and lie in the first or last mebibyte of a file. defuse
 types.
 """
 
+import contextlib
 import io
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta, timezone
+from datetime import UTC, datetime
 from typing import Any, Literal
 from xml.etree.ElementTree import Element, ParseError
 
@@ -170,9 +171,10 @@ def _time(tags: Mapping[str, Any]) -> tuple[float | None, TimeSource | None]:
     local = _datetime(_text(tags, "EXIF DateTimeOriginal") or _text(tags, "Image DateTime"))
     fraction = _text(tags, "EXIF SubSecTimeOriginal") or _text(tags, "EXIF SubSecTime")
     seconds = float(f"0.{fraction}") if fraction.isascii() and fraction.isdigit() else 0.0
-    zone = _zone(_text(tags, "EXIF OffsetTimeOriginal") or _text(tags, "EXIF OffsetTime"))
-    if local is not None and zone is not None:
-        return local.replace(tzinfo=zone).timestamp() + seconds, "offset"
+    zone = _text(tags, "EXIF OffsetTimeOriginal") or _text(tags, "EXIF OffsetTime")
+    if local is not None:
+        with contextlib.suppress(ValueError):  # no offset such as +02:00
+            return datetime.strptime(f"{local} {zone}", "%Y-%m-%d %H:%M:%S %z").timestamp() + seconds, "offset"
     stamp = _numbers(tags, "GPS GPSTimeStamp")
     day = _datetime(_text(tags, "GPS GPSDate") + " 00:00:00")
     if len(stamp) == 3 and day is not None:
@@ -186,14 +188,6 @@ def _datetime(text: str) -> datetime | None:
     try:
         return datetime.strptime(text.strip("\x00 ")[:19].replace("-", ":"), "%Y:%m:%d %H:%M:%S")
     except ValueError:
-        return None
-
-
-def _zone(text: str) -> timezone | None:
-    try:
-        sign = {"+": 1, "-": -1}[text[0]]
-        return timezone(sign * timedelta(hours=int(text[1:3]), minutes=int(text[4:6])))
-    except (IndexError, KeyError, ValueError):
         return None
 
 

@@ -5,8 +5,6 @@ begin at the top left of the pattern and go clockwise. Places are pixels, the ce
 (0.5, 0.5).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -97,9 +95,14 @@ def find_tags(grey: ByteArray, dictionaries: Sequence[str]) -> list[FoundTag]:
     grey values along its normals rise, by least squares; corners are where lines meet. σ of the centre follows from
     the scatter of these places about their lines, and from the bend of the sides, which is the lens's.
     """
+    # OpenCV's defaults overlook tags that are small in a large photograph.
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.minMarkerPerimeterRate = 4 * LEAST_SIDE_PX / max(grey.shape)
+    parameters.perspectiveRemovePixelPerCell = 8
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_CONTOUR
     found = []
     for name in dictionaries:
-        detector = cv2.aruco.ArucoDetector(_dictionary(name), _parameters(max(grey.shape)))
+        detector = cv2.aruco.ArucoDetector(_dictionary(name), parameters)
         corners, numbers, _ = detector.detectMarkers(grey)
         modules = _dictionary(name).markerSize + 2
         for number, rough in zip([] if numbers is None else numbers.ravel().tolist(), corners, strict=True):
@@ -110,15 +113,6 @@ def find_tags(grey: ByteArray, dictionaries: Sequence[str]) -> list[FoundTag]:
             middle, sigma = _center_with_sigma(sides)
             found.append(FoundTag(name, int(number), middle, _corners(sides.lines), sigma))
     return found
-
-
-def _parameters(longest_px: int) -> Any:
-    """Return how to detect; OpenCV's defaults overlook tags that are small in a large photograph."""
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.minMarkerPerimeterRate = 4 * LEAST_SIDE_PX / longest_px
-    parameters.perspectiveRemovePixelPerCell = 8
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_CONTOUR
-    return parameters
 
 
 def _shows(grey: ByteArray, corners: FloatArray, modules: ByteArray) -> bool:
@@ -230,16 +224,11 @@ def _side(
 
 
 def _corners(lines: FloatArray) -> FloatArray:
-    """Return where each side's line (4, 3) meets that of the side before: the corners (4, 2)."""
-    before = np.roll(lines, 1, axis=0)
+    """Return where each side's line (4, 3) meets that of the side before (4, 2); not finite: nowhere."""
+    signed = lines * [1, 1, -1]
+    at = np.cross(signed, np.roll(signed, 1, axis=0))
     with np.errstate(divide="ignore", invalid="ignore"):
-        return _meeting(lines, before)
-
-
-def _meeting(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return the points (…, 2) where lines (…, 3) meet; not finite where they are parallel."""
-    at = np.cross(first * [1, 1, -1], second * [1, 1, -1])
-    return np.asarray(at[..., :2] / at[..., 2:])
+        return np.asarray(at[:, :2] / at[:, 2:])
 
 
 def _center(lines: FloatArray) -> FloatArray:

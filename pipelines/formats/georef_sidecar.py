@@ -230,8 +230,7 @@ def _of_frame(sidecar: GeorefSidecar, name: str) -> IsoMetadata:
         place = f"whose origin is at latitude {lat:.8f}°, longitude {lon:.8f}°"
         place += f". {name}{SUFFIX} places the frame on Earth"
         box = lon, lat
-    sigma = sidecar.georeference_sigma
-    of = "the georeference alone; the model's shape is not counted"
+    sigma, of = sidecar.georeference_sigma, "the georeference alone; the model's shape is not counted"
     lengths = () if sigma is None else ((PLAN_SIGMA, sigma.sigma_h_m), (STANDARD_ERROR, sigma.sigma_v_m))
     return IsoMetadata(
         title=name,

@@ -5,7 +5,8 @@ Parts are small GeoTIFFs. A mosaic of them (GDAL's VRT) is copied once into the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -14,7 +15,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.core.files import replace_file
+from pipelines.core.files import replacing
 from pipelines.core.types import BoolArray, ByteArray, FloatArray
 
 NODATA = -9999.0
@@ -79,25 +80,15 @@ def write_part(path: Path, values: NDArray[Any], frame: RasterFrame) -> None:
 
     if values.dtype.kind == "f":
         values = np.where(np.isfinite(values), values, NODATA).astype(np.float32)
-    draft = path.with_name(path.name + ".tmp")
-    with rasterio.open(
-        draft,
-        "w",
-        driver="GTiff",
-        width=frame.columns,
-        height=frame.rows,
-        count=len(values),
-        dtype=values.dtype,
-        nodata=NODATA if values.dtype.kind == "f" else None,
-        transform=_transform(frame),
-        tiled=True,
-        blockxsize=_BLOCK_PX,
-        blockysize=_BLOCK_PX,
-        compress="DEFLATE",
-        zlevel=1,
-    ) as part:
+    profile: dict[str, Any] = {
+        **_cells(frame),
+        "count": len(values),
+        "dtype": values.dtype,
+        "nodata": NODATA if values.dtype.kind == "f" else None,
+    }
+    form = {"tiled": True, "blockxsize": _BLOCK_PX, "blockysize": _BLOCK_PX, "compress": "DEFLATE", "zlevel": 1}
+    with replacing(path) as draft, rasterio.open(draft, "w", driver="GTiff", **profile, **form) as part:
         part.write(values)
-    replace_file(draft, path)
 
 
 def write_mosaic(
@@ -112,8 +103,7 @@ def write_mosaic(
     import rasterio.shutil
 
     mosaic = write_vrt(path.stem, parts, frame, kind, tags)
-    draft = path.with_name(path.name + ".tmp")
-    with rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES):
+    with replacing(path) as draft, rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES):
         rasterio.shutil.copy(
             mosaic,
             draft,
@@ -125,7 +115,6 @@ def write_mosaic(
             NUM_THREADS="ALL_CPUS",
             BIGTIFF="IF_SAFER",
         )
-    replace_file(draft, path)
 
 
 def write_vrt(
@@ -181,32 +170,31 @@ def read_onto(
     path: Path, frame: RasterFrame, resampling: Literal["nearest", "bilinear", "average"]
 ) -> NDArray[Any]:
     """Return the first band (rows, columns) of a raster on the cells of a frame in its CRS; NaN or 0: no value."""
-    import rasterio
-    from rasterio.enums import Resampling
-    from rasterio.vrt import WarpedVRT
-
-    with rasterio.open(path) as raster:
-        place: dict[str, Any] = {"crs": raster.crs, "transform": _transform(frame)}
-        place |= {"width": frame.columns, "height": frame.rows, "resampling": Resampling[resampling]}
-        if raster.dtypes[0] == "uint8":
-            with WarpedVRT(raster, **place) as warped:
-                return np.asarray(warped.read(1))
-        with WarpedVRT(raster, src_nodata=NODATA, nodata=NODATA, **place) as warped:
-            values = warped.read(1)
+    with _warped(path, frame, resampling) as warped:
+        values = warped.read(1)
+    if values.dtype == np.uint8:
+        return np.asarray(values)
     return np.where(values == NODATA, np.nan, values).astype(np.float64)
 
 
 def read_colours_onto(path: Path, frame: RasterFrame) -> ByteArray:
     """Return the colours (rows, columns, bands) of a raster of bytes, averaged on the cells of a frame."""
+    with _warped(path, frame, "average") as warped:
+        return np.ascontiguousarray(np.moveaxis(warped.read(), 0, -1), dtype=np.uint8)
+
+
+@contextmanager
+def _warped(path: Path, frame: RasterFrame, resampling: str) -> Iterator[Any]:
+    """Open a raster as it is on the cells of a frame in its CRS."""
     import rasterio
     from rasterio.enums import Resampling
     from rasterio.vrt import WarpedVRT
 
     with rasterio.open(path) as raster:
-        place: dict[str, Any] = {"crs": raster.crs, "transform": _transform(frame)}
-        place |= {"width": frame.columns, "height": frame.rows, "resampling": Resampling.average}
-        with WarpedVRT(raster, **place) as warped:
-            return np.ascontiguousarray(np.moveaxis(warped.read(), 0, -1), dtype=np.uint8)
+        empty = {} if raster.dtypes[0] == "uint8" else {"src_nodata": NODATA, "nodata": NODATA}
+        place = {"crs": raster.crs, **_cells(frame), "resampling": Resampling[resampling]}
+        with WarpedVRT(raster, **place, **empty) as warped:
+            yield warped
 
 
 def cells_inside(polygon: Any, frame: RasterFrame) -> BoolArray:
@@ -231,6 +219,11 @@ def _transform(frame: RasterFrame) -> Any:
     from rasterio.transform import from_origin
 
     return from_origin(frame.west, frame.north, frame.step_x, frame.step_y)
+
+
+def _cells(frame: RasterFrame) -> dict[str, Any]:
+    """Return the size and the place of a frame as rasterio takes them."""
+    return {"width": frame.columns, "height": frame.rows, "transform": _transform(frame)}
 
 
 def read_reduced(path: Path, longest_px: int) -> tuple[NDArray[Any], float]:

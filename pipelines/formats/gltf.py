@@ -169,22 +169,30 @@ def _glb(
     attributes = {name: index for index, name in enumerate(accessors)}
     primitive = {"attributes": attributes, "mode": _POINTS, "extensions": {SPLATS: splats}}
     document = {
-        "asset": {"version": "2.0", "generator": "GeoRefGS", **({"extras": extras} if extras else {})},
         "extensionsUsed": extensions,
         **({"extensionsRequired": extensions} if is_spz else {}),
+        "accessors": list(accessors.values()),
+        "bufferViews": views,
+    }
+    return glb_of(primitive, document, payload, extras)
+
+
+def glb_of(
+    primitive: dict[str, Any], rest: dict[str, Any], binary: bytes, extras: dict[str, Any] | None = None
+) -> bytes:
+    """Return a glb of one primitive in a z-up frame, which a node turns y-up; a ValueError: 4 GiB or more.
+
+    `rest` is the rest of the glTF document but for its only buffer, and `extras` metadata for `asset.extras`.
+    """
+    document = {
+        "asset": {"version": "2.0", "generator": "GeoRefGS", **({"extras": extras} if extras else {})},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "matrix": Y_UP_FROM_Z_UP}],
         "meshes": [{"primitives": [primitive]}],
-        "accessors": list(accessors.values()),
-        "bufferViews": views,
-        "buffers": [{"byteLength": len(payload)}],
+        **rest,
+        "buffers": [{"byteLength": len(binary)}],
     }
-    return glb_of(document, payload)
-
-
-def glb_of(document: dict[str, Any], binary: bytes) -> bytes:
-    """Return a glb of a glTF document and its only buffer; a ValueError: 4 GiB or more."""
     text = json.dumps(document, separators=(",", ":")).encode()
     chunks = [_chunk(_JSON_CHUNK, text, b" "), _chunk(_BINARY_CHUNK, binary, b"\0")]
     size = 12 + sum(map(len, chunks))

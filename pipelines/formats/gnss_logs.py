@@ -255,19 +255,15 @@ def _times(clock: str, rows: Sequence[tuple[int, list[str]]], path: Path) -> Flo
 def _date(cells: Sequence[str], path: Path, line: int) -> float:
     """Return the seconds since 1970 of a date, counted without leap seconds."""
     text = " ".join(cells)
-    match = re.fullmatch(r"(\d{4})/(\d{1,2})/(\d{1,2}) (\d{1,2}):(\d{1,2}):(\d{1,2})(\.\d*)?", text)
+    minute, _, second = text.rpartition(":")
     try:
-        if match is None:
-            raise ValueError(text)
-        year, month, day, hour, minute, second = (int(part) for part in match.groups()[:6])
-        # RTKLIB rounds seconds, and writes 60.000.
-        start = datetime(year, month, day, hour, minute, tzinfo=UTC).timestamp()
-        if second > 60:
+        start = datetime.strptime(minute, "%Y/%m/%d %H:%M").replace(tzinfo=UTC).timestamp()
+        if not re.fullmatch(r"([0-5]?\d|60)(\.\d*)?", second):  # RTKLIB rounds seconds, and writes 60.000
             raise ValueError(text)
     except ValueError:
         message = f"{text[:40]!r} is not a time like 2024/05/01 12:00:00.000."
         raise InputError("time-invalid", message, path=path, line=line, field="time") from None
-    return start + second + float(f"0{match[7] or ''}")
+    return start + float(second)
 
 
 @dataclass(frozen=True)

@@ -65,11 +65,7 @@ class GroundPoints:
 
 
 def without_repeats(points: Sequence[ListedPoint], path: Path) -> tuple[ListedPoint, ...]:
-    """Return the first line of each point.
-
-    Raises:
-        InputError: a point has other coordinates in a later line.
-    """
+    """Return the first line of each point; an InputError: a point has other coordinates in a later line."""
     first: dict[str, ListedPoint] = {}
     for point in points:
         other = first.setdefault(point.name, point)
@@ -267,11 +263,7 @@ def read_point_table(path: Path) -> GroundPoints:
 
 
 def read_marks(path: Path) -> tuple[ListedMark, ...]:
-    """Read marks of ground points.
-
-    Raises:
-        InputError: no rows, a column is missing, or a cell is no number.
-    """
+    """Read marks of ground points; an InputError: no rows, a column is missing, or a cell is no number."""
     table = _pix4d_table(path, _MARK_ALIASES, _MARK_COLUMNS, slice(2, 4), "image, label, x and y")
     tables.require_columns(table.columns, _MARK_COLUMNS, path, table.header_line)
     tables.require_rows(table.rows, path)

@@ -1,7 +1,5 @@
 """HEIC photographs, as telephones take them, as JPEG with the same tags (the sole home of pillow-heif)."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 from typing import Any

@@ -35,11 +35,7 @@ class ImageFile:
 
 
 def read_bytes(path: Path) -> bytes:
-    """Return the bytes of the whole file.
-
-    Raises:
-        InputError: unreadable, empty, or larger than 512 MiB.
-    """
+    """Return the bytes of the whole file; an InputError: unreadable, empty, or larger than 512 MiB."""
     if file_size(path, limit_bytes=MAX_BYTES, kind="photograph") == 0:
         raise InputError("file-empty", "The file is empty.", path=path)
     with reading(path):

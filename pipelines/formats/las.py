@@ -62,11 +62,7 @@ class LasFile:
     crs: str | None
 
     def chunks(self, size: int) -> Iterator[CloudChunk]:
-        """Yield all points in chunks of at most `size`.
-
-        Raises:
-            InputError: the file is damaged.
-        """
+        """Yield all points in chunks of at most `size`; an InputError: the file is damaged."""
         import laspy
 
         done = 0
@@ -151,20 +147,17 @@ def _chunk(record: Any) -> CloudChunk:
 
 def _crs(header: Any) -> str | None:
     """Return the CRS as WKT or as EPSG codes; None where the file states none that stands alone."""
-    for record in header.vlrs:
-        if record.user_id == "LASF_Projection" and record.record_id == 2112:
-            text = getattr(record, "string", "").strip("\0 ")
-            if text:
-                return str(text)
-    for record in header.vlrs:
-        if record.user_id == "LASF_Projection" and record.record_id == 34735:
-            codes = {key.id: key.value_offset for key in record.geo_keys if key.tiff_tag_location == 0}
-            horizontal = codes.get(_PROJECTED, codes.get(_GEOGRAPHIC, _USER_DEFINED))
-            vertical = codes.get(_VERTICAL, 0)
-            if horizontal in (0, _USER_DEFINED) or vertical == _USER_DEFINED:
-                return None
-            return f"EPSG:{horizontal}+{vertical}" if vertical else f"EPSG:{horizontal}"
-    return None
+    found = [record for record in header.vlrs if record.user_id == "LASF_Projection"]
+    texts = (getattr(record, "string", "").strip("\0 ") for record in found if record.record_id == 2112)
+    if text := next(filter(None, texts), ""):
+        return str(text)
+    keys = next((record.geo_keys for record in found if record.record_id == 34735), ())
+    codes = {key.id: key.value_offset for key in keys if key.tiff_tag_location == 0}
+    horizontal = codes.get(_PROJECTED, codes.get(_GEOGRAPHIC, _USER_DEFINED))
+    vertical = codes.get(_VERTICAL, 0)
+    if horizontal in (0, _USER_DEFINED) or vertical == _USER_DEFINED:
+        return None
+    return f"EPSG:{horizontal}+{vertical}" if vertical else f"EPSG:{horizontal}"
 
 
 @contextmanager
@@ -233,10 +226,8 @@ class LazFile:
         import laspy
 
         record = laspy.ScaleAwarePointRecord.zeros(len(position), header=self._header)
-        for column, name in enumerate(("x", "y", "z")):
-            setattr(record, name, position[:, column])
-        record["return_number"][:] = 1
-        record["number_of_returns"][:] = 1
+        record[["x", "y", "z"]] = position
+        record["return_number"][:] = record["number_of_returns"][:] = 1
         return record
 
 
@@ -253,10 +244,8 @@ class LazWriter(LazFile):
             OverflowError: a coordinate is further from `near` than the file's integers reach (2147 km or 2.1°).
         """
         record = self._record(points.position)
-        for column, name in enumerate(("red", "green", "blue")):
-            setattr(record, name, points.rgb[:, column].astype(np.uint16) * _RGB16)
-        for column, name in enumerate(("nx", "ny", "nz")):
-            record[name] = points.normal[:, column]
+        record[["red", "green", "blue"]] = points.rgb.astype(np.uint16) * _RGB16
+        record[["nx", "ny", "nz"]] = points.normal
         record["sigma_h"], record["sigma_v"] = points.sigma_h_m, points.sigma_v_m
         record["classification"] = points.classification
         for name, (row, column) in _COVARIANCE.items():
@@ -276,11 +265,8 @@ def read_surface(path: Path, size: int) -> Iterator[CloudPoints]:
     with _damage(path), laspy.open(path, read_evlrs=False, laz_backend=laspy.LazBackend.Lazrs) as file:
         lacking = (_EXTRA.keys() | _COVARIANCE.keys()) - set(file.header.point_format.dimension_names)
         if lacking:
-            raise InputError(
-                "cloud-without-sigma",
-                f"The cloud has no {', '.join(sorted(lacking))}. Make it with `georef export-cloud`.",
-                path=path,
-            )
+            message = f"The cloud has no {', '.join(sorted(lacking))}. Make it with `georef export-cloud`."
+            raise InputError("cloud-without-sigma", message, path=path)
         for record in file.chunk_iterator(size):
             cov = np.empty((len(record), 3, 3), dtype=np.float32)
             for name, (row, column) in _COVARIANCE.items():
@@ -320,8 +306,7 @@ class MovedWriter(LazFile):
     def write(self, points: MovedPoints) -> None:
         """Append points; errors as of `LazWriter.write`."""
         record = self._record(points.position)
-        for column, name in enumerate(("nx", "ny", "nz")):
-            record[name] = points.normal[:, column]
+        record[["nx", "ny", "nz"]] = points.normal
         record["distance"], record["sigma"], record["lod"] = points.distance_m, points.sigma_m, points.lod_m
         record["significant"] = np.abs(points.distance_m) > points.lod_m
         self._writer.write_points(record)

@@ -8,7 +8,8 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 
 from pipelines.core.types import ByteArray, FloatArray, IntArray
-from pipelines.formats.gltf import Y_UP_FROM_Z_UP, glb_of
+from pipelines.formats.cloud_ply import COLOURS, set_columns
+from pipelines.formats.gltf import glb_of
 
 _FLOAT, _UNSIGNED_INT, _ARRAY, _ELEMENTS = 5126, 5125, 34962, 34963
 
@@ -16,13 +17,9 @@ _FLOAT, _UNSIGNED_INT, _ARRAY, _ELEMENTS = 5126, 5125, 34962, 34963
 def write_mesh_ply(path: Path, vertices: FloatArray, faces: IntArray, rgb: ByteArray, *, double: bool) -> None:
     """Write vertices (V, 3) with colours (V, 3) and faces (F, 3); coordinates are doubles or floats."""
     kind = "<f8" if double else "<f4"
-    vertex = np.empty(
-        len(vertices), [*((axis, kind) for axis in "xyz"), *((c, "u1") for c in ("red", "green", "blue"))]
-    )
-    for column, axis in enumerate("xyz"):
-        vertex[axis] = vertices[:, column]
-    for column, name in enumerate(("red", "green", "blue")):
-        vertex[name] = rgb[:, column]
+    vertex = np.empty(len(vertices), [*((axis, kind) for axis in "xyz"), *((colour, "u1") for colour in COLOURS)])
+    set_columns(vertex, "xyz", vertices)
+    set_columns(vertex, COLOURS, rgb)
     face = np.empty(len(faces), [("vertex_indices", "<i4", (3,))])
     face["vertex_indices"] = faces
     elements = [PlyElement.describe(vertex, "vertex"), PlyElement.describe(face, "face")]
@@ -45,13 +42,9 @@ def write_mesh_glb(
     data = [position.tobytes(), place.tobytes(), faces.astype("<u4").tobytes(), png_of(image)]
     start = np.cumsum([0, *(len(part) + -len(part) % 4 for part in data)]).tolist()
     targets: tuple[dict[str, int], ...] = ({"target": _ARRAY}, {"target": _ARRAY}, {"target": _ELEMENTS}, {})
+    primitive = {"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "material": 0}
     document = {
-        "asset": {"version": "2.0", "generator": "GeoRefGS", "extras": extras},
         "extensionsUsed": ["KHR_materials_unlit"],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "matrix": list(Y_UP_FROM_Z_UP)}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "material": 0}]}],
         "materials": [
             {
                 "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "metallicFactor": 0},
@@ -73,9 +66,9 @@ def write_mesh_glb(
             {"buffer": 0, "byteOffset": first, "byteLength": len(part), **target}
             for first, part, target in zip(start, data, targets, strict=False)
         ],
-        "buffers": [{"byteLength": start[-1]}],
     }  # fmt: skip
-    path.write_bytes(glb_of(document, b"".join(part + bytes(-len(part) % 4) for part in data)))
+    binary = b"".join(part + bytes(-len(part) % 4) for part in data)
+    path.write_bytes(glb_of(primitive, document, binary, extras))
 
 
 def write_mesh_obj(path: Path, vertices: FloatArray, faces: IntArray, uv: FloatArray, image: ByteArray) -> None:

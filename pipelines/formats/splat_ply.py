@@ -13,7 +13,7 @@ from numpy.lib import recfunctions
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from pipelines.core.errors import InputError
-from pipelines.core.files import file_size, reading, replace_file
+from pipelines.core.files import file_size, reading, replacing
 from pipelines.core.types import Float32Array, Rows
 
 _HEADER_LIMIT = 64 * 1024
@@ -61,9 +61,8 @@ def write_splat_ply(path: Path, splat: SplatArrays) -> None:
     rows[:, 10 + rest_count : 13 + rest_count], rows[:, 13 + rest_count :] = splat.log_scales, splat.quats_wxyz
     vertices = rows.view([(name, "<f4") for name in names]).reshape(count)
     path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(path.name + ".tmp")
-    PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(draft))
-    replace_file(draft, path)
+    with replacing(path) as draft:
+        PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(draft))
 
 
 def join_splat_plys(parts: Sequence[Path], path: Path) -> int:
@@ -80,14 +79,12 @@ def join_splat_plys(parts: Sequence[Path], path: Path) -> int:
             message = f"The PLY has other properties than {parts[0]}: the two cannot be joined."
             raise InputError("properties-differ", message, path=ply.path)
     count = sum(len(ply.rows) for ply in plys)
-    draft = path.with_name(path.name + ".tmp")
-    with draft.open("wb") as stream:
+    with replacing(path) as draft, draft.open("wb") as stream:
         lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
         lines += [*(f"property float {name}" for name in plys[0].names), "end_header\n"]
         stream.write("\n".join(lines).encode("ascii"))
         for ply in plys:
             _columns(ply, ply.names).astype("<f4", copy=False).tofile(stream)
-    replace_file(draft, path)
     return count
 
 

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.core.errors import InputError
-from pipelines.core.files import replace_file
+from pipelines.core.files import replacing
 from pipelines.core.types import ByteArray, Float32Array, FloatArray
 from pipelines.formats.splat_ply import SplatArrays
 
@@ -79,9 +79,8 @@ def write_spz(path: Path, splat: SplatArrays, version: SpzVersion = 3) -> None:
     """Write Gaussians; the file appears whole or not at all; raises as `encode_spz`."""
     data = encode_spz(splat, version)
     path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(path.name + ".tmp")
-    draft.write_bytes(data)
-    replace_file(draft, path)
+    with replacing(path) as draft:
+        draft.write_bytes(data)
 
 
 def encode_spz(splat: SplatArrays, version: SpzVersion = 3, fractional_bits: int = FRACTIONAL_BITS) -> bytes:

@@ -201,11 +201,7 @@ class Table:
         return np.array([row.line for row in self.rows], dtype=np.int64)
 
     def has(self, columns: Sequence[str]) -> bool:
-        """Return whether a group of columns is there: all of them, or none.
-
-        Raises:
-            InputError: a part of them.
-        """
+        """Return whether a group of columns is there: all of them, or none; an InputError: a part of them."""
         present = any(name in self.columns for name in columns)
         if present:
             require_columns(self.columns, columns, self.path, self.header_line)

@@ -27,8 +27,8 @@ def write_tiles_archive(path: Path, folder: Path, files: Iterable[str]) -> None:
     Raises:
         OSError: a file cannot be read, or the archive cannot be written.
     """
-    draft, records = path.with_name(f"{path.name}.tmp"), []
-    with replacing(path, draft), zipfile.ZipFile(draft, "w", zipfile.ZIP_STORED) as archive:
+    records = []
+    with replacing(path) as draft, zipfile.ZipFile(draft, "w", zipfile.ZIP_STORED) as archive:
         for name in files:
             entry = zipfile.ZipInfo(name)
             archive.writestr(entry, (folder / name).read_bytes())

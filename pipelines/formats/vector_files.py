@@ -7,9 +7,9 @@ Contours are a line a height, with the height as attribute and as z.
 import io
 import json
 import math
-import struct
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,18 +17,17 @@ from typing import Any
 
 import numpy as np
 import shapely
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from shapely import MultiPolygon
 
 from pipelines.core.errors import InputError
-from pipelines.core.files import file_size, replace_file
+from pipelines.core.files import file_size, replacing
 from pipelines.core.types import FloatArray
 from pipelines.geometry.footprints import clipped_ring, ring_area
 
 Json = dict[str, Any]
 _DECIMALS = 8  # of a degree: 1 mm
 _MOST_CONTOUR_BYTES = 1 << 30
-_LINE_STRING_Z = 1002  # OGC 06-103r4, table 8
 _MINOR, _MAJOR = "CONTOURS", "CONTOURS_MAJOR"
 
 
@@ -88,33 +87,47 @@ class ContourLine:
 
 
 def write_contours_gpkg(path: Path, lines: Sequence[ContourLine], wkt: str) -> None:
-    """Write contour lines as a GeoPackage 1.2 (OGC 12-128r15) with the layer `contours`.
+    """Write contour lines as a GeoPackage 1.2 (OGC 12-128r15) with the layer `contours`."""
+    shapes = [shapely.linestrings(np.insert(line.xy, 2, line.height, axis=1)) for line in lines]
+    columns = {
+        "height": np.array([line.height for line in lines], dtype=np.float64),
+        "major": np.array([line.is_major for line in lines], dtype=np.bool_),
+    }
+    with _new_gpkg(path) as draft:
+        _add_layer(draft, "contours", shapes, columns, kind="LineString Z", crs=wkt)
+
+
+@contextmanager
+def _new_gpkg(path: Path) -> Iterator[Path]:
+    """Yield the draft of a GeoPackage, renamed when it is complete; GDAL takes the format from its suffix."""
+    draft = path.with_name(f".{path.name}")
+    draft.unlink(missing_ok=True)
+    with replacing(path, draft):
+        yield draft
+
+
+def _add_layer(
+    draft: Path, layer: str, shapes: Sequence[Any], columns: Mapping[str, NDArray[Any]], *, kind: str, crs: str
+) -> None:
+    """Write a layer of shapes, whose values are the columns, into a GeoPackage 1.2, which is made if missing.
 
     GIS of some years ago warn of later versions, which GDAL writes by itself.
     """
     import pyogrio
 
-    draft = path.with_name(f".{path.name}")  # GDAL takes the format from the suffix
-    draft.unlink(missing_ok=True)
-    shapes = []
-    for line in lines:  # as WKB
-        points = np.column_stack([line.xy, np.full(len(line.xy), line.height)])
-        shapes.append(struct.pack("<BII", 1, _LINE_STRING_Z, len(points)) + points.astype("<f8").tobytes())
+    is_new = not draft.exists()
     pyogrio.raw.write(
         draft,
-        geometry=np.array(shapes, dtype=object),
-        field_data=[
-            np.array([line.height for line in lines], dtype=np.float64),
-            np.array([line.is_major for line in lines], dtype=np.bool_),
-        ],
-        fields=["height", "major"],
-        layer="contours",
+        geometry=np.array(shapely.to_wkb(shapes, output_dimension=3), dtype=object),
+        field_data=list(columns.values()),
+        fields=list(columns),
+        layer=layer,
         driver="GPKG",
-        geometry_type="LineString Z",
-        dataset_options={"VERSION": "1.2"},
-        crs=wkt or None,
+        geometry_type=kind,
+        append=not is_new,
+        dataset_options={"VERSION": "1.2"} if is_new else None,
+        crs=crs or None,
     )
-    replace_file(draft, path)
 
 
 def write_features_gpkg(path: Path, layers: Mapping[str, Sequence[Json]]) -> None:
@@ -122,31 +135,15 @@ def write_features_gpkg(path: Path, layers: Mapping[str, Sequence[Json]]) -> Non
 
     Properties are numbers, texts, or None.
     """
-    import pyogrio
-
-    draft = path.with_name(f".{path.name}")
-    draft.unlink(missing_ok=True)
-    for number, (layer, features) in enumerate(layers.items()):
-        names = list(dict.fromkeys(name for one in features for name in one["properties"]))
-        columns = [[one["properties"].get(name) for one in features] for name in names]
-        is_text = [any(isinstance(value, str) for value in column) for column in columns]
-        shapes = [shapely.from_geojson(json.dumps(one["geometry"])) for one in features]
-        pyogrio.raw.write(
-            draft,
-            geometry=np.array(shapely.to_wkb(shapes, output_dimension=3), dtype=object),
-            field_data=[
-                np.array(column, dtype=object if text else np.float64)
-                for column, text in zip(columns, is_text, strict=True)
-            ],
-            fields=names,
-            layer=layer,
-            driver="GPKG",
-            geometry_type=f"{shapes[0].geom_type} Z",
-            append=number > 0,
-            dataset_options={"VERSION": "1.2"} if number == 0 else None,
-            crs="EPSG:4979",
-        )
-    replace_file(draft, path)
+    with _new_gpkg(path) as draft:
+        for layer, features in layers.items():
+            columns = {}
+            for name in dict.fromkeys(name for one in features for name in one["properties"]):
+                values = [one["properties"].get(name) for one in features]
+                is_text = any(isinstance(value, str) for value in values)
+                columns[name] = np.array(values, dtype=object if is_text else np.float64)
+            shapes = [shapely.from_geojson(json.dumps(one["geometry"])) for one in features]
+            _add_layer(draft, layer, shapes, columns, kind=f"{shapes[0].geom_type} Z", crs="EPSG:4979")
 
 
 def read_contours(path: Path) -> tuple[str, list[ContourLine]]:
@@ -184,26 +181,10 @@ def _read_gpkg(
 
 def write_polygons_gpkg(path: Path, layer: str, polygons: Sequence[Any], rows: Sequence[Json], wkt: str) -> None:
     """Write polygons with a row of attributes each as a GeoPackage 1.2 of one layer."""
-    import pyogrio
-
-    draft = path.with_name(f".{path.name}")
-    draft.unlink(missing_ok=True)
-    names = list(rows[0]) if rows else []
-    pyogrio.raw.write(
-        draft,
-        geometry=np.array(
-            [shapely.to_wkb(shapely.MultiPolygon(shapely.get_parts(one))) for one in polygons] or np.zeros(0),
-            dtype=object,
-        ),
-        field_data=[np.array([row[name] for row in rows]) for name in names],
-        fields=names,
-        layer=layer,
-        driver="GPKG",
-        geometry_type="MultiPolygon",
-        dataset_options={"VERSION": "1.2"},
-        crs=wkt or None,
-    )
-    replace_file(draft, path)
+    shapes = [shapely.MultiPolygon(shapely.get_parts(one)) for one in polygons]
+    columns = {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
+    with _new_gpkg(path) as draft:
+        _add_layer(draft, layer, shapes, columns, kind="MultiPolygon", crs=wkt)
 
 
 def write_contours_dxf(path: Path, lines: Sequence[ContourLine]) -> None:
@@ -218,9 +199,8 @@ def write_contours_dxf(path: Path, lines: Sequence[ContourLine]) -> None:
         layer = _MAJOR if line.is_major else _MINOR
         polyline = space.add_lwpolyline(line.xy.tolist(), dxfattribs={"layer": layer})
         polyline.dxf.elevation = line.height
-    draft = path.with_name(path.name + ".tmp")
-    document.saveas(draft)
-    replace_file(draft, path)
+    with replacing(path) as draft:
+        document.saveas(draft)
 
 
 def drawing(lines: Sequence[tuple[str, int, FloatArray]]) -> bytes:

@@ -221,19 +221,14 @@ def run_batch(
     jobs = [plan.job(listed.folder) for plan in planned if not plan.is_current]
     if jobs:
         engine.run("missions", jobs, ended, progress)
-        _write_last(listed, table())
+        try:
+            with storage_failures(listed.folder):
+                write_batch(listed.folder, table())
+        except StorageError as error:
+            if table().is_complete:
+                raise
+            log.warning("The table of the batch was not updated. %s", error)  # The failed missions tell more.
     return table()
-
-
-def _write_last(listed: MissionList, table: BatchTable) -> None:
-    """Write the table; where missions have failed, which tell why, a table that cannot be written is a warning."""
-    try:
-        with storage_failures(listed.folder):
-            write_batch(listed.folder, table)
-    except StorageError as error:
-        if table.is_complete:
-            raise
-        log.warning("The table of the batch was not updated. %s", error)
 
 
 def run_arguments(mission: Mission) -> tuple[str, ...]:

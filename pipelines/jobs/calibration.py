@@ -15,7 +15,7 @@ import llvmlite.binding as llvm
 import platformdirs
 import torch
 
-from pipelines.core.files import replacing
+from pipelines.core.files import replace_text
 from pipelines.core.machine import thread_count
 from pipelines.geometry.cameras import Pinhole
 from pipelines.jobs.costs import MEASURED_CORES, iteration_seconds
@@ -52,9 +52,7 @@ def _factor(threads: int, key: str, compiled: bool) -> float:
     factor = _processor_s() / min(threads, _MOST_CORES) / modelled_s
     try:
         file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        draft = file.with_suffix(".tmp")
-        with replacing(file, draft):
-            draft.write_text(json.dumps({"key": key, "factor": factor}), encoding="utf-8")
+        replace_text(file, json.dumps({"key": key, "factor": factor}))
     except OSError as error:
         log.debug("the speed of this machine cannot be kept in %s: %s", file, error)
     return factor

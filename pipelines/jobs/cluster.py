@@ -79,18 +79,14 @@ def check_own_certificates(folder: Path) -> None:
             continue
         status = path.stat()
         if status.st_uid != os.geteuid():
-            raise InputError(
-                "key-of-another-user",
-                "belongs to another user, who can run programs as you. Delete it.",
-                path=path,
-            )
+            message = "belongs to another user, who can run programs as you. Delete it."
+            raise InputError("key-of-another-user", message, path=path)
         if status.st_mode & _OF_OTHERS:
-            raise InputError(
-                "key-open",
+            message = (
                 "is open to other users, who can run programs as you. If none of them has read or changed it: "
-                f"`chmod -R go-rwx {folder}`. Otherwise delete it.",
-                path=path,
+                f"`chmod -R go-rwx {folder}`. Otherwise delete it."
             )
+            raise InputError("key-open", message, path=path)
 
 
 def check_certificates(folder: Path) -> None:
@@ -102,12 +98,11 @@ def check_certificates(folder: Path) -> None:
     """
     for name in (CERTIFICATE, KEY):
         if not (folder / name).is_file():
-            raise InputError(
-                "certificate-missing",
+            message = (
                 f"has no {name}. Name the folder of the cluster's certificate with --certificates. `georef cluster "
-                "certificates DIR` makes one; `georef cluster scheduler` makes yours for this machine.",
-                path=folder,
+                "certificates DIR` makes one; `georef cluster scheduler` makes yours for this machine."
             )
+            raise InputError("certificate-missing", message, path=folder)
     if os.name == "posix" and (folder / KEY).stat().st_mode & _OF_EVERYBODY:
         raise InputError(
             "key-open", "can be read by every user of this machine. Close it with `chmod 600`.", path=folder / KEY

@@ -74,23 +74,29 @@ class Engine(Protocol):
         """
 
 
-class JobLine:
-    """Progress of a job as one line: its outermost task, with the task inside as its note.
+class JobDisplay(MessageReceiver):
+    """Receiver of a job's messages: its tasks are one line, the outermost, with the task inside as its note.
 
-    Its place is the latest note of the outermost task: the stage that runs.
+    Its place is the latest note of the outermost task: the stage that runs. Log records name the job, and only
+    warnings are logged by default: many jobs say much.
     """
 
     def __init__(self, progress: Progress, name: str) -> None:
+        super().__init__(self)
         self.place = ""
-        self._progress, self._name = progress, name
+        self._shown_in, self._name = progress, name
         self._outer: ProgressTask | None = None
+
+    def log(self, name: str, level: int, text: str) -> None:
+        shown = level if level >= logging.WARNING else logging.DEBUG
+        log.log(shown, "%s: %s", self._name, text)
 
     @contextmanager
     def task(self, name: str, total: int | None = None) -> Iterator[ProgressTask]:
         if self._outer is not None:
             yield _InnerTask(self, name, total)
             return
-        with self._progress.task(self._name, total) as outer:
+        with self._shown_in.task(self._name, total) as outer:
             self._outer = outer
             try:
                 yield self
@@ -108,7 +114,7 @@ class JobLine:
 
 
 class _InnerTask:
-    def __init__(self, line: JobLine, name: str, total: int | None) -> None:
+    def __init__(self, line: JobDisplay, name: str, total: int | None) -> None:
         self._line, self._name, self._total = line, name, total
         self._done, self._note = 0, ""
 
@@ -118,25 +124,6 @@ class _InnerTask:
         left = "" if not left_s or math.isinf(left_s) else f"{duration(left_s)} left"
         place = "" if self._name == self._line.place else self._line.place
         self._line.show(0, " · ".join(filter(None, (place, count, self._note, left))))
-
-
-class JobDisplay(MessageReceiver):
-    """Receiver of a job's messages: its tasks are one line, and its log records name it.
-
-    Only warnings are logged by default: many jobs say much.
-    """
-
-    def __init__(self, progress: Progress, name: str) -> None:
-        self._line, self._name = JobLine(progress, name), name
-        super().__init__(self._line)
-
-    @property
-    def place(self) -> str:
-        return self._line.place
-
-    def log(self, name: str, level: int, text: str) -> None:
-        shown = level if level >= logging.WARNING else logging.DEBUG
-        log.log(shown, "%s: %s", self._name, text)
 
 
 def tell_end(end: JobEnd) -> None:

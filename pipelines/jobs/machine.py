@@ -49,8 +49,8 @@ class Machine:
     python: str
     cores: int  # that this process may use
     threads: int  # that stages compute with (`--threads`)
-    memory_bytes: int | None  # main memory; None: the system does not state it
-    free_bytes: int | None  # likewise
+    memory_bytes: int  # main memory
+    free_bytes: int | None  # of it; None: not known
     gpus: tuple[Gpu, ...]
     backends: tuple[BackendState, ...]
     extras: tuple[Part, ...]  # optional libraries, by the extra that installs them

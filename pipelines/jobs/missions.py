@@ -124,21 +124,14 @@ def _in_file(path: Path, owners: Owners) -> MissionList:
     document = read_toml(path)
     for key, value in document.items():
         if key not in ("defaults", "missions"):
-            raise InputError(
-                "unknown-table",
-                "is no table of missions. The tables are defaults and missions.",
-                path=path,
-                field=key,
-            )
+            message = "is no table of missions. The tables are defaults and missions."
+            raise InputError("unknown-table", message, path=path, field=key)
         if not isinstance(value, dict):
             raise InputError("not-a-table", "is not a table.", path=path, field=key)
     tables = document.get("missions", {})
     if len(tables) > _MOST_MISSIONS:
-        raise InputError(
-            "too-many-missions",
-            f"holds too many missions: {len(tables)} (limit {_MOST_MISSIONS}).",
-            path=path,
-        )
+        message = f"holds too many missions: {len(tables)} (limit {_MOST_MISSIONS})."
+        raise InputError("too-many-missions", message, path=path)
     defaults = _Table(path, "defaults", owners).read(document.get("defaults", {}))
     missions = tuple(_mission(path, name, table, defaults, owners) for name, table in tables.items())
     _require_own_workspaces(path, missions)
@@ -170,7 +163,12 @@ class _Table:
             if key in _OWN_KEYS:
                 own[key] = self._own(key, value)
             elif key in BY_NAME:
-                flags.setdefault(key, {}).update(self._stage(key, value))
+                if not isinstance(value, dict):
+                    raise self._error("not-a-table", key, "is not a table of options.")
+                given = {
+                    name: self._value(BY_NAME[key], name, each, f"{key}.{name}") for name, each in value.items()
+                }
+                flags.setdefault(key, {}).update(given)
             elif key in self.owners:
                 for owner in self.owners[key]:
                     flags.setdefault(owner, {})[key] = self._value(BY_NAME[owner], key, value, key)
@@ -196,11 +194,6 @@ class _Table:
             code = "path-leaves-folder" if key == "workspace" else "option-invalid"
             raise self._error(code, key, str(error)) from error
         return value
-
-    def _stage(self, stage: str, table: Any) -> dict[str, Any]:
-        if not isinstance(table, dict):
-            raise self._error("not-a-table", stage, "is not a table of options.")
-        return {key: self._value(BY_NAME[stage], key, value, f"{stage}.{key}") for key, value in table.items()}
 
     def _value(self, spec: StageSpec, option: str, value: Any, key: str) -> Any:
         """Return the value of an option, with paths relative to the file made absolute."""
@@ -250,23 +243,15 @@ def _mission(path: Path, name: str, table: Any, defaults: _Settings, owners: Own
 
 def _require_name(name: str, path: Path, label: str) -> None:
     if not _NAME.fullmatch(name):
-        raise InputError(
-            "mission-name",
-            "cannot be the name of a mission. Use letters, digits, '.', '-' and '_'.",
-            path=path,
-            field=label,
-        )
+        message = "cannot be the name of a mission. Use letters, digits, '.', '-' and '_'."
+        raise InputError("mission-name", message, path=path, field=label)
 
 
 def _require_inside(root: Path, folder: Path, path: Path, label: str) -> None:
     """Refuse a workspace that a symbolic link leads out of its folder."""
     if not root.resolve().is_relative_to(folder.resolve()):
-        raise InputError(
-            "path-leaves-folder",
-            "has a workspace that leads out of the folder of missions.",
-            path=path,
-            field=label,
-        )
+        message = "has a workspace that leads out of the folder of missions."
+        raise InputError("path-leaves-folder", message, path=path, field=label)
 
 
 def _require_own_workspaces(path: Path, missions: Sequence[Mission]) -> None:
@@ -275,12 +260,8 @@ def _require_own_workspaces(path: Path, missions: Sequence[Mission]) -> None:
     for mission in missions:
         place = str(mission.workspace.root.resolve()).casefold()
         if place in taken:
-            raise InputError(
-                "workspace-shared",
-                f"is the workspace of {taken[place]} too. Each mission needs its own.",
-                path=path,
-                field=f"missions.{mission.name}.workspace",
-            )
+            message = f"is the workspace of {taken[place]} too. Each mission needs its own."
+            raise InputError("workspace-shared", message, path=path, field=f"missions.{mission.name}.workspace")
         taken[place] = mission.name
 
 

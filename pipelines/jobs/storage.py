@@ -87,11 +87,8 @@ class Storage:
             try:
                 index = PartIndex.model_validate_json(store.cat_file(place))
             except ValidationError as error:
-                raise InputError(
-                    "index-damaged",
-                    f"is a damaged index. {fault_sentence(error.errors()[0])} Delete it.",
-                    path=place,
-                ) from error
+                message = f"is a damaged index. {fault_sentence(error.errors()[0])} Delete it."
+                raise InputError("index-damaged", message, path=place) from error
             if index.part != part or not all(name == "." or stays_inside(name) for name in index.files):
                 raise InputError("index-leaves-part", "lists files outside its part. Delete it.", path=place)
             return index
@@ -260,11 +257,8 @@ class EngineExchange:
             InputError: the job names no parts, or a part lies outside its folder.
         """
         if job.folder is None or job.writes is None:
-            raise InputError(
-                "storage-not-supported",
-                f"is not supported by {job.name}, whose files are not known. Use a shared folder.",
-                field="--storage",
-            )
+            message = f"is not supported by {job.name}, whose files are not known. Use a shared folder."
+            raise InputError("storage-not-supported", message, field="--storage")
         folder = job.folder.resolve()
         writes, *reads = [_part(folder, path) for path in (job.writes, *job.reads)]
         self._collect(folder, writes)
@@ -326,8 +320,5 @@ def _part(folder: Path, path: Path) -> str:
     try:
         return path.resolve().relative_to(folder).as_posix()
     except ValueError:
-        raise InputError(
-            "path-leaves-folder",
-            f"lies outside {folder}. With --storage all that a job reads lies in one folder.",
-            path=path,
-        ) from None
+        message = f"lies outside {folder}. With --storage all that a job reads lies in one folder."
+        raise InputError("path-leaves-folder", message, path=path) from None

@@ -65,6 +65,10 @@ def accuracy_facts(evaluated: EvaluatedSurvey) -> AccuracyFacts:
     by_way = report.checkpoints.by_way
     sigma, error = _compared(report.checkpoints.triangulated, evaluated.solved.survey.check_points)
     enough = len(sigma) >= _LEAST_FOR_CHART
+    within: list[tuple[str, float, float]] = []
+    for name, ratio in zip(("horizontal", "vertical"), (error / np.maximum(sigma, 1e-12)).T, strict=True):
+        if enough:
+            within.append((name, float((ratio <= 1).mean()), float((ratio <= 2).mean())))
     crossed = report.cross_validation
     return AccuracyFacts(
         figures=(
@@ -75,7 +79,7 @@ def accuracy_facts(evaluated: EvaluatedSurvey) -> AccuracyFacts:
         ninety=tuple(ninety_percent(way, errors) for way, errors in by_way.items()),
         ways={way: WAYS[way] for way, errors in by_way.items() if errors.count},
         chart=picture_of_png(predicted_against_measured(sigma, error)) if enough else None,
-        within=_within(sigma, error) if enough else (),
+        within=tuple(within),
         map=png_file(evaluated.workspace.root / ACCURACY_MAP),
         surface="surface" in by_way,
         crossed=crossed is not None and crossed.count > 0,
@@ -92,27 +96,22 @@ def ninety_percent(way: str, errors: CheckPointErrors) -> NinetyPercent:
     """
     rows = [row.error_m for row in errors.points if row.error_m is not None]
     table = np.array(rows, dtype=np.float64).reshape(-1, 3)
-    has_quantile = len(table) >= _LEAST_FOR_QUANTILE
-    ce90 = le90 = None
+    ce90 = le90 = measured_h = measured_v = None
+    if len(table) >= _LEAST_FOR_QUANTILE:
+        measured_h = float(np.quantile(np.hypot(table[:, 0], table[:, 1]), 0.9))
+        measured_v = float(np.quantile(np.abs(table[:, 2]), 0.9))
     if errors.rmse_e_m is not None and errors.rmse_n_m is not None and errors.rmse_v_m is not None:
         ce90 = CE90_OF_AXIS_RMSE * (errors.rmse_e_m + errors.rmse_n_m) / 2
         le90 = LE90_OF_RMSE * errors.rmse_v_m
-    return NinetyPercent(
-        way=way,
-        ce90_m=ce90,
-        le90_m=le90,
-        measured_h_m=float(np.quantile(np.hypot(table[:, 0], table[:, 1]), 0.9)) if has_quantile else None,
-        measured_v_m=float(np.quantile(np.abs(table[:, 2]), 0.9)) if has_quantile else None,
-        count=errors.count,
-    )
+    return NinetyPercent(way, ce90, le90, measured_h, measured_v, errors.count)
 
 
 def _lines(group: str, names: tuple[str, ...], ending: str = "") -> tuple[FigureLine, ...]:
     """Return the lines of a table of errors: all errors, or those of a group."""
-    figures = [(name, ERRORS[name]) for name in names]
     return tuple(
         (figure.meaning + ending, group + name, "metres" if figure.unit else "whole", figure.unit)
-        for name, figure in figures
+        for name in names
+        for figure in (ERRORS[name],)
     )
 
 
@@ -129,9 +128,3 @@ def _compared(errors: CheckPointErrors, points: tuple[SurveyedPoint, ...]) -> tu
         sigma.append([np.sqrt(variance[0] + variance[1]), np.sqrt(variance[2])])
         error.append([np.hypot(off[0], off[1]), abs(off[2])])
     return np.array(sigma).reshape(-1, 2), np.array(error).reshape(-1, 2)
-
-
-def _within(sigma: FloatArray, error: FloatArray) -> tuple[tuple[str, float, float], ...]:
-    ratio = error / np.maximum(sigma, 1e-12)
-    once, twice = (ratio <= 1).mean(axis=0).tolist(), (ratio <= 2).mean(axis=0).tolist()
-    return (("horizontal", once[0], twice[0]), ("vertical", once[1], twice[1]))

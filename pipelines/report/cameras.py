@@ -88,7 +88,10 @@ def cameras_facts(evaluated: EvaluatedSurvey) -> CamerasFacts:
         None if covariance is None else covariance[:, :2, :2],
         is_outlier,
     )
-    stated_m = _stated_sigma_m(evaluated, fixes)
+    by_name = {image.name: image.fix for image in solved.survey.images}
+    stated = [fix.cov_in_geo for camera in fixes.camera if (fix := by_name[names[camera]]) is not None]
+    # Stated σ (F, 3) along east, north and up, without the error that a session shares.
+    stated_m = np.asarray(np.sqrt(np.diagonal(np.array(stated).reshape(-1, 3, 3), axis1=1, axis2=2)))
     series, by_time = _series(evaluated, fixes, stated_m)
     sigma_m = None if covariance is None else np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     return CamerasFacts(
@@ -132,14 +135,6 @@ def bias_of(fixes: FixDifferences, stated_m: FloatArray) -> tuple[FlightBias, ..
         FlightBias(axis, mean, sigma, vector3(within))
         for axis, mean, sigma, within in zip(("east", "north", "up"), means, scatter, shares, strict=True)
     )
-
-
-def _stated_sigma_m(evaluated: EvaluatedSurvey, fixes: FixDifferences) -> FloatArray:
-    """Return the stated σ (F, 3) of fixes along east, north and up, without the error that a session shares."""
-    by_name = {image.name: image.fix for image in evaluated.solved.survey.images}
-    names = [evaluated.solved.sparse.image_name[camera] for camera in fixes.camera]
-    covariance = [fix.cov_in_geo for name in names if (fix := by_name[name]) is not None]
-    return np.asarray(np.sqrt(np.diagonal(np.array(covariance).reshape(-1, 3, 3), axis1=1, axis2=2)))
 
 
 def _series(evaluated: EvaluatedSurvey, fixes: FixDifferences, stated_m: FloatArray) -> tuple[Picture | None, bool]:

@@ -49,6 +49,12 @@ def cover_facts(
     shown = {name: preview(root / product, _PREVIEW_PX) for name, product in previews.items()}
     registered = f"{count_text(lenses.photographs)} of {count_text(len(survey.images))} registered"
     control, check = (count_text(len(points)) for points in (survey.control_points, survey.check_points))
+    cameras = [
+        f"{lens.make_model or lens.camera.model}, {lens.camera.width} × {lens.camera.height} px, "
+        f"focal length {number_text(lens.camera.mean_focal_px, 0)} px"
+        for lens in lenses.lenses[:_MOST_CAMERAS]
+    ]
+    cameras += ["…"] if len(lenses.lenses) > _MOST_CAMERAS else []
     return CoverFacts(
         client=options.client,
         author=options.author,
@@ -58,7 +64,7 @@ def cover_facts(
             ("Area", MISSING if area_ha is None else f"{number_text(area_ha, 2)} ha"),
             ("Photographs", registered),
             ("Taken on", days_of(image.timestamp_s for image in survey.images)),
-            ("Camera", "; ".join(_cameras(lenses)) or MISSING),
+            ("Camera", "; ".join(cameras) or MISSING),
             ("Flying height above ground", MISSING if height_m is None else f"{number_text(height_m, 0)} m"),
             ("Ground sample distance", MISSING if gsd_m is None else f"{number_text(100 * gsd_m, 1)} cm"),
             ("Photographs of a place", f"{number_text(overlap.median, 0)} (median)"),
@@ -88,16 +94,6 @@ def ground_sampling_m(evaluated: EvaluatedSurvey) -> float | None:
 def days_of(times_s: Iterable[float | None]) -> str:
     """Return the first and the last day, in UTC, of times since 1970; a dash where none is known."""
     known = [time_s for time_s in times_s if time_s is not None and time_s >= _EARLIEST_S]
-    days = (
-        [f"{datetime.fromtimestamp(time_s, UTC):%Y-%m-%d}" for time_s in (min(known), max(known))] if known else []
-    )
+    ends = (min(known), max(known)) if known else ()
+    days = [f"{datetime.fromtimestamp(time_s, UTC):%Y-%m-%d}" for time_s in ends]
     return " to ".join(dict.fromkeys(days)) or MISSING
-
-
-def _cameras(lenses: LensesFacts) -> list[str]:
-    texts = [
-        f"{lens.make_model or lens.camera.model}, {lens.camera.width} × {lens.camera.height} px, "
-        f"focal length {number_text(lens.camera.mean_focal_px, 0)} px"
-        for lens in lenses.lenses[:_MOST_CAMERAS]
-    ]
-    return [*texts, "…"] if len(lenses.lenses) > _MOST_CAMERAS else texts

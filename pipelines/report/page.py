@@ -54,7 +54,10 @@ def in_metres(value: float | None) -> str:
 
 def signed(value: float | None) -> str:
     """Return millimetre-fine metres without their unit, with a sign: a column of errors."""
-    text = number_text(value, 3)
+    return _with_sign(number_text(value, 3))
+
+
+def _with_sign(text: str) -> str:
     return text if text == MISSING or text.startswith("−") else f"+{text}"
 
 
@@ -90,8 +93,7 @@ def volume(value: float | None) -> str:
 
 
 def signed_volume(value: float | None) -> str:
-    text = volume(value)
-    return text if text == MISSING or text.startswith("−") else f"+{text}"
+    return _with_sign(volume(value))
 
 
 def moment(value: datetime | None) -> str:

@@ -7,7 +7,7 @@ from scipy.sparse import csr_matrix, triu
 from scipy.sparse.csgraph import connected_components
 
 from pipelines.core.types import FloatArray, IntArray
-from pipelines.geodesy.enu import ecef_from_enu, lla_from_ecef
+from pipelines.geodesy.enu import lla_from_enu
 from pipelines.geodesy.operations import Operation
 from pipelines.geometry.bundle import Network
 from pipelines.report.page import Picture, picture_of_png
@@ -36,9 +36,9 @@ def texts_of(crs: TargetCrs, point_in_geo: FloatArray) -> list[Texts]:
     """Return coordinates of points (N, 3) in `geo` as text; an InputError: one is outside the domain of the CRS."""
     if not len(point_in_geo):
         return []
-    units = crs.crs.short_units
+    first, second, third = crs.crs.short_units
     return [
-        (coordinate(x, units[0]), coordinate(y, units[1]), coordinate(z, units[2]))
+        (coordinate(x, first), coordinate(y, second), coordinate(z, third))
         for x, y, z in crs.xyz_from_geo(point_in_geo).tolist()
     ]
 
@@ -84,35 +84,29 @@ def place_facts(evaluated: EvaluatedSurvey) -> PlaceFacts:
     everything = np.concatenate([evaluated.scene_in_geo, evaluated.center_in_geo])
     geographic: tuple[AxisExtent, ...] = ()
     if survey.origin is not None:
-        lla = lla_from_ecef(ecef_from_enu(everything, survey.origin))
+        lla = lla_from_enu(everything, survey.origin)
         lla[:, 1] -= 360.0 * np.round((lla[:, 1] - lla[0, 1]) / 360.0)
         names = ("longitude", "latitude", "ellipsoidal height")
         geographic = _axes(names, ("°", "°", "m"), lla[:, [1, 0, 2]])
     xyz = crs.xyz_from_geo(everything)
-    size = np.ptp(evaluated.scene_in_geo, axis=0).tolist() if len(evaluated.scene_in_geo) else [0.0, 0.0, 0.0]
+    scene, center = evaluated.scene_in_geo, evaluated.center_in_geo[:, :2]
+    size = np.ptp(scene, axis=0).tolist() if len(scene) else [0.0, 0.0, 0.0]
+    plan = site_plan(
+        center[evaluated.solved.indices("train")],
+        center[evaluated.solved.indices("test")],
+        named_places(survey.control_points),
+        named_places(survey.check_points),
+        scene[:: max(1, len(scene) // _MOST_DOTS), :2],
+    )
     return PlaceFacts(
         survey=survey,
         crs=crs,
         operation=crs.operation(),
-        plan=_plan(evaluated),
+        plan=picture_of_png(plan),
         geographic=geographic,
         projected=_axes(axis_names(crs), crs.crs.short_units, xyz),
         ground_size_m=(size[0], size[1]),
     )
-
-
-def _plan(evaluated: EvaluatedSurvey) -> Picture:
-    solved, center = evaluated.solved, evaluated.center_in_geo[:, :2]
-    scene = evaluated.scene_in_geo
-    step = max(1, len(scene) // _MOST_DOTS)
-    png = site_plan(
-        center[solved.indices("train")],
-        center[solved.indices("test")],
-        named_places(solved.survey.control_points),
-        named_places(solved.survey.check_points),
-        scene[::step, :2],
-    )
-    return picture_of_png(png)
 
 
 def named_places(points: tuple[SurveyedPoint, ...]) -> NamedPlaces:

@@ -28,18 +28,21 @@ _MOST_SHOWN_PX = 288  # stored side of a chip; the page magnifies it
 Pixel = tuple[float, float]
 
 
+Kind = Literal["control", "check"]
+
+
 @dataclass(frozen=True)
-class WantedChip:
-    """Mark to be shown, in pixels of a photograph; `owner` is kind and name of the point.
+class _Group:
+    """Control or check points, with the rays of their K marks and the pixels where points project; NaN: nowhere."""
 
-    `adjusted` and `surveyed` are where the measured and the surveyed point project; None: nowhere.
-    """
-
-    owner: tuple[str, str]
-    image: int
-    mark: Pixel
-    adjusted: Pixel | None
-    surveyed: Pixel | None
+    kind: Kind
+    points: tuple[SurveyedPoint, ...]
+    errors: Sequence[PointResidual]
+    field: str
+    surveyed_in_geo: FloatArray
+    rays: MarkRays
+    surveyed_px: FloatArray
+    adjusted_px: FloatArray
 
 
 @dataclass(frozen=True)
@@ -59,19 +62,19 @@ class Chip:
 
 
 def cut_chips(
-    evaluated: EvaluatedSurvey, wanted: Sequence[WantedChip], progress: Progress
+    evaluated: EvaluatedSurvey, wanted: Sequence[tuple[_Group, int]], progress: Progress
 ) -> tuple[dict[tuple[str, str], tuple[Chip, ...]], int]:
-    """Return chips by kind and name of points, and their side in pixels; an InputError: no photograph as surveyed.
+    """Return chips of marks by kind and name of points, and their side in pixels.
 
-    Photographs are decoded one at a time, each once.
+    Photographs are decoded one at a time, each once; an InputError: a photograph is not as surveyed.
     """
     sparse, survey = evaluated.solved.sparse, evaluated.solved.survey
     folder = photograph_folder(evaluated.workspace, survey.image_dir)
     sha256 = {image.name: image.sha256 for image in survey.images}
     side = _side_px(sparse)
-    by_image: dict[int, list[WantedChip]] = defaultdict(list)
-    for chip in wanted:
-        by_image[chip.image].append(chip)
+    by_image: dict[int, list[tuple[_Group, int]]] = defaultdict(list)
+    for group, mark in wanted:
+        by_image[int(group.rays.camera[mark])].append((group, mark))
     chips: dict[tuple[str, str], list[Chip]] = defaultdict(list)
     with progress.task("image chips", len(by_image)) as task:
         for image, of_image in by_image.items():
@@ -80,8 +83,10 @@ def cut_chips(
             if pixels is None:
                 message = "cannot be decoded, or has changed. Restore the photograph."
                 raise InputError("photograph-damaged", message, path=folder / name)
-            for chip in of_image:
-                chips[chip.owner].append(_cut(pixels[..., ::-1], name, chip, side))
+            for group, mark in of_image:
+                places = np.stack([group.rays.xy_px[mark], group.adjusted_px[mark], group.surveyed_px[mark]])
+                owner = group.kind, group.points[group.rays.point[mark]].name
+                chips[owner].append(_cut(pixels[..., ::-1], name, places, side))
             task.advance()
     return {owner: tuple(mine) for owner, mine in chips.items()}, side
 
@@ -92,38 +97,32 @@ def _side_px(sparse: SparseModel) -> int:
     return max(_LEAST_SIDE_PX, 2 * round(_SIDE_SHARE * longest / 2))
 
 
-def _cut(photograph: ByteArray, name: str, wanted: WantedChip, side: int) -> Chip:
-    """Return the piece around a mark, moved into the photograph at its rim; a smaller photograph ends in black."""
+def _cut(photograph: ByteArray, name: str, places: FloatArray, side: int) -> Chip:
+    """Return the piece around a mark, moved into the photograph at its rim; a smaller photograph ends in black.
+
+    The places (3, 2) are those of the mark and of the adjusted and the surveyed point; NaN: nowhere.
+    """
     height, width = photograph.shape[:2]
-    corner = (
-        np.floor(np.array(wanted.mark) - side / 2).astype(int).clip(0, np.maximum([width, height], side) - side)
-    )
+    last = np.maximum([width, height], side) - side
+    corner = np.floor(places[0] - side / 2).astype(int).clip(0, last)
     piece = np.zeros((side, side, 3), dtype=np.uint8)
     part = photograph[corner[1] : corner[1] + side, corner[0] : corner[0] + side]
     piece[: part.shape[0], : part.shape[1]] = part
-
-    def inside(pixel: Pixel | None) -> Pixel | None:
-        if pixel is None:
-            return None
-        x, y = (np.array(pixel) - corner).tolist()
-        return (x, y) if 0 <= x <= side and 0 <= y <= side else None
-
-    x_px, y_px = (np.array(wanted.mark) - corner).tolist()
-    distance = None if wanted.adjusted is None else float(np.hypot(*np.subtract(wanted.adjusted, wanted.mark)))
+    mark, *points = ((x, y) for x, y in (places - corner).tolist())
+    adjusted, surveyed = ((x, y) if 0 <= x <= side and 0 <= y <= side else None for x, y in points)
+    distance = float(np.hypot(*(places[1] - places[0])))
     return Chip(
         image=name,
         picture=picture_of(limited(piece, _MOST_SHOWN_PX)),
         side_px=side,
-        mark=(x_px, y_px),
-        adjusted=inside(wanted.adjusted),
-        surveyed=inside(wanted.surveyed),
-        distance_px=distance,
+        mark=mark,
+        adjusted=adjusted,
+        surveyed=surveyed,
+        distance_px=distance if np.isfinite(distance) else None,
     )
 
 
 _MOST_CHIPS = 240
-
-Kind = Literal["control", "check"]
 
 
 @dataclass(frozen=True)
@@ -158,15 +157,10 @@ def points_facts(
 ) -> tuple[PointsFacts, PointsFacts]:
     """Return the control and check points of an evaluated survey, with 240 chips at most."""
     survey, report = evaluated.solved.survey, evaluated.report
+    checked = report.checkpoints.triangulated.points
     groups = (
         _group(evaluated, "control", survey.control_points, report.fit.gcp.points, "fit.gcp.points"),
-        _group(
-            evaluated,
-            "check",
-            survey.check_points,
-            report.checkpoints.triangulated.points,
-            "checkpoints.triangulated.points",
-        ),
+        _group(evaluated, "check", survey.check_points, checked, "checkpoints.triangulated.points"),
     )
     total = sum(len(group.points) for group in groups)
     each = min(chips_a_point, max(1, _MOST_CHIPS // total)) if total else 0
@@ -174,20 +168,6 @@ def points_facts(
     chips, side_px = cut_chips(evaluated, wanted[:_MOST_CHIPS], progress)
     control, check = (_facts(evaluated, group, chips, side_px) for group in groups)
     return control, check
-
-
-@dataclass(frozen=True)
-class _Group:
-    """Control or check points, with the rays of their K marks and the pixels where points project; NaN: nowhere."""
-
-    kind: Kind
-    points: tuple[SurveyedPoint, ...]
-    errors: Sequence[PointResidual]
-    field: str
-    surveyed_in_geo: FloatArray
-    rays: MarkRays
-    surveyed_px: FloatArray
-    adjusted_px: FloatArray
 
 
 def _group(
@@ -207,22 +187,18 @@ def _group(
     return _Group(kind, points, errors, field, surveyed, rays, surveyed_px, adjusted_px)
 
 
-def _wanted(group: _Group, each: int, sparse: SparseModel) -> list[WantedChip]:
-    """Return the chips of a group: whole ones first, then of photographs that show most marked points."""
-    rays, chips, margin = group.rays, [], _side_px(sparse) / 2
+def _wanted(group: _Group, each: int, sparse: SparseModel) -> list[tuple[_Group, int]]:
+    """Return the marks of a group to show: whole chips first, then photographs that show most marked points."""
+    rays, margin = group.rays, _side_px(sparse) / 2
     cameras = [sparse.camera_of(int(image)) for image in rays.camera]
     size = np.array([(camera.width, camera.height) for camera in cameras]).reshape(-1, 2)
     is_cut = np.any((rays.xy_px < margin) | (rays.xy_px > size - margin), axis=1)
     popular = np.bincount(rays.camera, minlength=len(sparse.image_name))[rays.camera]
-    for index, point in enumerate(group.points):
+    chosen = []
+    for index in range(len(group.points)):
         marks = np.flatnonzero(rays.point == index)
-        for mark in marks[np.lexsort((-popular[marks], is_cut[marks]))][:each]:
-            x_px, y_px = rays.xy_px[mark].tolist()
-            adjusted, surveyed = _pair(group.adjusted_px[mark]), _pair(group.surveyed_px[mark])
-            chips.append(
-                WantedChip((group.kind, point.name), int(rays.camera[mark]), (x_px, y_px), adjusted, surveyed)
-            )
-    return chips
+        chosen += [(group, int(mark)) for mark in marks[np.lexsort((-popular[marks], is_cut[marks]))][:each]]
+    return chosen
 
 
 def _facts(
@@ -272,8 +248,3 @@ def _projected(evaluated: EvaluatedSurvey, point_in_geo: FloatArray, camera: np.
         if in_cam[2] > 0:
             pixels[row] = project(solved.sparse.camera_of(int(index)), in_cam)
     return pixels
-
-
-def _pair(values: FloatArray) -> tuple[float, float] | None:
-    x, y = values.tolist()
-    return (x, y) if np.isfinite([x, y]).all() else None

@@ -4,8 +4,9 @@ Also what other stages have left for the page: LiDAR that the training has used,
 and the change since an earlier survey.
 """
 
+import contextlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -41,12 +42,12 @@ class StageRecord:
     name: str
     state: str  # as in `georef status`, when the report was made
     reason: str  # likewise
-    made: datetime | None
-    duration_s: float | None
-    key_figure: str
-    options: dict[str, str]  # by flag, all of them
-    inputs: dict[str, str]  # SHA-256 by product or flag
-    warnings: tuple[Remark, ...]
+    made: datetime | None = None
+    duration_s: float | None = None
+    key_figure: str = ""
+    options: dict[str, str] = field(default_factory=dict)  # by flag, all of them
+    inputs: dict[str, str] = field(default_factory=dict)  # SHA-256 by product or flag
+    warnings: tuple[Remark, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -67,45 +68,46 @@ class RecordFacts:
 
 
 def record_facts(workspace: Workspace, survey: Survey) -> RecordFacts:
-    states = [row for row in status(workspace) if row.stage != _REPORT]
-    stages = []
+    stages: list[StageRecord] = []
     versions: dict[str, dict[str, list[str]]] = {}
-    for row in states:
-        spec = BY_NAME[row.stage]
-        stage, used = _stage(workspace, spec, row.state, row.reason)
-        stages.append(stage)
-        for name, version in used.items():
+    for row in status(workspace):
+        if row.stage == _REPORT:
+            continue
+        manifest, spec = None, BY_NAME[row.stage]
+        with contextlib.suppress(InputError):  # `state` tells
+            manifest = workspace.manifest(spec)
+        if manifest is None:
+            stages.append(StageRecord(spec.name, row.state, row.reason))
+            continue
+        stages.append(
+            StageRecord(
+                name=spec.name,
+                state=row.state,
+                reason=row.reason,
+                made=manifest.finished,
+                duration_s=manifest.duration_s,
+                key_figure=manifest.key_figure,
+                options=_options(spec, manifest.config),
+                inputs=manifest.inputs,
+                warnings=manifest.warnings,
+            )
+        )
+        for name, version in manifest.versions.items():
             versions.setdefault(name, {}).setdefault(version, []).append(row.stage)
     return RecordFacts(
         stages=tuple(stages),
         total_s=sum(stage.duration_s or 0.0 for stage in stages),
-        versions={name: _versions(by_version) for name, by_version in versions.items()},
+        versions={
+            name: "; ".join(
+                version if len(by_version) == 1 else f"{version} ({', '.join(ran)})"
+                for version, ran in by_version.items()
+            )
+            for name, by_version in versions.items()
+        },
         assumptions=survey.assumptions,
         cautions=cautions_by_stage(workspace),
         by_hand=tuple(stage.name for stage in stages if stage.made is None and stage.state == "current"),
     )
-
-
-def _stage(workspace: Workspace, spec: StageSpec, state: str, reason: str) -> tuple[StageRecord, dict[str, str]]:
-    """Return the record of a stage, and the versions that it ran with."""
-    try:
-        manifest = workspace.manifest(spec)
-    except InputError:  # `state` tells
-        manifest = None
-    if manifest is None:
-        return StageRecord(spec.name, state, reason, None, None, "", {}, {}, ()), {}
-    record = StageRecord(
-        name=spec.name,
-        state=state,
-        reason=reason,
-        made=manifest.finished,
-        duration_s=manifest.duration_s,
-        key_figure=manifest.key_figure,
-        options=_options(spec, manifest.config),
-        inputs=manifest.inputs,
-        warnings=manifest.warnings,
-    )
-    return record, manifest.versions
 
 
 def _options(spec: StageSpec, config: Mapping[str, Any]) -> dict[str, str]:
@@ -127,13 +129,6 @@ def _notation(value: object) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     return notation(value) or "none"
-
-
-def _versions(by_version: dict[str, list[str]]) -> str:
-    """Return a version as text; several versions with the stages that ran with each."""
-    if len(by_version) == 1:
-        return next(iter(by_version))
-    return "; ".join(f"{version} ({', '.join(stages)})" for version, stages in by_version.items())
 
 
 _MAP_PX = 1400

@@ -168,8 +168,7 @@ def _view(name: str, field: str, file: Path) -> TestView:
 
 
 def training_facts(workspace: Workspace, model: TrainedModel) -> TrainingFacts:
-    manifest = workspace.manifest(BY_NAME["train"])
-    metrics = workspace.root / METRICS
+    manifest, metrics = workspace.manifest(BY_NAME["train"]), workspace.root / METRICS
     panels = _panels(read_metrics(metrics)) if metrics.is_file() else {}
     return TrainingFacts(
         model=model,

@@ -1,7 +1,5 @@
 """A profile as CSV and DXF."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -29,22 +27,18 @@ def profile_file(profile: dict[str, Any], form: str, target: TargetCrs) -> tuple
         for name in ("along_m", "height", "sigma_m")
     )
     if form == "dxf":
-        data = _drawing(along, height, sigma_m / target.crs.height_unit_m)
+        require("vectors")
+        lines = []
+        for layer, factor, colour in _LAYERS:
+            values = height + factor * sigma_m / target.crs.height_unit_m if factor else height
+            known = np.isfinite(values)
+            for part in np.split(np.arange(len(values)), np.flatnonzero(np.diff(known.astype(int))) + 1):
+                if known[part].all() and len(part) > 1:
+                    lines.append((layer, colour, np.column_stack([along, values])[part]))
+        data = drawing(lines)
     else:
         names = ("longitude", "latitude") if target.crs.is_geographic else ("easting", "northing")
         rows = np.column_stack([along, np.array(profile["xy"]), height, sigma_m])
-        lines = [["" if np.isnan(value) else f"{value:.10g}" for value in row] for row in rows]
-        data = table_text([("distance_m", *names, "height", "sigma_m"), *lines]).encode()
+        cells = (["" if np.isnan(value) else f"{value:.10g}" for value in row] for row in rows)
+        data = table_text([("distance_m", *names, "height", "sigma_m"), *cells]).encode()
     return data, _TYPES[form], f"profile.{form}"
-
-
-def _drawing(along: Any, height: Any, sigma: Any) -> bytes:
-    require("vectors")
-    lines = []
-    for layer, factor, colour in _LAYERS:
-        values = height + factor * sigma if factor else height
-        known = np.isfinite(values)
-        for part in np.split(np.arange(len(values)), np.flatnonzero(np.diff(known.astype(int))) + 1):
-            if known[part].all() and len(part) > 1:
-                lines.append((layer, colour, np.column_stack([along, values])[part]))
-    return drawing(lines)

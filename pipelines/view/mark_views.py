@@ -1,7 +1,5 @@
 """A point in the photographs: lines of sight of its marks, and proposals for further marks."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 

@@ -2,9 +2,10 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import ConfigDict, Field
 from scipy.linalg import block_diag
 
 from pipelines.adjust.solution import posterior_of
@@ -33,11 +34,13 @@ _LEAST_COVERED = 0.9  # of a polygon, by a base
 
 @dataclass(frozen=True)
 class WantedBase:
-    """Base of a volume: of the polygon's rim, a height in the CRS, or a raster of the workspace."""
+    """Base of a volume, as pages ask for it: of the polygon's rim, a height in the CRS, or a raster."""
+
+    __pydantic_config__ = ConfigDict(extra="forbid", allow_inf_nan=False)
 
     kind: Literal["plane", "mean", "lowest", "height", "raster"] = "plane"
-    height: float = 0.0
-    raster: str = ""
+    height: Annotated[float, Field(ge=-1e9, le=1e9)] = 0.0
+    raster: Annotated[str, Field(max_length=60)] = ""
 
 
 @dataclass(frozen=True)

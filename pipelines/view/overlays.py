@@ -3,8 +3,6 @@
 What cannot be read is not drawn: the commands that write it say what is wrong.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -12,14 +10,13 @@ import shapely
 
 from pipelines.core.errors import GeorefError
 from pipelines.core.stages import REPORT
-from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.formats.geotiff import sampled_raster
 from pipelines.formats.vector_files import read_contours, read_regions
 from pipelines.report.plots.plans import nice_number
 from pipelines.survey.area import area_of
 from pipelines.survey.options import AreaOptions, CrsOptions
-from pipelines.survey.report import EvaluationReport, read_report
+from pipelines.survey.report import read_report
 from pipelines.survey.target_crs import TargetCrs, usable_crs
 from pipelines.survey.trained_survey import TrainedSurvey
 from pipelines.view.pictures import ViewFrame
@@ -33,27 +30,19 @@ _CONTOURS, _REGIONS, _SURFACE = "raster/contours.gpkg", "change/regions.gpkg", "
 def error_arrows(workspace: Workspace, trained: TrainedSurvey, frame: ViewFrame) -> Json | None:
     """Return arrows of the errors of surveyed points, enlarged so that they are seen; None: no errors."""
     try:
-        errors = _point_errors(trained, read_report(workspace.path(REPORT)))
+        report = read_report(workspace.path(REPORT))
     except GeorefError:
         return None
+    points = (*trained.survey.control_points, *trained.survey.check_points)
+    place = {point.name: np.array(point.position_in_geo) for point in points}
+    rows = (*report.checkpoints.triangulated.points, *report.fit.gcp.points)
+    errors = [(place[row.name], np.array(row.error_m)) for row in rows if row.name in place and row.error_m]
     if not errors:
         return None
-    longest = max(float(np.linalg.norm(measured - surveyed)) for surveyed, measured in errors)
+    longest = max(float(np.linalg.norm(error)) for _, error in errors)
     enlarged = nice_number(max(_LENGTH * frame.radius_m / max(longest, 1e-12), 1.0))
-    arrows = [[surveyed, surveyed + enlarged * (measured - surveyed)] for surveyed, measured in errors]
+    arrows = [[surveyed, surveyed + enlarged * error] for surveyed, error in errors]
     return {"enlarged": enlarged, "arrows": frame.place(np.array(arrows)).tolist()}
-
-
-def _point_errors(trained: TrainedSurvey, report: EvaluationReport) -> list[tuple[FloatArray, FloatArray]]:
-    """Return the surveyed and the triangulated place (3,) in `geo` of control and check points."""
-    survey = trained.survey
-    place = {p.name: np.array(p.position_in_geo) for p in (*survey.control_points, *survey.check_points)}
-    rows = [*report.checkpoints.triangulated.points, *report.fit.gcp.points]
-    return [
-        (place[row.name], place[row.name] + np.array([row.de_m, row.dn_m, row.du_m]))
-        for row in rows
-        if row.name in place and row.de_m is not None and row.dn_m is not None and row.du_m is not None
-    ]
 
 
 def boundary_rings(trained: TrainedSurvey, frame: ViewFrame) -> list[list[list[float]]]:

@@ -6,8 +6,6 @@ colours that depend on the direction included, and a page without a graphics car
 The viewer's frame is `geo` moved to the middle of the scene: metres, east, north, up.
 """
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -109,11 +107,8 @@ class Photographs:
         pixels = decoded_photograph(file, sha256.get(name, ""))
         lens = self._trained.sparse.camera_of(camera)
         if pixels is None or pixels.shape[:2] != (lens.height, lens.width):
-            raise InputError(
-                "photograph-damaged",
-                "cannot be decoded, or has another size than its camera. Restore the photograph.",
-                path=file,
-            )
+            message = "cannot be decoded, or has another size than its camera. Restore the photograph."
+            raise InputError("photograph-damaged", message, path=file)
         return np.ascontiguousarray(pixels[..., ::-1])
 
 
@@ -183,7 +178,8 @@ class Painter:
             apart = self._trained.poses.cam_center_in_model[wanted.photograph] - pose.center_in_model
             if float(np.linalg.norm(apart)) < _SAME_PLACE * self._frame.radius_m:
                 rgb = self._blended(rgb, wanted, pose)
-        small = _shrunk(depth.shape[1], depth.shape[0], _DEPTH_PX)
+        shrunk = min(1.0, _DEPTH_PX / max(depth.shape))
+        small = [max(round(side * shrunk), 1) for side in depth.shape[::-1]]
         coarse = cv2.resize(depth.astype(np.float32), small, interpolation=cv2.INTER_NEAREST)
         return PageView(rgb, np.asarray(coarse, dtype=np.float32), scale)
 
@@ -248,9 +244,3 @@ def _widest_slope(lens: Camera) -> float:
     across, down = np.linspace(0, lens.width, _EDGE_POINTS), np.linspace(0, lens.height, _EDGE_POINTS)
     edge = [(x, y) for x in across for y in (0, lens.height)] + [(x, y) for x in (0, lens.width) for y in down]
     return float(np.nanmax(np.linalg.norm(undistort(lens, edge), axis=-1))) * (1 + 1e-3)
-
-
-def _shrunk(width: int, height: int, longer_px: int) -> tuple[int, int]:
-    """Return the size of a picture whose longer side is at most `longer_px`."""
-    scale = min(1.0, longer_px / max(width, height))
-    return max(round(width * scale), 1), max(round(height * scale), 1)

@@ -4,8 +4,6 @@ A point is expected where its marks meet, else where it was surveyed. A quartere
 with σ. Where there is none, what the nearest marked photograph shows is searched, as in the viewer.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -63,17 +61,11 @@ def propose_marks(workspace: Workspace, options: ProposalOptions, progress: Prog
     """
     solved = load_cameras(workspace)
     found, left_out = proposed_marks(solved, Photographs(workspace, solved).full, options.reach, progress)
-    rows = [
-        (
-            mark.image,
-            each.point,
-            *(f"{value:.3f}" for value in (mark.x_px, mark.y_px, mark.sigma_px)),
-            each.how,
-            f"{each.score:.3f}",
-        )
-        for each in found
-        for mark in (each.mark,)
-    ]
+    rows = []
+    for each in found:
+        numbers = (each.mark.x_px, each.mark.y_px, each.mark.sigma_px)
+        cells = (f"{value:.3f}" for value in numbers)
+        rows.append((each.mark.image, each.point, *cells, each.how, f"{each.score:.3f}"))
     file = workspace.root / FILE
     file.parent.mkdir(exist_ok=True)
     replace_texts({file: table_text([("image", "label", "x", "y", "sigma", "how", "score"), *rows])})
@@ -94,7 +86,11 @@ def proposed_marks(
     points = (*survey.control_points, *survey.check_points, *survey.unmarked_points)
     if not points:
         raise InputError("no-ground-points", "The survey has no ground points. Give `georef ingest` --gcp.")
-    places = {point.name: _place(point, solved) for point in points}
+    places = {}  # where points are expected (3,) in `geo`
+    for point in points:
+        own = {mark.image: (mark.x_px, mark.y_px) for mark in point.marks}
+        by_marks = triangulated_points(solved, rays_of(MarkedPoint(point.name, None, marks=own), solved))[0]
+        places[point.name] = by_marks if np.isfinite(by_marks).all() else np.array(point.position_in_geo)
     found: list[ProposedMark] = []
     wanted: dict[int, list[tuple[str, FloatArray]]] = defaultdict(list)
     for point in points:
@@ -121,13 +117,6 @@ def proposed_marks(
             task.advance()
     found, more = _met(points, found, solved)
     return sorted(found, key=lambda each: (each.point, each.mark.image)), (*left_out, *more)
-
-
-def _place(point: SurveyedPoint, solved: SolvedSurvey) -> FloatArray:
-    """Return where a point is expected (3,) in `geo`."""
-    marks = {mark.image: (mark.x_px, mark.y_px) for mark in point.marks}
-    by_marks = triangulated_points(solved, rays_of(MarkedPoint(point.name, None, marks=marks), solved))[0]
-    return by_marks if np.isfinite(by_marks).all() else np.array(point.position_in_geo)
 
 
 def _quarters(

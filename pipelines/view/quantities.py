@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import shapely
 from pydantic import ConfigDict
 from scipy.spatial import Delaunay
 
-from pipelines.core.types import BoolArray, FloatArray, IntArray
+from pipelines.core.types import FloatArray, IntArray
 
 RimBase = Literal["plane", "mean", "lowest"]
 
@@ -115,8 +116,11 @@ def surface_area(surface: SampledSurface) -> Quantity:
     Its part above the horizontal area is the mean of sec(slope) over the triangles of neighbouring samples. Its
     relative σ is that of the horizontal area.
     """
-    plan = plan_area(surface.corners)
-    stretch = _mean_stretch(surface.samples)
+    plan, samples, stretch = plan_area(surface.corners), surface.samples, 1.0
+    if len(samples) >= 3:
+        triangles = samples[Delaunay(samples[:, :2]).simplices]
+        normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+        stretch = float(np.linalg.norm(normal, axis=1).sum() / np.abs(normal[:, 2]).sum())
     sigma = None if plan.sigma is None else plan.sigma * stretch
     return Quantity("area on the surface", plan.value * stretch, sigma, "m²")
 
@@ -173,7 +177,8 @@ def volumes(surface: SampledSurface, base: VolumeBase) -> tuple[Quantity, ...]:
     if of_points is not None:
         of_noise = area / count * float(np.linalg.norm(surface.sigma_up_m))
         of_whole = area * float(np.hypot(_SURFACE_BIAS_PX * surface.pixel_m, base.sigma_m))
-        white = _is_white(surface.samples[:, :2])
+        columns, rows = (np.unique(axis, return_inverse=True)[1] for axis in np.round(surface.samples[:, :2].T, 3))
+        white = (columns + rows) % 2 == 0
         of_sampling = 0.0
         if white.any() and not white.all():
             of_sampling = area * abs(float(above[white].mean() - above[~white].mean())) / 2
@@ -217,32 +222,7 @@ def grid_in_polygon(corners: FloatArray, spacing: float) -> FloatArray:
     count = np.maximum(np.ceil((high - low) / spacing).astype(int), 1)
     axes = [low[k] + (np.arange(count[k]) + 0.5) * (high[k] - low[k]) / count[k] for k in (0, 1)]
     places = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-    return places[_inside(places, corners)]
-
-
-def _inside(places: FloatArray, corners: FloatArray) -> BoolArray:
-    """Return whether places (N, 2) lie in a polygon (J, 2): a line to the east crosses its sides oddly often."""
-    inside = np.zeros(len(places), dtype=bool)
-    for (x1, y1), (x2, y2) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        if y1 != y2:
-            crossed = (places[:, 1] >= min(y1, y2)) & (places[:, 1] < max(y1, y2))
-            inside ^= crossed & (places[:, 0] < x1 + (places[:, 1] - y1) * (x2 - x1) / (y2 - y1))
-    return inside
-
-
-def _is_white(places: FloatArray) -> BoolArray:
-    """Return which points (N, 2) of a grid are white, if the grid is a chequerboard."""
-    column, row = (np.unique(np.round(places[:, axis], 3), return_inverse=True)[1] for axis in (0, 1))
-    return np.asarray((column + row) % 2 == 0)
-
-
-def _mean_stretch(samples: FloatArray) -> float:
-    """Return the mean of area over horizontal area of the triangles between samples (N, 3)."""
-    if len(samples) < 3:
-        return 1.0
-    triangles = samples[Delaunay(samples[:, :2]).simplices]
-    normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    return float(np.linalg.norm(normal, axis=1).sum() / np.abs(normal[:, 2]).sum())
+    return np.asarray(places[shapely.contains_xy(shapely.Polygon(corners), places)])
 
 
 def _area(points: MeasuredPoints) -> tuple[float, FloatArray]:

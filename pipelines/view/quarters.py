@@ -3,8 +3,6 @@
 On a circle around the middle of such a target the grey values rise and fall twice, however obliquely it is seen.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2
@@ -52,7 +50,8 @@ def find_quarters(grey: ByteArray, expected_px: FloatArray, reach_px: float) -> 
     if strongest[row, column] <= 0:
         return None
     good = np.flatnonzero(response[:, row, column] > 0)
-    radius = _RADII_PX[_last_of_run(good)]
+    first_run = good[good - good[0] == np.arange(len(good))]
+    radius = _RADII_PX[first_run[-1]]
     rivals = np.where(np.hypot(x - column, y - row) > 2 * radius, strongest, 0.0)
     if rivals.max() > _RIVAL * strongest[row, column]:
         return None
@@ -61,14 +60,6 @@ def find_quarters(grey: ByteArray, expected_px: FloatArray, reach_px: float) -> 
         return None
     place, sigma = middle
     return QuarteredTarget(place + low + 0.5, sigma, float(share[good[0], row, column]))
-
-
-def _last_of_run(good: np.ndarray) -> int:
-    """Return the last of the consecutive indices that begin with the first."""
-    after = int(good[0])
-    while after + 1 in good:
-        after += 1
-    return after
 
 
 def _responses(grey: Float32Array) -> tuple[FloatArray, FloatArray]:

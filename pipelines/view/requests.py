@@ -1,9 +1,7 @@
 """What a page may ask: bodies of requests, checked before anything is done with them."""
 
-from __future__ import annotations
-
 import math
-from typing import Annotated, Literal, Self
+from typing import Annotated, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -83,17 +81,6 @@ class Place(Request):
         return SurfacePoint(np.array(self.position_in_geo), (cov + cov.T) / 2, np.array(self.cameras, np.int64))
 
 
-class Base(Request):
-    """Base of a volume."""
-
-    kind: Literal["plane", "mean", "lowest", "height", "raster"] = "plane"
-    height: Number = 0.0
-    raster: Annotated[str, Field(max_length=60)] = ""
-
-    def wanted(self) -> WantedBase:
-        return WantedBase(self.kind, self.height, self.raster)
-
-
 _LEAST: dict[Kind, int] = {"point": 1, "distance": 2, "polyline": 2, "area": 3, "volume": 3, "profile": 2}
 
 
@@ -102,7 +89,7 @@ class MeasureRequest(Request):
 
     kind: Kind
     points: Annotated[tuple[Place, ...], Field(min_length=1, max_length=1000)]
-    base: Base = Base()
+    base: WantedBase = WantedBase()
 
     @model_validator(mode="after")
     def _enough(self) -> Self:

@@ -13,9 +13,9 @@ import uuid
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-import numpy as np
+import shapely
 from pydantic import Field, ValidationError
 
 from pipelines.core.errors import InputError, storage_failures
@@ -181,20 +181,14 @@ def tables_of(measurements: Sequence[NamedMeasurement]) -> dict[str, str]:
             first = each.points[0]
             place = (*first.xyz, *(first.sigma_m or ("", "", ""))) if kind == "point" else ("",) * 6
             found = {quantity.name: quantity for quantity in each.quantities}
-            values = [
-                value
-                for name in names
-                for value in _cells(found.get(name))
-            ]  # fmt: skip
+            values: list[object] = []
+            for one in map(found.get, names):
+                values += (
+                    ["", "", ""] if one is None else [one.value, "" if one.sigma is None else one.sigma, one.unit]
+                )
             lines.append([each.name, _wkt(each), each.crs, *place, *values])
         tables[file] = table_text(lines)
     return tables
-
-
-def _cells(quantity: Quantity | None) -> tuple[object, object, object]:
-    if quantity is None:
-        return "", "", ""
-    return quantity.value, "" if quantity.sigma is None else quantity.sigma, quantity.unit
 
 
 def _wkt(measurement: NamedMeasurement) -> str:
@@ -241,24 +235,18 @@ def _feature(measurement: NamedMeasurement) -> Json:
 
     The geometry is null in a local frame, which GeoJSON cannot state.
     """
-    lon_lat_h = [[lla[1], lla[0], lla[2]] for point in measurement.points if (lla := point.lla) is not None]
-    geometry: dict[str, Any] | None
+    lon_lat_h = [(lla[1], lla[0], lla[2]) for point in measurement.points if (lla := point.lla) is not None]
+    shape: shapely.Geometry | None
     if not lon_lat_h:  # in a local frame
-        geometry = None
+        shape = None
     elif len(lon_lat_h) == 1:
-        geometry = {"type": "Point", "coordinates": lon_lat_h[0]}
+        shape = shapely.Point(lon_lat_h[0])
     elif measurement.kind in CLOSED and len(lon_lat_h) > 2:
-        geometry = {"type": "Polygon", "coordinates": [_anticlockwise(lon_lat_h)]}
+        shape = shapely.orient_polygons(shapely.Polygon(lon_lat_h))
     else:
-        geometry = {"type": "LineString", "coordinates": lon_lat_h}
+        shape = shapely.LineString(lon_lat_h)
     values = {quantity.name: quantity.value for quantity in measurement.quantities}
     sigmas = {f"sigma of {quantity.name}": quantity.sigma for quantity in measurement.quantities}
     own = {"name": measurement.name, "kind": measurement.kind, **values, **sigmas}
+    geometry = None if shape is None else shapely.geometry.mapping(shape)
     return feature(geometry, {**own, "georef": measurement.model_dump(mode="json")})
-
-
-def _anticlockwise(ring: list[list[float]]) -> list[list[float]]:
-    x, y = (np.array([point[axis] for point in ring]) for axis in (0, 1))
-    area = float((x - x[0]) @ np.roll(y - y[0], -1) - (y - y[0]) @ np.roll(x - x[0], -1))
-    turned = ring if area > 0 else ring[::-1]
-    return [*turned, turned[0]]

@@ -5,8 +5,6 @@ looked at, and could pretend to come from here by a name that resolves to 127.0.
 Another program of this machine could send both, and lacks the key that is the beginning of each path.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import hmac
@@ -340,9 +338,7 @@ class _BadRequestError(Exception):
 
 
 def _job_json(job: Job) -> dict[str, Any]:
-    return {
-        "number": job.number, "state": job.state, "share": job.share, "answer": job.answer, "failure": job.failure
-    }  # fmt: skip
+    return {name: getattr(job, name) for name in ("number", "state", "share", "answer", "failure")}
 
 
 @contextlib.contextmanager

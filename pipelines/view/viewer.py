@@ -3,8 +3,6 @@
 A page has its own state. The viewer has the model, the saved measurements and the marks, which all pages share.
 """
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -13,7 +11,6 @@ from typing import Any
 import cv2
 import numpy as np
 
-from pipelines.adjust.accuracy_grid import AccuracyGrid
 from pipelines.core.errors import InputError
 from pipelines.core.manifest import hash_file
 from pipelines.core.progress import SILENT, Progress
@@ -21,6 +18,7 @@ from pipelines.core.stages import GAUSSIANS, MODEL
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.geodesy.enu import lla_from_enu
+from pipelines.report.page import limited
 from pipelines.report.plots.style import colours_of
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.picking import NoSurface, SurfacePoint
@@ -120,24 +118,18 @@ class Viewer:
             matrix = np.array([[1.0, 0.0, x - half - 0.5], [0.0, 1.0, y - half - 0.5]])
             side = max(int(2 * half), 1)
             image = np.asarray(cv2.warpAffine(image, matrix, (side, side), flags=cv2.WARP_INVERSE_MAP), np.uint8)
-        scale = min(1.0, longest_px / max(image.shape[:2]))
-        if scale < 1:
-            size = max(round(image.shape[1] * scale), 1), max(round(image.shape[0] * scale), 1)
-            image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-        return jpeg_of(image, 88)
+        return jpeg_of(limited(image, longest_px), 88)
 
     def seen_by(self, request: requests.SeenRequest) -> list[Json]:
         """Return the photographs that see a place, the best first: fine pixels, and away from their rim."""
         place, found = request.place(), []
+        centers = self.trained.geo_from_model.apply(self.trained.poses.cam_center_in_model)
         for camera, pixel in appears_in(place, self.trained):
-            lens = self.trained.sparse.camera_of(camera)
-            center = self._center(camera)
-            size = np.array([lens.width, lens.height])
-            gsd_m = float(np.linalg.norm(place - center)) / lens.mean_focal_px
+            lens, away = self.trained.sparse.camera_of(camera), centers[camera] - place
+            size, away_m = np.array([lens.width, lens.height]), float(np.linalg.norm(away))
+            gsd_m = away_m / lens.mean_focal_px
             rim = float(np.min(np.minimum(pixel, size - pixel) / size))
-            down_deg = float(
-                np.degrees(np.arccos(np.clip((center - place)[2] / np.linalg.norm(center - place), -1, 1)))
-            )
+            down_deg = float(np.degrees(np.arccos(np.clip(away[2] / away_m, -1, 1))))
             own = {"camera": camera, "image": self.name_of(camera), "px": pixel.tolist(), "gsd_m": gsd_m}
             found.append((gsd_m * (2.0 if rim < _PIXEL_MARGIN else 1.0), {**own, "angle_deg": down_deg}))
         return [each for _, each in sorted(found, key=lambda each: each[0])[:_MOST_SEEN]]
@@ -148,11 +140,6 @@ class Viewer:
     def _known(self, camera: int) -> None:
         if camera >= len(self.trained.sparse.image_name):
             raise InputError("no-such-photograph", f"There is no photograph {camera}. Load the page again.")
-
-    def _center(self, camera: int) -> FloatArray:
-        return np.asarray(
-            self.trained.geo_from_model.apply(self.trained.poses.cam_center_in_model[camera][None])[0]
-        )
 
     # Measuring
 
@@ -212,7 +199,7 @@ class Viewer:
                 if kind == "area":
                     yield _answer(self.model.area(points, fineness))
                 elif kind == "volume":
-                    yield _answer(self.model.volume(points, request.base.wanted(), fineness))
+                    yield _answer(self.model.volume(points, request.base, fineness))
                 else:
                     joint, line = self.model.jointly(points), self.model.profile(points, fineness)
                     yield {**_answer(length(joint)), "profile": profile_json(line)}
@@ -292,10 +279,10 @@ class Viewer:
         return path.read_bytes()
 
     def _saved(self, identity: str) -> NamedMeasurement:
-        found = [each for each in self.saved.all if each.id == identity]
-        if not found:
+        found = next((each for each in self.saved.all if each.id == identity), None)
+        if found is None:
             raise InputError("no-such-measurement", "The measurement was removed meanwhile. Load the page again.")
-        return found[0]
+        return found
 
     # Marking
 
@@ -508,7 +495,10 @@ class Viewer:
         point, rgb = point[::every], self.trained.sfm.point_rgb[::every]
         sigma = None
         if self._grid is not None and len(point):
-            sigma = _sigma_colours(self._grid, self.trained.geo_from_model.apply(point))
+            cov = self._grid.cov_at(self.trained.geo_from_model.apply(point))
+            sigma_m = np.sqrt(np.trace(cov, axis1=1, axis2=2))
+            low, high = np.quantile(sigma_m, [0.02, 0.98]).tolist()
+            sigma = {"rgb": colours_of(sigma_m, low, high).ravel().tolist(), "scale": [low, high]}
         return self.frame.view_from_model.apply(point), rgb, sigma
 
 
@@ -516,13 +506,6 @@ def accuracy_sentence(workspace: Workspace) -> str:
     """Return the accuracy of the result; empty where nothing states it."""
     headline = headline_of(workspace)
     return "" if headline is None else f"The {headline.sentence}."
-
-
-def _sigma_colours(grid: AccuracyGrid, in_geo: FloatArray) -> Json:
-    cov = grid.cov_at(in_geo)
-    sigma = np.sqrt(np.trace(cov, axis1=1, axis2=2))
-    low, high = np.quantile(sigma, [0.02, 0.98]).tolist()
-    return {"rgb": colours_of(sigma, low, high).ravel().tolist(), "scale": [low, high]}
 
 
 def _answer(quantities: tuple[Quantity, ...]) -> Json:

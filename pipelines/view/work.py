@@ -1,7 +1,5 @@
 """Work that takes longer than a click: jobs on threads of their own, with progress, a first answer, and an end."""
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections import OrderedDict

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from pipelines.core.progress import ProgressTask
-from pipelines.jobs.engine import JobLine
+from pipelines.jobs.engine import JobDisplay
 
 
 def test_inner_tasks_are_the_note_of_the_line() -> None:
@@ -22,7 +22,7 @@ def test_inner_tasks_are_the_note_of_the_line() -> None:
 
             yield Task()
 
-    line = JobLine(Recorder(), "north")
+    line = JobDisplay(Recorder(), "north")
     with line.task("stages", 8) as stages:
         stages.advance(0, note="train")
         with line.task("training", 900) as training:

@@ -1,18 +1,12 @@
 """Pictures of the change between two epochs: relief under colours, histogram of differences, profiles."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipelines.core.types import BoolArray, ByteArray, FloatArray
 from pipelines.report.plots import style as look
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 DIVERGING = "RdBu"  # red: lowered, blue: raised
 _SUN_AZIMUTH_DEG, _SUN_ELEVATION_DEG = 315.0, 45.0
@@ -115,22 +109,17 @@ def profile_chart(profile: Profile, names: tuple[str, str]) -> bytes:
         for side in (-1, 1):  # lines keep their colour in the dark, where a pale area becomes a dark one
             axes.plot(profile.distance_m, height + side * band, color=colour, linewidth=0.6, linestyle="--")
         axes.plot(profile.distance_m, height, color=colour, linewidth=1.7, label=name)
-    _limit_heights(axes, profile)
+    known = profile.height_m[np.isfinite(profile.height_m)]
+    if len(known):  # heights are shown in full; bands of interpolated parts may leave the picture
+        low, high = float(known.min()), float(known.max())
+        margin = max(0.12 * (high - low), 0.05)
+        axes.set_ylim(low - margin, high + margin)
     look.label(axes, "", x="distance along the line in m", y="height in m")
     axes.ticklabel_format(useOffset=False, style="plain")
     axes.set_xlim(profile.distance_m[0], profile.distance_m[-1])
     axes.spines[["top", "right"]].set_visible(False)
     look.add_key(figure, 2, loc="outside upper center")
     return look.png_of(figure)
-
-
-def _limit_heights(axes: Axes, profile: Profile) -> None:
-    """Show the heights in full; bands of interpolated parts may leave the picture."""
-    known = profile.height_m[np.isfinite(profile.height_m)]
-    if len(known):
-        low, high = float(known.min()), float(known.max())
-        margin = max(0.12 * (high - low), 0.05)
-        axes.set_ylim(low - margin, high + margin)
 
 
 def inside_parts(distance_m: FloatArray, inside: BoolArray) -> tuple[float, ...]:

@@ -41,7 +41,14 @@ def write_bars(path: Path, panels: Sequence[BarChart]) -> None:
 
 
 def _draw(axes: Axes, panel: BarChart) -> None:
-    _scale(axes, panel)
+    # A logarithmic axis where bars of unlike size would vanish on a linear one.
+    known = [value for values in panel.series.values() for value in values if value is not None]
+    if known and min(known) > 0 and max(known) > _WIDE_RANGE * min(known):
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.set_ylim(min(known) / 2, max(known) * 3)
+    elif known:
+        axes.set_ylim(0, 1.18 * max(*known, 1e-9))
     width = 0.8 / len(panel.series)
     for position, (name, values) in enumerate(panel.series.items()):
         heights = {index: value for index, value in enumerate(values) if value is not None}
@@ -57,17 +64,6 @@ def _draw(axes: Axes, panel: BarChart) -> None:
     if len(panel.series) > 1:
         form = {"frameon": False, "fontsize": look.TICK_POINTS, "ncols": len(panel.series)}
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.08), **form)
-
-
-def _scale(axes: Axes, panel: BarChart) -> None:
-    """A logarithmic axis where bars of unlike size would vanish on a linear one."""
-    heights = [value for values in panel.series.values() for value in values if value is not None]
-    if heights and min(heights) > 0 and max(heights) > _WIDE_RANGE * min(heights):
-        axes.set_yscale("log")
-        axes.yaxis.set_major_formatter("{x:g}")
-        axes.set_ylim(min(heights) / 2, max(heights) * 3)
-    elif heights:
-        axes.set_ylim(0, 1.18 * max(*heights, 1e-9))
 
 
 _MOST_CELLS = 600  # along the longer side of the map
@@ -128,15 +124,14 @@ def _medians(
     place_m: FloatArray, values: FloatArray, low: FloatArray, high: FloatArray, cell_m: float
 ) -> FloatArray:
     """Return the medians (R, C) of values in cells, rows from the south; NaN: none."""
+    from scipy.ndimage import median
+
     columns, rows = (np.ceil((high - low) / cell_m).astype(int)).tolist()
     raster = np.full((rows, columns), np.nan)
     cell = np.floor((place_m - low) / cell_m).astype(np.int64)
-    order = np.lexsort((values, cell[:, 0], cell[:, 1]))
-    key = (cell[:, 1] * columns + cell[:, 0])[order]
-    first = np.flatnonzero(np.diff(key, prepend=-1))
-    last = np.append(first[1:], len(key)) - 1
-    ordered = values[order]
-    raster.flat[key[first]] = (ordered[(first + last) // 2] + ordered[(first + last + 1) // 2]) / 2
+    key = cell[:, 1] * columns + cell[:, 0]
+    held = np.unique(key)
+    raster.flat[held] = median(values, key, held)
     return raster
 
 

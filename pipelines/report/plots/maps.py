@@ -42,7 +42,9 @@ def write_ticks(axes: Axes, coordinates: MapCoordinates) -> None:
     from matplotlib.ticker import FuncFormatter
 
     (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
-    decimals = _decimals(min(east - west, north - south), coordinates.unit)
+    # As many decimals as state a coordinate to a hundredth of the map's side, or better.
+    step = min(east - west, north - south) / 100 / (_METRES_PER_DEGREE if coordinates.unit == "°" else 1.0)
+    decimals = max(0, math.ceil(-math.log10(step)))
 
     def text(value: float, axis: int) -> str:
         place = np.array([[value, south]] if axis == 0 else [[west, value]])
@@ -82,12 +84,6 @@ def draw_north(figure: Figure, axes: Axes) -> None:
     figure.text(x, head, "N", ha="center", va="bottom", fontsize=look.LABEL_POINTS, color=look.DARK)
 
 
-def _decimals(side_m: float, unit: str) -> int:
-    """Return the decimals that state a coordinate to a hundredth of a map's side, or better."""
-    step = side_m / 100 / (_METRES_PER_DEGREE if unit == "°" else 1.0)
-    return max(0, math.ceil(-math.log10(step)))
-
-
 # Of the picture, in inches: the longer side of a map, and the room around each map for what is written there.
 _MAP = 3.4
 _LEFT, _RIGHT, _BELOW, _ABOVE = 1.15, 0.95, 1.2, 0.8
@@ -99,8 +95,6 @@ _MARGIN = 0.04  # of the longer side, around everything that is shown
 _MOST_TICKS = 8  # on the longer side
 
 _CAMERAS = {"marker": "X", "linewidths": 0.4, "color": "black", "edgecolors": "white"}
-_CHECK = {"marker": "o", "s": 24, "linewidths": 0.8, "color": "white", "edgecolors": "black"}
-_CONTROL = {"marker": "^", "s": 34, "linewidths": 0.8, "color": look.ORANGE, "edgecolors": "black"}
 # Of the sign of a camera in square points: many cameras must not hide the map.
 _LARGEST_SIGN, _SMALLEST_SIGN, _LARGE_SIGNS = 26.0, 9.0, 100
 
@@ -204,18 +198,18 @@ def _draw_sigma(
 
 def _mark(axes: Axes, points: MapPoints) -> None:
     size = min(max(_LARGEST_SIGN * _LARGE_SIGNS / max(len(points.cameras), 1), _SMALLEST_SIGN), _LARGEST_SIGN)
+
+    def named(name: str, places: plans.NamedPlaces, arrow: str) -> str:
+        return name if places.error_m is None else f"{name}, with {arrow}"
+
     kinds: tuple[tuple[str, FloatArray, Mapping[str, Any]], ...] = (
         ("camera", points.cameras, {**_CAMERAS, "s": size}),
-        (_named("check point", points.check, "its triangulated error"), points.check.place_m, _CHECK),
-        (_named("control point", points.control, "its residual"), points.control.place_m, _CONTROL),
+        (named("check point", points.check, "its triangulated error"), points.check.place_m, plans.CHECK_SIGN),
+        (named("control point", points.control, "its residual"), points.control.place_m, plans.CONTROL_SIGN),
     )
     for name, places, style in kinds:
         if len(places):
             axes.scatter(places[:, 0], places[:, 1], label=name, zorder=4, **style)
-
-
-def _named(name: str, points: plans.NamedPlaces, arrow: str) -> str:
-    return name if points.error_m is None else f"{name}, with {arrow}"
 
 
 def _draw_errors(axes: Axes, points: MapPoints, along: tuple[int, ...], side_m: float) -> float | None:

@@ -1,18 +1,13 @@
 """Charts of observations: residuals in the image and in time, correlations, prediction against measurement."""
 
-from __future__ import annotations
-
+import itertools
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.report.plots import style as look
 from pipelines.report.plots.plans import nice_number
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 _AXES = ("east", "north", "up")
 _ARROW_SHARE, _ARROW_QUANTILE = 0.9, 0.95  # of a region, that an arrow of this quantile takes
@@ -104,8 +99,7 @@ def correlation_matrix(names: Sequence[str], correlation: FloatArray) -> bytes:
                 color="white" if dark else "black",
             )
     look.label(axes, "Correlation of the lens parameters")
-    bar = figure.colorbar(image, ax=axes, fraction=0.04, pad=0.02)
-    bar.ax.tick_params(labelsize=look.TICK_POINTS)
+    look.add_scale(figure, image, "", ax=axes, fraction=0.04, pad=0.02)
     return look.png_of(figure)
 
 
@@ -133,26 +127,15 @@ def curves(abscissa_title: str, panels: Mapping[str, Mapping[str, tuple[FloatArr
     figure = look.new_figure((width, 0.62 * height * len(panels) + 0.5), "constrained")
     all_axes = np.atleast_1d(figure.subplots(len(panels), 1, sharex=True))
     for axes, (quantity, lines) in zip(all_axes, panels.items(), strict=True):
-        _draw_lines(axes, quantity, lines)
+        styles = itertools.product(("-", "--"), look.SERIES_COLOURS)
+        for (name, (x, y)), (dash, colour) in zip(lines.items(), styles, strict=False):
+            axes.plot(x, y, label=name, color=colour, linestyle=dash, linewidth=1.3)
+        positive = [value for _, y in lines.values() for value in y if value > 0]
+        if len(lines) > 1:
+            if positive and max(positive) > 100 * min(positive):
+                axes.set_yscale("log")
+            axes.legend(fontsize=look.TICK_POINTS, frameon=False, ncols=2)
+        look.label(axes, "", y=quantity)
+        axes.spines[["top", "right"]].set_visible(False)
     all_axes[-1].set_xlabel(abscissa_title, fontsize=look.LABEL_POINTS)
     return look.png_of(figure)
-
-
-def _draw_lines(axes: Axes, quantity: str, lines: Mapping[str, tuple[FloatArray, FloatArray]]) -> None:
-    styles = (
-        (look.BLUE, "-"),
-        (look.ORANGE, "-"),
-        (look.DARK, "-"),
-        (look.BLUE, "--"),
-        (look.ORANGE, "--"),
-        (look.DARK, "--"),
-    )
-    for (name, (x, y)), (colour, dash) in zip(lines.items(), styles, strict=False):
-        axes.plot(x, y, label=name, color=colour, linestyle=dash, linewidth=1.3)
-    positive = [value for _, y in lines.values() for value in y if value > 0]
-    if len(lines) > 1:
-        if positive and max(positive) > 100 * min(positive):
-            axes.set_yscale("log")
-        axes.legend(fontsize=look.TICK_POINTS, frameon=False, ncols=2)
-    look.label(axes, "", y=quantity)
-    axes.spines[["top", "right"]].set_visible(False)

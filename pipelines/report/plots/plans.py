@@ -19,7 +19,6 @@ from pipelines.report.plots import style as look
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.transforms import Bbox
 
 LONGER_INCHES = 4.6
 _LEFT, _RIGHT, _BELOW, _ABOVE = 0.85, 0.25, 0.6, 0.4  # around the map, in inches
@@ -29,6 +28,8 @@ _MARGIN = 0.06  # of the longer side, around everything that is shown
 _BAR_SHARE = 0.25  # of the width, that the scale bar takes at most
 _SIDES = ((1, 1), (-1, 1), (1, -1), (-1, -1))  # of a sign, where its name may stand
 _SIGN_DOTS = 4.0  # half the width of a sign
+CHECK_SIGN = {"marker": "o", "s": 24, "linewidths": 0.8, "color": "white", "edgecolors": "black"}
+CONTROL_SIGN = {"marker": "^", "s": 34, "linewidths": 0.8, "color": look.ORANGE, "edgecolors": "black"}
 _BOX = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85}
 
 
@@ -151,19 +152,15 @@ def add_names(figure: Figure, axes: Axes, places: FloatArray, names: Sequence[st
                 parse_math=False,  # A name may hold what is a formula elsewhere.
             )
             box = text.get_window_extent(renderer)
-            free = not any(box.overlaps(other) for other in taken) and not _holds_any(box, symbols)
+            around = box.padded(_SIGN_DOTS)
+            on_sign = ((symbols > around.min) & (symbols < around.max)).all(axis=1).any()
+            free = not on_sign and not any(box.overlaps(other) for other in taken)
             if free and inside.contains(box.x0, box.y0) and inside.contains(box.x1, box.y1):
                 taken.append(box)
                 written += 1
                 break
             text.remove()
     return written
-
-
-def _holds_any(box: Bbox, places: FloatArray) -> bool:
-    """Return whether a sign at places (N, 2) in dots touches a box."""
-    low, high = np.array([box.x0, box.y0]) - _SIGN_DOTS, np.array([box.x1, box.y1]) + _SIGN_DOTS
-    return bool(((places > low) & (places < high)).all(axis=1).any())
 
 
 def nice_number(most: float) -> float:
@@ -206,23 +203,13 @@ def site_plan(
     figure, axes = new_plan(frame, "Photographs and surveyed points", legend_rows=1)
     axes.scatter(scene_m[:, 0], scene_m[:, 1], s=1.5, color=look.GREY, alpha=0.6, linewidths=0, rasterized=True)
     size = float(np.clip(2600 / max(len(training_m), 1), 7, 24))
-    styles: tuple[tuple[str, FloatArray, dict[str, Any]], ...] = (
-        ("photograph for training", training_m, {"marker": "x", "s": size, "color": look.BLUE, "linewidths": 0.9}),
-        (
-            "test view",
-            test_m,
-            {"marker": "s", "s": size, "facecolors": "none", "edgecolors": look.BLUE, "linewidths": 0.9},
-        ),
-        (
-            "control point",
-            control.place_m,
-            {"marker": "^", "s": 42, "color": look.ORANGE, "edgecolors": "black", "linewidths": 0.8},
-        ),
-        (
-            "check point",
-            check.place_m,
-            {"marker": "o", "s": 28, "color": "white", "edgecolors": "black", "linewidths": 0.9},
-        ),
+    trained: dict[str, Any] = {"marker": "x", "s": size, "color": look.BLUE, "linewidths": 0.9}
+    tested = {"marker": "s", "s": size, "facecolors": "none", "edgecolors": look.BLUE, "linewidths": 0.9}
+    styles = (
+        ("photograph for training", training_m, trained),
+        ("test view", test_m, tested),
+        ("control point", control.place_m, CONTROL_SIGN),
+        ("check point", check.place_m, CHECK_SIGN),
     )
     for order, (name, places, style) in enumerate(styles):
         if len(places):

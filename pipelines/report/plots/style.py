@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from pipelines.core.files import replace_file
+from pipelines.core.files import replacing
 from pipelines.core.types import ByteArray, FloatArray
 
 if TYPE_CHECKING:
@@ -98,6 +98,5 @@ def png_of(figure: Figure) -> bytes:
 def write_png(figure: Figure, path: Path) -> None:
     """Write a figure; a file that is there is replaced when the new one is complete."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_suffix(".tmp")
-    draft.write_bytes(png_of(figure))
-    replace_file(draft, path)
+    with replacing(path) as draft:
+        draft.write_bytes(png_of(figure))
