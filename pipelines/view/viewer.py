@@ -19,11 +19,9 @@ from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.geodesy.enu import lla_from_enu
 from pipelines.report.page import limited
-from pipelines.report.plots.style import colours_of
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.picking import NoSurface, SurfacePoint
 from pipelines.surface.surface_views import ModelRenderer
-from pipelines.survey.headline import headline_of
 from pipelines.survey.marks import mark_rays, wrong_marks
 from pipelines.survey.scene import photographs
 from pipelines.survey.survey import SurveyedPoint
@@ -41,14 +39,13 @@ from pipelines.view.marking import (
 )
 from pipelines.view.measuring import ESTIMATE, Fineness, MeasuringModel
 from pipelines.view.options import ViewOptions
-from pipelines.view.overlays import boundary_rings, changed_regions, contour_lines, error_arrows
+from pipelines.view.page_scene import described_scene
 from pipelines.view.pictures import PageView, Painter, Photographs, frame_of
 from pipelines.view.quantities import Profile, Quantity, distances, length
 from pipelines.view.saved import FOLDER, NamedMeasurement, SavedMeasurements, SavedPoint, new_id
 from pipelines.view.work import Job, Jobs
 
 Json = dict[str, Any]
-_MOST_POINTS = 30_000  # SfM points that a page draws
 _PIXEL_MARGIN = 0.02  # of a photograph: nearer to its rim a place is seen badly
 _MOST_SEEN = 24  # photographs in the strip
 
@@ -79,7 +76,6 @@ class Viewer:
             lambda shown: renderer if shown is trained else ModelRenderer(shown, images, backend),
             self.photographs, trained, self.frame, grid,
         )  # fmt: skip
-        self._grid = grid
         self._hash, self.jobs, self._lock = hash_file(workspace.path(MODEL), {}), Jobs(), threading.RLock()
         folder = workspace.root / FOLDER
         self.saved = SavedMeasurements(folder)
@@ -88,7 +84,7 @@ class Viewer:
             self.model.target.crs.xyz_from_lla,
         )  # fmt: skip
         self._surveyed = {p.name: p for p in (*trained.survey.control_points, *trained.survey.check_points)}
-        self._scene = self._described_scene()
+        self._scene = described_scene(workspace, self.model, self.frame)
         # The Gaussians are sorted now, so that the first click does not wait.
         self._sorting = threading.Thread(target=lambda: renderer.blocks)
         self._sorting.start()
@@ -427,85 +423,6 @@ class Viewer:
                 yield found
 
         return self.jobs.begin(request, work)
-
-    # What a page needs once
-
-    def _described_scene(self) -> Json:
-        trained, frame, target = self.trained, self.frame, self.model.target
-        crs = target.crs
-        points, colours, sigma = self._tie_points()
-        xyz = target.xyz_from_geo((frame.middle_in_geo + np.vstack([np.zeros(3), np.eye(3)])).reshape(-1, 3))
-        return {
-            "name": self._workspace.root.name,
-            "accuracy": accuracy_sentence(self._workspace),
-            "crs": {
-                "name": crs.name,
-                "heights": crs.vertical.name,
-                "units": crs.units,
-                "axes": target.axes,
-                "assumed": list(target.assumed),
-                # Coordinates under the cursor: those of the middle, and how they change along east, north, up.
-                "middle": xyz[0].tolist(),
-                "by_view": (xyz[1:] - xyz[0]).T.tolist(),
-            },
-            "without_sigma": self.model.without_sigma,
-            "middle_in_geo": frame.middle_in_geo.tolist(),
-            "radius_m": frame.radius_m,
-            "cameras": [self._described_camera(camera) for camera in range(len(trained.sparse.image_name))],
-            "surveyed": [
-                {"name": point.name, "kind": kind, "at": frame.place(np.array(point.position_in_geo)).tolist()}
-                for kind, found in (
-                    ("control", trained.survey.control_points),
-                    ("check", trained.survey.check_points),
-                )
-                for point in found
-            ],
-            "errors": error_arrows(self._workspace, trained, frame),
-            "tie_points": {
-                "at": np.round(points, 3).ravel().tolist(),
-                "rgb": colours.ravel().tolist(),
-                "sigma": sigma,
-            },
-            "boundary": boundary_rings(trained, frame),
-            "contours": contour_lines(self._workspace, trained, frame),
-            "changes": changed_regions(self._workspace, trained, frame),
-            "rasters": self.model.rasters(),
-            "has_sigma": self._grid is not None,
-        }
-
-    def _described_camera(self, camera: int) -> Json:
-        trained = self.trained
-        lens = trained.sparse.camera_of(camera)
-        model_from_view = self.frame.view_from_model.inverse()
-        rotation = trained.poses.cam_from_model[camera] @ model_from_view.rotation
-        at = self.frame.view_from_model.apply(trained.poses.cam_center_in_model[camera][None])[0]
-        return {
-            "name": self.name_of(camera),
-            "split": trained.model.cameras[camera].split,
-            "at": at.tolist(),
-            "rotation": rotation.ravel().tolist(),
-            "half": [lens.width / 2 / lens.mean_focal_px, lens.height / 2 / lens.mean_focal_px],
-            "size": [lens.width, lens.height],
-        }
-
-    def _tie_points(self) -> tuple[FloatArray, Any, Json | None]:
-        """Return SfM points (N, 3) in the viewer's frame, colours (N, 3), and their colours by predicted σ."""
-        point = self.trained.point_in_model
-        every = max(1, -(-len(point) // _MOST_POINTS))
-        point, rgb = point[::every], self.trained.sfm.point_rgb[::every]
-        sigma = None
-        if self._grid is not None and len(point):
-            cov = self._grid.cov_at(self.trained.geo_from_model.apply(point))
-            sigma_m = np.sqrt(np.trace(cov, axis1=1, axis2=2))
-            low, high = np.quantile(sigma_m, [0.02, 0.98]).tolist()
-            sigma = {"rgb": colours_of(sigma_m, low, high).ravel().tolist(), "scale": [low, high]}
-        return self.frame.view_from_model.apply(point), rgb, sigma
-
-
-def accuracy_sentence(workspace: Workspace) -> str:
-    """Return the accuracy of the result; empty where nothing states it."""
-    headline = headline_of(workspace)
-    return "" if headline is None else f"The {headline.sentence}."
 
 
 def _answer(quantities: tuple[Quantity, ...]) -> Json:

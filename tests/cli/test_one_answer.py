@@ -26,7 +26,7 @@ from pipelines.survey.headline import headline, headline_of
 from pipelines.survey.options import CrsOptions
 from pipelines.survey.report import AccuracySummary, EvaluationReport, TotalRmse, read_report
 from pipelines.survey.survey import Survey
-from pipelines.view.viewer import accuracy_sentence
+from pipelines.view.page_scene import accuracy_sentence
 from tests.cli_runs import Georef
 from tests.evaluated_workspaces import CHECK_POINTS, ERROR_M, evaluated_workspace
 from tests.reports import check_points_with
