@@ -23,6 +23,7 @@ LOGIT_ALPHA_MIN = math.log(ALPHA_MIN / (1 - ALPHA_MIN))
 # Gaussians that one worker takes at a time. Blocks are dealt out in turn, because visible Gaussians come in
 # clusters.
 BLOCK = 256
+_ORDINARY = 100.0  # a size of which neither squares nor exponentials overflow in float64
 
 # Columns of the table of splats that blending reads: centre, factor of the conic (see `_write_splat`),
 # logarithm of the opacity, colour, depth of the centre, slope of the depth in metres per pixel.
@@ -81,6 +82,27 @@ def _is_visible(means: Any, quats: Any, log_scales: Any, logit: float, pose: Any
     )
 
 
+@jit
+def _is_surely_visible(quats: Any, log_scales: Any, logit: float, point: Any, view: View, i: int) -> bool:
+    """Return True only for a centre in the image whose ellipse holds a pixel by the image's dilation alone.
+
+    An ellipse that reaches half a pixel each way holds one. This test of most Gaussians is cheaper than their
+    ellipse, and is False where an infinite or NaN quaternion or scale would make that invisible.
+    """
+    u = view.fx * point[0] / point[2] + view.cx
+    v = view.fy * point[1] / point[2] + view.cy
+    level = 2.0 * (gaussian.log_sigmoid(logit) - LOG_ALPHA_MIN)
+    a, b, c = gaussian.row3(log_scales, i)
+    turn = abs(quats[i, 0]) + abs(quats[i, 1]) + abs(quats[i, 2]) + abs(quats[i, 3])
+    return (
+        0.0 <= u <= view.width
+        and 0.0 <= v <= view.height
+        and level * view.dilation >= 0.25
+        and abs(a) + abs(b) + abs(c) < _ORDINARY
+        and turn < _ORDINARY
+    )
+
+
 @worker_jit
 def _find_visible(
     means: Any, quats: Any, log_scales: Any, logit_opacities: Any, pose: Any, view: View, visible: Any, depth: Any,
@@ -95,7 +117,9 @@ def _find_visible(
                 continue
             a, b, c = gaussian.row3(log_scales, i)
             if _may_reach_image(point, max(a, b, c), view):
-                visible[i] = _is_visible(means, quats, log_scales, logit, pose, view, i)
+                visible[i] = _is_surely_visible(quats, log_scales, logit, point, view, i) or _is_visible(
+                    means, quats, log_scales, logit, pose, view, i
+                )
                 depth[i] = point[2]
 
 
