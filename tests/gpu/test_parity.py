@@ -32,18 +32,18 @@ def on_gpu(scene):
 
 
 @pytest.mark.parametrize(
-    # Number of Gaussians, logarithm of their size, degree of the harmonics, with depth or without.
+    # Number of Gaussians, logarithm of their size, degree of the harmonics, with depth and normals or without.
     "case",
     [(150, -2.0, 3, True), (150, -1.0, 2, True), (400, -3.0, 1, False), (60, 0.3, 0, True)],
 )
 def test_images_and_gradients(make_scene, leaves, camera, case):
     count, log_scale, degree, depth = case
     scene = make_scene(count, seed=count, log_scale=log_scale)
-    settings = RasterSettings(sh_degree=degree, background=BACKGROUND, depth=depth)
+    settings = RasterSettings(sh_degree=degree, background=BACKGROUND, depth=depth, normal=depth)
     (truth, truth_pose), (gaussians, pose) = leaves(scene, torch.float64), on_gpu(scene)
     expected = render_reference(truth, truth_pose, camera, settings)
     render = rasterizer("cuda").render(gaussians, pose, camera, settings)
-    names = ["colour", "alpha", *(["expected_depth", "median_depth"] if depth else [])]
+    names = ["colour", "alpha", *(["expected_depth", "normal", "median_depth"] if depth else [])]
     for name in names:
         scale = 8 if "depth" in name else 1  # metres
         difference = (getattr(render, name).cpu().double() - getattr(expected, name)).abs()
@@ -54,7 +54,7 @@ def test_images_and_gradients(make_scene, leaves, camera, case):
     loss = torch.zeros((), dtype=torch.float64)
     truth_loss = loss.clone()
     random = torch.Generator().manual_seed(0)
-    for name in names[:3]:
+    for name in names[:4]:  # a median has no gradient
         weight = torch.randn(getattr(expected, name).shape, generator=random, dtype=torch.float64)
         loss = loss.cuda() + (weight.cuda() * getattr(render, name)).sum()
         truth_loss = truth_loss + (weight * getattr(expected, name)).sum()

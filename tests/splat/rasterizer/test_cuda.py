@@ -92,7 +92,7 @@ def test_images_statistics_and_median(make_scene, leaves, camera, backend):
     rasteriser, stand_in = backend
     (gaussians, pose), settings = (
         leaves(make_scene(12, seed=4), torch.float32),
-        RasterSettings(0, BACKGROUND, depth=True),
+        RasterSettings(0, BACKGROUND, depth=True, normal=True),
     )
     small = type(camera)(20, 14, 18.0, 18.0, 10.0, 7.0)
     stand_in.camera = small
@@ -104,15 +104,17 @@ def test_images_statistics_and_median(make_scene, leaves, camera, backend):
     assert (truth.median_depth > 0).any() and (truth.median_depth == 0).any()
     torch.testing.assert_close(render.expected_depth, truth.expected_depth, rtol=0, atol=1e-4)
     torch.testing.assert_close(render.depth_variance, truth.depth_variance, rtol=0, atol=1e-3)
+    torch.testing.assert_close(render.normal, truth.normal, rtol=0, atol=1e-5)
     assert torch.equal(render.stats.visible, truth.stats.visible)
     render.colour.sum().backward()
     assert render.stats.mean_gradient.shape == (len(render.stats.visible), 2)
 
 
-def test_gradients_of_depth(make_scene, leaves, camera, backend, loss_of):
+def test_gradients_of_depth_and_normals(make_scene, leaves, camera, backend, loss_of):
     rasteriser, stand_in = backend
     small = stand_in.camera = type(camera)(20, 14, 18.0, 18.0, 9.0, 8.0)
-    settings, scene = RasterSettings(0, BACKGROUND, depth=True), make_scene(12, seed=4, log_scale=-0.5)
+    settings = RasterSettings(0, BACKGROUND, depth=True, normal=True)
+    scene = make_scene(12, seed=4, log_scale=-0.5)
     (gaussians, pose), (truth, truth_pose) = leaves(scene, torch.float32), leaves(scene, torch.float64)
     render = rasteriser.render(gaussians, pose, small, settings)
     expected = render_reference(truth, truth_pose, small, settings)
@@ -135,6 +137,7 @@ def test_without_depth_there_is_none(make_scene, camera, backend):
     assert render.expected_depth is None
     assert render.depth_variance is None
     assert render.median_depth is None
+    assert render.normal is None
 
 
 def test_nothing_visible(make_scene, camera, backend):
@@ -143,7 +146,8 @@ def test_nothing_visible(make_scene, camera, backend):
     gaussians, pose = make_scene(3)
     gaussians = Gaussians(*(tensor.float() for tensor in gaussians.tensors().values()))
     gaussians.means -= 100 * pose[2, :3].float()
-    render = rasteriser.render(gaussians, pose, camera, RasterSettings(0, BACKGROUND, depth=True))
+    render = rasteriser.render(gaussians, pose, camera, RasterSettings(0, BACKGROUND, depth=True, normal=True))
     assert len(render.stats.visible) == 0
     assert render.median_depth.abs().max() == 0
     assert render.expected_depth.abs().max() == 0
+    assert render.normal.abs().max() == 0
