@@ -212,7 +212,9 @@ class JointTrainer:
         """Return the view of this iteration, with all that its losses need."""
         index = self.schedule.view(self.iteration)
         pose = self.problem.cameras.cam_from_model(index)
-        render = self._render(pose, target, depth=self.problem.sees_by_depth(index))
+        depth = self.options.surface is not None or self.problem.sees_by_depth(index)
+        normal = self.schedule.weight_of_normals(self.iteration) > 0
+        render = self._render(pose, target, depth=depth, normal=normal)
         colour, counting = self._exposed(index, render.colour, target), target.mask
         if self.outliers is not None:
             longest_px = max(target.whole.width, target.whole.height)
@@ -221,13 +223,13 @@ class JointTrainer:
         stats, gaussians = self._own(render.stats), self.optimizer.gaussians
         return RenderedView(index, pose, target, gaussians, render, stats, colour, counting, points)
 
-    def _render(self, pose: Tensor, target: TargetImage, *, depth: bool = False) -> Render:
+    def _render(self, pose: Tensor, target: TargetImage, *, depth: bool = False, normal: bool = False) -> Render:
         """Return a render of the Gaussians, and behind their rows those that surround the region."""
         settings = RasterSettings(
             sh_degree=self.schedule.sh_degree(self.iteration),
             background=BACKGROUND,
-            depth=depth or self.options.surface is not None,
-            normal=self.schedule.weight_of_normals(self.iteration) > 0,
+            depth=depth,
+            normal=normal,
             median=False,
             window=target.part.window,
         )
