@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from pipelines.core.files import replace_text
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.formats.tables import table_text
-from pipelines.geodesy.enu import Origin, ecef_from_enu, lla_from_ecef
+from pipelines.geodesy.enu import Origin, lla_from_enu
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.report import AccuracySummary
 
@@ -165,7 +165,7 @@ def write_csv(grid: AccuracyGrid, origin: Origin | None, path: Path) -> None:
     """
     geodetic = [["", "", ""]] * len(grid.position_in_geo)
     if origin is not None:
-        lla = lla_from_ecef(ecef_from_enu(grid.position_in_geo, origin)).tolist()
+        lla = lla_from_enu(grid.position_in_geo, origin).tolist()
         geodetic = [[f"{lat:.8f}", f"{lon:.8f}", f"{height:.3f}"] for lat, lon, height in lla]
     values = np.column_stack([grid.sigma_m, grid.sigma_h_m, grid.sigma_v_m])
     rows = (

@@ -22,7 +22,7 @@ from pipelines.adjust.measurements import fix_correspondences
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.sentences import listed
 from pipelines.core.types import FloatArray, IntArray
-from pipelines.geodesy.enu import Origin, ecef_from_enu, ecef_from_lla, enu_from_ecef, lla_from_ecef
+from pipelines.geodesy.enu import Origin, ecef_from_lla, enu_from_ecef, lla_from_enu
 from pipelines.geodesy.vertical import FOOT_M
 from pipelines.geometry.similarity import Similarity, umeyama
 from pipelines.geometry.sparse_model import SparseModel
@@ -212,7 +212,7 @@ def _changed_axes(fixes: StatedFixes) -> Iterator[_Change]:
 
 def _latitude_for_longitude(position: FloatArray, origin: Origin) -> FloatArray:
     """Return the positions (n, 3) with latitude and longitude exchanged, about the median of their places."""
-    lla = lla_from_ecef(ecef_from_enu(position, origin))
+    lla = lla_from_enu(position, origin)
     middle = np.median(lla, axis=0)[[1, 0, 2]]
     exchanged = lla[:, [1, 0, 2]] - lla[:, [1, 0, 2]].mean(axis=0) + middle
     if np.abs(exchanged[:, 0]).max() > 89.0:

@@ -399,11 +399,9 @@ def _mistake_in_map(survey: Survey, model: SparseModel) -> str | None:
         return "the map of the control points is mirrored. Check the order of the columns and the CRS."
     ratio = by_control.scale / by_fixes.scale
     sigma = float(np.hypot(_sigma_of_scale(fixes, fix_m), _sigma_of_scale(control, control_m)))
+    mercator = 1.0 / np.cos(np.radians(survey.origin_on_earth.lat_deg))
     causes = {
-        1.0
-        / np.cos(
-            np.radians(survey.origin_on_earth.lat_deg)
-        ): "Web Mercator (EPSG:3857) has this scale at this latitude",
+        mercator: "Web Mercator (EPSG:3857) has this scale at this latitude",
         FOOT_M: "The coordinates are in metres, although their CRS has feet",
         1.0 / FOOT_M: "The coordinates are in feet, although their CRS has metres",
     }

@@ -57,7 +57,7 @@ from pipelines.survey.adjustment import GeolocatedPoints, InitialSimilarity
 from pipelines.survey.calibrated import load_survey
 from pipelines.survey.marks import of_wrong_marks, wrong_marks
 from pipelines.survey.scene import initial_scene
-from pipelines.survey.survey import LOCAL_FRAME, Survey
+from pipelines.survey.survey import Survey
 
 _DISAGREE = 3.5  # σ by which a distance misses the solution; one in two thousand does by chance
 _LEVEL = 0.01  # of the χ² test of σ where no joint adjustment is possible
@@ -81,7 +81,7 @@ def run(stage: StageRun, options: InitSim3Options) -> Summary:
     save_json(estimated.initial, stage.out / Path(SIM3).name)
     save_json(estimated.posterior.solution, stage.out / Path(ADJUSTMENT).name)
     save_posterior(estimated.posterior, stage.out / Path(SIM3_POSTERIOR).name)
-    return _summary(estimated)
+    return _summary(estimated, is_local=survey.origin is None)
 
 
 def estimate_similarity(
@@ -129,7 +129,7 @@ def _check_residual(initial: InitialSimilarity, limit_m: float | None) -> None:
     )
 
 
-def _summary(estimated: Estimated) -> Summary:
+def _summary(estimated: Estimated, *, is_local: bool) -> Summary:
     initial = estimated.initial
     sigma = np.sqrt(np.maximum(np.diag(np.array(initial.geo_from_local.covariance)), 0.0))
     parts = [
@@ -138,7 +138,6 @@ def _summary(estimated: Estimated) -> Summary:
         if stats.rmse_3d_m is not None and kind != "points"
     ]
     position = float(np.linalg.norm(sigma[4:]))
-    is_local = any(caution.code == LOCAL_FRAME for caution in initial.cautions)
     figure = f"σ of the georeference alone {position:.3f} m; residuals {', '.join(parts)}"
     if is_local:
         figure = f"local metric frame, σ of its scale {100 * sigma[0]:.2g} %"

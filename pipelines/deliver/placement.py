@@ -106,7 +106,7 @@ def place(model: Adjustment, survey: Survey, points_in_model: ArrayLike, accurac
     origin_lla, ecef_from_file, file_from_geo = None, None, Similarity()
     if survey.origin is not None:
         scene_in_geo = np.median(geo_from_model.apply(points_in_model), axis=0)
-        lla = enu.lla_from_ecef(enu.ecef_from_enu(scene_in_geo, survey.origin))
+        lla = enu.lla_from_enu(scene_in_geo, survey.origin)
         origin_lla = np.array([*np.round(lla[:2], _ORIGIN_DECIMALS_DEG), np.round(lla[2], _ORIGIN_DECIMALS_M)])
         ecef_from_file, ecef_from_geo = (
             Similarity(1.0, enu.ecef_from_enu_rotation(origin), enu.ecef_from_lla(origin))

@@ -17,10 +17,9 @@ from pipelines.geodesy.crs import PointCrs, local_frame, parse_crs
 from pipelines.geodesy.enu import (
     SEMI_MAJOR_M,
     Origin,
-    ecef_from_enu,
     ecef_from_lla,
     enu_from_ecef,
-    lla_from_ecef,
+    lla_from_enu,
     median_lla,
 )
 from pipelines.geodesy.operations import Operation
@@ -59,7 +58,7 @@ class TargetCrs:
         """
         if self.origin is None:
             return np.array(points, dtype=np.float64).reshape(-1, 3)
-        return self.crs.xyz_from_lla(lla_from_ecef(ecef_from_enu(points, self.origin)))
+        return self.crs.xyz_from_lla(lla_from_enu(points, self.origin))
 
     def geo_from_xyz(self, points: ArrayLike) -> FloatArray:
         """Return points (N, 3) in `geo` of points (N, 3) in the CRS.
@@ -124,7 +123,7 @@ def target_crs(
                 field="--vertical" if options.crs is None else "--crs",
             )
         return TargetCrs(local_frame(), None, np.zeros((0, 3)))
-    lla = lla_from_ecef(ecef_from_enu(scene_in_geo, origin)).reshape(-1, 3)
+    lla = lla_from_enu(scene_in_geo, origin).reshape(-1, 3)
     text = options.crs or utm_zone(lla)
     vertical = options.vertical or _as_choice(heights)
     crs = parse_crs(text, vertical=vertical, field="--crs")
