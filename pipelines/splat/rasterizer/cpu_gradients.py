@@ -211,8 +211,11 @@ def geometry_gradient(quats: Any, log_scales: Any, i: int, mean: Any, direction:
     g_axes = _axes_gradient(axes, variance, g_cov, g_c)
     turn_back = (turn[0], turn[3], turn[6], turn[1], turn[4], turn[7], turn[2], turn[5], turn[8])
     g_w = gaussian.times_rotation(g_axes, turn_back)
-    axis = gaussian.shortest_axis(log_scales, i)
-    _, sign = gaussian.facing_normal(turn, axis, direction)
+    axis, sign = -1, 1.0
+    if g_normal[0] != 0.0 or g_normal[1] != 0.0 or g_normal[2] != 0.0:
+        # Untrue in every render without normals.
+        axis = gaussian.shortest_axis(log_scales, i)
+        _, sign = gaussian.facing_normal(turn, axis, direction)
     g_turn = _turn_gradient(w, g_axes, axis, (sign * g_normal[0], sign * g_normal[1], sign * g_normal[2]))
     g_quats[i, 0], g_quats[i, 1], g_quats[i, 2], g_quats[i, 3] = _quat_gradient(quat, scale, g_turn)
     # Scaling a principal axis means scaling its column of V.
