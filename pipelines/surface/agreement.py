@@ -147,7 +147,6 @@ def without_rims(depth: Float32Array, reach_px: int) -> Float32Array:
 
 
 _REACH = 4  # steps on either side of the prior
-_STEPS = 3  # for one step of the sweep that the prior is from
 _SPECKLE_PX = 5  # parts smaller than half of this are chance where one view alone has depths
 
 
@@ -160,8 +159,11 @@ class SurfacePrior:
     step_m: Float32Array
 
 
-def surface_prior(coarse: SweepResult, agreed: Float32Array, camera: ViewPose) -> SurfacePrior:
-    """Return the prior at the pixels of a finer camera: the agreed depths (H, W), else the own ones."""
+def surface_prior(coarse: SweepResult, agreed: Float32Array, camera: ViewPose, steps: float) -> SurfacePrior:
+    """Return the prior at the pixels of a finer camera: the agreed depths (H, W), else the own ones.
+
+    Between two hypotheses of `coarse` there will be so many `steps`.
+    """
     normals, own = coarse.normals, coarse.depth()
     own = np.where(np.isfinite(own) & (own > 0), own, 0).astype(np.float32)
     own = np.asarray(cv2.medianBlur(own, _SPECKLE_PX), np.float32)
@@ -170,7 +172,7 @@ def surface_prior(coarse: SweepResult, agreed: Float32Array, camera: ViewPose) -
     finer = [
         # Interpolation between roof and ground would make offsets at which nothing lies.
         cv2.resize(image, size, interpolation=cv2.INTER_NEAREST)
-        for image in (normals.index, offset.astype(np.float32), coarse.step_m / np.float32(_STEPS))
+        for image in (normals.index, offset.astype(np.float32), coarse.step_m / np.float32(steps))
     ]
     which = np.asarray(finer[0], np.uint8)
     return SurfacePrior(

@@ -1,14 +1,17 @@
 """Depth maps of the training photographs by multi-view stereo, cached on disk: depths on which views agree.
 
-1. A plane sweep gives each view's depths on coarse pixels.
-2. The refinement on finer pixels starts from the depths on which views agree, elsewhere from the view's own.
+1. A plane sweep gives each view's depths on coarse pixels: its time grows with the cube of the photographs' side.
+2. The refinements on middle and fine pixels start from the depths on which views agree, elsewhere from the view's
+   own.
 3. The depth map keeps the refined depths on which views agree.
 """
 
 import hashlib
+import itertools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
+from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 
 import cv2
@@ -25,13 +28,25 @@ from pipelines.survey.photographs import ImageCache, save_array
 from pipelines.survey.scene import Scene
 
 # Layout of the cached arrays, a part of their key: files of another layout lie in another folder.
-_LAYOUT = b"coarse, fine: direction, offset, score, step, sharpness, by kernels"
-# Longest side of the photographs: in the plane sweep, whose time grows with its cube, and in refinement and maps.
-_COARSE_PX, FINE_PX = 320, 640
+_LAYOUT = b"levels: direction, offset, score, step, sharpness, by kernels"
 _NEIGHBOURS = 10  # views that each view is compared with
-MATCHING = MatchSettings()  # in the sweep: a wide window finds the surface where there is little texture
-# Where the surface is nearly known, a small window does not extend it across the foot of a wall.
-REFINING = MatchSettings(window_px=3, reach_px=2)
+
+
+@dataclass(frozen=True)
+class Level:
+    """Pixels on which depths are looked for: first by a plane sweep, then by refinement of the level before."""
+
+    name: str
+    longest_px: int  # longest side of the photographs
+    settings: MatchSettings
+    steps: float = 1.0  # of a refinement, for one step of the level before
+
+
+# On middle pixels a wide window finds the surface where there is little texture. Where the surface is nearly known,
+# a small window does not extend it across the foot of a wall.
+MIDDLE = Level("middle", 320, MatchSettings(), steps=1.5)
+FINE = Level("fine", 640, MatchSettings(window_px=3, reach_px=2), steps=3.0)
+_LEVELS = (Level("coarse", 200, MatchSettings(window_px=3, reach_px=3)), MIDDLE, FINE)
 
 
 class DepthMaps:
@@ -57,7 +72,11 @@ class DepthMaps:
         step begins.
         """
         train = [int(index) for index in self.scene.train]
-        steps = (("coarse", self._sweep), ("fine", self._refine), ("depth", self._agree))
+        refinements = [
+            (level, partial(self._refine, before, level)) for before, level in itertools.pairwise(_LEVELS)
+        ]
+        steps = [(_LEVELS[0].name, self._sweep), *((level.name, make) for level, make in refinements)]
+        steps.append(("depth", self._agree))
         if not all(self._path(index, "depth").exists() for index in train):
             for index in train:  # Photographs share masks, which two threads must not write at once.
                 self.images.mask(index)
@@ -88,62 +107,61 @@ class DepthMaps:
                 pool.shutdown(cancel_futures=True)
                 raise
 
-    def camera(self, index: int, kind: str = "fine") -> Pinhole:
-        """Return the camera of a depth map, or of the sweep's coarse pixels."""
-        longest_px = _COARSE_PX if kind == "coarse" else FINE_PX
-        return self.images.pinhole(index).limited(longest_px)
+    def camera(self, index: int, level: Level = FINE) -> Pinhole:
+        """Return the camera of a level, or of a depth map."""
+        return self.images.pinhole(index).limited(level.longest_px)
 
     def depth(self, index: int) -> Float32Array:
         """Return the depth (H, W) in metres along a training view's optical axis, mapped from disk; 0: unknown."""
         array: Float32Array = np.load(self._path(index, "depth"), mmap_mode="r", allow_pickle=False)
         return array
 
-    def rgb(self, index: int, kind: str = "fine") -> ByteArray:
+    def rgb(self, index: int, level: Level = FINE) -> ByteArray:
         """Return the photograph (H, W, 3) at the pixels of `camera`."""
-        whole, pinhole = self.images.pinhole(index), self.camera(index, kind)
+        whole, pinhole = self.images.pinhole(index), self.camera(index, level)
         # All neighbours read a view: large photographs are shrunken once, by a factor that divides both sides.
-        most = max(max(whole.width, whole.height) // (2 * FINE_PX), 1)
+        most = max(max(whole.width, whole.height) // (2 * FINE.longest_px), 1)
         shrink = max(s for s in range(1, most + 1) if whole.width % s == 0 == whole.height % s)
         image = np.array(self.images.image(index, shrink))
         small = cv2.resize(image, (pinhole.width, pinhole.height), interpolation=cv2.INTER_AREA)
         return np.asarray(small, np.uint8)
 
     def _sweep(self, index: int) -> Float32Array:
-        sweeps, others = self._planes(index), self._neighbours(index)
+        sweeps, others, level = self._planes(index), self._neighbours(index), _LEVELS[0]
         if not sweeps:
-            return _empty_maps(self.camera(index, "coarse"))
-        reference, *views = (self._view(j, "coarse") for j in (index, *others))
-        return _packed(plane_sweep(reference, views, sweeps, MATCHING))
+            return _empty_maps(self.camera(index, level))
+        reference, *views = (self._view(j, level) for j in (index, *others))
+        return _packed(plane_sweep(reference, views, sweeps, level.settings))
 
-    def _refine(self, index: int) -> Float32Array:
-        own = self._surface(index, "coarse")
+    def _refine(self, before: Level, level: Level, index: int) -> Float32Array:
+        own = self._surface(index, before)
         if own is None:
-            return _empty_maps(self.camera(index))
-        reference, *views = (self._view(j, "fine") for j in (index, *self._neighbours(index)))
-        prior = surface_prior(own, self._agreed(own, index, "coarse"), reference.camera)
-        return _packed(refine(reference, views, prior, REFINING))
+            return _empty_maps(self.camera(index, level))
+        reference, *views = (self._view(j, level) for j in (index, *self._neighbours(index)))
+        prior = surface_prior(own, self._agreed(own, index, before), reference.camera, level.steps)
+        return _packed(refine(reference, views, prior, level.settings))
 
     def _agree(self, index: int) -> Float32Array:
-        own = self._surface(index, "fine")
+        own = self._surface(index, FINE)
         if own is None:
             return np.zeros((self.camera(index).height, self.camera(index).width), dtype=np.float32)
-        return self._agreed(own, index, "fine")
+        return self._agreed(own, index, FINE)
 
-    def _agreed(self, own: SweepResult, index: int, kind: str) -> Float32Array:
+    def _agreed(self, own: SweepResult, index: int, level: Level) -> Float32Array:
         """Return the depths (H, W) on which views agree; 0 elsewhere."""
-        others = [self._surface(j, kind) for j in self._neighbours(index)]
+        others = [self._surface(j, level) for j in self._neighbours(index)]
         depth = agreed_depth(own, [other for other in others if other is not None])
-        # Refined depths started from the sweep: its window sets the width of a rim on fine pixels too.
-        window_px = MATCHING.window_px * own.camera.pinhole.width / self.camera(index, "coarse").width
+        # Fine depths started from those of the middle level: its window sets the width of a rim on all pixels.
+        window_px = MIDDLE.settings.window_px * own.camera.pinhole.width / self.camera(index, MIDDLE).width
         return without_rims(depth, int(window_px / 2))
 
-    def _surface(self, index: int, kind: str) -> SweepResult | None:
+    def _surface(self, index: int, level: Level) -> SweepResult | None:
         sweeps = self._planes(index)
         if not sweeps:
             return None
-        normal_index, *rest = np.load(self._path(index, kind), mmap_mode="r", allow_pickle=False)
+        normal_index, *rest = np.load(self._path(index, level.name), mmap_mode="r", allow_pickle=False)
         normals = NormalMap(np.stack([planes.normal_in_model for planes in sweeps]), normal_index.astype(np.uint8))
-        return SweepResult(self._pose(index, kind), normals, *rest)
+        return SweepResult(self._pose(index, level), normals, *rest)
 
     def _find_planes(self, index: int) -> list[SweepPlanes]:
         others = self._neighbours(index)
@@ -151,18 +169,18 @@ class DepthMaps:
             return []
         sparse = self.scene.sparse
         points = self.scene.point_in_model[np.unique(sparse.obs_point[sparse.obs_image == index])]
-        pose, *around = (self._pose(j, "coarse") for j in (index, *others))
+        pose, *around = (self._pose(j, _LEVELS[0]) for j in (index, *others))
         return planes_for(pose, around, points)
 
-    def _pose(self, index: int, kind: str) -> ViewPose:
+    def _pose(self, index: int, level: Level) -> ViewPose:
         poses = self.scene.poses
-        return ViewPose(self.camera(index, kind), poses.cam_from_model[index], poses.cam_center_in_model[index])
+        return ViewPose(self.camera(index, level), poses.cam_from_model[index], poses.cam_center_in_model[index])
 
-    def _view(self, index: int, kind: str) -> StereoView:
-        grey = cv2.cvtColor(self.rgb(index, kind), cv2.COLOR_RGB2GRAY).astype(np.float32) + 1
+    def _view(self, index: int, level: Level) -> StereoView:
+        grey = cv2.cvtColor(self.rgb(index, level), cv2.COLOR_RGB2GRAY).astype(np.float32) + 1
         mask = np.array(self.images.mask(index), dtype=np.uint8)
         grey[cv2.resize(mask, grey.shape[::-1], interpolation=cv2.INTER_NEAREST) == 0] = 0
-        return StereoView(self._pose(index, kind), grey)
+        return StereoView(self._pose(index, level), grey)
 
     def _path(self, index: int, kind: str) -> Path:
         return self.folder / f"{index:06d}.{kind}.npy"
@@ -181,7 +199,7 @@ class DepthMaps:
             digest.update(self.images.key(index).encode())
             if self.images.is_masked(index):
                 digest.update(self.images.mask_key(index).encode())
-        digest.update(repr((_COARSE_PX, FINE_PX, _NEIGHBOURS, MATCHING, REFINING, THRESHOLDS)).encode())
+        digest.update(repr((_LEVELS, _NEIGHBOURS, THRESHOLDS)).encode())
         return digest.hexdigest()[:32]
 
 

@@ -15,7 +15,7 @@ from pipelines.jobs.calibration import machine_factor
 from pipelines.jobs.costs import BLOCK_SECONDS, MEASURED_CORES, SURFACE_FACTOR, iteration_seconds
 from pipelines.splat.memory import USABLE, TrainingSize, fitting_gaussians, free_memory_bytes, predicted_peak_bytes
 from pipelines.splat.rasterizer.backends import chosen_backend
-from pipelines.surface.depth_maps import FINE_PX
+from pipelines.surface.depth_maps import FINE
 from pipelines.survey.block_plan import BlockPlan, PlannedBlock
 from pipelines.survey.options import NOT_IN_BLOCKS
 from pipelines.train.options import PRESET_PHOTOGRAPHS, PRESETS, TrainOptions
@@ -57,9 +57,9 @@ def with_effort(options: TrainOptions, photographs: int, largest: Pinhole, free_
     return options.model_copy(update={"max_gaussians": max(preset.max_gaussians, min(limits))})
 
 
-# Stereo, by photographs (the sweep has one size) and by megapixels of the depth maps: half of the processor time of
-# one thread on an Intel Xeon (AVX-512), 2026-11-22. Two threads on two idle cores were not measured.
-_STEREO_PHOTOGRAPH_S, _STEREO_MEGAPIXEL_S = 0.75, 0.6
+# Stereo, by photographs (sweep and middle pixels have one size) and by megapixels of the depth maps: half of the
+# processor time of one thread on an Intel Xeon (AVX-512), 2026-11-22, the first after its reduction of 2026-11-26.
+_STEREO_PHOTOGRAPH_S, _STEREO_MEGAPIXEL_S = 0.25, 0.6
 
 
 @dataclass(frozen=True)
@@ -197,5 +197,5 @@ def _seconds(photographs: int, camera: Pinhole, options: TrainOptions) -> float:
 
 
 def _stereo_s(photographs: int, camera: Pinhole) -> float:
-    maps = camera.limited(FINE_PX)
+    maps = camera.limited(FINE.longest_px)
     return photographs * (_STEREO_PHOTOGRAPH_S + _STEREO_MEGAPIXEL_S * maps.width * maps.height / 1e6)

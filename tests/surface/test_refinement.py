@@ -8,6 +8,7 @@ import pytest
 
 from pipelines.core.types import Float32Array
 from pipelines.geometry.cameras import Pinhole, ViewPose
+from pipelines.surface import depth_maps
 from pipelines.surface.agreement import (
     LEAST_SCORE,
     SurfacePrior,
@@ -15,7 +16,6 @@ from pipelines.surface.agreement import (
     refine,
     surface_prior,
 )
-from pipelines.surface.depth_maps import MATCHING, REFINING
 from pipelines.surface.matching import UNSEEN, MatchSettings, StereoView
 from pipelines.surface.sweep import NormalMap, SweepResult, plane_sweep
 from tests.stereo_scenes import (
@@ -35,7 +35,7 @@ from tests.stereo_scenes import (
 
 FINE = Pinhole(240, 180, 220.0, 220.0, 120.0, 90.0)  # pixels of half the width
 INNER = np.s_[16:-16, 16:-16]
-STEP_M = 0.25
+STEP_M, STEPS = 0.25, depth_maps.FINE.steps
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +95,9 @@ def test_the_ground_beside_a_roof_is_not_taken_for_roof(fine: list[StereoView], 
     roof = (height > GROUND_M + 3).astype(np.uint8)
     beside = (cv2.dilate(roof, np.ones((9, 9), np.uint8)) > roof)[INNER]
     agreed = agreed_depth(coarse[2], [coarse[index] for index in (0, 1, 3, 4)])
-    refined = refine(fine[2], neighbours_of(fine, 2), surface_prior(coarse[2], agreed, camera), MatchSettings())
+    refined = refine(
+        fine[2], neighbours_of(fine, 2), surface_prior(coarse[2], agreed, camera, STEPS), MatchSettings()
+    )
     planes = plane_sweep(fine[2], neighbours_of(fine, 2), [LEVEL], MatchSettings())
     trusted = LEAST_SCORE
     wrong = [
@@ -131,7 +133,7 @@ def test_small_windows_leave_the_foot_of_a_wall_where_it_is() -> None:
     prior = SurfacePrior(normals, offset, np.full(offset.shape, STEP_M, np.float32))
     edge = cv2.morphologyEx(upright.astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((9, 9), np.uint8)) > 0
     wrong = []
-    for settings in (REFINING, MATCHING):
+    for settings in (depth_maps.FINE.settings, depth_maps.MIDDLE.settings):
         refined = refine(view, [other[0] for other in others], prior, settings)
         error = np.abs(normals.depth(view.camera, refined.offset_m) - depth)
         wrong.append(np.median(error[INNER][edge[INNER]]))
@@ -143,7 +145,7 @@ def test_guesses_are_what_views_agree_on(fine: list[StereoView], coarse: list[Sw
     own = coarse[2]
     agreed = np.zeros((CAMERA.height, CAMERA.width), np.float32)
     agreed[10:20, 10:20] = level_normals().depth(own.camera, np.full(agreed.shape, 7.0, np.float32))[10:20, 10:20]
-    prior = surface_prior(own, agreed, fine[2].camera)
+    prior = surface_prior(own, agreed, fine[2].camera, STEPS)
     assert prior.offset_m.shape == (FINE.height, FINE.width)
     np.testing.assert_allclose(prior.offset_m[20:40, 20:40], 7.0, atol=1e-4)
     # Elsewhere it is the view's own.
@@ -156,7 +158,7 @@ def test_guesses_are_what_views_agree_on(fine: list[StereoView], coarse: list[Sw
 def test_pixels_that_nothing_fits_find_nothing(fine: list[StereoView], coarse: list[SweepResult]) -> None:
     empty = plane_sweep(*_nothing_to_see(), [LEVEL], MatchSettings())
     assert np.isnan(empty.offset_m).all()
-    prior = surface_prior(empty, np.zeros((CAMERA.height, CAMERA.width), np.float32), fine[2].camera)
+    prior = surface_prior(empty, np.zeros((CAMERA.height, CAMERA.width), np.float32), fine[2].camera, STEPS)
     assert np.isfinite(prior.offset_m).all()
     refined = refine(fine[2], neighbours_of(fine, 2), prior, MatchSettings())
     assert (refined.score[INNER] > LEAST_SCORE).mean() < 0.05
