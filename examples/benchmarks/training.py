@@ -58,11 +58,11 @@ def iterations(count: int, camera: Pinhole, visible: float, repeats: int, backen
     pose = torch.eye(4, device=device, requires_grad=True)
     for iteration in range(1, repeats + 2):
         start = now(device)
-        adam.zero_grad()
-        render = backend.render(adam.gaussians, pose, camera, RasterSettings())
+        rows = backend.candidates(adam.gaussians, pose, camera, RasterSettings())
+        render = backend.render(adam.show(rows), pose, camera, RasterSettings())
         photometric_loss(render.colour, target).backward()
         adam.step(iteration, render.stats.visible)
-        strategy.observe(render.stats, camera)
+        strategy.observe(render.stats.among(rows), camera)
         if iteration > 1:
             yield now(device) - start
 

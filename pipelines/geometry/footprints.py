@@ -192,10 +192,18 @@ def thin_to_voxels(points: FloatArray, side_m: FloatArray) -> IntArray:
     """
     if not len(points):
         return np.zeros(0, dtype=np.int64)
+    return np.sort(np.unique(_sized_voxel_keys(points, side_m), return_index=True)[1])
+
+
+def count_voxels(points: FloatArray, side_m: FloatArray) -> int:
+    """Return the number of points that `thin_to_voxels` leaves of P ≥ 1, several times as fast."""
+    return len(np.unique(_sized_voxel_keys(points, side_m)))
+
+
+def _sized_voxel_keys(points: FloatArray, side_m: FloatArray) -> IntArray:
     level = np.round(np.log2(np.maximum(side_m, _SMALLEST_M)))
     voxel = np.floor(points / (2.0**level)[:, None])
-    _, first = np.unique(_row_numbers(np.column_stack([level, voxel]).astype(np.int64)), return_index=True)
-    return np.sort(first)
+    return _row_numbers(np.column_stack([level, voxel]).astype(np.int64))
 
 
 def _row_numbers(rows: IntArray) -> IntArray:

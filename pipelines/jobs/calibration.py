@@ -89,8 +89,8 @@ def _processor_s() -> float:
     backend, pose, began = CpuRasterizer(), torch.eye(4), time.monotonic()
     while len(taken) < _FEWEST or (len(taken) < _MOST and time.monotonic() - began < _LONGEST_S):
         start = time.process_time()
-        adam.zero_grad()
-        render = backend.render(adam.gaussians, pose, _CAMERA, RasterSettings())
+        shown = adam.show(backend.candidates(adam.gaussians, pose, _CAMERA, RasterSettings()))
+        render = backend.render(shown, pose, _CAMERA, RasterSettings())
         photometric_loss(render.colour, target).backward()
         adam.step(len(taken) + 1, render.stats.visible)
         taken.append(time.process_time() - start)

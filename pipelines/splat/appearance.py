@@ -49,8 +49,9 @@ def refine_appearance(
         for iteration, number in enumerate(order):
             view = views(number)
             adam.rate_factor = next(factor for begin, factor in _FALLS if iteration >= begin * len(order))
-            adam.zero_grad()
-            render = rasterizer.render(adam.gaussians, view.cam_from_model.to(device), view.camera, settings)
+            pose = view.cam_from_model.to(device)
+            shown = adam.show(rasterizer.candidates(adam.gaussians, pose, view.camera, settings))
+            render = rasterizer.render(shown, pose, view.camera, settings)
             photometric_loss(render.colour, view.colour.to(device)).backward()
             adam.step(iteration, render.stats.visible)
             task.advance()

@@ -83,8 +83,8 @@ class DensityEdit:
 class Strategy(Protocol):
     """Interface of density control."""
 
-    def penalty(self, gaussians: Gaussians, stats: ScreenStats) -> Tensor | None:
-        """Return a scalar term to add to the loss of a render, or None."""
+    def penalty(self, gaussians: Gaussians, stats: ScreenStats, count: int) -> Tensor | None:
+        """Return a scalar term to add to the loss of a render of some of `count` Gaussians, or None."""
 
     def observe(self, stats: ScreenStats, camera: Pinhole) -> None:
         """Record a render, after its backward pass."""
@@ -155,7 +155,7 @@ class DefaultStrategy:
         self._gradient_sum = torch.zeros(count)
         self._observations = torch.zeros(count)
 
-    def penalty(self, gaussians: Gaussians, stats: ScreenStats) -> Tensor | None:
+    def penalty(self, gaussians: Gaussians, stats: ScreenStats, count: int) -> Tensor | None:
         """See `Strategy.penalty`; the photographs alone decide."""
         return None
 

@@ -68,13 +68,13 @@ class McmcStrategy:
         self._generator = torch.Generator().manual_seed(seed)
         self._visible: Tensor | None = None
 
-    def penalty(self, gaussians: Gaussians, stats: ScreenStats) -> Tensor | None:
+    def penalty(self, gaussians: Gaussians, stats: ScreenStats, count: int) -> Tensor | None:
         """Return the weighted sum of mean opacity and mean standard deviation of the visible Gaussians.
 
         Only visible rows are updated. Invisible Gaussians must not shrink either.
         """
         rows = stats.visible
-        share = len(rows) / max(len(gaussians), 1)
+        share = len(rows) / max(count, 1)
         opacity = torch.sigmoid(gaussians.logit_opacities[rows]).mean()
         scale = gaussians.log_scales[rows].exp().mean() / self.extent_m
         return share * (_OPACITY_PENALTY * opacity + _SCALE_PENALTY * scale)

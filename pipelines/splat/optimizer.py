@@ -6,9 +6,8 @@ Gaussians come to rest, instead of moving about the place where the photographs 
 
 Rows are added, and seen, at different times. Every row therefore counts its own updates, for the bias correction
 that its moments need. With all rows in every step the result is plain Adam. Visiting only the rows that a view
-sees,
-with all tensors of a row in one visit, saves the memory traffic that dominates Adam, and leaves the other moments
-alone.
+sees, with all tensors of a row in one visit, saves the memory traffic that dominates Adam, and leaves the other
+moments alone.
 """
 
 from __future__ import annotations
@@ -31,6 +30,7 @@ from pipelines.splat.kernel_cache import kernel
 @kernel(parallel=True, fastmath={"contract", "nsz"})
 def adam_rows(
     rows: Any,
+    places: Any,
     parameters: Any,
     gradients: Any,
     exp_avg: Any,
@@ -44,8 +44,8 @@ def adam_rows(
     """Take one step of Adam (doi 10.48550/arXiv.1412.6980, alg. 1) on some rows, in place.
 
     Args:
-        rows: (V,) rows to update, each at most once.
-        parameters, gradients: tuples of (N, Dᵢ) arrays, float32.
+        rows: (V,) rows to update, each at most once; places: (V,) those of their gradients.
+        parameters, gradients: tuples of (N, Dᵢ) and (M, Dᵢ) arrays, float32.
         exp_avg, exp_avg_sq: (N, D) first and second moments, D = Σ Dᵢ.
         steps: (N,) int32, number of updates of each row so far.
         rates: (D,) learning rates.
@@ -62,7 +62,7 @@ def adam_rows(
         unbias1, unbias2 = corrections[step, 0], corrections[step, 1]
         first = 0
         for group in range(len(parameters)):
-            parameter, gradient = parameters[group][row], gradients[group][row]
+            parameter, gradient = parameters[group][row], gradients[group][places[i]]
             width = parameter.shape[0]
             average, square = exp_avg[row, first : first + width], exp_avg_sq[row, first : first + width]
             rate = rates[first : first + width]
@@ -126,6 +126,7 @@ class GaussianAdam:
 
     Attributes:
         gaussians: leaf tensors that require gradients; replaced by `rearrange`.
+        shown: the Gaussians whose gradients the next step takes; see `show`.
         extent_m: size of the scene, the unit of the centres' rate.
         iterations: length of the training, over which that rate falls.
         rates: by default those of 3DGS, raised for trainings shorter than its own.
@@ -139,30 +140,43 @@ class GaussianAdam:
         self.extent_m = extent_m
         self.iterations = iterations
         self.rate_factor = 1.0
-        self.gaussians = _leaves(gaussians)
+        self.gaussians = self.shown = _leaves(gaussians)
+        self._rows: Tensor | None = None  # of `shown`; None: all
         count, width = len(gaussians), sum(math.prod(values.shape[1:]) for values in gaussians.tensors().values())
         self._exp_avg = gaussians.means.new_zeros(count, width)
         self._exp_avg_sq = torch.zeros_like(self._exp_avg)
         self._steps = torch.zeros(count, dtype=torch.int32, device=gaussians.means.device)
         self._corrections = _bias_corrections().to(gaussians.means.device)
 
-    def zero_grad(self) -> None:
-        for tensor in self.gaussians.tensors().values():
-            tensor.grad = None
+    def show(self, rows: Tensor | None = None) -> Gaussians:
+        """Return some Gaussians (M,) without gradients, for a render: copies of their rows; None: all themselves.
+
+        Gradients of few rows spare those of all others: allocated, cleared and added up at every iteration.
+        """
+        self._rows = rows
+        if rows is None:
+            self.shown = self.gaussians
+            for tensor in self.shown.tensors().values():
+                tensor.grad = None
+        else:
+            tensors = self.gaussians.detached().tensors()
+            copies = {name: tensor.index_select(0, rows) for name, tensor in tensors.items()}
+            self.shown = Gaussians(**{name: tensor.requires_grad_() for name, tensor in copies.items()})
+        return self.shown
 
     def step(self, iteration: int, rows: Tensor | None = None) -> None:
-        """Update the rows (V,) int64 without repetition (a render's visible Gaussians; None: all) by the tensors'
-        `.grad`.
+        """Update the rows (V,) int64 without repetition of `shown` (a render's visible Gaussians; None: all) by the
+        tensors' `.grad`.
 
         Raises:
             ValueError: a tensor has no gradient.
         """
-        tensors = self.gaussians.tensors()
+        tensors = self.shown.tensors()
         missing = [name for name, tensor in tensors.items() if tensor.grad is None]
         if missing:
             raise ValueError(f"{', '.join(missing)}: no gradient; call backward() first")
         if rows is None:
-            rows = torch.arange(len(self.gaussians), device=self._steps.device)
+            rows = torch.arange(len(self.shown), device=self._steps.device)
         with torch.no_grad():
             if self._steps.device.type == "cpu":
                 self._step_by_kernel(iteration, rows)
@@ -182,7 +196,8 @@ class GaussianAdam:
         """
         old = source >= 0
         index = source.clamp_min(0)
-        self.gaussians = _leaves(gaussians)
+        self.gaussians = self.shown = _leaves(gaussians)
+        self._rows = None
         self._exp_avg = self._exp_avg[index] * old[:, None]
         self._exp_avg_sq = self._exp_avg_sq[index] * old[:, None]
         self._steps = self._steps[index] * old
@@ -229,15 +244,17 @@ class GaussianAdam:
         rates[columns["means"]] = self.means_rate(iteration)
         return rates
 
-    def _step_by_kernel(self, iteration: int, rows: Tensor) -> None:
-        tensors = self.gaussians.tensors().values()
+    def _step_by_kernel(self, iteration: int, places: Tensor) -> None:
+        tensors, shown = self.gaussians.tensors().values(), self.shown.tensors().values()
         parameters, gradients = (
             tuple(part.detach().contiguous().numpy().reshape(len(part), -1) for part in parts if part is not None)
-            for parts in (tensors, [tensor.grad for tensor in tensors])
+            for parts in (tensors, [tensor.grad for tensor in shown])
         )
+        rows = places if self._rows is None else self._rows[places]
         betas = np.array([_BETA1, 1 - _BETA1, _BETA2, 1 - _BETA2], dtype=np.float32)
         adam_rows(
             rows.contiguous().numpy(),
+            places.contiguous().numpy(),
             parameters,
             gradients,
             self._exp_avg.numpy(),
@@ -249,15 +266,17 @@ class GaussianAdam:
             np.float32(EPS),
         )
 
-    def _step_by_tensors(self, iteration: int, rows: Tensor) -> None:
+    def _step_by_tensors(self, iteration: int, places: Tensor) -> None:
         """Take the same step by torch operations, for devices that the kernel does not run on.
 
         All quantities of a row are updated together: five times as few operations as one quantity after the other.
         """
-        tensors, columns = self.gaussians.tensors(), self._columns()
+        tensors, shown, columns = self.gaussians.tensors(), self.shown.tensors(), self._columns()
+        rows = places if self._rows is None else self._rows[places]
         self._steps[rows] += 1
         unbias = self._corrections[self._steps[rows].long().clamp_max(len(self._corrections) - 1)]
-        parts = [tensor.grad[rows].reshape(len(rows), -1) for tensor in tensors.values() if tensor.grad is not None]
+        grads = [tensor.grad for tensor in shown.values()]
+        parts = [grad[places].reshape(len(rows), -1) for grad in grads if grad is not None]
         gradient = torch.cat(parts, dim=1)
         average = self._exp_avg[rows].lerp_(gradient, 1 - _BETA1)
         square = self._exp_avg_sq[rows].lerp_(gradient * gradient, 1 - _BETA2)

@@ -147,8 +147,11 @@ def compactness_loss(depth_m: Tensor, variance_m2: Tensor, alpha: Tensor) -> Ten
 
 def flatness_loss(gaussians: Gaussians, visible: Tensor, extent_m: float) -> Tensor:
     """Return the mean smallest standard deviation of the visible Gaussians, in scene extents; 0 if none is."""
-    smallest = gaussians.log_scales[visible].amin(dim=1).exp()
-    return smallest.sum() / (max(len(visible), 1) * extent_m)
+    # A mask: the gradient of an index is added up row after row.
+    counts = torch.zeros_like(gaussians.log_scales[:, 0])
+    counts[visible] = 1
+    smallest = gaussians.log_scales.amin(dim=1).exp()
+    return (smallest * counts).sum() / (max(len(visible), 1) * extent_m)
 
 
 def depth_normals(depth_m: Tensor, camera: Pinhole) -> Tensor:

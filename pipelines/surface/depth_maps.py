@@ -72,10 +72,9 @@ class DepthMaps:
         step begins.
         """
         train = [int(index) for index in self.scene.train]
-        refinements = [
-            (level, partial(self._refine, before, level)) for before, level in itertools.pairwise(_LEVELS)
-        ]
-        steps = [(_LEVELS[0].name, self._sweep), *((level.name, make) for level, make in refinements)]
+        steps: list[tuple[str, Callable[[int], Float32Array]]] = [(_LEVELS[0].name, self._sweep)]
+        for before, level in itertools.pairwise(_LEVELS):
+            steps.append((level.name, partial(self._refine, before, level)))
         steps.append(("depth", self._agree))
         if not all(self._path(index, "depth").exists() for index in train):
             for index in train:  # Photographs share masks, which two threads must not write at once.

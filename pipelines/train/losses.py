@@ -28,9 +28,11 @@ class RenderedView:
     index: int
     pose: Tensor  # (4, 4) cam ← model
     target: TargetImage  # the photograph, or a crop of it
-    gaussians: Gaussians  # in training
+    gaussians: Gaussians  # in training that may be in view
+    rows: Tensor | None  # (M,) int64 of these among all in training; None: all
+    count: int  # of all Gaussians in training
     render: Render  # of these and of those around a region; with depths if a loss needs them
-    stats: ScreenStats  # of the render, for the Gaussians in training alone
+    stats: ScreenStats  # of the render, for `gaussians` alone
     colour: Tensor  # (H, W, 3) render with the exposure of the photograph
     counting: Tensor | None = None  # (H, W) bool; None: all pixels count
     points: ObservedPoints | None = None  # that the photograph shows; None: unknown
@@ -106,7 +108,7 @@ def training_losses(
         ),
         Loss("control_by_depth", control_by_depth, schedule.geographic_weight),
         Loss("geographic", lambda _view: problem.loss(), schedule.geographic_weight),
-        Loss("density control", lambda view: strategy.penalty(view.gaussians, view.stats)),
+        Loss("density control", lambda view: strategy.penalty(view.gaussians, view.stats, view.count)),
     ]
     settings = schedule.options.surface
     if settings is None:

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray, joined_rows, rows_of
-from pipelines.geometry.footprints import thin_to_voxels
+from pipelines.geometry.footprints import count_voxels, thin_to_voxels
 from pipelines.surface.depth_maps import DepthMaps
 
 _WINDOW_PX = 5  # side of the window that contrast is averaged over
@@ -154,6 +154,9 @@ class SceneSurface:
         return np.asarray(poses.cam_center_in_model[index] + turned)
 
 
+_ALIKE = 1.01  # ratio of cubes' sides that make no difference
+
+
 def spread_evenly(points: FloatArray, size_m: FloatArray, count: int) -> IntArray:
     """Return the indices of evenly spread points (P, 3), of sizes (P,) in metres, at most `count` of them.
 
@@ -162,12 +165,11 @@ def spread_evenly(points: FloatArray, size_m: FloatArray, count: int) -> IntArra
     if len(points) <= count:
         return np.arange(len(points))
     fine, coarse = 2.0**-4, 2.0**12
-    low, kept = points.min(axis=0), np.arange(1)
-    for _ in range(16):
+    above = points - points.min(axis=0)
+    while coarse > _ALIKE * fine:
         middle = float(np.sqrt(fine * coarse))
-        first = thin_to_voxels(points - low, middle * size_m)
-        if len(first) > count:
+        if count_voxels(above, middle * size_m) > count:
             fine = middle
         else:
-            coarse, kept = middle, first
-    return kept
+            coarse = middle
+    return thin_to_voxels(above, coarse * size_m)

@@ -140,7 +140,6 @@ class JointTrainer:
         if self.iteration % _LENS_EVERY == 1:
             self._look_through(self.problem.cameras.lens().detach().cpu().numpy())
         view = self._rendered(self._targets.get(self._look(self.iteration), self._look(self.iteration + 1)))
-        self.optimizer.zero_grad()
         self._unknowns.adam.zero_grad()
         total, values = weighted_sum(self._losses, view, self.iteration)
         total.backward()
@@ -152,7 +151,7 @@ class JointTrainer:
         self.optimizer.step(self.iteration, stats.visible)
         if self.exposures is not None:
             self.exposures.step(self.iteration)
-        self.strategy.observe(stats, view.target.whole)
+        self.strategy.observe(stats.among(view.rows), view.target.whole)
         self.strategy.update(self.iteration, self.optimizer, self.sample_contributions)
         return StepReport(
             losses,
@@ -172,7 +171,8 @@ class JointTrainer:
             least = 1 if self.options.crops is None else self.options.crops.shrink(camera.width, camera.height)
             shrink = max(self.schedule.shrink(self.iteration, camera.width, camera.height), least)
             target, pose = self._targets.get(ImageLook(index, shrink)), self.problem.cameras.cam_from_model(index)
-            colour = self._exposed(index, self._render(pose, target).colour, target)
+            render = self._render(self.optimizer.gaussians, pose, target, self._settings(target))
+            colour = self._exposed(index, render.colour, target)
             error = (colour - target.colour).abs().mean(dim=-1)
             error = error if target.mask is None else error * target.mask
             of_view = view_contributions(self.optimizer.gaussians, pose, target.camera, error, self.rasterizer)
@@ -214,18 +214,22 @@ class JointTrainer:
         pose = self.problem.cameras.cam_from_model(index)
         depth = self.options.surface is not None or self.problem.sees_by_depth(index)
         normal = self.schedule.weight_of_normals(self.iteration) > 0
-        render = self._render(pose, target, depth=depth, normal=normal)
+        settings, optimizer = self._settings(target, depth=depth, normal=normal), self.optimizer
+        rows = self.rasterizer.candidates(optimizer.gaussians.detached(), pose.detach(), target.whole, settings)
+        shown = optimizer.show(rows)
+        render = self._render(shown, pose, target, settings)
         colour, counting = self._exposed(index, render.colour, target), target.mask
         if self.outliers is not None:
             longest_px = max(target.whole.width, target.whole.height)
             counting = self.outliers.inliers(colour, target.colour, counting, longest_px)
         points = None if self.views.surface is None else self.views.surface(index)
-        stats, gaussians = self._own(render.stats), self.optimizer.gaussians
-        return RenderedView(index, pose, target, gaussians, render, stats, colour, counting, points)
+        count = len(optimizer.gaussians)
+        return RenderedView(
+            index, pose, target, shown, rows, count, render, self._own(render.stats), colour, counting, points
+        )
 
-    def _render(self, pose: Tensor, target: TargetImage, *, depth: bool = False, normal: bool = False) -> Render:
-        """Return a render of the Gaussians, and behind their rows those that surround the region."""
-        settings = RasterSettings(
+    def _settings(self, target: TargetImage, *, depth: bool = False, normal: bool = False) -> RasterSettings:
+        return RasterSettings(
             sh_degree=self.schedule.sh_degree(self.iteration),
             background=BACKGROUND,
             depth=depth,
@@ -233,7 +237,9 @@ class JointTrainer:
             median=False,
             window=target.part.window,
         )
-        gaussians = self.optimizer.gaussians
+
+    def _render(self, gaussians: Gaussians, pose: Tensor, target: TargetImage, settings: RasterSettings) -> Render:
+        """Return a render of Gaussians, and behind their rows those that surround the region."""
         if self.region is not None:
             gaussians = Gaussians.concatenate([gaussians, self.region.surroundings])
         return self.rasterizer.render(gaussians, pose, target.whole, settings)
@@ -246,7 +252,7 @@ class JointTrainer:
     def _own(self, stats: ScreenStats) -> ScreenStats:
         """Return the statistics of the Gaussians in training, without those that surround the region."""
         # Without a region nothing is left out: to look would make a GPU wait.
-        return stats if self.region is None else stats.of_first(len(self.optimizer.gaussians))
+        return stats if self.region is None else stats.of_first(len(self.optimizer.shown))
 
     @torch.no_grad()
     def _of_whole(self, stats: ScreenStats, pose: Tensor, target: TargetImage) -> ScreenStats:
@@ -254,7 +260,7 @@ class JointTrainer:
         part = target.part
         if part.crops == 1:
             return stats if part.share == 1.0 else stats.of_part(part.share)
-        means = self.optimizer.gaussians.means[stats.visible]
+        means = self.optimizer.shown.means[stats.visible]
         in_cam, camera = means @ pose[:3, :3].to(means).T + pose[:3, 3].to(means), target.whole
         x, y, z = in_cam.unbind(dim=1)
         x, y = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
@@ -263,7 +269,7 @@ class JointTrainer:
 
     def _watched(self, photometric: Tensor, geographic: Tensor) -> dict[str, Tensor]:
         """Return the scalars that must stay finite, by what messages call them."""
-        tensors = self.optimizer.gaussians.tensors()
+        tensors = self.optimizer.shown.tensors()
         gradients = {
             f"gradient of {name}": geographic.new_zeros(()) if tensor.grad is None else tensor.grad.sum()
             for name, tensor in ({name: tensors[name] for name in _WATCHED} | self._unknowns.named()).items()

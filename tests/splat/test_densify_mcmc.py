@@ -98,7 +98,7 @@ def test_noise_has_the_shape_of_the_gaussian() -> None:
 
 def test_the_penalty_pulls_visible_opacities_and_scales_down() -> None:
     gaussians = GaussianAdam(row([0.5, 0.5]), 1.0, 100).gaussians
-    penalty = McmcStrategy(SETTINGS, 1.0).penalty(gaussians, stats([0]))
+    penalty = McmcStrategy(SETTINGS, 1.0).penalty(gaussians, stats([0]), len(gaussians))
     assert penalty is not None
     penalty.backward()
     for tensor in (gaussians.logit_opacities, gaussians.log_scales):

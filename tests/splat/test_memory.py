@@ -49,7 +49,7 @@ for iteration in range(1, 5):
     adam.step(iteration, view.stats.visible)
     strategy.observe(view.stats, camera)
     strategy.update(iteration, adam)
-    adam.zero_grad()
+    adam.show()
 assert len(adam.gaussians) == 300_000, len(adam.gaussians)
 print(peak() - before)
 """

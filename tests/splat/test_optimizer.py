@@ -75,6 +75,25 @@ def test_only_the_given_rows_move() -> None:
         assert torch.equal(tensor[still], state[name][still])
 
 
+def test_copies_of_some_rows_move_these_rows_as_all_would() -> None:
+    every, some = (GaussianAdam(random_gaussians(30), 2.0, ITERATIONS) for _ in range(2))
+    tensors = GaussianAdam(random_gaussians(30), 2.0, ITERATIONS)
+    for iteration in range(5):
+        rows = torch.randperm(30, generator=torch.Generator().manual_seed(iteration))[:17].sort().values
+        places = torch.arange(0, 17, 2)
+        fill_gradients(every.show(), iteration)
+        for adam in (some, tensors):
+            for name, tensor in adam.show(rows).tensors().items():
+                tensor.grad = every.gaussians.tensors()[name].grad[rows]
+        every.step(iteration, rows[places])
+        some.step(iteration, places)
+        with torch.no_grad():
+            tensors._step_by_tensors(iteration, places)
+    for name, tensor in every.gaussians.tensors().items():
+        assert torch.equal(tensor, some.gaussians.tensors()[name])
+        torch.testing.assert_close(tensor, tensors.gaussians.tensors()[name], rtol=1e-6, atol=1e-6)
+
+
 def test_first_update_of_a_row_is_one_rate_whenever_it_comes() -> None:
     adam = GaussianAdam(random_gaussians(2), 1.0, ITERATIONS, LearningRates())
     for iteration in range(30):
@@ -151,7 +170,7 @@ def test_state_of_other_gaussians_is_refused() -> None:
 def test_step_without_gradient_is_refused() -> None:
     adam = GaussianAdam(random_gaussians(3), 1.0, ITERATIONS)
     fill_gradients(adam.gaussians, 0)
-    adam.zero_grad()
+    adam.show()
     with pytest.raises(ValueError, match="means, quats_wxyz"):
         adam.step(0)
 

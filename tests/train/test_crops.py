@@ -181,7 +181,18 @@ def test_crops_add_up_to_the_surface_losses_of_the_photograph(images: ImageCache
             for target in map(targets.get, looks):
                 raster = RasterSettings(sh_degree=0, depth=True, median=False, window=target.part.window)
                 render = CpuRasterizer().render(gaussians, pose, target.whole, raster)
-                view = RenderedView(1, pose, target, gaussians, render, render.stats, render.colour, points=points)
+                view = RenderedView(
+                    1,
+                    pose,
+                    target,
+                    gaussians,
+                    None,
+                    len(gaussians),
+                    render,
+                    render.stats,
+                    render.colour,
+                    points=points,
+                )
                 values.append(float(weighted_sum(losses, view, 1)[0]))
         assert np.mean(values[1:]) == pytest.approx(values[0], rel=0.02)
         assert max(values[1:]) > 1.1 * values[0], "crops differ"

@@ -22,7 +22,7 @@ The depth of a Gaussian is the depth of its plane at the pixel, not of its centr
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
 from torch import Tensor
@@ -95,6 +95,10 @@ class ScreenStats:
         counted = None if self.counted is None else self.counted[rows]
         return ScreenStats(self.visible[rows], gradient, counted)
 
+    def among(self, rows: Tensor | None) -> ScreenStats:
+        """Return the statistics of a render of some Gaussians with their `rows` among all; None: these are all."""
+        return self if rows is None else replace(self, visible=rows[self.visible])
+
     def of_part(self, share: float, counted: Tensor | None = None) -> ScreenStats:
         """Return the statistics of a part of an image, as what it adds to those of the whole image.
 
@@ -133,3 +137,11 @@ class Rasterizer(Protocol):
         self, gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, settings: RasterSettings
     ) -> Render:
         """Render `gaussians` from `cam_from_model` (4, 4), differentiable in both."""
+
+    def candidates(
+        self, gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, settings: RasterSettings
+    ) -> Tensor | None:
+        """Return the rows (M,) int64, ascending, of all Gaussians that may touch the image; None: unknown.
+
+        A training that copies these has gradients of them alone.
+        """

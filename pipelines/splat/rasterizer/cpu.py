@@ -64,6 +64,17 @@ class CpuRasterizer:
         median = median if settings.median else None
         return Render(colour, alpha, context.stats, expected, variance, median, normal)
 
+    def candidates(
+        self, gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, settings: RasterSettings
+    ) -> Tensor:
+        """See `Rasterizer.candidates`."""
+        pose = _array(cam_from_model[:3].to(torch.float64))
+        parameters = [_array(tensor) for tensor in gaussians.tensors().values()]
+        with KERNEL_LOCK, _threads_for(settings.image_of(camera)):
+            view = cpu_gaussian.make_view(camera, settings, pose)
+            found, _ = _find_visible(parameters, pose, view, numba.get_num_threads(), roughly=True)
+        return torch.from_numpy(found)
+
 
 # Tiles (16 × 32 px) that a visible Gaussian touches on average: 3 to 6 in trained models.
 _HITS_PER_VISIBLE = 6.0
@@ -176,10 +187,8 @@ def _project(context: _RenderContext, parameters: list[_Array], pose: _Array, ce
     """Project the visible Gaussians, order them by depth and list them by tile."""
     view = context.view = cpu_gaussian.make_view(context.camera, context.settings, pose)
     context.background = np.array(context.settings.background, dtype=np.float64)
-    every, dtype = len(parameters[0]), parameters[0].dtype
-    is_visible, depth = np.empty(every, dtype=np.bool_), np.empty(every, dtype=dtype)
-    cpu_project.find_visible(*parameters[:4], pose, view, is_visible, depth, context.workers)
-    context.visible = np.flatnonzero(is_visible)
+    dtype = parameters[0].dtype
+    context.visible, depth = _find_visible(parameters, pose, view, context.workers, roughly=False)
     count = len(context.visible)
     context.table = np.empty((count, cpu_project.SPLAT_WIDTH), dtype=dtype)
     ellipses = np.empty((count, cpu_project.ELLIPSE_WIDTH), dtype=dtype)
@@ -189,8 +198,19 @@ def _project(context: _RenderContext, parameters: list[_Array], pose: _Array, ce
         *(context.visible, context.table, ellipses, context.normals, context.workers),
     )
     image = context.settings.image_of(context.camera)
-    context.lists = list_tiles(ellipses, _depth_order(depth[context.visible]), image.width, image.height)
+    context.lists = list_tiles(ellipses, _depth_order(depth), image.width, image.height)
     context.stats = ScreenStats(torch.from_numpy(context.visible))
+
+
+def _find_visible(
+    parameters: list[_Array], pose: _Array, view: cpu_gaussian.View, workers: int, *, roughly: bool
+) -> tuple[_Array, _Array]:
+    """Return the rows (M,) of the visible Gaussians, ascending, and their depths (M,)."""
+    every, dtype = len(parameters[0]), parameters[0].dtype
+    is_visible, depth = np.empty(every, dtype=np.bool_), np.empty(every, dtype=dtype)
+    cpu_project.find_visible(*parameters[:4], pose, view, roughly, is_visible, depth, workers)
+    visible = np.flatnonzero(is_visible)
+    return visible, depth[visible]
 
 
 def _depth_order(depth: _Array) -> _Array:

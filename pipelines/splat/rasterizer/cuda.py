@@ -33,6 +33,11 @@ class CudaRasterizer:
     def __init__(self, progress: Progress = SILENT) -> None:
         self._gsplat = load_gsplat(progress)
 
+    def candidates(
+        self, gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, settings: RasterSettings
+    ) -> None:
+        """See `Rasterizer.candidates`; to count them, the processor would wait for the GPU."""
+
     def render(
         self, gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, settings: RasterSettings
     ) -> Render:

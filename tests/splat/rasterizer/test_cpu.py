@@ -96,6 +96,29 @@ def test_median_depth_is_where_half_is_left(camera):
     assert thin.median_depth.abs().max() == 0
 
 
+def test_candidates_alone_give_the_same_image_and_gradients(make_scene, leaves, camera):
+    # Half of the Gaussians lie to the side or behind, where they must not be missed: some reach into the image.
+    scene = make_scene(400, seed=3)
+    with torch.no_grad():
+        scene[0].means[::2] *= torch.tensor([6.0, 6.0, -1.0], dtype=torch.float64)
+        scene[0].means[1::4] *= torch.tensor([2.5, 2.5, 1.0], dtype=torch.float64)
+    (gaussians, pose), (_, again) = leaves(scene, torch.float64), leaves(scene, torch.float64)
+    rows = CpuRasterizer().candidates(gaussians, pose, camera, RasterSettings())
+    part = Gaussians(*(tensor.detach()[rows].requires_grad_() for tensor in gaussians.tensors().values()))
+    whole_view, view = (
+        render(gaussians, camera, RasterSettings(), pose),
+        render(part, camera, RasterSettings(), again),
+    )
+    assert torch.equal(view.stats.among(rows).visible, whole_view.stats.visible)
+    assert len(view.stats.visible) <= len(rows) < 300
+    assert torch.equal(view.colour, whole_view.colour)
+    whole_view.colour.square().sum().backward()
+    view.colour.square().sum().backward()
+    for name, tensor in part.tensors().items():
+        torch.testing.assert_close(tensor.grad, gaussians.tensors()[name].grad[rows], rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(again.grad, pose.grad, rtol=1e-9, atol=1e-9)
+
+
 def test_near_plane(camera):
     gaussians = stack([1.0], [2.0], [[1.0, 1, 1]])
     assert render(gaussians, camera, RasterSettings(sh_degree=0, near_m=0.999)).alpha.min() > 0.5
