@@ -99,9 +99,9 @@ def plan_chunks(survey: Survey, pairs: IntArray, options: SfmOptions) -> ChunkPl
     Photographs and pairs are cut in their order, which for photographs is that of the flight as a rule: a chunk of
     matches needs the features of few chunks. The pairs to match (P, 2) are sorted.
     """
-    count, size = len(survey.images), options.chunk_size
-    features = np.array_split(np.arange(count), max(-(-count // size), 1))
-    matches = np.array_split(pairs, max(-(-len(pairs) // (size * _PAIRS_PER_PHOTOGRAPH)), 1))
+    count = len(survey.images)
+    features = np.array_split(np.arange(count), options.chunks(count))
+    matches = np.array_split(pairs, options.chunks(-(-len(pairs) // _PAIRS_PER_PHOTOGRAPH)))
     common = _digest(
         [prior.model_dump(mode="json") for prior in survey.cameras],
         options.model_dump(include={"camera_model", "max_image_size", "max_features", "doubled"}),

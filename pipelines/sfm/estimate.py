@@ -3,7 +3,6 @@
 `jobs.costs` has the constants. The largest photographs of a survey have `photo_px` pixels, width and height.
 """
 
-import math
 from dataclasses import dataclass
 
 from pipelines.core.machine import chosen_threads, free_main_memory_bytes
@@ -52,7 +51,7 @@ def estimate_reconstruction(
     return ReconstructionEstimate(
         photographs=photographs,
         mapper=chosen_mapper(photographs, options),
-        chunks=max(math.ceil(photographs / options.chunk_size), 1),
+        chunks=options.chunks(photographs),
         seconds=estimated_cost(photographs, photo_px, options).total_s / MEASURED_CORES * machine_factor(),
         peak_bytes=peak_bytes(photographs, photo_px, options),
         free_bytes=free_bytes,

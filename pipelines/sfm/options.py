@@ -51,6 +51,13 @@ class SfmOptions(StageOptions):
         longest_px = min(max(photo_px), self.max_image_size)
         return self.doubled == "yes" or (self.doubled == "auto" and longest_px < _DOUBLED_BELOW_PX)
 
+    def chunks(self, photographs: int) -> int:
+        """Return the number of chunks of a survey; 1: it is worked in one process.
+
+        It is even: two chunks of one size keep both cores of a small machine at work until the end.
+        """
+        return 1 if photographs <= self.chunk_size else 2 * -(-photographs // (2 * self.chunk_size))
+
 
 class AdjustOptions(StageOptions):
     """Options of the bundle adjustment with the fixes as priors, the baseline of `georef compare`."""
