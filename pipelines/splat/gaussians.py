@@ -47,7 +47,10 @@ class Gaussians(Rows):
         return {name: tensor.detach().cpu().numpy() for name, tensor in self.tensors().items()}
 
     def select(self, index: Tensor) -> Gaussians:
-        return Gaussians(**{name: tensor[index] for name, tensor in self.tensors().items()})
+        """Return the Gaussians of some rows, int64, or of a mask (N,)."""
+        rows = index.nonzero()[:, 0] if index.dtype == torch.bool else index
+        # Twice as fast as `tensor[rows]`.
+        return Gaussians(**{name: tensor.index_select(0, rows) for name, tensor in self.tensors().items()})
 
     def to(self, device: torch.device) -> Gaussians:
         return Gaussians(**{name: tensor.to(device) for name, tensor in self.tensors().items()})

@@ -140,7 +140,8 @@ class GaussianAdam:
         self.extent_m = extent_m
         self.iterations = iterations
         self.rate_factor = 1.0
-        self.gaussians = self.shown = _leaves(gaussians)
+        copies = {name: tensor.detach().clone() for name, tensor in gaussians.tensors().items()}
+        self.gaussians = self.shown = _leaves(Gaussians(**copies))
         self._rows: Tensor | None = None  # of `shown`; None: all
         count, width = len(gaussians), sum(math.prod(values.shape[1:]) for values in gaussians.tensors().values())
         self._exp_avg = gaussians.means.new_zeros(count, width)
@@ -159,9 +160,7 @@ class GaussianAdam:
             for tensor in self.shown.tensors().values():
                 tensor.grad = None
         else:
-            tensors = self.gaussians.detached().tensors()
-            copies = {name: tensor.index_select(0, rows) for name, tensor in tensors.items()}
-            self.shown = Gaussians(**{name: tensor.requires_grad_() for name, tensor in copies.items()})
+            self.shown = _leaves(self.gaussians.detached().select(rows))
         return self.shown
 
     def step(self, iteration: int, rows: Tensor | None = None) -> None:
@@ -192,15 +191,19 @@ class GaussianAdam:
     def rearrange(self, gaussians: Gaussians, source: Tensor) -> None:
         """Replace all rows by N' Gaussians, whose `source` (N',) is their former row, or −1.
 
-        Surviving rows keep their moments, new rows start without.
+        Surviving rows keep their moments, new rows start without. The tensors are taken over, not copied.
         """
-        old = source >= 0
-        index = source.clamp_min(0)
-        self.gaussians = self.shown = _leaves(gaussians)
+        new, former = source < 0, source.clamp_min(0)
+        self.gaussians = self.shown = _leaves(gaussians.detached())
         self._rows = None
-        self._exp_avg = self._exp_avg[index] * old[:, None]
-        self._exp_avg_sq = self._exp_avg_sq[index] * old[:, None]
-        self._steps = self._steps[index] * old
+
+        def moved(moments: Tensor) -> Tensor:
+            kept = moments.index_select(0, former)
+            kept[new] = 0
+            return kept
+
+        self._exp_avg, self._exp_avg_sq = moved(self._exp_avg), moved(self._exp_avg_sq)
+        self._steps = moved(self._steps)
 
     def overwrite(self, name: str, values: Tensor) -> None:
         """Give one tensor of the Gaussians new values (N, …) and forget its moments."""
@@ -288,8 +291,8 @@ class GaussianAdam:
 
 
 def _leaves(gaussians: Gaussians) -> Gaussians:
-    copies = {name: tensor.detach().clone().contiguous() for name, tensor in gaussians.tensors().items()}
-    return Gaussians(**{name: tensor.requires_grad_() for name, tensor in copies.items()})
+    tensors = gaussians.tensors()
+    return Gaussians(**{name: tensor.contiguous().requires_grad_() for name, tensor in tensors.items()})
 
 
 def _bias_corrections() -> Tensor:

@@ -307,7 +307,9 @@ class JointTrainer:
         self.optimizer.rate_factor = float(state["rate_factor"])
         self._look_through(state["lens"].cpu().numpy())
         self.watch.reset()
-        tensors = {name: tensor.to(self.device) for name, tensor in unprefixed("gaussians", state).items()}
+        tensors = {
+            name: tensor.to(self.device, copy=True) for name, tensor in unprefixed("gaussians", state).items()
+        }
         gaussians = Gaussians(**tensors)
         fresh = torch.full((len(gaussians),), -1, dtype=torch.int64, device=self.device)
         fresh[: min(len(gaussians), len(self.optimizer.gaussians))] = 0
