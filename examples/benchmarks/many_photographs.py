@@ -37,8 +37,9 @@ from pipelines.core.machine import peak_memory_bytes
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.formats.colmap import flatten, quiet_colmap
 from pipelines.geometry.similarity import umeyama
+from pipelines.sfm.adjustment import adjust_finally, remove_drift
 from pipelines.sfm.features import select_pairs
-from pipelines.sfm.mapping import MapperRun, adjust_finally, remove_drift, run_mapper
+from pipelines.sfm.mapping import MapperRun, run_mapper
 
 SIZE_PX, FOCAL_PX, HEIGHT_M = (1200, 900), 1000.0, 100.0
 FORWARD_OVERLAP, SIDE_OVERLAP = 0.8, 0.6

@@ -1,6 +1,7 @@
 """Engine `colmap`: features, matches, mapping, and a final robust adjustment; a large survey in chunks."""
 
 import logging
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -8,13 +9,15 @@ from pipelines.core.errors import DegenerateGeometryError, InputError, ResourceE
 from pipelines.core.machine import chosen_threads, free_main_memory_bytes
 from pipelines.core.products import load_json, save_json
 from pipelines.core.progress import Progress
+from pipelines.core.types import Vector3
 from pipelines.core.workspace import StageRun
 from pipelines.formats.colmap import ROLLING_SHUTTER, quiet_colmap, write_reconstruction
+from pipelines.sfm.adjustment import adjust_finally
 from pipelines.sfm.chunks import PLAN, ChunkPlan, join_chunks, remove_chunks, work_in_chunks
 from pipelines.sfm.colmap_database import require_sound
 from pipelines.sfm.estimate import estimate_reconstruction, why_too_large
 from pipelines.sfm.features import SfmJob, candidate_pairs, extract_features, match_features
-from pipelines.sfm.mapping import adjust_finally, map_database, remove_drift
+from pipelines.sfm.mapping import map_database
 from pipelines.sfm.options import SfmOptions
 from pipelines.sfm.rolling_shutter import correct_tie_points
 from pipelines.survey.survey import Survey
@@ -95,14 +98,15 @@ def map_matches(colmap: Any, job: SfmJob, progress: Progress) -> Any:
     if len(models) > 1:
         sizes = [model.num_reg_images() for model in models]
         log.warning("The survey fell apart into %d models of %s images; the largest is used.", len(models), sizes)
-    model, threads = models[0], chosen_threads(job.options.threads)
+    fixes = None
     if len(job.survey.images) > _DRIFTLESS_UP_TO:
         fixes = {image.name: image.fix.position_in_geo for image in job.survey.images if image.fix is not None}
-        remove_drift(colmap, model, fixes, threads, progress)
-    _adjust(colmap, job, model, progress)
-    return model
+    _adjust(colmap, job, models[0], progress, fixes)
+    return models[0]
 
 
-def _adjust(colmap: Any, job: SfmJob, model: Any, progress: Progress) -> None:
-    threads = chosen_threads(job.options.threads)
-    adjust_finally(colmap, model, principal_point=job.options.principal_point, threads=threads, progress=progress)
+def _adjust(
+    colmap: Any, job: SfmJob, model: Any, progress: Progress, fixes: Mapping[str, Vector3] | None = None
+) -> None:
+    free, threads = job.options.principal_point, chosen_threads(job.options.threads)
+    adjust_finally(colmap, model, fixes=fixes, principal_point=free, threads=threads, progress=progress)

@@ -34,7 +34,7 @@ from pipelines.formats.colmap import (
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.robust.statistics import residual_stats
-from pipelines.sfm.mapping import position_adjuster
+from pipelines.sfm.adjustment import position_adjuster
 from pipelines.sfm.options import AdjustOptions
 from pipelines.survey.adjustment import InitialSimilarity
 from pipelines.survey.calibrated import load_survey

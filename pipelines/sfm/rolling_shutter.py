@@ -14,7 +14,7 @@ from pipelines.core.types import FloatArray, IntArray, vector3
 from pipelines.formats.colmap import RollingShutter, flatten
 from pipelines.geometry.rolling_shutter import in_global_shutter
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.sfm.mapping import alignment_with
+from pipelines.sfm.adjustment import alignment_with
 from pipelines.survey.survey import Survey
 
 log = logging.getLogger(__name__)

@@ -9,7 +9,7 @@ import pytest
 
 from pipelines.core.types import FloatArray, Vector3
 from pipelines.formats.colmap import quiet_colmap
-from pipelines.sfm.mapping import remove_drift
+from pipelines.sfm.adjustment import remove_drift
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -12,7 +12,7 @@ import pytest
 
 from pipelines.formats.colmap import quiet_colmap
 from pipelines.geometry.similarity import umeyama
-from pipelines.sfm.mapping import adjust_finally
+from pipelines.sfm.adjustment import adjust_finally
 from tests.refusals import logged_codes
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -20,7 +20,7 @@ from pipelines.geometry.sparse_model import SparseModel
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.remarks import Remarks
 from pipelines.ingest.rolling_shutter import with_readouts, with_velocities
-from pipelines.sfm.mapping import adjust_finally
+from pipelines.sfm.adjustment import adjust_finally
 from pipelines.sfm.rolling_shutter import correct_tie_points
 from pipelines.simulate.lens import BrownLens, Pose
 from pipelines.survey.marks import bearings_at
