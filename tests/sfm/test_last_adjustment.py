@@ -12,6 +12,7 @@ import pytest
 
 from pipelines.formats.colmap import quiet_colmap
 from pipelines.geometry.similarity import umeyama
+from pipelines.sfm import adjustment
 from pipelines.sfm.adjustment import adjust_finally
 from tests.refusals import logged_codes
 
@@ -181,6 +182,29 @@ class Bars:
 
     def advance(self, steps: int = 1, note: str = "", left_s: float | None = None) -> None:
         self.steps += steps
+
+
+def test_few_tracks_first_end_at_the_same_minimum(monkeypatch: pytest.MonkeyPatch) -> None:
+    truth, model = true_model(), true_model()
+    disturb(model, noise_px=0.3, wrong=0.06)
+    as_mapped(model)
+    few = adjustment.with_few_tracks(model, 60)
+    # All images see each of the 300 points: 60 points are enough.
+    assert (few.num_points3D(), model.num_points3D()) == (60, 300)
+    at_once = adjust(pycolmap.Reconstruction(model))
+    monkeypatch.setattr(adjustment, "_MANY_OBSERVATIONS", 1000)
+    monkeypatch.setattr(adjustment, "_TRACKS_A_PHOTOGRAPH", 60)
+    bars = Bars()
+    with quiet_colmap() as colmap:
+        adjust_finally(colmap, model, threads=1, progress=bars)
+    assert bars.steps == bars.total == 7
+    assert model.num_points3D() == 300
+    # Both end a small part of σ from their minimum; the errors against the truth are the measure of σ.
+    assert rms_off(model, at_once) < 0.1 * rms_off(at_once, truth)
+    np.testing.assert_allclose(model.cameras[1].params, at_once.cameras[1].params, atol=0.1)
+    assert model.compute_mean_reprojection_error() == pytest.approx(
+        at_once.compute_mean_reprojection_error(), rel=1e-3
+    )
 
 
 @pytest.mark.parametrize("noise_px", [0.0, 0.5])  # without noise the scale has settled after one round
