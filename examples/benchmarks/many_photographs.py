@@ -26,6 +26,7 @@ import sys
 import tempfile
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,12 +35,13 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from pipelines.core.machine import peak_memory_bytes
+from pipelines.core.progress import SILENT
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.formats.colmap import flatten, quiet_colmap
 from pipelines.geometry.similarity import umeyama
 from pipelines.sfm.adjustment import adjust_finally, remove_drift
 from pipelines.sfm.features import select_pairs
-from pipelines.sfm.mapping import MapperRun, run_mapper
+from pipelines.sfm.mapping import MapperRun, run_mapper, triangulate
 
 SIZE_PX, FOCAL_PX, HEIGHT_M = (1200, 900), 1000.0, 100.0
 FORWARD_OVERLAP, SIDE_OVERLAP = 0.8, 0.6
@@ -185,12 +187,13 @@ def map_flight(mapper: str, database: Path, count: int, seed: int, threads: int)
         sigma_m = remove_drift(colmap, model, fixes, threads)
         errors["with positions"] = _center_rms_m(model, flown)
         drift_s = time.monotonic() - clock
-        adjust_finally(colmap, model, threads=threads)
+        others = partial(triangulate, colmap, database=database, progress=SILENT) if mapper == "global" else None
+        adjust_finally(colmap, model, complete=others, threads=threads)
         errors["last"] = _center_rms_m(model, flown)
         adjustment_s = time.monotonic() - clock
         peak = _peak_bytes()
         if plain is not None:
-            adjust_finally(colmap, plain, threads=threads)
+            adjust_finally(colmap, plain, complete=others, threads=threads)
             errors["last without positions"] = _center_rms_m(plain, flown)
     return {
         **figures,

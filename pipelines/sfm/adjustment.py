@@ -16,7 +16,7 @@ them. Many observations are therefore adjusted with few tracks first, and begin 
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from typing import Any
 
@@ -37,6 +37,7 @@ _FEWEST_FOR_PRINCIPAL_POINT = 10
 _FURTHEST_PRINCIPAL_POINT = 0.05  # of the longer side: beyond, the principal point has absorbed other errors
 _ROBUST_ROUNDS = 3
 _MOST_STEPS = 100  # of a round
+_SETTLED_STEPS = 10  # of the last one with all tracks, after the cameras have settled with few
 _SETTLED = 0.01  # relative change of the residuals' scale
 _LEAST_SCALE_PX = 1e-3  # for observations without noise, which have no tails either
 # Least gain of a step, as a fraction of the cost and times the number of observations; a smaller gain ends the
@@ -47,9 +48,11 @@ _LEAST_GAIN_OF_FEW = 1e-6
 _COARSE = 10.0  # factor on the least gain while the scale of the kernel still changes
 
 
-# Observations from which an adjustment begins with few tracks, and tracks that then tie each photograph.
+# Observations from which an adjustment begins with few tracks; tracks that then tie each photograph, and that do in
+# the end, of a model that a mapper has left with few.
 _MANY_OBSERVATIONS = 400_000
 _TRACKS_A_PHOTOGRAPH = 400
+_TRACKS_KEPT = 2000
 
 
 def adjust_finally(
@@ -57,6 +60,7 @@ def adjust_finally(
     model: Any,
     *,
     fixes: Mapping[str, Vector3] | None = None,
+    complete: Callable[[Any], None] | None = None,
     principal_point: bool = True,
     threads: int = -1,
     progress: Progress = SILENT,
@@ -72,7 +76,7 @@ def adjust_finally(
        adjustment before, until that scale converges. No observation is removed: an outlier has nearly no weight.
 
     Of many observations, a model with few tracks takes all steps first. The last one then starts from its cameras,
-    with all tracks.
+    with all tracks; of a model that has few tracks only, after `complete` has added the others.
 
     Raises:
         ConvergenceError: COLMAP found no solution.
@@ -84,29 +88,42 @@ def adjust_finally(
     adjustment.print_summary = False
     adjustment.ceres.solver_options.num_threads = threads
     adjustment.ceres.solver_options.max_num_iterations = _MOST_STEPS
-    many = model.compute_num_observations() > _MANY_OBSERVATIONS
-    first = with_few_tracks(model, _TRACKS_A_PHOTOGRAPH) if many else model
+    many = complete is None and model.compute_num_observations() > _MANY_OBSERVATIONS
+    first, twice = model, many or complete is not None
+    if many:
+        first = type(model)(model)
+        keep_few_tracks(first, _TRACKS_A_PHOTOGRAPH)
     if fixes is not None:
         remove_drift(colmap, first, fixes, threads, progress)
-    with progress.task("last adjustment", int(free) + _ROBUST_ROUNDS * (1 + many)) as task:
+    title = "adjustment with few tracks" if twice else "last adjustment"
+    with progress.task(title, int(free) + _ROBUST_ROUNDS) as task:
         if free:
             adjustment.ceres.solver_options.function_tolerance = _COARSE * _least_gain(first)
             adjustment.refine_principal_point = _free_principal_point(colmap, first, adjustment)
             task.advance()
         _adjust_robustly(colmap, first, adjustment, task)
-        if many:
-            _follow(colmap, model, first, adjustment)
-            # The cameras are settled: the scale changes no more.
+    if complete is not None:
+        complete(model)
+        keep_few_tracks(model, _TRACKS_KEPT)
+    elif many:
+        _follow(colmap, model, first)
+    if twice:
+        with progress.task("last adjustment", 1 + _ROBUST_ROUNDS) as task:
+            _adjust_points(colmap, model, adjustment)
+            task.advance()
+            # The cameras are settled: the scale changes no more, and what more steps would change is weaker than
+            # the positions that the model is placed by.
+            adjustment.ceres.solver_options.max_num_iterations = _SETTLED_STEPS
             _adjust_robustly(colmap, model, adjustment, task, _scale_px(model))
     model.update_point_3d_errors()
 
 
-def with_few_tracks(model: Any, tracks: int) -> Any:
-    """Return a copy of a `pycolmap.Reconstruction` with points drawn until each image sees `tracks`, or all it has.
+def keep_few_tracks(model: Any, tracks: int) -> None:
+    """Leave a `pycolmap.Reconstruction` with points drawn until each image sees `tracks` of them, or all it has.
 
     Points are drawn at random, always the same: the longest tracks would lie in one part of the images.
     """
-    few, flat = type(model)(model), flatten(model)
+    flat = flatten(model)
     seen = np.zeros(len(flat.image_id), dtype=np.int64)
     bounds = np.searchsorted(flat.obs_point, np.arange(len(flat.point_id) + 1))
     for point in np.random.default_rng(0).permutation(len(flat.point_id)).tolist():
@@ -114,23 +131,26 @@ def with_few_tracks(model: Any, tracks: int) -> Any:
         if (seen[images] < tracks).any():
             seen[images] += 1
         else:
-            few.delete_point3D(int(flat.point_id[point]))
-    return few
+            model.delete_point3D(int(flat.point_id[point]))
 
 
-def _follow(colmap: Any, model: Any, leader: Any, adjustment: Any) -> None:
-    """Give a model the cameras of another one of the same images, and move its points to where these see them."""
+def _follow(colmap: Any, model: Any, leader: Any) -> None:
+    """Give a model the cameras of another one of the same images, and its points their place beside these."""
     before, after = (
         np.array([each.images[key].projection_center() for key in sorted(leader.reg_image_ids())])
         for each in (model, leader)
     )
     moved = umeyama(before, after)
-    model.transform(colmap.Sim3d(moved.scale, colmap.Rotation3d(moved.rotation), moved.translation))
+    model.transform(colmap.Sim3d(moved.matrix()[:3]))
     for key, camera in leader.cameras.items():
         model.cameras[key].params = camera.params
     for key, frame in leader.frames.items():
         if frame.has_pose():
             model.frames[key].rig_from_world = frame.rig_from_world
+
+
+def _adjust_points(colmap: Any, model: Any, adjustment: Any) -> None:
+    """Move points to where the cameras see them."""
     points_alone = deepcopy(adjustment)
     points_alone.refine_rig_from_world = points_alone.refine_principal_point = False
     points_alone.refine_focal_length = points_alone.refine_extra_params = False

@@ -1,7 +1,6 @@
 """Engine `colmap`: features, matches, mapping, and a final robust adjustment; a large survey in chunks."""
 
 import logging
-from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -9,7 +8,6 @@ from pipelines.core.errors import DegenerateGeometryError, InputError, ResourceE
 from pipelines.core.machine import chosen_threads, free_main_memory_bytes
 from pipelines.core.products import load_json, save_json
 from pipelines.core.progress import Progress
-from pipelines.core.types import Vector3
 from pipelines.core.workspace import StageRun
 from pipelines.formats.colmap import ROLLING_SHUTTER, quiet_colmap, write_reconstruction
 from pipelines.sfm.adjustment import adjust_finally
@@ -17,7 +15,7 @@ from pipelines.sfm.chunks import PLAN, ChunkPlan, join_chunks, remove_chunks, wo
 from pipelines.sfm.colmap_database import require_sound
 from pipelines.sfm.estimate import estimate_reconstruction, why_too_large
 from pipelines.sfm.features import SfmJob, candidate_pairs, extract_features, match_features
-from pipelines.sfm.mapping import map_database
+from pipelines.sfm.mapping import map_database, triangulate
 from pipelines.sfm.options import SfmOptions
 from pipelines.sfm.rolling_shutter import correct_tie_points
 from pipelines.survey.survey import Survey
@@ -88,7 +86,7 @@ def reconstruct(colmap: Any, job: SfmJob, progress: Progress) -> Any:
 def map_matches(colmap: Any, job: SfmJob, progress: Progress) -> Any:
     """Return the largest model of a database with features and matches, adjusted; raises as `reconstruct`."""
     colmap.set_random_seed(job.options.seed)
-    models = map_database(colmap, job, progress)
+    models, mapper = map_database(colmap, job, progress)
     if not models:
         raise DegenerateGeometryError(
             "no-matches",
@@ -101,12 +99,11 @@ def map_matches(colmap: Any, job: SfmJob, progress: Progress) -> Any:
     fixes = None
     if len(job.survey.images) > _DRIFTLESS_UP_TO:
         fixes = {image.name: image.fix.position_in_geo for image in job.survey.images if image.fix is not None}
-    _adjust(colmap, job, models[0], progress, fixes)
+    others = partial(triangulate, colmap, database=job.database, progress=progress)
+    _adjust(colmap, job, models[0], fixes=fixes, complete=others if mapper == "global" else None, progress=progress)
     return models[0]
 
 
-def _adjust(
-    colmap: Any, job: SfmJob, model: Any, progress: Progress, fixes: Mapping[str, Vector3] | None = None
-) -> None:
+def _adjust(colmap: Any, job: SfmJob, model: Any, **how: Any) -> None:
     free, threads = job.options.principal_point, chosen_threads(job.options.threads)
-    adjust_finally(colmap, model, fixes=fixes, principal_point=free, threads=threads, progress=progress)
+    adjust_finally(colmap, model, principal_point=free, threads=threads, **how)

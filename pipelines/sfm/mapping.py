@@ -20,9 +20,12 @@ MapperName = Literal["incremental", "global"]
 # Up to here the incremental mapper takes minutes; its time grows faster than the number of photographs.
 _INCREMENTAL_UP_TO = 500
 _FEWEST_IMAGES = 3
-# Tracks that position each photograph in the global mapper, the longest ones; all of them are triangulated and
-# adjusted at the end. Of 400 photographs, all 98 000 tracks took 2.3 times as long as 9700, for the same model.
+# Tracks that position each photograph in the global mapper, the longest ones. Of 400 photographs, all 98 000 tracks
+# took 2.3 times as long as 9700, for the same model. The mapper's own triangulation and adjustment of the others
+# take longer than all the rest.
 _GLOBAL_TRACKS = 200
+# Steps of its adjustment. Without positions a large model straightens slowly: those that follow have them.
+_GLOBAL_STEPS = 25
 _REGISTERED = 0.95  # of the photographs: if the global mapper has less, the incremental one has its turn
 
 
@@ -43,8 +46,9 @@ def chosen_mapper(photographs: int, options: SfmOptions) -> MapperName:
     return "incremental" if photographs <= _INCREMENTAL_UP_TO else "global"
 
 
-def map_database(colmap: Any, job: SfmJob, progress: Progress) -> list[Any]:
-    """Return the models (`pycolmap.Reconstruction`) of a database with features and matches, the largest first.
+def map_database(colmap: Any, job: SfmJob, progress: Progress) -> tuple[list[Any], MapperName]:
+    """Return the models (`pycolmap.Reconstruction`) of a database with features and matches, the largest first, and
+    their mapper.
 
     With `--mapper auto`, a global mapper that leaves out more than one photograph of twenty is followed by the
     incremental one, and the larger model counts.
@@ -59,12 +63,13 @@ def map_database(colmap: Any, job: SfmJob, progress: Progress) -> list[Any]:
             count,
         )
         others = _models(colmap, "incremental", job, progress)
-        models = others if _registered(others) > _registered(models) else models
-    return models
+        if _registered(others) > _registered(models):
+            return others, "incremental"
+    return models, mapper
 
 
 def run_mapper(colmap: Any, mapper: MapperName, run: MapperRun, registered: Callable[[], None]) -> list[Any]:
-    """Return the models of a mapper, the largest first.
+    """Return the models of a mapper, the largest first; those of the global mapper have few tracks.
 
     The incremental mapper calls `registered` when it has registered a photograph.
     """
@@ -72,6 +77,8 @@ def run_mapper(colmap: Any, mapper: MapperName, run: MapperRun, registered: Call
         options = colmap.GlobalPipelineOptions()
         options.num_threads, options.random_seed = run.threads, run.seed
         options.mapper.track_required_tracks_per_view = _GLOBAL_TRACKS
+        options.mapper.skip_retriangulation, options.mapper.ba_num_iterations = True, 1
+        options.mapper.bundle_adjustment.ceres.solver_options.max_num_iterations = _GLOBAL_STEPS
         models = colmap.global_mapping(run.database, run.images, run.scratch, options)
     else:
         options = colmap.IncrementalPipelineOptions()
@@ -92,6 +99,22 @@ def _models(colmap: Any, mapper: MapperName, job: SfmJob, progress: Progress) ->
         if mapper == "global":
             task.advance(len(job.survey.images))
         return models
+
+
+def triangulate(colmap: Any, model: Any, database: Path, progress: Progress) -> None:
+    """Add the tracks of a database to a `pycolmap.Reconstruction` of known cameras, in place."""
+    with colmap.Database.open(database) as opened:
+        cache = colmap.DatabaseCache.create(opened, colmap.DatabaseCacheOptions())
+    mapper, options = colmap.IncrementalMapper(cache), colmap.IncrementalTriangulatorOptions()
+    mapper.begin_reconstruction(model)
+    images = sorted(model.reg_image_ids())
+    with progress.task("triangulation", len(images)) as task:
+        for image_id in images:
+            mapper.triangulate_image(options, image_id)
+            task.advance()
+        mapper.complete_and_merge_tracks(options)
+        mapper.filter_points(colmap.IncrementalMapperOptions())
+    mapper.end_reconstruction(False)
 
 
 def _registered(models: list[Any]) -> int:

@@ -76,9 +76,10 @@ def test_a_mapper_that_leaves_many_out_is_followed_by_the_other(
     survey = survey_of([f"{index}.jpg" for index in range(1000)])
     job = SfmJob(survey, tmp_path, tmp_path / "database.db", CONFIG.model_copy(update={"mapper": asked}))
     with caplog.at_level(logging.WARNING):
-        models = map_database(None, job, SILENT)
+        models, chosen = map_database(None, job, SILENT)
     assert ran == runs
     assert models[0].num_reg_images() == largest
+    assert chosen == ("global" if largest == of_global else "incremental")
     assert ("the incremental mapper follows" in caplog.text) is (len(runs) == 2)
 
 
