@@ -69,9 +69,12 @@ def _run(ctx: click.Context, **values: Any) -> None:
         stages = stage_slice(first, values["last"])
     except GeorefError as error:
         raise click.UsageError(str(error)) from error
-    stages += deliverables(values["deliver"])
+    workspace, wanted = values["workspace"], deliverables(values["deliver"])
+    trains = any(spec.name == "train" for spec in stages)
+    if wanted and not trains and not (workspace.root / MODEL).exists():
+        raise click.UsageError("--deliver needs a trained model, which this run does not make: leave out --to.")
+    stages += wanted
     flags = _flags(ctx, stages, settings(values["settings"], stages))
-    workspace = values["workspace"]
     forget, force = _forgotten(values["forget"], stages), values["force"] or values["rerun_from"] is not None
     if stages[0].reads:
         must_exist(workspace)
@@ -84,7 +87,6 @@ def _run(ctx: click.Context, **values: Any) -> None:
     left = RunTimeLeft(announced_seconds(workspace, stages, asked, force=force))
     progress = progress_for(ctx.obj)
     # A program that follows several runs shows how many stages of each are done; bars and lines name the stages.
-    trains = any(spec.name == "train" for spec in stages)
     with (progress if ctx.obj.json_progress else SILENT).task("stages", len(stages)) as done:
         outcomes = runner.run_pipeline(
             workspace,

@@ -43,6 +43,12 @@ def test_missing_product_hints_at_the_command(georef: Georef, workspace: Workspa
     assert (error["code"], error["hint"]) == ("missing-product", f"run `georef sfm {workspace.root}` first")
 
 
+def test_deliverables_of_a_run_that_ends_before_training(georef: Georef, workspace: Workspace) -> None:
+    result = georef("run", workspace.root, "--to", "init-sim3", "--deliver", "cloud", "--json")
+    result.assert_failed(2)
+    assert "leave out --to" in result.err
+
+
 @pytest.mark.parametrize(
     ("words", "field"),
     [
