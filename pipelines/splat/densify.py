@@ -116,19 +116,21 @@ class DefaultSettings:
     max_gaussians: int = 1_000_000
 
     @classmethod
-    def for_iterations(cls, iterations: int, max_gaussians: int) -> DefaultSettings:
+    def for_iterations(cls, iterations: int, max_gaussians: int, surveys: float = 1.0) -> DefaultSettings:
         """Return the schedule of 3DGS, made for 30 000 iterations, adapted to a training of another length.
 
         Fewer iterations mean more frequent, not only fewer, additions; between two of them every Gaussian must
         still be seen a few times. Recovery from a reset of the opacities takes several hundred iterations: short
-        trainings have none.
+        trainings have none. A survey as large as so many `surveys` sees each Gaussian as many times less often, and
+        has the schedule of a training of its share, in so many times as many iterations.
         """
-        stop, reset_every = iterations // 2, max(iterations // 10, 1_500)
+        share = int(iterations / surveys)
+        stop, reset_every = share // 2, max(share // 10, 1_500)
         return cls(
-            start=min(max(iterations // 20, 50), 500),
-            stop=stop,
-            every=min(max(iterations // 40, 50), 100),
-            reset_every=reset_every if reset_every < stop else 0,
+            start=int(surveys * min(max(share // 20, 50), 500)),
+            stop=int(surveys * stop),
+            every=int(surveys * min(max(share // 40, 50), 100)),
+            reset_every=int(surveys * reset_every) if reset_every < stop else 0,
             prune_scale_from=iterations // 10,
             max_gaussians=max_gaussians,
         )

@@ -31,17 +31,18 @@ from pipelines.splat.densify_mcmc import McmcSettings, McmcStrategy
 from pipelines.splat.exposure import Exposures, FrozenExposures, squared_radius
 from pipelines.splat.gaussians import FinitenessMonitor, Gaussians
 from pipelines.splat.initialise import InitialisationOptions, scene_extent
-from pipelines.splat.optimizer import GaussianAdam
+from pipelines.splat.optimizer import GaussianAdam, LearningRates
 from pipelines.splat.outlier_pixels import OutlierPixels, OutlierSettings
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Render, ScreenStats
 from pipelines.splat.rasterizer.backends import device_of
 from pipelines.splat.surface import ObservedPoints
 from pipelines.survey.photographs import ImageCache, Pinholes
+from pipelines.survey.scene import Scene
 from pipelines.train.geographic.problem import GeographicAdam, GeoProblem
 from pipelines.train.initial_gaussians import TrainingScene, depth_loss_points, initial_gaussians
 from pipelines.train.lidar_surface import FusedSurface
 from pipelines.train.losses import Loss, RenderedView, training_losses, weighted_sum
-from pipelines.train.options import TrainOptions
+from pipelines.train.options import PRESET_PHOTOGRAPHS, TrainOptions
 from pipelines.train.region import TrainingRegion
 from pipelines.train.schedule import BACKGROUND, JointOptions, TrainingSchedule
 from pipelines.train.target_images import ImageLook, TargetImage, TargetImages
@@ -350,8 +351,10 @@ def make_trainer(
     known = depth_loss_points(training, device) if options.geometry_regularisation else None
     measured = surface.losses(device) if isinstance(surface, FusedSurface) else ()
     outliers = OutlierSettings(views=int(_OUTLIERS_FROM * effort.iterations))
+    # A Gaussian is seen as often as in so many iterations of a small survey.
+    share = int(effort.iterations / _surveys(scene))
     return JointTrainer(
-        GaussianAdam(gaussians, extent_m, effort.iterations),
+        GaussianAdam(gaussians, extent_m, effort.iterations, LearningRates.for_iterations(share)),
         _strategy(options, extent_m, len(gaussians), training),
         problem.to(device),
         TrainingViews(scene.train, images, known, scene.sparse.lenses, measured),
@@ -393,13 +396,18 @@ def make_finisher(
     )
 
 
+def _surveys(scene: Scene) -> float:
+    """Return how many surveys of the presets' number of photographs a scene is as large as, at least one."""
+    return max(len(scene.train) / PRESET_PHOTOGRAPHS, 1.0)
+
+
 def _strategy(options: TrainOptions, extent_m: float, count: int, training: TrainingScene) -> Strategy:
     iterations, most = options.effort.iterations, options.effort.max_gaussians
     strategy: McmcStrategy | DefaultStrategy
     if options.strategy == "mcmc":
         strategy = McmcStrategy(McmcSettings.for_iterations(iterations, count, most), extent_m, options.seed)
     else:
-        settings = DefaultSettings.for_iterations(iterations, most)
+        settings = DefaultSettings.for_iterations(iterations, most, _surveys(training.scene))
         fast = FastSettings(prune_stop=iterations * 5 // 6)
         strategy = (
             FastStrategy(settings, fast, extent_m, count, options.seed)

@@ -183,6 +183,16 @@ def test_schedule_of_30000_iterations_is_that_of_the_paper() -> None:
     assert DefaultSettings.for_iterations(30_000, 1_000_000) == DefaultSettings()
 
 
+def test_large_survey_has_the_schedule_of_a_small_one_in_as_many_times_the_iterations() -> None:
+    # A Gaussian is seen by a tenth of the share of the photographs: as often between two edits, and never reset.
+    one, ten = (
+        DefaultSettings.for_iterations(1500, 1000),
+        DefaultSettings.for_iterations(15_000, 1000, surveys=10.0),
+    )
+    assert (ten.start, ten.stop, ten.every) == (10 * one.start, 10 * one.stop, 10 * one.every)
+    assert one.reset_every == ten.reset_every == 0
+
+
 def test_render_without_backward_is_refused() -> None:
     _, strategy = setup(gaussians([SMALL_M]))
     with pytest.raises(ValueError, match="backward"):
