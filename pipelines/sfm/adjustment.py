@@ -46,8 +46,6 @@ _LEAST_SCALE_PX = 1e-3  # for observations without noise, which have no tails ei
 _LEAST_GAIN = 0.2
 _LEAST_GAIN_OF_FEW = 1e-6
 _COARSE = 10.0  # factor on the least gain while the scale of the kernel still changes
-
-
 # Observations from which an adjustment begins with few tracks; tracks that then tie each photograph, and that do in
 # the end, of a model that a mapper has left with few.
 _MANY_OBSERVATIONS = 400_000
@@ -111,10 +109,9 @@ def adjust_finally(
         with progress.task("last adjustment", 1 + _ROBUST_ROUNDS) as task:
             _adjust_points(colmap, model, adjustment)
             task.advance()
-            # The cameras are settled: the scale changes no more, and what more steps would change is weaker than
-            # the positions that the model is placed by.
+            # What more steps would change is weaker than the positions that the model is placed by.
             adjustment.ceres.solver_options.max_num_iterations = _SETTLED_STEPS
-            _adjust_robustly(colmap, model, adjustment, task, _scale_px(model))
+            _adjust_robustly(colmap, model, adjustment, task, settled=True)
     model.update_point_3d_errors()
 
 
@@ -202,12 +199,15 @@ def _free_principal_point(colmap: Any, model: Any, adjustment: Any) -> bool:
     return False
 
 
-def _adjust_robustly(colmap: Any, model: Any, adjustment: Any, task: ProgressTask, used_px: float = np.inf) -> None:
-    """Adjust until the scale of the kernel is that of the adjustment before, which used `used_px`."""
+def _adjust_robustly(
+    colmap: Any, model: Any, adjustment: Any, task: ProgressTask, *, settled: bool = False
+) -> None:
+    """Adjust until the scale of the kernel is that of the adjustment before; once, if the cameras are settled."""
     adjustment.ceres.loss_function_type = colmap.LossFunctionType.CAUCHY
+    used_px = np.inf
     for left in reversed(range(_ROBUST_ROUNDS)):
-        scale_px = _scale_px(model)
-        is_last = left == 0 or abs(scale_px / used_px - 1) < _SETTLED
+        scale_px = max(rayleigh_sigma(_residual_px(model)), _LEAST_SCALE_PX)
+        is_last = settled or left == 0 or abs(scale_px / used_px - 1) < _SETTLED
         adjustment.ceres.solver_options.function_tolerance = (1.0 if is_last else _COARSE) * _least_gain(model)
         adjustment.ceres.loss_function_scale = CAUCHY_95 * scale_px
         _adjust(colmap, model, adjustment)
@@ -215,10 +215,6 @@ def _adjust_robustly(colmap: Any, model: Any, adjustment: Any, task: ProgressTas
         if is_last:
             return
         used_px = scale_px
-
-
-def _scale_px(model: Any) -> float:
-    return max(rayleigh_sigma(_residual_px(model)), _LEAST_SCALE_PX)
 
 
 def _residual_px(model: Any) -> FloatArray:

@@ -18,7 +18,7 @@ from pipelines.splat.rasterizer.backends import chosen_backend
 from pipelines.surface.depth_maps import FINE
 from pipelines.survey.block_plan import BlockPlan, PlannedBlock
 from pipelines.survey.options import NOT_IN_BLOCKS
-from pipelines.train.options import PRESET_PHOTOGRAPHS, PRESETS, TrainOptions
+from pipelines.train.options import PRESETS, TrainOptions, surveys_of
 from pipelines.train.schedule import COARSE, pyramid
 from pipelines.train.target_images import Crops
 
@@ -41,7 +41,7 @@ def with_effort(options: TrainOptions, photographs: int, largest: Pinhole, free_
     3. Larger ones have more Gaussians, in proportion to their pixels, as far as all photographs together have 40
        pixels for each, and as far as they fit into `free_bytes` of memory; None: unknown.
     """
-    preset, more = PRESETS[options.preset], max(photographs / PRESET_PHOTOGRAPHS, 1.0)
+    preset, more = PRESETS[options.preset], surveys_of(photographs)
     if options.iterations is None and more > 1:
         options = options.model_copy(update={"iterations": round(more * preset.iterations)})
     enlarged = more**0.5 * max(max(largest.width, largest.height) / preset.max_image_size, 1.0)

@@ -33,6 +33,13 @@ PRESETS = {
 }
 # Iterations and Gaussians grow with the photographs beyond this number: a place is seen as often, on a larger area.
 PRESET_PHOTOGRAPHS = 100
+
+
+def surveys_of(photographs: int) -> float:
+    """Return how many surveys of the presets' number of photographs so many photographs are, at least one."""
+    return max(photographs / PRESET_PHOTOGRAPHS, 1.0)
+
+
 # Of `georef run` with 48 photographs of a megapixel, kernels compiled, on 2 idle cores of an AMD EPYC
 # (docs/benchmarks.md, Presets).
 RUN_MINUTES = {"smoke": 1, "fast": 2, "standard": 4, "high": 10}

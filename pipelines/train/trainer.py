@@ -37,12 +37,11 @@ from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Render, S
 from pipelines.splat.rasterizer.backends import device_of
 from pipelines.splat.surface import ObservedPoints
 from pipelines.survey.photographs import ImageCache, Pinholes
-from pipelines.survey.scene import Scene
 from pipelines.train.geographic.problem import GeographicAdam, GeoProblem
 from pipelines.train.initial_gaussians import TrainingScene, depth_loss_points, initial_gaussians
 from pipelines.train.lidar_surface import FusedSurface
 from pipelines.train.losses import Loss, RenderedView, training_losses, weighted_sum
-from pipelines.train.options import PRESET_PHOTOGRAPHS, TrainOptions
+from pipelines.train.options import TrainOptions, surveys_of
 from pipelines.train.region import TrainingRegion
 from pipelines.train.schedule import BACKGROUND, JointOptions, TrainingSchedule
 from pipelines.train.target_images import ImageLook, TargetImage, TargetImages
@@ -216,7 +215,7 @@ class JointTrainer:
         depth = self.options.surface is not None or self.problem.sees_by_depth(index)
         normal = self.schedule.weight_of_normals(self.iteration) > 0
         settings, optimizer = self._settings(target, depth=depth, normal=normal), self.optimizer
-        rows = self.rasterizer.candidates(optimizer.gaussians.detached(), pose.detach(), target.whole, settings)
+        rows = self.rasterizer.candidates(optimizer.gaussians, pose, target.whole, settings)
         shown = optimizer.show(rows)
         render = self._render(shown, pose, target, settings)
         colour, counting = self._exposed(index, render.colour, target), target.mask
@@ -352,7 +351,7 @@ def make_trainer(
     measured = surface.losses(device) if isinstance(surface, FusedSurface) else ()
     outliers = OutlierSettings(views=int(_OUTLIERS_FROM * effort.iterations))
     # A Gaussian is seen as often as in so many iterations of a small survey.
-    share = int(effort.iterations / _surveys(scene))
+    share = int(effort.iterations / surveys_of(len(scene.train)))
     return JointTrainer(
         GaussianAdam(gaussians, extent_m, effort.iterations, LearningRates.for_iterations(share)),
         _strategy(options, extent_m, len(gaussians), training),
@@ -396,18 +395,13 @@ def make_finisher(
     )
 
 
-def _surveys(scene: Scene) -> float:
-    """Return how many surveys of the presets' number of photographs a scene is as large as, at least one."""
-    return max(len(scene.train) / PRESET_PHOTOGRAPHS, 1.0)
-
-
 def _strategy(options: TrainOptions, extent_m: float, count: int, training: TrainingScene) -> Strategy:
     iterations, most = options.effort.iterations, options.effort.max_gaussians
     strategy: McmcStrategy | DefaultStrategy
     if options.strategy == "mcmc":
         strategy = McmcStrategy(McmcSettings.for_iterations(iterations, count, most), extent_m, options.seed)
     else:
-        settings = DefaultSettings.for_iterations(iterations, most, _surveys(training.scene))
+        settings = DefaultSettings.for_iterations(iterations, most, surveys_of(len(training.scene.train)))
         fast = FastSettings(prune_stop=iterations * 5 // 6)
         strategy = (
             FastStrategy(settings, fast, extent_m, count, options.seed)
