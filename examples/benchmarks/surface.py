@@ -7,7 +7,8 @@
 The options are those of `georef simulate`: the same scene is built again, and plumb lines through the middles of
 cells are intersected with it. Cells within 0.5 m of a step of the true surface are listed apart: there, a fraction
 of a cell decides between roof and ground. `the rest` is the RMSE of the cells that are off by 1 m at most, and
-`error/σ` the root mean square of their error over the predicted σ; of interpolated cells, that of all.
+`error/σ` the root mean square of their error over the predicted σ, and `> 2 σ` the share of them beyond two σ; of
+interpolated cells, that of all.
 
 Of `cloud.laz` and `mesh.ply`, where there are any, points are compared with points on the true surface, both drawn
 evenly: `off` is the mean distance of the file's points from the true surface, and `precision` the share of those
@@ -227,7 +228,8 @@ def main() -> None:
     around = [truth.at(xy + radius * np.array([np.cos(a), np.sin(a)]))[0] for radius in _AROUND_M for a in angle]
     smooth = np.ptp(np.stack([true, *around]), axis=0) < _STEP_M
     error = measured - true
-    heads = "".join(f"{head:>9s}" for head in ("cells", "bias", "RMSE", "95 %", "> 1 m", "the rest", "error/σ"))
+    names = ("cells", "bias", "RMSE", "95 %", "> 1 m", "the rest", "error/σ", "> 2 σ")
+    heads = "".join(f"{name:>9s}" for name in names)
     print(f"cells of {gsd:.3f} m; metres\n{'':20s}{heads}")
     classes = {
         f"{name}{where}": chosen & seen & np.isin(material, materials)
@@ -244,7 +246,7 @@ def main() -> None:
         print(
             f"{name:20s}{k.sum():9d}{np.median(e):+9.3f}{np.sqrt(np.mean(e**2)):9.3f}"
             f"{np.quantile(np.abs(e), 0.95):9.3f}{np.mean(~near):9.2%}{np.sqrt(np.mean(e[near] ** 2)):9.3f}"
-            f"{np.sqrt(np.mean(z**2)):9.2f}"
+            f"{np.sqrt(np.mean(z**2)):9.2f}{np.mean(np.abs(z) > 2):9.2%}"
         )
 
 

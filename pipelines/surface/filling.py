@@ -22,6 +22,7 @@ _FAR = 24.0  # cells from the nearest measured one
 _SOURCES = 0.25  # of the range of the heights around, by which one whose colour is taken may lie above the filled
 # Cells around one whose scatter counts in its σ: on the edge of a roof, a cell decides between storeys.
 _AROUND = 15
+_SQUARE = 0.25  # share of the mean square difference of the heights around from the low one, in its variance
 _REFLECTED = cv2.BORDER_REFLECT
 
 
@@ -53,9 +54,10 @@ def fill_cells(
     """Return heights (H, W), NaN where none was measured, filled where wanted from at most `reach` cells away.
 
     1. A cell looks in sixteen directions for the first measured height; the low quantile of these is its own.
-    2. Its variance is the mean square of their differences from it, plus the variance of all heights nearby, those
-       that a model knows (H, W) included, plus, for the share of directions that found nothing, what heights differ
-       by at that distance. Without σ, that of the result is 0.
+    2. Its variance is a quarter of the mean square of their differences from it, since what hides a place mostly
+       stands above it, plus the variance of all heights nearby, those that a model knows (H, W) included, plus, for
+       the share of directions that found nothing, what heights differ by at that distance. On three simulated
+       flights 3 to 5 % of the errors exceed two σ. Without σ, that of the result is 0.
     """
     height = np.ascontiguousarray(height, dtype=np.float64)
     empty = wanted & ~np.isfinite(height)
@@ -75,7 +77,8 @@ def fill_cells(
     distance[rows, columns] = near
     if with_sigma:
         relief = filled if modelled is None else np.where(empty & np.isfinite(modelled), modelled, filled)
-        variance = square + _scatter(relief)[rows, columns] + missing * np.interp(near, *_variogram(height))
+        unknown = missing * np.interp(near, *_variogram(height))
+        variance = _SQUARE * square + _scatter(relief)[rows, columns] + unknown
         sigma[rows, columns] = np.sqrt(variance)
     own[rows, columns] = np.where(found, source, own[rows, columns])
     return FilledCells(filled, sigma, distance, own)
