@@ -116,7 +116,7 @@ def unchanged_ground(samples: Samples, cell_m: float, prior_h_m: float, *, with_
     What does not fit shift and noise has changed. `prior_h_m` keeps a horizontal shift small that no slope shows.
 
     Raises:
-        DegenerateGeometryError: too little ground is left.
+        DegenerateGeometryError: too little ground is left, or both surfaces are one.
     """
     cells = samples.cells
     ground = (np.linalg.norm(cells.slope, axis=1) < STEEPEST) & cells.is_certain
@@ -130,7 +130,10 @@ def unchanged_ground(samples: Samples, cell_m: float, prior_h_m: float, *, with_
     factor, normal = 1.0, np.diag(prior + 1e-12)
     for _ in range(_PASSES):
         residual = (difference - design @ fit) / sigma
-        scale = mad_sigma(residual[kept]) if kept.sum() >= _LEAST_STABLE else 0.0
+        scale = mad_sigma(residual[kept]) if kept.sum() >= _LEAST_STABLE else np.nan
+        if scale == 0:
+            message = "The surfaces of both epochs are equal, cell by cell: they are of one flight."
+            raise DegenerateGeometryError("same-surface", message)
         kept = ground & (np.abs(residual) < _CLIPPED * scale)
         if kept.sum() < _LEAST_STABLE:
             raise DegenerateGeometryError(

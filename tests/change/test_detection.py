@@ -15,6 +15,7 @@ from pipelines.change.detection import (
     unchanged_ground,
     volumes,
 )
+from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import FloatArray
 
 SIDE, CELL_M, SIGMA_M, SHIFT_M = 320, 0.25, 0.04, 0.03
@@ -61,6 +62,11 @@ def test_noise_of_no_change_is_found_and_gives_few_false_alarms() -> None:
     centred = replace(cells, difference_m=cells.difference_m - noise.shift_m[2])
     sign = significant_change(centred, noise.factor, 4)
     assert (sign != 0).mean() < 0.05
+
+
+def test_a_copy_is_told_from_a_second_flight() -> None:
+    with pytest.raises(DegenerateGeometryError, match="of one flight"):
+        analysed(np.full((SIDE, SIDE), SHIFT_M))
 
 
 def test_volumes_err_as_their_sigma_says_over_twenty_pairs() -> None:
