@@ -228,8 +228,8 @@ def main() -> None:
     around = [truth.at(xy + radius * np.array([np.cos(a), np.sin(a)]))[0] for radius in _AROUND_M for a in angle]
     smooth = np.ptp(np.stack([true, *around]), axis=0) < _STEP_M
     error = measured - true
-    names = ("cells", "bias", "RMSE", "95 %", "> 1 m", "the rest", "error/σ", "> 2 σ")
-    heads = "".join(f"{name:>9s}" for name in names)
+    columns = ("cells", "bias", "RMSE", "95 %", "> 1 m", "the rest", "error/σ", "> 2 σ")
+    heads = "".join(f"{name:>9s}" for name in columns)
     print(f"cells of {gsd:.3f} m; metres\n{'':20s}{heads}")
     classes = {
         f"{name}{where}": chosen & seen & np.isin(material, materials)

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation
+from scipy.ndimage import binary_erosion
 
 from pipelines.core.types import BoolArray, ByteArray, FloatArray
 from pipelines.deliver.raster_window import RasterSource, between_nodes, georeference_sigma, places_in_geo
@@ -17,7 +17,7 @@ MEASURED, INTERPOLATED = 255, 128  # in `measured.tif`; 0: outside the area, or 
 # A hole is filled cell by cell up to `_NARROW` cells from its rim, and beyond `REACH` by a coarse raster of the
 # whole; between, one goes over into the other.
 _NARROW, REACH = 16, 64
-_RIM = 2  # cells around what stands on the ground
+_RIM_M = 1.0  # around what stands on the ground
 _WRONG = 0.1  # share of the heights of the model alone that are wrong, by three simulated flights
 
 
@@ -132,8 +132,9 @@ def _ground(source: RasterSource, terrain: GroundModel, seen: SeenCells) -> tupl
     above = seen.height - height
     with np.errstate(invalid="ignore"):
         is_ground = np.abs(above) * source.target.crs.height_unit_m <= terrain.limit_m
-    # On the rim of what stands there, cells have mixed heights.
-    is_ground &= ~binary_dilation(np.isfinite(above) & ~is_ground, iterations=_RIM)
+    # On the rim of what stands there, or hides the ground, cells have mixed heights.
+    rim = max(round(_RIM_M / (seen.frame.step_x * source.target.horizontal_unit_m)), 1)
+    is_ground = binary_erosion(is_ground, iterations=rim, border_value=1)
     around = fill_cells(np.where(is_ground, above, np.nan), seen.inside, REACH, with_sigma=False)
     share = np.clip(1.0 - around.distance / REACH, 0.0, 1.0)
     height = height + np.where(np.isfinite(around.height), share * around.height, 0.0)
