@@ -68,9 +68,9 @@ class GroundModel:
     def bridged_variance(self, gap_m: FloatArray) -> FloatArray:
         """Return the variance of the ground at distances (…) from the nearest ground point.
 
-        The foot of what stands there hides in the points within `limit_m`, evenly.
+        The foot of what stands there hides in the points within half of `limit_m`, evenly.
         """
-        return np.interp(gap_m, *self.bend) + np.where(gap_m > 0, self.limit_m**2 / 3, 0.0)
+        return np.interp(gap_m, *self.bend) + np.where(gap_m > 0, self.limit_m**2 / 12, 0.0)
 
 
 def terrain_of(points: FloatArray, normal: FloatArray, spacing_m: float) -> GroundModel:
