@@ -80,7 +80,7 @@ def trainer(
     cameras = CameraCorrections.frozen(
         poses(len(images)), State(Similarity(), np.zeros((len(images), 6)), np.zeros(0))
     )
-    exposures = Exposures(len(images), torch.from_numpy(train), options.iterations, torch.device("cpu"))
+    exposures = Exposures(torch.eye(3, 4).repeat(len(images), 1, 1), torch.from_numpy(train), options.iterations)
     return JointTrainer(
         GaussianAdam(start, EXTENT_M, options.iterations),
         strategy or DefaultStrategy(SETTINGS, EXTENT_M, len(start)),

@@ -155,7 +155,7 @@ def measured(workspace: Workspace, age_s: dict[Path, float]) -> list[Row]:
         renderer = ModelRenderer(trained, images, backend)
         views = compare_test_views(renderer, None, lambda _name, _picture: None, SILENT, saved=0)
         errors = check_points_on_surface(renderer, SILENT)
-        train_psnr = ViewQuality(trainer, images).psnr(scene.train, exposed=True)
+        train_psnr = ViewQuality(trainer, images).psnr(scene.train)
         rows.append(
             Row(
                 round(seconds, 1), trainer.iteration, model.gaussians, views.psnr, train_psnr,

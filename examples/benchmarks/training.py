@@ -134,7 +134,7 @@ def curve(arguments: argparse.Namespace) -> None:
                 views = ViewQuality(trainer, images, arguments.look)
                 print(
                     f"{strategy:8s} {processor_s:13.1f} {seconds:8.1f} {trainer.iteration:10d}"
-                    f" {len(trainer.optimizer.gaussians):10d} {views.psnr(scene.train, exposed=True):14.2f}"
+                    f" {len(trainer.optimizer.gaussians):10d} {views.psnr(scene.train):14.2f}"
                     f" {views.psnr(scene.test):13.2f}",
                     flush=True,
                 )
@@ -154,15 +154,15 @@ class ViewQuality:
     look: Path | None = None
 
     @torch.no_grad()
-    def psnr(self, views: IntArray, *, exposed: bool = False) -> float:
-        """Mean over views (V,) of the renders, with the exposure of their photographs or as they are."""
-        return statistics.fmean(self._psnr(index, exposed=exposed) for index in map(int, views))
+    def psnr(self, views: IntArray) -> float:
+        """Mean over views (V,) of the renders, with the exposure of their photographs."""
+        return statistics.fmean(map(self._psnr, map(int, views)))
 
-    def _psnr(self, index: int, *, exposed: bool) -> float:
+    def _psnr(self, index: int) -> float:
         trainer, settings = self.trainer, RasterSettings(sh_degree=self.trainer.options.sh_degree)
         pose, pinhole = trainer.problem.cameras.cam_from_model(index), trainer.pinholes.of(index)
         colour = trainer.rasterizer.render(trainer.optimizer.gaussians, pose, pinhole, settings).colour
-        if exposed and trainer.exposures is not None:
+        if trainer.exposures is not None:
             colour = trainer.exposures.apply(index, colour)
         photo = torch.from_numpy(np.array(self.images.image(index))).float() / 255.0
         colour = colour.cpu().clamp(0, 1)

@@ -76,9 +76,9 @@ def compare_test_views(
 ) -> PhotometricFigures:
     """Return PSNR, SSIM and LPIPS of the test views.
 
-    `psnr` compares the render as the lens shows it, with its vignetting. `psnr_compensated` first gives the render
-    the exposure of the photograph, by an affine change of colour fitted to that photograph. The remaining
-    difference is not one of exposure.
+    `psnr` compares the render as the lens shows it, with its vignetting, at the exposure of the photograph's tie
+    points, as its pose is that of its tie points: neither is fitted to the render. `psnr_compensated` has an affine
+    change of colour that is. The remaining difference is not one of exposure.
     `psnr_covered` leaves out ground that fewer than two training views show: at the rim of a flight, a render is a
     guess.
 
@@ -123,9 +123,11 @@ def _through_lens(renderer: ModelRenderer, index: int) -> Tensor:
     colour, trained = renderer.render(index).colour.cpu(), renderer.trained
     camera_id, pinhole = int(trained.sparse.image_camera_id[index]), renderer.pinholes.of(index)
     lens = next((lens for lens in trained.model.vignetting if lens.camera_id == camera_id), None)
-    if lens is None:
-        return colour
-    return with_vignetting(colour, squared_radius(pinhole, pinhole, colour.device), torch.tensor(lens.coefficients))
+    if lens is not None:
+        radius2 = squared_radius(pinhole, pinhole, colour.device)
+        colour = with_vignetting(colour, radius2, torch.tensor(lens.coefficients))
+    exposure = trained.model.cameras[index].exposure
+    return colour if exposure is None else with_affine(colour, torch.tensor(exposure))
 
 
 def _mean(values: Iterable[float | None]) -> float | None:

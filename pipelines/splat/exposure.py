@@ -8,19 +8,11 @@ before and after it, which decides where its own colours do not. Without exposur
 into the colours of Gaussians that few views see. The images cannot tell a change of all exposures from a change of
 all Gaussians: the mean over the training photographs is therefore fixed to the identity.
 
-Without Gaussians, exposures follow from the colours of points that several photographs show: photograph i shows the
-colour c of a point as A_i c + b_i. Robust least squares adjusts exposures and colours together, as a bundle
-adjustment does with poses and points:
-
-1. Linearised normal equations; the points are eliminated (Schur complement).
-2. The reduced matrix couples photographs with common points only, in blocks of 12 × 12. Conjugate gradients solve
-   it.
-3. Cauchy's weights follow from the residuals: a point may shine, or move, in one of its photographs.
-
-A weak prior keeps each exposure near the identity where a photograph has too few colours to determine it.
+Without Gaussians, the gains of the channels follow from the colours of points that several photographs show. Such
+points are of few colours: grey roads and green lawns do not tell what a camera mixes between its channels.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -28,11 +20,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.sparse import bsr_matrix
-from scipy.sparse.linalg import LinearOperator, cg
+from scipy.sparse import coo_matrix, diags
+from scipy.sparse.linalg import spsolve
 from torch import Tensor
 
-from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import Float32Array, FloatArray, IntArray
 from pipelines.geometry.cameras import Pinhole
 from pipelines.robust.statistics import cauchy_weight, median_chi2
@@ -77,18 +68,17 @@ class _RowsAdam:
 class Exposures:
     """Affine colour corrections (V, 3, 4) of V images, and the vignetting of their lenses, with their optimiser.
 
-    The corrections, gain matrix and offset, of the images `train` (T,) change; the others are identities. `lens`
+    The corrections, gain matrix and offset, of the images `train` (T,) change, from `start` (V, 3, 4) on. `lens`
     (V,) tells the lens of each image by a number; None: all have one. Vignetting is that of `with_vignetting`. The
     order of the training images of a lens is that of their time.
     """
 
-    def __init__(
-        self, count: int, train: Tensor, iterations: int, device: torch.device, lens: Sequence[int] | None = None
-    ) -> None:
+    def __init__(self, start: Tensor, train: Tensor, iterations: int, lens: Sequence[int] | None = None) -> None:
+        count, device = len(start), start.device
         numbers = [0] * count if lens is None else list(lens)
         self.lenses = sorted(set(numbers))
         self._lens = [self.lenses.index(number) for number in numbers]
-        self._affine = _RowsAdam(torch.eye(3, 4, device=device).repeat(count, 1, 1), iterations)
+        self._affine = _RowsAdam(start.clone(), iterations)
         self._vignetting = _RowsAdam(torch.zeros(len(self.lenses), VIGNETTING_TERMS, device=device), iterations)
         self._train = train.to(device)
         self._beside = _neighbours(train.tolist(), self._lens)
@@ -216,159 +206,70 @@ def fitted_affine(rendered: Tensor, photograph: Tensor, mask: Tensor | None = No
     return solution.T.to(rendered)
 
 
-_CHUNK = 2**17  # observations whose points are eliminated together
-_MOST_STEPS = 15
-_CONVERGED = 5e-4  # change of an exposure that ends the adjustment: an eighth of a grey level
-_STEP_TOLERANCE = 1e-3  # relative, of conjugate gradients: the next step corrects the rest
+_ROUNDS = 10  # of robust weights
+_CONVERGED = 5e-4  # change of a gain that ends the adjustment: an eighth of a grey level
 _LEAST_SIGMA = 1e-3  # of a colour: rounding to 256 levels
-# σ of the prior: gain of a channel, leak from one channel to another, offset. A colour runs from 0 to 1.
-_GAIN, _LEAK, _OFFSET = 0.5, 0.1, 0.2
-_SIGMA = np.where(np.eye(3, 4, dtype=bool), _GAIN, _LEAK)
-_SIGMA[:, 3] = _OFFSET
+_GAIN = 0.5  # σ of the prior of a gain's logarithm
 
 
 @dataclass(frozen=True)
 class PointColours:
-    """RGB (M, 3) from 0 to 1 of M observations of points in photographs, sorted by the index of the point."""
+    """RGB (M, 3) above 0 up to 1 of M observations of points (M,) in photographs (M,)."""
 
     point: IntArray
     image: IntArray
     colour: Float32Array
 
 
-def adjusted_exposures(observed: PointColours, count: int) -> FloatArray:
-    """Return the exposures (count, 3, 4): gain, offset (A | b); a DegenerateGeometryError: no point is seen twice.
+def adjusted_exposures(observed: PointColours, count: int, reference: IntArray) -> FloatArray:
+    """Return the exposures (count, 3, 4) of photographs: a gain for each channel, from the colours of points.
 
-    Points with one observation do not count. The mean over the photographs with observations is the identity. A
-    photograph without observations has it too. Memory holds the coupled pairs of photographs, and the derivatives
-    of one chunk of observations.
+    Photograph i shows the colour c of a point as g_i c. Logarithms make that linear; weighted least squares adjusts
+    gains and colours together, with Cauchy's weights: a point may shine, or move, in one of its photographs. The
+    mean over the photographs of reference with observations is the identity, as is a photograph without any.
     """
-    rays = np.bincount(observed.point)
-    several = rays[observed.point] >= 2
-    if not several.any():
-        message = "No point is seen in two photographs: exposures cannot be compared."
-        raise DegenerateGeometryError("no-common-points", message)
+    gain = np.ones((count, 3))
+    several = np.bincount(observed.point)[observed.point] >= 2
+    if not several[np.isin(observed.image, reference)].any():
+        return _diagonal(gain)
     point = np.unique(observed.point[several], return_inverse=True)[1]
-    observed = PointColours(point, observed.image[several], observed.colour[several])
-    seen = np.bincount(observed.image, minlength=count) > 0
-    exposure = np.tile(np.eye(3, 4), (count, 1, 1))
-    for _ in range(_MOST_STEPS):
-        step = _step(observed, exposure)
-        exposure = exposure + step
-        if np.abs(step).max() < _CONVERGED:
+    image, colour = observed.image[several], observed.colour[several].astype(np.float64)
+    points, logarithm = int(point.max()) + 1, np.log(colour)
+    redundancy = max(1 - (points + count) / len(point), 0.1)
+    weight, log_gain = colour**2, np.zeros((count, 3))  # colours, not their logarithms, have the same noise
+    for _ in range(_ROUNDS):
+        before = log_gain
+        log_gain = np.column_stack(
+            [_log_gains(point, image, logarithm[:, k], weight[:, k], count) for k in range(3)]
+        )
+        corrected = logarithm - log_gain[image]
+        total = np.column_stack([np.bincount(point, weight[:, k]) for k in range(3)])
+        mean = np.column_stack([np.bincount(point, weight[:, k] * corrected[:, k]) for k in range(3)]) / total
+        squared = ((corrected - mean[point]) ** 2 * colour**2).sum(axis=1)
+        sigma2 = max(float(np.median(squared)) / median_chi2(3) / redundancy, _LEAST_SIGMA**2)
+        weight = colour**2 * cauchy_weight(squared / sigma2, 3)[:, None]
+        if np.abs(log_gain - before).max() < _CONVERGED:
             break
-    # Other colours of the points make the mean of the exposures the identity.
-    mean = exposure[seen].mean(axis=0)
-    change = np.linalg.solve(mean[:, :3], np.column_stack([np.eye(3), -mean[:, 3]]))
-    gain, offset = exposure[seen][:, :, :3], exposure[seen][:, :, 3:]
-    exposure[seen] = np.concatenate([gain @ change[:, :3], gain @ change[:, 3:] + offset], axis=2)
-    return exposure
+    seen = np.bincount(image, minlength=count) > 0
+    gain[seen] = np.exp(log_gain[seen])
+    gain[seen] /= gain[reference[seen[reference]]].mean(axis=0)
+    return _diagonal(gain)
 
 
-def _step(observed: PointColours, exposure: FloatArray) -> FloatArray:
-    """Return the Gauss–Newton step (n, 3, 4) of the exposures; the points' colours are eliminated."""
-    count, numbers = len(exposure), 3 * len(observed.point)
-    redundancy = numbers - 3 * int(observed.point[-1] + 1) - 12 * count
-    squared = np.concatenate([part.squared for part in _parts(observed, exposure, None)])
-    share = max(redundancy / numbers, 0.1)
-    sigma2 = max(float(np.median(squared)) / median_chi2(3) / share, _LEAST_SIGMA**2)
-    weight = cauchy_weight(squared / sigma2, 3) / sigma2
-    precise = _SIGMA.ravel() ** -2.0
-    own = np.tile(np.diag(precise), (count, 1, 1))
-    slope = ((exposure - np.eye(3, 4)).reshape(count, 12) * precise).ravel()
-    coupled: bsr_matrix | None = None
-    for part in _parts(observed, exposure, weight):
-        np.add.at(own, part.image, part.normal)
-        size = (12 * count, 3 * part.points)
-        order = np.lexsort((part.point, part.image))
-        pointer = np.concatenate([[0], np.cumsum(np.bincount(part.image, minlength=count))])
-        cross = bsr_matrix((part.cross[order], part.point[order], pointer), shape=size)
-        slope += (
-            np.bincount(
-                (12 * part.image[:, None] + np.arange(12)).ravel(), part.slope.ravel(), minlength=12 * count
-            )
-            - cross @ part.of_points.ravel()
-        )
-        taken = (cross @ cross.T).tobsr((12, 12))
-        coupled = taken if coupled is None else coupled + taken
-    diagonal = bsr_matrix((own, np.arange(count), np.arange(count + 1)), shape=(12 * count, 12 * count))
-    return -_solved((diagonal - coupled).tobsr((12, 12)), slope).reshape(count, 3, 4)
+def _log_gains(
+    point: IntArray, image: IntArray, logarithm: FloatArray, weight: FloatArray, count: int
+) -> FloatArray:
+    """Return the logarithms (count,) of one channel's gains; the points' colours are eliminated."""
+    shape = (int(point.max()) + 1, count)
+    seen = coo_matrix((weight, (point, image)), shape=shape).tocsr()
+    shown = coo_matrix((weight * logarithm, (point, image)), shape=shape).tocsr()
+    of_points = diags(1 / np.asarray(seen.sum(axis=1)).ravel())
+    own = np.asarray(seen.sum(axis=0)).ravel()
+    scale = weight.mean()
+    normal = diags(own + scale * _LEAST_SIGMA**2 / _GAIN**2) - seen.T @ of_points @ seen
+    right = np.asarray(shown.sum(axis=0)).ravel() - seen.T @ (of_points @ np.asarray(shown.sum(axis=1)).ravel())
+    return np.asarray(spsolve(normal.tocsc(), right))
 
 
-def _solved(matrix: bsr_matrix, right: FloatArray) -> FloatArray:
-    """Return the solution of a positive definite system by conjugate gradients, preconditioned by its blocks."""
-    count = matrix.shape[0] // 12
-    row = np.repeat(np.arange(count), np.diff(matrix.indptr))
-    on_diagonal = row == matrix.indices
-    blocks = np.empty((count, 12, 12))
-    blocks[row[on_diagonal]] = matrix.data[on_diagonal]
-    inverse = np.linalg.inv(blocks)
-    preconditioner = LinearOperator(
-        matrix.shape, matvec=lambda vector: (inverse @ vector.reshape(count, 12, 1)).ravel(), dtype=np.float64
-    )
-    return np.asarray(cg(matrix, right, rtol=_STEP_TOLERANCE, M=preconditioner)[0])
-
-
-@dataclass(frozen=True)
-class _Part:
-    """Normal equations of m observations of P points, which are whole tracks."""
-
-    points: int
-    point: IntArray  # (m,) from 0
-    image: IntArray  # (m,)
-    squared: FloatArray  # (m,) residuals, squared
-    normal: FloatArray  # (m, 12, 12) of an exposure
-    cross: FloatArray  # (m, 12, 3) of exposure and point, the latter whitened
-    slope: FloatArray  # (m, 12) by the exposure
-    of_points: FloatArray  # (P, 3) slope by the point, whitened
-
-
-def _parts(observed: PointColours, exposure: FloatArray, weight: FloatArray | None) -> Iterator[_Part]:
-    """Yield the normal equations by chunks of points, whose colours are the best under the exposures.
-
-    Without the observations' weights (M,), all weights are equal.
-    """
-    last = np.cumsum(np.bincount(observed.point))
-    first_point = first = 0
-    while first_point < len(last):
-        next_point = max(int(np.searchsorted(last, first + _CHUNK, side="right")), first_point + 1)
-        rows = slice(first, int(last[next_point - 1]))
-        w = np.ones(rows.stop - first) if weight is None else weight[rows]
-        yield _part(
-            observed.point[rows] - first_point,
-            observed.image[rows],
-            observed.colour[rows].astype(np.float64),
-            exposure[observed.image[rows]],
-            w,
-        )
-        first_point, first = next_point, rows.stop
-
-
-def _part(point: IntArray, image: IntArray, colour: FloatArray, exposure: FloatArray, weight: FloatArray) -> _Part:
-    gain, count = exposure[:, :, :3], int(point[-1]) + 1
-    weighted_gain = weight[:, None, None] * np.swapaxes(gain, 1, 2)
-    start = np.flatnonzero(np.diff(point, prepend=-1))
-    normal = np.add.reduceat(weighted_gain @ gain, start)
-    normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-    right = np.add.reduceat((weighted_gain @ (colour - exposure[:, :, 3])[:, :, None]), start)
-    of_point = np.linalg.solve(normal, right)[:, :, 0]
-    residual = (exposure @ np.append(of_point, np.ones((count, 1)), axis=1)[point][:, :, None])[:, :, 0] - colour
-    known = np.append(of_point, np.ones((count, 1)), axis=1)[point]  # (m, 4)
-    inverse_root = np.swapaxes(np.linalg.inv(np.linalg.cholesky(normal)), 1, 2)
-    own = np.zeros((len(point), 3, 4, 3, 4))
-    outer = weight[:, None, None] * known[:, :, None] * known[:, None, :]
-    for channel in range(3):
-        own[:, channel, :, channel] = outer
-    white_gain = (weight[:, None, None] * gain) @ inverse_root[point]  # (m, 3, 3)
-    cross = (white_gain[:, :, None, :] * known[:, None, :, None]).reshape(-1, 12, 3)
-    by_point = np.add.reduceat(weighted_gain @ residual[:, :, None], start)
-    return _Part(
-        points=count,
-        point=point,
-        image=image,
-        squared=(residual**2).sum(axis=1),
-        normal=own.reshape(-1, 12, 12),
-        cross=cross,
-        slope=(weight[:, None, None] * residual[:, :, None] * known[:, None, :]).reshape(-1, 12),
-        of_points=(np.swapaxes(inverse_root, 1, 2) @ by_point)[:, :, 0],
-    )
+def _diagonal(gain: FloatArray) -> FloatArray:
+    return gain[:, :, None] * np.eye(3, 4)

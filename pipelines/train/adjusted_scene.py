@@ -129,9 +129,9 @@ def figures_of(adjustment: Adjustment) -> dict[str, Any]:
 
 
 def with_exposures(adjustment: Adjustment, exposure: FloatArray) -> Adjustment:
-    """Return an adjustment with the exposures (n, 3, 4) of its training cameras."""
-    cameras = list(adjustment.cameras)
-    for place, (camera, affine) in enumerate(zip(cameras, exposure, strict=True)):
-        if camera.split == "train":
-            cameras[place] = camera.model_copy(update={"exposure": tuple(map(tuple, affine.tolist()))})
-    return adjustment.model_copy(update={"cameras": tuple(cameras)})
+    """Return an adjustment with the exposures (n, 3, 4) of its cameras."""
+    cameras = tuple(
+        camera.model_copy(update={"exposure": tuple(map(tuple, affine.tolist()))})
+        for camera, affine in zip(adjustment.cameras, exposure, strict=True)
+    )
+    return adjustment.model_copy(update={"cameras": cameras})

@@ -45,6 +45,7 @@ from pipelines.train.options import TrainOptions, surveys_of
 from pipelines.train.region import TrainingRegion
 from pipelines.train.schedule import BACKGROUND, JointOptions, TrainingSchedule
 from pipelines.train.target_images import ImageLook, TargetImage, TargetImages
+from pipelines.train.track_exposures import exposures_from_tracks
 
 _OUTLIERS_FROM = 0.5  # of the iterations: before, the model is too coarse to tell what has moved
 _FINISHING_RATE = 0.3  # of the rates at which a training starts
@@ -332,12 +333,12 @@ def make_trainer(
     problem: GeoProblem,
     backend: Rasterizer,
     options: TrainOptions,
-    exposures: FrozenExposures | None = None,
+    exposures: Exposures | FrozenExposures | None = None,
 ) -> JointTrainer:
     """Return the trainer with initial Gaussians; a DegenerateGeometryError: fewer than two different points.
 
-    The problem moves to the backend's device. Exposures stay frozen; None: those of the training photographs are
-    fitted, if the options say so.
+    The problem moves to the backend's device. Exposures are those given; None: those of the training photographs
+    are fitted, if the options say so, from those that their tracks have.
     """
     effort, device = options.effort, device_of(backend)
     scene, images, surface = training.scene, training.images, training.surface
@@ -346,7 +347,9 @@ def make_trainer(
     extent_m = scene_extent(scene.poses.cam_center_in_model)
     train = torch.from_numpy(scene.train)
     lens = scene.sparse.image_camera_id.tolist()
-    fitted = Exposures(len(images), train, effort.iterations, device, lens) if options.exposure else None
+    if exposures is None and options.exposure:
+        from_tracks = torch.from_numpy(exposures_from_tracks(scene, images)).float().to(device)
+        exposures = Exposures(from_tracks, train, effort.iterations, lens)
     known = depth_loss_points(training, device) if options.geometry_regularisation else None
     measured = surface.losses(device) if isinstance(surface, FusedSurface) else ()
     outliers = OutlierSettings(views=int(_OUTLIERS_FROM * effort.iterations))
@@ -359,7 +362,7 @@ def make_trainer(
         TrainingViews(scene.train, images, known, scene.sparse.lenses, measured),
         rasterizer=backend,
         options=JointOptions.of(options),
-        exposures=exposures or fitted,
+        exposures=exposures,
         outliers=OutlierPixels(device, outliers) if options.robust_photometric else None,
         region=training.region,
     )

@@ -75,6 +75,26 @@ def test_equal_images_are_reported_at_the_cap(altered: Workspace) -> None:
     assert (test["psnr"], test["psnr_compensated"], test["ssim"]) == (100.0, 100.0, 1.0)
 
 
+def test_a_test_view_is_compared_at_the_exposure_of_its_tie_points(altered: Workspace) -> None:
+    """Photographs at 0.7 of the light, as their exposures in the model say: the same figures but for 8 bits."""
+    run_stage(altered, EVALUATE, {"renders": 0})
+    before = report_of(altered)["photometric"]["test"]
+    model, gain = load_json(TrainedModel, altered.path(MODEL)), 0.7
+    for camera in model.cameras:
+        path = altered.root / "photos" / camera.name
+        dark = cv2.imencode(".png", np.rint(gain * cv2.imread(str(path))))[1]
+        path.write_bytes(dark.tobytes())
+    told, found = {"known": tuple(map(tuple, (gain * np.eye(3, 4)).tolist())), "unknown": None}, {}
+    for name, exposure in told.items():
+        cameras = tuple(camera.model_copy(update={"exposure": exposure}) for camera in model.cameras)
+        save_json(model.model_copy(update={"cameras": cameras}), altered.root / MODEL)
+        run_stage(altered, EVALUATE, {"renders": 0})
+        found[name] = report_of(altered)["photometric"]["test"]
+    # Errors of 0.7 of the light are 3.1 dB smaller.
+    assert found["known"]["psnr"] == pytest.approx(before["psnr"] - 20 * np.log10(gain), abs=1.0)
+    assert found["unknown"]["psnr"] < before["psnr"] - 5
+
+
 def test_without_test_views_there_are_no_figures(altered: Workspace) -> None:
     model = load_json(TrainedModel, altered.path(MODEL))
     cameras = tuple(camera.model_copy(update={"split": "train"}) for camera in model.cameras)

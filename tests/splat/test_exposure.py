@@ -11,6 +11,10 @@ CPU = torch.device("cpu")
 TRAIN = torch.tensor([0, 1, 3])
 
 
+def identities(count: int) -> torch.Tensor:
+    return torch.eye(3, 4).repeat(count, 1, 1)
+
+
 def picture(seed: int = 0) -> torch.Tensor:
     return torch.rand(12, 16, 3, generator=torch.Generator().manual_seed(seed))
 
@@ -18,7 +22,7 @@ def picture(seed: int = 0) -> torch.Tensor:
 def test_gains_that_differ_are_found_and_their_mean_is_frozen() -> None:
     # Photograph 0 is 10 % brighter and 1 is 10 % darker than the scene; 3 is as the scene is.
     gain = {0: 1.1, 1: 0.9, 3: 1.0}
-    exposures, colour = Exposures(4, TRAIN, 600, CPU), picture()
+    exposures, colour = Exposures(identities(4), TRAIN, 600), picture()
     for iteration in range(1, 601):
         index = int(TRAIN[iteration % 3])
         shown = exposures.apply(index, colour)
@@ -34,7 +38,7 @@ def test_gains_that_differ_are_found_and_their_mean_is_frozen() -> None:
 def test_a_photograph_without_light_has_the_gains_of_its_neighbours() -> None:
     """Photograph 1 is black: it tells its offset alone. Those beside it are brighter than the others."""
     gain, train = {0: 1.1, 1: 1.0, 2: 1.1, 3: 0.9, 4: 0.9}, torch.arange(5)
-    exposures, colour = Exposures(5, train, 1000, CPU), picture()
+    exposures, colour = Exposures(identities(5), train, 1000), picture()
     for iteration in range(1, 1001):
         index = iteration % 5
         shown = exposures.apply(index, 0 * colour if index == 1 else colour)
@@ -47,7 +51,7 @@ def test_a_photograph_without_light_has_the_gains_of_its_neighbours() -> None:
 
 
 def test_a_common_gain_is_left_to_the_gaussians() -> None:
-    exposures, colour = Exposures(4, TRAIN, 300, CPU), picture()
+    exposures, colour = Exposures(identities(4), TRAIN, 300), picture()
     for iteration in range(1, 301):
         shown = exposures.apply(int(TRAIN[iteration % 3]), colour)
         (shown - 1.2 * colour).square().mean().backward()
@@ -65,7 +69,7 @@ def test_vignetting_of_each_lens_is_found_beside_the_exposures() -> None:
     torch.testing.assert_close(squared_radius(part, whole, CPU), radius2[10:16, 20:28])
     true = {7: torch.tensor([-0.3, 0.1, -0.1]), 9: torch.tensor([-0.1, 0.0, 0.05])}
     lens, gain, colour = [7, 7, 7, 9], {0: 1.1, 1: 0.9, 3: 1.0}, torch.rand(24, 32, 3)
-    exposures = Exposures(4, TRAIN, 1500, CPU, lens)
+    exposures = Exposures(identities(4), TRAIN, 1500, lens)
     for iteration in range(1, 1501):
         index = int(TRAIN[iteration % 3])
         shown = exposures.apply(index, colour, radius2)
@@ -86,7 +90,7 @@ def test_a_state_continues_exactly() -> None:
             (shown - picture(iteration % 3 + 1)).abs().mean().backward()
             exposures.step(iteration)
 
-    whole, part, resumed = (Exposures(4, TRAIN, 40, CPU) for _ in range(3))
+    whole, part, resumed = (Exposures(identities(4), TRAIN, 40) for _ in range(3))
     run(whole, 1, 30)
     run(part, 1, 13)
     resumed.restore(part.state())

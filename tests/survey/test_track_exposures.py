@@ -11,7 +11,7 @@ from pipelines.geometry.cameras import Camera, undistort
 from pipelines.geometry.similarity import Similarity
 from pipelines.survey.photographs import ImageCache, Photograph
 from pipelines.survey.scene import Scene
-from pipelines.train.blocks.solution import exposures_from_tracks
+from pipelines.train.track_exposures import exposures_from_tracks
 from tests.scenes import STATED, TrueScene, make_scene, sparse_model
 
 CAMERA = Camera("SIMPLE_RADIAL", 240, 180, np.array([200.0, 121.0, 88.0, -0.04]))
@@ -58,8 +58,7 @@ def test_exposures_of_photographs_follow_from_their_tracks(tmp_path: Path) -> No
     sparse = sparse_model(scene, STATED, rng)
     setting = Scene(sparse, Similarity(), Similarity(), train, np.array([TEST]))
     found = exposures_from_tracks(setting, photographs(scene, exposure, tmp_path))
-    np.testing.assert_array_equal(found[TEST], np.eye(3, 4))
     place = np.append(ground_colour(rng.uniform(-50, 50, (200, 2))), np.ones((200, 1)), axis=1)
     error = place @ np.swapaxes(found - exposure, 1, 2)
     # Levels of grey are rounded to 1/255, the blur over 5 pixels is about the same in all photographs.
-    assert np.sqrt((error[train] ** 2).mean()) < 1 / 255
+    assert np.sqrt((error**2).mean()) < 1 / 255
