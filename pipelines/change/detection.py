@@ -288,7 +288,7 @@ def volumes(number: NDArray[Any], cells: Cells, count: int) -> list[Volume]:
     """Return the sums of regions 1 … `count`, by the number (H, W) of each cell; 0: no region.
 
     A wall lies in the neighbourhood of the cells on both of its sides: its error in a volume is half their sum, and
-    one along a connected row of such cells.
+    one along a connected row of such cells. The error of a connected interpolated part is one, too.
     """
     known = (number > 0) & np.isfinite(cells.difference_m)
     of, difference = number[known], cells.difference_m[known]
@@ -298,7 +298,8 @@ def volumes(number: NDArray[Any], cells: Cells, count: int) -> list[Volume]:
 
     wall, walls = label(known & (cells.step_m2 > 0), structure=np.ones((3, 3)), output=np.int32)
     pair, member = np.unique(of.astype(np.int64) * (walls + 1) + wall[known], return_inverse=True)
-    moved = np.bincount(member, np.sqrt(cells.step_m2[known]), len(pair)) / 2
+    own_m = np.sqrt(cells.step_m2[known]) * np.where(cells.is_measured[known], 0.5, 1.0)
+    moved = np.bincount(member, own_m, len(pair))
     steps = np.bincount(pair // (walls + 1), moved**2, count + 1)[1:]
     low, high = np.zeros(count + 1), np.zeros(count + 1)
     np.minimum.at(low, of, difference)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from scipy.ndimage import label, map_coordinates, maximum, maximum_filter, minimum, minimum_filter
+from scipy.ndimage import map_coordinates, maximum_filter, minimum_filter
 
 from pipelines.change.datum import Epoch, Shared
 from pipelines.change.detection import LAGS, STEEPEST, Cells, Samples
@@ -192,9 +192,9 @@ class CommonGrid:
             sigma = self._read(one, one.names[1], self.part(wide))
             noise = np.maximum(np.nan_to_num(sigma**2 - self._between(node, wide)), 0.0)
             measured = self._measured(one, self.part(wide))
-            beside = step_variance(height, measured, np.where(measured, np.sqrt(noise), 0.0), self.cell_m, reach)
+            beside = step_variance(height, np.where(measured, np.sqrt(noise), 0.0), self.cell_m, reach)
             # The σ of an interpolated cell is that of its interpolation.
-            step = np.maximum(step, np.where(measured, beside, np.maximum(beside, noise))[own])
+            step = np.maximum(step, np.where(measured, beside, noise)[own])
             variance += np.where(measured, noise, 0.0)[own]
             both &= measured[own]
             # On the rim of what is known, the slope is not: such a cell counts as steep.
@@ -266,18 +266,14 @@ class CommonGrid:
         return np.asarray(map_coordinates(nodes, np.meshgrid(row, column, indexing="ij"), order=1, mode="nearest"))
 
 
-def step_variance(
-    height_m: FloatArray, measured: BoolArray, sigma_m: FloatArray, cell_m: float, reach: int
-) -> FloatArray:
-    """Return the variance (H, W) in m² of heights beside steps, and of interpolated ones; 0: elsewhere.
+def step_variance(height_m: FloatArray, sigma_m: FloatArray, cell_m: float, reach: int) -> FloatArray:
+    """Return the variance (H, W) in m² of heights beside steps; 0: elsewhere.
 
     An error of up to `reach` cells in the plan changes a height by any value up to the relief of its neighbourhood:
-    the variance is that of the uniform distribution. What the slope and the noise explain is no relief. The
-    neighbourhood of an interpolated cell is the connected part with its rim.
+    the variance is that of the uniform distribution. What the slope and the noise explain is no relief.
 
     Args:
         height_m: (H, W); NaN: not known.
-        measured: (H, W) whether the height is; else it is interpolated.
         sigma_m: (H, W) noise of the heights.
     """
     known = np.isfinite(height_m)
@@ -291,12 +287,6 @@ def step_variance(
         least = np.minimum(*np.abs(np.nan_to_num(rise)))
         explained += np.where(rise[0] * rise[1] > 0, np.minimum(least, STEEPEST * cell_m), 0.0)
     relief = np.maximum(relief - 2 * reach * explained - _NOISE_RANGE * sigma_m, 0.0)
-    hole, count = label(known & ~measured, structure=np.ones((3, 3)), output=np.int32)
-    if count:
-        numbers = np.arange(count + 1)
-        highest = np.asarray(maximum(maximum_filter(high, 3), hole, numbers))
-        lowest = np.asarray(minimum(minimum_filter(low, 3), hole, numbers))
-        relief = np.where(hole > 0, np.maximum(highest - lowest, 2 * cell_m)[hole], relief)
     return np.asarray(np.where(known, np.nan_to_num(relief, posinf=0.0, neginf=0.0) ** 2 / 3, 0.0))
 
 

@@ -48,7 +48,8 @@ class Parts:
         difference, datum, variance, step = (
             read_cells(self.path(name, window))[0].astype(np.float64) for name in CELLS
         )
-        return Cells(difference, variance, datum, np.zeros(0), step, np.isfinite(difference))
+        measured = read_cells(self.path("measured", window))[0] > 0
+        return Cells(difference, variance, datum, np.zeros(0), step, measured)
 
 
 @dataclass(frozen=True)
