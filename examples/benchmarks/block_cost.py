@@ -14,7 +14,7 @@ import numpy as np
 from blocks import copied, georef
 
 from pipelines.core.products import load_json
-from pipelines.jobs.costs import BlockCost
+from pipelines.jobs.costs import IterationCost
 from pipelines.survey.block_plan import BlockPlan, BlockTraining, PlannedBlock
 
 # Blocks, Gaussians of the whole, longest side of the photographs.
@@ -53,7 +53,7 @@ def main() -> None:
     in_plan = np.column_stack([[planned.view_px for planned, _ in blocks], visible, sizes[:, 2]])
     seconds = np.array([row.processor_s for row in records], dtype=np.float64)
     memory = np.array([row.peak_bytes or np.nan for row in records], dtype=np.float64)
-    time, peak = BlockCost.fitted(sizes[::2], seconds[::2]), BlockCost.fitted(sizes[::2], memory[::2])
+    time, peak = IterationCost.fitted(sizes[::2], seconds[::2]), IterationCost.fitted(sizes[::2], memory[::2])
     print(f"{'pixels':>9}{'visible':>9}{'all':>9}{'ms':>8}{'model':>8}{'plan':>8}{'MiB':>8}{'model':>8}")
     for row, (size, before, took, held) in enumerate(zip(sizes, in_plan, seconds, memory, strict=True)):
         values = 1e3 * took, 1e3 * time.of(*size), 1e3 * time.of(*before)
@@ -70,8 +70,8 @@ def main() -> None:
     ):
         error = np.abs(np.array(predicted) / truth - 1)[1::2]
         print(f"{what}, held out: median {100 * np.median(error):.0f} %, largest {100 * error.max():.0f} %")
-    print("seconds", BlockCost.fitted(sizes, seconds).coefficients.tolist())
-    print("bytes", BlockCost.fitted(sizes, memory).coefficients.tolist())
+    print("seconds", IterationCost.fitted(sizes, seconds).coefficients.tolist())
+    print("bytes", IterationCost.fitted(sizes, memory).coefficients.tolist())
 
 
 if __name__ == "__main__":

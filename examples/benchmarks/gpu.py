@@ -108,7 +108,7 @@ def speed(arguments: argparse.Namespace) -> dict[str, Any]:
         for count in arguments.gaussians:
             if arguments.backend == "cuda":
                 torch.cuda.reset_peak_memory_stats()
-            seconds = list(iterations(count, camera, 1 / 3, arguments.repeats, arguments.backend))
+            seconds = [one for one, _ in iterations(count, camera, 1 / 3, arguments.repeats, arguments.backend)]
             rows.append(
                 {
                     "gaussians": count,

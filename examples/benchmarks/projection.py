@@ -1,8 +1,8 @@
-"""Project the time of large surveys from the models of SfM and blocks: python examples/benchmarks/projection.py.
+"""Project the time of large surveys from the models of SfM and training: python examples/benchmarks/projection.py.
 
-Nothing is reconstructed or trained: surveys are made up, divided into blocks, and the models that were fitted to
-small surveys (pipelines/jobs/costs.py) are evaluated at their sizes. What is printed is a
-projection, for processors only: nothing was measured on a GPU.
+Nothing is reconstructed or trained: surveys of photographs of 1600×1200 are made up, divided into blocks where one
+training does not fit, and the models of pipelines/jobs/costs.py are evaluated at their sizes, for processors only.
+Each cell says whether it is projected or was measured; docs/benchmarks.md, Large surveys, has the measured survey.
 """
 
 from __future__ import annotations
@@ -12,17 +12,21 @@ from dataclasses import dataclass
 
 from block_plan import made_up_scene
 
+from pipelines.jobs.costs import MEASURED_CORES
 from pipelines.sfm.estimate import estimated_cost
 from pipelines.sfm.options import SfmOptions
 from pipelines.survey.block_plan import BlockPlan
 from pipelines.survey.scene import Scene
 from pipelines.train.blocks.plan import plan_blocks
 from pipelines.train.estimate import block_processor_s
-from pipelines.train.options import PlanOptions, TrainOptions
+from pipelines.train.options import PRESETS, PlanOptions, TrainOptions, surveys_of
 
-PHOTO_PX = (5280, 3956)
-TRAINED_PX = 1600
-GAUSSIANS_A_PHOTOGRAPH = 2000
+PHOTO_PX = (1600, 1200)
+TRAINED_PX = 800  # of the preset `standard`
+GAUSSIANS_A_PHOTOGRAPH = 1500
+STEPS = ("features and matches", "mapping, in one process", "stereo", "training", "blocks", "together")
+# Seconds of steps, by photographs and machines, on 2 cores of an AMD EPYC without AVX-512, 2026-11-26.
+MEASURED: dict[tuple[int, str], dict[str, float]] = {}
 # Two one-thread workers do 1.88 times the work of one (examples/benchmarks/cluster.py); more were not measured.
 SHARING = 0.94
 
@@ -43,7 +47,7 @@ class Machines:
 
 
 COLUMNS = {
-    "2 cores": Machines(2, 2, 8.0),
+    "2 cores": Machines(2, 1, 20.0),
     "32 cores": Machines(32, 32, 8.0),
 }
 
@@ -62,22 +66,31 @@ def plan_of(scene: Scene, machines: Machines) -> BlockPlan:
     return plan_blocks(scene, options.model_copy(update={"blocks": machines.workers, "block_memory": None}))
 
 
-def projected(count: int, scene: Scene, machines: Machines) -> list[str]:
+def projected(count: int, scene: Scene, name: str) -> list[str]:
     """Return the steps of a survey on some machines: times, and the number and memory of the blocks."""
+    machines, measured = COLUMNS[name], MEASURED.get((count, name), {})
     reconstruction = estimated_cost(count, PHOTO_PX, SfmOptions())
     plan = plan_of(scene, machines)
-    options = TrainOptions(preset="standard", max_image_size=TRAINED_PX)
+    options = TrainOptions(preset="standard", iterations=round(surveys_of(count) * PRESETS["standard"].iterations))
     whole = block_processor_s(plan, PHOTO_PX, options)
     blocks = block_processor_s(plan, PHOTO_PX, options.model_copy(update={"dense": False}))
-    sfm = (reconstruction.features_s + reconstruction.matching_s) / machines.cores / SHARING
-    stereo = (sum(whole.values()) - sum(blocks.values())) / machines.cores / SHARING
+    each = machines.cores / machines.workers
     # The longest block is the least time, however many workers there are.
-    together = sum(blocks.values()) / machines.workers / SHARING
-    training = max(together, *blocks.values())
+    training = max(sum(blocks.values()) / machines.cores / SHARING, max(blocks.values()) / each)
+    times = {
+        "features and matches": (reconstruction.features_s + reconstruction.matching_s) / machines.cores / SHARING,
+        "mapping, in one process": reconstruction.mapping_s / min(machines.cores, MEASURED_CORES),
+        "stereo": (sum(whole.values()) - sum(blocks.values())) / machines.cores / SHARING,
+        "training": training,
+    }
     peak_gib = max(block.peak_bytes for block in plan.blocks) / 2**30
-    size = f"{len(plan.blocks)} of {peak_gib:.1f} GiB"
-    times = (sfm, reconstruction.mapping_s, stereo, training)
-    return [*map(hours, times), size, hours(sum(times))]
+    cells = {step: f"{hours(seconds)} (projected)" for step, seconds in times.items()}
+    cells |= {
+        step: f"{hours(seconds)} (measured; projected {hours(times[step])})" for step, seconds in measured.items()
+    }
+    total = sum((times | measured).values())
+    cells |= {"blocks": f"{len(plan.blocks)} of {peak_gib:.1f} GiB (projected)", "together": hours(total)}
+    return [cells[step] for step in STEPS]
 
 
 def hours(seconds: float) -> str:
@@ -91,11 +104,10 @@ def main() -> None:
     parser.add_argument("--photographs", type=int, nargs="+", default=[1000, 10_000])
     args = parser.parse_args()
     print("| photographs | step | " + " | ".join(COLUMNS) + " |\n" + "|---" * (2 + len(COLUMNS)) + "|")
-    steps = ("features and matches", "mapping, in one process", "stereo", "training", "blocks", "together")
     for count in args.photographs:
         scene = made_up_scene(count, 1000)
-        columns = [projected(count, scene, machines) for machines in COLUMNS.values()]
-        for step, *cells in zip(steps, *columns, strict=True):
+        columns = [projected(count, scene, name) for name in COLUMNS]
+        for step, *cells in zip(STEPS, *columns, strict=True):
             print(f"| {count} | {step} | {' | '.join(cells)} |")
 
 

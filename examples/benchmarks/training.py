@@ -29,6 +29,7 @@ from raster import make_scene
 from pipelines.core.types import IntArray
 from pipelines.core.workspace import Workspace
 from pipelines.geometry.cameras import Pinhole
+from pipelines.jobs.costs import IterationCost
 from pipelines.splat.densify import DefaultSettings, DefaultStrategy
 from pipelines.splat.losses import photometric_loss
 from pipelines.splat.memory import TrainingSize, predicted_peak_bytes
@@ -47,8 +48,10 @@ from pipelines.train.surface import SceneSurface
 from pipelines.train.trainer import JointTrainer, make_trainer
 
 
-def iterations(count: int, camera: Pinhole, visible: float, repeats: int, backend_name: str) -> Iterator[float]:
-    """Seconds of each of `repeats` whole iterations; the first, which compiles, is left out."""
+def iterations(
+    count: int, camera: Pinhole, visible: float, repeats: int, backend_name: str
+) -> Iterator[tuple[float, float]]:
+    """Seconds and processor seconds of `repeats` whole iterations; the first, which compiles, is left out."""
     device = "cuda" if backend_name == "cuda" else "cpu"
     backend = rasterizer("cuda" if device == "cuda" else "cpu")
     gaussians = make_scene(count, camera, visible, device)
@@ -57,32 +60,39 @@ def iterations(count: int, camera: Pinhole, visible: float, repeats: int, backen
     target = torch.rand(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(1)).to(device)
     pose = torch.eye(4, device=device, requires_grad=True)
     for iteration in range(1, repeats + 2):
-        start = now(device)
+        start, worked = now(device), time.process_time()
         rows = backend.candidates(adam.gaussians, pose, camera, RasterSettings())
         render = backend.render(adam.show(rows), pose, camera, RasterSettings())
         photometric_loss(render.colour, target).backward()
         adam.step(iteration, render.stats.visible)
         strategy.observe(render.stats.among(rows), camera)
         if iteration > 1:
-            yield now(device) - start
+            yield now(device) - start, time.process_time() - worked
 
 
 def scaling(arguments: argparse.Namespace) -> None:
     """Print the table of time and memory."""
-    print("gaussians       size   best ms  median ms  peak RSS MiB  predicted peak MiB (above the start)")
-    base = _peak_bytes()
-    for size in arguments.size:
+    print("gaussians  in view       size   best ms  median ms  peak RSS MiB  predicted peak MiB (above the start)")
+    base, sizes, best = _peak_bytes(), [], []
+    for size, visible, count in product(arguments.size, arguments.visible, arguments.gaussians):
         width, height = (int(part) for part in size.split("x"))
         camera = Pinhole(width, height, 0.8 * width, 0.8 * width, width / 2, height / 2)
-        for count in arguments.gaussians:
-            seconds = list(iterations(count, camera, arguments.visible, arguments.repeats, arguments.backend))
-            predicted = predicted_peak_bytes(TrainingSize(count, camera, 3, 0))
-            print(
-                f"{count:9d} {size:>10s} {1e3 * min(seconds):9.1f} {1e3 * statistics.median(seconds):10.1f}"
-                f" {_peak_bytes() / 2**20:13.0f} {predicted / 2**20:10.0f}",
-                flush=True,
-            )
+        taken = np.array(list(iterations(count, camera, visible, arguments.repeats, arguments.backend)))
+        predicted = predicted_peak_bytes(TrainingSize(count, camera, 3, 0))
+        sizes.append([width * height, visible * count, count])
+        best.append(taken.min(axis=0))
+        print(
+            f"{count:9d} {visible:8.1%} {size:>10s} {1e3 * best[-1][0]:9.1f} {1e3 * np.median(taken[:, 0]):10.1f}"
+            f" {_peak_bytes() / 2**20:13.0f} {predicted / 2**20:10.0f}",
+            flush=True,
+        )
     print(f"peak RSS before the first: {base / 2**20:.0f} MiB; the peak of a process never falls")
+    if len(sizes) < 4:
+        return
+    for name, measured in zip(("seconds", "processor seconds"), np.array(best).T, strict=True):
+        cost = IterationCost.fitted(np.array(sizes), measured)
+        ratio = np.array([cost.of(*one) for one in sizes]) / measured
+        print(f"{name}: {np.round(cost.coefficients, 4).tolist()}, {ratio.min():.2f} to {ratio.max():.2f} of each")
 
 
 def scene_of(root: Path, options: TrainOptions) -> tuple[AdjustedScene, ImageCache]:
@@ -196,7 +206,7 @@ def main() -> None:
     table = modes.add_parser("scaling", help="time and memory against Gaussians and pixels")
     table.add_argument("--gaussians", type=int, nargs="+", default=[10_000, 30_000, 100_000, 300_000, 1_000_000])
     table.add_argument("--size", nargs="+", default=["600x450", "661x372", "1280x960"], help="WIDTHxHEIGHT …")
-    table.add_argument("--visible", type=float, default=1 / 3, help="fraction within the image")
+    table.add_argument("--visible", type=float, nargs="+", default=[1 / 3], help="fractions within the image")
     table.add_argument("--repeats", type=int, default=7)
     table.set_defaults(run=scaling)
     time_line = modes.add_parser("curve", help="PSNR against time for each strategy and limit of Gaussians")

@@ -134,7 +134,7 @@ def _estimate(renderer: ModelRenderer, options: MeasurableOptions) -> str | None
     gaussians = discs + round(_KEPT_SHARE * len(trained.gaussians))
     size_bytes = gaussians * 4 * (_PLY_VALUES + 3 * coefficient_count(trained.gaussians.sh_degree))
     pixels = [pinhole.width * pinhole.height for pinhole in map(renderer.pinholes.of, cameras)]
-    pass_s = iteration_seconds(float(np.mean(pixels)), gaussians, surface=False)  # over one view
+    pass_s = iteration_seconds(float(np.mean(pixels)), gaussians, len(cameras), surface=False)  # over one view
     seconds = (options.appearance_passes + _OTHER_PASSES) * len(cameras) * pass_s
     return (
         f"about {discs} discs {spacing_m:.3f} m apart, {size_bytes / 1e6:.3g} MB and {about(seconds)}; a larger "

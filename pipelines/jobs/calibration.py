@@ -18,7 +18,7 @@ import torch
 from pipelines.core.files import replace_text
 from pipelines.core.machine import thread_count
 from pipelines.geometry.cameras import Pinhole
-from pipelines.jobs.costs import MEASURED_CORES, iteration_seconds
+from pipelines.jobs.costs import ITERATION_SECONDS, MEASURED_CORES
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.kernel_cache import compilation_stamp
 from pipelines.splat.losses import photometric_loss
@@ -48,7 +48,7 @@ def _factor(threads: int, key: str, compiled: bool) -> float:
         return kept
     if not compiled:
         return MEASURED_CORES / min(threads, _MOST_CORES)
-    modelled_s = iteration_seconds(_CAMERA.width * _CAMERA.height, _GAUSSIANS, surface=False)
+    modelled_s = ITERATION_SECONDS.of(_CAMERA.width * _CAMERA.height, _GAUSSIANS / 3, _GAUSSIANS)
     factor = _processor_s() / min(threads, _MOST_CORES) / modelled_s
     try:
         file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)

@@ -16,11 +16,11 @@ from scipy.optimize import nnls
 from pipelines.core.types import FloatArray
 
 MEASURED_CORES = 2
-# Four reconstructions of 18, 48, 48 and 40 photographs took 61, 134, 148 and 175 s, on 2 cores of an AMD EPYC
-# beside other programs, 2026-11-22. This model says 49, 147, 125 and 103 s.
-_FEATURES_MEGAPIXEL_S, _PAIR_S, _MAPPING_S = 1.2, 0.12, 0.8  # mapping: of a photograph
-# Of photographs that are not doubled: one of 0.8 megapixels takes 0.72 s on one core, doubled 2.15 s.
-_OWN_SIZE_FEATURES_MEGAPIXEL_S = 0.45
+# Three reconstructions of 18, 48 and 1000 photographs took 15, 23 and 1320 s on 2 cores of an AMD EPYC, 2026-11-26.
+# This model says 15, 34 and 1070 s.
+_FEATURES_MEGAPIXEL_S, _PAIR_S, _MAPPING_S = 0.54, 0.04, 0.3  # mapping: of a photograph
+# Of photographs that are not doubled: a third of the time.
+_OWN_SIZE_FEATURES_MEGAPIXEL_S = 0.18
 # Features a megapixel of aerial photographs, about, and their number for which `_PAIR_S` holds: matching compares
 # each feature of a photograph with each of the other.
 _FEATURES_MEGAPIXEL, _OWN_SIZE_FEATURES_MEGAPIXEL, _PAIR_FEATURES = 6000, 3000, 5000
@@ -84,52 +84,50 @@ def mapping_peak_bytes(photographs: int, max_features: int) -> int:
     return int(_FIXED_BYTES + photographs * a_photograph)
 
 
-# Fitted to one whole iteration of docs/benchmarks.md: 10 000 … 1 000 000 Gaussians, 0.25 … 1.2 megapixels, a third
-# of the Gaussians in view. 2 cores of an AMD EPYC (AVX-512), CPU backend, 2026-11-21.
 MEASURED_ON = "2 cores of an AMD EPYC"
-_FIXED_S, _MEGAPIXEL_S, _MILLION_GAUSSIANS_S = 0.003, 0.092, 0.367
-# Part of a Gaussian's time that does not depend on whether an iteration sees it.
-_UNSEEN_SHARE = 0.3
-# Surface losses render depth and normals too. Ratio of seven trainings with them to the fit, 1.5 … 2.0, 2026-11-22.
+# Surface losses render depth and normals too. Ratio of trainings with them to the cost below: 1.5 … 2.3.
 SURFACE_FACTOR = 1.9
-
-
-def iteration_seconds(pixels: float, gaussians: float, *, surface: bool, crops: int = 1) -> float:
-    """Return the seconds of one iteration on the machine of `MEASURED_ON`, with surface losses or without.
-
-    Pixels are those of the photograph, which is seen in crops, one at an iteration; Gaussians those of the model.
-    """
-    seen = 1 / crops  # share of the pixels, and of the Gaussians that the photograph shows
-    of_gaussians = _MILLION_GAUSSIANS_S * (_UNSEEN_SHARE + (1 - _UNSEEN_SHARE) * seen)
-    plain = _FIXED_S + _MEGAPIXEL_S * seen * pixels / 1e6 + of_gaussians * gaussians / 1e6
-    return (SURFACE_FACTOR if surface else 1.0) * plain
+# Photographs that show a place of a survey, about, and the largest share of Gaussians that one shows.
+_SEEN_BY, _MOST_SEEN = 25, 1 / 3
 
 
 @dataclass(frozen=True)
-class BlockCost:
-    """Cost of a training: c₀ + c₁ · pixels + c₂ · visible Gaussians + c₃ · all of them, each in millions."""
+class IterationCost:
+    """Cost of an iteration: c₀ + c₁ · pixels + c₂ · visible Gaussians + c₃ · all of them, each in millions."""
 
-    coefficients: FloatArray  # (4,) c₀ … c₃: processor seconds of an iteration, or bytes of the process at its peak
+    coefficients: FloatArray  # (4,) c₀ … c₃: seconds, processor seconds, or bytes of the process at its peak
 
     def of(self, pixels: float, visible: float, gaussians: float) -> float:
-        """Return the cost of a block with so many pixels and visible Gaussians in a view, and Gaussians in all."""
+        """Return the cost of so many pixels and visible Gaussians in a view, and Gaussians in all."""
         terms = np.array([[1.0, pixels / 1e6, visible / 1e6, gaussians / 1e6]])
         return float((terms @ self.coefficients).item())
 
     @staticmethod
-    def fitted(sizes: FloatArray, measured: FloatArray) -> BlockCost:
-        """Return the model that fits measured blocks best in relative terms, with no coefficient below zero.
+    def fitted(sizes: FloatArray, measured: FloatArray) -> IterationCost:
+        """Return the model that fits measurements best in relative terms, with no coefficient below zero.
 
-        Sizes (B, 3) are pixels, visible and all Gaussians of each block, whose cost (B,) was measured.
+        Sizes (B, 3) are pixels, visible and all Gaussians of each measurement (B,).
         """
         terms = np.column_stack([np.ones(len(sizes)), sizes / 1e6])
-        return BlockCost(nnls(terms / measured[:, None], np.ones(len(measured)))[0])
+        return IterationCost(nnls(terms / measured[:, None], np.ones(len(measured)))[0])
 
 
-# Processor seconds of an iteration, fitted by examples/benchmarks/block_cost.py to 16 blocks of 7 000 … 51 000
-# Gaussians and 35 000 … 141 000 pixels a view, on one thread of an AMD EPYC, 2026-11-22. For a million Gaussians in
-# 1.2 megapixels it gives 1.0 s, and the measurements above 0.96 s.
-BLOCK_SECONDS = BlockCost(np.array([0.0046, 0.202, 1.20, 0.353]))
+# Fitted by `examples/benchmarks/training.py scaling` to 10 000 … 1 000 000 Gaussians, a third and a thirtieth of
+# them in view, in 0.25 … 1.2 megapixels: seconds on 2 cores of an AMD EPYC without AVX-512, and processor seconds,
+# 2026-11-26.
+ITERATION_SECONDS = IterationCost(np.array([0.003, 0.035, 0.52, 0.0215]))
+ITERATION_PROCESSOR_SECONDS = IterationCost(np.array([0.005, 0.06, 0.9, 0.035]))
+
+
+def iteration_seconds(pixels: float, gaussians: float, photographs: int, *, surface: bool, crops: int = 1) -> float:
+    """Return the seconds of one iteration on the machine of `MEASURED_ON`, with surface losses or without.
+
+    Pixels are those of a photograph, which is seen in crops, one at an iteration; Gaussians those of the model of
+    so many photographs.
+    """
+    visible = gaussians * min(_SEEN_BY / max(photographs, 1), _MOST_SEEN)
+    plain = ITERATION_SECONDS.of(pixels / crops, visible / crops, gaussians)
+    return (SURFACE_FACTOR if surface else 1.0) * plain
 
 
 class TimeLeft:

@@ -12,7 +12,7 @@ from pipelines.core.machine import thread_count
 from pipelines.core.sentences import about
 from pipelines.geometry.cameras import Pinhole
 from pipelines.jobs.calibration import machine_factor
-from pipelines.jobs.costs import BLOCK_SECONDS, MEASURED_CORES, SURFACE_FACTOR, iteration_seconds
+from pipelines.jobs.costs import ITERATION_PROCESSOR_SECONDS, MEASURED_CORES, SURFACE_FACTOR, iteration_seconds
 from pipelines.splat.memory import USABLE, TrainingSize, fitting_gaussians, free_memory_bytes, predicted_peak_bytes
 from pipelines.splat.rasterizer.backends import chosen_backend
 from pipelines.surface.depth_maps import FINE
@@ -151,7 +151,7 @@ def block_processor_s(plan: BlockPlan, photo_px: tuple[int, int], options: Train
 
         def one(pixels: float, crops: int, block: PlannedBlock = block) -> float:
             count = block.gaussians + plan.scaffold_gaussians
-            return factor * BLOCK_SECONDS.of(pixels / crops, block.visible / crops, count)
+            return factor * ITERATION_PROCESSOR_SECONDS.of(pixels / crops, block.visible / crops, count)
 
         iterating = _of_all_iterations(camera, block.view_px, options, one)
         stereo = MEASURED_CORES * _stereo_s(len(block.cameras), camera)
@@ -188,7 +188,7 @@ def _seconds(photographs: int, camera: Pinhole, options: TrainOptions) -> float:
 
     def one(pixels: float, crops: int) -> float:
         surface, count = options.geometry_regularisation, options.effort.max_gaussians
-        return iteration_seconds(pixels, count, surface=surface, crops=crops)
+        return iteration_seconds(pixels, count, photographs, surface=surface, crops=crops)
 
     seconds = _of_all_iterations(camera, camera.width * camera.height, options, one)
     if options.dense:

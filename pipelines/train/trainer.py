@@ -190,7 +190,8 @@ class JointTrainer:
         width, height = camera.width // shrink, camera.height // shrink
         crops = 1 if self.options.crops is None else self.options.crops.count(width, height)
         surface = self.options.surface is not None
-        return iteration_seconds(width * height, len(self.optimizer.gaussians), surface=surface, crops=crops)
+        gaussians, photographs = len(self.optimizer.gaussians), len(self.views.camera)
+        return iteration_seconds(width * height, gaussians, photographs, surface=surface, crops=crops)
 
     def slow_down(self, factor: float) -> None:
         """Multiply all learning rates but the exposures' by `factor`, and forget values that were not finite."""

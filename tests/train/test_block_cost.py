@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.jobs.costs import BLOCK_SECONDS, SURFACE_FACTOR, BlockCost
+from pipelines.jobs.costs import ITERATION_PROCESSOR_SECONDS, SURFACE_FACTOR, IterationCost
 from pipelines.survey.block_plan import BlockCell, BlockPlan, PlannedBlock
 from pipelines.train.estimate import block_processor_s
 from pipelines.train.options import TrainOptions
@@ -16,10 +16,10 @@ PHOTO_PX = (640, 480)
 def test_the_model_is_found_again() -> None:
     """From 16 blocks measured to 3 %, predictions are right to 5 %: four unknowns take a quarter of the noise."""
     rng = np.random.default_rng(0)
-    truth = BlockCost(np.array([0.004, 0.2, 1.2, 0.3]))
+    truth = IterationCost(np.array([0.004, 0.2, 1.2, 0.3]))
     sizes = rng.uniform([3e4, 5e2, 5e3], [3e5, 2e4, 1e5], (16, 3))
     seconds = np.array([truth.of(*size) for size in sizes])
-    fitted = BlockCost.fitted(sizes, seconds * (1 + 0.03 * rng.standard_normal(16)))
+    fitted = IterationCost.fitted(sizes, seconds * (1 + 0.03 * rng.standard_normal(16)))
     np.testing.assert_allclose([fitted.of(*size) for size in sizes], seconds, rtol=0.05)
     assert (fitted.coefficients >= 0).all()
 
@@ -50,7 +50,10 @@ def test_an_estimate_is_that_of_its_iterations() -> None:
     document = plan((50_000, 3_000, 8_000), (25_000, 1_000, 2_000))
     predicted = block_processor_s(document, PHOTO_PX, options)
     # A block's iterations see the scaffold around it, too.
-    expected = [300 * BLOCK_SECONDS.of(5e4, 3e3, 8_500), 300 * BLOCK_SECONDS.of(2.5e4, 1e3, 2_500)]
+    expected = [
+        300 * ITERATION_PROCESSOR_SECONDS.of(5e4, 3e3, 8_500),
+        300 * ITERATION_PROCESSOR_SECONDS.of(2.5e4, 1e3, 2_500),
+    ]
     np.testing.assert_allclose([predicted[0], predicted[1]], expected)
     surface = block_processor_s(document, PHOTO_PX, options.model_copy(update={"geometry_regularisation": True}))
     assert surface[0] == pytest.approx(SURFACE_FACTOR * predicted[0])
