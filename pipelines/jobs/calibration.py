@@ -38,17 +38,18 @@ _SLOWEST = 100.0  # factor: beyond it, or below its inverse, a file is damaged
 def machine_factor() -> float:
     """Return how many times as long as in the cost models anything takes on this machine, with its threads."""
     threads, stamp = thread_count(), compilation_stamp(_COMPILER)
-    return _factor(threads, f"{stamp.parent.name} {llvm.get_host_cpu_name()} {threads}", stamp.exists())
+    modelled_s = ITERATION_SECONDS.of(_CAMERA.width * _CAMERA.height, _GAUSSIANS / 3, _GAUSSIANS)
+    key = f"{stamp.parent.name} {llvm.get_host_cpu_name()} {threads} {modelled_s:.4f}"
+    return _factor(threads, key, stamp.exists(), modelled_s)
 
 
 @cache
-def _factor(threads: int, key: str, compiled: bool) -> float:
+def _factor(threads: int, key: str, compiled: bool, modelled_s: float) -> float:
     file = platformdirs.user_cache_path("georefgs", appauthor=False) / "speed.json"
     if (kept := _kept(file, key)) is not None:
         return kept
     if not compiled:
         return MEASURED_CORES / min(threads, _MOST_CORES)
-    modelled_s = ITERATION_SECONDS.of(_CAMERA.width * _CAMERA.height, _GAUSSIANS / 3, _GAUSSIANS)
     factor = _processor_s() / min(threads, _MOST_CORES) / modelled_s
     try:
         file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)

@@ -17,7 +17,7 @@ from pipelines.core.types import FloatArray
 
 MEASURED_CORES = 2
 # Three reconstructions of 18, 48 and 1000 photographs took 15, 23 and 1320 s on 2 cores of an AMD EPYC, 2026-11-26.
-# This model says 15, 34 and 1070 s.
+# This model says 14, 30 and 970 s.
 _FEATURES_MEGAPIXEL_S, _PAIR_S, _MAPPING_S = 0.54, 0.04, 0.3  # mapping: of a photograph
 # Of photographs that are not doubled: a third of the time.
 _OWN_SIZE_FEATURES_MEGAPIXEL_S = 0.18
@@ -85,7 +85,7 @@ def mapping_peak_bytes(photographs: int, max_features: int) -> int:
 
 
 MEASURED_ON = "2 cores of an AMD EPYC"
-# Surface losses render depth and normals too. Ratio of trainings with them to the cost below: 1.5 … 2.3.
+# Surface losses render depth and normals too. Ratio of trainings with them to the cost below, about.
 SURFACE_FACTOR = 1.9
 # Photographs that show a place of a survey, about, and the largest share of Gaussians that one shows.
 _SEEN_BY, _MOST_SEEN = 25, 1 / 3
@@ -115,8 +115,8 @@ class IterationCost:
 # Fitted by `examples/benchmarks/training.py scaling` to 10 000 … 1 000 000 Gaussians, a third and a thirtieth of
 # them in view, in 0.25 … 1.2 megapixels: seconds on 2 cores of an AMD EPYC without AVX-512, and processor seconds,
 # 2026-11-26.
-ITERATION_SECONDS = IterationCost(np.array([0.003, 0.035, 0.52, 0.0215]))
-ITERATION_PROCESSOR_SECONDS = IterationCost(np.array([0.005, 0.06, 0.9, 0.035]))
+ITERATION_SECONDS = IterationCost(np.array([0.0016, 0.0481, 0.675, 0.0219]))
+ITERATION_PROCESSOR_SECONDS = IterationCost(np.array([0.0014, 0.091, 1.273, 0.0402]))
 
 
 def iteration_seconds(pixels: float, gaussians: float, photographs: int, *, surface: bool, crops: int = 1) -> float:

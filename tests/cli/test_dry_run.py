@@ -193,12 +193,14 @@ class TestCostModel:
         assert left.after(100) == 0.0
 
     @pytest.mark.parametrize(
-        ("gaussians", "pixels", "seconds"),
-        [(30_000, 600 * 450, 0.039), (100_000, 661 * 372, 0.061), (1_000_000, 1280 * 960, 0.531)],
+        ("gaussians", "pixels", "photographs", "seconds"),
+        [(100_000, 661 * 372, 48, 0.039), (1_000_000, 1280 * 960, 48, 0.371), (1_000_000, 661 * 372, 750, 0.059)],
     )
-    def test_iterations_take_the_time_of_the_benchmarks(self, gaussians: int, pixels: int, seconds: float) -> None:
-        """Within 20 %, the largest deviation of the fit over the table of docs/benchmarks.md."""
-        assert iteration_seconds(pixels, gaussians, surface=False) == pytest.approx(seconds, rel=0.2)
+    def test_iterations_take_the_time_of_the_benchmarks(
+        self, gaussians: int, pixels: int, photographs: int, seconds: float
+    ) -> None:
+        """Within 25 %, the largest deviation of the fit over the table of docs/benchmarks.md."""
+        assert iteration_seconds(pixels, gaussians, photographs, surface=False) == pytest.approx(seconds, rel=0.25)
 
 
 def test_a_reconstruction_that_does_not_fit(
