@@ -26,7 +26,14 @@ TRAINED_PX = 800  # of the preset `standard`
 GAUSSIANS_A_PHOTOGRAPH = 1500
 STEPS = ("features and matches", "mapping, in one process", "stereo", "training", "blocks", "together")
 # Seconds of steps, by photographs and machines, on 2 cores of an AMD EPYC without AVX-512, 2026-11-26.
-MEASURED: dict[tuple[int, str], dict[str, float]] = {}
+MEASURED = {
+    (1000, "2 cores"): {
+        "features and matches": 900.0,
+        "mapping, in one process": 410.0,
+        "stereo": 232.0,
+        "training": 2195.0,
+    }
+}
 # Two one-thread workers do 1.88 times the work of one (examples/benchmarks/cluster.py); more were not measured.
 SHARING = 0.94
 
