@@ -30,6 +30,7 @@ log = logging.getLogger(__name__)
 
 _COMPILER = "pipelines.train.compilation"  # the module that leaves a stamp once all kernels are compiled
 _CAMERA, _GAUSSIANS = Pinhole(480, 360, 400.0, 400.0, 240.0, 180.0), 60_000
+_MODELLED_S = ITERATION_SECONDS.of(_CAMERA.width * _CAMERA.height, _GAUSSIANS / 3, _GAUSSIANS)
 _LONGEST_S, _FEWEST, _MOST = 4.0, 3, 12  # of the measurement, and its iterations
 _MOST_CORES = 16  # beyond, the kernels gain little
 _SLOWEST = 100.0  # factor: beyond it, or below its inverse, a file is damaged
@@ -38,19 +39,18 @@ _SLOWEST = 100.0  # factor: beyond it, or below its inverse, a file is damaged
 def machine_factor() -> float:
     """Return how many times as long as in the cost models anything takes on this machine, with its threads."""
     threads, stamp = thread_count(), compilation_stamp(_COMPILER)
-    modelled_s = ITERATION_SECONDS.of(_CAMERA.width * _CAMERA.height, _GAUSSIANS / 3, _GAUSSIANS)
-    key = f"{stamp.parent.name} {llvm.get_host_cpu_name()} {threads} {modelled_s:.4f}"
-    return _factor(threads, key, stamp.exists(), modelled_s)
+    key = f"{stamp.parent.name} {llvm.get_host_cpu_name()} {threads} {_MODELLED_S:.4f}"
+    return _factor(threads, key, stamp.exists())
 
 
 @cache
-def _factor(threads: int, key: str, compiled: bool, modelled_s: float) -> float:
+def _factor(threads: int, key: str, compiled: bool) -> float:
     file = platformdirs.user_cache_path("georefgs", appauthor=False) / "speed.json"
     if (kept := _kept(file, key)) is not None:
         return kept
     if not compiled:
         return MEASURED_CORES / min(threads, _MOST_CORES)
-    factor = _processor_s() / min(threads, _MOST_CORES) / modelled_s
+    factor = _processor_s() / min(threads, _MOST_CORES) / _MODELLED_S
     try:
         file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         replace_text(file, json.dumps({"key": key, "factor": factor}))
