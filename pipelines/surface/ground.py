@@ -101,9 +101,10 @@ def terrain_of(points: FloatArray, normal: FloatArray, spacing_m: float) -> Grou
     is_known = (count > 0) & (above == 0)
     if is_known.sum() < 4:
         is_known = count > 0
-    is_known = _inner(is_known.reshape(rows, columns), _PATCH_M / cell_m).ravel()
-    place = np.column_stack(np.divmod(np.flatnonzero(is_known), columns))
-    if np.linalg.matrix_rank(place - place.mean(axis=0)) < 2:
+    inner = _inner(is_known.reshape(rows, columns), _PATCH_M / cell_m).ravel()
+    if _spans_plane(inner, columns):  # not those of a narrow street
+        is_known = inner
+    elif not _spans_plane(is_known, columns):
         raise no_ground
     ground, cell, known = points[on_cloth], cell[on_cloth], np.flatnonzero(is_known)
     mean = np.column_stack([np.bincount(cell, axis, rows * columns)[known] / count[known] for axis in ground.T])
@@ -126,6 +127,11 @@ def _inner(is_known: BoolArray, apart: float) -> BoolArray:
     if not inner.any():
         return is_known
     return np.asarray(inner | (is_known & (distance_transform_edt(~inner) > apart)))
+
+
+def _spans_plane(cells: BoolArray, columns: int) -> bool:
+    place = np.column_stack(np.divmod(np.flatnonzero(cells), columns))
+    return len(place) > 2 and int(np.linalg.matrix_rank(place - place.mean(axis=0))) == 2
 
 
 def _on_cloth(points: FloatArray, knot_m: float, limit_m: float) -> IntArray:

@@ -71,6 +71,16 @@ def test_ground_is_where_it_is_and_its_sigma_says_how_well(
     assert np.sqrt(np.mean(error[below] ** 2 / found.bridged_variance(gap_m[below]))) < 1.4
 
 
+def test_a_street_between_houses_is_ground() -> None:
+    """It is three cells wide: those with known ground all around lie on one line, which spans no plane."""
+    rng, step = np.random.default_rng(4), np.arange(SPACING_M / 2, SIZE_M, SPACING_M)
+    plan = np.stack(np.meshgrid(step, step[step < 15]), axis=-1).reshape(-1, 2)
+    street = (plan[:, 1] >= 6) & (plan[:, 1] < 9)
+    height = np.where(street, 0.0, 7.0) + rng.normal(0, NOISE_M, len(plan))
+    found = terrain_of(np.column_stack([plan, height]), np.tile([0.0, 0.0, 1.0], (len(plan), 1)), SPACING_M)
+    assert np.abs(found.interpolated(found.height, plan[street])).max() < 0.1
+
+
 def test_library_writes_nothing_into_the_results(capfd: pytest.CaptureFixture[str]) -> None:
     points, normal, _ = town(np.random.default_rng(1))
     terrain_of(points, normal, SPACING_M)
