@@ -48,8 +48,11 @@ class Parts:
         difference, datum, variance, step = (
             read_cells(self.path(name, window))[0].astype(np.float64) for name in CELLS
         )
-        measured = read_cells(self.path("measured", window))[0] > 0
-        return Cells(difference, variance, datum, np.zeros(0), step, measured)
+        return Cells(difference, variance, datum, np.zeros(0), step, self.measured(window))
+
+    def measured(self, window: Window) -> BoolArray:
+        """Return which cells of a window both epochs have measured."""
+        return np.asarray(read_cells(self.path("measured", window))[0] > 0)
 
 
 @dataclass(frozen=True)
@@ -109,7 +112,7 @@ def find_regions(
     grid = parts.grid
     measured = np.zeros(sign.shape, dtype=bool)
     for window in grid.windows():
-        measured[window.slices] = read_cells(parts.path("measured", window))[0] > 0
+        measured[window.slices] = parts.measured(window)
     number = candidates(sign, measured, grid.cell_m2, reach_of(grid, noise), min_area_m2)
     count = int(number.max(initial=0))
     whole, cores, of_given = ([Volume() for _ in range(size)] for size in (count, count, len(given)))

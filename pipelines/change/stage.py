@@ -35,7 +35,7 @@ from pipelines.core.products import Remark, save_json, union
 from pipelines.core.stages import CHANGE_PAGE
 from pipelines.core.staleness import status
 from pipelines.core.workspace import StageRun, Summary, Workspace
-from pipelines.formats.geotiff import Band, RasterKind, read_cells, write_mosaic
+from pipelines.formats.geotiff import Band, RasterKind, write_mosaic
 from pipelines.formats.tables import table_text
 from pipelines.formats.vector_files import feature, features_text, read_boundary, write_polygons_gpkg
 from pipelines.geodesy.crs import PointCrs, parse_crs
@@ -217,8 +217,7 @@ def _write_rasters(
 def _write_significant(folder: Path, parts: Parts, sign: NDArray[np.int8]) -> None:
     for window in parts.grid.windows():
         change = sign[window.slices]
-        known = read_cells(parts.path("measured", window))[0] > 0
-        classes = np.select([~known, change < 0, change > 0], [0, LOWERED, RAISED], UNCHANGED)
+        classes = np.select([~parts.measured(window), change < 0, change > 0], [0, LOWERED, RAISED], UNCHANGED)
         parts.write("significant", window, classes.astype(np.uint8))
     _write_mosaic(folder, parts, "significant")
 

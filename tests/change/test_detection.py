@@ -64,6 +64,18 @@ def test_noise_of_no_change_is_found_and_gives_few_false_alarms() -> None:
     assert (sign != 0).mean() < 0.05
 
 
+def test_an_interpolated_part_errs_as_one() -> None:
+    """40 cells of a pit of which one epoch has interpolated heights, all off by one error of 0.5 m."""
+    shape, sigma_m = (20, 30), 0.5
+    inside, hole = np.zeros(shape, np.int64), np.zeros(shape, dtype=bool)
+    inside[5:15, 5:25], hole[5:9, 5:15] = 1, True
+    cells = level_cells(np.full(shape, -1.0), np.zeros(shape), np.zeros(shape), np.zeros((*shape, 2)))
+    cells = replace(cells, step_m2=np.where(hole, sigma_m**2, 0.0), is_measured=~hole)
+    _, noise = analysed(correlated_noise(np.random.default_rng(2)))
+    (volume,) = volumes(inside, cells, 1)
+    assert volume.sigma_m3(noise, CELL_M**2) == pytest.approx(40 * sigma_m * CELL_M**2)
+
+
 def test_a_copy_is_told_from_a_second_flight() -> None:
     with pytest.raises(DegenerateGeometryError, match="of one flight"):
         analysed(np.full((SIDE, SIDE), SHIFT_M))
