@@ -18,12 +18,10 @@ from pipelines.sfm.options import SfmOptions
 from pipelines.survey.block_plan import BlockPlan
 from pipelines.survey.scene import Scene
 from pipelines.train.blocks.plan import plan_blocks
-from pipelines.train.estimate import block_processor_s
-from pipelines.train.options import PRESETS, PlanOptions, TrainOptions, surveys_of
+from pipelines.train.estimate import block_processor_s, training_pinhole, with_effort
+from pipelines.train.options import PlanOptions, Preset, TrainOptions
 
 PHOTO_PX = (1600, 1200)
-TRAINED_PX = 800  # of the preset `standard`
-GAUSSIANS_A_PHOTOGRAPH = 1500
 STEPS = ("features and matches", "mapping, in one process", "stereo", "training", "blocks", "together")
 # Seconds of steps, by photographs and machines, on 2 cores of an AMD EPYC without AVX-512, 2026-11-26.
 MEASURED = {
@@ -59,12 +57,12 @@ COLUMNS = {
 }
 
 
-def plan_of(scene: Scene, machines: Machines) -> BlockPlan:
+def plan_of(scene: Scene, machines: Machines, effort: Preset) -> BlockPlan:
     """Return as many blocks as the memory of a worker demands, and at least one for each worker."""
     options = PlanOptions(
         block_memory=machines.memory_gib,
-        max_gaussians=GAUSSIANS_A_PHOTOGRAPH * len(scene.train),
-        max_image_size=TRAINED_PX,
+        max_gaussians=effort.max_gaussians,
+        max_image_size=effort.max_image_size,
         sh_degree=3,
     )
     plan = plan_blocks(scene, options)
@@ -77,8 +75,9 @@ def projected(count: int, scene: Scene, name: str) -> list[str]:
     """Return the steps of a survey on some machines: times, and the number and memory of the blocks."""
     machines, measured = COLUMNS[name], MEASURED.get((count, name), {})
     reconstruction = estimated_cost(count, PHOTO_PX, SfmOptions())
-    plan = plan_of(scene, machines)
-    options = TrainOptions(preset="standard", iterations=round(surveys_of(count) * PRESETS["standard"].iterations))
+    standard = TrainOptions(preset="standard")
+    options = with_effort(standard, count, training_pinhole(PHOTO_PX, standard), None)
+    plan = plan_of(scene, machines, options.effort)
     whole = block_processor_s(plan, PHOTO_PX, options)
     blocks = block_processor_s(plan, PHOTO_PX, options.model_copy(update={"dense": False}))
     each = machines.cores / machines.workers
