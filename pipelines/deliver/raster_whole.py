@@ -17,7 +17,7 @@ MEASURED, INTERPOLATED = 255, 128  # in `measured.tif`; 0: outside the area, or 
 # A hole is filled cell by cell up to `_NARROW` cells from its rim, and beyond `REACH` by a coarse raster of the
 # whole; between, one goes over into the other.
 _NARROW, REACH = 16, 64
-_RIM_M = 1.0  # around what stands on the ground
+_RIM_M = 1.0  # around what stands on the ground, or hides it
 _WRONG = 0.1  # share of the heights of the model alone that are wrong, by three simulated flights
 
 

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.sparse import coo_matrix, diags
+from scipy.sparse import csr_matrix, diags
 from scipy.sparse.linalg import spsolve
 from torch import Tensor
 
@@ -260,15 +260,12 @@ def _log_gains(
     point: IntArray, image: IntArray, logarithm: FloatArray, weight: FloatArray, count: int
 ) -> FloatArray:
     """Return the logarithms (count,) of one channel's gains; the points' colours are eliminated."""
-    shape = (int(point.max()) + 1, count)
-    seen = coo_matrix((weight, (point, image)), shape=shape).tocsr()
-    shown = coo_matrix((weight * logarithm, (point, image)), shape=shape).tocsr()
-    of_points = diags(1 / np.asarray(seen.sum(axis=1)).ravel())
-    own = np.asarray(seen.sum(axis=0)).ravel()
-    scale = weight.mean()
-    normal = diags(own + scale * _LEAST_SIGMA**2 / _GAIN**2) - seen.T @ of_points @ seen
-    right = np.asarray(shown.sum(axis=0)).ravel() - seen.T @ (of_points @ np.asarray(shown.sum(axis=1)).ravel())
-    return np.asarray(spsolve(normal.tocsc(), right))
+    of_points = np.bincount(point, weight)
+    seen = csr_matrix((weight, (point, image)), shape=(len(of_points), count))
+    prior = weight.mean() * _LEAST_SIGMA**2 / _GAIN**2
+    normal = diags(np.bincount(image, weight, count) + prior) - seen.T @ diags(1 / of_points) @ seen
+    mean = np.bincount(point, weight * logarithm) / of_points
+    return np.asarray(spsolve(normal.tocsc(), np.bincount(image, weight * logarithm, count) - seen.T @ mean))
 
 
 def _diagonal(gain: FloatArray) -> FloatArray:

@@ -199,8 +199,8 @@ class TestCostModel:
     def test_iterations_take_the_time_of_the_benchmarks(
         self, gaussians: int, pixels: int, photographs: int, seconds: float
     ) -> None:
-        """Within 25 %, the largest deviation of the fit over the table of docs/benchmarks.md."""
-        assert iteration_seconds(pixels, gaussians, photographs, surface=False) == pytest.approx(seconds, rel=0.25)
+        """Within 20 %; over the whole table of docs/benchmarks.md the fit deviates by up to 21 %."""
+        assert iteration_seconds(pixels, gaussians, photographs, surface=False) == pytest.approx(seconds, rel=0.2)
 
 
 def test_a_reconstruction_that_does_not_fit(

@@ -1,7 +1,6 @@
-"""Solution that all blocks of a survey share: the adjustment, with the exposures of the training photographs.
+"""Solution that all blocks of a survey share: the adjustment, with the exposures of the photographs.
 
-Reads the survey, the SfM model and
-the adjustment. Writes `solution.json`.
+Reads the survey, the SfM model and the adjustment. Writes `solution.json`.
 """
 
 from pipelines.core.products import save_json
