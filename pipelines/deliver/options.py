@@ -193,7 +193,7 @@ class ExportTilesOptions(WebSplatOptions, PageOptions):
     compression: Compression = Field(
         "spz",
         description="Content of the tiles: SPZ, or plain arrays of the ratified KHR_gaussian_splatting, exact and "
-        "several times larger. CesiumJS reads SPZ alone: none writes no index.html.",
+        "several times larger. CesiumJS reads SPZ alone, or plain arrays by the program in index.html.",
     )
     archive: bool = Field(False, description="Write the tileset as one file too: tiles.3tz.")
 

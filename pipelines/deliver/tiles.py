@@ -2,8 +2,8 @@
 
 Reads `ingest/survey.json`, `train/model.json`, `train/gaussians.ply` and, of a training in blocks,
 `train/blocks.json`: the Gaussians of one block after another come into memory. Writes `tiles/tileset.json` with the
-contents in `tiles/content/`, `tiles/splat.glb`, a sidecar of each (docs/formats.md), and of tiles with SPZ
-`tiles/index.html`, which shows them in a browser; if asked, `tiles/tiles.3tz`, the tileset in one file.
+contents in `tiles/content/`, `tiles/splat.glb`, a sidecar of each (docs/formats.md), and `tiles/index.html`, which
+shows them in a browser; if asked, `tiles/tiles.3tz`, the tileset in one file.
 
 All files are in the frame of the placement, East-North-Up; the tileset's root places it on Earth.
 """
@@ -60,7 +60,7 @@ def run(stage: StageRun, options: ExportTilesOptions) -> Summary:
             "3D Tiles need a place on Earth, and this survey has a local metric frame. `georef export-ply`, "
             "`georef export-spz` and `georef export-mesh` write it in that frame.",
         )
-    page = _page(stage.workspace, splat, options) if options.compression == "spz" else None
+    page = _page(stage.workspace, splat, options)
     count, sidecar = len(splat.center_in_file), splat.placement.sidecar()
     each, harmonic = _BYTES[options.compression]
     copies = _COPIES + (_ARCHIVED_COPIES if options.archive else 0)
@@ -72,8 +72,7 @@ def run(stage: StageRun, options: ExportTilesOptions) -> Summary:
     in_glb = write_whole(stage.out, splat, root, sidecar, count, compression=options.compression)
     for name in (TILESET, GLB):
         write_sidecar(sidecar, stage.out / name)
-    if page is not None:
-        write_scene_page(page, stage.out)
+    write_scene_page(page, stage.out)
     tiles = list(root.all())
     if options.archive:
         names = [TILESET, *(_content_uri(tile.name) for tile in tiles)]

@@ -7,8 +7,8 @@ CesiumJS draws Gaussians from SPZ alone, and reads the first primitive of the fi
 opacity from COLOR_0. An attribute for the harmonic of degree 0 would make it drop all harmonics, so a file with SPZ
 names none. A file with plain data names all that the ratified extension demands: standard deviations and opacity
 as they are (no logarithm, no logit), rotations x, y, z, w, and every harmonic. It does not demand that a reader
-knows the extension: others may draw the centres as points, in the colours of COLOR_0. CesiumJS 1.145 fails, because
-its shader takes the names of the attributes.
+knows the extension: others may draw the centres as points, in the colours of COLOR_0. CesiumJS 1.145 by
+itself fails, because its shader takes the names of the attributes: `tiles.html` hands it the arrays.
 """
 
 import json

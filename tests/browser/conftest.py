@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser
 
+from pipelines.deliver.options import Compression
 from pipelines.deliver.splat import codec_arrays
 from pipelines.deliver.tiles import Tiling, write_tiles
 from pipelines.deliver.tiles_page import write_scene_page
@@ -33,11 +34,13 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         yield root
 
 
-def write_scene(folder: Path, gaussians: Gaussians, largest_tile: int = 200_000) -> DetailTile:
+def write_scene(
+    folder: Path, gaussians: Gaussians, largest_tile: int = 200_000, compression: Compression = "spz"
+) -> DetailTile:
     """Write tiles and page of Gaussians of the hill; return the root of the tiles."""
     splat = hill.placed(gaussians)
     arrays = codec_arrays(splat.gaussians)
-    tiling = Tiling(scene_box(arrays.means), len(arrays), largest_tile)
+    tiling = Tiling(scene_box(arrays.means), len(arrays), largest_tile, compression)
     root = write_tiles(folder, [arrays], tiling, splat.placement.sidecar())
     write_scene_page(hill.page(splat, "Cesium/"), folder)
     return root

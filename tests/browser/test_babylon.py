@@ -43,7 +43,6 @@ PAGE = """<!doctype html>
 """
 GLTF_FROM_FILE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 # Babylon.js widens Gaussians by 0.3 px² as we do, and nothing is rounded: 40 to 46 dB are left by the edges of α.
-# CesiumJS shows the SPZ at 34 to 36 dB.
 LEAST_PSNR_DB = 38.0
 
 

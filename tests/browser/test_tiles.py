@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from playwright.sync_api import Browser
 
 from tests.browser import hill
-from tests.browser.chromium import Viewer
+from tests.browser.chromium import Viewer, served
+from tests.browser.conftest import new_viewer, write_scene
 
 pytestmark = pytest.mark.browser
 
@@ -21,6 +25,7 @@ VIEWS = {
 # SPZ rounds harmonics to 1/16 and 1/8, scales to 3 %. CesiumJS cuts Gaussians at 2.8 standard deviations, and adds
 # 0.02 px² to their screen covariance where our renders add 0.3 px². All of it together leaves 34 to 36 dB here.
 LEAST_PSNR_DB = 30.0
+LEAST_PLAIN_PSNR_DB = 42.0  # 8-bit colours, and single pixels at the edges: 45 to 50 dB
 
 
 def psnr_db(first: np.ndarray, second: np.ndarray) -> float:
@@ -40,6 +45,27 @@ def test_view_from_a_known_place_is_our_render_from_there(viewer: Viewer, name: 
     ours = VIEWS[name].render(hill.make_gaussians())
     assert ours.std() > 0.1  # there is something to see
     assert psnr_db(viewer.picture(), ours) > LEAST_PSNR_DB
+
+
+@pytest.mark.parametrize("largest_tile", [200_000, 500])
+def test_plain_tiles_are_the_picture_of_spz(
+    browser: Browser, viewer: Viewer, tmp_path: Path, largest_tile: int
+) -> None:
+    """In one tile and in several: our render, but for what SPZ rounds."""
+    gaussians = hill.make_gaussians()
+    write_scene(tmp_path, gaussians, largest_tile, "none")
+    plain = new_viewer(browser)
+    with served(tmp_path) as root:
+        plain.open(root)
+        for box in plain.page.locator("#kinds input").all():
+            box.uncheck()
+        for name in ("from the south", "near"):
+            for opened in (viewer, plain):
+                opened.stand(VIEWS[name].ecef_from_cam(), hill.CAMERA)
+            assert psnr_db(viewer.picture(), plain.picture()) > LEAST_PSNR_DB
+            assert psnr_db(plain.picture(), VIEWS[name].render(gaussians)) > LEAST_PLAIN_PSNR_DB
+        assert (plain.failed_tiles(), plain.problems, plain.outside) == ([], [], [])
+        plain.page.close()
 
 
 def centroids(picture: np.ndarray, near: np.ndarray) -> np.ndarray:
