@@ -139,9 +139,7 @@ class ExportMeshOptions(CrsOptions, AreaOptions):
         ge=0,
         description="Metres by which the simplification may move the surface; 0: none (default: half a voxel).",
     )
-    least_part: float = Field(
-        0.01, ge=0, le=1, description="Leave out unconnected parts with a smaller share of the largest part's area."
-    )
+    least_part: float = Field(4.0, ge=0, description="Leave out unconnected parts with less area, in m².")
     watertight: bool = Field(
         False, description="Close the mesh: holes by fans, outer rims by plumb walls down to a common base."
     )

@@ -127,13 +127,13 @@ def distances(points: FloatArray, mesh: RawMesh, step_m: float) -> FloatArray:
     return np.asarray(np.min(found, axis=0))
 
 
-def without_islands(mesh: RawMesh, least_share: float) -> tuple[RawMesh, int]:
-    """Return the connected parts with at least a share of the largest part's area, and the number of the others."""
+def without_islands(mesh: RawMesh, least_m2: float) -> tuple[RawMesh, int]:
+    """Return the largest connected part and others of at least an area, and the number of the parts left out."""
     number, part = _parts(mesh)
     corners = mesh.vertices[mesh.faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
     areas = np.bincount(part, area, number)
-    kept = areas >= least_share * areas.max()
+    kept = areas >= min(least_m2, areas.max())
     return compact(RawMesh(mesh.vertices, mesh.faces[kept[part]])), int((~kept & (areas > 0)).sum())
 
 
