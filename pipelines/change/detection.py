@@ -83,7 +83,7 @@ class Noise:
         shift_cov_m2: (3, 3) its covariance.
         tilt: (2,) rise of the later epoch to the east and to the north; zero without `with_tilt`.
         tilt_sigma: (2,)
-        factor: of the variance of the cells.
+        scatter: of the cells over their predicted σ.
         correlated_m2: area over which errors of cells are one error.
         length_m: distance at which the correlation has fallen below 5 %.
         long_range_m: σ of the errors that vary slowly over the scene.
@@ -95,7 +95,7 @@ class Noise:
     shift_cov_m2: FloatArray
     tilt: FloatArray
     tilt_sigma: FloatArray
-    factor: float
+    scatter: float
     correlated_m2: float
     length_m: float
     long_range_m: float
@@ -103,6 +103,15 @@ class Noise:
     share: float
     lags_m: FloatArray
     correlation: FloatArray
+
+    @property
+    def factor(self) -> float:
+        """Factor of the variance of the cells that decides what has changed.
+
+        It only ever raises them: level ground that scatters less than predicted says nothing of what lies beside
+        objects and at the rim, where cells scatter more and false changes are.
+        """
+        return max(self.scatter**2, 1.0)
 
     def moved_by(self, slope: FloatArray, place_m: FloatArray) -> FloatArray:
         """Return the part (…,) of differences that shift and tilt explain, at slopes and places (…, 2)."""
@@ -127,7 +136,7 @@ def unchanged_ground(samples: Samples, cell_m: float, prior_h_m: float, *, with_
     fit, kept = np.zeros(design.shape[1]), ground
     if ground.sum() >= _LEAST_STABLE:
         fit[0] = np.median(difference[ground])
-    factor, normal = 1.0, np.diag(prior + 1e-12)
+    scale, normal = 1.0, np.diag(prior + 1e-12)
     for _ in range(_PASSES):
         residual = (difference - design @ fit) / sigma
         scale = mad_sigma(residual[kept]) if kept.sum() >= _LEAST_STABLE else np.nan
@@ -145,8 +154,7 @@ def unchanged_ground(samples: Samples, cell_m: float, prior_h_m: float, *, with_
         rows = design[kept]
         normal = rows.T @ (rows * weight[:, None]) + np.diag(prior)
         fit = np.linalg.solve(normal, rows.T @ (weight * difference[kept]))
-        factor = scale**2
-    lags_m, correlation = _correlation(samples, fit, np.sqrt(factor), cell_m)
+    lags_m, correlation = _correlation(samples, fit, scale, cell_m)
     correlated_m2, length_m = _correlated(lags_m, correlation, cell_m)
     residual_m = (difference - design @ fit)[kept]
     extent_m2 = float(np.prod(np.ptp(samples.place_m[ground], axis=0)))
@@ -161,7 +169,7 @@ def unchanged_ground(samples: Samples, cell_m: float, prior_h_m: float, *, with_
         shift_cov_m2=covariance[np.ix_(order, order)],
         tilt=fit[3:] if with_tilt else np.zeros(2),
         tilt_sigma=tilt_sigma,
-        factor=factor,
+        scatter=scale,
         correlated_m2=correlated_m2,
         length_m=length_m,
         long_range_m=_long_range(samples.place_m[kept], residual_m, correlated_m2, area_m2),
@@ -278,10 +286,14 @@ class Volume:
             max(self.highest, other.highest),
         )
 
-    def sigma_m3(self, noise: Noise, cell_m2: float) -> float:
-        """Return the σ of the net volume: the datum's in full, and of the cells by their number that counts."""
+    def sigma_m3(self, noise: Noise, cell_m2: float, *, to_detect: bool = False) -> float:
+        """Return the σ of the net volume: the datum's in full, and of the cells by their number that counts.
+
+        The cells scatter as unchanged ground does, or by what decides whether something has changed.
+        """
         joined = min(max(noise.correlated_m2 / cell_m2, 1.0), max(self.cells, 1))
-        return float(cell_m2 * np.sqrt(self.datum**2 + noise.factor * self.variance * joined + self.steps))
+        factor = noise.factor if to_detect else noise.scatter**2
+        return float(cell_m2 * np.sqrt(self.datum**2 + factor * self.variance * joined + self.steps))
 
 
 def volumes(number: NDArray[Any], cells: Cells, count: int) -> list[Volume]:

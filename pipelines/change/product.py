@@ -23,7 +23,7 @@ def registration_of(noise: Noise, *, applied: bool, datum_v_m: float) -> Registr
         long_range_sigma_m=noise.long_range_m,
         correlated_m2=noise.correlated_m2,
         correlation_length_m=noise.length_m,
-        noise_factor=float(np.sqrt(noise.factor)),
+        noise_factor=noise.scatter,
         stable_share=noise.share,
         contradicts=not applied and abs(float(noise.shift_m[2])) > limit,
     )

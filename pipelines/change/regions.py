@@ -134,7 +134,7 @@ def find_regions(
         for sums in (whole, cores)
         for values in (
             [(one.fill - one.cut) * grid.cell_m2 for one in sums],
-            [one.sigma_m3(noise, grid.cell_m2) for one in sums],
+            [one.sigma_m3(noise, grid.cell_m2, to_detect=True) for one in sums],
         )
     )
     # A region is as large as its errors at least, so that more of them are no further chance.

@@ -32,11 +32,11 @@ def level_cells(difference: FloatArray, variance: FloatArray, datum: FloatArray,
     return Cells(difference, variance, datum, slope, np.zeros(shape), np.ones(shape, dtype=bool))
 
 
-def analysed(difference: FloatArray) -> tuple[Cells, Noise]:
-    """Cells of a level raster whose variance is stated as half of what it is, and their noise."""
+def analysed(difference: FloatArray, stated: float = 0.5) -> tuple[Cells, Noise]:
+    """Cells of a level raster whose variance is stated as a multiple of what it is, and their noise."""
     shape = difference.shape
     slope = np.random.default_rng(0).normal(0, 0.1, (*shape, 2))
-    cells = level_cells(difference, np.full(shape, SIGMA_M**2 / 2), np.zeros(shape), slope)
+    cells = level_cells(difference, np.full(shape, stated * SIGMA_M**2), np.zeros(shape), slope)
     row, column = (axis.ravel()[::7] for axis in np.indices(shape))
     place = np.asarray(CELL_M * (np.stack([column, -row], axis=-1) - SIDE / 2.0), dtype=np.float64)
     design = np.concatenate(
@@ -62,6 +62,21 @@ def test_noise_of_no_change_is_found_and_gives_few_false_alarms() -> None:
     centred = replace(cells, difference_m=cells.difference_m - noise.shift_m[2])
     sign = significant_change(centred, noise.factor, 4)
     assert (sign != 0).mean() < 0.05
+
+
+def test_smooth_ground_does_not_lower_the_level_of_rough_ground() -> None:
+    """A tenth of the ground scatters as predicted, the rest half as much: none of it has changed.
+
+    By the scatter of most of the ground, a third of the rough cells would exceed their level.
+    """
+    noise_m = correlated_noise(np.random.default_rng(3))
+    rough = np.zeros((SIDE, SIDE), dtype=bool)
+    rough[:, : SIDE // 10] = True
+    cells, noise = analysed(np.where(rough, 2.0, 1.0) * noise_m, stated=4.0)
+    assert noise.scatter == pytest.approx(0.5, rel=0.15)
+    sign = significant_change(cells, noise.factor, 4)
+    assert (sign[rough] != 0).mean() < 0.05
+    assert (significant_change(cells, noise.scatter**2, 4)[rough] != 0).mean() > 0.1
 
 
 def test_an_interpolated_part_errs_as_one() -> None:
