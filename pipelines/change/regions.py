@@ -20,7 +20,6 @@ from scipy.special import erfc
 
 from pipelines.change.detection import QUANTILE_95, Cells, Noise, Volume, volumes
 from pipelines.change.grid import CommonGrid, Window
-from pipelines.change.product import region_of
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.formats.geotiff import cells_inside, outlines, read_cells, write_part
 from pipelines.survey.change_report import ChangedRegion
@@ -147,7 +146,7 @@ def find_regions(
         polygons.append(_outline(number, index + 1, places[index], grid))
     for name, chosen in (("lowered", kept[net[kept] < 0]), ("raised", kept[net[kept] > 0]), ("every", kept)):
         named.append((name, sum((whole[index] for index in chosen.tolist()), Volume())))
-    *regions, lowered, raised, every = (region_of(name, volume, noise, grid.cell_m2) for name, volume in named)
+    *regions, lowered, raised, every = (_region_of(name, volume, noise, grid.cell_m2) for name, volume in named)
     in_cores = np.where(np.isin(number, kept + 1), sign, 0).astype(np.int8)
     return FoundRegions(tuple(regions), lowered, raised, every, polygons, in_cores)
 
@@ -157,3 +156,17 @@ def _outline(number: IntArray | NDArray[np.int32], which: int, place: tuple[slic
     cells = number[rows, columns] == which
     frame = grid.frame.part(columns.start, rows.start, cells.shape[1], cells.shape[0])
     return shapely.union_all(outlines(cells, frame))
+
+
+def _region_of(name: str, volume: Volume, noise: Noise, cell_m2: float) -> ChangedRegion:
+    """Return the record of a region from the sums of its cells."""
+    return ChangedRegion(
+        name=name,
+        area_m2=volume.cells * cell_m2,
+        cut_m3=volume.cut * cell_m2,
+        fill_m3=volume.fill * cell_m2,
+        net_m3=(volume.fill - volume.cut) * cell_m2,
+        sigma_m3=volume.sigma_m3(noise, cell_m2),
+        lowest_m=volume.lowest,
+        highest_m=volume.highest,
+    )

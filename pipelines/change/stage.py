@@ -27,20 +27,20 @@ from pipelines.change.detection import (
 from pipelines.change.grid import CommonGrid, Window, epoch_rasters
 from pipelines.change.options import ChangeOptions
 from pipelines.change.page import Compared, change_page
-from pipelines.change.product import registration_of
 from pipelines.change.regions import Parts, find_regions, reach_of
 from pipelines.core.errors import InputError
 from pipelines.core.files import remove, replace_text
 from pipelines.core.products import Remark, save_json, union
 from pipelines.core.stages import CHANGE_PAGE
 from pipelines.core.staleness import status
+from pipelines.core.types import vector3
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.formats.geotiff import Band, RasterKind, write_mosaic
 from pipelines.formats.tables import table_text
 from pipelines.formats.vector_files import feature, features_text, read_boundary, write_polygons_gpkg
 from pipelines.geodesy.crs import PointCrs, parse_crs
 from pipelines.report.page import render_page
-from pipelines.survey.change_report import Change, ChangedRegion
+from pipelines.survey.change_report import Change, ChangedRegion, Registration
 
 _ROOM = __name__.rpartition(".")[0]
 _MOST_LEVELS = 1_000_000  # of detection, whose median is stated
@@ -81,7 +81,7 @@ def run(stage: StageRun, options: ChangeOptions) -> Summary:
     noise = unchanged_ground(
         grid.samples(ground, stage.progress), grid.cell_m, grid.datum_h_m, with_tilt=options.tilt
     )
-    registration = registration_of(noise, applied=registered, datum_v_m=grid.datum_v_m)
+    registration = _registration_of(noise, applied=registered, datum_v_m=grid.datum_v_m)
     parts = Parts(stage.out / "parts", grid)
     sign, median_lod_m = _write_rasters(stage, parts, noise, registered=registered)
     given = _polygons(options.regions, "--regions", crs, options) or ()
@@ -116,6 +116,26 @@ def run(stage: StageRun, options: ChangeOptions) -> Summary:
     page = change_page(compared, summary.warnings, cautions, stage.progress)
     replace_text(stage.out / Path(CHANGE_PAGE).name, render_page(page, _ROOM))
     return summary
+
+
+def _registration_of(noise: Noise, *, applied: bool, datum_v_m: float) -> Registration:
+    """Return the record of a registration; `datum_v_m` is the σ of a vertical shift by both adjustments."""
+    sigma = np.sqrt(np.diag(noise.shift_cov_m2))
+    limit = QUANTILE_95 * float(np.hypot(datum_v_m, np.hypot(sigma[2], noise.long_range_m)))
+    return Registration(
+        applied=applied,
+        shift_m=vector3(noise.shift_m),
+        sigma_shift_m=vector3(sigma),
+        tilt=(float(noise.tilt[0]), float(noise.tilt[1])),
+        sigma_tilt=(float(noise.tilt_sigma[0]), float(noise.tilt_sigma[1])),
+        datum_sigma_v_m=datum_v_m,
+        long_range_sigma_m=noise.long_range_m,
+        correlated_m2=noise.correlated_m2,
+        correlation_length_m=noise.length_m,
+        noise_factor=noise.scatter,
+        stable_share=noise.share,
+        contradicts=not applied and abs(float(noise.shift_m[2])) > limit,
+    )
 
 
 def _stale_rasters(workspace: Workspace) -> Iterator[Remark]:
