@@ -1,7 +1,7 @@
 """PSNR of test photographs in CesiumJS, of tiles with SPZ and of plain ones: `tiles_in_cesium.py WORKSPACE`.
 
 Needs a trained workspace, Chromium and npm. A photograph without lens distortion is moved so that its principal
-point is in the middle, where Cesium's cameras have it.
+point is in the middle, where Cesium's cameras have it. The workspace's own tiles and cameras are exported anew.
 """
 
 from __future__ import annotations
@@ -16,11 +16,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pycolmap
+import torch
 
 from pipelines.core.products import load_json
 from pipelines.formats.georef_sidecar import GeorefSidecar
 from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.similarity import Similarity
+from pipelines.splat.metrics import psnr
 from tests.browser.chromium import Viewer, chromium, served
 
 _RIM_PX = 8  # which lacks pixels of the moved photograph
@@ -35,7 +37,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder)
         _georef("export-cameras", args.workspace, "--undistorted", "--to", scratch / "cameras")
-        tiles = {kind: scratch / kind for kind in ("spz", "none")}
+        tiles = {kind: scratch / kind for kind in ("none", "spz")}
         for kind, to in tiles.items():
             _georef("export-tiles", args.workspace, "--cesium", "Cesium/", "--compression", kind, "--to", to)
         _compare(scratch / "cameras", tiles, args.most)
@@ -53,8 +55,7 @@ def _compare(cameras: Path, tiles: dict[str, Path], most: int) -> None:
             with served(folder) as root:
                 viewer = Viewer(browser.new_page())
                 viewer.open(root)
-                for box in viewer.page.locator("#kinds input").all():
-                    box.uncheck()
+                viewer.hide_labels()
                 for image in images:
                     pose = image.cam_from_world()
                     cam_from_file = Similarity(1.0, pose.rotation.matrix(), np.asarray(pose.translation))
@@ -71,12 +72,12 @@ def _compare(cameras: Path, tiles: dict[str, Path], most: int) -> None:
         moved = np.array([[1, 0, width / 2 - lens.principal_point_x], [0, 1, height / 2 - lens.principal_point_y]])
         photograph = cv2.warpAffine(file, moved, (width, height))[..., ::-1] / 255.0
         inner = (slice(_RIM_PX, -_RIM_PX), slice(_RIM_PX, -_RIM_PX))
-        seen = photograph[inner].sum(axis=-1) > 0
-        of_kind = {
-            kind: -10 * np.log10(np.mean((shown[kind, image.name][inner] - photograph[inner])[seen] ** 2))
-            for kind in tiles
-        }
-        print(f"{image.name}: SPZ {of_kind['spz']:.2f} dB, plain {of_kind['none']:.2f} dB")
+        target = torch.from_numpy(photograph[inner].copy())
+        spz, plain = (
+            psnr(torch.from_numpy(shown[kind, image.name][inner].copy()), target, target.sum(dim=-1) > 0)
+            for kind in ("spz", "none")
+        )
+        print(f"{image.name}: SPZ {spz:.2f} dB, plain {plain:.2f} dB")
 
 
 def _even(lens: pycolmap.Camera) -> tuple[int, int]:

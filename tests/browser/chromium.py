@@ -199,6 +199,11 @@ class Viewer:
             }"""
         )
 
+    def hide_labels(self) -> None:
+        """Hide the labels of the surveyed points, which no splat shows."""
+        for box in self.page.locator("#kinds input").all():
+            box.uncheck()
+
     def _heard(self, line: ConsoleMessage) -> None:
         if line.type == "error":
             self.problems.append(f"console: {line.text}")

@@ -29,8 +29,7 @@ def levels(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterat
     viewer = new_viewer(browser)
     with served(folder) as address:
         viewer.open(address)
-        for box in viewer.page.locator("#kinds input").all():
-            box.uncheck()
+        viewer.hide_labels()
         yield viewer, root
         viewer.page.close()
 

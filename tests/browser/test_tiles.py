@@ -34,9 +34,7 @@ def psnr_db(first: np.ndarray, second: np.ndarray) -> float:
 
 @pytest.fixture(autouse=True, scope="module")
 def without_labels(viewer: Viewer) -> None:
-    """Hide the labels of the surveyed points, which no splat shows."""
-    for box in viewer.page.locator("#kinds input").all():
-        box.uncheck()
+    viewer.hide_labels()
 
 
 @pytest.mark.parametrize("name", VIEWS)
@@ -57,8 +55,7 @@ def test_plain_tiles_are_the_picture_of_spz(
     plain = new_viewer(browser)
     with served(tmp_path) as root:
         plain.open(root)
-        for box in plain.page.locator("#kinds input").all():
-            box.uncheck()
+        plain.hide_labels()
         for name in ("from the south", "near"):
             for opened in (viewer, plain):
                 opened.stand(VIEWS[name].ecef_from_cam(), hill.CAMERA)
