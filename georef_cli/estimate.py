@@ -17,7 +17,7 @@ from georef_cli.layout import plain_table, shown
 from georef_cli.output import print_json, print_rich, size
 from georef_cli.tables import Renderable
 from pipelines.core.errors import GeorefError
-from pipelines.core.options import OptionsT, notation, require_extras
+from pipelines.core.options import OptionsT, notation, require_available
 from pipelines.core.plan import PlannedStage, photograph_folder, plan
 from pipelines.core.products import load_json
 from pipelines.core.progress import SILENT, Progress
@@ -67,7 +67,7 @@ def estimate_run(
     planned = plan(workspace, stages, flags, force=force)
     for row in planned:
         if row.action not in ("keep", "refuse"):
-            require_extras(row.resolved)
+            require_available(row.resolved)
     photographs = _photographs(workspace, planned)
     reconstruction, training = None, None
     if photographs is not None:

@@ -47,7 +47,9 @@ def _lines(machine: Machine) -> list[tuple[str, str]]:
         ("GPU", "; ".join(gpus)),
     ]
     for backend in machine.backends:
-        reason = "see below" if backend.name == "cuda" else shown(backend.reason)
+        reason = shown(backend.reason)
+        if backend.name == "cuda":
+            reason = "see below" if machine.gpus else "no GPU that torch sees; it needs one, and all below"
         state = "[green]available[/]" if backend.available else f"[yellow]no[/]: {reason}"
         lines.append((f"backend {backend.name}", state))
     lines += [(f"  {part.name}", _state(part)) for part in machine.cuda_parts]

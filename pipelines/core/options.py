@@ -58,6 +58,16 @@ class ExtraMarker:
     extra: Extra
 
 
+@dataclass(frozen=True)
+class NeedMarker:
+    """Mark of an option of which some values need what a machine may lack.
+
+    `require` takes the value, and raises a BackendUnavailableError that names what is missing.
+    """
+
+    require: Callable[[Any], None]
+
+
 class EffortMarker:
     """Mark of an option that changes the time or the messages of a stage, and not its result."""
 
@@ -154,12 +164,15 @@ def decisive_fields(options_type: type[StageOptions]) -> list[str]:
     return [name for name, info in fields.items() if name not in inputs and EFFORT not in marks_of(info)]
 
 
-def require_extras(options: StageOptions) -> None:
-    """Raise a BackendUnavailableError if an option that is given needs an extra that is not installed."""
+def require_available(options: StageOptions) -> None:
+    """Raise a BackendUnavailableError if an option needs an extra, or a device, that this machine lacks."""
     for name, info in type(options).model_fields.items():
-        for mark in marks_of(info):
-            if isinstance(mark, ExtraMarker) and getattr(options, name) is not None:
+        value = getattr(options, name)
+        for mark in marks_of(info) if value is not None else ():
+            if isinstance(mark, ExtraMarker):
                 require(mark.extra)
+            elif isinstance(mark, NeedMarker):
+                mark.require(value)
 
 
 def as_flags(options: StageOptions, names: Collection[str]) -> str:

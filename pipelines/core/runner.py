@@ -18,7 +18,7 @@ from pipelines.core.files import remove, replace_text
 from pipelines.core.fingerprints import library_versions
 from pipelines.core.lock import WriteLock
 from pipelines.core.manifest import MANIFEST, Manifest, Memo, record_files
-from pipelines.core.options import REQUESTS, read_requests, remember, remembered, require_extras
+from pipelines.core.options import REQUESTS, read_requests, remember, remembered, require_available
 from pipelines.core.products import union
 from pipelines.core.progress import AT_END, SILENT, Progress
 from pipelines.core.sentences import duration
@@ -119,7 +119,7 @@ def run_stage(
         if previous is not None and resume != "never" and _goes_on(workspace, asked):
             previous = None
         if previous is None:
-            require_extras(asked.options)
+            require_available(asked.options)
             if not force:
                 staleness.refuse_loss(workspace, spec, asked.options, asked.inputs.hashes)
         before = read_requests(workspace.written).get(spec.name, {})
@@ -163,7 +163,7 @@ def run_pipeline(
     for spec in stages:
         options = staleness.stage_config(workspace, spec, asked[spec.name])
         if force or not (workspace.root / spec.product).exists():  # else it may be current, and need no extra
-            require_extras(options)
+            require_available(options)
         if not force:
             staleness.refuse_loss_by_options(workspace, spec, options)
     outcomes: list[Outcome] = []

@@ -6,6 +6,7 @@ from pydantic import Field
 
 from pipelines.core.options import ExtraMarker, InputPath
 from pipelines.geodesy.vertical import Vertical
+from pipelines.splat.rasterizer.choice import Backend
 from pipelines.survey.options import AreaOptions, CloudPath
 from pipelines.survey.report_parts import Alignment
 
@@ -13,7 +14,7 @@ from pipelines.survey.report_parts import Alignment
 class EvaluateOptions(AreaOptions):
     """Options of the evaluation with test views and check points."""
 
-    backend: Literal["auto", "cpu", "cuda"] = Field("auto", description="Rasteriser.")
+    backend: Backend = Field("auto", description="Rasteriser.")
     renders: int = Field(8, ge=0, description="Largest number of side-by-side renders to write.")
     similarity: Literal["trained", "initial"] = Field(
         "trained", description="Similarity of the model: that of the training, or that of init-sim3."

@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 from pipelines.core.errors import InputError
 from pipelines.core.options import InputPath, StageOptions
 from pipelines.geodesy.vertical import Vertical
+from pipelines.splat.rasterizer.choice import Backend
 from pipelines.survey.options import AreaOptions, CloudPath
 
 
@@ -173,7 +174,7 @@ class GaussianOptions(StageOptions):
         "crops of its area.",
     )
     max_gaussians: int | None = Field(None, ge=100, description="Limit of Gaussians (default: likewise).")
-    backend: Literal["auto", "cpu", "cuda"] = Field("auto", description="Rasteriser.")
+    backend: Backend = Field("auto", description="Rasteriser.")
     sh_degree: int = Field(3, ge=0, le=3, description="Degree of the spherical harmonics.")
     strategy: Literal["default", "mcmc", "fast"] = Field(
         "default", description="Densification: as in 3DGS, by MCMC, or by errors in several views (fast)."

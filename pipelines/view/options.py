@@ -1,10 +1,9 @@
 """Options of the viewer."""
 
-from typing import Literal
-
 from pydantic import Field
 
 from pipelines.core.options import StageOptions
+from pipelines.splat.rasterizer.choice import Backend
 from pipelines.survey.options import CrsOptions
 
 
@@ -19,7 +18,7 @@ class ViewOptions(CrsOptions):
     port: int = Field(
         8080, ge=1024, le=65000, description="Port on this machine; if it is taken, the next free one."
     )
-    backend: Literal["auto", "cpu", "cuda"] = Field("auto", description="Rasteriser that draws the pictures.")
+    backend: Backend = Field("auto", description="Rasteriser that draws the pictures.")
 
 
 class ProposalOptions(StageOptions):

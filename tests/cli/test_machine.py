@@ -6,8 +6,10 @@ import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
+import torch
 from click.shell_completion import BashComplete
 
 from georef_cli.main import PROGRAM, cli
@@ -50,10 +52,21 @@ def test_doctor_tells_what_there_is_and_why_not(real_georef: Georef, monkeypatch
     assert offered["versions"]["numpy"] != NOT_INSTALLED
     text = real_georef("doctor").out
     words = " ".join(text.split())
-    assert (
-        "backend cuda no: see below NVIDIA driver missing: install it C++ compiler g++ 12 kernels not comp" in words
-    )
+    assert "backend cuda no: no GPU that torch sees; it needs one, and all below NVIDIA driver" in words
+    assert "NVIDIA driver missing: install it C++ compiler g++ 12 kernels not compiled yet" in words
     assert "/opt/chromium" in text
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+@pytest.mark.parametrize("option", [("--backend", "cuda"), ("--set", "evaluate.backend=cuda")])
+def test_run_refuses_cuda_before_its_first_stage(
+    real_georef: Georef, tmp_path: Path, option: tuple[str, str]
+) -> None:
+    (tmp_path / "photos").mkdir()
+    result = real_georef("run", tmp_path / "ws", "--images", tmp_path / "photos", *option)
+    result.assert_failed(1, "cuda-unavailable")
+    assert not (tmp_path / "ws").exists()
+    assert real_georef("run", tmp_path / "ws", "--images", tmp_path / "photos").error["code"] != "cuda-unavailable"
 
 
 @pytest.mark.parametrize("topic", TOPICS)

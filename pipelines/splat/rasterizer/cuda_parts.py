@@ -40,7 +40,7 @@ def running_parts() -> tuple[Part, ...]:
 
     Without a CUDA build of torch or a driver, nothing is said of devices: there cannot be any.
     """
-    base = (_torch_build(), _driver())
+    base = (_driver(), _torch_build())
     device = () if lacking(base) is not None else (_device(),)
     return (*base, *device, gsplat())
 
