@@ -30,6 +30,7 @@ from pipelines.survey.scene import Scene
 # Layout of the cached arrays, a part of their key: files of another layout lie in another folder.
 _LAYOUT = b"levels: direction, offset, score, step, sharpness, by kernels"
 _NEIGHBOURS = 10  # views that each view is compared with
+_KEY_DECIMALS = 6  # of metres and of direction cosines, in the key of the cache
 
 
 @dataclass(frozen=True)
@@ -193,7 +194,9 @@ class DepthMaps:
             sparse.obs_point, sparse.obs_image,
         )  # fmt: skip
         for array in arrays:
-            digest.update(np.ascontiguousarray(array).tobytes())
+            # The last bits of a pose depend on the processor and on numpy's version: a micrometre does not matter.
+            rounded = array.round(_KEY_DECIMALS) + 0.0 if array.dtype.kind == "f" else array
+            digest.update(np.ascontiguousarray(rounded).tobytes())
         for index in range(len(sparse.image_name)):
             digest.update(self.images.key(index).encode())
             if self.images.is_masked(index):

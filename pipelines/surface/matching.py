@@ -12,6 +12,8 @@ branches: LLVM makes vector instructions of them. Floating-point flags exclude N
 therefore keep out.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import Any
 

@@ -24,7 +24,6 @@ from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
 from pipelines.geometry.cameras import Pinhole, ViewPose, pose_matrix
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Render, Window
-from pipelines.splat.rasterizer.backends import device_of
 from pipelines.splat.spatial import SpatialBlocks
 from pipelines.splat.surface import measured_depth
 from pipelines.surface.visibility import DepthViews, Support, Viewpoints, support
@@ -62,7 +61,7 @@ class ModelRenderer:
         self.trained, self.images = trained, images
         self._backend = backend
         self.pinholes = Pinholes(images, trained.sfm.lenses, trained.sparse.lenses)
-        self._gaussians = trained.gaussians.to(device_of(backend))
+        self._gaussians = trained.gaussians.to(backend.device)
 
     @cached_property
     def blocks(self) -> SpatialBlocks:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+
 import cv2
 import numpy as np
 import pytest
@@ -21,6 +25,7 @@ from pipelines.surface.matching import (
     camera_matrix,
 )
 from pipelines.surface.sweep import SweepResult
+from tests.cli_runs import REPOSITORY
 from tests.stereo_scenes import depth_estimate, neighbours_of, ring_of_views, true_depth
 
 # float32: sums of squares of grey levels have an error of 1e-7, that is 0.01 grey levels² of a variance of 0.3
@@ -162,3 +167,9 @@ def test_the_winner_is_the_largest_score_with_the_scores_around_it(seed: int, co
     before, after = (np.take_along_axis(padded, best[None] + k, axis=0)[0] for k in (0, 2))
     parabola = best + 0.5 * (after - before) / (2 * winner.score - before - after)
     np.testing.assert_allclose(winner.hypothesis[winner.inner], parabola[winner.inner].clip(0, count), atol=1e-3)
+
+
+def test_depth_maps_load_without_opencvs_contributed_modules() -> None:
+    """A machine without them can train on depth maps that exist."""
+    code = "import cv2; vars(cv2).pop('ximgproc', None); import pipelines.surface.depth_maps"
+    subprocess.run([sys.executable, "-c", code], check=True, env={**os.environ, "PYTHONPATH": str(REPOSITORY)})

@@ -139,6 +139,26 @@ def test_another_scene_has_other_maps(maps: DepthMaps, material: tuple[Rendered,
     assert DepthMaps(maps.folder.parent, fewer, images).folder != maps.folder
 
 
+def test_another_processor_finds_the_maps(maps: DepthMaps, material: tuple[Rendered, Scene, ImageCache]) -> None:
+    """The last bits of a solution are those of its processor."""
+    _, scene, images = material
+    poses = scene.poses
+    other = replace(
+        scene,
+        poses=replace(
+            poses,
+            cam_from_model=poses.cam_from_model * (1 + 1e-15),
+            cam_center_in_model=poses.cam_center_in_model * (1 - 1e-15),
+        ),
+        point_in_model=scene.point_in_model * (1 + 1e-15),
+    )
+    assert not np.array_equal(other.point_in_model, scene.point_in_model)
+    assert DepthMaps(maps.folder.parent, other, images).folder == maps.folder
+    # A tenth of a millimetre is less than a hundredth of a pixel here, and seen all the same.
+    moved = replace(scene, poses=replace(poses, cam_center_in_model=poses.cam_center_in_model + 1e-4))
+    assert DepthMaps(maps.folder.parent, moved, images).folder != maps.folder
+
+
 def test_test_views_show_nothing_of_the_surface(
     maps: DepthMaps, material: tuple[Rendered, Scene, ImageCache]
 ) -> None:
