@@ -157,3 +157,26 @@ def test_convolution_form_for_other_devices_agrees() -> None:
     fused = image_similarity(x, y, mask)
     assert l1.item() == pytest.approx(fused[0], abs=1e-13)
     assert ssim.item() == pytest.approx(fused[1], abs=1e-13)
+
+
+def test_convolutions_for_other_devices_are_never_rounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """cuDNN may round to TF32 whatever torch does not forbid, in the backward pass too."""
+    from pipelines.splat.losses import _terms_by_convolution
+
+    allowed, convolve = [], functional.conv2d
+
+    def watched(*arguments: object, **options: object) -> Tensor:
+        allowed.append(torch.backends.cudnn.allow_tf32)
+        return convolve(*arguments, **options)
+
+    x, y = image_pair(33, 21, torch.float64)
+    fused, other = x.clone().requires_grad_(), x.clone().requires_grad_()
+    mask = border_mask(33, 21)
+    photometric_loss(fused, y, mask).backward()
+    monkeypatch.setattr(functional, "conv2d", watched)
+    before = torch.backends.cudnn.allow_tf32
+    l1, ssim = _terms_by_convolution(other, y, mask)
+    (0.8 * l1 + 0.2 * (1 - ssim)).backward()
+    assert allowed == [False] * 4  # two of the forward pass, two of the backward pass
+    assert torch.backends.cudnn.allow_tf32 == before
+    torch.testing.assert_close(other.grad, fused.grad, rtol=0, atol=1e-13)
