@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 DEMO := demo
 
-.PHONY: setup demo test test-all test-browser fuzz lint types docs check release clean
+.PHONY: setup demo test test-all test-browser test-gpu-build fuzz lint types docs check release clean
 
 setup test lint types docs:
 	@.ci/run $@
@@ -17,6 +17,10 @@ test-all:
 # The tiles in CesiumJS, in headless Chromium without a network: needs chromium and npm.
 test-browser:
 	@.ci/run browser
+
+# The kernels of the cuda backend compile, with the compilers of the package index; needs no GPU.
+test-gpu-build:
+	@.ci/run gpu-build
 
 check:
 	@.ci/run

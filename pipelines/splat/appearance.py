@@ -12,7 +12,6 @@ from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.losses import photometric_loss
 from pipelines.splat.optimizer import GaussianAdam, LearningRates
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings
-from pipelines.splat.rasterizer.backends import device_of
 
 # Rates of a short fit of linear quantities. Gaussians without a rate for their geometry keep it to the last bit.
 _RATES = LearningRates(
@@ -43,7 +42,7 @@ def refine_appearance(
 
     The order tells the number of a view for each iteration, the settings degree of the harmonics and background.
     """
-    device = device_of(rasterizer)
+    device = rasterizer.device
     adam = GaussianAdam(gaussians.to(device), 1.0, len(order), _RATES)
     with progress.task("appearance refinement", len(order)) as task:
         for iteration, number in enumerate(order):

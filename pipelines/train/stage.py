@@ -25,7 +25,7 @@ from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.splat.exposure import Exposures
 from pipelines.splat.gaussians import write_gaussians
 from pipelines.splat.memory import free_memory_bytes, require_memory
-from pipelines.splat.rasterizer.backends import device_of, rasterizer
+from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.depth_maps import DepthMaps
 from pipelines.surface.lidar_cloud import ScannerTrack
 from pipelines.surface.measured_cloud import CloudReader
@@ -79,7 +79,7 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     track = None if path is None else ScannerTrack.read(path, stated, survey.origin_on_earth)
     options.require_trainable(len(scene.sparse.image_name))
     images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
-    options = _within_memory(options, images, free_memory_bytes(device_of(backend)))
+    options = _within_memory(options, images, free_memory_bytes(backend.device))
     images.build(stage.progress)
     compile_kernels(stage.progress, renders=backend.name == "cpu")
     surface, compared, planes, lidar = None, None, None, None

@@ -34,7 +34,6 @@ from pipelines.splat.initialise import InitialisationOptions, scene_extent
 from pipelines.splat.optimizer import GaussianAdam, LearningRates
 from pipelines.splat.outlier_pixels import OutlierPixels, OutlierSettings
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Render, ScreenStats
-from pipelines.splat.rasterizer.backends import device_of
 from pipelines.splat.surface import ObservedPoints
 from pipelines.survey.photographs import ImageCache, Pinholes
 from pipelines.train.geographic.problem import GeographicAdam, GeoProblem
@@ -341,7 +340,7 @@ def make_trainer(
     The problem moves to the backend's device. Exposures are those given; None: those of the training photographs
     are fitted, if the options say so, from those that their tracks have.
     """
-    effort, device = options.effort, device_of(backend)
+    effort, device = options.effort, backend.device
     scene, images, surface = training.scene, training.images, training.surface
     start = InitialisationOptions(sh_degree=options.sh_degree, max_gaussians=effort.max_gaussians)
     gaussians = initial_gaussians(training, start, effort.max_gaussians, options.seed).to(device)
@@ -382,7 +381,7 @@ def make_finisher(
 
     The Gaussians are on the backend's device, and the problem freezes the cameras.
     """
-    device, scene, iterations = device_of(backend), training.scene, options.effort.iterations
+    device, scene, iterations = backend.device, training.scene, options.effort.iterations
     extent_m = scene_extent(scene.poses.cam_center_in_model[scene.train])
     optimizer = GaussianAdam(gaussians, extent_m, iterations)
     optimizer.rate_factor = _FINISHING_RATE

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from tests.splat.rasterizer.conftest import camera, leaves, loss_of, make_scene
+from tests.splat.rasterizer.conftest import camera, make_scene
 
-__all__ = ["camera", "leaves", "loss_of", "make_scene"]
+__all__ = ["camera", "make_scene"]

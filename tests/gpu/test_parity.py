@@ -14,57 +14,18 @@ from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.splat.rasterizer.cuda_kernels import missing_for_cuda
-from pipelines.splat.rasterizer.reference import render_reference
+from tests.splat.rasterizer.parity import BACKGROUND, CASES, GRADIENT, assert_parity
 
 MISSING = missing_for_cuda()
 pytestmark = [pytest.mark.gpu, pytest.mark.skipif(MISSING is not None, reason=f"no GPU to test on: {MISSING}")]
-BACKGROUND = (0.2, 0.5, 0.9)
-# float32 with the fast exponential of CUDA: some 1e-6 a contribution. Gradients sum 1e3 of them, of either sign.
-IMAGE, GRADIENT = 1e-4, 1e-3
 
 
-def on_gpu(scene):
-    gaussians, pose = scene
-    tensors = [
-        tensor.detach().to("cuda", torch.float32).requires_grad_() for tensor in gaussians.tensors().values()
-    ]
-    return Gaussians(*tensors), pose.detach().to("cuda").requires_grad_()
-
-
-@pytest.mark.parametrize(
-    # Number of Gaussians, logarithm of their size, degree of the harmonics, with depth and normals or without.
-    "case",
-    [(150, -2.0, 3, True), (150, -1.0, 2, True), (400, -3.0, 1, False), (60, 0.3, 0, True)],
-)
-def test_images_and_gradients(make_scene, leaves, camera, case):
+@pytest.mark.parametrize("case", CASES)
+def test_images_and_gradients(make_scene, camera, case):
     count, log_scale, degree, depth = case
-    scene = make_scene(count, seed=count, log_scale=log_scale)
     settings = RasterSettings(sh_degree=degree, background=BACKGROUND, depth=depth, normal=depth)
-    (truth, truth_pose), (gaussians, pose) = leaves(scene, torch.float64), on_gpu(scene)
-    expected = render_reference(truth, truth_pose, camera, settings)
-    render = rasterizer("cuda").render(gaussians, pose, camera, settings)
-    names = ["colour", "alpha", *(["expected_depth", "normal", "median_depth"] if depth else [])]
-    for name in names:
-        scale = 8 if "depth" in name else 1  # metres
-        difference = (getattr(render, name).cpu().double() - getattr(expected, name)).abs()
-        # Whether an alpha of exactly 1/255 counts is a matter of rounding: one pixel in a thousand may differ.
-        assert (difference > scale * IMAGE).double().mean() < 1e-3, f"{name}: {difference.max()}"
-    torch.testing.assert_close(render.stats.visible.cpu().sort().values, expected.stats.visible)
-
-    loss = torch.zeros((), dtype=torch.float64)
-    truth_loss = loss.clone()
-    random = torch.Generator().manual_seed(0)
-    for name in names[:4]:  # a median has no gradient
-        weight = torch.randn(getattr(expected, name).shape, generator=random, dtype=torch.float64)
-        loss = loss.cuda() + (weight.cuda() * getattr(render, name)).sum()
-        truth_loss = truth_loss + (weight * getattr(expected, name)).sum()
-    loss.backward()
-    truth_loss.backward()
-    pairs = {name: (tensor, truth.tensors()[name]) for name, tensor in gaussians.tensors().items()}
-    pairs["cam_from_model"] = (pose, truth_pose)
-    for name, (ours, theirs) in pairs.items():
-        error = (ours.grad.cpu().double() - theirs.grad).abs().max() / theirs.grad.abs().max()
-        assert error < GRADIENT, f"{name}: {error}"
+    scene = make_scene(count, seed=count, log_scale=log_scale)
+    assert_parity(rasterizer("cuda"), "cuda", scene, camera, settings)
 
 
 @pytest.mark.parametrize("masked", [False, True])

@@ -25,6 +25,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
+import torch
 from torch import Tensor
 
 from pipelines.geometry.cameras import Pinhole
@@ -132,6 +133,7 @@ class Rasterizer(Protocol):
     """Rasteriser backend."""
 
     name: BackendName
+    device: torch.device  # of the tensors that it takes and gives
 
     def render(
         self, gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, settings: RasterSettings

@@ -50,7 +50,3 @@ def rasterizer(name: Literal["auto", "cpu", "cuda"], progress: Progress = SILENT
     from pipelines.splat.rasterizer.cpu import CpuRasterizer
 
     return CpuRasterizer()
-
-
-def device_of(backend: Rasterizer) -> torch.device:
-    return torch.device("cuda" if backend.name == "cuda" else "cpu")

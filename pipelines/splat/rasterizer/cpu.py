@@ -41,6 +41,7 @@ class CpuRasterizer:
     """
 
     name: BackendName = "cpu"
+    device = torch.device("cpu")
 
     def render(
         self, gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, settings: RasterSettings

@@ -29,6 +29,7 @@ class CudaRasterizer:
     """
 
     name: BackendName = "cuda"
+    device = torch.device("cuda")
 
     def __init__(self, progress: Progress = SILENT) -> None:
         self._gsplat = load_gsplat(progress)
@@ -57,9 +58,10 @@ class CudaRasterizer:
             eps2d=settings.dilation_px2,
             sh_degree=settings.sh_degree,
             packed=True,
-            backgrounds=_row(settings.background, device),
         )
-        view = Render(image[0], alpha[0, ..., 0], _screen_stats(meta))
+        # gsplat refuses a background for packed Gaussians.
+        colour = image[0] + (1 - alpha[0]) * _row(settings.background, device)
+        view = Render(colour, alpha[0, ..., 0], _screen_stats(meta))
         if settings.depth:
             slope = _depth_slope(gaussians, cam_from_model, camera, meta, settings.dilation_px2)
             view.expected_depth, view.depth_variance = self._depth_moments(meta, slope, camera, view.alpha)

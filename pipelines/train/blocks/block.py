@@ -19,7 +19,7 @@ from pipelines.core.stages import BLOCK_PLAN, SCAFFOLD, SOLUTION
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.splat.gaussians import Gaussians, read_gaussians, write_gaussians
 from pipelines.splat.memory import free_memory_bytes, require_memory
-from pipelines.splat.rasterizer.backends import device_of, rasterizer
+from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.depth_maps import DepthMaps
 from pipelines.survey.area import boundary_area
 from pipelines.survey.block_plan import BlockPlan, BlockTraining, PlannedBlock
@@ -54,9 +54,9 @@ def run(stage: StageRun, options: BlockTrainOptions) -> Summary:
     solved = whole.of_images(rows)
     options = options.model_copy(update={"max_gaussians": block.gaussians, "optimize_cameras": False})
     images = photographs(solved.scene.sparse, solved.survey, workspace, options.effort.max_image_size)
-    scaffold = read_gaussians(workspace.path(SCAFFOLD)).to(device_of(backend))
+    scaffold = read_gaussians(workspace.path(SCAFFOLD)).to(backend.device)
     size = training_size(options, len(images), images.largest(), beside=len(scaffold))
-    require_memory(size, free_memory_bytes(device_of(backend)))
+    require_memory(size, free_memory_bytes(backend.device))
     images.build(stage.progress)
     maps = None
     if options.dense:
@@ -76,7 +76,7 @@ def run(stage: StageRun, options: BlockTrainOptions) -> Summary:
     scene, region = replace(solved.scene, train=seeing), _region(block, box, scaffold, masks)
     area = boundary_area(options, scene.geo_from_model.apply(whole.scene.point_in_model), solved.survey.origin)
     training = TrainingScene(scene, images, surface, region, area)
-    exposures = solved.exposures(device_of(backend))
+    exposures = solved.exposures(backend.device)
     trainer = make_trainer(training, frozen_problem(solved), backend, options, exposures)
     earlier = None if stage.extends is None else stage.extends / "record.json"
     done = load_json(BlockTraining, earlier).iterations if earlier is not None and earlier.is_file() else 0

@@ -30,7 +30,7 @@ from pipelines.geometry.cameras import pose_matrix
 from pipelines.robust.statistics import mad_sigma
 from pipelines.splat.gaussians import Gaussians, read_gaussians
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings
-from pipelines.splat.rasterizer.backends import device_of, rasterizer
+from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.splat.surface import measured_depth
 from pipelines.survey.block_plan import BlockPlan, BlockRecord, BlockTraining, MergedBlock, PlannedBlock, Seam
 from pipelines.survey.photographs import pinhole_of
@@ -79,7 +79,7 @@ class SeamViews:
     def __init__(self, parts: Parts, plan: BlockPlan, solution: Adjustment) -> None:
         self._parts, self._plan = parts, plan
         self._backend: Rasterizer = rasterizer(parts.options.backend)
-        self._device = device_of(self._backend)
+        self._device = self._backend.device
         self._poses = solution.poses
         self._sfm = solution.with_lenses(read_sparse(parts.workspace.path(stages.SPARSE)))
         self._index = self._sfm.image_index()

@@ -8,7 +8,7 @@ from pipelines.core.stages import SOLUTION
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.splat.gaussians import write_gaussians
 from pipelines.splat.memory import free_memory_bytes, require_memory
-from pipelines.splat.rasterizer.backends import device_of, rasterizer
+from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.survey.block_plan import SCAFFOLD_IMAGE_PX, scaffold_gaussians
 from pipelines.survey.scene import photographs
 from pipelines.train.adjusted_scene import AdjustedScene
@@ -29,9 +29,9 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     solved = AdjustedScene.load(workspace, SOLUTION)
     coarse = coarse_options(options, len(solved.scene.train))
     images = photographs(solved.scene.sparse, solved.survey, workspace, coarse.effort.max_image_size)
-    require_memory(training_size(coarse, len(images), images.largest()), free_memory_bytes(device_of(backend)))
+    require_memory(training_size(coarse, len(images), images.largest()), free_memory_bytes(backend.device))
     images.build(stage.progress)
-    exposures = solved.exposures(device_of(backend))
+    exposures = solved.exposures(backend.device)
     trainer = make_trainer(TrainingScene(solved.scene, images), frozen_problem(solved), backend, coarse, exposures)
     record = train_in_folder(stage, trainer, coarse)
     gaussians = trainer.optimizer.gaussians.detached()

@@ -24,7 +24,7 @@ from pipelines.core.stages import BLOCK_GAUSSIANS, BLOCK_PLAN, SCAFFOLD, SOLUTIO
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.splat.gaussians import Gaussians, read_gaussians, write_gaussians
 from pipelines.splat.rasterizer.api import Rasterizer
-from pipelines.splat.rasterizer.backends import device_of, rasterizer
+from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.survey.block_plan import BlockCell, BlockPlan, PlannedBlock
 from pipelines.survey.photographs import ImageCache
 from pipelines.survey.scene import photographs
@@ -136,7 +136,7 @@ class _SeamTrainer:
         """Return the Gaussians of a strip after their training; None if too few views show the strip."""
         if not len(start):
             return None
-        scene, device = self.solved.scene, device_of(self.backend)
+        scene, device = self.solved.scene, self.backend.device
         index = scene.sparse.image_index()
         train = np.array([index[name] for name in names if name in index], dtype=np.int64)
         everything = Gaussians.concatenate([start, surroundings]).to(device)

@@ -8,6 +8,7 @@ import sys
 import sysconfig
 import threading
 import time
+from importlib import metadata
 from types import SimpleNamespace
 
 import pytest
@@ -98,8 +99,12 @@ def _no_driver(name):
     raise OSError(name)
 
 
-def _no_gsplat(machine):
-    (machine.package.parent / "gsplat-1.5.3.dist-info").rename(machine.root / "gone")
+def _no_gsplat(patch):
+    def version(name):
+        raise metadata.PackageNotFoundError(name)
+
+    missing = SimpleNamespace(version=version, PackageNotFoundError=metadata.PackageNotFoundError)
+    patch.setattr(cuda_parts, "metadata", missing)
 
 
 def _no_python_headers(patch):
@@ -117,7 +122,7 @@ def _no_python_headers(patch):
         ),
         (lambda m, p: setattr(m.driver, "version", 12040), "it knows CUDA 12.4, torch is built for 13.0"),
         (lambda m, p: p.setattr(torch.cuda, "device_count", lambda: 0), "no CUDA device: torch sees none"),
-        (lambda m, p: _no_gsplat(m), r"no gsplat: pip install 'georefgs\[cuda\]'"),
+        (lambda m, p: _no_gsplat(p), r"no gsplat: pip install 'georefgs\[cuda\]'"),
         (lambda m, p: m.nvcc.unlink(), r"no CUDA compiler \(nvcc\): pip install 'georefgs\[cuda\]'"),
         (lambda m, p: p.setattr(torch.version, "cuda", "12.8"), "is CUDA 13.0, torch is built for 12.8"),
         (lambda m, p: (m.home / "include" / HEADERS[2]).unlink(), "without those of nvidia-cuda-cccl"),
