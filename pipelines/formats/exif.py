@@ -1,47 +1,63 @@
-"""Tags of a photograph: EXIF's position, time and lens, and DJI's XMP with gimbal angles, RTK state and altitudes.
+"""Tags of a photograph: EXIF's and XMP's position, time and lens, attitude, RTK state and altitudes of a drone.
 
 Thousands of programs write EXIF. A tag that cannot be trusted (a zero denominator, a latitude without its
-hemisphere, 0° 0°) counts as absent, and the reason is kept for the log. DJI's XMP has attribute or element form;
-its packet must be short and lie in the first or last mebibyte of a file. defusedxml refuses entities and document
-types.
+hemisphere, 0° 0°) counts as absent, and the reason is kept for the log. A tag whose form is wrong and whose meaning
+is not (a reference as text, a sign in the value, a negative number written as a positive one) is read, and the
+correction kept as well. All sources of one quantity are returned: who uses them compares them.
 """
 
 import contextlib
-import io
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import Any, Literal
-from xml.etree.ElementTree import Element, ParseError
+from typing import Literal
+
+from PIL import ExifTags
 
 from pipelines.core.types import Vector3
-
-_SEARCHED_BYTES = 1024 * 1024
-_MAX_PACKET_BYTES = 256 * 1024
-_OPEN, _CLOSE = b"<x:xmpmeta", b"</x:xmpmeta>"
+from pipelines.formats.photo_blocks import find_blocks
+from pipelines.formats.tiff_tags import Tag, read_directory
+from pipelines.formats.xmp import Xmp, number_of, read_packets
 
 RTK_FIXED = 50
 RTK_FLOAT = 34
-_JPEG = b"\xff\xd8"
-_TIFF = (b"II*\x00", b"MM\x00*")
-# A JPEG's EXIF lies in one of its first segments of 64 KiB. The parser gets no more than this head.
-_JPEG_HEAD_BYTES = 1024 * 1024
+_MAX_TAG_BYTES = 4096  # makers' notes and previews are not kept
+_EXIF_DIRECTORY, _GPS_DIRECTORY = 0x8769, 0x8825
+# Names that differ from Pillow's: the standard's spelling, and short ones.
+_OWN_NAMES = {
+    0x001D: "GPSDate", 0x9290: "SubSecTime", 0x9291: "SubSecTimeOriginal", 0x9292: "SubSecTimeDigitized",
+    0xA003: "ExifImageLength",
+}  # fmt: skip
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # by EXIF's FocalPlaneResolutionUnit
-_BELOW_ZERO = frozenset({1, 3})  # EXIF 3.0 added 2 and 3: above and below sea level, stated explicitly
+_ABOVE_ZERO, _BELOW_ZERO = frozenset({0, 2}), frozenset({1, 3})  # EXIF 3.0 added 2 and 3
 _WGS84_NAMES = frozenset({"", "WGS84"})
-_GPS_H_ERROR = ("GPS GPSHPositioningError", "GPS Tag 0x001F")
+_WRAP = 2.0**32  # a negative number of 32 bits that is written without its sign
+_HIGHEST_M = 20_000.0  # no photograph of a survey is taken higher
+_FOOT_M = 0.3048
+_NO_35_MM = frozenset({1.0, 65535.0})  # how cameras write that they do not know
+_TEXT_NUMBER = re.compile(r"[+-]?\d+(?:\.\d+)?")
+# Names of latitude and longitude: DJI's (an early one misspelt) and Adobe's, Skydio's and Autel's.
+_XMP_AXES = (("GpsLatitude", ("GpsLongitude", "GpsLongtitude")), ("Latitude", ("Longitude",)))
+_VOID = frozenset({"invalid", "v", "void", "none"})
+_PLACES_OF_CAMERAS = frozenset({"", "position", "gps", "gpsposition", "location", "cameraposition"})
 TimeSource = Literal["offset", "gps", "assumed UTC"]
+GpsSource = Literal["EXIF", "XMP"]
 
 
 @dataclass(frozen=True)
 class DjiTags:
-    """DJI's tags; None if absent."""
+    """Tags of a drone, by DJI's names or by those of other makers that mean the same; None if absent."""
 
     gimbal_yaw_pitch_roll_deg: Vector3 | None = None  # Z-Y-X from North-East-Down
     rtk_flag: int | None = None  # 50 fixed, 34 float, 16 single point, 0 none
     rtk_sigma_enu_m: Vector3 | None = None
     absolute_altitude_m: float | None = None  # above the same reference as `GPSAltitude`
+    relative_altitude_m: float | None = None  # above the place of take-off
+    flight_yaw_deg: float | None = None  # of the aircraft's nose
+    sigma_h_m: float | None = None  # of the position, as PIX4D's tags state it
+    sigma_v_m: float | None = None
 
 
 @dataclass(frozen=True)
@@ -53,6 +69,8 @@ class GpsTag:
     alt_m: float | None
     sigma_h_m: float | None
     datum: str
+    source: GpsSource = "EXIF"
+    void: bool = False  # the receiver says that it had no fix
 
 
 @dataclass(frozen=True)
@@ -76,97 +94,267 @@ class PhotoTags:
     lens: LensTags = LensTags()
     timestamp_s: float | None = None  # seconds since 1970 UTC; `time_source` is the source of the time zone
     time_source: TimeSource | None = None
-    gps: GpsTag | None = None
+    gps: GpsTag | None = None  # EXIF's, of its first block that has one
+    more_gps: tuple[GpsTag, ...] = ()  # of EXIF's further blocks, and of XMP
+    direction_deg: float | None = None  # EXIF's GPSImgDirection from true north
     dji: DjiTags | None = None
+    xmp: Xmp = field(default_factory=Xmp)  # every property of every packet
+    # every tag, by directory and name: "Image Make", "EXIF LensModel"
+    exif: Mapping[str, Tag] = field(default_factory=dict)
     problems: tuple[str, ...] = ()  # why tags were not used, one phrase each
+    corrections: tuple[str, ...] = ()  # how tags of a wrong form were read, one sentence each
 
     @property
     def make_model(self) -> str:
         """Make and model, without a repetition of the make."""
         return self.model if self.model.startswith(self.make) else f"{self.make} {self.model}"
 
+    @property
+    def positions(self) -> tuple[GpsTag, ...]:
+        """All positions that the tags state, EXIF's first."""
+        return self.more_gps if self.gps is None else (self.gps, *self.more_gps)
+
 
 def read_tags(data: bytes) -> PhotoTags:
-    """Return EXIF and DJI XMP of a photograph; tags that cannot be read become `problems`, never an error."""
-    problems: list[str] = []
-    tags = _exif(data, problems)
-    try:
-        dji = read_dji(data)
-    except XmpError as error:
-        dji = None
-        problems.append(str(error))
+    """Return EXIF and XMP of a photograph; tags that cannot be read become `problems`, never an error."""
+    blocks = find_blocks(data)
+    notes = _Notes(list(blocks.problems), [])
+    directories = [_tags_of(block) for block in blocks.exif]
+    tags: dict[str, Tag] = {}
+    for directory in directories:
+        tags = directory | tags  # the first of a name counts
+    xmp = read_packets(blocks.xmp, notes.problems)
+    found = [_gps(directory, notes) for directory in directories]
+    in_exif = list(dict.fromkeys(each for each in found if each is not None))
+    in_xmp = _xmp_positions(xmp, notes)
     timestamp_s, time_source = _time(tags)
     return PhotoTags(
         make=_text(tags, "Image Make"),
         model=_text(tags, "Image Model"),
         orientation=int(_number(tags, "Image Orientation") or 1),
-        lens=_lens(tags),
+        lens=_lens(tags, notes),
         timestamp_s=timestamp_s,
         time_source=time_source,
-        gps=_gps(tags, problems),
-        dji=dji,
-        problems=tuple(problems),
+        gps=in_exif[0] if in_exif else None,
+        more_gps=(*in_exif[1:], *in_xmp),
+        direction_deg=_direction(tags),
+        dji=_drone(xmp) if xmp else None,
+        xmp=xmp,
+        exif=tags,
+        problems=tuple(dict.fromkeys(notes.problems)),
+        corrections=tuple(dict.fromkeys(notes.corrections)),
     )
 
 
-def _exif(data: bytes, problems: list[str]) -> Mapping[str, Any]:
-    import exifread
+@dataclass(frozen=True)
+class _Notes:
+    """What is said of the tags: why some are not used, and how some of a wrong form were read."""
 
-    if data[:2] == _JPEG:
-        data = data[:_JPEG_HEAD_BYTES]
-    elif data[:4] not in _TIFF:
-        return {}
-    try:
-        tags: Mapping[str, Any] = exifread.process_file(io.BytesIO(data), details=False)
-    except Exception as error:  # the parser's arithmetic on broken bytes may raise any error
-        problems.append(f"the EXIF data cannot be read ({type(error).__name__})")
-        return {}
+    problems: list[str]
+    corrections: list[str]
+
+
+def _tags_of(block: bytes) -> dict[str, Tag]:
+    """Return the tags of an EXIF block by directory and name."""
+    image = read_directory(block, limit_bytes=_MAX_TAG_BYTES)
+    tags = {f"Image {_name(number, ExifTags.TAGS)}": tag for number, tag in image.items()}
+    for directory, prefix, names in (
+        (_EXIF_DIRECTORY, "EXIF", ExifTags.TAGS),
+        (_GPS_DIRECTORY, "GPS", ExifTags.GPSTAGS),
+    ):
+        pointer = image.get(directory)
+        if pointer is not None and pointer.fractions:
+            entries = read_directory(block, int(pointer.fractions[0][0]), limit_bytes=_MAX_TAG_BYTES)
+            tags |= {f"{prefix} {_name(number, names)}": tag for number, tag in entries.items()}
     return tags
 
 
-def _gps(tags: Mapping[str, Any], problems: list[str]) -> GpsTag | None:
-    lat = _degrees(tags, "GPS GPSLatitude")
-    lon = _degrees(tags, "GPS GPSLongitude")
+def _name(number: int, names: Mapping[int, str]) -> str:
+    return _OWN_NAMES.get(number) or names.get(number) or f"0x{number:04X}"
+
+
+def _gps(tags: Mapping[str, Tag], notes: _Notes) -> GpsTag | None:
+    lat, lon = (_signed(tags, f"GPS GPS{axis}", notes) for axis in ("Latitude", "Longitude"))
     if lat is None or lon is None:
         if "GPS GPSLatitude" in tags or "GPS GPSLongitude" in tags:
-            problems.append("the GPS latitude or longitude is not a number")
+            notes.problems.append("the GPS latitude or longitude is not a number")
         return None
-    lat_side = _text(tags, "GPS GPSLatitudeRef")[:1].upper()
-    lon_side = _text(tags, "GPS GPSLongitudeRef")[:1].upper()
-    if lat_side not in ("N", "S") or lon_side not in ("E", "W"):
-        problems.append("the GPS position does not say its hemisphere")
+    if not (math.isfinite(lat) and math.isfinite(lon)):
+        notes.problems.append("the GPS position does not say its hemisphere")
         return None
-    lat, lon = (-lat if lat_side == "S" else lat), (-lon if lon_side == "W" else lon)
-    if abs(lat) > 90.0 or abs(lon) > 180.0:
-        problems.append(f"the GPS position {lat:.6g}, {lon:.6g} is out of range")
-        return None
-    if lat == 0.0 and lon == 0.0:
-        problems.append("the GPS position is 0, 0, which means none")
+    if not _is_a_place(lat, lon, "GPS position", notes):
         return None
     datum = _text(tags, "GPS GPSMapDatum")
     plain = datum.upper().replace("-", "").replace(" ", "")
-    altitude = _number(tags, "GPS GPSAltitude")
-    if altitude is not None and _number(tags, "GPS GPSAltitudeRef") in _BELOW_ZERO:
-        altitude = -altitude
-    sigma_h_m = next(filter(None, (_positive(_number(tags, key)) for key in _GPS_H_ERROR)), None)
-    return GpsTag(lat, lon, altitude, sigma_h_m, "" if plain in _WGS84_NAMES else datum)
+    return GpsTag(
+        lat_deg=lat,
+        lon_deg=lon,
+        alt_m=_altitude(tags, notes),
+        sigma_h_m=_positive(_number(tags, "GPS GPSHPositioningError")),
+        datum="" if plain in _WGS84_NAMES else datum,
+        void=_text(tags, "GPS GPSStatus")[:1].upper() == "V",
+    )
 
 
-def _lens(tags: Mapping[str, Any]) -> LensTags:
+def _is_a_place(lat: float, lon: float, name: str, notes: _Notes) -> bool:
+    if abs(lat) > 90.0 or abs(lon) > 180.0:
+        notes.problems.append(f"the {name} {lat:.6g}, {lon:.6g} is out of range")
+        return False
+    if lat == 0.0 and lon == 0.0:
+        notes.problems.append(f"the {name} is 0, 0, which means none")
+        return False
+    return True
+
+
+def _signed(tags: Mapping[str, Tag], key: str, notes: _Notes) -> float | None:
+    """Return degrees, negative in the south and west; None if they are no number, infinite without a hemisphere.
+
+    A sign in the value says south or west, whatever the reference says.
+    """
+    tag, axis = tags.get(key), key.removeprefix("GPS GPS").lower()
+    if tag is None:
+        return None
+    negative_side = "S" if axis == "latitude" else "W"
+    sides = ("N", "S") if axis == "latitude" else ("E", "W")
+    side = _text(tags, f"{key}Ref")[:1].upper()
+    if tag.is_text:
+        degrees, letter = _degrees_of_text(tag.text)
+        if degrees is not None:
+            notes.corrections.append(f"The GPS {axis} is a text where EXIF has numbers; it is read as a number.")
+            side = letter if letter in sides else side
+    else:
+        degrees = _degrees(tag.fractions)
+        most = 90.0 if axis == "latitude" else 180.0
+        if degrees is not None and degrees > most:
+            wrapped = _degrees([(a - _WRAP if a >= _WRAP / 2 else a, b) for a, b in tag.fractions])
+            if wrapped is not None and -most <= wrapped < 0.0:
+                notes.corrections.append(
+                    f"The GPS {axis} is a negative number that was written without its sign; it is read as "
+                    "negative."
+                )
+                degrees = wrapped
+    if degrees is None:
+        return None
+    if degrees < 0.0:
+        if side in sides and side != negative_side:
+            notes.corrections.append(f"The GPS {axis} has a minus and the reference {side}; the minus counts.")
+        return degrees
+    if side not in sides:
+        return math.inf
+    return -degrees if side == negative_side else degrees
+
+
+def _degrees(fractions: Sequence[tuple[float, float]]) -> float | None:
+    """Return degrees from degrees, minutes and seconds; some writers omit seconds, or minutes too, or write 0/0."""
+    parts = list(fractions)
+    while len(parts) > 1 and parts[-1] == (0, 0):
+        parts.pop()
+    if not 1 <= len(parts) <= 3 or any(below == 0 for _, below in parts):
+        return None
+    values = [above / below for above, below in parts]
+    if not all(math.isfinite(value) for value in values):
+        return None
+    total = sum(abs(value) / 60.0**power for power, value in enumerate(values))
+    return -total if min(values) < 0.0 else total
+
+
+def _degrees_of_text(text: str) -> tuple[float | None, str]:
+    """Return degrees of a text such as `33,24.7407S`, `33 24 44.4` or `-33.41`, and its letter of a hemisphere."""
+    numbers = [float(number) for number in _TEXT_NUMBER.findall(text)]
+    if not 1 <= len(numbers) <= 3:
+        return None, ""
+    letter = next((letter for letter in reversed(text.upper()) if letter in "NSEW"), "")
+    return _degrees([(number, 1.0) for number in numbers]), letter
+
+
+def _altitude(tags: Mapping[str, Tag], notes: _Notes) -> float | None:
+    tag = tags.get("GPS GPSAltitude")
+    if tag is None:
+        return None
+    if tag.is_text:
+        value = _length_m(tag.text)
+        if value is not None:
+            notes.corrections.append("The GPS altitude is a text where EXIF has a number; it is read as a number.")
+    else:
+        value = _number(tags, "GPS GPSAltitude")
+    if value is None:
+        return None
+    if value > _HIGHEST_M:
+        above, below = tag.fractions[0] if tag.fractions else (value, 1.0)
+        wrapped = next((low for bits in (16, 32) if -1000.0 <= (low := (above - 2.0**bits) / below) < 0.0), None)
+        if wrapped is None:
+            notes.problems.append(f"the GPS altitude of {value:.0f} m is higher than any flight")
+            return None
+        notes.corrections.append(
+            f"The GPS altitude is a negative number that was written without its sign ({value:.1f} m); it is read "
+            "as negative, below sea level."
+        )
+        return wrapped
+    reference = _altitude_reference(tags, notes)
+    if value < 0.0:
+        if reference in _BELOW_ZERO:
+            notes.corrections.append(
+                "The GPS altitude has a minus, and GPSAltitudeRef says below sea level too; it is taken as below "
+                "sea level."
+            )
+        return value
+    return -value if reference in _BELOW_ZERO else value
+
+
+def _altitude_reference(tags: Mapping[str, Tag], notes: _Notes) -> int:
+    """Return EXIF's reference of the altitude, 0 if there is none; texts that mean one are read."""
+    tag = tags.get("GPS GPSAltitudeRef")
+    if tag is None:
+        return 0
+    if tag.is_text and (text := tag.text.strip("\x01\x02\x03")):
+        reference = 1 if text.lstrip("+0").startswith(("1", "3")) or "below" in text.casefold() else 0
+        notes.corrections.append(
+            f"GPSAltitudeRef is the text {text[:20]!r} where EXIF has a number; it is read as "
+            f"{'below' if reference else 'above'} sea level."
+        )
+        return reference
+    numbers = _numbers(tags, "GPS GPSAltitudeRef") or [float(byte) for byte in tag.data[:1]]
+    reference = int(numbers[0]) if numbers else 0
+    if reference not in _ABOVE_ZERO | _BELOW_ZERO:
+        notes.corrections.append(f"GPSAltitudeRef is {reference}, which means nothing; above sea level is assumed.")
+        return 0
+    return reference
+
+
+def _length_m(text: str) -> float | None:
+    """Return metres of a text such as `396 m`, `396` or `1299 ft`."""
+    found = re.fullmatch(r"\s*([+-]?\d+(?:\.\d*)?)\s*(m|metres|meters|ft|feet)?\.?\s*", text, re.IGNORECASE)
+    if found is None:
+        return None
+    return float(found[1]) * (_FOOT_M if (found[2] or "").casefold().startswith("f") else 1.0)
+
+
+def _direction(tags: Mapping[str, Tag]) -> float | None:
+    """Return the direction of view from true north; None of one from magnetic north."""
+    value = _number(tags, "GPS GPSImgDirection")
+    true = _text(tags, "GPS GPSImgDirectionRef")[:1].upper() != "M"
+    return value if value is not None and true and 0.0 <= value <= 360.0 else None
+
+
+def _lens(tags: Mapping[str, Tag], notes: _Notes) -> LensTags:
     resolution = _number(tags, "EXIF FocalPlaneXResolution")
     unit = _MM_PER_UNIT.get(int(_number(tags, "EXIF FocalPlaneResolutionUnit") or 2))
     sides = [_number(tags, f"EXIF ExifImage{side}") for side in ("Width", "Length")]
     zoom = _number(tags, "EXIF DigitalZoomRatio")
+    equivalent = _positive(_number(tags, "EXIF FocalLengthIn35mmFilm"))
+    if equivalent in _NO_35_MM:
+        notes.problems.append(f"a focal length of {equivalent:g} mm on 35 mm film means none")
+        equivalent = None
     return LensTags(
         focal_mm=_positive(_number(tags, "EXIF FocalLength")),
-        focal_35mm_mm=_positive(_number(tags, "EXIF FocalLengthIn35mmFilm")),
+        focal_35mm_mm=equivalent,
         px_per_mm=resolution / unit if resolution and resolution > 0 and unit else None,
         taken_width_px=_positive(max((side for side in sides if side is not None), default=None)),
         zoom=zoom if zoom is not None and zoom > 1.0 else 1.0,
     )
 
 
-def _time(tags: Mapping[str, Any]) -> tuple[float | None, TimeSource | None]:
+def _time(tags: Mapping[str, Tag]) -> tuple[float | None, TimeSource | None]:
     """Return seconds since 1970 UTC: by the clock's own zone, else from GPS, else with the clock taken for UTC."""
     local = _datetime(_text(tags, "EXIF DateTimeOriginal") or _text(tags, "Image DateTime"))
     fraction = _text(tags, "EXIF SubSecTimeOriginal") or _text(tags, "EXIF SubSecTime")
@@ -191,29 +379,21 @@ def _datetime(text: str) -> datetime | None:
         return None
 
 
-def _text(tags: Mapping[str, Any], key: str) -> str:
+def _text(tags: Mapping[str, Tag], key: str) -> str:
     tag = tags.get(key)
-    values = getattr(tag, "values", "")
-    return values.strip("\x00 ") if isinstance(values, str) else ""
+    return "" if tag is None else tag.text
 
 
-def _numbers(tags: Mapping[str, Any], key: str) -> list[float]:
+def _numbers(tags: Mapping[str, Tag], key: str) -> list[float]:
     """Return all values of a tag, or none if one of them is not a number."""
-    values = getattr(tags.get(key), "values", None)
-    if values is None or isinstance(values, str):
+    tag = tags.get(key)
+    if tag is None or any(below == 0 for _, below in tag.fractions):
         return []
-    numbers = []
-    for value in values if isinstance(values, (list, tuple)) else [values]:
-        if hasattr(value, "den") and value.den == 0:
-            return []
-        try:
-            numbers.append(float(value))
-        except (TypeError, ValueError, OverflowError):
-            return []
+    numbers = [above / below for above, below in tag.fractions]
     return numbers if all(math.isfinite(value) for value in numbers) else []
 
 
-def _number(tags: Mapping[str, Any], key: str) -> float | None:
+def _number(tags: Mapping[str, Tag], key: str) -> float | None:
     values = _numbers(tags, key)
     return values[0] if values else None
 
@@ -222,79 +402,67 @@ def _positive(value: float | None) -> float | None:
     return value if value is not None and value > 0.0 else None
 
 
-def _degrees(tags: Mapping[str, Any], key: str) -> float | None:
-    """Return degrees from degrees, minutes and seconds; some writers omit seconds, or minutes too."""
-    values = _numbers(tags, key)
-    if not 1 <= len(values) <= 3 or min(values) < 0.0:
-        return None
-    return sum(value / 60.0**power for power, value in enumerate(values))
+def _xmp_positions(xmp: Xmp, notes: _Notes) -> list[GpsTag]:
+    """Return the different positions of the camera that XMP states, in the order of the file."""
+    found: list[GpsTag] = []
+    for lat_name, lon_names in _XMP_AXES:
+        for each in xmp.named(lat_name):
+            if each.within.casefold() not in _PLACES_OF_CAMERAS:
+                continue
+            same = {"within": each.within, "namespace": each.namespace}
+            lat, lon = _xmp_degrees(each.text), _xmp_degrees(xmp.text(*lon_names, **same) or "")
+            if lat is None or lon is None:
+                notes.problems.append("the latitude or longitude in XMP is not a number")
+            elif _is_a_place(lat, lon, "position in XMP", notes):
+                void = (xmp.text("GpsStatus", namespace=each.namespace) or "").casefold() in _VOID
+                found.append(GpsTag(lat, lon, _xmp_altitude(xmp, each.namespace), None, "", "XMP", void))
+    return list(dict.fromkeys(found))
 
 
-class XmpError(ValueError):
-    """A packet exists, but cannot be read."""
+def _xmp_degrees(text: str) -> float | None:
+    """Return degrees of a decimal number, or of Adobe's `33,24.7407S`."""
+    if (value := number_of(text)) is not None:
+        return value
+    degrees, letter = _degrees_of_text(text)
+    return degrees if degrees is None or letter not in ("S", "W") else -abs(degrees)
 
 
-def read_dji(data: bytes) -> DjiTags | None:
-    """Return DJI's tags of a photograph, or None without an XMP packet.
+def _xmp_altitude(xmp: Xmp, namespace: str) -> float | None:
+    """Return the absolute altitude beside a position, in the words of drones or in Adobe's."""
+    absolute = xmp.number("AbsoluteAltitude", namespace=namespace)
+    if absolute is None:
+        absolute = xmp.number("GPSAltitude", namespace=namespace)
+        if absolute is not None and xmp.text("GPSAltitudeRef", namespace=namespace) in ("1", "3"):
+            absolute = -abs(absolute)
+    return absolute
 
-    Raises:
-        XmpError: a packet that is too long or not well formed.
-    """
-    packet = _find_packet(data)
-    if packet is None:
-        return None
-    values = _values(packet)
-    sigma = _triple(values, "RtkStdLon", "RtkStdLat", "RtkStdHgt")  # DJI writes zero for an unknown σ
+
+def _drone(xmp: Xmp) -> DjiTags:
+    sigma = _triple(xmp, ("RtkStdLon", "RtkStdLat", "RtkStdHgt"))  # DJI writes zero for an unknown σ
+    turned = ("Yaw", "Pitch", "Roll")
+    gimbal = (
+        _triple(xmp, [f"Gimbal{angle}Degree" for angle in turned])
+        or _triple(xmp, [f"Camera{angle}Degree" for angle in turned])  # Parrot
+        or _triple(xmp, turned, within="CameraOrientationNED")  # Skydio
+    )
+    flight_yaw = xmp.number("FlightYawDegree", "DroneYawDegree")
+    if flight_yaw is None:
+        flight_yaw = xmp.number("Yaw", within="VehicleOrientationNED")
+    flag = xmp.number("RtkFlag")
     return DjiTags(
-        gimbal_yaw_pitch_roll_deg=_triple(values, "GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree"),
-        rtk_flag=None if (flag := _xmp_number(values, "RtkFlag")) is None else int(flag),
+        gimbal_yaw_pitch_roll_deg=gimbal,
+        rtk_flag=None if flag is None else int(flag),
         rtk_sigma_enu_m=sigma if sigma is not None and min(sigma) > 0.0 else None,
-        absolute_altitude_m=_xmp_number(values, "AbsoluteAltitude"),
+        absolute_altitude_m=xmp.number("AbsoluteAltitude"),
+        relative_altitude_m=xmp.number("RelativeAltitude"),
+        flight_yaw_deg=flight_yaw,
+        sigma_h_m=_positive(xmp.number("GPSXYAccuracy")),
+        sigma_v_m=_positive(xmp.number("GPSZAccuracy")),
     )
 
 
-def _find_packet(data: bytes) -> bytes | None:
-    """Return the XMP packet in the first or last mebibyte of a file, or None."""
-    for part in (data[:_SEARCHED_BYTES], data[max(_SEARCHED_BYTES, len(data) - _SEARCHED_BYTES) :]):
-        begin = part.find(_OPEN)
-        if begin < 0:
-            continue
-        end = part.find(_CLOSE, begin, begin + _MAX_PACKET_BYTES)
-        if end < 0:
-            raise XmpError("the XMP packet has no end within 256 KiB")
-        return part[begin : end + len(_CLOSE)]
-    return None
-
-
-def _values(packet: bytes) -> dict[str, str]:
-    """Return the properties that attributes or elements have as text, by local name; the first of a name counts."""
-    from defusedxml.common import DefusedXmlException
-    from defusedxml.ElementTree import fromstring
-
-    try:
-        root: Element = fromstring(packet, forbid_dtd=True)
-    except (ParseError, DefusedXmlException, ValueError) as error:
-        raise XmpError(f"the XMP packet is not well formed: {error}") from error
-    properties: dict[str, str] = {}
-    for element in root.iter():
-        listed = list(element.attrib.items())
-        if element.text and not len(element):
-            listed.append((element.tag, element.text))
-        for name, text in listed:
-            properties.setdefault(name.rsplit("}", maxsplit=1)[-1], text)
-    return properties
-
-
-def _xmp_number(values: dict[str, str], key: str) -> float | None:
-    try:
-        value = float(values[key])
-    except (KeyError, ValueError):
-        return None
-    return value if math.isfinite(value) else None
-
-
-def _triple(values: dict[str, str], *keys: str) -> Vector3 | None:
-    first, second, third = (_xmp_number(values, key) for key in keys)
+def _triple(xmp: Xmp, names: Sequence[str], within: str | None = None) -> Vector3 | None:
+    first, second, third = (xmp.number(name, within=within) for name in names)
     if first is None or second is None or third is None:
         return None
     return (first, second, third)

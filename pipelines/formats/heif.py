@@ -7,6 +7,7 @@ from typing import Any
 from pipelines.core.errors import InputError
 from pipelines.core.extras import require
 from pipelines.formats.image_file import MAX_PIXELS, read_bytes
+from pipelines.formats.photo_blocks import jpeg_with_blocks
 
 _QUALITY = 97
 
@@ -32,9 +33,8 @@ def jpeg_of_heif(path: Path) -> bytes:
     except (OSError, ValueError, RuntimeError, EOFError) as error:
         raise InputError("image-damaged", f"The photograph does not decode: {error}.", path=path) from error
     pillow_heif.set_orientation(image.info)  # decoding has turned the picture: its tag must not do so again
-    exif = image.info.get("exif")
-    picture.save(out, "JPEG", quality=_QUALITY, subsampling=0, **({"exif": exif} if exif else {}))
-    return out.getvalue()
+    picture.save(out, "JPEG", quality=_QUALITY, subsampling=0)
+    return jpeg_with_blocks(out.getvalue(), image.info.get("exif"), image.info.get("xmp"))
 
 
 def _opened(path: Path) -> Any:

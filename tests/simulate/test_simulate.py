@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import exifread
 import numpy as np
 import pycolmap
 import pytest
+from PIL import Image
+from PIL.ExifTags import GPS, IFD
 from rosbags.highlevel import AnyReader
 
 from pipelines.core.errors import InputError
@@ -156,16 +157,16 @@ def test_photographs_carry_the_same_position(survey: SimulatedSurvey) -> None:
     recorded = survey.recorded_positions()
     for name, (lat, lon, alt) in zip(survey.truth.images, recorded, strict=True):
         data = (survey.folder / "images" / name).read_bytes()
-        tags = exifread.process_file(io.BytesIO(data), details=False)
+        tags = Image.open(io.BytesIO(data)).getexif().get_ifd(IFD.GPSInfo)
         degrees = []
         for key, sign in (("Latitude", "S"), ("Longitude", "W")):
-            whole, minutes, seconds = (float(part) for part in tags[f"GPS GPS{key}"].values)
-            negative = str(tags[f"GPS GPS{key}Ref"]) == sign
+            whole, minutes, seconds = (float(part) for part in tags[GPS[f"GPS{key}"]])
+            negative = tags[GPS[f"GPS{key}Ref"]] == sign
             degrees.append((whole + minutes / 60 + seconds / 3600) * (-1 if negative else 1))
         np.testing.assert_allclose(degrees, [lat, lon], atol=1e-9)
         assert f'GpsLatitude="{lat:.9f}"'.encode() in data
         assert f'GpsLongitude="{lon:.9f}"'.encode() in data
-        height = float(tags["GPS GPSAltitude"].values[0]) * (-1 if tags["GPS GPSAltitudeRef"].values[0] else 1)
+        height = float(tags[GPS.GPSAltitude]) * (-1 if tags[GPS.GPSAltitudeRef] == b"\x01" else 1)
         assert height == pytest.approx(alt, abs=2e-4)
 
 
