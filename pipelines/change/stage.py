@@ -24,7 +24,7 @@ from pipelines.change.detection import (
     significant_change,
     unchanged_ground,
 )
-from pipelines.change.grid import CommonGrid, Window, epoch_rasters
+from pipelines.change.grid import CommonGrid, EpochRasters, Window, epoch_rasters
 from pipelines.change.options import ChangeOptions
 from pipelines.change.page import Compared, change_page
 from pipelines.change.regions import Parts, find_regions, reach_of
@@ -37,11 +37,13 @@ from pipelines.core.types import vector3
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.formats.geotiff import Band, RasterKind, write_mosaic
 from pipelines.formats.tables import table_text
-from pipelines.formats.vector_files import feature, features_text, read_boundary, write_polygons_gpkg
-from pipelines.geodesy.crs import PointCrs, parse_crs
+from pipelines.formats.vector_files import feature, features_text, write_polygons_gpkg
+from pipelines.geodesy.crs import parse_crs
 from pipelines.report.page import render_page
+from pipelines.survey.boundaries import Outlines, read_outlines
 from pipelines.survey.change_report import Change, ChangedRegion, Registration
 
+_PLACES = 20  # along each side of the rasters, which stand for the survey
 _ROOM = __name__.rpartition(".")[0]
 _MOST_LEVELS = 1_000_000  # of detection, whose median is stated
 LOWERED, UNCHANGED, RAISED = 2, 1, 3  # in significant.tif; 0: not measured in both
@@ -73,10 +75,9 @@ def run(stage: StageRun, options: ChangeOptions) -> Summary:
             message = f"has no σ of its datum: {one.reason}. Register with --stable FILE or --stable-auto."
             raise InputError("datum-not-known", message, path=workspace.root)
     shared = shared_by(epochs[0].survey, epochs[1].survey, same_base=options.same_base)
-    crs = parse_crs(after.sidecar.crs_wkt)
-    area = _polygons(options.boundary, "--boundary", crs, options)
+    area = _polygons(options.boundary, "--boundary", after, options)
     grid = CommonGrid((before, after), epochs, shared, None if area is None else shapely.union_all(area))
-    stable = _polygons(options.stable, "--stable", crs, options)
+    stable = _polygons(options.stable, "--stable", after, options)
     ground = None if stable is None else shapely.union_all(stable)
     noise = unchanged_ground(
         grid.samples(ground, stage.progress), grid.cell_m, grid.datum_h_m, with_tilt=options.tilt
@@ -84,7 +85,7 @@ def run(stage: StageRun, options: ChangeOptions) -> Summary:
     registration = _registration_of(noise, applied=registered, datum_v_m=grid.datum_v_m)
     parts = Parts(stage.out / "parts", grid)
     sign, median_lod_m = _write_rasters(stage, parts, noise, registered=registered)
-    given = _polygons(options.regions, "--regions", crs, options) or ()
+    given = _polygons(options.regions, "--regions", after, options) or ()
     found = find_regions(parts, sign, noise, given, options.min_area)
     _write_significant(stage.out, parts, found.sign)
     moved = None
@@ -175,20 +176,30 @@ def _summary(change: Change, warnings: tuple[Remark, ...], cautions: tuple[Remar
     return Summary(figure, values, warnings, cautions)
 
 
-def _polygons(path: Path | None, field: str, crs: PointCrs, options: ChangeOptions) -> tuple[Any, ...] | None:
-    """Return the polygons of a file in the plan of a CRS; None: no file."""
+def _polygons(path: Path | None, field: str, after: EpochRasters, options: ChangeOptions) -> tuple[Any, ...] | None:
+    """Return the polygons of a file in the plan of the rasters; None: no file."""
     if path is None:
         return None
-    boundary = read_boundary(path, field=field)
-    text = boundary.crs or options.polygons_crs
-    if not text:
-        raise InputError("boundary-without-crs", "states no CRS. Give --polygons-crs.", path=path, field=field)
-    own = parse_crs(text, path=path, field="--polygons-crs")
+    crs = parse_crs(after.sidecar.crs_wkt)
+    west, south, east, north = after.frame.bounds
+    across, up = np.meshgrid(np.linspace(west, east, _PLACES), np.linspace(south, north, _PLACES))
+    places = crs.lla_from_xyz(np.column_stack([across.ravel(), up.ravel(), np.zeros(across.size)]))
+    found = read_outlines(
+        path,
+        places,
+        field=field,
+        crs=options.polygons_crs,
+        crs_field="--polygons-crs",
+        one_site=field == "--boundary",
+    )
 
-    def moved(plan: NDArray[Any]) -> NDArray[Any]:
-        return crs.xyz_from_lla(own.lla_from_xyz(np.column_stack([plan, np.zeros(len(plan))])))[:, :2]
+    def moved(one: Outlines) -> list[Any]:
+        def to_rasters(plan: NDArray[Any]) -> NDArray[Any]:
+            return crs.xyz_from_lla(one.lla(plan, path))[:, :2]
 
-    return tuple(shapely.transform(part, moved) for part in boundary.parts)
+        return [shapely.transform(part, to_rasters) for part in one.polygons]
+
+    return tuple(part for one in found for part in moved(one))
 
 
 def _registered(cells: Cells, grid: CommonGrid, window: Window, noise: Noise, *, registered: bool) -> Cells:

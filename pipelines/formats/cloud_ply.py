@@ -7,7 +7,7 @@ and with the vertices first; faces and other elements after these are not read.
 
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
@@ -17,6 +17,7 @@ from plyfile import PlyData, PlyElement
 from pipelines.core.errors import InputError
 from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, Rows
 from pipelines.formats.splat_ply import PLY_TYPES, ply_header
+from pipelines.geodesy.geotiff_keys import FileCrs
 
 
 @dataclass(frozen=True)
@@ -31,14 +32,14 @@ class CloudChunk(Rows):
 
 
 class CloudFile(Protocol):
-    """File of points whose header has been checked; `crs` is None where the file states none."""
+    """File of points whose header has been checked."""
 
     @property
     def path(self) -> Path: ...
     @property
     def count(self) -> int: ...
     @property
-    def crs(self) -> str | None: ...
+    def crs(self) -> FileCrs: ...
     def chunks(self, size: int) -> Iterator[CloudChunk]:
         """Yield all points in chunks of at most `size`."""
 
@@ -57,7 +58,7 @@ class PlyCloudFile:
     count: int
     dtype: np.dtype[np.void]
     offset: int
-    crs: str | None = None
+    crs: FileCrs = field(default_factory=FileCrs)
 
     def chunks(self, size: int) -> Iterator[CloudChunk]:
         """Yield all points in chunks of at most `size`.

@@ -8,7 +8,6 @@ The CRS is written as WKT1 in GDAL's dialect: LAS 1.4 predates WKT2, which reade
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -23,6 +22,8 @@ from pipelines.core.errors import InputError
 from pipelines.core.files import file_size
 from pipelines.core.types import BoolArray, ByteArray, FloatArray
 from pipelines.formats.cloud_ply import CloudChunk, CloudPoints
+from pipelines.formats.las_head import InOrder, LasHead, read_head
+from pipelines.geodesy.geotiff_keys import FileCrs
 
 if TYPE_CHECKING:
     import laspy
@@ -45,12 +46,8 @@ _COVARIANCE = {  # name of each element of the upper triangle, with its row and 
     if row <= column
 }
 _ANGLE_STEP_DEG = 0.006
-_HEADER_BYTES = 227  # of LAS 1.0; later versions have more
-_VLR_BYTES = 54
 _POINT_BITS_LEAST = 0.05  # LAZ spends more on each point, even on equal ones
 _OVERLAP_CLASS = 12  # of the point formats 0 to 5, which have no flag for it
-_USER_DEFINED = 32767
-_GEOGRAPHIC, _PROJECTED, _VERTICAL = 2048, 3072, 4096  # keys of GeoTIFF
 
 
 @dataclass(frozen=True)
@@ -59,15 +56,16 @@ class LasFile:
 
     path: Path
     count: int
-    crs: str | None
+    head: LasHead
+
+    @property
+    def crs(self) -> FileCrs:
+        return self.head.crs
 
     def chunks(self, size: int) -> Iterator[CloudChunk]:
         """Yield all points in chunks of at most `size`; an InputError: the file is damaged."""
-        import laspy
-
         done = 0
-        backend = laspy.LazBackend.Lazrs  # decodes one chunk at a time, where the parallel one holds many
-        with _damage(self.path), laspy.open(self.path, read_evlrs=False, laz_backend=backend) as file:
+        with _damage(self.path), _opened(self.path, self.head) as file:
             for record in file.chunk_iterator(size):
                 done += len(record)
                 yield _chunk(record)
@@ -82,12 +80,10 @@ def open_las(path: Path) -> LasFile:
     Raises:
         InputError: no such file, or not a readable LAS file.
     """
-    import laspy
-
     size = file_size(path)
     with _damage(path):
-        _check_head(path, size)
-        with laspy.open(path, read_evlrs=False) as file:
+        head = read_head(path, size)
+        with _opened(path, head) as file:
             header = file.header
             count, record = int(header.point_count), int(header.point_format.size)
             body = size - int(header.offset_to_point_data)
@@ -95,35 +91,15 @@ def open_las(path: Path) -> LasFile:
             if count < 1 or body < count * least:
                 message = f"The header promises {count} points, the file has {max(body, 0)} bytes for them."
                 raise InputError("size-differs", f"{message} It is empty, cut off or damaged.", path=path)
-            return LasFile(path, count, _crs(header))
+            return LasFile(path, count, head)
 
 
-def _check_head(path: Path, size: int) -> None:
-    """Refuse a file whose records or table of chunks would reach beyond its end, and one that is no LAS file."""
-    with path.open("rb") as stream:
-        head = stream.read(_HEADER_BYTES)
-        if len(head) < _HEADER_BYTES or head[:4] != b"LASF":
-            raise InputError("not-a-las", "The file is not a LAS or LAZ file.", path=path)
-        offset, records = struct.unpack_from("<II", head, 96)
-        point_format, record_bytes = struct.unpack_from("<BH", head, 104)
-        if offset > size or records * _VLR_BYTES > offset or record_bytes == 0:
-            message = "The header is damaged: its records reach beyond the file's end."
-            raise InputError("file-damaged", message, path=path)
-        if not point_format & 0x80:
-            return
-        stream.seek(offset)
-        table = struct.unpack("<q", stream.read(8))[0]
-        if table == -1:  # written to a stream: the place of the table is the file's last number
-            stream.seek(size - 8)
-            table = struct.unpack("<q", stream.read(8))[0]
-        if not offset < table <= size - 8:
-            message = "The table of compressed chunks is missing: the file is cut off."
-            raise InputError("file-cut-off", message, path=path)
-        stream.seek(table)
-        _, chunks = struct.unpack("<II", stream.read(8))
-        if chunks > size - offset:
-            message = f"{chunks} compressed chunks do not fit into the file: it is damaged."
-            raise InputError("chunk-count", message, path=path)
+def _opened(path: Path, head: LasHead) -> laspy.LasReader:
+    import laspy
+
+    source = path if head.table_at is None else InOrder(path, file_size(path), head.table_at)
+    # This decoder holds one chunk at a time, where the parallel one holds many.
+    return laspy.open(source, read_evlrs=False, laz_backend=laspy.LazBackend.Lazrs)
 
 
 def _chunk(record: Any) -> CloudChunk:
@@ -143,21 +119,6 @@ def _chunk(record: Any) -> CloudChunk:
         flag("withheld"),
         np.asarray(record.gps_time, dtype=np.float64) if "gps_time" in names else None,
     )
-
-
-def _crs(header: Any) -> str | None:
-    """Return the CRS as WKT or as EPSG codes; None where the file states none that stands alone."""
-    found = [record for record in header.vlrs if record.user_id == "LASF_Projection"]
-    texts = (getattr(record, "string", "").strip("\0 ") for record in found if record.record_id == 2112)
-    if text := next(filter(None, texts), ""):
-        return str(text)
-    keys = next((record.geo_keys for record in found if record.record_id == 34735), ())
-    codes = {key.id: key.value_offset for key in keys if key.tiff_tag_location == 0}
-    horizontal = codes.get(_PROJECTED, codes.get(_GEOGRAPHIC, _USER_DEFINED))
-    vertical = codes.get(_VERTICAL, 0)
-    if horizontal in (0, _USER_DEFINED) or vertical == _USER_DEFINED:
-        return None
-    return f"EPSG:{horizontal}+{vertical}" if vertical else f"EPSG:{horizontal}"
 
 
 @contextmanager
@@ -259,10 +220,7 @@ def read_surface(path: Path, size: int) -> Iterator[CloudPoints]:
     Raises:
         InputError: no such file, a damaged one, or one without normals and covariances.
     """
-    import laspy
-
-    open_las(path)
-    with _damage(path), laspy.open(path, read_evlrs=False, laz_backend=laspy.LazBackend.Lazrs) as file:
+    with _damage(path), _opened(path, open_las(path).head) as file:
         lacking = (_EXTRA.keys() | _COVARIANCE.keys()) - set(file.header.point_format.dimension_names)
         if lacking:
             message = f"The cloud has no {', '.join(sorted(lacking))}. Make it with `georef export-cloud`."

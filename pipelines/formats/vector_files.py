@@ -1,4 +1,4 @@
-"""Vectors as files: features as GeoJSON, contour lines as GeoPackage and DXF, and boundaries, which are read.
+"""Vectors as files: features as GeoJSON, and contour lines as GeoPackage and DXF.
 
 GeoJSON (RFC 7946) has longitude and latitude in WGS84 degrees, outer rings anticlockwise, cut at the date line.
 Contours are a line a height, with the height as attribute and as z.
@@ -7,18 +7,15 @@ Contours are a line a height, with the height as attribute and as z.
 import io
 import json
 import math
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
-from shapely import MultiPolygon
 
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size, replacing
@@ -214,67 +211,3 @@ def drawing(lines: Sequence[tuple[str, int, FloatArray]]) -> bytes:
         document.modelspace().add_lwpolyline(places.tolist(), dxfattribs={"layer": layer})
     document.write(text)
     return text.getvalue().encode(document.output_encoding, errors="replace")
-
-
-_MOST_BOUNDARY_BYTES = 64 * 1024 * 1024
-# By suffix: what the file begins with, white space and a byte order mark apart. GDAL opens a file by its content,
-# also one that names other files and servers.
-BOUNDARY_FORMATS: dict[str, tuple[bytes, ...]] = {
-    ".geojson": (b"{",),
-    ".json": (b"{",),
-    ".gpkg": (b"SQLite format 3\0",),
-    ".kml": (b"<?xml", b"<kml"),
-    ".dxf": (b"0", b"999", b"AutoCAD Binary DXF"),
-}
-
-
-@dataclass(frozen=True)
-class Boundary:
-    """Polygons of a file, easting or longitude first, as one and each by itself.
-
-    `crs` is the file's CRS as text; empty: it states none.
-    """
-
-    polygon: MultiPolygon
-    crs: str
-    parts: tuple[Any, ...] = ()
-
-
-def read_boundary(path: Path, *, field: str) -> Boundary:
-    """Read the polygons and the closed lines of a GeoJSON, GeoPackage, KML or DXF file.
-
-    Raises:
-        InputError: not such a file, too large, damaged, or without an area; names file and option.
-    """
-    import pyogrio
-    from pyogrio.errors import DataLayerError, DataSourceError
-
-    refusal = partial(InputError, path=path, field=field)
-    file_size(path, limit_bytes=_MOST_BOUNDARY_BYTES, kind="boundary", field=field)
-    with path.open("rb") as file:
-        head = file.read(4096).lstrip(b"\xef\xbb\xbf \t\r\n")
-    begins = BOUNDARY_FORMATS.get(path.suffix.lower(), ())
-    if not head.startswith(begins) or not begins or b"<OGR" in head:
-        kinds = "GeoJSON (.geojson), GeoPackage (.gpkg), KML (.kml) or DXF (.dxf)"
-        raise refusal("boundary-format", f"is no boundary file that is known. Give {kinds}.")
-    shapes, crs = [], ""
-    try:
-        with warnings.catch_warnings():  # of GDAL, about what does not matter here
-            warnings.simplefilter("ignore", RuntimeWarning)
-            layers = pyogrio.list_layers(path).tolist()
-            read = [pyogrio.raw.read(path, layer=layer, columns=[], force_2d=True) for layer, _ in layers]
-        for meta, _, geometry, _ in read:
-            shapes += [one for one in shapely.from_wkb(geometry, on_invalid="ignore") if one is not None]
-            crs = crs or meta["crs"] or ""
-    except (DataSourceError, DataLayerError, ValueError, OSError) as error:
-        raise refusal("boundary-unreadable", f"cannot be read: {error}. Write it again, as GeoJSON.") from error
-    parts = [part for shape in shapes for part in shapely.get_parts(shape)]
-    rings = [shapely.Polygon(part.coords) for part in parts if part.geom_type == "LineString" and part.is_ring]
-    single = shapely.make_valid([*(part for part in parts if part.geom_type == "Polygon"), *rings])
-    whole = shapely.union_all(single)
-    polygons = [part for part in shapely.get_parts(whole) if part.geom_type == "Polygon" and part.area > 0]
-    if not polygons:
-        raise refusal(
-            "boundary-without-area", f"has {len(parts)} shapes, and none is a polygon. Draw the boundary as one."
-        )
-    return Boundary(MultiPolygon(polygons), crs, tuple(part for part in single if part.area > 0))

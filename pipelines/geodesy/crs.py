@@ -291,6 +291,16 @@ def parse_crs(
         raise refusal("crs-unusable", f"PROJ cannot use {_short(name)!r}: {error}.") from error
 
 
+def proj_crs(text: str, *, path: Path | str | None = None, field: str | None = None) -> CRS:
+    """Return what PROJ makes of the text of a CRS, of points or not; an InputError: none, or it opens files."""
+    refusal = partial(InputError, path=path, field=field)
+    name = " ".join(text.split())
+    try:
+        return _parse(name, refusal)
+    except ProjError as error:
+        raise refusal("crs-unusable", f"PROJ cannot use {_short(name)!r}: {error}.") from error
+
+
 def _point_crs(crs: CRS, name: str, vertical: VerticalChoice | None) -> PointCrs:
     axes = (crs.source_crs or crs if crs.is_bound else crs).axis_info
     short = _short(name)

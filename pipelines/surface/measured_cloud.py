@@ -8,21 +8,22 @@
 
 import logging
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from pipelines.core.errors import InputError
-from pipelines.core.products import Remark
+from pipelines.core.products import Remark, union
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import ByteArray, FloatArray, IntArray, Rows, joined_rows, rows_of
 from pipelines.formats.cloud_ply import CloudChunk, CloudFile, open_cloud_ply
 from pipelines.formats.las import open_las
-from pipelines.geodesy.crs import PointCrs, parse_crs
+from pipelines.geodesy.crs import PointCrs
 from pipelines.geodesy.enu import Origin, ecef_from_lla, enu_from_ecef
 from pipelines.geometry.footprints import voxel_keys
+from pipelines.surface.cloud_crs import PlacedCrs, place_crs
 from pipelines.survey.options import CLOUD_SUFFIXES, CloudCrs
 
 log = logging.getLogger(__name__)
@@ -83,29 +84,32 @@ class CloudReader:
 
     def __init__(self, path: Path, stated: CloudCrs) -> None:
         self._files = [_opened(file, stated) for file in _paths(path, stated)]
-        self._crs = [_crs_of(file, stated) for file in self._files]
+        self._placed = [place_crs(file.crs, stated, file.path) for file in self._files]
         self.count = sum(file.count for file in self._files)
         self.tally = ReadTally()
-        silent = {_short_name(crs.name) for crs in self._crs if not crs.vertical.stated}
-        self.crs_names = tuple(dict.fromkeys(_short_name(crs.name) for crs in self._crs))
-        self.assumptions = tuple(
+        crs = [one.crs for one in self._placed]
+        silent = {(_short_name(one.name), one.height_unit) for one in crs if not one.vertical.stated}
+        self.crs_names = tuple(dict.fromkeys(_short_name(one.name) for one in crs))
+        heights = tuple(
             Remark(
                 code=f"{stated.flag.removeprefix('--')}-heights",
-                sentence=f"The heights of the cloud were taken as ellipsoidal: {name} has no vertical part "
-                f"({stated.flag}-vertical states one).",
+                sentence=f"The heights of the cloud were taken as ellipsoidal, in {unit}: {name} has no vertical "
+                f"part ({stated.flag}-vertical states one).",
             )
-            for name in sorted(silent)
+            for name, unit in sorted(silent)
         )
+        self.assumptions = union(*(_few(one) for one in _by_code(self._placed)), heights)
 
     def chunks(self, origin: Origin, progress: Progress = SILENT) -> Iterator[MeasuredCloud]:
         """Yield all valid points in geo, in chunks; an InputError: damage, points outside the CRS, no grid."""
         with progress.task("lidar", self.count) as task:
-            for file, crs in zip(self._files, self._crs, strict=True):
+            for file, placed in zip(self._files, self._placed, strict=True):
+                crs = placed.crs
                 serving: PointCrs | None = None
                 for raw in file.chunks(_CHUNK):
                     chunk = self._valid(raw, file.path)
                     if len(chunk):
-                        lla = (serving or crs).lla_from_xyz(chunk.position, path=file.path)
+                        lla = (serving or crs).lla_from_xyz(chunk.position * placed.scale, path=file.path)
                         # One operation serves the file: neighbours in two chunks keep their distance.
                         serving = serving or crs.serving(lla)
                         place, count = enu_from_ecef(ecef_from_lla(lla), origin), len(chunk)
@@ -193,6 +197,20 @@ def _short_name(name: str) -> str:
     return found[1] if found else name
 
 
+def _by_code(placed: Sequence[PlacedCrs]) -> list[list[Remark]]:
+    found: dict[str, list[Remark]] = {}
+    for remark in (remark for one in placed for remark in one.remarks):
+        found.setdefault(remark.code, []).append(remark)
+    return list(found.values())
+
+
+def _few(remarks: Sequence[Remark]) -> tuple[Remark, ...]:
+    """Return the remarks of one code on many files as one, which counts the others."""
+    first = remarks[0]
+    more = "" if len(remarks) == 1 else f" {len(remarks) - 1} more of the files are so."
+    return (Remark(code=first.code, sentence=first.sentence + more),)
+
+
 def _paths(path: Path, stated: CloudCrs) -> list[Path]:
     """Return the files of a path in the order of their names."""
     if not path.is_dir():
@@ -218,16 +236,3 @@ def _opened(path: Path, stated: CloudCrs) -> CloudFile:
         hint = " (CloudCompare and PDAL convert E57)" if path.suffix.lower() == ".e57" else ""
         raise InputError("format-unknown", f"Expected .las, .laz or .ply{hint}", path=path, field=stated.flag)
     return reader(path)
-
-
-def _crs_of(file: CloudFile, stated: CloudCrs) -> PointCrs:
-    if file.crs is not None:
-        return parse_crs(file.crs, vertical=stated.vertical, path=file.path)
-    if stated.crs is None:
-        raise InputError(
-            "crs-unknown",
-            f"states no CRS: give {stated.flag}-crs EPSG:n, or EPSG:n+m with the vertical CRS.",
-            path=file.path,
-            field=stated.flag,
-        )
-    return parse_crs(stated.crs, vertical=stated.vertical, field=f"{stated.flag}-crs")

@@ -4,7 +4,6 @@ Files are cut to it: a photograph shows far more than it measures.
 """
 
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import contourpy
@@ -15,11 +14,10 @@ from shapely import MultiPolygon, Polygon
 
 from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.types import BoolArray, FloatArray, IntArray
-from pipelines.formats.vector_files import read_boundary
-from pipelines.geodesy.crs import parse_crs
-from pipelines.geodesy.enu import Origin, ecef_from_lla, enu_from_ecef
+from pipelines.geodesy.enu import Origin, ecef_from_lla, enu_from_ecef, lla_from_enu
 from pipelines.geometry.cameras import project
 from pipelines.geometry.footprints import PointSurface, border_rays
+from pipelines.survey.boundaries import Outlines, read_outlines
 from pipelines.survey.options import LEAST_PHOTOGRAPHS, AreaOptions
 from pipelines.survey.target_crs import TargetCrs
 from pipelines.survey.trained_survey import SolvedSurvey
@@ -110,24 +108,29 @@ def boundary_area(options: AreaOptions, scene: FloatArray, origin: Origin | None
     if origin is None:
         message = "The survey has a local metric frame, in which a boundary has no place. Remove --boundary."
         raise InputError("not-on-earth", message, field="--boundary")
-    boundary = read_boundary(options.boundary, field="--boundary")
-    refusal = partial(InputError, path=options.boundary)
-    text = boundary.crs or options.boundary_crs
-    if not text:
-        raise refusal("boundary-without-crs", "states no CRS. Give --boundary-crs.", field="--boundary-crs")
-    crs = parse_crs(text, path=options.boundary, field="--boundary-crs")
+    path = options.boundary
+    outlines = read_outlines(
+        path,
+        lla_from_enu(scene, origin),
+        field="--boundary",
+        crs=options.boundary_crs,
+        crs_field="--boundary-crs",
+    )
 
-    def moved(plan: FloatArray) -> FloatArray:
-        lla = crs.lla_from_xyz(np.column_stack([plan, np.zeros(len(plan))]), path=options.boundary)
-        # At the height of the survey: a place far above another has another plan in `geo`.
-        lla[:, 2] = origin.alt_m
-        return enu_from_ecef(ecef_from_lla(lla), origin)[:, :2]
+    def moved(one: Outlines) -> Any:
+        def to_geo(plan: FloatArray) -> FloatArray:
+            lla = one.lla(plan, path)
+            # At the height of the survey: a place far above another has another plan in `geo`.
+            lla[:, 2] = origin.alt_m
+            return enu_from_ecef(ecef_from_lla(lla), origin)[:, :2]
 
-    polygon = shapely.make_valid(shapely.transform(_with_short_edges(boundary.polygon), moved))
-    area = Area(polygon, float(np.median(scene[:, 2])) if len(scene) else 0.0, options.boundary.name)
+        return shapely.make_valid(shapely.transform(_with_short_edges(shapely.union_all(one.polygons)), to_geo))
+
+    polygon = shapely.union_all([moved(one) for one in outlines])
+    area = Area(polygon, float(np.median(scene[:, 2])) if len(scene) else 0.0, path.name)
     if not area.contains(scene).any():
         message = "holds no point of the survey. Check its CRS (--boundary-crs), and that it is of this place."
-        raise refusal("boundary-elsewhere", message, field="--boundary")
+        raise InputError("boundary-elsewhere", message, path=path, field="--boundary")
     return area
 
 

@@ -12,7 +12,7 @@ import shapely
 from ezdxf.filemanagement import new
 
 from pipelines.core.errors import DegenerateGeometryError, InputError
-from pipelines.formats.vector_files import BOUNDARY_FORMATS
+from pipelines.formats.boundary_file import BOUNDARY_FORMATS
 from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import Origin, lla_from_enu
 from pipelines.geometry.cameras import CameraPoses

@@ -1,0 +1,306 @@
+"""Boundaries as people draw them: polygons and closed lines of GeoJSON, GeoPackage, KML and DXF files.
+
+GDAL reads GeoPackage and DXF. GeoJSON and KML are read here: GDAL drops rings of KML that are not closed, knows no
+UTF-16, and follows the addresses that both formats may name.
+
+Lines are polygons where they are closed, or where they close around areas together. One open line alone is closed
+by its chord; the file then has a remark.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+
+from pipelines.core.errors import InputError
+from pipelines.core.files import file_size
+from pipelines.core.products import Remark
+from pipelines.formats.kml import read_kml
+
+_MOST_BYTES = 64 * 1024 * 1024
+# By suffix: what the file begins with, white space and a byte order mark apart. GDAL opens a file by its content,
+# also one that names other files and servers.
+BOUNDARY_FORMATS: dict[str, tuple[bytes, ...]] = {
+    ".geojson": (b"{",),
+    ".json": (b"{",),
+    ".gpkg": (b"SQLite format 3\0",),
+    ".kml": (b"<",),
+    ".dxf": (b"0", b"999", b"AutoCAD Binary DXF"),
+}
+_MARKS = ((b"\xef\xbb\xbf", "utf-8"), (b"\xff\xfe\0\0", "utf-32"), (b"\0\0\xfe\xff", "utf-32"))
+_MARKS += ((b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16"))
+_WGS84 = "EPSG:4326"  # of GeoJSON (RFC 7946) and KML
+_DXF_UNIT = re.compile(rb"\$INSUNITS\s*?\r?\n\s*70\s*?\r?\n\s*(\d{1,2})\s")
+_DXF_UNIT_BINARY = re.compile(rb"\$INSUNITS\0F\0(.\0)", re.DOTALL)
+_DXF_HEADER_BYTES = 1 << 20
+_US_FOOT_M = 1200 / 3937
+_DXF_UNITS: dict[int, tuple[str, float]] = {
+    1: ("inches", 0.0254), 2: ("feet", 0.3048), 3: ("miles", 1609.344), 4: ("millimetres", 0.001),
+    5: ("centimetres", 0.01), 6: ("metres", 1.0), 7: ("kilometres", 1000.0), 8: ("microinches", 2.54e-8),
+    9: ("mils", 2.54e-5), 10: ("yards", 0.9144), 13: ("micrometres", 1e-6), 14: ("decimetres", 0.1),
+    15: ("decametres", 10.0), 16: ("hectometres", 100.0), 21: ("US survey feet", _US_FOOT_M),
+    22: ("US survey inches", _US_FOOT_M / 12), 23: ("US survey yards", 3 * _US_FOOT_M),
+    24: ("US survey miles", 5280 * _US_FOOT_M),
+}  # fmt: skip
+_ROUNDING = 1e-6  # of a line's length: a gap that is none
+
+
+@dataclass(frozen=True)
+class BoundaryLayer:
+    """Layer of a file with polygons in plan, easting or longitude first.
+
+    `crs` is its CRS as text; empty: it states none. `crs_is_default`: it is the format's, and not named in the file.
+    """
+
+    name: str
+    polygons: tuple[Any, ...]
+    crs: str = ""
+    crs_is_default: bool = False
+
+
+@dataclass(frozen=True)
+class Boundary:
+    """Layers of a file, each of polygons; `unit`: name and size in metres of a drawing's unit, if it states one.
+
+    `is_drawing`: the layers are those of a CAD drawing, which holds more than a boundary.
+    """
+
+    layers: tuple[BoundaryLayer, ...]
+    unit: tuple[str, float] | None = None
+    is_drawing: bool = False
+    remarks: tuple[Remark, ...] = ()
+
+
+@dataclass(frozen=True)
+class _Shapes:
+    """Shapes of one layer as a file has them."""
+
+    name: str
+    shapes: list[Any]
+    crs: str = ""
+    crs_is_default: bool = False
+
+
+_Refusal = Callable[..., InputError]
+
+
+def read_boundary(path: Path, *, field: str) -> Boundary:
+    """Read the polygons and the closed lines of a GeoJSON, GeoPackage, KML or DXF file.
+
+    Raises:
+        InputError: not such a file, too large, damaged, with a coordinate that is no number, or without an area;
+            names file and option.
+    """
+    refusal = partial(InputError, path=path, field=field)
+    file_size(path, limit_bytes=_MOST_BYTES, kind="boundary", field=field)
+    suffix = path.suffix.lower()
+    data = path.read_bytes()
+    if suffix in (".geojson", ".json", ".kml"):
+        data = _as_utf8(data, refusal)
+    begins = BOUNDARY_FORMATS.get(suffix, ())
+    head = data[:4096].lstrip(b"\xef\xbb\xbf \t\r\n")
+    if not begins or not head.startswith(begins) or b"<OGR" in head:
+        raise _no_boundary(refusal)
+    unit = _drawing_unit(data) if suffix == ".dxf" else None
+    if suffix == ".kml":
+        layers = [_Shapes("", read_kml(data, refusal), _WGS84, crs_is_default=True)]
+    elif suffix in (".geojson", ".json"):
+        layers = [_geojson(data, refusal)]
+    else:
+        layers = _gdal_layers(path, refusal, is_drawing=suffix == ".dxf")
+    for layer in layers:
+        _check_finite(layer, refusal)
+    found, remarks = _with_areas(layers, path.name)
+    if not found:
+        count = sum(len(layer.shapes) for layer in layers)
+        raise refusal(
+            "boundary-without-area", f"has {count} shapes, and none is a polygon. Draw the boundary as one."
+        )
+    return Boundary(tuple(found), unit, suffix == ".dxf", remarks)
+
+
+def _no_boundary(refusal: _Refusal) -> InputError:
+    kinds = "GeoJSON (.geojson), GeoPackage (.gpkg), KML (.kml) or DXF (.dxf)"
+    return refusal("boundary-format", f"is no boundary file that is known. Give {kinds}.")
+
+
+def _as_utf8(data: bytes, refusal: _Refusal) -> bytes:
+    """Return a text in UTF-8, whichever encoding its byte order mark, its zeros or its XML declaration tell."""
+    encoding = next((name for mark, name in _MARKS if data.startswith(mark)), "")
+    if not encoding and b"\0" in data[:4]:  # UTF-16 without a mark: its first character is ASCII
+        encoding = "utf-16-be" if data[:1] == b"\0" else "utf-16-le"
+    declared = re.match(rb"\s*<\?xml[^>]*encoding\s*=\s*[\"']([\w.:-]{1,40})[\"']", data[:400])
+    names = [encoding] if encoding else ["utf-8", declared[1].decode() if declared else "", "cp1252"]
+    for name in filter(None, names):
+        try:
+            return data.decode(name).lstrip("\ufeff").encode()
+        except (UnicodeError, LookupError):
+            continue
+    raise refusal("boundary-encoding", f"is no text in {names[0].upper()}. Save it as UTF-8.")
+
+
+def _geojson(data: bytes, refusal: _Refusal) -> _Shapes:
+    unreadable = partial(refusal, "boundary-unreadable")
+    try:
+        document = json.loads(data)
+        pending, shapes, own = [document], [], []
+        while pending:
+            item = pending.pop()
+            own += [item["crs"]] if "crs" in item else []
+            if item["type"] == "FeatureCollection":
+                pending += item["features"][::-1]
+            elif item["type"] == "Feature":
+                pending += [item["geometry"]] if item["geometry"] is not None else []
+            elif item["type"] == "GeometryCollection":
+                pending += item["geometries"][::-1]
+            else:
+                shapes += _geometry(item["type"], item["coordinates"])
+    except (ValueError, TypeError, KeyError, IndexError, RecursionError, shapely.errors.ShapelyError) as error:
+        message = f"cannot be read as GeoJSON: {type(error).__name__} {str(error)[:100]}. Write it again."
+        raise unreadable(message) from error
+    if not own:
+        return _Shapes("", shapes, _WGS84, crs_is_default=True)
+    names = list(dict.fromkeys(_crs_member(member, refusal) for member in own))
+    if len(names) > 1:
+        raise refusal("boundary-two-crs", f"names several CRSs: {', '.join(names)}. Give one of them.")
+    return _Shapes("", shapes, names[0])
+
+
+def _geometry(kind: str, coordinates: Any) -> list[Any]:
+    """Return the polygons and lines of a geometry of GeoJSON; the reader of it catches what is malformed."""
+
+    def plan(places: Any) -> list[tuple[float, float]]:
+        return [(float(place[0]), float(place[1])) for place in places]
+
+    if kind == "Polygon":
+        rings = [plan(ring) for ring in coordinates]
+        return [shapely.Polygon(rings[0], rings[1:])] if rings and len(rings[0]) > 2 else []
+    if kind == "LineString":
+        return [shapely.LineString(plan(coordinates))] if len(coordinates) > 1 else []
+    if kind in ("MultiPolygon", "MultiLineString"):
+        return [shape for part in coordinates for shape in _geometry(kind.removeprefix("Multi"), part)]
+    if kind in ("Point", "MultiPoint"):
+        return [shapely.Point(*place[:2]) for place in ([coordinates] if kind == "Point" else coordinates)]
+    raise ValueError(f"type {str(kind)[:40]}")
+
+
+def _crs_member(member: Any, refusal: _Refusal) -> str:
+    """Return the CRS that a member `crs` of GeoJSON 2008 names; empty: that it is unknown."""
+    if member is None:
+        return ""
+    if isinstance(member, str):
+        return member
+    properties = member.get("properties") if isinstance(member, dict) else None
+    if isinstance(properties, dict):
+        name, code = properties.get("name"), properties.get("code")
+        if isinstance(name, str):
+            return name
+        if isinstance(code, int | str):
+            return f"EPSG:{code}"
+    raise refusal("boundary-crs-member", "has a member `crs` without a name. Write the CRS as EPSG:n there.")
+
+
+def _gdal_layers(path: Path, refusal: _Refusal, *, is_drawing: bool) -> list[_Shapes]:
+    import pyogrio
+    from pyogrio.errors import DataLayerError, DataSourceError
+
+    columns = ["Layer", "PaperSpace"] if is_drawing else []
+    try:
+        with warnings.catch_warnings():  # of GDAL, about what does not matter here
+            warnings.simplefilter("ignore", RuntimeWarning)
+            names = [str(name) for name, kind in pyogrio.list_layers(path).tolist() if kind is not None]
+            read = [pyogrio.raw.read(path, layer=name, columns=columns, force_2d=True) for name in names]
+        layers = []
+        for name, (meta, _, geometry, values) in zip(names, read, strict=True):
+            shapes = shapely.from_wkb(geometry, on_invalid="ignore")
+            known = dict(zip(meta["fields"], values, strict=True))
+            layers += _drawn(shapes, known) if is_drawing else [_Shapes(name, list(shapes), meta["crs"] or "")]
+    except (DataSourceError, DataLayerError, ValueError, OSError) as error:
+        message = f"cannot be read: {error}. Write it again, as GeoJSON."
+        raise refusal("boundary-unreadable", message) from error
+    return [replace(one, shapes=[shape for shape in one.shapes if shape is not None]) for one in layers]
+
+
+def _drawn(shapes: Any, values: dict[str, Any]) -> Iterator[_Shapes]:
+    """Yield the layers of a drawing's model space; what lies on its sheets of paper has their coordinates."""
+    count = len(shapes)
+    layer = values.get("Layer", np.full(count, ""))
+    paper = values.get("PaperSpace", np.zeros(count))
+    is_paper = np.array([value is not None and bool(np.nan_to_num(value)) for value in paper], dtype=bool)
+    for name in dict.fromkeys(layer[~is_paper].tolist()):
+        yield _Shapes(str(name or ""), list(shapes[~is_paper & (layer == name)]))
+
+
+def _drawing_unit(data: bytes) -> tuple[str, float] | None:
+    head = data[:_DXF_HEADER_BYTES]
+    if (found := _DXF_UNIT.search(head)) is not None:
+        return _DXF_UNITS.get(int(found[1]))
+    binary = _DXF_UNIT_BINARY.search(head)
+    return None if binary is None else _DXF_UNITS.get(int.from_bytes(binary[1], "little"))
+
+
+def _check_finite(layer: _Shapes, refusal: _Refusal) -> None:
+    for number, shape in enumerate(layer.shapes, start=1):
+        places = shapely.get_coordinates(shape)
+        wrong = np.flatnonzero(~np.isfinite(places).all(axis=1))
+        if len(wrong):
+            x, y = places[wrong[0]].tolist()
+            of_layer = f" of layer {layer.name}" if layer.name else ""
+            raise refusal(
+                "boundary-not-finite",
+                f"has a corner that is no place: ({x:g}, {y:g}), corner {int(wrong[0]) + 1} of shape {number}"
+                f"{of_layer}. Write its coordinates as numbers.",
+            )
+
+
+def _with_areas(layers: list[_Shapes], name: str) -> tuple[list[BoundaryLayer], tuple[Remark, ...]]:
+    """Return the layers that hold an area, and a remark if an open line had to be closed for one."""
+    parts = [[part for shape in layer.shapes for part in _simple_parts(shape)] for layer in layers]
+    lines = [[part for part in every if part.geom_type == "LineString" and not _is_ring(part)] for every in parts]
+    areas = [[area for part in every if (area := _area(part)) is not None] for every in parts]
+    if not any(areas):
+        areas = [list(shapely.get_parts(shapely.polygonize(every))) for every in lines]
+    remarks: tuple[Remark, ...] = ()
+    drawn = [(at, line) for at, every in enumerate(lines) for line in every if len(line.coords) > 2]
+    if not any(areas) and len(drawn) == 1:
+        at, line = drawn[0]
+        areas[at] = [shapely.Polygon(line.coords)]
+        sentence = f"{name}: its line is open, and was closed by the straight line from its end to its beginning."
+        remarks = (Remark(code="boundary-line-closed", sentence=sentence),)
+    found = []
+    for layer, polygons in zip(layers, areas, strict=True):
+        valid = [part for shape in shapely.make_valid(polygons) for part in _simple_parts(shape)]
+        valid = [part for part in valid if part.geom_type == "Polygon" and part.area > 0]
+        if valid:
+            found.append(BoundaryLayer(layer.name, tuple(valid), layer.crs, layer.crs_is_default))
+    return found, remarks
+
+
+def _simple_parts(shape: Any) -> Iterator[Any]:
+    pending = [shape]
+    while pending:
+        one = pending.pop()
+        if one.geom_type.startswith("Multi") or one.geom_type == "GeometryCollection":
+            pending += shapely.get_parts(one).tolist()[::-1]
+        else:
+            yield one
+
+
+def _is_ring(line: Any) -> bool:
+    first, last = line.coords[0], line.coords[-1]
+    return len(line.coords) > 3 and float(np.hypot(*np.subtract(first, last))) <= _ROUNDING * line.length
+
+
+def _area(part: Any) -> Any | None:
+    if part.geom_type == "Polygon":
+        return part
+    return shapely.Polygon(part.coords) if part.geom_type == "LineString" and _is_ring(part) else None
