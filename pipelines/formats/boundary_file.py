@@ -58,7 +58,7 @@ _ROUNDING = 1e-6  # of a line's length: a gap that is none
 class BoundaryLayer:
     """Layer of a file with polygons in plan, easting or longitude first.
 
-    `crs` is its CRS as text; empty: it states none. `crs_is_default`: it is the format's, and not named in the file.
+    `crs` is its CRS as text; empty: it states none. `crs_is_default`: it is the format's, not named in the file.
     """
 
     name: str
@@ -111,12 +111,13 @@ def read_boundary(path: Path, *, field: str) -> Boundary:
     if not begins or not head.startswith(begins) or b"<OGR" in head:
         raise _no_boundary(refusal)
     unit = _drawing_unit(data) if suffix == ".dxf" else None
-    if suffix == ".kml":
-        layers = [_Shapes("", read_kml(data, refusal), _WGS84, crs_is_default=True)]
-    elif suffix in (".geojson", ".json"):
-        layers = [_geojson(data, refusal)]
-    else:
-        layers = _gdal_layers(path, refusal, is_drawing=suffix == ".dxf")
+    with np.errstate(invalid="ignore"):  # corners that are no numbers are named below
+        if suffix == ".kml":
+            layers = [_Shapes("", read_kml(data, refusal), _WGS84, crs_is_default=True)]
+        elif suffix in (".geojson", ".json"):
+            layers = [_geojson(data, refusal)]
+        else:
+            layers = _gdal_layers(path, refusal, is_drawing=suffix == ".dxf")
     for layer in layers:
         _check_finite(layer, refusal)
     found, remarks = _with_areas(layers, path.name)

@@ -9,6 +9,7 @@
 import logging
 import re
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -76,6 +77,7 @@ class CloudReader:
 
     Attributes:
         crs_names: names of the CRSs of the files, without repetition.
+        notes: where files and options disagree, and units that were converted.
         assumptions: sentences on what the files do not say.
 
     Raises:
@@ -98,7 +100,8 @@ class CloudReader:
             )
             for name, unit in sorted(silent)
         )
-        self.assumptions = union(*(_few(one) for one in _by_code(self._placed)), heights)
+        self.notes = union(*(_few(one) for one in _by_code(self._placed)))
+        self.assumptions = union(self.notes, heights)
 
     def chunks(self, origin: Origin, progress: Progress = SILENT) -> Iterator[MeasuredCloud]:
         """Yield all valid points in geo, in chunks; an InputError: damage, points outside the CRS, no grid."""
@@ -109,7 +112,8 @@ class CloudReader:
                 for raw in file.chunks(_CHUNK):
                     chunk = self._valid(raw, file.path)
                     if len(chunk):
-                        lla = (serving or crs).lla_from_xyz(chunk.position * placed.scale, path=file.path)
+                        with _explained(placed):
+                            lla = (serving or crs).lla_from_xyz(chunk.position * placed.scale, path=file.path)
                         # One operation serves the file: neighbours in two chunks keep their distance.
                         serving = serving or crs.serving(lla)
                         place, count = enu_from_ecef(ecef_from_lla(lla), origin), len(chunk)
@@ -152,7 +156,7 @@ def read_thinned(
         raise InputError(
             "no-overlap",
             f"None of the {files.tally.read} points lies in the scene of the photographs: the cloud is of another "
-            f"place, or its CRS ({', '.join(files.crs_names)}) is wrong.",
+            f"place, or its CRS ({', '.join(files.crs_names)}) is wrong.{_said(files.notes)}",
         )
     cloud = _limited(waiting, voxel_m, thinning.most)
     log.info(
@@ -195,6 +199,22 @@ def _short_name(name: str) -> str:
     """Return the name that a WKT gives its CRS; any other text itself."""
     found = re.match(r'\w+\["([^"]+)"', name)
     return found[1] if found else name
+
+
+@contextmanager
+def _explained(placed: PlacedCrs) -> Iterator[None]:
+    """Add to the error of points that cannot be placed what is remarkable about their CRS."""
+    try:
+        yield
+    except InputError as error:
+        if not placed.remarks:
+            raise
+        message = error.message + _said(placed.remarks)
+        raise InputError(error.code, message, path=error.path, line=error.line, field=error.field) from error
+
+
+def _said(remarks: Sequence[Remark]) -> str:
+    return "".join(f" {remark.sentence}" for remark in remarks)
 
 
 def _by_code(placed: Sequence[PlacedCrs]) -> list[list[Remark]]:

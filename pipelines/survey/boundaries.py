@@ -37,7 +37,8 @@ _SITE = re.compile(
 _FRAME = re.compile(
     r"frame|sheet|title|viewport|defpoints|legend|limits\b|rahmen|blatt|cadre|marco|caj[ei]tin", re.IGNORECASE
 )
-_FRAMES_IN_LAYER = 3  # the largest outlines of a layer that may be frames
+_FRAMES_IN_LAYER = 3  # the most frames around the outlines of one layer, less one
+_RECTANGULAR = 0.999  # least area of a sheet's frame over that of the rectangle around it
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ def read_outlines(
     """
     boundary = read_boundary(path, field=field)
     for remark in boundary.remarks:
-        log.warning("%s (%s)", remark.sentence, remark.code)
+        log.warning("%s", remark.sentence, extra={"code": remark.code})
     refusal = partial(InputError, path=path, field=crs_field)
     found = []
     for layer in boundary.layers:
@@ -91,17 +92,29 @@ def read_outlines(
 
 def _crs_text(layer: BoundaryLayer, stated: str | None, path: Path, crs_field: str) -> str:
     """Return the CRS that counts: the user's, else the layer's, if that is one of places on Earth."""
-    of_layer = "" if not layer.crs or _is_local(layer.crs, path) else layer.crs
+    try:
+        of_layer = "" if not layer.crs or _is_local(layer.crs, path) else layer.crs
+    except InputError:
+        if not stated:
+            raise
+        log.warning(
+            "%s: %s, %s, overrules the file's CRS, %s, which PROJ does not know.",
+            path.name, crs_field, stated, layer.crs[:60], extra={"code": "boundary-crs-overrules"},
+        )  # fmt: skip
+        return stated
     if not stated or not of_layer or _are_equal(stated, of_layer):
         return of_layer or stated or ""
     shown = proj_crs(of_layer).name
     if path.suffix.lower() == ".kml":
-        log.warning("%s: %s is not used, KML is in WGS84 (boundary-crs-unused)", path.name, crs_field)
+        log.warning(
+            "%s: %s is not used, KML is in WGS84.", path.name, crs_field, extra={"code": "boundary-crs-unused"}
+        )
         return of_layer
     if not layer.crs_is_default:
         log.warning(
-            "%s: %s, %s, overrules the file's CRS, %s (boundary-crs-overrules)", path.name, crs_field, stated, shown
-        )
+            "%s: %s, %s, overrules the file's CRS, %s.",
+            path.name, crs_field, stated, shown, extra={"code": "boundary-crs-overrules"},
+        )  # fmt: skip
     return stated
 
 
@@ -139,11 +152,14 @@ def _in_unit_of_crs(
     stated = size_m / crs.horizontal_unit
     factor = _unit_factor(found, places, stated)
     if factor != 1.0:
-        log.info("%s: coordinates were converted from %s, its $INSUNITS (boundary-unit)", path.name, name)
+        log.warning(
+            "%s: coordinates were converted from %s, its $INSUNITS, into %s, the unit of %s.",
+            path.name, name, crs.units[0], crs.name, extra={"code": "boundary-unit"},
+        )  # fmt: skip
     elif abs(stated - 1) > _SAME_UNIT:
         log.warning(
             "%s: its $INSUNITS states %s, but only coordinates in %s, the unit of %s, meet the survey: these were "
-            "used (boundary-unit-ignored)", path.name, name, crs.units[0], crs.name,
+            "used.", path.name, name, crs.units[0], crs.name, extra={"code": "boundary-unit-ignored"},
         )  # fmt: skip
     return [
         replace(one, polygons=tuple(shapely.transform(list(one.polygons), lambda plan: plan * factor)))
@@ -195,18 +211,23 @@ def _site(found: Sequence[Outlines], places: FloatArray | None, path: Path) -> t
     frames = max(len(one.polygons) for one in found if one.layer == taken.layer) - len(taken.polygons)
     size = "" if taken.crs.is_geographic else f" ({area.area * taken.crs.horizontal_unit**2 / 1e4:.4g} ha)"
     log.warning(
-        "%s: layer %s%s was taken as the boundary%s%s (boundary-layer)",
+        "%s: layer %s%s was taken as the boundary%s%s.",
         path.name, taken.layer, size, f", without {frames} outlines around its others" if frames else "",
-        f"; not taken: {others[:300]}" if others else "",
+        f"; not taken: {others[:300]}" if others else "", extra={"code": "boundary-layer"},
     )  # fmt: skip
     return (taken,)
 
 
 def _choices(one: Outlines) -> Iterator[tuple[Outlines, Any]]:
-    """Yield a layer with its area: whole, and without the largest outlines that contain all its others."""
+    """Yield a layer with its area: whole, and without the largest rectangles that contain all its others."""
     polygons = sorted(one.polygons, key=lambda part: float(part.area), reverse=True)
     for left_out in range(min(_FRAMES_IN_LAYER, len(polygons))):
         rest = polygons[left_out:]
-        if left_out and not shapely.contains(shapely.envelope(polygons[left_out - 1]), shapely.union_all(rest)):
+        whole = shapely.union_all(rest)
+        if left_out and not (_is_rectangle(polygons[left_out - 1]) and polygons[left_out - 1].covers(whole)):
             return
-        yield replace(one, polygons=tuple(rest)), shapely.union_all(rest)
+        yield replace(one, polygons=tuple(rest)), whole
+
+
+def _is_rectangle(polygon: Any) -> bool:
+    return float(shapely.oriented_envelope(polygon).area) * _RECTANGULAR <= float(polygon.area)
