@@ -43,7 +43,7 @@ class ChangeOptions(StageOptions):
         None, description="Polygons whose volumes are wanted, beside the regions that are found."
     )
     polygons_crs: str | None = Field(
-        None, description="CRS of the polygons where their file states none, as in DXF: EPSG:32632 or another."
+        None, description="CRS of the polygons, as a DXF needs one: EPSG:32632 or another. It overrules the file's."
     )
     along_normals: bool = Field(
         False,

@@ -34,11 +34,12 @@ class EvaluateOptions(AreaOptions):
         "saw it.",
     )
     reference_crs: str | None = Field(
-        None, description="CRS of a reference that states none: EPSG:32632, or EPSG:32632+5773 for heights."
+        None,
+        description="CRS of the reference: EPSG:32632, or EPSG:32632+5773 for heights. It overrules the file's.",
     )
     reference_vertical: Vertical | None = Field(
         None,
-        description="Datum of the reference's heights if its CRS states none: ellipsoidal, EGM96 or EPSG:n.",
+        description="Datum of the reference's heights: ellipsoidal, EGM96 or EPSG:n. It overrules the file's.",
     )
     reference_sigma: float = Field(
         0.0,

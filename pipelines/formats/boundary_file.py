@@ -103,9 +103,11 @@ def read_boundary(path: Path, *, field: str) -> Boundary:
     refusal = partial(InputError, path=path, field=field)
     file_size(path, limit_bytes=_MOST_BYTES, kind="boundary", field=field)
     suffix = path.suffix.lower()
-    data = path.read_bytes()
     if suffix in (".geojson", ".json", ".kml"):
-        data = _as_utf8(data, refusal)
+        data = _as_utf8(path.read_bytes(), refusal)
+    else:
+        with path.open("rb") as file:
+            data = file.read(_DXF_HEADER_BYTES)
     begins = BOUNDARY_FORMATS.get(suffix, ())
     head = data[:4096].lstrip(b"\xef\xbb\xbf \t\r\n")
     if not begins or not head.startswith(begins) or b"<OGR" in head:
@@ -242,10 +244,9 @@ def _drawn(shapes: Any, values: dict[str, Any]) -> Iterator[_Shapes]:
 
 
 def _drawing_unit(data: bytes) -> tuple[str, float] | None:
-    head = data[:_DXF_HEADER_BYTES]
-    if (found := _DXF_UNIT.search(head)) is not None:
+    if (found := _DXF_UNIT.search(data)) is not None:
         return _DXF_UNITS.get(int(found[1]))
-    binary = _DXF_UNIT_BINARY.search(head)
+    binary = _DXF_UNIT_BINARY.search(data)
     return None if binary is None else _DXF_UNITS.get(int.from_bytes(binary[1], "little"))
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import math
+import re
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ _WKT_BIT = 16  # of the global encoding
 _LEAST_SCALE, _MOST_SCALE = 1e-12, 1e3
 # WKT lies in 2112 by the specification; PDAL puts WKT2 into 4224, and libLAS its WKT under its own name.
 _WKT_RECORDS = (2112, 4224)
+_LOCAL = re.compile(r"LOCAL_CS|ENGCRS|ENGINEERINGCRS", re.IGNORECASE)
 _KEYS, _DOUBLES, _TEXTS = 34735, 34736, 34737  # of GeoTIFF
 _USERS = ("lasf_projection", "liblas", "pdal")
 _POINTWISE, _VARIABLE_CHUNKS = 1, 0xFFFFFFFF
@@ -59,7 +61,9 @@ def read_head(path: Path, size: int) -> LasHead:
             message = "The header is damaged: its records reach beyond the file's end."
             raise InputError("file-damaged", message, path=path)
         _check_steps(path, head)
-        found = dict(_records(stream, head, size))
+        found: _Found = {}
+        for key, data in _records(stream, head, size):
+            found.setdefault(key, []).append(data)
         is_compressed = bool(point_format & 0x80)
         table_at = _missing_table(path, stream, offset, size, found) if is_compressed else None
     return LasHead(_crs(head, found), table_at)
@@ -78,17 +82,16 @@ def _check_steps(path: Path, head: bytes) -> None:
             raise InputError("las-offset", message, path=path, field=f"{axis} offset")
 
 
-_Found = dict[tuple[str, int], bytes]
+_Found = dict[tuple[str, int], list[bytes]]  # by user and number, in the order of the file
 
 
 def _records(stream: BinaryIO, head: bytes, size: int) -> Iterator[tuple[tuple[str, int], bytes]]:
-    """Yield user and number of the records of CRS and compression with their bytes, extended records first."""
-    places = []
+    """Yield user and number of the records of CRS and compression with their bytes, extended records last."""
+    at, _, count = struct.unpack_from("<HII", head, 94)
+    places = [(_VLR, at, min(count, _MOST_RECORDS))]
     if len(head) >= _HEADER_BYTES_14 and head[24:26] >= b"\1\4" and struct.unpack_from("<H", head, 94)[0] >= 247:
         at, count = struct.unpack_from("<QI", head, 235)
         places.append((_EVLR, at, min(count, _MOST_RECORDS)))
-    at, _, count = struct.unpack_from("<HII", head, 94)
-    places.append((_VLR, at, min(count, _MOST_RECORDS)))
     for form, first, records in places:
         place = first
         for _ in range(records):
@@ -104,8 +107,10 @@ def _records(stream: BinaryIO, head: bytes, size: int) -> Iterator[tuple[tuple[s
 
 
 def _crs(head: bytes, found: _Found) -> FileCrs:
-    texts = (_text(found.get((user, number), b"")) for number in _WKT_RECORDS for user in _USERS)
-    wkt = next(filter(None, texts), "")
+    every = [_text(one) for number in _WKT_RECORDS for user in _USERS for one in found.get((user, number), [])]
+    texts = [text for text in every if text]
+    # A placeholder in one record must not hide a CRS in another.
+    wkt = next((text for text in texts if not _LOCAL.match(text)), texts[0] if texts else "")
     middle = tuple((low + high) / 2 for high, low in struct.iter_unpack("<2d", head[179:227]))
     return FileCrs(
         wkt=wkt,
@@ -126,9 +131,8 @@ def _text(data: bytes) -> str:
 def _geo_keys(found: _Found) -> dict[int, KeyValue]:
     """Return the keys of GeoTIFF with their values; damaged ones are left out."""
     user = next((user for user in _USERS if (user, _KEYS) in found), "")
-    directory = found.get((user, _KEYS), b"")
+    directory, doubles, texts = (found.get((user, key), [b""])[0] for key in (_KEYS, _DOUBLES, _TEXTS))
     words = [word for (word,) in struct.iter_unpack("<H", directory[: len(directory) // 2 * 2])]
-    doubles, texts = found.get((user, _DOUBLES), b""), found.get((user, _TEXTS), b"")
     keys: dict[int, KeyValue] = {}
     for at in range(4, min(len(words), 4 + 4 * (words[3] if len(words) > 3 else 0)) - 3, 4):
         key, location, count, value = words[at : at + 4]
@@ -147,7 +151,7 @@ def _missing_table(path: Path, stream: BinaryIO, offset: int, size: int, found: 
     Raises:
         InputError: the file is cut off, has more chunks than bytes, or points that only a table could find.
     """
-    compression = found.get(("laszip encoded", 22204), b"").ljust(16, b"\0")
+    compression = found.get(("laszip encoded", 22204), [b""])[0].ljust(16, b"\0")
     if struct.unpack_from("<H", compression)[0] == _POINTWISE:
         message = "The points are compressed as by LASzip before version 2, without chunks. Write it again as LAZ."
         raise InputError("laz-without-chunks", message, path=path)

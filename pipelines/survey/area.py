@@ -28,6 +28,7 @@ _FARTHEST_CELLS = 6.0  # distance from a point of the scene beyond which there i
 _COARSEST = 1.5  # largest width of a pixel on the ground over the median: beyond, rasters would promise too much
 _SMOOTHED_CELLS = 4.0  # width of tongues that are left out, and of bays that are taken in, halved
 _EDGES = 200  # pieces of a boundary's longer side, which may be bent in another CRS
+_PLACES = 2000  # of the scene that tell units and layers of a drawing apart
 LEAST_RAYS = 3  # of a point of the scene
 _OUTLIERS = 0.005  # fraction of the points that are taken for errors above, and below
 
@@ -111,7 +112,7 @@ def boundary_area(options: AreaOptions, scene: FloatArray, origin: Origin | None
     path = options.boundary
     outlines = read_outlines(
         path,
-        lla_from_enu(scene, origin),
+        lla_from_enu(scene[:: max(len(scene) // _PLACES, 1)], origin),
         field="--boundary",
         crs=options.boundary_crs,
         crs_field="--boundary-crs",

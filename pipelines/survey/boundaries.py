@@ -28,7 +28,6 @@ from pipelines.geodesy.crs import PointCrs, parse_crs, proj_crs
 
 log = logging.getLogger(__name__)
 
-_MOST_PLACES = 2000
 _SAME_UNIT = 1e-4  # relative: the two feet, of which a drawing's header knows one
 _SITE = re.compile(
     r"site|boundar|perimet|outline|area.?of.?interest|\baoi\b|limit|grenze|gebiet|umriss|emprise|contorno|linder",
@@ -169,9 +168,8 @@ def _in_unit_of_crs(
 
 def _plan_of(crs: PointCrs, places_lla: FloatArray) -> FloatArray | None:
     """Return places (N, 2) of the survey in the plan of a CRS; None: none, or they lie outside it."""
-    step = max(len(places_lla) // _MOST_PLACES, 1)
     try:
-        places = crs.xyz_from_lla(places_lla[::step])[:, :2]
+        places = crs.xyz_from_lla(places_lla)[:, :2]
     except InputError:  # said later, of the boundary
         return None
     return places if len(places) else None

@@ -22,10 +22,10 @@ CloudPath = Annotated[Path, InputMarker(CLOUD_SUFFIXES)]
 
 @dataclass(frozen=True)
 class CloudCrs:
-    """CRS of clouds as the user states it; what the files say themselves counts first."""
+    """CRS of clouds as the user states it, which counts before what the files say themselves."""
 
-    crs: str | None = None  # text of the CRS, for files without one
-    vertical: VerticalChoice | None = None  # datum of the heights, where the CRS has no vertical part
+    crs: str | None = None  # text of the CRS, with the unit of the coordinates
+    vertical: VerticalChoice | None = None  # datum of the heights
     # Option that named the clouds, for errors: `--lidar` has `--lidar-crs` and `--lidar-vertical`
     flag: str = "--lidar"
 
@@ -54,5 +54,6 @@ class AreaOptions(StageOptions):
         f"at least {LEAST_PHOTOGRAPHS} photographs see.",
     )
     boundary_crs: str | None = Field(
-        None, description="CRS of the boundary where its file states none, as in DXF: EPSG:32632 or another."
+        None,
+        description="CRS of the boundary, as a DXF needs one: EPSG:32632 or another. It overrules the file's.",
     )

@@ -56,9 +56,9 @@ class LidarOptions(StageOptions):
     lidar: CloudPath | None = Field(
         None, description="LiDAR of the same place, for the surface: LAS, LAZ or PLY, or a folder of tiles."
     )
-    lidar_crs: str | None = Field(None, description="CRS of the LiDAR, for files that state none.")
+    lidar_crs: str | None = Field(None, description="CRS of the LiDAR. It overrules what its files state.")
     lidar_vertical: Vertical | None = Field(
-        None, description="Datum of the LiDAR's heights, where its CRS has no vertical part."
+        None, description="Datum of the LiDAR's heights. It overrules what its files state."
     )
     lidar_trajectory: InputPath | None = Field(
         None,

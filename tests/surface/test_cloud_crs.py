@@ -111,6 +111,14 @@ def test_the_crs_is_found_in_every_record(tmp_path: Path, said_by: dict[str, Any
     assert codes(reader.assumptions) == ["lidar-heights"]
 
 
+def test_a_placeholder_does_not_hide_the_crs_of_an_extended_record(tmp_path: Path) -> None:
+    path = write(tmp_path / "c.laz", wkt=wkt1(ZONE), extended=True)
+    las = laspy.read(path)
+    las.header.vlrs.append(laspy.VLR("LASF_Projection", 2112, "WKT", b'LOCAL_CS["unknown",UNIT["metre",1]]'))
+    las.write(path)
+    require_place(placed(path)[0])
+
+
 @pytest.mark.parametrize(
     "text",
     [
