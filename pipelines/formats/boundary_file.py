@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import json
 import re
-import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
@@ -25,6 +24,7 @@ from pipelines.core.errors import InputError
 from pipelines.core.files import file_size
 from pipelines.core.products import Remark
 from pipelines.formats.kml import read_kml
+from pipelines.formats.vector_files import ReadLayer, read_layers
 
 _MOST_BYTES = 64 * 1024 * 1024
 # By suffix: what the file begins with, white space and a byte order mark apart. GDAL opens a file by its content,
@@ -119,7 +119,7 @@ def read_boundary(path: Path, *, field: str) -> Boundary:
         elif suffix in (".geojson", ".json"):
             layers = [_geojson(data, refusal)]
         else:
-            layers = _gdal_layers(path, refusal, is_drawing=suffix == ".dxf")
+            layers = _gdal_layers(path, is_drawing=suffix == ".dxf", field=field)
     for layer in layers:
         _check_finite(layer, refusal)
     found, remarks = _with_areas(layers, path.name)
@@ -212,32 +212,18 @@ def _crs_member(member: Any, refusal: _Refusal) -> str:
     raise refusal("boundary-crs-member", "has a member `crs` without a name. Write the CRS as EPSG:n there.")
 
 
-def _gdal_layers(path: Path, refusal: _Refusal, *, is_drawing: bool) -> list[_Shapes]:
-    import pyogrio
-    from pyogrio.errors import DataLayerError, DataSourceError
-
-    columns = ["Layer", "PaperSpace"] if is_drawing else []
-    try:
-        with warnings.catch_warnings():  # of GDAL, about what does not matter here
-            warnings.simplefilter("ignore", RuntimeWarning)
-            names = [str(name) for name, kind in pyogrio.list_layers(path).tolist() if kind is not None]
-            read = [pyogrio.raw.read(path, layer=name, columns=columns, force_2d=True) for name in names]
-        layers = []
-        for name, (meta, _, geometry, values) in zip(names, read, strict=True):
-            shapes = shapely.from_wkb(geometry, on_invalid="ignore")
-            known = dict(zip(meta["fields"], values, strict=True))
-            layers += _drawn(shapes, known) if is_drawing else [_Shapes(name, list(shapes), meta["crs"] or "")]
-    except (DataSourceError, DataLayerError, ValueError, OSError) as error:
-        message = f"cannot be read: {error}. Write it again, as GeoJSON."
-        raise refusal("boundary-unreadable", message) from error
-    return [replace(one, shapes=[shape for shape in one.shapes if shape is not None]) for one in layers]
+def _gdal_layers(path: Path, *, is_drawing: bool, field: str) -> list[_Shapes]:
+    found: list[_Shapes] = []
+    for layer in read_layers(path, ("Layer", "PaperSpace") if is_drawing else (), field=field):
+        found += _drawn(layer) if is_drawing else [_Shapes(layer.name, list(layer.shapes), layer.crs)]
+    return [replace(one, shapes=[shape for shape in one.shapes if shape is not None]) for one in found]
 
 
-def _drawn(shapes: Any, values: dict[str, Any]) -> Iterator[_Shapes]:
+def _drawn(read: ReadLayer) -> Iterator[_Shapes]:
     """Yield the layers of a drawing's model space; what lies on its sheets of paper has their coordinates."""
-    count = len(shapes)
-    layer = values.get("Layer", np.full(count, ""))
-    paper = values.get("PaperSpace", np.zeros(count))
+    shapes, count = read.shapes, len(read.shapes)
+    layer = read.values.get("Layer", np.full(count, ""))
+    paper = read.values.get("PaperSpace", np.zeros(count))
     is_paper = np.array([value is not None and bool(np.nan_to_num(value)) for value in paper], dtype=bool)
     for name in dict.fromkeys(layer[~is_paper].tolist()):
         yield _Shapes(str(name or ""), list(shapes[~is_paper & (layer == name)]))

@@ -7,6 +7,7 @@ Contours are a line a height, with the height as attribute and as z.
 import io
 import json
 import math
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -211,3 +212,39 @@ def drawing(lines: Sequence[tuple[str, int, FloatArray]]) -> bytes:
         document.modelspace().add_lwpolyline(places.tolist(), dxfattribs={"layer": layer})
     document.write(text)
     return text.getvalue().encode(document.output_encoding, errors="replace")
+
+
+@dataclass(frozen=True)
+class ReadLayer:
+    """Layer of a file as GDAL reads it: shapes in plan, of which None cannot be read, and columns of their values.
+
+    `crs` is its CRS as text; empty: it states none.
+    """
+
+    name: str
+    shapes: NDArray[Any]
+    values: dict[str, NDArray[Any]]
+    crs: str
+
+
+def read_layers(path: Path, columns: Sequence[str] = (), *, field: str) -> list[ReadLayer]:
+    """Return the layers with geometry of a GeoPackage or DXF file; an InputError names file and option."""
+    import pyogrio
+    from pyogrio.errors import DataLayerError, DataSourceError
+
+    layers = []
+    try:
+        with warnings.catch_warnings():  # of GDAL, about what does not matter here
+            warnings.simplefilter("ignore", RuntimeWarning)
+            for name, kind in pyogrio.list_layers(path).tolist():
+                if kind is not None:
+                    meta, _, shapes, values = pyogrio.raw.read(
+                        path, layer=name, columns=list(columns), force_2d=True
+                    )
+                    known = dict(zip(meta["fields"], values, strict=True))
+                    plan = shapely.from_wkb(shapes, on_invalid="ignore")
+                    layers.append(ReadLayer(str(name), plan, known, meta["crs"] or ""))
+    except (DataSourceError, DataLayerError, ValueError, OSError) as error:
+        message = f"cannot be read: {error}. Write it again, as GeoJSON."
+        raise InputError("boundary-unreadable", message, path=path, field=field) from error
+    return layers

@@ -21,10 +21,10 @@ from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import ByteArray, FloatArray, IntArray, Rows, joined_rows, rows_of
 from pipelines.formats.cloud_ply import CloudChunk, CloudFile, open_cloud_ply
 from pipelines.formats.las import open_las
+from pipelines.geodesy.cloud_crs import PlacedCrs, place_crs
 from pipelines.geodesy.crs import PointCrs
 from pipelines.geodesy.enu import Origin, ecef_from_lla, enu_from_ecef
 from pipelines.geometry.footprints import voxel_keys
-from pipelines.surface.cloud_crs import PlacedCrs, place_crs
 from pipelines.survey.options import CLOUD_SUFFIXES, CloudCrs
 
 log = logging.getLogger(__name__)
@@ -86,7 +86,10 @@ class CloudReader:
 
     def __init__(self, path: Path, stated: CloudCrs) -> None:
         self._files = [_opened(file, stated) for file in _paths(path, stated)]
-        self._placed = [place_crs(file.crs, stated, file.path) for file in self._files]
+        self._placed = [
+            place_crs(file.crs, file.path, crs=stated.crs, vertical=stated.vertical, flag=stated.flag)
+            for file in self._files
+        ]
         self.count = sum(file.count for file in self._files)
         self.tally = ReadTally()
         crs = [one.crs for one in self._placed]

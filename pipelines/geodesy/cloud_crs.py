@@ -25,7 +25,6 @@ from pipelines.geodesy.crs import PointCrs, parse_crs, proj_crs
 from pipelines.geodesy.enu import ecef_from_lla
 from pipelines.geodesy.geotiff_keys import FileCrs, Unit, keyed_crs
 from pipelines.geodesy.vertical import ELLIPSOIDAL, NAME_OF_EPSG, VerticalChoice, VerticalDatum
-from pipelines.survey.options import CloudCrs
 
 _SAME_PLACE_M = 0.01
 _NEARLY = 1e-4  # relative difference of units that no glance at the coordinates tells apart: the two feet
@@ -78,27 +77,35 @@ class _Statement:
 _NOTHING = _Statement("")
 
 
-def place_crs(said: FileCrs, stated: CloudCrs, path: Path) -> PlacedCrs:
+def place_crs(
+    said: FileCrs, path: Path, *, crs: str | None = None, vertical: VerticalChoice | None = None, flag: str
+) -> PlacedCrs:
     """Return the CRS of a file's points, by the rules of this module.
+
+    Args:
+        said: what the file's records say.
+        crs, vertical: what the user says, by the options `--lidar-crs` and `--lidar-vertical` of the `flag`
+            `--lidar`.
 
     Raises:
         InputError: no CRS, one that PROJ cannot use, a datum that is not known, or units that disagree.
     """
-    return _Placing(said, stated, path).result()
+    return _Placing(said, path, crs, vertical, flag).result()
 
 
 class _Placing:
     """One file, its statements in the order in which they count, and the remarks on it."""
 
-    def __init__(self, said: FileCrs, stated: CloudCrs, path: Path) -> None:
-        self._flag, self._path, self._middle = stated.flag, path, said.middle
+    def __init__(
+        self, said: FileCrs, path: Path, crs: str | None, vertical: VerticalChoice | None, flag: str
+    ) -> None:
+        self._flag, self._path, self._middle, self._choice = flag, path, said.middle, vertical
         self._option = _NOTHING
-        if stated.crs is not None:
-            option = f"{stated.flag}-crs"
-            self._option = _of_text(stated.crs, option, field=option)
+        if crs is not None:
+            option = f"{flag}-crs"
+            self._option = _of_text(crs, option, field=option)
             if self._option.problem:
-                parse_crs(stated.crs, field=option)  # the error of what is no CRS of points
-        self._choice = stated.vertical
+                parse_crs(crs, field=option)  # the error of what is no CRS of points
         by_bit = [_of_keys(said), _of_wkt(said, path)]
         self._sources = [one for one in (by_bit[::-1] if said.wkt_counts else by_bit) if one is not _NOTHING]
         self._remarks: list[Remark] = []
