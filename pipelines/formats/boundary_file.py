@@ -36,8 +36,10 @@ BOUNDARY_FORMATS: dict[str, tuple[bytes, ...]] = {
     ".kml": (b"<",),
     ".dxf": (b"0", b"999", b"AutoCAD Binary DXF"),
 }
-_MARKS = ((b"\xef\xbb\xbf", "utf-8"), (b"\xff\xfe\0\0", "utf-32"), (b"\0\0\xfe\xff", "utf-32"))
-_MARKS += ((b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16"))
+_MARKS = {  # byte order marks, longer ones first
+    b"\0\0\xfe\xff": "utf-32", b"\xff\xfe\0\0": "utf-32", b"\xef\xbb\xbf": "utf-8", b"\xff\xfe": "utf-16",
+    b"\xfe\xff": "utf-16",
+}  # fmt: skip
 _WGS84 = "EPSG:4326"  # of GeoJSON (RFC 7946) and KML
 _DXF_UNIT = re.compile(rb"\$INSUNITS\s*?\r?\n\s*70\s*?\r?\n\s*(\d{1,2})\s")
 _DXF_UNIT_BINARY = re.compile(rb"\$INSUNITS\0F\0(.\0)", re.DOTALL)
@@ -138,7 +140,7 @@ def _no_boundary(refusal: _Refusal) -> InputError:
 
 def _as_utf8(data: bytes, refusal: _Refusal) -> bytes:
     """Return a text in UTF-8, whichever encoding its byte order mark, its zeros or its XML declaration tell."""
-    encoding = next((name for mark, name in _MARKS if data.startswith(mark)), "")
+    encoding = next((name for mark, name in _MARKS.items() if data.startswith(mark)), "")
     if not encoding and b"\0" in data[:4]:  # UTF-16 without a mark: its first character is ASCII
         encoding = "utf-16-be" if data[:1] == b"\0" else "utf-16-le"
     declared = re.match(rb"\s*<\?xml[^>]*encoding\s*=\s*[\"']([\w.:-]{1,40})[\"']", data[:400])

@@ -27,6 +27,7 @@ from pipelines.geodesy.geotiff_keys import FileCrs, Unit, keyed_crs
 from pipelines.geodesy.vertical import ELLIPSOIDAL, NAME_OF_EPSG, VerticalChoice, VerticalDatum
 
 _SAME_PLACE_M = 0.01
+_SAME = 1e-9  # relative difference of one unit in two registers
 _NEARLY = 1e-4  # relative difference of units that no glance at the coordinates tells apart: the two feet
 _KEYS, _WKT = "GeoTIFF keys", "WKT"
 
@@ -56,6 +57,8 @@ class _Statement:
     height_unit: Unit | None = None
     problem: str = ""
     vertical_problem: str = ""
+    unit_problem: str = ""  # of heights
+    is_unreadable: bool = False
 
     @property
     def has_heights(self) -> bool:
@@ -115,8 +118,14 @@ class _Placing:
         plan = self._option if self._option.horizontal else file
         if not plan.horizontal:
             raise self._without_crs()
+        for one in self._sources:
+            if one.is_unreadable and self._option is _NOTHING:
+                self._remark(
+                    "crs-unreadable",
+                    f"{self._path.name}: its {one.source} cannot be read, its {plan.source} count: {one.problem}",
+                )
         self._compare_plans(file)
-        self._check_units(file)
+        self._check_units()
         crs, heights = self._with_heights(plan)
         plan_unit = None if plan is self._option else plan.plan_unit
         across = self._plan_scale(crs, plan, plan_unit)
@@ -159,9 +168,9 @@ class _Placing:
             return False
         places = [self._place(statement) for statement in (one, other)]
         if places[0] is None or places[1] is None:
-            same = CRS.from_user_input(one.horizontal).equals(
-                CRS.from_user_input(other.horizontal), ignore_axis_order=True
-            )
+            first, second = CRS.from_user_input(one.horizontal), CRS.from_user_input(other.horizontal)
+            epsg = first.to_epsg()
+            same = first.equals(second, ignore_axis_order=True) or (epsg is not None and epsg == second.to_epsg())
             return not same or (places[0] is None) != (places[1] is None)
         return float(np.linalg.norm(places[0] - places[1])) > _SAME_PLACE_M
 
@@ -176,17 +185,17 @@ class _Placing:
             return None
         return ecef_from_lla(lla)[0]
 
-    def _check_units(self, file: _Statement) -> None:
+    def _check_units(self) -> None:
         """Refuse units of keys and WKT that differ, unless the user states the CRS."""
         if self._option.horizontal or len(self._sources) < 2:
             return
         keys, wkt = sorted(self._sources, key=lambda one: one.source != _KEYS)
-        pairs = [("heights", keys.stated_height_unit, wkt.stated_height_unit)]
+        pairs = [("heights", keys.stated_height_unit, wkt.stated_height_unit, _NEARLY)]
         if keys.plan_unit is not None and wkt.horizontal:
             crs = parse_crs(wkt.horizontal, path=self._path)
-            pairs.append(("the map", keys.plan_unit, Unit(crs.units[0], crs.horizontal_unit)))
-        for what, of_keys, of_wkt in pairs:
-            if of_keys is not None and of_wkt is not None and not of_keys.is_as_long_as(of_wkt.size):
+            pairs.append(("the map", keys.plan_unit, Unit(crs.units[0], crs.horizontal_unit), _SAME))
+        for what, of_keys, of_wkt, most in pairs:
+            if of_keys is not None and of_wkt is not None and abs(of_keys.size / of_wkt.size - 1) > most:
                 raise InputError(
                     "cloud-units-disagree",
                     f"states two units of {what}: {of_keys.name} in its {_KEYS}, {of_wkt.name} in its {_WKT}. Give "
@@ -273,12 +282,22 @@ class _Placing:
         The whole CRS of the option states its unit too; a datum alone leaves it to the file.
         """
         own = crs.height_unit_m
+        problem = next((one.unit_problem for one in self._sources if one.unit_problem), "")
+        if problem and heights is not self._option:
+            raise InputError(
+                "height-unit-unknown",
+                f"states the unit of its heights by {problem}. Give {self._flag}-crs EPSG:n+m, in its unit.",
+                path=self._path,
+                field=self._flag,
+            )
         # The user's CRS states its unit. So does a datum in feet, where one in metres is the datum's usual name.
-        by_user = heights is self._option and heights.vertical is not None
+        by_user = heights is self._option and heights is not _NOTHING
         by_choice = self._choice is not None and self._choice.epsg is not None and own != 1.0
         if by_user or by_choice:
             return 1.0
-        unit = next((one.height_unit for one in (heights, *self._sources) if one.height_unit is not None), None)
+        has_own = heights.stated_height_unit is not None
+        said = [heights] if has_own else self._sources
+        unit = next((one.height_unit for one in said if one.height_unit is not None), None)
         if unit is None and heights.unit_is_open:  # a datum has no unit: heights are in that of the map
             unit = Unit("metre", 1.0) if crs.is_geographic else Unit(crs.units[0], crs.horizontal_unit)
         if unit is None and plan_scale != 1.0:
@@ -308,10 +327,19 @@ def _of_text(text: str, source: str, *, path: Path | None = None, field: str | N
         problem = "a vertical CRS alone" if flat is None else f"a {flat.type_name} {flat.name!r}"
         return _Statement(source, vertical=upright, vertical_note=note, problem=problem)
     if not crs.is_compound:
-        three = len((flat.source_crs or flat if flat.is_bound else flat).axis_info) == 3
-        return _Statement(source, text, _short_name(text, crs), text if three else "", is_ellipsoidal=three)
+        return _of_whole(source, text, flat)
     horizontal = f"EPSG:{flat.to_epsg()}" if text.upper().startswith("EPSG:") else flat.to_wkt()
     return _Statement(source, horizontal, flat.name, text, upright, vertical_note=note)
+
+
+def _of_whole(source: str, text: str, crs: CRS) -> _Statement:
+    """Return what the text of a CRS of two or three axes says that is not compound."""
+    axes, name = (crs.source_crs or crs if crs.is_bound else crs).axis_info, _short_name(text, crs)
+    if len(axes) < 3:
+        return _Statement(source, text, name)
+    flat = text if crs.is_geocentric or crs.is_bound else crs.to_2d().to_wkt()
+    unit = Unit(axes[2].unit_name, axes[2].unit_conversion_factor)
+    return _Statement(source, flat, name, text, is_ellipsoidal=True, height_unit=unit)
 
 
 def _short_name(text: str, crs: CRS) -> str:
@@ -324,7 +352,7 @@ def _of_wkt(said: FileCrs, path: Path) -> _Statement:
     try:
         return _of_text(said.wkt, _WKT, path=path)
     except InputError as error:
-        return _Statement(_WKT, problem=error.message)
+        return _Statement(_WKT, problem=error.message, is_unreadable=True)
 
 
 def _of_keys(said: FileCrs) -> _Statement:
@@ -341,14 +369,17 @@ def _of_keys(said: FileCrs) -> _Statement:
         "plan_unit": keys.plan_unit,
         "height_unit": keys.height_unit,
         "vertical_problem": keys.vertical_problem,
+        "unit_problem": keys.unit_problem,
     }
     if text and not problem:
         try:
             crs = proj_crs(text)
             if crs.is_geographic or crs.is_projected or crs.is_geocentric:
-                three = len(crs.axis_info) == 3 and vertical is None
-                common["is_ellipsoidal"] = common["is_ellipsoidal"] or three
-                return _Statement(_KEYS, text, text, text if three else "", **common)
+                whole = _of_whole(_KEYS, text, crs)
+                if whole.is_ellipsoidal and vertical is None and not keys.is_ellipsoidal:
+                    common |= {"is_ellipsoidal": True, "height_unit": keys.height_unit or whole.height_unit}
+                    return replace(whole, **common)
+                return _Statement(_KEYS, whole.horizontal, text, **common)
             problem = f"{text} is a {crs.type_name}"
         except InputError as error:
             problem = error.message

@@ -82,6 +82,7 @@ class KeyedCrs:
     height_unit: Unit | None = None
     problem: str = ""
     vertical_problem: str = ""
+    unit_problem: str = ""  # of heights
 
 
 def keyed_crs(keys: Mapping[int, KeyValue]) -> KeyedCrs:
@@ -106,7 +107,8 @@ def keyed_crs(keys: Mapping[int, KeyValue]) -> KeyedCrs:
         plan_unit=plan_unit,
         height_unit=height_unit,
         problem=problem or unit_problem,
-        vertical_problem=vertical.vertical_problem or height_problem,
+        vertical_problem=vertical.vertical_problem,
+        unit_problem=height_problem,
     )
 
 

@@ -299,6 +299,33 @@ def test_the_user_overrules_the_file(tmp_path: Path) -> None:
         CloudReader(agreeing, CloudCrs(crs=f"{ZONE}+5728", vertical=parse_vertical("EGM96")))
 
 
+def test_a_stated_datum_overrules_the_ellipsoid_of_a_crs_in_space(tmp_path: Path) -> None:
+    for path in (
+        write(tmp_path / "w.laz", wkt=CRS("EPSG:32631").to_3d().to_wkt()),
+        write(tmp_path / "k.laz", keys=keys_of(ZONE, (4096, 4979))),
+    ):
+        found, reader = placed(path)
+        require_place(found)
+        assert not reader.assumptions
+        stated = CloudReader(path, CloudCrs(vertical=parse_vertical("EPSG:5728")))
+        assert codes(stated.notes) == ["lidar-vertical-overrules"]
+        with pytest.raises(InputError, match="LN02"):
+            next(stated.chunks(ORIGIN))
+
+
+def test_a_unit_of_heights_that_is_not_known_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path / "c.laz", keys=keys_of(ZONE, (4096, 5030), (4099, 32767)))
+    with refused("height-unit-unknown", InputError) as error:
+        CloudReader(path, CloudCrs())
+    assert "4099" in error.value.message
+
+
+def test_a_wkt_that_cannot_be_read_is_named_where_keys_stand_for_it(tmp_path: Path) -> None:
+    found, reader = placed(write(tmp_path / "c.laz", wkt='PROJCS["cut off', keys=keys_of(ZONE)))
+    require_place(found)
+    assert codes(reader.notes) == ["lidar-crs-unreadable"]
+
+
 def test_an_error_of_place_tells_what_is_odd_about_the_crs(tmp_path: Path) -> None:
     """Keys that state feet beside coordinates in metres: the error names both units, and the option counts."""
     path = write(tmp_path / "c.laz", keys=keys_of(ZONE, (3076, 9002), (4099, 9001)))
