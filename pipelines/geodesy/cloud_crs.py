@@ -183,7 +183,7 @@ class _Placing:
             lla = crs.lla_from_xyz([[self._middle[0] * unit, self._middle[1] * unit, 0.0]])
         except InputError:
             return None
-        return ecef_from_lla(lla)[0]
+        return np.asarray(ecef_from_lla(lla)[0])
 
     def _check_units(self) -> None:
         """Refuse units of keys and WKT that differ, unless the user states the CRS."""
