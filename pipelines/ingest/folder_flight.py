@@ -24,6 +24,7 @@ from pipelines.ingest import flight_record
 from pipelines.ingest.exif_poses import poses_from_tags
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo, camera_priors, scan_folder
+from pipelines.ingest.reference_system import is_projected
 from pipelines.ingest.remarks import Remarks
 from pipelines.ingest.table_poses import poses_from_table
 
@@ -78,7 +79,7 @@ def read_folder(
 
 def _poses(photos: list[Photo], options: IngestOptions, remarks: Remarks) -> flight_record.ImagePoses:
     if options.trajectory is not None:
-        table = _read_positions(options.trajectory, photos, remarks)
+        table = _read_positions(options.trajectory, photos, options, remarks)
     elif options.geo is not None:
         table = read_geo(options.geo)
     else:
@@ -106,7 +107,7 @@ def _poses(photos: list[Photo], options: IngestOptions, remarks: Remarks) -> fli
     return replace(poses, position_in_ecef=position, recorded=None)
 
 
-def _read_positions(path: Path, photos: Sequence[Photo], remarks: Remarks) -> PoseTable:
+def _read_positions(path: Path, photos: Sequence[Photo], options: IngestOptions, remarks: Remarks) -> PoseTable:
     """Read a table of poses; the kind of the file follows from its content, and is noted.
 
     1. The first line begins with %: RTKLIB's solution.
@@ -127,7 +128,14 @@ def _read_positions(path: Path, photos: Sequence[Photo], remarks: Remarks) -> Po
     if any(HEADER.match(line) for line in lines):
         remarks.assume("file-kind", f"{path.name} is read as {REFERENCE}.")
         return read_cameras(path)
-    return read_trajectory(path)
+    try:
+        return read_trajectory(path, projected=is_projected(options.crs, "--crs"))
+    except InputError as error:
+        if error.code != "header-missing":
+            raise
+        # No kind of file: what the option was given is no trajectory.
+        message = f"{path}:{error.line} is no table of positions. {error.message}"
+        raise InputError(error.code, message, field="--trajectory") from error
 
 
 def _positions_of_events(events: CameraEvents, photos: Sequence[Photo], remarks: Remarks) -> PoseTable:
