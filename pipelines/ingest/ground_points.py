@@ -16,7 +16,6 @@ from pipelines.formats.tables import beginning, is_number, separator_of, split
 from pipelines.geodesy.crs import PointCrs
 from pipelines.geodesy.enu import ecef_from_lla
 from pipelines.ingest.options import IngestOptions
-from pipelines.ingest.photo_folder import ImageNames
 from pipelines.ingest.reference_system import (
     crs_of_points,
     east_first,
@@ -28,6 +27,7 @@ from pipelines.ingest.reference_system import (
 from pipelines.ingest.remarks import Remarks, shortened
 from pipelines.ingest.shown_marks import ShownMarks
 from pipelines.ingest.targets import Targets
+from pipelines.survey.image_names import ImageNames
 from pipelines.survey.survey import KnownDistance, Mark, PointMarks
 
 _LEAST_MARKS = 2

@@ -19,9 +19,10 @@ from pipelines.geometry.trajectory import Trajectory
 from pipelines.ingest.exif_poses import altitude_m, compare_with_exif, gimbal_attitudes, photo_times
 from pipelines.ingest.flight_record import RECEIVERS, ImagePoses, with_defaults
 from pipelines.ingest.options import IngestOptions
-from pipelines.ingest.photo_folder import ImageNames, Photo
+from pipelines.ingest.photo_folder import Photo
 from pipelines.ingest.reference_system import crs_of_table, in_units_of, note_operation, note_unread
 from pipelines.ingest.remarks import Remarks
+from pipelines.survey.image_names import ImageNames
 
 
 def poses_from_table(
