@@ -170,7 +170,7 @@ def note_operation(crs: PointCrs, lla: FloatArray, remarks: Remarks) -> None:
 
 
 def _own(crs: PointCrs, path: Path, options: IngestOptions, remarks: Remarks) -> PointCrs:
-    """Return the CRS that a file has; what its name is read as, and a `--vertical` that does not apply, are noted."""
+    """Return the CRS that a file has; what its name is read as, and an unused `--vertical`, are noted."""
     if crs.read_as is not None:
         remarks.assume("crs-by-name", f"The CRS {crs.name!r} of {path.name} is read as {crs.read_as}.")
     if _excludes(crs, options):
