@@ -23,7 +23,7 @@ from pyproj.exceptions import CRSError, ProjError
 from pipelines.core.types import FloatArray
 
 _UTM = re.compile(
-    r"(?P<datum>.*?)[\s/_,-]*\bUTM[\s/_,-]*(?:zone)?[\s_-]*(?P<zone>\d{1,2})[\s_-]*(?P<side>north|south|[c-hj-np-x])?",
+    r"(?P<datum>.*?)[\s/_,-]*(?<![a-z])UTM[\s/_,-]*(?:zone)?[\s_-]*(?P<zone>\d{1,2})[\s_-]*(?P<side>north|south|[c-hj-np-x])?",
     re.IGNORECASE,
 )
 _WGS84 = frozenset({"wgs84", "wgs1984", "epsg4326"})
@@ -104,9 +104,11 @@ def _holds(code: int, points: FloatArray) -> bool:
         lon, lat = map(np.asarray, to_degrees.transform(points[:, 0], points[:, 1]))
     except (CRSError, ProjError):
         return False
+    if not np.isfinite(lon + lat).all():
+        return False
     width = (area.east - area.west) % 360.0 or 360.0
     inside = ((lon - area.west) % 360.0 <= width) & (lat >= area.south) & (lat <= area.north)
-    return bool((np.isfinite(lon + lat) & inside).all())
+    return bool(inside.all())
 
 
 @cache

@@ -27,7 +27,7 @@ _CLEARLY_S = 0.5
 # the lag of a shutter, or that lag alone where times have fractions.
 _WHOLE_SECONDS_S, _FRACTIONS_S = 0.75, 0.3
 _MOST_PAIRS = 4_000_000
-_NEARLY_ALL, _RUNNER_UP = 0.9, 0.8
+_NEARLY_ALL, _RUNNER_UP = 0.8, 0.7
 _LEAST_TIED = 3
 _REGULAR = 1.2  # largest interval of a track over its median, where it has a rate
 
