@@ -190,7 +190,7 @@ class Row:
         text = self.text(column) if column in self.columns else ""
         if parts := _SEXAGESIMAL.fullmatch(text):
             sign = -1.0 if parts[1] == "-" or (parts[5] or "").upper() in ("S", "W") else 1.0
-            value = sign * sum(float(parts[at] or 0) / 60 ** (at - 2) for at in (2, 3, 4))
+            value = sign * math.fsum(float(parts[at] or 0) / 60 ** (at - 2) for at in (2, 3, 4))
         else:
             value = self.number(column) * column_names.ANGLES_DEG.get(self.units.get(column, "deg"), 1.0)
         hemisphere = self.text(f"{column}_ref")[:1].upper() if f"{column}_ref" in self.columns else ""

@@ -187,7 +187,7 @@ def _read_table(path: Path) -> tuple[tables.Table, list[str]]:
 def _in_range(table: tables.Table, columns: tuple[str, ...], factors: Mapping[str, float]) -> FloatArray:
     """Return the numbers of columns (N, K), each in its range; factors (by unit) lead to metres or degrees."""
     factor = [factors.get(table.units.get(name, ""), 1.0) for name in columns]
-    values = table.numbers(columns) * np.array(factor)
+    values: FloatArray = table.numbers(columns) * np.array(factor)
     _require_ranges(values, columns, table)
     return values
 
