@@ -44,6 +44,7 @@ _IN_AREA = (
 LATER: dict[str, tuple[str, ...]] = {
     "mapper": ("sfm",),
     "import_model": ("sfm",),
+    "triangulate": ("sfm",),
     "max_residual": ("init-sim3",),
     "accept_inconsistency": ("ingest", "init-sim3"),
     **dict.fromkeys(_EFFORT, ("train",)),

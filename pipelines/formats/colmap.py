@@ -25,6 +25,7 @@ from pipelines.core.files import file_size, storage_failure_of
 from pipelines.core.products import ImageName, Product, load_json
 from pipelines.core.types import FloatArray, IntArray, Vector3
 from pipelines.core.validators import stays_inside
+from pipelines.formats.colmap_text import check_images_text
 from pipelines.geometry.cameras import Camera
 from pipelines.geometry.sparse_model import SparseModel
 
@@ -76,13 +77,8 @@ def _check_model_files(folder: Path) -> None:
         if suffix == ".bin":
             _check_binary(file, size, _RECORDS[name])
             continue
-        with file.open("rb") as stream:
-            for number, line in enumerate(stream if name == "images" else (), start=1):
-                try:
-                    line.decode("utf-8")
-                except UnicodeDecodeError as error:
-                    message = f"The image {_INVALID_NAME}"
-                    raise InputError("name-not-utf8", message, path=file, line=number) from error
+        if name == "images":
+            check_images_text(file)
 
 
 def _check_binary(file: Path, size: int, record_end: Callable[[_Bytes, int], int]) -> None:

@@ -10,6 +10,7 @@ EPSG:4326: https://support.pix4d.com/hc/en-us/articles/360038397752. The fifth c
 zoom level, by version, and is not read.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +19,8 @@ import numpy as np
 
 from pipelines.core.errors import InputError
 from pipelines.core.types import Vector3
-from pipelines.formats import tables
+from pipelines.formats import column_names, tables
+from pipelines.formats.place_columns import PlaceColumns, place_columns
 from pipelines.formats.trajectory_csv import PoseTable, camera_quaternions, complete
 
 
@@ -60,7 +62,12 @@ class GroundPoints:
     geographic: bool | None = None
     # Whether the coordinates are in the order of the axes of the CRS; else the easting is first
     in_order_of_crs: bool = False
+    assumed_crs: str | None = None  # of latitude and longitude, as of `PoseTable`
+    heights_above_geoid: bool = False  # whether the heights are above a geoid that the file does not name
+    plan_unit_m: float | None = None  # units of x and y, and of the height, where the header states them
+    height_unit_m: float | None = None
     unknown_columns: tuple[str, ...] = ()  # names in the header that mean nothing here
+    unread_columns: tuple[str, ...] = ()  # names of coordinates beside those that are read
     left_out: tuple[str, ...] = ()  # places of marks that the file itself does not count as made by a person
 
 
@@ -81,6 +88,7 @@ _GEO_COLUMNS = ("image", "x", "y", "z", "yaw", "pitch", "roll", "h_acc", "v_acc"
 _GCP_FORM = "x y z px py image [name]"
 _GCP_COLUMNS = ("x", "y", "z", "px", "py", "image", "name")
 # OpenDroneMap's pitch is 0 straight down, the gimbal's −90.
+_PHOTOGRAPH = re.compile(r"(.*?\.(?:jpe?g|png|tiff?|heic|heif|dng))(?=\s|$)", re.IGNORECASE)
 _GIMBAL_FROM_ODM_DEG = np.array([0.0, -90.0, 0.0])
 
 
@@ -147,8 +155,13 @@ _LIST_COLUMNS = ("name", "x", "y", "z")
 
 def is_point_list(lines: Sequence[str]) -> bool:
     """Return whether the first line without `#`, or the one after it, is a row of a list of points."""
-    rows = [line.split() for line in lines if not line.startswith("#")][:2]
+    rows = [_cells(line) for line in lines if not line.startswith("#")][:2]
     return any(len(row) == 4 and all(tables.is_number(cell) for cell in row[1:]) for row in rows)
+
+
+def _cells(line: str) -> list[str]:
+    """Return the cells of a line: between tabs, where it has tabs, so that names may hold spaces; else spaces."""
+    return line.split("\t") if "\t" in line else line.split()
 
 
 def read_point_list(path: Path) -> GroundPoints:
@@ -164,7 +177,7 @@ def read_point_list(path: Path) -> GroundPoints:
     tables.require_rows(lines, path)
     places = {name: at for at, name in enumerate(_LIST_COLUMNS)}
     points = []
-    for row in tables.table_rows(path, lines, None, places):
+    for row in [tables.Row(path, at, _cells(text), places) for at, text in lines]:
         if len(row.cells) != 4:
             raise _wrong_columns(row, f"4: {' '.join(_LIST_COLUMNS)}")
         points.append(ListedPoint(row.line, row.named("name"), (row.finite("x"), row.finite("y"), row.finite("z"))))
@@ -172,7 +185,7 @@ def read_point_list(path: Path) -> GroundPoints:
 
 
 def _odm_table(path: Path, columns: Sequence[str]) -> tables.Table:
-    """Return the rows below the CRS but comments, cells between spaces, with columns in an order."""
+    """Return the rows below the CRS but comments, with columns in an order."""
     lines = [(at, text) for at, text in tables.numbered_lines(path) if not text.startswith("#")]
     tables.require_rows(lines, path)
     first, crs_text = lines[0]
@@ -182,7 +195,27 @@ def _odm_table(path: Path, columns: Sequence[str]) -> tables.Table:
         raise InputError("crs-missing", message, path=path, line=first)
     tables.require_rows(lines[1:], path)
     places = {name: at for at, name in enumerate(columns)}
-    return tables.Table(path, None, places, (), tables.table_rows(path, lines[1:], None, places), crs_text)
+    image_at = places["image"]
+    rows = [tables.Row(path, at, _cells_around_image(text, image_at), places) for at, text in lines[1:]]
+    return tables.Table(path, None, places, (), rows, crs_text)
+
+
+def _cells_around_image(line: str, image_at: int) -> list[str]:
+    """Return the cells of a line of OpenDroneMap: between tabs, where tabs separate the numbers; else spaces.
+
+    Between spaces, the name of an image extends to the first suffix of photographs, if there is one.
+    """
+    by_tab = [cell.strip() for cell in line.split("\t")]
+    numbers = by_tab[:image_at] or by_tab[1:3]
+    if len(by_tab) > image_at + (image_at == 0) * 2 and all(map(tables.is_number, numbers)):
+        return by_tab
+    words = line.split(None, image_at)
+    if len(words) <= image_at:
+        return words
+    named = _PHOTOGRAPH.match(words[image_at])
+    if named is None:
+        return [*words[:image_at], *words[image_at].split()]
+    return [*words[:image_at], named[1], *words[image_at][named.end() :].split()]
 
 
 def _wrong_columns(row: tables.Row, expected: str) -> InputError:
@@ -192,26 +225,18 @@ def _wrong_columns(row: tables.Row, expected: str) -> InputError:
 
 
 PIX4D_POINTS = "a table of points (PIX4D)"
-_POINT_ALIASES = {
-    **dict.fromkeys(
-        ("label", "name", "id", "point", "pointname", "pointid", "gcp", "gcplabel", "gcpname"), "label"
-    ),
-    **dict.fromkeys(("x", "easting", "east", "e"), "x"),
-    **dict.fromkeys(("y", "northing", "north", "n"), "y"),
-    **dict.fromkeys(("latitude", "lat"), "latitude"),
-    **dict.fromkeys(("longitude", "lon", "long", "lng"), "longitude"),
-    **dict.fromkeys(("z", "altitude", "alt", "height", "elevation", "h", "ellipsoidalheight"), "z"),
-    **dict.fromkeys(("accuracyhorz", "accuracyhorizontal", "horizontalaccuracy", "sigmah"), "sigma_h"),
-    **dict.fromkeys(("accuracyvert", "accuracyvertical", "verticalaccuracy", "sigmav"), "sigma_v"),
-}
-_MARK_ALIASES = {
-    **dict.fromkeys(("image", "imagename", "filename", "file", "photo"), "image"),
-    **dict.fromkeys(("label", "name", "point", "gcp", "gcplabel", "gcpname", "tiepoint"), "label"),
-    **dict.fromkeys(("x", "pixelx", "xpx", "px", "u", "imageu"), "x"),
-    **dict.fromkeys(("y", "pixely", "ypx", "py", "v", "imagev"), "y"),
+_POINT_VOCABULARY = column_names.POINTS | column_names.COORDINATES | column_names.ACCURACIES
+_PIXEL = ("image", "img", "pixel", "pix", "px", "photo", "screen", "picture", "proj", "projection")
+_MARK_VOCABULARY = {
+    **column_names.IMAGES,
+    **column_names.POINTS,
+    **dict.fromkeys(("tiepoint", "tiepointname", "object", "class"), "label"),
+    **{name: axis for axis in "xy" for word in _PIXEL for name in (word + axis, axis + word)},
+    **dict.fromkeys(("x", "u", "px", "imageu", "col", "column", "sample"), "x"),
+    **dict.fromkeys(("y", "v", "py", "imagev", "row"), "y"),
     **dict.fromkeys(("sigma", "sigmapx"), "sigma"),
 }
-_DISTANCE_ALIASES = {
+_DISTANCE_VOCABULARY = {
     **dict.fromkeys(("from", "a", "point1", "first", "start"), "from"),
     **dict.fromkeys(("to", "b", "point2", "second", "end"), "to"),
     **dict.fromkeys(("distance", "distancem", "length", "lengthm", "d"), "distance"),
@@ -223,49 +248,63 @@ _POINT_COLUMNS = ("label", "first", "second", "z", "sigma_h", "sigma_v")
 _MARK_COLUMNS = ("image", "label", "x", "y")
 
 
-def read_point_table(path: Path) -> GroundPoints:
-    """Read ground points without marks.
+def read_point_table(path: Path, *, projected: bool = False) -> GroundPoints:
+    """Read ground points without marks; `projected`: x,y,z count where a table has latitude,longitude too.
 
     Raises:
         InputError: no rows, a column is missing, a cell is no number, or one point at two places.
     """
-    table = _pix4d_table(path, _POINT_ALIASES, _POINT_COLUMNS, slice(1, 4), "label, two coordinates and z")
-    axes, geographic = ("first", "second"), None
-    if table.header_line is not None:
-        geographic = "latitude" in table.columns or "longitude" in table.columns
-        axes = ("longitude", "latitude") if geographic else ("x", "y")
-        missing = {"label", *axes, "z"} - set(table.columns)
-        if missing or (geographic and {"x", "y"} & set(table.columns)):
-            header = tables.read_lines(path)[table.header_line - 1]
-            message = (
-                f"The header must name label, z, and either x and y or longitude and latitude; it is {header!r}."
-            )
-            raise InputError("column-missing", message[:300], path=path, line=table.header_line)
+    table, header = _pix4d_table(
+        path, _POINT_VOCABULARY, _POINT_COLUMNS, slice(1, 4), "label, two coordinates and z"
+    )
+    place = None
+    if header is not None:
+        line = table.header_line or 1
+        place = place_columns(header, table.columns, _POINT_VOCABULARY, projected=projected, path=path, line=line)
+        if "label" not in table.columns:
+            needed = "label, z, and either x and y or longitude and latitude"
+            raise tables.unknown_header(header, _POINT_VOCABULARY, needed, path=path, line=line)
     tables.require_rows(table.rows, path)
     points = [
-        ListedPoint(
-            line=row.line,
-            name=row.named("label"),
-            xyz=(row.finite(axes[0]), row.finite(axes[1]), row.finite("z")),
-            sigma_h_m=row.sigma_m("sigma_h"),
-            sigma_v_m=row.sigma_m("sigma_v"),
-        )
+        ListedPoint(row.line, row.named("label"), _point_xyz(row, place), *_point_sigma_m(row))
         for row in table.rows
     ]
     return GroundPoints(
         path=path,
         kind=PIX4D_POINTS,
         points=without_repeats(points, path),
-        geographic=geographic,
-        in_order_of_crs=table.header_line is None,
+        geographic=None if place is None else place.geographic,
+        in_order_of_crs=place is None,
+        assumed_crs="EPSG:4979" if place is not None and place.geographic and place.above_ellipsoid else None,
+        heights_above_geoid=place is not None and place.above_geoid,
+        plan_unit_m=None if place is None else place.plan_unit_m,
+        height_unit_m=None if place is None else place.height_unit_m,
         unknown_columns=table.unknown,
+        unread_columns=() if place is None else place.unread,
     )
+
+
+def _point_xyz(row: tables.Row, place: PlaceColumns | None) -> Vector3:
+    if place is None:
+        return row.finite("first"), row.finite("second"), row.finite("z")
+    for value, column in zip(place.xyz(row), (*place.plan, place.height), strict=True):
+        if not np.isfinite(value):
+            raise row.fault("number-missing", "the number is missing or not finite", column)
+    return place.xyz(row)
+
+
+def _point_sigma_m(row: tables.Row) -> tuple[float | None, float | None]:
+    """Return σ horizontal, of east and north the larger one, and vertical."""
+    by_axis = [sigma for axis in ("sigma_e", "sigma_n") if (sigma := row.sigma_m(axis)) is not None]
+    return row.sigma_m("sigma_h") or max(by_axis, default=None), row.sigma_m("sigma_v") or row.sigma_m("sigma_u")
 
 
 def read_marks(path: Path) -> tuple[ListedMark, ...]:
     """Read marks of ground points; an InputError: no rows, a column is missing, or a cell is no number."""
-    table = _pix4d_table(path, _MARK_ALIASES, _MARK_COLUMNS, slice(2, 4), "image, label, x and y")
-    tables.require_columns(table.columns, _MARK_COLUMNS, path, table.header_line)
+    table, header = _pix4d_table(path, _MARK_VOCABULARY, _MARK_COLUMNS, slice(2, 4), "image, label, x and y")
+    if header is not None and not set(_MARK_COLUMNS) <= table.columns.keys():
+        needed = "image, label, x and y"
+        raise tables.unknown_header(header, _MARK_VOCABULARY, needed, path=path, line=table.header_line)
     tables.require_rows(table.rows, path)
     return tuple(
         ListedMark(
@@ -293,8 +332,10 @@ def read_distances(path: Path) -> tuple[ListedDistance, ...]:
         InputError: no rows, a column is missing, a distance or σ is not above zero, both ends are one point, a pair
             is listed twice, or a use is neither control nor check.
     """
-    table = _pix4d_table(path, _DISTANCE_ALIASES, _DISTANCE_COLUMNS, slice(2, 3), "from, to and distance")
-    tables.require_columns(table.columns, _DISTANCE_COLUMNS[:3], path, table.header_line)
+    needed = "from, to and distance"
+    table, header = _pix4d_table(path, _DISTANCE_VOCABULARY, _DISTANCE_COLUMNS, slice(2, 3), needed)
+    if header is not None and not set(_DISTANCE_COLUMNS[:3]) <= table.columns.keys():
+        raise tables.unknown_header(header, _DISTANCE_VOCABULARY, needed, path=path, line=table.header_line)
     tables.require_rows(table.rows, path)
     distances: list[ListedDistance] = []
     seen: dict[frozenset[str], int] = {}
@@ -316,11 +357,22 @@ def read_distances(path: Path) -> tuple[ListedDistance, ...]:
 
 
 def _pix4d_table(
-    path: Path, aliases: Mapping[str, str], in_order: Sequence[str], numeric: slice, expected: str
-) -> tables.Table:
-    """Return a table whose first line is a header if none of its cells `numeric` is a number."""
+    path: Path, vocabulary: Mapping[str, str], in_order: Sequence[str], numeric: slice, expected: str
+) -> tuple[tables.Table, list[str] | None]:
+    """Return a table and its header: the first line if none of its cells `numeric` is a number, else None."""
     numbered = enumerate(tables.read_lines(path), start=1)
-    lines = [(at, text) for at, text in numbered if text.strip() and not text.lstrip().startswith("#")]
+    lines = [(at, text) for at, text in numbered if text.strip()]
+    # A comment that names columns is the header (RealityCapture: `#name,x,y,alt`).
+    while len(lines) > 1 and lines[0][1].lstrip().startswith("#"):
+        cells = tables.split(
+            lines[0][1].lstrip("# "), tables.separator_of(lines[0][1]), path=path, line=lines[0][0]
+        )
+        known = sum(column_names.meaning_of(cell, vocabulary) is not None for cell in cells)
+        if len(cells) >= numeric.stop and known >= numeric.stop:
+            lines[0] = (lines[0][0], lines[0][1].lstrip("# "))
+            break
+        del lines[0]
+    lines = [(at, text) for at, text in lines if not text.lstrip().startswith("#")]
     tables.require_rows(lines, path)
     first, text = lines[0]
     separator = tables.separator_of(text)
@@ -330,7 +382,11 @@ def _pix4d_table(
         raise InputError("wrong-columns", message, path=path, line=first)
     if any(map(tables.is_number, header[numeric])):
         places = {name: at for at, name in enumerate(in_order)}
-        return tables.Table(path, None, places, (), tables.table_rows(path, lines, separator, places))
-    columns, unknown = tables.named_columns(header, aliases, path, first)
-    named = tuple(name for name in unknown if tables.bare_name(name))
-    return tables.Table(path, first, columns, named, tables.table_rows(path, lines[1:], separator, columns))
+        return tables.Table(path, None, places, (), tables.table_rows(path, lines, separator, places)), None
+    columns, unknown = tables.named_columns(header, vocabulary, path, first)
+    named, units = (
+        tuple(name for name in unknown if column_names.plain_name(name)),
+        tables.units_of(header, columns),
+    )
+    listed = tables.table_rows(path, lines[1:], separator, columns, units)
+    return tables.Table(path, first, columns, named, listed, units=units), header

@@ -7,8 +7,9 @@ definitions.
 
 Reference (File ▸ Export ▸ Export Reference): a comment states the CRS as WKT, and another one is the header:
 `#Label,X/Longitude,Y/Latitude,Z/Altitude,…`. X is the easting or longitude. Yaw, pitch and roll are those of the
-camera's mount: pitch 0 looks straight down. Columns with `_est` and errors are results of Metashape and are not
-read.
+camera's mount: pitch 0 looks straight down. Omega, phi and kappa stand in their place where the chunk is set
+so: they turn the camera's axes (x right, y up, z backward) into those of the CRS. Columns with `_est` and errors
+are results of Metashape and are not read.
 """
 
 from __future__ import annotations
@@ -23,9 +24,14 @@ import numpy as np
 
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size, reading
-from pipelines.formats import tables
+from pipelines.formats import column_names, tables
 from pipelines.formats.ground_points import GroundPoints, ListedMark, ListedPoint, without_repeats
-from pipelines.formats.trajectory_csv import PoseTable, camera_quaternions, complete
+from pipelines.formats.trajectory_csv import (
+    PoseTable,
+    camera_quaternions,
+    complete,
+    photogrammetric_quaternions,
+)
 
 if TYPE_CHECKING:
     from xml.sax.xmlreader import AttributesImpl, Locator
@@ -209,18 +215,20 @@ REFERENCE = "Metashape's reference"
 HEADER = re.compile(r"#\s*label\b", re.IGNORECASE)
 _CRS = re.compile(r"#\s*CoordinateSystem:\s*(.*)", re.IGNORECASE)
 _GIMBAL_FROM_MOUNT_DEG = np.array([0.0, -90.0, 0.0])
-_ALIASES = {
+_VOCABULARY = {
     "label": "label",
-    **dict.fromkeys(("x/longitude", "x/easting", "x", "longitude", "easting"), "x"),
-    **dict.fromkeys(("y/latitude", "y/northing", "y", "latitude", "northing"), "y"),
-    **dict.fromkeys(("z/altitude", "z", "altitude"), "z"),
-    "accuracy": "sigma",
-    "accuracyx/y": "sigma_h",
-    "accuracyz": "sigma_v",
-    **{name: name for name in ("yaw", "pitch", "roll")},
+    **dict.fromkeys(("xlongitude", "xeasting", "xeast", "x", "longitude", "easting", "east"), "x"),
+    **dict.fromkeys(("ylatitude", "ynorthing", "ynorth", "y", "latitude", "northing", "north"), "y"),
+    **dict.fromkeys(("zaltitude", "zheight", "zelevation", "z", "altitude", "height", "elevation"), "z"),
+    **dict.fromkeys(("accuracy", "accuracyxyz", "xyzaccuracy"), "sigma"),
+    **dict.fromkeys(("accuracyxy", "xyaccuracy"), "sigma_h"),
+    **dict.fromkeys(("accuracyx", "xaccuracy"), "sigma_x"),
+    **dict.fromkeys(("accuracyy", "yaccuracy"), "sigma_y"),
+    **dict.fromkeys(("accuracyz", "zaccuracy"), "sigma_v"),
+    **{name: name for name in ("yaw", "pitch", "roll", "omega", "phi", "kappa")},
     **dict.fromkeys(("enable", "enabled"), "enabled"),
 }
-_RESULT = re.compile(r"error|est|variance|var\b|omega|phi|kappa|projections", re.IGNORECASE)
+_RESULT = re.compile(r"error|est|variance|var\b|projections", re.IGNORECASE)
 
 
 def read_markers(path: Path) -> GroundPoints:
@@ -258,8 +266,10 @@ def read_cameras(path: Path) -> PoseTable:
     on = np.array([_is_enabled(row) for row in table.rows])
     xyz = np.array([[row.number(name) for name in "xyz"] for row in table.rows])
     sigma = np.array([_sigma_m(row) for row in table.rows], dtype=np.float64)[:, [0, 0, 1]]  # NaN for None
-    angles = np.array([[row.number(name) for name in ("yaw", "pitch", "roll")] for row in table.rows])
-    gimbal = angles + _GIMBAL_FROM_MOUNT_DEG
+    gimbal = table.numbers(("yaw", "pitch", "roll")) + _GIMBAL_FROM_MOUNT_DEG
+    attitudes, of_grid = camera_quaternions(gimbal), False
+    if not complete(gimbal).any():
+        attitudes, of_grid = photogrammetric_quaternions(table.numbers(("omega", "phi", "kappa"))), True
     return PoseTable(
         path=path,
         source="metashape",
@@ -268,7 +278,8 @@ def read_cameras(path: Path) -> PoseTable:
         time_s=None,
         xyz=np.where(on[:, None], xyz, np.nan),
         geographic=geographic,
-        quat_xyzw=camera_quaternions(gimbal) if complete(gimbal).any() else None,
+        quat_xyzw=attitudes if complete(attitudes).any() else None,
+        attitudes_of_grid=of_grid,
         sigma_enu_m=sigma if np.isfinite(sigma).any() else None,
         crs_text=table.crs_text,
         crs_line=table.crs_line,
@@ -287,12 +298,16 @@ def _reference(path: Path) -> tuple[tables.Table, bool | None]:
     crs_line, crs_text = next(((at, crs[1]) for at, text in lines if (crs := _CRS.match(text))), (1, None))
     separator = tables.separator_of(header)
     cells = tables.split(header.lstrip("# "), separator, path=path, line=header_line)
-    columns, unknown = tables.named_columns(cells, _ALIASES, path, header_line)
-    tables.require_columns(columns, ("label", "x", "y", "z"), path, header_line)
+    columns, unknown = tables.named_columns(cells, _VOCABULARY, path, header_line)
+    missing = [name for name in ("label", "x", "y", "z") if name not in columns]
+    if missing:
+        needed = "Label, X/Longitude or X/Easting, Y/Latitude or Y/Northing, and Z/Altitude"
+        raise tables.unknown_header(cells, _VOCABULARY, needed, path=path, line=header_line, missing=missing)
     kept = [(at, text) for at, text in lines if at > header_line and not text.startswith("#")]
-    named = tuple(name for name in unknown if tables.bare_name(name) and not _RESULT.search(name))
-    listed = tables.table_rows(path, kept, separator, columns)
-    table = tables.Table(path, header_line, columns, named, listed, crs_text, crs_line)
+    named = tuple(name for name in unknown if column_names.plain_name(name) and not _RESULT.search(name))
+    units = tables.units_of(cells, columns)
+    listed = tables.table_rows(path, kept, separator, columns, units)
+    table = tables.Table(path, header_line, columns, named, listed, crs_text, crs_line, units)
     tables.require_rows(table.rows, path)
     for row in table.rows:
         row.named("label")
@@ -304,5 +319,7 @@ def _is_enabled(row: tables.Row) -> bool:
 
 
 def _sigma_m(row: tables.Row) -> tuple[float | None, float | None]:
-    """Return σ horizontal and vertical."""
-    return row.sigma_m("sigma_h") or row.sigma_m("sigma"), row.sigma_m("sigma_v") or row.sigma_m("sigma")
+    """Return σ horizontal and vertical; of σ along x and y the larger one."""
+    by_axis = [sigma for axis in ("sigma_x", "sigma_y") if (sigma := row.sigma_m(axis)) is not None]
+    both = row.sigma_m("sigma")
+    return row.sigma_m("sigma_h") or max(by_axis, default=both), row.sigma_m("sigma_v") or both

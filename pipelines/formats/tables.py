@@ -13,7 +13,7 @@ import io
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,14 @@ import numpy as np
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size, reading
 from pipelines.core.types import BoolArray, FloatArray, IntArray
+from pipelines.formats import column_names
 
+# Sign, degrees, minutes, seconds and hemisphere: at least one mark makes it one.
+_SEXAGESIMAL = re.compile(
+    r"([+-]?)\s*(\d{1,3}(?:\.\d+)?)\s*(?:°|º|deg\w*|d|(?=\s*[NSEW]$))\s*"
+    r"(?:(\d{1,2}(?:\.\d+)?)\s*['′’m]\s*(?:(\d{1,2}(?:\.\d+)?)\s*(?:[\"″”s]|'')\s*)?)?([NSEW]?)",
+    re.IGNORECASE,
+)
 _FORMULA = re.compile(r"'*[=+\-@\t\r]")  # those of names that begin with apostrophes, too: nothing is ambiguous
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _NO_UTF8 = re.compile("[\udc80-\udcff]")  # what `surrogateescape` makes of such bytes
@@ -29,7 +36,8 @@ _BEGINNING_BYTES = 64 * 1024
 # A line becomes a kilobyte of cells: these bound the memory of a table to about a gibibyte.
 MAX_BYTES, MOST_LINES, LONGEST_LINE = 128 * 1024 * 1024, 1_000_000, 64 * 1024
 _SEPARATORS = ";\t,"
-_LONGEST_NAME = 100  # of a column that means something
+_NAMES = frozenset({"image", "label"})  # columns that hold names, of which a table may have several
+_AROUND_TAB = re.compile(r"[,;] *\t|\t *[,;]")
 
 
 def table_text(rows: Iterable[Iterable[object]]) -> str:
@@ -141,6 +149,7 @@ class Row:
     cells: list[str]
     columns: Mapping[str, int]
     decimal_comma: bool = False
+    units: Mapping[str, str] = field(default_factory=dict)  # that the header states, of the columns
 
     def fault(self, code: str, message: str, column: str | None = None) -> InputError:
         """Return the error of this line."""
@@ -172,9 +181,24 @@ class Row:
             raise self.fault("number-missing", "the number is missing or not finite", column)
         return value
 
+    def degrees(self, column: str) -> float:
+        """Return the angle of a cell in degrees; NaN if it is empty or there is no such column.
+
+        Degrees, minutes and seconds are read (`46°48'36.0"N`, `46 deg 48' 36.00" S`, `9.41 W`), and a column
+        `…_ref` with S or W makes the angle negative.
+        """
+        text = self.text(column) if column in self.columns else ""
+        if parts := _SEXAGESIMAL.fullmatch(text):
+            sign = -1.0 if parts[1] == "-" or (parts[5] or "").upper() in ("S", "W") else 1.0
+            value = sign * math.fsum(float(parts[at] or 0) / 60 ** (at - 2) for at in (2, 3, 4))
+        else:
+            value = self.number(column) * column_names.ANGLES_DEG.get(self.units.get(column, "deg"), 1.0)
+        hemisphere = self.text(f"{column}_ref")[:1].upper() if f"{column}_ref" in self.columns else ""
+        return -abs(value) if hemisphere in ("S", "W") else value
+
     def sigma_m(self, column: str) -> float | None:
         """Return the σ of a cell, not negative; None if it is empty, zero, or there is no such column."""
-        value = self.number(column)
+        value = self.number(column) * column_names.LENGTHS_M.get(self.units.get(column, "m"), 1.0)
         if value < 0:
             raise self.fault("sigma-not-positive", f"the σ of {value:g} is not above zero", column)
         return value if value > 0 else None
@@ -194,6 +218,7 @@ class Table:
     rows: list[Row]
     crs_text: str | None = None
     crs_line: int = 1
+    units: Mapping[str, str] = field(default_factory=dict)  # that the header states, of the columns
 
     @property
     def lines(self) -> IntArray:
@@ -213,7 +238,12 @@ class Table:
 
 
 def separator_of(line: str) -> str | None:
-    """Return the separator of a line: the most frequent of semicolon, tab and comma; None: spaces, or one cell."""
+    """Return the separator of a line: a tab between cells, else the more frequent of semicolon and comma.
+
+    None: spaces, or one cell.
+    """
+    if "\t" in line.strip() and not _AROUND_TAB.search(line):
+        return "\t"
     best = max(_SEPARATORS, key=line.count)
     return best if best in line else None
 
@@ -233,44 +263,76 @@ def split(text: str, separator: str | None, *, path: Path, line: int) -> list[st
 
 
 def table_rows(
-    path: Path, lines: Sequence[tuple[int, str]], separator: str | None, columns: Mapping[str, int]
+    path: Path,
+    lines: Sequence[tuple[int, str]],
+    separator: str | None,
+    columns: Mapping[str, int],
+    units: Mapping[str, str] | None = None,
 ) -> list[Row]:
     """Return the rows of numbered lines; see `split`."""
-    comma = separator not in (",", None)
-    return [Row(path, line, split(text, separator, path=path, line=line), columns, comma) for line, text in lines]
-
-
-def bare_name(text: str) -> str:
-    """Return the name of a column without what does not matter: case, units in brackets, spaces and underscores."""
-    return re.sub(r"[(\[][^)\]]*[)\]]|[\s_#]", "", text[:_LONGEST_NAME]).lower()
+    comma, units = separator not in (",", None), units or {}
+    return [
+        Row(path, line, split(text, separator, path=path, line=line), columns, comma, units) for line, text in lines
+    ]
 
 
 def named_columns(
-    header: Sequence[str],
-    aliases: Mapping[str, str],
-    path: Path,
-    line: int,
-    plain: Callable[[str], str] = bare_name,
+    header: Sequence[str], vocabulary: Mapping[str, str], path: Path, line: int
 ) -> tuple[dict[str, int], tuple[str, ...]]:
     """Return the place of each column by its canonical name, and the names that mean nothing here.
 
-    `plain` makes a plain name of a cell, and `aliases` has the canonical one of each.
+    `vocabulary` has the canonical name of each plain one. Of two names of an image or a point, the one that stands
+    first in it counts; of two coordinates the one whose name says nothing else (`altitude` before `gps_altitude`).
 
     Raises:
         InputError: two columns have one meaning.
     """
+    order = {name: rank for rank, name in enumerate(vocabulary)}
     columns: dict[str, int] = {}
-    unknown = []
+    ranks: dict[str, int] = {}
+    unknown: dict[int, str] = {}
     for at, text in enumerate(header):
-        key = aliases.get(plain(text))
+        key, plain = column_names.meaning_of(text, vocabulary), column_names.plain_name(text)
         if key is None:
-            unknown.append(text.strip())
-        elif key in columns:
-            message = f"Two columns are {key}: {header[columns[key]]}, {text}."
+            unknown[at] = text.strip()
+            continue
+        rank = order.get(plain, len(order)) if key in _NAMES else int(plain not in vocabulary)
+        if key in columns and rank == ranks[key]:
+            message = f"Two columns are {key}: {header[columns[key]].strip()}, {text.strip()}."
             raise InputError("column-twice", message, path=path, line=line)
-        else:
-            columns[key] = at
-    return columns, tuple(unknown)
+        if key in columns and rank > ranks[key]:
+            unknown[at] = text.strip()
+            continue
+        if key in columns:
+            unknown[columns[key]] = header[columns[key]].strip()
+        columns[key], ranks[key] = at, rank
+    return columns, tuple(unknown[at] for at in sorted(unknown))
+
+
+def units_of(header: Sequence[str], columns: Mapping[str, int]) -> dict[str, str]:
+    """Return the units that the names of columns state, by canonical name."""
+    units = {name: column_names.unit_of(header[at]) for name, at in columns.items() if at < len(header)}
+    return {name: unit for name, unit in units.items() if unit is not None}
+
+
+def unknown_header(
+    header: Sequence[str],
+    vocabulary: Mapping[str, str],
+    needed: str,
+    *,
+    path: Path,
+    line: int | None,
+    missing: Iterable[str] = (),
+) -> InputError:
+    """Return the error of a header without the columns that are needed: what was found, and what is near."""
+    lacks, near = ", ".join(missing), column_names.proposals(header, vocabulary)
+    found = column_names.listed(header)
+    known = any(column_names.meaning_of(text, vocabulary) for text in header)
+    message = (
+        f"The header has no column {lacks}. It has {found}" if lacks else f"The header has the columns {found}"
+    )
+    code = "column-missing" if known else "header-missing"
+    return InputError(code, f"{message}; needed are {needed}.{near}", path=path, line=line)
 
 
 def require_columns(columns: Mapping[str, int], needed: Iterable[str], path: Path, line: int | None) -> None:

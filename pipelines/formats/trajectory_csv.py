@@ -7,6 +7,7 @@ Attitude is either the gimbal's `yaw, pitch, roll` in degrees (docs/conventions.
 from __future__ import annotations
 
 import csv
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,8 +17,9 @@ from numpy.typing import NDArray
 
 from pipelines.core.errors import InputError
 from pipelines.core.types import BoolArray, FloatArray, IntArray, rows_of
-from pipelines.formats import tables
-from pipelines.geometry.rotations import geo_from_cam, quat_xyzw_from_matrix
+from pipelines.formats import column_names, tables
+from pipelines.formats.place_columns import place_columns
+from pipelines.geometry.rotations import geo_from_cam, map_from_cam, quat_xyzw_from_matrix
 
 
 @dataclass(frozen=True)
@@ -42,13 +44,25 @@ class PoseTable:
     assumed_crs: str | None = None
     heights_above_geoid: bool = False  # whether the heights are above a geoid that the file does not name
     zoneless_times: bool = False  # whether a time was a text without a zone
+    attitudes_of_grid: bool = False  # whether the attitudes count from the axes of the CRS's grid, not from north
+    plan_unit_m: float | None = None  # units of x and y, and of the height, where the header states them
+    height_unit_m: float | None = None
     unknown_columns: tuple[str, ...] = ()  # names in the header that mean nothing here
+    unread_columns: tuple[str, ...] = ()  # names of coordinates beside those that are read
     header_line: int = 1
 
     def take(self, rows: IntArray | BoolArray) -> PoseTable:
         """Return the rows of an index (M,) or mask (N,)."""
         names = None if self.names is None else tuple(np.array(self.names, dtype=object)[rows])
         return replace(rows_of(self, rows), names=names)
+
+
+def photogrammetric_quaternions(omega_phi_kappa_deg: FloatArray) -> FloatArray:
+    """Return rotations camera → axes of the map (N, 4) of omega, phi, kappa (N, 3), NaN where one is NaN."""
+    known = complete(omega_phi_kappa_deg)
+    result = np.full((len(known), 4), np.nan)
+    result[known] = quat_xyzw_from_matrix(map_from_cam(omega_phi_kappa_deg[known]))
+    return result
 
 
 def complete(values: FloatArray) -> BoolArray:
@@ -64,55 +78,49 @@ def camera_quaternions(gimbal_yaw_pitch_roll_deg: FloatArray) -> FloatArray:
     return result
 
 
-_ALIASES = {
-    "image": ("image_name", "filename", "file_name", "file", "name"),
-    "timestamp": ("timestamp_s", "time", "time_s", "t"),
-    "latitude": ("lat", "latitude_deg"),
-    "longitude": ("lon", "lng", "long", "longitude_deg"),
-    "altitude": ("alt", "height", "altitude_m", "ellipsoidal_height"),
-    "x": ("easting", "east"),
-    "y": ("northing", "north"),
-    "z": ("elevation",),
-    "yaw": ("yaw_deg", "heading"),
-    "pitch": ("pitch_deg",),
-    "roll": ("roll_deg",),
-    **dict.fromkeys(("qx", "qy", "qz", "qw"), ()),
-    **{f"sigma_{axis}": (f"sigma_{axis}_m", f"std_{axis}") for axis in ("e", "n", "u")},
-}
-_CANONICAL = {alias: key for key, aliases in _ALIASES.items() for alias in (key, *aliases)}
-_GEOGRAPHIC = ("longitude", "latitude", "altitude")
-_PROJECTED = ("x", "y", "z")
+_VOCABULARY = (
+    {"image": "image", **column_names.COORDINATES, **column_names.ANGLES, **column_names.ACCURACIES}
+    | column_names.IMAGES
+    | {"name": "image", "label": "image"}
+    | dict.fromkeys(("timestamp", "time", "t", "datetime", "timeutc", "utctime", "utc", "unixtime"), "timestamp")
+)
+_NEEDED = "image and/or timestamp, then latitude,longitude,altitude or x,y,z"
 _ANGLES = ("yaw", "pitch", "roll")
+_PHOTOGRAMMETRIC = ("omega", "phi", "kappa")
 _QUATERNION = ("qx", "qy", "qz", "qw")
 _SIGMAS = ("sigma_e", "sigma_n", "sigma_u")
+_ACCURACIES = ("sigma_h", "sigma_v")
 _RANGES = {
     "latitude": (-90.0, 90.0),
     "longitude": (-360.0, 360.0),
     "yaw": (-360.0, 360.0),
     "pitch": (-180.0, 180.0),
     "roll": (-360.0, 360.0),
-    **dict.fromkeys(_SIGMAS, (1e-6, 1e6)),
+    **dict.fromkeys(_PHOTOGRAMMETRIC, (-360.0, 360.0)),
+    **dict.fromkeys((*_SIGMAS, *_ACCURACIES), (1e-6, 1e6)),
 }
+_MOST_CONVERGENCE_DEG = 10.0  # in a zone of UTM near the pole
+_FEWEST_WORDS = 4  # between spaces, of a header without other separators
 _LATEST_S = 1e11  # the year 5138; larger numbers are milliseconds or finer
 
 
-def read_trajectory(path: Path) -> PoseTable:
-    """Read a trajectory.
+def read_trajectory(path: Path, *, projected: bool = False) -> PoseTable:
+    """Read a trajectory; `projected`: of x,y,z and latitude,longitude,altitude in one table, the former count.
 
-    Separators are `,`, `;` or tab; with the latter two, decimals may be written with commas.
+    Separators are tab, `;`, `,` or spaces; with the first two, decimals may be written with commas.
 
     Raises:
         InputError: no usable header, no row, a cell that is no number, a value out of range, half a group of
             columns, or a row longer than the header. Names file, line and column.
     """
-    table = _read_table(path)
-    geographic, projected = table.has(_GEOGRAPHIC), table.has(_PROJECTED)
-    if geographic == projected:
-        code, which = ("columns-ambiguous", "both") if geographic else ("column-missing", "neither of")
-        message = f"The header has {which} latitude,longitude,altitude and x,y,z."
-        raise InputError(code, message, path=path, line=table.header_line)
-    xyz = _in_range(table, _GEOGRAPHIC) if geographic else table.numbers(_PROJECTED)
+    table, header = _read_table(path)
+    line = table.header_line or 1
+    place = place_columns(header, table.columns, _VOCABULARY, projected=projected, path=path, line=line)
+    xyz = place.numbers(table.rows)
+    if place.geographic:
+        _require_ranges(xyz[:, :2], place.plan, table)
     time_s, zoneless = _times(table) if "timestamp" in table.columns else (None, False)
+    attitudes, of_grid = _attitudes(table)
     return PoseTable(
         path=path,
         source="csv",
@@ -122,39 +130,43 @@ def read_trajectory(path: Path) -> PoseTable:
         else None,
         time_s=time_s,
         xyz=xyz,
-        geographic=geographic,
-        quat_xyzw=_attitudes(table),
-        sigma_enu_m=_in_range(table, _SIGMAS) if table.has(_SIGMAS) else None,
+        geographic=place.geographic,
+        quat_xyzw=attitudes,
+        attitudes_of_grid=of_grid,
+        sigma_enu_m=_sigmas(table),
         zoneless_times=zoneless,
+        assumed_crs="EPSG:4979" if place.geographic and place.above_ellipsoid else None,
+        heights_above_geoid=place.above_geoid,
+        plan_unit_m=place.plan_unit_m,
+        height_unit_m=place.height_unit_m,
         unknown_columns=table.unknown,
-        header_line=table.header_line or 1,
+        unread_columns=place.unread,
+        header_line=line,
     )
 
 
-def _read_table(path: Path) -> tables.Table:
-    """Return the rows; unlike those of other tables, cells in quotes may hold line ends."""
+def _read_table(path: Path) -> tuple[tables.Table, list[str]]:
+    """Return the rows and the header; unlike those of other tables, cells in quotes may hold line ends."""
     lines = tables.read_lines(path)
     first = next(index for index, line in enumerate(lines) if line.strip())
     header = lines[first].lstrip("# ")
     separator = tables.separator_of(header)
-    if separator is None:
+    if separator is None and len(header.split()) < _FEWEST_WORDS:
         message = "The header has one column only: separate columns by , ; or tab."
         raise InputError("one-column", message, path=path, line=first + 1)
     names = [name.strip() for name in tables.split(header, separator, path=path, line=first + 1)]
-    columns, unknown = tables.named_columns(
-        names, _CANONICAL, path, first + 1, lambda name: name.lower().replace(" ", "_")
-    )
+    columns, unknown = tables.named_columns(names, _VOCABULARY, path, first + 1)
     if not columns:
-        message = (
-            "The first line must be a header: image and/or timestamp, then latitude,longitude,altitude or x,y,z."
-        )
-        raise InputError("header-missing", message, path=path, line=first + 1)
+        raise tables.unknown_header(names, _VOCABULARY, _NEEDED, path=path, line=first + 1)
     if "image" not in columns and "timestamp" not in columns:
-        message = "The header has no column image and no column timestamp."
+        message = f"The header has no column image and no column timestamp; it has {column_names.listed(names)}."
+        message += column_names.proposals(unknown, _VOCABULARY)
         raise InputError("column-missing", message, path=path, line=first + 1)
-    width = header.count(separator) + 1
+    width, units = len(names), tables.units_of(names, columns)
+    if separator is None:
+        lines = [*lines[: first + 1], *("\t".join(line.split()) for line in lines[first + 1 :])]
     rows = []
-    reader = csv.reader(lines[first + 1 :], delimiter=separator)
+    reader = csv.reader(lines[first + 1 :], delimiter=separator or "\t")
     try:
         for cells in reader:
             line = first + 1 + reader.line_num
@@ -164,34 +176,55 @@ def _read_table(path: Path) -> tables.Table:
                 hint = "; decimal commas need ; as separator" if separator == "," else ""
                 message = f"The line has {len(cells)} cells, the header has {width}{hint}"
                 raise InputError("wrong-columns", message, path=path, line=line)
-            rows.append(tables.Row(path, line, cells, columns, separator != ","))
+            rows.append(tables.Row(path, line, cells, columns, separator != ",", units))
     except csv.Error as error:
         line = first + 1 + reader.line_num
         raise InputError("not-csv", f"The line is not CSV: {error}", path=path, line=line) from error
     tables.require_rows(rows, path)
-    return tables.Table(path, first + 1, columns, unknown, rows)
+    return tables.Table(path, first + 1, columns, unknown, rows, units=units), names
 
 
-def _in_range(table: tables.Table, columns: tuple[str, ...]) -> FloatArray:
-    """Return the numbers of columns (N, K), each in its range."""
-    values = table.numbers(columns)
+def _in_range(table: tables.Table, columns: tuple[str, ...], factors: Mapping[str, float]) -> FloatArray:
+    """Return the numbers of columns (N, K), each in its range; factors (by unit) lead to metres or degrees."""
+    factor = [factors.get(table.units.get(name, ""), 1.0) for name in columns]
+    values: FloatArray = table.numbers(columns) * np.array(factor)
+    _require_ranges(values, columns, table)
+    return values
+
+
+def _require_ranges(values: FloatArray, columns: tuple[str, ...], table: tables.Table) -> None:
     for name, (low, high) in _RANGES.items():
         if name in columns:
             column = values[:, columns.index(name)]
             tables.require_range(column, low, high, path=table.path, lines=table.lines, field=name)
-    return values
 
 
-def _attitudes(table: tables.Table) -> FloatArray | None:
-    """Return rotations camera → East-North-Up (N, 4), NaN where a row has none."""
-    angles, quaternion = table.has(_ANGLES), table.has(_QUATERNION)
+def _sigmas(table: tables.Table) -> FloatArray | None:
+    """Return σ east, north, up (N, 3): by axis, or horizontal and vertical."""
+    if table.has(_SIGMAS):
+        return _in_range(table, _SIGMAS, column_names.LENGTHS_M)
+    if not table.has(_ACCURACIES):
+        return None
+    return _in_range(table, _ACCURACIES, column_names.LENGTHS_M)[:, [0, 0, 1]]
+
+
+def _attitudes(table: tables.Table) -> tuple[FloatArray | None, bool]:
+    """Return rotations camera → East-North-Up (N, 4), NaN where a row has none; and whether to the grid's axes."""
+    angles, photogrammetric, quaternion = (table.has(kind) for kind in (_ANGLES, _PHOTOGRAMMETRIC, _QUATERNION))
     if angles and quaternion:
         message = "The header has both yaw,pitch,roll and qx,qy,qz,qw."
         raise InputError("columns-ambiguous", message, path=table.path, line=table.header_line)
+    if photogrammetric:
+        by_omega = photogrammetric_quaternions(_in_range(table, _PHOTOGRAMMETRIC, column_names.ANGLES_DEG))
     if angles:
-        return camera_quaternions(_in_range(table, _ANGLES))
+        by_yaw = camera_quaternions(_in_range(table, _ANGLES, column_names.ANGLES_DEG))
+        if photogrammetric:
+            _require_alike(by_yaw, by_omega, table)
+        return by_yaw, False
+    if photogrammetric:
+        return by_omega, True
     if not quaternion:
-        return None
+        return None, False
     values = table.numbers(_QUATERNION)
     length = np.linalg.norm(values, axis=1)
     known = complete(values)
@@ -203,7 +236,20 @@ def _attitudes(table: tables.Table) -> FloatArray | None:
         lines=table.lines,
         field="qx,qy,qz,qw",
     )
-    return np.where(known[:, None], values / length[:, None], np.nan)
+    return np.where(known[:, None], values / length[:, None], np.nan), False
+
+
+def _require_alike(by_yaw: FloatArray, by_omega: FloatArray, table: tables.Table) -> None:
+    """Refuse attitudes (N, 4) of two kinds that differ by more than north of a grid and true north can."""
+    apart_deg = 2 * np.degrees(np.arccos(np.clip(np.abs((by_yaw * by_omega).sum(axis=1)), 0.0, 1.0)))
+    tables.refuse_first(
+        apart_deg > _MOST_CONVERGENCE_DEG,
+        "attitudes-disagree",
+        lambda row: f"yaw,pitch,roll and omega,phi,kappa are {apart_deg[row]:.1f}° apart: remove the wrong ones",
+        path=table.path,
+        lines=table.lines,
+        field="omega,phi,kappa",
+    )
 
 
 def _times(table: tables.Table) -> tuple[FloatArray, bool]:

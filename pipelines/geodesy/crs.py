@@ -30,6 +30,7 @@ from pyproj.exceptions import CRSError, ProjError
 
 from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray
+from pipelines.geodesy.crs_names import code_of_name, proposals
 from pipelines.geodesy.enu import ecef_from_enu_rotation, ecef_from_lla, lla_from_ecef
 from pipelines.geodesy.operations import Operation, OperationRequest, best_operation, proj_errors
 from pipelines.geodesy.plausible import ListedPoints, check_area, horizontal_of, rough_lon_lat
@@ -43,6 +44,7 @@ _WKT_FILE = re.compile(r"PARAMETERFILE", re.IGNORECASE)
 _WKT_FILE_NAME = re.compile(r'PARAMETERFILE\s*[\[(]\s*"[^"]*"\s*,\s*"([^"]*)"', re.IGNORECASE)
 ECEF = "EPSG:4978"
 _MAX_TEXT = 20_000
+_LONGEST_NAME = 80  # of a CRS that is looked for among names
 _ELLIPSOID_HEIGHT = (
     'VERT_CS["Ellipsoid (metre)",VERT_DATUM["Ellipsoid",2002],UNIT["metre",1,AUTHORITY["EPSG","9001"]],'
     'AXIS["Up",UP]]'
@@ -114,6 +116,15 @@ class PointCrs:
         return float(self._plan_axes[0].unit_conversion_factor)
 
     @property
+    def read_as(self) -> str | None:
+        """Name and code in the register, where the text is a name that is spelled otherwise there; else None."""
+        text, registered = self.name.casefold(), self._crs.name.casefold()
+        is_name = not any(sign in text for sign in ":+=[{") and not text.isdigit() and len(text) <= _LONGEST_NAME
+        alike = text == registered or (self.is_geographic and text.replace(" ", "") == registered.replace(" ", ""))
+        epsg = self._crs.to_epsg() if is_name and not alike and not _UTM.fullmatch(self.name) else None
+        return None if epsg is None else f"{self._crs.name} (EPSG:{epsg})"
+
+    @property
     def wkt(self) -> str:
         """As WKT2:2019."""
         return str(self._crs.to_wkt("WKT2_2019"))
@@ -156,7 +167,7 @@ class PointCrs:
         listed = ListedPoints(points, self.name, path, lines)
         height = points[:, 2] * (1.0 if self._three_dimensional else self._height_unit_m)
         with proj_errors(self.name, path):
-            lon, lat = rough_lon_lat(self._crs, listed)
+            lon, lat = self._rough_lon_lat(listed)
             transformer, _ = self._operation(lon, lat, path)
             x, y, z = transformer.transform(points[:, 0], points[:, 1], height)
         lla = np.stack([y, x, z if self._three_dimensional else height], axis=-1)
@@ -165,6 +176,19 @@ class PointCrs:
             np.isfinite(lla).all(axis=1), "point-outside-domain", f"is outside the domain of {self.name}"
         )
         return lla
+
+    def _rough_lon_lat(self, listed: ListedPoints) -> tuple[FloatArray, FloatArray]:
+        """Return degrees as `rough_lon_lat`; a name of angles is answered with systems that the points fit."""
+        try:
+            return rough_lon_lat(self._crs, listed)
+        except InputError as error:
+            if error.code not in ("latitude-range", "longitude-range") or len(self.name) > _LONGEST_NAME:
+                raise
+            near = proposals(self.name, listed.points)
+            if not near:
+                raise
+            message = f"{error.message} {self.name} is {self._crs.name}, whose coordinates are angles.{near}"
+            raise InputError(error.code, message, path=error.path, line=error.line, field=error.field) from error
 
     def xyz_from_lla(self, lla: ArrayLike) -> FloatArray:
         """Return points (N, 3) in this CRS of WGS84 latitude, longitude, ellipsoidal height (N, 3).
@@ -342,9 +366,15 @@ def _parse(name: str, refusal: Callable[[str, str], InputError]) -> CRS:
     try:
         return CRS.from_user_input(name)
     except CRSError as error:
+        is_name = len(name) <= _LONGEST_NAME and not any(sign in name for sign in "+=[{")
+        code = code_of_name(name) if is_name else None
+        if code is not None:
+            return CRS.from_epsg(code)
+        near = proposals(name) if is_name else ""
         raise refusal(
             "crs-unknown",
-            f"PROJ knows no CRS {_short(name)!r}. Give EPSG:n, EPSG:n+m, a PROJ string, WGS84 UTM 16N or WKT.",
+            f"PROJ knows no CRS {_short(name)!r}.{near} Give EPSG:n, EPSG:n+m, a PROJ string, WGS84 UTM 16N or "
+            "WKT.",
         ) from error
 
 

@@ -166,6 +166,10 @@ class EliminatedPoints:
     modes: FloatArray  # (7, 7) information on it
 
 
+# No feature of a photograph is located better; σ of a model without residuals, as a renderer computes it.
+LEAST_SIGMA_PX = 0.01
+
+
 @dataclass(frozen=True)
 class BundleInformation:
     """Information of the image observations on corrections x = (δω, δc) (6 n,) of cameras and ℓ (L,) of the lens.
@@ -254,6 +258,8 @@ def bundle_information(network: Network) -> BundleInformation:
     length = np.linalg.norm(residual, axis=1)
     weight = cauchy_weight((length / max(rayleigh_sigma(length), 1e-9)) ** 2, 2)
     variance = float((weight[:, None] * residual**2).sum() / (_MEAN_WEIGHTED_SQUARE * redundancy))
+    # A computed model has no residuals at all, which is no infinite information.
+    variance = max(variance, LEAST_SIGMA_PX**2)
     return BundleInformation(
         sums=eliminate_points(network, np.sqrt(weight / (_MEAN_WEIGHT * variance))),
         similarity_modes=similarity_modes(network.cam_center_in_world).reshape(-1, 7),

@@ -107,6 +107,13 @@ def omega_phi_kappa_deg(map_from_cam_rotation: ArrayLike) -> FloatArray:
     return _angles_deg("XYZ", np.asarray(map_from_cam_rotation, np.float64) @ _CAM_FROM_PHOTO)
 
 
+def map_from_cam(omega_phi_kappa_deg: ArrayLike) -> FloatArray:
+    """Return rotations (…, 3, 3) camera → map axes of ω, φ, κ (…, 3) in degrees: inverts `omega_phi_kappa_deg`."""
+    angles = np.asarray(omega_phi_kappa_deg, dtype=np.float64)
+    turned = np.asarray(Rotation.from_euler("XYZ", angles.reshape(-1, 3), degrees=True).as_matrix())
+    return np.asarray(turned.reshape(*angles.shape[:-1], 3, 3) @ _CAM_FROM_PHOTO.T)
+
+
 def _angles_deg(order: str, rotation: FloatArray) -> FloatArray:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Gimbal lock", category=UserWarning)

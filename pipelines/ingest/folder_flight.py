@@ -3,7 +3,6 @@
 Events are tied to photographs by the number in a photograph's name.
 """
 
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -21,13 +20,14 @@ from pipelines.formats.trajectory_csv import PoseTable, read_trajectory
 from pipelines.geodesy.enu import ecef_from_enu_rotation, lla_from_ecef
 from pipelines.geometry.trajectory import Rig, Trajectory
 from pipelines.ingest import flight_record
+from pipelines.ingest.event_ties import event_numbers, rows_by_order
 from pipelines.ingest.exif_poses import poses_from_tags
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo, camera_priors, scan_folder
+from pipelines.ingest.reference_system import is_projected
 from pipelines.ingest.remarks import Remarks
 from pipelines.ingest.table_poses import poses_from_table
 
-_EVENT_NUMBER = re.compile(r"(?<!\d)\d{4}(?!\d)")  # DJI_20240501120000_0007_V, DJI_0007, 100_0042_0007
 # The camera's clock has whole seconds and may be hours off, but runs evenly: a photograph counted wrongly shows.
 _MOST_SPREAD_S = 3.0
 
@@ -78,12 +78,14 @@ def read_folder(
 
 def _poses(photos: list[Photo], options: IngestOptions, remarks: Remarks) -> flight_record.ImagePoses:
     if options.trajectory is not None:
-        table = _read_positions(options.trajectory, photos, remarks)
+        table = _read_positions(options.trajectory, photos, options, remarks)
     elif options.geo is not None:
         table = read_geo(options.geo)
     else:
         return poses_from_tags(photos, options, remarks)
     if options.events is None:
+        if not options.time_offset and not options.estimated:
+            table = rows_by_order(table, photos, remarks) or table
         return poses_from_table(table, photos, options, remarks)
     if table.names is not None:
         raise InputError(
@@ -106,7 +108,7 @@ def _poses(photos: list[Photo], options: IngestOptions, remarks: Remarks) -> fli
     return replace(poses, position_in_ecef=position, recorded=None)
 
 
-def _read_positions(path: Path, photos: Sequence[Photo], remarks: Remarks) -> PoseTable:
+def _read_positions(path: Path, photos: Sequence[Photo], options: IngestOptions, remarks: Remarks) -> PoseTable:
     """Read a table of poses; the kind of the file follows from its content, and is noted.
 
     1. The first line begins with %: RTKLIB's solution.
@@ -127,7 +129,14 @@ def _read_positions(path: Path, photos: Sequence[Photo], remarks: Remarks) -> Po
     if any(HEADER.match(line) for line in lines):
         remarks.assume("file-kind", f"{path.name} is read as {REFERENCE}.")
         return read_cameras(path)
-    return read_trajectory(path)
+    try:
+        return read_trajectory(path, projected=is_projected(options.crs, "--crs"))
+    except InputError as error:
+        if error.code != "header-missing":
+            raise
+        # No kind of file: what the option was given is no trajectory.
+        message = f"{path}:{error.line} is no table of positions. {error.message}"
+        raise InputError(error.code, message, field="--trajectory") from error
 
 
 def _positions_of_events(events: CameraEvents, photos: Sequence[Photo], remarks: Remarks) -> PoseTable:
@@ -157,10 +166,8 @@ def _event_of_each(events: CameraEvents, photos: Sequence[Photo], remarks: Remar
     """
     row_of = {int(number): row for row, number in enumerate(events.number)}
     rows = np.full(len(photos), -1)
-    for at, photo in enumerate(photos):
-        numbers = _EVENT_NUMBER.findall(PurePosixPath(photo.name).stem)
-        if numbers:
-            rows[at] = row_of.get(int(numbers[-1]), -1)
+    for at, number in enumerate(event_numbers(events, photos, remarks)):
+        rows[at] = -1 if number is None else row_of.get(number, -1)
     tied = [(photo, int(row)) for photo, row in zip(photos, rows, strict=True) if row >= 0]
     folders = sorted({PurePosixPath(photo.name).parent.as_posix() for photo, _ in tied})
     if not folders:

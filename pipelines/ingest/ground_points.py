@@ -16,10 +16,18 @@ from pipelines.formats.tables import beginning, is_number, separator_of, split
 from pipelines.geodesy.crs import PointCrs
 from pipelines.geodesy.enu import ecef_from_lla
 from pipelines.ingest.options import IngestOptions
-from pipelines.ingest.photo_folder import ImageNames
-from pipelines.ingest.reference_system import crs_of_points, east_first, note_operation
+from pipelines.ingest.reference_system import (
+    crs_of_points,
+    east_first,
+    in_units_of,
+    is_projected,
+    note_operation,
+    note_unread,
+)
 from pipelines.ingest.remarks import Remarks, shortened
+from pipelines.ingest.shown_marks import ShownMarks
 from pipelines.ingest.targets import Targets
+from pipelines.survey.image_names import ImageNames
 from pipelines.survey.survey import KnownDistance, Mark, PointMarks
 
 _LEAST_MARKS = 2
@@ -67,7 +75,7 @@ def read_ground_files(options: IngestOptions, remarks: Remarks) -> tuple[GroundF
         InputError: a malformed file, no CRS, one name at two places, or impossible coordinates.
     """
     control, check = (
-        None if path is None else _placed(_recognised(path, remarks), options, remarks)
+        None if path is None else _placed(_recognised(path, options, remarks), options, remarks)
         for path in (options.gcp, options.checkpoints)
     )
     if options.marks is None:
@@ -99,7 +107,7 @@ def _with_table_of_marks(file: GroundFile, path: Path, marks: Sequence[ListedMar
     return replace(file, listed_marks=(*file.listed_marks, (path, own)))
 
 
-def _recognised(path: Path, remarks: Remarks) -> GroundPoints:
+def _recognised(path: Path, options: IngestOptions, remarks: Remarks) -> GroundPoints:
     """Read ground points; the kind of the file follows from its content, and is noted.
 
     1. XML: Metashape's markers.
@@ -115,7 +123,7 @@ def _recognised(path: Path, remarks: Remarks) -> GroundPoints:
     elif any(metashape.HEADER.match(line) for line in lines):
         listed = metashape.read_markers(path)
     elif _begins_a_table([line for line in lines if not line.startswith("#")], path):
-        listed = ground_points.read_point_table(path)
+        listed = ground_points.read_point_table(path, projected=is_projected(options.gcp_crs, "--gcp-crs"))
     elif ground_points.is_point_list(lines):
         listed = ground_points.read_point_list(path)
     else:
@@ -126,6 +134,7 @@ def _recognised(path: Path, remarks: Remarks) -> GroundPoints:
         [f"{path.name} ({name})" for name in listed.unknown_columns],
         "Columns are unknown and are ignored",
     )
+    note_unread(listed, remarks)
     remarks.warn_counted(
         "mark-not-pinned", listed.left_out, "Marks that are not pinned (Metashape set them itself) are left out"
     )
@@ -149,7 +158,7 @@ def _begins_a_table(lines: list[str], path: Path) -> bool:
 
 def _placed(listed: GroundPoints, options: IngestOptions, remarks: Remarks) -> GroundFile:
     crs = crs_of_points(listed, options, remarks)
-    xyz = east_first(listed, crs, remarks)
+    xyz = in_units_of(crs, east_first(listed, crs, remarks), listed)
     lla = crs.lla_from_xyz(xyz, path=listed.path, lines=[point.line for point in listed.points])
     note_operation(crs, lla, remarks)
     points = tuple(
@@ -165,16 +174,25 @@ def tie_marks(
     sigma_px: float,
     remarks: Remarks,
     targets: Targets | None = None,
+    *,
+    shown: ShownMarks | None = None,
 ) -> GroundFile:
     """Return the points of a file with their marks in the images; marks in images that are not here are noted.
 
-    `sizes` has width and height of each image by name. `targets` are marks where the file has none.
+    `sizes` has width and height of each image by name. `targets` are marks where the file has none. `shown` turns
+    marks that were made on pictures as shown.
 
     Raises:
         InputError: two marks of a point in one image, a mark outside its image, or no mark in any image here.
     """
     marks = _tied(
-        [point.name for point in file.points], file.listed_marks, sizes, sigma_px, remarks, targets=targets
+        [point.name for point in file.points],
+        file.listed_marks,
+        sizes,
+        sigma_px,
+        remarks,
+        targets=targets,
+        shown=shown or ShownMarks(),
     )
     return replace(file, points=tuple(replace(point, marks=marks[point.name]) for point in file.points))
 
@@ -187,6 +205,7 @@ def _tied(
     remarks: Remarks,
     *,
     targets: Targets | None,
+    shown: ShownMarks,
 ) -> dict[str, tuple[Mark, ...]]:
     """Return the marks of points by name; raises as `tie_marks`."""
     names = ImageNames(sizes)
@@ -199,18 +218,18 @@ def _tied(
                 unknown.append(f"{path.name}:{mark.line} ({mark.image})")
                 continue
             (width, height), fault = sizes[image], partial(InputError, path=path, line=mark.line)
-            if not (0.0 <= mark.x_px <= width and 0.0 <= mark.y_px <= height):
+            x_px, y_px = shown.stored(image, mark.x_px, mark.y_px, sizes[image])
+            if not (0.0 <= x_px <= width and 0.0 <= y_px <= height):
+                turned = shown.why_outside(image, mark.x_px, mark.y_px, sizes[image])
                 raise fault(
-                    "mark-outside-image",
+                    "mark-outside-image" if turned is None else "mark-on-turned-picture",
                     f"The mark of {mark.name} at ({mark.x_px:g}, {mark.y_px:g}) lies outside {image} "
-                    f"({width}×{height} px). Was it made on an image of another size?",
+                    f"({width}×{height} px). {turned or 'Was it made on an image of another size?'}",
                     field="px py",
                 )
             if image in marks[mark.name]:
                 raise fault("mark-twice", f"{mark.name} is already marked in {image}.", field="image")
-            marks[mark.name][image] = Mark(
-                image=image, x_px=mark.x_px, y_px=mark.y_px, sigma_px=mark.sigma_px or sigma_px
-            )
+            marks[mark.name][image] = Mark(image=image, x_px=x_px, y_px=y_px, sigma_px=mark.sigma_px or sigma_px)
         if listed and len(unknown) == len(listed):
             raise InputError(
                 "no-image-matched",
@@ -229,6 +248,8 @@ def known_distances(
     sizes: Mapping[str, tuple[int, int]],
     remarks: Remarks,
     targets: Targets | None = None,
+    *,
+    shown: ShownMarks | None = None,
 ) -> tuple[KnownDistance, ...]:
     """Return the measured distances of `--distances`, whose ends are points of files, of `--marks`, or targets.
 
@@ -244,7 +265,9 @@ def known_distances(
     if others and options.marks is not None:
         own = tuple(mark for mark in ground_points.read_marks(options.marks) if mark.name in others)
         listed_marks.append((options.marks, own))
-    marks |= _tied(others, listed_marks, sizes, options.sigma_mark, remarks, targets=targets)
+    marks |= _tied(
+        others, listed_marks, sizes, options.sigma_mark, remarks, targets=targets, shown=shown or ShownMarks()
+    )
     for distance in listed:
         for field, name in zip(("from", "to"), distance.ends, strict=True):
             if len(marks[name]) < _LEAST_MARKS:

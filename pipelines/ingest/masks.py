@@ -17,8 +17,8 @@ from pipelines.core.types import BoolArray, ByteArray
 from pipelines.formats.image_file import inspect_image, read_bytes, read_head
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.ingest.options import IngestOptions
-from pipelines.ingest.photo_folder import ImageNames
 from pipelines.ingest.remarks import Remarks
+from pipelines.survey.image_names import ImageNames
 from pipelines.survey.photographs import decoded_photograph
 from pipelines.survey.survey import CameraPrior, Survey, SurveyImage
 

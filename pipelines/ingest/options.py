@@ -140,6 +140,11 @@ class IngestOptions(StageOptions):
     marks: InputPath | None = Field(
         None, description="PIX4D's CSV of image marks: image, point, x, y; for points whose file has none."
     )
+    marks_as_shown: bool = Field(
+        False,
+        description="Marks were made on photographs turned as EXIF's orientation says, as browsers and most "
+        "programs show them.",
+    )
     targets: TagDictionaries | None = Field(
         None,
         description="Dictionaries (with commas, named as by OpenCV: DICT_APRILTAG_36h11, DICT_4X4_50) of ArUco or "
@@ -250,9 +255,9 @@ def check_options(options: IngestOptions, frames: Path | None) -> None:
             "--trajectory, and remove --lever-arm. A .MRK without a trajectory is given by --trajectory.",
             field="--events",
         )
-    for name in ("marks", "targets", "gcp_crs"):
+    for name in ("marks", "targets", "gcp_crs", "marks_as_shown"):
         needed = (options.gcp, options.checkpoints, options.distances if name != "gcp_crs" else None)
-        if getattr(options, name) is not None and not any(needed):
+        if getattr(options, name) not in (None, False) and not any(needed):
             flag = flag_name(IngestOptions, name)
             raise InputError(
                 "needs-ground-points", f"{flag} needs ground points. Give --gcp or --checkpoints.", field=flag

@@ -13,6 +13,8 @@ from pipelines.geodesy.operations import WGS84
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.remarks import Remarks
 
+_ALIKE_UNITS = 1e-5  # the foot and the US survey foot are 2e-6 apart, and headers do not tell them apart
+
 
 def crs_of_table(table: PoseTable, options: IngestOptions, remarks: Remarks) -> PointCrs:
     """Return the CRS of a table of poses: its own, else that of `--crs`, else the one of its kind of file.
@@ -34,14 +36,9 @@ def crs_of_table(table: PoseTable, options: IngestOptions, remarks: Remarks) -> 
                 f"{crs.vertical.name}.",
                 field="--vertical",
             )
+        _require_geoid(table, crs, options)
         return crs
-    if table.heights_above_geoid and options.vertical is None:
-        raise InputError(
-            "geoid-not-named",
-            "The heights are above a geoid that the file does not name (geodetic). Name it, e.g. --vertical EGM96.",
-            path=path,
-            field="--vertical",
-        )
+    _require_geoid(table, None, options)
     assumed = table.assumed_crs or (WGS84 if table.geographic else None)
     if assumed is None:
         raise InputError(
@@ -65,12 +62,61 @@ def crs_of_points(listed: GroundPoints, options: IngestOptions, remarks: Remarks
         crs = parse_crs(listed.crs_text, vertical=options.vertical, path=path, line=listed.crs_line)
         return _own(crs, path, options, remarks)
     if options.gcp_crs is not None:
-        return _given(options.gcp_crs, "--gcp-crs", listed, options)
+        crs = _given(options.gcp_crs, "--gcp-crs", listed, options)
+        _require_geoid(listed, crs, options)
+        return crs
     if not listed.geographic:
         message = f"{path.name} states no CRS. Give it, e.g. --gcp-crs EPSG:32632 or --gcp-crs EPSG:4326."
         raise InputError("crs-missing", message, field="--gcp-crs")
-    remarks.assume("crs-assumed", f"The latitude and longitude in {path.name} are WGS84 ({WGS84}).")
-    return parse_crs(WGS84, vertical=options.vertical)
+    _require_geoid(listed, None, options)
+    assumed = listed.assumed_crs or WGS84
+    remarks.assume("crs-assumed", f"The latitude and longitude in {path.name} are WGS84 ({assumed}).")
+    return _own(parse_crs(assumed, vertical=options.vertical), path, options, remarks)
+
+
+def is_projected(text: str | None, flag: str) -> bool:
+    """Return whether an option names a CRS with eastings and northings."""
+    return text is not None and not parse_crs(text, field=flag).is_geographic
+
+
+def note_unread(listed: PoseTable | GroundPoints, remarks: Remarks) -> None:
+    """Note the columns of coordinates that are not read, since others of the table say the same."""
+    if listed.unread_columns:
+        remarks.assume(
+            "columns-unread",
+            f"{listed.path.name} states places more than once: {', '.join(listed.unread_columns)} are not read.",
+        )
+
+
+def in_units_of(crs: PointCrs, xyz: FloatArray, listed: PoseTable | GroundPoints) -> FloatArray:
+    """Return coordinates (N, 3) with the heights in the unit of the CRS, where the header states another one.
+
+    Raises:
+        InputError: the header states another unit of x and y than the CRS has.
+    """
+    own = None if crs.is_geographic or crs.is_geocentric else crs.horizontal_unit
+    if listed.plan_unit_m is not None and own is not None and abs(listed.plan_unit_m / own - 1.0) > _ALIKE_UNITS:
+        raise InputError(
+            "unit-against-crs",
+            f"The header says that x and y are in units of {listed.plan_unit_m:g} m, but {crs.name} counts in "
+            f"{crs.units[0]} ({own:g} m). Correct the header, or name the right CRS.",
+            path=listed.path,
+        )
+    if listed.height_unit_m is None:
+        return xyz
+    return np.asarray(xyz * np.array([1.0, 1.0, listed.height_unit_m / crs.height_unit_m]))
+
+
+def _require_geoid(listed: PoseTable | GroundPoints, crs: PointCrs | None, options: IngestOptions) -> None:
+    """Refuse heights above a geoid that neither the file nor its CRS nor an option names."""
+    if listed.heights_above_geoid and options.vertical is None and not (crs is not None and crs.states_vertical):
+        raise InputError(
+            "geoid-not-named",
+            "The heights are above a geoid that the file does not name (geodetic, orthometric). Name it, e.g. "
+            "--vertical EGM96.",
+            path=listed.path,
+            field="--vertical",
+        )
 
 
 def _given(text: str, flag: str, listed: PoseTable | GroundPoints, options: IngestOptions) -> PointCrs:
@@ -124,7 +170,9 @@ def note_operation(crs: PointCrs, lla: FloatArray, remarks: Remarks) -> None:
 
 
 def _own(crs: PointCrs, path: Path, options: IngestOptions, remarks: Remarks) -> PointCrs:
-    """Return the CRS that a file has; a `--vertical` that does not apply to its heights is noted."""
+    """Return the CRS that a file has; what its name is read as, and an unused `--vertical`, are noted."""
+    if crs.read_as is not None:
+        remarks.assume("crs-by-name", f"The CRS {crs.name!r} of {path.name} is read as {crs.read_as}.")
     if _excludes(crs, options):
         remarks.assume(
             "vertical-unused",

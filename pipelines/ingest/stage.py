@@ -22,6 +22,7 @@ from pipelines.ingest.masks import mask_files, write_masks
 from pipelines.ingest.options import IngestOptions, check_options
 from pipelines.ingest.photo_folder import convert_heif, glance, heif_photographs
 from pipelines.ingest.remarks import Remarks
+from pipelines.ingest.shown_marks import ShownMarks
 from pipelines.ingest.survey_assembly import assemble_survey, require_placed
 from pipelines.ingest.targets import find_targets, numbers_of_points
 from pipelines.ingest.video_frames import (
@@ -144,10 +145,13 @@ def survey_and_track(
     targets = (
         find_targets(flight.folder, tuple(sizes), options.targets, numbers, progress) if options.targets else None
     )
+    shown = ShownMarks({photo.name: photo.tags.orientation for photo in flight.photos}, options.marks_as_shown)
     control, check = (
-        None if file is None else tie_marks(file, sizes, options.sigma_mark, remarks, targets) for file in ground
+        None if file is None else tie_marks(file, sizes, options.sigma_mark, remarks, targets, shown=shown)
+        for file in ground
     )
-    distances = known_distances(options, (control, check), sizes, remarks, targets)
+    distances = known_distances(options, (control, check), sizes, remarks, targets, shown=shown)
+    shown.note(remarks)
     if targets is not None:
         targets.note(remarks)
         if listing is not None:

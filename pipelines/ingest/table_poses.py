@@ -12,16 +12,17 @@ from numpy.typing import NDArray
 from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray, rows_of
 from pipelines.formats.trajectory_csv import PoseTable, complete
-from pipelines.geodesy.crs import PointCrs
+from pipelines.geodesy.crs import PointCrs, grid_from_enu
 from pipelines.geodesy.enu import ecef_from_lla
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.trajectory import Trajectory
 from pipelines.ingest.exif_poses import altitude_m, compare_with_exif, gimbal_attitudes, photo_times
 from pipelines.ingest.flight_record import RECEIVERS, ImagePoses, with_defaults
 from pipelines.ingest.options import IngestOptions
-from pipelines.ingest.photo_folder import ImageNames, Photo
-from pipelines.ingest.reference_system import crs_of_table, note_operation
+from pipelines.ingest.photo_folder import Photo
+from pipelines.ingest.reference_system import crs_of_table, in_units_of, note_operation, note_unread
 from pipelines.ingest.remarks import Remarks
+from pipelines.survey.image_names import ImageNames
 
 
 def poses_from_table(
@@ -100,6 +101,7 @@ def usable_rows(table: PoseTable, remarks: Remarks) -> PoseTable:
         [f"{file}:{table.header_line} ({name or 'unnamed'})" for name in table.unknown_columns],
         "Columns are unknown and are ignored",
     )
+    note_unread(table, remarks)
     if table.zoneless_times:
         remarks.assume("time-zone", f"Times without a zone in {file} are UTC.")
     needed, gaps = (2, "NaN") if table.source == "geo.txt" else (3, "empty or NaN")
@@ -213,7 +215,8 @@ def _with_heights(table: PoseTable, photos: Sequence[Photo], crs: PointCrs, rema
 
 def _measured(table: PoseTable, crs: PointCrs, options: IngestOptions, remarks: Remarks) -> Trajectory:
     """Return the rows Earth-centred, in the order of the file; NaN where a row has no time, attitude or σ."""
-    lla = crs.lla_from_xyz(table.xyz, path=table.path, lines=table.lines.tolist())
+    xyz = in_units_of(crs, table.xyz, table)
+    lla = crs.lla_from_xyz(xyz, path=table.path, lines=table.lines.tolist())
     note_operation(crs, lla, remarks)
     if table.sigma_enu_m is not None and "foot" in crs.units[0]:
         remarks.assume(
@@ -223,6 +226,12 @@ def _measured(table: PoseTable, crs: PointCrs, options: IngestOptions, remarks: 
     if table.quat_xyzw is not None:
         turned = complete(table.quat_xyzw)
         enu_from_cam[turned] = matrix_from_quat_xyzw(table.quat_xyzw[turned])
+        if table.attitudes_of_grid:
+            grid_axes = grid_from_enu(crs, lla[turned])
+            enu_from_cam[turned] = np.swapaxes(grid_axes, 1, 2) @ enu_from_cam[turned]
+            remarks.assume(
+                "angles-of-grid", f"Omega, phi and kappa in {table.path.name} count from the axes of {crs.name}."
+            )
     return Trajectory.from_samples(
         np.full(len(lla), np.nan) if table.time_s is None else table.time_s,
         position=ecef_from_lla(lla),

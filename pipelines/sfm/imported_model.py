@@ -1,85 +1,216 @@
-"""Engine `imported`: a COLMAP model that another program has made."""
+"""Engine `imported`: a COLMAP model that another program has made, or points triangulated from its poses."""
 
 import logging
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from pipelines.core.errors import InputError
 from pipelines.core.progress import Progress
 from pipelines.core.workspace import StageRun
-from pipelines.formats.colmap import load_reconstruction, quiet_colmap, write_reconstruction
+from pipelines.formats.colmap import flatten, load_reconstruction, quiet_colmap, write_reconstruction
+from pipelines.sfm.chunks import remove_chunks
+from pipelines.sfm.colmap_reconstruction import ColmapReconstructor
+from pipelines.sfm.estimate import ReconstructionEstimate, estimate_reconstruction
 from pipelines.sfm.features import SfmJob
+from pipelines.sfm.known_poses import triangulated_from
+from pipelines.sfm.model_poses import check_observations
 from pipelines.sfm.options import SfmOptions
+from pipelines.survey.image_names import ImageNames
 from pipelines.survey.survey import Survey
 
 log = logging.getLogger(__name__)
 
-# Below the folder of a project: COLMAP's mapper numbers its models and puts the largest first as a rule.
+# Below the folder of a project, where COLMAP's mapper numbers its models as it finds them.
 _PLACES = ("", "sparse/0", "sparse", "0")
 _IMAGES = ("images.bin", "images.txt")
 _WITHOUT_DISTORTION = frozenset({"PINHOLE", "SIMPLE_PINHOLE"})
+_FEWEST_IMAGES = 3
+_SEEN = 0.5  # of the images with a pose: where fewer have observations, the model is poses alone
 
 
 @dataclass(frozen=True)
 class ImportedModel:
-    """Import of a COLMAP model from a folder; nothing is computed."""
+    """Import of a COLMAP model from a folder; without `triangulates` nothing is computed."""
 
     path: Path
+    triangulates: bool = False
     remedy: str = "COLMAP cannot read the imported model: export it again"
 
-    def estimate(self, photographs: int, photo_px: tuple[int, int], options: SfmOptions) -> None:
-        return None
+    def estimate(
+        self, photographs: int, photo_px: tuple[int, int], options: SfmOptions
+    ) -> ReconstructionEstimate | None:
+        return estimate_reconstruction(photographs, photo_px, options) if self.triangulates else None
 
     def prepare(self, stage: StageRun, survey: Survey, options: SfmOptions) -> bool:
-        return True
+        if not self.triangulates:
+            return True
+        with quiet_colmap():
+            import_poses(self.path, survey)  # What cannot be imported is said before features are computed.
+        return ColmapReconstructor().prepare(stage, survey, options)
 
     def reconstruct(self, job: SfmJob, progress: Progress) -> Any:
-        with quiet_colmap():
-            model = import_model(self.path, job.survey)
+        with quiet_colmap() as colmap:
+            if self.triangulates:
+                model, folder = import_poses(self.path, job.survey)
+                model = triangulated_from(colmap, model, job, folder, progress)
+                model.update_point_3d_errors()
+                check_observations(flatten(model), folder)
+            else:
+                model = import_model(self.path, job.survey)
             write_reconstruction(model, job.sparse)
+        if self.triangulates:
+            remove_chunks(job.database.parent)
         return model
 
 
 def import_model(path: Path, survey: Survey) -> Any:
     """Return the COLMAP model at `path` (a `pycolmap.Reconstruction`), reduced to the survey's images.
 
-    The folder is that of the model, or of a COLMAP project that has it in `sparse/0` or `sparse`.
+    The folder is that of the model, or of a COLMAP project that has it in `sparse/0` or `sparse`. Images are
+    renamed as in the survey. Errors of points are computed from the observations.
 
     Raises:
-        InputError: the folder holds no COLMAP model, fewer than 3 of its images are in the survey, or its cameras
-            have other sizes than the photographs.
+        InputError: the folder holds no COLMAP model, fewer than 3 of its images are in the survey, its cameras have
+            other sizes than the photographs, its images have no observations, or its poses contradict them.
+    """
+    model, folder = import_poses(path, survey)
+    _require_observations(model, folder)
+    check_observations(flatten(model), folder)
+    model.update_point_3d_errors()
+    return model
+
+
+def import_poses(path: Path, survey: Survey) -> tuple[Any, Path]:
+    """Return the model at `path` reduced to the survey's images, whatever it observes, and its folder.
+
+    Raises as `import_model`, but for observations.
     """
     folder = find_model(path)
     model = load_reconstruction(folder)
-    names = {image.name for image in survey.images}
-    foreign = [image for image in model.images.values() if image.has_pose and image.name not in names]
+    foreign = _rename(model, survey, folder)
     for frame_id in {image.frame_id for image in foreign}:  # The images of a rig share a frame.
         model.deregister_frame(frame_id)
-    if model.num_reg_images() < 3:
+    if model.num_reg_images() < _FEWEST_IMAGES:
+        example = foreign[0].name if foreign else "none"
         raise InputError(
             "too-few-images-in-survey",
-            f"{model.num_reg_images()} of its images are in the survey, and at least three are needed; names must "
-            "be equal.",
+            f"{model.num_reg_images()} of its images are in the survey, and at least three are needed. The model "
+            f"has {example!r} …, the survey {survey.images[0].name!r} …: names may differ in folder, case and "
+            "suffix only. Give `georef ingest` the photographs of the model, or rename its images.",
             path=folder,
         )
     if foreign:
         log.warning("%d images of the imported model are not in the survey, and were left out.", len(foreign))
     _check_cameras(model, survey, folder)
-    return model
+    return model, folder
+
+
+def _rename(model: Any, survey: Survey, folder: Path) -> list[Any]:
+    """Give the posed images of a model their names in the survey; return those that are none of its images.
+
+    Raises:
+        InputError: a name fits several photographs, or two names one photograph.
+    """
+    names = ImageNames(image.name for image in survey.images)
+    taken: dict[str, str] = {}
+    foreign, renamed = [], []
+    for image_id in sorted(model.reg_image_ids()):
+        image = model.images[image_id]
+        found = names.find(_relative(image.name), path=folder)
+        if found is None:
+            foreign.append(image)
+            continue
+        if found in taken:
+            message = f"{taken[found]!r} and {image.name!r} of the model are both the photograph {found}."
+            raise InputError("image-twice", message, path=folder, field="images")
+        taken[found] = image.name
+        if image.name != found:
+            renamed.append(f"{image.name} is {found}")
+            image.name = found
+    if renamed:
+        log.warning(
+            "%d images of the model have another folder, case or suffix than their photographs (%s).",
+            len(renamed),
+            renamed[0],
+        )
+    return foreign
+
+
+def _relative(name: str) -> str:
+    """Return a name without the folders of another machine."""
+    pure = PurePosixPath(name.replace("\\", "/"))
+    return pure.name if pure.is_absolute() or ".." in pure.parts or name[1:2] == ":" else name
+
+
+def _require_observations(model: Any, folder: Path) -> None:
+    """Refuse a model of poses alone; leave out single images without observations.
+
+    Raises:
+        InputError: fewer than half of the images with a pose observe points.
+    """
+    posed = [model.images[image_id] for image_id in sorted(model.reg_image_ids())]
+    blind = [image for image in posed if image.num_points3D == 0]
+    if len(blind) > (1.0 - _SEEN) * len(posed) or len(posed) - len(blind) < _FEWEST_IMAGES:
+        raise InputError(
+            "model-without-observations",
+            f"{len(blind)} of its {len(posed)} images have a pose, but no observations of points (such as "
+            f"{blind[0].name}). The adjustment needs points: --triangulate takes the poses and triangulates points "
+            "from the photographs.",
+            path=folder,
+            field="images",
+        )
+    for frame_id in {image.frame_id for image in blind}:
+        model.deregister_frame(frame_id)
+    if blind:
+        log.warning(
+            "%d images of the model observe no points and are left out (such as %s); --triangulate takes them.",
+            len(blind),
+            blind[0].name,
+        )
 
 
 def find_model(path: Path) -> Path:
     """Return the folder of the model at or below `path`; `path` itself if there is none.
 
-    Among several models of a project the one in `sparse/0` is returned, with a warning.
+    Among several models of a project the one with most images is returned, with a warning.
     """
     places = [path / place for place in _PLACES]
-    folder = next((place for place in places for name in _IMAGES if (place / name).exists()), path)
-    others = {file.parent for name in _IMAGES for file in folder.parent.glob(f"[0-9]*/{name}")} - {folder}
-    if folder != path and others:
-        log.warning("%s is imported; %d further models lie beside it.", folder, len(others))
-    return folder
+    folder = next((place for place in places for name in _IMAGES if (place / name).exists()), None)
+    if folder is None:
+        beside = [child for parent in (path / "sparse", path) for child in _numbered(parent)]
+        folder = beside[0] if beside else path
+    models = _numbered(folder.parent) if folder != path else []
+    if len(models) < 2:
+        return folder
+    sizes = {model: _number_of_images(model) for model in models}
+    largest = max(models, key=lambda model: sizes[model])
+    log.warning(
+        "%s is imported: it has %d images, the most of %d models beside each other (%s).",
+        largest,
+        sizes[largest],
+        len(models),
+        ", ".join(f"{model.name}: {size}" for model, size in sizes.items()),
+    )
+    return largest
+
+
+def _numbered(parent: Path) -> list[Path]:
+    """Return the folders of numbered models in a folder, by number."""
+    found = {file.parent for name in _IMAGES for file in parent.glob(f"[0-9]*/{name}")}
+    return sorted(found, key=lambda folder: (len(folder.name), folder.name))
+
+
+def _number_of_images(folder: Path) -> int:
+    """Return how many images a model has, by the head of its file or by its lines; what is wrong is said later."""
+    try:
+        if (folder / "images.bin").exists():
+            with (folder / "images.bin").open("rb") as stream:
+                return int.from_bytes(stream.read(8), "little")
+        with (folder / "images.txt").open("rb") as stream:
+            return sum(not line.startswith(b"#") for line in stream) // 2
+    except OSError:
+        return 0
 
 
 def _check_cameras(model: Any, survey: Survey, folder: Path) -> None:

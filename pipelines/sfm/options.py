@@ -1,8 +1,8 @@
 """Options of `georef sfm`, and of the adjustment with position priors."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from pipelines.core.options import EFFORT, InputPath, StageOptions
 
@@ -33,6 +33,11 @@ class SfmOptions(StageOptions):
     import_model: InputPath | None = Field(
         None, description="Use this COLMAP model instead of reconstructing.", json_schema_extra={"flag": "--import"}
     )
+    triangulate: bool = Field(
+        False,
+        description="Take the poses of the --import model alone, held fixed, and triangulate points from the "
+        "photographs.",
+    )
     chunk_size: Annotated[int, EFFORT] = Field(
         200,
         ge=4,
@@ -41,6 +46,12 @@ class SfmOptions(StageOptions):
     )
     threads: Annotated[int, EFFORT] = Field(-1, ge=-1, description="Threads (-1: all).")
     seed: int = Field(0, ge=0, description="Seed of every random choice.")
+
+    @model_validator(mode="after")
+    def _poses_to_triangulate(self) -> Self:
+        if self.triangulate and self.import_model is None:
+            raise ValueError("--triangulate takes the poses of --import, which is not given")
+        return self
 
     def doubles(self, photo_px: tuple[int, int]) -> bool:
         """Return whether features are detected on photographs of this size doubled.

@@ -46,4 +46,6 @@ class Reconstructor(Protocol):
 
 
 def reconstructor_of(options: SfmOptions) -> Reconstructor:
-    return ColmapReconstructor() if options.import_model is None else ImportedModel(options.import_model)
+    if options.import_model is None:
+        return ColmapReconstructor()
+    return ImportedModel(options.import_model, options.triangulate)

@@ -78,6 +78,19 @@ def test_stage_recovers_the_truth_with_rtk(tmp_path: Path) -> None:
     assert outcome.manifest.warnings == ()
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("control", [False, True])
+@pytest.mark.parametrize("pixel_px", [0.0, 1e-7, 1e-3])  # exact, rounded in a text file, of a renderer's distortion
+def test_model_without_residuals_has_finite_sigma(pixel_px: float, control: bool) -> None:
+    survey, model, points = material(Noise(pixel_px=pixel_px), Measured(gcps=control), seed=2)
+    found, _ = estimated(survey, model, points, CONFIG)
+    # 24 fixes of 2 cm over 50 m.
+    assert found.geo_from_local.scale == pytest.approx(GEO_FROM_LOCAL.scale, rel=1e-3)
+    sigma = np.sqrt(np.diag(np.array(found.geo_from_local.covariance)))
+    assert np.isfinite(sigma).all() and (sigma > 0).all()
+    assert squared_error(found) < 24.3  # χ²₇ at 0.999
+
+
 def test_outlying_fixes_are_listed() -> None:
     noise = replace(Noise(fix_m=(0.05, 0.05, 0.08)), outliers=(2, 7, 11, 20))
     survey, model, points = material(noise, Measured())

@@ -13,6 +13,7 @@ from pipelines.core.files import replace_text
 from pipelines.formats.camera_files import CameraTable, write_camera_table
 from pipelines.formats.tables import plain_text, table_text
 from pipelines.formats.trajectory_csv import read_trajectory
+from pipelines.geometry.rotations import geo_from_cam, omega_phi_kappa_deg
 from tests.cli_runs import REPOSITORY
 
 FORMULAS = ["=cmd|' /C calc'!A0", "+1+2", "-2+3", "@SUM(A1)", "\t=1", "\r=1", "'=1", "''-x"]
@@ -31,7 +32,8 @@ def test_formulas_alone_begin_with_an_apostrophe(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["=1+2.jpg", "-a.jpg", "'@b.jpg", "c.jpg"])
 def test_names_of_a_table_of_cameras_are_read_back(tmp_path: Path, name: str) -> None:
     three = np.full((1, 3), -1.25)
-    table = CameraTable((name,), ("train",), three, False, three, three, three.clip(0.1), three)
+    omega = omega_phi_kappa_deg(geo_from_cam(three))
+    table = CameraTable((name,), ("train",), three, False, omega, three, three.clip(0.1), three)
     write_camera_table(tmp_path / "cameras.csv", table)
     text = (tmp_path / "cameras.csv").read_text("utf-8").splitlines()[1]
     assert text.startswith(name if name == "c.jpg" else f"'{name}")

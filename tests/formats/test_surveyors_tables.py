@@ -324,7 +324,7 @@ class TestPix4d:
         ("text", "told"),
         [
             ("GCP0,46.02,7.75\n", ("wrong-columns", 1, None, "3 columns", "two coordinates and z")),
-            ("label,x,latitude,z\nP,1,2,3\n", ("column-missing", 1, None, "label,x,latitude,z")),
+            ("label,x,latitude,z\nP,1,2,3\n", ("column-missing", 1, None, "label, x, latitude, z")),
             ("label,x,y,z\n", ("no-rows", None, None)),
             ("GCP0,46.02,7.75,\n", ("number-missing", 1, "z")),
             ("GCP0,46.02,7.75,1\n,46.02,7.75,1\n", ("name-missing", 2, "label")),

@@ -94,7 +94,7 @@ def test_rows_without_position_and_repeated_times_stay(tmp_path: Path) -> None:
         ("image,x,y,z\n", "no-rows", None, None, ""),
         ("a.jpg,46.0,7.0,1620\n", "header-missing", 1, None, ""),
         ("image\na.jpg\n", "one-column", 1, None, ""),
-        ("image,speed\na,1\n", "column-missing", 1, None, "latitude,longitude,altitude and x,y,z"),
+        ("image,speed\na,1\n", "column-missing", 1, None, "latitude,longitude,altitude or x,y,z"),
         ("x,y,z\n1,2,3\n", "column-missing", 1, None, "timestamp"),
         ("image,x,y\na,1,2\n", "column-missing", 1, None, "column z"),
         ("image,x,y,z,lat,lon,alt\na,1,2,3,4,5,6\n", "columns-ambiguous", 1, None, "altitude and x,y,z"),

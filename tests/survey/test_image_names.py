@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from pipelines.core.errors import InputError
-from pipelines.ingest.photo_folder import ImageNames
+from pipelines.survey.image_names import ImageNames
 from tests.refusals import refused
 
 TABLE = Path("gcp_list.txt")
