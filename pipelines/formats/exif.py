@@ -283,11 +283,10 @@ def _altitude(tags: Mapping[str, Tag], notes: _Notes) -> float | None:
         above, below = tag.fractions[0] if tag.fractions else (value, 1.0)
         wrapped = next((low for bits in (16, 32) if -1000.0 <= (low := (above - 2.0**bits) / below) < 0.0), None)
         if wrapped is None:
-            notes.problems.append(f"the GPS altitude of {value:.0f} m is higher than any flight")
+            notes.problems.append("the GPS altitude is higher than any flight (20 km)")
             return None
         notes.corrections.append(
-            f"The GPS altitude is a negative number that was written without its sign ({value:.1f} m); it is read "
-            "as negative, below sea level."
+            "The GPS altitude is a negative number that was written without its sign; it is read as negative."
         )
         return wrapped
     reference = _altitude_reference(tags, notes)
@@ -429,12 +428,20 @@ def _xmp_degrees(text: str) -> float | None:
 
 def _xmp_altitude(xmp: Xmp, namespace: str) -> float | None:
     """Return the absolute altitude beside a position, in the words of drones or in Adobe's."""
-    absolute = xmp.number("AbsoluteAltitude", namespace=namespace)
+    absolute = _xmp_height(xmp, namespace)
     if absolute is None:
         absolute = xmp.number("GPSAltitude", namespace=namespace)
         if absolute is not None and xmp.text("GPSAltitudeRef", namespace=namespace) in ("1", "3"):
             absolute = -abs(absolute)
     return absolute
+
+
+def _xmp_height(xmp: Xmp, namespace: str | None = None) -> float | None:
+    """Return a drone's absolute altitude; one that lost its sign in 32 bits is read as negative."""
+    value = xmp.number("AbsoluteAltitude", namespace=namespace)
+    if value is None or value <= _HIGHEST_M:
+        return value
+    return next((low for digits in range(7) if -1000.0 <= (low := value - _WRAP / 10.0**digits) < 0.0), None)
 
 
 def _drone(xmp: Xmp) -> DjiTags:
@@ -453,7 +460,7 @@ def _drone(xmp: Xmp) -> DjiTags:
         gimbal_yaw_pitch_roll_deg=gimbal,
         rtk_flag=None if flag is None else int(flag),
         rtk_sigma_enu_m=sigma if sigma is not None and min(sigma) > 0.0 else None,
-        absolute_altitude_m=xmp.number("AbsoluteAltitude"),
+        absolute_altitude_m=_xmp_height(xmp),
         relative_altitude_m=xmp.number("RelativeAltitude"),
         flight_yaw_deg=flight_yaw,
         sigma_h_m=_positive(xmp.number("GPSXYAccuracy")),

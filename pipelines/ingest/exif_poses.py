@@ -21,11 +21,12 @@ from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import ecef_from_enu_rotation, ecef_from_lla, lla_from_ecef
 from pipelines.geodesy.operations import WGS84
 from pipelines.geodesy.vertical import ELLIPSOIDAL, FOOT_M, MOST_GEOID_M, VerticalDatum
-from pipelines.geometry.rotations import geo_from_cam
 from pipelines.ingest.flight_record import ImagePoses, with_defaults
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo
 from pipelines.ingest.remarks import Remarks
+from pipelines.ingest.tag_headings import tagged_attitudes
+from pipelines.ingest.tag_positions import tagged_positions
 from pipelines.robust.statistics import blunders_among, mad_sigma, median_spacing, scatter_about_median, two_groups
 
 # Vertical over horizontal σ of a fix that states only the horizontal one.
@@ -41,17 +42,15 @@ _LEAST_TIMED = 6  # photographs, for a velocity
 
 
 def poses_from_tags(photos: Sequence[Photo], options: IngestOptions, remarks: Remarks) -> ImagePoses:
-    """Return positions from EXIF, attitudes and RTK σ from DJI's XMP.
+    """Return positions from EXIF and XMP, attitudes and RTK σ from XMP.
 
     Raises:
         InputError: `--vertical` names a geoid whose grid is missing.
     """
-    xyz = np.full((len(photos), 3), np.nan)
-    for row, photo in enumerate(photos):
-        if photo.tags.gps is not None:
-            xyz[row] = photo.tags.gps.lon_deg, photo.tags.gps.lat_deg, _or_nan(altitude_m(photo.tags))
+    tagged, time_s = tagged_positions(photos, remarks), photo_times(photos)
+    xyz = tagged.xyz
     located = complete(xyz)
-    flat = [photo.name for photo in photos if photo.tags.gps is not None and altitude_m(photo.tags) is None]
+    flat = [photos[row].name for row in np.flatnonzero(np.isfinite(xyz[:, 0]) & ~located)]
     remarks.warn_counted(
         "image-without-altitude", flat, "Images have a GPS position without altitude, which is not used"
     )
@@ -67,19 +66,23 @@ def poses_from_tags(photos: Sequence[Photo], options: IngestOptions, remarks: Re
     flags = [0 if photo.tags.dji is None else photo.tags.dji.rtk_flag or 0 for photo in photos]
     receivers = tuple(_RECEIVER.get(flag, "single-frequency") for flag in flags)
     sigma, sigma_source = with_defaults(stated, receivers, located, options, remarks)
+    free = [options.sigma_h is None, options.sigma_h is None, options.sigma_v is None]
+    sigma = np.where(free, np.hypot(sigma, tagged.sigma_m), sigma)
+    attitudes = tagged_attitudes(photos, xyz[:, :2], time_s, remarks)
     assumed = VerticalDatum(name=ELLIPSOIDAL, stated=False, note=_EXIF_NOTE)
     return ImagePoses(
         position_in_ecef=position_in_ecef,
         sigma_enu_m=sigma,
         sigma_source=sigma_source,
         receivers=receivers,
-        enu_from_cam=gimbal_attitudes(photos),
+        enu_from_cam=attitudes.enu_from_cam,
         attitude_source=tuple("gimbal" for _ in photos),
-        sigma_attitude_deg=np.full(len(photos), np.nan),
-        time_s=photo_times(photos),
+        sigma_attitude_deg=attitudes.sigma_deg,
+        time_s=time_s,
         source="exif",
         crs_name=WGS84,
         vertical=crs.vertical if crs.vertical.stated else assumed,
+        common_sigma_m=tagged.common_sigma_m,
     )
 
 
@@ -97,23 +100,17 @@ def photo_times(photos: Sequence[Photo]) -> FloatArray:
     return np.array([_or_nan(photo.tags.timestamp_s) for photo in photos])
 
 
-def gimbal_attitudes(photos: Sequence[Photo]) -> FloatArray:
-    """Return rotations camera → East-North-Up (N, 3, 3) from DJI's XMP, NaN where it has none."""
-    enu_from_cam = np.full((len(photos), 3, 3), np.nan)
-    for row, photo in enumerate(photos):
-        dji = photo.tags.dji
-        if dji is not None and dji.gimbal_yaw_pitch_roll_deg is not None:
-            enu_from_cam[row] = geo_from_cam(dji.gimbal_yaw_pitch_roll_deg)
-    return enu_from_cam
-
-
 def _stated_sigma(tags: PhotoTags) -> FloatArray:
     """Return σ east, north, up (3,) that the tags state, NaN if none."""
     if tags.dji is not None and tags.dji.rtk_sigma_enu_m is not None:
         return np.array(tags.dji.rtk_sigma_enu_m)
-    if tags.gps is not None and tags.gps.sigma_h_m is not None:
-        return tags.gps.sigma_h_m * np.array([1.0, 1.0, _VERTICAL_RATIO])
-    return np.full(3, np.nan)
+    horizontal_m = None if tags.gps is None else tags.gps.sigma_h_m
+    vertical_m = None if tags.dji is None else tags.dji.sigma_v_m
+    if horizontal_m is None and tags.dji is not None:
+        horizontal_m = tags.dji.sigma_h_m
+    if horizontal_m is None:
+        return np.full(3, np.nan)
+    return np.array([horizontal_m, horizontal_m, vertical_m or _VERTICAL_RATIO * horizontal_m])
 
 
 def _or_nan(value: float | None) -> float:

@@ -52,6 +52,8 @@ class ImagePoses:
     source: str  # of the positions, with their CRS and the datum that their heights counted from
     crs_name: str
     vertical: VerticalDatum
+    # What disagreeing sources add to the error that all positions share, σ horizontal and vertical
+    common_sigma_m: tuple[float, float] = (0.0, 0.0)
     # The Earth-centred trajectory that images were matched with by time, None where it was by name
     recorded: Trajectory | None = None
 

@@ -27,6 +27,7 @@ from pipelines.ingest.photo_folder import Photo, camera_priors, scan_folder
 from pipelines.ingest.reference_system import is_projected
 from pipelines.ingest.remarks import Remarks
 from pipelines.ingest.table_poses import poses_from_table
+from pipelines.ingest.tag_contents import note_repeats, note_tags
 
 # The camera's clock has whole seconds and may be hours off, but runs evenly: a photograph counted wrongly shows.
 _MOST_SPREAD_S = 3.0
@@ -51,14 +52,7 @@ def read_folder(
     """
     photos = scan_folder(folder, remarks, progress, decode=decode)
     flight_record.require_enough(len(photos), folder, "--images", remarks)
-    for problem in sorted({problem for photo in photos for problem in photo.tags.problems}):
-        with_it = [photo.name for photo in photos if problem in photo.tags.problems]
-        remarks.warn_counted("exif-unusable", with_it, f"Tags of images are not used, because {problem}")
-    remarks.warn_counted(
-        "exif-orientation",
-        [photo.name for photo in photos if photo.tags.orientation != 1],
-        "Images have an EXIF orientation, which is ignored: pixels are read as stored",
-    )
+    note_tags(photos, remarks)
     poses = _poses(photos, options, remarks) if table is None else poses_from_table(table, photos, options, remarks)
     if options.time_offset_s and poses.recorded is None:
         raise InputError(
@@ -68,6 +62,7 @@ def read_folder(
             field="--time-offset",
         )
     rig, names = flight_record.given_rig(options), [photo.name for photo in photos]
+    note_repeats(names, poses.position_in_ecef, poses.time_s, remarks)
     navigation = None
     if poses.recorded is not None:
         navigation = _navigation(poses.recorded, rig, names, poses.time_s, options)

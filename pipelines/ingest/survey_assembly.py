@@ -18,8 +18,10 @@ from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.ingest import flight_record
 from pipelines.ingest.ground_points import GroundFile, GroundPoint, require_near, split_checks, unmarked_points
 from pipelines.ingest.options import IngestOptions
+from pipelines.ingest.photo_folder import Photo
 from pipelines.ingest.remarks import Remarks
 from pipelines.ingest.rolling_shutter import with_readouts, with_velocities
+from pipelines.ingest.tag_contents import contents
 from pipelines.survey.calibrated import FIX_RANGE_M, NavigationTrack, require_estimable
 from pipelines.survey.survey import (
     LOCAL_FRAME,
@@ -89,6 +91,7 @@ def assemble_survey(
     control_distances = sum(distance.use == "control" for distance in distances)
     origin = None
     if located or files or not control_distances:
+        require_placed(located or bool(marked), flight.photos)
         origin = _origin(poses, marked)
         _note_coverage(flight, len(marked), remarks)
     else:
@@ -130,13 +133,14 @@ def assemble_survey(
     return survey, track
 
 
-def require_placed(placed: bool) -> None:
-    """Refuse a survey that nothing places on Earth."""
+def require_placed(placed: bool, photos: Sequence[Photo] = ()) -> None:
+    """Refuse a survey that nothing places on Earth, with what its photographs' tags hold instead."""
     if not placed:
+        held = f" {contents(photos)}" if photos else ""
         raise InputError(
             "no-positions",
-            "No image has a position, and there are no ground control points. Give --trajectory, --geo or --gcp; "
-            "or, for a result in a local metric frame without a place on Earth, known --distances between marked "
+            f"No image has a position, and there are no ground control points.{held} Give --trajectory, --geo or "
+            "--gcp; or, for a result in a local metric frame without a place on Earth, known --distances between marked "
             "points.",
         )
 
@@ -284,7 +288,7 @@ def fix_sessions(
         session_of[rows] = len(sessions) + by_time
         for number in np.unique(by_time):
             kind = _kind(receiver, float(np.median(sigma_h_m[rows[by_time == number]])))
-            horizontal_m, vertical_m = COMMON_SIGMA_M[kind]
+            horizontal_m, vertical_m = np.hypot(COMMON_SIGMA_M[kind], poses.common_sigma_m).tolist()
             h_m, v_m = horizontal_m if given_h is None else given_h, vertical_m if given_v is None else given_v
             source: flight_record.SigmaSource = "default" if given_h is None and given_v is None else "option"
             sessions.append(FixSession(receiver=kind, sigma_common_m=(h_m, h_m, v_m), sigma_source=source))
@@ -294,7 +298,7 @@ def fix_sessions(
             int(count) for session, count in zip(sessions, counts, strict=True) if session.receiver == kind
         )
         if of_kind:
-            _note_default(kind, of_kind, options, remarks)
+            _note_default(kind, of_kind, poses.common_sigma_m, options, remarks)
     return tuple(sessions), session_of
 
 
@@ -319,8 +323,10 @@ def _kind(receiver: str, sigma_h_m: float) -> str:
     return "RTK float" if receiver == flight_record.RECEIVERS[-1] and sigma_h_m <= _FLOAT_SIGMA_M else receiver
 
 
-def _note_default(kind: str, count: int, options: IngestOptions, remarks: Remarks) -> None:
-    horizontal_m, vertical_m = COMMON_SIGMA_M[kind]
+def _note_default(
+    kind: str, count: int, added_m: tuple[float, float], options: IngestOptions, remarks: Remarks
+) -> None:
+    horizontal_m, vertical_m = np.round(np.hypot(COMMON_SIGMA_M[kind], added_m), 2).tolist()
     defaults = {}
     if options.sigma_common_h is None:
         defaults["--sigma-common-h"] = f"{horizontal_m:g} m horizontal"
@@ -377,7 +383,6 @@ def _origin(poses: flight_record.ImagePoses, control: Sequence[GroundPoint]) -> 
     places = enu.lla_from_ecef(poses.position_in_ecef[poses.located])
     if not len(places) and control:
         places = enu.lla_from_ecef([point.position_in_ecef for point in control])
-    require_placed(len(places) > 0)
     lat, lon, alt = enu.median_lla(places)
     return enu.Origin(lat_deg=round(float(lat), 5), lon_deg=round(float(lon), 5), alt_m=round(float(alt)))
 

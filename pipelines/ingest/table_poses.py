@@ -13,15 +13,16 @@ from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray, rows_of
 from pipelines.formats.trajectory_csv import PoseTable, complete
 from pipelines.geodesy.crs import PointCrs, grid_from_enu
-from pipelines.geodesy.enu import ecef_from_lla
+from pipelines.geodesy.enu import ecef_from_lla, lla_from_ecef
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.trajectory import Trajectory
-from pipelines.ingest.exif_poses import altitude_m, compare_with_exif, gimbal_attitudes, photo_times
+from pipelines.ingest.exif_poses import altitude_m, compare_with_exif, photo_times
 from pipelines.ingest.flight_record import RECEIVERS, ImagePoses, with_defaults
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo
 from pipelines.ingest.reference_system import crs_of_table, in_units_of, note_operation, note_unread
 from pipelines.ingest.remarks import Remarks
+from pipelines.ingest.tag_headings import tagged_attitudes
 from pipelines.survey.image_names import ImageNames
 
 
@@ -67,15 +68,18 @@ def poses_from_table(
         f"Images have no position in {table.path.name}",
     )
     sigma, sigma_source = with_defaults(at_images.sigma_m, receivers, located, options, remarks)
+    lla = np.full((len(photos), 3), np.nan)
+    lla[located] = lla_from_ecef(at_images.position[located])
+    attitudes = tagged_attitudes(photos, lla[:, 1::-1], time_s, remarks)
     from_file = np.asarray(np.isfinite(at_images.rotation).all(axis=(1, 2)))
     poses = ImagePoses(
         position_in_ecef=at_images.position,
         sigma_enu_m=sigma,
         sigma_source=sigma_source,
         receivers=receivers,
-        enu_from_cam=np.where(from_file[:, None, None], at_images.rotation, gimbal_attitudes(photos)),
+        enu_from_cam=np.where(from_file[:, None, None], at_images.rotation, attitudes.enu_from_cam),
         attitude_source=tuple(table.source if row else "gimbal" for row in from_file),
-        sigma_attitude_deg=np.full(len(photos), np.nan),
+        sigma_attitude_deg=np.where(from_file, np.nan, attitudes.sigma_deg),
         time_s=time_s,
         source=table.source,
         crs_name=crs.name,
