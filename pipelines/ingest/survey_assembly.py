@@ -140,8 +140,8 @@ def require_placed(placed: bool, photos: Sequence[Photo] = ()) -> None:
         raise InputError(
             "no-positions",
             f"No image has a position, and there are no ground control points.{held} Give --trajectory, --geo or "
-            "--gcp; or, for a result in a local metric frame without a place on Earth, known --distances between marked "
-            "points.",
+            "--gcp; or, for a result in a local metric frame without a place on Earth, known --distances between "
+            "marked points.",
         )
 
 
