@@ -192,4 +192,4 @@ def _summary(survey: Survey) -> Summary:
         key_figure += ", in a local metric frame"
     origin = None if survey.origin is None else survey.origin.model_dump()
     values = {**counts, "origin": origin, "vertical": survey.vertical.model_dump()}
-    return Summary(key_figure, values, survey.warnings)
+    return Summary(key_figure, values, survey.warnings, survey.cautions)
