@@ -15,6 +15,7 @@ from typing import Literal
 
 from pipelines.core.errors import InputError
 from pipelines.core.progress import SILENT, Progress
+from pipelines.core.sentences import listed
 from pipelines.core.validators import stays_inside
 from pipelines.formats.exif import PhotoTags, read_tags
 from pipelines.formats.heif import heif_size, jpeg_of_heif
@@ -208,27 +209,52 @@ ASSUMED_RATIO = 0.85
 FocalSource = Literal["exif", "assumed"]
 
 
-def focal_px(tags: PhotoTags, width: int, height: int) -> tuple[float, FocalSource, str]:
-    """Return the focal length in pixels of a stored image, its source, and a sentence on it.
+_NEAR_PART = 0.15  # what whole millimetres, and counting by the diagonal or by the width, make of an equivalent
+_LEAST_PART, _MOST_PART = 0.2, 20.0  # of the longer side, beyond which a focal length is nonsense
 
-    In this order: real focal length and the sensor's width in a table; real focal length and focal plane
-    resolution (scaled by how much smaller the image is than when it was taken); 35 mm equivalent by the diagonal
-    (CIPA DCG-001); else 0.85 of the longer side.
+
+def focal_px(tags: PhotoTags, width: int, height: int) -> tuple[float, FocalSource, str]:
+    """Return the focal length in pixels of a stored image, its source, and a phrase on it.
+
+    In this order: real focal length and the sensor's width in a table; a drone's own calibration in XMP; real focal
+    length and focal plane resolution (scaled by how much smaller the image is than when it was taken), unless it
+    contradicts the next, as that of a preview or of another unit does; 35 mm equivalent by the diagonal (CIPA
+    DCG-001); else 0.85 of the longer side. The phrase names all that differ from what is used.
     """
+    found = _focal_lengths(tags, width, height)
+    if not found:
+        return ASSUMED_RATIO * max(width, height), "assumed", f"assumed as {ASSUMED_RATIO:g} of the longer side"
+    if "plane" in found and "equivalent" in found and not _near(found["plane"][0], found["equivalent"][0]):
+        found["plane"] = found.pop("plane")  # behind the equivalent
+    (focal, origin), *others = found.values()
+    apart = [f"{value:.0f} px {how}" for value, how in others if not _near(value, focal)]
+    return focal, "exif", f"{origin}{f', and not {listed(apart)}' if apart else ''}"
+
+
+def _focal_lengths(tags: PhotoTags, width: int, height: int) -> dict[str, tuple[float, str]]:
+    """Return the focal lengths in pixels that the tags state and that are no nonsense, with a phrase on each."""
     lens, long_side = tags.lens, max(width, height)
+    scale = long_side / (lens.taken_width_px or long_side)
     sensor_mm = _SENSOR_WIDTH_MM.get(tags.model.strip().upper())
+    found: dict[str, tuple[float, str]] = {}
     if lens.focal_mm and sensor_mm:
         focal = lens.focal_mm * lens.zoom / sensor_mm * long_side
-        return focal, "exif", f"from {lens.focal_mm:g} mm on a sensor {sensor_mm:g} mm wide"
+        found["sensor"] = (focal, f"from {lens.focal_mm:g} mm on a sensor {sensor_mm:g} mm wide")
+    calibrated = tags.xmp.number("CalibratedFocalLength") or tags.xmp.number("X", within="CalibratedFocalLength")
+    if calibrated is not None:
+        found["calibrated"] = (calibrated * scale, "from CalibratedFocalLength in XMP")
     if lens.focal_mm and lens.px_per_mm:
-        original_width_px = lens.taken_width_px or long_side
-        focal = lens.focal_mm * lens.zoom * lens.px_per_mm * long_side / original_width_px
-        if 0.2 * long_side < focal < 20.0 * long_side:  # the tag is often nonsense
-            return focal, "exif", f"from {lens.focal_mm:g} mm and the focal plane resolution"
+        focal = lens.focal_mm * lens.zoom * lens.px_per_mm * scale
+        found["plane"] = (focal, f"from {lens.focal_mm:g} mm and the focal plane resolution")
     if lens.focal_35mm_mm:
         focal = lens.focal_35mm_mm / _FILM_DIAGONAL_MM * math.hypot(width, height)
-        return focal, "exif", f"from {lens.focal_35mm_mm:g} mm on 35 mm film"
-    return ASSUMED_RATIO * long_side, "assumed", f"assumed as {ASSUMED_RATIO:g} of the longer side"
+        found["equivalent"] = (focal, f"from {lens.focal_35mm_mm:g} mm on 35 mm film")
+    usual = (_LEAST_PART * long_side, _MOST_PART * long_side)
+    return {name: each for name, each in found.items() if usual[0] < each[0] < usual[1]}
+
+
+def _near(one: float, other: float) -> bool:
+    return abs(one / other - 1.0) < _NEAR_PART
 
 
 def camera_priors(

@@ -6,11 +6,12 @@ import math
 
 import pytest
 
-from pipelines.formats.exif import LensTags, PhotoTags
+from pipelines.formats.exif import LensTags, PhotoTags, read_tags
 from pipelines.formats.image_file import ImageFile
 from pipelines.ingest.photo_folder import Photo, camera_priors, focal_px
 from pipelines.ingest.remarks import Remarks
-from tests.refusals import said
+from tests.photos import SHORT, Exif, dji_xmp, jpeg
+from tests.refusals import numbers, said
 
 
 def _photo(name: str, width: int, height: int, tags: PhotoTags) -> Photo:
@@ -66,3 +67,40 @@ def test_an_option_overrides_exif() -> None:
     photos = [_photo("1", 60, 40, PhotoTags(model="FC300S", lens=LensTags(focal_mm=3.61)))]
     cameras, _ = camera_priors(photos, 77.0, Remarks())
     assert cameras[0].params[0] == 77.0 and cameras[0].focal_source == "option"
+
+
+@pytest.mark.parametrize(
+    ("px_per_mm", "focal_35mm_mm"),
+    [
+        (82.0, 38.0),  # the resolution of a preview
+        (6000 / 36.0 / 2.54, 26.0),  # per inch where it says per centimetre
+        (6000 / 36.0 * 2.54, 26.0),  # and the reverse
+    ],
+)
+def test_a_focal_plane_that_contradicts_35_mm_is_named_and_not_used(px_per_mm: float, focal_35mm_mm: float) -> None:
+    lens = LensTags(focal_mm=25.6, px_per_mm=px_per_mm, focal_35mm_mm=focal_35mm_mm, taken_width_px=6000.0)
+    focal, source, how = focal_px(PhotoTags(lens=lens), 6000, 4000)
+    assert focal == pytest.approx(focal_35mm_mm / math.hypot(36, 24) * math.hypot(6000, 4000))
+    assert source == "exif"
+    assert round(25.6 * px_per_mm) in numbers(how) and focal_35mm_mm in numbers(how)
+
+
+def test_a_focal_plane_that_agrees_has_more_digits() -> None:
+    lens = LensTags(focal_mm=25.6, px_per_mm=6000 / 36.0, focal_35mm_mm=26.0, taken_width_px=6000.0)
+    focal, _, how = focal_px(PhotoTags(lens=lens), 6000, 4000)
+    assert focal == pytest.approx(25.6 / 36 * 6000) and "35 mm" not in how
+
+
+@pytest.mark.parametrize("value", [1, 65535])
+def test_a_35_mm_equivalent_that_means_none_is_said(value: int) -> None:
+    tags = read_tags(jpeg(exif=Exif(photo=[(0xA405, SHORT, value)])))
+    assert tags.lens.focal_35mm_mm is None
+    assert numbers(tags.problems[0])[0] == value
+
+
+def test_calibration_in_xmp_counts_before_the_focal_plane() -> None:
+    lens = LensTags(focal_mm=8.8, px_per_mm=100.0, taken_width_px=5472.0)
+    xmp = read_tags(jpeg(xmp=dji_xmp(CalibratedFocalLength="3666.67"))).xmp
+    focal, _, how = focal_px(PhotoTags(lens=lens, xmp=xmp), 1368, 912)
+    assert focal == pytest.approx(3666.67 / 4)
+    assert 220.0 in numbers(how)  # the focal plane says 880 px of 5472
