@@ -62,7 +62,8 @@ def read_folder(
             field="--time-offset",
         )
     rig, names = flight_record.given_rig(options), [photo.name for photo in photos]
-    note_repeats(names, poses.position_in_ecef, poses.time_s, remarks)
+    located = np.where(poses.located[:, None], poses.position_in_ecef, np.nan)
+    note_repeats(names, lla_from_ecef(located)[:, :2], poses.time_s, remarks)
     navigation = None
     if poses.recorded is not None:
         navigation = _navigation(poses.recorded, rig, names, poses.time_s, options)

@@ -23,6 +23,7 @@ from pipelines.ingest.photo_folder import Photo
 from pipelines.ingest.reference_system import crs_of_table, in_units_of, note_operation, note_unread
 from pipelines.ingest.remarks import Remarks
 from pipelines.ingest.tag_headings import tagged_attitudes
+from pipelines.ingest.written_values import UNKNOWN_SIGMA_M, digits_sigma_m, zero_heights
 from pipelines.survey.image_names import ImageNames
 
 
@@ -44,6 +45,10 @@ def poses_from_table(
     images = [photo.name for photo in photos]
     if table.names is not None:
         table = _with_heights(match_by_name(table, images, remarks), photos, crs, remarks)
+    zero, unknown = zero_heights(
+        table.xyz[:, 2], [f"{table.path.name}:{line}" for line in table.lines], table.path.name, remarks
+    )
+    table = table.take(~zero)
     measured = _measured(table, crs, options, remarks)
     receiver = np.full(len(table.lines), RECEIVERS[-1]) if table.receiver is None else table.receiver
     time_s = photo_times(photos)
@@ -68,6 +73,12 @@ def poses_from_table(
         f"Images have no position in {table.path.name}",
     )
     sigma, sigma_source = with_defaults(at_images.sigma_m, receivers, located, options, remarks)
+    digits_h, digits_v = digits_sigma_m(
+        table.xyz[:, :2], table.xyz[:, 2], degrees="degree" in crs.units[0], of=table.path.name, remarks=remarks
+    )
+    # A file that states σ states them of its values as written.
+    default = np.array([source == "default" for source in sigma_source])[:, None]
+    sigma = np.where(default, np.hypot(sigma, [digits_h, digits_h, digits_v]), sigma)
     lla = np.full((len(photos), 3), np.nan)
     lla[located] = lla_from_ecef(at_images.position[located])
     attitudes = tagged_attitudes(photos, lla[:, 1::-1], time_s, remarks)
@@ -84,6 +95,7 @@ def poses_from_table(
         source=table.source,
         crs_name=crs.name,
         vertical=crs.vertical,
+        common_sigma_m=(0.0, UNKNOWN_SIGMA_M if unknown else 0.0),
         recorded=recorded,
     )
     compare_with_exif(poses, photos, table.path, options, remarks)

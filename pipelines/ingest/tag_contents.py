@@ -11,7 +11,7 @@ from pipelines.ingest.remarks import Remarks, shortened
 
 _LEAST = 3
 _REPEATED = 0.3  # of the photographs, from which repeats are no hovering
-_SAME_M = 1e-3
+_SAME_DEG = 1e-9
 
 
 def note_tags(photos: Sequence[Photo], remarks: Remarks) -> None:
@@ -29,13 +29,12 @@ def note_tags(photos: Sequence[Photo], remarks: Remarks) -> None:
     )
 
 
-def note_repeats(names: Sequence[str], position_m: FloatArray, time_s: FloatArray, remarks: Remarks) -> None:
-    """Note positions (N, 3), in metres and NaN where unknown, that photographs of other moments repeat."""
-    known = np.flatnonzero(np.isfinite(position_m).all(axis=1))
+def note_repeats(names: Sequence[str], lat_lon_deg: FloatArray, time_s: FloatArray, remarks: Remarks) -> None:
+    """Note places (N, 2), NaN where unknown, that photographs of other moments repeat."""
+    known = np.flatnonzero(np.isfinite(lat_lon_deg).all(axis=1))
     if len(known) < _LEAST:
         return
-    places = position_m[known]
-    if np.linalg.norm(places - places[0], axis=1).max() < _SAME_M:
+    if np.ptp(lat_lon_deg[known], axis=0).max() < _SAME_DEG:
         remarks.caution(
             "one-position-for-all",
             f"All {len(known)} photographs have one position: programs write that of an album, and receivers "
@@ -44,8 +43,8 @@ def note_repeats(names: Sequence[str], position_m: FloatArray, time_s: FloatArra
         return
     if np.isfinite(time_s[known]).all():
         known = known[np.argsort(time_s[known], kind="stable")]
-    places, times = position_m[known], time_s[known]
-    same = np.linalg.norm(np.diff(places, axis=0), axis=1) < _SAME_M
+    places, times = lat_lon_deg[known], time_s[known]
+    same = np.abs(np.diff(places, axis=0)).max(axis=1) < _SAME_DEG
     same &= ~(np.abs(np.diff(times)) < 0.5)  # two cameras of one moment; an unknown time is another
     if same.sum() >= max(2.0, _REPEATED * len(known)):
         remarks.caution(

@@ -22,22 +22,21 @@ from pipelines.formats.exif import GpsTag
 from pipelines.geodesy.vertical import FOOT_M
 from pipelines.ingest.photo_folder import Photo
 from pipelines.ingest.remarks import Remarks, shortened
+from pipelines.ingest.written_values import (
+    M_PER_DEG,
+    UNKNOWN_SIGMA_M,
+    digits_sigma_m,
+    step_of_heights,
+    step_of_places,
+    zero_heights,
+)
 from pipelines.robust.statistics import scatter_about_median
 
-_M_PER_DEG = 111_320.0
-# Steps that positions are written in, degrees: decimals of a minute and of a second, and of a degree.
-_SEXAGESIMAL_DEG = frozenset(
-    unit / 10.0**digits for unit, most in ((1 / 60, 6), (1 / 3600, 4)) for digits in range(most + 1)
-)
-_STEPS_DEG = sorted(_SEXAGESIMAL_DEG | {10.0**-digits for digits in range(8)}, reverse=True)
-_STEPS_M = (100.0, 10.0, 1.0, 0.1, 0.01, 0.001)
-_LEAST_VALUES = 4  # different ones, of which a common step is no chance
 _FINE_M = 0.1  # a step that no σ of a plain receiver notices
 _SLACK_M = 0.02
 _FEW = 1 / 3  # of the photographs, whose differences are blunders
 _DECISIVE = 0.5
 _LOWEST_GROUND_M = -450.0  # the shore of the Dead Sea
-_UNKNOWN_SIGMA_M = 1000.0
 
 
 @dataclass(frozen=True)
@@ -82,16 +81,11 @@ def tagged_positions(photos: Sequence[Photo], remarks: Remarks) -> TaggedPositio
     height = _first(heights, len(photos), 1)
     for name in list(heights)[1:]:
         height = _chosen_heights(height, heights[name], (next(iter(heights)), name), flight)
-    height, unknown = _without_zero_heights(height, names, remarks)
-    step_deg = _step_deg(place.values)
-    digits_h = step_deg * _M_PER_DEG / np.sqrt(3.0)  # of values that were cut off, which has no sign
-    digits_v = common_step(height.values.ravel(), _STEPS_M) / np.sqrt(3.0)
-    if digits_h > 1.0:
-        remarks.caution(
-            "position-digits",
-            f"The positions of the photographs are written in steps of {step_deg * _M_PER_DEG:.0f} m: "
-            f"{digits_h:.1f} m is added to their σ.",
-        )
+    zero, unknown = zero_heights(height.values[:, 0], names, "the photographs", remarks)
+    height = replace(height, values=np.where(zero[:, None], np.nan, height.values))
+    digits_h, digits_v = digits_sigma_m(
+        place.values, height.values[:, 0], degrees=True, of="the photographs", remarks=remarks
+    )
     place_h = np.hypot(place.sigma_m, digits_h)
     low = height.values[np.isfinite(height.values)]
     if len(low) and low.min() < 0.0:
@@ -102,26 +96,8 @@ def tagged_positions(photos: Sequence[Photo], remarks: Remarks) -> TaggedPositio
     return TaggedPositions(
         xyz=np.column_stack([place.values[:, ::-1], height.values[:, 0]]),
         sigma_m=np.column_stack([place_h, place_h, np.hypot(height.sigma_m, digits_v)]),
-        common_sigma_m=(place.common_m, _UNKNOWN_SIGMA_M if unknown else height.common_m),
+        common_sigma_m=(place.common_m, UNKNOWN_SIGMA_M if unknown else height.common_m),
     )
-
-
-def common_step(values: FloatArray, steps: Sequence[float]) -> float:
-    """Return the coarsest of some steps that all values are multiples of; 0 for none, or of too few values."""
-    known = np.unique(values[np.isfinite(values)])
-    if len(known) < _LEAST_VALUES:
-        return 0.0
-    return next((step for step in steps if np.abs(known - np.round(known / step) * step).max() < 2e-9), 0.0)
-
-
-def _step_deg(places: FloatArray) -> float:
-    """Return the step in degrees that latitudes and longitudes (N, 2) are written in, 0 if it is unknown.
-
-    Whole minutes and seconds are how degrees are cut off. Round decimals of a degree are so only in both axes.
-    """
-    step = common_step(places.ravel(), _STEPS_DEG)
-    varied = all(len(np.unique(axis[np.isfinite(axis)])) >= _LEAST_VALUES for axis in places.T)
-    return step if varied or step in _SEXAGESIMAL_DEG else 0.0
 
 
 def _without_void(photos: Sequence[Photo], remarks: Remarks) -> list[tuple[GpsTag, ...]]:
@@ -208,7 +184,7 @@ def _chosen_places(place: _Choice, other: FloatArray, sources: tuple[str, str], 
                 f"differ from those in {winner}, which are used: {_named(names, zero)}.",
             )
             wrong[zero] = right[zero]
-    turned = both & (np.abs(np.abs(chosen) - np.abs(other)) * _M_PER_DEG < 100.0).all(axis=1)
+    turned = both & (np.abs(np.abs(chosen) - np.abs(other)) * M_PER_DEG < 100.0).all(axis=1)
     turned &= (chosen * other < 0.0).any(axis=1) & (_metres(chosen, other) > 1000.0)
     if turned.any():
         row = int(np.flatnonzero(turned)[0])
@@ -221,15 +197,15 @@ def _chosen_places(place: _Choice, other: FloatArray, sources: tuple[str, str], 
         negative = np.minimum(chosen, other)
         differs = (chosen * other < 0.0) & turned[:, None]
         chosen[differs], other = negative[differs], np.where(differs, negative, other)
-    step = [_step_deg(each[both]) for each in (chosen, other)]
-    allowed = (step[0] + step[1]) * _M_PER_DEG * np.sqrt(2.0) + _SLACK_M
+    step = [step_of_places(each[both]) for each in (chosen, other)]
+    allowed = (step[0] + step[1]) * M_PER_DEG * np.sqrt(2.0) + _SLACK_M
     apart = np.where(both, _metres(chosen, other), 0.0)
     if (apart <= allowed).all():
-        if step[0] * _M_PER_DEG > _FINE_M and step[0] > 3.0 * step[1]:
+        if step[0] * M_PER_DEG > _FINE_M and step[0] > 3.0 * step[1]:
             remarks.assume(
                 "position-digits-differ",
                 f"{one} and {two} differ by up to {apart.max():.1f} m, as far as the digits of {one} explain, "
-                f"which are steps of {step[0] * _M_PER_DEG:.2g} m. The positions in {two} are used.",
+                f"which are steps of {step[0] * M_PER_DEG:.2g} m. The positions in {two} are used.",
             )
             chosen[both] = other[both]
         return replace(place, values=chosen)
@@ -243,7 +219,7 @@ def _chosen_heights(height: _Choice, other: FloatArray, sources: tuple[str, str]
     (one, two), names, remarks = sources, flight.names, flight.remarks
     values = _filled(height.values, other, sources, "heights", remarks)
     both = np.isfinite(height.values[:, 0]) & np.isfinite(other[:, 0])
-    step = [common_step(each[both].ravel(), _STEPS_M) for each in (height.values, other)]
+    step = [step_of_heights(each[both].ravel()) for each in (height.values, other)]
     allowed = step[0] + step[1] + _SLACK_M
     a, b, relative = values[:, 0].copy(), other[:, 0].copy(), np.where(both, flight.relative_m, np.nan)
     rules = (
@@ -411,29 +387,6 @@ def _roughness(values_m: FloatArray, order: Sequence[int], both: BoolArray) -> f
     return float(np.median(np.linalg.norm(np.diff(track, 2, axis=0), axis=1))) if len(track) > 4 else 0.0
 
 
-def _without_zero_heights(height: _Choice, names: Sequence[str], remarks: Remarks) -> tuple[_Choice, bool]:
-    """Return heights without those of exactly zero among others, and whether all are zero: none is known."""
-    values = height.values[:, 0]
-    known = np.isfinite(values)
-    zero = known & (values == 0.0)
-    if not zero.any():
-        return height, False
-    if zero.sum() == known.sum():
-        remarks.caution(
-            "heights-all-zero", f"All {int(zero.sum())} heights are 0 m: their vertical accuracy is unknown."
-        )
-        return height, True
-    others = values[known & ~zero]
-    if abs(float(np.median(others))) < 10.0 or np.abs(others).min() < 5.0:
-        return height, False
-    remarks.warn(
-        "height-zero",
-        f"{int(zero.sum())} heights of 0 m among heights of {others.min():.0f} to {others.max():.0f} m are none, "
-        f"and are not used: {_named(names, zero)}.",
-    )
-    return replace(height, values=np.where(zero, np.nan, values)[:, None]), False
-
-
 def _filled(
     first: FloatArray, second: FloatArray, sources: tuple[str, str], what: str, remarks: Remarks
 ) -> FloatArray:
@@ -449,7 +402,7 @@ def _filled(
 def _scale(values_deg: FloatArray) -> FloatArray:
     """Return metres of a degree of latitude and of longitude (2,) where positions (N, 2) lie."""
     lat = float(np.nanmedian(values_deg[:, 0])) if np.isfinite(values_deg).any() else 0.0
-    return np.array([_M_PER_DEG, _M_PER_DEG * np.cos(np.radians(lat))])
+    return np.array([M_PER_DEG, M_PER_DEG * np.cos(np.radians(lat))])
 
 
 def _metres(one: FloatArray, two: FloatArray) -> FloatArray:

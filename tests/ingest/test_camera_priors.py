@@ -99,8 +99,8 @@ def test_a_35_mm_equivalent_that_means_none_is_said(value: int) -> None:
 
 
 def test_calibration_in_xmp_counts_before_the_focal_plane() -> None:
-    lens = LensTags(focal_mm=8.8, px_per_mm=100.0, taken_width_px=5472.0)
+    lens = LensTags(focal_mm=8.8, px_per_mm=200.0, taken_width_px=5472.0)
     xmp = read_tags(jpeg(xmp=dji_xmp(CalibratedFocalLength="3666.67"))).xmp
     focal, _, how = focal_px(PhotoTags(lens=lens, xmp=xmp), 1368, 912)
     assert focal == pytest.approx(3666.67 / 4)
-    assert 220.0 in numbers(how)  # the focal plane says 880 px of 5472
+    assert 440.0 in numbers(how)  # the focal plane says 1760 px of 5472
