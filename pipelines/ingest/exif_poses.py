@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 from pipelines.core.errors import InconsistencyError
 from pipelines.core.products import Remark
 from pipelines.core.sentences import listed
-from pipelines.core.types import FloatArray
+from pipelines.core.types import BoolArray, FloatArray
 from pipelines.formats.exif import RTK_FIXED, RTK_FLOAT, PhotoTags
 from pipelines.formats.trajectory_csv import complete
 from pipelines.geodesy.crs import parse_crs
@@ -146,7 +146,7 @@ def compare_with_exif(
         time_s=exif.time_s[both],
     )
     heights_m = np.column_stack([in_table, lla[:, 2]])
-    found = (_horizontal(places, path), _heights(heights_m, apart[:, 2], sigma[:, 2], path))
+    found = (_horizontal(places, path), _heights(places.name, heights_m, apart[:, 2], sigma[:, 2], path))
     for fatal, caution in filter(None, found):
         if fatal and not options.accept_inconsistency:
             raise InconsistencyError(
@@ -172,11 +172,24 @@ def _horizontal(places: _Places, path: Path) -> tuple[bool, Remark] | None:
     distance = np.hypot(*(places.table - places.exif).T)
     allowed = np.maximum(_SIGMAS * np.hypot(*places.sigma_m.T), _LEAST_M)
     inconsistent = distance > allowed
-    if inconsistent.mean() <= _MOST_INCONSISTENT:
+    if not inconsistent.any():
         return None
+    if inconsistent.mean() <= _MOST_INCONSISTENT:
+        return False, _few(places.name, distance, inconsistent, "positions", path)
     code, cause = _cause(places, float(np.median(distance)), float(np.median(allowed)) / _SIGMAS)
     sentence = f"{int(inconsistent.sum())} of {len(distance)} positions in {path.name} {cause}"
     return True, Remark(code=code, sentence=sentence)
+
+
+def _few(names: Sequence[str], apart_m: FloatArray, bad: BoolArray, what: str, path: Path) -> Remark:
+    """Return the caution of the few positions or heights that differ, where most agree."""
+    worst = np.flatnonzero(bad)[np.argsort(-apart_m[bad], kind="stable")]
+    sentence = (
+        f"{len(worst)} of {len(names)} {what} in {path.name} differ from those in EXIF, by far more than σ, and "
+        f"the others agree: {listed([f'{names[row]} {apart_m[row]:.1f} m' for row in worst])}. Those in "
+        f"{path.name} are used."
+    )
+    return Remark(code=f"exif-few-{what}", sentence=sentence)
 
 
 def _cause(places: _Places, typical_m: float, sigma_m: float) -> tuple[str, str]:
@@ -239,13 +252,15 @@ def _clock_offset(places: _Places) -> float | None:
 
 
 def _heights(
-    heights_m: FloatArray, apart_m: FloatArray, sigma_m: FloatArray, path: Path
+    names: Sequence[str], heights_m: FloatArray, apart_m: FloatArray, sigma_m: FloatArray, path: Path
 ) -> tuple[bool, Remark] | None:
     """Return the caution of heights (n, 2) of table and EXIF that are too far apart (n,) for the σ (n,) of both."""
     offset, spread = float(np.median(apart_m)), mad_sigma(apart_m)
     allowed = max(_SIGMAS * float(np.median(sigma_m)), _LEAST_M)
     if abs(offset) <= allowed:
-        return None
+        off_m = np.abs(apart_m - offset)
+        bad = off_m > np.maximum(_SIGMAS * sigma_m, _LEAST_M)
+        return (False, _few(names, off_m, bad, "heights", path)) if bad.any() else None
     for factor, cause in ((FOOT_M, "in feet, and taken for metres"), (1 / FOOT_M, "in metres, and taken for feet")):
         left = abs(float(np.median(heights_m[:, 0] * factor - heights_m[:, 1])))
         tolerance = max(_UNIT_PART * abs(float(np.median(heights_m[:, 1]))), allowed / _SIGMAS)

@@ -77,6 +77,33 @@ def feet(source: Source, rng: np.random.Generator) -> None:
     source.lla[:, 2] /= 0.3048
 
 
+def one_wrong(source: Source, rng: np.random.Generator) -> None:
+    """One photograph alone: elsewhere, of another hemisphere, or with its height of another."""
+    row, kind = rng.integers(COUNT), rng.integers(3)
+    if kind == 0:
+        source.lla[row, :2] += rng.choice([-1, 1]) * rng.uniform(1e-3, 1.0)
+    elif kind == 1:
+        source.lla[row, rng.integers(2)] *= -1
+    else:
+        source.lla[row, 2] *= rng.choice([-1.0, 1 / 0.3048])
+
+
+def shifted(source: Source, rng: np.random.Generator) -> None:
+    """Another datum, or another reference of heights: all by a constant."""
+    if rng.random() < 0.5:
+        source.lla[:, :2] += rng.uniform(3e-5, 2e-3, 2)
+    else:
+        source.lla[:, 2] += rng.uniform(2.0, 100.0)
+
+
+def shifted_far(source: Source, rng: np.random.Generator) -> None:
+    """The same, by more than two plain receivers may differ."""
+    if rng.random() < 0.5:
+        source.lla[:, 0] += rng.uniform(4e-4, 2e-3)
+    else:
+        source.lla[:, 2] += rng.uniform(60.0, 100.0)
+
+
 def text(source: Source, rng: np.random.Generator) -> None:
     kind = rng.integers(4)
     for tags, (lat, lon, height) in zip(source.tags, source.lla, strict=True):
@@ -103,7 +130,7 @@ def wrapped(source: Source, rng: np.random.Generator) -> None:
 
 ALONE: tuple[Rule, ...] = (truncated, whole_metres, zero_height, zero_place, stale)
 TAGS_ONLY: tuple[Rule, ...] = (text, wrapped)
-COMPARED: tuple[Rule, ...] = (sign, feet)
+COMPARED: tuple[Rule, ...] = (sign, feet, one_wrong)
 
 
 def flight(rng: np.random.Generator) -> tuple[np.ndarray, float]:
@@ -178,7 +205,8 @@ def outcome(folder: Path, seed: int, *, spoil: bool) -> tuple[str, set[str], flo
     if spoil:
         wrong = names[rng.integers(len(names))]
         rules = ALONE if wrong == "table" else ALONE + TAGS_ONLY
-        rules = rules + COMPARED if len(names) > 1 else rules
+        if len(names) > 1:
+            rules += (*COMPARED, shifted_far if wrong == "table" else shifted)
         rule = rules[rng.integers(len(rules))]
         rule(sources[wrong], rng)
         drawn += f", {rule.__name__} in {wrong}"
