@@ -141,8 +141,8 @@ def _warnings(
     warnings, turned, total = [], recorded.inconsistent, len(model.image_name)
     if turned:
         sentence = (
-            f"{len(turned)} attitudes disagree with the SfM model and are not used: {listed(sorted(turned))}. "
-            "A photograph that was turned in an image viewer keeps its old attitude."
+            f"{len(turned)} attitudes disagree with the SfM model and with the others, and are not used: "
+            f"{listed(sorted(turned))}."
         )
         warnings.append(Remark(code="attitudes-inconsistent", sentence=sentence))
     if len(fixes) < total:

@@ -178,8 +178,8 @@ def intersect_in_local(model: SparseModel, rays: MarkRays) -> tuple[FloatArray, 
 def recorded_rotations(survey: Survey, model: SparseModel) -> RecordedRotations:
     """Return the recorded attitudes of the registered images, without those that disagree with the SfM model.
 
-    For example, a photograph that was turned in an image viewer keeps the attitude that the drone wrote. That
-    attitude differs from the others by far more than its σ.
+    For example, a picture that lags the gimbal in a turn, or one that was turned since. Its attitude differs from
+    the others by far more than its σ.
     """
     attitudes = {image.name: image.attitude for image in survey.images if image.attitude is not None}
     image = np.array([index for index, name in enumerate(model.image_name) if name in attitudes], dtype=np.int64)

@@ -197,7 +197,7 @@ def _chosen_places(place: _Choice, other: FloatArray, sources: tuple[str, str], 
         negative = np.minimum(chosen, other)
         differs = (chosen * other < 0.0) & turned[:, None]
         chosen[differs], other = negative[differs], np.where(differs, negative, other)
-    step = [step_of_places(each[both]) for each in (chosen, other)]
+    step = [step_of_places(each[both], compared=True) for each in (chosen, other)]
     allowed = (step[0] + step[1]) * M_PER_DEG * np.sqrt(2.0) + _SLACK_M
     apart = np.where(both, _metres(chosen, other), 0.0)
     if (apart <= allowed).all():

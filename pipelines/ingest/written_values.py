@@ -48,15 +48,16 @@ def digits_sigma_m(
     return sigma_m
 
 
-def step_of_places(places: FloatArray) -> float:
+def step_of_places(places: FloatArray, *, compared: bool = False) -> float:
     """Return the step in degrees that latitudes and longitudes (N, 2) are written in, 0 if it is unknown.
 
-    Whole minutes and seconds are how degrees are cut off. Round decimals of a degree are so only in both axes.
+    Whole minutes and seconds are how degrees are cut off. Round decimals of a degree are so only in both axes, or
+    where they are compared with another source of the same places.
     """
     whole = _common_step(places.ravel(), (1 / 60, 1 / 3600), _LEAST_VALUES - 1)
     step = whole or _common_step(places.ravel(), _STEPS_DEG, _LEAST_VALUES)
     varied = all(len(np.unique(axis[np.isfinite(axis)])) >= _LEAST_VALUES for axis in places.T)
-    return step if varied or step in _SEXAGESIMAL_DEG else 0.0
+    return step if varied or compared or step in _SEXAGESIMAL_DEG else 0.0
 
 
 def step_of_heights(heights: FloatArray) -> float:
