@@ -50,7 +50,7 @@ def poses_from_tags(photos: Sequence[Photo], options: IngestOptions, remarks: Re
     tagged, time_s = tagged_positions(photos, remarks), photo_times(photos)
     xyz = tagged.xyz
     located = complete(xyz)
-    flat = [photos[row].name for row in np.flatnonzero(np.isfinite(xyz[:, 0]) & ~located)]
+    flat = [photos[row].name for row in np.flatnonzero(np.isfinite(xyz[:, 0]) & ~located).tolist()]
     remarks.warn_counted(
         "image-without-altitude", flat, "Images have a GPS position without altitude, which is not used"
     )

@@ -68,7 +68,7 @@ def tagged_attitudes(
             if _disagrees(headings, rows & nadir, 1):
                 angles[rows, 0], sigma_deg[rows] = _of_start(headings, nadir, rows, second, remarks)
     enu_from_cam = np.full((len(photos), 3, 3), np.nan)
-    for row in np.flatnonzero(np.isfinite(angles).all(axis=1)):
+    for row in np.flatnonzero(np.isfinite(angles).all(axis=1)).tolist():
         enu_from_cam[row] = geo_from_cam(angles[row])
     return TaggedAttitudes(enu_from_cam, sigma_deg)
 

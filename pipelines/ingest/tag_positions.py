@@ -171,7 +171,7 @@ def _chosen_places(place: _Choice, other: FloatArray, sources: tuple[str, str], 
     """Return the better of two sources of latitude and longitude (N, 2), by the rules of this module."""
     (one, two), names, remarks = sources, flight.names, flight.remarks
     values = _filled(place.values, other, sources, "positions", remarks)
-    both = np.isfinite(place.values).all(axis=1) & np.isfinite(other).all(axis=1)
+    both = _known(place.values) & _known(other)
     if not both.any():
         return replace(place, values=values)
     chosen, other = values.copy(), other.copy()
@@ -363,7 +363,7 @@ def _by_neighbours(case: _Case, differ: BoolArray, before: _Choice, flight: _Fli
     good = np.flatnonzero(case.both & ~differ)
     good = good[np.argsort(place[good])]
     chosen: dict[str, list[str]] = {case.one: [], case.two: [], "neither": []}
-    for row in np.flatnonzero(differ):
+    for row in np.flatnonzero(differ).tolist():
         expected = [np.interp(place[row], place[good], axis) for axis in case.chosen[good].T]
         off = [float(np.linalg.norm((each[row] - expected) * case.metres)) for each in (case.chosen, case.other)]
         winner = "neither" if min(off) > _DECISIVE * max(off) else (case.one, case.two)[int(off[1] < off[0])]
@@ -391,12 +391,17 @@ def _filled(
     first: FloatArray, second: FloatArray, sources: tuple[str, str], what: str, remarks: Remarks
 ) -> FloatArray:
     """Return the first source with its gaps filled from the second."""
-    gaps = ~np.isfinite(first).all(axis=1) & np.isfinite(second).all(axis=1)
+    gaps = ~_known(first) & _known(second)
     if gaps.any():
         remarks.assume(
             f"{what}-from-xmp", f"{int(gaps.sum())} {what} that {sources[0]} lacks are those in {sources[1]}."
         )
     return np.where(gaps[:, None], second, first)
+
+
+def _known(values: FloatArray) -> BoolArray:
+    """Return which rows (N,) of values (N, k) are complete."""
+    return np.asarray(np.isfinite(values).all(axis=1))
 
 
 def _scale(values_deg: FloatArray) -> FloatArray:
@@ -407,11 +412,12 @@ def _scale(values_deg: FloatArray) -> FloatArray:
 
 def _metres(one: FloatArray, two: FloatArray) -> FloatArray:
     """Return the distance (N,) of positions (N, 2) in degrees."""
-    return np.nan_to_num(np.linalg.norm((one - two) * _scale(one), axis=1))
+    distance: FloatArray = np.linalg.norm((one - two) * _scale(one), axis=1)
+    return np.nan_to_num(distance)
 
 
 def _named(names: Sequence[str], rows: BoolArray) -> str:
-    return shortened([names[row] for row in np.flatnonzero(rows)])
+    return shortened([names[row] for row in np.flatnonzero(rows).tolist()])
 
 
 def _pair(values: FloatArray) -> str:

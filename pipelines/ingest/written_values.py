@@ -31,7 +31,7 @@ def digits_sigma_m(
     more than a metre are a caution.
     """
     step_m = step_of_places(places) * M_PER_DEG if degrees else step_of_heights(places.ravel())
-    sigma_m = np.array([step_m, step_of_heights(heights)]) / np.sqrt(3.0)
+    sigma_m: FloatArray = np.array([step_m, step_of_heights(heights)]) / np.sqrt(3.0)
     for step, name, code in (
         (step_m, "positions", "position-digits"),
         (step_of_heights(heights), "heights", "height-digits"),
@@ -93,6 +93,6 @@ def zero_heights(heights: FloatArray, names: Sequence[str], of: str, remarks: Re
     remarks.warn(
         "height-zero",
         f"{int(zero.sum())} heights of 0 m among heights of {others.min():.0f} to {others.max():.0f} m are none, "
-        f"and are not used: {shortened([names[row] for row in np.flatnonzero(zero)])}.",
+        f"and are not used: {shortened([names[row] for row in np.flatnonzero(zero).tolist()])}.",
     )
     return zero, False
