@@ -62,7 +62,8 @@ def off_m(poses: ImagePoses, lat: np.ndarray = LAT, lon: np.ndarray = LON, alt: 
 @pytest.mark.parametrize("step", [1 / 60, 1 / 3600, 1e-4])
 def test_coarser_digits_lose(step: float) -> None:
     cut = [np.trunc(values / step) * step for values in (LAT, LON)]
-    poses, remarks = read(photos(gps=gps(*cut), more_gps=xmp()))
+    lat, lon = cut
+    poses, remarks = read(photos(gps=gps(lat, lon), more_gps=xmp()))
     assert off_m(poses) < 0.01
     assert remarks.assumptions or remarks.cautions
     poses, _ = read(photos(gps=gps(), more_gps=xmp(*cut)))
@@ -73,7 +74,7 @@ def test_coarser_digits_lose(step: float) -> None:
 def test_coarse_digits_alone_are_part_of_sigma(step: float) -> None:
     lat, lon = (values + np.linspace(0, 20 * step, COUNT) for values in (LAT, LON))
     cut = [np.trunc(values / step) * step for values in (lat, lon)]
-    poses, remarks = read(photos(gps=gps(*cut)))
+    poses, remarks = read(photos(gps=gps(cut[0], cut[1])))
     expected = step * 111_320 / np.sqrt(3)
     np.testing.assert_allclose(poses.sigma_enu_m[:, 0], np.hypot(2.5, expected), rtol=0.01)
     assert codes(remarks.cautions) == ["position-digits"]
@@ -85,7 +86,7 @@ def test_a_lost_sign_is_south_or_west(axis: int, wrong: str) -> None:
     right, lost = [-LAT, -LON], [-LAT, -LON]
     lost[axis] = -lost[axis]
     in_exif, in_xmp = (lost, right) if wrong == "EXIF" else (right, lost)
-    poses, remarks = read(photos(gps=gps(*in_exif), more_gps=xmp(*in_xmp)))
+    poses, remarks = read(photos(gps=gps(in_exif[0], in_exif[1]), more_gps=xmp(*in_xmp)))
     assert off_m(poses, -LAT, -LON) < 0.01
     assert codes(remarks.cautions) == ["position-sign"]
 
@@ -153,8 +154,8 @@ def test_of_one_photograph_the_neighbours_decide(wrong: str) -> None:
 
 
 def test_sources_that_agree_to_their_digits_say_nothing() -> None:
-    rounded = [np.round(values, 7) for values in (LAT, LON)]
-    poses, remarks = read(photos(gps=gps(), more_gps=xmp(*rounded, np.round(HEIGHT, 2))))
+    lat, lon = (np.round(values, 7) for values in (LAT, LON))
+    poses, remarks = read(photos(gps=gps(), more_gps=xmp(lat, lon, np.round(HEIGHT, 2))))
     assert off_m(poses) < 0.01 and not remarks.cautions and not remarks.warnings
 
 
