@@ -31,8 +31,8 @@ def native_lines_logged() -> Iterator[None]:
     `sys.stderr` becomes a stream of its own to where descriptor 2 has led. Python's warnings become records, too. A
     process without that descriptor, or whose `sys.stderr` is replaced already, stays as it is.
     """
-    before = sys.stderr
-    if before is None or before is not sys.__stderr__ or not _leads_to_stderr(before):
+    before = sys.__stderr__
+    if before is None or sys.stderr is not before or not _leads_to_stderr(before):
         yield
         return
     before.flush()
