@@ -32,7 +32,7 @@ _WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB = 0, 1, 2  # TIFF's photometric interpretat
 _UNSIGNED, _FLOAT = 1, 3  # TIFF's formats of a sample
 _MOST_DIRECTORIES, _MOST_ENTRIES = 64, 4096
 _ONE_IN = 10_000  # of pixels: beyond are hot and dead ones
-_MINIATURE_PX = 16
+_MINIATURE_PX, _LARGE_PX = 16, 256
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def inspect_image(data: bytes, path: Path, *, decode: bool = True) -> ImageFile:
     file = ImageFile(width, height, sha256, header.channels, header.bits, header.is_float)
     if not decode:
         return file
-    pixels = deep_pixels(data) if header.is_deep else _reduced(data)
+    pixels = deep_pixels(data) if header.is_deep else _grey(data, reduced=min(width, height) >= _LARGE_PX)
     if pixels is None or not pixels.size:
         message = "The photograph is damaged: it does not decode to its end."
         raise InputError("photograph-damaged", message, path=path)
@@ -239,11 +239,12 @@ def deep_pixels(data: bytes) -> NDArray[Any] | None:
     return _decoded(data, flags)
 
 
-def _reduced(data: bytes) -> NDArray[Any] | None:
+def _grey(data: bytes, *, reduced: bool) -> NDArray[Any] | None:
     import cv2
 
     # Decoding at an eighth of the size still reads the entropy-coded stream to its end, where truncation shows.
-    return _decoded(data, cv2.IMREAD_REDUCED_GRAYSCALE_8 | cv2.IMREAD_IGNORE_ORIENTATION)
+    flags = cv2.IMREAD_REDUCED_GRAYSCALE_8 if reduced else cv2.IMREAD_GRAYSCALE
+    return _decoded(data, flags | cv2.IMREAD_IGNORE_ORIENTATION)
 
 
 def _decoded(data: bytes, flags: int) -> NDArray[Any] | None:

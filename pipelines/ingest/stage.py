@@ -9,7 +9,9 @@ See docs/inputs.md and docs/bags.md for every format and default.
 
 import logging
 import shutil
+from collections import Counter
 from pathlib import Path
+from typing import Any
 
 from pipelines.core.errors import InputError
 from pipelines.core.extras import require
@@ -172,6 +174,26 @@ def _copy_images(survey: Survey, stage: StageRun) -> None:
             task.advance()
 
 
+def _camera_list(survey: Survey) -> list[dict[str, Any]]:
+    """Return the cameras of a survey: model, serial number, sensor, size, focal length, photographs."""
+    images = Counter(image.camera_id for image in survey.images)
+    return [
+        {
+            "camera_id": camera.camera_id,
+            "make_model": camera.make_model,
+            "serial": camera.serial,
+            "sensor": camera.sensor,
+            "width": camera.width,
+            "height": camera.height,
+            "model": camera.model,
+            "focal_px": round(camera.params[0], 1),
+            "focal_source": camera.focal_source,
+            "images": images[camera.camera_id],
+        }
+        for camera in survey.cameras
+    ]
+
+
 def _summary(survey: Survey) -> Summary:
     counts = {
         "images": len(survey.images),
@@ -195,5 +217,10 @@ def _summary(survey: Survey) -> Summary:
     if survey.origin is None:
         key_figure += ", in a local metric frame"
     origin = None if survey.origin is None else survey.origin.model_dump()
-    values = {**counts, "origin": origin, "vertical": survey.vertical.model_dump()}
+    values = {
+        **counts,
+        "origin": origin,
+        "vertical": survey.vertical.model_dump(),
+        "camera_list": _camera_list(survey),
+    }
     return Summary(key_figure, values, survey.warnings)
