@@ -28,6 +28,7 @@ _LENS_NAMES = frozenset(
 )
 _FISHEYE = re.compile(r"fish[\s_-]?eye|\bequidistant\b|\bf-?theta\b", re.IGNORECASE)
 _DEWARPED = ("DewarpFlag", "Dewarped", "IsDewarped")
+_NEAR_CENTRE = 0.1  # of a side: a principal point further off is in another unit
 _WIDEST_RAD = 1.6  # angle off the axis up to which a fisheye's polynomial is taken over
 
 
@@ -127,8 +128,9 @@ def grouped_by_serials(serials: Sequence[Serials]) -> list[int]:
 
 @dataclass(frozen=True)
 class Fisheye:
-    """Fisheye lens: focal length in pixels if XMP states it, and distortion k1, k2 of the equidistant model."""
+    """Fisheye lens: principal point, focal length in pixels if stated, k1 and k2 of the equidistant model."""
 
+    centre_px: tuple[float, float]
     focal_px: float | None = None
     k1: float = 0.0
     k2: float = 0.0
@@ -146,17 +148,29 @@ def fisheye_of(tags: PhotoTags, width: int, height: int) -> Fisheye | None:
     perspective = any(re.search(r"\bperspective\b|rectilinear|brown", text, re.IGNORECASE) for text in stated)
     if not (told or (affine and not perspective)) or tags.xmp.number(*_DEWARPED) == 1:
         return None
-    if len(affine) != 4 or affine[0] <= 0:
-        return Fisheye()
     scale = max(width, height) / (tags.lens.taken_width_px or max(width, height))
-    focal_px = 0.5 * (affine[0] + affine[3]) * 2 / np.pi * scale
-    if len(polynomial) < 2 or not 0 < focal_px < 20 * max(width, height):
-        return Fisheye(focal_px if 0 < focal_px < 20 * max(width, height) else None)
+    centre_px = _principal_point(tags, width, height, scale)
+    focal_px = 0.5 * (affine[0] + affine[3]) * 2 / np.pi * scale if len(affine) == 4 else 0.0
+    if not 0 < focal_px < 20 * max(width, height):
+        return Fisheye(centre_px)
+    if len(polynomial) < 2:
+        return Fisheye(centre_px, focal_px)
     angle = np.linspace(0.01, min(np.hypot(width, height) / 2 / focal_px, _WIDEST_RAD), 50)
     radius = np.polynomial.polynomial.polyval(angle * 2 / np.pi, polynomial) * np.pi / 2
     k1, k2 = np.linalg.lstsq(np.stack([angle**3, angle**5], axis=1), radius - angle, rcond=None)[0]
     rises = np.all(1 + 3 * k1 * angle**2 + 5 * k2 * angle**4 > 0)
-    return Fisheye(focal_px, float(k1), float(k2)) if rises else Fisheye(focal_px)
+    return Fisheye(centre_px, focal_px, float(k1), float(k2)) if rises else Fisheye(centre_px, focal_px)
+
+
+def _principal_point(tags: PhotoTags, width: int, height: int, scale: float) -> tuple[float, float]:
+    """Return the principal point that XMP states in millimetres from the first pixel, else the centre."""
+    centre = (width / 2.0, height / 2.0)
+    stated, px_per_mm = _numbers(tags.xmp.text("PrincipalPoint")), tags.lens.px_per_mm
+    if len(stated) != 2 or px_per_mm is None:
+        return centre
+    x, y = (value * px_per_mm * scale for value in stated)
+    near = abs(x - centre[0]) < _NEAR_CENTRE * width and abs(y - centre[1]) < _NEAR_CENTRE * height
+    return (x, y) if near else centre
 
 
 def _numbers(text: str | None) -> list[float]:

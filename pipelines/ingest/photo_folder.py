@@ -319,7 +319,7 @@ def _camera_prior(
         "focal-length",
         f"The focal length of {name or 'the camera'}{kind} at {width}×{height} is {focal:.1f} px, {origin}.",
     )
-    centre = (width / 2.0, height / 2.0)
+    centre = (width / 2.0, height / 2.0) if fisheye is None else fisheye.centre_px
     if fisheye is not None:
         remarks.assume(
             "fisheye-lens",

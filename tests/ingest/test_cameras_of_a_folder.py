@@ -285,9 +285,11 @@ def test_the_fisheye_of_the_tags_maps_rays_as_they_say(folder: Folder) -> None:
             "ModelType": "fisheye",
             "FisheyeAffineMatrix": f"{affine},0,0,{affine}",
             "FisheyePolynomial": ",".join(map(str, polynomial)),
+            "PrincipalPoint": "2.544297,1.797905",
         },
     )
     taken = ((0xA002, 4, 1280), (0xA003, 4, 960), (0x920A, RATIONAL, [rational(4.0)]))
+    taken += ((0xA20E, RATIONAL, [rational(266.6667)]), (0xA210, 3, 4))  # pixels a millimetre, as taken
     for number in range(3):
         folder.add(f"{number}.jpg", size=size, xmp=xmp, photo=taken)
     (camera,) = folder.ingest()[0].cameras
@@ -296,7 +298,8 @@ def test_the_fisheye_of_the_tags_maps_rays_as_they_say(folder: Folder) -> None:
     pixel = distort(lens, np.stack([np.tan(angle), np.zeros_like(angle)], axis=1))
     expected = affine / 2 * np.polynomial.polynomial.polyval(2 * angle / np.pi, polynomial)
     # Two coefficients of odd powers replace a cubic polynomial with an even power of 0.006.
-    assert np.abs(pixel[:, 0] - 320 - expected).max() < 0.2
+    assert np.abs(pixel[:, 0] - 2.544297 * 266.6667 / 2 - expected).max() < 0.2
+    assert camera.params[3] == pytest.approx(1.797905 * 266.6667 / 2, abs=0.01)
 
 
 def test_text_lists_the_cameras(folder: Folder, capsys: pytest.CaptureFixture[str]) -> None:
