@@ -41,7 +41,7 @@ _WORDS = (
     (r"visible|visual|\brgb\b|colou?r|\beo\b", VISIBLE),
     (r"screen", SCREEN),
 )
-# Last part of a file's name. Names of one or two letters mean this where the folder's names have that form.
+# Last part of a file's name. Most mean this in names of DJI, and where several names differ in them alone.
 _SUFFIXES = {
     "t": THERMAL, "thrm": THERMAL, "thermal": THERMAL, "ir": THERMAL, "tir": THERMAL, "lwir": THERMAL,
     "infrared": THERMAL, "w": WIDE, "wide": WIDE, "z": ZOOM, "zoom": ZOOM, "tele": ZOOM, "v": VISIBLE,
@@ -50,13 +50,15 @@ _SUFFIXES = {
     "red": "red", "re": "red-edge", "reg": "red-edge", "rededge": "red-edge", "nir": "nir", "n": "nir",
     "pan": "panchromatic",
 }  # fmt: skip
-_LONG = 3  # letters of a suffix that means a sensor by itself
+# Those that mean a sensor by themselves: a roof may be red.
+_ALONE = frozenset({"thrm", "thermal", "infrared", "lwir", "tir", "nir", "rgb"})
 _THERMAL_NAME = re.compile(r"(irx?|flir|thermal)[_-]?\d", re.IGNORECASE)
 # Sensors of thermal cameras, in pixels.
 _THERMAL_SIZES = frozenset(
     {(160, 120), (160, 128), (256, 192), (320, 240), (320, 256), (336, 256), (384, 288), (640, 480), (640, 512)}
     | {(1024, 768), (1280, 1024)}
 )
+_MUCH_WIDER = 1.5
 _LENSES = range(3, 11)  # of a multispectral rig
 _TOGETHER_S = 1.5  # between the lenses of a rig
 
@@ -240,7 +242,7 @@ def _by_suffix(photos: Sequence[Photo], everything: Sequence[Photo]) -> dict[str
         prefix, suffix = parts[photo.name]
         sensor = _SUFFIXES.get(suffix)
         is_dji = PurePosixPath(photo.name).name.casefold().startswith("dji_")
-        if sensor is None or not (len(suffix) >= _LONG or in_pairs or is_dji):
+        if sensor is None or not (suffix in _ALONE or in_pairs or is_dji):
             continue
         if suffix == "r" and not suffixes & {"g", "re", "nir"}:
             sensor = THERMAL  # FLIR's radiometric JPEG of DJI's Zenmuse XT
@@ -279,25 +281,25 @@ def _together(photos: Iterable[Photo]) -> bool:
 
 
 def _by_size(photos: Sequence[Photo], _all: Sequence[Photo]) -> dict[str, str]:
-    """Return the thermal photographs beside larger ones of the same maker, by their size.
+    """Return the thermal photographs beside larger ones, by their size.
 
-    Their name or folder says so, or they have a shape that the larger ones of the same model lack.
+    Their maker, name or folder says so, or they have a shape that the larger ones of the same model lack.
     """
-    larger: dict[str, list[Photo]] = {}
+    shapes: dict[str, set[tuple[int, float]]] = {}
     for photo in photos:
-        larger.setdefault(photo.tags.make, []).append(photo)
+        width, height = _sides(photo)
+        shapes.setdefault(photo.tags.make_model, set()).add((width, round(width / height, 2)))
+    widest = max((width for members in shapes.values() for width, _ in members), default=0)
     found = {}
     for photo in photos:
         width, height = _sides(photo)
-        others = [other for other in larger[photo.tags.make] if _sides(other)[0] > 1.5 * width]
-        if (width, height) not in _THERMAL_SIZES or not others:
+        if (width, height) not in _THERMAL_SIZES or not widest > _MUCH_WIDER * width:
             continue
         parts = [part.casefold() for part in PurePosixPath(photo.name).parts]
         told = "flir" in photo.tags.make_model.casefold() or _THERMAL_NAME.match(parts[-1]) is not None
         told |= any(_ALIASES.get(part, part) == THERMAL for part in parts[:-1])
-        shapes = {round(a / b, 2) for a, b in map(_sides, others)}
-        one_model = {other.tags.make_model for other in others} == {photo.tags.make_model} != {""}
-        if told or (one_model and round(width / height, 2) not in shapes):
+        larger = {shape for wide, shape in shapes[photo.tags.make_model] if wide > _MUCH_WIDER * width}
+        if told or (photo.tags.make_model and larger and round(width / height, 2) not in larger):
             found[photo.name] = THERMAL
     return found
 

@@ -177,6 +177,14 @@ RIGS: dict[str, tuple[dict[str, dict[str, Any]], list[str]]] = {
         {"MAX_{:04d}.jpg": {"size": (1600, 1200)}, "IRX_{:04d}.jpg": {"size": (640, 512)}},
         ["visible", "thermal"],
     ),
+    "one model, two shapes": (
+        {"DJI_{:04d}.JPG": {"size": (800, 600)}, "DJI_1{:03d}.JPG": {"size": (320, 256)}},
+        ["visible", "thermal"],
+    ),
+    "FLIR beside another maker": (
+        {"a{}.jpg": {"size": (800, 600)}, "b{}.jpg": {"size": (336, 256), "model": "FLIR Vue Pro"}},
+        ["visible", "thermal"],
+    ),
     "Phantom 4 Multispectral": (
         {
             "DJI_00{}0.JPG": {},
@@ -248,8 +256,10 @@ def test_two_drones_are_no_pair(folder: Folder) -> None:
         folder.add(f"P4_{number}.JPG", model="FC6310")
         folder.add(f"plot_{number}_1.jpg", model="X")
         folder.add(f"house{number}_T.jpg", model="X")
+    folder.add("roof_red.jpg", model="X")
+    folder.add("small.jpg", model="X", size=(32, 24))
     survey, _ = folder.ingest()
-    assert len(survey.images) == 12 and len(survey.cameras) == 3
+    assert len(survey.images) == 14 and len(survey.cameras) == 4
     assert "other-sensors" not in codes(survey.warnings)
 
 
