@@ -246,7 +246,8 @@ def test_one_sensor_is_used_and_the_others_are_named(folder: Folder, rig: str) -
         assert not {image.name for image in chosen.images} & {image.name for image in survey.images}
     with refused("no-such-sensor", InputError) as error:
         folder.ingest(workspace="none", geo=geo, sensor="ultraviolet")
-    assert error.value.field == "--sensor" and all(f"{sensor} (3)" in error.value.message for sensor in sensors)
+    assert isinstance(error.value, InputError) and error.value.field == "--sensor"
+    assert all(f"{sensor} (3)" in error.value.message for sensor in sensors)
 
 
 def test_two_drones_are_no_pair(folder: Folder) -> None:
@@ -298,7 +299,7 @@ def test_the_fisheye_of_the_tags_maps_rays_as_they_say(folder: Folder) -> None:
             "PrincipalPoint": "2.544297,1.797905",
         },
     )
-    taken = ((0xA002, 4, 1280), (0xA003, 4, 960), (0x920A, RATIONAL, [rational(4.0)]))
+    taken: tuple[Entry, ...] = ((0xA002, 4, 1280), (0xA003, 4, 960), (0x920A, RATIONAL, [rational(4.0)]))
     taken += ((0xA20E, RATIONAL, [rational(266.6667)]), (0xA210, 3, 4))  # pixels a millimetre, as taken
     for number in range(3):
         folder.add(f"{number}.jpg", size=size, xmp=xmp, photo=taken)
