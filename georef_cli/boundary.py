@@ -1,7 +1,8 @@
 """Boundary of the program: errors become messages and exit codes, log records become lines.
 
 Exit codes: 0 done, 1 known failure, 2 usage, 130 interrupted. An unexpected exception keeps its traceback. All
-messages go to stderr; stdout is for the result, or with `--json` for the error as one JSON document.
+messages go to stderr; stdout is for the result, or with `--json` for the error as one JSON document. With
+`--json-progress` each line of stderr is JSON, the error too.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ from typing import IO, TYPE_CHECKING, TextIO
 
 import click
 
-from georef_cli.verbosity import LineFormatter, SafeFormatter, Verbosity, stderr_sender
+from georef_cli.native_lines import SentLines
+from georef_cli.verbosity import LineFormatter, SafeFormatter, StderrSender, Verbosity, stderr_sender
 from pipelines.core.errors import GeorefError, InputError, storage_error
 from pipelines.core.progress import AT_END, SIGNALS
 from pipelines.core.sentences import printable, printable_lines
@@ -75,7 +77,16 @@ FILE_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 def guarded(group: click.Group, arguments: Sequence[str] | None) -> int:
     """Run the command line, by default that of the process, and return its exit code."""
     words = sys.argv[1:] if arguments is None else arguments
-    as_json, tells_progress = "--json" in words, "--json-progress" in words
+    if "--json-progress" not in words:
+        return _guarded(group, arguments, "--json" in words)
+    sender = stderr_sender()
+    with contextlib.redirect_stderr(SentLines(sender)):  # Each line is a message, also those of Python itself.
+        return _guarded(group, arguments, "--json" in words, sender)
+
+
+def _guarded(
+    group: click.Group, arguments: Sequence[str] | None, as_json: bool, sender: StderrSender | None = None
+) -> int:
     try:
         if isinstance(sys.stdout, io.TextIOWrapper):
             # As on stderr, characters that the encoding lacks are escaped: a pipe on Windows has no σ.
@@ -94,14 +105,16 @@ def guarded(group: click.Group, arguments: Sequence[str] | None) -> int:
 
             with contextlib.suppress(OSError):  # Stdout may be what has failed.
                 click.echo(dump_json({"error": document}))
-        if tells_progress:
+        if sender is not None:
+            text = printable_lines(tracebacks.format_exc().rstrip("\n")) if ended is None else ended.message
             with contextlib.suppress(KeyboardInterrupt):  # Nobody reads it.
-                stderr_sender().send("error", error_kind=document["kind"])
-        if ended is None:
+                sender.send("error", error_kind=document["kind"], text=text)
+        elif ended is None:
             raise
-        _say(ended.message)
+        else:
+            _say(ended.message)
         _drop_stdout()
-        return ended.code
+        return FAILED if ended is None else ended.code
     return code if isinstance(code, int) else 0
 
 

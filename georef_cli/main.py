@@ -15,6 +15,7 @@ import click
 
 from georef_cli import boundary
 from georef_cli.command import Command, merged_verbosity, shared_options
+from georef_cli.native_lines import native_lines_logged
 from pipelines import __version__
 
 PROGRAM = "georef"
@@ -132,4 +133,6 @@ def cli() -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of `georef`: run the command line and exit with its code."""
     sys.excepthook = boundary.safe_traceback
-    sys.exit(boundary.guarded(cli, arguments))
+    with native_lines_logged():
+        code = boundary.guarded(cli, arguments)
+    sys.exit(code)

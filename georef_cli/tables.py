@@ -122,6 +122,29 @@ def cautions(by_stage: Mapping[str, Sequence[Remark]]) -> list[Renderable]:
     ]
 
 
+def _cameras(rows: Sequence[Mapping[str, Any]]) -> list[Renderable]:
+    """Return the table of a survey's cameras, without columns that are empty for all."""
+    if not rows:
+        return []
+    columns = {
+        "camera": [str(row["camera_id"]) for row in rows],
+        "model": [shown(row["make_model"]) for row in rows],
+        "serial number": [shown(row["serial"]) for row in rows],
+        "sensor": [shown(row["sensor"]) for row in rows],
+        "lens": [shown(row["model"]) for row in rows],
+        "size px": [f"{row['width']}×{row['height']}" for row in rows],
+        "focal px": [f"{row['focal_px']:.1f}" for row in rows],
+        "from": [shown(row["focal_source"]) for row in rows],
+        "images": [str(row["images"]) for row in rows],
+    }
+    columns = {head: cells for head, cells in columns.items() if any(cells)}
+    numbers = [place for place, head in enumerate(columns) if head in ("focal px", "images")]
+    table = plain_table(*columns, right=numbers)
+    for row in zip(*columns.values(), strict=True):
+        table.add_row(*row)
+    return ["", table]
+
+
 def outcome(workspace: Workspace, result: Outcome, *, headline: bool = True) -> list[Renderable]:
     """Return the result of one stage: headline if asked, figures, and the warnings of an earlier run."""
     manifest = result.manifest
@@ -137,6 +160,7 @@ def outcome(workspace: Workspace, result: Outcome, *, headline: bool = True) -> 
             if isinstance(value, str | int | float) or value is None:
                 table.add_row(shown(name), shown(_number(value)))
         parts.append(table)
+        parts += _cameras(manifest.values.get("camera_list", ()))
     if not result.ran:  # the warnings of a stage that just ran are on stderr already
         parts += [f"[yellow]warning:[/] {shown(warning.sentence)}" for warning in manifest.warnings]
     return parts

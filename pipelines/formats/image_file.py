@@ -1,14 +1,17 @@
-"""Photographs as files: size from the header, a check that they decode, and their hash.
+"""Photographs as files: size and samples from the header, a check that they decode, their values and their hash.
 
 The header is read before memory is allocated, so that a file that claims a billion pixels is refused.
 """
 
 import hashlib
 import struct
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size, reading
@@ -21,17 +24,50 @@ MAX_PIXELS = 400_000_000
 # EXIF and XMP of a JPEG lie in its first segments of 64 KiB.
 _HEAD_BYTES = 256 * 1024
 _FRAME_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-_JPEG = b"\xff\xd8"
-_TIFF_WIDTH, _TIFF_HEIGHT = 256, 257
+_JPEG, _PNG = b"\xff\xd8", b"\x89PNG\r\n\x1a\n"
+_TIFF, _BIG_TIFF = (b"II*\x00", b"MM\x00*"), (b"II+\x00", b"MM\x00+")
+_PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}  # by colour type
+_SUBFILE, _WIDTH, _HEIGHT, _BITS, _PHOTOMETRIC, _SAMPLES, _FORMAT = 254, 256, 257, 258, 262, 277, 339  # TIFF's tags
+_WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB = 0, 1, 2  # TIFF's photometric interpretations
+_UNSIGNED, _FLOAT = 1, 3  # TIFF's formats of a sample
+_MOST_DIRECTORIES, _MOST_ENTRIES = 64, 4096
+_ONE_IN = 10_000  # of pixels: beyond are hot and dead ones
+_MINIATURE_PX, _LARGE_PX = 16, 256
+
+
+@dataclass(frozen=True)
+class ImageHeader:
+    """Statements of the header of a JPEG, PNG or TIFF file; `refusal` is why such a file is not read."""
+
+    width: int
+    height: int
+    channels: int = 3
+    bits: int = 8  # of a sample
+    is_float: bool = False
+    refusal: str = ""
+
+    @property
+    def is_deep(self) -> bool:
+        """Whether samples have more than eight bits."""
+        return self.bits > 8
 
 
 @dataclass(frozen=True)
 class ImageFile:
-    """Photograph that decodes: pixels as stored, before any EXIF orientation, and the hash of the whole file."""
+    """Photograph that decodes: pixels as stored, before any EXIF orientation, and the hash of the whole file.
+
+    `values` are the darkest and the brightest value of samples with more than eight bits, but for one pixel in ten
+    thousand at each end; None: eight bits, or not decoded. `miniature` is the whole picture in 16×16 grey pixels.
+    """
 
     width: int
     height: int
     sha256: str
+    channels: int = 3
+    bits: int = 8
+    is_float: bool = False
+    values: tuple[float, float] | None = None
+    miniature: bytes = b""
 
 
 def read_bytes(path: Path) -> bytes:
@@ -62,41 +98,61 @@ def require_unchanged(data: bytes, sha256: str, path: Path) -> None:
 
 
 def inspect_image(data: bytes, path: Path, *, decode: bool = True) -> ImageFile:
-    """Return size and hash of a JPEG, PNG or TIFF file, after decoding it to its end.
+    """Return size, samples and hash of a JPEG, PNG or TIFF file, after decoding it to its end.
 
     Without `decode`, the data are a head that is not decoded, and what is hashed is the head.
 
     Raises:
-        InputError: no such image, more than 400 million pixels, or it does not decode.
+        InputError: no such image, more than 400 million pixels, samples that make no photograph (five bands in one
+            file), or it does not decode.
     """
-    size = header_size(data)
-    if size is None:
+    if data[:4] in _BIG_TIFF:
+        message = "The file is a BigTIFF, which is not read. Convert it to a plain TIFF."
+        raise InputError("big-tiff", message, path=path)
+    header = image_header(data)
+    if header is None:
         raise InputError("not-an-image", "The file is not a JPEG, PNG or TIFF image.", path=path)
-    width, height = size
+    width, height = header.width, header.height
     if not (0 < width * height <= MAX_PIXELS):
         message = f"The header states {width}×{height} pixels; the limit is {MAX_PIXELS // 10**6} million."
         raise InputError("too-many-pixels", message, path=path)
-    if decode and not _decodes(data):
+    if header.refusal:
+        raise InputError("image-samples", header.refusal, path=path)
+    sha256 = hashlib.sha256(data).hexdigest()
+    file = ImageFile(width, height, sha256, header.channels, header.bits, header.is_float)
+    if not decode:
+        return file
+    pixels = deep_pixels(data) if header.is_deep else _grey(data, reduced=min(width, height) >= _LARGE_PX)
+    if pixels is None or not pixels.size:
         message = "The photograph is damaged: it does not decode to its end."
         raise InputError("photograph-damaged", message, path=path)
-    return ImageFile(width, height, hashlib.sha256(data).hexdigest())
+    values = _extremes(pixels) if header.is_deep else None
+    return replace(file, values=values, miniature=_miniature(pixels, values))
 
 
 def header_size(data: bytes) -> tuple[int, int] | None:
     """Return width and height that a JPEG, PNG or TIFF header states, or None."""
+    header = image_header(data)
+    return None if header is None else (header.width, header.height)
+
+
+def image_header(data: bytes) -> ImageHeader | None:
+    """Return what a JPEG, PNG or TIFF header states, or None."""
     try:
         if data[:2] == _JPEG:
-            return _jpeg_size(data)
-        if data[:8] == b"\x89PNG\r\n\x1a\n" and data[12:16] == b"IHDR":
-            return struct.unpack(">II", data[16:24])
-        if data[:4] in (b"II*\x00", b"MM\x00*"):
-            return _tiff_size(data)
+            return _jpeg_header(data)
+        if data[:8] == _PNG and data[12:16] == b"IHDR":
+            width, height = struct.unpack(">II", data[16:24])
+            bits, colour = (data[24], data[25]) if len(data) > 25 else (8, 2)
+            return ImageHeader(width, height, _PNG_CHANNELS.get(colour, 3), bits)
+        if data[:4] in _TIFF:
+            return _tiff_header(data)
     except (struct.error, IndexError):
         return None
     return None
 
 
-def _jpeg_size(data: bytes) -> tuple[int, int] | None:
+def _jpeg_header(data: bytes) -> ImageHeader | None:
     position = 2
     while position + 4 <= len(data):
         if data[position] != 0xFF:
@@ -106,34 +162,115 @@ def _jpeg_size(data: bytes) -> tuple[int, int] | None:
             position += 1
             continue
         if marker in _FRAME_MARKERS:
-            height, width = struct.unpack(">HH", data[position + 5 : position + 9])
-            return width, height
+            bits, height, width, channels = struct.unpack(">BHHB", data[position + 4 : position + 10])
+            refusal = f"The file is a JPEG of {bits} bits, of which 8 are read. Convert it." if bits != 8 else ""
+            return ImageHeader(width, height, channels, 8, refusal=refusal)
         (length,) = struct.unpack(">H", data[position + 2 : position + 4])
         position += 2 + length
     return None
 
 
-def _tiff_size(data: bytes) -> tuple[int, int] | None:
-    order = "<" if data[:2] == b"II" else ">"
-    (directory,) = struct.unpack_from(order + "I", data, 4)
-    (count,) = struct.unpack_from(order + "H", data, directory)
-    sizes: dict[int, int] = {}
-    for entry in range(count):
-        at = directory + 2 + 12 * entry
-        tag, kind = struct.unpack_from(order + "HH", data, at)
-        if tag in (_TIFF_WIDTH, _TIFF_HEIGHT):
-            (sizes[tag],) = struct.unpack_from(order + ("H" if kind == 3 else "I"), data, at + 8)
-    if len(sizes) < 2:
+def _tiff_header(data: bytes) -> ImageHeader | None:
+    pages = list(_tiff_directories(data))
+    first = pages[0] if pages else {}
+    if not {_WIDTH, _HEIGHT} <= set(first):
         return None
-    return sizes[_TIFF_WIDTH], sizes[_TIFF_HEIGHT]
+    width, height, channels = first[_WIDTH], first[_HEIGHT], first.get(_SAMPLES, 1)
+    bits, form = first.get(_BITS, 1), first.get(_FORMAT, _UNSIGNED)
+    header = ImageHeader(width, height, channels, bits, form == _FLOAT)
+    # Further directories are thumbnails (smaller, or marked as reduced), or a stack of bands.
+    alike = (first[_WIDTH], first[_HEIGHT], 0)
+    stacked = sum((page.get(_WIDTH), page.get(_HEIGHT), page.get(_SUBFILE, 0) & 1) == alike for page in pages)
+    if stacked > 1:
+        return _refused(header, f"a stack of {stacked} pictures in one TIFF file")
+    photometric = first.get(_PHOTOMETRIC, _BLACK_IS_ZERO if channels < 3 else _RGB)
+    most = 2 if photometric in (_WHITE_IS_ZERO, _BLACK_IS_ZERO) else 4  # one of them opacity
+    if channels > most:
+        return _refused(header, f"a TIFF of {channels} bands in one file")
+    if form == _FLOAT and bits not in (32, 64):
+        return _refused(header, f"a TIFF of floating-point numbers of {bits} bits")
+    if form != _FLOAT and bits > 16:
+        return _refused(header, f"a TIFF of integers of {bits} bits")
+    return header
 
 
-def _decodes(data: bytes) -> bool:
+def _refused(header: ImageHeader, what: str) -> ImageHeader:
+    refusal = f"The file is {what}, which is no photograph. Give each band as a file of its own, of 8 or 16 bits."
+    return ImageHeader(header.width, header.height, header.channels, header.bits, header.is_float, refusal)
+
+
+def _tiff_directories(data: bytes) -> Iterator[dict[int, int]]:
+    """Yield the directories of a TIFF file: the first value of each tag that holds integers."""
+    order = "<" if data[:2] == b"II" else ">"
+    (at,) = struct.unpack_from(order + "I", data, 4)
+    seen: set[int] = set()
+    while at and at not in seen and len(seen) < _MOST_DIRECTORIES:
+        seen.add(at)
+        try:
+            (count,) = struct.unpack_from(order + "H", data, at)
+            if count > _MOST_ENTRIES:
+                return
+            yield dict(_tiff_entries(data, at, count, order))
+            (at,) = struct.unpack_from(order + "I", data, at + 2 + 12 * count)
+        except struct.error:  # of a file that is cut short: decoding it fails
+            if len(seen) == 1:
+                raise
+            return
+
+
+def _tiff_entries(data: bytes, at: int, count: int, order: str) -> Iterator[tuple[int, int]]:
+    for entry in range(at + 2, at + 2 + 12 * count, 12):
+        tag, kind, length = struct.unpack_from(order + "HHI", data, entry)
+        size = {1: 1, 3: 2, 4: 4}.get(kind)
+        if size is None or not length:
+            continue
+        place = entry + 8
+        if size * length > 4:
+            (place,) = struct.unpack_from(order + "I", data, place)
+        if place + size <= len(data):
+            yield tag, struct.unpack_from(order + {1: "B", 2: "H", 4: "I"}[size], data, place)[0]
+
+
+def deep_pixels(data: bytes) -> NDArray[Any] | None:
+    """Return the pixels (H, W) or (H, W, 3) BGR as stored, of integers or floats; None: they do not decode."""
+    import cv2
+
+    flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    return _decoded(data, flags)
+
+
+def _grey(data: bytes, *, reduced: bool) -> NDArray[Any] | None:
     import cv2
 
     # Decoding at an eighth of the size still reads the entropy-coded stream to its end, where truncation shows.
-    flags = cv2.IMREAD_REDUCED_GRAYSCALE_8 | cv2.IMREAD_IGNORE_ORIENTATION
+    flags = cv2.IMREAD_REDUCED_GRAYSCALE_8 if reduced else cv2.IMREAD_GRAYSCALE
+    return _decoded(data, flags | cv2.IMREAD_IGNORE_ORIENTATION)
+
+
+def _decoded(data: bytes, flags: int) -> NDArray[Any] | None:
+    import cv2
+
     try:
-        return cv2.imdecode(np.frombuffer(data, np.uint8), flags) is not None
+        return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
-        return False
+        return None
+
+
+def _extremes(pixels: NDArray[Any]) -> tuple[float, float]:
+    """Return the values that all but one pixel in ten thousand at each end lie between; zeros without a number."""
+    values = pixels[np.isfinite(pixels)] if pixels.dtype.kind == "f" else pixels.ravel()
+    if not values.size:
+        return 0.0, 0.0
+    beyond = values.size // _ONE_IN
+    ends = np.partition(values, (beyond, values.size - 1 - beyond))
+    return float(ends[beyond]), float(ends[values.size - 1 - beyond])
+
+
+def _miniature(pixels: NDArray[Any], values: tuple[float, float] | None) -> bytes:
+    import cv2
+
+    low, high = values or (0.0, 255.0)
+    scale = 255.0 / (high - low) if high > low else 0.0
+    grey = np.nan_to_num(pixels.astype(np.float32) if pixels.ndim == 2 else pixels.mean(axis=2, dtype=np.float32))
+    small = cv2.resize(grey, (_MINIATURE_PX, _MINIATURE_PX), interpolation=cv2.INTER_AREA)
+    return bytes(np.clip((small - low) * scale, 0, 255).astype(np.uint8).tobytes())

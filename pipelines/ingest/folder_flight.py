@@ -26,6 +26,8 @@ from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo, camera_priors, scan_folder
 from pipelines.ingest.reference_system import is_projected
 from pipelines.ingest.remarks import Remarks
+from pipelines.ingest.sensors import chosen_sensor, with_sensors
+from pipelines.ingest.stray_pictures import without_panoramas, without_reduced_copies
 from pipelines.ingest.table_poses import poses_from_table
 from pipelines.ingest.tag_contents import note_repeats, note_tags
 
@@ -48,9 +50,11 @@ def read_folder(
 
     Raises:
         InconsistencyError: the files are inconsistent.
-        InputError: anything wrong with the files, or too few photographs.
+        InputError: anything wrong with the files, too few photographs, or none of the sensor that is asked for.
     """
-    photos = scan_folder(folder, remarks, progress, decode=decode)
+    photos = without_panoramas(scan_folder(folder, remarks, progress, decode=decode), remarks)
+    photos = without_reduced_copies(with_sensors(photos), remarks)
+    photos = chosen_sensor(photos, options.sensor, remarks) if photos else photos
     flight_record.require_enough(len(photos), folder, "--images", remarks)
     note_tags(photos, remarks)
     poses = _poses(photos, options, remarks) if table is None else poses_from_table(table, photos, options, remarks)

@@ -82,6 +82,11 @@ class IngestOptions(StageOptions):
     """What `georef ingest` reads, and what it assumes where the files are silent."""
 
     images: PhotographFolder | None = Field(None, description="Folder of photographs.")
+    sensor: str | None = Field(
+        None,
+        description="Sensor whose photographs are used, where the folder holds several: visible, wide, zoom, "
+        "thermal, or a band such as green, red, red-edge, nir (default: a visible one).",
+    )
     bag: InputPath | None = Field(
         None, description="ROS bag with photographs and navigation: rosbag2 folder, .mcap, .db3 or ROS 1 .bag."
     )
@@ -224,7 +229,7 @@ class IngestOptions(StageOptions):
 
 
 _BAG_ONLY = ("image_topic", "fix_topic", "attitude_topic", "every", "origin")
-_BESIDE_VIDEO = ("images", "bag", "geo", "events")  # what --video excludes
+_BESIDE_VIDEO = ("images", "bag", "geo", "events", "sensor")  # what --video excludes
 
 
 def check_options(options: IngestOptions, frames: Path | None) -> None:
@@ -292,7 +297,9 @@ def _check_bag(options: IngestOptions, frames: Path | None) -> None:
             "A --bag has latitude, longitude and ellipsoidal height, or metres from --origin. Remove --crs.",
             field="--crs",
         )
-    beside = [name for name in ("images", "trajectory", "geo", "events") if getattr(options, name) is not None]
+    beside = [
+        name for name in ("images", "sensor", "trajectory", "geo", "events") if getattr(options, name) is not None
+    ]
     if beside:
         raise InputError(
             "bag-and-other-source",

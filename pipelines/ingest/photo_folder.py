@@ -5,12 +5,13 @@ Cameras are those before any reconstruction: focal length in pixels from a photo
 
 import math
 import os
+import re
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Literal
 
 from pipelines.core.errors import InputError
@@ -29,24 +30,29 @@ from pipelines.formats.image_file import (
     read_bytes,
     read_head,
 )
+from pipelines.ingest.camera_identity import Fisheye, Serials, fisheye_of, grouped_by_serials, serials_of
 from pipelines.ingest.remarks import Remarks
 from pipelines.survey.survey import CameraPrior
 
 
 @dataclass(frozen=True)
 class Photo:
-    """A usable photograph; `name` is relative to its folder, with forward slashes."""
+    """A usable photograph; `name` is relative to its folder, with forward slashes.
+
+    `sensor` is that of `ingest.sensors`, empty where nothing tells one.
+    """
 
     name: str
     file: ImageFile
     tags: PhotoTags
+    sensor: str = ""
 
 
 def scan_folder(root: Path, remarks: Remarks, progress: Progress = SILENT, *, decode: bool = True) -> list[Photo]:
     """Return every usable photograph below `root`, sorted by name; files that are left out are noted.
 
-    Left out are files that are empty, damaged or too large, links that lead out of the folder, and all but the
-    first of identical files. Hidden files and folders are not looked at.
+    Left out are files that are empty, damaged or too large, links that lead out of the folder, thumbnails by the
+    name of file or folder, and all but the first of identical files. Hidden files and folders are not looked at.
 
     Each file is decoded to its end; without `decode` its head alone is read, in about a millisecond.
 
@@ -66,6 +72,7 @@ def scan_folder(root: Path, remarks: Remarks, progress: Progress = SILENT, *, de
         [ascii(name) for name in sorted(set(inside) - set(usable))],
         "Images with names that are not text are left out",
     )
+    usable = _without_thumbnails(usable, remarks)
     if not usable:
         videos = sorted(path.name for path in root.iterdir() if path.suffix.lower() in VIDEO_SUFFIXES)
         hint = f" Take photographs from a video by --video {root / videos[0]}." if videos else ""
@@ -182,6 +189,31 @@ def _beginning(path: Path) -> bytes:
         return b""
 
 
+# Folders and files of servers, viewers and file managers: Synology, QNAP, freedesktop, Windows, Sony, galleries.
+_THUMBNAIL_FOLDER = re.compile(
+    r"@eadir|@__thumb|[._-]?(thumb|thumbs|thumbnail|thumbnails|thmbnl|thm)|image[_-]?previews?|\$recycle\.bin|"
+    r"[@#]recycle|__macosx",
+    re.IGNORECASE,
+)
+_THUMBNAIL_FILE = re.compile(
+    r"synophoto_thumb.*|(thumb|thumbnail)[._-].*|.*[._-](thumb|thumbnail|thumbs)", re.IGNORECASE
+)
+
+
+def _without_thumbnails(names: list[str], remarks: Remarks) -> list[str]:
+    """Return the names that are no thumbnails' by folder or file; all if there are no others."""
+    thumbnails = {
+        name
+        for name in names
+        if any(_THUMBNAIL_FOLDER.fullmatch(part) for part in PurePosixPath(name).parts[:-1])
+        or _THUMBNAIL_FILE.fullmatch(PurePosixPath(name).stem)
+    }
+    if len(thumbnails) == len(names):
+        return names
+    remarks.warn_counted("image-thumbnails", sorted(thumbnails), "Thumbnails and deleted files are left out")
+    return [name for name in names if name not in thumbnails]
+
+
 def _without_duplicates(photos: list[Photo], remarks: Remarks) -> list[Photo]:
     first: dict[str, str] = {}
     kept, dropped = [], []
@@ -260,36 +292,76 @@ def _near(one: float, other: float) -> bool:
 def camera_priors(
     photos: Sequence[Photo], given_focal_px: float | None, remarks: Remarks
 ) -> tuple[tuple[CameraPrior, ...], dict[str, int]]:
-    """Return a prior for each size, camera model and focal length; and the id of each image's camera by name.
+    """Return a prior for each camera, and the id of each image's camera by name.
 
-    A given focal length counts instead of EXIF's. How each was found is noted.
+    Photographs of one camera agree in size, model, focal length, sensor, lens model and serial numbers. A given
+    focal length counts instead of EXIF's. How each was found is noted.
     """
-    cameras: dict[tuple[int, int, str, float], CameraPrior] = {}
-    camera_of: dict[str, int] = {}
+    alike: dict[tuple[object, ...], list[Photo]] = {}
     for photo in photos:
         width, height = photo.file.width, photo.file.height
-        name = photo.tags.make_model.strip()
-        focal, source, origin = focal_px(photo.tags, width, height)
-        if given_focal_px is not None:
-            focal, origin = given_focal_px, "from --focal-px"
-        key = (width, height, name, round(focal, 1))
-        if key not in cameras:
-            cameras[key] = CameraPrior(
-                camera_id=len(cameras) + 1,
-                model="SIMPLE_RADIAL",
-                width=width,
-                height=height,
-                params=(focal, width / 2.0, height / 2.0, 0.0),
-                focal_source=source if given_focal_px is None else "option",
-                make_model=name,
-            )
-            remarks.assume(
-                "focal-length",
-                f"The focal length of {name or 'the camera'} at {width}×{height} is {focal:.1f} px, {origin}.",
-            )
-        camera_of[photo.name] = cameras[key].camera_id
-    sizes = sorted({(width, height) for width, height, _, _ in cameras})
+        fisheye = fisheye_of(photo.tags, width, height)
+        focal = given_focal_px or _focal(photo, fisheye)[0]
+        key = (width, height, photo.tags.make_model.strip(), round(focal, 1), photo.sensor, fisheye is None)
+        alike.setdefault(key, []).append(photo)
+    cameras: list[CameraPrior] = []
+    camera_of: dict[str, int] = {}
+    for members in alike.values():
+        serials = [serials_of(photo.tags) for photo in members]
+        first: dict[int, int] = {}
+        for photo, own, number in zip(members, serials, grouped_by_serials(serials), strict=True):
+            if number not in first:
+                first[number] = len(cameras) + 1
+                cameras.append(_camera_prior(photo, len(cameras) + 1, own, given_focal_px, remarks))
+            camera_of[photo.name] = first[number]
+    sizes = sorted({(camera.width, camera.height) for camera in cameras})
     if len(sizes) > 1:
         listed = ", ".join(f"{width}×{height}" for width, height in sizes)
         remarks.warn("image-sizes", f"The images have {len(sizes)} sizes ({listed}): each is a camera of its own.")
-    return tuple(cameras.values()), camera_of
+    return tuple(cameras), {photo.name: camera_of[photo.name] for photo in photos}
+
+
+def _focal(photo: Photo, fisheye: Fisheye | None) -> tuple[float, FocalSource, str]:
+    """Return the focal length of a photograph in pixels, its source, and a phrase on it."""
+    width, height = photo.file.width, photo.file.height
+    if fisheye is not None and fisheye.focal_px is not None:
+        return fisheye.focal_px, "exif", "from the fisheye's own calibration in XMP"
+    focal, source, origin = focal_px(photo.tags, width, height)
+    if fisheye is None or source != "assumed":
+        return focal, source, origin
+    return math.hypot(width, height) / math.pi, "assumed", "assumed as that of 180° across the diagonal"
+
+
+def _camera_prior(
+    photo: Photo, number: int, serials: Serials, given_focal_px: float | None, remarks: Remarks
+) -> CameraPrior:
+    width, height, name = photo.file.width, photo.file.height, photo.tags.make_model.strip()
+    fisheye = fisheye_of(photo.tags, width, height)
+    focal, source, origin = _focal(photo, fisheye)
+    if given_focal_px is not None:
+        focal, origin = given_focal_px, "from --focal-px"
+    kind = f" ({photo.sensor})" if photo.sensor else ""
+    remarks.assume(
+        "focal-length",
+        f"The focal length of {name or 'the camera'}{kind} at {width}×{height} is {focal:.1f} px, {origin}.",
+    )
+    centre = (width / 2.0, height / 2.0) if fisheye is None else fisheye.centre_px
+    if fisheye is not None:
+        remarks.assume(
+            "fisheye-lens",
+            f"The lens of {name or 'the camera'}{kind} is a fisheye by its tags: COLMAP's OPENCV_FISHEYE is used, "
+            "whatever --camera-model says.",
+        )
+    return CameraPrior(
+        camera_id=number,
+        model="SIMPLE_RADIAL" if fisheye is None else "OPENCV_FISHEYE",
+        width=width,
+        height=height,
+        params=(focal, *centre, 0.0)
+        if fisheye is None
+        else (focal, focal, *centre, fisheye.k1, fisheye.k2, 0.0, 0.0),
+        focal_source=source if given_focal_px is None else "option",
+        make_model=name,
+        serial=serials.shown,
+        sensor=photo.sensor,
+    )

@@ -1,14 +1,17 @@
 """Stage `ingest`: photographs, positions, attitudes and ground points into one survey in one frame.
 
 Reads: a folder of photographs, a ROS bag or a video; optionally positions, control and check points, marks.
-Writes: `ingest/survey.json`; `ingest/images/` with --bag, --video or --copy; `ingest/masks/` with masks;
-`ingest/targets.csv` and `.html` with --targets; `ingest/track.npz` where the navigation was recorded by time.
+Writes: `ingest/survey.json`; `ingest/images/` with --bag, --video, --copy, HEIC or more than eight bits;
+`ingest/masks/` with masks; `ingest/targets.csv` and `.html` with --targets; `ingest/track.npz` where the navigation
+was recorded by time.
 See docs/inputs.md and docs/bags.md for every format and default.
 """
 
 import logging
 import shutil
+from collections import Counter
 from pathlib import Path
+from typing import Any
 
 from pipelines.core.errors import InputError
 from pipelines.core.extras import require
@@ -20,6 +23,7 @@ from pipelines.ingest.folder_flight import read_folder
 from pipelines.ingest.ground_points import ends_of, known_distances, read_ground_files, tie_marks
 from pipelines.ingest.masks import mask_files, write_masks
 from pipelines.ingest.options import IngestOptions, check_options
+from pipelines.ingest.photo_depth import with_common_scale
 from pipelines.ingest.photo_folder import convert_heif, glance, heif_photographs
 from pipelines.ingest.remarks import Remarks
 from pipelines.ingest.shown_marks import ShownMarks
@@ -107,9 +111,9 @@ def survey_and_track(
 ) -> tuple[Survey, NavigationTrack | None]:
     """Return the survey, and the navigation in the same frame where it was recorded by time; raises as `run`.
 
-    Photographs of a bag or a video, and those of a folder with HEIC, are written into `frames`. Photographs are
-    decoded to their end, as their hashes need; without `decode`, their heads are read, but for targets. What was
-    found of targets is written into the folder `listing`.
+    Photographs of a bag or a video, and of a folder with HEIC or bits to scale, are written into `frames`.
+    Photographs are decoded to their end, as their hashes need; without `decode`, their heads are read, but for
+    targets. What was found of targets is written into the folder `listing`.
     """
     remarks = Remarks()
     check_options(options, frames)
@@ -135,6 +139,8 @@ def survey_and_track(
             convert_heif(folder, heif, frames, remarks, progress)
             folder = frames
         flight = read_folder(folder, options, remarks, progress, decode=decode)
+        if frames is not None:
+            flight = with_common_scale(flight, frames, remarks, progress)
     else:
         raise InputError(
             "no-photographs-given",
@@ -168,6 +174,26 @@ def _copy_images(survey: Survey, stage: StageRun) -> None:
             task.advance()
 
 
+def _camera_list(survey: Survey) -> list[dict[str, Any]]:
+    """Return the cameras of a survey: model, serial number, sensor, size, focal length, photographs."""
+    images = Counter(image.camera_id for image in survey.images)
+    return [
+        {
+            "camera_id": camera.camera_id,
+            "make_model": camera.make_model,
+            "serial": camera.serial,
+            "sensor": camera.sensor,
+            "width": camera.width,
+            "height": camera.height,
+            "model": camera.model,
+            "focal_px": round(camera.params[0], 1),
+            "focal_source": camera.focal_source,
+            "images": images[camera.camera_id],
+        }
+        for camera in survey.cameras
+    ]
+
+
 def _summary(survey: Survey) -> Summary:
     counts = {
         "images": len(survey.images),
@@ -191,5 +217,10 @@ def _summary(survey: Survey) -> Summary:
     if survey.origin is None:
         key_figure += ", in a local metric frame"
     origin = None if survey.origin is None else survey.origin.model_dump()
-    values = {**counts, "origin": origin, "vertical": survey.vertical.model_dump()}
+    values = {
+        **counts,
+        "origin": origin,
+        "vertical": survey.vertical.model_dump(),
+        "camera_list": _camera_list(survey),
+    }
     return Summary(key_figure, values, survey.warnings, survey.cautions)

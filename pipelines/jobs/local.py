@@ -98,6 +98,7 @@ class JobProcess:
                 message = _message(line)
                 if message is not None and message["kind"] == "error":
                     self._kind = str(message.get("error_kind", ""))
+                    self._plain.extend(str(message.get("text", "")).splitlines())
                 elif message is None or not self._take(message):
                     self._plain.append(line.rstrip())
         code = self._process.wait()

@@ -96,7 +96,10 @@ _NotNegative = Annotated[float, Field(ge=0)]
 
 
 class CameraPrior(Product):
-    """Intrinsics of a camera before SfM: COLMAP's model and parameters, in pixels of the full image."""
+    """Intrinsics of a camera before SfM: COLMAP's model and parameters, in pixels of the full image.
+
+    `serial` is its serial number and `sensor` its kind (thermal, a band), as far as the photographs state them.
+    """
 
     camera_id: int = Field(ge=1)
     model: str
@@ -105,6 +108,8 @@ class CameraPrior(Product):
     params: tuple[float, ...]
     focal_source: Literal["exif", "option", "assumed", "calibrated"]
     make_model: str = ""
+    serial: str = ""
+    sensor: str = ""
     readout_s: float = Field(0.0, ge=0, le=1)  # of a rolling shutter, from the first row to the last; 0: global
 
 

@@ -70,3 +70,65 @@ def test_empty_and_huge_files(tmp_path: Path) -> None:
         read_bytes(tmp_path / "huge.jpg")
     with refused("file-unreadable", InputError):
         read_bytes(tmp_path / "absent.jpg")
+
+
+def _tiff(pixels: np.ndarray, **more: object) -> bytes:
+    """A TIFF of any number of bands, by GDAL."""
+    import rasterio
+    from rasterio.io import MemoryFile
+
+    bands = pixels if pixels.ndim == 3 else pixels[None]
+    with MemoryFile() as memory:
+        with rasterio.open(
+            memory, "w", driver="GTiff", width=bands.shape[2], height=bands.shape[1], count=len(bands),
+            dtype=bands.dtype, **more,
+        ) as file:  # fmt: skip
+            file.write(bands)
+        return bytes(memory.read())
+
+
+@pytest.mark.filterwarnings("ignore:Dataset has no geotransform")
+@pytest.mark.parametrize(
+    ("bands", "dtype", "more", "code", "text"),
+    [
+        (5, "uint16", {}, "image-samples", "5 bands"),
+        (5, "uint8", {"interleave": "band"}, "image-samples", "5 bands"),
+        (4, "uint16", {"photometric": "minisblack"}, "image-samples", "4 bands"),
+        (7, "float32", {}, "image-samples", "7 bands"),
+        (1, "uint32", {}, "image-samples", "integers of 32 bits"),
+        (3, "uint8", {"BIGTIFF": "YES"}, "big-tiff", "BigTIFF"),
+        (5, "uint16", {"BIGTIFF": "YES", "ENDIANNESS": "BIG"}, "big-tiff", "BigTIFF"),
+    ],
+)
+def test_rasters_that_are_no_photographs(
+    bands: int, dtype: str, more: dict[str, str], code: str, text: str
+) -> None:
+    pixels = np.random.default_rng(2).integers(0, 255, (bands, 30, 40)).astype(dtype)
+    with refused(code, InputError) as error:
+        inspect_image(_tiff(pixels, **more), PATH)
+    assert text in error.value.message
+
+
+@pytest.mark.filterwarnings("ignore:Dataset has no geotransform")
+def test_a_stack_of_pages_is_told_from_a_thumbnail() -> None:
+    import io
+
+    from PIL import Image
+
+    full, small = (Image.fromarray(np.full((h, 2 * h), 90, np.uint8)) for h in (30, 10))
+    for second, is_stack in ((full, True), (small, False)):
+        out = io.BytesIO()
+        full.save(out, "TIFF", save_all=True, append_images=[second])
+        if is_stack:
+            with refused("image-samples", InputError) as error:
+                inspect_image(out.getvalue(), PATH)
+            assert "2 pictures" in error.value.message
+        else:
+            assert inspect_image(out.getvalue(), PATH).width == 60
+
+
+@pytest.mark.filterwarnings("ignore:Dataset has no geotransform")
+def test_opacity_is_no_band() -> None:
+    for bands, more in ((2, {"alpha": "YES"}), (4, {"photometric": "RGB", "alpha": "YES"})):
+        pixels = np.full((bands, 30, 40), 200, np.uint8)
+        assert inspect_image(_tiff(pixels, **more), PATH).channels == bands

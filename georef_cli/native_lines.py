@@ -1,0 +1,92 @@
+"""What libraries write to standard error by themselves, as records of the log.
+
+OpenCV, libtiff, libpng, GDAL, glog and OpenMP write to file descriptor 2 and know no `sys.stderr`. That descriptor
+becomes a pipe whose lines are logged, and standard error belongs to this program alone: with `--json-progress` each
+of its lines is JSON, whatever a library says.
+"""
+
+import io
+import logging
+import os
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import TextIO
+
+from pipelines.core.child import MessageSender
+
+_STDERR = 2
+_MOST_OF_A_LINE = 300
+_MOST_LINES = 1000  # of a process: thousands of photographs bring forth the same warning each
+_PATIENCE_S = 1.0  # a process that this one has started may keep the pipe open
+
+log = logging.getLogger(__name__)
+
+
+@contextmanager
+def native_lines_logged() -> Iterator[None]:
+    """Log what native code writes to file descriptor 2, at DEBUG: seen with `--verbose` and in the stages' logs.
+
+    `sys.stderr` becomes a stream of its own to where descriptor 2 has led. Python's warnings become records, too. A
+    process without that descriptor, or whose `sys.stderr` is replaced already, stays as it is.
+    """
+    before = sys.__stderr__
+    if before is None or sys.stderr is not before or not _leads_to_stderr(before):
+        yield
+        return
+    before.flush()
+    kept = os.dup(_STDERR)
+    reading, writing = os.pipe()
+    os.dup2(writing, _STDERR)
+    os.close(writing)
+    log.setLevel(logging.DEBUG)  # The logs of the stages have these lines without --verbose too.
+    reader = threading.Thread(target=_log_lines, args=(reading,), daemon=True)
+    reader.start()
+    logging.captureWarnings(True)
+    sys.stderr = os.fdopen(kept, "w", encoding=before.encoding, errors=before.errors, buffering=1)
+    try:
+        yield
+    finally:
+        # What native code writes while the process ends is dropped: nobody reads it any more.
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, _STDERR)
+        os.close(nowhere)
+        reader.join(_PATIENCE_S)
+
+
+def _leads_to_stderr(stream: TextIO) -> bool:
+    try:
+        os.fstat(_STDERR)
+        return stream.fileno() == _STDERR
+    except (OSError, ValueError):
+        return False
+
+
+def _log_lines(descriptor: int) -> None:
+    """Log the lines of a pipe until nobody can write into it."""
+    count = 0
+    with os.fdopen(descriptor, encoding="utf-8", errors="replace") as lines:
+        for line in lines:
+            count += bool(line.strip())
+            if line.strip() and count <= _MOST_LINES:
+                log.debug("a library wrote: %s", line.strip()[:_MOST_OF_A_LINE])
+            if count == _MOST_LINES:
+                log.debug("further lines of libraries are not logged")
+
+
+class SentLines(io.TextIOBase):
+    """Text stream whose lines are sent as records of the log: for what Python itself writes to `sys.stderr`."""
+
+    def __init__(self, sender: MessageSender) -> None:
+        self._sender, self._line = sender, ""
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, text: str) -> int:
+        *lines, self._line = (self._line + text).split("\n")
+        for line in filter(str.strip, lines):
+            with suppress(OSError):
+                self._sender.send("log", name=__name__, level=logging.WARNING, text=line)
+        return len(text)
