@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import KDTree
 
-from pipelines.core.errors import InconsistencyError
+from pipelines.core.errors import InconsistencyError, InputError
 from pipelines.core.products import Remark
 from pipelines.core.sentences import listed
 from pipelines.core.types import FloatArray
@@ -20,7 +20,14 @@ from pipelines.formats.trajectory_csv import complete
 from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import ecef_from_enu_rotation, ecef_from_lla, lla_from_ecef
 from pipelines.geodesy.operations import WGS84
-from pipelines.geodesy.vertical import ELLIPSOIDAL, FOOT_M, MOST_GEOID_M, VerticalDatum
+from pipelines.geodesy.vertical import (
+    ELLIPSOIDAL,
+    FOOT_M,
+    HEIGHT_REMEDY,
+    MOST_GEOID_M,
+    VerticalDatum,
+    impossible_heights,
+)
 from pipelines.geometry.rotations import geo_from_cam
 from pipelines.ingest.flight_record import ImagePoses, with_defaults
 from pipelines.ingest.options import IngestOptions
@@ -50,6 +57,16 @@ def poses_from_tags(photos: Sequence[Photo], options: IngestOptions, remarks: Re
     for row, photo in enumerate(photos):
         if photo.tags.gps is not None:
             xyz[row] = photo.tags.gps.lon_deg, photo.tags.gps.lat_deg, _or_nan(altitude_m(photo.tags))
+    impossible = impossible_heights(xyz[:, 2])
+    if impossible.any():
+        names = [f"{photos[row].name} ({xyz[row, 2]:.0f} m)" for row in np.flatnonzero(impossible)]
+        if 2 * len(names) > np.isfinite(xyz[:, 2]).sum():
+            message = f"The height is impossible ({len(names)} photographs, first {names[0]}): {HEIGHT_REMEDY}"
+            raise InputError(
+                "height-impossible", message, path=photos[int(np.argmax(impossible))].name, field="GPSAltitude"
+            )
+        remarks.warn_counted("height-impossible", names, "Images have an impossible height, which is not used")
+        xyz[impossible] = np.nan
     located = complete(xyz)
     flat = [photo.name for photo in photos if photo.tags.gps is not None and altitude_m(photo.tags) is None]
     remarks.warn_counted(
