@@ -5,6 +5,8 @@ Parts are small GeoTIFFs. A mosaic of them (GDAL's VRT) is copied once into the 
 
 from __future__ import annotations
 
+import errno
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,7 +17,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.core.errors import GeorefError, StorageError, storage_error_in
+from pipelines.core.errors import GeorefError, storage_error, storage_error_in
 from pipelines.core.files import replacing, storage_failure_of
 from pipelines.core.types import BoolArray, ByteArray, FloatArray
 
@@ -88,7 +90,7 @@ def write_part(path: Path, values: NDArray[Any], frame: RasterFrame) -> None:
         "nodata": NODATA if values.dtype.kind == "f" else None,
     }
     form = {"tiled": True, "blockxsize": _BLOCK_PX, "blockysize": _BLOCK_PX, "compress": "DEFLATE", "zlevel": 1}
-    with replacing(path) as draft, _written(path):
+    with replacing(path) as draft, _written(path, frame, len(values), values.itemsize):
         with rasterio.open(draft, "w", driver="GTiff", **profile, **form) as part:
             part.write(values)
         _require_whole(draft)
@@ -106,7 +108,12 @@ def write_mosaic(
     import rasterio.shutil
 
     mosaic = write_vrt(path.stem, parts, frame, kind, tags)
-    with replacing(path) as draft, _written(path), rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES):
+    bands, bytes_each = len(kind.bands), np.dtype(kind.dtype).itemsize
+    with (
+        replacing(path) as draft,
+        _written(path, frame, bands, bytes_each),
+        rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES),
+    ):
         rasterio.shutil.copy(
             mosaic,
             draft,
@@ -122,10 +129,10 @@ def write_mosaic(
 
 
 @contextmanager
-def _written(path: Path) -> Iterator[None]:
+def _written(path: Path, frame: RasterFrame, bands: int, bytes_each: int) -> Iterator[None]:
     """Turn GDAL's errors of a disk that is full or fails, which seldom name it, into a `StorageError`.
 
-    The draft must still be there, so that the disk is as full as it was.
+    The disk is full where it has no room for the cells, unpacked and with their overviews.
     """
     try:
         yield
@@ -133,29 +140,27 @@ def _written(path: Path) -> Iterator[None]:
         raise
     except Exception as error:  # rasterio's, and those of GDAL's own numbers
         failure = storage_error_in(f"{error} {error.__cause__}", path) or storage_failure_of(path.parent)
+        needed = frame.rows * frame.columns * bands * bytes_each * 4 // 3 + _BLOCK_PX**2 * bytes_each
+        if failure is None and shutil.disk_usage(path.parent).free < needed:
+            failure = storage_error(OSError(errno.ENOSPC, "no room", str(path)))
         if failure is None:
             raise
         raise failure from error
 
 
 def _require_whole(draft: Path) -> None:
-    """Raise a StorageError where GDAL closed a raster without all its tiles: it does not report every full disk."""
+    """Raise an OSError where GDAL closed a raster without all its tiles: it does not report every full disk."""
     import rasterio
 
-    try:
-        size = draft.stat().st_size
-        with rasterio.open(draft, driver="GTiff") as raster:
-            tiles = [(place, band) for band in raster.indexes for place, _ in raster.block_windows(band)]
-            places = [
-                [raster.get_tag_item(f"BLOCK_{what}_{x}_{y}", "TIFF", bidx=band) for what in ("OFFSET", "SIZE")]
-                for (y, x), band in tiles
-            ]
-        whole = all(None not in place and sum(map(int, place)) <= size for place in places)
-    except rasterio.errors.RasterioError:
-        whole = False
-    if not whole:
-        message = f"{draft.parent}: the raster could not be written whole."
-        raise storage_failure_of(draft.parent) or StorageError("raster-not-written", message)
+    size = draft.stat().st_size
+    with rasterio.open(draft, driver="GTiff") as raster:
+        tiles = [(place, band) for band in raster.indexes for place, _ in raster.block_windows(band)]
+        places = [
+            [raster.get_tag_item(f"BLOCK_{what}_{x}_{y}", "TIFF", bidx=band) for what in ("OFFSET", "SIZE")]
+            for (y, x), band in tiles
+        ]
+    if not all(None not in place and sum(map(int, place)) <= size for place in places):
+        raise OSError(errno.EIO, "the raster was not written whole", str(draft))
 
 
 def _opened(path: Path) -> Any:
