@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pipelines.core.errors import InputError
 from pipelines.core.extras import require
 from pipelines.core.types import ByteArray
-from pipelines.formats.bag_files import BagFiles, counts_of, open_files
+from pipelines.formats.bag_files import BagFiles, counts_of, has_data_files, open_files
 from pipelines.formats.bag_limits import DEFINITIONS, refuse_large_chunk, unpacked
 from pipelines.formats.image_file import MAX_BYTES, MAX_PIXELS, header_size
 
@@ -201,10 +201,8 @@ def open_bag(path: Path) -> Iterator[Bag]:
     """
     if not path.exists():
         raise InputError("bag-missing", "The bag does not exist.", path=path, field="--bag")
-    if path.is_dir() and not (path / "metadata.yaml").exists():
-        message = (
-            "The folder has no metadata.yaml: give the .mcap or .db3 file in it, or `ros2 bag reindex` the folder."
-        )
+    if path.is_dir() and not (path / "metadata.yaml").exists() and not has_data_files(path):
+        message = "The folder has no metadata.yaml and no .mcap or .db3 files: give the folder of a bag."
         raise InputError("bag-metadata-missing", message, path=path, field="--bag")
     if not path.is_dir() and path.suffix not in (".bag", ".mcap", ".db3"):
         message = "The file is not a bag: give a rosbag2 folder, or a .mcap, .db3 or .bag file."

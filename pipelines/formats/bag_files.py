@@ -7,6 +7,7 @@ SQLite's last messages lie in `NAME.db3-wal`; they are read from a copy, since S
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -26,6 +27,7 @@ _FOOTER_BYTES = 37
 # What SQLite keeps beside a database until it is closed.
 _LOGS = ("-wal", "-journal")
 _SHOWN = 6
+_DEEPEST = 64  # brackets in YAML; recorders write three
 
 
 @dataclass
@@ -67,21 +69,68 @@ def open_files(path: Path) -> Iterator[BagFiles]:
             bag.storages = [_opened(path, room, bag.notes, stack)]
             yield bag
             return
-        metadata = _read_metadata(path / "metadata.yaml")
+        information = _information(path / "metadata.yaml", bag.notes)
+        metadata = _Metadata() if information is None else _stated(information, path / "metadata.yaml")
         listed, others = _data_files(path, metadata, bag.notes)
         bag.stated = metadata.topics
         bag.storages = [_opened(file, room, bag.notes, stack) for file in listed]
+        found = len(bag.notes)
         for file in others:
             _add_unlisted(bag, file, _opened(file, room, bag.notes, stack))
+        if information is None:  # that no file is listed was said
+            bag.notes[found:] = [note for note in bag.notes[found:] if note.code != "bag-file-not-listed"]
+        else:
+            _note_differences(bag, metadata, {_storage_of(file) for file in listed})
         bag.storages.sort(key=lambda storage: storage.metadata.start_time)
-        _note_differences(bag, metadata, {_storage_of(file) for file in listed})
         yield bag
 
 
-def _read_metadata(path: Path) -> _Metadata:
+def has_data_files(folder: Path) -> bool:
+    """Return whether a folder has files of a rosbag2."""
+    return any(Path(_unpacked_name(file)).suffix in _STORAGE for file in folder.iterdir())
+
+
+def _information(path: Path, notes: list[Remark]) -> Any | None:
+    """Return the information of a `metadata.yaml`; None, noted, where it is missing or damaged."""
     from ruamel.yaml import YAML
 
-    information = YAML(typ="safe").load(path.read_text(encoding="utf-8"))["rosbag2_bagfile_information"]
+    if not path.exists():
+        sentence = "The folder has no metadata.yaml, which a recorder writes last: its data files were read."
+        notes.append(Remark(code="bag-metadata-missing", sentence=sentence))
+        return None
+    try:
+        text = path.read_text(encoding="utf-8")
+        _require_flat(text)
+        return {**YAML(typ="safe").load(text)["rosbag2_bagfile_information"]}
+    except Exception as error:  # of the parser, or of a document of another form
+        cause = (str(error).splitlines() or [""])[0]
+        sentence = f"metadata.yaml is damaged ({type(error).__name__}: {cause[:80]}): the data files were read."
+        notes.append(Remark(code="bag-metadata-damaged", sentence=sentence))
+        return None
+
+
+def _require_flat(text: str) -> None:
+    """Raise a ValueError for YAML with deep brackets, which cost its parser the square of their number."""
+    depth = 0
+    for match in re.finditer(r"[\[\]{}]", text):
+        depth += 1 if match[0] in "[{" else -1
+        if depth > _DEEPEST:
+            raise ValueError("brackets are nested too deeply")
+
+
+def _quality(stated: Any) -> list[Any]:
+    """Return the profiles of quality of service that a text or list states; none where it is damaged."""
+    from rosbags.rosbag2.metadata import parse_qos
+
+    try:
+        if isinstance(stated, str):
+            _require_flat(stated)
+        return list(parse_qos(stated or []))
+    except Exception:  # of the parser, or of other types than it expects
+        return []
+
+
+def _stated(information: Any, path: Path) -> _Metadata:
     packing = str(information.get("compression_format") or "").lower()
     if str(information.get("compression_mode") or "none").lower() != "none" and packing != "zstd":
         how = repr(packing) if packing else "a format that is not stated"
@@ -191,8 +240,7 @@ def _readers() -> dict[str, Any]:
     """Return rosbags' reader by storage, that of mcap also for files of ROS 1 and for those without a profile."""
     from rosbags import rosbag1
     from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
-    from rosbags.rosbag2 import ReaderError, storage_mcap
-    from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
+    from rosbags.rosbag2 import ReaderError, storage_mcap, storage_sqlite3
     from rosbags.typesys.msg import normalize_msgtype
 
     usual = storage_mcap.get_msgdef
@@ -254,7 +302,8 @@ def _readers() -> dict[str, Any]:
             )
 
     storage_mcap.get_msgdef = definition_of
-    return {"mcap": McapReader, "sqlite3": Sqlite3Reader, ".bag": rosbag1.Reader}
+    storage_mcap.parse_qos = storage_sqlite3.parse_qos = _quality
+    return {"mcap": McapReader, "sqlite3": storage_sqlite3.Sqlite3Reader, ".bag": rosbag1.Reader}
 
 
 def _add_unlisted(bag: BagFiles, file: Path, storage: Any) -> None:
@@ -308,11 +357,6 @@ def _note_differences(bag: BagFiles, metadata: _Metadata, storages: set[str]) ->
 
 
 def _quality_differs(storages: list[Any], topic: str, stated: Any) -> bool:
-    from rosbags.rosbag2.metadata import parse_qos
-
-    try:
-        wanted = parse_qos(stated or [])
-    except Exception:  # no profiles at all
-        return True
+    wanted = _quality(stated)
     links = [link for storage in storages for link in storage.connections if link.topic == topic]
-    return all(list(link.ext.offered_qos_profiles) != wanted for link in links)
+    return (bool(stated) and not wanted) or all(list(link.ext.offered_qos_profiles) != wanted for link in links)

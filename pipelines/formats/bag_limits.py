@@ -50,7 +50,8 @@ def check_files(path: Path) -> None:
     """
     files = [path]
     if path.is_dir():
-        file_size(path / "metadata.yaml", limit_bytes=_MAX_METADATA_BYTES, kind="metadata.yaml")
+        if (path / "metadata.yaml").exists():
+            file_size(path / "metadata.yaml", limit_bytes=_MAX_METADATA_BYTES, kind="metadata.yaml")
         files = sorted(file for file in path.iterdir() if file.suffix in (".mcap", ".db3", ".zstd"))
     for file in files:
         check_file(file)

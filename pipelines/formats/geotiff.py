@@ -17,7 +17,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.core.errors import GeorefError, storage_error, storage_error_in
+from pipelines.core.errors import GeorefError, InputError, storage_error, storage_error_in
 from pipelines.core.files import replacing, storage_failure_of
 from pipelines.core.types import BoolArray, ByteArray, FloatArray
 
@@ -163,11 +163,22 @@ def _require_whole(draft: Path) -> None:
         raise OSError(errno.EIO, "the raster was not written whole", str(draft))
 
 
-def _opened(path: Path) -> Any:
-    """Return a raster as its suffix says: GDAL's other drivers open what a file names, also addresses."""
-    import rasterio
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """Open a raster as its suffix says: GDAL's other drivers open what a file names, also addresses.
 
-    return rasterio.open(path, driver="VRT" if path.suffix.lower() == ".vrt" else "GTiff")
+    Raises:
+        InputError: not such a raster, or a damaged one.
+    """
+    import rasterio
+    from rasterio.errors import RasterioError
+
+    try:
+        with rasterio.open(path, driver="VRT" if path.suffix.lower() == ".vrt" else "GTiff") as raster:
+            yield raster
+    except RasterioError as error:
+        message = f"The raster cannot be read: {error}. Make it again with `georef`."
+        raise InputError("raster-unreadable", message, path=path) from error
 
 
 def write_vrt(

@@ -59,7 +59,7 @@ def poses_from_tags(photos: Sequence[Photo], options: IngestOptions, remarks: Re
             xyz[row] = photo.tags.gps.lon_deg, photo.tags.gps.lat_deg, _or_nan(altitude_m(photo.tags))
     impossible = impossible_heights(xyz[:, 2])
     if impossible.any():
-        names = [f"{photos[row].name} ({xyz[row, 2]:.0f} m)" for row in np.flatnonzero(impossible)]
+        names = [f"{photos[int(row)].name} ({xyz[row, 2]:.0f} m)" for row in np.flatnonzero(impossible)]
         if 2 * len(names) > np.isfinite(xyz[:, 2]).sum():
             message = f"The height is impossible ({len(names)} photographs, first {names[0]}): {HEIGHT_REMEDY}"
             raise InputError(

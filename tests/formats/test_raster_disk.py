@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.core.errors import StorageError
+from pipelines.core.errors import InputError, StorageError
 from pipelines.formats.geotiff import (
     Band,
     RasterFrame,
@@ -21,6 +21,7 @@ from pipelines.formats.geotiff import (
     write_part,
 )
 from tests.faults.injection import mounted
+from tests.refusals import refused
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # of rasterio itself
 
@@ -77,5 +78,6 @@ def test_no_other_file_is_opened(tmp_path: Path, text: str) -> None:
     path.write_text(text.format(other=other))
     readers = (read_cells, frame_of, lambda file: read_reduced(file, 10), lambda file: sampled_raster(file, PLACE))
     for read in readers:
-        with pytest.raises(OSError, match=r"dsm\.tif"):
+        with refused("raster-unreadable", InputError) as caught:
             read(path)
+        assert caught.value.path == path

@@ -9,6 +9,7 @@ import sqlite3
 import struct
 import sys
 from collections.abc import Callable
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -156,8 +157,7 @@ EDITS: dict[str, Callable[[dict[str, Any]], object]] = {
 }
 
 
-@pytest.mark.parametrize("storage", STORAGES)
-@pytest.mark.parametrize("edit", EDITS)
+@pytest.mark.parametrize(("edit", "storage"), list(zip(EDITS, cycle(STORAGES))))
 def test_data_count_and_not_what_is_stated(
     ingest: Ingest, tmp_path: Path, edit: str, storage: StoragePlugin
 ) -> None:
@@ -221,8 +221,7 @@ def test_file_that_is_lost(refusal: Refusal, tmp_path: Path) -> None:
 LOST = ["/gnss/fix", "/imu/data", "/camera/image_raw/compressed", "/tf_static"]
 
 
-@pytest.mark.parametrize("storage", STORAGES)
-@pytest.mark.parametrize("topic", LOST)
+@pytest.mark.parametrize(("topic", "storage"), list(zip(LOST, cycle(STORAGES))))
 def test_counted_topic_that_no_file_has(
     refusal: Refusal, tmp_path: Path, capsys: pytest.CaptureFixture[str], topic: str, storage: StoragePlugin
 ) -> None:
@@ -366,3 +365,36 @@ def test_mcap_of_any_profile(ingest: Ingest, tmp_path: Path, profile: str) -> No
     flight = Flight(count=4)
     (tmp_path / "flight.mcap").write_bytes(mcap(profile, "cdr", "ros2msg", rows_of(flight, False)))
     check(ingest(tmp_path / "flight.mcap"), flight)
+
+
+CUT = [None, "", "rosbag2_bagfile_information:\n  version: 5\n  relative_fi", "{", "a: 1", "- 1", "[" * 50_000]
+
+
+@pytest.mark.parametrize(
+    ("text", "storage"),
+    list(zip(CUT, cycle(STORAGES))),
+    ids=["none", "empty", "cut", "open", "other", "list", "deep"],
+)
+def test_metadata_that_a_killed_recorder_leaves(
+    ingest: Ingest, tmp_path: Path, storage: StoragePlugin, text: str | None
+) -> None:
+    flight = Flight(count=3)
+    bag = bags.write(tmp_path / "bag", bags.usual(flight), Form(storage))
+    if text is None:
+        (bag / "metadata.yaml").unlink()
+    else:
+        (bag / "metadata.yaml").write_text(text)
+    survey = ingest(bag)
+    check(survey, flight)
+    assert remarked(survey, "bag-metadata-missing" if text is None else "bag-metadata-damaged")
+    assert not remarked(survey, "bag-file-not-listed")
+
+
+@pytest.mark.parametrize("text", ["[" * 50_000, "- history: [", "3", "- 4"])
+def test_damaged_quality_of_service_in_the_data(ingest: Ingest, tmp_path: Path, text: str) -> None:
+    flight = Flight(count=3)
+    bag = bags.write(tmp_path / "bag", bags.usual(flight), Form(StoragePlugin.SQLITE3))
+    (file,) = bag.glob("*.db3")
+    with contextlib.closing(sqlite3.connect(file, isolation_level=None)) as base:
+        base.execute("UPDATE topics SET offered_qos_profiles = ?", (text,))
+    check(ingest(file), flight)
