@@ -302,7 +302,9 @@ def _readers() -> dict[str, Any]:
             )
 
     storage_mcap.get_msgdef = definition_of
-    storage_mcap.parse_qos = storage_sqlite3.parse_qos = _quality
+    modules: tuple[Any, ...] = (storage_mcap, storage_sqlite3)
+    for module in modules:
+        module.parse_qos = _quality
     return {"mcap": McapReader, "sqlite3": storage_sqlite3.Sqlite3Reader, ".bag": rosbag1.Reader}
 
 
