@@ -88,7 +88,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "jinja2": ("pipelines.report.page",),
     "zstandard": ("pipelines.formats",),
     "rasterio": ("pipelines.formats",),
-    "pyogrio": ("pipelines.formats.vector_files",),
+    "pyogrio": ("pipelines.formats.vector_files", "pipelines.formats.vector_source"),
     "ezdxf": ("pipelines.formats.vector_files",),
     "CSF": ("pipelines.surface.ground",),
     "tornado": ("pipelines.view.server",),

@@ -8,7 +8,7 @@ topic only.
 import re
 import struct
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -20,13 +20,16 @@ from numpy.typing import NDArray
 from pipelines.core.errors import InputError
 from pipelines.core.extras import require
 from pipelines.core.types import ByteArray
-from pipelines.formats.bag_limits import DEFINITIONS, bound_decompressors, check_files, refuse_large_chunk, unpacked
+from pipelines.formats.bag_files import BagFiles, counts_of, has_data_files, open_files
+from pipelines.formats.bag_limits import DEFINITIONS, refuse_large_chunk, unpacked
 from pipelines.formats.image_file import MAX_BYTES, MAX_PIXELS, header_size
 
-# Schemas of mcap that do not belong in a ROS bag; the reader cannot open a bag with them.
+# Schemas of mcap that do not belong in a ROS bag; the reader cannot open a bag with them. ROS 1's do not belong
+# beside messages in CDR.
 _FOREIGN_SCHEMAS = ("jsonschema", "protobuf", "flatbuffer", "ros1msg")
 # PX4 sends a message within milliseconds of its sample.
 _SAMPLE_LAG_US = 60_000_000
+_ZSTD = b"\x28\xb5\x2f\xfd"
 _REPAIR = "repair it with `mcap recover` (mcap) or `ros2 bag reindex` (sqlite3, or metadata.yaml missing)"
 
 
@@ -56,40 +59,51 @@ class RawMessage:
 class Bag:
     """Open bag; see `open_bag`."""
 
-    def __init__(self, path: Path, reader: Any, ros2: bool) -> None:
-        self.path, self._reader, self._ros2 = path, reader, ros2
-        self._packed = _leave_packed(reader)
-        self._connections = list(reader.connections)
+    def __init__(self, path: Path, files: BagFiles) -> None:
+        self.path, self._storages = path, files.storages
+        links = [link for storage in self._storages for link in storage.connections]
         # Any file of a split bag may have the definition.
-        links = [link for part in _parts(reader) for link in part.connections] + self._connections
         self._definitions = {link.msgtype: link.msgdef for link in links if link.msgdef.data}
-        self._stores: dict[str, Any] = {}
+        is_bag1 = path.suffix == ".bag" and not path.is_dir()
+        self._ros1 = {
+            link.topic for link in links if is_bag1 or getattr(link.ext, "serialization_format", "") == "ros1"
+        }
+        self._stores: dict[tuple[str, bool], Any] = {}
+        self.notes = tuple(files.notes)  # where metadata.yaml states something else than the data files hold
         self.damage: str | None = None  # reason why reading ended before the end of the bag
         self.fallback_types: set[str] = set()  # decoded by a definition that the bag itself does not have
-        counts: dict[tuple[str, str], int] = {}
-        for link in self._connections:
-            key = (link.topic, link.msgtype)
-            counts[key] = counts.get(key, 0) + link.msgcount
+        # Topics that metadata.yaml counts messages of, and that no data file has any of
+        self.lost: dict[str, BagTopic] = {}
+        counts = counts_of(self._storages)
         self.topics = {
             name: BagTopic(name, kind, count) for (name, kind), count in sorted(counts.items(), reverse=True)
         }
+        for name, (kind, count) in files.stated.items():
+            if count and not (name in self.topics and self.topics[name].count):
+                self.lost[name] = BagTopic(name, kind, count)
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        """Yield the messages of these topics by time of recording.
+        """Yield the messages of these topics, of each file by time of recording.
 
-        Reading ends early where the bag is damaged; `damage` then states the reason.
+        Reading of a file ends early where it is damaged; `damage` then states the reason.
         """
         wanted = {name: self.topics[name].type for name in topics}
-        links = [link for link in self._connections if wanted.get(link.topic) == link.msgtype]
-        if not links:
-            return
-        stream = self._reader.messages(connections=links)
+        for storage in self._storages:
+            links = [link for link in storage.connections if wanted.get(link.topic) == link.msgtype]
+            if links:
+                yield from self._messages_of(storage, links)
+
+    def _messages_of(self, storage: Any, links: list[Any]) -> Iterator[RawMessage]:
+        stream = storage.messages(links)
         while True:
             try:
                 link, bag_ns, data = next(stream)
                 if not isinstance(bag_ns, int) or not isinstance(data, bytes | bytearray | memoryview):
                     raise TypeError(f"a message of {link.topic} is no bytes")  # SQLite has any type in any column
-                data = unpacked(bytes(data), MAX_BYTES) if self._packed else bytes(data)
+                data = bytes(data)
+                # CDR begins with a zero: recorders compress message by message, whatever metadata.yaml states.
+                if data.startswith(_ZSTD) and link.topic not in self._ros1:
+                    data = unpacked(data, MAX_BYTES)
             except StopIteration:
                 return
             except Exception as error:  # the library raises any error of its parsers
@@ -104,7 +118,7 @@ class Bag:
             UndecodableError: the message does not fit, or has no known definition.
         """
         store = self._store(message)
-        deserialize = store.deserialize_cdr if self._ros2 else store.deserialize_ros1
+        deserialize = store.deserialize_ros1 if message.topic in self._ros1 else store.deserialize_cdr
         try:
             return deserialize(message.data, message.type)
         except Exception as error:  # hostile bytes make generated code raise any error
@@ -124,7 +138,7 @@ class Bag:
         """Return the stamp of a message that begins with a `std_msgs/Header`, without decoding it; None if zero."""
         try:
             layout = "<II"
-            if self._ros2:
+            if message.topic not in self._ros1:
                 layout = "<iI" if message.data[1] & 1 else ">iI"
             sec, nanosec = struct.unpack_from(layout, message.data, 4)
         except (struct.error, IndexError):
@@ -132,19 +146,19 @@ class Bag:
         return sec * 1_000_000_000 + nanosec or None
 
     def _store(self, message: RawMessage) -> Any:
-        kind = message.type
-        if kind not in self._stores:
+        kind, is_ros1 = message.type, message.topic in self._ros1
+        if (kind, is_ros1) not in self._stores:
             stated = self._definitions.get(kind)
             if stated is None and kind in DEFINITIONS:
-                self._stores[kind] = self._store_that_fits(message)
+                self._stores[kind, is_ros1] = self._store_that_fits(message)
             else:
-                self._stores[kind] = self._make_store(kind, stated)
-        store = self._stores[kind]
+                self._stores[kind, is_ros1] = self._make_store(kind, stated, is_ros1)
+        store = self._stores[kind, is_ros1]
         if isinstance(store, str):
             raise UndecodableError(store)
         return store
 
-    def _make_store(self, kind: str, stated: Any | None) -> Any:
+    def _make_store(self, kind: str, stated: Any | None, is_ros1: bool) -> Any:
         """Return a typestore that has `kind` by the bag's or a default definition, or the reason why none has."""
         if stated is not None:
             try:
@@ -152,7 +166,7 @@ class Bag:
             except Exception as error:  # a grammar error, an unknown word, a repeated name …
                 return f"its definition of {kind} cannot be read: {type(error).__name__}: {error}"
         self.fallback_types.add(kind)
-        common = _common_store(self._ros2)
+        common = _common_store(is_ros1)
         return common if kind in common.types else f"it has no definition of {kind}"
 
     def _store_that_fits(self, message: RawMessage) -> Any:
@@ -187,62 +201,37 @@ def open_bag(path: Path) -> Iterator[Bag]:
     """
     if not path.exists():
         raise InputError("bag-missing", "The bag does not exist.", path=path, field="--bag")
-    if path.is_dir() and not (path / "metadata.yaml").exists():
-        message = (
-            "The folder has no metadata.yaml: give the .mcap or .db3 file in it, or `ros2 bag reindex` the folder."
-        )
+    if path.is_dir() and not (path / "metadata.yaml").exists() and not has_data_files(path):
+        message = "The folder has no metadata.yaml and no .mcap or .db3 files: give the folder of a bag."
         raise InputError("bag-metadata-missing", message, path=path, field="--bag")
     if not path.is_dir() and path.suffix not in (".bag", ".mcap", ".db3"):
         message = "The file is not a bag: give a rosbag2 folder, or a .mcap, .db3 or .bag file."
         raise InputError("not-a-bag", message, path=path, field="--bag")
-    reader = _opened(path)
-    try:
-        for part in _parts(reader):
-            chunks = getattr(part, "chunks", ())
-            refuse_large_chunk(path, max((chunk.uncompressed_size for chunk in chunks), default=0))
-        for link in reader.connections:  # SQLite and YAML have any type in any place
-            types = isinstance(link.topic, str), isinstance(link.msgtype, str), isinstance(link.msgcount, int)
-            if not all(types):
-                message = f"The bag is damaged (topic {str(link.topic)[:40]!r}): {_REPAIR}"
-                raise InputError("bag-damaged", message, path=path)
-        yield Bag(path, reader, path.suffix != ".bag")
-    finally:
-        reader.close()
-
-
-def _opened(path: Path) -> Any:
     require("bags")
-    from rosbags import rosbag1, rosbag2
-
-    try:
-        check_files(path)
-        bound_decompressors()
-        reader: Any = rosbag1.Reader(path) if path.suffix == ".bag" else rosbag2.Reader(path)
-        reader.open()
-    except InputError:
-        raise
-    except Exception as error:  # truncated and forged files make the parser raise any error
-        if isinstance(error, KeyError) and error.args[0] in _FOREIGN_SCHEMAS:
-            message = f"A topic is in {error.args[0]!r}, not in ROS 2's messages: leave it out with `mcap filter`."
-            raise InputError("bag-foreign-schema", message, path=path) from error
-        cause = f"{type(error).__name__}: {error}".rstrip(": ").rstrip(".")
-        message = f"The file is not a bag, or it is damaged ({cause}): {_REPAIR}"
-        raise InputError("bag-damaged", message, path=path) from error
-    return reader
+    with ExitStack() as stack:
+        try:
+            files = stack.enter_context(open_files(path))
+        except InputError:
+            raise
+        except Exception as error:  # truncated and forged files make the parser raise any error
+            raise _refusal(path, error) from error
+        for storage in files.storages:
+            chunks = getattr(storage, "chunks", ()) if path.suffix != ".bag" or path.is_dir() else ()
+            refuse_large_chunk(path, max((chunk.uncompressed_size for chunk in chunks), default=0))
+            for link in storage.connections:  # SQLite has any type in any place
+                if not isinstance(link.topic, str) or not isinstance(link.msgtype, str):
+                    message = f"The bag is damaged (topic {str(link.topic)[:40]!r}): {_REPAIR}"
+                    raise InputError("bag-damaged", message, path=path)
+        yield Bag(path, files)
 
 
-def _leave_packed(reader: Any) -> bool:
-    """Return whether messages are compressed one by one, and let rosbags hand them over packed."""
-    storage: Any = getattr(reader, "storage", None)
-    if getattr(getattr(storage, "metadata", None), "compression_mode", None) != "message":
-        return False
-    storage.metadata = storage.metadata._replace(compression_mode=None)
-    return True
-
-
-def _parts(reader: Any) -> list[Any]:
-    outer = getattr(reader, "storage", None)
-    return list(getattr(outer, "storages", [] if outer is None else [outer]))
+def _refusal(path: Path, error: Exception) -> InputError:
+    if isinstance(error, KeyError) and error.args[0] in _FOREIGN_SCHEMAS:
+        message = f"A topic is in {error.args[0]!r}, not in ROS 2's messages: leave it out with `mcap filter`."
+        return InputError("bag-foreign-schema", message, path=path)
+    cause = f"{type(error).__name__}: {error}".rstrip(": ").rstrip(".")
+    message = f"The file is not a bag, or it is damaged ({cause}): {_REPAIR}"
+    return InputError("bag-damaged", message, path=path)
 
 
 @lru_cache(maxsize=256)
@@ -272,11 +261,11 @@ def _stated_store(definition: Any, kind: str) -> Any:
 
 
 @lru_cache
-def _common_store(ros2: bool) -> Any:
+def _common_store(is_ros1: bool) -> Any:
     """Return a typestore with the types of a ROS distribution."""
     from rosbags.typesys import Stores, get_typestore
 
-    return get_typestore(Stores.ROS2_JAZZY if ros2 else Stores.ROS1_NOETIC)
+    return get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_JAZZY)
 
 
 IMAGE, COMPRESSED, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/CameraInfo"

@@ -9,6 +9,7 @@ px4_msgs. Fields changed between releases. The length of a message reveals its l
 """
 
 import mmap
+import shutil
 import struct
 import sys
 from collections.abc import Callable, Collection, Iterator
@@ -49,14 +50,28 @@ def check_files(path: Path) -> None:
     """
     files = [path]
     if path.is_dir():
-        file_size(path / "metadata.yaml", limit_bytes=_MAX_METADATA_BYTES, kind="metadata.yaml")
+        if (path / "metadata.yaml").exists():
+            file_size(path / "metadata.yaml", limit_bytes=_MAX_METADATA_BYTES, kind="metadata.yaml")
         files = sorted(file for file in path.iterdir() if file.suffix in (".mcap", ".db3", ".zstd"))
     for file in files:
-        size = file_size(file, field="--bag")
-        if file.suffix == ".mcap" and size:
-            _check_mcap(file)
-        elif file.suffix == ".zstd":
-            _check_unpacked(file, size)
+        check_file(file)
+
+
+def check_file(file: Path) -> None:
+    """Refuse a data file as `check_files` does."""
+    size = file_size(file, field="--bag")
+    with file.open("rb") as stream:
+        is_mcap = stream.read(len(_MAGIC)) == _MAGIC or file.suffix == ".mcap"
+    if is_mcap and size:
+        _check_mcap(file)
+    elif file.suffix == ".zstd":
+        _check_unpacked(file, size)
+
+
+def unpack_file(packed: Path, file: Path) -> None:
+    """Write the content of a compressed file that `check_files` passed."""
+    with _zstd().open(packed, "rb") as stream, file.open("wb") as out:
+        shutil.copyfileobj(stream, out, _BLOCK_BYTES)
 
 
 def refuse_large_chunk(path: Path, uncompressed_bytes: int) -> None:

@@ -26,6 +26,7 @@ from pipelines.core.products import ImageName, Product, load_json
 from pipelines.core.types import FloatArray, IntArray, Vector3
 from pipelines.core.validators import stays_inside
 from pipelines.formats.colmap_text import check_images_text
+from pipelines.formats.colmap_values import check_lenses, check_quaternions_text, quaternion_fault
 from pipelines.geometry.cameras import Camera
 from pipelines.geometry.sparse_model import SparseModel
 
@@ -79,6 +80,7 @@ def _check_model_files(folder: Path) -> None:
             continue
         if name == "images":
             check_images_text(file)
+            check_quaternions_text(file)
 
 
 def _check_binary(file: Path, size: int, record_end: Callable[[_Bytes, int], int]) -> None:
@@ -131,6 +133,7 @@ def _camera(record: _Bytes, at: int) -> int:
 
 
 def _image(record: _Bytes, at: int) -> int:
+    _require_rotation(record, at + 4)
     name_at = at + 64
     name_end = record.data.find(b"\0", name_at, min(record.size, name_at + _LONGEST_NAME))
     if name_end < 0:
@@ -152,11 +155,23 @@ def _rig(record: _Bytes, at: int) -> int:
     return at
 
 
+def _frame(record: _Bytes, at: int) -> int:
+    _require_rotation(record, at + 8)
+    return record.end(at + 68 + _FRAME_DATA_BYTES * record.unsigned(at + 64, 4))
+
+
+def _require_rotation(record: _Bytes, at: int) -> None:
+    record.end(at + 32)
+    fault = quaternion_fault(struct.unpack_from("<4d", record.data, at))
+    if fault is not None:
+        raise ValueError(fault)
+
+
 # The end of a record that begins at a place, by file.
 _RECORDS: dict[str, Callable[[_Bytes, int], int]] = {
     "rigs": _rig,
     "cameras": _camera,
-    "frames": lambda record, at: record.end(at + 68 + _FRAME_DATA_BYTES * record.unsigned(at + 64, 4)),
+    "frames": _frame,
     "images": _image,
     "points3D": lambda record, at: record.end(at + 51 + _TRACK_BYTES * record.unsigned(at + 43, 8)),
 }
@@ -250,7 +265,7 @@ def write_reconstruction(reconstruction: Any, folder: Path) -> None:
     reconstruction.write_binary(str(folder))
     counts = []
     try:
-        for model in (reconstruction, load_reconstruction(folder)):
+        for model in (reconstruction, _loaded(folder)):
             counts.append((model.num_images(), model.num_points3D(), model.compute_num_observations()))
         whole = counts[0] == counts[1]
     except InputError:
@@ -264,8 +279,16 @@ def load_reconstruction(path: Path) -> Any:
     """Return the COLMAP model in a folder as a `pycolmap.Reconstruction`.
 
     Raises:
-        InputError: no such folder, not a readable model, or one whose counts do not fit its files.
+        InputError: no such folder, not a readable model, one whose counts do not fit its files, or poses or lenses
+            that are nonsense.
     """
+    model = _loaded(path)
+    files = (path / f"cameras{suffix}" for suffix in (".bin", ".txt"))
+    check_lenses(model, next(file for file in files if file.exists()))
+    return model
+
+
+def _loaded(path: Path) -> Any:
     pycolmap = pycolmap_module()
     _check_model_files(path)
     try:

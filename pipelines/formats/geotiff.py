@@ -5,6 +5,8 @@ Parts are small GeoTIFFs. A mosaic of them (GDAL's VRT) is copied once into the 
 
 from __future__ import annotations
 
+import errno
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,7 +17,8 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.core.files import replacing
+from pipelines.core.errors import GeorefError, InputError, storage_error, storage_error_in
+from pipelines.core.files import replacing, storage_failure_of
 from pipelines.core.types import BoolArray, ByteArray, FloatArray
 
 NODATA = -9999.0
@@ -87,8 +90,10 @@ def write_part(path: Path, values: NDArray[Any], frame: RasterFrame) -> None:
         "nodata": NODATA if values.dtype.kind == "f" else None,
     }
     form = {"tiled": True, "blockxsize": _BLOCK_PX, "blockysize": _BLOCK_PX, "compress": "DEFLATE", "zlevel": 1}
-    with replacing(path) as draft, rasterio.open(draft, "w", driver="GTiff", **profile, **form) as part:
-        part.write(values)
+    with replacing(path) as draft, _written(path, frame, len(values), values.itemsize):
+        with rasterio.open(draft, "w", driver="GTiff", **profile, **form) as part:
+            part.write(values)
+        _require_whole(draft)
 
 
 def write_mosaic(
@@ -103,7 +108,12 @@ def write_mosaic(
     import rasterio.shutil
 
     mosaic = write_vrt(path.stem, parts, frame, kind, tags)
-    with replacing(path) as draft, rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES):
+    bands, bytes_each = len(kind.bands), np.dtype(kind.dtype).itemsize
+    with (
+        replacing(path) as draft,
+        _written(path, frame, bands, bytes_each),
+        rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES),
+    ):
         rasterio.shutil.copy(
             mosaic,
             draft,
@@ -115,6 +125,60 @@ def write_mosaic(
             NUM_THREADS="ALL_CPUS",
             BIGTIFF="IF_SAFER",
         )
+        _require_whole(draft)
+
+
+@contextmanager
+def _written(path: Path, frame: RasterFrame, bands: int, bytes_each: int) -> Iterator[None]:
+    """Turn GDAL's errors of a disk that is full or fails, which seldom name it, into a `StorageError`.
+
+    The disk is full where it has no room for the cells, unpacked and with their overviews.
+    """
+    try:
+        yield
+    except GeorefError:
+        raise
+    except Exception as error:  # rasterio's, and those of GDAL's own numbers
+        failure = storage_error_in(f"{error} {error.__cause__}", path) or storage_failure_of(path.parent)
+        needed = frame.rows * frame.columns * bands * bytes_each * 4 // 3 + _BLOCK_PX**2 * bytes_each
+        if failure is None and shutil.disk_usage(path.parent).free < needed:
+            failure = storage_error(OSError(errno.ENOSPC, "no room", str(path)))
+        if failure is None:
+            raise
+        raise failure from error
+
+
+def _require_whole(draft: Path) -> None:
+    """Raise an OSError where GDAL closed a raster without all its tiles: it does not report every full disk."""
+    import rasterio
+
+    size = draft.stat().st_size
+    with rasterio.open(draft, driver="GTiff") as raster:
+        tiles = [(place, band) for band in raster.indexes for place, _ in raster.block_windows(band)]
+        places = [
+            [raster.get_tag_item(f"BLOCK_{what}_{x}_{y}", "TIFF", bidx=band) for what in ("OFFSET", "SIZE")]
+            for (y, x), band in tiles
+        ]
+    if not all(None not in place and sum(map(int, place)) <= size for place in places):
+        raise OSError(errno.EIO, "the raster was not written whole", str(draft))
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """Open a raster as its suffix says: GDAL's other drivers open what a file names, also addresses.
+
+    Raises:
+        InputError: not such a raster, or a damaged one.
+    """
+    import rasterio
+    from rasterio.errors import RasterioError
+
+    try:
+        with rasterio.open(path, driver="VRT" if path.suffix.lower() == ".vrt" else "GTiff") as raster:
+            yield raster
+    except RasterioError as error:
+        message = f"The raster cannot be read: {error}. Make it again with `georef`."
+        raise InputError("raster-unreadable", message, path=path) from error
 
 
 def write_vrt(
@@ -132,30 +196,27 @@ def write_vrt(
 
 def read_cells(path: Path, part: tuple[slice, slice] | None = None) -> NDArray[Any]:
     """Return the bands (bands, rows, columns) of a raster, or of rows and columns that lie in it; NaN: no value."""
-    import rasterio
     from rasterio.windows import Window
 
-    with rasterio.open(path) as raster:
+    with _opened(path) as raster:
         values = raster.read(window=None if part is None else Window.from_slices(*part))
     return np.where(values == NODATA, np.nan, values) if values.dtype.kind == "f" else np.asarray(values)
 
 
 def sampled_raster(path: Path, xy: FloatArray) -> FloatArray:
     """Return the values (N,) of a raster's first band at places (N, 2) in its CRS; NaN: none, or no such file."""
-    import rasterio
 
     if not path.is_file():
         return np.full(len(xy), np.nan)
-    with rasterio.open(path) as raster:
+    with _opened(path) as raster:
         values = np.array([value[0] for value in raster.sample(xy)], dtype=np.float64)
     return np.where(values == NODATA, np.nan, values)
 
 
 def frame_of(path: Path) -> RasterFrame:
     """Return the place of a raster's cells."""
-    import rasterio
 
-    with rasterio.open(path) as raster:
+    with _opened(path) as raster:
         at, wkt = raster.transform, raster.crs.to_wkt(version="WKT1_GDAL") if raster.crs else ""
         return RasterFrame(wkt, at.c, at.f, at.a, -at.e, raster.width, raster.height)
 
@@ -186,11 +247,10 @@ def read_colours_onto(path: Path, frame: RasterFrame) -> ByteArray:
 @contextmanager
 def _warped(path: Path, frame: RasterFrame, resampling: str) -> Iterator[Any]:
     """Open a raster as it is on the cells of a frame in its CRS."""
-    import rasterio
     from rasterio.enums import Resampling
     from rasterio.vrt import WarpedVRT
 
-    with rasterio.open(path) as raster:
+    with _opened(path) as raster:
         empty = {} if raster.dtypes[0] == "uint8" else {"src_nodata": NODATA, "nodata": NODATA}
         place = {"crs": raster.crs, **_cells(frame), "resampling": Resampling[resampling]}
         with WarpedVRT(raster, **place, **empty) as warped:
@@ -231,10 +291,9 @@ def read_reduced(path: Path, longest_px: int) -> tuple[NDArray[Any], float]:
 
     Float rasters have NaN where there is no value.
     """
-    import rasterio
     from rasterio.enums import Resampling
 
-    with rasterio.open(path) as raster:
+    with _opened(path) as raster:
         factor = max(max(raster.width, raster.height) / longest_px, 1.0)
         shape = (raster.count, max(round(raster.height / factor), 1), max(round(raster.width / factor), 1))
         values = raster.read(out_shape=shape, resampling=Resampling.average, masked=True)
@@ -248,7 +307,6 @@ def _vrt(
     parts: Sequence[tuple[Path, int, int]], frame: RasterFrame, kind: RasterKind, tags: Mapping[str, str]
 ) -> bytes:
     """Return the mosaic as XML that GDAL reads (https://gdal.org/drivers/raster/vrt.html)."""
-    import rasterio
 
     root = ElementTree.Element("VRTDataset", rasterXSize=str(frame.columns), rasterYSize=str(frame.rows))
     if frame.wkt:
@@ -260,7 +318,7 @@ def _vrt(
         ElementTree.SubElement(metadata, "MDI", key=key).text = value
     sizes = []
     for path, _, _ in parts:
-        with rasterio.open(path) as part:
+        with _opened(path) as part:
             sizes.append((part.width, part.height))
     for number, band in enumerate(kind.bands, start=1):
         element = ElementTree.SubElement(root, "VRTRasterBand", dataType=_GDAL_TYPE[kind.dtype], band=str(number))

@@ -140,7 +140,7 @@ def decode_plain_glb(data: bytes, path: Path | None = None) -> SplatArrays:
             logit_opacities=logit(opacity),
             sh=np.stack([arrays[name] for name in names], axis=1),
         )
-    except (ValueError, KeyError, IndexError, TypeError, StopIteration, struct.error) as error:
+    except (ValueError, KeyError, IndexError, TypeError, StopIteration, struct.error, RecursionError) as error:
         raise InputError("file-damaged", f"The glb does not hold plain Gaussians: {error}", path=path) from error
 
 

@@ -18,9 +18,10 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
-from pipelines.core.errors import InputError
-from pipelines.core.files import file_size, replacing
+from pipelines.core.errors import InputError, StorageError, storage_error_in
+from pipelines.core.files import file_size, replacing, storage_failure_of
 from pipelines.core.types import FloatArray
+from pipelines.formats.vector_source import gdal, layers_with_shapes, reading_errors, rows_of_table, tables_alone
 from pipelines.geometry.footprints import clipped_ring, ring_area
 
 Json = dict[str, Any]
@@ -97,11 +98,21 @@ def write_contours_gpkg(path: Path, lines: Sequence[ContourLine], wkt: str) -> N
 
 @contextmanager
 def _new_gpkg(path: Path) -> Iterator[Path]:
-    """Yield the draft of a GeoPackage, renamed when it is complete; GDAL takes the format from its suffix."""
+    """Yield the draft of a GeoPackage, renamed when it is complete; GDAL takes the format from its suffix.
+
+    Raises:
+        StorageError: the disk is full or fails, which GDAL reports by errors of its own.
+    """
     draft = path.with_name(f".{path.name}")
-    draft.unlink(missing_ok=True)
-    with replacing(path, draft):
-        yield draft
+    logs = [draft.with_name(draft.name + mark) for mark in ("-journal", "-wal", "-shm")]
+    for file in (draft, *logs):
+        file.unlink(missing_ok=True)
+    try:
+        with replacing(path, draft):
+            yield draft
+    finally:
+        for file in logs:
+            file.unlink(missing_ok=True)
 
 
 def _add_layer(
@@ -111,37 +122,66 @@ def _add_layer(
 
     GIS of some years ago warn of later versions, which GDAL writes by itself.
     """
-    import pyogrio
-
     is_new = not draft.exists()
-    pyogrio.raw.write(
-        draft,
-        geometry=np.array(shapely.to_wkb(shapes, output_dimension=3), dtype=object),
-        field_data=list(columns.values()),
-        fields=list(columns),
-        layer=layer,
-        driver="GPKG",
-        geometry_type=kind,
-        append=not is_new,
-        dataset_options={"VERSION": "1.2"} if is_new else None,
-        crs=crs or None,
-    )
+    wkb = [None if shape is None else shapely.to_wkb(shape, output_dimension=3) for shape in shapes]
+    try:
+        gdal().raw.write(
+            draft,
+            geometry=np.array(wkb, dtype=object),
+            field_data=list(columns.values()),
+            fields=list(columns),
+            layer=layer,
+            driver="GPKG",
+            geometry_type=kind,
+            append=not is_new,
+            dataset_options={"VERSION": "1.2"} if is_new else None,
+            crs=crs or None,
+        )
+        whole = rows_of_table(draft, layer) == len(shapes)
+    except (RuntimeError, ValueError) as error:  # pyogrio's are of these
+        failure = storage_error_in(str(error), draft) or storage_failure_of(draft.parent)
+        if failure is None:
+            raise
+        raise failure from error
+    if not whole:
+        message = f"{draft.parent}: the GeoPackage could not be written whole."
+        raise storage_failure_of(draft.parent) or StorageError("gpkg-not-written", message)
 
 
-def write_features_gpkg(path: Path, layers: Mapping[str, Sequence[Json]]) -> None:
-    """Write features of GeoJSON as a GeoPackage 1.2 in WGS84 with heights, a layer for each kind of geometry.
+@contextmanager
+def replacing_features_gpkg(path: Path, layers: Mapping[str, Sequence[Json]]) -> Iterator[None]:
+    """Write features of GeoJSON as a GeoPackage 1.2 in WGS84 with heights, renamed to `path` when the context ends.
 
-    Properties are numbers, texts, or None.
+    A layer has the features of a name; features may have no geometry. Properties are numbers, texts, or None. Where
+    the context ends by an error, `path` stays as it is. Raises as `_new_gpkg`.
     """
     with _new_gpkg(path) as draft:
         for layer, features in layers.items():
+            names = list(dict.fromkeys(name for one in features for name in one["properties"]))
             columns = {}
-            for name in dict.fromkeys(name for one in features for name in one["properties"]):
+            for name, column in zip(names, column_names(names), strict=True):
                 values = [one["properties"].get(name) for one in features]
                 is_text = any(isinstance(value, str) for value in values)
-                columns[name] = np.array(values, dtype=object if is_text else np.float64)
-            shapes = [shapely.from_geojson(json.dumps(one["geometry"])) for one in features]
-            _add_layer(draft, layer, shapes, columns, kind=f"{shapes[0].geom_type} Z", crs="EPSG:4979")
+                columns[column] = np.array(values, dtype=object if is_text else np.float64)
+            found = [one["geometry"] for one in features]
+            shapes = [None if one is None else shapely.from_geojson(json.dumps(one)) for one in found]
+            kinds = {shape.geom_type for shape in shapes if shape is not None}
+            kind = f"{kinds.pop()} Z" if len(kinds) == 1 else "Unknown"
+            _add_layer(draft, layer, shapes, columns, kind=kind, crs="EPSG:4979")
+        yield
+
+
+def column_names(names: Sequence[str]) -> list[str]:
+    """Return names of columns of a GeoPackage: SQLite tells no capitals apart, and `fid` and `geom` are taken."""
+    taken, columns = {"fid", "geom"}, []
+    for name in names:
+        column, number = name.replace("\0", " "), 1
+        while column.casefold() in taken:
+            number += 1
+            column = f"{name} {number}".replace("\0", " ")
+        taken.add(column.casefold())
+        columns.append(column)
+    return columns
 
 
 def read_contours(path: Path) -> tuple[str, list[ContourLine]]:
@@ -163,16 +203,14 @@ def _read_gpkg(
     path: Path, layer: str, columns: Sequence[str], command: str
 ) -> tuple[str, list[Any], list[tuple[Any, ...]]]:
     """Return the CRS as WKT, shapes and columns of a layer; an InputError names the command that wrote it."""
-    import pyogrio
-    from pyogrio.errors import DataLayerError, DataSourceError
-
     file_size(path, limit_bytes=_MOST_CONTOUR_BYTES, kind=layer)
     try:
-        meta, _, shapes, values = pyogrio.raw.read(path, layer=layer, columns=list(columns))
+        with tables_alone(path) as source:
+            meta, _, shapes, values = gdal().raw.read(source, layer=layer, columns=list(columns))
         order = [list(meta["fields"]).index(name) for name in columns]
         rows = list(zip(*(values[at].tolist() for at in order), strict=True))
         return str(meta["crs"]), [shapely.from_wkb(shape) for shape in shapes], rows
-    except (DataSourceError, DataLayerError, ValueError, OSError, shapely.errors.ShapelyError) as error:
+    except (*reading_errors(), shapely.errors.ShapelyError) as error:
         message = f"cannot be read: {error}. Write it again with `{command}`."
         raise InputError(f"{layer}-unreadable", message, path=path) from error
 
@@ -229,22 +267,16 @@ class ReadLayer:
 
 def read_layers(path: Path, columns: Sequence[str] = (), *, field: str) -> list[ReadLayer]:
     """Return the layers with geometry of a GeoPackage or DXF file; an InputError names file and option."""
-    import pyogrio
-    from pyogrio.errors import DataLayerError, DataSourceError
-
     layers = []
     try:
-        with warnings.catch_warnings():  # of GDAL, about what does not matter here
-            warnings.simplefilter("ignore", RuntimeWarning)
-            for name, kind in pyogrio.list_layers(path).tolist():
-                if kind is not None:
-                    meta, _, shapes, values = pyogrio.raw.read(
-                        path, layer=name, columns=list(columns), force_2d=True
-                    )
-                    known = dict(zip(meta["fields"], values, strict=True))
-                    plan = shapely.from_wkb(shapes, on_invalid="ignore")
-                    layers.append(ReadLayer(str(name), plan, known, meta["crs"] or ""))
-    except (DataSourceError, DataLayerError, ValueError, OSError) as error:
+        with warnings.catch_warnings(), tables_alone(path, field=field) as source:
+            warnings.simplefilter("ignore", RuntimeWarning)  # of GDAL, about what does not matter here
+            for name in layers_with_shapes(source):
+                meta, _, shapes, values = gdal().raw.read(source, layer=name, columns=list(columns), force_2d=True)
+                known = dict(zip(meta["fields"], values, strict=True))
+                plan = shapely.from_wkb(shapes, on_invalid="ignore")
+                layers.append(ReadLayer(str(name), plan, known, meta["crs"] or ""))
+    except reading_errors() as error:
         message = f"cannot be read: {error}. Write it again, as GeoJSON."
         raise InputError("boundary-unreadable", message, path=path, field=field) from error
     return layers

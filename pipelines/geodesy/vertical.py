@@ -10,15 +10,31 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 from pipelines.core.errors import InputError
 from pipelines.core.options import WRITTEN, from_text
 from pipelines.core.products import Product
+from pipelines.core.types import BoolArray
 
 ELLIPSOIDAL = "ellipsoidal"
 MOST_GEOID_M = 110.0  # between the ellipsoid and any geoid
 FOOT_M = 0.3048  # international foot; the US survey foot differs by 2e-6
+# Metres below and above which nobody flies and nothing is surveyed: the deepest pits lie above, jets fly below.
+LOWEST_M, HIGHEST_M = -1000.0, 20_000.0
+HEIGHT_REMEDY = (
+    f"heights of flights and surveys lie between {LOWEST_M:.0f} and {HIGHEST_M:.0f} m. Check the column and its "
+    "unit (autopilots log millimetres)."
+)
 _EPSG_OF = {"EGM84": 5798, "EGM96": 5773, "EGM2008": 3855}
 NAME_OF_EPSG = {code: name for name, code in _EPSG_OF.items()}  # `EPSG:5773` and `EGM96` are the same datum
+
+
+def impossible_heights(height_m: ArrayLike) -> BoolArray:
+    """Return which heights, above any datum, no flight and no survey has; NaN is none of them."""
+    heights = np.asarray(height_m, dtype=np.float64)
+    return np.asarray((heights < LOWEST_M) | (heights > HIGHEST_M))
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,10 @@ from pipelines.formats.trajectory_csv import complete
 from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import Origin, ecef_from_enu, ecef_from_lla
 from pipelines.geodesy.operations import WGS84
-from pipelines.geodesy.vertical import ELLIPSOIDAL, VerticalDatum
+from pipelines.geodesy.vertical import ELLIPSOIDAL, HEIGHT_REMEDY, VerticalDatum
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.trajectory import Rig, Trajectory, frame_from_frd
-from pipelines.ingest.bag_messages import BASE, GEODETIC_HEIGHTS
+from pipelines.ingest.bag_messages import BASE, GEODETIC_HEIGHTS, IMPOSSIBLE_HEIGHT
 from pipelines.ingest.bag_photos import lens_priors, write_photos
 from pipelines.ingest.bag_streams import BagStreams, TopicSamples, read_streams
 from pipelines.ingest.flight_record import (
@@ -97,6 +97,9 @@ def _positions(streams: BagStreams, options: IngestOptions, remarks: Remarks) ->
     """Return the positions, Earth-centred with the σ of the messages, and what their heights counted from."""
     series = streams.positions
     if series is None or not len(series.stamps):
+        if series is not None and set(series.problems) == {IMPOSSIBLE_HEIGHT}:
+            message = f"All messages of {series.topic} have an impossible altitude: {HEIGHT_REMEDY}"
+            raise InputError("height-impossible", message, path=streams.path, field=series.topic)
         if series is not None:
             remarks.warn("no-usable-position", f"No message of {series.topic} has a usable position.")
         return Trajectory.from_samples(np.empty(0)), VerticalDatum(name=ELLIPSOIDAL, stated=True)

@@ -6,7 +6,7 @@ Reads the bag once, message by message; writes nothing.
 from __future__ import annotations
 
 from array import array
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ import numpy as np
 from pipelines.core.progress import SILENT, Progress
 from pipelines.formats.bag import Bag, RawMessage, UndecodableError, open_bag
 from pipelines.ingest.bag_messages import BASE, GEODETIC_HEIGHTS, TRANSFORM_TYPES, Transforms
-from pipelines.ingest.bag_streams import SelectedTopics, select_topics
+from pipelines.ingest.bag_streams import SelectedTopics, clock_shifts_of, select_topics
 from pipelines.ingest.options import IngestOptions
 
 # A gap is worth telling if it is this many times the usual step.
@@ -56,6 +56,7 @@ class _Tally:
     """Counts of one pass over a topic."""
 
     times: array[int] = field(default_factory=lambda: array("q"))
+    recorded: array[int] = field(default_factory=lambda: array("q"))  # by the recorder's clock
     stamped: bool = False
     frame: str = ""
     child: str = ""
@@ -85,9 +86,28 @@ def inspect_bag(path: Path, progress: Progress = SILENT) -> BagReport:
             _report(name, bag.topics[name].type, uses.get(name, ""), tally)
             for name, tally in sorted(tallies.items())
         )
+        reports += tuple(
+            replace(
+                _report(topic.name, topic.type, "", _Tally()),
+                problem=f"metadata.yaml counts {topic.count} messages, and the data files have none",
+            )
+            for topic in bag.lost.values()
+        )
         missing = _missing(bag, topics, tallies, transforms)
         count = sum(len(tally.times) for tally in tallies.values())
-        return BagReport(str(path), count, reports, topics.remarks, missing)
+        remarks = (*(note.sentence for note in bag.notes), *topics.remarks, *_clock_remarks(topics, tallies))
+        return BagReport(str(path), count, reports, remarks, missing)
+
+
+def _clock_remarks(topics: SelectedTopics, tallies: dict[str, _Tally]) -> list[str]:
+    """Return what is to be said of topics to read whose stamps are on another clock than the others'."""
+    raw = {}
+    for topic in filter(None, (topics.image, topics.fix, topics.attitude)):
+        times, recorded = (
+            np.array(each, dtype=np.int64) for each in (tallies[topic].times, tallies[topic].recorded)
+        )
+        raw[topic] = (times if tallies[topic].stamped else np.zeros_like(times)), recorded
+    return [shift.sentence for shift in clock_shifts_of(raw).values()]
 
 
 def _count(bag: Bag, message: RawMessage, tally: _Tally, transforms: Transforms) -> None:
@@ -107,6 +127,7 @@ def _count(bag: Bag, message: RawMessage, tally: _Tally, transforms: Transforms)
             tally.problem = str(error)[:200]
     stamp = bag.header_stamp_ns(message) if tally.stamped else None
     tally.times.append(stamp or message.bag_ns)
+    tally.recorded.append(message.bag_ns)
 
 
 def _report(name: str, kind: str, use: str, tally: _Tally) -> TopicReport:
@@ -136,6 +157,10 @@ def _missing(
 ) -> tuple[str, ...]:
     """Return what a survey would lack, and the remedies."""
     missing: list[str] = []
+    for topic in bag.lost.values():
+        missing.append(
+            f"all {topic.count} messages of {topic.name}, which metadata.yaml counts and the data files do not have"
+        )
     if bag.damage is not None:
         missing.append(f"the bag is damaged and could not be read to its end ({bag.damage})")
     if topics.image is None:

@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from pipelines.core.types import FloatArray, Quaternion, Vector3, vector3
+from pipelines.geodesy.vertical import impossible_heights
 from pipelines.geometry.rotations import ENU_FROM_NED, matrix_from_quat_xyzw, quat_xyzw_from_matrix
 from pipelines.geometry.trajectory import Trajectory
 
@@ -26,6 +27,15 @@ _LARGEST_SIGMA_M = 1e4
 _PX4_FIXES = range(3, 7)  # 3D, differential, RTK float, RTK fixed; 8 is extrapolated
 _PX4_RECEIVER = {5: "RTK float", 6: "RTK fixed"}
 _STATUS_NO_FIX = -1
+IMPOSSIBLE_HEIGHT = "altitude is impossible"
+# Kinds of fix from the worst to the best, by their place
+FIX_KINDS = (
+    "without corrections",
+    "with corrections (SBAS, differential)",
+    "RTK float",
+    "RTK or ground-based (GBAS)",
+)
+_KIND_OF_STATUS, _KIND_OF_PX4 = {1: 1, 2: 3}, {4: 1, 5: 2, 6: 3}
 _COVARIANCE_UNKNOWN = 0
 _POSE_FRAME_NED = 1
 
@@ -40,6 +50,7 @@ class PositionSample:
     world: str = ""  # the local frame; "" for geodetic positions
     receiver: str = "unknown receiver"  # kind of receiver, for σ where the message has none
     problem: str = ""  # why it cannot be used, or ""
+    fix_kind: int = 0  # of a receiver, as a place in `FIX_KINDS`
 
 
 @dataclass(frozen=True)
@@ -76,7 +87,14 @@ def _fix(message: Any) -> PositionSample:
     known = message.position_covariance_type != _COVARIANCE_UNKNOWN
     sigma = _sigmas(np.diag(covariance)) if known else _NAN3
     problem = "no fix (status)" if message.status.status <= _STATUS_NO_FIX else _geodetic_problem(place)
-    return PositionSample(place, sigma, message.header.frame_id, receiver="single-frequency", problem=problem)
+    return PositionSample(
+        place,
+        sigma,
+        message.header.frame_id,
+        receiver="single-frequency",
+        problem=problem,
+        fix_kind=_KIND_OF_STATUS.get(int(message.status.status), 0),
+    )
 
 
 def _global_position(message: Any) -> PositionSample:
@@ -97,7 +115,8 @@ def _sensor_gps(message: Any) -> PositionSample:
     place = (float(place[0]), float(place[1]), float(place[2]))
     problem = "no fix (status)" if message.fix_type not in _PX4_FIXES else _geodetic_problem(place)
     receiver = _PX4_RECEIVER.get(int(message.fix_type), "single-frequency")
-    return PositionSample(place, _eph_epv(message), "gps", receiver=receiver, problem=problem)
+    kind = _KIND_OF_PX4.get(int(message.fix_type), 0)
+    return PositionSample(place, _eph_epv(message), "gps", receiver=receiver, problem=problem, fix_kind=kind)
 
 
 def _geodetic_problem(place: Sequence[float]) -> str:
@@ -106,7 +125,9 @@ def _geodetic_problem(place: Sequence[float]) -> str:
         return "latitude or longitude is NaN"
     if abs(lat) > 90 or abs(lon) > 360 or (lat == 0 and lon == 0):
         return "latitude or longitude is impossible"
-    return "" if math.isfinite(alt) else "altitude is NaN"
+    if not math.isfinite(alt):
+        return "altitude is NaN"
+    return IMPOSSIBLE_HEIGHT if impossible_heights(alt) else ""
 
 
 def _local(position: Any, message: Any, frame: str = "", covariance: Any = None) -> PositionSample:

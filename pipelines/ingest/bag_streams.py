@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from array import array
 from collections import Counter
-from collections.abc import Container, Iterable
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,15 +16,19 @@ import numpy as np
 
 from pipelines.core.errors import InputError
 from pipelines.core.progress import SILENT, Progress
-from pipelines.core.types import BoolArray, FloatArray
+from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.formats.bag import COMPRESSED, IMAGE, INFO, Bag, BagTopic, RawMessage, UndecodableError
+from pipelines.ingest.bag_clocks import ClockShift, clock_shifts
 from pipelines.ingest.bag_messages import ATTITUDES, POSITIONS, TRANSFORM_TYPES, Axes, Transforms, stamp_ns
+from pipelines.ingest.bag_receivers import RECEIVER_TYPES, ranked_receivers
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.remarks import Remarks
 
 # Pictures that are no photographs.
 _NOT_PHOTOS = ("depth", "disparity", "mask", "confidence", "segmentation", "thermal", "theora")
 _DAY_NS = 86_400_000_000_000
+# Notes of a bag that change nothing of what is read.
+_HARMLESS_NOTES = ("bag-qos-differs",)
 # A stamp this far off the others, against the recorder's clock, is no late message but a wrong clock.
 _JUMP_NS = 60_000_000_000
 
@@ -45,8 +49,8 @@ def select_topics(bag: Bag, options: IngestOptions) -> SelectedTopics:
 
     Images: names that tell of depth, masks and the like come last, then topics with a `CameraInfo` beside them
     first, then those with more messages. Positions and attitudes: by the order of types in `bag_messages`
-    (receivers before estimators before local frames), then those with more messages. Attitudes only where the
-    first message has one. Equals go by name.
+    (receivers before estimators before local frames), then those with more messages; of several receivers the
+    better one, as `bag_receivers` has it. Attitudes only where the first message has one. Equals go by name.
 
     Raises:
         InputError: a named topic is not there, or is of no type that fits.
@@ -54,8 +58,14 @@ def select_topics(bag: Bag, options: IngestOptions) -> SelectedTopics:
     remarks: list[str] = []
     images = sorted(_of(bag, (IMAGE, COMPRESSED)), key=lambda topic: _image_rank(bag, topic))
     image = _pick(bag, images, options.image_topic, flag="--image-topic", subject="photographs", remarks=remarks)
-    fixes = _by_type(bag, POSITIONS)
-    fix = _pick(bag, fixes, options.fix_topic, flag="--fix-topic", subject="positions", remarks=remarks)
+    fixes, choice = _by_type(bag, POSITIONS), ""
+    receivers = [topic for topic in fixes if topic.type in RECEIVER_TYPES]
+    if options.fix_topic is None and len(receivers) > 1:
+        receivers, choice = ranked_receivers(bag, receivers)
+        fixes = receivers + [topic for topic in fixes if topic.type not in RECEIVER_TYPES]
+    fix = _pick(
+        bag, fixes, options.fix_topic, flag="--fix-topic", subject="positions", remarks=remarks, choice=choice
+    )
     attitudes = _by_type(bag, ATTITUDES)
     if options.attitude_topic is None:
         attitudes = [topic for topic in attitudes if _has_attitude(bag, topic)]
@@ -99,7 +109,14 @@ def _has_attitude(bag: Bag, topic: BagTopic) -> bool:
 
 
 def _pick(
-    bag: Bag, candidates: list[BagTopic], requested: str | None, *, flag: str, subject: str, remarks: list[str]
+    bag: Bag,
+    candidates: list[BagTopic],
+    requested: str | None,
+    *,
+    flag: str,
+    subject: str,
+    remarks: list[str],
+    choice: str = "",
 ) -> str | None:
     names = [topic.name for topic in candidates]
     if requested is not None:
@@ -115,9 +132,8 @@ def _pick(
             )
         return requested
     if len(names) > 1:
-        remarks.append(
-            f"The {subject} are from {names[0]}, not {', '.join(names[1:5])}. {flag} selects another topic."
-        )
+        usual = f"The {subject} are from {names[0]}, not {', '.join(names[1:5])}. {flag} selects another topic."
+        remarks.append(choice or usual)
     return names[0] if names else None
 
 
@@ -174,8 +190,10 @@ def read_streams(bag: Bag, options: IngestOptions, remarks: Remarks, progress: P
     """Read everything but the pictures; messages that cannot be used are counted and noted.
 
     Raises:
-        InputError: no photographs, or a named topic that does not fit.
+        InputError: no photographs, a named topic that does not fit, or a topic whose messages are counted and that
+            has none.
     """
+    _note_files(bag, options, remarks)
     topics = select_topics(bag, options)
     if topics.image is None:
         raise InputError(
@@ -199,9 +217,11 @@ def read_streams(bag: Bag, options: IngestOptions, remarks: Remarks, progress: P
     frames = [topic.name for topic in bag.topics.values() if topic.type in TRANSFORM_TYPES]
     wanted = {topics.image, *frames, *filter(None, (topics.info, topics.fix, topics.attitude))}
     undecodable: dict[str, list[str]] = {}
+    read: Counter[str] = Counter()
     with progress.task("bag", sum(bag.topics[name].count for name in wanted)) as task:
         for message in bag.messages(wanted):
             task.advance()
+            read[message.topic] += 1
             try:
                 if message.topic == images.topic:
                     images.add(bag.header_stamp_ns(message), message.bag_ns)
@@ -215,9 +235,43 @@ def read_streams(bag: Bag, options: IngestOptions, remarks: Remarks, progress: P
             except UndecodableError as error:
                 undecodable.setdefault(message.topic, []).append(str(error)[:120])
     series = [samples for samples in (images, positions, attitudes) if samples is not None]
+    _require_read(bag, wanted, read, remarks)
     _note_losses(bag, series, undecodable, transforms.refused, remarks)
     _settle_clocks(series, remarks)
     return BagStreams(bag.path, images, positions, attitudes, transforms, info, topics.info)
+
+
+def _note_files(bag: Bag, options: IngestOptions, remarks: Remarks) -> None:
+    """Note where `metadata.yaml` and the data files differ; refuse a topic to read whose messages are all lost."""
+    for note in bag.notes:
+        (remarks.assume if note.code in _HARMLESS_NOTES else remarks.warn)(note.code, note.sentence)
+    roles: tuple[tuple[str | None, Container[str]], ...] = (
+        (options.image_topic, (IMAGE, COMPRESSED)), (options.fix_topic, POSITIONS),
+        (options.attitude_topic, ATTITUDES), (None, (INFO, *TRANSFORM_TYPES)),
+    )  # fmt: skip
+    for topic in bag.lost.values():
+        asked = [named for named, types in roles if topic.type in types]
+        sentence = f"metadata.yaml counts {topic.count} messages of {topic.name}, and the data files have none."
+        if any(named in (None, topic.name) for named in asked):
+            remedy = (
+                "Copy the bag again; if they are lost, `ros2 bag reindex` writes metadata.yaml anew without them."
+            )
+            raise InputError("topic-not-read", f"{sentence} {remedy}", path=bag.path, field=topic.name)
+        remarks.warn("topic-not-read", sentence)
+
+
+def _require_read(bag: Bag, wanted: Iterable[str], read: Counter[str], remarks: Remarks) -> None:
+    """Refuse a topic of which no message was read though its file counts some; note those read in part."""
+    if bag.damage is not None:
+        return
+    for topic in sorted(wanted):
+        counted = bag.topics[topic].count
+        sentence = f"The data files count {counted} messages of {topic}, and {read[topic]} were read"
+        if counted and not read[topic]:
+            remedy = "Repair the bag with `mcap recover` (mcap) or `ros2 bag reindex` (sqlite3)."
+            raise InputError("topic-not-read", f"{sentence}. {remedy}", path=bag.path, field=topic)
+        if read[topic] < counted:
+            remarks.warn("topic-read-in-part", f"{sentence}.")
 
 
 def _note_losses(
@@ -285,8 +339,8 @@ def _settle_clocks(series: list[TopicSamples], remarks: Remarks) -> None:
 
     Messages without a stamp get the time of recording. Topics that count from another epoch than the rest (since
     boot) are brought to the recorder's clock by the median difference; if all do (a simulator's time), they keep
-    it. Left out are stamps that jump by more than a minute against the recorder's clock, and those that are not
-    later than one before.
+    it. Clocks that are a known number of seconds apart (`bag_clocks`) become one. Left out are stamps that jump by
+    more than a minute against the recorder's clock, and those that are not later than one before.
     """
     raw = {
         samples.topic: (np.array(samples.stamps, dtype=np.int64), np.array(samples.bag_times, dtype=np.int64))
@@ -297,6 +351,7 @@ def _settle_clocks(series: list[TopicSamples], remarks: Remarks) -> None:
         for topic, (stamp, bag) in raw.items()
     }
     other_epoch = {topic for topic in raw if len(raw[topic][0]) and abs(offset[topic]) > _DAY_NS}
+    shifts = clock_shifts_of(raw)
     mixed = bool(other_epoch) and len(other_epoch) < sum(len(stamp) > 0 for stamp, _ in raw.values())
     for topic, (stamp, bag) in raw.items():
         without = int((stamp == 0).sum())
@@ -306,7 +361,11 @@ def _settle_clocks(series: list[TopicSamples], remarks: Remarks) -> None:
                 f"{without} messages of {topic} have no stamp: the time of recording is used.",
             )
         time = np.where(stamp == 0, bag + offset[topic], stamp)
-        jump = np.abs(time - bag - offset[topic]) > _JUMP_NS
+        if topic in shifts:
+            time = time - int(shifts[topic].shift_s * 1e9)
+            (remarks.assume if shifts[topic].shift_s else remarks.warn)(shifts[topic].code, shifts[topic].sentence)
+        moved = int(shifts[topic].shift_s * 1e9) if topic in shifts else 0
+        jump = np.abs(time - bag - offset[topic] + moved) > _JUMP_NS
         _note_left_out(remarks, "stamp-jump", jump, topic, "have a stamp more than a minute off the others")
         if mixed and topic in other_epoch:
             time = time - offset[topic]
@@ -324,6 +383,21 @@ def _settle_clocks(series: list[TopicSamples], remarks: Remarks) -> None:
         for samples in series:
             if samples.topic == topic:  # positions and attitudes may be of one topic
                 samples.time_s, samples.usable = time / 1e9, usable & ~backwards
+
+
+def clock_shifts_of(raw: Mapping[str, tuple[IntArray, IntArray]]) -> dict[str, ClockShift]:
+    """Return the shifts of topics on other clocks, of stamps and times of recording (N,) of each, in nanoseconds.
+
+    Topics without stamps have the recorder's clock; those that count from another epoch have no shift.
+    """
+    ahead, at_s = {}, 0.0
+    for topic, (stamp, bag) in raw.items():
+        known = stamp != 0
+        if len(stamp) and not known.any():
+            ahead[topic] = 0.0
+        elif known.any() and abs(between := float(np.median((stamp - bag)[known]))) <= _DAY_NS:
+            ahead[topic], at_s = between / 1e9, float(np.median(bag[known])) / 1e9
+    return clock_shifts(ahead, at_s)
 
 
 def _note_left_out(remarks: Remarks, code: str, bad: BoolArray, topic: str, reason: str) -> None:

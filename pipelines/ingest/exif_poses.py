@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import KDTree
 
-from pipelines.core.errors import InconsistencyError
+from pipelines.core.errors import InconsistencyError, InputError
 from pipelines.core.products import Remark
 from pipelines.core.sentences import listed
 from pipelines.core.types import BoolArray, FloatArray
@@ -20,7 +20,14 @@ from pipelines.formats.trajectory_csv import complete
 from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import ecef_from_enu_rotation, ecef_from_lla, lla_from_ecef
 from pipelines.geodesy.operations import WGS84
-from pipelines.geodesy.vertical import ELLIPSOIDAL, FOOT_M, MOST_GEOID_M, VerticalDatum
+from pipelines.geodesy.vertical import (
+    ELLIPSOIDAL,
+    FOOT_M,
+    HEIGHT_REMEDY,
+    MOST_GEOID_M,
+    VerticalDatum,
+    impossible_heights,
+)
 from pipelines.ingest.flight_record import ImagePoses, with_defaults
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo
@@ -48,7 +55,17 @@ def poses_from_tags(photos: Sequence[Photo], options: IngestOptions, remarks: Re
         InputError: `--vertical` names a geoid whose grid is missing.
     """
     tagged, time_s = tagged_positions(photos, remarks), photo_times(photos)
-    xyz = tagged.xyz
+    xyz = tagged.xyz.copy()
+    impossible = impossible_heights(xyz[:, 2])
+    if impossible.any():
+        names = [f"{photos[int(row)].name} ({xyz[row, 2]:.0f} m)" for row in np.flatnonzero(impossible)]
+        if 2 * len(names) > np.isfinite(xyz[:, 2]).sum():
+            message = f"The height is impossible ({len(names)} photographs, first {names[0]}): {HEIGHT_REMEDY}"
+            raise InputError(
+                "height-impossible", message, path=photos[int(np.argmax(impossible))].name, field="GPSAltitude"
+            )
+        remarks.warn_counted("height-impossible", names, "Images have an impossible height, which is not used")
+        xyz[impossible] = np.nan
     located = complete(xyz)
     flat = [photos[row].name for row in np.flatnonzero(np.isfinite(xyz[:, 0]) & ~located).tolist()]
     remarks.warn_counted(

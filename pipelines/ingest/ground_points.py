@@ -23,6 +23,7 @@ from pipelines.ingest.reference_system import (
     is_projected,
     note_operation,
     note_unread,
+    require_heights,
 )
 from pipelines.ingest.remarks import Remarks, shortened
 from pipelines.ingest.shown_marks import ShownMarks
@@ -159,7 +160,9 @@ def _begins_a_table(lines: list[str], path: Path) -> bool:
 def _placed(listed: GroundPoints, options: IngestOptions, remarks: Remarks) -> GroundFile:
     crs = crs_of_points(listed, options, remarks)
     xyz = in_units_of(crs, east_first(listed, crs, remarks), listed)
-    lla = crs.lla_from_xyz(xyz, path=listed.path, lines=[point.line for point in listed.points])
+    lines = [point.line for point in listed.points]
+    lla = crs.lla_from_xyz(xyz, path=listed.path, lines=lines)
+    require_heights(lla, listed.path, lines)
     note_operation(crs, lla, remarks)
     points = tuple(
         GroundPoint(point.name, position, point.line, point.sigma_h_m, point.sigma_v_m, point.is_check)

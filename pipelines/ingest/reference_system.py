@@ -1,5 +1,6 @@
 """Reference systems of the input files: which one a file's coordinates are in, and what is said of it."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -7,9 +8,11 @@ import numpy as np
 from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray
 from pipelines.formats.ground_points import GroundPoints
+from pipelines.formats.tables import refuse_first
 from pipelines.formats.trajectory_csv import PoseTable
 from pipelines.geodesy.crs import PointCrs, parse_crs
 from pipelines.geodesy.operations import WGS84
+from pipelines.geodesy.vertical import HEIGHT_REMEDY, impossible_heights
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.remarks import Remarks
 
@@ -144,6 +147,17 @@ def east_first(listed: GroundPoints, crs: PointCrs, remarks: Remarks) -> FloatAr
             "axis-order", f"The x in {listed.path.name} is the easting, although {crs.name} has the northing first."
         )
     return xyz
+
+
+def require_heights(lla: FloatArray, path: Path, lines: Sequence[int]) -> None:
+    """Raise an InputError for the first of points `lla` (N, 3) that is higher or lower than anybody flies."""
+
+    def message(row: int) -> str:
+        return f"The height of {lla[row, 2]:.0f} m is impossible: {HEIGHT_REMEDY}"
+
+    refuse_first(
+        impossible_heights(lla[:, 2]), "height-impossible", message, path=path, lines=lines, field="height"
+    )
 
 
 def note_operation(crs: PointCrs, lla: FloatArray, remarks: Remarks) -> None:

@@ -20,7 +20,13 @@ from pipelines.ingest.exif_poses import altitude_m, compare_with_exif, photo_tim
 from pipelines.ingest.flight_record import RECEIVERS, ImagePoses, with_defaults
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo
-from pipelines.ingest.reference_system import crs_of_table, in_units_of, note_operation, note_unread
+from pipelines.ingest.reference_system import (
+    crs_of_table,
+    in_units_of,
+    note_operation,
+    note_unread,
+    require_heights,
+)
 from pipelines.ingest.remarks import Remarks
 from pipelines.ingest.tag_headings import tagged_attitudes
 from pipelines.ingest.written_values import UNKNOWN_SIGMA_M, digits_sigma_m, zero_heights
@@ -233,6 +239,7 @@ def _measured(table: PoseTable, crs: PointCrs, options: IngestOptions, remarks: 
     """Return the rows Earth-centred, in the order of the file; NaN where a row has no time, attitude or σ."""
     xyz = in_units_of(crs, table.xyz, table)
     lla = crs.lla_from_xyz(xyz, path=table.path, lines=table.lines.tolist())
+    require_heights(lla, table.path, table.lines.tolist())
     note_operation(crs, lla, remarks)
     if table.sigma_enu_m is not None and "foot" in crs.units[0]:
         remarks.assume(

@@ -20,6 +20,26 @@ from pipelines.ingest.options import Every, IngestOptions
 from pipelines.ingest.remarks import Remarks
 
 _EVERY = Every(1.0, "s")
+# What the files of video containers have, and where. FFmpeg chooses by content: playlists and scripts, which are
+# text, would let it read other files.
+_ATOMS = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot")
+_CONTAINERS: tuple[tuple[int, tuple[bytes, ...]], ...] = (
+    (4, _ATOMS),  # MP4, MOV, 3GP
+    (8, (b"AVI ", b"AVIX")),
+    (
+        0,
+        (
+            b"\x1a\x45\xdf\xa3",
+            b"\x30\x26\xb2\x75\x8e\x66\xcf\x11",
+            b"OggS\0",
+            b"FLV\x01",
+            b"\0\0\x01\xba",
+            b"\0\0\x01\xb3",
+        ),
+    ),
+)
+_TS_SYNC = 0x47
+_TS_PACKETS = ((0, 188), (4, 192))  # MPEG transport streams: first sync byte, and the distance of the next
 _MOST_FRAMES = 20_000  # to be written
 _JPEG_QUALITY = 95
 _SMALL_PX = 960  # longer side at which sharpness is judged
@@ -73,7 +93,13 @@ def _opened(video: Path) -> tuple[cv2.VideoCapture, int, float]:
     """Return a video with the number of its frames, as its header has it, and how many there are a second."""
     if not video.is_file():
         raise InputError("no-video", "The video does not exist.", path=video, field="--video")
-    capture = cv2.VideoCapture(str(video), cv2.CAP_FFMPEG)
+    if not _is_container(video):
+        message = (
+            "The file is no video: it has none of the containers MP4, MOV, AVI, MKV, WebM, WMV, FLV, Ogg and MPEG."
+        )
+        raise InputError("not-a-video", message, path=video, field="--video")
+    # A name with a colon means a protocol to FFmpeg, unless it follows a folder.
+    capture = cv2.VideoCapture(str(video.absolute()), cv2.CAP_FFMPEG)
     width, height = capture.get(cv2.CAP_PROP_FRAME_WIDTH), capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
     if not capture.isOpened() or not width * height:
         capture.release()
@@ -88,6 +114,18 @@ def _opened(video: Path) -> tuple[cv2.VideoCapture, int, float]:
         )
     count = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
     return capture, count, max(float(capture.get(cv2.CAP_PROP_FPS)), 1e-3)
+
+
+def _is_container(video: Path) -> bool:
+    """Return whether a file begins as a container of video does."""
+    with video.open("rb") as file:
+        head = file.read(1024)
+    if any(head[at : at + len(mark)] == mark for at, marks in _CONTAINERS for mark in marks):
+        return head[:4] == b"RIFF" or head[8:11] != b"AVI"
+    return any(
+        len(head) > first + 2 * step and all(head[first + k * step] == _TS_SYNC for k in range(3))
+        for first, step in _TS_PACKETS
+    )
 
 
 def _sharpest(video: Path, step_s: float, progress: Progress) -> Iterator[tuple[float, ByteArray]]:

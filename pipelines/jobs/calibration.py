@@ -64,7 +64,7 @@ def _kept(file: Path, key: str) -> float | None:
         document = json.loads(file.read_text(encoding="utf-8"))
         factor = float(document["factor"])
         return factor if document["key"] == key and 1 / _SLOWEST < factor < _SLOWEST else None
-    except (OSError, ValueError, TypeError, KeyError):  # missing, or damaged
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):  # missing, or damaged
         return None
 
 

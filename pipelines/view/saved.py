@@ -25,7 +25,7 @@ from pipelines.core.lock import WriteLock
 from pipelines.core.products import ImageName, Product
 from pipelines.core.types import Matrix3, Vector3
 from pipelines.formats.tables import table_text
-from pipelines.formats.vector_files import Json, feature, features_text, write_features_gpkg
+from pipelines.formats.vector_files import Json, feature, features_text, replacing_features_gpkg
 from pipelines.view.quantities import Quantity
 
 FOLDER = "view"  # of the workspace: what the user saves in the viewer
@@ -143,16 +143,21 @@ class SavedMeasurements:
                 MEASUREMENTS: features_text([_feature(each) for each in measurements]),
                 **tables_of(measurements),
             }
-            replace_texts({self._folder / name: text for name, text in texts.items()})
+            with _package(self._folder / PACKAGE, measurements):
+                replace_texts({self._folder / name: text for name, text in texts.items()})
             for file in set(TABLES.values()) - set(texts):
                 (self._folder / file).unlink(missing_ok=True)
-            _write_package(self._folder / PACKAGE, measurements)
         self.all = tuple(measurements)
 
 
-def _write_package(path: Path, measurements: Sequence[NamedMeasurement]) -> None:
-    """Write a GeoPackage with a layer for each kind, where the extra `vectors` is installed."""
+@contextmanager
+def _package(path: Path, measurements: Sequence[NamedMeasurement]) -> Iterator[None]:
+    """Write a GeoPackage with a layer for each kind, where the extra `vectors` is installed.
+
+    It takes its place when the context ends: what cannot be written whole is not stored at all.
+    """
     if extra_part("vectors").found is None or not measurements:
+        yield
         path.unlink(missing_ok=True)
         return
     layers: dict[str, list[Json]] = {}
@@ -161,7 +166,8 @@ def _write_package(path: Path, measurements: Sequence[NamedMeasurement]) -> None
         layers.setdefault(TABLES[each.kind].removesuffix(".csv"), []).append(
             {**one, "properties": {name: value for name, value in one["properties"].items() if name != "georef"}}
         )
-    write_features_gpkg(path, layers)
+    with replacing_features_gpkg(path, layers):
+        yield
 
 
 def tables_of(measurements: Sequence[NamedMeasurement]) -> dict[str, str]:
@@ -215,7 +221,7 @@ def read_measurements(folder: Path) -> list[NamedMeasurement]:
         document = json.loads(path.read_text("utf-8"))
         features = document["features"]
         measurements = [each["properties"]["georef"] for each in features]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         message = "is no file of saved measurements; move the file away."
         raise InputError("not-measurements", message, path=path) from error
     read = []
@@ -247,6 +253,7 @@ def _feature(measurement: NamedMeasurement) -> Json:
         shape = shapely.LineString(lon_lat_h)
     values = {quantity.name: quantity.value for quantity in measurement.quantities}
     sigmas = {f"sigma of {quantity.name}": quantity.sigma for quantity in measurement.quantities}
-    own = {"name": measurement.name, "kind": measurement.kind, **values, **sigmas}
+    names = {"name": measurement.name, "kind": measurement.kind}  # which no quantity replaces
+    own = {**names, **values, **sigmas, **names}
     geometry = None if shape is None else shapely.geometry.mapping(shape)
     return feature(geometry, {**own, "georef": measurement.model_dump(mode="json")})

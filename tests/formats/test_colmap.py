@@ -96,3 +96,73 @@ def test_truncated_missing_and_not_finite_models_are_refused(model: SparseModel,
         handle.truncate(1000)
     with refused("file-cut-off", InputError):
         read_sparse(tmp_path / "cut")
+
+
+def text_model(model: SparseModel, folder: Path) -> Path:
+    """Write a model as text."""
+    write_sparse(model, folder / "binary")
+    (folder / "text").mkdir()
+    pycolmap.Reconstruction(str(folder / "binary")).write_text(str(folder / "text"))
+    for name in ("rigs", "frames"):
+        (folder / "text" / f"{name}.txt").unlink(missing_ok=True)
+    return folder / "text"
+
+
+@pytest.mark.parametrize(
+    "quaternion", [(0, 0, 0, 0), (2, 0, 0, 0), (1, 1, 1, 1), (0.5, 0.5, 0.5, 0.1), (1e-6, 0, 0, 0)]
+)
+@pytest.mark.parametrize("image", [1, 3])
+def test_rotations_that_are_none(
+    model: SparseModel, tmp_path: Path, quaternion: tuple[float, ...], image: int
+) -> None:
+    folder = text_model(model, tmp_path)
+    lines = (folder / "images.txt").read_text().splitlines(keepends=True)
+    at = next(k for k, line in enumerate(lines) if line.startswith(f"{image} "))
+    cells = lines[at].split()
+    lines[at] = " ".join([cells[0], *map(str, quaternion), *cells[5:]]) + "\n"
+    (folder / "images.txt").write_text("".join(lines))
+    with refused("quaternion-norm", InputError) as caught:
+        read_sparse(folder)
+    assert (caught.value.path, caught.value.line) == (folder / "images.txt", at + 1)
+    assert cells[9] in caught.value.message
+    binary = tmp_path / "binary"
+    data = bytearray((binary / "images.bin").read_bytes())
+    struct.pack_into("<4d", data, 8 + 4, *quaternion)  # of the first record
+    (binary / "images.bin").write_bytes(data)
+    with refused("file-damaged", InputError) as caught:
+        read_sparse(binary)
+    assert caught.value.path == binary / "images.bin" and "Record 1 of 6" in caught.value.message
+
+
+def test_quaternions_of_few_digits_are_rotations(model: SparseModel, tmp_path: Path) -> None:
+    folder = text_model(model, tmp_path)
+    lines = (folder / "images.txt").read_text().splitlines()
+    for k, line in enumerate(lines):
+        cells = line.split()
+        if len(cells) == 10 and not line.startswith("#"):
+            lines[k] = " ".join([cells[0], *(f"{float(cell):.2f}" for cell in cells[1:5]), *cells[5:]])
+    (folder / "images.txt").write_text("\n".join(lines) + "\n")
+    again = read_sparse(folder)
+    apart = again.rotation_cam_from_local - model.rotation_cam_from_local
+    assert np.abs(apart).max() < 0.03  # twice the half digit that was lost, over the cells
+
+
+@pytest.mark.parametrize(
+    ("name", "params"),
+    [
+        ("PINHOLE", (0, 300, 160, 120)),
+        ("PINHOLE", (300, 0, 160, 120)),
+        ("SIMPLE_PINHOLE", (-300, 160, 120)),
+        ("OPENCV", (8.8, 8.8, 160, 120, 0, 0, 0, 0)),  # millimetres
+        ("SIMPLE_RADIAL", (0.9, 160, 120, 0.01)),  # widths of the picture
+        ("RADIAL", (1e9, 160, 120, 0, 0)),
+    ],
+)
+def test_focal_lengths_that_no_lens_has(
+    model: SparseModel, tmp_path: Path, name: str, params: tuple[float, ...]
+) -> None:
+    folder = text_model(model, tmp_path)
+    (folder / "cameras.txt").write_text(f"1 {name} 320 240 {' '.join(map(str, params))}\n")
+    with refused("focal-length-impossible", InputError) as caught:
+        read_sparse(folder)
+    assert (caught.value.path, caught.value.field) == (folder / "cameras.txt", "camera 1")

@@ -13,6 +13,7 @@ from pipelines.core.errors import InputError
 from pipelines.formats.gnss_logs import read_subtitles
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.stage import survey_and_track
+from pipelines.ingest.video_frames import video_length
 from pipelines.survey.survey import Survey
 from tests import gopro
 from tests.earth import enu_from_lla
@@ -148,3 +149,44 @@ def test_positions_of_a_gopro(tmp_path: Path) -> None:
     recorded(b"", fix=2)
     with refused("file-without-positions", InputError):
         surveyed(path, tmp_path, vertical=None)
+
+
+SCRIPTS = {
+    "ffconcat": "ffconcat version 1.0\nfile flight.avi\n",
+    "ffconcat with a comment": "# a film\nffconcat version 1.0\nfile 'flight.avi'\n",
+    "playlist": "#EXTM3U\n#EXT-X-TARGETDURATION:6\n#EXTINF:6,\nflight.avi\n#EXT-X-ENDLIST\n",
+    "session": "v=0\no=- 0 0 IN IP4 127.0.0.1\ns=a\nm=video 5004 RTP/AVP 96\n",
+    "manifest": "<?xml version='1.0'?><MPD><Period><BaseURL>flight.avi</BaseURL></Period></MPD>",
+    "script that looks like a film": "ffconcat version 1.0\n# ftyp\nfile flight.avi\n",
+}
+
+
+@pytest.mark.parametrize("suffix", [".MP4", ".mov", ".avi", ".mkv"])
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_scripts_that_name_another_film(video: Path, tmp_path: Path, script: str, suffix: str) -> None:
+    path = video.with_name(f"DJI_0001{suffix}")
+    path.write_text(SCRIPTS[script])
+    path.with_suffix(".SRT").write_bytes(video.with_suffix(".SRT").read_bytes())
+    with refused("not-a-video", InputError):
+        surveyed(path, tmp_path / "out")
+    assert not list((tmp_path / "out").rglob("*.jpg"))
+
+
+def test_names_that_are_protocols_to_ffmpeg(video: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file's name with a colon in the current folder is the file, and no protocol and its argument."""
+    (home := tmp_path / "home").mkdir()
+    named = home / "concat:flight.avi"
+    named.write_bytes(video.read_bytes())
+    named.with_suffix(".SRT").write_bytes(video.with_suffix(".SRT").read_bytes())
+    monkeypatch.chdir(home)
+    assert len(surveyed(Path(named.name), tmp_path / "out", vertical="ellipsoidal").images) == SECONDS
+
+
+@pytest.mark.parametrize(("suffix", "codec"), [(".mp4", "mp4v"), (".mov", "mp4v"), (".mkv", "MJPG")])
+def test_containers_of_films_are_known(tmp_path: Path, suffix: str, codec: str) -> None:
+    path = tmp_path / f"film{suffix}"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*codec), 10, (64, 48))  # type: ignore[attr-defined]
+    for number in range(20):
+        writer.write(np.random.default_rng(number).integers(0, 255, (48, 64, 3), dtype=np.uint8))
+    writer.release()
+    assert video_length(path) == pytest.approx(2.0, abs=0.11)

@@ -10,14 +10,15 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pyogrio
 import pytest
 
 from pipelines.core.errors import InputError, StorageError
 from pipelines.formats.ground_points import read_ground_points
 from pipelines.view.marking import CHECK, CONTROL
-from pipelines.view.saved import TABLES, SavedMeasurements
+from pipelines.view.saved import FILES, PACKAGE, TABLES, SavedMeasurements
 from tests.cli_runs import REPOSITORY
-from tests.faults.injection import Disk, Kind
+from tests.faults.injection import Disk, Kind, mounted
 from tests.view.test_kept_marks import kept, marks
 from tests.view.test_saved import measurement, names
 
@@ -129,3 +130,27 @@ def test_a_viewer_killed_while_saving_leaves_whole_records(tmp_path: Path) -> No
         written = [mark.image for mark in read_ground_points(folder / CHECK).marks]
         assert written in (images, images[:-1])
         SavedMeasurements(folder).put(measurement("after it"))  # nothing is in the way of the next one
+
+
+def test_a_disk_that_fills_stores_a_measurement_whole_or_not_at_all(tmp_path: Path) -> None:
+    """The GeoPackage is written by GDAL, past Python's files: the disk is a real one."""
+    folder = tmp_path / "small"
+    with mounted(folder, "700k"):
+        saved, stored, refusals = SavedMeasurements(folder), ["first"], 0
+        saved.put(measurement("first"))
+        for free in (4096, 8192, 16384, 24576, 32768, 49152, 65536, 81920, 98304, 200_000):
+            status = os.statvfs(folder)
+            with (folder / "filler").open("wb") as filler:
+                filler.write(bytes(max(status.f_bavail * status.f_frsize - free, 0)))
+            try:
+                saved.put(measurement(f"with {free}"))
+                stored.append(f"with {free}")
+            except StorageError as error:
+                refusals += 1
+                assert error.code == "storage-enospc"
+            (folder / "filler").unlink()
+            assert names(folder) == [each.name for each in saved.all] == stored
+            _, _, shapes, _ = pyogrio.raw.read(folder / PACKAGE, layer="points")
+            assert len(shapes) == len(stored)
+            assert {file.name for file in folder.iterdir()} <= {*FILES, ".lock", ".lock.holder"}
+        assert refusals >= 3 and stored[-1] == "with 200000"

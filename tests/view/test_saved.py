@@ -152,3 +152,59 @@ def test_two_viewers_keep_what_the_other_saves(tmp_path: Path) -> None:
 def test_kinds_are_those_of_the_page() -> None:
     page = (Path(saved.__file__).parent / "page" / "measure.js").read_text("utf-8")
     assert all(f"{kind}: [" in page for kind in Kind.__args__)
+
+
+DEEP = "[" * 100_000 + "]" * 100_000
+
+
+@pytest.mark.parametrize(
+    "text",
+    [f'{{"features": {DEEP}}}', DEEP, f'{{"features": [{{"properties": {{"georef": {DEEP}}}}}]}}', "{" * 9999],
+)
+def test_deep_brackets_are_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / MEASUREMENTS).write_text(text, "utf-8")
+    with refused("not-measurements", InputError):
+        SavedMeasurements(tmp_path)
+
+
+def located(name: str, *quantities: str, kind: Kind = "point", lla=(46.0, 7.0, 1.0), points: int = 1):
+    places = tuple(saved_point((k, 2 * k * k, 3), lla, None) for k in range(points))
+    made = tuple(Quantity(name=each, value=1.5, sigma=0.1, unit="m") for each in quantities)
+    return NamedMeasurement(name=name, kind=kind, crs="C", model="m", points=places, quantities=made)
+
+
+@pytest.mark.parametrize(
+    "quantity", ["fid", "FID", "geom", "Geom", "NAME", "name", "kind", "Kind", "georef", "a\0b"]
+)
+def test_quantities_with_names_of_columns(tmp_path: Path, quantity: str) -> None:
+    saved = SavedMeasurements(tmp_path)
+    for each in (located(quantity), located("wall", quantity, quantity.upper()), located("later", "length")):
+        saved.put(each)
+    assert names(tmp_path) == [quantity, "wall", "later"]
+    meta, _, _, values = pyogrio.raw.read(tmp_path / PACKAGE, layer="points")
+    at = list(meta["fields"]).index("name")
+    assert list(values[at])[1:] == ["wall", "later"]
+    assert any(np.asarray(column)[1] == 1.5 for column in values if np.asarray(column).dtype.kind == "f")
+
+
+@pytest.mark.parametrize("kind", ["point", "distance", "area", "profile"])
+def test_measurements_in_a_local_frame(tmp_path: Path, kind: Kind) -> None:
+    """Without a place on Earth they have no geometry in longitude and latitude, and are saved once a press."""
+    saved = SavedMeasurements(tmp_path)
+    saved.put(located("first", "length", kind=kind, lla=None, points=4))
+    saved.put(located("second", "length", kind=kind, lla=None, points=4))
+    assert names(tmp_path) == ["first", "second"]
+    saved.put(located("on Earth", "length", kind=kind, points=4))
+    _, _, shapes, _ = pyogrio.raw.read(tmp_path / PACKAGE, layer=TABLES[kind].removesuffix(".csv"))
+    assert [shape is None for shape in shapes] == [True, True, False]
+
+
+@pytest.mark.filterwarnings("error")
+def test_shapes_of_several_kinds_are_one_layer(tmp_path: Path) -> None:
+    """An area of two points is a line."""
+    saved = SavedMeasurements(tmp_path)
+    for count in (1, 2, 4):
+        places = tuple(saved_point((k, k, 0), (46 + k * k * 1e-5, 7 + k * 1e-5, 0.0), None) for k in range(count))
+        saved.put(located(f"{count}", kind="area").model_copy(update={"points": places}))
+    _, _, shapes, _ = pyogrio.raw.read(tmp_path / PACKAGE, layer="areas")
+    assert [shapely.from_wkb(shape).geom_type for shape in shapes] == ["Point", "LineString", "Polygon"]

@@ -1,0 +1,105 @@
+"""Several receivers in one bag: the better one by what its messages state of themselves, and both σ.
+
+The order of receivers: those that cover less than half of the time of another come last; then a σ that is clearly
+smaller (by a factor of two); then the kind of fix (corrected or not); then σ, the number of fixes and the name.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pipelines.core.types import FloatArray
+from pipelines.formats.bag import Bag, BagTopic, UndecodableError
+from pipelines.geodesy.enu import Origin, ecef_from_lla, enu_from_ecef
+from pipelines.ingest.bag_messages import FIX_KINDS, POSITIONS
+
+RECEIVER_TYPES = ("sensor_msgs/msg/NavSatFix", "px4_msgs/msg/SensorGps")
+# σ in metres by kind of fix, of receivers that state none; it only orders them.
+_USUAL_SIGMA_M = (2.5, 1.0, 0.5, 0.05)
+_LEAST_SHARE = 0.5
+
+
+@dataclass
+class _Receiver:
+    """Fixes of a topic: time of recording, latitude, longitude, height; σ where stated; the kind of each fix."""
+
+    topic: BagTopic
+    fixes: list[tuple[float, float, float, float]] = field(default_factory=list)
+    sigma_h_m: list[float] = field(default_factory=list)
+    kinds: list[int] = field(default_factory=list)
+
+    @property
+    def span_s(self) -> float:
+        return self.fixes[-1][0] - self.fixes[0][0] if self.fixes else 0.0
+
+    @property
+    def sigma_m(self) -> float:
+        """Median of the σ that are stated; NaN: none."""
+        known = [value for value in self.sigma_h_m if math.isfinite(value)]
+        return float(np.median(known)) if known else math.nan
+
+    @property
+    def kind(self) -> int:
+        return int(np.median(self.kinds)) if self.kinds else 0
+
+    def rank(self, longest_s: float) -> tuple[bool, int, int, float, int, str]:
+        sigma = self.sigma_m if math.isfinite(self.sigma_m) else _USUAL_SIGMA_M[self.kind]
+        short = not self.fixes or self.span_s < _LEAST_SHARE * longest_s
+        return short, round(math.log2(sigma)), -self.kind, sigma, -len(self.fixes), self.topic.name
+
+    def words(self) -> str:
+        known = math.isfinite(self.sigma_m)
+        sigma = f"σ {self.sigma_m:.3g} m horizontally" if known else "no σ stated"
+        return f"{len(self.fixes)} fixes, {FIX_KINDS[self.kind]}, {sigma}"
+
+
+def ranked_receivers(bag: Bag, topics: Sequence[BagTopic]) -> tuple[list[BagTopic], str]:
+    """Return the topics of receivers from the best to the worst, and a sentence on the choice.
+
+    Reads all their messages.
+    """
+    receivers = {topic.name: _Receiver(topic) for topic in topics}
+    for message in bag.messages(list(receivers)):
+        try:
+            sample = POSITIONS[message.type](bag.decode(message))
+        except UndecodableError:
+            continue
+        if not sample.problem:
+            one = receivers[message.topic]
+            one.fixes.append((message.bag_ns / 1e9, *sample.place))
+            one.sigma_h_m.append(math.hypot(*sample.sigma_enu_m[:2]) / math.sqrt(2.0))
+            one.kinds.append(sample.fix_kind)
+    longest_s = max(one.span_s for one in receivers.values())
+    order = sorted(receivers.values(), key=lambda one: one.rank(longest_s))
+    best, second = order[0], order[1]
+    others = ", ".join(f"{one.topic.name} ({one.words()})" for one in order[1:])
+    apart = _apart(best, second)
+    distance = ""
+    if apart is not None:
+        distance = (
+            f" {second.topic.name} is {apart[0]:.2f} m away horizontally and {apart[1]:+.2f} m in height (median)."
+        )
+    sentence = (
+        f"The positions are from {best.topic.name} ({best.words()}), not {others}.{distance} --fix-topic selects "
+        "another topic."
+    )
+    return [one.topic for one in order], sentence
+
+
+def _apart(best: _Receiver, other: _Receiver) -> tuple[float, float] | None:
+    """Return how far another receiver is from the best one, horizontally and upwards in metres (medians)."""
+    if len(best.fixes) < 2 or not other.fixes:
+        return None
+    own, its = np.array(best.fixes), np.array(other.fixes)
+    order = np.argsort(own[:, 0])
+    inside = (its[:, 0] >= own[order[0], 0]) & (its[:, 0] <= own[order[-1], 0])
+    if not inside.any():
+        return None
+    origin = Origin(lat_deg=own[0, 1], lon_deg=own[0, 2], alt_m=own[0, 3])
+    place = enu_from_ecef(ecef_from_lla(own[order, 1:]), origin)
+    there: FloatArray = enu_from_ecef(ecef_from_lla(its[inside, 1:]), origin)
+    at = np.column_stack([np.interp(its[inside, 0], own[order, 0], place[:, axis]) for axis in range(3)])
+    shift = np.median(there - at, axis=0)
+    return float(math.hypot(*shift[:2])), float(shift[2])
