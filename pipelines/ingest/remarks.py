@@ -16,6 +16,11 @@ class Remarks:
     warnings: list[Remark] = field(default_factory=list)
     cautions: list[Remark] = field(default_factory=list)
 
+    @property
+    def by_kind(self) -> tuple[Sequence[Remark], Sequence[Remark], Sequence[Remark]]:
+        """Warnings, cautions and assumptions, in the order of `core.workspace.Summary`."""
+        return self.warnings, self.cautions, self.assumptions
+
     def assume(self, code: str, sentence: str) -> None:
         """Record what stands in for what the input does not state."""
         _add(self.assumptions, code, sentence)

@@ -4,6 +4,7 @@ Images and surveyed points get their positions, attitudes and covariances in geo
 base station, a receiver or a day, form a session, with the σ of that error.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
@@ -91,7 +92,7 @@ def assemble_survey(
     control_distances = sum(distance.use == "control" for distance in distances)
     origin = None
     if located or files or not control_distances:
-        require_placed(located or bool(marked), flight.photos)
+        require_placed(located or bool(marked), flight.photos, controls)
         origin = _origin(poses, marked)
         _note_coverage(flight, len(marked), remarks)
     else:
@@ -133,8 +134,22 @@ def assemble_survey(
     return survey, track
 
 
-def require_placed(placed: bool, photos: Sequence[Photo] = ()) -> None:
-    """Refuse a survey that nothing places on Earth, with what its photographs' tags hold instead."""
+def require_placed(placed: bool, photos: Sequence[Photo] = (), points: Sequence[GroundPoint] = ()) -> None:
+    """Refuse a survey that nothing places on Earth, with what its photographs' tags hold instead.
+
+    `points` are control points whose marks do not suffice.
+    """
+    if not placed and points:
+        counts = Counter(len(point.marks) for point in points)
+        of_each = ", ".join(
+            f"{count} with {marks} mark{'s'[: marks != 1]}" for marks, count in sorted(counts.items(), reverse=True)
+        )
+        raise InputError(
+            "control-points-unmarked",
+            f"No image has a position, and no control point is marked in two or more photographs: of {len(points)} "
+            f"control points there are {of_each}. Mark each point in at least 2 photographs, better in all that show "
+            "it well, or give positions with --trajectory or --geo.",
+        )
     if not placed:
         held = f" {contents(photos)}" if photos else ""
         raise InputError(

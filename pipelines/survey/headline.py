@@ -32,7 +32,16 @@ def headline(triangulated: CheckPointErrors, scene: AccuracySummary, cautions: t
     if total is None:
         return predicted(scene, cautions)
     count = triangulated.asprs.points
-    return Headline(kind="measured", rmse_h_m=total.rmse_h_m, rmse_v_m=total.rmse_v_m, check_points=count)
+    others = triangulated.with_survey_without_refuted
+    return Headline(
+        kind="measured",
+        rmse_h_m=total.rmse_h_m,
+        rmse_v_m=total.rmse_v_m,
+        check_points=count,
+        blunders=() if others is None else triangulated.refuted,
+        rmse_h_without_m=None if others is None else others.rmse_h_m,
+        rmse_v_without_m=None if others is None else others.rmse_v_m,
+    )
 
 
 def predicted(scene: AccuracySummary, cautions: tuple[Remark, ...]) -> Headline:
