@@ -97,7 +97,7 @@ def fix_correspondences(survey: Survey, model: SparseModel) -> Correspondences:
         in_local=model.cam_center_in_local[[index for index, _ in fixed]].reshape(-1, 3),
         cov_in_local=np.zeros((len(fixed), 3, 3)),
         in_geo=np.array([fixes[name].position_in_geo for _, name in fixed]).reshape(-1, 3),
-        cov_in_geo=np.array([fixes[name].cov_in_geo for _, name in fixed]).reshape(-1, 3, 3),
+        cov_in_geo=np.array([fixes[name].cov_apart for _, name in fixed]).reshape(-1, 3, 3),
     )
 
 
@@ -253,7 +253,8 @@ def problem_of(
         frame = LocalFrame.fixed(float(np.linalg.norm(center - center.mean(axis=0), axis=1).max()))
     every: tuple[Term | None, ...] = (fixes, control, distances_of(scene, survey), attitudes, planes, frame)
     measured = tuple(term for term in every if term is not None)
-    return Problem(scene.poses, scene.bundle, measured, SystematicErrors(tuple(blocks)))
+    datum = (0.0, 0.0, 0.0) if control is None else survey.sigma_datum_m
+    return Problem(scene.poses, scene.bundle, measured, SystematicErrors(tuple(blocks)), sigma_datum_m=datum)
 
 
 def rejected_of(scene: Scene, survey: Survey, initial: InitialSimilarity) -> Problem | None:

@@ -107,7 +107,7 @@ def _share_of_control(survey: Survey) -> FloatArray:
     fixes = [image.fix for image in survey.images if image.fix is not None]
     if not fixes:
         return np.ones(3)
-    of_fixes = 1.0 / np.sum([1.0 / np.diag(fix.cov_in_geo) for fix in fixes], axis=0)
+    of_fixes = 1.0 / np.sum([1.0 / np.diag(fix.cov_apart) for fix in fixes], axis=0)
     if survey.sessions:
         of_fixes = of_fixes + np.square(survey.sessions[0].sigma_common_m)
     return np.asarray(of_fixes / (of_fixes + of_control))

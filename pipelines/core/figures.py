@@ -88,7 +88,7 @@ class Headline(Product):
     Attributes:
         kind: `measured`: of the triangulated check points; `predicted`: of the scene; `unknown`: neither.
         rmse_h_m, rmse_v_m: RMSE of the check points, their survey's error included, or the root mean square of the
-            predicted σ over the scene. None: not known.
+            predicted σ over the scene. None: not known, such as V where heights count from an unknown take-off.
         check_points: number of check points; 0 unless measured.
         reason: reason why it is not known; None: it is.
         blunders: names of the check points that the others and σ refute; they count in RMSE and number.
@@ -109,7 +109,8 @@ class Headline(Product):
         """Kind and figures, such as `measured at 9 check points: RMSE H 4.2 cm, V 5.1 cm`."""
         if self.kind == "unknown":
             return f"not known: {self.reason}"
-        figures = f"H {ACCURACY_H.with_unit(self.rmse_h_m)}, V {ACCURACY_V.with_unit(self.rmse_v_m)}"
+        vertical = "unknown" if self.rmse_v_m is None else ACCURACY_V.with_unit(self.rmse_v_m)
+        figures = f"H {ACCURACY_H.with_unit(self.rmse_h_m)}, V {vertical}"
         if self.kind == "predicted":
             return f"predicted, not measured: σ {figures}"
         text = f"measured at {self.check_points} check point{'s'[: self.check_points != 1]}: RMSE {figures}"

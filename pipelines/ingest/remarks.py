@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from pipelines.core.products import Remark
+from pipelines.survey.survey import UsedTransformation
 
 _SHOWN = 4
 
@@ -15,6 +16,7 @@ class Remarks:
     assumptions: list[Remark] = field(default_factory=list)
     warnings: list[Remark] = field(default_factory=list)
     cautions: list[Remark] = field(default_factory=list)
+    transformations: list[UsedTransformation] = field(default_factory=list)
 
     @property
     def by_kind(self) -> tuple[Sequence[Remark], Sequence[Remark], Sequence[Remark]]:

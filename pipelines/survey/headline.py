@@ -13,6 +13,7 @@ from pipelines.core.products import Remark, is_checked
 from pipelines.core.stages import REPORT
 from pipelines.core.types import Vector3
 from pipelines.core.workspace import Workspace
+from pipelines.geodesy.vertical import MOST_GEOID_M
 from pipelines.survey.report import (
     AccuracySummary,
     CheckPointErrors,
@@ -53,7 +54,9 @@ def predicted(scene: AccuracySummary, cautions: tuple[Remark, ...]) -> Headline:
         return Headline(kind="unknown", reason=NOTHING_CHECKS)
     if scene.rms_sigma_h_m is None or scene.rms_sigma_v_m is None:
         return Headline(kind="unknown", reason=scene.reason or "no σ is predicted")
-    return Headline(kind="predicted", rmse_h_m=scene.rms_sigma_h_m, rmse_v_m=scene.rms_sigma_v_m)
+    # A σ beyond that of any datum says that the zero of the heights is unknown.
+    vertical_m = scene.rms_sigma_v_m if scene.rms_sigma_v_m < MOST_GEOID_M else None
+    return Headline(kind="predicted", rmse_h_m=scene.rms_sigma_h_m, rmse_v_m=vertical_m)
 
 
 def headline_of(workspace: Workspace) -> Headline | None:
