@@ -17,9 +17,7 @@ from pipelines.core.types import BoolArray, FloatArray
 
 # A blunder misses by more than this many σ, and by so many times what the others scatter. Errors of points that
 # are only poorly predicted stay below: their σ is at fault then, and `chi2_caution` says so.
-_SIGMAS = 6.0
-# Of two points that contradict each other, one is the blunder if its own misfit is so many times the other's.
-_CLEAR = 2.0
+_SIGMAS = 5.0
 _AXES = 3
 
 
@@ -35,8 +33,9 @@ def find_blunders(error_in_geo: FloatArray, joint_cov: FloatArray) -> Blunders:
     """Return the blunders among J ≥ 1 errors (J, 3), whose joint covariance is (3 J, 3 J), survey included.
 
     1. Each point's misfit is its error less what the other points predict of it, in σ.
-    2. The largest misfit is a blunder if it exceeds six σ, also after the others' own scatter has scaled σ.
-    3. Without it, the rule is applied again, until more than half of the points would be left out.
+    2. The largest misfit is a blunder if it exceeds five σ, also after the others' own scatter has scaled σ.
+    3. Of two points, the blunder is the one whose own error does so; if none does, either may be wrong.
+    4. Without the blunder, the rule is applied again, until more than half of the points would be left out.
 
     A single point is none: nothing tells whether the point or the solution is wrong.
     """
@@ -44,13 +43,13 @@ def find_blunders(error_in_geo: FloatArray, joint_cov: FloatArray) -> Blunders:
     wrong, doubtful = np.zeros((2, len(error)), dtype=bool)
     while (rows := np.flatnonzero(~wrong)).size >= 2 and wrong.sum() < len(error) / 2:
         misfit = _misfits(error[rows], _part(joint_cov, rows))
-        order = np.argsort(-misfit)
-        worst = rows[order[0]]
+        own = np.array([_scatter(error[row], _part(joint_cov, np.array([row]))) for row in rows])
+        worst = rows[np.argmax(own if len(rows) == 2 else misfit)]
         others = rows[rows != worst]
-        scatter = _scatter(error[others], _part(joint_cov, others))
-        if misfit[order[0]] <= _SIGMAS * max(scatter, 1.0):
+        allowed = _SIGMAS * max(_scatter(error[others], _part(joint_cov, others)), 1.0)
+        if misfit[rows == worst] <= allowed:
             break
-        if len(rows) == 2 and misfit[order[0]] < _CLEAR * misfit[order[1]]:
+        if len(rows) == 2 and own[rows == worst] <= allowed:
             doubtful[rows] = True
             break
         wrong[worst] = True

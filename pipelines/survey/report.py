@@ -160,7 +160,7 @@ class PointResidual(Product):
 class PointError(PointResidual):
     """Error of a point that entered no solution.
 
-    That of a blunder is thrice the class that the others meet, or six times what σ and the others let expect.
+    That of a blunder is thrice the class that the others meet, or five times what σ and the others let expect.
     """
 
     blunder: bool
