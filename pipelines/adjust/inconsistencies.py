@@ -201,8 +201,15 @@ def _shift_of_fixes(joint: JointAdjustment) -> Iterator[_Finding]:
         information = (np.swapaxes(fixes.root_information, 1, 2) @ fixes.root_information).mean(axis=0)
         # The variance of an estimate under a prior is the prior's variance less the estimate's own (posterior).
         shift_m, variance = np.array(bias.value), np.square(bias.prior) - np.square(bias.sigma)
-        # A datum that was only assumed explains no shift: the receiver's own common error is the measure.
-        of_datum = np.zeros(3) if bias.session is None else joint.survey.sessions[bias.session].sigma_datum_m
+        # A datum that was only assumed explains no shift: the receiver's own common error is the measure. Of a zero
+        # that is known to be doubtful, nothing else was expected.
+        of_datum = (
+            np.zeros(3) if bias.session is None else np.array(joint.survey.sessions[bias.session].sigma_datum_m)
+        )
+        if joint.problem.term(ControlPoints.kind) is None:
+            of_datum = np.zeros(3)
+        elif any(image.fix is not None and image.fix.sigma_zero_m for image in joint.survey.images):
+            of_datum[2] = 0.0
         variance = np.maximum(variance, 1e-9) * _without_datum(bias, np.square(of_datum))
         if (shift_m**2 / np.maximum(variance, 1e-9)).sum() <= outlier_gate(3):
             continue

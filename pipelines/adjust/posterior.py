@@ -80,14 +80,21 @@ class Posterior:
         """Covariance (3, 3) in m² of the error that all positions share beyond the matrix of the adjustment."""
         return np.asarray(np.diag(np.square(self.solution.sigma_datum_m)))
 
+    @property
+    def datum_against_points(self) -> FloatArray:
+        """The part (3, 3) of `datum` that surveyed points show: none where control points have the same datum."""
+        rows = self.solution.measurements
+        return np.zeros((3, 3)) if any(row.kind == "control point" and row.used for row in rows) else self.datum
+
     def of_marked_points(self, point_in_geo: FloatArray, rays: MarkRays) -> FloatArray:
         """Return covariances (J, 3, 3) in m² of points (J, 3) intersected from their marks, with the marks' errors.
 
-        They are those against points of the control points' datum, without `datum`. NaN for a point that is NaN, or
+        They are those against surveyed points, with `datum_against_points`. NaN for a point that is NaN, or
         that its marks do not determine.
         """
         rays = rows_of(rays, np.flatnonzero(np.isfinite(point_in_geo[rays.point]).all(axis=1)))
-        return self._intersected(np.nan_to_num(point_in_geo), rays.point, rays.camera, rays.sigma_px)
+        own = self._intersected(np.nan_to_num(point_in_geo), rays.point, rays.camera, rays.sigma_px)
+        return own + self.datum_against_points
 
     def jointly_of_marked_points(self, point_in_geo: FloatArray, rays: MarkRays) -> FloatArray:
         """Return the joint covariance (3 J, 3 J) in m² of points (J, 3) that are all determined by their marks.
@@ -96,6 +103,7 @@ class Posterior:
         """
         jacobian = self._jacobian(point_in_geo, rays.point, rays.camera, rays.sigma_px)
         joint = self.normal.covariance(*self._derivatives(jacobian)) + self._second_order(point_in_geo)
+        joint = joint + np.tile(self.datum_against_points, (len(point_in_geo), len(point_in_geo)))
         return np.asarray(joint + block_diag(*self._cov_of_marks(jacobian)))
 
     def of_distances(self, point_in_geo: FloatArray, rays: MarkRays) -> FloatArray:
