@@ -73,7 +73,8 @@ def height_doubts(flight: FlightRecord, ground: Sequence[KnownGround]) -> tuple[
 
     1. Heights equal those above the take-off, which the photographs hold beside them.
     2. All cameras lie below the known ground, or far above it.
-    3. Heights whose datum nobody stated begin near zero and climb, as above the take-off.
+    3. Heights whose datum nobody stated, also those of a message with one datum by definition, begin near zero and
+       climb, as above the take-off.
     """
     poses = flight.poses
     rows = np.flatnonzero(poses.located)
@@ -88,7 +89,7 @@ def height_doubts(flight: FlightRecord, ground: Sequence[KnownGround]) -> tuple[
         for each in ground
         if (doubt := _against_ground(height, each, width_m, stated=not poses.vertical.is_assumed)) is not None
     )
-    if not doubts and poses.vertical.is_assumed and not _has_relative(flight, rows):
+    if not doubts and not poses.vertical.stated and not _has_relative(flight, rows):
         doubts += _begins_near_zero(height, poses.time_s[rows])
     return doubts
 
