@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
-def evaluated_cameras(workspace: Workspace) -> EvaluationReport | None:
-    """Return the evaluation of the cameras alone.
+def evaluated_cameras(workspace: Workspace, *, with_area: bool = True) -> EvaluationReport | None:
+    """Return the evaluation of the cameras alone; without its area, which takes longest, where nobody shows it.
 
     None: a model is trained, there is a report of `georef evaluate`, or the cameras cannot be evaluated.
     """
@@ -37,7 +37,8 @@ def evaluated_cameras(workspace: Workspace) -> EvaluationReport | None:
     try:
         solved = load_solved(workspace)
         posterior, options = posterior_of(workspace, solved.model, solved.sfm), EvaluateOptions()
-        return evaluate(solved, posterior, options, area_ha=hectares_of(options, solved))
+        area_ha = hectares_of(options, solved) if with_area else None
+        return evaluate(solved, posterior, options, area_ha=area_ha)
     except GeorefError as error:  # The stages have succeeded all the same.
         log.debug("no evaluation of the cameras: %s", error)
         return None

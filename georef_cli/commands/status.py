@@ -16,7 +16,7 @@ from pipelines.survey.headline import headline_of
 
 
 def _status(workspace: Workspace, with_options: bool, as_json: bool) -> None:
-    rows, solved = states.status(workspace), evaluated_cameras(workspace)
+    rows, solved = states.status(workspace), evaluated_cameras(workspace, with_area=False)
     cautions = with_evaluation(states.cautions_by_stage(workspace), solved)
     accuracy = headline_of(workspace) if solved is None else solved.headline
     origins = [row for spec in BY_NAME.values() for row in option_origins(workspace, spec)] if with_options else []
