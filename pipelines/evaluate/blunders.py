@@ -73,7 +73,8 @@ def _misfits(error: FloatArray, cov: FloatArray) -> FloatArray:
 def _scatter(error: FloatArray, cov: FloatArray) -> float:
     """Return how many times their σ the errors of points are, root mean square."""
     flat = error.ravel()
-    return float(np.sqrt(max(flat @ np.linalg.solve((cov + cov.T) / 2, flat), 0.0) / len(flat)))
+    squared = float(flat @ np.linalg.solve((cov + cov.T) / 2, flat))
+    return float(np.sqrt(max(squared, 0.0) / len(flat)))
 
 
 def blunder_caution(names: Sequence[str], error_in_geo: FloatArray, found: Blunders) -> tuple[Remark, ...]:
