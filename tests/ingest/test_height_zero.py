@@ -57,7 +57,9 @@ def test_heights_that_equal_those_above_the_takeoff_are_unknown(tmp_path: Path, 
     assert sigma_up_m(survey) > MOST_GEOID_M and survey.sessions[0].sigma_common_m[2] > MOST_GEOID_M
     # Against each other the heights are as good as before: SfM is levelled by them.
     fix = survey.images[0].fix
-    assert fix is not None and fix.cov_apart[2][2] == pytest.approx(5.0**2)
+    assert fix is not None and fix.cov_apart[2][2] == pytest.approx(
+        5.0**2, rel=0.01
+    )  # resolution of the tags included
 
 
 def test_a_datum_that_the_user_states_does_not_hide_them(tmp_path: Path) -> None:
@@ -76,7 +78,7 @@ def test_a_table_of_such_heights_is_the_same(tmp_path: Path) -> None:
 def test_heights_beside_those_above_the_takeoff_are_believed(tmp_path: Path) -> None:
     absolute = np.array(MISSION) + 158.5
     survey = survey_of(images=flight(tmp_path / "a", absolute.tolist(), MISSION))
-    assert not doubts_of(survey) and sigma_up_m(survey) == pytest.approx(5.0)
+    assert not doubts_of(survey) and sigma_up_m(survey) == pytest.approx(5.0, rel=0.01)
     # A beach: the take-off lies 3 m above the sea, and the first photograph is taken there.
     low = survey_of(images=flight(tmp_path / "b", (np.array(CLIMB) + 3.0).tolist(), CLIMB))
     assert not doubts_of(low)
@@ -140,7 +142,7 @@ def test_sigma_of_an_assumed_datum_is_common_to_all_fixes(tmp_path: Path) -> Non
     assert "default-datum-sigma" in codes(assumed.assumptions)
     assert "default-datum-sigma" not in codes(stated.assumptions)
     for one in (assumed, stated):
-        assert sigma_up_m(one) == pytest.approx(5.0)
+        assert sigma_up_m(one) == pytest.approx(5.0, rel=0.01)
     # Who states the common error knows it.
     known = survey_of(images=tmp_path / "a", sigma_common_v=0.4)
     assert known.sessions[0].sigma_common_m[2] == 0.4
