@@ -163,6 +163,8 @@ def print_dry_run(
         parts.append(f"\n[bold]Photographs[/]: {run.photographs.count} of {width}×{height} px{files}")
     if survey is not None:
         parts.append(f"\n[bold]Survey[/]: {shown(survey.key_figure)}")
+        parts += [f"  assumed: {shown(assumption.sentence)}" for assumption in survey.assumptions]
+        parts += tables.cautions({"ingest": survey.cautions})
     if run.reconstruction is not None:
         parts += ["\n[bold]Reconstruction[/]", *(f"  {shown(text)}" for text in run.reconstruction.sentences())]
     if run.training is not None:
@@ -205,6 +207,8 @@ def _document(workspace: Workspace, run: RunEstimate, survey: Summary | None) ->
             "key_figure": survey.key_figure,
             "values": survey.values,
             "warnings": [warning.model_dump() for warning in survey.warnings],
+            "cautions": [caution.model_dump() for caution in survey.cautions],
+            "assumptions": [assumption.model_dump() for assumption in survey.assumptions],
         },
         "photographs": run.photographs and dataclasses.asdict(run.photographs),
         "reconstruction": run.reconstruction and dataclasses.asdict(run.reconstruction),

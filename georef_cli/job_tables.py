@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from pipelines.survey.block_plan import BlockPlan
 
 _STYLE = {"done": "green", "current": "green", "failed": "red", "interrupted": "yellow", "waiting": "dim"}
-_ACCURACY = ("accuracy", *(f"{figure.label} {figure.unit}" for figure in (ACCURACY_H, ACCURACY_V)))
+_ACCURACY = ("accuracy", ACCURACY_H.label, ACCURACY_V.label)
 
 
 def batch(table: BatchTable, page: Path) -> list[Renderable]:

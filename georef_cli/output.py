@@ -12,9 +12,10 @@ from rich.table import Table
 from rich.text import Text
 
 from georef_cli import tables
+from georef_cli.evaluation import with_evaluation
 from georef_cli.layout import ByWidth, Safe, plain_table, shown
 from georef_cli.tables import Renderable
-from pipelines.core.products import dump_json, union
+from pipelines.core.products import dump_json
 from pipelines.core.runner import Outcome
 from pipelines.core.staleness import cautions_by_stage, document_of_cautions
 from pipelines.core.workspace import Workspace
@@ -184,10 +185,7 @@ def print_outcomes(
 
     `solved` is the evaluation of cameras without training. `told`: the log on the same terminal has shown the rest.
     """
-    cautions = cautions_by_stage(workspace)
-    if solved is not None:
-        carried = union(*cautions.values())
-        cautions["evaluation"] = tuple(caution for caution in solved.cautions if caution not in carried)
+    cautions = with_evaluation(cautions_by_stage(workspace), solved)
     if as_json:
         stages = [document_of(outcome) for outcome in outcomes]
         document = {"workspace": str(workspace.root), "stages": stages, "result": result and result.feature()}
@@ -201,7 +199,7 @@ def print_outcomes(
         print_rich(*run_summary(result))
     else:
         if solved is not None:
-            print_rich(*tables.report(solved))
+            print_rich(*tables.report(solved), *tables.error_tables(solved))
         print_rich(*tables.accuracy_line(headline_of(workspace) if solved is None else solved.headline))
         if told:
             print_rich(f"[bold]Next[/]: georef run {shown(str(workspace.root))} completes it")

@@ -13,6 +13,7 @@ from georef_cli import boundary, options
 from georef_cli.command import Command
 from georef_cli.display import is_told, progress_for
 from georef_cli.estimate import RunTimeLeft, announced_seconds, print_dry_run
+from georef_cli.evaluation import evaluated_cameras
 from georef_cli.options import SET, settings
 from georef_cli.output import print_outcomes
 from pipelines.core import runner
@@ -28,7 +29,6 @@ from pipelines.survey.options import AreaOptions, CrsOptions
 
 if TYPE_CHECKING:
     from pipelines.deliver.overview import Overview
-    from pipelines.survey.report import EvaluationReport
 
 log = logging.getLogger(__name__)
 
@@ -98,7 +98,7 @@ def _run(ctx: click.Context, **values: Any) -> None:
             progress=progress,
             around=lambda spec: _counted(workspace, spec, done, left, trains=trains),
         )
-    solved = _evaluated_cameras(workspace) if stages[-1].name == "init-sim3" else None
+    solved = evaluated_cameras(workspace) if stages[-1].name == "init-sim3" else None
     print_outcomes(
         workspace, outcomes, _overview(workspace), solved, as_json=values["as_json"], told=is_told(ctx.obj)
     )
@@ -136,25 +136,6 @@ def _overview(workspace: Workspace) -> Overview | None:
         return None
 
 
-def _evaluated_cameras(workspace: Workspace) -> EvaluationReport | None:
-    """Return the evaluation of the cameras alone; None: a model is trained, or they cannot be evaluated."""
-    if workspace.has(MODEL):
-        return None
-    from pipelines.adjust.solution import posterior_of
-    from pipelines.evaluate.options import EvaluateOptions
-    from pipelines.evaluate.stage import evaluate
-    from pipelines.survey.area import hectares_of
-    from pipelines.survey.trained_survey import load_solved
-
-    try:
-        solved = load_solved(workspace)
-        posterior, options = posterior_of(workspace, solved.model, solved.sfm), EvaluateOptions()
-        return evaluate(solved, posterior, options, area_ha=hectares_of(options, solved))
-    except GeorefError as error:  # The run has succeeded all the same.
-        log.debug("no evaluation of the cameras: %s", error)
-        return None
-
-
 def deliverables(text: str | None) -> tuple[StageSpec, ...]:
     """Return the stages of the deliverables in a text, such as `raster,cloud` or `all`."""
     try:
@@ -181,14 +162,19 @@ def _flags(
     ctx: click.Context, stages: tuple[StageSpec, ...], flags: dict[str, dict[str, Any]]
 ) -> dict[str, dict[str, Any]]:
     """Return the given options by stage, those of `--set` among them."""
-    running = {spec.name for spec in stages}
+    running, last = {spec.name for spec in stages}, PIPELINE.index(stages[-1]) if stages[-1] in PIPELINE else None
     for name, value in options.given(ctx, OWNERS).items():
         owners = [owner for owner in OWNERS[name] if owner in running]
         if not owners:
-            raise click.UsageError(
-                f"{options.stage_option(BY_NAME[OWNERS[name][0]].options, name).opts[0]} is for "
-                f"{' and '.join(OWNERS[name])}, which is not among the stages to run."
-            )
+            flag = options.stage_option(BY_NAME[OWNERS[name][0]].options, name).opts[0]
+            owned = " and ".join(OWNERS[name])
+            if last is None or any(PIPELINE.index(BY_NAME[owner]) < last for owner in OWNERS[name]):
+                raise click.UsageError(f"{flag} is for {owned}, which is not among the stages to run.")
+            # A script may give all its runs the same options, and end some of them early.
+            log.warning(
+                "%s is for %s, which this run does not reach: it is not used, and not remembered.",
+                flag, owned, extra={"code": "option-not-used"},
+            )  # fmt: skip
         for owner in owners:
             flags.setdefault(owner, {})[name] = value
     return flags

@@ -5,6 +5,7 @@ from typing import Any
 
 from georef_cli import options, tables
 from georef_cli.command import Command
+from georef_cli.evaluation import evaluated_cameras, with_evaluation
 from georef_cli.output import print_json, print_rich
 from pipelines.core import staleness as states
 from pipelines.core.options import notation
@@ -15,8 +16,9 @@ from pipelines.survey.headline import headline_of
 
 
 def _status(workspace: Workspace, with_options: bool, as_json: bool) -> None:
-    rows, cautions = states.status(workspace), states.cautions_by_stage(workspace)
-    accuracy = headline_of(workspace)
+    rows, solved = states.status(workspace), evaluated_cameras(workspace, with_area=False)
+    cautions = with_evaluation(states.cautions_by_stage(workspace), solved)
+    accuracy = headline_of(workspace) if solved is None else solved.headline
     origins = [row for spec in BY_NAME.values() for row in option_origins(workspace, spec)] if with_options else []
     if not as_json:
         print_rich(tables.states(rows, cautions), *tables.accuracy_line(accuracy), *tables.cautions(cautions))

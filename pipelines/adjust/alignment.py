@@ -23,6 +23,7 @@ Fixes against control points:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import compress
@@ -42,6 +43,7 @@ _LEAST_FOR_EXCESS = 5  # points of a kind; the scatter of fewer is too uncertain
 _STEPS = 12
 _OPEN = 1e-12  # eigenvalue over the largest one, below which nothing determines a direction
 _WORST_ROTATION_RAD = np.radians(5.0)  # beyond, the linear covariance is not valid
+_NARROW = 0.1  # second extent of a line over the first
 _FLAT = 0.02  # third extent of the layout over the first
 _GATE_FACTORS = (1.0, 3.0, 10.0, 30.0, 100.0)  # of the stated σ
 
@@ -299,17 +301,39 @@ def align(data: Correspondences, rng: np.random.Generator, *, attitude: Rotation
     prior = None
     if not firm:
         if attitude is None:
-            worst = min((np.degrees(candidate.rotation_sigma_rad) for candidate in candidates), default=np.inf)
-            size = f"has a σ of {worst:.0f}°" if worst < 90 else "is not determined"
-            raise DegenerateGeometryError(
-                "positions-on-a-line",
-                f"The positions lie on one line, and the rotation about it {size}. {_ADVICE}",
-            )
+            raise _open_rotation(data, candidates)
         prior, firm = attitude, _candidates(data, [_start_with_rotation(data, attitude.rotation, rng)], attitude)
     # A bias of the fixes costs as much as an outlier. Where both explain a single control point, rounding must not
     # decide: it is the outlier.
     best = min(firm, key=lambda one: one.cost + 1.001 * OUTLIER_GATE * (one.state.fix_bias_in_geo is not None))
     return Alignment(best, "line" if prior else layout_of(data.in_local[best.state.inlier]))
+
+
+def _open_rotation(data: Correspondences, candidates: Sequence[AdjustedSimilarity]) -> DegenerateGeometryError:
+    """Return the error of positions that leave the rotation open: a line, or a block that is small against their σ.
+
+    The shape in `local` decides, which SfM knows far better than the positions know theirs.
+    """
+    worst = min((np.degrees(candidate.rotation_sigma_rad) for candidate in candidates), default=np.inf)
+    size = f"has a σ of {worst:.0f}°" if worst < 90 else "is not determined"
+    centred = data.in_local - data.in_local.mean(axis=0)
+    _, extent, axes = np.linalg.svd(centred, full_matrices=False)
+    if len(data) < 3 or extent[1] < _NARROW * extent[0] or not candidates:
+        return DegenerateGeometryError(
+            "positions-on-a-line",
+            f"The positions lie on one line, and the rotation about it {size}. {_ADVICE}",
+        )
+    scale = candidates[0].state.geo_from_local.scale
+    length_m, width_m = (scale * float(np.ptp(centred @ axis)) for axis in axes[:2])
+    variance = np.median(np.diagonal(data.cov_in_geo, axis1=1, axis2=2), axis=0)
+    sigma_h_m, sigma_v_m = float(np.sqrt(variance[:2].mean())), float(np.sqrt(variance[2]))
+    return DegenerateGeometryError(
+        "block-too-small",
+        f"The {len(data)} positions span {length_m:.0f} × {width_m:.0f} m, which is small against their σ of "
+        f"{sigma_h_m:.2g} m horizontally and {sigma_v_m:.2g} m vertically: the rotation of the block {size}, and "
+        f"more than {np.degrees(_WORST_ROTATION_RAD):.0f}° are not used. State better σ if they are known "
+        f"(--sigma-h, --sigma-v). {_ADVICE}",
+    )
 
 
 def layout_of(positions: FloatArray) -> Literal["volume", "plane"]:

@@ -38,7 +38,7 @@ from pipelines.geodesy.vertical import FOOT_M, MOST_GEOID_M
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.robust.statistics import median_spacing, outlier_gate, typical_sigma
-from pipelines.survey.report_parts import Group, VarianceFactor
+from pipelines.survey.report_parts import EstimatedError, Group, VarianceFactor
 from pipelines.survey.survey import Survey
 
 _SIGMA_REJECTED = "sigma-rejected"
@@ -201,12 +201,23 @@ def _shift_of_fixes(joint: JointAdjustment) -> Iterator[_Finding]:
         information = (np.swapaxes(fixes.root_information, 1, 2) @ fixes.root_information).mean(axis=0)
         # The variance of an estimate under a prior is the prior's variance less the estimate's own (posterior).
         shift_m, variance = np.array(bias.value), np.square(bias.prior) - np.square(bias.sigma)
+        # A datum that was only assumed explains no shift: the receiver's own common error is the measure. Of a zero
+        # that is known to be doubtful, nothing else was expected.
+        of_datum = (
+            np.zeros(3) if bias.session is None else np.array(joint.survey.sessions[bias.session].sigma_datum_m)
+        )
+        if joint.problem.term(ControlPoints.kind) is None:
+            of_datum = np.zeros(3)
+        elif any(image.fix is not None and image.fix.sigma_zero_m for image in joint.survey.images):
+            of_datum[2] = 0.0
+        variance = np.maximum(variance, 1e-9) * _without_datum(bias, np.square(of_datum))
         if (shift_m**2 / np.maximum(variance, 1e-9)).sum() <= outlier_gate(3):
             continue
         values = ", ".join(
             f"{value:+.3f} ± {sigma:.3f}" for value, sigma in zip(bias.value, bias.sigma, strict=True)
         )
-        stated = ", ".join(f"{sigma:.3g}" for sigma in bias.prior)
+        of_receiver = np.sqrt(np.maximum(np.square(bias.prior) - np.square(of_datum), 0.0))
+        stated = ", ".join(f"{sigma:.3g}" for sigma in of_receiver)
         sentence = (
             f"All fixes are shifted by ({values}) m east, north, up against the control points, which determine "
             f"the position; the σ of the fixes' common error is ({stated}) m. Either side may be wrong. Check "
@@ -215,6 +226,19 @@ def _shift_of_fixes(joint: JointAdjustment) -> Iterator[_Finding]:
         within_one_fix = bool(shift_m @ information @ shift_m <= outlier_gate(3))
         is_everyday = bool(np.linalg.norm(shift_m) <= _EVERYDAY_SHIFT_M)
         yield _Finding("fixes-shifted", sentence, ends=not (within_one_fix or is_everyday))
+
+
+def _without_datum(bias: EstimatedError, of_datum: FloatArray) -> FloatArray:
+    """Return by which factor (3,) the variance of an estimate shrinks under a prior without the part of the datum.
+
+    With the prior's variance p, that of the estimate s and of the observations alone L = p s / (p − s), the square
+    of the estimate has the expectation (p − s)² / (p² (r + L)) under a prior r.
+    """
+    prior, sigma = np.square(bias.prior), np.square(bias.sigma)
+    gained = np.maximum(prior - sigma, 1e-12)
+    observed = prior * sigma / gained
+    of_receiver = np.maximum(prior - of_datum, 1e-9)
+    return np.asarray((of_receiver + observed) / (prior + observed))
 
 
 def _control_points(joint: JointAdjustment) -> Iterator[_Finding]:
@@ -302,7 +326,7 @@ def _weak_checks(joint: JointAdjustment) -> Iterator[_Finding]:
         yield _Finding("hardly-checked", sentence)
     if joint.problem.term(Fixes.kind) is not None and joint.factors.get("control points") is None:
         fixes = [image.fix for image in joint.survey.images if image.fix is not None]
-        sigma = typical_sigma(np.array([fix.cov_in_geo for fix in fixes]))
+        sigma = typical_sigma(np.array([fix.cov_apart for fix in fixes]))
         sentence = (
             "No control point checks an error that all fixes share, such as that of the base station. The "
             f"predicted σ take the errors of the fixes, σ {sigma:.2g} m, as independent. Add control points with "
@@ -337,8 +361,9 @@ def _before_adjustment(factor: VarianceFactor, survey: Survey) -> str:
         sigma, unit = np.median([mark.sigma_px for point in survey.control_points for mark in point.marks]), "px"
     else:
         fixes = [image.fix for image in survey.images if image.fix is not None]
-        measured = survey.control_points if factor.group == "control points" else fixes
-        sigma, unit = typical_sigma(np.array([position.cov_in_geo for position in measured])), "m"
+        of_control = [point.cov_in_geo for point in survey.control_points]
+        covariances = of_control if factor.group == "control points" else [fix.cov_apart for fix in fixes]
+        sigma, unit = typical_sigma(np.array(covariances)), "m"
     return f"{float(sigma) / factor.applied**0.5:.3g} {unit}"
 
 

@@ -30,7 +30,7 @@ from pipelines.adjust.terms import (
 )
 from pipelines.core.errors import InputError
 from pipelines.core.sentences import listed
-from pipelines.core.types import BoolArray, FloatArray, IntArray, vector3
+from pipelines.core.types import BoolArray, FloatArray, IntArray, Vector3, vector3
 from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.adjustment import InitialSimilarity
@@ -97,7 +97,7 @@ def fix_correspondences(survey: Survey, model: SparseModel) -> Correspondences:
         in_local=model.cam_center_in_local[[index for index, _ in fixed]].reshape(-1, 3),
         cov_in_local=np.zeros((len(fixed), 3, 3)),
         in_geo=np.array([fixes[name].position_in_geo for _, name in fixed]).reshape(-1, 3),
-        cov_in_geo=np.array([fixes[name].cov_in_geo for _, name in fixed]).reshape(-1, 3, 3),
+        cov_in_geo=np.array([fixes[name].cov_apart for _, name in fixed]).reshape(-1, 3, 3),
     )
 
 
@@ -237,7 +237,7 @@ def problem_of(
                 f"{name} cannot be estimated, because no {what} were recorded.",
                 field="--estimate",
             )
-    blocks = [] if fixes is None else _common_errors(survey, fixes)
+    blocks = [] if fixes is None else _common_errors(survey, fixes, with_datum=control is not None)
     if "lever-arm" in wanted:
         blocks.append(SystematicError("lever-arm", (SIGMA_ARM_M,) * 3))
     if attitudes is not None:
@@ -253,7 +253,8 @@ def problem_of(
         frame = LocalFrame.fixed(float(np.linalg.norm(center - center.mean(axis=0), axis=1).max()))
     every: tuple[Term | None, ...] = (fixes, control, distances_of(scene, survey), attitudes, planes, frame)
     measured = tuple(term for term in every if term is not None)
-    return Problem(scene.poses, scene.bundle, measured, SystematicErrors(tuple(blocks)))
+    datum = survey.sigma_datum_m if control is not None else _datum_of_fixes(survey, fixes)
+    return Problem(scene.poses, scene.bundle, measured, SystematicErrors(tuple(blocks)), sigma_datum_m=datum)
 
 
 def rejected_of(scene: Scene, survey: Survey, initial: InitialSimilarity) -> Problem | None:
@@ -371,10 +372,25 @@ def onto_control(problem: Problem, state: State) -> State:
     return replace(state, errors=errors)
 
 
-def _common_errors(survey: Survey, fixes: Fixes) -> list[SystematicError]:
+def _datum_of_fixes(survey: Survey, fixes: Fixes | None) -> Vector3:
+    """Return the σ east, north, up of the error of the reference system that all fixes share; zeros without any."""
+    sessions = [] if fixes is None or not survey.sessions else np.unique(fixes.session).tolist()
+    return vector3(
+        np.max([survey.sessions[session].sigma_datum_m for session in sessions] or [np.zeros(3)], axis=0)
+    )
+
+
+def _common_errors(survey: Survey, fixes: Fixes, *, with_datum: bool) -> list[SystematicError]:
+    """Return the common errors of the fixes by session.
+
+    Control points reveal the error of the reference system, which is then part of these. Where nothing reveals it,
+    it is no unknown (`Problem.sigma_datum_m`): a prior of hundreds of metres would drown in rounding.
+    """
     blocks = []
     for session in np.unique(fixes.session) if survey.sessions else ():
         sigma = np.array(survey.sessions[session].sigma_common_m)
+        if not with_datum:
+            sigma = np.sqrt(np.maximum(sigma**2 - np.square(survey.sessions[session].sigma_datum_m), 0.0))
         if sigma.any():
             at_least = vector3(np.maximum(sigma, _LEAST_SIGMA_COMMON_M))
             blocks.append(SystematicError("bias", at_least, int(session)))

@@ -75,13 +75,26 @@ class Posterior:
     camera_cov: FloatArray  # (n, 6, 6) of (δθ [rad], δc [m]) of the cameras, along the axes of `geo`
     grid: AccuracyGrid | None = None  # σ over the scene; None: the scene has too few points
 
+    @property
+    def datum(self) -> FloatArray:
+        """Covariance (3, 3) in m² of the error that all positions share beyond the matrix of the adjustment."""
+        return np.asarray(np.diag(np.square(self.solution.sigma_datum_m)))
+
+    @property
+    def datum_against_points(self) -> FloatArray:
+        """The part (3, 3) of `datum` that surveyed points show: none where control points have the same datum."""
+        rows = self.solution.measurements
+        return np.zeros((3, 3)) if any(row.kind == "control point" and row.used for row in rows) else self.datum
+
     def of_marked_points(self, point_in_geo: FloatArray, rays: MarkRays) -> FloatArray:
         """Return covariances (J, 3, 3) in m² of points (J, 3) intersected from their marks, with the marks' errors.
 
-        NaN for a point that is NaN, or that its marks do not determine.
+        They are those against surveyed points, with `datum_against_points`. NaN for a point that is NaN, or
+        that its marks do not determine.
         """
         rays = rows_of(rays, np.flatnonzero(np.isfinite(point_in_geo[rays.point]).all(axis=1)))
-        return self._intersected(np.nan_to_num(point_in_geo), rays.point, rays.camera, rays.sigma_px)
+        own = self._intersected(np.nan_to_num(point_in_geo), rays.point, rays.camera, rays.sigma_px)
+        return own + self.datum_against_points
 
     def jointly_of_marked_points(self, point_in_geo: FloatArray, rays: MarkRays) -> FloatArray:
         """Return the joint covariance (3 J, 3 J) in m² of points (J, 3) that are all determined by their marks.
@@ -90,6 +103,7 @@ class Posterior:
         """
         jacobian = self._jacobian(point_in_geo, rays.point, rays.camera, rays.sigma_px)
         joint = self.normal.covariance(*self._derivatives(jacobian)) + self._second_order(point_in_geo)
+        joint = joint + np.tile(self.datum_against_points, (len(point_in_geo), len(point_in_geo)))
         return np.asarray(joint + block_diag(*self._cov_of_marks(jacobian)))
 
     def of_distances(self, point_in_geo: FloatArray, rays: MarkRays) -> FloatArray:
@@ -112,12 +126,13 @@ class Posterior:
         Each of K rays sees one point from one camera: `point` and `camera` (K,) are indices.
         """
         jacobian = self._jacobian(point_in_geo, point, camera)
-        return self.normal.covariances(*self._derivatives(jacobian), 3)
+        return self.normal.covariances(*self._derivatives(jacobian), 3) + self.datum
 
     def jointly_of_scene(self, point_in_geo: FloatArray, point: IntArray, camera: IntArray) -> FloatArray:
         """Return the joint covariance (3 J, 3 J) in m² of points of the scene; arguments as of `of_scene`."""
         jacobian = self._jacobian(point_in_geo, point, camera)
-        return self.normal.covariance(*self._derivatives(jacobian)) + self._second_order(point_in_geo)
+        joint = self.normal.covariance(*self._derivatives(jacobian)) + self._second_order(point_in_geo)
+        return joint + np.tile(self.datum, (len(point_in_geo), len(point_in_geo)))
 
     def of_tie_points(self, point_in_geo: FloatArray, point: IntArray, camera: IntArray) -> FloatArray:
         """Return the covariance (J, 3, 3) in m² of tie points, errors of their own image observations included.
@@ -125,7 +140,7 @@ class Posterior:
         NaN for a point that fewer than two rays see; arguments as of `of_scene`.
         """
         sigma_px = np.full(len(point), np.nan if self.solution.sigma_px is None else self.solution.sigma_px)
-        return self._intersected(point_in_geo, point, camera, sigma_px)
+        return self._intersected(point_in_geo, point, camera, sigma_px) + self.datum
 
     def of_lens(self) -> FloatArray | None:
         """Return the covariance (L, L) of the lens parameters, in the order of `geometry.cameras.Lenses`.
@@ -158,7 +173,9 @@ class Posterior:
         to_pivot = np.eye(7)
         to_pivot[4:, :4] = about[:, :4]
         by_model = to_pivot @ turn
-        return np.asarray(by_model @ in_model @ by_model.T)
+        covariance = np.asarray(by_model @ in_model @ by_model.T)
+        covariance[4:, 4:] += self.datum
+        return covariance
 
     def _intersected(
         self, point_in_geo: FloatArray, point: IntArray, camera: IntArray, sigma_px: FloatArray

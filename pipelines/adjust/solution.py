@@ -57,10 +57,12 @@ def adjusted(
         estimated_errors=problem.errors.estimates(state.errors, covariance),
         measurements=tuple(_measurements(near, normal, rejected)),
         sigma_px=problem.bundle.sigma_px,
+        sigma_datum_m=problem.sigma_datum_m,
         variance_factors=initial.variance_factors,
         cautions=union(initial.cautions),
     )
     of_cameras = camera_covariances(normal, similarity.rotation, similarity.scale)
+    of_cameras[:, 3:, 3:] += np.diag(np.square(problem.sigma_datum_m))
     lens, moved = problem.lens, solution.with_lenses(sparse)
     posterior = Posterior(solution, moved, normal, problem.bundle.followed, lens, of_cameras)
     record = similarity.to_record("model", "geo", covariance=posterior.of_similarity, pivot=pivot)

@@ -27,7 +27,7 @@ from scipy.sparse import bsr_matrix, csr_matrix, diags
 from pipelines.adjust.state import State, SystematicErrors
 from pipelines.adjust.terms import At, CommonErrors, Slopes, Term
 from pipelines.core.errors import ConvergenceError, DegenerateGeometryError
-from pipelines.core.types import FloatArray, IntArray
+from pipelines.core.types import FloatArray, IntArray, Vector3
 from pipelines.geometry.bundle import BundleInformation
 from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.rotations import skew
@@ -61,6 +61,8 @@ class Problem:
     measured: tuple[Term, ...]
     errors: SystematicErrors = field(default_factory=SystematicErrors)
     lens_frozen: bool = False
+    # σ east, north, up in m of an error that all positions share, and that no measurement reveals
+    sigma_datum_m: Vector3 = (0.0, 0.0, 0.0)
 
     @cached_property
     def terms(self) -> tuple[Term, ...]:

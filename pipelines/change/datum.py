@@ -19,7 +19,7 @@ from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.geodesy.crs import PointCrs
 from pipelines.geodesy.enu import ecef_from_enu, ecef_from_lla, enu_from_ecef
-from pipelines.survey.survey import Survey
+from pipelines.survey.survey import FixSession, Survey
 from pipelines.survey.trained_survey import load_cameras
 
 _SAME_PLACE_M = 0.02  # between the coordinates of one control point in both surveys
@@ -60,14 +60,20 @@ def load_epoch(workspace: Workspace) -> Epoch:
 
 @dataclass(frozen=True)
 class Shared:
-    """What two epochs share: variance (3,) east, north, up in m² by source, and the names of the control points."""
+    """What two epochs share: variance (3,) east, north, up in m² by source, and the names of the control points.
+
+    `by_system_m2` is that of one reference system with one assumption or transformation, which the difference is
+    free of.
+    """
 
     control: tuple[str, ...]
     by_control_m2: FloatArray
     by_base_m2: FloatArray
+    by_system_m2: FloatArray
 
     def of_difference(self, first: FloatArray, second: FloatArray) -> FloatArray:
         """Return the variances (N, 3) of the difference from those (N, 3) of both epochs."""
+        first, second = (np.maximum(each - self.by_system_m2, 0.0) for each in (first, second))
         common = np.minimum(self.by_control_m2 + self.by_base_m2, _MOST_SHARED * np.minimum(first, second))
         return np.asarray(first + second - 2 * common)
 
@@ -94,9 +100,31 @@ def shared_by(before: Survey, after: Survey, *, same_base: bool) -> Shared:
         counts = len(before.control_points) * len(after.control_points)
         by_control = control_share[0] * control_share[1] * error * len(pairs) / counts
     if same_base and before.sessions and after.sessions:
-        error = np.minimum(*(np.square(survey.sessions[0].sigma_common_m) for survey in (before, after)))
+        error = np.minimum(*(_of_base(survey.sessions[0]) for survey in (before, after)))
         by_base = (1 - control_share[0]) * (1 - control_share[1]) * error
-    return Shared(tuple(point.name for _, point in pairs), by_control, by_base)
+    by_system = np.minimum(*(_of_system(survey) for survey in (before, after)))
+    systems = [
+        {(used.crs, used.operation) for used in survey.transformations if used.sigma_m}
+        for survey in (before, after)
+    ]
+    by_system[:2] *= systems[0] == systems[1]
+    by_system[2] *= before.vertical.name == after.vertical.name
+    return Shared(tuple(point.name for _, point in pairs), by_control, by_base, by_system)
+
+
+def _of_base(session: FixSession) -> FloatArray:
+    """Return the variance (3,) of the common error of a session, without that of its reference system."""
+    return np.asarray(np.maximum(np.square(session.sigma_common_m) - np.square(session.sigma_datum_m), 0.0))
+
+
+def _of_system(survey: Survey) -> FloatArray:
+    """Return the variance (3,) that a survey has of its reference system, but for a doubtful zero of heights."""
+    if survey.control_points:
+        return np.square(survey.sigma_datum_m)
+    sigma_m = np.max([session.sigma_datum_m for session in survey.sessions] or [(0.0, 0.0, 0.0)], axis=0)
+    if any(image.fix is not None and image.fix.sigma_zero_m for image in survey.images):
+        sigma_m[2] = 0.0
+    return np.square(sigma_m)
 
 
 def _share_of_control(survey: Survey) -> FloatArray:
@@ -107,7 +135,7 @@ def _share_of_control(survey: Survey) -> FloatArray:
     fixes = [image.fix for image in survey.images if image.fix is not None]
     if not fixes:
         return np.ones(3)
-    of_fixes = 1.0 / np.sum([1.0 / np.diag(fix.cov_in_geo) for fix in fixes], axis=0)
+    of_fixes = 1.0 / np.sum([1.0 / np.diag(fix.cov_apart) for fix in fixes], axis=0)
     if survey.sessions:
         of_fixes = of_fixes + np.square(survey.sessions[0].sigma_common_m)
     return np.asarray(of_fixes / (of_fixes + of_control))

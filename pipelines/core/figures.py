@@ -4,32 +4,48 @@ Tables, pages and sentences take their words and decimals from here, so that one
 digits everywhere. `survey.headline` says which figure is the headline of a workspace.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
 from pipelines.core.products import Product
+from pipelines.core.sentences import listed
 
 MISSING = "–"
-_PER_METRE = {"m": 1.0, "cm": 100.0}
 # How the position of a check point was measured, by the key of the report.
 WAYS = {"triangulated": "triangulated", "surface": "on the rendered surface"}
+
+
+def length_text(metres: float | None) -> str:
+    """Return an estimated length with its unit: `4.2 cm`, `2.57 m`, `31.4 m`, `412 m`; a dash for None.
+
+    The unit follows from the rounded value: from one metre on, lengths are in metres.
+    """
+    if metres is None or not math.isfinite(metres):
+        return MISSING
+    size = abs(metres)
+    if round(100.0 * size, 1) < 100.0:
+        return f"{100.0 * metres:.1f} cm"
+    return f"{metres:.{2 if size < 9.995 else 1 if size < 99.95 else 0}f} m"
 
 
 @dataclass(frozen=True)
 class Figure:
     """Accuracy figure: `label` heads its column, `meaning` its row; unit and decimals are those of its text.
 
-    The unit is empty for a number of points.
+    The unit is empty for a number of points, and for a length whose text has its own (`length_text`).
     """
 
     label: str
     meaning: str
-    unit: Literal["m", "cm", ""] = "m"
-    decimals: int = 3
+    unit: Literal["m", ""] = "m"
+    decimals: int | None = 3
 
     def text(self, value: float | None) -> str:
-        """Return a value as text without its unit; lengths are given in metres. A dash for None."""
-        return MISSING if value is None else f"{value * _PER_METRE.get(self.unit, 1.0):.{self.decimals}f}"
+        """Return a value as text without the unit of the figure; lengths are given in metres. A dash for None."""
+        if self.decimals is None:
+            return length_text(value)
+        return MISSING if value is None else f"{value:.{self.decimals}f}"
 
     def with_unit(self, value: float | None) -> str:
         """Return a value as text with its unit; a dash for None."""
@@ -37,8 +53,8 @@ class Figure:
 
 
 # Figures of the headline, as `Headline` explains them.
-ACCURACY_H = Figure("H", "horizontal accuracy", "cm", 1)
-ACCURACY_V = Figure("V", "vertical accuracy", "cm", 1)
+ACCURACY_H = Figure("H", "horizontal accuracy", "", None)
+ACCURACY_V = Figure("V", "vertical accuracy", "", None)
 CHECK_POINTS = Figure("checks", "check points that the accuracy was measured at", "", 0)
 # Errors of surveyed points, by field of `survey.report.ErrorStats`.
 ERRORS = {
@@ -72,9 +88,11 @@ class Headline(Product):
     Attributes:
         kind: `measured`: of the triangulated check points; `predicted`: of the scene; `unknown`: neither.
         rmse_h_m, rmse_v_m: RMSE of the check points, their survey's error included, or the root mean square of the
-            predicted σ over the scene. None: not known.
+            predicted σ over the scene. None: not known, such as V where heights count from an unknown take-off.
         check_points: number of check points; 0 unless measured.
         reason: reason why it is not known; None: it is.
+        blunders: names of the check points that the others and σ refute; they count in RMSE and number.
+        rmse_h_without_m, rmse_v_without_m: RMSE without the blunders. None: there are none, or no other point.
     """
 
     kind: Literal["measured", "predicted", "unknown"]
@@ -82,16 +100,24 @@ class Headline(Product):
     rmse_v_m: float | None = None
     check_points: int = 0
     reason: str | None = None
+    blunders: tuple[str, ...] = ()
+    rmse_h_without_m: float | None = None
+    rmse_v_without_m: float | None = None
 
     @property
     def text(self) -> str:
         """Kind and figures, such as `measured at 9 check points: RMSE H 4.2 cm, V 5.1 cm`."""
         if self.kind == "unknown":
             return f"not known: {self.reason}"
-        figures = f"H {ACCURACY_H.with_unit(self.rmse_h_m)}, V {ACCURACY_V.with_unit(self.rmse_v_m)}"
+        vertical = "unknown" if self.rmse_v_m is None else ACCURACY_V.with_unit(self.rmse_v_m)
+        figures = f"H {ACCURACY_H.with_unit(self.rmse_h_m)}, V {vertical}"
         if self.kind == "predicted":
             return f"predicted, not measured: σ {figures}"
-        return f"measured at {self.check_points} check point{'s'[: self.check_points != 1]}: RMSE {figures}"
+        text = f"measured at {self.check_points} check point{'s'[: self.check_points != 1]}: RMSE {figures}"
+        if self.rmse_h_without_m is None:
+            return text
+        others = f"H {ACCURACY_H.with_unit(self.rmse_h_without_m)}, V {ACCURACY_V.with_unit(self.rmse_v_without_m)}"
+        return f"{text}; without {listed(self.blunders)}, which the others refute: RMSE {others}"
 
     @property
     def sentence(self) -> str:

@@ -121,13 +121,15 @@ Resume = Literal["never", "if-same", "always"]
 class Summary:
     """Summary of a stage's result, for tables, `--json` and the log.
 
-    The key figure is one line such as "48 of 48 registered". The cautions are those of the inputs too.
+    The key figure is one line such as "48 of 48 registered". The cautions are those of the inputs too. The
+    assumptions stand for what the input does not state; a manifest has none, as they stand in the survey.
     """
 
     key_figure: str
     values: dict[str, Any] = field(default_factory=dict)
     warnings: tuple[Remark, ...] = ()
     cautions: tuple[Remark, ...] = ()
+    assumptions: tuple[Remark, ...] = ()
 
 
 @dataclass(frozen=True)

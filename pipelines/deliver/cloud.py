@@ -61,7 +61,8 @@ def run(stage: StageRun, options: ExportCloudOptions) -> Summary:
     if not tally.count:
         raise DegenerateGeometryError(
             "no-surface-points",
-            f"No point of the surface has the same depth in {options.min_views} training views. Train longer, or "
+            f"No point of the surface has the same depth in {options.min_views} training views: too few "
+            "photographs overlap, or the training was too short. Add photographs, train longer, or "
             "lower --min-views.",
         )
     empty = "The cloud states no σ, and its dimensions sigma_h, sigma_v and cov_ee to cov_uu are empty"

@@ -196,7 +196,8 @@ def _collected(squares: Iterable[SurfaceCloud], views: SurfaceViews, trained: Tr
     if not count:
         raise DegenerateGeometryError(
             "no-surface-points",
-            f"No point of the surface has the same depth in {_MIN_VIEWS} training views. Train longer, or hand "
+            f"No point of the surface has the same depth in {_MIN_VIEWS} training views: too few "
+            "photographs overlap there, or the training was too short. Add photographs, train longer, or hand "
             "over export/splat.ply alone.",
         )
     return joined_rows(parts)

@@ -66,7 +66,8 @@ def run(stage: StageRun, options: ExportMeshOptions) -> Summary:
     if not len(simple.mesh.faces):
         raise DegenerateGeometryError(
             "no-surface-points",
-            f"No part of the surface has the same depth in {options.min_views} training views. Train longer, or "
+            f"No part of the surface has the same depth in {options.min_views} training views: too few "
+            "photographs overlap, or the training was too short. Add photographs, train longer, or "
             "lower --min-views.",
         )
     mesh, islands = without_islands(simple.mesh, options.least_part)

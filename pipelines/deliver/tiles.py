@@ -11,7 +11,7 @@ All files are in the frame of the placement, East-North-Up; the tileset's root p
 import json
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,11 +33,10 @@ from pipelines.formats.gltf import SPLATS, SPZ_IN_GLTF, decode_plain_glb, encode
 from pipelines.formats.splat_ply import SplatArrays
 from pipelines.formats.spz import FRACTIONAL_BITS, decode_spz, encode_spz
 from pipelines.formats.tiles_archive import write_tiles_archive
-from pipelines.geodesy.vertical import ELLIPSOIDAL, parse_vertical
 from pipelines.splat.level_of_detail import DetailTile, Tiler, best_cut, build_tiles, scene_box
 from pipelines.splat.sh import coefficient_count
 from pipelines.survey.calibrated import load_survey
-from pipelines.survey.target_crs import target_crs
+from pipelines.survey.target_crs import target_crs, without_grid
 
 _REACH_M = 2.0 ** (23 - FRACTIONAL_BITS)  # largest coordinate that SPZ's 24 bits hold at their finest step
 # Bytes of a Gaussian in SPZ before its compression, or in plain arrays: without harmonics, and of each of these.
@@ -105,9 +104,8 @@ def _page(workspace: Workspace, splat: SplatParts, options: ExportTilesOptions) 
         if options.crs is not None or options.vertical is not None:
             raise
         # The tiles themselves need no grid: without one, the page shows ellipsoidal heights, and says so.
-        without_grid = options.model_copy(update={"vertical": parse_vertical(ELLIPSOIDAL)})
-        target = target_crs(without_grid, survey.origin, middle_in_geo, survey.vertical)
-        target = replace(target, assumed=(*target.assumed, f"heights are ellipsoidal, because {error}"))
+        reason = f"heights are ellipsoidal, because {error}"
+        target = without_grid(options, survey.origin, middle_in_geo, survey.vertical, reason)
     return scene_page(
         workspace.root.resolve().name,
         splat.placement,

@@ -203,10 +203,9 @@ def _policy(program: str, cesium: str) -> str:
 
 def _facts(placement: Placement, target: TargetCrs) -> tuple[Fact, ...]:
     accuracy = placement.accuracy
-    input_heights = placement.vertical.name + ("" if placement.vertical.stated else " (assumed)")
     facts = (
         ("CRS", target.crs.name),
-        ("Heights", f"{target.crs.vertical.name}; of the survey's input: {input_heights}"),
+        ("Heights", f"{target.crs.vertical.described}; of the survey's input: {placement.vertical.described}"),
         ("h", "height above the WGS84 ellipsoid; labels stand at it, too"),
         ("Accuracy", "not known: nothing states it yet (georef evaluate)" if accuracy is None else accuracy.text),
         *(("Assumed", sentence) for sentence in target.assumed),

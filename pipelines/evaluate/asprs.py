@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from pipelines.core.figures import length_text
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.robust.statistics import residual_stats
 from pipelines.survey.report import AsprsStatement, ErrorStats, Rmse, TotalRmse, VegetatedAccuracy
@@ -41,9 +42,12 @@ class Assessment:
     # Errors and survey in quadrature, the accuracy after the standard; both are of the points outside vegetation
     with_survey: TotalRmse | None
     asprs: AsprsStatement  # classes that `with_survey` meets, and the accuracy under vegetation
-    # (N,) mask of the errors beyond three times the class that the other points meet; none is under vegetation
+    # (N,) mask of the errors beyond three times the class that the other points meet, of which none is under
+    # vegetation, and of those that their prediction accuses
     blunder: BoolArray
     without_blunders: ErrorStats | None  # figures of the other points; None without blunders
+    # As `with_survey`, without the accused points; None: none is accused, or all are
+    with_survey_without_refuted: TotalRmse | None = None
 
 
 def assess(
@@ -51,6 +55,8 @@ def assess(
     cov_survey: ArrayLike,
     vegetated: ArrayLike | None = None,
     area_km2: float | None = None,
+    *,
+    accused: ArrayLike | None = None,
 ) -> Assessment:
     """Return the accuracy after the standard, from the errors at check points.
 
@@ -61,6 +67,7 @@ def assess(
         cov_survey: (N, 3, 3) m², of the surveyed positions.
         vegetated: (N,) mask of the points under vegetation; None: none is.
         area_km2: of the project; None: not known, and taken for a small one.
+        accused: (N,) mask of the points that count as blunders whatever the class of the others; None: none does.
     """
     error = np.asarray(error_in_geo, dtype=np.float64).reshape(-1, 3)
     variance = np.diagonal(np.asarray(cov_survey, dtype=np.float64).reshape(-1, 3, 3), axis1=1, axis2=2)
@@ -70,14 +77,17 @@ def assess(
     if covered.any():
         under = VegetatedAccuracy(count=int(covered.sum()), rmse_v_m=_rmse(square[covered]).rmse_v_m)
     blunder = np.zeros(len(error), dtype=bool)
-    survey, with_survey = None, None
+    survey, with_survey, of_others = None, None, None
     if not covered.all():
         survey, total = _rmse(variance[~covered]), _rmse(square[~covered])
-        with_survey = TotalRmse(**total.model_dump(), rmse_3d_m=math.hypot(total.rmse_h_m, total.rmse_v_m))
+        with_survey = _total(total)
         blunder[~covered] = _blunders(error[~covered], variance[~covered])
+    blunder |= False if accused is None else np.asarray(accused, dtype=bool)
+    if accused is not None and np.any(accused) and (others := ~covered & ~np.asarray(accused, dtype=bool)).any():
+        of_others = _total(_rmse(square[others]))
     statement = _statement(int((~covered).sum()), with_survey, under, area_km2)
     without_blunders = error_stats(error[~blunder]) if blunder.any() else None
-    return Assessment(stats, survey, with_survey, statement, blunder, without_blunders)
+    return Assessment(stats, survey, with_survey, statement, blunder, without_blunders, of_others)
 
 
 def error_stats(error_in_geo: ArrayLike) -> ErrorStats:
@@ -103,6 +113,10 @@ def classes_cm(*rmse_m: float) -> list[int]:
     return [max(math.ceil(100 * value - 1e-9), 1) for value in rmse_m]
 
 
+def _class_text(class_cm: int) -> str:
+    return f"{class_cm} cm" if class_cm < 100 else f"{class_cm / 100:.2f} m"
+
+
 def least_points(area_km2: float | None) -> int:
     """Return the number of check points that the standard demands for a project of an area in km²."""
     further = math.ceil((area_km2 or 0.0) / _AREA_KM2) - 1
@@ -123,7 +137,7 @@ def _statement(
     """Return the classes that `count` check points outside vegetation meet, and a sentence with their number."""
     least, under = least_points(area_km2), ""
     if vegetated is not None:
-        under = f"RMSE_V {100 * vegetated.rmse_v_m:.1f} cm at {vegetated.count} points under vegetation (VVA)"
+        under = f"RMSE_V {length_text(vegetated.rmse_v_m)} at {vegetated.count} points under vegetation (VVA)"
     asprs = AsprsStatement(
         points=count,
         horizontal_class=None,
@@ -138,16 +152,20 @@ def _statement(
     if tested is None:
         return asprs
     classes_of = classes_cm(tested.rmse_h_m, tested.rmse_v_m, tested.rmse_3d_m)
-    horizontal, vertical, class_3d = (f"{class_cm} cm" for class_cm in classes_of)
+    horizontal, vertical, class_3d = (_class_text(class_cm) for class_cm in classes_of)
     sample = f"tested on {count} check points: " if asprs.enough_points else f"{few_points(asprs)} "
     classes = {"horizontal_class": horizontal, "vertical_class": vertical, "class_3d": class_3d}
     statement = (
-        f"{sample}RMSE_H {100 * tested.rmse_h_m:.1f} cm, RMSE_V {100 * tested.rmse_v_m:.1f} cm outside vegetation "
-        f"(NVA), RMSE_3D {100 * tested.rmse_3d_m:.1f} cm, the check points' survey included: horizontal accuracy "
+        f"{sample}RMSE_H {length_text(tested.rmse_h_m)}, RMSE_V {length_text(tested.rmse_v_m)} outside vegetation "
+        f"(NVA), RMSE_3D {length_text(tested.rmse_3d_m)}, the check points' survey included: horizontal accuracy "
         f"class {horizontal}, vertical accuracy class {vertical}, three-dimensional accuracy class {class_3d} "
         f"({STANDARD})" + (under and f"; {under}, without a class")
     )
     return asprs.model_copy(update={**classes, "statement": statement})
+
+
+def _total(rmse: Rmse) -> TotalRmse:
+    return TotalRmse(**rmse.model_dump(), rmse_3d_m=math.hypot(rmse.rmse_h_m, rmse.rmse_v_m))
 
 
 def _rmse(square: FloatArray) -> Rmse:

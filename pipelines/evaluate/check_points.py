@@ -4,6 +4,7 @@ Each is a section of the report, with errors, accuracy after ASPRS, and predicte
 σ that check points reject, and check points close to control points.
 """
 
+from collections.abc import Container
 from dataclasses import dataclass
 from itertools import compress
 from typing import Any
@@ -17,6 +18,7 @@ from pipelines.core.progress import Progress
 from pipelines.core.sentences import listed
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.evaluate.asprs import Assessment, assess
+from pipelines.evaluate.blunders import blunder_caution, find_blunders
 from pipelines.robust.statistics import chi2_quantile, residual_stats
 from pipelines.surface.picking import DepthMap, depth_around, points_on_surface
 from pipelines.surface.surface_views import ModelRenderer
@@ -41,10 +43,20 @@ class RemeasuredPoints:
         return np.asarray(np.isfinite(self.error_in_geo).all(axis=1))
 
 
-def check_point_errors(measured: RemeasuredPoints, area_km2: float | None) -> report.CheckPointErrors:
-    """Return the report's section on check points; the area is that of the scene, None: not known."""
-    assessment = _assess(measured, area_km2)
-    return report.CheckPointErrors(**_figures(measured, assessment), asprs=assessment.asprs)
+def check_point_errors(
+    measured: RemeasuredPoints, area_km2: float | None, accused: BoolArray | None = None
+) -> report.CheckPointErrors:
+    """Return the report's section on check points; the area is that of the scene, None: not known.
+
+    `accused` is the mask (J,) of the points that their predicted σ calls blunders.
+    """
+    assessment = _assess(measured, area_km2, accused)
+    names = np.array([point.name for point in measured.points])
+    return report.CheckPointErrors(
+        **_figures(measured, assessment),
+        refuted=() if accused is None else tuple(names[accused].tolist()),
+        asprs=assessment.asprs,
+    )
 
 
 def _residuals(measured: RemeasuredPoints) -> tuple[report.PointResidual, ...]:
@@ -55,11 +67,19 @@ def _residuals(measured: RemeasuredPoints) -> tuple[report.PointResidual, ...]:
     )
 
 
-def _assess(measured: RemeasuredPoints, area_km2: float | None = None) -> Assessment:
+def _assess(
+    measured: RemeasuredPoints, area_km2: float | None = None, accused: BoolArray | None = None
+) -> Assessment:
     known = measured.is_measured
     vegetated = np.array([point.land_cover == "vegetated" for point in measured.points], dtype=bool)
     cov_survey = [point.cov_in_geo for point in compress(measured.points, known)]
-    return assess(measured.error_in_geo[known], cov_survey, vegetated[known], area_km2)
+    return assess(
+        measured.error_in_geo[known],
+        cov_survey,
+        vegetated[known],
+        area_km2,
+        accused=None if accused is None else accused[known],
+    )
 
 
 def _figures(measured: RemeasuredPoints, assessment: Assessment) -> dict[str, Any]:
@@ -71,6 +91,7 @@ def _figures(measured: RemeasuredPoints, assessment: Assessment) -> dict[str, An
         "survey": assessment.survey,
         "with_survey": assessment.with_survey,
         "without_blunders": assessment.without_blunders,
+        "with_survey_without_refuted": assessment.with_survey_without_refuted,
         "blunders": tuple(point.name for point in compress(measured.points, blunder)),
         "predicted": _predicted_sigma(measured),
         "points": _rows(measured, blunder),
@@ -132,7 +153,44 @@ def triangulated_check_points(
     points, rays = solved.survey.check_points, mark_rays(solved.survey.check_points, solved.sparse)
     position = triangulated_points(solved, rays)
     cov = posterior.of_marked_points(position, rays) if points else None
-    return check_point_errors(_compared(points, position, rays, cov), area_km2)
+    accused, joint = np.zeros(len(points), dtype=bool), jointly_checked(solved, posterior)
+    if joint is not None:
+        wrong = compress(joint.names, find_blunders(joint.error_in_geo, joint.cov).wrong)
+        accused = np.isin([point.name for point in points], tuple(wrong))
+    return check_point_errors(_compared(points, position, rays, cov), area_km2, accused)
+
+
+@dataclass(frozen=True)
+class JointErrors:
+    """Errors of the triangulated check points with their joint covariance: of prediction, marks and survey."""
+
+    names: tuple[str, ...]
+    error_in_geo: FloatArray  # (J, 3) m
+    cov: FloatArray  # (3 J, 3 J) m²
+
+    def without(self, names: Container[str]) -> "JointErrors":
+        """Return the errors of the other points."""
+        kept = np.array([name not in names for name in self.names], dtype=bool)
+        axes = np.repeat(kept, 3)
+        return JointErrors(tuple(compress(self.names, kept)), self.error_in_geo[kept], self.cov[np.ix_(axes, axes)])
+
+
+def jointly_checked(solved: SolvedSurvey, posterior: Posterior) -> JointErrors | None:
+    """Return the errors of the check points that have a predicted σ; None: there is no such point."""
+    points = solved.survey.check_points
+    if not points:
+        return None
+    rays = mark_rays(points, solved.sparse)
+    position = triangulated_points(solved, rays)
+    variance = np.diagonal(posterior.of_marked_points(position, rays), axis1=1, axis2=2)
+    known = np.asarray(np.isfinite(position + variance).all(axis=1))
+    if not known.any():
+        return None
+    chosen = tuple(compress(points, known))
+    error = position[known] - np.array([point.position_in_geo for point in chosen])
+    cov = posterior.jointly_of_marked_points(position[known], rays.of_points(known))
+    cov = cov + block_diag(*(point.cov_in_geo for point in chosen))
+    return JointErrors(tuple(point.name for point in chosen), error, cov)
 
 
 def check_points_on_surface(
@@ -238,22 +296,15 @@ def cautions_of_prediction(
     if of_initial:
         sentence = "The points are measured with the initial similarity; the predicted σ are of the adjusted one."
         return (Remark(code="prediction-of-adjusted-similarity", sentence=sentence),)
-    points = solved.survey.check_points
-    if len(points) < _LEAST_POINTS:
+    joint = jointly_checked(solved, posterior)
+    if joint is None:
         return ()
-    rays = mark_rays(points, solved.sparse)
-    position = triangulated_points(solved, rays)
-    variance = np.diagonal(posterior.of_marked_points(position, rays), axis1=1, axis2=2)
-    known = np.asarray(np.isfinite(position + variance).all(axis=1))
-    if known.sum() < _LEAST_POINTS:
-        return ()
-    chosen = [point for point, is_known in zip(points, known, strict=True) if is_known]
-    error = position[known] - np.array([point.position_in_geo for point in chosen])
-    cov = posterior.jointly_of_marked_points(position[known], rays.of_points(known))
-    cov = cov + block_diag(*(point.cov_in_geo for point in chosen))
-    names = tuple(point.name for point in chosen)
-    test = chi2_caution(names, error.ravel(), cov, frozenset(triangulated.blunders))
-    return () if test is None else (test,)
+    found = find_blunders(joint.error_in_geo, joint.cov)
+    named = blunder_caution(joint.names, joint.error_in_geo, found)
+    others = joint.without(frozenset(compress(joint.names, found.wrong | found.doubtful)))
+    blunders = frozenset(triangulated.blunders) & frozenset(others.names)
+    test = chi2_caution(others.names, others.error_in_geo.ravel(), others.cov, blunders)
+    return named if test is None else (*named, test)
 
 
 def chi2_caution(

@@ -132,7 +132,8 @@ def _model(
         sample.append(square.position[first_of_voxels(square.position, 2 * _OVERVIEW_M)])
     views.close()
     if not delivered.count:
-        message = "No point of the surface has the same depth in three training views. Train longer."
+        message = "No point of the surface has the same depth in three training views: too few photographs "
+        message += "overlap, or the training was too short. Add photographs, or train longer."
         raise DegenerateGeometryError("surface-not-seen", message)
     sparse = overview.position_in_geo[first_of_voxels(overview.position_in_geo, 2 * _OVERVIEW_M)]
     normal, kind = plane_normals(sparse, 2 * _OVERVIEW_M), options.reference_align

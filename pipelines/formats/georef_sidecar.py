@@ -237,7 +237,7 @@ def _of_frame(sidecar: GeorefSidecar, name: str) -> IsoMetadata:
         abstract=f"Model from photographs in a metric frame of its own, {place}. "
         f"{_accuracy_sentence(sidecar.accuracy)}",
         crs=sidecar.crs_id or LOCAL_FRAME,
-        heights=sidecar.vertical_datum.name,
+        heights=_heights(sidecar.vertical_datum, sidecar.crs_wkt),
         west_south=box,
         east_north=box,
         height_range=None,
@@ -268,7 +268,7 @@ def _of_crs(sidecar: CrsSidecar, name: str) -> IsoMetadata:
         title=name,
         abstract=f"Product of a survey with photographs, in {sidecar.crs}. {_accuracy_sentence(sidecar.accuracy)}",
         crs=sidecar.crs,
-        heights=sidecar.vertical_datum.name,
+        heights=_heights(sidecar.vertical_datum, sidecar.crs_wkt),
         west_south=west_south,
         east_north=east_north,
         height_range=(float(bounds[0, 2]), float(bounds[1, 2])) if has_heights else None,
@@ -287,6 +287,11 @@ def _of_crs(sidecar: CrsSidecar, name: str) -> IsoMetadata:
 
 def _accuracy_sentence(headline: Headline | None) -> str:
     return "Its accuracy is not stated." if headline is None else f"Accuracy: {headline.text}."
+
+
+def _heights(datum: VerticalDatum, crs_wkt: str) -> str:
+    """Return what heights count from, and whether nobody stated it; a local frame needs no word."""
+    return f"{datum.name} ({datum.source})" if crs_wkt and not datum.stated else datum.name
 
 
 def _sentences(cautions: tuple[Remark, ...]) -> list[str]:

@@ -71,14 +71,16 @@ class IsoMetadata:
 
 def headline_quality(headline: Headline | None) -> tuple[QualityElement, ...]:
     """Return the quality elements of the accuracy of a result; none where it is not known."""
-    if headline is None or headline.rmse_h_m is None or headline.rmse_v_m is None:
+    if headline is None or headline.rmse_h_m is None:
         return ()
     measured = headline.kind == "measured"
     of_plan, upright = (RMSE_PLAN, RMSE) if measured else (PREDICTED_RMS, PREDICTED_RMS)
     method: Literal["directExternal", "directInternal"] = "directExternal" if measured else "directInternal"
-    return (
-        QualityElement(of_plan, f"horizontal accuracy, {headline.text}", headline.rmse_h_m, method),
-        QualityElement(upright, f"vertical accuracy, {headline.text}", headline.rmse_v_m, method),
+    lengths = ((of_plan, "horizontal", headline.rmse_h_m), (upright, "vertical", headline.rmse_v_m))
+    return tuple(
+        QualityElement(kind, f"{axis} accuracy, {headline.text}", value, method)
+        for kind, axis, value in lengths
+        if value is not None
     )
 
 

@@ -5,6 +5,7 @@ a grid that a PROJ string calls optional (`+nadgrids=@file`) is a shift of zero 
 errors that name the grid.
 """
 
+import re
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -26,16 +27,34 @@ _WGS84_3D = "EPSG:4979"
 _NO_SHIFT = "@null"  # a PROJ string's way to say that there is none
 # Ellipsoids of frames that follow the Earth's centre, as WGS84 does: semi-major axis and inverse flattening.
 _MODERN_AXIS_M, _MODERN_FLATTENING = 6378137.0, (298.25, 298.26)
+# Steps of PROJ that change the horizontal coordinates of a datum, and the parameters by which a Helmert one does.
+_MOVING_STEPS = frozenset(
+    {
+        *("affine", "defmodel", "deformation", "geogoffset", "gridshift", "hgridshift", "horner"),
+        *("molobadekas", "molodensky", "tinshift", "xyzgridshift"),
+    }
+)
+_HELMERT_PARAMETERS = frozenset({"x", "y", "z", "rx", "ry", "rz", "s"})
 _GRID_SUFFIXES = (".tif", ".gtx", ".gsb")
 
 
 @dataclass(frozen=True)
 class Operation:
-    """How PROJ gets from a CRS to WGS84, how well (None: unknown), and grids with which it would do better."""
+    """How PROJ gets from a CRS to WGS84, how well (None: unknown), and grids with which it would do better.
+
+    `renames`: the operation changes no horizontal coordinate of a datum. Its published accuracy is then that of
+    calling ETRS89, NAD83 or GDA94 by the name of WGS84, as receivers do that get their corrections in these.
+    """
 
     name: str
     accuracy_m: float | None
     missing_grids: tuple[str, ...]
+    renames: bool = False
+
+    @property
+    def sigma_m(self) -> float:
+        """σ of each horizontal axis by the published accuracy, 0 where none is known or nothing is moved."""
+        return 0.0 if self.renames or self.accuracy_m is None else self.accuracy_m / 2**0.5
 
 
 @dataclass(frozen=True)
@@ -72,7 +91,8 @@ def best_operation(request: OperationRequest, lon: FloatArray, lat: FloatArray) 
     if real:
         best = real[0]
         better = () if group.best_available else _missing(group.unavailable_operations[:1])
-        return best, Operation(best.description, best.accuracy if best.accuracy >= 0 else None, better)
+        accuracy_m = best.accuracy if best.accuracy >= 0 else None
+        return best, Operation(best.description, accuracy_m, better, renames=not _moves(best.definition))
     # The fewest files to fetch; where as many would do, the way that PROJ likes best.
     lacking = [grids for operation in group.unavailable_operations if (grids := _missing([operation]))]
     lacking += [_missing(transformer.operations or ()) for transformer in group.transformers]
@@ -97,6 +117,17 @@ def _does_nothing(transformer: Transformer) -> bool:
     steps = [operation.grids for operation in transformer.operations or ()]
     named = [grids for grids in steps if grids and all(grid.short_name != _NO_SHIFT for grid in grids)]
     return any(not any(grid.available for grid in grids) for grids in named)
+
+
+def _moves(definition: str) -> bool:
+    """Return whether a pipeline of PROJ changes horizontal coordinates beyond projections, units and axes."""
+    for step in re.split(r"(?:^|\s)step(?:\s|$)", definition.replace("+", " ")):
+        given = dict(part.partition("=")[::2] for part in step.split())
+        if given.get("proj") in _MOVING_STEPS:
+            return True
+        if given.get("proj") == "helmert" and any(float(given.get(key) or 0.0) for key in _HELMERT_PARAMETERS):
+            return True
+    return False
 
 
 def _missing(operations: Iterable[CoordinateOperation]) -> tuple[str, ...]:

@@ -98,8 +98,29 @@ Vertical = Annotated[VerticalChoice, from_text(parse_vertical), WRITTEN]
 
 
 class VerticalDatum(Product):
-    """Vertical datum of input heights; whether the user or the file stated it, or it was assumed; `note`: why."""
+    """Vertical datum of heights; whether the user or the file stated it; `note`: where from, or why assumed.
+
+    `by_definition`: nobody stated it, but the kind of message or file has one datum only, which `note` names.
+    """
 
     name: str
     stated: bool
     note: str = ""
+    by_definition: bool = False
+
+    @property
+    def is_assumed(self) -> bool:
+        """Whether neither user, file nor the definition of its format names the datum."""
+        return not (self.stated or self.by_definition)
+
+    @property
+    def source(self) -> str:
+        """Where the datum comes from: `as stated`, `by definition` or `assumed: nobody stated the datum`."""
+        if self.stated:
+            return "as stated"
+        return f"by definition: {self.note}" if self.by_definition else "assumed: nobody stated the datum"
+
+    @property
+    def described(self) -> str:
+        """Name and source, for pages and metadata."""
+        return f"{self.name}, {self.source}"

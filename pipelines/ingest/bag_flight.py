@@ -102,7 +102,7 @@ def _positions(streams: BagStreams, options: IngestOptions, remarks: Remarks) ->
             raise InputError("height-impossible", message, path=streams.path, field=series.topic)
         if series is not None:
             remarks.warn("no-usable-position", f"No message of {series.topic} has a usable position.")
-        return Trajectory.from_samples(np.empty(0)), VerticalDatum(name=ELLIPSOIDAL, stated=True)
+        return Trajectory.from_samples(np.empty(0)), VerticalDatum(name=ELLIPSOIDAL, stated=False)
     values = series.table()
     if series.type in GEODETIC_HEIGHTS:
         position_in_ecef, vertical = _geodetic(series, options, remarks)
@@ -141,7 +141,7 @@ def _geodetic(series: TopicSamples, options: IngestOptions, remarks: Remarks) ->
             "bag-heights",
             f"Heights of {series.topic} are {heights}. If its driver writes others, state them with --vertical.",
         )
-    by_definition = VerticalDatum(name=ELLIPSOIDAL, stated=True, note=heights)
+    by_definition = VerticalDatum(name=ELLIPSOIDAL, stated=False, note=heights, by_definition=True)
     lla = crs.lla_from_xyz(series.table()[:, [1, 0, 2]])
     return ecef_from_lla(lla), crs.vertical if crs.vertical.stated else by_definition
 

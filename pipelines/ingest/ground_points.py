@@ -37,6 +37,9 @@ _SAME_PLACE_M = 1e-3
 _RANGE_M = 50_000.0
 
 Use = Literal["control", "check"]
+Kind = Literal["control points", "check points"]
+_CONTROL: Kind = "control points"
+_CHECK: Kind = "check points"
 
 
 @dataclass(frozen=True)
@@ -76,8 +79,8 @@ def read_ground_files(options: IngestOptions, remarks: Remarks) -> tuple[GroundF
         InputError: a malformed file, no CRS, one name at two places, or impossible coordinates.
     """
     control, check = (
-        None if path is None else _placed(_recognised(path, options, remarks), options, remarks)
-        for path in (options.gcp, options.checkpoints)
+        None if path is None else _placed(_recognised(path, options, remarks), of, options, remarks)
+        for path, of in ((options.gcp, _CONTROL), (options.checkpoints, _CHECK))
     )
     if options.marks is None:
         return control, check
@@ -157,13 +160,13 @@ def _begins_a_table(lines: list[str], path: Path) -> bool:
     return len(cells) >= 4 and (all(map(is_number, cells[1:4])) or not any(map(is_number, cells)))
 
 
-def _placed(listed: GroundPoints, options: IngestOptions, remarks: Remarks) -> GroundFile:
+def _placed(listed: GroundPoints, of: Kind, options: IngestOptions, remarks: Remarks) -> GroundFile:
     crs = crs_of_points(listed, options, remarks)
     xyz = in_units_of(crs, east_first(listed, crs, remarks), listed)
     lines = [point.line for point in listed.points]
     lla = crs.lla_from_xyz(xyz, path=listed.path, lines=lines)
     require_heights(lla, listed.path, lines)
-    note_operation(crs, lla, remarks)
+    note_operation(crs, lla, listed.path, of, remarks)
     points = tuple(
         GroundPoint(point.name, position, point.line, point.sigma_h_m, point.sigma_v_m, point.is_check)
         for point, position in zip(listed.points, ecef_from_lla(lla), strict=True)

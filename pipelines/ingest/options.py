@@ -103,6 +103,11 @@ class IngestOptions(StageOptions):
         description="Take a frame of the bag every 2s, or every 5m flown (default: all); of a video, every 2s.",
     )
     skip_blurred: bool = Field(False, description="Leave out blurred frames of the bag.")
+    ground_height: float | None = Field(
+        None,
+        description="Height of the terrain in metres, above the datum of --vertical, else the ellipsoid: cameras "
+        "below it or far above it are a caution.",
+    )
     origin: PlaceOnEarth | None = Field(
         None,
         description="Zero of a bag's local frame (odometry, poses): latitude,longitude,ellipsoidal height.",

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -15,6 +16,9 @@ from pipelines.geodesy.operations import WGS84
 from pipelines.geodesy.vertical import HEIGHT_REMEDY, impossible_heights
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.remarks import Remarks
+from pipelines.survey.survey import UsedTransformation
+
+_LEAST_SIGMA_M = 0.02  # from which the accuracy of a transformation is a caution
 
 _ALIKE_UNITS = 1e-5  # the foot and the US survey foot are 2e-6 apart, and headers do not tell them apart
 
@@ -160,11 +164,42 @@ def require_heights(lla: FloatArray, path: Path, lines: Sequence[int]) -> None:
     )
 
 
-def note_operation(crs: PointCrs, lla: FloatArray, remarks: Remarks) -> None:
-    """Record how well the way from a CRS to WGS84 is known at points `lla` (N, 3), where that may matter."""
+def note_operation(
+    crs: PointCrs,
+    lla: FloatArray,
+    path: Path,
+    of: Literal["positions", "control points", "check points"],
+    remarks: Remarks,
+) -> None:
+    """Record the way from a CRS to WGS84 at points `lla` (N, 3) of a file, and how well it is known.
+
+    An accuracy that enters the σ is a caution, which names the grid that would do better.
+    """
     if not len(lla):
         return
     operation = crs.operation(lla)
+    remarks.transformations.append(
+        UsedTransformation(
+            of=of,
+            file=path.name,
+            crs=crs.name,
+            operation=operation.name,
+            accuracy_m=operation.accuracy_m,
+            sigma_m=operation.sigma_m,
+            missing_grids=operation.missing_grids,
+        )
+    )
+    if operation.sigma_m >= _LEAST_SIGMA_M:
+        grids = ", ".join(operation.missing_grids)
+        better = (
+            f" A better one needs the PROJ grid {grids}: `pyproj sync --file NAME` installs it." if grids else ""
+        )
+        remarks.caution(
+            "transformation-accuracy",
+            f"The {of} of {path.name} come from {crs.name} to WGS84 by “{operation.name}”, published with an "
+            f"accuracy of {operation.accuracy_m:g} m: an error common to all of them, which the σ include, and "
+            f"which points of the same CRS do not show.{better}",
+        )
     if operation.accuracy_m is None or operation.accuracy_m >= 0.5:
         accuracy = (
             "an unknown accuracy" if operation.accuracy_m is None else f"an accuracy of {operation.accuracy_m:g} m"

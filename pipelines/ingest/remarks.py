@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from pipelines.core.products import Remark
+from pipelines.survey.survey import UsedTransformation
 
 _SHOWN = 4
 
@@ -15,6 +16,12 @@ class Remarks:
     assumptions: list[Remark] = field(default_factory=list)
     warnings: list[Remark] = field(default_factory=list)
     cautions: list[Remark] = field(default_factory=list)
+    transformations: list[UsedTransformation] = field(default_factory=list)
+
+    @property
+    def by_kind(self) -> tuple[Sequence[Remark], Sequence[Remark], Sequence[Remark]]:
+        """Warnings, cautions and assumptions, in the order of `core.workspace.Summary`."""
+        return self.warnings, self.cautions, self.assumptions
 
     def assume(self, code: str, sentence: str) -> None:
         """Record what stands in for what the input does not state."""

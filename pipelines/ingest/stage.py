@@ -88,7 +88,7 @@ def check_inputs(workspace: Workspace, options: IngestOptions, progress: Progres
         require("heif")
         assert options.images is not None
         figure = f"{glance(options.images)[0]} photographs, {len(heif)} of them HEIC"
-    return Summary(figure, {}, tuple(remarks.warnings))
+    return Summary(figure, {}, *(tuple(of_kind) for of_kind in remarks.by_kind))
 
 
 def _refuse_inside_photographs(workspace: Workspace, options: IngestOptions) -> None:
@@ -223,4 +223,4 @@ def _summary(survey: Survey) -> Summary:
         "vertical": survey.vertical.model_dump(),
         "camera_list": _camera_list(survey),
     }
-    return Summary(key_figure, values, survey.warnings, survey.cautions)
+    return Summary(key_figure, values, survey.warnings, survey.cautions, survey.assumptions)

@@ -4,6 +4,8 @@ Images and surveyed points get their positions, attitudes and covariances in geo
 base station, a receiver or a day, form a session, with the σ of that error.
 """
 
+import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
@@ -17,6 +19,7 @@ from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.ingest import flight_record
 from pipelines.ingest.ground_points import GroundFile, GroundPoint, require_near, split_checks, unmarked_points
+from pipelines.ingest.height_checks import SIGMA_DATUM_M, height_doubts, known_ground
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo
 from pipelines.ingest.remarks import Remarks
@@ -91,7 +94,7 @@ def assemble_survey(
     control_distances = sum(distance.use == "control" for distance in distances)
     origin = None
     if located or files or not control_distances:
-        require_placed(located or bool(marked), flight.photos)
+        require_placed(located or bool(marked), flight.photos, controls)
         origin = _origin(poses, marked)
         _note_coverage(flight, len(marked), remarks)
     else:
@@ -105,11 +108,18 @@ def assemble_survey(
     )
     if options.estimated:
         require_estimable(track, options.estimated, "--estimate" if options.estimate else "--time-offset")
-    sessions, session_of = fix_sessions(poses, options, remarks)
+    doubts = height_doubts(flight, known_ground(files, options.ground_height, options.vertical, flight))
+    for doubt in doubts:
+        remarks.caution(doubt.remark.code, doubt.remark.sentence)
+    sigma_zero_m = max((doubt.sigma_m for doubt in doubts), default=0.0)
+    sessions, session_of = fix_sessions(poses, options, remarks, sigma_zero_m=sigma_zero_m)
+    of_control_m = _sigma_of_transformation(remarks, "control points")
     cameras = with_readouts(flight.cameras, options, remarks)
-    images = _images(flight, session_of, origin, options)
+    images = _images(flight, session_of, origin, options, sigma_zero_m)
     survey = Survey(
         origin=origin,
+        transformations=tuple(remarks.transformations),
+        sigma_datum_m=(of_control_m, of_control_m, 0.0),
         source_crs=_source_crs(poses, control) if origin is not None else crs.LOCAL_FRAME,
         vertical=crs.local_frame().vertical if origin is None else _vertical(poses, files, remarks),
         image_dir=str(flight.folder),
@@ -133,8 +143,22 @@ def assemble_survey(
     return survey, track
 
 
-def require_placed(placed: bool, photos: Sequence[Photo] = ()) -> None:
-    """Refuse a survey that nothing places on Earth, with what its photographs' tags hold instead."""
+def require_placed(placed: bool, photos: Sequence[Photo] = (), points: Sequence[GroundPoint] = ()) -> None:
+    """Refuse a survey that nothing places on Earth, with what its photographs' tags hold instead.
+
+    `points` are control points whose marks do not suffice.
+    """
+    if not placed and points:
+        counts = Counter(len(point.marks) for point in points)
+        of_each = ", ".join(
+            f"{count} with {marks} mark{'s'[: marks != 1]}" for marks, count in sorted(counts.items(), reverse=True)
+        )
+        raise InputError(
+            "control-points-unmarked",
+            f"No image has a position, and no control point is marked in two or more photographs: of {len(points)} "
+            f"control points there are {of_each}. Mark each point in at least 2 photographs, better in all that "
+            "show it, or give positions with --trajectory or --geo.",
+        )
     if not placed:
         held = f" {contents(photos)}" if photos else ""
         raise InputError(
@@ -146,7 +170,13 @@ def require_placed(placed: bool, photos: Sequence[Photo] = ()) -> None:
 
 
 def _source_crs(poses: flight_record.ImagePoses, control: GroundFile | None) -> str:
+    """Return the CRS of the positions, else that of the control points; `transformations` has all."""
     return poses.crs_name if poses.located.any() or control is None else control.crs.name
+
+
+def _sigma_of_transformation(remarks: Remarks, *of: str) -> float:
+    """Return the σ of each horizontal axis by the transformations of the named parts of the input; the largest."""
+    return max((each.sigma_m for each in remarks.transformations if each.of in of), default=0.0)
 
 
 def _require_checks(checks: Sequence[GroundPoint], vegetated: Sequence[str]) -> None:
@@ -163,11 +193,15 @@ def _require_checks(checks: Sequence[GroundPoint], vegetated: Sequence[str]) -> 
 
 
 def _images(
-    flight: flight_record.FlightRecord, session_of: IntArray, origin: enu.Origin | None, options: IngestOptions
+    flight: flight_record.FlightRecord,
+    session_of: IntArray,
+    origin: enu.Origin | None,
+    options: IngestOptions,
+    sigma_zero_m: float,
 ) -> tuple[SurveyImage, ...]:
     """Return the photographs with fixes and attitudes in the frame at an origin, and their split."""
     poses = flight.poses
-    fixes, attitudes = _fixes(poses, session_of, origin), _attitudes(poses, origin, options)
+    fixes, attitudes = _fixes(poses, session_of, origin, sigma_zero_m), _attitudes(poses, origin, options)
     test = _held_out(len(flight.photos), options.test_every)
     return tuple(
         SurveyImage(
@@ -216,11 +250,14 @@ def _surveyed(
     )
 
 
-def _fixes(poses: flight_record.ImagePoses, session_of: IntArray, origin: enu.Origin | None) -> list[Fix | None]:
+def _fixes(
+    poses: flight_record.ImagePoses, session_of: IntArray, origin: enu.Origin | None, sigma_zero_m: float
+) -> list[Fix | None]:
     if origin is None:
         return [None] * len(poses.position_in_ecef)
     position = enu.enu_from_ecef(poses.position_in_ecef, origin)
     covariance = _turned(poses.sigma_enu_m, poses.position_in_ecef, origin)
+    covariance[:, 2, 2] += sigma_zero_m**2
     return [
         Fix(
             position_in_geo=vector3(position[row]),
@@ -228,6 +265,7 @@ def _fixes(poses: flight_record.ImagePoses, session_of: IntArray, origin: enu.Or
             source=poses.source,
             sigma_source=poses.sigma_source[row],
             session=int(session_of[row]),
+            sigma_zero_m=sigma_zero_m,
         )
         if located
         else None
@@ -270,15 +308,22 @@ def _matrix(values: FloatArray) -> Matrix3:
 
 
 def fix_sessions(
-    poses: flight_record.ImagePoses, options: IngestOptions, remarks: Remarks
+    poses: flight_record.ImagePoses, options: IngestOptions, remarks: Remarks, *, sigma_zero_m: float = 0.0
 ) -> tuple[tuple[FixSession, ...], IntArray]:
     """Return the sessions, and the session of each of N images (N,), 0 for images without a position.
 
     Positions of one kind of receiver form a session until a gap of more than four hours. Where the time of one is
     unknown, all of its kind form one session: a session too many would count as an independent check of a common
-    error. The σ of that error is that of the option, else of the kind of receiver.
+    error. The σ of that error is that of the option, else of the kind of receiver; where the datum of the heights
+    is assumed, and no option states the vertical σ, it includes that of the datum, and always that of a
+    doubtful zero.
     """
     given_h, given_v = options.sigma_common_h, options.sigma_common_v
+    datum_v_m = SIGMA_DATUM_M if poses.vertical.is_assumed and given_v is None and poses.located.any() else 0.0
+    datum_v_m = max(datum_v_m, sigma_zero_m)
+    # Positions in WGS84 check a transformation of the control points no better than that is published: WGS84 is a
+    # name for realisations that are metres apart, and positions do not tell theirs.
+    datum_h_m = _sigma_of_transformation(remarks, "positions", "control points")
     sessions: list[FixSession] = []
     session_of = np.zeros(len(poses.receivers), dtype=np.int64)
     located, sigma_h_m = poses.located, poses.sigma_enu_m[:, :2].max(axis=1)
@@ -291,7 +336,24 @@ def fix_sessions(
             horizontal_m, vertical_m = np.hypot(COMMON_SIGMA_M[kind], poses.common_sigma_m).tolist()
             h_m, v_m = horizontal_m if given_h is None else given_h, vertical_m if given_v is None else given_v
             source: flight_record.SigmaSource = "default" if given_h is None and given_v is None else "option"
-            sessions.append(FixSession(receiver=kind, sigma_common_m=(h_m, h_m, v_m), sigma_source=source))
+            sessions.append(
+                FixSession(
+                    receiver=kind,
+                    sigma_common_m=(
+                        math.hypot(h_m, datum_h_m),
+                        math.hypot(h_m, datum_h_m),
+                        math.hypot(v_m, datum_v_m),
+                    ),
+                    sigma_source=source,
+                    sigma_datum_m=(datum_h_m, datum_h_m, datum_v_m),
+                )
+            )
+    if datum_v_m > sigma_zero_m:
+        remarks.assume(
+            "default-datum-sigma",
+            f"Nobody stated the datum of the heights: the σ of the error that they share includes {datum_v_m:g} m "
+            "for it. State the datum with --vertical.",
+        )
     counts = np.bincount(session_of[located], minlength=len(sessions))
     for kind in COMMON_SIGMA_M:
         of_kind = sum(

@@ -240,7 +240,7 @@ def _measured(table: PoseTable, crs: PointCrs, options: IngestOptions, remarks: 
     xyz = in_units_of(crs, table.xyz, table)
     lla = crs.lla_from_xyz(xyz, path=table.path, lines=table.lines.tolist())
     require_heights(lla, table.path, table.lines.tolist())
-    note_operation(crs, lla, remarks)
+    note_operation(crs, lla, table.path, "positions", remarks)
     if table.sigma_enu_m is not None and "foot" in crs.units[0]:
         remarks.assume(
             "sigma-in-metres", f"σ in {table.path.name} are in metres, although {crs.name} counts in feet."

@@ -89,7 +89,7 @@ def cameras_facts(evaluated: EvaluatedSurvey) -> CamerasFacts:
         is_outlier,
     )
     by_name = {image.name: image.fix for image in solved.survey.images}
-    stated = [fix.cov_in_geo for camera in fixes.camera if (fix := by_name[names[camera]]) is not None]
+    stated = [fix.cov_apart for camera in fixes.camera if (fix := by_name[names[camera]]) is not None]
     # Stated σ (F, 3) along east, north and up, without the error that a session shares.
     stated_m = np.asarray(np.sqrt(np.diagonal(np.array(stated).reshape(-1, 3, 3), axis1=1, axis2=2)))
     series, by_time = _series(evaluated, fixes, stated_m)

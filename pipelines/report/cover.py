@@ -6,7 +6,8 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from pipelines.core.figures import MISSING, Headline
+from pipelines.core.figures import MISSING, Headline, length_text
+from pipelines.core.sentences import listed
 from pipelines.core.stages import HILLSHADE, ORTHOPHOTO_PREVIEW
 from pipelines.report.cameras import LensesFacts
 from pipelines.report.options import ReportOptions
@@ -35,6 +36,7 @@ class CoverFacts:
     facts: tuple[tuple[str, str], ...]  # name and value
     headline: Headline
     accuracy_note: str
+    without: str  # blunders among the check points, for the figures without them; empty: there are none
 
 
 def cover_facts(
@@ -44,7 +46,6 @@ def cover_facts(
     survey, crs, root = evaluated.solved.survey, evaluated.crs, evaluated.workspace.root
     area_ha = evaluated.report.area_ha
     height_m, gsd_m = flying_height_m(evaluated), ground_sampling_m(evaluated)
-    stated = ", as stated" if crs.crs.vertical.stated else ", assumed: nobody stated the datum"
     previews = {"Orthophoto": ORTHOPHOTO_PREVIEW, "Surface model": HILLSHADE}
     shown = {name: preview(root / product, _PREVIEW_PX) for name, product in previews.items()}
     registered = f"{count_text(lenses.photographs)} of {count_text(len(survey.images))} registered"
@@ -66,14 +67,15 @@ def cover_facts(
             ("Taken on", days_of(image.timestamp_s for image in survey.images)),
             ("Camera", "; ".join(cameras) or MISSING),
             ("Flying height above ground", MISSING if height_m is None else f"{number_text(height_m, 0)} m"),
-            ("Ground sample distance", MISSING if gsd_m is None else f"{number_text(100 * gsd_m, 1)} cm"),
+            ("Ground sample distance", length_text(gsd_m)),
             ("Photographs of a place", f"{number_text(overlap.median, 0)} (median)"),
             ("Surveyed points", f"{control} control points, {check} check points"),
             ("Coordinate system", crs.crs.name),
-            ("Heights", crs.crs.vertical.name + ("" if crs.origin is None else stated)),
+            ("Heights", crs.crs.vertical.name if crs.origin is None else crs.crs.vertical.described),
         ),
         headline=evaluated.report.headline,
         accuracy_note=_NOTES[evaluated.report.headline.kind],
+        without=listed(evaluated.report.headline.blunders),
     )
 
 

@@ -10,8 +10,9 @@ from typing import Literal
 
 from pipelines.core.products import NOT_CHECKED, Remark
 from pipelines.core.sentences import listed
+from pipelines.core.types import Vector3
 from pipelines.report.page import decibel, number_text, share
-from pipelines.survey.report import CheckPointErrors, DistanceError, EvaluationReport
+from pipelines.survey.report import CheckPointErrors, DistanceError, EvaluationReport, PhotometricFigures
 from pipelines.survey.report_parts import VarianceFactor
 from pipelines.survey.survey import LOCAL_FRAME
 
@@ -26,6 +27,7 @@ CONTROL_POINTS = (4, 3)
 LEAST_TESTED = 3  # check points, from which `evaluate` tests the predicted σ
 _LEAST_DISTANCES, _DISTANCE_SIGMAS = 3, 3.0
 TEST_PSNR_DB = (22.0, 18.0)
+_COVERAGE_DB = 2.0  # by which covered ground is better, where the lack of coverage is to blame
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,7 @@ def verdicts(report: EvaluationReport, measured: Measured, cautions: Sequence[Re
         "Check points": _check_points(measured, triangulated),
         "Predicted against measured": _prediction(triangulated, codes),
         "Blunders": _blunders(triangulated),
-        **({} if on_surface is None else {"Surface at the points": _surface(on_surface)}),
+        **({} if on_surface is None else {"Surface at the points": _surface(on_surface, triangulated)}),
     }
     by_subject: dict[str, _Fields] = {
         "Registered photographs": _registered(measured),
@@ -82,7 +84,7 @@ def verdicts(report: EvaluationReport, measured: Measured, cautions: Sequence[Re
         **({"Known distances": _distances(report.distances)} if is_local else of_place),
         "σ of the measurements": _stated_sigma(report.variance_factors, codes),
         **({} if is_local else of_points),
-        **({} if test is None else {"Test views": _views(test.psnr, test.views)}),
+        **({} if test is None else {"Test views": _views(test)}),
         **({"Cautions": _cautions(cautions)} if cautions else {}),
         **({"State of the products": _current(measured)} if measured.stale else {}),
     }
@@ -246,11 +248,15 @@ def _blunders(errors: CheckPointErrors) -> _Fields:
     return "good", "none", "no triangulated check point stands out", rule
 
 
-def _surface(errors: CheckPointErrors) -> _Fields:
+def _surface(errors: CheckPointErrors, triangulated: CheckPointErrors) -> _Fields:
+    """Return the verdict on the surface; a point that surface and triangulation miss alike does not accuse it."""
     rule = "good if no check point is a blunder on the rendered surface, fair up to a fifth of them, poor beyond"
     if not errors.count:
         return "unknown", "no check points", "nothing to compare with", rule
-    count = len(errors.blunders)
+    rays = {row.name: row.error_m for row in triangulated.points if row.name in triangulated.refuted}
+    count = sum(
+        not _miss_alike(row.error_m, rays.get(row.name)) for row in errors.points if row.name in errors.blunders
+    )
     level: Level = "good" if not count else "fair" if count <= errors.count / 5 else "poor"
     reason = (
         "the surface of the splat lies where the points are"
@@ -260,13 +266,28 @@ def _surface(errors: CheckPointErrors) -> _Fields:
     return level, f"{count} of {errors.count} off", reason, rule
 
 
-def _views(psnr_db: float | None, count: int) -> _Fields:
+def _miss_alike(on_surface: Vector3 | None, triangulated: Vector3 | None) -> bool:
+    """Return whether both errors of a point have one cause: they differ by less than half of either."""
+    if on_surface is None or triangulated is None:
+        return False
+    return 2.0 * math.dist(on_surface, triangulated) < min(math.hypot(*on_surface), math.hypot(*triangulated))
+
+
+def _views(test: PhotometricFigures) -> _Fields:
     rule = f"good from {TEST_PSNR_DB[0]:g} dB, fair from {TEST_PSNR_DB[1]:g} dB (mean PSNR)"
+    psnr_db, covered_db, covered_share = test.psnr, test.psnr_covered, test.covered_share
     if psnr_db is None:
         return "unknown", "none", "no photograph was left out of the training", rule
     level = level_of(psnr_db, TEST_PSNR_DB, more_is_better=True)
     reason = "renders look like the photographs" if level == "good" else "train longer, or at a larger image size"
-    return level, f"{decibel(psnr_db)} over {count}", reason, rule
+    if level != "good" and covered_db is not None and covered_share is not None:
+        there = level_of(covered_db, TEST_PSNR_DB, more_is_better=True)
+        if there != level or covered_db - psnr_db > _COVERAGE_DB:
+            reason = (
+                f"the training photographs show {share(covered_share)} of the test views' ground, and there "
+                f"the PSNR is {decibel(covered_db)}: photographs are missing, and longer training adds none"
+            )
+    return level, f"{decibel(psnr_db)} over {test.views}", reason, rule
 
 
 def _cautions(cautions: Sequence[Remark]) -> _Fields:

@@ -1,6 +1,7 @@
 """Engine `colmap`: features, matches, mapping, and a final robust adjustment; a large survey in chunks."""
 
 import logging
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -93,15 +94,22 @@ def map_matches(colmap: Any, job: SfmJob, progress: Progress) -> Any:
             "No two photographs could be matched: overlap or texture is too low. Try a larger --max-features, or "
             "--pairs exhaustive.",
         )
-    if len(models) > 1:
-        sizes = [model.num_reg_images() for model in models]
-        log.warning("The survey fell apart into %d models of %s images; the largest is used.", len(models), sizes)
+    _tell_of_parts([model.num_reg_images() for model in models], len(job.survey.images))
     fixes = None
     if len(job.survey.images) > _DRIFTLESS_UP_TO:
         fixes = {image.name: image.fix.position_in_geo for image in job.survey.images if image.fix is not None}
     others = partial(triangulate, colmap, database=job.database, progress=progress)
     _adjust(colmap, job, models[0], fixes=fixes, complete=others if mapper == "global" else None, progress=progress)
     return models[0]
+
+
+def _tell_of_parts(sizes: Sequence[int], photographs: int) -> None:
+    """Log that the survey fell apart; further models of images that the largest has, too, are no parts."""
+    if len(sizes) > 1 and sizes[0] < photographs:
+        log.warning(
+            "The survey fell apart into %d models of %s images; the largest, with %d of %d photographs, is used.",
+            len(sizes), ", ".join(map(str, sizes)), sizes[0], photographs, extra={"code": "survey-in-parts"},
+        )  # fmt: skip
 
 
 def _adjust(colmap: Any, job: SfmJob, model: Any, **how: Any) -> None:

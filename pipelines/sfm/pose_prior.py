@@ -101,7 +101,7 @@ def adjust_to_fixes(model: Any, survey: Survey, alignment: Alignment, seed: int 
         )
     colmap = pycolmap_module()
     fixes = [
-        (image, np.array(fix.position_in_geo), np.array(fix.cov_in_geo)) for image, fix in _located(model, survey)
+        (image, np.array(fix.position_in_geo), np.array(fix.cov_apart)) for image, fix in _located(model, survey)
     ]
     solution = alignment.solution
     furthest = np.linalg.norm(solution.residual[solution.state.inlier], axis=1).max()

@@ -13,6 +13,7 @@ from pipelines.core.products import Remark, is_checked
 from pipelines.core.stages import REPORT
 from pipelines.core.types import Vector3
 from pipelines.core.workspace import Workspace
+from pipelines.geodesy.vertical import MOST_GEOID_M
 from pipelines.survey.report import (
     AccuracySummary,
     CheckPointErrors,
@@ -32,7 +33,16 @@ def headline(triangulated: CheckPointErrors, scene: AccuracySummary, cautions: t
     if total is None:
         return predicted(scene, cautions)
     count = triangulated.asprs.points
-    return Headline(kind="measured", rmse_h_m=total.rmse_h_m, rmse_v_m=total.rmse_v_m, check_points=count)
+    others = triangulated.with_survey_without_refuted
+    return Headline(
+        kind="measured",
+        rmse_h_m=total.rmse_h_m,
+        rmse_v_m=total.rmse_v_m,
+        check_points=count,
+        blunders=() if others is None else triangulated.refuted,
+        rmse_h_without_m=None if others is None else others.rmse_h_m,
+        rmse_v_without_m=None if others is None else others.rmse_v_m,
+    )
 
 
 def predicted(scene: AccuracySummary, cautions: tuple[Remark, ...]) -> Headline:
@@ -44,7 +54,9 @@ def predicted(scene: AccuracySummary, cautions: tuple[Remark, ...]) -> Headline:
         return Headline(kind="unknown", reason=NOTHING_CHECKS)
     if scene.rms_sigma_h_m is None or scene.rms_sigma_v_m is None:
         return Headline(kind="unknown", reason=scene.reason or "no σ is predicted")
-    return Headline(kind="predicted", rmse_h_m=scene.rms_sigma_h_m, rmse_v_m=scene.rms_sigma_v_m)
+    # A σ beyond that of any datum says that the zero of the heights is unknown.
+    vertical_m = scene.rms_sigma_v_m if scene.rms_sigma_v_m < MOST_GEOID_M else None
+    return Headline(kind="predicted", rmse_h_m=scene.rms_sigma_h_m, rmse_v_m=vertical_m)
 
 
 def headline_of(workspace: Workspace) -> Headline | None:

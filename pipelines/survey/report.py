@@ -158,7 +158,10 @@ class PointResidual(Product):
 
 
 class PointError(PointResidual):
-    """Error of a point that entered no solution; that of a blunder is thrice the class that the others meet."""
+    """Error of a point that entered no solution.
+
+    That of a blunder is thrice the class that the others meet, or five times what σ and the others let expect.
+    """
 
     blunder: bool
 
@@ -183,14 +186,17 @@ PointRows = tuple[PredictedPointError | PointError, ...]
 class StatedErrors(ErrorStats):
     """Figures of errors; with σ of the points' own survey, and both in quadrature.
 
-    Points under vegetation count in the errors alone, and neither in `survey` nor in `with_survey`. None: there are
-    no blunders, or there is no prediction.
+    Points under vegetation count in the errors alone, and neither in `survey` nor in `with_survey`. Of the
+    blunders, `refuted` are those that σ and the other points refute, and `with_survey_without_refuted` is the
+    accuracy without these. None: there are no such points, or there is no prediction.
     """
 
     survey: Rmse | None
     with_survey: TotalRmse | None
     without_blunders: ErrorStats | None
+    with_survey_without_refuted: TotalRmse | None = None
     blunders: tuple[str, ...]
+    refuted: tuple[str, ...] = ()
     predicted: PredictedSigma | None
     points: PointRows
 

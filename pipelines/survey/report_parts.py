@@ -220,7 +220,7 @@ def with_variance_factors(survey: Survey, applied: dict[Group, float]) -> Survey
 def _image(image: SurveyImage, applied: dict[Group, float]) -> SurveyImage:
     fix, attitude = image.fix, image.attitude
     if fix is not None:
-        fix = fix.model_copy(update={"cov_in_geo": _scaled(fix.cov_in_geo, applied.get("fixes", 1.0))})
+        fix = fix.scaled(applied.get("fixes", 1.0))
     if attitude is not None:
         sigma_deg = attitude.sigma_deg * applied.get("attitudes", 1.0) ** 0.5
         attitude = attitude.model_copy(update={"sigma_deg": sigma_deg})

@@ -9,12 +9,14 @@ from __future__ import annotations
 from collections.abc import Container
 from typing import Annotated, Any, Literal, get_args
 
+import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import AfterValidator, Field, model_validator
 
 from pipelines.core.errors import InputError
 from pipelines.core.options import WRITTEN, from_text, listed_names
 from pipelines.core.products import Covariance3, ImageName, Product, Remark, Rotation
-from pipelines.core.types import Vector3
+from pipelines.core.types import Matrix3, Vector3, vector3
 from pipelines.core.validators import image_dir
 from pipelines.geodesy.enu import Origin
 from pipelines.geodesy.vertical import VerticalDatum
@@ -116,7 +118,9 @@ class CameraPrior(Product):
 class Fix(Product):
     """Measured position of a camera centre in metres and m²; `session` is an index into the survey's `sessions`.
 
-    `source` is the kind of file that it was read from, such as `exif`, `csv` or `bag`.
+    `source` is the kind of file that it was read from, such as `exif`, `csv` or `bag`. `sigma_zero_m` is the
+    vertical σ of a zero that is doubtful, such as that of heights above the take-off: a part of `cov_in_geo`, but
+    common to all fixes of the session, whose `sigma_common_m` has it, too. 0: the zero is that of the datum.
     """
 
     position_in_geo: Vector3
@@ -124,18 +128,52 @@ class Fix(Product):
     source: str
     sigma_source: Literal["file", "option", "default"]
     session: int = Field(0, ge=0)
+    sigma_zero_m: float = Field(0.0, ge=0)
+
+    @property
+    def cov_apart(self) -> Matrix3:
+        """Covariance of the position against the others of its session, without the doubtful zero."""
+        return _with_zero(self.cov_in_geo, -(self.sigma_zero_m**2))
+
+    def scaled(self, factor: float) -> Fix:
+        """Return the fix with its own variances times a factor; that of a doubtful zero stays."""
+        own = np.array(self.cov_apart) * factor
+        return self.model_copy(update={"cov_in_geo": _with_zero(own, self.sigma_zero_m**2)})
+
+
+def _with_zero(cov: ArrayLike, variance_up: float) -> Matrix3:
+    changed = np.array(cov, dtype=np.float64)
+    changed[2, 2] += variance_up
+    return vector3(changed[0]), vector3(changed[1]), vector3(changed[2])
 
 
 class FixSession(Product):
     """Fixes that share one error beside their own: of the base station, the receiver, or the day.
 
     `sigma_common_m` is its σ east, north, up, 0 for none along that axis; `receiver` is one of
-    `ingest.flight_record.RECEIVERS`.
+    `ingest.flight_record.RECEIVERS`. `sigma_datum_m` is the part east, north, up that the reference system causes:
+    a vertical datum that was assumed, a doubtful zero of heights, a transformation of limited accuracy.
     """
 
     receiver: str
     sigma_common_m: tuple[_NotNegative, _NotNegative, _NotNegative]
+    sigma_datum_m: tuple[_NotNegative, _NotNegative, _NotNegative] = (0.0, 0.0, 0.0)
     sigma_source: Literal["file", "option", "default"]
+
+
+class UsedTransformation(Product):
+    """Transformation to WGS84 of coordinates of the input; the accuracy is the published one, None: unknown.
+
+    `sigma_m` is the σ of each horizontal axis that it adds as an error common to all points of the file; 0: none.
+    """
+
+    of: Literal["positions", "control points", "check points"]
+    file: str
+    crs: str
+    operation: str
+    accuracy_m: float | None
+    sigma_m: float = Field(0.0, ge=0)
+    missing_grids: tuple[str, ...] = ()
 
 
 class Attitude(Product):
@@ -227,6 +265,9 @@ class Survey(Product):
         origin: of the frame `geo`; None: the frame is local, because nothing places the survey on Earth.
         image_dir: folder of photographs, absolute or inside the workspace.
         sessions: groups of fixes with one common error each; empty: no common error is modelled.
+        transformations: ways of the input's coordinates to WGS84, where their CRS is another.
+        sigma_datum_m: σ east, north, up that all control points share, because their CRS is tied to WGS84 no
+            better; no adjustment reveals it, and all absolute σ of a result with control points include it.
         check_points: points that enter no solution.
         assumptions: decisions that `ingest` made where the input states nothing.
         cautions: limits of every result of the survey.
@@ -242,6 +283,8 @@ class Survey(Product):
     cameras: tuple[CameraPrior, ...]
     images: tuple[SurveyImage, ...]
     sessions: tuple[FixSession, ...] = ()
+    transformations: tuple[UsedTransformation, ...] = ()
+    sigma_datum_m: Vector3 = (0.0, 0.0, 0.0)
     control_points: tuple[SurveyedPoint, ...] = ()
     check_points: tuple[SurveyedPoint, ...] = ()
     unmarked_points: tuple[UnmarkedPoint, ...] = ()

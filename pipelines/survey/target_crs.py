@@ -127,12 +127,17 @@ def target_crs(
     text = options.crs or utm_zone(lla)
     vertical = options.vertical or _as_choice(heights)
     crs = parse_crs(text, vertical=vertical, field="--crs")
+    crs = replace(crs, vertical=_datum_of_result(crs, options, heights))
     assumed = []
     if options.crs is None:
         assumed.append(f"no --crs was given: the UTM zone of the scene, {text}")
     if not crs.states_vertical and options.vertical is None:
-        source = "stated for" if heights.stated else "assumed for"
-        assumed.append(f"no --vertical was given: heights are {crs.vertical.name}, as {source} the survey's input")
+        assumed.append(
+            f"no --vertical was given: heights are {crs.vertical.name}, the datum of the survey's input "
+            f"({heights.source})"
+        )
+    elif heights.is_assumed:
+        assumed.append(f"the survey's heights were assumed to be {heights.name}: nobody stated their datum")
     return TargetCrs(crs.serving(lla), origin, lla, tuple(assumed))
 
 
@@ -152,10 +157,36 @@ def usable_crs(
     except InputError:
         if options.crs is not None or options.vertical is not None:
             raise
-    choice = VerticalChoice(ELLIPSOIDAL, None)
-    crs = target_crs(CrsOptions(vertical=choice), origin, scene_in_geo, heights)
-    return replace(
-        crs, assumed=(*crs.assumed, f"heights are ellipsoidal: the grid of {heights.name} is not installed")
+    reason = f"heights are ellipsoidal: the grid of {heights.name} is not installed"
+    return without_grid(options, origin, scene_in_geo, heights, reason)
+
+
+def without_grid(
+    options: CrsOptions, origin: Origin | None, scene_in_geo: ArrayLike, heights: VerticalDatum, reason: str
+) -> TargetCrs:
+    """Return the CRS with ellipsoidal heights, which need no grid, and the reason as an assumption."""
+    ellipsoidal = options.model_copy(update={"vertical": VerticalChoice(ELLIPSOIDAL, None)})
+    target = target_crs(ellipsoidal, origin, scene_in_geo, heights)
+    datum = target.crs.vertical.model_copy(update={"note": reason})
+    return replace(target, crs=replace(target.crs, vertical=datum), assumed=(*target.assumed, reason))
+
+
+def _datum_of_result(crs: PointCrs, options: CrsOptions, heights: VerticalDatum) -> VerticalDatum:
+    """Return the datum of a result's heights; it is stated only if the datum of the survey's heights was.
+
+    A datum that the user names for a file is that of the file. Where the input's was assumed, so is every height
+    that was converted from it.
+    """
+    datum = crs.vertical
+    named = options.vertical is not None or crs.states_vertical
+    note = datum.note if named else heights.note
+    if named and heights.is_assumed:
+        note = f"{note}; from heights that were assumed to be {heights.name}"
+    return VerticalDatum(
+        name=datum.name,
+        stated=heights.stated or (named and heights.by_definition),
+        note=note,
+        by_definition=heights.by_definition and not named,
     )
 
 

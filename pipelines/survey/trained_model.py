@@ -74,6 +74,8 @@ class Adjustment(Product):
         gnss_outliers, control_outliers: names of the images whose fixes, and of the control points that `init-sim3`
             has rejected: they entered no solution.
         sigma_px: σ of an image coordinate of a tie point.
+        sigma_datum_m: σ east, north, up that all positions share beyond the matrix of the adjustment: that of the
+            transformation of the control points' CRS. All absolute covariances include it.
         accuracy: predicted σ over the scene; None: a solution that states none.
         variance_factors: tests of the stated σ, of the initial similarity.
         cautions: limits: those of the initial similarity, then the solution's own.
@@ -89,6 +91,7 @@ class Adjustment(Product):
     estimated_errors: tuple[EstimatedError, ...] = ()
     measurements: tuple[Measurement, ...] = ()
     sigma_px: float | None = None
+    sigma_datum_m: Vector3 = (0.0, 0.0, 0.0)
     accuracy: AccuracySummary | None = None
     variance_factors: tuple[VarianceFactor, ...] = ()
     cautions: tuple[Remark, ...] = ()

@@ -85,7 +85,8 @@ class MeasuringModel:
         position = triangulated_points(self.trained, rays)
         if self.posterior is None or not np.isfinite(position).all():
             return position[0], None
-        return position[0], self.posterior.of_marked_points(position, rays)[0]
+        absolute = self.posterior.datum - self.posterior.datum_against_points
+        return position[0], self.posterior.of_marked_points(position, rays)[0] + absolute
 
     def place(self, point: SurfacePoint) -> tuple[FloatArray, FloatArray | None]:
         """Return a point (3,) in the CRS, easting or longitude first, and its σ (3,) east, north, up in metres.

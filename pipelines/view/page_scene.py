@@ -27,7 +27,7 @@ def described_scene(workspace: Workspace, model: MeasuringModel, frame: ViewFram
         "accuracy": accuracy_sentence(workspace),
         "crs": {
             "name": crs.name,
-            "heights": crs.vertical.name,
+            "heights": crs.vertical.name if target.origin is None else crs.vertical.described,
             "units": crs.units,
             "axes": target.axes,
             "assumed": list(target.assumed),

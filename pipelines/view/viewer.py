@@ -404,7 +404,7 @@ class Viewer:
             files = self.marks.write(self.model.target.crs.name)
         if not files:
             raise InputError("nothing-to-write", "No point has both coordinates and marks: nothing to write.")
-        return {"files": [str(file) for file in files], "heights": self.model.target.crs.vertical.name}
+        return {"files": [str(file) for file in files], "heights": self.model.target.crs.vertical.described}
 
     def propose(self, request: requests.ProposalRequest) -> Job:
         """Begin the search for marks of a point in further photographs."""

@@ -95,10 +95,6 @@ class TestRunOptions:
     @pytest.mark.parametrize(
         ("arguments", "message"),
         [
-            (
-                ["--to", "sfm", "--iterations", "5"],
-                "--iterations is for train, which is not among",
-            ),
             (["--from", "train", "--copy"], "--copy is for ingest"),
             (["--from", "train", "--to", "sfm"], "--from train"),
             (["--from", "training"], "'training' is not one of 'ingest'"),
@@ -110,6 +106,16 @@ class TestRunOptions:
         result = georef("run", done, *arguments)
         result.assert_failed(2)
         assert message in result.err
+
+    @pytest.mark.parametrize("given", [["--iterations", "5"], ["--preset", "fast"], ["--backend", "cpu"]])
+    def test_options_of_stages_that_are_not_reached_are_named_and_not_used(
+        self, georef: Georef, done: Path, given: list[str]
+    ) -> None:
+        before = read_requests(done)
+        result = georef("run", done, "--to", "sfm", *given)
+        assert result.code == 0
+        assert f"{given[0]} is for train" in result.err
+        assert read_requests(done) == before
 
     def test_relative_paths_are_remembered_absolute(
         self, georef: Georef, workspace: Workspace, photos: Path, monkeypatch: pytest.MonkeyPatch

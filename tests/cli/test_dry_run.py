@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from pipelines.core.workspace import StageRun, Summary, Workspace
+from pipelines.geodesy.crs import parse_crs
 from pipelines.jobs.costs import TimeLeft, iteration_seconds
 from tests import bags, fakes
 from tests.cli_runs import Georef
@@ -213,3 +214,20 @@ def test_a_reconstruction_that_does_not_fit(
     assert georef(*words, "--dry-run", "--json").document["reconstruction"]["peak_bytes"] > 100 << 20
     assert "SfM of 5 photographs needs about" in " ".join(georef(*words, "--dry-run").out.split())
     assert actions(georef, *words, "--import", tmp_path / "photos")["sfm"] == "run"
+
+
+def test_assumptions_and_cautions_are_told_before_anything_runs(real_georef: Georef, tmp_path: Path) -> None:
+    names = write_flight(tmp_path / "photos", 5, lat=46.9, lon=7.4, alt=560.0)
+    (x, y, z), *_ = parse_crs("EPSG:21781").xyz_from_lla([[46.9, 7.4, 500.0]]).tolist()
+    rows = [f"{x:.3f} {y:.3f} {z:.3f} 10.5 20.5 {name} P1" for name in names[:2]]
+    (tmp_path / "gcp.txt").write_text("\n".join(["EPSG:21781", *rows]) + "\n")
+    words = ("run", tmp_path / "ws", "--images", tmp_path / "photos", "--gcp", tmp_path / "gcp.txt", "--dry-run")
+    found = real_georef(*words, "--json").document["survey"]
+    assumed = {one["code"] for one in found["assumptions"]}
+    assert {"vertical-datum-assumed", "default-datum-sigma", "default-position-sigma"} <= assumed
+    (caution,) = (one for one in found["cautions"] if one["code"] == "transformation-accuracy")
+    assert 1.5 in numbers(caution["sentence"])  # as PROJ publishes it for CH1903
+    text = " ".join(real_georef(*words).out.split())
+    for one in (*found["assumptions"], *found["cautions"]):
+        assert one["sentence"][:60] in text
+    assert not (tmp_path / "ws").exists()

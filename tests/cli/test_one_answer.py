@@ -67,7 +67,7 @@ def test_it_is_the_same_everywhere(
     assert stated is not None
     truth = true_headline(flight)
     assert (stated.rmse_h_m, stated.rmse_v_m) == pytest.approx((truth.rmse_h_m, truth.rmse_v_m), rel=1e-12)
-    text, figures = truth.text, stated.model_dump()
+    text, figures = truth.text, stated.model_dump(mode="json")
     assert re.fullmatch(r"measured at 3 check points: RMSE H \d\.\d cm, V \d\.\d cm", text)
 
     # In JSON, to the last digit.
@@ -99,7 +99,7 @@ def test_it_is_the_same_everywhere(
     write_batch(tmp_path, table)
     print_rich(*job_tables.batch(table, tmp_path))
     horizontal, vertical = re.findall(r"[HV] (\d\.\d) cm", text)
-    assert re.search(rf"measured +{horizontal} +{vertical} +3", capsys.readouterr().out)
+    assert re.search(rf"measured +{horizontal} cm +{vertical} cm +3", capsys.readouterr().out)
     for html in ((tmp_path / "b.batch.html").read_text("utf-8"), page):
         head = html.split("Errors of the check")[0]
         shown = re.findall(r'rmse_[hv]_m" data-value="([^"]+)">([^<]+)</data>', head)
@@ -146,7 +146,7 @@ def test_before_evaluation_the_adjustment_predicts_it(real_georef: Georef, fligh
     assert stated is not None and stated.rmse_h_m is not None and grid is not None
     assert stated.kind == "predicted"
     assert stated.rmse_h_m == pytest.approx(np.sqrt(np.mean(grid.sigma_h_m**2)), rel=1e-12)
-    assert real_georef("status", flight.root, "--json").document["accuracy"] == stated.model_dump()
+    assert real_georef("status", flight.root, "--json").document["accuracy"] == stated.model_dump(mode="json")
     assert stated.text in " ".join(real_georef("info", flight.root).out.split())
     untrained(flight)  # init-sim3 predicts it as training does
     assert headline_of(flight) == stated
@@ -174,3 +174,33 @@ def test_a_run_without_training_ends_with_its_evaluation(real_georef: Georef, tm
     # The stage, asked for by its name, states the same; and so does the report, without what Gaussians show.
     assert real_georef("evaluate", root).code == 0
     assert read_report(root / REPORT).model_dump(mode="json") == evaluation
+    # Each check point stands in a line of its own.
+    for point in points["check_points"]:
+        assert re.search(rf"^ *{point.name} +triangulated ", ended.out, re.MULTILINE)
+    status = real_georef("status", root, "--json").document
+    assert status["accuracy"] == evaluation["headline"]
+    assert status["cautions"] == document["cautions"]
+    assert stated.text in " ".join(real_georef("status", root).out.split())
+
+
+def test_a_wrong_check_point_is_named_by_run_and_status_alike(real_georef: Georef, tmp_path: Path) -> None:
+    scene, rng = make_scene(), np.random.default_rng(4)
+    survey = survey_of(scene, Noise(), WITH_GCPS, rng)
+    wrong, *others = survey.control_points[:3]
+    east, north, up = wrong.position_in_geo
+    typed = wrong.model_copy(update={"position_in_geo": (east, north + 1.5, up)})
+    points = {"control_points": survey.control_points[3:], "check_points": (typed, *others)}
+    root = write_workspace(
+        tmp_path / "ws", survey.model_copy(update=points), sparse_model(scene, Noise(), rng)
+    ).root
+    document = real_georef("run", root, "--to", "init-sim3", "--json").document
+    headline_ = document["evaluation"]["headline"]
+    assert headline_["blunders"] == [wrong.name]
+    # One of three points is off by 1.5 m; the others are as good as their σ of centimetres.
+    assert headline_["rmse_h_m"] == pytest.approx(1.5 / 3**0.5, rel=0.1)
+    assert headline_["rmse_h_without_m"] < 0.1
+    (caution,) = (one for one in document["cautions"] if one["code"] == "check-point-blunder")
+    assert wrong.name in caution["sentence"] and not any(point.name in caution["sentence"] for point in others)
+    assert "prediction-rejected" not in {one["code"] for one in document["cautions"]}
+    status = real_georef("status", root, "--json").document
+    assert status["accuracy"] == headline_ and caution in status["cautions"]

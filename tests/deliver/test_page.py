@@ -147,7 +147,7 @@ def test_points_are_labelled_where_they_were_surveyed() -> None:
 def test_page_says_what_coordinates_and_heights_mean() -> None:
     facts = {fact.name: fact.value for fact in reversed(page_of(surveyed()).facts)}
     assert facts["CRS"] == "EPSG:32632"
-    assert facts["Heights"] == "ellipsoidal; of the survey's input: ellipsoidal"
+    assert facts["Heights"] == "ellipsoidal, as stated; of the survey's input: ellipsoidal, as stated"
     assert facts["Accuracy"] == "not known: nothing states it yet (georef evaluate)"
     assert "--crs" in facts["Assumed"]
 

@@ -210,7 +210,8 @@ def test_sidecar_has_the_fields_that_were_promised(stage: StageRun) -> None:
     assert (document["format"], document["version"], document["crsId"]) == ("georefgs", 2, "EPSG:4978")
     assert document["crsWkt"].startswith("GEODCRS[")
     assert np.array(document["covariance"]).shape == (7, 7)
-    assert document["verticalDatum"] == {"name": "EGM2008", "stated": True, "note": ""}
+    datum = {"name": "EGM2008", "stated": True, "note": "", "by_definition": False}
+    assert document["verticalDatum"] == datum
 
 
 def test_matrix_is_the_similarity_of_the_sidecar(stage: StageRun) -> None:

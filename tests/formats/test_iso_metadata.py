@@ -128,7 +128,7 @@ def test_values_are_those_of_the_sidecar(tmp_path: Path) -> None:
         (drms, None, internal, 0.25),
         ("standard linear error", "34", internal, 0.21),
     ]
-    assert texts(root, "RS_Identifier/code") == ["32632", "heights: ellipsoidal"]
+    assert texts(root, "RS_Identifier/code") == ["32632", "heights: ellipsoidal (assumed: nobody stated the datum)"]
     sides = [f"{side}Bound{angle}" for side, angle in (("west", "Longitude"), ("south", "Latitude"))]
     corner = [float(texts(root, side)[0]) for side in sides]
     south_west = parse_crs("EPSG:32632").lla_from_xyz([BOUNDS[0]])[0, :2]

@@ -25,7 +25,9 @@ def test_usual_bag(ingest: Ingest, tmp_path: Path) -> None:
     survey = ingest(bags.usual(flight))
     check(survey, flight)
     assert survey.warnings == ()
-    assert survey.vertical.stated and survey.vertical.name == "ellipsoidal"
+    vertical = survey.vertical
+    assert (vertical.name, vertical.stated, vertical.by_definition) == ("ellipsoidal", False, True)
+    assert "NavSatFix" in vertical.note and not vertical.is_assumed
     (camera,) = survey.cameras
     # ROS counts pixels from the centre of the first one: half a pixel more in COLMAP's coordinates.
     assert (camera.model, camera.focal_source) == ("OPENCV", "calibrated")

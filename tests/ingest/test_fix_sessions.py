@@ -17,7 +17,7 @@ from pipelines.core.stages import BY_NAME, SURVEY
 from pipelines.core.staleness import status
 from pipelines.core.workspace import Workspace
 from pipelines.geodesy.enu import ecef_from_lla
-from pipelines.geodesy.vertical import VerticalDatum
+from pipelines.geodesy.vertical import VerticalDatum, parse_vertical
 from pipelines.ingest.flight_record import RECEIVER_SIGMA_M, RECEIVERS, ImagePoses
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.remarks import Remarks
@@ -26,6 +26,8 @@ from pipelines.ingest.survey_assembly import COMMON_SIGMA_M, SESSION_GAP_S, fix_
 from pipelines.survey.survey import FixSession, Survey
 from tests.photos import Exif, dji_xmp, gps_entries, jpeg, write_flight
 from tests.refusals import codes, numbers, said
+
+ELLIPSOIDAL = ("--vertical", "ellipsoidal")
 
 
 def poses_of(receivers: list[str], sigma_h_m: list[float], time_s: list[float]) -> ImagePoses:
@@ -119,7 +121,7 @@ def test_exif_states_kinds_of_receiver(tmp_path: Path) -> None:
         exif, xmp = Exif(gps=gps_entries(46.02, 7.75 + 1e-4 * index)), dji_xmp(RtkFlag=flag)
         (tmp_path / f"{index}.jpg").write_bytes(jpeg(index, exif=exif, xmp=xmp))
     (tmp_path / "without.jpg").write_bytes(jpeg(9))
-    survey, _ = survey_and_track(IngestOptions(images=tmp_path), None)
+    survey, _ = survey_and_track(IngestOptions(images=tmp_path, vertical=parse_vertical("ellipsoidal")), None)
     assert survey.sessions == (session("RTK fixed"), session("RTK float"), session("single-frequency"))
     assert [image.fix and image.fix.session for image in survey.images] == [0, 0, 1, 2, None]
     fixed = next(
@@ -136,7 +138,8 @@ def test_stated_sigma_and_options_decide_for_a_table(tmp_path: Path) -> None:
     def ingested(sigma: str, **given: float) -> Survey:
         rows = "".join(f"{name},46.02,{7.75 + 1e-4 * index:.4f},120,{sigma}\n" for index, name in enumerate(names))
         (tmp_path / "t.csv").write_text("image,lat,lon,alt,sigma_e,sigma_n,sigma_u\n" + rows)
-        options = IngestOptions(images=tmp_path / "images", trajectory=tmp_path / "t.csv", **given)
+        stated = {"vertical": parse_vertical("ellipsoidal"), **given}
+        options = IngestOptions(images=tmp_path / "images", trajectory=tmp_path / "t.csv", **stated)
         return survey_and_track(options, None)[0]
 
     assert ingested(",,").sessions == (session("unknown receiver"),)
@@ -164,7 +167,7 @@ def test_option_reaches_the_survey_and_an_earlier_survey_is_made_anew(
 
     write_flight(tmp_path / "images", 4)
     workspace = Workspace(tmp_path / "ws")
-    georef("ingest", workspace.root, "--images", tmp_path / "images", "--sigma-common-h", 0.7)
+    georef("ingest", workspace.root, "--images", tmp_path / "images", "--sigma-common-h", 0.7, *ELLIPSOIDAL)
     survey = load_json(Survey, workspace.root / SURVEY)
     assert survey.sessions[0].sigma_common_m == (0.7, 0.7, 3.0)
     assert survey.sessions[0].receiver == "single-frequency"

@@ -21,7 +21,9 @@ from pipelines.ingest.ground_points import (
 )
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.remarks import Remarks
+from pipelines.ingest.stage import survey_and_track
 from pipelines.survey.survey import KnownDistance
+from tests.photos import write_flight
 from tests.refusals import codes, refused, said
 
 SIZES = {"a.jpg": (64, 48), "b.jpg": (64, 48)}
@@ -158,3 +160,15 @@ def test_unusable_distances_are_refused(row: str, code: str, field: str, tmp_pat
         _distances(tmp_path, row + "\n", Remarks())
     assert (error.value.path, error.value.field) == (tmp_path / "bars.csv", field)
     assert error.value.line == 1 + row.count("\n")
+
+
+@pytest.mark.parametrize("marks", [1, 0])
+def test_points_with_one_mark_each_do_not_place_a_survey(tmp_path: Path, marks: int) -> None:
+    names = write_flight(tmp_path / "images", 4, positions=False)
+    rows = [f"7.75 46.02 16{index}0 10.5 20.5 {name} G{index}" for index, name in enumerate(names[: 3 + marks])]
+    (tmp_path / "gcp.txt").write_text("\n".join(["EPSG:4979", *rows]) + "\n")
+    options = IngestOptions(images=tmp_path / "images", gcp=tmp_path / "gcp.txt")
+    with refused("control-points-unmarked", InputError) as error:
+        survey_and_track(options, None)
+    # How many points have how many marks, and how many a point needs.
+    assert {3 + marks, 1, 2} <= set(map(int, re.findall(r"\d+", str(error.value))))

@@ -25,7 +25,7 @@ from pipelines.report.points import cut_chips, points_facts
 from pipelines.report.verdicts import FIX_OUTLIERS, REGISTERED, Measured, level_of, verdicts
 from pipelines.report.views import read_metrics
 from pipelines.survey.area import photographs_that_see
-from pipelines.survey.report import ByAxis, DistanceError, PredictedSigma
+from pipelines.survey.report import ByAxis, DistanceError, PointError, PredictedSigma
 from pipelines.survey.report_parts import VarianceFactor
 from pipelines.survey.survey import LOCAL_FRAME, Survey
 from pipelines.survey.trained_survey import fix_differences
@@ -332,3 +332,28 @@ def test_in_a_local_frame_distances_take_the_place_of_ground_points(
     found = {verdict.subject: verdict for verdict in verdicts(report, MEASURED, local)}
     assert found["Known distances"].level == level
     assert not {"Control points", "Recorded positions", "Check points"} & found.keys()
+
+
+@pytest.mark.parametrize(
+    ("psnr", "covered_db", "share_", "longer"),
+    [(15.0, 24.0, 0.4, False), (17.0, 17.2, 0.97, True), (17.0, None, None, True), (20.0, 20.5, 0.9, True)],
+)
+def test_longer_training_is_advised_only_where_photographs_show_the_ground(
+    psnr: float, covered_db: float | None, share_: float | None, *, longer: bool
+) -> None:
+    figures = {"psnr": psnr, "psnr_covered": covered_db, "covered_share": share_}
+    (verdict,) = (one for one in verdicts(report_with(test=figures), MEASURED, ()) if one.subject == "Test views")
+    assert ("train longer" in verdict.reason) == longer
+    assert longer or "photographs" in verdict.reason
+
+
+def test_the_surface_is_not_blamed_for_a_wrong_check_point() -> None:
+    def errors(north: float, up: float) -> tuple[PointError, ...]:
+        return (PointError(name="G7", rays=4, de_m=0.0, dn_m=north, du_m=up, blunder=True),)
+
+    triangulated = check_points_with(count=3, blunders=("G7",), refuted=("G7",), points=errors(1.5, 0.0))
+    for on_surface, level in ((errors(1.52, 0.05), "good"), (errors(0.2, 1.4), "poor")):
+        surface = check_points_with(count=3, blunders=("G7",), points=on_surface)
+        report = report_with(triangulated=triangulated, surface=surface)
+        found = {verdict.subject: verdict for verdict in verdicts(report, MEASURED, ())}
+        assert found["Surface at the points"].level == level

@@ -36,6 +36,8 @@ function showState() {
 }
 const whole = () => { const r = scene.radius_m; return [-r, -r, -r, r, r, r]; };
 
+const pixelSize = (m) => m < 1 ? `${(1000 * m).toFixed(0)} mm/px` : `${m.toFixed(2)} m/px`;
+
 // Photographs that see a place, the best first.
 async function showSeen(inGeo) {
   place = inGeo;
@@ -43,7 +45,7 @@ async function showSeen(inGeo) {
   const seen = (await safely(() => post("seen", { position_in_geo: place }))) ?? [];
   byId("strip").replaceChildren(...seen.map((each) => element("figure", { "data-seen": each.image },
     element("button", { "aria-label": `Show ${each.image}`, onclick: () => change({ photo: each.camera }, { step: true }) }, crop(each.camera, each.px, 60, (context, pixel) => cross(context, each.px, 9 * pixel, "#ff5a1f"))),
-    element("figcaption", { title: each.image }, `${(1000 * each.gsd_m).toFixed(0)} mm/px, ${each.angle_deg.toFixed(0)}° · ${each.image}`))));
+    element("figcaption", { title: each.image }, `${pixelSize(each.gsd_m)}, ${each.angle_deg.toFixed(0)}° · ${each.image}`))));
   showState();
 }
 
