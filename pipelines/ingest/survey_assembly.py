@@ -221,6 +221,9 @@ def _fixes(poses: flight_record.ImagePoses, session_of: IntArray, origin: enu.Or
         return [None] * len(poses.position_in_ecef)
     position = enu.enu_from_ecef(poses.position_in_ecef, origin)
     covariance = _turned(poses.sigma_enu_m, poses.position_in_ecef, origin)
+    if poses.along_track_m is not None:
+        along = poses.along_track_m @ enu.ecef_from_enu_rotation(enu.lla_of(origin))
+        covariance = covariance + along[:, :, None] * along[:, None, :]
     return [
         Fix(
             position_in_geo=vector3(position[row]),
