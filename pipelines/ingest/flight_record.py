@@ -66,6 +66,14 @@ class ImagePoses:
         """Which images have a position (N,)."""
         return complete(self.position_in_ecef)
 
+    @property
+    def coarse_times_m(self) -> float:
+        """Median σ along the motion that the times cause, in metres; zero where it is below that of the positions."""
+        if self.along_track_m is None or not self.located.any():
+            return 0.0
+        along_m = float(np.median(np.linalg.norm(self.along_track_m[self.located], axis=1)))
+        return along_m if along_m > float(np.median(self.sigma_enu_m[self.located, :2])) else 0.0
+
 
 @dataclass(frozen=True)
 class RecordedNavigation:

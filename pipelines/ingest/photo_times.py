@@ -77,8 +77,8 @@ def _decided(photos: Sequence[Photo], remarks: Remarks) -> list[Photo]:
         if offset_s and np.isfinite(zone_s[both]).any():
             remarks.assume(
                 "time-zone-of-gps",
-                f"By the zone in OffsetTime of {photos[0].name} … the camera's clock is {abs(offset_s) / 3600:.4g} h "
-                f"{'before' if offset_s > 0 else 'after'} GPSTimeStamp, which is UTC and counts.",
+                f"By the zone in OffsetTime of {photos[0].name} … the camera's clock is {abs(offset_s) / 3600:.4g} "
+                f"h {'before' if offset_s > 0 else 'after'} GPSTimeStamp, which is UTC and counts.",
             )
         clock_s = clock_s + offset_s
     times = _Times(clock_s, steps[0], gps_s, steps[1])

@@ -33,6 +33,7 @@ from pipelines.survey.survey import (
     SurveyedPoint,
     SurveyImage,
     UnmarkedPoint,
+    in_usual_order,
 )
 
 SIGMA_GIMBAL_DEG = 2.0
@@ -103,6 +104,10 @@ def assemble_survey(
         if flight.navigation is None or origin is None
         else flight_record.track_in_geo(flight.navigation, origin)
     )
+    estimated = options.estimated
+    if poses.coarse_times_m and track is not None and not options.time_offset_s:
+        # Only the photographs' own motion tells what coarse times leave open.
+        estimated = in_usual_order((*estimated, "time-offset"))
     if options.estimated:
         require_estimable(track, options.estimated, "--estimate" if options.estimate else "--time-offset")
     sessions, session_of = fix_sessions(poses, options, remarks)
@@ -127,7 +132,7 @@ def assemble_survey(
         assumptions=tuple(remarks.assumptions),
         warnings=tuple(remarks.warnings),
         cautions=tuple(remarks.cautions),
-        estimate=options.estimated,
+        estimate=estimated,
         default_sigmas=_default_sigmas(poses, marked, options),
     )
     return survey, track

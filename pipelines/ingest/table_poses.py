@@ -26,8 +26,6 @@ from pipelines.ingest.tag_headings import tagged_attitudes
 from pipelines.ingest.written_values import UNKNOWN_SIGMA_M, digits_sigma_m, zero_heights
 from pipelines.survey.image_names import ImageNames
 
-_TOLD_SIGMAS = 1.0  # σ along the track by time, of those of the table, from which it is said
-
 
 def poses_from_table(
     table: PoseTable, photos: Sequence[Photo], options: IngestOptions, remarks: Remarks
@@ -102,24 +100,21 @@ def poses_from_table(
         recorded=recorded,
         along_track_m=along_track_m,
     )
-    _note_time_sigma(poses, photos, remarks)
+    _note_coarse_times(poses, photos, remarks)
     compare_with_exif(poses, photos, table.path, options, remarks)
     return poses
 
 
-def _note_time_sigma(poses: ImagePoses, photos: Sequence[Photo], remarks: Remarks) -> None:
+def _note_coarse_times(poses: ImagePoses, photos: Sequence[Photo], remarks: Remarks) -> None:
     """Note that times good to a step or less make positions along the track worse than the table states."""
-    if poses.along_track_m is None or not poses.located.any():
+    if not poses.coarse_times_m:
         return
-    along_m = np.linalg.norm(poses.along_track_m[poses.located], axis=1)
-    typical_m, typical_s = float(np.median(along_m)), float(np.median(time_sigmas(photos)[poses.located]))
-    if typical_m <= _TOLD_SIGMAS * float(np.median(poses.sigma_enu_m[poses.located, :2])):
-        return
+    sigma_s = float(np.median(time_sigmas(photos)[poses.located]))
     remarks.caution(
         "photo-times-coarse",
-        f"The times of the photographs have a σ of {typical_s:.2g} s, which at {typical_m / typical_s:.1f} m/s is "
-        f"{typical_m:.2g} m along the track. Photographs with fractions of a second in EXIF, or positions by image "
-        "name, have none of it.",
+        f"The times of the photographs have a σ of {sigma_s:.2g} s, which at {poses.coarse_times_m / sigma_s:.1f} "
+        f"m/s is {poses.coarse_times_m:.2g} m along the track. Photographs with fractions of a second in EXIF, or "
+        "positions by image name, have none of it.",
     )
 
 

@@ -62,6 +62,44 @@ class RigEstimate(Product):
         return self
 
 
+class FixLag(Product):
+    """Time by which the positions of photographs lag the exposure, from the motion of the SfM cameras.
+
+    Attributes:
+        lag_s: a position is that of so many seconds before the exposure; negative: after it.
+        applied: whether positions are moved to the exposure when the survey is read.
+        sigma_along_s: σ that positions get along the motion, times the velocity.
+        scatter_m: robust σ of the fixes about the SfM model along a horizontal axis, without and with the lag.
+        velocity_in_geo: of the photographs that took part, in m/s.
+    """
+
+    lag_s: float
+    sigma_s: float = Field(ge=0)
+    applied: bool
+    sigma_along_s: float = Field(ge=0)
+    scatter_m: tuple[float, float]
+    velocity_in_geo: dict[ImageName, Vector3]
+
+    @property
+    def sentence(self) -> str:
+        """What was found, and what was made of it."""
+        found = f"{abs(self.lag_s):.2f} ± {self.sigma_s:.2f} s"
+        if self.applied:
+            side = "before" if self.lag_s > 0 else "after"
+            return (
+                f"The positions are those of {found} {side} the exposures, by the motion of the SfM cameras: a "
+                f"{'lag' if self.lag_s > 0 else 'lead'} of the receiver, or of clocks. They are moved to the "
+                f"exposures, which leaves {self.scatter_m[1]:.2f} m of {self.scatter_m[0]:.2f} m along an axis."
+            )
+        if self.sigma_along_s:
+            return (
+                "The flight does not show whether the positions lag the exposures, as it has no lines in two "
+                f"directions or too few photographs: a lag of ± {self.sigma_along_s:.2f} s is part of their σ "
+                "along the motion."
+            )
+        return f"The positions are those of the exposures: lag {self.lag_s:+.2f} ± {self.sigma_s:.2f} s."
+
+
 class RigCalibration(Product):
     """Product of `calibrate`: estimates of the rig, divided into those that `load_survey` applies and the others.
 
@@ -77,6 +115,7 @@ class RigCalibration(Product):
     rms_position_m: float | None = None
     rms_attitude_deg: float | None = None
     problem: str = ""
+    fix_lag: FixLag | None = None
 
     @model_validator(mode="after")
     def _names_each_once(self) -> RigCalibration:
