@@ -102,12 +102,12 @@ def with_lag(
     Of positions from a recorded navigation, whose times somebody answers for, a time offset is estimated if it is
     asked for, and a lag if that offset is not observable.
     """
-    applied = {estimate.name for estimate in calibration.applied}
-    asked = "time-offset" in calibration.wanted and "time-offset" not in applied
-    if survey.origin is None or not (track is None or asked):
+    observed = {estimate.name for estimate in calibration.estimates if all(estimate.observable)}
+    is_open = "time-offset" in set(survey.estimate) & set(calibration.wanted) and "time-offset" not in observed
+    if survey.origin is None or not (track is None or is_open):
         return calibration
     calibrated = survey
-    if applied and track is not None:
+    if calibration.applied and track is not None:
         calibrated = apply_calibration(survey, track, calibration)
     pattern = pattern_of(calibrated, model)
     if pattern is None:

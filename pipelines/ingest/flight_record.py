@@ -68,7 +68,7 @@ class ImagePoses:
 
     @property
     def coarse_times_m(self) -> float:
-        """Median σ along the motion that the times cause, in metres; zero where it is below that of the positions."""
+        """Median σ along the motion by the times, in metres; zero where it is below that of the positions."""
         if self.along_track_m is None or not self.located.any():
             return 0.0
         along_m = float(np.median(np.linalg.norm(self.along_track_m[self.located], axis=1)))
