@@ -209,7 +209,8 @@ def _key_figure(calibration: RigCalibration) -> str:
     parts = []
     lag = calibration.fix_lag
     if lag is not None and lag.applied:
-        parts.append(f"positions lag the exposures by {lag.lag_s:.2f} ± {lag.sigma_s:.2f} s (applied)")
+        side = "lag" if lag.lag_s > 0 else "lead"
+        parts.append(f"positions {side} the exposures by {abs(lag.lag_s):.2f} ± {lag.sigma_s:.2f} s (applied)")
     if not calibration.wanted:
         return "; ".join(parts) or "nothing to estimate"
     for estimate in calibration.estimates:

@@ -35,9 +35,11 @@ _LEAST_IMAGES = 8
 _LEG_STEPS, _LEG_PAUSE_S = 2.5, 3.0  # usual intervals, and seconds, beyond which a leg ends
 _MOST_LAG_S, _SCAN_STEP_S = 3.0, 0.1
 _PRIOR_LAG_S, _PRIOR_ARM_M = 5.0, 5.0  # wide: they keep what is open finite
+_USUAL_LAG_S, _USUAL_ARM_M = 1.0, 0.5
 _STEPS = 20
 _LEAST_SIGMA_M = 1e-3
 _MOST_CORRELATION = 0.8
+_INNER = 0.9  # part of the search whose end is no answer
 _SIGNIFICANT = 4.0  # σ of an estimate that counts
 _GATE = outlier_gate(3)
 _LAG, _ARM = slice(7, 8), slice(8, 10)
@@ -290,11 +292,13 @@ def _chosen(fits: dict[tuple[bool, bool], _Fit], count: int, pixel: float) -> tu
 
     def cost(kind: tuple[bool, bool]) -> float:
         squared = (fits[kind].white ** 2).sum(axis=1) / (scale**2 * common)
-        return float(np.minimum(squared, _GATE).sum()) + of_one * (kind[0] + 2 * kind[1])
+        # A long arm and a lag are one pattern on lines with the nose ahead: drones have lags rather than masts.
+        unlikely = (fits[kind].lag_s / _USUAL_LAG_S) ** 2 + float((fits[kind].arm_m ** 2).sum()) / _USUAL_ARM_M**2
+        return float(np.minimum(squared, _GATE).sum()) + of_one * (kind[0] + 2 * kind[1]) + unlikely
 
     def counts(kind: tuple[bool, bool]) -> bool:
         one = fits[kind]
-        lag = not kind[0] or abs(one.lag_s) > _SIGNIFICANT * one.sigma[_LAG][0]
+        lag = not kind[0] or _SIGNIFICANT * one.sigma[_LAG][0] < abs(one.lag_s) < _INNER * _MOST_LAG_S
         sigma = np.hypot(one.sigma[_ARM], one.similarity.scale * pixel)
         arm = not kind[1] or bool((np.abs(one.arm_m) > _SIGNIFICANT * sigma).any())
         return lag and arm

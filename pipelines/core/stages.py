@@ -187,6 +187,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         options_place="pipelines.adjust.options:CalibrateOptions",
         reads=(MEASURED, *whole_products(SPARSE), ProductPart(TRACK, optional=True)),
         product=RIG,
+        product_version=2,  # with the lag of positions by photograph
     ),
     StageSpec(
         name="geolocate",

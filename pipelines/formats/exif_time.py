@@ -71,7 +71,7 @@ def times_of(tags: Mapping[str, Tag], problems: list[str]) -> TimeTags:
     )
     zone_s = next((known for known in zones if known is not None), None)
     stamp = tags.get("GPS GPSTimeStamp")
-    if stamp is None:
+    if stamp is None or not (stamp.text or any(den for _, den in stamp.fractions)):  # 0/0 is how cameras write none
         return TimeTags(clock_s, clock_step_s, zone_s)
     of_day = time_of_day(stamp.text if stamp.is_text else stamp.fractions)
     if of_day is None:
