@@ -92,7 +92,9 @@ class PhotoTags:
     lens: LensTags = LensTags()
     timestamp_s: float | None = None  # seconds since 1970 UTC; `time_source` is the source of the time zone
     time_source: TimeSource | None = None
-    time_sigma_s: float = 0.0  # of `timestamp_s`, by its last digit and by what the times disagree
+    # σ of `timestamp_s` by its last digit, and of an error that the times of all photographs share
+    time_sigma_s: float = 0.0
+    time_common_s: float = 0.0
     times: TimeTags = NO_TIMES  # all that the tags state
     gps: GpsTag | None = None  # EXIF's, of its first block that has one
     more_gps: tuple[GpsTag, ...] = ()  # of EXIF's further blocks, and of XMP

@@ -78,7 +78,11 @@ def times_of(tags: Mapping[str, Tag], problems: list[str]) -> TimeTags:
         numbers = ":".join(f"{num / den if den else num:g}" for num, den in stamp.fractions[:3])
         problems.append(f"the GPSTimeStamp {stamp.text[:20] if stamp.is_text else numbers} is no time of day")
         return TimeTags(clock_s, clock_step_s, zone_s)
-    day_s = day_of(_text(tags, "GPS GPSDate"))
+    date = _text(tags, "GPS GPSDate")
+    day_s = day_of(date)
+    if date and day_s is None:
+        problems.append(f"the GPSDateStamp {date[:20]} is the date of a receiver without a time")
+        return TimeTags(clock_s, clock_step_s, zone_s)
     gps_s = gps_near(of_day[0], day_s, clock_s, zone_s)
     return TimeTags(clock_s, clock_step_s, zone_s, gps_s, of_day[1])
 

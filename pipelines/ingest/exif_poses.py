@@ -100,9 +100,10 @@ def photo_times(photos: Sequence[Photo]) -> FloatArray:
     return np.array([_or_nan(photo.tags.timestamp_s) for photo in photos])
 
 
-def time_sigmas(photos: Sequence[Photo]) -> FloatArray:
-    """Return the σ of the times of the photographs (N,) in s."""
-    return np.array([photo.tags.time_sigma_s for photo in photos])
+def time_sigmas(photos: Sequence[Photo]) -> tuple[FloatArray, FloatArray]:
+    """Return the σ (N,) in s of the times of the photographs, and of an error that all times share."""
+    sigma = np.array([(photo.tags.time_sigma_s, photo.tags.time_common_s) for photo in photos]).reshape(-1, 2)
+    return sigma[:, 0], sigma[:, 1]
 
 
 def _stated_sigma(tags: PhotoTags) -> FloatArray:
@@ -141,8 +142,8 @@ def compare_with_exif(
     apart = np.einsum("nij,nj->ni", enu_from_ecef, poses.position_in_ecef[both] - exif.position_in_ecef[both])
     sigma = np.hypot(poses.sigma_enu_m[both], exif.sigma_enu_m[both])
     if poses.along_track_m is not None:
-        along = np.einsum("nij,nj->ni", enu_from_ecef, poses.along_track_m[both])
-        sigma = np.hypot(sigma, np.linalg.norm(along, axis=1)[:, None] * [1.0, 1.0, 0.0])
+        along_m = np.linalg.norm(poses.along_track_m[both], axis=(1, 2))
+        sigma = np.hypot(sigma, along_m[:, None] * [1.0, 1.0, 0.0])
     in_table = lla_from_ecef(poses.position_in_ecef[both])[:, 2]
     from_ecef, origin = enu_from_ecef[len(both) // 2], exif.position_in_ecef[both[len(both) // 2]]
     in_enu = [(each.position_in_ecef[both] - origin) @ from_ecef.T for each in (exif, poses)]

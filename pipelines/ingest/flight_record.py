@@ -58,7 +58,7 @@ class ImagePoses:
     common_sigma_m: tuple[float, float] = (0.0, 0.0)
     # The Earth-centred trajectory that images were matched with by time, None where it was by name
     recorded: Trajectory | None = None
-    # (N, 3) σ along the motion that the σ of the times causes, as a vector in ECEF; None: none
+    # (N, 2, 3) σ along the motion as vectors in ECEF: by the σ of each time, and by an error that all times share
     along_track_m: FloatArray | None = None
 
     @property
@@ -71,7 +71,7 @@ class ImagePoses:
         """Median σ along the motion by the times, in metres; zero where it is below that of the positions."""
         if self.along_track_m is None or not self.located.any():
             return 0.0
-        along_m = float(np.median(np.linalg.norm(self.along_track_m[self.located], axis=1)))
+        along_m = float(np.median(np.linalg.norm(self.along_track_m[self.located], axis=(1, 2))))
         return along_m if along_m > float(np.median(self.sigma_enu_m[self.located, :2])) else 0.0
 
 

@@ -101,7 +101,10 @@ def _poses(photos: list[Photo], options: IngestOptions, remarks: Remarks) -> fli
     for photo, row in zip(photos, rows, strict=True):
         time_s = float(events.time_s[row]) if row >= 0 else None
         timed.append(
-            replace(photo, tags=replace(photo.tags, timestamp_s=time_s, time_source=None, time_sigma_s=0.0))
+            replace(
+                photo,
+                tags=replace(photo.tags, timestamp_s=time_s, time_source=None, time_sigma_s=0.0, time_common_s=0.0),
+            )
         )
     poses = poses_from_table(table, timed, options, remarks)
     # From the antenna to the camera, by the events' offsets.

@@ -32,7 +32,8 @@ _MOST_ZONE_S = 14 * 3600.0
 _ROLLOVER_S = 1024 * 7 * 86_400.0  # receivers that count weeks in ten bits fall back by so much
 _JITTER_S = 0.02  # between two times of one moment, beside their digits
 _SAME_S = 1e-6
-_CUT = 3.0**-0.5  # root mean square of what is cut off at a step of 1: of 0.5 ± 0.29
+_STUCK_S = 5.0  # of the camera's clock, beyond a fix that is old
+_CUT, _CUT_COMMON = 12.0**-0.5, 0.5  # σ and mean of what is cut off at a step of 1
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,14 @@ def _decided(photos: Sequence[Photo], remarks: Remarks) -> list[Photo]:
     both = np.isfinite(clock_s) & np.isfinite(gps_s)
     if both.any():
         gps_s = _without_rollover(gps_s, clock_s, both, remarks)
+        if _is_stuck(gps_s[both], clock_s[both]):
+            remarks.assume(
+                "gps-time-stuck",
+                f"GPSTimeStamp is the same in all {int(both.sum())} photographs, and is not used: the zone of the "
+                "camera's clock is known from OffsetTime only.",
+            )
+            gps_s, both = np.full_like(gps_s, np.nan), np.zeros_like(both)
+    if both.any():
         offset_s = round(float(np.median((gps_s - clock_s)[both])) / _QUARTER_S) * _QUARTER_S
         if offset_s and np.isfinite(zone_s[both]).any():
             remarks.assume(
@@ -84,7 +93,7 @@ def _decided(photos: Sequence[Photo], remarks: Remarks) -> list[Photo]:
     times = _Times(clock_s, steps[0], gps_s, steps[1])
     by_gps, common_s = _choice(times, both, photos, remarks)
     time_s = np.where(by_gps, gps_s, clock_s)
-    sigma_s = np.hypot(_CUT * np.where(by_gps, times.gps_step_s, times.clock_step_s), common_s)
+    step_s = np.where(by_gps, times.gps_step_s, times.clock_step_s)
     result = []
     for row, photo in enumerate(photos):
         source: TimeSource = "gps" if both.any() or by_gps[row] else "assumed UTC"
@@ -94,7 +103,8 @@ def _decided(photos: Sequence[Photo], remarks: Remarks) -> list[Photo]:
             photo.tags,
             timestamp_s=float(time_s[row]) if known else None,
             time_source=source if known else None,
-            time_sigma_s=float(sigma_s[row]) if known else 0.0,
+            time_sigma_s=_CUT * float(step_s[row]) if known else 0.0,
+            time_common_s=float(np.hypot(_CUT_COMMON * step_s[row], common_s)) if known else 0.0,
         )
         result.append(replace(photo, tags=tagged))
     return result
@@ -126,6 +136,11 @@ def _without_rollover(gps_s: FloatArray, clock_s: FloatArray, both: BoolArray, r
         "ten bits. The camera's date counts.",
     )
     return gps_s + weeks * _ROLLOVER_S
+
+
+def _is_stuck(gps_s: FloatArray, clock_s: FloatArray) -> bool:
+    """Return whether a receiver's times (n,) stand while the camera's clock (n,) goes on."""
+    return bool(np.ptp(gps_s) < _SAME_S and np.ptp(clock_s) > _STUCK_S)
 
 
 def _choice(times: _Times, both: BoolArray, photos: Sequence[Photo], remarks: Remarks) -> tuple[BoolArray, float]:

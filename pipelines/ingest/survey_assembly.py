@@ -226,13 +226,16 @@ def _fixes(poses: flight_record.ImagePoses, session_of: IntArray, origin: enu.Or
         return [None] * len(poses.position_in_ecef)
     position = enu.enu_from_ecef(poses.position_in_ecef, origin)
     covariance = _turned(poses.sigma_enu_m, poses.position_in_ecef, origin)
+    common = np.zeros_like(position)
     if poses.along_track_m is not None:
         along = poses.along_track_m @ enu.ecef_from_enu_rotation(enu.lla_of(origin))
-        covariance = covariance + along[:, :, None] * along[:, None, :]
+        covariance = covariance + np.swapaxes(along, 1, 2) @ along
+        common = along[:, 1]
     return [
         Fix(
             position_in_geo=vector3(position[row]),
             cov_in_geo=_matrix(covariance[row]),
+            common_along_m=vector3(common[row]),
             source=poses.source,
             sigma_source=poses.sigma_source[row],
             session=int(session_of[row]),

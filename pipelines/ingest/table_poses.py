@@ -66,7 +66,8 @@ def poses_from_table(
         recorded = rows_of(measured, order)
         at_images = match_by_time(recorded, photos, table.path, options, remarks)
         receivers = _worse_neighbour(receiver[order], recorded.time_s, time_s + options.time_offset_s)
-        along_track_m = along_track(recorded, time_s + options.time_offset_s, time_sigmas(photos))
+        at_s = time_s + options.time_offset_s
+        along_track_m = np.stack([along_track(recorded, at_s, each) for each in time_sigmas(photos)], axis=1)
     located = complete(at_images.position)
     remarks.warn_counted(
         "images-without-position",
@@ -109,7 +110,7 @@ def _note_coarse_times(poses: ImagePoses, photos: Sequence[Photo], remarks: Rema
     """Note that times good to a step or less make positions along the track worse than the table states."""
     if not poses.coarse_times_m:
         return
-    sigma_s = float(np.median(time_sigmas(photos)[poses.located]))
+    sigma_s = float(np.median(np.hypot(*time_sigmas(photos))[poses.located]))
     remarks.caution(
         "photo-times-coarse",
         f"The times of the photographs have a σ of {sigma_s:.2g} s, which at {poses.coarse_times_m / sigma_s:.1f} "

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pipelines.core.errors import InputError, MissingProductError
 from pipelines.core.products import ArrayProduct, Remark, load_json, union
 from pipelines.core.stages import RIG, SURVEY, TRACK
-from pipelines.core.types import BoolArray, FloatArray, vector3
+from pipelines.core.types import BoolArray, FloatArray, Matrix3, vector3
 from pipelines.core.workspace import Workspace
 from pipelines.geometry.rotations import exp_so3, matrix_from_quat_xyzw, quat_xyzw_from_matrix
 from pipelines.geometry.trajectory import Rig, Trajectory, with_rig
@@ -174,15 +174,24 @@ def at_exposures(survey: Survey, lag: FixLag) -> Survey:
         velocity = np.array(moving)
         position = np.array(image.fix.position_in_geo) + (lag.lag_s if lag.applied else 0.0) * velocity
         along = lag.sigma_along_s * velocity
-        cov = np.array(image.fix.cov_in_geo) + along[:, None] * along[None, :]
-        update = {
-            "position_in_geo": vector3(position),
-            "cov_in_geo": (vector3(cov[0]), vector3(cov[1]), vector3(cov[2])),
-        }
-        images.append(image.model_copy(update={"fix": image.fix.model_copy(update=update)}))
+        fix = _without_common(image.fix) if lag.applied else image.fix
+        cov = np.array(fix.cov_in_geo) + along[:, None] * along[None, :]
+        update = {"position_in_geo": vector3(position), "cov_in_geo": _matrix(cov)}
+        images.append(image.model_copy(update={"fix": fix.model_copy(update=update)}))
     code = FIX_LAG if lag.applied else FIX_LAG_OPEN
     told = union(survey.cautions, (Remark(code=code, sentence=lag.sentence),))
     return survey.model_copy(update={"images": tuple(images), "cautions": told})
+
+
+def _without_common(fix: Fix) -> Fix:
+    """Return a fix without the σ of a time that is known now."""
+    common = np.array(fix.common_along_m)
+    cov = np.array(fix.cov_in_geo) - common[:, None] * common[None, :]
+    return fix.model_copy(update={"cov_in_geo": _matrix(cov), "common_along_m": (0.0, 0.0, 0.0)})
+
+
+def _matrix(values: FloatArray) -> Matrix3:
+    return (vector3(values[0]), vector3(values[1]), vector3(values[2]))
 
 
 def apply_calibration(survey: Survey, track: NavigationTrack, calibration: RigCalibration) -> Survey:
@@ -203,6 +212,12 @@ def apply_calibration(survey: Survey, track: NavigationTrack, calibration: RigCa
     time_s = track.image_time_s + offset_s
     center, geo_from_cam = with_rig(track.positions.at(time_s).position, _bodies(survey, track, time_s), rig)
     center[_far_from_others(center)] = np.nan
+    if "time-offset" in values:
+        kept = [None if image.fix is None else _without_common(image.fix) for image in survey.images]
+        pairs = zip(survey.images, kept, strict=True)
+        survey = survey.model_copy(
+            update={"images": tuple(image.model_copy(update={"fix": fix}) for image, fix in pairs)}
+        )
     return survey.model_copy(update={"images": _images(survey, track, center, geo_from_cam)})
 
 

@@ -155,11 +155,13 @@ class CameraPrior(Product):
 class Fix(Product):
     """Measured position of a camera centre in metres and m²; `session` is an index into the survey's `sessions`.
 
-    `source` is the kind of file that it was read from, such as `exif`, `csv` or `bag`.
+    `source` is the kind of file that it was read from, such as `exif`, `csv` or `bag`. `common_along_m` is the part
+    of the covariance, as a vector of one σ, that an error of all times causes: an estimated time offset removes it.
     """
 
     position_in_geo: Vector3
     cov_in_geo: Covariance3
+    common_along_m: Vector3 = (0.0, 0.0, 0.0)
     source: str
     sigma_source: Literal["file", "option", "default"]
     session: int = Field(0, ge=0)
