@@ -96,12 +96,14 @@ class _Path:
         moving = apart_s[apart_s > 1e-3]
         pause_s = max(_LEG_PAUSE_S, _LEG_STEPS * float(np.median(moving))) if len(moving) else np.inf
         self.leg = np.concatenate([[0], np.cumsum(apart_s > pause_s)])
+        self.noise = np.zeros(len(time_s))  # of the velocity along an axis
         self.curves: dict[int, tuple[float, float, CubicSpline]] = {}
         for leg in np.unique(self.leg):
             rows = np.flatnonzero(self.leg == leg)
             rows = rows[np.diff(time_s[rows], prepend=-np.inf) > 1e-3]
             if len(rows) >= 2:
                 clock = time_s[rows]
+                self.noise[rows] = _unresolved(clock, center[rows])
                 curve = CubicSpline(clock, center[rows], bc_type="not-a-knot" if len(rows) > 3 else "natural")
                 self.curves[int(leg)] = (float(clock[0]), float(clock[-1]), curve)
 
@@ -122,6 +124,20 @@ class _Path:
         return shift, velocity
 
 
+def _unresolved(time_s: FloatArray, center: FloatArray) -> FloatArray:
+    """Return the σ (n,) of velocities along an axis, by how far a path misses the places that it leaves out."""
+    noise = np.zeros(len(time_s))
+    for row in range(2, len(time_s) - 2):
+        near = [row - 2, row - 1, row + 1, row + 2]
+        at = (time_s[near] - time_s[row]) / (time_s[row + 1] - time_s[row - 1])
+        # Lagrange's polynomial of the four neighbours, at the place between them.
+        part = np.array([np.prod([at[k] / (at[k] - at[j]) for k in range(4) if k != j]) for j in range(4)])
+        missed = center[row] - part @ center[near]
+        alone = float((missed**2).mean() / (1.0 + (part**2).sum()))
+        noise[row] = np.sqrt(alone) / ((time_s[row + 1] - time_s[row - 1]) / 2.0)
+    return noise
+
+
 def pattern_of(survey: Survey, model: SparseModel) -> FixPattern | None:
     """Return lag and lever arm of a survey's fixes; None: too few have a time, or they lie on one line."""
     gathered = _gathered(survey, model)
@@ -136,16 +152,16 @@ def pattern_of(survey: Survey, model: SparseModel) -> FixPattern | None:
         }
     except DegenerateGeometryError:
         return None
-    plain, whole = fits[False, False], fits[True, True]
     chosen = _chosen(fits, len(name), data.pixel)
-    best = fits[chosen]
-    # What is not part of the pattern keeps the σ that it has where nothing is frozen.
+    plain, best = fits[False, False], fits[chosen]
+    # What is no part of the pattern is told by the fit that adds it.
+    of_lag, of_arm = fits[True, chosen[1]], fits[chosen[0], True]
     return FixPattern(
         name=name,
-        lag_s=best.lag_s if chosen[0] else whole.lag_s,
-        sigma_lag_s=float((best if chosen[0] else whole).sigma[_LAG][0]),
-        arm_m=best.arm_m if chosen[1] else whole.arm_m,
-        sigma_arm_m=np.hypot((best if chosen[1] else whole).sigma[_ARM], best.similarity.scale * data.pixel),
+        lag_s=of_lag.lag_s,
+        sigma_lag_s=of_lag.sigma_lag_s,
+        arm_m=of_arm.arm_m,
+        sigma_arm_m=np.hypot(of_arm.sigma[_ARM], best.similarity.scale * data.pixel),
         has_lag=chosen[0],
         has_arm=chosen[1],
         velocity_in_geo=best.velocity,
@@ -211,6 +227,7 @@ class _Fit:
     white: FloatArray  # (n, 3) whitened by the stated covariances
     velocity: FloatArray  # (n, 3)
     common: float  # factor of variances by which neighbours in time are alike
+    sigma_lag_s: float  # without what the path's own noise tells
 
 
 def _fitted(data: _Data, start: tuple[Similarity, float, Similarity], with_lag: bool, with_arm: bool) -> _Fit:
@@ -244,7 +261,12 @@ def _fitted(data: _Data, start: tuple[Similarity, float, Similarity], with_lag: 
     redundancy = max(1.0 - free.sum() / (3.0 * len(residual)), 0.1)
     covariance = covariance_of(design, 1.0 / np.linalg.norm(design, axis=0))
     sigma[free] = np.sqrt(np.diag(covariance) * common / redundancy)
-    return _Fit(similarity, lag_s, arm, sigma, residual, white, velocity, common)
+    # Motion that the photographs are too far apart to show looks like information on the lag, as noise does.
+    by_noise = np.minimum(data.path.noise**2, (velocity**2).sum(axis=1) / 3.0) * similarity.scale**2
+    information = (np.square(weight * np.linalg.norm(data.root, axis=2) / scale) * by_noise[:, None]).sum()
+    known = sigma[_LAG][0] ** -2 - redundancy * information / common
+    sigma_lag_s = float(np.maximum(known, _PRIOR_LAG_S**-2) ** -0.5) if with_lag else np.inf
+    return _Fit(similarity, lag_s, arm, sigma, residual, white, velocity, common, sigma_lag_s)
 
 
 def _linearised(
