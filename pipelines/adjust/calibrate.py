@@ -1,8 +1,8 @@
 """Stage `calibrate`: time offset, boresight and lever arm, from the SfM cameras against the recorded navigation.
 
-Reads `ingest/survey.json`, and if any parameter is to be estimated, `ingest/track.npz` and `sfm/sparse`. Writes
-`calibrate/rig.json`. Its applied estimates change positions and attitudes when later stages read the survey
-(`survey.calibrated.load_survey`). The SfM model stays as it is.
+Reads `ingest/survey.json`, `sfm/sparse`, and `ingest/track.npz` if the navigation was recorded by time; positions by
+photograph are tested for a lag instead. Writes `calibrate/rig.json`. Its applied estimates change positions and
+attitudes when later stages read the survey (`survey.calibrated.load_survey`). The SfM model stays as it is.
 """
 
 from typing import Literal
@@ -13,11 +13,11 @@ from pipelines.adjust import rig_fit
 from pipelines.adjust.fix_patterns import FixPattern, pattern_of
 from pipelines.adjust.measurements import control_correspondences
 from pipelines.adjust.options import CalibrateOptions
-from pipelines.core.errors import DegenerateGeometryError
+from pipelines.core.errors import DegenerateGeometryError, MissingProductError
 from pipelines.core.products import Remark, load_json, save_json
 from pipelines.core.stages import SPARSE, SURVEY, TRACK
 from pipelines.core.types import FloatArray, vector3
-from pipelines.core.workspace import StageRun, Summary
+from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.rotations import log_so3
 from pipelines.geometry.sparse_model import SparseModel
@@ -48,13 +48,23 @@ def run(stage: StageRun, options: CalibrateOptions) -> Summary:
     workspace, calibration = stage.workspace, RigCalibration()
     survey = load_json(Survey, workspace.path(SURVEY))
     model = read_sparse(workspace.path(SPARSE))
-    track = load_track(workspace) if (workspace.root / TRACK).exists() or _wanted(survey, options) else None
+    track = _track(workspace, needed=bool(_wanted(survey, options)))
     if track is not None and _wanted(survey, options):
         calibration = calibrate(survey, model, track, options)
     if options.apply is not False:
         calibration = with_lag(survey, model, track, calibration)
     save_json(calibration, stage.out / "rig.json")
     return _summary(calibration, survey)
+
+
+def _track(workspace: Workspace, *, needed: bool) -> NavigationTrack | None:
+    """Return the recorded navigation; None: there is none, and none is needed."""
+    try:
+        workspace.path(TRACK)
+    except MissingProductError:
+        if not needed:
+            return None
+    return load_track(workspace)
 
 
 def calibrate(
@@ -128,7 +138,11 @@ def lag_of(survey: Survey, pattern: FixPattern) -> FixLag:
         and not (survey.sessions and survey.sessions[image.fix.session].receiver.startswith("RTK"))
     }
     is_open = pattern.sigma_lag_s > OPEN_LAG_S and by_receiver.issuperset(pattern.name)
-    sigma_along_s = min(pattern.sigma_lag_s, _PRIOR_LAG_S) if pattern.has_lag or is_open else 0.0
+    sigma_along_s = 0.0
+    if pattern.has_lag:
+        sigma_along_s = min(pattern.sigma_lag_s, abs(pattern.lag_s))
+    elif is_open:
+        sigma_along_s = min(pattern.sigma_lag_s, max(_PRIOR_LAG_S, abs(pattern.lag_s) / 2.0))
     return FixLag(
         lag_s=pattern.lag_s,
         sigma_s=min(pattern.sigma_lag_s, _ENDLESS),
