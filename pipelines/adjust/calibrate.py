@@ -1,7 +1,7 @@
 """Stage `calibrate`: time offset, boresight and lever arm, from the SfM cameras against the recorded navigation.
 
-Reads `ingest/survey.json`, `sfm/sparse`, and `ingest/track.npz` if the navigation was recorded by time; positions by
-photograph are tested for a lag instead. Writes `calibrate/rig.json`. Its applied estimates change positions and
+Reads `ingest/survey.json`, `sfm/sparse`, and `ingest/track.npz` if the navigation was recorded by time; positions
+by photograph are tested for a lag instead. Writes `calibrate/rig.json`. Its applied estimates change positions and
 attitudes when later stages read the survey (`survey.calibrated.load_survey`). The SfM model stays as it is.
 """
 
