@@ -27,6 +27,7 @@ from pipelines.ingest.flight_record import (
     FlightRecord,
     ImagePoses,
     RecordedNavigation,
+    along_track,
     camera_poses,
     gap_limit,
     given_rig,
@@ -230,4 +231,5 @@ def _poses(
         source="bag",
         crs_name=WGS84,
         vertical=vertical,
+        along_track_m=along_track(recorded.positions, at_s, (np.zeros(len(at_s)), np.zeros(len(at_s)))),
     )

@@ -58,7 +58,8 @@ class ImagePoses:
     common_sigma_m: tuple[float, float] = (0.0, 0.0)
     # The Earth-centred trajectory that images were matched with by time, None where it was by name
     recorded: Trajectory | None = None
-    # (N, 2, 3) σ along the motion as vectors in ECEF: by the σ of each time, and by an error that all times share
+    # (N, 3, 3) σ of the motion as vectors in ECEF: along it by the σ of each time, and by an error that all times
+    # share; and of what bends between two samples of a slow track
     along_track_m: FloatArray | None = None
 
     @property
@@ -71,7 +72,7 @@ class ImagePoses:
         """Median σ along the motion by the times, in metres; zero where it is below that of the positions."""
         if self.along_track_m is None or not self.located.any():
             return 0.0
-        along_m = float(np.median(np.linalg.norm(self.along_track_m[self.located], axis=(1, 2))))
+        along_m = float(np.median(np.linalg.norm(self.along_track_m[self.located, :2], axis=(1, 2))))
         return along_m if along_m > float(np.median(self.sigma_enu_m[self.located, :2])) else 0.0
 
 
@@ -173,14 +174,15 @@ def gap_limit(time_s: FloatArray, options: IngestOptions) -> float:
     return max(_LEAST_GAP_S, _GAP_STEPS * usual_s, 1.25 * slow_s if slow_s < _MOST_BURST * usual_s else 0.0)
 
 
-def along_track(recorded: Trajectory, time_s: FloatArray, sigma_s: FloatArray) -> FloatArray:
-    """Return σ vectors (N, 3) along the motion at times (N,) of a trajectory with a σ (N,); zero where unknown."""
+def along_track(recorded: Trajectory, time_s: FloatArray, sigmas_s: Sequence[FloatArray]) -> FloatArray:
+    """Return σ vectors (N, 3, 3) at times (N,) with two σ (N,) of a trajectory, as `ImagePoses.along_track_m`."""
     ends = [recorded.at(time_s + side * _HALF_WINDOW_S).position for side in (-1.0, 0.0, 1.0)]
     slopes = ((ends[2] - ends[0]) / 2.0, ends[2] - ends[1], ends[1] - ends[0])
     velocity = np.full_like(ends[1], np.nan)
     for slope in slopes:
         velocity = np.where(complete(velocity)[:, None], velocity, slope / _HALF_WINDOW_S)
-    return np.asarray(np.nan_to_num(velocity * sigma_s[:, None]))
+    along = [np.nan_to_num(velocity * sigma_s[:, None]) for sigma_s in sigmas_s]
+    return np.stack([*along, recorded.chord_error(time_s, _LEAST_GAP_S)], axis=1)
 
 
 def require_enough(count: int, source: Path, field: str, remarks: Remarks) -> None:

@@ -31,7 +31,9 @@ _MOST_DRIFT = 1e-3  # of a clock, seconds a second
 _MOST_ZONE_S = 14 * 3600.0
 _ROLLOVER_S = 1024 * 7 * 86_400.0  # receivers that count weeks in ten bits fall back by so much
 _JITTER_S = 0.02  # between two times of one moment, beside their digits
+_LEAP_S, _MOST_LEAP_S = 18.0, 0.7  # GPS time is ahead of UTC
 _SAME_S = 1e-6
+_FINE_S = 0.1  # step of a receiver's time up to which its digits are no reason against it
 _STUCK_S = 5.0  # of the camera's clock, beyond a fix that is old
 _CUT, _CUT_COMMON = 12.0**-0.5, 0.5  # σ and mean of what is cut off at a step of 1
 
@@ -156,9 +158,12 @@ def _choice(times: _Times, both: BoolArray, photos: Sequence[Photo], remarks: Re
         return by_gps | (both & finer_gps), 0.0
     middle_s = float(np.median(apart_s))
     steady = _spread(apart_s, times.clock_s[both]) <= max(gps_step_s, clock_step_s) + 10.0 * _JITTER_S
-    gps_counts = steady and finer_gps
-    if gps_counts:
-        which = "GPSTimeStamp counts, because it has the finer digits and the clock of the positions"
+    leaps = abs(middle_s - _LEAP_S) < _MOST_LEAP_S
+    gps_counts = steady and gps_step_s <= max(_FINE_S, 0.999 * clock_step_s) and not leaps
+    if leaps:
+        which = f"the camera's clock counts, because GPSTimeStamp is {_LEAP_S:.0f} s ahead, as GPS time is of UTC"
+    elif gps_counts:
+        which = "GPSTimeStamp counts, because it has fractions and the clock of the positions"
     elif steady:
         which = f"the camera's clock counts, because GPSTimeStamp has steps of {gps_step_s:.3g} s"
     else:

@@ -66,8 +66,7 @@ def poses_from_table(
         recorded = rows_of(measured, order)
         at_images = match_by_time(recorded, photos, table.path, options, remarks)
         receivers = _worse_neighbour(receiver[order], recorded.time_s, time_s + options.time_offset_s)
-        at_s = time_s + options.time_offset_s
-        along_track_m = np.stack([along_track(recorded, at_s, each) for each in time_sigmas(photos)], axis=1)
+        along_track_m = along_track(recorded, time_s + options.time_offset_s, time_sigmas(photos))
     located = complete(at_images.position)
     remarks.warn_counted(
         "images-without-position",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -132,6 +132,7 @@ EXACT: dict[str, Write] = {
     "receiver that lost 1024 weeks": lambda t: Exif(photo=clock(t), gps=stamp(t, 1, shown_s=t - 619_315_200.0)),
     "summer time forgotten": lambda t: Exif(photo=clock(t + 7200, zone="+01:00"), gps=stamp(t, 1)),
     "clock 0.65 s late of the receiver": lambda t: Exif(photo=clock(t + 0.65), gps=stamp(t)),
+    "clock with microseconds 0.65 s late": lambda t: Exif(photo=clock(t + 0.65, digits=6), gps=stamp(t)),
     "hours that are seconds": lambda t: Exif(
         photo=clock(t), gps=[(STAMP, RATIONAL, [(549_455_200, 1), (0, 1), (0, 1)]), (DAY, ASCII, "2024:05:14")]
     ),
@@ -186,7 +187,8 @@ def test_whole_seconds_are_a_sigma_along_the_track(write: Write) -> None:
     ratio = np.sqrt((found.off_m**2).mean()) / np.median(found.sigma_m)
     assert 0.7 < ratio < 1.4
     assert np.median(found.sigma_m) == pytest.approx(SPEED_M_S * np.sqrt(1 / 12 + 1 / 4), rel=0.02)
-    along = found.poses.along_track_m
+    assert found.poses.along_track_m is not None
+    along = found.poses.along_track_m[:, :2]
     np.testing.assert_allclose(np.abs(along @ _east()), np.linalg.norm(along, axis=2), rtol=1e-3)
     # An estimated time offset removes what all photographs share, half a second, and leaves 0.29 s.
     assert np.median(np.linalg.norm(along, axis=2), axis=0) == pytest.approx(
@@ -198,6 +200,30 @@ def test_whole_seconds_are_a_sigma_along_the_track(write: Write) -> None:
 def _east() -> np.ndarray:
     lon = np.radians(ORIGIN.lon_deg)
     return np.array([-np.sin(lon), np.cos(lon), 0.0])
+
+
+def test_a_receiver_in_gps_time_loses() -> None:
+    found = placed(lambda t: Exif(photo=clock(t), gps=stamp(t + 18.0)))
+    assert np.abs(found.off_m).max() < 0.13
+    assert 18.0 in _said_values(found, "photo-times-differ")
+
+
+def test_what_bends_between_two_rows_of_a_slow_track_is_a_sigma() -> None:
+    """A circle of 60 m at 12 m/s, a row each 4 s: the chord is up to 5 m off, and σ says so."""
+    table = track(0.25)
+    assert table.time_s is not None
+    angle = SPEED_M_S * (table.time_s - START_S) / 60.0
+    around = np.column_stack([60.0 * np.sin(angle), 60.0 * np.cos(angle), 0.0 * angle])
+    table = replace(table, xyz=lla_from_ecef(ecef_from_enu(around, ORIGIN))[:, [1, 0, 2]])
+    poses = placed(EXACT["zone"], table).poses
+    true = SPEED_M_S * (EXPOSURE_S - START_S) / 60.0
+    off = enu_from_ecef(poses.position_in_ecef, ORIGIN)[:, :2] - 60.0 * np.column_stack(
+        [np.sin(true), np.cos(true)]
+    )
+    assert poses.along_track_m is not None
+    sigma_m = np.linalg.norm(poses.along_track_m, axis=(1, 2))
+    assert np.linalg.norm(off, axis=1).max() > 3.0
+    assert (np.linalg.norm(off, axis=1) < 1.5 * sigma_m + 0.1).all()
 
 
 @pytest.mark.parametrize(
