@@ -259,8 +259,8 @@ FALSIFIED = {
     "lever arm of 1 m forward": Falsified(
         inward(1.0), codes=("lever-arm",), flights=("orbit", "turns"), named=True, estimated=True
     ),
-    "lever arm of 0.6 m backward": Falsified(
-        inward(-0.6), codes=("lever-arm",), flights=("turns",), named=True, estimated=True
+    "lever arm of 0.8 m backward": Falsified(
+        inward(-0.8), codes=("lever-arm",), flights=("turns",), named=True, estimated=True
     ),
 }  # fmt: skip
 FLIGHTS = {

@@ -22,7 +22,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from pipelines.adjust.alignment import covariance_of
-from pipelines.adjust.hypotheses import fit
+from pipelines.adjust.hypotheses import fit, hangs_upside_down
 from pipelines.adjust.measurements import fix_correspondences
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import BoolArray, FloatArray
@@ -33,10 +33,10 @@ from pipelines.survey.survey import Survey
 
 _LEAST_IMAGES = 8
 _LEG_STEPS, _LEG_PAUSE_S = 2.5, 3.0  # usual intervals, and seconds, beyond which a leg ends
-_MOST_LAG_S, _SCAN_STEP_S = 3.0, 0.1
+_LEAST_SEARCH_S, _MOST_LAG_S, _SCAN_STEP_S = 1.2, 3.0, 0.1
 _PRIOR_LAG_S, _PRIOR_ARM_M = 5.0, 5.0  # wide: they keep what is open finite
 _USUAL_LAG_S, _USUAL_ARM_M = 1.0, 0.5
-_STEPS = 20
+_STEPS, _WIDE, _NARROWING = 25, 16.0, 0.6
 _LEAST_SIGMA_M = 1e-3
 _MOST_CORRELATION = 0.8
 _INNER = 0.9  # part of the search whose end is no answer
@@ -95,6 +95,9 @@ class _Path:
         apart_s = np.diff(time_s)
         moving = apart_s[apart_s > 1e-3]
         pause_s = max(_LEG_PAUSE_S, _LEG_STEPS * float(np.median(moving))) if len(moving) else np.inf
+        # From one photograph's place to the next one's, a lag is told from rows that are off by one no more.
+        usual_s = float(np.median(moving)) if len(moving) else 0.0
+        self.most_lag_s = min(_MOST_LAG_S, max(_LEAST_SEARCH_S, usual_s))
         self.leg = np.concatenate([[0], np.cumsum(apart_s > pause_s)])
         self.noise = np.zeros(len(time_s))  # of the velocity along an axis
         self.curves: dict[int, tuple[float, float, CubicSpline]] = {}
@@ -152,14 +155,18 @@ def pattern_of(survey: Survey, model: SparseModel) -> FixPattern | None:
         }
     except DegenerateGeometryError:
         return None
-    chosen = _chosen(fits, len(name), data.pixel)
+    upright = {
+        kind: one for kind, one in fits.items() if not any(kind) or not hangs_upside_down(model, one.similarity)
+    }
+    chosen = _chosen(upright, data)
     plain, best = fits[False, False], fits[chosen]
     # What is no part of the pattern is told by the fit that adds it.
     of_lag, of_arm = fits[True, chosen[1]], fits[chosen[0], True]
     return FixPattern(
         name=name,
         lag_s=of_lag.lag_s,
-        sigma_lag_s=of_lag.sigma_lag_s,
+        # A lag without which the residuals are evidently larger is known to half of itself, whatever noise tells.
+        sigma_lag_s=min(of_lag.sigma_lag_s, abs(of_lag.lag_s) / 2.0) if chosen[0] else of_lag.sigma_lag_s,
         arm_m=of_arm.arm_m,
         sigma_arm_m=np.hypot(of_arm.sigma[_ARM], best.similarity.scale * data.pixel),
         has_lag=chosen[0],
@@ -209,7 +216,8 @@ def _start(data: _Data) -> tuple[Similarity, float, Similarity]:
     """Return the similarity without a lag, and the lag with its similarity at which the path fits best."""
     plain = fit(data.center, data.position)[0]
     best: tuple[float, float, Similarity] | None = None
-    for lag_s in sorted(np.arange(-_MOST_LAG_S, _MOST_LAG_S + 1e-9, _SCAN_STEP_S).tolist(), key=abs):
+    most_s = data.path.most_lag_s
+    for lag_s in sorted(np.arange(-most_s, most_s + 1e-9, _SCAN_STEP_S).tolist(), key=abs):
         similarity, scatter = fit(data.center + data.path.moved(lag_s)[0], data.position)
         if best is None or scatter < 0.999 * best[0]:
             best = scatter, lag_s, similarity
@@ -238,21 +246,25 @@ def _fitted(data: _Data, start: tuple[Similarity, float, Similarity], with_lag: 
     prior = np.full(10, np.inf)
     prior[_LAG], prior[_ARM] = _PRIOR_LAG_S, _PRIOR_ARM_M
     pivot = similarity.apply(data.center).mean(axis=0)
-    for _ in range(_STEPS):
+    for number in range(_STEPS):
         residual, jacobian, velocity = _linearised(data, similarity, lag_s, arm, pivot)
         white = np.einsum("nij,nj->ni", data.root, residual)
-        scale = np.array([_spread(white[:, :2]), _spread(white[:, :2]), _spread(white[:, 2:])])
+        # The kernel narrows, and heights get a σ of their own last: else a start without the pattern holds, whose
+        # residuals are large in one axis or in some photographs.
+        width = max(1.0, _WIDE * _NARROWING**number)
+        parts = (white, white) if width > 1.0 else (white[:, :2], white[:, 2:])
+        scale = np.array([_spread(parts[0]), _spread(parts[0]), _spread(parts[1])])
         scaled = white / scale
-        weight = np.sqrt(cauchy_weight((scaled**2).sum(axis=1), 3))[:, None]
+        weight = np.sqrt(cauchy_weight((scaled**2).sum(axis=1) / width**2, 3))[:, None]
         rows = (weight[..., None] * (data.root @ jacobian) / scale[:, None]).reshape(-1, 10)
         design = np.vstack([rows, np.diag(1.0 / prior)])[:, free]
         missed = np.concatenate([(weight * scaled).ravel(), -np.concatenate([np.zeros(7), [lag_s], arm]) / prior])
         step = np.zeros(10)
         step[free] = np.linalg.lstsq(design, missed, rcond=None)[0]
         similarity = perturbation(step[:7], pivot) @ similarity
-        lag_s = float(np.clip(lag_s + step[7], -2.0 * _MOST_LAG_S, 2.0 * _MOST_LAG_S))
+        lag_s = float(np.clip(lag_s + step[7], -data.path.most_lag_s, data.path.most_lag_s))
         arm = arm + step[_ARM]
-        if np.abs(step).max() < 1e-6:
+        if width == 1.0 and np.abs(step).max() < 1e-6:
             break
     residual, jacobian, velocity = _linearised(data, similarity, lag_s, arm, pivot)
     white = np.einsum("nij,nj->ni", data.root, residual)
@@ -306,11 +318,11 @@ def _common(scaled: FloatArray) -> float:
     return (1.0 + correlation) / (1.0 - correlation)
 
 
-def _chosen(fits: dict[tuple[bool, bool], _Fit], count: int, pixel: float) -> tuple[bool, bool]:
+def _chosen(fits: dict[tuple[bool, bool], _Fit], data: _Data) -> tuple[bool, bool]:
     """Return whether lag and arm are patterns of the fixes: of all choices, that of the least cost."""
     scale = min(max(_spread(one.white), 1.0) for one in fits.values())
     common = min(one.common for one in fits.values())
-    of_one = float(np.log(3.0 * count))
+    of_one = float(np.log(3.0 * len(data.time_s)))
 
     def cost(kind: tuple[bool, bool]) -> float:
         squared = (fits[kind].white ** 2).sum(axis=1) / (scale**2 * common)
@@ -320,8 +332,8 @@ def _chosen(fits: dict[tuple[bool, bool], _Fit], count: int, pixel: float) -> tu
 
     def counts(kind: tuple[bool, bool]) -> bool:
         one = fits[kind]
-        lag = not kind[0] or _SIGNIFICANT * one.sigma[_LAG][0] < abs(one.lag_s) < _INNER * _MOST_LAG_S
-        sigma = np.hypot(one.sigma[_ARM], one.similarity.scale * pixel)
+        lag = not kind[0] or _SIGNIFICANT * one.sigma[_LAG][0] < abs(one.lag_s) < _INNER * data.path.most_lag_s
+        sigma = np.hypot(one.sigma[_ARM], one.similarity.scale * data.pixel)
         arm = not kind[1] or bool((np.abs(one.arm_m) > _SIGNIFICANT * sigma).any())
         return lag and arm
 
