@@ -38,6 +38,7 @@ class Falsified:
         defaults: whether σ of the control points is a default.
         flights: that the kind is tried on; empty: on the orbit, and on the grid if its shape matters.
         named: the caution or refusal has to come, whatever the error.
+        estimated: `georef run` estimates the error and states σ that hold without it.
     """
 
     fixes: Change | None
@@ -51,6 +52,7 @@ class Falsified:
     marks: Callable[[float, float], tuple[float, float]] | None = None
     flights: tuple[str, ...] = ()
     named: bool = False
+    estimated: bool = False
 
 
 def as_they_are(fixes: Positions, rng: np.random.Generator) -> Positions:
@@ -63,6 +65,22 @@ def late(by_s: float) -> Change:
         return CubicSpline(time_s, fixes)(np.clip(time_s - by_s, time_s[0] - STEP_S, None))
 
     return change
+
+
+def behind(by_m: float) -> Change:
+    """Leave the fixes behind along the track, by a time."""
+
+    def change(fixes: Positions, rng: np.random.Generator) -> Positions:
+        spacing_m = float(np.median(np.linalg.norm(np.diff(fixes, axis=0), axis=1)))
+        time_s = STEP_S * np.arange(len(fixes))
+        return CubicSpline(time_s, fixes)(time_s - by_m * STEP_S / spacing_m)
+
+    return change
+
+
+def inward(by_m: float) -> Change:
+    """Move the antenna to where the cameras of an orbit look, level."""
+    return lambda fixes, rng: fixes - by_m * fixes / np.linalg.norm(fixes[:, :2], axis=1)[:, None] * [1.0, 1.0, 0.0]
 
 
 def half_of_them(*by_m: float) -> Change:
@@ -232,6 +250,18 @@ FALSIFIED = {
         fix_m=CONSUMER, named=True,
     ),
     "control points mirrored": Falsified(as_they_are, 8, mirror, ("control-map",), ("mirrored",), named=True),
+    "clock late by 3 m of an orbit": Falsified(
+        behind(3.0), codes=("clock", "fix-lag"), flights=("orbit", "turns"), named=True, estimated=True
+    ),
+    "fixes lag by 4 m, consumer": Falsified(
+        behind(4.0), codes=("clock", "fix-lag"), fix_m=CONSUMER, flights=("lines",), named=True, estimated=True
+    ),
+    "lever arm of 1 m forward": Falsified(
+        inward(1.0), codes=("lever-arm",), flights=("orbit", "turns"), named=True, estimated=True
+    ),
+    "lever arm of 0.8 m backward": Falsified(
+        inward(-0.8), codes=("lever-arm",), flights=("turns",), named=True, estimated=True
+    ),
 }  # fmt: skip
 FLIGHTS = {
     "orbit": ("orbit", 12), "grid": ("grid", 12), "lines": ("lines", 40), "circle": ("circle", 36),

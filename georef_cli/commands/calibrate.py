@@ -52,6 +52,9 @@ command = StageCommand(
     the positions and attitudes of later stages; other parameters only with --apply. The survey itself stays as
     recorded.
 
+    Positions by photograph, of EXIF or a table with image names, are tested for a lag against the exposures, which
+    is applied where lines in two directions show it; --no-apply leaves them as they are.
+
     \b
     Examples:
       georef calibrate flight

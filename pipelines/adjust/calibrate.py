@@ -1,8 +1,8 @@
 """Stage `calibrate`: time offset, boresight and lever arm, from the SfM cameras against the recorded navigation.
 
-Reads `ingest/survey.json`, and if any parameter is to be estimated, `ingest/track.npz` and `sfm/sparse`. Writes
-`calibrate/rig.json`. Its applied estimates change positions and attitudes when later stages read the survey
-(`survey.calibrated.load_survey`). The SfM model stays as it is.
+Reads `ingest/survey.json`, `sfm/sparse`, and `ingest/track.npz` if the navigation was recorded by time; positions
+by photograph are tested for a lag instead. Writes `calibrate/rig.json`. Its applied estimates change positions and
+attitudes when later stages read the survey (`survey.calibrated.load_survey`). The SfM model stays as it is.
 """
 
 from typing import Literal
@@ -10,31 +10,61 @@ from typing import Literal
 import numpy as np
 
 from pipelines.adjust import rig_fit
+from pipelines.adjust.fix_patterns import FixPattern, pattern_of
 from pipelines.adjust.measurements import control_correspondences
 from pipelines.adjust.options import CalibrateOptions
-from pipelines.core.errors import DegenerateGeometryError
+from pipelines.core.errors import DegenerateGeometryError, MissingProductError
 from pipelines.core.products import Remark, load_json, save_json
-from pipelines.core.stages import SPARSE, SURVEY
-from pipelines.core.types import FloatArray
-from pipelines.core.workspace import StageRun, Summary
+from pipelines.core.stages import SPARSE, SURVEY, TRACK
+from pipelines.core.types import FloatArray, vector3
+from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.rotations import log_so3
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.survey.calibrated import NavigationTrack, load_track, require_estimable
-from pipelines.survey.survey import RigCalibration, RigEstimate, RigParameter, Survey
+from pipelines.survey.calibrated import (
+    FIX_LAG,
+    FIX_LAG_OPEN,
+    NavigationTrack,
+    apply_calibration,
+    load_track,
+    require_estimable,
+)
+from pipelines.survey.survey import (
+    FixLag,
+    RigCalibration,
+    RigEstimate,
+    RigParameter,
+    Survey,
+)
 
 # A parameter without any information has an infinite σ, which JSON cannot hold.
 _ENDLESS = 1e6
+# A lag counts as open beyond this σ; of a receiver that writes its last fix it has the other, without any evidence.
+OPEN_LAG_S, _PRIOR_LAG_S = 0.1, 0.3
 
 
 def run(stage: StageRun, options: CalibrateOptions) -> Summary:
     """Estimate the rig of the flight and write the estimates; without any to estimate, write an empty product."""
     workspace, calibration = stage.workspace, RigCalibration()
     survey = load_json(Survey, workspace.path(SURVEY))
-    if _wanted(survey, options):
-        calibration = calibrate(survey, read_sparse(workspace.path(SPARSE)), load_track(workspace), options)
+    model = read_sparse(workspace.path(SPARSE))
+    track = _track(workspace, needed=bool(_wanted(survey, options)))
+    if track is not None and _wanted(survey, options):
+        calibration = calibrate(survey, model, track, options)
+    if options.apply is not False:
+        calibration = with_lag(survey, model, track, calibration)
     save_json(calibration, stage.out / "rig.json")
     return _summary(calibration, survey)
+
+
+def _track(workspace: Workspace, *, needed: bool) -> NavigationTrack | None:
+    """Return the recorded navigation; None: there is none, and none is needed."""
+    try:
+        workspace.path(TRACK)
+    except MissingProductError:
+        if not needed:
+            return None
+    return load_track(workspace)
 
 
 def calibrate(
@@ -71,6 +101,57 @@ def calibrate(
         control_points=len(data.control),
         rms_position_m=fit.rms_position_m,
         rms_attitude_deg=attitude if np.isfinite(attitude) else None,
+    )
+
+
+def with_lag(
+    survey: Survey, model: SparseModel, track: NavigationTrack | None, calibration: RigCalibration
+) -> RigCalibration:
+    """Return the calibration with the lag that the residuals of positions by photograph show.
+
+    Of positions from a recorded navigation, whose times somebody answers for, a time offset is estimated if it is
+    asked for, and a lag if that offset is not observable.
+    """
+    observed = {estimate.name for estimate in calibration.estimates if all(estimate.observable)}
+    is_open = "time-offset" in set(survey.estimate) & set(calibration.wanted) and "time-offset" not in observed
+    if survey.origin is None or not (track is None or is_open):
+        return calibration
+    calibrated = survey
+    if calibration.applied and track is not None:
+        calibrated = apply_calibration(survey, track, calibration)
+    pattern = pattern_of(calibrated, model)
+    if pattern is None:
+        return calibration
+    return calibration.model_copy(update={"fix_lag": lag_of(calibrated, pattern)})
+
+
+def lag_of(survey: Survey, pattern: FixPattern) -> FixLag:
+    """Return the lag of a survey's positions; one that the flight leaves open is a σ along the motion.
+
+    Positions that were computed for the exposures, as those of RTK receivers and of tables, have no open lag.
+    """
+    by_receiver = {
+        image.name
+        for image in survey.images
+        if image.fix is not None
+        and image.fix.source == "exif"
+        and not (survey.sessions and survey.sessions[image.fix.session].receiver.startswith("RTK"))
+    }
+    is_open = pattern.sigma_lag_s > OPEN_LAG_S and by_receiver.issuperset(pattern.name)
+    sigma_along_s = 0.0
+    if pattern.has_lag:
+        sigma_along_s = min(pattern.sigma_lag_s, abs(pattern.lag_s))
+    elif is_open:
+        sigma_along_s = min(pattern.sigma_lag_s, max(_PRIOR_LAG_S, abs(pattern.lag_s) / 2.0))
+    return FixLag(
+        lag_s=pattern.lag_s,
+        sigma_s=min(pattern.sigma_lag_s, _ENDLESS),
+        applied=pattern.has_lag,
+        sigma_along_s=sigma_along_s,
+        scatter_m=pattern.scatter_m,
+        velocity_in_geo={
+            name: vector3(velocity) for name, velocity in zip(pattern.name, pattern.velocity_in_geo, strict=True)
+        },
     )
 
 
@@ -125,7 +206,9 @@ def _estimates(fit: rig_fit.RigFit, track: NavigationTrack) -> dict[RigParameter
 
 
 def _summary(calibration: RigCalibration, survey: Survey) -> Summary:
+    lag = calibration.fix_lag
     values = {
+        "fix_lag": None if lag is None else lag.model_dump(mode="json", exclude={"velocity_in_geo"}),
         "wanted": list(calibration.wanted),
         "estimates": [estimate.model_dump(mode="json") for estimate in calibration.estimates],
         "applied": [estimate.name for estimate in calibration.applied],
@@ -137,9 +220,13 @@ def _summary(calibration: RigCalibration, survey: Survey) -> Summary:
 
 
 def _key_figure(calibration: RigCalibration) -> str:
-    if not calibration.wanted:
-        return "nothing to estimate"
     parts = []
+    lag = calibration.fix_lag
+    if lag is not None and lag.applied:
+        side = "lag" if lag.lag_s > 0 else "lead"
+        parts.append(f"positions {side} the exposures by {abs(lag.lag_s):.2f} ± {lag.sigma_s:.2f} s (applied)")
+    if not calibration.wanted:
+        return "; ".join(parts) or "nothing to estimate"
     for estimate in calibration.estimates:
         value = ", ".join(f"{number:.3f}" for number in estimate.value)
         sigma = ", ".join(f"{number:.3f}" for number in estimate.sigma)
@@ -152,19 +239,23 @@ def _key_figure(calibration: RigCalibration) -> str:
 
 def _warnings(calibration: RigCalibration, survey: Survey) -> tuple[Remark, ...]:
     """Return warnings of parameters that keep the values of `ingest` although they were to be estimated."""
+    warnings = []
+    if calibration.fix_lag is not None and (calibration.fix_lag.applied or calibration.fix_lag.sigma_along_s):
+        code = FIX_LAG if calibration.fix_lag.applied else FIX_LAG_OPEN
+        warnings.append(Remark(code=code, sentence=calibration.fix_lag.sentence))
     if calibration.problem:
         sentence = (
             f"{calibration.problem} The values that `georef ingest` set stay: {', '.join(calibration.wanted)}."
         )
-        return (Remark(code="rig-not-calibrated", sentence=sentence),)
-    warnings = [
+        return (*warnings, Remark(code="rig-not-calibrated", sentence=sentence))
+    warnings += [
         Remark(
             code="rig-not-observable",
             sentence=f"The {estimate.name} is not observable in this flight (σ {max(estimate.sigma):.2g} "
             f"{estimate.unit}): the value that `georef ingest` set stays.",
         )
         for estimate in calibration.estimates
-        if not all(estimate.observable)
+        if not all(estimate.observable) and not (estimate.name == "time-offset" and warnings)
     ]
     missed = [name for name in survey.estimate if name not in calibration.wanted]
     if missed:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipelines.adjust.alignment import Correspondences, turn_against
+from pipelines.adjust.fix_patterns import FixPattern
 from pipelines.adjust.hypotheses import (
     Hypothesis,
     StatedFixes,
@@ -49,6 +50,7 @@ _SIGMA_OPTIONS: dict[Group, str] = {
     "marks": "--sigma-mark",
 }
 # A stated σ that is too small by this factor is an inconsistency, if the scatter is so many metres or is explained.
+_BETTER = 0.7  # part of the scatter under a lag that another explanation has to leave
 _WRONG_SIGMA, _WRONG_SCATTER_M = 10.0, 0.3
 # A variance factor up to this, of σ that are larger by one half, is applied without a caution.
 _QUIET_FACTOR = 2.25
@@ -84,9 +86,12 @@ class _Finding:
 
 
 def cautions_of(
-    survey: Survey, model: SparseModel, joint: JointAdjustment
+    survey: Survey, model: SparseModel, joint: JointAdjustment, pattern: FixPattern | None = None
 ) -> tuple[tuple[Remark, ...], tuple[Remark, ...]]:
-    """Return the inconsistencies, which end the stage unless the user accepts them, and further limits."""
+    """Return the inconsistencies, which end the stage unless the user accepts them, and further limits.
+
+    `pattern` is that of the fixes; a lever arm in it is estimated by `joint`.
+    """
     fixes = StatedFixes(survey, model)
     findings, mistake = list(_upside_down(fixes, joint.geo_from_local)), _mistake_in_map(survey, model)
     of_map = []
@@ -94,7 +99,8 @@ def cautions_of(
         sentence = f"Control points and fixes disagree: {mistake}"
         of_map.append(_Finding("control-map", sentence, ends=True))
     if not findings:
-        findings += [] if of_map else _fixes_against_model(fixes, joint)
+        of_lag = list(_lag_of_fixes(fixes, joint, pattern))
+        findings += of_lag or ([] if of_map else _fixes_against_model(fixes, joint))
         findings += _view(model, joint.geo_from_local)
     findings += of_map or [*_shift_of_fixes(joint), *_control_points(joint)]
     findings += [*_attitudes(survey, fixes, joint), *_weak_checks(joint), *_assumed_sigmas(joint)]
@@ -105,7 +111,9 @@ def cautions_of(
     return ending, others
 
 
-def unadjustable(survey: Survey, model: SparseModel, geo_from_local: Similarity | None) -> tuple[Remark, ...]:
+def unadjustable(
+    survey: Survey, model: SparseModel, geo_from_local: Similarity | None, pattern: FixPattern | None = None
+) -> tuple[Remark, ...]:
     """Return the inconsistencies of measurements that determine no adjustment, and perhaps no alignment (None)."""
     fixes = StatedFixes(survey, model)
     if geo_from_local is not None and hangs_upside_down(model, geo_from_local):
@@ -118,6 +126,12 @@ def unadjustable(survey: Survey, model: SparseModel, geo_from_local: Similarity 
         return ()
     if scatter < max(_WRONG_SIGMA * fixes.sigma_m, _WRONG_SCATTER_M):
         return ()
+    if (
+        pattern is not None
+        and pattern.has_lag
+        and (best is None or best.scatter_m >= _BETTER * pattern.scatter_m[1])
+    ):
+        return (Remark(code="clock", sentence=lag_sentence(pattern)),)
     cause = "Check that they belong to these photographs." if best is None else best.sentence
     sentence = f"The fixes scatter by {scatter:.2f} m along each axis about the SfM model: no similarity fits them."
     return (Remark(code=_OTHER_PHOTOGRAPHS if best is None else best.code, sentence=f"{sentence} {cause}"),)
@@ -190,6 +204,41 @@ def _fixes_against_model(fixes: StatedFixes, joint: JointAdjustment) -> Iterator
             f"the SfM model is bent. Every σ of the result is enlarged. State the σ with {_SIGMA_OPTIONS['fixes']}."
         )
     yield _Finding(code, f"{sides} {remedy}", ends=is_wrong and scatter_m > _WRONG_SCATTER_M)
+
+
+def _lag_of_fixes(fixes: StatedFixes, joint: JointAdjustment, pattern: FixPattern | None) -> Iterator[_Finding]:
+    """Yield the finding that residuals have the pattern of fixes at other times than those of the photographs."""
+    if pattern is None or not pattern.has_lag:
+        return
+    other = explanation_of(fixes)
+    if other is not None and other.scatter_m < _BETTER * pattern.scatter_m[1]:
+        return
+    factor = joint.factors.get("fixes")
+    yield _Finding("clock", lag_sentence(pattern), ends=factor is not None and _is_wrong(factor))
+
+
+def lag_sentence(pattern: FixPattern) -> str:
+    """Return what the lag of the fixes is, and what to do."""
+    along_m = abs(pattern.lag_s) * float(np.median(np.linalg.norm(pattern.velocity_in_geo, axis=1)))
+    return (
+        f"The navigation clock differs by {pattern.lag_s:+.2f} ± {pattern.sigma_lag_s:.2f} s from the camera's: "
+        f"the fixes {'lag' if pattern.lag_s > 0 else 'lead'} the exposures by {along_m:.2f} m along the motion. "
+        f"Without that they scatter by {pattern.scatter_m[1]:.2f} m about the SfM model along an axis, with it by "
+        f"{pattern.scatter_m[0]:.2f} m. Correct the times, let `georef ingest --time-offset auto` estimate the "
+        "offset, or, for positions by photograph, `georef calibrate`."
+    )
+
+
+def arm_caution(pattern: FixPattern) -> Remark:
+    """Return the caution that a lever arm is estimated, whose pattern the residuals have."""
+    (forward, right), (sigma_forward, sigma_right) = pattern.arm_m, pattern.sigma_arm_m
+    sentence = (
+        f"The fixes have the pattern of a lever arm: the antenna is {forward:+.2f} ± {sigma_forward:.2f} m forward "
+        f"and {right:+.2f} ± {sigma_right:.2f} m right of the camera. Without it they scatter by "
+        f"{pattern.scatter_m[1]:.3f} m about the SfM model along an axis, with it by {pattern.scatter_m[0]:.3f} m. "
+        "It is estimated with the adjustment; state it with `georef ingest --lever-arm` and --camera-mount."
+    )
+    return Remark(code="lever-arm", sentence=sentence)
 
 
 def _shift_of_fixes(joint: JointAdjustment) -> Iterator[_Finding]:

@@ -25,7 +25,14 @@ from pipelines.adjust.alignment import (
     covariance_of,
     layout_of,
 )
-from pipelines.adjust.inconsistencies import cautions_of, marks_that_do_not_meet, mistake_in_marks, unadjustable
+from pipelines.adjust.fix_patterns import pattern_of
+from pipelines.adjust.inconsistencies import (
+    arm_caution,
+    cautions_of,
+    marks_that_do_not_meet,
+    mistake_in_marks,
+    unadjustable,
+)
 from pipelines.adjust.joint import JointAdjustment, Start, adjust_jointly, component_of, in_own_frame
 from pipelines.adjust.local_frame import local_similarity
 from pipelines.adjust.measurements import (
@@ -185,19 +192,24 @@ def robust_similarity(
     warnings += of_wrong_marks(wrong_marks(survey.control_points, model))
     meeting = tuple(point for point in survey.control_points if point.name in control.name)
     meets = survey.model_copy(update={"control_points": meeting})
+    pattern = pattern_of(meets, model)
+    of_arm: tuple[Remark, ...] = ()
+    if pattern is not None and pattern.has_arm and "lever-arm" not in options.estimate:
+        options = options.model_copy(update={"estimate": (*options.estimate, "lever-arm")})
+        of_arm = (arm_caution(pattern),)
     try:
         joint = adjust_jointly(meets, model, _starts(data, aligned, options.seed), estimate=options.estimate)
     except DegenerateGeometryError as error:
-        inconsistencies = unadjustable(meets, model, alignment.geo_from_local)
+        inconsistencies = unadjustable(meets, model, alignment.geo_from_local, pattern)
         _refuse(inconsistencies, options)
         unchecked = Remark(code=NOT_CHECKED, sentence=f"Nothing checks the stated σ. {error}")
-        cautions = union(survey.cautions, inconsistencies, of_marks, (unchecked,))
+        cautions = union(survey.cautions, inconsistencies, of_marks, of_arm, (unchecked,))
         initial = _without_joint(aligned, alignment.solution, cautions)
         return Estimated(initial, solved(survey, model, initial, options.estimate), warnings)
-    inconsistencies, limits = cautions_of(meets, model, joint)
+    inconsistencies, limits = cautions_of(meets, model, joint, pattern)
     _refuse(inconsistencies, options)
     initial, more = _joint_product(model, points, aligned, joint)
-    cautions = union(survey.cautions, inconsistencies, of_marks, limits)
+    cautions = union(survey.cautions, inconsistencies, of_marks, of_arm, limits)
     told = {caution.code for caution in cautions}
     initial = initial.model_copy(update={"cautions": cautions})
     posterior = solved(survey, model, initial, options.estimate, joint)

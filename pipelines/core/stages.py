@@ -92,7 +92,7 @@ PHOTOGRAPHS = ProductPart(
 )
 # The estimates that are applied to the survey when the survey is read, and the navigation that they are applied to.
 APPLIED_RIG = ProductPart(
-    RIG, fields=("applied.name", "applied.value", "applied.start"), optional=True, brings=(TRACK,)
+    RIG, fields=("applied.name", "applied.value", "applied.start", "fix_lag"), optional=True, brings=(TRACK,)
 )
 
 # The solution with its covariances, which is init-sim3's until training goes on from it.
@@ -187,6 +187,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         options_place="pipelines.adjust.options:CalibrateOptions",
         reads=(MEASURED, *whole_products(SPARSE), ProductPart(TRACK, optional=True)),
         product=RIG,
+        product_version=2,  # with the lag of positions by photograph
     ),
     StageSpec(
         name="geolocate",

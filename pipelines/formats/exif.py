@@ -6,17 +6,16 @@ is not (a reference as text, a sign in the value, a negative number written as a
 correction kept as well. All sources of one quantity are returned: who uses them compares them.
 """
 
-import contextlib
 import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from typing import Literal
 
 from PIL import ExifTags
 
 from pipelines.core.types import Vector3
+from pipelines.formats.exif_time import NO_TIMES, TimeSource, TimeTags, times_of
 from pipelines.formats.photo_blocks import find_blocks
 from pipelines.formats.tiff_tags import Tag, read_directory
 from pipelines.formats.xmp import Xmp, number_of, read_packets
@@ -42,7 +41,6 @@ _TEXT_NUMBER = re.compile(r"[+-]?\d+(?:\.\d+)?")
 _XMP_AXES = (("GpsLatitude", ("GpsLongitude", "GpsLongtitude")), ("Latitude", ("Longitude",)))
 _VOID = frozenset({"invalid", "v", "void", "none"})
 _PLACES_OF_CAMERAS = frozenset({"", "position", "gps", "gpsposition", "location", "cameraposition"})
-TimeSource = Literal["offset", "gps", "assumed UTC"]
 GpsSource = Literal["EXIF", "XMP"]
 
 
@@ -94,6 +92,10 @@ class PhotoTags:
     lens: LensTags = LensTags()
     timestamp_s: float | None = None  # seconds since 1970 UTC; `time_source` is the source of the time zone
     time_source: TimeSource | None = None
+    # σ of `timestamp_s` by its last digit, and of an error that the times of all photographs share
+    time_sigma_s: float = 0.0
+    time_common_s: float = 0.0
+    times: TimeTags = NO_TIMES  # all that the tags state
     gps: GpsTag | None = None  # EXIF's, of its first block that has one
     more_gps: tuple[GpsTag, ...] = ()  # of EXIF's further blocks, and of XMP
     direction_deg: float | None = None  # EXIF's GPSImgDirection from true north
@@ -127,7 +129,8 @@ def read_tags(data: bytes) -> PhotoTags:
     found = [_gps(directory, notes) for directory in directories]
     in_exif = list(dict.fromkeys(each for each in found if each is not None))
     in_xmp = _xmp_positions(xmp, notes)
-    timestamp_s, time_source = _time(tags)
+    times = times_of(tags, notes.problems)
+    timestamp_s, time_source = times.timestamp
     return PhotoTags(
         make=_text(tags, "Image Make"),
         model=_text(tags, "Image Model"),
@@ -135,6 +138,7 @@ def read_tags(data: bytes) -> PhotoTags:
         lens=_lens(tags, notes),
         timestamp_s=timestamp_s,
         time_source=time_source,
+        times=times,
         gps=in_exif[0] if in_exif else None,
         more_gps=(*in_exif[1:], *in_xmp),
         direction_deg=_direction(tags),
@@ -351,31 +355,6 @@ def _lens(tags: Mapping[str, Tag], notes: _Notes) -> LensTags:
         taken_width_px=_positive(max((side for side in sides if side is not None), default=None)),
         zoom=zoom if zoom is not None and zoom > 1.0 else 1.0,
     )
-
-
-def _time(tags: Mapping[str, Tag]) -> tuple[float | None, TimeSource | None]:
-    """Return seconds since 1970 UTC: by the clock's own zone, else from GPS, else with the clock taken for UTC."""
-    local = _datetime(_text(tags, "EXIF DateTimeOriginal") or _text(tags, "Image DateTime"))
-    fraction = _text(tags, "EXIF SubSecTimeOriginal") or _text(tags, "EXIF SubSecTime")
-    seconds = float(f"0.{fraction}") if fraction.isascii() and fraction.isdigit() else 0.0
-    zone = _text(tags, "EXIF OffsetTimeOriginal") or _text(tags, "EXIF OffsetTime")
-    if local is not None:
-        with contextlib.suppress(ValueError):  # no offset such as +02:00
-            return datetime.strptime(f"{local} {zone}", "%Y-%m-%d %H:%M:%S %z").timestamp() + seconds, "offset"
-    stamp = _numbers(tags, "GPS GPSTimeStamp")
-    day = _datetime(_text(tags, "GPS GPSDate") + " 00:00:00")
-    if len(stamp) == 3 and day is not None:
-        return day.replace(tzinfo=UTC).timestamp() + 3600 * stamp[0] + 60 * stamp[1] + stamp[2], "gps"
-    if local is not None:
-        return local.replace(tzinfo=UTC).timestamp() + seconds, "assumed UTC"
-    return None, None
-
-
-def _datetime(text: str) -> datetime | None:
-    try:
-        return datetime.strptime(text.strip("\x00 ")[:19].replace("-", ":"), "%Y:%m:%d %H:%M:%S")
-    except ValueError:
-        return None
 
 
 def _text(tags: Mapping[str, Tag], key: str) -> str:

@@ -65,6 +65,30 @@ class Trajectory(Rows):
         """Return for which times (n,) there is a value, by rules 1 and 2."""
         return _bracket(self.time_s, time_s, self.max_gap_s).covered
 
+    def chord_error(self, time_s: FloatArray, beyond_s: float) -> FloatArray:
+        """Return how far (n, 3) the motion may be from the straight line between two samples; zero in short gaps.
+
+        The acceleration is that of the samples' velocities before and after, the larger of the two. Gaps up to
+        `beyond_s` count as short.
+        """
+        error = np.zeros((len(time_s), 3))
+        if len(self) < 3:
+            return error
+        gap_s = np.diff(self.time_s)
+        velocity = np.diff(self.position, axis=0) / gap_s[:, None]
+        turning = np.zeros((len(self), 3))
+        turning[1:-1] = np.diff(velocity, axis=0) / ((gap_s[1:] + gap_s[:-1]) / 2.0)[:, None]
+        turning[0], turning[-1] = turning[1], turning[-2]
+        bracket = _bracket(self.time_s, time_s, self.max_gap_s)
+        rows = bracket.covered & (bracket.after > bracket.before)
+        before, after, part = bracket.before[rows], bracket.after[rows], bracket.part[rows]
+        ends = np.stack([turning[before], turning[after]])
+        larger = np.linalg.norm(ends, axis=2).argmax(axis=0)
+        apart_s = self.time_s[after] - self.time_s[before]
+        bend = 0.5 * part * (1.0 - part) * np.where(apart_s > beyond_s, apart_s, 0.0) ** 2
+        error[rows] = ends[larger, np.arange(len(larger))] * bend[:, None]
+        return np.asarray(np.nan_to_num(error))
+
     def at(self, time_s: FloatArray) -> Trajectory:
         """Return the motion at times (n,)."""
         bracket = _bracket(self.time_s, time_s, self.max_gap_s)

@@ -27,7 +27,9 @@ from pipelines.ingest.flight_record import (
     FlightRecord,
     ImagePoses,
     RecordedNavigation,
+    along_track,
     camera_poses,
+    gap_limit,
     given_rig,
     require_enough,
     with_defaults,
@@ -128,7 +130,7 @@ def _positions(streams: BagStreams, options: IngestOptions, remarks: Remarks) ->
         series.time_s[series.usable],
         position=position_in_ecef[series.usable],
         sigma_m=values[series.usable, 3:6],
-        max_gap_s=options.max_gap,
+        max_gap_s=gap_limit(series.time_s[series.usable], options),
     )
     return positions, vertical
 
@@ -156,7 +158,7 @@ def _attitudes(streams: BagStreams, options: IngestOptions) -> Trajectory:
         series.time_s[series.usable],
         rotation=matrix_from_quat_xyzw(samples[:, :4]) @ frame_from_frd(series.axes),
         sigma_deg=samples[:, 4],
-        max_gap_s=options.max_gap,
+        max_gap_s=gap_limit(series.time_s[series.usable], options),
     )
 
 
@@ -215,7 +217,7 @@ def _poses(
     remarks.warn_counted(
         "images-without-position",
         [stamps[row] for row in np.flatnonzero(~complete(antenna.position))],
-        f"Frames have no position within --max-gap {options.max_gap:g} s",
+        f"Frames have no position within --max-gap {recorded.positions.max_gap_s:g} s",
     )
     position_in_ecef, enu_from_cam = camera_poses(antenna.position, body.rotation, recorded.rig, stamps, remarks)
     receivers, located = (receiver,) * len(time_s), complete(position_in_ecef)
@@ -232,4 +234,5 @@ def _poses(
         source="bag",
         crs_name=WGS84,
         vertical=vertical,
+        along_track_m=along_track(recorded.positions, at_s, (np.zeros(len(at_s)), np.zeros(len(at_s)))),
     )

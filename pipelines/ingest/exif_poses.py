@@ -117,6 +117,12 @@ def photo_times(photos: Sequence[Photo]) -> FloatArray:
     return np.array([_or_nan(photo.tags.timestamp_s) for photo in photos])
 
 
+def time_sigmas(photos: Sequence[Photo]) -> tuple[FloatArray, FloatArray]:
+    """Return the σ (N,) in s of the times of the photographs, and of an error that all times share."""
+    sigma = np.array([(photo.tags.time_sigma_s, photo.tags.time_common_s) for photo in photos]).reshape(-1, 2)
+    return sigma[:, 0], sigma[:, 1]
+
+
 def _stated_sigma(tags: PhotoTags) -> FloatArray:
     """Return σ east, north, up (3,) that the tags state, NaN if none."""
     if tags.dji is not None and tags.dji.rtk_sigma_enu_m is not None:
@@ -152,6 +158,9 @@ def compare_with_exif(
     enu_from_ecef = np.swapaxes(ecef_from_enu_rotation(lla), 1, 2)
     apart = np.einsum("nij,nj->ni", enu_from_ecef, poses.position_in_ecef[both] - exif.position_in_ecef[both])
     sigma = np.hypot(poses.sigma_enu_m[both], exif.sigma_enu_m[both])
+    if poses.along_track_m is not None:
+        along_m = np.linalg.norm(poses.along_track_m[both], axis=(1, 2))
+        sigma = np.hypot(sigma, along_m[:, None] * [1.0, 1.0, 0.0])
     in_table = lla_from_ecef(poses.position_in_ecef[both])[:, 2]
     from_ecef, origin = enu_from_ecef[len(both) // 2], exif.position_in_ecef[both[len(both) // 2]]
     in_enu = [(each.position_in_ecef[both] - origin) @ from_ecef.T for each in (exif, poses)]

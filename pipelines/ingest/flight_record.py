@@ -35,6 +35,8 @@ RECEIVER_SIGMA_M = {
     "unknown receiver": (5.0, 10.0),
 }
 RECEIVERS = tuple(RECEIVER_SIGMA_M)
+_LEAST_GAP_S, _GAP_STEPS, _MOST_BURST = 1.0, 2.5, 10.0
+_HALF_WINDOW_S = 0.5  # of a trajectory, for the velocity at a moment
 
 
 @dataclass(frozen=True)
@@ -56,11 +58,22 @@ class ImagePoses:
     common_sigma_m: tuple[float, float] = (0.0, 0.0)
     # The Earth-centred trajectory that images were matched with by time, None where it was by name
     recorded: Trajectory | None = None
+    # (N, 3, 3) σ of the motion as vectors in ECEF: along it by the σ of each time, and by an error that all times
+    # share; and of what bends between two samples of a slow track
+    along_track_m: FloatArray | None = None
 
     @property
     def located(self) -> BoolArray:
         """Which images have a position (N,)."""
         return complete(self.position_in_ecef)
+
+    @property
+    def coarse_times_m(self) -> float:
+        """Median σ along the motion by the times, in metres; zero where it is below that of the positions."""
+        if self.along_track_m is None or not self.located.any():
+            return 0.0
+        along_m = float(np.median(np.linalg.norm(self.along_track_m[self.located, :2], axis=(1, 2))))
+        return along_m if along_m > float(np.median(self.sigma_enu_m[self.located, :2])) else 0.0
 
 
 @dataclass(frozen=True)
@@ -143,6 +156,33 @@ def track_in_geo(recorded: RecordedNavigation, origin: Origin) -> NavigationTrac
         max_gap_s=np.array(positions.max_gap_s),
         body_known=np.array(recorded.body_known),
     )
+
+
+def gap_limit(time_s: FloatArray, options: IngestOptions) -> float:
+    """Return the longest gap in s to interpolate over between samples at times (K,): --max-gap, or by their rate.
+
+    A sample may be missing, and stamps jitter: the limit is two and a half usual intervals, and at least a second.
+    """
+    if options.max_gap is not None:
+        return options.max_gap
+    known = time_s[np.isfinite(time_s)]
+    if len(known) < 2:
+        return _LEAST_GAP_S
+    apart_s = np.diff(np.sort(known))
+    usual_s = float(np.median(apart_s))
+    slow_s = float(np.quantile(apart_s, 0.9))  # of a logger that writes in bursts, or at two rates
+    return max(_LEAST_GAP_S, _GAP_STEPS * usual_s, 1.25 * slow_s if slow_s < _MOST_BURST * usual_s else 0.0)
+
+
+def along_track(recorded: Trajectory, time_s: FloatArray, sigmas_s: Sequence[FloatArray]) -> FloatArray:
+    """Return σ vectors (N, 3, 3) at times (N,) with two σ (N,) of a trajectory, as `ImagePoses.along_track_m`."""
+    ends = [recorded.at(time_s + side * _HALF_WINDOW_S).position for side in (-1.0, 0.0, 1.0)]
+    slopes = ((ends[2] - ends[0]) / 2.0, ends[2] - ends[1], ends[1] - ends[0])
+    velocity = np.full_like(ends[1], np.nan)
+    for slope in slopes:
+        velocity = np.where(complete(velocity)[:, None], velocity, slope / _HALF_WINDOW_S)
+    along = [np.nan_to_num(velocity * sigma_s[:, None]) for sigma_s in sigmas_s]
+    return np.stack([*along, recorded.chord_error(time_s, _LEAST_GAP_S)], axis=1)
 
 
 def require_enough(count: int, source: Path, field: str, remarks: Remarks) -> None:

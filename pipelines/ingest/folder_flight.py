@@ -24,6 +24,7 @@ from pipelines.ingest.event_ties import event_numbers, rows_by_order
 from pipelines.ingest.exif_poses import poses_from_tags
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo, camera_priors, scan_folder
+from pipelines.ingest.photo_times import with_times
 from pipelines.ingest.reference_system import is_projected
 from pipelines.ingest.remarks import Remarks
 from pipelines.ingest.sensors import chosen_sensor, with_sensors
@@ -56,6 +57,7 @@ def read_folder(
     photos = without_reduced_copies(with_sensors(photos), remarks)
     photos = chosen_sensor(photos, options.sensor, remarks) if photos else photos
     flight_record.require_enough(len(photos), folder, "--images", remarks)
+    photos = with_times(photos, remarks)
     note_tags(photos, remarks)
     poses = _poses(photos, options, remarks) if table is None else poses_from_table(table, photos, options, remarks)
     if options.time_offset_s and poses.recorded is None:
@@ -98,7 +100,12 @@ def _poses(photos: list[Photo], options: IngestOptions, remarks: Remarks) -> fli
     timed = []
     for photo, row in zip(photos, rows, strict=True):
         time_s = float(events.time_s[row]) if row >= 0 else None
-        timed.append(replace(photo, tags=replace(photo.tags, timestamp_s=time_s, time_source=None)))
+        timed.append(
+            replace(
+                photo,
+                tags=replace(photo.tags, timestamp_s=time_s, time_source=None, time_sigma_s=0.0, time_common_s=0.0),
+            )
+        )
     poses = poses_from_table(table, timed, options, remarks)
     # From the antenna to the camera, by the events' offsets.
     moved = np.flatnonzero(poses.located & (rows >= 0))

@@ -195,7 +195,12 @@ class IngestOptions(StageOptions):
     sigma_distance: float = Field(
         0.002, gt=0, description="σ of a distance in metres, where --distances states none."
     )
-    max_gap: float = Field(1.0, gt=0, description="Longest gap to interpolate over in the trajectory, in seconds.")
+    max_gap: float | None = Field(
+        None,
+        gt=0,
+        description="Longest gap to interpolate over in the trajectory, in seconds (default: 2.5 times its usual "
+        "interval, at least 1).",
+    )
     focal_px: float | None = Field(None, gt=0, description="Focal length in pixels, instead of the one from EXIF.")
     rolling_shutter: float | None = Field(
         None,

@@ -36,6 +36,7 @@ from pipelines.survey.survey import (
     SurveyedPoint,
     SurveyImage,
     UnmarkedPoint,
+    in_usual_order,
 )
 
 SIGMA_GIMBAL_DEG = 2.0
@@ -106,6 +107,10 @@ def assemble_survey(
         if flight.navigation is None or origin is None
         else flight_record.track_in_geo(flight.navigation, origin)
     )
+    estimated = options.estimated
+    if poses.coarse_times_m and track is not None and not options.time_offset_s:
+        # Only the photographs' own motion tells what coarse times leave open.
+        estimated = in_usual_order((*estimated, "time-offset"))
     if options.estimated:
         require_estimable(track, options.estimated, "--estimate" if options.estimate else "--time-offset")
     doubts = height_doubts(flight, known_ground(files, options.ground_height, options.vertical, flight))
@@ -137,7 +142,7 @@ def assemble_survey(
         assumptions=tuple(remarks.assumptions),
         warnings=tuple(remarks.warnings),
         cautions=tuple(remarks.cautions),
-        estimate=options.estimated,
+        estimate=estimated,
         default_sigmas=_default_sigmas(poses, marked, options),
     )
     return survey, track
@@ -258,10 +263,16 @@ def _fixes(
     position = enu.enu_from_ecef(poses.position_in_ecef, origin)
     covariance = _turned(poses.sigma_enu_m, poses.position_in_ecef, origin)
     covariance[:, 2, 2] += sigma_zero_m**2
+    common = np.zeros_like(position)
+    if poses.along_track_m is not None:
+        along = poses.along_track_m @ enu.ecef_from_enu_rotation(enu.lla_of(origin))
+        covariance = covariance + np.swapaxes(along, 1, 2) @ along
+        common = along[:, 1]
     return [
         Fix(
             position_in_geo=vector3(position[row]),
             cov_in_geo=_matrix(covariance[row]),
+            common_along_m=vector3(common[row]),
             source=poses.source,
             sigma_source=poses.sigma_source[row],
             session=int(session_of[row]),

@@ -16,8 +16,8 @@ from pipelines.geodesy.crs import PointCrs, grid_from_enu
 from pipelines.geodesy.enu import ecef_from_lla, lla_from_ecef
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.trajectory import Trajectory
-from pipelines.ingest.exif_poses import altitude_m, compare_with_exif, photo_times
-from pipelines.ingest.flight_record import RECEIVERS, ImagePoses, with_defaults
+from pipelines.ingest.exif_poses import altitude_m, compare_with_exif, photo_times, time_sigmas
+from pipelines.ingest.flight_record import RECEIVERS, ImagePoses, along_track, gap_limit, with_defaults
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo
 from pipelines.ingest.reference_system import (
@@ -58,7 +58,7 @@ def poses_from_table(
     measured = _measured(table, crs, options, remarks)
     receiver = np.full(len(table.lines), RECEIVERS[-1]) if table.receiver is None else table.receiver
     time_s = photo_times(photos)
-    recorded = None
+    recorded, along_track_m = None, None
     if table.names is not None:
         place = {name: row for row, name in enumerate(images)}
         rows = [place[name] for name in table.names]
@@ -72,6 +72,7 @@ def poses_from_table(
         recorded = rows_of(measured, order)
         at_images = match_by_time(recorded, photos, table.path, options, remarks)
         receivers = _worse_neighbour(receiver[order], recorded.time_s, time_s + options.time_offset_s)
+        along_track_m = along_track(recorded, time_s + options.time_offset_s, time_sigmas(photos))
     located = complete(at_images.position)
     remarks.warn_counted(
         "images-without-position",
@@ -103,9 +104,24 @@ def poses_from_table(
         vertical=crs.vertical,
         common_sigma_m=(0.0, UNKNOWN_SIGMA_M if unknown else 0.0),
         recorded=recorded,
+        along_track_m=along_track_m,
     )
+    _note_coarse_times(poses, photos, remarks)
     compare_with_exif(poses, photos, table.path, options, remarks)
     return poses
+
+
+def _note_coarse_times(poses: ImagePoses, photos: Sequence[Photo], remarks: Remarks) -> None:
+    """Note that times good to a step or less make positions along the track worse than the table states."""
+    if not poses.coarse_times_m:
+        return
+    sigma_s = float(np.median(np.hypot(*time_sigmas(photos))[poses.located]))
+    remarks.caution(
+        "photo-times-coarse",
+        f"The times of the photographs have a σ of {sigma_s:.2g} s, which at {poses.coarse_times_m / sigma_s:.1f} "
+        f"m/s is {poses.coarse_times_m:.2g} m along the track. Photographs with fractions of a second in EXIF, or "
+        "positions by image name, have none of it.",
+    )
 
 
 def usable_rows(table: PoseTable, remarks: Remarks) -> PoseTable:
@@ -255,12 +271,13 @@ def _measured(table: PoseTable, crs: PointCrs, options: IngestOptions, remarks: 
             remarks.assume(
                 "angles-of-grid", f"Omega, phi and kappa in {table.path.name} count from the axes of {crs.name}."
             )
+    measured_s = np.full(len(lla), np.nan) if table.time_s is None else table.time_s
     return Trajectory.from_samples(
-        np.full(len(lla), np.nan) if table.time_s is None else table.time_s,
+        measured_s,
         position=ecef_from_lla(lla),
         rotation=enu_from_cam,
         sigma_m=table.sigma_enu_m,
-        max_gap_s=options.max_gap,
+        max_gap_s=np.inf if table.names is not None else gap_limit(measured_s, options),
     )
 
 

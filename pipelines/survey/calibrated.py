@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.core.errors import InputError, MissingProductError
-from pipelines.core.products import ArrayProduct, load_json
+from pipelines.core.products import ArrayProduct, Remark, load_json, union
 from pipelines.core.stages import RIG, SURVEY, TRACK
-from pipelines.core.types import BoolArray, FloatArray, vector3
+from pipelines.core.types import BoolArray, FloatArray, Matrix3, vector3
 from pipelines.core.workspace import Workspace
 from pipelines.geometry.rotations import exp_so3, matrix_from_quat_xyzw, quat_xyzw_from_matrix
 from pipelines.geometry.trajectory import Rig, Trajectory, with_rig
-from pipelines.survey.survey import Attitude, Fix, RigCalibration, RigParameter, Survey, SurveyImage
+from pipelines.survey.survey import Attitude, Fix, FixLag, RigCalibration, RigParameter, Survey, SurveyImage
 
 log = logging.getLogger(__name__)
 
@@ -135,6 +135,7 @@ def require_estimable(track: NavigationTrack | None, wanted: Sequence[RigParamet
 
 # A position that is farther from the median of all positions is a blunder.
 FIX_RANGE_M = 100_000.0
+FIX_LAG, FIX_LAG_OPEN = "fix-lag", "fix-lag-open"  # codes of cautions
 ValueT = TypeVar("ValueT")
 
 
@@ -155,7 +156,42 @@ def load_survey(workspace: Workspace) -> Survey:
                 ", ".join(survey.estimate),
             )
         return survey
-    return apply_calibration(survey, load_track(workspace), calibration) if calibration.applied else survey
+    if calibration.applied:
+        survey = apply_calibration(survey, load_track(workspace), calibration)
+    return survey if calibration.fix_lag is None else at_exposures(survey, calibration.fix_lag)
+
+
+def at_exposures(survey: Survey, lag: FixLag) -> Survey:
+    """Return the survey with positions moved to the exposures, or with the σ of an open lag along the motion."""
+    if not lag.applied and not lag.sigma_along_s:
+        return survey
+    images = []
+    for image in survey.images:
+        moving = lag.velocity_in_geo.get(image.name)
+        if moving is None or image.fix is None:
+            images.append(image)
+            continue
+        velocity = np.array(moving)
+        position = np.array(image.fix.position_in_geo) + (lag.lag_s if lag.applied else 0.0) * velocity
+        along = lag.sigma_along_s * velocity
+        fix = _without_common(image.fix) if lag.applied else image.fix
+        cov = np.array(fix.cov_in_geo) + along[:, None] * along[None, :]
+        update = {"position_in_geo": vector3(position), "cov_in_geo": _matrix(cov)}
+        images.append(image.model_copy(update={"fix": fix.model_copy(update=update)}))
+    code = FIX_LAG if lag.applied else FIX_LAG_OPEN
+    told = union(survey.cautions, (Remark(code=code, sentence=lag.sentence),))
+    return survey.model_copy(update={"images": tuple(images), "cautions": told})
+
+
+def _without_common(fix: Fix) -> Fix:
+    """Return a fix without the σ of a time that is known now."""
+    common = np.array(fix.common_along_m)
+    cov = np.array(fix.cov_in_geo) - common[:, None] * common[None, :]
+    return fix.model_copy(update={"cov_in_geo": _matrix(cov), "common_along_m": (0.0, 0.0, 0.0)})
+
+
+def _matrix(values: FloatArray) -> Matrix3:
+    return (vector3(values[0]), vector3(values[1]), vector3(values[2]))
 
 
 def apply_calibration(survey: Survey, track: NavigationTrack, calibration: RigCalibration) -> Survey:
@@ -176,6 +212,12 @@ def apply_calibration(survey: Survey, track: NavigationTrack, calibration: RigCa
     time_s = track.image_time_s + offset_s
     center, geo_from_cam = with_rig(track.positions.at(time_s).position, _bodies(survey, track, time_s), rig)
     center[_far_from_others(center)] = np.nan
+    if "time-offset" in values:
+        kept = [None if image.fix is None else _without_common(image.fix) for image in survey.images]
+        pairs = zip(survey.images, kept, strict=True)
+        survey = survey.model_copy(
+            update={"images": tuple(image.model_copy(update={"fix": fix}) for image, fix in pairs)}
+        )
     return survey.model_copy(update={"images": _images(survey, track, center, geo_from_cam)})
 
 

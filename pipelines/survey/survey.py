@@ -64,6 +64,44 @@ class RigEstimate(Product):
         return self
 
 
+class FixLag(Product):
+    """Time by which the positions of photographs lag the exposure, from the motion of the SfM cameras.
+
+    Attributes:
+        lag_s: a position is that of so many seconds before the exposure; negative: after it.
+        applied: whether positions are moved to the exposure when the survey is read.
+        sigma_along_s: σ that positions get along the motion, times the velocity.
+        scatter_m: robust σ of the fixes about the SfM model along a horizontal axis, without and with the lag.
+        velocity_in_geo: of the photographs that took part, in m/s.
+    """
+
+    lag_s: float
+    sigma_s: float = Field(ge=0)
+    applied: bool
+    sigma_along_s: float = Field(ge=0)
+    scatter_m: tuple[float, float]
+    velocity_in_geo: dict[ImageName, Vector3]
+
+    @property
+    def sentence(self) -> str:
+        """What was found, and what was made of it."""
+        found = f"{abs(self.lag_s):.2f} ± {self.sigma_s:.2f} s"
+        if self.applied:
+            side = "before" if self.lag_s > 0 else "after"
+            return (
+                f"The positions are those of {found} {side} the exposures, by the motion of the SfM cameras: a "
+                f"{'lag' if self.lag_s > 0 else 'lead'} of the receiver, or of clocks. They are moved to the "
+                f"exposures, which leaves {self.scatter_m[1]:.2f} m of {self.scatter_m[0]:.2f} m along an axis."
+            )
+        if self.sigma_along_s:
+            return (
+                "The flight does not show whether the positions lag the exposures, as it has no lines in two "
+                f"directions or too few photographs: a lag of ± {self.sigma_along_s:.2f} s is part of their σ "
+                "along the motion."
+            )
+        return f"The positions are those of the exposures: lag {self.lag_s:+.2f} ± {self.sigma_s:.2f} s."
+
+
 class RigCalibration(Product):
     """Product of `calibrate`: estimates of the rig, divided into those that `load_survey` applies and the others.
 
@@ -79,6 +117,7 @@ class RigCalibration(Product):
     rms_position_m: float | None = None
     rms_attitude_deg: float | None = None
     problem: str = ""
+    fix_lag: FixLag | None = None
 
     @model_validator(mode="after")
     def _names_each_once(self) -> RigCalibration:
@@ -120,11 +159,14 @@ class Fix(Product):
 
     `source` is the kind of file that it was read from, such as `exif`, `csv` or `bag`. `sigma_zero_m` is the
     vertical σ of a zero that is doubtful, such as that of heights above the take-off: a part of `cov_in_geo`, but
-    common to all fixes of the session, whose `sigma_common_m` has it, too. 0: the zero is that of the datum.
+    common to all fixes of the session, whose `sigma_common_m` has it, too. 0: the zero is that of the datum. `common_along_m`
+    is the part of the covariance, as a vector of one σ, that an error of all times causes: an estimated time offset
+    removes it.
     """
 
     position_in_geo: Vector3
     cov_in_geo: Covariance3
+    common_along_m: Vector3 = (0.0, 0.0, 0.0)
     source: str
     sigma_source: Literal["file", "option", "default"]
     session: int = Field(0, ge=0)

@@ -165,6 +165,24 @@ def test_time_matched_trajectory(tmp_path: Path) -> None:
     np.testing.assert_allclose(_positions(survey), truth, rtol=0, atol=1e-3)
 
 
+def test_times_in_whole_seconds_ask_for_the_time_offset(tmp_path: Path) -> None:
+    """Only the photographs' own motion tells what of a second was cut off: 0.5 s at 7.7 m/s is far beyond 2 cm."""
+    write_flight(tmp_path / "images", 4, positions=False)
+    rows = [
+        f"{FLIGHT_START_S - 0.5 + index},46.02,{7.75 + 1e-4 * index:.6f},500,0.02,0.02,0.03" for index in range(6)
+    ]
+    head = "timestamp,lat,lon,alt,sigma_e,sigma_n,sigma_u"
+    (tmp_path / "t.csv").write_text("\n".join([head, *rows]))
+    survey = _build(tmp_path / "images", trajectory=tmp_path / "t.csv")
+    assert survey.estimate == ("time-offset",)
+    assert _build(tmp_path / "images", trajectory=tmp_path / "t.csv", time_offset=0.1).estimate == ()
+    fix = survey.images[1].fix
+    assert fix is not None
+    sigma_e = np.sqrt(fix.cov_in_geo[0][0])
+    assert sigma_e == pytest.approx(0.577 * 7.74, rel=0.02)
+    np.testing.assert_allclose(np.abs(fix.common_along_m), [0.5 * 7.74, 0.0, 0.0], atol=0.05)
+
+
 def test_some_without_position_and_one_astray(tmp_path: Path) -> None:
     images = tmp_path / "images"
     write_flight(images, 5)
