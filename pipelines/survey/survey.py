@@ -159,9 +159,9 @@ class Fix(Product):
 
     `source` is the kind of file that it was read from, such as `exif`, `csv` or `bag`. `sigma_zero_m` is the
     vertical σ of a zero that is doubtful, such as that of heights above the take-off: a part of `cov_in_geo`, but
-    common to all fixes of the session, whose `sigma_common_m` has it, too. 0: the zero is that of the datum. `common_along_m`
-    is the part of the covariance, as a vector of one σ, that an error of all times causes: an estimated time offset
-    removes it.
+    common to all fixes of the session, whose `sigma_common_m` has it, too. 0: the zero is that of the datum.
+    `common_along_m` is the part of the covariance, as a vector of one σ, that an error of all times causes: an
+    estimated time offset removes it.
     """
 
     position_in_geo: Vector3
