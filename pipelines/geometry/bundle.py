@@ -144,7 +144,7 @@ def similarity_modes(cam_center_in_world: FloatArray) -> FloatArray:
 
 
 _CHUNK = 2**19  # observations that are linearised together
-_RIDGE = 1e-12  # small: what it adds to each point fixes the similarity of the whole as well
+_RIDGE = 1e-14  # small: what it adds to each point fixes the similarity of the whole as well
 # A camera with few observations has a prior σ of a tenth of its distance from the scene.
 _LOOSEST_RELATIVE_SIGMA = 0.1
 # Means of the weight w and of w r²/2 under Gaussian noise of σ = 1, where r²/2 is exponentially distributed. Robust
