@@ -3,9 +3,9 @@
 Errors of satellites' orbits and clocks, of the atmosphere and of reflections change within minutes, so that the
 fixes of a few minutes err together. As independent errors they would average out, and a height that climbs by
 metres over a flight would tilt the whole survey. The drift of a session is a Gauss–Markov process with a σ and a
-time constant, less its mean, which the session's common error holds. Its covariance has eigenvectors over the fixes
-(Karhunen–Loève): few of them have almost all of its variance. Each is a systematic error of three components with the
-same prior, the shape in time being scaled by the root of its eigenvalue.
+time constant, less its mean, which the session's common error holds. Its covariance over the fixes has eigenvectors
+(Karhunen–Loève), and few of them have almost all of its variance. Each is a systematic error of three components
+with the same prior, its shape in time scaled by the root of its eigenvalue.
 """
 
 import numpy as np

@@ -291,7 +291,7 @@ def _levelled_start(
     survey: Survey, model: SparseModel, data: Correspondences, aligned: InitialSimilarity
 ) -> Iterator[Start]:
     """Yield the start that the photographs level, where the fixes may drift and so tilt the survey."""
-    if aligned.layout == "line" or not any(any(session.drift_m) for session in survey.sessions):
+    if aligned.layout == "line" or not survey.drifts:
         return
     level, fixes = level_of(survey, model, attitude_prior(survey, model)), data.part(~data.control)
     if level is None or len(fixes) < 3:
@@ -299,9 +299,7 @@ def _levelled_start(
     with suppress(DegenerateGeometryError):
         similarity = levelled(level, fixes.in_local, fixes.in_geo)
         yield Start(
-            aligned.model_copy(
-                update={"geo_from_local": similarity.to_record("local", "geo"), "gnss_outliers": ()}
-            )
+            aligned.model_copy(update={"geo_from_local": similarity.to_record("local", "geo"), "gnss_outliers": ()})
         )
 
 

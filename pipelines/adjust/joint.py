@@ -186,11 +186,15 @@ def _adjust(
         problem = problem_at(applied)
         minimum = minimise(problem, minimum.state, None if max(changes) > _NEAR else normal)
         components, normal = variance_components(linearised(problem, minimum.state))
-    factors = {
-        group: _factor(survey, group, components[group], applied.get(group, 1.0))
-        for group in _TESTED
-        if group in components
-    } | fixed | _stated_common_errors(survey, applied)
+    factors = (
+        {
+            group: _factor(survey, group, components[group], applied.get(group, 1.0))
+            for group in _TESTED
+            if group in components
+        }
+        | fixed
+        | _stated_common_errors(survey, applied)
+    )
     weighted = with_variance_factors(survey, applied)
     return JointAdjustment(weighted, scene, problem, minimum.state, normal, at_stated, components, factors, cost)
 

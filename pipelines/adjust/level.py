@@ -10,11 +10,11 @@ little: it is level on the whole, but for the slopes that most sites have.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipelines.adjust.alignment import RotationPrior
+from pipelines.adjust.alignment import Alignment, Correspondences, RotationPrior, SimilarityState, adjust
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.geometry.rotations import exp_so3
@@ -34,6 +34,8 @@ _LEAST_SCATTER = np.radians(0.05)
 _SAME_LINE = np.cos(np.radians(30.0))  # of two headings
 _WORST = np.radians(30.0)  # σ beyond which a level is none
 SIGMA_SLOPE = np.radians(6.0)  # of the ground of a site, on the whole
+_TILTED_SIGMAS, _TILTED = 3.0, np.radians(5.0)  # of an alignment against the level, beyond which it is wrong
+_HELD = 1e-3  # rad
 _STEEPEST = np.radians(45.0)  # beyond, a plane of points is a wall
 _FLAT = 0.25  # thickness of the points about their plane, over its shorter extent
 
@@ -185,7 +187,7 @@ def _weighted(
 
 
 def _roll_and_pitch(seen: FloatArray) -> FloatArray:
-    """Return the directions (2, 3) in a camera along which its roll and its pitch move the vertical it sees (3,)."""
+    """Return the directions (2, 3) in a camera along which its roll and its pitch move the vertical (3,)."""
     sideways = np.eye(3)[0 if abs(seen[0]) < _UPRIGHT else 1]
     roll = sideways - (sideways @ seen) * seen
     roll = roll / np.linalg.norm(roll)
@@ -219,7 +221,7 @@ def _lines(cam_from_local: FloatArray, up: FloatArray) -> int:
 
 
 def levelled(level: KnownLevel, center_in_local: FloatArray, position_in_geo: FloatArray) -> Similarity:
-    """Return the similarity geo ← local that keeps the level: heading, scale and shift by the plan of the positions.
+    """Return the similarity geo ← local that keeps the level, with heading, scale and shift by the plan.
 
     Raises:
         DegenerateGeometryError: the positions do not determine the heading.
@@ -247,3 +249,24 @@ def levelled(level: KnownLevel, center_in_local: FloatArray, position_in_geo: Fl
     rotation = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]]) @ turn
     height = float(np.median(position_in_geo[:, 2] - scale * flat[:, 2]))
     return Similarity(scale, rotation, np.array([shift.real, shift.imag, height]))
+
+
+def kept_level(alignment: Alignment, level: KnownLevel | None, data: Correspondences) -> Alignment:
+    """Return the alignment of camera centres with their fixes, held to the level where it is tilted against it.
+
+    Drifting heights tilt an alignment of fixes that count as independent.
+    """
+    if level is None or len(data) < 3:
+        return alignment
+    tilt = float(np.arccos(np.clip(alignment.geo_from_local.rotation[2] @ level.up_in_local, -1.0, 1.0)))
+    if tilt < max(_TILTED_SIGMAS * level.sigma_rad, _TILTED):
+        return alignment
+    try:
+        start = levelled(level, data.in_local, data.in_geo)
+    except DegenerateGeometryError:
+        return alignment
+    prior = RotationPrior(start.rotation, np.diag([_HELD, _HELD, 1.0]) ** 2)
+    solution = adjust(data, SimilarityState(start, np.ones(len(data), dtype=bool)), prior)
+    covariance = solution.covariance.copy()
+    covariance[1:3, 1:3] += level.sigma_rad**2 * np.eye(2)
+    return replace(alignment, solution=replace(solution, covariance=covariance))

@@ -136,8 +136,8 @@ class FixSession(Product):
 
     `sigma_common_m` is its σ east, north, up, 0 for none along that axis; `receiver` is one of
     `ingest.flight_record.RECEIVERS`. `sigma_drift_m` is the σ, by axis, of a further error that neighbouring fixes
-    share, whose correlation decays with a time constant; its mean over the session is in the first. None: that of the
-    kind of receiver (`DRIFT_SIGMA_M`).
+    share, whose correlation decays with a time constant; its mean over the session is in the first. None: that of
+    the kind of receiver (`DRIFT_SIGMA_M`).
     """
 
     receiver: str
@@ -318,6 +318,11 @@ class Survey(Product):
     def largest_photograph_px(self) -> tuple[int, int]:
         largest = max(self.cameras, key=lambda camera: camera.width * camera.height)
         return largest.width, largest.height
+
+    @property
+    def drifts(self) -> bool:
+        """Whether the fixes of any session drift."""
+        return any(any(session.drift_m) for session in self.sessions)
 
     def names(self, split: Literal["train", "test"]) -> tuple[str, ...]:
         """Return the names of the images in a split, in order."""
