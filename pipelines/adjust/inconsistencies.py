@@ -56,7 +56,10 @@ _QUIET_FACTOR = 2.25
 _LEAST_FIXES = 4
 # A drift of the fixes is said if its σ is three times the assumed one; ground is steep beyond so many σ of slopes.
 _DRIFT_FACTOR, _STEEP_SIGMAS, _WALL_RAD = 9.0, 3.0, np.radians(60.0)
-_IN_TIME, _FITS = {"drift", "step"}, 2.0  # explanations that a drift contains; scatter in σ of one that fits
+_IN_TIME, _FITS = (
+    {"drift", "step"},
+    2.0,
+)  # explanations that a drift contains; scatter of others over what it leaves
 _AT_SKY = 0.3  # median up component of the views
 # Residuals share a constant shift if it is so many times as large as their mean distance from it.
 _SHIFT_SPREADS = 5.0
@@ -185,8 +188,11 @@ def _fixes_against_model(fixes: StatedFixes, joint: JointAdjustment) -> Iterator
     )
     sides += f", and {rejected} of {factor.count} are outliers." if rejected else "."
     best = explanation_of(fixes)
-    if best is not None and drifts and (best.code in _IN_TIME or best.scatter_m > _FITS * fixes.sigma_m):
-        best = None
+    if best is not None and drifts:
+        _, missed, used = joint.residuals(Fixes.kind)
+        left_m = float(np.sqrt((missed[used] ** 2).mean()))
+        if best.code in _IN_TIME or best.scatter_m > _FITS * left_m:
+            best = None
     if best is not None:
         yield _Finding(best.code, f"{sides} {_explained(best)}", ends=is_wrong)
         return

@@ -78,7 +78,7 @@ def test_level_is_that_of_the_adjustment(every: tuple[Scene, Problem]) -> None:
     state = drawn(scene, problem, 0)
     arrays = (state.correction, state.lens, state.errors)
     found = residuals_of(problem, level, state)(*(torch.from_numpy(array) for array in arrays))
-    np.testing.assert_allclose(found.numpy(), level.residuals(problem.at(state)), rtol=1e-12)
+    np.testing.assert_allclose(found.detach().numpy(), level.residuals(problem.at(state)), rtol=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(4))
