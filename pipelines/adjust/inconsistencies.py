@@ -60,6 +60,7 @@ _IN_TIME, _FITS = (
     {"drift", "step"},
     2.0,
 )  # explanations that a drift contains; scatter of others over what it leaves
+_TILTED_RAD = np.radians(10.0)  # of an explanation against the level of the photographs
 _AT_SKY = 0.3  # median up component of the views
 # Residuals share a constant shift if it is so many times as large as their mean distance from it.
 _SHIFT_SPREADS = 5.0
@@ -191,7 +192,8 @@ def _fixes_against_model(fixes: StatedFixes, joint: JointAdjustment) -> Iterator
     if best is not None and drifts:
         _, missed, used = joint.residuals(Fixes.kind)
         left_m = float(np.sqrt((missed[used] ** 2).mean()))
-        if best.code in _IN_TIME or best.scatter_m > _FITS * left_m:
+        tilt = joint.geo_from_local.rotation[2] @ best.geo_from_local.rotation[2]
+        if best.code in _IN_TIME or best.scatter_m > _FITS * left_m or tilt < np.cos(_TILTED_RAD):
             best = None
     if best is not None:
         yield _Finding(best.code, f"{sides} {_explained(best)}", ends=is_wrong)
