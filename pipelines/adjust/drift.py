@@ -24,7 +24,7 @@ def drift_shapes(time_s: FloatArray, constant_s: float) -> FloatArray:
     Where a time (F,) is unknown, photographs follow each other at equal intervals. Too few instants have no shapes.
     """
     if not np.isfinite(time_s).all():
-        time_s = _INTERVAL_S * np.arange(len(time_s))
+        time_s = _INTERVAL_S * np.arange(len(time_s), dtype=np.float64)
     instants = np.unique(time_s)
     if len(instants) < _LEAST_INSTANTS:
         return np.zeros((len(time_s), 0))

@@ -111,7 +111,7 @@ class Fixes(Term):
         count, similarity = len(self), at.geo_from_model
         by_pose = np.zeros((count, 3, 6))
         by_pose[:, :, 3:] = similarity.scale * similarity.rotation
-        by_errors = np.kron(self.shares(at.errors), np.eye(3)).reshape(count, 3, len(at.vector))
+        by_errors = np.einsum("fb,ij->fibj", self.shares(at.errors), np.eye(3)).reshape(count, 3, len(at.vector))
         arm, columns = at.errors.value(at.vector, "lever-arm"), at.errors.columns("lever-arm")
         if arm is not None and columns is not None:
             in_model = np.swapaxes(at.cam_from_model[self.camera], 1, 2) @ arm

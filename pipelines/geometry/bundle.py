@@ -146,7 +146,8 @@ def similarity_modes(cam_center_in_world: FloatArray) -> FloatArray:
 _CHUNK = 2**19  # observations that are linearised together
 _RIDGE = 1e-14  # small: what it adds to each point fixes the similarity of the whole as well
 _SHARED_GRIDS = ((3, 2), (5, 4), (8, 6))  # columns and rows of the cells of a photograph
-_BY_CHANCE = 4.0  # σ of the factor of independent errors, which is 1
+_IN_A_CELL = 20.0  # least mean number of observations: fewer show chance, and share little
+_BY_CHANCE = 5.0  # σ of the factor of independent errors, which is 1
 # A camera with few observations has a prior σ of a tenth of its distance from the scene.
 _LOOSEST_RELATIVE_SIGMA = 0.1
 # Means of the weight w and of w r²/2 under Gaussian noise of σ = 1, where r²/2 is exponentially distributed. Robust
@@ -279,7 +280,7 @@ def shared_error_factor(network: Network, residual: FloatArray) -> float:
     A lens that its model cannot express, or a rolling shutter, moves all observations of a part of a photograph
     alike: they do not average out as independent ones do. The factor is the sum of the squared sums of the
     residuals (M, 2) in the cells of a grid over that of their squares (the design effect of clustered samples), of
-    the grid with the largest; 1 where chance explains it.
+    the grid with the largest; 1 where chance explains it. The pose of a photograph has absorbed six of the sums.
     """
     factor = 1.0
     size = np.array([(camera.width, camera.height) for camera in network.cameras.values()], dtype=np.float64)
@@ -290,10 +291,14 @@ def shared_error_factor(network: Network, residual: FloatArray) -> float:
     for columns, rows in _SHARED_GRIDS:
         cell = (network.obs_image * columns + (part[:, 0] * columns).astype(np.int64)) * rows
         cell = cell + (part[:, 1] * rows).astype(np.int64)
-        count = int((np.bincount(cell) > 1).sum())
+        count = 2 * int((np.bincount(cell) > 0).sum())
+        free = count - 6 * int((np.bincount(network.obs_image) > 0).sum())
+        if free < count / 3 or total <= 0 or 2 * len(residual) < _IN_A_CELL * count:
+            continue
         sums = sum(float((np.bincount(cell, values) ** 2).sum()) for values in residual.T)
-        if count and total > 0 and sums / total > 1.0 + _BY_CHANCE / count**0.5:
-            factor = max(factor, sums / total)
+        effect = sums / total * count / free
+        if effect > 1.0 + _BY_CHANCE * (2.0 / free) ** 0.5:
+            factor = max(factor, effect)
     return factor
 
 

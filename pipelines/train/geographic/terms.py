@@ -210,7 +210,8 @@ class LevelTerm(TensorTerm):
         solved = at.geo_from_model.rotation[2].expand_as(self.up_in_model)
         along = (self.up_in_model * solved).sum(dim=1)
         across = torch.linalg.cross(self.up_in_model, solved)
-        return 2.0 * (self.axes_in_model @ across[:, :, None])[:, :, 0] / (1.0 + along)[:, None]
+        turned: Tensor = (self.axes_in_model @ across[:, :, None])[:, :, 0]
+        return 2.0 * turned / (1.0 + along)[:, None]
 
 
 def tensor_term(term: adjustment.Term, errors: SystematicErrors) -> TensorTerm:
