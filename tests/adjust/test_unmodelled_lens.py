@@ -68,7 +68,7 @@ def field_of(kind: str, rng: np.random.Generator) -> Field:
     radial, focus = rng.choice([-10.0, 10.0]), np.cumsum(rng.normal(size=count))
     focus = 1e-3 * (focus - focus.mean()) / focus.std()
     # Along the nose, and by turns of the body that differ between photographs.
-    motion = [0.0, 0.5] + rng.normal(0, 0.25, (count, 2))
+    motion = rng.normal([0.0, 0.5], 0.25, (count, 2))
 
     def shift(xy_px: np.ndarray, image: np.ndarray) -> np.ndarray:
         away = (xy_px - middle) / focal
