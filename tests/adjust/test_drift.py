@@ -99,16 +99,21 @@ def ratio(of: Drift, draws: int) -> float:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "of",
+    ("of", "draws"),
     [
-        CLIMB,
-        WALK,
-        Drift(climb_m=-80.0, walk=(0.5, 1.0), pitch_deg=25.0),
-        Drift(climb_m=100.0, times=False),
-        Drift(climb_m=90.0, wobble_deg=1.5, lean_deg=1.5, headings=False),
+        (CLIMB, 20),
+        (WALK, 20),
+        (Drift(climb_m=-80.0, walk=(0.5, 1.0), pitch_deg=25.0), 12),
+        (Drift(climb_m=100.0, times=False), 12),
     ],
-    ids=["climb", "walk", "oblique", "without times", "one heading"],
+    ids=["climb", "walk", "oblique", "without times"],
 )
-def test_sigma_of_the_tilt_is_true(of: Drift) -> None:
-    # 40 values know their root mean square to 11 %.
-    assert 0.7 < ratio(of, draws=20) < 1.4
+def test_sigma_of_the_tilt_is_true(of: Drift, draws: int) -> None:
+    # 24 to 40 values know their root mean square to 14 or 11 %.
+    assert 0.7 < ratio(of, draws) < 1.4
+
+
+@pytest.mark.slow
+def test_sigma_of_the_tilt_holds_what_one_heading_does_not_tell() -> None:
+    # Nothing but the assumption of a view straight down, without roll, levels such a flight.
+    assert ratio(Drift(climb_m=90.0, wobble_deg=1.5, lean_deg=3.0, headings=False), draws=8) < 1.4
