@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from pipelines.adjust.alignment import Alignment, Correspondences, RotationPrior, align, turn_against
+from pipelines.adjust.level import kept_level, level_of
 from pipelines.adjust.measurements import RecordedRotations, attitude_prior, fix_correspondences, recorded_rotations
 from pipelines.adjust.options import GeolocateOptions
 from pipelines.core.errors import DegenerateGeometryError, InputError
@@ -77,6 +78,8 @@ def geolocate(survey: Survey, model: SparseModel, options: GeolocateOptions) -> 
     alignment, problem = None, ""
     try:
         alignment = align(fixes, np.random.default_rng(_ALIGNMENT_SEED), attitude=prior)
+        if alignment.layout != "line" and survey.drifts:
+            alignment = kept_level(alignment, level_of(survey, model, prior), fixes)
     except DegenerateGeometryError as error:
         problem = str(error)
         log.info("fixes cannot be compared with the SfM model: %s", error)

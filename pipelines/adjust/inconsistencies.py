@@ -24,13 +24,14 @@ from pipelines.adjust.hypotheses import (
     vector_text,
 )
 from pipelines.adjust.joint import JointAdjustment
+from pipelines.adjust.level import SIGMA_SLOPE, ground_normal
 from pipelines.adjust.measurements import (
     UnusedControlPoint,
     attitude_prior,
     control_correspondences,
     fix_correspondences,
 )
-from pipelines.adjust.terms import ControlPoints, Fixes
+from pipelines.adjust.terms import ControlPoints, Fixes, Level
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.products import Remark
 from pipelines.core.sentences import listed
@@ -55,6 +56,13 @@ _WRONG_SIGMA, _WRONG_SCATTER_M = 10.0, 0.3
 # A variance factor up to this, of σ that are larger by one half, is applied without a caution.
 _QUIET_FACTOR = 2.25
 _LEAST_FIXES = 4
+# A drift of the fixes is said if its σ is three times the assumed one; ground is steep beyond so many σ of slopes.
+_DRIFT_FACTOR, _STEEP_SIGMAS, _WALL_RAD = 9.0, 3.0, np.radians(60.0)
+_IN_TIME, _FITS = (
+    {"drift", "step"},
+    2.0,
+)  # explanations that a drift contains; scatter of others over what it leaves
+_TILTED_RAD = np.radians(10.0)  # of an explanation against the level of the photographs
 _AT_SKY = 0.3  # median up component of the views
 # Residuals share a constant shift if it is so many times as large as their mean distance from it.
 _SHIFT_SPREADS = 5.0
@@ -103,6 +111,7 @@ def cautions_of(
         findings += of_lag or ([] if of_map else _fixes_against_model(fixes, joint))
         findings += _view(model, joint.geo_from_local)
     findings += of_map or [*_shift_of_fixes(joint), *_control_points(joint)]
+    findings += _steep_ground(survey, model, joint)
     findings += [*_attitudes(survey, fixes, joint), *_weak_checks(joint), *_assumed_sigmas(joint)]
     ending, others = (
         tuple(Remark(code=found.code, sentence=found.sentence) for found in findings if found.ends == ends)
@@ -176,8 +185,8 @@ def _view(model: SparseModel, geo_from_local: Similarity) -> Iterator[_Finding]:
 
 
 def _fixes_against_model(fixes: StatedFixes, joint: JointAdjustment) -> Iterator[_Finding]:
-    factor = joint.factors.get("fixes")
-    if factor is None or factor.applied <= _QUIET_FACTOR:
+    factor, drifts = joint.factors.get("fixes"), _drifts(joint)
+    if factor is None or (factor.applied <= _QUIET_FACTOR and not drifts):
         return
     is_wrong = _is_wrong(factor)
     shift = _constant_shift(joint.residuals(Fixes.kind)[1])
@@ -185,14 +194,26 @@ def _fixes_against_model(fixes: StatedFixes, joint: JointAdjustment) -> Iterator
         yield _apart(-shift, joint.survey, ends=is_wrong)
         return
     scatter_m, rejected = fixes.sigma_m * factor.applied**0.5, factor.count - factor.used
+    if drifts:  # it has taken a part of the scatter, and explains more than any cause that leaves some
+        scatter_m = max(scatter_m, _plain_scatter(fixes))
+        is_wrong |= factor.sigma_source == "stated" and scatter_m > _WRONG_SIGMA * fixes.sigma_m
     sides = (
         f"The fixes scatter by {scatter_m:.2f} m along each axis about the SfM model; their {_source(factor)} σ is "
         f"{fixes.sigma_m:.3g} m"
     )
     sides += f", and {rejected} of {factor.count} are outliers." if rejected else "."
     best = explanation_of(fixes)
+    if best is not None and drifts:
+        _, missed, used = joint.residuals(Fixes.kind)
+        left_m = float(np.sqrt((missed[used] ** 2).mean()))
+        tilt = joint.geo_from_local.rotation[2] @ best.geo_from_local.rotation[2]
+        if best.code in _IN_TIME or best.scatter_m > _FITS * left_m or tilt < np.cos(_TILTED_RAD):
+            best = None
     if best is not None:
         yield _Finding(best.code, f"{sides} {_explained(best)}", ends=is_wrong)
+        return
+    if drifts:
+        yield _drifting(drifts, joint)
         return
     if scatter_m > median_spacing(fixes.position_in_geo) / 2:
         code = _OTHER_PHOTOGRAPHS
@@ -239,6 +260,65 @@ def arm_caution(pattern: FixPattern) -> Remark:
         "It is estimated with the adjustment; state it with `georef ingest --lever-arm` and --camera-mount."
     )
     return Remark(code="lever-arm", sentence=sentence)
+
+
+def _drifts(joint: JointAdjustment) -> list[VarianceFactor]:
+    """Return the tests of the drift of the fixes that find it far larger than assumed."""
+    groups: tuple[Group, ...] = ("horizontal drift", "vertical drift")
+    factors = [joint.factors[group] for group in groups if group in joint.factors]
+    return [factor for factor in factors if factor.applied > _DRIFT_FACTOR]
+
+
+def _plain_scatter(fixes: StatedFixes) -> float:
+    """Return the scatter per axis in metres of the fixes about the SfM model, without any drift."""
+    try:
+        return fit(fixes.center_in_local, fixes.position_in_geo)[1]
+    except DegenerateGeometryError:
+        return 0.0
+
+
+def _drifting(drifts: Sequence[VarianceFactor], joint: JointAdjustment) -> _Finding:
+    fixes, errors = joint.problem.term(Fixes.kind), joint.problem.errors
+    assert isinstance(fixes, Fixes)
+    drifting = np.array([block.name == "drift" for block in errors.blocks])
+    drift = fixes.shares(errors)[:, drifting] @ joint.state.errors.reshape(-1, 3)[drifting]
+    groups, spread = {factor.group for factor in drifts}, np.ptp(drift, axis=0)
+    parts = []
+    if "horizontal drift" in groups:
+        parts.append(f"{float(spread[:2].max()):.0f} m horizontally")
+    if "vertical drift" in groups:
+        parts.append(f"{float(spread[2]):.0f} m in height")
+    level = joint.problem.term(Level.kind)
+    by = (
+        "Control points or nothing level the survey"
+        if not isinstance(level, Level)
+        else "What the photographs know of the vertical levels the survey, with a σ of "
+        f"{np.degrees(np.linalg.inv(level.root_information[0]).diagonal().max()):.1f}°"
+    )
+    sentence = (
+        f"The recorded positions drift within the flight: against the photographs they change by {listed(parts)}, "
+        f"far more than a receiver without corrections does. {by}; neither heights nor terrain are known better "
+        "than the σ of the result, which the drift enlarges. Give control points with --gcp, or other positions."
+    )
+    return _Finding("position-drift", sentence)
+
+
+def _steep_ground(survey: Survey, model: SparseModel, joint: JointAdjustment) -> Iterator[_Finding]:
+    """Yield the finding that the ground is steeper than sites are, where the fixes may drift in height."""
+    if joint.problem.term(ControlPoints.kind) is not None or not survey.drifts:
+        return
+    up = joint.geo_from_local.rotation[2]
+    normal = ground_normal(model, up)
+    if normal is None:
+        return
+    slope = float(np.arccos(np.clip(normal @ up, -1.0, 1.0)))
+    if _STEEP_SIGMAS * SIGMA_SLOPE < slope < _WALL_RAD:
+        sentence = (
+            f"The ground as a whole is inclined by {np.degrees(slope):.0f}° in this solution. If the site is not, "
+            "recorded heights that drift within the flight have tilted the survey. Check them, or give control "
+            "points with --gcp."
+        )
+        yield _Finding("ground-steep", sentence)
 
 
 def _shift_of_fixes(joint: JointAdjustment) -> Iterator[_Finding]:
@@ -376,10 +456,12 @@ def _weak_checks(joint: JointAdjustment) -> Iterator[_Finding]:
     if joint.problem.term(Fixes.kind) is not None and joint.factors.get("control points") is None:
         fixes = [image.fix for image in joint.survey.images if image.fix is not None]
         sigma = typical_sigma(np.array([fix.cov_apart for fix in fixes]))
+        drift_m = max((max(session.drift_m) for session in joint.survey.sessions), default=0.0)
+        beside = f" but for a drift of σ {drift_m:.2g} m" if drift_m else ""
         sentence = (
             "No control point checks an error that all fixes share, such as that of the base station. The "
-            f"predicted σ take the errors of the fixes, σ {sigma:.2g} m, as independent. Add control points with "
-            "--gcp."
+            f"predicted σ take the errors of the fixes, σ {sigma:.2g} m, as independent{beside}. Add control "
+            "points with --gcp."
         )
         yield _Finding("no-control-points", sentence)
 

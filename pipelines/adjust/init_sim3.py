@@ -10,6 +10,7 @@ A survey without a place on Earth gets a local metric frame (`pipelines.adjust.l
 """
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -34,6 +35,7 @@ from pipelines.adjust.inconsistencies import (
     unadjustable,
 )
 from pipelines.adjust.joint import JointAdjustment, Start, adjust_jointly, component_of, in_own_frame
+from pipelines.adjust.level import level_of, levelled
 from pipelines.adjust.local_frame import local_similarity
 from pipelines.adjust.measurements import (
     UnusedControlPoint,
@@ -198,7 +200,8 @@ def robust_similarity(
         options = options.model_copy(update={"estimate": (*options.estimate, "lever-arm")})
         of_arm = (arm_caution(pattern),)
     try:
-        joint = adjust_jointly(meets, model, _starts(data, aligned, options.seed), estimate=options.estimate)
+        starts = (*_levelled_start(survey, model, data, aligned), *_starts(data, aligned, options.seed))
+        joint = adjust_jointly(meets, model, starts, estimate=options.estimate)
     except DegenerateGeometryError as error:
         inconsistencies = unadjustable(meets, model, alignment.geo_from_local, pattern)
         _refuse(inconsistencies, options)
@@ -294,6 +297,22 @@ def _aligned_product(
         layout=alignment.layout,
         attitude_used=alignment.layout == "line",
     )
+
+
+def _levelled_start(
+    survey: Survey, model: SparseModel, data: Correspondences, aligned: InitialSimilarity
+) -> Iterator[Start]:
+    """Yield the start that the photographs level, where the fixes may drift and so tilt the survey."""
+    if aligned.layout == "line" or not survey.drifts:
+        return
+    level, fixes = level_of(survey, model, attitude_prior(survey, model)), data.part(~data.control)
+    if level is None or len(fixes) < 3:
+        return
+    with suppress(DegenerateGeometryError):
+        similarity = levelled(level, fixes.in_local, fixes.in_geo)
+        yield Start(
+            aligned.model_copy(update={"geo_from_local": similarity.to_record("local", "geo"), "gnss_outliers": ()})
+        )
 
 
 def _starts(data: Correspondences, aligned: InitialSimilarity, seed: int) -> Iterator[Start]:

@@ -22,7 +22,7 @@ from pipelines.adjust.measurements import onto_control, problem_of, recorded_rot
 from pipelines.adjust.options import EstimatedErrorName
 from pipelines.adjust.state import State
 from pipelines.adjust.system import Linearised, NormalMatrix, Problem, linearised, minimise, posterior_weights
-from pipelines.adjust.terms import ControlPoints, Distances, Fixes
+from pipelines.adjust.terms import CommonErrors, ControlPoints, Distances, Fixes
 from pipelines.core.errors import ConvergenceError, DegenerateGeometryError
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.geometry.rotations import log_so3
@@ -46,7 +46,12 @@ _ROUNDS, _SETTLED = 8, 0.02  # of the factors, and their relative change at whic
 _NEAR = 0.5  # relative change up to which the equations before it serve the first steps
 # Level of the test below which a σ is rejected: a stated one, and one that nobody stated.
 _LEVEL: dict[SigmaSource, float] = {"stated": 0.001, "default": 0.01}
-_TESTED: tuple[Group, ...] = ("fixes", "control points")
+_TESTED: tuple[Group, ...] = ("fixes", "horizontal drift", "vertical drift", "control points")
+# Axes of the drift, and the group whose σ holds the mean of the drift.
+_DRIFTS: dict[Group, tuple[list[int], Group]] = {
+    "horizontal drift": ([0, 1], "horizontal common error"),
+    "vertical drift": ([2], "vertical common error"),
+}
 _EXACT = 1e-9
 _FEW_OUTLIERS = 0.02  # of the fixes: noise alone puts one in a thousand beyond the gate
 # Observations agree if so large a part of them is within the gate, and so many degrees of freedom check them.
@@ -71,7 +76,7 @@ class JointAdjustment:
     @property
     def is_consistent(self) -> bool:
         """Whether fixes and control points agree with each other at the stated σ, but for a few outlying fixes."""
-        fixes, control = (self.at_stated.get(kind) for kind in _TESTED)
+        fixes, control = (self.at_stated.get(kind) for kind in (Fixes.kind, ControlPoints.kind))
         of_fixes = fixes is None or (fixes.agree and float(fixes.used.mean()) >= 1.0 - _FEW_OUTLIERS)
         return of_fixes and (control is None or (control.agree and bool(control.used.all())))
 
@@ -174,17 +179,22 @@ def _adjust(
     components = at_stated
     for _ in range(_ROUNDS):
         before, applied = applied, applied | _next_factors(survey, components, applied)
+        applied |= _of_common_errors(survey, problem, minimum.state, applied)
         changes = [abs(applied.get(group, 1.0) / before.get(group, 1.0) - 1) for group in _TESTED]
         if all(change < _SETTLED for change in changes):
             break
         problem = problem_at(applied)
         minimum = minimise(problem, minimum.state, None if max(changes) > _NEAR else normal)
         components, normal = variance_components(linearised(problem, minimum.state))
-    factors = {
-        group: _factor(survey, group, components[group], applied.get(group, 1.0))
-        for group in _TESTED
-        if group in components
-    } | fixed
+    factors = (
+        {
+            group: _factor(survey, group, components[group], applied.get(group, 1.0))
+            for group in _TESTED
+            if group in components
+        }
+        | fixed
+        | _stated_common_errors(survey, applied)
+    )
     weighted = with_variance_factors(survey, applied)
     return JointAdjustment(weighted, scene, problem, minimum.state, normal, at_stated, components, factors, cost)
 
@@ -203,12 +213,56 @@ def _next_factors(
         if component is None:
             continue
         rejected = component.probability(present) < _LEVEL[_source(survey, group)]
-        factors[group] = max(present * component.cautious_factor, 1.0) if rejected else 1.0
+        estimated = component.factor if group in _DRIFTS else component.cautious_factor
+        factors[group] = max(present * (estimated or 1.0), 1.0) if rejected else 1.0
     return factors
 
 
+def _of_common_errors(
+    survey: Survey, problem: Problem, state: State, applied: dict[Group, float]
+) -> dict[Group, float]:
+    """Return the factors of the common errors of sessions that drift more than stated.
+
+    The adjustment does not see the mean of a drift. It is taken to be as large as what the drift does within the
+    session.
+    """
+    fixes, factors = problem.term(Fixes.kind), {}
+    if not isinstance(fixes, Fixes):
+        return {}
+    blocks = problem.errors.blocks
+    drifting = np.array([block.name == "drift" for block in blocks], dtype=bool)
+    if not drifting.any():
+        return {}
+    drift = fixes.shares(problem.errors)[:, drifting] @ state.errors.reshape(-1, 3)[drifting]
+    stated = np.array([session.sigma_common_m for session in survey.sessions])[fixes.session]
+    for group, (axes, common) in _DRIFTS.items():
+        variance = float(np.square(stated[:, axes]).mean())
+        if variance > 0:
+            grown = applied.get(group, 1.0) > 1.0
+            factors[common] = 1.0 + float(np.square(drift[:, axes]).mean()) / variance if grown else 1.0
+    return factors
+
+
+def _stated_common_errors(survey: Survey, applied: dict[Group, float]) -> dict[Group, VarianceFactor]:
+    count = len(survey.sessions)
+    return {
+        group: VarianceFactor(
+            group=group,
+            count=count,
+            used=count,
+            redundancy=0.0,
+            estimated=None,
+            probability=1.0,
+            applied=applied[group],
+            sigma_source="default",
+        )
+        for _, group in _DRIFTS.values()
+        if applied.get(group, 1.0) > 1.0
+    }
+
+
 def _source(survey: Survey, group: Group) -> SigmaSource:
-    return "default" if group in survey.default_sigmas else "stated"
+    return "default" if group in survey.default_sigmas or group in _DRIFTS else "stated"
 
 
 def _factor(survey: Survey, group: Group, component: VarianceComponent, applied: float) -> VarianceFactor:
@@ -329,4 +383,13 @@ def variance_components(linear: Linearised) -> tuple[dict[str, VarianceComponent
         dimension = rows.shape[1]
         absorbed = np.trace(linear.spread(weights, kind, normal), axis1=1, axis2=2) * weights[kind]
         components[kind] = component_of((rows**2).sum(axis=1), dimension - absorbed, dimension)
+    blocks = linear.problem.errors.blocks
+    drifting = np.array([block.name == "drift" for block in blocks], dtype=bool)
+    if drifting.any():
+        kind = CommonErrors.kind
+        spread = np.diagonal(linear.spread(weights, kind, normal), axis1=1, axis2=2) * weights[kind][:, None]
+        for group, (axes, _) in _DRIFTS.items():
+            squares = float((residuals[kind][drifting][:, axes] ** 2).sum())
+            free = float(np.clip(1.0 - spread[drifting][:, axes], 0.0, 1.0).sum())
+            components[group] = VarianceComponent(np.ones(int(drifting.sum()), dtype=bool), True, squares, free)
     return components, normal

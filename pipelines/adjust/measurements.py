@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 
 from pipelines.adjust.alignment import Correspondences, RotationPrior, mean_rotation
+from pipelines.adjust.drift import drift_shapes
+from pipelines.adjust.level import level_of
 from pipelines.adjust.options import EstimatedErrorName
 from pipelines.adjust.state import (
     SIGMA_ARM_M,
@@ -23,6 +25,7 @@ from pipelines.adjust.terms import (
     ControlPoints,
     Distances,
     Fixes,
+    Level,
     LocalFrame,
     Planes,
     Term,
@@ -251,7 +254,9 @@ def problem_of(
     if survey.origin is None:
         center = scene.poses.cam_center_in_model
         frame = LocalFrame.fixed(float(np.linalg.norm(center - center.mean(axis=0), axis=1).max()))
-    every: tuple[Term | None, ...] = (fixes, control, distances_of(scene, survey), attitudes, planes, frame)
+    has_drift = any(block.name == "drift" for block in blocks)
+    level = level_term(scene, survey) if has_drift and attitudes is None else None
+    every: tuple[Term | None, ...] = (fixes, control, distances_of(scene, survey), attitudes, planes, frame, level)
     measured = tuple(term for term in every if term is not None)
     datum = survey.sigma_datum_m if control is not None else _datum_of_fixes(survey, fixes)
     return Problem(scene.poses, scene.bundle, measured, SystematicErrors(tuple(blocks)), sigma_datum_m=datum)
@@ -275,7 +280,36 @@ def fixes_of(scene: Scene, survey: Survey) -> Fixes | None:
         position_in_geo=fixes.in_geo,
         root_information=root_information(fixes.cov_in_geo),
         session=np.array([session[name] for name in fixes.name]),
+        drift=_drift_of(survey, fixes.name),
     )
+
+
+def _drift_of(survey: Survey, names: tuple[str, ...]) -> FloatArray:
+    """Return the shapes (F, K) of the drift of the fixes of these images; K = 0: no session drifts."""
+    fixed = {image.name: (image.fix.session, image.timestamp_s) for image in survey.images if image.fix is not None}
+    session = np.array([fixed[name][0] for name in names])
+    time_s = np.array([fixed[name][1] for name in names], dtype=np.float64)
+    shapes = np.zeros((len(names), 0))
+    for number in np.unique(session) if survey.sessions else ():
+        of_session = survey.sessions[number]
+        if not any(of_session.drift_m):
+            continue
+        rows = np.flatnonzero(session == number)
+        own = drift_shapes(time_s[rows], of_session.drift_time_s)
+        shapes = np.pad(shapes, ((0, 0), (0, max(0, own.shape[1] - shapes.shape[1]))))
+        shapes[rows, : own.shape[1]] = own
+    return shapes
+
+
+def level_term(scene: Scene, survey: Survey) -> Level | None:
+    """Return what the photographs know of the vertical, or None if they know nothing."""
+    level = level_of(survey, scene.sparse, attitude_prior(survey, scene.sparse))
+    if level is None:
+        return None
+    turn = scene.model_from_local.rotation
+    axes = np.linalg.svd(level.up_in_local[None])[2][1:]
+    covariance = axes @ level.cov_rad2 @ axes.T
+    return Level((turn @ level.up_in_local)[None], (axes @ turn.T)[None], root_information(covariance[None]))
 
 
 def control_of(scene: Scene, survey: Survey) -> ControlPoints | None:
@@ -394,6 +428,12 @@ def _common_errors(survey: Survey, fixes: Fixes, *, with_datum: bool) -> list[Sy
         if sigma.any():
             at_least = vector3(np.maximum(sigma, _LEAST_SIGMA_COMMON_M))
             blocks.append(SystematicError("bias", at_least, int(session)))
+        drift = np.array(survey.sessions[session].drift_m)
+        if drift.any():
+            at_least = vector3(np.maximum(drift, _LEAST_SIGMA_COMMON_M))
+            own = fixes.drift[fixes.session == session]
+            modes = np.flatnonzero(np.abs(own).max(axis=0, initial=0.0) > 0)
+            blocks += [SystematicError("drift", at_least, int(session), mode) for mode in map(int, modes)]
     return blocks
 
 

@@ -115,7 +115,7 @@ def _measurements(near: Linearised, normal: NormalMatrix, rejected: Problem | No
     for error, row in zip(near.problem.errors.blocks, near.state.errors.reshape(-1, 3), strict=True):
         yield Measurement(
             kind="systematic error",
-            name=error.name if error.session is None else f"{error.name} of session {error.session + 1}",
+            name=error.label,
             used=True,
             residual=tuple(row.tolist()),
             normalised=float(np.linalg.norm(row / np.array(error.sigma))),

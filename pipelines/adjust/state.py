@@ -17,7 +17,7 @@ SIGMA_BORESIGHT_RAD = np.radians(5.0)
 # A component counts as observed if its σ is at most this part of the prior's.
 _OBSERVED_PART = 0.5
 
-ErrorName = Literal["bias", "lever-arm", "boresight", "common", "lidar-shift"]
+ErrorName = Literal["bias", "drift", "lever-arm", "boresight", "common", "lidar-shift"]
 
 
 @dataclass(frozen=True)
@@ -25,6 +25,8 @@ class SystematicError:
     """Three components that many measurements share, with a prior N(0, σ²) per axis, metres or radians.
 
     - bias: fix minus true position of the antenna, axes of geo, common to a session.
+    - drift: what the error of a session's fixes does beside its mean, as a factor of one shape in time (`mode`),
+      axes of geo (`adjust.drift`).
     - lever-arm: the antenna seen from the camera beyond the arm that the survey has applied, camera axes.
     - boresight: rotation vector from the true to the nominal camera axes, to which attitudes refer.
     - common: rotation vector that all recorded attitudes share, axes of geo (compass, tilt of a gimbal). Its prior
@@ -35,6 +37,13 @@ class SystematicError:
     name: ErrorName
     sigma: tuple[float, float, float]
     session: int | None = None
+    mode: int | None = None
+
+    @property
+    def label(self) -> str:
+        """Name in products, one for each error."""
+        name = self.name if self.mode is None else f"{self.name} {self.mode + 1}"
+        return name if self.session is None else f"{name} of session {self.session + 1}"
 
 
 @dataclass(frozen=True)
@@ -46,9 +55,10 @@ class SystematicErrors:
     def __len__(self) -> int:
         return 3 * len(self.blocks)
 
-    def columns(self, name: ErrorName, session: int | None = None) -> slice | None:
+    def columns(self, name: ErrorName, session: int | None = None, mode: int | None = None) -> slice | None:
         """Return the place of an error in v; None if it is not among them."""
-        places = (i for i, block in enumerate(self.blocks) if (block.name, block.session) == (name, session))
+        wanted = (name, session, mode)
+        places = (i for i, block in enumerate(self.blocks) if (block.name, block.session, block.mode) == wanted)
         place = next(places, None)
         return None if place is None else slice(3 * place, 3 * place + 3)
 
@@ -60,12 +70,12 @@ class SystematicErrors:
     def estimates(self, vector: FloatArray, covariance: FloatArray) -> tuple[EstimatedError, ...]:
         """Return the values (p,) with the σ of their covariance (p, p), in metres and degrees.
 
-        The rotation that all attitudes share is not included.
+        The rotation that all attitudes share and the drift of the fixes are not included.
         """
         values, sigmas = vector.reshape(-1, 3), np.sqrt(np.diag(covariance)).reshape(-1, 3)
         estimates = []
         for block, value, sigma in zip(self.blocks, values, sigmas, strict=True):
-            if block.name == "common":
+            if block.name in ("common", "drift"):
                 continue
             is_angle, prior = block.name == "boresight", np.array(block.sigma)
             factor = float(np.degrees(1.0)) if is_angle else 1.0

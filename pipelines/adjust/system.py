@@ -25,7 +25,7 @@ from scipy.linalg import lu_factor, lu_solve
 from scipy.sparse import bsr_matrix, csr_matrix, diags
 
 from pipelines.adjust.state import State, SystematicErrors
-from pipelines.adjust.terms import At, CommonErrors, Slopes, Term
+from pipelines.adjust.terms import At, CommonErrors, Level, LocalFrame, Slopes, Term
 from pipelines.core.errors import ConvergenceError, DegenerateGeometryError
 from pipelines.core.types import FloatArray, IntArray, Vector3
 from pipelines.geometry.bundle import BundleInformation
@@ -44,6 +44,7 @@ _NEW_FACTOR = 0.6  # a step that leaves more of the last change of the residuals
 _CHUNK = 32  # groups of rows whose covariances are computed together
 _EQUILIBRATIONS = 8
 _OPEN = 1e-13  # singular value of the equilibrated Schur complement over the largest
+_FRAME_RIDGE = 1e-12  # of the diagonal, where no term fixes the similarity of the cameras themselves
 _UNSEEN = 10.0  # times the bundle's loosest σ, at which a camera is frozen that nothing observes
 _ADVICE = "Fixes and control points do not determine the similarity. Add at least three control points."
 
@@ -88,13 +89,21 @@ class Problem:
         own = bundle.sums.poses.diagonal() * bundle.unit**2
         weak = own < bundle.loosest_sigma_m**-2
         prior = diags(weak * (_UNSEEN * bundle.unit * bundle.loosest_sigma_m) ** -2.0).tobsr((6, 6))
-        return (bundle.sums.poses + prior).tobsr((6, 6))
+        return (self._images + prior).tobsr((6, 6))
+
+    @cached_property
+    def _images(self) -> bsr_matrix:
+        """Information (6 n, 6 n) of the image observations, regular also where the border alone has a frame."""
+        poses = self.bundle.sums.poses
+        if self.term(LocalFrame.kind) is None:
+            return poses
+        return (poses + diags(_FRAME_RIDGE * poses.diagonal()).tobsr((6, 6))).tobsr((6, 6))
 
     @cached_property
     def of_rounding(self) -> FloatArray:
         """Information (7, 7) on a similarity of the whole in `poses`, which should be zero: ridge and rounding."""
         modes = self.bundle.similarity_modes
-        return np.asarray(modes.T @ (self.bundle.sums.poses @ modes))
+        return np.asarray(modes.T @ (self._images @ modes))
 
     def at(self, state: State) -> At:
         poses, turn = state.poses(self.base), skew(state.correction[:, :3])
@@ -111,7 +120,7 @@ class Problem:
         """Return a state of a problem with other systematic errors, with those that this one has as well."""
         values = np.zeros(len(self.errors))
         for block in self.errors.blocks:
-            here, there = (each.columns(block.name, block.session) for each in (self.errors, errors))
+            here, there = (each.columns(block.name, block.session, block.mode) for each in (self.errors, errors))
             if here is not None and there is not None:
                 values[here] = state.errors[there]
         return replace(state, errors=values)
@@ -426,6 +435,6 @@ def posterior_weights(residuals: Residuals) -> dict[str, FloatArray]:
     weights = robust_weights(residuals)
     for kind, rows in residuals.items():
         weights[kind] = weights[kind] / NOISE_WEIGHT[rows.shape[1]]
-        if kind == CommonErrors.kind:
+        if kind in (CommonErrors.kind, Level.kind):
             weights[kind] = np.minimum(weights[kind], 1.0)
     return weights

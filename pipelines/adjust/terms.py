@@ -8,7 +8,7 @@ cameras contain it (`adjust.system`). A new kind of measurement is one subclass 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
@@ -84,34 +84,40 @@ class Fixes(Term):
     position_in_geo: FloatArray  # (F, 3) metres
     root_information: FloatArray  # (F, 3, 3) of the fixes' own errors, in 1/m
     session: IntArray  # (F,) session of each fix, whose common error they share
+    # (F, K) shapes in time of the drift of each session, for a factor of 1; without drift it is not read
+    drift: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+
+    def shares(self, errors: SystematicErrors) -> FloatArray:
+        """Return how far each fix has each systematic error (F, B): its session's bias, and shapes of its drift."""
+        shares = np.zeros((len(self), len(errors.blocks)))
+        for column, block in enumerate(errors.blocks):
+            if block.name == "bias":
+                shares[:, column] = self.session == block.session
+            elif block.name == "drift" and block.mode is not None:
+                shares[:, column] = np.where(self.session == block.session, self.drift[:, block.mode], 0.0)
+        return shares
 
     def residuals(self, at: At) -> FloatArray:
-        """Return S(c_i) + lever arm + bias − C_i (F, 3) in metres."""
+        """Return S(c_i) + lever arm + bias + drift − C_i (F, 3) in metres."""
         predicted = at.geo_from_model.apply(at.center[self.camera])
         arm = at.errors.value(at.vector, "lever-arm")
         if arm is not None:
             predicted = predicted + at.geo_from_cam(self.camera) @ arm
-        for session in np.unique(self.session):
-            columns = at.errors.columns("bias", int(session))
-            if columns is not None:
-                predicted[self.session == session] += at.vector[columns]
+        if len(at.errors):
+            predicted = predicted + self.shares(at.errors) @ at.vector.reshape(-1, 3)
         return predicted - self.position_in_geo
 
     def slopes(self, at: At) -> Slopes:
         count, similarity = len(self), at.geo_from_model
         by_pose = np.zeros((count, 3, 6))
         by_pose[:, :, 3:] = similarity.scale * similarity.rotation
-        by_errors = np.zeros((count, 3, len(at.vector)))
+        by_errors = np.einsum("fb,ij->fibj", self.shares(at.errors), np.eye(3)).reshape(count, 3, len(at.vector))
         arm, columns = at.errors.value(at.vector, "lever-arm"), at.errors.columns("lever-arm")
         if arm is not None and columns is not None:
             in_model = np.swapaxes(at.cam_from_model[self.camera], 1, 2) @ arm
             turned = similarity.rotation @ -skew(in_model)
             by_pose[:, :, :3] = turned @ at.turn_by_correction[self.camera]
             by_errors[:, :, columns] = at.geo_from_cam(self.camera)
-        for session in np.unique(self.session):
-            columns = at.errors.columns("bias", int(session))
-            if columns is not None:
-                by_errors[self.session == session, :, columns] = np.eye(3)
         no_lens = np.zeros((count, 3, len(at.lens)))
         return Slopes(self.residuals(at), np.arange(count), self.camera, by_pose, no_lens, by_errors)
 
@@ -316,6 +322,55 @@ class Planes(Term):
             by_errors,
             similarity.scale * normal @ similarity.rotation @ moved,
         )
+
+
+@dataclass(frozen=True)
+class Level(Term):
+    """Upward direction of the whole, from what is known of the photographs (`adjust.level`): one row.
+
+    Its heading is open. The scene turns with the mean of the SfM points.
+    """
+
+    kind: ClassVar[str] = "level"
+    dimension: ClassVar[int] = 2
+
+    up_in_model: FloatArray  # (1, 3) unit vector
+    axes_in_model: FloatArray  # (1, 2, 3) unit vectors square to it, about which it turns
+    root_information: FloatArray  # (1, 2, 2), in 1/rad
+
+    def residuals(self, at: At) -> FloatArray:
+        """Return 2 tan(θ/2) (1, 2) along the axes, θ being the turn from the known to the solved vertical."""
+        return self._compared(at)[0]
+
+    def slopes(self, at: At) -> Slopes:
+        residual, across, solved, along = self._compared(at)
+        known = self.up_in_model
+        # A rotation δω of the whole turns the solved vertical v, seen in `model`, by −δω × v.
+        by_cross = self.axes_in_model @ (
+            -(along[:, None, None] * np.eye(3)) + solved[:, :, None] * known[:, None, :]
+        )
+        scale = 2.0 / (1.0 + along)[:, None, None]
+        by_turn = scale * by_cross - residual[:, :, None] * (scale[:, 0] / 2 * across)[:, None, :]
+        none = np.zeros(0, dtype=np.int64)
+        by_similarity = np.zeros((1, 2, 7))
+        by_similarity[:, :, 1:4] = by_turn
+        return Slopes(
+            residual,
+            none,
+            none,
+            np.zeros((0, 2, 6)),
+            np.zeros((1, 2, len(at.lens))),
+            np.zeros((1, 2, len(at.vector))),
+            by_similarity,
+        )
+
+    def _compared(self, at: At) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return residual (1, 2), cross product (1, 3) and solved vertical (1, 3) in `model`, cosine (1,)."""
+        solved = at.geo_from_model.rotation[2][None, :]
+        across = np.cross(self.up_in_model, solved)
+        along = np.maximum((self.up_in_model * solved).sum(axis=1), -1.0 + 1e-9)
+        turned = np.einsum("mak,mk->ma", self.axes_in_model, across)
+        return 2.0 * turned / (1.0 + along)[:, None], across, solved, along
 
 
 @dataclass(frozen=True)

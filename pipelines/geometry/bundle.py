@@ -144,7 +144,10 @@ def similarity_modes(cam_center_in_world: FloatArray) -> FloatArray:
 
 
 _CHUNK = 2**19  # observations that are linearised together
-_RIDGE = 1e-12  # small: what it adds to each point fixes the similarity of the whole as well
+_RIDGE = 1e-14  # small: what it adds to each point fixes the similarity of the whole as well
+_SHARED_GRIDS = ((3, 2), (5, 4), (8, 6))  # columns and rows of the cells of a photograph
+_IN_A_CELL = 20.0  # least mean number of observations: fewer show chance, and share little
+_BY_CHANCE = 5.0  # σ of the factor of independent errors, which is 1
 # A camera with few observations has a prior σ of a tenth of its distance from the scene.
 _LOOSEST_RELATIVE_SIGMA = 0.1
 # Means of the weight w and of w r²/2 under Gaussian noise of σ = 1, where r²/2 is exponentially distributed. Robust
@@ -258,15 +261,45 @@ def bundle_information(network: Network) -> BundleInformation:
     length = np.linalg.norm(residual, axis=1)
     weight = cauchy_weight((length / max(rayleigh_sigma(length), 1e-9)) ** 2, 2)
     variance = float((weight[:, None] * residual**2).sum() / (_MEAN_WEIGHTED_SQUARE * redundancy))
-    # A computed model has no residuals at all, which is no infinite information.
+    # A computed model has no residuals at all, which is no infinite information; rounding has no pattern of a lens.
+    has_noise = variance > LEAST_SIGMA_PX**2
     variance = max(variance, LEAST_SIGMA_PX**2)
+    shared = variance * (shared_error_factor(network, weight[:, None] * residual) if has_noise else 1.0)
     return BundleInformation(
-        sums=eliminate_points(network, np.sqrt(weight / (_MEAN_WEIGHT * variance))),
+        sums=eliminate_points(network, np.sqrt(weight / (_MEAN_WEIGHT * shared))),
         similarity_modes=similarity_modes(network.cam_center_in_world).reshape(-1, 7),
         unit=np.tile([1 / typical_m] * 3 + [1.0] * 3, n),  # rotations in metres at the scene, so that units agree
         loosest_sigma_m=_LOOSEST_RELATIVE_SIGMA * typical_m,
         sigma_px=float(np.sqrt(variance)),
     )
+
+
+def shared_error_factor(network: Network, residual: FloatArray) -> float:
+    """Return the factor by which errors that neighbours in a photograph share enlarge the variance of a bundle.
+
+    A lens that its model cannot express, or a rolling shutter, moves all observations of a part of a photograph
+    alike: they do not average out as independent ones do. The factor is the sum of the squared sums of the
+    residuals (M, 2) in the cells of a grid over that of their squares (the design effect of clustered samples), of
+    the grid with the largest; 1 where chance explains it. The pose of a photograph has absorbed six of the sums.
+    """
+    factor = 1.0
+    size = np.array([(camera.width, camera.height) for camera in network.cameras.values()], dtype=np.float64)
+    place = dict(zip(network.cameras, range(len(size)), strict=True))
+    of_image = size[[place[key] for key in network.camera_id.tolist()]]
+    part = np.clip(network.obs_xy_px / of_image[network.obs_image], 0.0, 1.0 - 1e-9)
+    total = float((residual**2).sum())
+    for columns, rows in _SHARED_GRIDS:
+        cell = (network.obs_image * columns + (part[:, 0] * columns).astype(np.int64)) * rows
+        cell = cell + (part[:, 1] * rows).astype(np.int64)
+        count = 2 * int((np.bincount(cell) > 0).sum())
+        free = count - 6 * int((np.bincount(network.obs_image) > 0).sum())
+        if free < count / 3 or total <= 0 or 2 * len(residual) < _IN_A_CELL * count:
+            continue
+        sums = sum(float((np.bincount(cell, values) ** 2).sum()) for values in residual.T)
+        effect = sums / total * count / free
+        if effect > 1.0 + _BY_CHANCE * (2.0 / free) ** 0.5:
+            factor = max(factor, effect)
+    return factor
 
 
 def eliminate_points(

@@ -9,7 +9,7 @@ import numpy as np
 
 from pipelines.core.products import Covariance3, Product, Remark
 from pipelines.core.types import Matrix3, Matrix34, Vector3
-from pipelines.survey.survey import Survey, SurveyedPoint, SurveyImage
+from pipelines.survey.survey import FixSession, Survey, SurveyedPoint, SurveyImage
 
 Alignment = Literal["none", "shift", "similarity"]
 
@@ -172,7 +172,17 @@ class LidarReport(Product):
     assumptions: tuple[Remark, ...] = ()
 
 
-Group = Literal["fixes", "control points", "marks", "attitudes", "tie points"]
+Group = Literal[
+    "fixes",
+    "horizontal drift",
+    "vertical drift",
+    "horizontal common error",
+    "vertical common error",
+    "control points",
+    "marks",
+    "attitudes",
+    "tie points",
+]
 SigmaSource = Literal["stated", "default"]
 
 
@@ -209,6 +219,7 @@ def with_variance_factors(survey: Survey, applied: dict[Group, float]) -> Survey
     return survey.model_copy(
         update={
             "images": tuple(_image(image, applied) for image in survey.images),
+            "sessions": tuple(_session(session, applied) for session in survey.sessions),
             "control_points": tuple(
                 _point(point, applied.get("control points", 1.0), of_marks) for point in survey.control_points
             ),
@@ -225,6 +236,19 @@ def _image(image: SurveyImage, applied: dict[Group, float]) -> SurveyImage:
         sigma_deg = attitude.sigma_deg * applied.get("attitudes", 1.0) ** 0.5
         attitude = attitude.model_copy(update={"sigma_deg": sigma_deg})
     return image.model_copy(update={"fix": fix, "attitude": attitude})
+
+
+def _session(session: FixSession, applied: dict[Group, float]) -> FixSession:
+    def scaled(sigma_m: Vector3, horizontal: Group, vertical: Group) -> Vector3:
+        across, up = (applied.get(group, 1.0) ** 0.5 for group in (horizontal, vertical))
+        return (across * sigma_m[0], across * sigma_m[1], up * sigma_m[2])
+
+    return session.model_copy(
+        update={
+            "sigma_common_m": scaled(session.sigma_common_m, "horizontal common error", "vertical common error"),
+            "sigma_drift_m": scaled(session.drift_m, "horizontal drift", "vertical drift"),
+        }
+    )
 
 
 def _point(point: SurveyedPoint, of_survey: float, of_marks: float) -> SurveyedPoint:

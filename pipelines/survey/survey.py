@@ -24,6 +24,11 @@ from pipelines.geodesy.vertical import VerticalDatum
 LOCAL_FRAME = "local-frame"  # code of the caution that a survey has no place on Earth
 RigParameter = Literal["time-offset", "boresight", "lever-arm"]
 RIG_PARAMETERS: tuple[RigParameter, ...] = get_args(RigParameter)
+# σ of the drift of positions within a session, horizontal and vertical in metres, by kind of receiver, and its time
+# constant: satellites' orbits and clocks, atmosphere and reflections change within minutes. With corrections from a
+# base station next to nothing is left of it.
+DRIFT_SIGMA_M = {"RTK float": (0.2, 0.4), "single-frequency": (1.5, 3.0), "unknown receiver": (2.0, 4.0)}
+DRIFT_TIME_S = 300.0
 _COMPONENTS: dict[RigParameter, int] = {"time-offset": 1, "boresight": 3, "lever-arm": 3}
 
 
@@ -195,12 +200,25 @@ class FixSession(Product):
     `sigma_common_m` is its σ east, north, up, 0 for none along that axis; `receiver` is one of
     `ingest.flight_record.RECEIVERS`. `sigma_datum_m` is the part east, north, up that the reference system causes:
     a vertical datum that was assumed, a doubtful zero of heights, a transformation of limited accuracy.
+    `sigma_drift_m` is the σ, by axis, of a further error that neighbouring fixes share, whose correlation decays with
+    a time constant; its mean over the session is in the first. None: that of the kind of receiver
+    (`DRIFT_SIGMA_M`).
     """
 
     receiver: str
     sigma_common_m: tuple[_NotNegative, _NotNegative, _NotNegative]
     sigma_datum_m: tuple[_NotNegative, _NotNegative, _NotNegative] = (0.0, 0.0, 0.0)
     sigma_source: Literal["file", "option", "default"]
+    sigma_drift_m: tuple[_NotNegative, _NotNegative, _NotNegative] | None = None
+    drift_time_s: float = Field(DRIFT_TIME_S, gt=0)
+
+    @property
+    def drift_m(self) -> Vector3:
+        """σ of the drift by axis, as stated, or as of the kind of receiver."""
+        if self.sigma_drift_m is not None:
+            return self.sigma_drift_m
+        horizontal_m, vertical_m = DRIFT_SIGMA_M.get(self.receiver, (0.0, 0.0))
+        return (horizontal_m, horizontal_m, vertical_m)
 
 
 class UsedTransformation(Product):
@@ -386,6 +404,11 @@ class Survey(Product):
     def largest_photograph_px(self) -> tuple[int, int]:
         largest = max(self.cameras, key=lambda camera: camera.width * camera.height)
         return largest.width, largest.height
+
+    @property
+    def drifts(self) -> bool:
+        """Whether the fixes of any session drift."""
+        return any(any(session.drift_m) for session in self.sessions)
 
     def names(self, split: Literal["train", "test"]) -> tuple[str, ...]:
         """Return the names of the images in a split, in order."""

@@ -96,11 +96,11 @@ class AdjustedScene:
             if columns is not None:
                 unit = np.radians(1.0) if estimate.unit == "deg" else 1.0
                 value[columns], sigma[columns] = unit * np.array(estimate.value), unit * np.array(estimate.sigma)
-        # The estimates leave out the rotation that all attitudes share.
-        columns = errors.columns("common")
-        for measurement in self.adjustment.measurements:
-            if columns is not None and (measurement.kind, measurement.name) == ("systematic error", "common"):
-                value[columns] = measurement.residual
+        # The estimates leave out the rotation that all attitudes share, and the drift of the fixes.
+        solved = {one.name: one.residual for one in self.adjustment.measurements if one.kind == "systematic error"}
+        for row, block in enumerate(errors.blocks):
+            if block.name in ("common", "drift") and block.label in solved:
+                value[3 * row : 3 * row + 3] = solved[block.label]
         return value, sigma
 
     def require_determined(self, problem: Problem) -> None:

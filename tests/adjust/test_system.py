@@ -19,6 +19,7 @@ from pipelines.adjust.terms import (
     ControlPoints,
     Distances,
     Fixes,
+    Level,
     MarkedTerm,
     Planes,
     Term,
@@ -178,6 +179,9 @@ def at_a_random_state(kind: str, seed: int) -> tuple[Problem, State, Term]:
         rng.normal(0, 0.3, len(ERRORS)),
     )
     of_kind = measured(EXACT, GEO_FROM_MODEL, rng, 1.0) if kind != CommonErrors.kind else {}
+    if kind == Level.kind:  # half a radian off
+        up = exp_so3([0.3, -0.4, 0.1]) @ GEO_FROM_MODEL.rotation[2]
+        of_kind = {kind: Level(up[None], np.linalg.svd(up[None])[2][None, 1:], np.eye(2)[None] / 0.05)}
     problem = problem_of(EXACT, tuple(term for name, term in of_kind.items() if name == kind), ERRORS)
     term = problem.term(kind)
     assert term is not None
@@ -192,7 +196,7 @@ def at_a_random_state(kind: str, seed: int) -> tuple[Problem, State, Term]:
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(
-    "kind", [t.kind for t in (Fixes, ControlPoints, Distances, Attitudes, Planes, CommonErrors)]
+    "kind", [t.kind for t in (Fixes, ControlPoints, Distances, Attitudes, Planes, Level, CommonErrors)]
 )
 def test_slopes_are_the_derivatives_of_the_residuals(kind: str, seed: int) -> None:
     problem, state, term = at_a_random_state(kind, seed)

@@ -66,17 +66,17 @@ class TensorTerm(ABC):
 
 @dataclass(frozen=True)
 class FixTerm(TensorTerm):
-    """L_abs, `adjust.terms.Fixes`, in float64; `bias` (F, B) is 1 where a block of errors is the session's."""
+    """L_abs, `adjust.terms.Fixes`, in float64; `shares` (F, B) as of its function of that name."""
 
     kind: ClassVar[str] = "absolute"
 
     camera: Tensor
     position_in_geo: Tensor
     root_information: Tensor
-    bias: Tensor
+    shares: Tensor
 
     def residuals(self, at: Estimate) -> Tensor:
-        predicted = at.geo_from_model.apply(at.center[self.camera]) + self.bias @ at.vector.view(-1, 3)
+        predicted = at.geo_from_model.apply(at.center[self.camera]) + self.shares @ at.vector.view(-1, 3)
         arm = at.error("lever-arm")
         if arm is not None:
             predicted = predicted + at.geo_from_cam(self.camera) @ arm
@@ -194,20 +194,40 @@ class PlaneTerm(TensorTerm):
         return (self.normal_in_geo * apart).sum(dim=1, keepdim=True)
 
 
+@dataclass(frozen=True)
+class LevelTerm(TensorTerm):
+    """Upward direction of the whole, `adjust.terms.Level`, in float64."""
+
+    kind: ClassVar[str] = "level"
+    dimension: ClassVar[int] = 2
+    in_metres: ClassVar[bool] = False
+
+    up_in_model: Tensor
+    axes_in_model: Tensor
+    root_information: Tensor
+
+    def residuals(self, at: Estimate) -> Tensor:
+        solved = at.geo_from_model.rotation[2].expand_as(self.up_in_model)
+        along = (self.up_in_model * solved).sum(dim=1)
+        across = torch.linalg.cross(self.up_in_model, solved)
+        turned: Tensor = (self.axes_in_model @ across[:, :, None])[:, :, 0]
+        return 2.0 * turned / (1.0 + along)[:, None]
+
+
 def tensor_term(term: adjustment.Term, errors: SystematicErrors) -> TensorTerm:
     """Return a term of the adjustment as tensors, given the systematic errors of its problem."""
     match term:
         case adjustment.Fixes():
-            blocks = [(block.name, block.session) for block in errors.blocks]
-            bias = [[block == ("bias", session) for block in blocks] for session in term.session.tolist()]
-            of_errors = torch.tensor(bias, dtype=torch.float64).view(len(term), len(blocks))
-            return FixTerm(**_tensors(term, "camera", "position_in_geo", "root_information"), bias=of_errors)
+            shares = torch.from_numpy(term.shares(errors))
+            return FixTerm(**_tensors(term, "camera", "position_in_geo", "root_information"), shares=shares)
         case adjustment.ControlPoints():
             return ControlTerm(**_tensors(term, *(field.name for field in fields(ControlTerm))))
         case adjustment.Distances():
             return KnownDistanceTerm(**_tensors(term, *(field.name for field in fields(KnownDistanceTerm))))
         case adjustment.Attitudes():
             return AttitudeTerm(**_tensors(term, *(field.name for field in fields(AttitudeTerm))))
+        case adjustment.Level():
+            return LevelTerm(**_tensors(term, *(field.name for field in fields(LevelTerm))))
         case adjustment.Planes():
             return PlaneTerm(**_tensors(term, *(field.name for field in fields(PlaneTerm))))
     raise TypeError(f"{term.kind} has no tensors")

@@ -12,7 +12,8 @@ from torch import Tensor
 from pipelines.adjust.measurements import problem_of
 from pipelines.adjust.state import State
 from pipelines.adjust.system import Problem
-from pipelines.adjust.terms import Planes, Term
+from pipelines.adjust.terms import Level, Planes, Term
+from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import perturbation
 from pipelines.survey.scene import Scene, initial_scene
 from pipelines.survey.survey import KnownDistance
@@ -68,6 +69,16 @@ def residuals_of(problem: Problem, term: Term, state: State) -> Callable[[Tensor
         return tensors.residuals(Estimate(*cameras.moved(), similarity, problem.errors, errors, lens))
 
     return residuals
+
+
+def test_level_is_that_of_the_adjustment(every: tuple[Scene, Problem]) -> None:
+    scene, problem = every
+    up = exp_so3([0.2, -0.3, 0.1]) @ np.array([0.0, 0.0, 1.0])
+    level = Level(up[None], np.linalg.svd(up[None])[2][None, 1:], np.eye(2)[None] / 0.05)
+    state = drawn(scene, problem, 0)
+    arrays = (state.correction, state.lens, state.errors)
+    found = residuals_of(problem, level, state)(*(torch.from_numpy(array) for array in arrays))
+    np.testing.assert_allclose(found.detach().numpy(), level.residuals(problem.at(state)), rtol=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(4))
