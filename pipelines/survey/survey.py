@@ -200,8 +200,8 @@ class FixSession(Product):
     `sigma_common_m` is its σ east, north, up, 0 for none along that axis; `receiver` is one of
     `ingest.flight_record.RECEIVERS`. `sigma_datum_m` is the part east, north, up that the reference system causes:
     a vertical datum that was assumed, a doubtful zero of heights, a transformation of limited accuracy.
-    `sigma_drift_m` is the σ, by axis, of a further error that neighbouring fixes share, whose correlation decays with
-    a time constant; its mean over the session is in the first. None: that of the kind of receiver
+    `sigma_drift_m` is the σ, by axis, of a further error that neighbouring fixes share, whose correlation decays
+    with a time constant; its mean over the session is in the first. None: that of the kind of receiver
     (`DRIFT_SIGMA_M`).
     """
 
