@@ -77,7 +77,7 @@ def projection_ewa_3dgs_packed_bwd(
     with torch.enable_grad():
         leaves = [tensor.detach().requires_grad_() for tensor in (means, quats, scales, viewmats)]
         _, *outputs, factor = _projected(
-            *leaves[:3], None, leaves[3], Ks, width, height, eps2d, 0.0, math.inf, 0.0,
+            leaves[0], leaves[1], leaves[2], None, leaves[3], Ks, width, height, eps2d, 0.0, math.inf, 0.0,
             compensations is not None, camera_model,
         )  # fmt: skip
         outputs += [] if compensations is None else [factor]
@@ -221,7 +221,7 @@ def rasterize_to_pixels_3dgs_bwd(
     assert backgrounds is None and not absolute
     with torch.enable_grad():
         leaves = [tensor.detach().requires_grad_() for tensor in (means2d, conics, colors, opacities)]
-        images = _blended(*leaves, width, height, offsets, ids)
+        images = _blended(leaves[0], leaves[1], leaves[2], leaves[3], width, height, offsets, ids)
         incoming = [
             gradient.reshape(image.shape) for gradient, image in zip((v_colors, v_alphas), images, strict=True)
         ]

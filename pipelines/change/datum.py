@@ -120,11 +120,13 @@ def _of_base(session: FixSession) -> FloatArray:
 def _of_system(survey: Survey) -> FloatArray:
     """Return the variance (3,) that a survey has of its reference system, but for a doubtful zero of heights."""
     if survey.control_points:
-        return np.square(survey.sigma_datum_m)
-    sigma_m = np.max([session.sigma_datum_m for session in survey.sessions] or [(0.0, 0.0, 0.0)], axis=0)
+        return np.asarray(survey.sigma_datum_m) ** 2
+    sigma_m: FloatArray = np.max(
+        [session.sigma_datum_m for session in survey.sessions] or [(0.0, 0.0, 0.0)], axis=0
+    )
     if any(image.fix is not None and image.fix.sigma_zero_m for image in survey.images):
         sigma_m[2] = 0.0
-    return np.square(sigma_m)
+    return sigma_m**2
 
 
 def _share_of_control(survey: Survey) -> FloatArray:

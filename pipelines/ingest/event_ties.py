@@ -135,7 +135,7 @@ def rows_by_order(table: PoseTable, photos: Sequence[Photo], remarks: Remarks) -
         f"within {fit.worst_s:.2f} s; the next best order would tie {fit.runner_up} photographs.",
     )
     rows = table.take(fit.row[tied])
-    return replace(rows, names=tuple(photos[at].name for at in tied))
+    return replace(rows, names=tuple(photos[at].name for at in tied.tolist()))
 
 
 def _refusal(table: PoseTable, photos: Sequence[Photo], why: str) -> InputError:
