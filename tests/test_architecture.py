@@ -80,8 +80,6 @@ HOMES: dict[str, tuple[str, ...]] = {
     "plyfile": ("pipelines.formats",),
     "defusedxml": ("pipelines.formats",),
     "rosbags": ("pipelines.formats",),
-    "skimage": ("pipelines.surface.tsdf",),
-    "pyfqmr": ("pipelines.surface.mesh",),
     "trimesh": ("pipelines.surface.mesh",),
     "embreex": ("pipelines.simulate.mesh",),
     "matplotlib": ("pipelines.report.plots",),

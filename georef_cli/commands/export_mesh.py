@@ -6,9 +6,9 @@ command = StageCommand(
     "export-mesh",
     """Write the surface as a triangle mesh with texture (PLY, glTF, OBJ).
 
-    The depth maps of the training views are averaged on a grid of voxels, and colours are those of the photographs.
-    mesh.ply has coloured vertices, mesh.glb a texture. FILE.georef.json beside each states its place on Earth, its
-    accuracy, and the error of the simplification.
+    The surface goes through the points of the cloud and closes narrow gaps between them. Colours are those of the
+    photographs: mesh.ply has coloured vertices with their σ, mesh.glb a texture. FILE.georef.json beside each
+    states its place on Earth, its accuracy, the error of the simplification and the holes.
 
     \b
     Examples:

@@ -13,7 +13,7 @@ EXTRAS: dict[Extra, tuple[str, tuple[str, ...]]] = {
     "bags": ("a ROS bag (--bag, georef inspect)", ("rosbags",)),
     "cluster": ("a cluster (--cluster, georef cluster)", ("distributed", "cryptography")),
     "heif": ("HEIC photographs", ("pillow-heif",)),
-    "mesh": ("georef export-mesh", ("pyfqmr", "scikit-image", "trimesh")),
+    "mesh": ("georef export-mesh", ("trimesh",)),
     "reference": ("M3C2 (georef evaluate --reference)", ("py4dgeo",)),
     "simulator": ("georef simulate", ("embreex",)),
     "terrain": ("the ground (dtm.tif, classes of the cloud)", ("cloth-simulation-filter",)),
@@ -33,11 +33,7 @@ class Part:
 
 def module_of(package: str) -> str:
     """Return the module that a package of an extra installs."""
-    return {
-        "cloth-simulation-filter": "CSF",
-        "pillow-heif": "pillow_heif",
-        "scikit-image": "skimage",
-    }.get(package, package)
+    return {"cloth-simulation-filter": "CSF", "pillow-heif": "pillow_heif"}.get(package, package)
 
 
 def installing(extra: str) -> str:

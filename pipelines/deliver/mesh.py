@@ -1,35 +1,57 @@
 """Stage `export-mesh`: the surface of the trained model as a triangle mesh with the colours of the photographs.
 
-Reads the trained model, the survey and the photographs. Writes `mesh/mesh.ply` with coloured vertices,
+Reads the trained model, the survey and the photographs. Writes `mesh/mesh.ply` with coloured vertices and their σ,
 `mesh/mesh.glb` with a texture, on request `mesh.obj` and, in a CRS, `mesh_crs.ply`; a sidecar beside each.
 """
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from pipelines.adjust.accuracy_grid import AccuracyGrid
 from pipelines.core.errors import DegenerateGeometryError, ResourceError
+from pipelines.core.extras import require
 from pipelines.core.machine import free_main_memory_bytes
+from pipelines.core.products import union
+from pipelines.core.progress import Progress
 from pipelines.core.stages import MESH, MESH_GLB
-from pipelines.core.types import BoolArray, ByteArray, FloatArray
+from pipelines.core.types import ByteArray, FloatArray, joined_rows, rows_of, vector3
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import ExportMeshOptions
 from pipelines.deliver.placement import place
-from pipelines.deliver.surface import surface_views
-from pipelines.formats.georef_sidecar import MeshCrsSidecar, MeshFigures, MeshSidecar, write_sidecar
+from pipelines.deliver.surface import predicted_sigma, surface_views, without_sigma
+from pipelines.formats.georef_sidecar import MeshCrsSidecar, MeshFigures, MeshHole, MeshSidecar, write_sidecar
 from pipelines.formats.mesh_files import write_mesh_glb, write_mesh_obj, write_mesh_ply
-from pipelines.surface.fusion import COARSEST, pixel_on_surface_m
-from pipelines.surface.mesh import closed, surface_mesh, vertex_normals, without_islands
+from pipelines.geometry.similarity import Similarity
+from pipelines.surface.fusion import fused_squares, fusion_settings, pixel_on_surface_m
+from pipelines.surface.mesh import (
+    Hole,
+    RawMesh,
+    closed,
+    compact,
+    distances,
+    holes_of,
+    open_share,
+    vertex_normals,
+    without_islands,
+)
+from pipelines.surface.poisson import MeasuredPoints, closed_gap_m, poisson_mesh, simplified, surface_sigma_at
+from pipelines.surface.surface_views import SurfaceViews
 from pipelines.surface.texture import TexturedMesh, colours_of, textured
-from pipelines.surface.tsdf import GridSettings, RawMesh, occupied_cells
-from pipelines.survey.area import area_of
+from pipelines.survey.area import Area, area_of
 from pipelines.survey.headline import headline_of
 from pipelines.survey.target_crs import target_crs
-from pipelines.survey.trained_survey import load_trained
+from pipelines.survey.trained_survey import TrainedSurvey, load_trained
 
 _BASE_VOXELS = 4.0  # of the base of a watertight mesh, below its lowest vertex
-# Measured on a simulated flight: the mesh with its texture, its parts and the copies that welding makes.
-_FIXED_BYTES, _CELL_BYTES = 850 << 20, 600
+_AROUND = 16.0  # spacings around the area: points there hold the surface at its rim
+_SAMPLE = 200_000  # vertices at most that are measured against the simplified mesh
+_LISTED = 100  # widest holes
+_LEAST_POINTS = 100
+# Measured on simulated flights: the mesh with its texture, its parts and the copies that are made of them.
+_FIXED_BYTES, _POINT_BYTES = 850 << 20, 2000
+SIGMA_COUNTS = "georeference, disagreement of the training views about the surface, distance from measured points"
 
 
 def run(stage: StageRun, options: ExportMeshOptions) -> Summary:
@@ -40,82 +62,174 @@ def run(stage: StageRun, options: ExportMeshOptions) -> Summary:
         ResourceError: the mesh does not fit into the memory.
         BackendUnavailableError: a library of the extra is missing.
     """
+    require("mesh")
     trained, progress = load_trained(stage.workspace), stage.progress
     headline, folder = headline_of(stage.workspace), stage.out
     placement = place(trained.model, trained.survey, trained.gaussians.means.numpy(), headline)
-    frame_from_model, geo_from_file = placement.file_from_model, placement.file_from_geo.inverse()
+    geo_from_file = placement.file_from_geo.inverse()
     target = None
     if options.crs is not None:
         middle = geo_from_file.apply(np.zeros((1, 3)))
         target = target_crs(options, trained.survey.origin, middle, trained.survey.vertical)
-    views = surface_views(stage, trained)
-    pixel_m = pixel_on_surface_m(views, trained.geo_from_model)
-    voxel_m = options.voxel or pixel_m
-    error_m = voxel_m / 2 if options.simplify_error is None else options.simplify_error
-    settings = GridSettings(voxel_m, pixel_m, COARSEST * pixel_m, options.min_views)
-    area = area_of(options, trained)
-
-    def inside(place_in_file: FloatArray) -> BoolArray:
-        return area.contains(geo_from_file.apply(place_in_file))
-
-    cells = occupied_cells(views, frame_from_model, settings, inside, progress)
-    _require_memory(len(cells), voxel_m)
-    simple = surface_mesh(
-        views, frame_from_model, settings, cells, error_m=error_m, inside=inside, progress=progress
-    )
-    if not len(simple.mesh.faces):
-        raise DegenerateGeometryError(
-            "no-surface-points",
-            f"No part of the surface has the same depth in {options.min_views} training views: too few "
-            "photographs overlap, or the training was too short. Add photographs, train longer, or "
-            "lower --min-views.",
-        )
-    mesh, islands = without_islands(simple.mesh, options.least_part)
-    surface_faces = len(mesh.faces)
+    views = surface_views(stage, trained, colours=True)
+    pixel_m, area = pixel_on_surface_m(views, trained.geo_from_model), area_of(options, trained)
+    points = _points(views, trained, area, placement.file_from_geo, options=options, progress=progress)
+    surface = _surface(points, area, geo_from_file, options=options, folder=folder, progress=progress)
+    mesh, surface_faces = surface.mesh, len(surface.mesh.faces)
     if options.watertight:
-        mesh, surface_faces = closed(mesh, _BASE_VOXELS * voxel_m)
-    rgb, _ = colours_of(mesh.vertices, vertex_normals(mesh), views, frame_from_model)
-    texel_m = max(voxel_m, pixel_m)
-    shown = textured(mesh, views, frame_from_model, texel_m, progress, surface_faces=surface_faces)
+        mesh, surface_faces = closed(mesh, _BASE_VOXELS * points.spacing_m)
+    grid, no_sigma = predicted_sigma(stage.workspace, trained)
+    sigma = _sigma(mesh, points, grid, geo_from_file)
+    rgb, _ = colours_of(mesh.vertices, vertex_normals(mesh), views, placement.file_from_model)
+    texel_m = max(points.spacing_m, pixel_m)
+    shown = textured(mesh, views, placement.file_from_model, texel_m, progress, surface_faces=surface_faces)
     views.close()
-    figures = MeshFigures(
-        voxel_m=voxel_m,
-        texel_m=shown.texel_m,
-        faces_before_simplification=simple.faces_before,
-        faces=len(mesh.faces),
-        rms_simplification_error_m=simple.rms_error_m,
-        largest_simplification_error_m=simple.largest_error_m,
-        watertight=options.watertight,
-    )
-    sidecar = MeshSidecar(**dict(placement.sidecar()), mesh=figures)
-    _write_in_frame(folder, mesh, rgb, shown, sidecar, obj=options.obj)
+    figures = surface.figures(points.spacing_m, shown.texel_m, mesh, watertight=options.watertight)
+    cautions = union(placement.cautions, without_sigma("The mesh states no σ of its vertices", no_sigma))
+    sidecar = MeshSidecar(**{**dict(placement.sidecar()), "cautions": cautions}, mesh=figures)
+    _write_in_frame(folder, mesh, rgb, sigma, shown=shown, sidecar=sidecar, obj=options.obj)
     if target is not None:
         xyz, path = target.xyz_from_geo(geo_from_file.apply(mesh.vertices)), folder / "mesh_crs.ply"
-        write_mesh_ply(path, xyz, mesh.faces, rgb, double=True)
+        write_mesh_ply(path, xyz, mesh.faces, rgb, double=True, sigma=sigma)
         bounds = [xyz.min(axis=0), xyz.max(axis=0)]
-        in_crs = target.sidecar(bounds, headline, None, placement.cautions)
-        write_sidecar(MeshCrsSidecar(**dict(in_crs), mesh=figures), path)
+        write_sidecar(MeshCrsSidecar(**dict(target.sidecar(bounds, headline, None, cautions)), mesh=figures), path)
     values = {
-        **figures.model_dump(),
+        **figures.model_dump(exclude={"widest_holes"}),
         "vertices": len(mesh.vertices),
         "area_ha": area.hectares,
-        "islands_left_out": islands,
+        "islands_left_out": surface.islands,
         "texture_px": len(shown.image),
         "crs": None if target is None else target.crs.name,
     }
     key = (
-        f"{len(mesh.faces)} faces of {simple.faces_before}, voxels of {voxel_m:.3f} m, simplified by "
-        f"{simple.rms_error_m:.3f} m RMS, {simple.largest_error_m:.3f} m at most"
+        f"{len(mesh.faces)} faces of {surface.faces_before}, voxels of {points.spacing_m:.3f} m, simplified by "
+        f"{surface.rms_error_m:.3f} m RMS, {surface.largest_error_m:.3f} m at most; {surface.holes_text}"
     )
-    return Summary(key, values, cautions=placement.cautions)
+    return Summary(key, values, cautions=cautions)
+
+
+def _points(
+    views: SurfaceViews,
+    trained: TrainedSurvey,
+    area: Area,
+    file_from_geo: Similarity,
+    *,
+    options: ExportMeshOptions,
+    progress: Progress,
+) -> MeasuredPoints:
+    """Return the fused points in and around the area, in the frame of the file; errors as of `run`."""
+    settings = fusion_settings(views, trained.geo_from_model, options.min_views, options.voxel)
+    west, south, east, north = area.polygon.buffer(_AROUND * settings.spacing_m).bounds
+    parts = []
+    for square in fused_squares(views, trained.geo_from_model, settings, progress):
+        plan = square.position[:, :2]
+        near = ((plan >= (west, south)) & (plan <= (east, north))).all(axis=1)
+        # Points whose normals cancel say nothing of the side.
+        parts.append(rows_of(square, np.flatnonzero(near & np.isfinite(square.normal).all(axis=1))))
+    if sum(len(part.position) for part in parts) < _LEAST_POINTS:
+        raise _no_surface(options)
+    cloud = joined_rows(parts)
+    _require_memory(len(cloud.position), settings.spacing_m)
+    position, normal = file_from_geo.apply(cloud.position), cloud.normal @ file_from_geo.rotation.T
+    return MeasuredPoints(position, normal, cloud.sigma_m, settings.spacing_m)
+
+
+def _no_surface(options: ExportMeshOptions) -> DegenerateGeometryError:
+    return DegenerateGeometryError(
+        "no-surface-points",
+        f"No part of the surface has the same depth in {options.min_views} training views: too few photographs "
+        "overlap, or the training was too short. Add photographs, train longer, or lower --min-views.",
+    )
+
+
+@dataclass(frozen=True)
+class _Surface:
+    """Simplified mesh, and what became of it on the way."""
+
+    mesh: RawMesh
+    faces_before: int
+    rms_error_m: float
+    largest_error_m: float
+    islands: int
+    holes: list[Hole]
+
+    def figures(self, voxel_m: float, texel_m: float, mesh: RawMesh, *, watertight: bool) -> MeshFigures:
+        """Return the figures of the mesh that is written."""
+        listed = self.holes[:_LISTED]
+        return MeshFigures(
+            voxel_m=voxel_m,
+            texel_m=texel_m,
+            faces_before_simplification=self.faces_before,
+            faces=len(mesh.faces),
+            rms_simplification_error_m=self.rms_error_m,
+            largest_simplification_error_m=self.largest_error_m,
+            closed_gap_m=closed_gap_m(voxel_m),
+            open_edges=open_share(mesh),
+            holes=len(self.holes),
+            widest_holes=tuple(MeshHole(at=vector3(hole.middle), width_m=hole.width_m) for hole in listed),
+            watertight=watertight,
+        )
+
+    @property
+    def holes_text(self) -> str:
+        if not self.holes:
+            return "no holes"
+        return f"{len(self.holes)} holes, the widest of {self.holes[0].width_m:.1f} m"
+
+
+def _surface(
+    points: MeasuredPoints,
+    area: Area,
+    geo_from_file: Similarity,
+    *,
+    options: ExportMeshOptions,
+    folder: Path,
+    progress: Progress,
+) -> _Surface:
+    """Return the mesh of the surface in the area; errors as of `run`."""
+    voxel_m = points.spacing_m
+    error_m = voxel_m / 2 if options.simplify_error is None else options.simplify_error
+    whole = poisson_mesh(points, voxel_m, folder, progress)
+    inside = area.contains(geo_from_file.apply(whole.vertices))
+    whole = compact(RawMesh(whole.vertices, whole.faces[inside[whole.faces].all(axis=1)]))
+    if not len(whole.faces):
+        raise _no_surface(options)
+    whole, islands = without_islands(whole, options.least_part)
+    mesh = simplified(whole, error_m, folder, progress)
+    errors = np.zeros(1)
+    if error_m > 0:
+        drawn = whole.vertices[:: -(-len(whole.vertices) // _SAMPLE)]
+        errors = distances(drawn, mesh, voxel_m)
+    rms_m = float(np.sqrt(np.mean(errors**2)))
+    return _Surface(mesh, len(whole.faces), rms_m, float(errors.max()), islands, holes_of(mesh))
+
+
+def _sigma(
+    mesh: RawMesh, points: MeasuredPoints, grid: AccuracyGrid | None, geo_from_file: Similarity
+) -> tuple[FloatArray, FloatArray]:
+    """Return the horizontal and vertical σ (V,) of the vertices in metres, as of the cloud; NaN: unknown."""
+    if grid is None:
+        unknown = np.full(len(mesh.vertices), np.nan)
+        return unknown, unknown
+    along = surface_sigma_at(mesh.vertices, points)[:, None] * (vertex_normals(mesh) @ geo_from_file.rotation.T)
+    georeference = np.einsum("vii->vi", grid.cov_at(geo_from_file.apply(mesh.vertices)))
+    east, north, up = (georeference + along**2).T
+    return np.sqrt(east + north), np.sqrt(up)
 
 
 def _write_in_frame(
-    folder: Path, mesh: RawMesh, rgb: ByteArray, shown: TexturedMesh, sidecar: MeshSidecar, *, obj: bool
+    folder: Path,
+    mesh: RawMesh,
+    rgb: ByteArray,
+    sigma: tuple[FloatArray, FloatArray],
+    *,
+    shown: TexturedMesh,
+    sidecar: MeshSidecar,
+    obj: bool,
 ) -> None:
     """Write the files in the frame of the sidecar, which comes beside each."""
     files = [folder / Path(MESH).name, folder / Path(MESH_GLB).name]
-    write_mesh_ply(files[0], mesh.vertices, mesh.faces, rgb, double=False)
+    write_mesh_ply(files[0], mesh.vertices, mesh.faces, rgb, double=False, sigma=sigma)
     with_texture = (shown.mesh.vertices, shown.mesh.faces, shown.uv, shown.image)
     write_mesh_glb(files[1], *with_texture, extras={"georef": sidecar.model_dump(mode="json", by_alias=True)})
     if obj:
@@ -125,9 +239,9 @@ def _write_in_frame(
         write_sidecar(sidecar, path)
 
 
-def _require_memory(cells: int, voxel_m: float) -> None:
-    """Refuse a mesh that the memory would not hold, by the number of cells with surface."""
-    needed, free = _FIXED_BYTES + _CELL_BYTES * cells, free_main_memory_bytes()
+def _require_memory(points: int, voxel_m: float) -> None:
+    """Refuse a mesh that the memory would not hold, by the number of points of its surface."""
+    needed, free = _FIXED_BYTES + _POINT_BYTES * points, free_main_memory_bytes()
     if needed > free:
         raise ResourceError(
             "mesh-memory",

@@ -130,10 +130,11 @@ class ExportMeshOptions(CrsOptions, AreaOptions):
     voxel: float | None = Field(
         None,
         ge=0.001,
-        description="Side of the voxels in metres (default: the width of a pixel of the training photographs on "
-        "the ground).",
+        description="Spacing in metres of the measured points that the surface goes through, and of its octree's "
+        "finest cells, within a factor of two (default: the width of a pixel of the training photographs on the "
+        "ground).",
     )
-    min_views: int = Field(3, ge=2, description="Number of training views that must agree on a vertex.")
+    min_views: int = Field(3, ge=2, description="Number of training views that must agree on a measured point.")
     simplify_error: float | None = Field(
         None,
         ge=0,

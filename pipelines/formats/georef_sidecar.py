@@ -167,10 +167,18 @@ class CrsSidecar(_CamelCase):
     cautions: tuple[Remark, ...] = ()
 
 
+class MeshHole(_CamelCase):
+    """Hole inside a mesh: the middle of its rim in the file's frame, and the longest side of the box around it."""
+
+    at: Vector3
+    width_m: float
+
+
 class MeshFigures(_CamelCase):
-    """Figures of a mesh: grid, faces, and what its simplification has moved, in metres.
+    """Figures of a mesh: its grid, faces, what its simplification has moved, and where it is open, in metres.
 
     The errors are distances of vertices before the simplification from the simplified mesh: RMS, and the largest.
+    Gaps between measured points up to `closed_gap_m` are closed. The widest of the holes that are left are listed.
     """
 
     voxel_m: float
@@ -179,6 +187,10 @@ class MeshFigures(_CamelCase):
     faces: int
     rms_simplification_error_m: float
     largest_simplification_error_m: float
+    closed_gap_m: float
+    open_edges: float  # share of all edges
+    holes: int
+    widest_holes: tuple[MeshHole, ...]
     watertight: bool
 
 

@@ -11,19 +11,56 @@ from pipelines.core.types import ByteArray, FloatArray, IntArray
 from pipelines.formats.cloud_ply import COLOURS, set_columns
 from pipelines.formats.gltf import glb_of
 
+_MOST_OF_A_HEADER = 4096
+SIGMAS = ("sigma_h", "sigma_v")
 _FLOAT, _UNSIGNED_INT, _ARRAY, _ELEMENTS = 5126, 5125, 34962, 34963
 
 
-def write_mesh_ply(path: Path, vertices: FloatArray, faces: IntArray, rgb: ByteArray, *, double: bool) -> None:
-    """Write vertices (V, 3) with colours (V, 3) and faces (F, 3); coordinates are doubles or floats."""
+def write_mesh_ply(
+    path: Path,
+    vertices: FloatArray,
+    faces: IntArray,
+    rgb: ByteArray,
+    *,
+    double: bool,
+    sigma: tuple[FloatArray, FloatArray] | None = None,
+) -> None:
+    """Write vertices (V, 3) with colours (V, 3) and faces (F, 3); coordinates are doubles or floats.
+
+    Args:
+        sigma: horizontal and vertical σ (V,) of the vertices in metres, NaN where unknown; None: no such columns.
+    """
     kind = "<f8" if double else "<f4"
-    vertex = np.empty(len(vertices), [*((axis, kind) for axis in "xyz"), *((colour, "u1") for colour in COLOURS)])
+    columns = [*((axis, kind) for axis in "xyz"), *((colour, "u1") for colour in COLOURS)]
+    names = () if sigma is None else SIGMAS
+    vertex = np.empty(len(vertices), [*columns, *((name, "<f4") for name in names)])
     set_columns(vertex, "xyz", vertices)
     set_columns(vertex, COLOURS, rgb)
+    if sigma is not None:
+        set_columns(vertex, SIGMAS, np.column_stack(sigma))
     face = np.empty(len(faces), [("vertex_indices", "<i4", (3,))])
     face["vertex_indices"] = faces
     elements = [PlyElement.describe(vertex, "vertex"), PlyElement.describe(face, "face")]
     PlyData(elements, byte_order="<").write(str(path))
+
+
+def read_mesh_ply(path: Path) -> tuple[FloatArray, IntArray]:
+    """Return vertices (V, 3) and faces (F, 3) of a mesh of triangles that this program or COLMAP wrote."""
+    with path.open("rb") as file:
+        header = file.read(_MOST_OF_A_HEADER)
+    corners = "vertex_indices" if b" vertex_indices" in header else "vertex_index"
+    # With lists of known length, faces are one array, and not millions of lists.
+    ply = PlyData.read(str(path), known_list_len={"face": {corners: 3}})
+    vertices = np.column_stack([ply["vertex"][axis] for axis in "xyz"]).astype(np.float64)
+    return vertices, np.asarray(ply["face"][corners]).reshape(-1, 3).astype(np.int64)
+
+
+def write_oriented_points(path: Path, points: FloatArray, normals: FloatArray) -> None:
+    """Write points (N, 3) with unit normals (N, 3) as a PLY of floats."""
+    names = ("x", "y", "z", "nx", "ny", "nz")
+    vertex = np.empty(len(points), [(name, "<f4") for name in names])
+    set_columns(vertex, names, np.column_stack([points, normals]))
+    PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(path))
 
 
 def png_of(image: ByteArray) -> bytes:
@@ -36,7 +73,7 @@ def write_mesh_glb(
 ) -> None:
     """Write vertices (V, 3) of a z-up frame with a texture (H, W, 3) as a glb, which a node turns y-up.
 
-    The material is unlit: the photographs have the light of the day.
+    The material is unlit, since the photographs have the light of the day, and seen from both sides.
     """
     position, place = vertices.astype("<f4"), uv.astype("<f4")
     data = [position.tobytes(), place.tobytes(), faces.astype("<u4").tobytes(), png_of(image)]
@@ -49,6 +86,7 @@ def write_mesh_glb(
             {
                 "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "metallicFactor": 0},
                 "extensions": {"KHR_materials_unlit": {}},
+                "doubleSided": True,
             }
         ],
         "textures": [{"source": 0, "sampler": 0}],

@@ -1,4 +1,4 @@
-"""Mesh of the surface: the zeros of the grid that views confirm, simplified square by square, welded and closed."""
+"""Triangle meshes: normals, distances, connected parts, holes, and walls and fans that close them."""
 
 from dataclasses import dataclass
 
@@ -7,74 +7,17 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from pipelines.core.extras import require
-from pipelines.core.progress import SILENT, Progress
-from pipelines.core.types import BoolArray, FloatArray, IntArray
-from pipelines.geometry.similarity import Similarity
-from pipelines.surface.fusion import MOST_THROUGH, surface_sigma
-from pipelines.surface.surface_views import SurfaceViews
-from pipelines.surface.tsdf import GridSettings, Inside, RawMesh, surface_squares, welded
+from pipelines.core.types import FloatArray, IntArray
 
-_SAMPLED = 4  # one in so many vertices is measured against the simplified mesh
-_MOST_PASSES = 1000  # of the simplification, which ends before
 _NEAR_FACES = 4  # of those nearest a vertex whose distance is measured
 
 
 @dataclass(frozen=True)
-class SimplifiedMesh:
-    """Mesh with the errors of its simplification, metres, at a sample of the vertices before it."""
+class RawMesh:
+    """V vertices (V, 3) in metres, F faces (F, 3), anticlockwise seen from outside."""
 
-    mesh: RawMesh
-    faces_before: int
-    rms_error_m: float
-    largest_error_m: float
-
-
-def surface_mesh(
-    views: SurfaceViews,
-    frame_from_model: Similarity,
-    settings: GridSettings,
-    cells: IntArray,
-    *,
-    error_m: float,
-    inside: Inside,
-    progress: Progress = SILENT,
-) -> SimplifiedMesh:
-    """Return the mesh of the surface in a frame with z up, without faces that too few views confirm.
-
-    Each square of the plan is simplified by itself; vertices on its border stay, so that squares meet.
-
-    Args:
-        error_m: bound of the simplification, see `simplified`; 0: not simplified.
-
-    Raises:
-        BackendUnavailableError: a library of the extra is missing.
-    """
-    parts, faces, squares, largest = [], 0, [np.zeros(0)], 0.0
-    for square in surface_squares(views, frame_from_model, settings, cells, progress):
-        good = _confirmed(square, views, frame_from_model, settings) & inside(square.vertices)
-        kept = compact(RawMesh(square.vertices, square.faces[good[square.faces].all(axis=1)]))
-        if not len(kept.faces):
-            continue
-        simple = simplified(kept, error_m)
-        errors = distances(kept.vertices[::_SAMPLED], simple, settings.voxel_m) if error_m > 0 else np.zeros(1)
-        squares.append(errors**2)
-        largest, faces = max(largest, float(errors.max())), faces + len(kept.faces)
-        parts.append(simple)
-    mesh = welded(parts, settings.voxel_m) if parts else RawMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
-    return SimplifiedMesh(mesh, faces, float(np.sqrt(np.concatenate(squares).mean())) if parts else 0.0, largest)
-
-
-def _confirmed(
-    mesh: RawMesh, views: SurfaceViews, frame_from_model: Similarity, settings: GridSettings
-) -> BoolArray:
-    """Return which vertices views agree on, by the rules of the point cloud."""
-    model_from_frame = frame_from_model.inverse()
-    normal = vertex_normals(mesh) @ frame_from_model.rotation
-    support = views.support(model_from_frame.apply(mesh.vertices), normal)
-    with np.errstate(invalid="ignore"):
-        good = surface_sigma(support, np.full(len(normal), settings.pixel_m)) < settings.pixel_m
-    return good & (support.views >= settings.min_views) & (support.seen_through <= MOST_THROUGH * support.views)
+    vertices: FloatArray
+    faces: IntArray
 
 
 def vertex_normals(mesh: RawMesh) -> FloatArray:
@@ -90,24 +33,6 @@ def compact(mesh: RawMesh) -> RawMesh:
     """Return a mesh without the vertices that no face has."""
     used, faces = np.unique(mesh.faces, return_inverse=True)
     return RawMesh(mesh.vertices[used], faces.reshape(-1, 3))
-
-
-def simplified(mesh: RawMesh, error_m: float) -> RawMesh:
-    """Return a mesh with fewer faces; its open borders stay.
-
-    Edges collapse as long as the distances of the new vertex from the planes of the faces that it replaces are not
-    above `error_m`, as a root of the sum of squares (Garland and Heckbert, doi 10.1145/258734.258849).
-    """
-    if error_m <= 0:
-        return mesh
-    require("mesh")
-    from pyfqmr import Simplify
-
-    work = Simplify()
-    work.setMesh(mesh.vertices, mesh.faces.astype(np.int32))
-    work.simplify_mesh_lossless(False, error_m**2, _MOST_PASSES, True)  # quietly, open borders preserved
-    vertices, faces, _ = work.getMesh()
-    return RawMesh(np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64))
 
 
 def distances(points: FloatArray, mesh: RawMesh, step_m: float) -> FloatArray:
@@ -129,7 +54,7 @@ def distances(points: FloatArray, mesh: RawMesh, step_m: float) -> FloatArray:
 
 def without_islands(mesh: RawMesh, least_m2: float) -> tuple[RawMesh, int]:
     """Return the largest connected part and others of at least an area, and the number of the parts left out."""
-    number, part = _parts(mesh)
+    number, part = parts_of(mesh)
     corners = mesh.vertices[mesh.faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
     areas = np.bincount(part, area, number)
@@ -137,7 +62,7 @@ def without_islands(mesh: RawMesh, least_m2: float) -> tuple[RawMesh, int]:
     return compact(RawMesh(mesh.vertices, mesh.faces[kept[part]])), int((~kept & (areas > 0)).sum())
 
 
-def _parts(mesh: RawMesh) -> tuple[int, IntArray]:
+def parts_of(mesh: RawMesh) -> tuple[int, IntArray]:
     """Return the number of connected parts, and that of each face (F,)."""
     edges, size = mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2), len(mesh.vertices)
     number, of_vertex = connected_components(coo_array((np.ones(len(edges)), tuple(edges.T)), (size, size)))
@@ -157,20 +82,12 @@ def closed(mesh: RawMesh, depth_m: float) -> tuple[RawMesh, int]:
         if not crowded.any():
             break
         mesh = compact(RawMesh(mesh.vertices, mesh.faces[~crowded.reshape(-1, 3).any(axis=1)]))
-    directed = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    loops = _cycles(directed[count[edge] == 1])
-    _, part = _parts(mesh)
-    of_vertex = np.zeros(len(mesh.vertices), np.int64)
-    of_vertex[mesh.faces[:, 0]] = of_vertex[mesh.faces[:, 1]] = of_vertex[mesh.faces[:, 2]] = part
-    reach = [float(np.linalg.norm(np.ptp(mesh.vertices[loop, :2], axis=0))) for loop in loops]
-    outer: dict[int, int] = {}
-    for number in np.argsort(reach, kind="stable"):
-        outer[int(of_vertex[loops[number][0]])] = int(number)
+    loops, outer = _rims(mesh)
     base_m = float(mesh.vertices[:, 2].min()) - depth_m
     vertices, faces, total = [mesh.vertices], [mesh.faces], len(mesh.vertices)
     for number, loop in enumerate(loops):
         ring, middle = loop, mesh.vertices[loop].mean(axis=0)
-        if outer[int(of_vertex[loop[0]])] == number:
+        if number in outer:
             after, foot = np.roll(loop, -1), total + np.arange(len(loop))
             vertices.append(np.column_stack([mesh.vertices[loop, :2], np.full(len(loop), base_m)]))
             faces += [np.column_stack([after, loop, foot]), np.column_stack([after, foot, np.roll(foot, -1)])]
@@ -179,6 +96,42 @@ def closed(mesh: RawMesh, depth_m: float) -> tuple[RawMesh, int]:
         faces.append(np.column_stack([np.roll(ring, -1), ring, np.full(len(ring), total)]))
         total += 1
     return RawMesh(np.concatenate(vertices), np.concatenate(faces)), len(mesh.faces)
+
+
+@dataclass(frozen=True)
+class Hole:
+    """Hole of a mesh: the middle of its rim, and the longest side of the box around it."""
+
+    middle: FloatArray
+    width_m: float
+
+
+def holes_of(mesh: RawMesh) -> list[Hole]:
+    """Return the holes inside the outer rims of a mesh's parts, the widest first."""
+    loops, outer = _rims(mesh)
+    rims = [mesh.vertices[loop] for number, loop in enumerate(loops) if number not in outer]
+    holes = [Hole(rim.mean(axis=0), float(np.ptp(rim, axis=0).max())) for rim in rims]
+    return sorted(holes, key=lambda hole: -hole.width_m)
+
+
+def open_share(mesh: RawMesh) -> float:
+    """Return the share of the edges that have one face."""
+    _, count = edges_of(mesh.faces)
+    return float(np.mean(count == 1)) if len(count) else 0.0
+
+
+def _rims(mesh: RawMesh) -> tuple[list[IntArray], set[int]]:
+    """Return the rims of a mesh as cycles of vertices, and the numbers of each part's outer rim: widest in plan."""
+    edge, count = edges_of(mesh.faces)
+    loops = _cycles(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)[count[edge] == 1])
+    _, part = parts_of(mesh)
+    of_vertex = np.zeros(len(mesh.vertices), np.int64)
+    of_vertex[mesh.faces] = part[:, None]
+    reach = [float(np.linalg.norm(np.ptp(mesh.vertices[loop, :2], axis=0))) for loop in loops]
+    outer: dict[int, int] = {}
+    for number in np.argsort(reach, kind="stable"):
+        outer[int(of_vertex[loops[number][0]])] = int(number)
+    return loops, set(outer.values())
 
 
 def edges_of(faces: IntArray) -> tuple[IntArray, IntArray]:

@@ -18,9 +18,8 @@ from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, ByteArray, FloatArray, IntArray
 from pipelines.geometry.similarity import Similarity
 from pipelines.splat.kernel_cache import kernel
-from pipelines.surface.mesh import edges_of, vertex_normals
+from pipelines.surface.mesh import RawMesh, edges_of, vertex_normals
 from pipelines.surface.surface_views import SAME_SURFACE, SurfaceViews
-from pipelines.surface.tsdf import RawMesh
 from pipelines.surface.visibility import point_in_cam, sees_sphere, surface_at
 
 # ruff: noqa: PLR0917  (kernels take arrays, not objects)

@@ -1,4 +1,4 @@
-"""Mesh: on the true surface, the same in one chunk or in many, closed on request, with the photographs' colours."""
+"""Mesh: on the true surface and without gaps, open where nothing was measured, with the photographs' colours."""
 
 from __future__ import annotations
 
@@ -11,33 +11,42 @@ import numpy as np
 import pytest
 import trimesh
 from plyfile import PlyData
-from scipy.spatial import KDTree
 
 from pipelines.core.errors import ResourceError
 from pipelines.core.products import load_json
 from pipelines.core.runner import run_stage
 from pipelines.core.stages import BY_NAME, MESH
+from pipelines.core.types import joined_rows
 from pipelines.core.workspace import Workspace
 from pipelines.deliver import mesh as stage
 from pipelines.formats.georef_sidecar import MeshCrsSidecar, MeshSidecar, sidecar_path
-from pipelines.formats.mesh_files import write_mesh_glb, write_mesh_obj, write_mesh_ply
+from pipelines.formats.mesh_files import read_mesh_ply, write_mesh_glb, write_mesh_obj, write_mesh_ply
 from pipelines.geodesy.enu import ecef_from_enu, enu_from_ecef
 from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.similarity import Similarity
-from pipelines.surface import tsdf
-from pipelines.surface.mesh import closed, distances, simplified, surface_mesh, vertex_normals, without_islands
+from pipelines.surface.fusion import FusionSettings, fused_squares
+from pipelines.surface.mesh import RawMesh, closed, distances, holes_of, vertex_normals, without_islands
+from pipelines.surface.poisson import (
+    MeasuredPoints,
+    certain_points,
+    closed_gap_m,
+    near_points,
+    poisson_depth,
+    poisson_mesh,
+    simplified,
+    surface_sigma_at,
+)
 from pipelines.surface.surface_views import SurfaceViews
-from pipelines.surface.texture import TexturedMesh, colours_of, textured
-from pipelines.surface.tsdf import GridSettings, RawMesh, occupied_cells
+from pipelines.surface.texture import colours_of, textured
 from pipelines.survey.calibrated import load_survey
-from tests.depth_scenes import BOX_M, CAMERA, DOWN, depth_map, looking_down
+from tests.depth_scenes import BOX_M, CAMERA, DOWN, UP, depth_map, looking_down
 from tests.refusals import refused
 from tests.splat_scenes import ground_height
 
 GEO_FROM_MODEL = Similarity(1.0, np.eye(3), np.array([1000.3, -500.2, 20.1]))
 CENTERS = looking_down(8)
 PIXEL_M = 36 / CAMERA.fx
-SETTINGS = GridSettings(PIXEL_M, PIXEL_M, 2 * PIXEL_M, 3)
+SETTINGS = FusionSettings(PIXEL_M, 2 * PIXEL_M, 3)
 EAST, WEST = (200, 40, 10), (20, 60, 180)  # colours of the photographs on either side of the origin
 
 
@@ -72,16 +81,35 @@ def surface_views(folder: Path, *, floater: bool = False) -> SurfaceViews:
         surface=surface,
         images=SimpleNamespace(image=photograph),
     )
-    return SurfaceViews(renderer, folder)
+    return SurfaceViews(renderer, folder, colours=True)
 
 
-def mesh_of(views: SurfaceViews, error_m: float = 0.0, settings: GridSettings = SETTINGS) -> RawMesh:
-    cells = occupied_cells(views, GEO_FROM_MODEL, settings, everywhere)
-    return surface_mesh(views, GEO_FROM_MODEL, settings, cells, error_m=error_m, inside=everywhere).mesh
+def points_of(views: SurfaceViews) -> MeasuredPoints:
+    cloud = joined_rows(list(fused_squares(views, GEO_FROM_MODEL, SETTINGS)))
+    return MeasuredPoints(cloud.position, cloud.normal, cloud.sigma_m, PIXEL_M)
 
 
-def everywhere(places: np.ndarray) -> np.ndarray:
-    return np.ones(len(places), dtype=bool)
+@pytest.fixture(scope="module")
+def views(tmp_path_factory: pytest.TempPathFactory) -> SurfaceViews:
+    return surface_views(tmp_path_factory.mktemp("maps"))
+
+
+@pytest.fixture(scope="module")
+def whole(views: SurfaceViews, tmp_path_factory: pytest.TempPathFactory) -> RawMesh:
+    return poisson_mesh(points_of(views), PIXEL_M, tmp_path_factory.mktemp("poisson"))
+
+
+@pytest.fixture(scope="module")
+def simple(whole: RawMesh, tmp_path_factory: pytest.TempPathFactory) -> RawMesh:
+    return simplified(without_islands(whole, 1.0)[0], PIXEL_M / 2, tmp_path_factory.mktemp("simple"))
+
+
+def plane(side_m: float, hole_m: float = 0.0, spacing_m: float = 0.25) -> MeasuredPoints:
+    """Return points of level ground around (20, 0), without those in a disc in its middle."""
+    axis = np.arange(-side_m / 2, side_m / 2, spacing_m)
+    position = np.stack([*np.meshgrid(axis, axis), np.zeros((len(axis),) * 2)], axis=-1).reshape(-1, 3)
+    position = position[np.hypot(*position.T[:2]) >= hole_m / 2] + [20.0, 0.0, 0.0]
+    return MeasuredPoints(position, np.tile(UP, (len(position), 1)), np.full(len(position), 0.03), spacing_m)
 
 
 def open_edges(mesh: RawMesh) -> np.ndarray:
@@ -91,76 +119,101 @@ def open_edges(mesh: RawMesh) -> np.ndarray:
     return sides[count == 1]
 
 
-def test_vertices_lie_on_the_plane_and_the_roof(tmp_path: Path) -> None:
-    mesh = mesh_of(surface_views(tmp_path))
-    at, up = mesh.vertices - GEO_FROM_MODEL.translation, vertex_normals(mesh)[:, 2]
+def test_vertices_lie_on_the_plane_and_the_roof(whole: RawMesh) -> None:
+    at, up = whole.vertices - GEO_FROM_MODEL.translation, vertex_normals(whole)[:, 2]
     reach = np.abs(at[:, :2]).max(axis=1)
-    roof, ground = reach < BOX_M - 2 * PIXEL_M, (reach > BOX_M + 4 * PIXEL_M) & (reach < 15)
-    assert roof.sum() > 50 and ground.sum() > 1500
-    # The distance to a plane is linear on the grid, so that its zero is exact: to float32 of depths of 36 m.
-    np.testing.assert_allclose(at[roof, 2], BOX_M, atol=1e-3 * PIXEL_M)
-    np.testing.assert_allclose(at[ground, 2], 0, atol=1e-3 * PIXEL_M)
-    assert (up[ground] > 0.999).all()
-    # Nothing lies further from ground, roof and the edges between them than the truncation.
-    assert at[:, 2].min() > -PIXEL_M and at[:, 2].max() < BOX_M + PIXEL_M
+    # No view shows the walls, so that the solver rounds the roof: over four of its cells, of two voxels at most.
+    roof, ground = (reach < 2 * PIXEL_M) & (at[:, 2] > BOX_M / 2), (reach > BOX_M + 8 * PIXEL_M) & (reach < 12)
+    assert roof.sum() > 3 and ground.sum() > 100
+    assert np.abs(at[roof, 2] - BOX_M).max() < 0.3 * PIXEL_M
+    assert np.sqrt(np.mean(at[ground, 2] ** 2)) < 0.05 * PIXEL_M
+    assert (up[ground] > 0.97).all() and (up[roof] > 0.9).all()  # seen from above, no face is seen from behind
 
 
-def test_chunks_have_no_seam(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    views = surface_views(tmp_path)
-    whole = mesh_of(views)
-    monkeypatch.setattr(tsdf, "_CHUNK", 3)
-    monkeypatch.setattr(tsdf, "_SQUARE", 1)
-    parts = mesh_of(views)
-    assert len(parts.faces) == len(whole.faces)
-    assert len(open_edges(parts)) == len(open_edges(whole))
-    # float32 resolves places in a chunk of 64 voxels to 4e-6 voxels.
-    distance, _ = KDTree(parts.vertices).query(whole.vertices)
-    assert distance.max() < 1e-4 * PIXEL_M
-    # Simplified squares still meet: the ground in the middle has no open edge.
-    simple = mesh_of(views, PIXEL_M / 2)
-    at = simple.vertices[open_edges(simple)].mean(axis=1) - GEO_FROM_MODEL.translation
-    reach = np.abs(at[:, :2]).max(axis=1)
-    assert not ((reach > BOX_M + 4 * PIXEL_M) & (reach < 12)).any()
+def test_walls_that_no_view_shows_are_closed(whole: RawMesh, simple: RawMesh) -> None:
+    """Cameras look straight down on a box whose walls are less high than the gap that is closed."""
+    assert closed_gap_m(PIXEL_M) > BOX_M
+    for mesh in (whole, simple):
+        rim = mesh.vertices[open_edges(mesh)].mean(axis=1) - GEO_FROM_MODEL.translation
+        assert np.abs(rim[:, :2]).max(axis=1).min() > 12
     assert len(simple.faces) < len(whole.faces) / 3
 
 
-def test_what_one_view_shows_is_carved(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("side_m", "spacing_m"), [(40.0, 0.25), (40.0, 0.5)])
+def test_narrow_gaps_are_closed_and_wide_ones_listed(side_m: float, spacing_m: float, tmp_path: Path) -> None:
+    narrow, wide = 0.8 * closed_gap_m(spacing_m), 2 * closed_gap_m(spacing_m)
+    whole, holed = (plane(side_m, hole_m, spacing_m) for hole_m in (narrow, wide))
+    mesh = poisson_mesh(whole, spacing_m, tmp_path)
+    assert holes_of(mesh) == []
+    mesh = poisson_mesh(holed, spacing_m, tmp_path)
+    (hole,) = [hole for hole in holes_of(mesh) if hole.width_m > spacing_m]
+    np.testing.assert_allclose(hole.middle[:2], [20, 0], atol=spacing_m)
+    # The rim goes into the gap by four spacings at most, as around the plane, less a face of a cell of two.
+    assert wide - 8 * spacing_m - 0.01 < hole.width_m < wide - 3 * spacing_m
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_sigma_grows_with_the_way_from_measured_points() -> None:
+    points = plane(40.0, 10.0)
+    on, above, within = np.array([[30.1, 0.1, 0.0], [30.1, 0.1, 0.04], [20.0, 0.0, 0.0]])
+    sigma_m = surface_sigma_at(np.array([on, above, within]), points)
+    np.testing.assert_allclose(sigma_m, [0.03, 0.05, 5.0], rtol=0.02)
+
+
+def test_uncertain_points_count_only_where_no_others_are() -> None:
+    points = plane(10.0)
+    uncertain = np.hypot(points.position[:, 0] - 20, points.position[:, 1]) < 2.0
+    sigma_m = np.where(uncertain, 0.2, 0.03)
+    used = certain_points(MeasuredPoints(points.position, points.normal, sigma_m, points.spacing_m))
+    distance = np.hypot(used.position[:, 0] - 20, used.position[:, 1])
+    assert len(used.position) < len(points.position)
+    assert distance.min() < 0.3 and not ((distance > 1.7) & (distance < 1.95)).any()
+
+
+def test_depth_gives_cells_of_a_voxel() -> None:
+    for side_m, voxel_m in ((40.0, 0.25), (300.0, 0.1), (1000.0, 0.02)):
+        cell_m = 1.1 * side_m / 2 ** poisson_depth(plane(side_m, spacing_m=side_m / 100), voxel_m)
+        assert 0.95 * voxel_m < cell_m < 2 * voxel_m or side_m / voxel_m > 2**14
+    assert poisson_depth(plane(1.0), 10.0) == 5
+
+
+def test_surface_far_from_points_is_cut() -> None:
+    """A sphere around a plane: all its faces are farther than the rim, and its part is too far to be a gap."""
+    points, ball = plane(10.0), trimesh.creation.icosphere(subdivisions=3, radius=20.0)
+    far = RawMesh(ball.vertices + np.array([20.0, 0.0, 0.0]), np.array(ball.faces, dtype=np.int64))
+    assert len(near_points(far, points).faces) == 0
+
+
+def test_what_one_view_shows_is_left_out(tmp_path: Path) -> None:
     """A plate 16 m above the ground in one of eight maps: the others look through it."""
-    two = GridSettings(PIXEL_M, PIXEL_M, 2 * PIXEL_M, 2)
-    for settings in (SETTINGS, two):
-        mesh = mesh_of(surface_views(tmp_path / str(settings.min_views), floater=True), settings=settings)
-        assert mesh.vertices[:, 2].max() - GEO_FROM_MODEL.translation[2] < BOX_M + PIXEL_M
-    nine = GridSettings(PIXEL_M, PIXEL_M, 2 * PIXEL_M, 9)
-    assert len(mesh_of(surface_views(tmp_path / "nine"), settings=nine).faces) == 0
+    points = points_of(surface_views(tmp_path, floater=True))
+    assert points.position[:, 2].max() - GEO_FROM_MODEL.translation[2] < BOX_M + PIXEL_M
 
 
-def test_simplification_keeps_its_error() -> None:
+def test_simplification_keeps_its_error(tmp_path: Path) -> None:
     """A sphere of 5 m: the measured error is that of the chords; the bound is on distances from planes."""
     ball = trimesh.creation.icosphere(subdivisions=5, radius=5.0)
     mesh = RawMesh(np.array(ball.vertices), np.array(ball.faces, dtype=np.int64))
     for error_m in (0.01, 0.05):
-        simple = simplified(mesh, error_m)
+        simple = simplified(mesh, error_m, tmp_path)
         off = distances(mesh.vertices, simple, 0.1)
         inner = 5.0 - np.linalg.norm(simple.vertices[simple.faces].mean(axis=1), axis=1)
-        assert 0.2 * inner.max() < off.max() < 5 * error_m
+        assert 0.2 * inner.max() < off.max() < 10 * error_m
         assert np.sqrt(np.mean(off**2)) < error_m / 2
         assert len(simple.faces) < len(mesh.faces) / 2
     np.testing.assert_allclose(distances(2 * mesh.vertices[:50], mesh, 0.1), 5.0, rtol=1e-6)
 
 
-def test_watertight_mesh_is_a_solid(tmp_path: Path) -> None:
-    mesh, islands = without_islands(mesh_of(surface_views(tmp_path), PIXEL_M / 2), 1.0)
-    assert islands == 0 or len(open_edges(mesh))
-    solid, of_surface = closed(mesh, 2.0)
-    np.testing.assert_array_equal(solid.faces[:of_surface], mesh.faces)
+def test_watertight_mesh_is_a_solid(simple: RawMesh) -> None:
+    solid, of_surface = closed(simple, 2.0)
+    np.testing.assert_array_equal(solid.faces[:of_surface], simple.faces)
     body = trimesh.Trimesh(solid.vertices, solid.faces, process=False)
     assert body.is_watertight and body.is_winding_consistent
-    # What is covered, down to a base 2 m below, and the hole where the box hides the ground, as wide as the box.
-    a, b, c = (mesh.vertices[mesh.faces[:, k], :] for k in range(3))
+    # All that is below the surface, down to a base 2 m below: the surface itself has no hole.
+    a, b, c = (simple.vertices[simple.faces[:, k], :] for k in range(3))
     plan_m2 = np.cross(b - a, c - a)[:, 2] / 2
     heights = (a + b + c)[:, 2] / 3 - solid.vertices[:, 2].min()
-    hole_m3 = body.volume - plan_m2 @ heights
-    assert (2 * BOX_M) ** 2 * 2.0 < hole_m3 < (2 * BOX_M + 6 * PIXEL_M) ** 2 * 2.2
+    assert body.volume == pytest.approx(plan_m2 @ heights, rel=1e-3)
 
 
 def test_islands_are_left_out() -> None:
@@ -173,24 +226,20 @@ def test_islands_are_left_out() -> None:
     assert len(without_islands(mesh, 0.0)[0].faces) == len(mesh.faces)
 
 
-def shown(folder: Path) -> TexturedMesh:
-    views = surface_views(folder)
-    return textured(mesh_of(views, PIXEL_M / 2), views, GEO_FROM_MODEL, PIXEL_M)
+def test_colours_are_those_of_the_photographs(views: SurfaceViews, whole: RawMesh) -> None:
+    rgb, known = colours_of(whole.vertices, vertex_normals(whole), views, GEO_FROM_MODEL)
+    at = whole.vertices - GEO_FROM_MODEL.translation
+    # No view shows the walls, and few the ground around the views.
+    reach = np.abs(at[:, :2]).max(axis=1)
+    flat = (reach < 2 * PIXEL_M) | ((reach > BOX_M + 8 * PIXEL_M) & (reach < 12))
+    assert known[flat].mean() > 0.98
+    clear = known & (np.abs(at[:, 0]) > 2 * PIXEL_M)
+    assert (rgb[clear & (at[:, 0] > 0)] == EAST).all()
+    assert (rgb[clear & (at[:, 0] < 0)] == WEST).all()
 
 
-def test_colours_are_those_of_the_photographs(tmp_path: Path) -> None:
-    views = surface_views(tmp_path)
-    mesh = mesh_of(views)
-    rgb, known = colours_of(mesh.vertices, vertex_normals(mesh), views, GEO_FROM_MODEL)
-    assert known.mean() > 0.98
-    east = mesh.vertices[:, 0] - GEO_FROM_MODEL.translation[0]
-    clear = known & (np.abs(east) > 2 * PIXEL_M)
-    assert (rgb[clear & (east > 0)] == EAST).all()
-    assert (rgb[clear & (east < 0)] == WEST).all()
-
-
-def test_other_readers_see_mesh_and_texture(tmp_path: Path) -> None:
-    result = shown(tmp_path / "maps")
+def test_other_readers_see_mesh_and_texture(views: SurfaceViews, whole: RawMesh, tmp_path: Path) -> None:
+    result = textured(whole, views, GEO_FROM_MODEL, PIXEL_M)
     vertices = result.mesh.vertices - GEO_FROM_MODEL.translation
     parts = (vertices, result.mesh.faces, result.uv, result.image)
     write_mesh_glb(tmp_path / "mesh.glb", *parts, extras={"georef": {}})
@@ -204,6 +253,7 @@ def test_other_readers_see_mesh_and_texture(tmp_path: Path) -> None:
     # y is up: height becomes y, north −z.
     up = trimesh.transform_points(geometry.vertices, turn)
     np.testing.assert_allclose(up, np.column_stack([vertices[:, 0], vertices[:, 2], -vertices[:, 1]]), atol=1e-5)
+    assert geometry.visual.material.doubleSided
     for loaded, picture in (
         (geometry, geometry.visual.material.baseColorTexture),
         (obj, obj.visual.material.image),
@@ -213,14 +263,29 @@ def test_other_readers_see_mesh_and_texture(tmp_path: Path) -> None:
         row = ((1 - place[:, 1]) * len(image)).astype(int)
         rgb = image[row, (place[:, 0] * image.shape[1]).astype(int)]
         corners = np.asarray(loaded.vertices)[loaded.faces][..., 0]
-        # A face of two texels and more, clear of the border between the colours.
+        # Clear of the border between the colours, and of the places that no view shows: walls, and the outer rim.
+        reach = np.abs(vertices[result.mesh.faces][..., :2]).max(axis=2)
+        flat = (reach < BOX_M / 2).all(axis=1) | ((reach > BOX_M + 4 * PIXEL_M) & (reach < 13)).all(axis=1)
+        corners = np.where(flat[:, None], corners, 0)
         clear_east, clear_west = corners.min(axis=1) > 2 * PIXEL_M, corners.max(axis=1) < -2 * PIXEL_M
+        assert clear_east.sum() > 20 and clear_west.sum() > 20
         assert (rgb[clear_east] == EAST).all(axis=1).mean() > 0.97
         assert (rgb[clear_west] == WEST).all(axis=1).mean() > 0.97
-    write_mesh_ply(tmp_path / "crs.ply", vertices + 5e6, result.mesh.faces, np.full(vertices.shape, 7), double=True)
+    write_mesh_ply(
+        tmp_path / "crs.ply",
+        vertices + 5e6,
+        result.mesh.faces,
+        np.full(vertices.shape, 7),
+        double=True,
+        sigma=(vertices[:, 0], vertices[:, 1]),
+    )
     ply = PlyData.read(tmp_path / "crs.ply")
     np.testing.assert_array_equal(ply["vertex"]["x"], vertices[:, 0] + 5e6)
+    np.testing.assert_array_equal(ply["vertex"]["sigma_v"], vertices[:, 1].astype(np.float32))
     np.testing.assert_array_equal(np.stack(ply["face"]["vertex_indices"]), result.mesh.faces)
+    read, faces = read_mesh_ply(tmp_path / "crs.ply")
+    np.testing.assert_array_equal(read, vertices + 5e6)
+    np.testing.assert_array_equal(faces, result.mesh.faces)
 
 
 def test_too_little_memory_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
