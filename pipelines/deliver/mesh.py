@@ -1,10 +1,11 @@
 """Stage `export-mesh`: the surface of the trained model as a triangle mesh with the colours of the photographs.
 
-Reads the trained model, the survey and the photographs. Writes `mesh/mesh.ply` with coloured vertices and their σ,
-`mesh/mesh.glb` with a texture, on request `mesh.obj` and, in a CRS, `mesh_crs.ply`; a sidecar beside each.
+Reads the trained model, the survey and the photographs. Writes `mesh/mesh.ply` with coloured
+vertices and their σ, `mesh/mesh.glb`, simplified, with a texture, on request `mesh.obj` and, in a CRS,
+`mesh_crs.ply`; a sidecar beside each.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from pipelines.core.machine import free_main_memory_bytes
 from pipelines.core.products import union
 from pipelines.core.progress import Progress
 from pipelines.core.stages import MESH, MESH_GLB
-from pipelines.core.types import ByteArray, FloatArray, joined_rows, rows_of, vector3
+from pipelines.core.types import FloatArray, joined_rows, rows_of, vector3
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import ExportMeshOptions
 from pipelines.deliver.placement import place
@@ -75,34 +76,43 @@ def run(stage: StageRun, options: ExportMeshOptions) -> Summary:
     pixel_m, area = pixel_on_surface_m(views, trained.geo_from_model), area_of(options, trained)
     points = _points(views, trained, area, placement.file_from_geo, options=options, progress=progress)
     surface = _surface(points, area, geo_from_file, options=options, folder=folder, progress=progress)
-    mesh, surface_faces = surface.mesh, len(surface.mesh.faces)
+    whole, simple = surface.whole, surface.simple
+    surface_faces = len(simple.faces)
     if options.watertight:
-        mesh, surface_faces = closed(mesh, _BASE_VOXELS * points.spacing_m)
+        base_m = _BASE_VOXELS * points.spacing_m
+        (whole, _), (simple, surface_faces) = closed(whole, base_m), closed(simple, base_m)
     grid, no_sigma = predicted_sigma(stage.workspace, trained)
-    sigma = _sigma(mesh, points, grid, geo_from_file)
-    rgb, _ = colours_of(mesh.vertices, vertex_normals(mesh), views, placement.file_from_model)
+    sigma = _sigma(whole, points, grid, geo_from_file)
+    rgb, _ = colours_of(whole.vertices, vertex_normals(whole), views, placement.file_from_model)
     texel_m = max(points.spacing_m, pixel_m)
-    shown = textured(mesh, views, placement.file_from_model, texel_m, progress, surface_faces=surface_faces)
+    shown = textured(simple, views, placement.file_from_model, texel_m, progress, surface_faces=surface_faces)
     views.close()
-    figures = surface.figures(points.spacing_m, shown.texel_m, mesh, watertight=options.watertight)
     cautions = union(placement.cautions, without_sigma("The mesh states no σ of its vertices", no_sigma))
-    sidecar = MeshSidecar(**{**dict(placement.sidecar()), "cautions": cautions}, mesh=figures)
-    _write_in_frame(folder, mesh, rgb, sigma, shown=shown, sidecar=sidecar, obj=options.obj)
+    exact = replace(surface, rms_error_m=0.0, largest_error_m=0.0)
+    of_whole, figures = (
+        of_file.figures(mesh, points.spacing_m, shown.texel_m, watertight=options.watertight)
+        for of_file, mesh in ((exact, whole), (surface, simple))
+    )
+    in_frame = {**dict(placement.sidecar()), "cautions": cautions}
+    write_mesh_ply(folder / Path(MESH).name, whole.vertices, whole.faces, rgb, double=False, sigma=sigma)
+    write_sidecar(MeshSidecar(**in_frame, mesh=of_whole), folder / Path(MESH).name)
+    _write_textured(folder, shown, MeshSidecar(**in_frame, mesh=figures), obj=options.obj)
     if target is not None:
-        xyz, path = target.xyz_from_geo(geo_from_file.apply(mesh.vertices)), folder / "mesh_crs.ply"
-        write_mesh_ply(path, xyz, mesh.faces, rgb, double=True, sigma=sigma)
+        xyz, path = target.xyz_from_geo(geo_from_file.apply(whole.vertices)), folder / "mesh_crs.ply"
+        write_mesh_ply(path, xyz, whole.faces, rgb, double=True, sigma=sigma)
         bounds = [xyz.min(axis=0), xyz.max(axis=0)]
-        write_sidecar(MeshCrsSidecar(**dict(target.sidecar(bounds, headline, None, cautions)), mesh=figures), path)
+        in_crs = target.sidecar(bounds, headline, None, cautions)
+        write_sidecar(MeshCrsSidecar(**dict(in_crs), mesh=of_whole), path)
     values = {
         **figures.model_dump(exclude={"widest_holes"}),
-        "vertices": len(mesh.vertices),
+        "vertices": len(simple.vertices),
         "area_ha": area.hectares,
         "islands_left_out": surface.islands,
         "texture_px": len(shown.image),
         "crs": None if target is None else target.crs.name,
     }
     key = (
-        f"{len(mesh.faces)} faces of {surface.faces_before}, voxels of {points.spacing_m:.3f} m, simplified by "
+        f"{len(simple.faces)} faces of {len(whole.faces)}, voxels of {points.spacing_m:.3f} m, simplified by "
         f"{surface.rms_error_m:.3f} m RMS, {surface.largest_error_m:.3f} m at most; {surface.holes_text}"
     )
     return Summary(key, values, cautions=cautions)
@@ -144,29 +154,31 @@ def _no_surface(options: ExportMeshOptions) -> DegenerateGeometryError:
 
 @dataclass(frozen=True)
 class _Surface:
-    """Simplified mesh, and what became of it on the way."""
+    """Mesh of the surface, whole and simplified, and what was found of it."""
 
-    mesh: RawMesh
-    faces_before: int
+    whole: RawMesh
+    simple: RawMesh
     rms_error_m: float
     largest_error_m: float
     islands: int
     holes: list[Hole]
 
-    def figures(self, voxel_m: float, texel_m: float, mesh: RawMesh, *, watertight: bool) -> MeshFigures:
-        """Return the figures of the mesh that is written."""
+    def figures(self, mesh: RawMesh, voxel_m: float, texel_m: float, *, watertight: bool) -> MeshFigures:
+        """Return the figures of a mesh that is written: the whole or the simplified, or either closed."""
         listed = self.holes[:_LISTED]
         return MeshFigures(
             voxel_m=voxel_m,
             texel_m=texel_m,
-            faces_before_simplification=self.faces_before,
+            faces_before_simplification=len(self.whole.faces),
             faces=len(mesh.faces),
             rms_simplification_error_m=self.rms_error_m,
             largest_simplification_error_m=self.largest_error_m,
             closed_gap_m=closed_gap_m(voxel_m),
             open_edges=open_share(mesh),
-            holes=len(self.holes),
-            widest_holes=tuple(MeshHole(at=vector3(hole.middle), width_m=hole.width_m) for hole in listed),
+            holes=0 if watertight else len(self.holes),
+            widest_holes=tuple(
+                MeshHole(at=vector3(hole.middle), width_m=hole.width_m) for hole in listed if not watertight
+            ),
             watertight=watertight,
         )
 
@@ -195,13 +207,13 @@ def _surface(
     if not len(whole.faces):
         raise _no_surface(options)
     whole, islands = without_islands(whole, options.least_part)
-    mesh = simplified(whole, error_m, folder, progress)
+    simple = simplified(whole, error_m, folder, progress)
     errors = np.zeros(1)
     if error_m > 0:
         drawn = whole.vertices[:: -(-len(whole.vertices) // _SAMPLE)]
-        errors = distances(drawn, mesh, voxel_m)
+        errors = distances(drawn, simple, voxel_m)
     rms_m = float(np.sqrt(np.mean(errors**2)))
-    return _Surface(mesh, len(whole.faces), rms_m, float(errors.max()), islands, holes_of(mesh))
+    return _Surface(whole, simple, rms_m, float(errors.max()), islands, holes_of(whole))
 
 
 def _sigma(
@@ -217,24 +229,14 @@ def _sigma(
     return np.sqrt(east + north), np.sqrt(up)
 
 
-def _write_in_frame(
-    folder: Path,
-    mesh: RawMesh,
-    rgb: ByteArray,
-    sigma: tuple[FloatArray, FloatArray],
-    *,
-    shown: TexturedMesh,
-    sidecar: MeshSidecar,
-    obj: bool,
-) -> None:
-    """Write the files in the frame of the sidecar, which comes beside each."""
-    files = [folder / Path(MESH).name, folder / Path(MESH_GLB).name]
-    write_mesh_ply(files[0], mesh.vertices, mesh.faces, rgb, double=False, sigma=sigma)
+def _write_textured(folder: Path, shown: TexturedMesh, sidecar: MeshSidecar, *, obj: bool) -> None:
+    """Write the files with a texture, in the frame of the sidecar, which comes beside each."""
+    files = [folder / Path(MESH_GLB).name]
     with_texture = (shown.mesh.vertices, shown.mesh.faces, shown.uv, shown.image)
-    write_mesh_glb(files[1], *with_texture, extras={"georef": sidecar.model_dump(mode="json", by_alias=True)})
+    write_mesh_glb(files[0], *with_texture, extras={"georef": sidecar.model_dump(mode="json", by_alias=True)})
     if obj:
         files.append(folder / "mesh.obj")
-        write_mesh_obj(files[2], *with_texture)
+        write_mesh_obj(files[1], *with_texture)
     for path in files:
         write_sidecar(sidecar, path)
 

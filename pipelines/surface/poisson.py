@@ -26,7 +26,7 @@ _RIM = 4.0  # spacings by which the surface may go beyond the points
 _CLOSED, _CLOSED_M = 10.0, 2.0  # widest gap that is closed: spacings, and metres, whichever is more
 # One thread: more share sums in an order that changes from run to run, and wait for each other actively.
 _THREADS = 1
-_CERTAIN, _APART = 0.5, 2.0  # spacings: least σ of an uncertain point, and its least way to a certain one
+_CERTAIN = 0.5  # spacings: largest σ of a certain point
 _POINT_WEIGHT = 4.0  # of the points' places over their normals; of 1, 4 and 16 the best on a simulated flight
 _RIM_WEIGHT = 4.0  # of an open edge over the faces in the simplification: rims move by half of its error at most
 _REMEDY = "Give a larger --voxel or a smaller --boundary."
@@ -65,7 +65,7 @@ def closed_gap_m(spacing_m: float) -> float:
 def poisson_mesh(points: MeasuredPoints, voxel_m: float, folder: Path, progress: Progress = SILENT) -> RawMesh:
     """Return the surface through points, without what lies far from them; a scratch folder holds files meanwhile.
 
-    1. Points with a large σ are left out beside others (`certain_points`), and the solver runs.
+    1. Points with a large σ are left out near others (`certain_points`), and the solver runs.
     2. Faces farther than `rim_m` from all points are cut.
     3. Connected faces cut so are put back if none of them is farther than half of `closed_gap_m`: they close a gap.
 
@@ -85,20 +85,21 @@ def poisson_mesh(points: MeasuredPoints, voxel_m: float, folder: Path, progress:
         whole = RawMesh(*read_mesh_ply(folder / _SURFACE))
     finally:
         _remove(folder, _POINTS, _SURFACE)
-    return near_points(whole, points)
+    return near_points(whole, used)
 
 
 def certain_points(points: MeasuredPoints) -> MeasuredPoints:
-    """Return points without those with σ above half a spacing that have a better one within two spacings.
+    """Return points without those with σ above half a spacing that have a better one within `closed_gap_m`.
 
-    They blur what the others measure. Where there are no others, they are all that is known.
+    They blur what the others measure, and the surface closes gaps of that width. Farther away, they are all that is
+    known.
     """
     uncertain = points.sigma_m > _CERTAIN * points.spacing_m
     if uncertain.all() or not uncertain.any():
         return points
     tree = KDTree(points.position[~uncertain])
     rows = np.flatnonzero(uncertain)
-    distance, _ = tree.query(points.position[rows], distance_upper_bound=_APART * points.spacing_m, workers=-1)
+    distance, _ = tree.query(points.position[rows], distance_upper_bound=closed_gap_m(points.spacing_m), workers=-1)
     kept = ~uncertain
     kept[rows] = np.isinf(distance)
     return MeasuredPoints(points.position[kept], points.normal[kept], points.sigma_m[kept], points.spacing_m)

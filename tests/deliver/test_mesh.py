@@ -15,7 +15,7 @@ from plyfile import PlyData
 from pipelines.core.errors import ResourceError
 from pipelines.core.products import load_json
 from pipelines.core.runner import run_stage
-from pipelines.core.stages import BY_NAME, MESH
+from pipelines.core.stages import BY_NAME, MESH, MESH_GLB
 from pipelines.core.types import joined_rows
 from pipelines.core.workspace import Workspace
 from pipelines.deliver import mesh as stage
@@ -161,13 +161,16 @@ def test_sigma_grows_with_the_way_from_measured_points() -> None:
 
 
 def test_uncertain_points_count_only_where_no_others_are() -> None:
-    points = plane(10.0)
-    uncertain = np.hypot(points.position[:, 0] - 20, points.position[:, 1]) < 2.0
-    sigma_m = np.where(uncertain, 0.2, 0.03)
-    used = certain_points(MeasuredPoints(points.position, points.normal, sigma_m, points.spacing_m))
-    distance = np.hypot(used.position[:, 0] - 20, used.position[:, 1])
-    assert len(used.position) < len(points.position)
-    assert distance.min() < 0.3 and not ((distance > 1.7) & (distance < 1.95)).any()
+    for radius_m, kept in (
+        (1.0, False),
+        (8.0, True),
+    ):  # the middle is nearer and farther than the gap that is closed
+        points = plane(20.0)
+        distance = np.hypot(points.position[:, 0] - 20, points.position[:, 1])
+        sigma_m = np.where(distance < radius_m, 0.2, 0.03)
+        used = certain_points(MeasuredPoints(points.position, points.normal, sigma_m, points.spacing_m))
+        assert (np.hypot(used.position[:, 0] - 20, used.position[:, 1]).min() < 0.3) == kept
+        assert (sigma_m == 0.03).sum() <= len(used.position) < len(points.position)
 
 
 def test_depth_gives_cells_of_a_voxel() -> None:
@@ -313,10 +316,13 @@ def test_mesh_of_a_trained_survey_lies_on_its_ground(
         ),
     }  # fmt: skip
     body = trimesh.load(workspace.path(MESH), force="mesh", process=False)
-    assert body.is_watertight and len(body.faces) == values["faces"]
+    assert body.is_watertight and len(body.faces) > values["faces"]
     sidecar = load_json(MeshSidecar, sidecar_path(workspace.path(MESH)))
-    assert sidecar.mesh.largest_simplification_error_m == values["largest_simplification_error_m"]
-    assert 0 < sidecar.mesh.rms_simplification_error_m < values["voxel_m"] / 2
+    assert sidecar.mesh.faces == len(body.faces) and sidecar.mesh.largest_simplification_error_m == 0
+    textured_file = load_json(MeshSidecar, sidecar_path(workspace.path(MESH_GLB))).mesh
+    assert textured_file.faces == values["faces"]
+    assert textured_file.largest_simplification_error_m == values["largest_simplification_error_m"]
+    assert 0 < textured_file.rms_simplification_error_m < values["voxel_m"] / 2
     in_crs = PlyData.read(root / "mesh/mesh_crs.ply")["vertex"]
     xyz = np.column_stack([in_crs[axis] for axis in "xyz"])
     # float32 resolves 4e-6 m within 64 m of the origin.
