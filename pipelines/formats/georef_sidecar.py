@@ -168,7 +168,7 @@ class CrsSidecar(_CamelCase):
 
 
 class MeshHole(_CamelCase):
-    """Hole inside a mesh: the middle of its rim in the file's frame, and the longest side of the box around it."""
+    """Hole inside a mesh: middle, in the file's frame, and longest side of the box around its rim."""
 
     at: Vector3
     width_m: float

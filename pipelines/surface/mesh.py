@@ -100,7 +100,7 @@ def closed(mesh: RawMesh, depth_m: float) -> tuple[RawMesh, int]:
 
 @dataclass(frozen=True)
 class Hole:
-    """Hole of a mesh: the middle of its rim, and the longest side of the box around it."""
+    """Hole of a mesh: the middle of the box around its rim, and the longest side of that."""
 
     middle: FloatArray
     width_m: float
@@ -110,7 +110,7 @@ def holes_of(mesh: RawMesh) -> list[Hole]:
     """Return the holes inside the outer rims of a mesh's parts, the widest first."""
     loops, outer = _rims(mesh)
     rims = [mesh.vertices[loop] for number, loop in enumerate(loops) if number not in outer]
-    holes = [Hole(rim.mean(axis=0), float(np.ptp(rim, axis=0).max())) for rim in rims]
+    holes = [Hole((rim.min(axis=0) + rim.max(axis=0)) / 2, float(np.ptp(rim, axis=0).max())) for rim in rims]
     return sorted(holes, key=lambda hole: -hole.width_m)
 
 

@@ -33,6 +33,7 @@ from pipelines.surface.poisson import (
     near_points,
     poisson_depth,
     poisson_mesh,
+    rim_m,
     simplified,
     surface_sigma_at,
 )
@@ -135,7 +136,7 @@ def test_walls_that_no_view_shows_are_closed(whole: RawMesh, simple: RawMesh) ->
     assert closed_gap_m(PIXEL_M) > BOX_M
     for mesh in (whole, simple):
         rim = mesh.vertices[open_edges(mesh)].mean(axis=1) - GEO_FROM_MODEL.translation
-        assert np.abs(rim[:, :2]).max(axis=1).min() > 12
+        assert np.abs(rim[:, :2]).max(axis=1).min() > 10  # where fewer than three of the views end
     assert len(simple.faces) < len(whole.faces) / 3
 
 
@@ -147,9 +148,10 @@ def test_narrow_gaps_are_closed_and_wide_ones_listed(side_m: float, spacing_m: f
     assert holes_of(mesh) == []
     mesh = poisson_mesh(holed, spacing_m, tmp_path)
     (hole,) = [hole for hole in holes_of(mesh) if hole.width_m > spacing_m]
-    np.testing.assert_allclose(hole.middle[:2], [20, 0], atol=spacing_m)
-    # The rim goes into the gap by four spacings at most, as around the plane, less a face of a cell of two.
-    assert wide - 8 * spacing_m - 0.01 < hole.width_m < wide - 3 * spacing_m
+    np.testing.assert_allclose(hole.middle[:2], [20, 0], atol=2 * spacing_m)
+    # The rim goes into the gap by at most what `rim_m` says, less a face of a cell of two voxels.
+    reach = hole.width_m - (wide - 2 * rim_m(spacing_m))
+    assert -0.01 < reach < 6 * spacing_m
     assert list(tmp_path.iterdir()) == []
 
 
@@ -212,11 +214,11 @@ def test_watertight_mesh_is_a_solid(simple: RawMesh) -> None:
     np.testing.assert_array_equal(solid.faces[:of_surface], simple.faces)
     body = trimesh.Trimesh(solid.vertices, solid.faces, process=False)
     assert body.is_watertight and body.is_winding_consistent
-    # All that is below the surface, down to a base 2 m below: the surface itself has no hole.
+    # All that is below the surface, down to a base 2 m below. Bays of the rim, closed by walls, may count as holes.
     a, b, c = (simple.vertices[simple.faces[:, k], :] for k in range(3))
     plan_m2 = np.cross(b - a, c - a)[:, 2] / 2
     heights = (a + b + c)[:, 2] / 3 - solid.vertices[:, 2].min()
-    assert body.volume == pytest.approx(plan_m2 @ heights, rel=1e-3)
+    assert body.volume == pytest.approx(plan_m2 @ heights, rel=0.02)
 
 
 def test_islands_are_left_out() -> None:
