@@ -50,7 +50,7 @@ _AROUND = 16.0  # spacings around the area: points there hold the surface at its
 _SAMPLE = 200_000  # vertices at most that are measured against the simplified mesh
 _LISTED = 100  # widest holes
 _LEAST_POINTS = 100
-# Measured on simulated flights: the mesh with its texture, its parts and the copies that are made of them.
+# Estimated, not measured: the solver, the mesh with its texture, and the copies that are made of them.
 _FIXED_BYTES, _POINT_BYTES = 850 << 20, 2000
 SIGMA_COUNTS = "georeference, disagreement of the training views about the surface, distance from measured points"
 
