@@ -45,6 +45,7 @@ FACTOR_COLUMNS = {
 IMAGE_COLUMNS = {
     "views": "views",
     "psnr": "PSNR dB",
+    "psnr_over_white": "over white dB",
     "psnr_covered": "covered dB",
     "covered_share": "covered share",
     "ssim": "SSIM",

@@ -32,13 +32,13 @@ SETTINGS = DefaultSettings(start=4, stop=60, every=8, reset_every=0, max_gaussia
 
 
 def true_gaussians(count: int = 200, seed: int = 0) -> Gaussians:
-    """Return coloured blobs on a wall 4 m away."""
+    """Return coloured blobs that cover a wall 4 m away: photographs have no holes."""
     random = torch.Generator().manual_seed(seed)
-    place = torch.rand(count, 2, generator=random) * torch.tensor([5.0, 4.0]) - torch.tensor([2.5, 2.0])
+    place = torch.rand(count, 2, generator=random) * torch.tensor([8.0, 5.0]) - torch.tensor([4.0, 2.5])
     return Gaussians(
         torch.cat([place, torch.full((count, 1), 4.0)], dim=1),
         torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
-        torch.full((count, 3), -1.8),
+        torch.full((count, 3), -1.0),
         torch.full((count,), 2.0),
         torch.randn(count, 4, 3, generator=random) * torch.tensor([1.0, 0.0, 0.0, 0.0])[:, None],
     )

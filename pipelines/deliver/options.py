@@ -5,7 +5,7 @@ from urllib.parse import urlsplit
 
 from pydantic import AfterValidator, Field
 
-from pipelines.core.options import ExtraMarker
+from pipelines.core.options import WRITTEN, ExtraMarker, from_text
 from pipelines.survey.options import AreaOptions, CrsOptions
 
 # The page was tried with this version: the extensions of splats in glTF are younger than those of meshes.
@@ -85,6 +85,20 @@ class TerrainOptions(AreaOptions):
     )
 
 
+def _width(fill: float | Literal["all"]) -> float | Literal["all"]:
+    if fill != "all" and not 0 <= fill < 1e6:
+        raise ValueError("a width in metres, or all")
+    return fill
+
+
+FillWidth = Annotated[
+    float | Literal["all"],
+    from_text(lambda text: text if text == "all" else float(text)),
+    AfterValidator(_width),
+    WRITTEN,
+]
+
+
 class ExportRasterOptions(CrsOptions, TerrainOptions):
     """Options of the export of orthophoto, surface model, σ and contours."""
 
@@ -102,6 +116,18 @@ class ExportRasterOptions(CrsOptions, TerrainOptions):
     )
     min_views: int = Field(
         3, ge=2, description="Number of training views that must show a cell's surface; others are interpolated."
+    )
+    colours: Literal["photographs", "splat"] = Field(
+        "photographs",
+        description="Colours of the orthophoto: of the photographs, at their own resolution, or of the splat. What "
+        "no photograph sees has the splat's.",
+    )
+    source: bool = Field(False, description="Write source.tif: which photograph the detail of each cell is from.")
+    fill: FillWidth | None = Field(
+        None,
+        description="Width in metres up to which holes in the measured surface are filled by interpolation, 0 for "
+        "none; all: the whole area. Without it: all inside a --boundary, else two metres and ten cells, at most "
+        "a tenth of the area.",
     )
     max_pixels: float = Field(1e9, gt=0, description="Refuse a raster with more cells.")
     hillshade: bool = Field(True, description="Draw hillshade.png and preview.png.")

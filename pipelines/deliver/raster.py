@@ -2,10 +2,11 @@
 
 Reads the survey, the trained model and the initial similarity. Writes `raster/orthophoto.tif`, `dsm.tif`,
 `sigma_h.tif`, `sigma_v.tif` as Cloud Optimized GeoTIFF, each with its sidecar, `hillshade.png` and `preview.png`;
-with `--contours` also `contours.gpkg` and `contours.dxf`. The Gaussians are rendered orthographically, window by
-window: finished windows survive an interruption.
+with `--contours` also `contours.gpkg` and `contours.dxf`. The Gaussians are rendered orthographically, and the
+photographs projected onto that surface, window by window: finished windows survive an interruption.
 """
 
+import json
 import math
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from pipelines.core.products import Remark, union
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import ExportRasterOptions
+from pipelines.deliver.photo_colours import PhotoColours
 from pipelines.deliver.placement import median_values, require_space, scene_sigma
 from pipelines.deliver.raster_mosaic import Mosaic
 from pipelines.deliver.raster_plan import ground_sampling_m, make_frame
@@ -30,12 +32,15 @@ from pipelines.formats.geotiff import RasterFrame, read_reduced
 from pipelines.formats.vector_files import ContourLine, features_text, write_contours_dxf, write_contours_gpkg
 from pipelines.survey.area import area_of
 from pipelines.survey.headline import headline_of
+from pipelines.survey.scene import photographs
 from pipelines.survey.target_crs import target_crs
 from pipelines.survey.trained_survey import corners, load_trained, scene_points
 
 _DETAIL = 1.5  # training pixels over cells, beyond which a raster shows less than its cells promise
 # Bytes of a cell on the disk at most: colours, height, mask and two σ, as measured, whole and final rasters.
 _BYTES_PER_CELL = 74
+# Width of the holes that are filled unless the user says otherwise, and largest share of what is delivered.
+_FILLED_M, _FILLED_CELLS, _MOST_FILLED = 2.0, 10, 0.1
 _PICTURE_PX = 2000
 _COLOURED, _TINT = (0.01, 0.99), 0.55  # quantiles of the heights at the ends of the colours, and their strength
 _SUN_AZIMUTH_DEG, _SUN_ELEVATION_DEG = 315.0, 45.0
@@ -61,8 +66,19 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
     source, reason, warnings = raster_source(
         stage, trained, target, frame, area, training_gsd_m=training_m, options=options
     )
-    mosaic = Mosaic(stage.out / "parts", frame, target, polygon, has_terrain=source.terrain is not None)
+    fill_m, most_filled = _filling(options, frame.step_x * target.horizontal_unit_m)
+    mosaic = Mosaic(
+        stage.out / "parts", frame, target, polygon,
+        fill_m=fill_m, most_filled=most_filled, has_terrain=source.terrain is not None,
+    )  # fmt: skip
     mosaic.render(source, stage.progress)
+    if options.colours == "photographs":
+        longest_px = max(max(camera.width, camera.height) for camera in trained.sfm.cameras.values())
+        images = photographs(trained.sfm, trained.survey, stage.workspace, longest_px)
+        mosaic.colour(PhotoColours(trained, source, images), stage.progress)
+        if options.source:
+            mosaic.add_source()
+            replace_text(stage.out / "source.json", json.dumps(["", *trained.sfm.image_name], indent=1))
     height = mosaic.sample("dsm")
     if not len(height):
         message = f"No cell is seen by {options.min_views} training views or more. Lower --min-views."
@@ -73,10 +89,8 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
         sigma = scene_sigma(counts, mosaic.sample("sigma_h"), mosaic.sample("sigma_v"))
     west, south, east, north = frame.bounds
     bounds = [[west, south, height.min()], [east, north, height.max()]]
-    detail = (
-        f"The model was trained at {training_m:.3f} m a pixel on the ground, and shows no finer detail, whatever "
-        "the size of a raster's cells."
-    )
+    what = "Heights show" if options.colours == "photographs" else "Heights and colours show"
+    detail = f"{what} no finer detail than the training's pixels of {training_m:.3f} m, whatever the cell size."
     coarse = (Remark(code="detail-of-training", sentence=detail),) if source.training_px > _DETAIL else ()
     empty = "The rasters state no σ, and sigma_h.tif and sigma_v.tif are empty"
     cautions = union(trained.model.cautions, (*coarse, *without_sigma(empty, reason)))
@@ -88,19 +102,14 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
     if options.hillshade:
         _write_pictures(stage.out, target.horizontal_unit_m / target.crs.height_unit_m)
     of_ground = options.contours_of == "terrain" and source.terrain is not None
-    heights = stage.out / ("dtm.tif" if of_ground else "dsm.tif")
-    lines: list[ContourLine] = []
-    if options.contours:
-        height, _ = read_reduced(heights, _CONTOUR_PX)
-        lines = _contour_lines(height[0].astype(np.float64), frame, options.contours)
-        write_contours_gpkg(stage.out / "contours.gpkg", lines, frame.wkt)
-        write_contours_dxf(stage.out / "contours.dxf", lines)
-    measured, interpolated = mosaic.shares()
+    lines = _write_contours(stage.out, "dtm.tif" if of_ground else "dsm.tif", frame, options.contours)
+    measured, interpolated, delivered_ha = mosaic.shares()
+    photographed = mosaic.photographed()
     source.views.close()
     remove(mosaic.folder)
     figure = (
         f"{size} of {frame.step_x:g} {target.crs.units[0]} in {target.crs.name}, {measured:.0%} of "
-        f"{area.hectares:.3g} ha measured, {interpolated:.0%} interpolated"
+        f"{delivered_ha:.3g} ha measured, {interpolated:.0%} interpolated"
     )
     return Summary(
         figure + median_sigma(sigma, "cells"),
@@ -115,15 +124,37 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
             "units": target.crs.units,
             "bounds": bounds,
             "area_ha": area.hectares,
+            "delivered_ha": delivered_ha,
             "measured": measured,
             "interpolated": interpolated,
+            "photographed": photographed,
             **median_values(sigma, "cell"),
-            "contour_lines": len(lines),
+            "contour_lines": lines,
             "assumed": "; ".join(target.assumed),
         },
         warnings,
         cautions,
     )
+
+
+def _filling(options: ExportRasterOptions, cell_m: float) -> tuple[float, float]:
+    """Return the width in metres up to which holes are filled, and the largest share that may be filled."""
+    if options.fill == "all" or (options.fill is None and options.boundary is not None):
+        return math.inf, 1.0
+    if options.fill is not None:
+        return options.fill, 1.0
+    return max(_FILLED_M, _FILLED_CELLS * cell_m), _MOST_FILLED
+
+
+def _write_contours(folder: Path, heights: str, frame: RasterFrame, interval: float | None) -> int:
+    """Write the contour lines of a raster of the folder, and return their number; None: there are to be none."""
+    if not interval:
+        return 0
+    height, _ = read_reduced(folder / heights, _CONTOUR_PX)
+    lines = _contour_lines(height[0].astype(np.float64), frame, interval)
+    write_contours_gpkg(folder / "contours.gpkg", lines, frame.wkt)
+    write_contours_dxf(folder / "contours.dxf", lines)
+    return len(lines)
 
 
 def _write_pictures(folder: Path, heights_by_plan: float) -> None:

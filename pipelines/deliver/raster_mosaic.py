@@ -1,11 +1,13 @@
 """Rasters of the stage, window by window: rendered into parts, made whole inside the area, then put together."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import shapely
 from numpy.typing import NDArray
@@ -14,6 +16,7 @@ from scipy.ndimage import label
 from pipelines import __version__
 from pipelines.core.progress import Progress
 from pipelines.core.types import BoolArray, FloatArray, IntArray
+from pipelines.deliver.photo_colours import MARGIN, PhotoColours
 from pipelines.deliver.raster_whole import INTERPOLATED, MEASURED, REACH, CoarseCells, SeenCells, whole_cells
 from pipelines.deliver.raster_window import PAINTED, RasterSource, render_window
 from pipelines.formats.georef_sidecar import CrsSidecar
@@ -36,7 +39,8 @@ from pipelines.survey.target_crs import TargetCrs
 _SEEN = ("orthophoto", "dsm", "modelled", "sigma_h", "sigma_v")  # parts of what is measured
 _WINDOW_PX = 1536
 _SAMPLES_PX = 192  # a side of a window
-_ISLANDS_PX = 4000  # along the longer side, at which islands are looked for
+_OVERVIEW_PX = 4000  # along the longer side, at which islands and the outline are looked for
+_SPIKE_M = 1.0  # width of tongues of the outline that are cut off
 _LEAST_ISLAND = 0.01  # of the largest part of the surface
 _COARSE_PX = 1500  # along the longer side, at which wide holes are filled
 _OUTLINES_PX = 2000  # along the longer side, at which interpolated parts are outlined
@@ -61,13 +65,25 @@ class _Window:
 class Mosaic:
     """Rasters over one frame, and the area (a polygon in their CRS) outside which they are empty.
 
+    Of the area, the measured surface is delivered, and its holes up to the width `fill_m`; infinite: all of it. The
+    width is halved until no larger share than `most_filled` is filled.
+
     Parts in the folder are kept: `parts` of what is measured, `whole` of the rasters to deliver.
     """
 
     def __init__(
-        self, folder: Path, frame: RasterFrame, target: TargetCrs, polygon: Any, *, has_terrain: bool
+        self,
+        folder: Path,
+        frame: RasterFrame,
+        target: TargetCrs,
+        polygon: Any,
+        *,
+        fill_m: float,
+        most_filled: float,
+        has_terrain: bool,
     ) -> None:
         self.folder, self.frame, self.target, self.polygon = folder, frame, target, polygon
+        self.fill_m, self._most_filled = fill_m, most_filled
         height = f"height above {target.crs.vertical.name}"
         self._kinds = {
             "orthophoto": RasterKind("uint8", _COLOURS),
@@ -81,8 +97,8 @@ class Mosaic:
                 "dtm": RasterKind("float32", (Band(f"ground: {height}", target.crs.height_unit),)),
                 "sigma_dtm": RasterKind("float32", (Band("predicted vertical standard deviation", "metre"),)),
             }
-        self._seen, self._whole = folder / "seen", folder / "whole"
-        for part in (self._seen, self._whole):
+        self._seen, self._whole, self._coloured = (folder / name for name in ("seen", "whole", "coloured"))
+        for part in (self._seen, self._whole, self._coloured):
             part.mkdir(parents=True, exist_ok=True)
 
     def render(self, source: RasterSource, progress: Progress) -> None:
@@ -110,13 +126,82 @@ class Mosaic:
                     self._write(self._whole, window, whole_cells(source, seen, self._coarse, first))
                 task.advance()
 
-    def _drop_islands(self) -> None:
-        """Unmeasure the cells of islands: small parts, apart from all other surface, are agreements by chance."""
-        step = -(-max(self.frame.columns, self.frame.rows) // _ISLANDS_PX)
+    def colour(self, colours: PhotoColours, progress: Progress) -> None:
+        """Colour the orthophoto's cells by the photographs that see them; the others keep the splat's colours."""
+        windows = list(self._windows())
+        whole = [(self._part(self._whole, "dsm", one), one.column, one.row) for one in windows]
+        heights = write_vrt("dsm", whole, self.frame, self._kinds["dsm"], {})
+        with progress.task("colours of the photographs", len(windows)) as task:
+            for window in windows:
+                if not all(self._part(self._coloured, name, window).exists() for name in ("orthophoto", "source")):
+                    part, own, frame = self._around(window, MARGIN)
+                    height = read_cells(heights, part)[0].astype(np.float64)
+                    found = colours.window(frame, (part[0].start, part[1].start), height)
+                    rgba = read_cells(self._part(self._whole, "orthophoto", window))
+                    number = np.where(rgba[3] > 0, found.camera[own] + 1, 0)
+                    rgba[:3] = np.where(number > 0, found.rgb[:, *own], rgba[:3])
+                    bands = {"orthophoto": rgba, "source": number[None].astype(np.uint16)}
+                    self._write(self._coloured, window, bands)
+                task.advance()
+
+    def add_source(self) -> None:
+        """Deliver the number of the photograph that each cell's detail is from, from 1 on; 0: none."""
+        self._kinds["source"] = RasterKind("uint16", (Band("number of the photograph (source.json)"),))
+
+    def photographed(self) -> float:
+        """Return the share of the cells with a colour whose colour is that of photographs."""
+        seen = known = 0
+        for window in self._windows():
+            path = self._part(self._coloured, "source", window)
+            seen += int((read_cells(path)[0] > 0).sum()) if path.exists() else 0
+            known += int((read_cells(self._part(self._whole, "measured", window))[0] > 0).sum())
+        return seen / max(known, 1)
+
+    @property
+    def _step(self) -> int:
+        """Cells along a side of those at which the whole raster is looked at."""
+        return -(-max(self.frame.columns, self.frame.rows) // _OVERVIEW_PX)
+
+    def _measured(self) -> BoolArray:
+        """Return which coarse cells of the whole raster hold a measured one."""
+        step = self._step
         seen = np.zeros((-(-self.frame.rows // step), -(-self.frame.columns // step)), dtype=bool)
         for window in self._windows():
             alpha = read_cells(self._part(self._seen, "orthophoto", window))[3]
             np.logical_or.at(seen, _coarse_cells(window, step), alpha == MEASURED)
+        return seen
+
+    @cached_property
+    def _outline(self) -> BoolArray | None:
+        """Return which coarse cells are delivered: the measured surface, its holes up to a width, no spikes."""
+        if np.isinf(self.fill_m):
+            return None
+        measured = self._measured()
+        inside = cells_inside(self.polygon, self.frame.resized(*measured.shape[::-1]))
+        measured &= inside
+        cell_m = self._step * self.frame.step_x * self.target.horizontal_unit_m
+        width = self.fill_m
+        while True:
+            found = _without_spikes(_closed(measured, width / cell_m / 2), _SPIKE_M / cell_m / 2) & inside
+            filled = (found & ~measured).sum() / max(found.sum(), 1)
+            if filled <= self._most_filled or width < cell_m:
+                return found
+            width /= 2
+
+    def _inside(self, frame: RasterFrame, first: tuple[int, int]) -> BoolArray:
+        """Return which cells of a part that begins at a row and column are delivered."""
+        inside = cells_inside(self.polygon, frame)
+        if self._outline is None:
+            return inside
+        rows, columns = (
+            (start + np.arange(size)) // self._step
+            for start, size in zip(first, (frame.rows, frame.columns), strict=True)
+        )
+        return np.asarray(inside & self._outline[np.ix_(rows, columns)])
+
+    def _drop_islands(self) -> None:
+        """Unmeasure the cells of islands: small parts, apart from all other surface, are agreements by chance."""
+        step, seen = self._step, self._measured()
         number, _ = label(seen, structure=np.ones((3, 3)))
         sizes = np.bincount(number.ravel())
         if len(sizes) < 3:
@@ -135,26 +220,31 @@ class Mosaic:
             self._write(self._seen, window, bands)
 
     def _seen_around(self, window: _Window) -> SeenCells:
-        row, column = window.row, window.column
-        top, left = max(row - REACH, 0), max(column - REACH, 0)
-        rows = min(row + window.frame.rows + REACH, self.frame.rows) - top
-        columns = min(column + window.frame.columns + REACH, self.frame.columns) - left
-        frame = self.frame.part(left, top, columns, rows)
-        part = (slice(top, top + rows), slice(left, left + columns))
+        part, own, frame = self._around(window, REACH)
         sigma_h, sigma_v = (read_cells(self._part(self._seen, name, window))[0] for name in ("sigma_h", "sigma_v"))
         return SeenCells(
             frame=frame,
-            own=(
-                slice(row - top, row - top + window.frame.rows),
-                slice(column - left, column - left + window.frame.columns),
-            ),
+            own=own,
             height=read_cells(self._seen / "dsm.vrt", part)[0].astype(np.float64),
             rgba=read_cells(self._seen / "orthophoto.vrt", part),
             modelled=read_cells(self._seen / "modelled.vrt", part)[0].astype(np.float64),
             sigma_h_m=sigma_h,
             sigma_v_m=sigma_v,
-            inside=cells_inside(self.polygon, frame),
+            inside=self._inside(frame, (part[0].start, part[1].start)),
         )
+
+    def _around(self, window: _Window, margin: int) -> tuple[tuple[slice, slice], tuple[slice, slice], RasterFrame]:
+        """Return the cells of a window and up to `margin` around it, its own among them, and the frame of all."""
+        row, column = window.row, window.column
+        top, left = max(row - margin, 0), max(column - margin, 0)
+        rows = min(row + window.frame.rows + margin, self.frame.rows) - top
+        columns = min(column + window.frame.columns + margin, self.frame.columns) - left
+        own = (
+            slice(row - top, row - top + window.frame.rows),
+            slice(column - left, column - left + window.frame.columns),
+        )
+        part = (slice(top, top + rows), slice(left, left + columns))
+        return part, own, self.frame.part(left, top, columns, rows)
 
     @cached_property
     def _coarse(self) -> CoarseCells:
@@ -162,6 +252,9 @@ class Mosaic:
         rgba, _ = read_reduced(self._seen / "orthophoto.vrt", _COARSE_PX)
         rows, columns = height.shape[1:]
         inside = cells_inside(self.polygon, self.frame.resized(columns, rows))
+        if self._outline is not None:
+            size = (columns, rows)
+            inside &= cv2.resize(self._outline.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
         modelled, _ = read_reduced(self._seen / "modelled.vrt", _COARSE_PX)
         cells = fill_cells(height[0], inside, max(rows, columns), modelled[0])
         rgb = np.moveaxis(rgba[:3], 0, 2).reshape(-1, 3)[cells.source]
@@ -174,15 +267,16 @@ class Mosaic:
         flat = np.concatenate([part.ravel() for part in values])
         return np.asarray(flat[np.isfinite(flat)], dtype=np.float64)
 
-    def shares(self) -> tuple[float, float]:
-        """Return the shares of the area that are measured, and interpolated."""
+    def shares(self) -> tuple[float, float, float]:
+        """Return the measured and interpolated shares of the delivered area, and that area in hectares."""
         inside = measured = interpolated = 0
         for window in self._windows():
             mask = read_cells(self._part(self._whole, "measured", window))[0]
-            inside += int(cells_inside(self.polygon, window.frame).sum())
+            inside += int(self._inside(window.frame, (window.row, window.column)).sum())
             measured += int((mask == MEASURED).sum())
             interpolated += int((mask == INTERPOLATED).sum())
-        return measured / max(inside, 1), interpolated / max(inside, 1)
+        hectares = inside * self.frame.step_x * self.frame.step_y * self.target.horizontal_unit_m**2 / 1e4
+        return measured / max(inside, 1), interpolated / max(inside, 1), hectares
 
     def interpolated_parts(self, path: Path) -> list[Json]:
         """Return the interpolated parts of the mask at a path as features in WGS84, the largest first.
@@ -223,7 +317,7 @@ class Mosaic:
             tags["GEOREF_MEDIAN_CELL_SIGMA_V_M"] = f"{sidecar.sigma.median_sigma_v_m:.4f}"
         with progress.task("rasters", len(self._kinds)) as task:
             for name, kind in self._kinds.items():
-                parts = [(self._part(self._whole, name, one), one.column, one.row) for one in self._windows()]
+                parts = [(self._delivered(name, one), one.column, one.row) for one in self._windows()]
                 path = folder / f"{name}.tif"
                 write_mosaic(path, parts, self.frame, kind, tags)
                 yield path
@@ -240,8 +334,34 @@ class Mosaic:
         for name, values in bands.items():
             write_part(self._part(folder, name, window), values, window.frame)
 
+    def _delivered(self, name: str, window: _Window) -> Path:
+        coloured = self._part(self._coloured, name, window)
+        return coloured if coloured.exists() else self._part(self._whole, name, window)
+
     def _part(self, folder: Path, name: str, window: _Window) -> Path:
         return folder / f"{name}_{window.row}_{window.column}.tif"
+
+
+def _closed(cells: BoolArray, radius: float) -> BoolArray:
+    """Return cells with their holes and bays that are narrower than twice a radius in cells."""
+    margin = math.ceil(radius) + 1
+    padded = np.pad(cells, margin)
+    dilated = _distance(~padded) <= radius
+    closed = _distance(dilated) > radius
+    return np.asarray(cells | closed[margin:-margin, margin:-margin])
+
+
+def _without_spikes(cells: BoolArray, radius: float) -> BoolArray:
+    """Return cells without tongues that are narrower than twice a radius in cells."""
+    padded = np.pad(cells, 1)
+    eroded = _distance(padded) > radius
+    opened = _distance(~eroded) <= radius
+    return np.asarray(cells & opened[1:-1, 1:-1])
+
+
+def _distance(cells: BoolArray) -> NDArray[Any]:
+    """Return the distance of each chosen cell to the nearest other one, in cells; 0 of the others."""
+    return cv2.distanceTransform(cells.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
 
 
 def _coarse_cells(window: _Window, step: int) -> tuple[IntArray, IntArray]:

@@ -180,8 +180,8 @@ def render_window(source: RasterSource, frame: RasterFrame, column: int, row: in
     modelled, height = np.where(seen, np.nan, height), np.where(seen, height, np.nan)
     solid = np.isfinite(height)
     rgba = np.zeros((4, frame.rows, frame.columns), dtype=np.uint8)
-    # Colours were blended over black: what is not opaque would be dark.
-    rgb = np.clip(colour / np.maximum(alpha, _SOLID)[..., None], 0.0, 1.0)
+    # Over black, as in the training, which may have learned dark places as holes: they would be whitened otherwise.
+    rgb = np.clip(colour, 0.0, 1.0)
     painted = solid | (alpha > _SOLID)
     rgba[:3] = np.where(painted, np.moveaxis(np.round(255 * rgb), 2, 0), 0)
     rgba[3] = np.where(solid, 255, np.where(painted, PAINTED, 0))

@@ -91,7 +91,9 @@ def compare_test_views(
     with progress.task("test views", len(indices)) as task:
         for place, index in enumerate(indices):
             name = renderer.trained.sparse.image_name[index]
-            render = _through_lens(renderer, index).clamp(0, 1)
+            seen = renderer.render(index)
+            render = _through_lens(renderer, index, seen.colour.cpu()).clamp(0, 1)
+            over_white = seen.colour + (1 - seen.alpha)[..., None] * _to_white(renderer)
             photo = torch.from_numpy(np.array(renderer.images.image(index))).float() / 255.0
             mask = torch.from_numpy(np.array(renderer.images.mask(index)))
             covered = coverage.covered(index)
@@ -104,13 +106,14 @@ def compare_test_views(
                 ssim=ssim(render, photo, mask),
                 lpips=None if distance is None else distance(render, photo, mask),
                 covered_share=None if covered is None else float(covered.sum() / mask.sum()),
+                psnr_over_white=psnr(_through_lens(renderer, index, over_white.cpu()).clamp(0, 1), photo, mask),
                 psnr_covered=None if covered is None or not covered.any() else psnr(render, photo, covered),
             )
             views.append(figures)
             if place < saved:
                 save_render(name, _side_by_side(photo, render, figures))
             task.advance()
-    means = ("psnr", "psnr_compensated", "ssim", "psnr_covered", "covered_share", "lpips")
+    means = ("psnr", "psnr_over_white", "psnr_compensated", "ssim", "psnr_covered", "covered_share", "lpips")
     return PhotometricFigures(
         views=len(views),
         **{name: _mean(getattr(view, name) for view in views) for name in means},
@@ -119,8 +122,15 @@ def compare_test_views(
     )
 
 
-def _through_lens(renderer: ModelRenderer, index: int) -> Tensor:
-    colour, trained = renderer.render(index).colour.cpu(), renderer.trained
+def _to_white(renderer: ModelRenderer) -> Tensor:
+    """Return what a render (…, 3) over the model's background lacks where nothing lies, to be one over white."""
+    background = torch.tensor(renderer.trained.model.background, dtype=torch.float32)
+    return (1 - background).to(renderer.device)
+
+
+def _through_lens(renderer: ModelRenderer, index: int, colour: Tensor) -> Tensor:
+    """Return colours (H, W, 3) of a render as the lens and the exposure of its photograph show them."""
+    trained = renderer.trained
     camera_id, pinhole = int(trained.sparse.image_camera_id[index]), renderer.pinholes.of(index)
     lens = next((lens for lens in trained.model.vignetting if lens.camera_id == camera_id), None)
     if lens is not None:

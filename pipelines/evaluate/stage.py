@@ -76,7 +76,7 @@ def summarise(report: EvaluationReport) -> Summary:
     test = report.test_views
     values: dict[str, Any] = {"accuracy": report.headline.model_dump()}
     if test is not None:
-        names = ("views", "psnr", "psnr_covered", "covered_share", "psnr_compensated", "ssim")
+        names = ("views", "psnr", "psnr_over_white", "psnr_covered", "covered_share", "psnr_compensated", "ssim")
         values |= {name: getattr(test, name) for name in names}
     for way, errors in report.checkpoints.by_way.items():
         figures = ("count", "mean_h_m", "rmse_h_m", "rmse_v_m", "rmse_3d_m")

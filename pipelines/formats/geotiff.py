@@ -24,7 +24,7 @@ from pipelines.core.types import BoolArray, ByteArray, FloatArray
 NODATA = -9999.0
 _CACHE_BYTES = 256 * 1024 * 1024
 _BLOCK_PX = 512
-_GDAL_TYPE = {"uint8": "Byte", "float32": "Float32"}
+_GDAL_TYPE = {"uint8": "Byte", "uint16": "UInt16", "float32": "Float32"}
 
 
 @dataclass(frozen=True)
@@ -71,9 +71,9 @@ class Band:
 
 @dataclass(frozen=True)
 class RasterKind:
-    """Bands of a raster. Without a value, float32 rasters have `NODATA`; bytes have an alpha band, or are 0."""
+    """Bands of a raster. Without a value, float32 rasters have `NODATA`; integers have an alpha band, or are 0."""
 
-    dtype: Literal["uint8", "float32"]
+    dtype: Literal["uint8", "uint16", "float32"]
     bands: tuple[Band, ...]
 
 

@@ -1,7 +1,7 @@
 """Appearance refinement: colours and opacities of Gaussians are fitted to images, while their geometry stays."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from torch import Tensor
@@ -9,7 +9,12 @@ from torch import Tensor
 from pipelines.core.progress import SILENT, Progress
 from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.losses import photometric_loss
+from pipelines.splat.losses import (
+    TRANSPARENCY_WEIGHT,
+    photometric_loss,
+    training_background,
+    transparency_loss,
+)
 from pipelines.splat.optimizer import GaussianAdam, LearningRates
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings
 
@@ -40,7 +45,8 @@ def refine_appearance(
 ) -> Gaussians:
     """Return the Gaussians, on their own device, with colours and opacities that show the views.
 
-    The order tells the number of a view for each iteration, the settings degree of the harmonics and background.
+    The order tells the number of a view for each iteration, the settings the degree of the harmonics. As in a
+    training, the background changes and transparency costs.
     """
     device = rasterizer.device
     adam = GaussianAdam(gaussians.to(device), 1.0, len(order), _RATES)
@@ -50,8 +56,10 @@ def refine_appearance(
             adam.rate_factor = next(factor for begin, factor in _FALLS if iteration >= begin * len(order))
             pose = view.cam_from_model.to(device)
             shown = adam.show(rasterizer.candidates(adam.gaussians, pose, view.camera, settings))
-            render = rasterizer.render(shown, pose, view.camera, settings)
-            photometric_loss(render.colour, view.colour.to(device)).backward()
+            before = replace(settings, background=training_background(iteration))
+            render = rasterizer.render(shown, pose, view.camera, before)
+            loss = photometric_loss(render.colour, view.colour.to(device))
+            (loss + TRANSPARENCY_WEIGHT * transparency_loss(render.alpha)).backward()
             adam.step(iteration, render.stats.visible)
             task.advance()
     return adam.gaussians.detached().to(gaussians.means.device)

@@ -1,8 +1,11 @@
-"""Losses of Gaussians: photometric, of opacity in free space, and of distance to measured planes.
+"""Losses of Gaussians: photometric, of transparency, of opacity in free space, and of distance to measured planes.
 
 The photometric loss is that of 3D Gaussian Splatting (doi 10.1145/3592433, eq. 7): 0.8 · L1 + 0.2 · (1 − SSIM).
 SSIM (doi 10.1109/TIP.2003.819861) has the 11×11 Gaussian window, σ = 1.5 px, zeros around the image. On a CPU value
 and gradient come from one pass of fused kernels: torch's convolutions cost more than the rasteriser.
+
+Photographs have no holes. Over one background, a training learns places of its colour as holes, which every viewer
+with another background shows. So the background changes from iteration to iteration, and transparency costs.
 
 A mask selects the pixels that count. The others are zero in both images, like pixels outside the image: they add
 neither to L1 nor to SSIM's mean, and a window that reaches over them sees the same zeros as at the image's edge.
@@ -28,6 +31,7 @@ from pipelines.splat import ssim_kernels as kernels
 from pipelines.splat.gaussians import Gaussians
 
 SSIM_WEIGHT = 0.2
+TRANSPARENCY_WEIGHT = 0.3  # 99 % of the pixels in the middle of a simulated town become 0.97 opaque
 
 
 def photometric_loss(
@@ -154,6 +158,25 @@ def _check(rendered: Tensor, target: Tensor, mask: Tensor | None) -> None:
         raise ValueError(f"expected two float images of one type, got {rendered.dtype} and {target.dtype}")
     if mask is not None and (mask.shape != rendered.shape[:2] or mask.dtype != torch.bool):
         raise ValueError(f"expected a bool mask {tuple(rendered.shape[:2])}, got {mask.dtype} {tuple(mask.shape)}")
+
+
+# RGB behind the scene in turn: colours from all over the cube, so that no shade can be learned as a hole. They are
+# few, since each is copied to a GPU once.
+_BACKGROUNDS = np.random.default_rng(0).permutation(
+    np.stack(np.meshgrid(*3 * (np.linspace(0.0, 1.0, 4),)), axis=-1).reshape(-1, 3)
+)
+
+
+def training_background(iteration: int) -> tuple[float, float, float]:
+    """Return the colour behind the scene in an iteration of a training."""
+    red, green, blue = _BACKGROUNDS[iteration % len(_BACKGROUNDS)].tolist()
+    return red, green, blue
+
+
+def transparency_loss(alpha: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Return the mean of 1 − α over the pixels (H, W) of a render that count; `mask` None: all do."""
+    through = 1 - alpha
+    return through.mean() if mask is None else (through * mask).sum() / mask.sum().clamp_min(1)
 
 
 @dataclass(frozen=True)

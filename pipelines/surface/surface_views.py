@@ -68,6 +68,10 @@ class ModelRenderer:
         """Gaussians sorted for windows: a second for a million, which the first window takes otherwise."""
         return SpatialBlocks(self.trained.gaussians)
 
+    @property
+    def device(self) -> torch.device:
+        return self._backend.device
+
     def pose(self, index: int) -> ViewPose:
         poses = self.trained.poses
         return ViewPose(self.pinholes.of(index), poses.cam_from_model[index], poses.cam_center_in_model[index])

@@ -130,6 +130,28 @@ class ImageCache:
             write()
             return _mapped(path)
 
+    def decoded(self, index: int) -> ByteArray:
+        """Return a photograph (H, W, 3) as it was taken, RGB at its full size, from its file.
+
+        Raises:
+            InputError: it cannot be read, is not that of the survey, or has another size than its camera.
+        """
+        return np.ascontiguousarray(_decoded(self._photographs[index])[..., ::-1])
+
+    def sampled(self, index: int, decoded: ByteArray, place: Float32Array) -> ByteArray:
+        """Return the colours (…, 3) of a decoded photograph at places (…, 2) in pixels of its pinhole.
+
+        The photograph is interpolated once, where reading its undistorted image would be the second time. The cache
+        must be one of photographs at full size.
+        """
+        photograph, flat = self._photographs[index], (place - 0.5).astype(np.float32)
+        lens = self._map(index)[0]
+        source = cv2.remap(lens, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        if photograph.shift is not None:
+            source = source + _shift_at(photograph, source)
+        colours = cv2.remap(decoded, source[..., 0], source[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+        return np.asarray(colours, dtype=np.uint8)
+
     def mask(self, index: int) -> BoolArray:
         """Return the mask (H, W) of the pixels that the photograph covers and that count, mapped from disk.
 
@@ -241,6 +263,15 @@ def _undistorted(
     Raises:
         InputError: the photograph cannot be read, is not that of the survey, or has another size than its camera.
     """
+    small = cv2.resize(_decoded(photograph), (pinhole.width, pinhole.height), interpolation=cv2.INTER_AREA)
+    if photograph.shift is not None:
+        source = source + _shift_at(photograph, source)
+    flat = cv2.remap(small, source[..., 0], source[..., 1], interpolation, borderMode=cv2.BORDER_REFLECT)
+    return np.asarray(flat, dtype=np.uint8)
+
+
+def _decoded(photograph: Photograph) -> ByteArray:
+    """Return a photograph (H, W, 3) BGR at full size; an InputError: it is not that of the survey."""
     full = decoded_photograph(photograph.file, photograph.sha256)
     if full is None:
         raise InputError("photograph-damaged", "The photograph cannot be read.", path=photograph.file)
@@ -251,11 +282,7 @@ def _undistorted(
             f"{photograph.camera.width}×{photograph.camera.height}",
             path=photograph.file,
         )
-    small = cv2.resize(full, (pinhole.width, pinhole.height), interpolation=cv2.INTER_AREA)
-    if photograph.shift is not None:
-        source = source + _shift_at(photograph, source)
-    flat = cv2.remap(small, source[..., 0], source[..., 1], interpolation, borderMode=cv2.BORDER_REFLECT)
-    return np.asarray(flat, dtype=np.uint8)
+    return full
 
 
 def _shift_at(photograph: Photograph, source: Float32Array) -> Float32Array:

@@ -40,13 +40,15 @@ class ViewFigures(Product):
     lpips: float | None
     covered_share: float | None = None
     psnr_covered: float | None = None
+    psnr_over_white: float | None = None
 
 
 class PhotometricFigures(_OptionalKeys):
     """Photometric figures of all test views: means, and the figures of each view.
 
     `psnr_compensated` follows an affine change of colour that is fitted to each photograph; `psnr_covered` is the
-    mean over the views that have covered pixels. LPIPS is None without weights of its network, as its reason says.
+    mean over the views that have covered pixels. `psnr` is that of renders over black, `psnr_over_white` of renders
+    over white. LPIPS is None without weights of its network, as its reason says.
     """
 
     views: int
@@ -56,6 +58,7 @@ class PhotometricFigures(_OptionalKeys):
     lpips: float | None
     lpips_reason: str | None = None
     psnr_covered: float | None = None
+    psnr_over_white: float | None = None
     covered_share: float | None = None
     per_view: tuple[ViewFigures, ...]
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.densify import Strategy
 from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.losses import photometric_loss
+from pipelines.splat.losses import TRANSPARENCY_WEIGHT, photometric_loss, transparency_loss
 from pipelines.splat.rasterizer.api import Render, ScreenStats
 from pipelines.splat.surface import ObservedPoints, compactness_loss, depth_loss, flatness_loss, normal_loss
 from pipelines.train.geographic.problem import GeoProblem
@@ -105,6 +105,12 @@ def training_losses(
             "photometric",
             lambda view: photometric_loss(view.colour, view.target.colour, view.counting),
             share=_by_pixels,
+        ),
+        Loss(
+            "transparency",
+            lambda view: transparency_loss(view.render.alpha, view.counting),
+            lambda _: TRANSPARENCY_WEIGHT,
+            _by_pixels,
         ),
         Loss("control_by_depth", control_by_depth, schedule.geographic_weight),
         Loss("geographic", lambda _view: problem.loss(), schedule.geographic_weight),

@@ -18,7 +18,7 @@ _FINAL_RATE = 0.05  # of the geographic unknowns, relative to their first learni
 COARSE = ((2, 0.3),)
 _DENSITY_UNTIL = 0.5  # of the training
 _GEO_RISE = 0.1  # τ of eq. 27, as a fraction of the iterations
-BACKGROUND = (0.0, 0.0, 0.0)  # RGB behind the scene
+BACKGROUND = (0.0, 0.0, 0.0)  # RGB behind the scene in renders of the trained model
 
 
 @dataclass(frozen=True)

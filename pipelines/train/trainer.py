@@ -31,6 +31,7 @@ from pipelines.splat.densify_mcmc import McmcSettings, McmcStrategy
 from pipelines.splat.exposure import Exposures, FrozenExposures, squared_radius
 from pipelines.splat.gaussians import FinitenessMonitor, Gaussians
 from pipelines.splat.initialise import InitialisationOptions, scene_extent
+from pipelines.splat.losses import training_background
 from pipelines.splat.optimizer import GaussianAdam, LearningRates
 from pipelines.splat.outlier_pixels import OutlierPixels, OutlierSettings
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Render, ScreenStats
@@ -42,7 +43,7 @@ from pipelines.train.lidar_surface import FusedSurface
 from pipelines.train.losses import Loss, RenderedView, training_losses, weighted_sum
 from pipelines.train.options import TrainOptions, surveys_of
 from pipelines.train.region import TrainingRegion
-from pipelines.train.schedule import BACKGROUND, JointOptions, TrainingSchedule
+from pipelines.train.schedule import JointOptions, TrainingSchedule
 from pipelines.train.target_images import ImageLook, TargetImage, TargetImages
 from pipelines.train.track_exposures import exposures_from_tracks
 
@@ -232,7 +233,7 @@ class JointTrainer:
     def _settings(self, target: TargetImage, *, depth: bool = False, normal: bool = False) -> RasterSettings:
         return RasterSettings(
             sh_degree=self.schedule.sh_degree(self.iteration),
-            background=BACKGROUND,
+            background=training_background(self.iteration),
             depth=depth,
             normal=normal,
             median=False,

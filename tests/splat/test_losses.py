@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from pipelines.splat.losses import image_similarity, photometric_loss
+from pipelines.splat.losses import image_similarity, photometric_loss, training_background, transparency_loss
 
 
 def reference_terms(x: Tensor, y: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -146,6 +146,26 @@ def test_refuses_a_mask_of_another_size() -> None:
     image = torch.zeros(4, 4, 3)
     with pytest.raises(ValueError, match="bool mask"):
         photometric_loss(image, image, torch.zeros(5, 4, dtype=torch.bool))
+
+
+def test_transparency_counts_pixels_of_the_mask() -> None:
+    alpha = torch.tensor([[1.0, 0.5], [0.0, 0.75]], requires_grad=True)
+    assert transparency_loss(alpha).item() == pytest.approx((0 + 0.5 + 1 + 0.25) / 4)
+    mask = torch.tensor([[True, True], [False, True]])
+    masked = transparency_loss(alpha, mask)
+    assert masked.item() == pytest.approx((0 + 0.5 + 0.25) / 3)
+    masked.backward()
+    torch.testing.assert_close(alpha.grad, -mask.float() / 3)
+    assert transparency_loss(alpha, torch.zeros_like(mask)).item() == 0
+
+
+def test_backgrounds_of_a_training_have_no_shade_in_common() -> None:
+    """A shade that all backgrounds were near to could be learned as a hole."""
+    colours = np.array([training_background(iteration) for iteration in range(64)])
+    assert colours.min() == 0 and colours.max() == 1
+    np.testing.assert_allclose(colours.mean(axis=0), 0.5)
+    assert colours.std(axis=0).min() > 0.3
+    assert training_background(64) == training_background(0)  # few, for a GPU to keep
 
 
 def test_convolution_form_for_other_devices_agrees() -> None:

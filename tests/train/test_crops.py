@@ -135,11 +135,15 @@ def recorded(images: ImageCache, crops: Crops | None, iterations: int) -> tuple[
     return state["gradient_sum"], state["observations"]
 
 
-def test_density_control_sees_what_it_sees_of_whole_photographs(images: ImageCache) -> None:
+def test_density_control_sees_what_it_sees_of_whole_photographs(
+    images: ImageCache, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """After a round of all crops: as many observations, and gradients of the photographs' losses.
 
     The gradient of a Gaussian on a cut comes in parts, whose lengths add up to more than the length of their sum.
     """
+    # A round of crops takes several iterations, which have several backgrounds.
+    monkeypatch.setattr("pipelines.train.trainer.training_background", lambda iteration: (0.0, 0.0, 0.0))
     views = len(images)
     gradient, observations = recorded(images, None, views)
     in_parts, observed = recorded(images, CROPS, ROUND * views)
@@ -195,4 +199,4 @@ def test_crops_add_up_to_the_surface_losses_of_the_photograph(images: ImageCache
                 )
                 values.append(float(weighted_sum(losses, view, 1)[0]))
         assert np.mean(values[1:]) == pytest.approx(values[0], rel=0.02)
-        assert max(values[1:]) > 1.1 * values[0], "crops differ"
+        assert max(values[1:]) > 1.1 * min(values[1:]), "crops differ"

@@ -51,11 +51,20 @@ def test_the_list_of_a_training(images: ImageCache) -> None:
     trainer = tiny.trainer(images, schedule.options)
     measured = Loss("planes", lambda _view: None)
     losses = training_losses(trainer.problem, trainer.strategy, schedule, extent_m=1.0, measured=[measured])
-    names = ["photometric", "control_by_depth", "geographic", "density control", "flatness", "compactness", "depth"]
+    names = [
+        "photometric",
+        "transparency",
+        "control_by_depth",
+        "geographic",
+        "density control",
+        "flatness",
+        "compactness",
+        "depth",
+    ]
     in_use = {loss.name: loss for loss in losses if loss.weight(40)}
     assert list(in_use) == [*names, "planes", "normals"]
     assert [in_use["normals"].weight(iteration) for iteration in (8, 20, 21, 24)] == [0, 0, 0, 0.08]
     assert in_use["geographic"].weight(40) == schedule.geographic_weight(40)
     plain = TrainingSchedule(JointOptions(40), np.arange(len(images)))
     without = training_losses(trainer.problem, trainer.strategy, plain, extent_m=1.0, measured=[measured])
-    assert [loss.name for loss in without if loss.weight(40)] == names[:4]
+    assert [loss.name for loss in without if loss.weight(40)] == names[:5]

@@ -1,0 +1,339 @@
+"""Colours of the orthophoto's cells from the photographs themselves, at their own resolution.
+
+1. A photograph sees a cell if its depth map shows the surface there, and nothing before it.
+2. The detail of a cell is that of one photograph, the one that sees it best: steeply, closely, near the middle of
+   its picture, and sharp.
+3. The broad colours are those of all photographs that see the place, weighted smoothly. So the photographs meet
+   without a seam (two bands of Burt & Adelson, doi 10.1145/245.247). Their exposures and lenses are undone before.
+4. Where three photographs or more see a place, one whose broad colour departs from their median shows something
+   that has moved, and does not count.
+
+Broad colours are means over blocks of cells that lie on whole multiples of a block in the raster: neighbouring
+windows have the same.
+"""
+
+from collections import OrderedDict
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
+from pipelines.deliver.raster_window import RasterSource, places_in_geo
+from pipelines.formats.geotiff import RasterFrame
+from pipelines.geometry.cameras import Pinhole
+from pipelines.surface.surface_views import SurfaceView
+from pipelines.survey.photographs import ImageCache, Pinholes
+from pipelines.survey.trained_survey import TrainedSurvey
+
+BLOCK = 8  # cells along a side of a block, of which broad colours are means
+MARGIN = 4 * BLOCK  # cells around a window that its broad colours depend on
+_EVERY = 2  # cells between two samples of a broad colour
+_MOST_VIEWS = 32  # of a window: the best
+_SAME_SURFACE = 0.006  # of the depth: largest distance of what a photograph sees from the surface in its depth map
+_FEATHER = 0.12  # of the shorter side: width of the rim over which a photograph's weight falls to nothing
+_MOVED = 30.0  # grey levels from the median: another thing, and not another light
+_LEAST_VIEWS = 3  # for a median
+_DISCOUNT = 1e-3  # of the weight of what has moved: it counts where nothing else is seen
+_CACHE_BYTES = 1 << 30  # of decoded photographs
+_ROWS = 256  # whose places are computed at once
+_BEST = 0.5  # of a block's best weight: photographs below it are not asked for detail there
+
+
+@dataclass(frozen=True)
+class CellColours:
+    """Colours (3, H, W) of a window, and the camera (H, W) whose detail each cell has; −1: none sees it."""
+
+    rgb: ByteArray
+    camera: IntArray
+
+
+@dataclass(frozen=True)
+class _View:
+    """Photograph of a view at full size, and what undoes its light.
+
+    `colour_of` (3, 4) applies to homogeneous colours of 0 … 255; the vignetting divides what it gives.
+    """
+
+    seen: SurfaceView
+    pinhole: Pinhole
+    colour_of: FloatArray
+    vignetting: tuple[float, ...]
+    sharpness: float
+
+    def weight(self, u: Float32Array, v: Float32Array, z: Float32Array, cosine: Float32Array) -> Float32Array:
+        """Return how well cells are seen at pixels (…,): 0 outside the picture, and smooth up to its rim."""
+        pinhole = self.pinhole
+        rim = np.minimum(np.minimum(u, pinhole.width - u), np.minimum(v, pinhole.height - v))
+        inside = np.clip(rim / (_FEATHER * min(pinhole.width, pinhole.height)), 0.0, 1.0)
+        resolution = pinhole.fx / np.maximum(z, 1e-3)
+        return np.asarray(inside * self.sharpness * (resolution * cosine**2) ** 2, dtype=np.float32)
+
+    def shows(self, u: Float32Array, v: Float32Array, z: Float32Array) -> BoolArray:
+        """Return whether the depth map has its surface at pixels (…,) of the photograph, at their depths."""
+        small, depth = self.seen.pinhole, self.seen.depth_m
+        column = np.clip(u * (small.width / self.pinhole.width), 0, small.width - 1).astype(np.int32)
+        row = np.clip(v * (small.height / self.pinhole.height), 0, small.height - 1).astype(np.int32)
+        there = depth[row, column]
+        return np.asarray((there > 0) & (z > 0) & (z <= there * (1 + _SAME_SURFACE)))
+
+
+class PhotoColours:
+    """Photographs of the training views, for the colours of one raster's cells.
+
+    Memory holds decoded photographs of up to a gibibyte, and the places of one window.
+    """
+
+    def __init__(self, trained: TrainedSurvey, source: RasterSource, images: ImageCache) -> None:
+        self._trained, self._source, self._images = trained, source, images
+        self._pinholes = Pinholes(images, trained.sfm.lenses, trained.sparse.lenses)
+        self._views: dict[int, _View] = {}
+        self._decoded: OrderedDict[int, ByteArray] = OrderedDict()
+        self._held_bytes = 0
+
+    def window(self, frame: RasterFrame, first: tuple[int, int], height: FloatArray) -> CellColours:
+        """Return the colours of a window whose first cell in the raster is at a row and column.
+
+        Args:
+            height: (H, W) of the cells in the CRS's unit; NaN: no surface.
+
+        Raises:
+            InputError: a photograph cannot be read, or is not that of the survey.
+        """
+        # Blocks begin on whole multiples: rows and columns are added around.
+        before = tuple(start % BLOCK for start in first)
+        after = tuple(-(start + size) % BLOCK for start, size in zip(before, height.shape, strict=True))
+        place = np.pad(
+            self._places(frame, height), [*zip(before, after, strict=True), (0, 0)], constant_values=np.nan
+        )
+        views = self._candidates(place)
+        low, share, wanted = self._broad(place, views)
+        shape = (place.shape[1], place.shape[0])
+        base = cv2.resize(low, shape, interpolation=cv2.INTER_LINEAR)
+        base /= np.maximum(cv2.resize(share, shape, interpolation=cv2.INTER_LINEAR), 1e-6)[..., None]
+        detail, camera = self._detail(place, views, wanted)
+        known = camera >= 0
+        rgb = np.where(known[..., None], np.clip(np.round(base + detail), 0, 255), 0).astype(np.uint8)
+        own = tuple(slice(start, start + size) for start, size in zip(before, height.shape, strict=True))
+        return CellColours(np.moveaxis(rgb[own], 2, 0), camera[own])
+
+    def _places(self, frame: RasterFrame, height: FloatArray) -> Float32Array:
+        """Return the places (H, W, 3) of cells in `model`; NaN: no surface."""
+        place = np.full((*height.shape, 3), np.nan, dtype=np.float32)
+        known = np.isfinite(height)
+        model_from_geo = self._source.geo_from_model.inverse()
+        for top in range(0, len(height), _ROWS) if known.any() else ():
+            rows = slice(top, min(top + _ROWS, len(height)))
+            row, column = np.nonzero(known[rows])
+            if len(row):
+                cell = np.column_stack([column, row + top]) + 0.5
+                in_geo = places_in_geo(self._source, frame, cell, height[rows][row, column])
+                place[rows][row, column] = model_from_geo.apply(in_geo)
+        return place
+
+    def _candidates(self, place: Float32Array) -> list[_View]:
+        """Return the views that see most of a window, the best first."""
+        coarse = place[BLOCK // 2 :: BLOCK, BLOCK // 2 :: BLOCK].reshape(-1, 3)
+        coarse = coarse[np.isfinite(coarse[:, 0])]
+        found = []
+        for number in range(len(self._source.views)) if len(coarse) else ():
+            view = self._view(number)
+            u, v, z, cosine = self._seen_at(view, coarse)
+            weight = np.where(z > 0, view.weight(u, v, z, cosine), 0.0)
+            if (weight > 0).any():
+                found.append((float(weight.sum()), number))
+        return [self._view(number) for _, number in sorted(found, reverse=True)[:_MOST_VIEWS]]
+
+    def _broad(self, place: Float32Array, views: list[_View]) -> tuple[Float32Array, Float32Array, Float32Array]:
+        """Return the blended colours (h, w, 3) of blocks times their weight, that weight as 0 or 1, and weights.
+
+        The weights (V, h, w) are those of each view in each block, without what has moved.
+        """
+        sparse = place[_EVERY // 2 :: _EVERY, _EVERY // 2 :: _EVERY]
+        shape = (place.shape[0] // BLOCK, place.shape[1] // BLOCK)
+        colours = np.full((len(views), *shape, 3), np.nan, dtype=np.float32)
+        weights = np.zeros((len(views), *shape), dtype=np.float32)
+        for number, view in enumerate(views):
+            rows, columns = _box(self._reach(view, sparse, BLOCK // _EVERY), BLOCK // _EVERY)
+            part = sparse[rows, columns]
+            if not part.size:
+                continue
+            colour, weight = self._colours(view, part)
+            side = BLOCK // _EVERY
+            blocks = (number, *(slice(cells.start // side, cells.stop // side) for cells in (rows, columns)))
+            total = _block_sums(weight > 0, side)
+            mean = _block_sums(np.where(weight[..., None] > 0, colour, 0.0), side)
+            colours[blocks] = mean / np.where(total > 0, total, np.nan)[..., None]
+            weights[blocks] = _block_sums(weight, side) / side**2
+        if len(views) >= _LEAST_VIEWS:
+            weights *= self._unmoved(colours, weights)
+        blended = np.einsum("vhw,vhwc->hwc", weights, np.nan_to_num(colours))
+        total = weights.sum(axis=0)
+        share = (total > 0).astype(np.float32)
+        low = np.where(total[..., None] > 0, blended / np.where(total > 0, total, 1.0)[..., None], 0.0)
+        return low.astype(np.float32), share, weights
+
+    def _unmoved(self, colours: Float32Array, weights: Float32Array) -> Float32Array:
+        """Return factors (V, h, w) of the weights: small where a view differs from the median of three or more."""
+        counted = np.where(weights[..., None] > 0, colours, np.nan)
+        several = (weights > 0).sum(axis=0) >= _LEAST_VIEWS
+        factor = np.ones_like(weights)
+        if several.any():
+            chosen = counted[:, several]
+            away = np.abs(chosen - np.nanmedian(chosen, axis=0)).max(axis=2)
+            factor[:, several] = np.where(away > _MOVED, np.float32(_DISCOUNT), np.float32(1.0))
+        return factor
+
+    def _detail(
+        self, place: Float32Array, views: list[_View], wanted: Float32Array
+    ) -> tuple[Float32Array, IntArray]:
+        """Return what the best view of each cell shows beyond its broad colour (H, W, 3), and its camera (H, W)."""
+        detail = np.zeros((*place.shape[:2], 3), dtype=np.float32)
+        camera = np.full(place.shape[:2], -1, dtype=np.int64)
+        best = np.zeros(place.shape[:2], dtype=np.float32)
+        highest = wanted.max(axis=0, initial=0.0)
+        for view, weight in zip(views, wanted, strict=True):
+            asked = cv2.dilate(
+                ((weight > 0) & (weight >= _BEST * highest)).astype(np.uint8), np.ones((3, 3), np.uint8)
+            )
+            rows, columns = _box(asked > 0, BLOCK)
+            part = place[rows, columns]
+            if not part.size:
+                continue
+            colour, own = self._colours(view, part)
+            blocks = weight[
+                rows.start // BLOCK : rows.stop // BLOCK, columns.start // BLOCK : columns.stop // BLOCK
+            ]
+            trusted = cv2.resize(
+                (blocks > 0).astype(np.float32) * blocks, own.shape[::-1], interpolation=cv2.INTER_LINEAR
+            )
+            seen = own > 0
+            own = np.where(seen, trusted, 0.0)
+            better = own > best[rows, columns]
+            if not better.any():
+                continue
+            detail[rows, columns][better] = (colour - _block_means(colour, seen))[better]
+            camera[rows, columns][better] = view.seen.camera
+            best[rows, columns][better] = own[better]
+        return detail, camera
+
+    def _colours(self, view: _View, place: Float32Array) -> tuple[Float32Array, Float32Array]:
+        """Return the colours (H, W, 3), 0 … 255, that a view shows at places (H, W, 3), and weights; 0: unseen."""
+        u, v, z, cosine = self._seen_at(view, place.reshape(-1, 3))
+        u, v, z, cosine = (values.reshape(place.shape[:2]) for values in (u, v, z, cosine))
+        weight = np.where(view.shows(u, v, z), view.weight(u, v, z, cosine), 0.0).astype(np.float32)
+        raw = self._images.sampled(view.seen.camera, self._photograph(view.seen.camera), np.stack([u, v], axis=-1))
+        linear, offset = view.colour_of[:, :3].astype(np.float32), view.colour_of[:, 3].astype(np.float32)
+        colour = raw.astype(np.float32) @ linear.T + offset
+        if view.vignetting:
+            pinhole = view.pinhole
+            corner = max(
+                ((x - pinhole.cx) / pinhole.fx) ** 2 + ((y - pinhole.cy) / pinhole.fy) ** 2
+                for x in (0.0, pinhole.width)
+                for y in (0.0, pinhole.height)
+            )
+            radius2 = (((u - pinhole.cx) / pinhole.fx) ** 2 + ((v - pinhole.cy) / pinhole.fy) ** 2) / corner
+            factor = np.zeros_like(radius2)
+            for coefficient in reversed(view.vignetting):
+                factor = radius2 * (factor + coefficient)
+            colour /= np.maximum(1.0 + factor, 0.1)[..., None]
+        return np.asarray(colour, dtype=np.float32), weight
+
+    def _reach(self, view: _View, place: Float32Array, size: int) -> BoolArray:
+        """Return the blocks (h, w) of places (H, W, 3) of which a view may show a part."""
+        middle = place[size // 2 :: size, size // 2 :: size]
+        u, v, z, _ = self._seen_at(view, middle.reshape(-1, 3))
+        slack = 0.05 * max(view.pinhole.width, view.pinhole.height)
+        inside = (z > 0) & (u > -slack) & (u < view.pinhole.width + slack)
+        inside &= (v > -slack) & (v < view.pinhole.height + slack)
+        return np.asarray(inside.reshape(middle.shape[:2]))
+
+    def _seen_at(
+        self, view: _View, place: Float32Array
+    ) -> tuple[Float32Array, Float32Array, Float32Array, Float32Array]:
+        """Return pixels u and v (K,), depths (K,) and the cosine to the vertical of places (K, 3).
+
+        Of places without a surface, or behind the camera, the depth is 0 and the pixel −1, −1.
+        """
+        rotation = view.seen.cam_from_model.astype(np.float32)
+        arm = place - view.seen.cam_center_in_model.astype(np.float32)
+        in_cam = arm @ rotation.T
+        z = in_cam[:, 2]
+        ahead = z > 1e-3  # not of NaN
+        inverse = 1.0 / np.where(ahead, z, 1.0)
+        u = np.where(ahead, view.pinhole.fx * in_cam[:, 0] * inverse + view.pinhole.cx, -1.0)
+        v = np.where(ahead, view.pinhole.fy * in_cam[:, 1] * inverse + view.pinhole.cy, -1.0)
+        up = (self._source.geo_from_model.rotation.T @ [0.0, 0.0, 1.0]).astype(np.float32)
+        cosine = np.abs(arm @ up) / np.maximum(np.linalg.norm(arm, axis=1), 1e-6)
+        most = 4.0 * max(view.pinhole.width, view.pinhole.height)  # far outside, for OpenCV's 16-bit places
+        return (
+            np.clip(u, -most, most).astype(np.float32),
+            np.clip(v, -most, most).astype(np.float32),
+            np.where(ahead, z, 0.0).astype(np.float32),
+            np.nan_to_num(cosine).astype(np.float32),
+        )
+
+    def _view(self, number: int) -> _View:
+        if number not in self._views:
+            seen = self._source.views.view(number)
+            _, colour_of = self._source.views.photograph(number)
+            camera_id = int(self._trained.sparse.image_camera_id[seen.camera])
+            lens = [each for each in self._trained.model.vignetting if each.camera_id == camera_id]
+            self._views[number] = _View(
+                seen,
+                self._pinholes.of(seen.camera),
+                colour_of,
+                tuple(lens[0].coefficients) if lens else (),
+                self._sharpness(number),
+            )
+        return self._views[number]
+
+    def _sharpness(self, number: int) -> float:
+        """Return how sharp a photograph is, about 1: blur of motion halves it."""
+        image, _ = self._source.views.photograph(number)
+        grey = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY).astype(np.float32)
+        fine = float(np.abs(cv2.Laplacian(grey, cv2.CV_32F)).mean())
+        broad = float(np.abs(grey - cv2.GaussianBlur(grey, (0, 0), 4.0)).mean())
+        return float(np.clip(fine / max(broad, 1e-3), 0.1, 10.0))
+
+    def _photograph(self, camera: int) -> ByteArray:
+        if camera in self._decoded:
+            self._decoded.move_to_end(camera)
+            return self._decoded[camera]
+        image = self._images.decoded(camera)
+        self._decoded[camera] = image
+        self._held_bytes += image.nbytes
+        while self._held_bytes > _CACHE_BYTES and len(self._decoded) > 1:
+            _, dropped = self._decoded.popitem(last=False)
+            self._held_bytes -= dropped.nbytes
+        return image
+
+
+def _box(blocks: BoolArray, size: int) -> tuple[slice, slice]:
+    """Return the rows and columns of the cells, `size` along a side of a block, around the chosen blocks (h, w)."""
+    rows, columns = np.flatnonzero(blocks.any(axis=1)), np.flatnonzero(blocks.any(axis=0))
+    if not len(rows):
+        return slice(0, 0), slice(0, 0)
+    return (
+        slice(int(rows[0]) * size, (int(rows[-1]) + 1) * size),
+        slice(int(columns[0]) * size, (int(columns[-1]) + 1) * size),
+    )
+
+
+def _block_sums(values: NDArray[np.generic], size: int) -> Float32Array:
+    """Return the sums of values (H, W, …) over blocks."""
+    rows, columns = values.shape[0] // size, values.shape[1] // size
+    blocks = values.reshape(rows, size, columns, size, *values.shape[2:])
+    return np.asarray(blocks.sum(axis=(1, 3), dtype=np.float32))
+
+
+def _block_means(colour: Float32Array, seen: BoolArray) -> Float32Array:
+    """Return the broad colours (H, W, 3) of a view: means of seen cells over blocks, linearly between these."""
+    total = _block_sums(seen, BLOCK)
+    mean = _block_sums(np.where(seen[..., None], colour, 0.0), BLOCK)
+    share = (total > 0).astype(np.float32)
+    mean = mean / np.maximum(total, 1.0)[..., None]
+    shape = (colour.shape[1], colour.shape[0])
+    weight = np.maximum(cv2.resize(share, shape, interpolation=cv2.INTER_LINEAR), 1e-6)
+    return np.asarray(cv2.resize(mean, shape, interpolation=cv2.INTER_LINEAR) / weight[..., None])
