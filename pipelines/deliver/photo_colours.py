@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
 
 from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
 from pipelines.deliver.raster_window import RasterSource, places_in_geo
@@ -35,6 +36,7 @@ _SAME_SURFACE = 0.006  # of the depth: largest distance of what a photograph see
 _FEATHER = 0.12  # of the shorter side: width of the rim over which a photograph's weight falls to nothing
 _MOVED = 30.0  # grey levels from the median: another thing, and not another light
 _LEAST_VIEWS = 3  # for a median
+_UNKNOWN = 0.05  # of the weight, where the depth map does not tell what a photograph shows
 _DISCOUNT = 1e-3  # of the weight of what has moved: it counts where nothing else is seen
 _CACHE_BYTES = 1 << 30  # of decoded photographs
 _ROWS = 256  # whose places are computed at once
@@ -61,6 +63,7 @@ class _View:
     colour_of: FloatArray
     vignetting: tuple[float, ...]
     sharpness: float
+    unknown: float  # what counts of a pixel without a depth
 
     def weight(self, u: Float32Array, v: Float32Array, z: Float32Array, cosine: Float32Array) -> Float32Array:
         """Return how well cells are seen at pixels (…,): 0 outside the picture, and smooth up to its rim."""
@@ -70,13 +73,17 @@ class _View:
         resolution = pinhole.fx / np.maximum(z, 1e-3)
         return np.asarray(inside * self.sharpness * (resolution * cosine**2) ** 2, dtype=np.float32)
 
-    def shows(self, u: Float32Array, v: Float32Array, z: Float32Array) -> BoolArray:
-        """Return whether the depth map has its surface at pixels (…,) of the photograph, at their depths."""
+    def shows(self, u: Float32Array, v: Float32Array, z: Float32Array) -> Float32Array:
+        """Return whether nothing hides the surface at pixels (…,) of the photograph, at their depths: 1, 0 if not.
+
+        Where the depth map has nothing, such as where the splat misses the photograph's detail, it is not known.
+        """
         small, depth = self.seen.pinhole, self.seen.depth_m
         column = np.clip(u * (small.width / self.pinhole.width), 0, small.width - 1).astype(np.int32)
         row = np.clip(v * (small.height / self.pinhole.height), 0, small.height - 1).astype(np.int32)
         there = depth[row, column]
-        return np.asarray((there > 0) & (z > 0) & (z <= there * (1 + _SAME_SURFACE)))
+        open_to = np.where(there > 0, z <= there * (1 + _SAME_SURFACE), np.float32(self.unknown))
+        return np.where(z > 0, open_to, np.float32(0.0)).astype(np.float32)
 
 
 class PhotoColours:
@@ -159,7 +166,8 @@ class PhotoColours:
             part = sparse[rows, columns]
             if not part.size:
                 continue
-            colour, weight = self._colours(view, part)
+            colour, shown, weight = self._colours(view, part)
+            weight *= shown
             side = BLOCK // _EVERY
             blocks = (number, *(slice(cells.start // side, cells.stop // side) for cells in (rows, columns)))
             total = _block_sums(weight > 0, side)
@@ -194,35 +202,27 @@ class PhotoColours:
         best = np.zeros(place.shape[:2], dtype=np.float32)
         highest = wanted.max(axis=0, initial=0.0)
         for view, weight in zip(views, wanted, strict=True):
-            asked = cv2.dilate(
-                ((weight > 0) & (weight >= _BEST * highest)).astype(np.uint8), np.ones((3, 3), np.uint8)
-            )
-            rows, columns = _box(asked > 0, BLOCK)
+            asked = binary_dilation((weight > 0) & (weight >= _BEST * highest), np.ones((3, 3)))
+            rows, columns = _box(asked, BLOCK)
             part = place[rows, columns]
             if not part.size:
                 continue
-            colour, own = self._colours(view, part)
-            blocks = weight[
-                rows.start // BLOCK : rows.stop // BLOCK, columns.start // BLOCK : columns.stop // BLOCK
-            ]
-            trusted = cv2.resize(
-                (blocks > 0).astype(np.float32) * blocks, own.shape[::-1], interpolation=cv2.INTER_LINEAR
-            )
-            seen = own > 0
-            own = np.where(seen, trusted, 0.0)
+            colour, shown, _ = self._colours(view, part)
+            blocks = tuple(slice(cells.start // BLOCK, cells.stop // BLOCK) for cells in (rows, columns))
+            own = shown * cv2.resize(weight[blocks], shown.shape[::-1], interpolation=cv2.INTER_LINEAR)
             better = own > best[rows, columns]
             if not better.any():
                 continue
-            detail[rows, columns][better] = (colour - _block_means(colour, seen))[better]
+            detail[rows, columns][better] = (colour - _block_means(colour, shown > 0))[better]
             camera[rows, columns][better] = view.seen.camera
             best[rows, columns][better] = own[better]
         return detail, camera
 
-    def _colours(self, view: _View, place: Float32Array) -> tuple[Float32Array, Float32Array]:
-        """Return the colours (H, W, 3), 0 … 255, that a view shows at places (H, W, 3), and weights; 0: unseen."""
+    def _colours(self, view: _View, place: Float32Array) -> tuple[Float32Array, Float32Array, Float32Array]:
+        """Return colours (H, W, 3), 0 … 255, of a view at places (H, W, 3), whether it shows them, and weights."""
         u, v, z, cosine = self._seen_at(view, place.reshape(-1, 3))
         u, v, z, cosine = (values.reshape(place.shape[:2]) for values in (u, v, z, cosine))
-        weight = np.where(view.shows(u, v, z), view.weight(u, v, z, cosine), 0.0).astype(np.float32)
+        shown, weight = view.shows(u, v, z), view.weight(u, v, z, cosine)
         raw = self._images.sampled(view.seen.camera, self._photograph(view.seen.camera), np.stack([u, v], axis=-1))
         linear, offset = view.colour_of[:, :3].astype(np.float32), view.colour_of[:, 3].astype(np.float32)
         colour = raw.astype(np.float32) @ linear.T + offset
@@ -238,7 +238,7 @@ class PhotoColours:
             for coefficient in reversed(view.vignetting):
                 factor = radius2 * (factor + coefficient)
             colour /= np.maximum(1.0 + factor, 0.1)[..., None]
-        return np.asarray(colour, dtype=np.float32), weight
+        return np.asarray(colour, dtype=np.float32), np.where(weight > 0, shown, np.float32(0.0)), weight
 
     def _reach(self, view: _View, place: Float32Array, size: int) -> BoolArray:
         """Return the blocks (h, w) of places (H, W, 3) of which a view may show a part."""
@@ -286,6 +286,7 @@ class PhotoColours:
                 colour_of,
                 tuple(lens[0].coefficients) if lens else (),
                 self._sharpness(number),
+                0.0 if self._images.is_masked(seen.camera) else _UNKNOWN,  # what is masked has no depth either
             )
         return self._views[number]
 

@@ -5,6 +5,7 @@ The Gaussians are laid on the surface by hand, so that all errors are those of t
 
 from __future__ import annotations
 
+import json
 import shutil
 import sys
 from pathlib import Path
@@ -28,7 +29,7 @@ from pipelines.deliver.raster_whole import INTERPOLATED, MEASURED
 from pipelines.formats.georef_sidecar import CrsSidecar, sidecar_path
 from pipelines.geodesy.enu import lla_from_enu
 from pipelines.geometry.cameras import Camera, Pinhole
-from pipelines.geometry.rotations import exp_so3, quat_xyzw_from_matrix
+from pipelines.geometry.rotations import exp_so3, matrix_from_quat_xyzw, quat_xyzw_from_matrix
 from pipelines.geometry.similarity import Similarity
 from pipelines.splat.gaussians import Gaussians, transformed, write_gaussians
 from pipelines.splat.rasterizer.api import RasterSettings
@@ -36,7 +37,7 @@ from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from pipelines.splat.sh import sh_from_rgb
 from pipelines.survey.area import area_of
 from pipelines.survey.options import AreaOptions
-from pipelines.survey.trained_model import TrainedCamera
+from pipelines.survey.trained_model import TrainedCamera, TrainedModel
 from pipelines.survey.trained_survey import load_trained
 from tests.refusals import codes, refused
 from tests.scenes import (
@@ -148,7 +149,8 @@ def _write_photographs(folder: Path, scene: TrueScene) -> None:
 @pytest.fixture(scope="module")
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
     made = write_trained(tmp_path_factory.mktemp("raster") / "ws")
-    run_stage(made, BY_NAME["export-raster"], {"crs": UTM, "gsd": GSD, "contours": 1.0, "contours_of": "surface"})
+    options = {"contours": 1.0, "contours_of": "surface", "colours": "splat", "fill": "all"}
+    run_stage(made, BY_NAME["export-raster"], {"crs": UTM, "gsd": GSD, **options})
     return made
 
 
@@ -350,3 +352,90 @@ def test_a_disk_that_is_too_small_is_said_before_the_work(
         run_stage(workspace, BY_NAME["export-raster"], {"gsd": 0.3})
     assert "--gsd" in str(error.value)
     assert not (workspace.root / "raster.partial/parts").exists()
+
+
+WAVE_M = 1.0  # of a texture that the splat does not have: seven pixels of the photographs
+
+
+def texture(east: np.ndarray, north: np.ndarray) -> np.ndarray:
+    return 25.0 * np.sin(2 * np.pi * east / WAVE_M) * np.sin(2 * np.pi * north / WAVE_M)
+
+
+@pytest.fixture(scope="module")
+def textured(workspace: Workspace, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
+    """The same survey: its photographs show a fine texture of the ground, each at its own exposure."""
+    root = tmp_path_factory.mktemp("textured") / "ws"
+    shutil.copytree(workspace.root, root, ignore=shutil.ignore_patterns("raster", "cache", "logs", ".lock*"))
+    made = Workspace(root)
+    model = load_json(TrainedModel, made.path(MODEL))
+    cameras = []
+    u, v = np.meshgrid(np.arange(CAMERA.width) + 0.5, np.arange(CAMERA.height) + 0.5)
+    fx, fy, cx, cy = CAMERA.params
+    for number, camera in enumerate(model.cameras):
+        rotation = GEO_FROM_MODEL.rotation @ matrix_from_quat_xyzw(camera.quat_xyzw).T
+        in_model = -matrix_from_quat_xyzw(camera.quat_xyzw).T @ np.array(camera.translation)
+        center = GEO_FROM_MODEL.apply(in_model[None])[0]
+        ray = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones_like(u)], axis=-1) @ rotation.T
+        ground = center[:2] + ray[..., :2] * (-center[2] / ray[..., 2:])
+        picture = cv2.imread(str(root / camera.name)).astype(np.float64)
+        gain = 1.0 + 0.15 * (-1) ** number
+        picture = gain * (0.8 * picture + 25 + texture(ground[..., 0], ground[..., 1])[..., None])
+        data = cv2.imencode(".png", np.clip(picture, 0, 255).round().astype(np.uint8))[1].tobytes()
+        (root / camera.name).write_bytes(data)
+        exposure = tuple(tuple(gain * float(row == column) for column in range(4)) for row in range(3))
+        cameras.append(camera.model_copy(update={"exposure": exposure}))
+    save_json(model.model_copy(update={"cameras": tuple(cameras)}), root / MODEL)
+    run_stage(made, BY_NAME["export-raster"], {"crs": UTM, "gsd": GSD, "source": True, "terrain": False})
+    return made
+
+
+def test_orthophoto_is_that_of_the_photographs(textured: Workspace) -> None:
+    """Detail that only the photographs have, at their contrast, and no step where the photograph changes."""
+    with rasterio.open(textured.root / "raster/orthophoto.tif") as raster:
+        colour, alpha = raster.read(1).astype(np.float64), raster.read(4)
+        row, column = np.mgrid[: raster.height, : raster.width]
+        east, north = raster.xy(row.ravel(), column.ravel())
+    place = np.column_stack([np.reshape(east, -1), np.reshape(north, -1)])
+    origin = in_utm(np.zeros((1, 3)), textured)[0]
+    # Some metres from the origin, the axes of UTM and of `geo` differ by the convergence alone.
+    turn = in_utm(np.array([[0.0, 10.0, 0.0]]), textured)[0] - origin
+    angle = np.arctan2(turn[0], turn[1])
+    shifted = (place - origin[:2]) @ np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    shifted = shifted / np.hypot(*turn[:2]) * 10.0
+    expected = texture(shifted[:, 0], shifted[:, 1]).reshape(colour.shape)
+    within = (np.abs(shifted) < 3.2 * SQUARE_M).all(axis=1).reshape(colour.shape)
+    within &= (np.abs(shifted) > 2.5 * TOWER_M).any(axis=1).reshape(colour.shape) & (alpha == 255)
+    detail = colour - cv2.boxFilter(colour, -1, (13, 13))
+    # Inside of one square of the chequerboard, whose edges are detail too.
+    away = np.abs(shifted / SQUARE_M - np.round(shifted / SQUARE_M)).min(axis=1).reshape(colour.shape) * SQUARE_M
+    inner = within & (away > 7 * GSD)
+    assert inner.sum() > 2000
+    # The photographs' pixels are about as large as the cells: interpolation takes some of the contrast.
+    assert np.corrcoef(detail[inner], expected[inner])[0, 1] > 0.9
+    assert 0.6 < detail[inner].std() / expected[inner].std() < 1.1
+
+    with rasterio.open(textured.root / "raster/source.tif") as raster:
+        source = raster.read(1)
+    names = json.loads((textured.root / "raster/source.json").read_text())
+    assert len(np.unique(source[inner])) > 4 and source.max() < len(names) and names[0] == ""
+    # 15 % of gain either way is a step of 30 grey levels and more, if it is not undone.
+    broad = cv2.boxFilter(colour, -1, (5, 5))
+    step = np.abs(np.diff(broad, axis=1))
+    changes = (np.diff(source.astype(int), axis=1) != 0) & inner[:, 1:] & inner[:, :-1]
+    same = ~changes & inner[:, 1:] & inner[:, :-1]
+    assert changes.sum() > 50
+    assert np.median(step[changes]) < np.median(step[same]) + 1.0
+
+
+def test_holes_are_filled_up_to_a_width(workspace: Workspace) -> None:
+    """Nothing beyond the measured surface is painted; --fill all, and a boundary, ask for more."""
+    shares = {}
+    for fill in (0.0, None, "all"):
+        options = {"crs": UTM, "gsd": GSD, "terrain": False, "hillshade": False, "fill": fill}
+        outcome = run_stage(workspace, BY_NAME["export-raster"], options)
+        values = outcome.manifest.values
+        shares[fill] = (values["measured"], values["interpolated"], values["delivered_ha"])
+    assert shares[0.0][1] <= shares[None][1] <= shares["all"][1]
+    assert shares[None][1] <= 0.1 + 1e-6
+    assert shares[None][0] + shares[None][1] == pytest.approx(1.0, abs=0.01)
+    assert shares[0.0][2] <= shares[None][2] <= shares["all"][2]
