@@ -116,9 +116,7 @@ class PhotoColours:
         )
         views = self._candidates(place)
         low, share, wanted = self._broad(place, views)
-        shape = (place.shape[1], place.shape[0])
-        base = cv2.resize(low, shape, interpolation=cv2.INTER_LINEAR)
-        base /= np.maximum(cv2.resize(share, shape, interpolation=cv2.INTER_LINEAR), 1e-6)[..., None]
+        base = _between_blocks(low, share, place.shape[:2])
         detail, camera = self._detail(place, views, wanted)
         known = camera >= 0
         rgb = np.where(known[..., None], np.clip(np.round(base + detail), 0, 255), 0).astype(np.uint8)
@@ -135,7 +133,7 @@ class PhotoColours:
             row, column = np.nonzero(known[rows])
             if len(row):
                 cell = np.column_stack([column, row + top]) + 0.5
-                in_geo = places_in_geo(self._source, frame, cell, height[rows][row, column])
+                in_geo = places_in_geo(self._source, frame, cell.astype(np.float64), height[rows][row, column])
                 place[rows][row, column] = model_from_geo.apply(in_geo)
         return place
 
@@ -169,11 +167,11 @@ class PhotoColours:
             colour, shown, weight = self._colours(view, part)
             weight *= shown
             side = BLOCK // _EVERY
-            blocks = (number, *(slice(cells.start // side, cells.stop // side) for cells in (rows, columns)))
+            above, across = (slice(cells.start // side, cells.stop // side) for cells in (rows, columns))
             total = _block_sums(weight > 0, side)
             mean = _block_sums(np.where(weight[..., None] > 0, colour, 0.0), side)
-            colours[blocks] = mean / np.where(total > 0, total, np.nan)[..., None]
-            weights[blocks] = _block_sums(weight, side) / side**2
+            colours[number, above, across] = mean / np.where(total > 0, total, np.nan)[..., None]
+            weights[number, above, across] = _block_sums(weight, side) / side**2
         if len(views) >= _LEAST_VIEWS:
             weights *= self._unmoved(colours, weights)
         blended = np.einsum("vhw,vhwc->hwc", weights, np.nan_to_num(colours))
@@ -334,7 +332,12 @@ def _block_means(colour: Float32Array, seen: BoolArray) -> Float32Array:
     total = _block_sums(seen, BLOCK)
     mean = _block_sums(np.where(seen[..., None], colour, 0.0), BLOCK)
     share = (total > 0).astype(np.float32)
-    mean = mean / np.maximum(total, 1.0)[..., None]
-    shape = (colour.shape[1], colour.shape[0])
-    weight = np.maximum(cv2.resize(share, shape, interpolation=cv2.INTER_LINEAR), 1e-6)
-    return np.asarray(cv2.resize(mean, shape, interpolation=cv2.INTER_LINEAR) / weight[..., None])
+    return _between_blocks((mean / np.maximum(total, 1.0)[..., None]).astype(np.float32), share, colour.shape[:2])
+
+
+def _between_blocks(colour: Float32Array, share: Float32Array, shape: tuple[int, ...]) -> Float32Array:
+    """Return colours (H, W, 3) of cells, linearly between those of the blocks (h, w, 3) whose share (h, w) is 1."""
+    size = (shape[1], shape[0])
+    weight = np.maximum(cv2.resize(share, size, interpolation=cv2.INTER_LINEAR), 1e-6)
+    wide = cv2.resize(colour, size, interpolation=cv2.INTER_LINEAR)
+    return np.asarray(wide / weight[..., None], dtype=np.float32)

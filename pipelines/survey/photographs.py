@@ -146,7 +146,10 @@ class ImageCache:
         """
         photograph, flat = self._photographs[index], (place - 0.5).astype(np.float32)
         lens = self._map(index)[0]
-        source = cv2.remap(lens, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        source: Float32Array = np.asarray(
+            cv2.remap(lens, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),
+            dtype=np.float32,
+        )
         if photograph.shift is not None:
             source = source + _shift_at(photograph, source)
         colours = cv2.remap(decoded, source[..., 0], source[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
