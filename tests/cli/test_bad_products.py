@@ -187,7 +187,7 @@ def test_pipe_in_place_of_a_product(real_georef: Georef, made: Path, stage: str,
 
 def test_import_of_another_flight(real_georef: Georef, made: Path) -> None:
     survey = load_json(Survey, made / SURVEY)
-    others = [image.model_copy(update={"name": f"other/{image.name}"}) for image in survey.images]
+    others = [image.model_copy(update={"name": f"frame_{n}.jpg"}) for n, image in enumerate(survey.images, 5000)]
     save_json(survey.model_copy(update={"images": tuple(others)}), made / SURVEY)
     shutil.copytree(made / SPARSE, made.parent / "model")
     result = real_georef("sfm", made, "--import", made.parent / "model", "--force")

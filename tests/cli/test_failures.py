@@ -58,7 +58,6 @@ def test_deliverables_of_a_run_that_ends_before_training(georef: Georef, workspa
         (["compare", "WS", "--configs", "Z"], "--configs"),
         (["run", "WS", "--deliver", "meshes"], None),
         (["run", "WS", "--from", "train", "--to", "sfm"], None),
-        (["run", "WS", "--to", "sfm", "--preset", "fast"], None),
         (["sfm"], None),
         (["splat", "WS"], None),
     ],

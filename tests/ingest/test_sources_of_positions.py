@@ -231,5 +231,5 @@ def test_a_wrong_source_is_never_silent(tmp_path: Path, seeds: range) -> None:
 def test_sources_that_agree_are_not_blamed(tmp_path: Path) -> None:
     for seed in range(40):
         drawn, said, error = outcome(tmp_path / str(seed), seed, spoil=False)
-        assert said <= {"heights-below-zero"}, (seed, drawn)
+        assert said <= {"heights-below-zero", "default-datum-sigma"}, (seed, drawn)
         assert error < 0.1, (seed, drawn)  # of σ: the digits of the files

@@ -49,9 +49,9 @@ def xmp(lat: np.ndarray = LAT, lon: np.ndarray = LON, alt: np.ndarray = HEIGHT) 
     return [(tag,) for tag in gps(lat, lon, alt, "XMP")]
 
 
-def read(found: list[Photo]) -> tuple[ImagePoses, Remarks]:
+def read(found: list[Photo], options: IngestOptions | None = None) -> tuple[ImagePoses, Remarks]:
     remarks = Remarks()
-    return poses_from_tags(found, IngestOptions(), remarks), remarks
+    return poses_from_tags(found, options or IngestOptions(), remarks), remarks
 
 
 def off_m(poses: ImagePoses, lat: np.ndarray = LAT, lon: np.ndarray = LON, alt: np.ndarray = HEIGHT) -> float:
@@ -123,11 +123,13 @@ def test_heights_of_both_signs(height: float, common_m: float) -> None:
 @pytest.mark.parametrize(("east_m", "up_m"), [(4.25, 0.0), (60.0, 0.0), (0.0, 47.3)])
 def test_a_constant_between_sources_is_part_of_the_common_sigma(east_m: float, up_m: float) -> None:
     lon = LON + east_m / 111_320 / np.cos(np.radians(LAT))
-    poses, remarks = read(photos(gps=gps(), more_gps=xmp(lon=lon, alt=HEIGHT + up_m)))
+    # A stated datum: one that is assumed has a σ of its own.
+    options = IngestOptions(vertical="ellipsoidal")
+    poses, remarks = read(photos(gps=gps(), more_gps=xmp(lon=lon, alt=HEIGHT + up_m)), options)
     (caution,) = remarks.cautions
     assert caution.code == ("position-sources-apart" if east_m else "height-sources-apart")
     assert numbers(caution.sentence)[0] == pytest.approx(max(east_m, up_m), abs=0.1)
-    (session,), _ = fix_sessions(poses, IngestOptions(), Remarks())
+    (session,), _ = fix_sessions(poses, options, Remarks())
     np.testing.assert_allclose(
         session.sigma_common_m, [np.hypot(1.5, east_m)] * 2 + [np.hypot(3.0, up_m)], rtol=0.02
     )

@@ -142,21 +142,18 @@ def test_another_scene_has_other_maps(maps: DepthMaps, material: tuple[Rendered,
 def test_another_processor_finds_the_maps(maps: DepthMaps, material: tuple[Rendered, Scene, ImageCache]) -> None:
     """The last bits of a solution are those of its processor."""
     _, scene, images = material
-    poses = scene.poses
-    other = replace(
-        scene,
-        poses=replace(
-            poses,
-            cam_from_model=poses.cam_from_model * (1 + 1e-15),
-            cam_center_in_model=poses.cam_center_in_model * (1 - 1e-15),
-        ),
-        point_in_model=scene.point_in_model * (1 + 1e-15),
-    )
+
+    def with_translations(offset: float, factor: float) -> Scene:
+        sparse = scene.sparse
+        translation = factor * sparse.translation_cam_from_local + offset
+        points = factor * sparse.point_in_local
+        return replace(scene, sparse=replace(sparse, translation_cam_from_local=translation, point_in_local=points))
+
+    other = with_translations(0.0, 1 + 1e-15)
     assert not np.array_equal(other.point_in_model, scene.point_in_model)
     assert DepthMaps(maps.folder.parent, other, images).folder == maps.folder
     # A tenth of a millimetre is less than a hundredth of a pixel here, and seen all the same.
-    moved = replace(scene, poses=replace(poses, cam_center_in_model=poses.cam_center_in_model + 1e-4))
-    assert DepthMaps(maps.folder.parent, moved, images).folder != maps.folder
+    assert DepthMaps(maps.folder.parent, with_translations(1e-4, 1.0), images).folder != maps.folder
 
 
 def test_test_views_show_nothing_of_the_surface(
