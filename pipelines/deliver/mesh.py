@@ -5,6 +5,7 @@ vertices and their σ, `mesh/mesh.glb`, simplified, with a texture, on request `
 `mesh_crs.ply`; a sidecar beside each.
 """
 
+import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -52,6 +53,7 @@ _LISTED = 100  # widest holes
 _LEAST_POINTS = 100
 # Estimated, not measured: the solver, the mesh with its texture, and the copies that are made of them.
 _FIXED_BYTES, _POINT_BYTES = 850 << 20, 2000
+log = logging.getLogger(__name__)
 SIGMA_COUNTS = "georeference, disagreement of the training views about the surface, distance from measured points"
 
 
@@ -128,18 +130,30 @@ def _points(
     progress: Progress,
 ) -> MeasuredPoints:
     """Return the fused points in and around the area, in the frame of the file; errors as of `run`."""
-    settings = fusion_settings(views, trained.geo_from_model, options.min_views, options.voxel)
-    west, south, east, north = area.polygon.buffer(_AROUND * settings.spacing_m).bounds
-    parts = []
-    for square in fused_squares(views, trained.geo_from_model, settings, progress):
-        plan = square.position[:, :2]
-        near = ((plan >= (west, south)) & (plan <= (east, north))).all(axis=1)
-        # Points whose normals cancel say nothing of the side.
-        parts.append(rows_of(square, np.flatnonzero(near & np.isfinite(square.normal).all(axis=1))))
-    if sum(len(part.position) for part in parts) < _LEAST_POINTS:
-        raise _no_surface(options)
-    cloud = joined_rows(parts)
-    _require_memory(len(cloud.position), settings.spacing_m)
+    spacing_m = options.voxel
+    while True:
+        settings = fusion_settings(views, trained.geo_from_model, options.min_views, spacing_m)
+        west, south, east, north = area.polygon.buffer(_AROUND * settings.spacing_m).bounds
+        parts = []
+        for square in fused_squares(views, trained.geo_from_model, settings, progress):
+            plan = square.position[:, :2]
+            near = ((plan >= (west, south)) & (plan <= (east, north))).all(axis=1)
+            # Points whose normals cancel say nothing of the side.
+            parts.append(rows_of(square, np.flatnonzero(near & np.isfinite(square.normal).all(axis=1))))
+        if sum(len(part.position) for part in parts) < _LEAST_POINTS:
+            raise _no_surface(options)
+        cloud = joined_rows(parts)
+        excess = _memory_excess(len(cloud.position), settings.spacing_m, stated=options.voxel is not None)
+        if excess <= 1:
+            break
+        # Points on a surface become fewer with the square of their distance.
+        spacing_m = 1.1 * excess**0.5 * settings.spacing_m
+        log.warning(
+            "Voxels of %.3f m would need %.1f times the free memory: the mesh has voxels of %.3f m (--voxel).",
+            settings.spacing_m,
+            excess,
+            spacing_m,
+        )
     position, normal = file_from_geo.apply(cloud.position), cloud.normal @ file_from_geo.rotation.T
     return MeasuredPoints(position, normal, cloud.sigma_m, settings.spacing_m)
 
@@ -241,12 +255,17 @@ def _write_textured(folder: Path, shown: TexturedMesh, sidecar: MeshSidecar, *, 
         write_sidecar(sidecar, path)
 
 
-def _require_memory(points: int, voxel_m: float) -> None:
-    """Refuse a mesh that the memory would not hold, by the number of points of its surface."""
+def _memory_excess(points: int, voxel_m: float, *, stated: bool) -> float:
+    """Return the share of the free memory that a mesh of so many points may need; its fixed part is left out.
+
+    Raises:
+        ResourceError: it is more than one, and the voxels are `stated`; or the fixed part alone is more.
+    """
     needed, free = _FIXED_BYTES + _POINT_BYTES * points, free_main_memory_bytes()
-    if needed > free:
+    if needed > free and (stated or free < _FIXED_BYTES):
         raise ResourceError(
             "mesh-memory",
             f"The mesh with voxels of {voxel_m:.3f} m may need {needed / 2**30:.1f} GiB of memory; "
             f"{free / 2**30:.1f} GiB are free. Give a larger --voxel.",
         )
+    return _POINT_BYTES * points / max(free - _FIXED_BYTES, 1)
