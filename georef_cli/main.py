@@ -8,6 +8,7 @@ import importlib
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -133,6 +134,8 @@ def cli() -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of `georef`: run the command line and exit with its code."""
     sys.excepthook = boundary.safe_traceback
-    with native_lines_logged():
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    # Scheduler and workers of a cluster are Dask's, and its processes tell on standard error what they do.
+    with nullcontext() if words[:1] == ["cluster"] else native_lines_logged():
         code = boundary.guarded(cli, arguments)
     sys.exit(code)
