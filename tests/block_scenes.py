@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from georef_cli import boundary
+from georef_cli.main import cli
+from pipelines.core.progress import Progress
 from pipelines.core.workspace import Workspace
+from pipelines.jobs.engine import Job, JobEnd
+from pipelines.jobs.local import chosen_engine
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.sh import sh_from_rgb
 from tests.scenes import Measured, TrueScene, looking_at, sparse_model, survey_of
@@ -19,6 +25,7 @@ from tests.splat_scenes import (
     write_photographs,
     write_rendered,
 )
+from tests.threads import single_thread
 
 HEIGHT_M = 40.0
 
@@ -83,3 +90,26 @@ def write_field(root: Path, rendered: Rendered) -> Workspace:
     """Return a workspace of the field as the stages before training leave it, with its photographs."""
     write_photographs(rendered, root / "photos")
     return write_rendered(root, rendered)
+
+
+class OneByOne:
+    """Engine that runs each job in this process."""
+
+    def __init__(self) -> None:
+        self.ran: list[str] = []
+
+    def together(self, jobs: Sequence[Job]) -> int:
+        return 1
+
+    def run(self, title: str, jobs: Sequence[Job], ended: Callable[[JobEnd], None], progress: Progress) -> None:
+        for job in jobs:
+            self.ran.append(job.name)
+            code = boundary.guarded(cli, [*job.arguments, "--quiet"])
+            ended(JobEnd(job, code, 0.0, "", "failed" if code else ""))
+
+
+def georef(*arguments: object) -> tuple[int, list[str]]:
+    """Exit code of a command, and the names of its jobs, which run in this process."""
+    engine = OneByOne()
+    with single_thread(), chosen_engine(engine):
+        return boundary.guarded(cli, [*map(str, arguments), "--quiet"]), engine.ran

@@ -152,7 +152,8 @@ class CudaRasterizer:
 # Small constants are made once: every copy to the device waits for all work that is queued there.
 @lru_cache(maxsize=4096)
 def _row(values: tuple[float, ...], device: torch.device) -> Tensor:
-    return torch.tensor([values], device=device)
+    # numpy's numbers, of cameras that COLMAP read, would make float64, which the kernels refuse.
+    return torch.tensor([values], dtype=torch.float32, device=device)
 
 
 def _depth_slope(

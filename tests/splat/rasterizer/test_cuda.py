@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
+from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer import cuda
 from pipelines.splat.rasterizer.api import RasterSettings, Window
@@ -56,6 +58,17 @@ def test_background_shows_where_nothing_lies(make_scene, camera, rasteriser):
     for background in (BACKGROUND, (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)):
         render = rasteriser.render(gaussians, pose, camera, RasterSettings(0, background))
         torch.testing.assert_close(render.colour, torch.tensor(background).expand(45, 70, 3))
+
+
+def test_a_camera_of_numpys_numbers_renders_the_same(make_scene, leaves, camera, rasteriser):
+    """Cameras that COLMAP read hold them; of two equal ones, the constants of the first are kept."""
+    of_numpy = Pinhole(camera.width, camera.height, *np.array([camera.fx, camera.fy, camera.cx, camera.cy]))
+    cuda._row.cache_clear()
+    images = [
+        rasteriser.render(*leaves(make_scene(60, seed=4), torch.float32), of, RasterSettings(1, BACKGROUND)).colour
+        for of in (of_numpy, camera)
+    ]
+    assert torch.equal(*images)
 
 
 def test_without_depth_there_is_none(make_scene, leaves, camera, rasteriser):

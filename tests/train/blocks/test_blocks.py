@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,19 +14,16 @@ import torch
 from georef_cli import boundary
 from georef_cli.main import cli
 from pipelines.core.products import load_json
-from pipelines.core.progress import Progress
 from pipelines.core.stages import BLOCK_GAUSSIANS, BLOCK_PLAN, BLOCK_RECORD, GAUSSIANS, MODEL
 from pipelines.core.staleness import status
 from pipelines.core.workspace import Workspace
-from pipelines.jobs.engine import Job, JobEnd
-from pipelines.jobs.local import chosen_engine
 from pipelines.splat.gaussians import read_gaussians
 from pipelines.survey.block_plan import BlockPlan, BlockRecord
 from pipelines.survey.trained_model import TrainedModel
 from pipelines.survey.trained_survey import load_trained
 from pipelines.train.estimate import estimate_training
 from pipelines.train.options import TrainOptions
-from tests.block_scenes import make_field, write_field
+from tests.block_scenes import georef, make_field, write_field
 from tests.threads import single_thread
 
 OPTIONS = (
@@ -40,29 +37,6 @@ OPTIONS = (
     "--no-dense",
 )
 SHORT = (*OPTIONS, "--iterations", 60, "--checkpoint-every", 20)
-
-
-class OneByOne:
-    """Engine that runs each job in this process."""
-
-    def __init__(self) -> None:
-        self.ran: list[str] = []
-
-    def together(self, jobs: Sequence[Job]) -> int:
-        return 1
-
-    def run(self, title: str, jobs: Sequence[Job], ended: Callable[[JobEnd], None], progress: Progress) -> None:
-        for job in jobs:
-            self.ran.append(job.name)
-            code = boundary.guarded(cli, [*job.arguments, "--quiet"])
-            ended(JobEnd(job, code, 0.0, "", "failed" if code else ""))
-
-
-def georef(*arguments: object) -> tuple[int, list[str]]:
-    """Exit code of a command, and the names of its jobs."""
-    engine = OneByOne()
-    with single_thread(), chosen_engine(engine):
-        return boundary.guarded(cli, [*map(str, arguments), "--quiet"]), engine.ran
 
 
 @pytest.fixture(scope="module")
