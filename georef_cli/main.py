@@ -17,7 +17,7 @@ import click
 from georef_cli import boundary
 from georef_cli.command import Command, merged_verbosity, shared_options
 from georef_cli.native_lines import native_lines_logged
-from pipelines import __version__
+from pipelines.core.version import described_version
 
 PROGRAM = "georef"
 
@@ -111,13 +111,21 @@ class LazyGroup(click.Group):
                 formatter.write_dl([(name, e.help) for name, e in COMMANDS.items() if e.section == section])
 
 
+def _tell_version(ctx: click.Context, _option: click.Parameter, is_asked: bool) -> None:
+    if is_asked and not ctx.resilient_parsing:
+        click.echo(f"{PROGRAM} {described_version()}")
+        ctx.exit()
+
+
 @click.group(
     name=PROGRAM,
     cls=LazyGroup,
     params=list(shared_options()),
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-@click.version_option(__version__, prog_name=PROGRAM, message="%(prog)s %(version)s", help="Show the version.")
+@click.option(
+    "--version", is_flag=True, expose_value=False, is_eager=True, callback=_tell_version, help="Show the version."
+)
 def cli() -> None:
     """From drone flights to georeferenced 3D Gaussian splats.
 

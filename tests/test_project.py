@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import re
 import tomllib
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import pytest
+from packaging.requirements import Requirement
 from ruamel.yaml import YAML
 
 import pipelines
-from pipelines.core.extras import EXTRAS
+from pipelines.core.extras import CORE_MB, EXTRAS, SIZES_MB
+from pipelines.core.version import described_commit
 from tests.cli_runs import finish, start
 
 REPOSITORY = Path(__file__).parents[1]
@@ -33,7 +36,10 @@ class TestVersion:
         assert re.fullmatch(r"\d+\.\d+\.\d+", pipelines.__version__)
 
     def test_command_line_tells_it(self) -> None:
-        assert finish(start("--version")).out == f"georef {pipelines.__version__}\n"
+        commit = described_commit(REPOSITORY)
+        assert commit is None or re.search(r"\b[0-9a-f]{7,}|^v\d", commit)
+        about = pipelines.__version__ if commit is None else f"{pipelines.__version__} ({commit})"
+        assert finish(start("--version")).out == f"georef {about}\n"
 
     def test_citation_has_it(self) -> None:
         assert str(load_yaml(REPOSITORY / "CITATION.cff")["version"]) == pipelines.__version__
@@ -85,6 +91,38 @@ def test_extras_are_those_that_the_errors_name() -> None:
     for extra, (_, libraries) in EXTRAS.items():
         assert set(libraries) <= installed[extra]
     assert project()["project"]["optional-dependencies"]["all"] == [f"georefgs[{','.join(EXTRAS)}]"]
+
+
+def test_sizes_are_about_what_is_installed() -> None:
+    """What an extra adds are its libraries, and theirs that an installation without extras lacks."""
+    wanted = project()["project"]
+    core = closure(wanted["dependencies"])
+    # Another version of a library may be a third larger.
+    assert megabytes(core) == pytest.approx(CORE_MB, rel=0.35)
+    for extra in EXTRAS:
+        added = closure(wanted["optional-dependencies"][extra]) - core
+        assert megabytes(added) == pytest.approx(SIZES_MB[extra], rel=0.35, abs=2), extra
+
+
+def closure(requirements: list[str]) -> set[str]:
+    """The installed distributions that requirements bring, directly or not."""
+    found: set[str] = set()
+    waiting = [(Requirement(line), frozenset({""})) for line in requirements]
+    while waiting:
+        wanted, extras = waiting.pop()
+        name = re.sub("[-_.]+", "-", wanted.name).lower()
+        if wanted.marker is not None and not any(wanted.marker.evaluate({"extra": extra}) for extra in extras):
+            continue
+        if name not in found or wanted.extras:
+            found.add(name)
+            inner = frozenset(wanted.extras) | {""}
+            waiting += [(Requirement(line), inner) for line in metadata.requires(name) or []]
+    return found
+
+
+def megabytes(distributions: set[str]) -> float:
+    """Size by the lists that the distributions bring."""
+    return sum(file.size or 0 for name in distributions for file in metadata.files(name) or []) / 1e6
 
 
 @pytest.mark.parametrize("path", [path for path in FORMS if path.name != "config.yml"], ids=lambda path: path.stem)

@@ -65,7 +65,10 @@ def _lines(machine: Machine) -> list[tuple[str, str]]:
         ("in", shown(", ".join(machine.grid_folders))),
         ("Chromium", shown(machine.chromium or "not found; `georef report --pdf` needs it")),
     ]
-    lines += [(f"extra {part.name}", _state(part)) for part in machine.extras]
+    sizes = machine.sizes_mb
+    lines += [(f"extra {part.name}", f"{_state(part)} ({sizes[part.name]} MB)") for part in machine.extras]
+    lines.append(("extra cuda", f"see backend cuda ({sizes['cuda']} MB, with torch's build for CUDA)"))
+    lines.append(("without extras", f"{sizes['core']} MB, with torch's build for the CPU"))
     versions = ", ".join(f"{name} {version}" for name, version in machine.versions.items())
     return [*lines, ("versions", shown(versions))]
 

@@ -20,6 +20,21 @@ EXTRAS: dict[Extra, tuple[str, tuple[str, ...]]] = {
     "vectors": ("contour lines and boundaries (--contours, --boundary)", ("ezdxf", "pyogrio")),
     "viewer": ("georef view", ("tornado",)),
 }
+# Megabytes on the disk that an extra adds to an installation without extras, and those of that installation: Linux
+# (x86-64), Python 3.11, torch for the CPU. `cuda` includes what torch's build for CUDA adds.
+CORE_MB = 1900
+SIZES_MB: dict[Extra | Literal["cuda"], int] = {
+    "bags": 22,
+    "cluster": 52,
+    "heif": 27,
+    "mesh": 4,
+    "reference": 150,
+    "simulator": 46,
+    "terrain": 6,
+    "vectors": 130,
+    "viewer": 5,
+    "cuda": 5000,
+}
 
 
 @dataclass(frozen=True)

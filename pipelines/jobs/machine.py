@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 
 from pipelines.core.errors import BackendUnavailableError
-from pipelines.core.extras import EXTRAS, Part, extra_part
+from pipelines.core.extras import CORE_MB, EXTRAS, SIZES_MB, Part, extra_part
 from pipelines.core.fingerprints import library_versions
 from pipelines.core.machine import available_cores, thread_count, total_main_memory_bytes
 from pipelines.core.progress import Progress
@@ -54,6 +54,7 @@ class Machine:
     gpus: tuple[Gpu, ...]
     backends: tuple[BackendState, ...]
     extras: tuple[Part, ...]  # optional libraries, by the extra that installs them
+    sizes_mb: dict[str, int]  # on the disk, about: `core`, and what each extra adds
     cuda_parts: tuple[Part, ...]  # what the cuda backend needs, and what compiles its kernels
     cuda_kernels: str | None  # place of the compiled kernels; None: the first use compiles them
     grid_folders: tuple[str, ...]  # where PROJ looks for grids
@@ -75,6 +76,7 @@ def inspect_machine() -> Machine:
         gpus=tuple(Gpu(properties.name, int(properties.total_memory)) for properties in found),
         backends=tuple(_backend(name) for name in BACKENDS),
         extras=tuple(map(extra_part, EXTRAS)),
+        sizes_mb={"core": CORE_MB, **SIZES_MB},
         cuda_parts=(*running_parts(), *compiling_parts()),
         cuda_kernels=kernels_ready(),
         grid_folders=tuple(map(str, grid_folders())),
