@@ -58,7 +58,7 @@ def installed(packages: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     (site / "libraries.pth").write_text("\n".join(libraries), encoding="utf-8")
     guard = WITHOUT_CHECKOUT.format(checkout=str(REPOSITORY), libraries=tuple(libraries))
     (site / "sitecustomize.py").write_text(guard, encoding="utf-8")
-    return next(folder.glob("venv/*/python*")).parent
+    return folder / "venv" / ("Scripts" if sys.platform == "win32" else "bin")
 
 
 def only(folder: Path, pattern: str) -> Path:

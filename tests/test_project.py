@@ -97,11 +97,11 @@ def test_sizes_are_about_what_is_installed() -> None:
     """What an extra adds are its libraries, and theirs that an installation without extras lacks."""
     wanted = project()["project"]
     core = closure(wanted["dependencies"])
-    # Another version of a library may be a third larger.
-    assert megabytes(core) == pytest.approx(CORE_MB, rel=0.35)
+    # The lists give no size of compiled Python, which may be as much again; another version may be a third larger.
+    assert 0.7 * megabytes(core) < CORE_MB < 2.0 * megabytes(core)
     for extra in EXTRAS:
-        added = closure(wanted["optional-dependencies"][extra]) - core
-        assert megabytes(added) == pytest.approx(SIZES_MB[extra], rel=0.35, abs=2), extra
+        added = megabytes(closure(wanted["optional-dependencies"][extra]) - core)
+        assert 0.7 * added - 1 < SIZES_MB[extra] < 2.5 * added + 2, extra
 
 
 def closure(requirements: list[str]) -> set[str]:
