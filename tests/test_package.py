@@ -17,6 +17,7 @@ import pytest
 
 import pipelines
 from pipelines.core.version import PACKED, described_commit
+from tests.environments import make_environment, site_packages, without_python
 
 REPOSITORY = Path(__file__).parents[1]
 PATIENCE_S = 300.0
@@ -49,16 +50,14 @@ def packages(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def installed(packages: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Programs of an environment with the wheel, beside the libraries of this one."""
     folder = tmp_path_factory.mktemp("installed")
-    run([sys.executable, "-m", "venv", "--without-pip", "venv"], folder)
-    site = next(folder.glob("venv/**/site-packages"))
+    programs = make_environment(folder / "venv")
+    site = site_packages(folder / "venv")
     with zipfile.ZipFile(only(packages, "*.whl")) as wheel:
         wheel.extractall(site)
-    # As text, a folder of libraries brings no editable installation with it.
     libraries = [path for path in sys.path if path.endswith("site-packages")]
-    (site / "libraries.pth").write_text("\n".join(libraries), encoding="utf-8")
     guard = WITHOUT_CHECKOUT.format(checkout=str(REPOSITORY), libraries=tuple(libraries))
     (site / "sitecustomize.py").write_text(guard, encoding="utf-8")
-    return folder / "venv" / ("Scripts" if sys.platform == "win32" else "bin")
+    return programs
 
 
 def only(folder: Path, pattern: str) -> Path:
@@ -66,14 +65,10 @@ def only(folder: Path, pattern: str) -> Path:
     return found
 
 
-def environment() -> dict[str, str]:
-    return {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
-
-
 def run(words: Sequence[object], folder: Path) -> str:
     """Run a command there, without this process's path of modules, and return what it printed."""
     done = subprocess.run(
-        list(map(str, words)), cwd=folder, env=environment(), check=False, capture_output=True, text=True,
+        list(map(str, words)), cwd=folder, env=without_python(), check=False, capture_output=True, text=True,
         timeout=PATIENCE_S,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
@@ -84,7 +79,7 @@ def test_the_checkout_is_out_of_reach(installed: Path, tmp_path: Path) -> None:
     """Otherwise the test below would prove nothing."""
     read = f"import pathlib; pathlib.Path({str(REPOSITORY / 'README.md')!r}).read_text()"
     words = [str(installed / "python"), "-c", read]
-    done = subprocess.run(words, cwd=tmp_path, env=environment(), check=False, capture_output=True, text=True)
+    done = subprocess.run(words, cwd=tmp_path, env=without_python(), check=False, capture_output=True, text=True)
     assert "outside the package" in done.stderr
     place = run([installed / "python", "-c", "import pipelines; print(pipelines.__file__)"], tmp_path)
     assert Path(place.strip()).is_relative_to(installed.parent)
@@ -121,7 +116,7 @@ def test_a_flight_without_the_checkout(installed: Path, tmp_path: Path) -> None:
     assert "<html" in (tmp_path / "ws/report/report.html").read_text(encoding="utf-8")
     assert pipelines.__version__ in (tmp_path / "ws/report/report.html").read_text(encoding="utf-8")
     words = [*map(str, georef(installed)), "view", "ws", "--json"]
-    viewer = subprocess.Popen(words, cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, text=True)
+    viewer = subprocess.Popen(words, cwd=tmp_path, env=without_python(), stdout=subprocess.PIPE, text=True)
     ended = threading.Timer(PATIENCE_S, viewer.kill)
     ended.start()
     try:
