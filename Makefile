@@ -5,9 +5,9 @@ VENV := .venv
 BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 DEMO := demo
 
-.PHONY: setup demo test test-all test-browser test-gpu-build fuzz lint types docs check release clean
+.PHONY: setup demo test test-all test-browser test-gpu-build fuzz lint types docs packages check release clean
 
-setup test lint types docs:
+setup test lint types docs packages:
 	@.ci/run $@
 
 # What a contributor runs before each commit is `test`; this adds the tests that take minutes.
@@ -42,7 +42,7 @@ demo: setup
 fuzz: setup
 	$(BIN)/python -m tests.fuzz
 
-# `make release VERSION=0.2.0`: checks, version, changelog, commit, tag. Nothing is pushed.
+# `make release VERSION=0.2.0`: checks, version, changelog, commit, tag, packages. Nothing is pushed.
 release: setup
 	$(BIN)/python .ci/release.py $(VERSION)
 

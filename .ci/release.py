@@ -3,7 +3,9 @@
 1. The version must be higher than the last release, the working tree clean, and CHANGELOG.md must tell of changes.
 2. The version is written into pipelines/__init__.py (its only source), CITATION.cff and CHANGELOG.md.
 3. `.ci/run` checks that state. If it fails, the three files are put back.
-4. The state is committed and tagged. Nothing is pushed.
+4. The state is committed and tagged.
+5. `.ci/run packages` builds the packages of the tag into dist/ and tries the wheel. If it fails, commit and tag are
+   taken back. Nothing is pushed.
 """
 
 from __future__ import annotations
@@ -84,16 +86,27 @@ def check_with(check: Callable[[], None], files: dict[str, str]) -> None:
         raise
 
 
-def run_checks() -> None:
-    """Run `.ci/run`.
+def run_checks(*steps: str) -> None:
+    """Run `.ci/run`, or some of its steps.
 
     Raises:
         SystemExit: a check failed.
     """
     # Without its path, Windows would take the bash of its Linux subsystem.
     bash = shutil.which("bash") or "bash"
-    if subprocess.run([bash, ".ci/run"], cwd=ROOT, check=False).returncode:
+    if subprocess.run([bash, ".ci/run", *steps], cwd=ROOT, check=False).returncode:
         raise SystemExit("the checks failed: nothing was released")
+
+
+def tag_and_pack(version: str) -> None:
+    """Tag the commit of a release and build its packages; whatever ends that takes tag and commit back."""
+    git("tag", "--annotate", f"v{version}", "--message", f"GeoRefGS {version}")
+    try:
+        run_checks("packages")
+    except BaseException:
+        git("tag", "--delete", f"v{version}")
+        git("reset", "--hard", "HEAD^")
+        raise
 
 
 def main() -> None:
@@ -107,8 +120,9 @@ def main() -> None:
     check_with(run_checks, files)
     git("add", *files)
     git("commit", "--message", f"Release {version}")
-    git("tag", "--annotate", f"v{version}", "--message", f"GeoRefGS {version}")
-    sys.stdout.write(f"released {version}: look at it, then `git push --follow-tags`\n")
+    tag_and_pack(version)
+    published = "`git push --follow-tags`, and publish dist/"
+    sys.stdout.write(f"released {version}: look at it, then {published}\n")
 
 
 if __name__ == "__main__":

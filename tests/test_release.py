@@ -26,7 +26,7 @@ def checkout(tmp_path: Path) -> Path:
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         (root / name).write_bytes((REPOSITORY / name).read_bytes())
     (root / "CHANGELOG.md").write_text(CHANGELOG, encoding="utf-8")
-    (root / ".ci/run").write_text("cat pipelines/__init__.py > ../checked\n", encoding="utf-8")
+    (root / ".ci/run").write_text("cat pipelines/__init__.py > ../checked\necho $@ >> ../steps\n", encoding="utf-8")
     git(root, "init", "--quiet")
     git(root, "add", ".")
     git(root, "commit", "--quiet", "--message", "All")
@@ -67,7 +67,8 @@ def test_release_is_checked_written_committed_and_tagged(checkout: Path, release
         git(checkout, "cat-file", "-t", "v0.2.0") == "tag\n"
     )  # annotated: `git push --follow-tags` takes it along
     assert git(checkout, "status", "--porcelain") == ""
-    # The checks saw what was tagged.
+    # The checks saw what was tagged, and the packages were built.
+    assert (checkout.parent / "steps").read_text(encoding="utf-8") == "\npackages\n"
     assert '"0.2.0"' in (checkout.parent / "checked").read_text(encoding="utf-8")
 
 
@@ -88,6 +89,17 @@ def test_failing_checks_leave_everything_as_it_was(checkout: Path, release: Rele
     assert "nothing was released" in done.stderr
     assert git(checkout, "status", "--porcelain") == ""
     assert git(checkout, "tag") == "v0.0.9\n"
+
+
+def test_a_package_that_fails_takes_the_release_back(checkout: Path, release: Release) -> None:
+    (checkout / ".ci/run").write_text('test "$1" != packages\n', encoding="utf-8")
+    git(checkout, "commit", "--quiet", "--all", "--message", "Fail")
+    before = git(checkout, "rev-parse", "HEAD")
+    done = release("0.2.0")
+    assert done.returncode != 0
+    assert "nothing was released" in done.stderr
+    assert (git(checkout, "rev-parse", "HEAD"), git(checkout, "tag")) == (before, "v0.0.9\n")
+    assert git(checkout, "status", "--porcelain") == ""
 
 
 @pytest.mark.parametrize(
