@@ -1,9 +1,14 @@
 """Extras: optional libraries, what needs them, whether they are installed, and the command that installs them."""
 
+import contextlib
+import json
 from dataclasses import dataclass
 from importlib import metadata
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Literal
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
 
 from pipelines.core.errors import BackendUnavailableError
 
@@ -52,7 +57,19 @@ def module_of(package: str) -> str:
 
 
 def installing(extra: str) -> str:
-    return f"pip install 'georefgs[{extra}]' (in a checkout: pip install '.[{extra}]')"
+    """Return the command that adds an extra, from where this program came: a checkout, a file, an index."""
+    home = Path(__file__).parents[2]
+    if (home / "pyproject.toml").is_file():
+        return f"pip install '{home}[{extra}]'"
+    with contextlib.suppress(metadata.PackageNotFoundError):
+        origin = json.loads(metadata.distribution("georefgs").read_text("direct_url.json") or "{}")
+        url = origin.get("url", "")
+        if url.startswith("file:"):
+            return f"pip install '{url2pathname(urlsplit(url).path)}[{extra}]'"
+        if url:
+            vcs = f"{origin['vcs_info']['vcs']}+" if "vcs_info" in origin else ""
+            return f"pip install 'georefgs[{extra}] @ {vcs}{url}'"
+    return f"pip install 'georefgs[{extra}]'"
 
 
 def require(extra: Extra) -> None:

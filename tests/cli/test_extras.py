@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from pipelines.core import extras
 from pipelines.core.extras import EXTRAS, Extra, installing, module_of
 from pipelines.core.workspace import Workspace
 from tests.cli_runs import REPOSITORY, Georef, Result
@@ -124,3 +127,39 @@ main(["doctor"])
     words = " ".join(done.stdout.split())
     for extra in EXTRAS:
         assert f"extra {extra} missing: {EXTRAS[extra][0]} needs" in words
+
+
+FROM_COMMIT = {"url": "https://example.org/georef.git", "vcs_info": {"vcs": "git", "commit_id": "1a2b3c4"}}
+
+
+@pytest.mark.parametrize(
+    ("origin", "expected"),
+    [
+        (
+            {"url": "file:///home/me/georefgs-0.2.0-py3-none-any.whl"},
+            "/home/me/georefgs-0.2.0-py3-none-any.whl[mesh]",
+        ),
+        ({"url": "file:///home/my%20name/georef", "dir_info": {}}, "/home/my name/georef[mesh]"),
+        (
+            {"url": "https://example.org/georefgs-0.2.0.tar.gz"},
+            "georefgs[mesh] @ https://example.org/georefgs-0.2.0.tar.gz",
+        ),
+        (FROM_COMMIT, "georefgs[mesh] @ git+https://example.org/georef.git"),
+        (None, "georefgs[mesh]"),
+    ],
+)
+@pytest.mark.skipif(sys.platform == "win32", reason="the paths are of Linux")
+def test_remedy_installs_from_where_the_program_came(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, origin: dict[str, object] | None, expected: str
+) -> None:
+    """As pip records it (PEP 610); of an index it records nothing."""
+    text = None if origin is None else json.dumps(origin)
+    monkeypatch.setattr(extras, "__file__", str(tmp_path / "site/pipelines/core/extras.py"))
+    monkeypatch.setattr(
+        extras.metadata, "distribution", lambda _name: SimpleNamespace(read_text=lambda _file: text)
+    )
+    assert installing("mesh") == f"pip install '{expected}'"
+
+
+def test_remedy_in_a_checkout_names_it() -> None:
+    assert installing("mesh") == f"pip install '{REPOSITORY}[mesh]'"
