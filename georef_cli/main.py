@@ -36,14 +36,14 @@ class HelpLine:
 
 
 COMMANDS: dict[str, HelpLine] = {
-    "simulate": HelpLine("Surveys", "Simulate a survey whose truth is known exactly."),
-    "inspect": HelpLine("Surveys", "Show what a ROS bag holds, what ingest would choose, what is missing."),
+    "simulate": HelpLine("Start", "Simulate a survey whose truth is known exactly."),
+    "inspect": HelpLine("Start", "Show what a ROS bag holds, and what ingest would choose."),
     "run": HelpLine("Pipeline", "Run all stages, or some, skipping what is current."),
     "batch": HelpLine("Pipeline", "Run many missions, and put their results into one table."),
     "blocks": HelpLine("Pipeline", "Train a large survey in blocks, and merge them."),
-    "cluster certificates": HelpLine("Cluster", "Make the certificate that the machines of a cluster share."),
-    "cluster scheduler": HelpLine("Cluster", "Start the scheduler of a cluster."),
-    "cluster worker": HelpLine("Cluster", "Lend this machine to a cluster."),
+    "cluster certificates": HelpLine("Pipeline", "Make the certificate that the machines of a cluster share."),
+    "cluster scheduler": HelpLine("Pipeline", "Start the scheduler of a cluster."),
+    "cluster worker": HelpLine("Pipeline", "Lend this machine to a cluster."),
     "status": HelpLine("Pipeline", "Show the state of every stage."),
     "info": HelpLine("Pipeline", "Show where on Earth the result is, and what each file is for."),
     "view": HelpLine("Pipeline", "See the trained model in a browser, and measure in it."),
@@ -65,9 +65,11 @@ COMMANDS: dict[str, HelpLine] = {
     "export-cameras": HelpLine("Deliverables", "Write the trained cameras for other programs."),
     "report": HelpLine("Deliverables", "Write the report: one page, and its PDF."),
     "change": HelpLine("Deliverables", "Compare two surveys: what changed, by how much, is it real."),
-    "help": HelpLine("Help", "Explain a topic, such as heights or options, or a command."),
-    "doctor": HelpLine("Help", "Show what this machine offers: memory, GPU, backends, geoid grids."),
+    "help": HelpLine("Start", "Explain a topic, such as heights or options, or a command."),
+    "doctor": HelpLine("Start", "Show what this machine offers: memory, GPU, backends, geoid grids."),
 }
+# Commands of two words are one line of the help, so that it fits on a screen.
+TOGETHER = {"cluster": "Lend machines to a cluster: certificates, scheduler, worker."}
 
 
 def module_of(name: str) -> str:
@@ -108,7 +110,12 @@ class LazyGroup(click.Group):
         """Write the commands from the table, without an import."""
         for section in dict.fromkeys(entry.section for entry in COMMANDS.values()):
             with formatter.section(section):
-                formatter.write_dl([(name, e.help) for name, e in COMMANDS.items() if e.section == section])
+                lines = {
+                    name.partition(" ")[0]: TOGETHER.get(name.partition(" ")[0], entry.help)
+                    for name, entry in COMMANDS.items()
+                    if entry.section == section
+                }
+                formatter.write_dl(list(lines.items()))
 
 
 def _tell_version(ctx: click.Context, _option: click.Parameter, is_asked: bool) -> None:
@@ -129,7 +136,7 @@ def _tell_version(ctx: click.Context, _option: click.Parameter, is_asked: bool) 
 def cli() -> None:
     """From drone flights to georeferenced 3D Gaussian splats.
 
-    Every command works on a workspace, a folder that holds the products of the stages.
+    Every command works on a workspace, the folder of a survey's products.
 
     \b
     Examples:

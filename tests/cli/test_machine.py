@@ -12,7 +12,7 @@ import pytest
 import torch
 from click.shell_completion import BashComplete
 
-from georef_cli.main import PROGRAM, cli
+from georef_cli.main import COMMANDS, PROGRAM, cli
 from georef_cli.topics import TOPICS, topic_text
 from pipelines.core.errors import BackendUnavailableError
 from pipelines.core.extras import Part
@@ -77,6 +77,15 @@ def test_topic_fits_a_terminal_and_its_commands_parse(topic: str) -> None:
         parse(re.split(r"\s{3,}", line)[0])
 
 
+def test_help_names_every_command_on_one_screen(real_georef: Georef) -> None:
+    lines = real_georef("--help").out.splitlines()
+    assert len(lines) <= 58 and max(map(len, lines)) <= 80
+    named = {line.split()[0] for line in lines if line.startswith("  ")}
+    assert {name.partition(" ")[0] for name in COMMANDS} <= named
+    told = " ".join(lines)
+    assert all(name.partition(" ")[2] in told for name in COMMANDS)
+
+
 def test_help_lists_topics_and_explains_commands(real_georef: Georef) -> None:
     listing = real_georef("help").out
     assert all(f"  {name} " in listing for name in TOPICS)
@@ -113,6 +122,8 @@ def test_shell_completes(words: list[str], last: str, expected: set[str]) -> Non
     ("variables", "told"),
     [
         ({"_GEOREF_COMPLETE": "zsh_source"}, "#compdef georef"),
+        ({"_GEOREF_COMPLETE": "fish_source"}, "complete --no-files --command georef"),
+        ({"_GEOREF_COMPLETE": "bash_source"}, "complete -o nosort -F _georef_completion georef"),
         ({"_GEOREF_COMPLETE": "bash_complete", "COMP_WORDS": "georef stat", "COMP_CWORD": "1"}, "plain,status"),
     ],
 )
@@ -123,3 +134,11 @@ def test_program_answers_the_shell(variables: dict[str, str], told: str) -> None
         capture_output=True, text=True, check=True, env={**os.environ, **variables, "PYTHONPATH": str(REPOSITORY)},
     )  # fmt: skip
     assert told in done.stdout
+
+
+def test_page_has_the_lines_of_the_topic(real_georef: Georef) -> None:
+    page = (REPOSITORY / "docs/installation.md").read_text(encoding="utf-8")
+    lines = [
+        line.strip() for line in real_georef("help", "completion").out.splitlines() if "_GEOREF_COMPLETE" in line
+    ]
+    assert len(lines) == 3 and all(f"    {line}\n" in page for line in lines)
