@@ -62,6 +62,8 @@ def main() -> int:
         if not (project / "images").is_dir():
             raise RefusedError(f"{project} has no folder images.")
         words = run_words(given, project)
+        for remark in remarks(given, project):
+            journal.say("warning", remark)
         code, result = run_georef(words, journal, Progress(given.name))
         if code == 0:
             outputs.lay_out(project, result, wanted_outputs(given), journal.say)
@@ -88,7 +90,7 @@ def run_words(given: argparse.Namespace, project: Path) -> list[str]:
     words += [f"--{name}={getattr(given, name)}" for name in ("gcp", "geo", "vertical") if getattr(given, name)]
     if given.gps_accuracy > 0:
         words += [f"--sigma-h={given.gps_accuracy}", f"--sigma-v={given.gps_accuracy}"]
-    if given.rerun_from:
+    if given.rerun_from and (project / "workspace").is_dir():
         words.append(f"--rerun-from={STEPS[given.rerun_from]}")
     if last < steps.index("openmvs"):
         words.append(f"--to={STEPS[given.end_with]}")
@@ -114,6 +116,22 @@ def run_words(given: argparse.Namespace, project: Path) -> list[str]:
         if "report" in delivered:
             sets |= {"report.pdf": str(outputs.can_print()).lower(), "report.title": json.dumps(given.name)}
     return words + [f"--set={name}={value}" for name, value in sets.items()]
+
+
+def remarks(given: argparse.Namespace, project: Path) -> list[str]:
+    """Return what a call asks and does not get, in sentences."""
+    widths = {given.orthophoto_resolution, given.dem_resolution} - {0.0}
+    said = {
+        f"All rasters have cells of {min(widths, default=0)} cm, the smaller of orthophoto-resolution and "
+        "dem-resolution.": len(widths) > 1,
+        f"{Path(given.align).name} is compared with the surface, in the report. The survey is not moved onto it: "
+        "give control points to correct its place.": bool(given.align),
+        "split-image-groups is not used: large surveys are divided by themselves.": bool(given.split_image_groups),
+        f"rerun-from {given.rerun_from} is not used: this task has no earlier run here.": (
+            bool(given.rerun_from) and not (project / "workspace").is_dir()
+        ),
+    }
+    return [sentence for sentence, is_so in said.items() if is_so]
 
 
 def deliverables(given: argparse.Namespace) -> list[str]:

@@ -162,7 +162,7 @@ def test_the_node_can_read_every_option() -> None:
         "--orthophoto-resolution 5 --dem-resolution 2.5 --gps-accuracy 0.5 --vertical EGM96 --gcp GCP/gcp_list.txt",
         "--fast-orthophoto --skip-report --skip-3dmodel --preset high",
         "--end-with dataset",
-        "--end-with opensfm --rerun-from dataset",
+        "--end-with opensfm --rerun-from dataset",  # of which the latter is not used before a first run
         "--end-with odm_georeferencing --vertical ellipsoidal",
         "--end-with openmvs --crop 3",
         "--end-with odm_orthophoto --3d-tiles",
@@ -192,7 +192,20 @@ def test_options_reach_the_stages(engine: ModuleType, project: Path) -> None:
     assert {"--sigma-h=2.5", "--sigma-v=2.5"} <= set(words("--gps-accuracy", "2.5"))
     assert "--set=export-spz.crop=true" in words() and "--set=export-spz.crop=true" not in words("--crop", "0")
     assert "--vertical=EGM96; rm -r /" in words("--vertical", "EGM96; rm -r /")  # one word, which georef refuses
+    assert not any("rerun" in word for word in words("--rerun-from", "opensfm"))  # nothing was run here
+    (project / "workspace").mkdir()
     assert "--rerun-from=sfm" in words("--rerun-from", "opensfm")
+
+
+def test_what_is_asked_and_not_done_is_said(engine: ModuleType, project: Path) -> None:
+    def said(*asked: str) -> str:
+        return " ".join(engine.remarks(engine.config([*asked, "--project-path", "/data", UUID]), project))
+
+    assert said("--dsm", "--orthophoto-resolution", "4") == said("--split-image-groups", "") == ""
+    assert "cells of 2.5 cm" in said("--orthophoto-resolution", "4", "--dem-resolution", "2.5")
+    assert "not moved onto it" in said("--align", "/data/align.laz")
+    assert "split-image-groups" in said("--split-image-groups", "/data/image_groups.txt")
+    assert "rerun-from openmvs is not used" in said("--rerun-from", "openmvs")
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,7 @@ PRESETS = ("smoke", "fast", "standard", "high")
 SURFACES = ("surface", "terrain")
 Style = Callable[[Any], None]
 
-# Output, file in the workspace, its name in QGIS, and its style (None: QGIS's own); the first lies undermost. Rasters
+# Output, file in the workspace, name in QGIS, and style (None: QGIS's own); the first lies undermost. Rasters
 # that would cover the first are loaded, and not shown.
 RASTERS: tuple[tuple[str, str, str, Style | None], ...] = (
     ("ORTHOPHOTO", "raster/orthophoto.tif", "Orthophoto", None),
