@@ -1,8 +1,9 @@
 """Make a release: `make release VERSION=0.2.0`, or `python .ci/release.py 0.2.0`.
 
 1. The version must be higher than the last release, the working tree clean, and CHANGELOG.md must tell of changes.
-2. The version is written into pipelines/__init__.py (its only source), CITATION.cff and CHANGELOG.md.
-3. `.ci/run` checks that state. If it fails, the three files are put back.
+2. The version is written into pipelines/__init__.py (its only source), CITATION.cff, CHANGELOG.md and the VERSION
+   of the engine of WebODM.
+3. `.ci/run` checks that state. If it fails, the files are put back.
 4. The state is committed and tagged.
 5. `.ci/run packages` builds the packages of the tag into dist/ and tries the wheel. If it fails, commit and tag are
    taken back. Nothing is pushed.
@@ -22,6 +23,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 VERSION = re.compile(r"\d+\.\d+\.\d+")
 SOURCE, CITATION, CHANGELOG = "pipelines/__init__.py", "CITATION.cff", "CHANGELOG.md"
+ENGINE = "examples/webodm/VERSION"
 UNRELEASED = "## Unreleased\n"
 
 
@@ -45,6 +47,7 @@ def released(version: str, day: date) -> dict[str, str]:
     return {
         SOURCE: edited(SOURCE, r'^__version__ = ".+"$', f'__version__ = "{version}"'),
         CITATION: edited(CITATION, r"^version: .+\n(?:date-released: .+\n)?", citation),
+        ENGINE: f"{version}\n",
         CHANGELOG: edited(CHANGELOG, rf"^{UNRELEASED}", f"## {version} ({day.isoformat()})\n"),
     }
 

@@ -13,7 +13,7 @@ import pytest
 
 from tests.scripts import REPOSITORY
 
-FILES = (".ci/release.py", "pipelines/__init__.py", "CITATION.cff")
+FILES = (".ci/release.py", "pipelines/__init__.py", "CITATION.cff", "examples/webodm/VERSION")
 CHANGELOG = "# Changelog\n\n## Unreleased\n\n- Something new.\n\n## 0.0.9 (2020-01-01)\n\n- The first.\n"
 Release = Callable[[str], subprocess.CompletedProcess[str]]
 

@@ -1,0 +1,1 @@
+"""Package in which NodeODM looks for the options of an engine."""
