@@ -428,11 +428,13 @@ def _default_sigmas(
         bool(control) and all(point.sigma_h_m and point.sigma_v_m for point in control)
     )
     attitudes = np.isfinite(poses.enu_from_cam).all(axis=(1, 2)).any() and options.sigma_attitude is None
+    # A gimbal's tags have no σ: one that is set for them is that of a correction by the track.
+    of_file = np.isfinite(poses.sigma_attitude_deg) & (np.array(poses.attitude_source, dtype=object) != "gimbal")
     groups: list[tuple[bool, SigmaGroup]] = [
         ("default" in poses.sigma_source, "fixes"),
         (not points_stated, "control points"),
         ("sigma_mark" not in stated and not _only_targets(control, options), "marks"),
-        (bool(attitudes) and not np.isfinite(poses.sigma_attitude_deg).any(), "attitudes"),
+        (bool(attitudes) and not of_file.any(), "attitudes"),
     ]
     return tuple(group for is_default, group in groups if is_default)
 
