@@ -99,7 +99,8 @@ def _place(result: Overview, *, brief: bool = False) -> Table:
         lines = {
             "longitude": f"{on_earth.west:.6f} … {on_earth.east:.6f}°",
             "latitude": f"{on_earth.south:.6f} … {on_earth.north:.6f}°",
-            "height": f"{on_earth.height_m[0]:.2f} … {on_earth.height_m[1]:.2f} m, ellipsoidal",
+            "height": f"{on_earth.height_m[0]:.2f} … {on_earth.height_m[1]:.2f} m, ellipsoidal"
+            + ", if the assumed datum is right" * on_earth.datum_assumed,
         }
     lines |= {
         bounds.crs: ", ".join(

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from pipelines.geometry.bundle import Network
+from pipelines.geometry.network import Network
 from pipelines.geometry.sparse_model import SparseModel
 from tests.bundle_scenes import adjuster, pixels, readjusted, size
 from tests.scenes import Layout, Noise, TrueScene, looking_at, make_scene, sparse_model

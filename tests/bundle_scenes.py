@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipelines.geometry.bundle import BundleInformation, Network, bundle_information, eliminate_points
+from pipelines.geometry.bundle import BundleInformation, bundle_information
 from pipelines.geometry.cameras import Camera, project
+from pipelines.geometry.network import Network, eliminate_points
 from pipelines.geometry.rotations import exp_so3
 from tests.scenes import looking_at
 

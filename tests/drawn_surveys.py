@@ -13,8 +13,9 @@ import numpy as np
 from scipy.sparse import diags
 
 from pipelines.adjust.posterior import Posterior
-from pipelines.geometry.bundle import BundleInformation, Network, bundle_information
+from pipelines.geometry.bundle import BundleInformation, bundle_information
 from pipelines.geometry.cameras import CameraPoses
+from pipelines.geometry.network import Network
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.sparse_cholesky import SparseCholesky
 from pipelines.geometry.sparse_model import SparseModel

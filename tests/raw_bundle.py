@@ -16,7 +16,7 @@ from pipelines.adjust.posterior import IntersectionJacobian, intersection_jacobi
 from pipelines.adjust.system import NormalMatrix
 from pipelines.core.errors import ConvergenceError, DegenerateGeometryError, InputError
 from pipelines.core.types import FloatArray, IntArray
-from pipelines.geometry.bundle import (
+from pipelines.geometry.network import (
     Network,
     eliminate_points,
     has_positive_depth,

@@ -25,8 +25,9 @@ from pipelines.adjust.system import Problem, linearised, minimise, posterior_wei
 from pipelines.adjust.terms import ControlPoints, Fixes
 from pipelines.core.machine import peak_memory_bytes
 from pipelines.core.types import FloatArray, IntArray
-from pipelines.geometry.bundle import BundleInformation, Network, bundle_information
+from pipelines.geometry.bundle import BundleInformation, bundle_information
 from pipelines.geometry.cameras import Camera, CameraPoses, Lenses, bearings, project_each
+from pipelines.geometry.network import Network
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import perturbation
 from pipelines.geometry.sparse_cholesky import SparseCholesky

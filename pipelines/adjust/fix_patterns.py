@@ -39,6 +39,7 @@ _USUAL_LAG_S, _USUAL_ARM_M = 1.0, 0.5
 _STEPS, _WIDE, _NARROWING = 25, 16.0, 0.6
 _LEAST_SIGMA_M = 1e-3
 _MOST_CORRELATION = 0.8
+_AGREES, _BETTER = 2.0, 0.7  # σ that a lag leaves, or part of the scatter without it
 _INNER = 0.9  # part of the search whose end is no answer
 _SIGNIFICANT = 4.0  # σ of an estimate that counts
 _GATE = outlier_gate(3)
@@ -82,11 +83,11 @@ class _Data:
     center: FloatArray  # (n, 3) in local
     local_from_cam: FloatArray  # (n, 3, 3)
     time_s: FloatArray  # (n,)
-    path: _Path
+    path: CameraPath
     pixel: float  # width of a pixel at the scene, in local: SfM's own error along its views
 
 
-class _Path:
+class CameraPath:
     """The path of the cameras in local, by legs without a long pause."""
 
     def __init__(self, time_s: FloatArray, center: FloatArray) -> None:
@@ -199,7 +200,7 @@ def _gathered(survey: Survey, model: SparseModel) -> tuple[tuple[str, ...], _Dat
         center=center,
         local_from_cam=np.swapaxes(model.rotation_cam_from_local[cameras], 1, 2),
         time_s=time_s[rows],
-        path=_Path(time_s[rows], center),
+        path=CameraPath(time_s[rows], center),
         pixel=_pixel_at_scene(model),
     )
     return (tuple(fixes.name[row] for row in rows), data) if data.path.known.sum() >= _LEAST_IMAGES else None
@@ -333,6 +334,10 @@ def _chosen(fits: dict[tuple[bool, bool], _Fit], data: _Data) -> tuple[bool, boo
     def counts(kind: tuple[bool, bool]) -> bool:
         one = fits[kind]
         lag = not kind[0] or _SIGNIFICANT * one.sigma[_LAG][0] < abs(one.lag_s) < _INNER * data.path.most_lag_s
+        if kind[0]:  # A model that is bent, or fixes of other photographs, leave most of the scatter with any lag.
+            without = fits.get((False, kind[1]), one)
+            falls = _horizontal(one.residual) < _BETTER * _horizontal(without.residual)
+            lag = lag and (falls or _spread(one.white) < _AGREES)
         sigma = np.hypot(one.sigma[_ARM], one.similarity.scale * data.pixel)
         arm = not kind[1] or bool((np.abs(one.arm_m) > _SIGNIFICANT * sigma).any())
         return lag and arm

@@ -94,11 +94,17 @@ class _Finding:
 
 
 def cautions_of(
-    survey: Survey, model: SparseModel, joint: JointAdjustment, pattern: FixPattern | None = None
+    survey: Survey,
+    model: SparseModel,
+    joint: JointAdjustment,
+    pattern: FixPattern | None = None,
+    *,
+    bent: bool = False,
 ) -> tuple[tuple[Remark, ...], tuple[Remark, ...]]:
     """Return the inconsistencies, which end the stage unless the user accepts them, and further limits.
 
-    `pattern` is that of the fixes; a lever arm in it is estimated by `joint`.
+    `pattern` is that of the fixes; a lever arm in it is estimated by `joint`. Of a model that is known to be `bent`
+    fixes are not taken for those of other photographs.
     """
     fixes = StatedFixes(survey, model)
     findings, mistake = list(_upside_down(fixes, joint.geo_from_local)), _mistake_in_map(survey, model)
@@ -108,7 +114,7 @@ def cautions_of(
         of_map.append(_Finding("control-map", sentence, ends=True))
     if not findings:
         of_lag = list(_lag_of_fixes(fixes, joint, pattern))
-        findings += of_lag or ([] if of_map else _fixes_against_model(fixes, joint))
+        findings += of_lag or ([] if of_map else _fixes_against_model(fixes, joint, bent=bent))
         findings += _view(model, joint.geo_from_local)
     findings += of_map or [*_shift_of_fixes(joint), *_control_points(joint)]
     findings += _steep_ground(survey, model, joint)
@@ -184,7 +190,7 @@ def _view(model: SparseModel, geo_from_local: Similarity) -> Iterator[_Finding]:
         yield _Finding("looks-at-sky", sentence)
 
 
-def _fixes_against_model(fixes: StatedFixes, joint: JointAdjustment) -> Iterator[_Finding]:
+def _fixes_against_model(fixes: StatedFixes, joint: JointAdjustment, *, bent: bool) -> Iterator[_Finding]:
     factor, drifts = joint.factors.get("fixes"), _drifts(joint)
     if factor is None or (factor.applied <= _QUIET_FACTOR and not drifts):
         return
@@ -215,7 +221,7 @@ def _fixes_against_model(fixes: StatedFixes, joint: JointAdjustment) -> Iterator
     if drifts:
         yield _drifting(drifts, joint)
         return
-    if scatter_m > median_spacing(fixes.position_in_geo) / 2:
+    if scatter_m > median_spacing(fixes.position_in_geo) / 2 and not bent:
         code = _OTHER_PHOTOGRAPHS
         remedy = "They are farther off than photographs are apart. Check that they belong to these photographs."
     else:

@@ -35,6 +35,7 @@ from pipelines.adjust.inconsistencies import (
     unadjustable,
 )
 from pipelines.adjust.joint import JointAdjustment, Start, adjust_jointly, component_of, in_own_frame
+from pipelines.adjust.lens_cautions import focal_length_of, rolling_shutter_of
 from pipelines.adjust.level import level_of, levelled
 from pipelines.adjust.local_frame import local_similarity
 from pipelines.adjust.measurements import (
@@ -209,10 +210,12 @@ def robust_similarity(
         cautions = union(survey.cautions, inconsistencies, of_marks, of_arm, (unchecked,))
         initial = _without_joint(aligned, alignment.solution, cautions)
         return Estimated(initial, solved(survey, model, initial, options.estimate), warnings)
-    inconsistencies, limits = cautions_of(meets, model, joint, pattern)
+    motion, of_lens = joint.problem.bundle.row_motion, focal_length_of(survey, model)
+    inconsistencies, limits = cautions_of(meets, model, joint, pattern, bent=bool(of_lens))
+    of_lens += rolling_shutter_of(survey, model, joint.geo_from_local.scale, motion)
     _refuse(inconsistencies, options)
     initial, more = _joint_product(model, points, aligned, joint)
-    cautions = union(survey.cautions, inconsistencies, of_marks, of_arm, limits)
+    cautions = union(survey.cautions, inconsistencies, of_marks, of_arm, of_lens, limits)
     told = {caution.code for caution in cautions}
     initial = initial.model_copy(update={"cautions": cautions})
     posterior = solved(survey, model, initial, options.estimate, joint)

@@ -18,7 +18,13 @@ from pipelines.core.errors import InputError
 from pipelines.core.files import read_npz
 from pipelines.core.products import save_npz
 from pipelines.core.types import FloatArray, IntArray, rows_of
-from pipelines.geometry import bundle
+from pipelines.geometry.network import (
+    Network,
+    has_positive_depth,
+    lens_slots,
+    linearise_bundle,
+    with_positive_depths,
+)
 from pipelines.geometry.similarity import jacobian_at, second_moment_at
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.marks import MarkRays
@@ -38,15 +44,15 @@ class IntersectionJacobian:
 
 
 def intersection_jacobian(
-    marks: bundle.Network, sigma_px: FloatArray, surveyed: FloatArray | None = None
+    marks: Network, sigma_px: FloatArray, surveyed: FloatArray | None = None
 ) -> IntersectionJacobian:
     """Return the derivatives by poses and lens of the points of a network, each intersected from its own marks.
 
     The derivatives are taken at the projections of the points; of the marks their σ (M,) enter, and not the pixels.
     Marks of points behind their camera do not count. Points may have information (N, 3, 3) beyond these, in 1/m².
     """
-    sigma_px, marks = sigma_px[bundle.has_positive_depth(marks)], bundle.with_positive_depths(marks)
-    lin, count = bundle.linearise_bundle(marks), len(marks.point_in_world)
+    sigma_px, marks = sigma_px[has_positive_depth(marks)], with_positive_depths(marks)
+    lin, count = linearise_bundle(marks), len(marks.point_in_world)
     weighted = np.swapaxes(lin.jacobian_point, 1, 2) / (sigma_px**2)[:, None, None]
     normal = np.zeros((count, 3, 3)) if surveyed is None else surveyed.copy()
     np.add.at(normal, marks.obs_point, weighted @ lin.jacobian_point)
@@ -55,7 +61,7 @@ def intersection_jacobian(
     cov = (vector / value[:, None, :]) @ np.swapaxes(vector, 1, 2)
     response = -cov[marks.obs_point] @ weighted  # (M, 3, 2) metres per pixel
     lens = np.zeros((count, len(marks.cameras), 3, lin.jacobian_intrinsics.shape[2]))
-    np.add.at(lens, (marks.obs_point, bundle.lens_slots(marks)), response @ lin.jacobian_intrinsics)
+    np.add.at(lens, (marks.obs_point, lens_slots(marks)), response @ lin.jacobian_intrinsics)
     order = np.argsort(marks.obs_point, kind="stable")
     first = np.searchsorted(marks.obs_point[order], np.arange(count + 1))
     blocks = ((response @ lin.jacobian_pose)[order], marks.obs_image[order], first)

@@ -36,13 +36,17 @@ _MOST = 100_000  # Gaussians that the bounds are taken from
 
 @dataclass(frozen=True)
 class GeographicBounds:
-    """Bounds in WGS84 degrees, west > east across the date line, and least and largest ellipsoidal height."""
+    """Bounds in WGS84 degrees, west > east across the date line, and least and largest ellipsoidal height.
+
+    `datum_assumed`: nobody stated the datum of the survey's heights.
+    """
 
     west: float
     south: float
     east: float
     north: float
     height_m: tuple[float, float]
+    datum_assumed: bool = False
 
 
 @dataclass(frozen=True)
@@ -191,6 +195,7 @@ def _bounds(points_in_geo: FloatArray, survey: Survey, options: CrsOptions) -> B
             east=east - 360.0 * round(east / 360.0),
             north=north,
             height_m=(low_m, high_m),
+            datum_assumed=survey.vertical.is_assumed,
         )
     crs = usable_crs(options, survey.origin, np.quantile(points_in_geo, _WITHIN, axis=0), survey.vertical)
     low, high = np.quantile(crs.xyz_from_geo(points_in_geo), _WITHIN, axis=0)

@@ -1,132 +1,32 @@
 """Bundle of photographs: observations, their derivatives, and the information that they leave in the camera poses.
 
-The points are eliminated from the normal matrix of the bundle (Schur complement). Two cameras stay coupled only if
-they see a common point, so that the memory grows with the number of cameras and not with its square. Two dense
-parts of low rank complete the sparse one: the lens, which all its cameras share, and the seven movements of a
-similarity, which no observation resists.
+The normal equations (`geometry.network`) have a sparse part, and two dense ones of low rank complete it: the lens,
+which all its cameras share, and the seven movements of a similarity, which no observation resists.
 """
 
 from __future__ import annotations
 
-import operator
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import block_diag, solve_triangular
-from scipy.sparse import bsr_matrix, csr_matrix
+from scipy.sparse import bsr_matrix
 from scipy.special import exp1
 
 from pipelines.core.errors import DegenerateGeometryError
-from pipelines.core.types import BoolArray, FloatArray, IntArray
-from pipelines.geometry.cameras import Camera, parameter_derivative, project, project_each
+from pipelines.core.types import FloatArray
+from pipelines.geometry.network import (
+    EliminatedPoints,
+    Network,
+    eliminate_points,
+    projection_residuals,
+    with_positive_depths,
+)
 from pipelines.geometry.rotations import skew
-from pipelines.geometry.similarity import Similarity, jacobian_at
+from pipelines.geometry.row_motion import RowMotion, with_row_motion
+from pipelines.geometry.similarity import Similarity
 from pipelines.robust.statistics import CAUCHY_SCALE2, cauchy_weight, rayleigh_sigma
-
-_STEP = 1e-6
-
-
-@dataclass(frozen=True)
-class Network:
-    """Bundle of n cameras, N points and M observations in a metric frame `world`."""
-
-    cameras: dict[int, Camera]  # intrinsics by camera id
-    camera_id: IntArray  # (n,) keys of `cameras`
-    cam_from_world: FloatArray  # (n, 3, 3) rotations
-    cam_center_in_world: FloatArray  # (n, 3) metres
-    point_in_world: FloatArray  # (N, 3) metres
-    obs_point: IntArray  # (M,) indices
-    obs_image: IntArray  # (M,) indices
-    obs_xy_px: FloatArray  # (M, 2) pixels
-
-    def rays(self) -> FloatArray:
-        """Return the vectors (M, 3) from the camera's centre to the point of each observation."""
-        ray = self.point_in_world[self.obs_point]
-        ray -= self.cam_center_in_world[self.obs_image]
-        return ray
-
-
-@dataclass(frozen=True)
-class LinearisedBundle:
-    """Jacobians of M observations in pixels."""
-
-    jacobian_pose: FloatArray  # (M, 2, 6), by (δω, δc) of the camera, as in `CorrectionBasis`
-    jacobian_point: FloatArray  # (M, 2, 3)
-    jacobian_intrinsics: FloatArray  # (M, 2, P), P the longest parameter list; zero beyond a shorter one
-
-
-def with_positive_depths(network: Network) -> Network:
-    """Return the network without observations of points behind their camera, which an imported model may hold."""
-    positive = has_positive_depth(network)
-    if positive.all():
-        return network
-    return replace(
-        network,
-        obs_point=network.obs_point[positive],
-        obs_image=network.obs_image[positive],
-        obs_xy_px=network.obs_xy_px[positive],
-    )
-
-
-def has_positive_depth(network: Network) -> BoolArray:
-    """Return the mask (M,) of the observations whose points lie in front of their camera."""
-    return np.asarray(np.einsum("mj,mj->m", network.cam_from_world[network.obs_image, 2], network.rays()) > 0)
-
-
-def projection_residuals(network: Network) -> FloatArray:
-    """Return the residuals (M, 2) in pixels, projected minus observed; NaN for a point behind its camera."""
-    in_cam = np.einsum("mij,mj->mi", network.cam_from_world[network.obs_image], network.rays())
-    projected = project_each(network.cameras, network.camera_id[network.obs_image], in_cam)
-    return np.asarray(projected - network.obs_xy_px)
-
-
-def linearise_bundle(network: Network) -> LinearisedBundle:
-    """Return the derivatives of the observations; all points lie in front of their cameras."""
-    ray, rotation = network.rays(), network.cam_from_world[network.obs_image]
-    in_cam = np.einsum("mij,mj->mi", rotation, ray)
-    count = len(ray)
-    longest = max(len(camera.params) for camera in network.cameras.values())
-    camera_of = network.camera_id[network.obs_image]
-    jacobian_cam, jacobian_intrinsics = np.zeros((count, 2, 3)), np.zeros((count, 2, longest))
-    for key, camera in network.cameras.items():
-        rows = np.flatnonzero(camera_of == key)
-        local = in_cam[rows]
-        jacobian_cam[rows] = _central_differences(partial(project, camera), local)
-        for index in range(len(camera.params)):
-            jacobian_intrinsics[rows, :, index] = parameter_derivative(
-                partial(project, point_in_cam=local), camera, index, _STEP
-            )
-    jacobian_point = jacobian_cam @ rotation
-    jacobian_pose = np.concatenate([jacobian_point @ skew(ray), -jacobian_point], axis=2)
-    return LinearisedBundle(jacobian_pose, jacobian_point, jacobian_intrinsics)
-
-
-def _central_differences(function: Callable[[FloatArray], FloatArray], points: FloatArray) -> FloatArray:
-    """Return central differences (M, 2, 3) of a function of points (M, 3), with steps relative to their depths."""
-    step = _STEP * points[:, 2:3]
-    columns = []
-    for axis in range(3):
-        shift = np.zeros((1, 3))
-        shift[0, axis] = 1.0
-        columns.append((function(points + step * shift) - function(points - step * shift)) / (2 * step))
-    return np.stack(columns, axis=2)
-
-
-def lens_slots(network: Network) -> IntArray:
-    """Return the place (M,) of each observation's camera among `network.cameras`."""
-    keys = list(network.cameras)
-    return np.array([keys.index(int(key)) for key in network.camera_id], dtype=np.int64)[network.obs_image]
-
-
-def sparse_jacobian(blocks: FloatArray, column_block: IntArray, count: int) -> csr_matrix:
-    """Return the sparse matrix (2 M, w · count) with blocks (M, 2, w) in block columns (M,)."""
-    rows, height, width = blocks.shape
-    columns = column_block[:, None, None] * width + np.arange(width)[None, None, :]
-    columns = np.broadcast_to(columns, blocks.shape)
-    pointer = np.arange(0, rows * height * width + 1, width)
-    return csr_matrix((blocks.ravel(), columns.ravel(), pointer), shape=(rows * height, width * count))
 
 
 def similarity_modes(cam_center_in_world: FloatArray) -> FloatArray:
@@ -143,8 +43,6 @@ def similarity_modes(cam_center_in_world: FloatArray) -> FloatArray:
     return modes
 
 
-_CHUNK = 2**19  # observations that are linearised together
-_RIDGE = 1e-14  # small: what it adds to each point fixes the similarity of the whole as well
 _SHARED_GRIDS = ((3, 2), (5, 4), (8, 6))  # columns and rows of the cells of a photograph
 _IN_A_CELL = 20.0  # least mean number of observations: fewer show chance, and share little
 _BY_CHANCE = 5.0  # σ of the factor of independent errors, which is 1
@@ -155,18 +53,6 @@ _LOOSEST_RELATIVE_SIGMA = 0.1
 _HALF_SCALE2 = CAUCHY_SCALE2[2] / 2
 _MEAN_WEIGHT = float(_HALF_SCALE2 * np.exp(_HALF_SCALE2) * exp1(_HALF_SCALE2))
 _MEAN_WEIGHTED_SQUARE = _HALF_SCALE2 * (1 - _MEAN_WEIGHT)
-
-
-@dataclass(frozen=True)
-class EliminatedPoints:
-    """Normal equations of n poses and L lens parameters, with the points eliminated."""
-
-    poses: bsr_matrix  # (6 n, 6 n) sparse, in blocks (6, 6)
-    cross: FloatArray  # (6 n, L)
-    lens: FloatArray  # (L, L)
-    pose_modes: FloatArray  # (6 n, 7) of the poses on the points' similarity
-    lens_modes: FloatArray  # (L, 7) of the lens on it
-    modes: FloatArray  # (7, 7) information on it
 
 
 # No feature of a photograph is located better; σ of a model without residuals, as a renderer computes it.
@@ -189,6 +75,7 @@ class BundleInformation:
     unit: FloatArray  # (6 n,) corrections that count as one metre at the scene
     loosest_sigma_m: float  # σ in these units that the prior gives even a camera without observations
     sigma_px: float  # σ of an image coordinate, estimated from the residuals
+    row_motion: RowMotion | None = None  # what moves the rows of photographs, and is part of the information
 
     @cached_property
     def followed(self) -> FloatArray:
@@ -238,6 +125,7 @@ class BundleInformation:
             unit=self.unit * np.tile([1 / scale] * 3 + [1.0] * 3, count),
             loosest_sigma_m=scale * self.loosest_sigma_m,
             sigma_px=self.sigma_px,
+            row_motion=self.row_motion,
         )
 
 
@@ -245,7 +133,9 @@ def bundle_information(network: Network) -> BundleInformation:
     """Return the information of a bundle on its cameras.
 
     1. Cauchy's kernel weights the observations, whose σ is estimated from the residuals.
-    2. Chunks of points are eliminated one after the other, so that memory holds the derivatives of one chunk.
+    2. Errors that neighbours in a photograph share enlarge the variance (`shared_error_factor`).
+    3. Rows that move, as of a rolling shutter, add to the covariance of the poses (`geometry.row_motion`).
+    4. Chunks of points are eliminated one after the other, so that memory holds the derivatives of one chunk.
 
     Raises:
         DegenerateGeometryError: fewer observations than unknowns.
@@ -264,13 +154,20 @@ def bundle_information(network: Network) -> BundleInformation:
     # A computed model has no residuals at all, which is no infinite information; rounding has no pattern of a lens.
     has_noise = variance > LEAST_SIGMA_PX**2
     variance = max(variance, LEAST_SIGMA_PX**2)
-    shared = variance * (shared_error_factor(network, weight[:, None] * residual) if has_noise else 1.0)
+    root_weight, motion = np.sqrt(weight / (_MEAN_WEIGHT * variance)), None
+    if has_noise:
+        sums, motion = with_row_motion(network, root_weight, residual)
+        factor = shared_error_factor(network, weight[:, None] * residual)
+        sums = sums.scaled(1.0 / factor) if motion is None else motion.considered(sums, factor)
+    else:
+        sums = eliminate_points(network, root_weight)
     return BundleInformation(
-        sums=eliminate_points(network, np.sqrt(weight / (_MEAN_WEIGHT * shared))),
+        sums=sums,
         similarity_modes=similarity_modes(network.cam_center_in_world).reshape(-1, 7),
         unit=np.tile([1 / typical_m] * 3 + [1.0] * 3, n),  # rotations in metres at the scene, so that units agree
         loosest_sigma_m=_LOOSEST_RELATIVE_SIGMA * typical_m,
         sigma_px=float(np.sqrt(variance)),
+        row_motion=motion,
     )
 
 
@@ -300,91 +197,6 @@ def shared_error_factor(network: Network, residual: FloatArray) -> float:
         if effect > 1.0 + _BY_CHANCE * (2.0 / free) ** 0.5:
             factor = max(factor, effect)
     return factor
-
-
-def eliminate_points(
-    network: Network,
-    root_weight: FloatArray,
-    surveyed: FloatArray | None = None,
-    *,
-    ridge: float = _RIDGE,
-) -> EliminatedPoints:
-    """Return the normal equations of poses and lens of a network, chunk by chunk of its points.
-
-    Each of M ≥ 1 observations lies in front of its camera, and has an inverse σ (M,) in 1/px. Points may have
-    information (N, 3, 3) beyond their observations, in 1/m². The ridge, relative to the trace of the information on
-    a point, is for a point that its rays leave open.
-    """
-    total: EliminatedPoints | None = None
-    for part, points, rows in chunks_of_points(network, _CHUNK):
-        sums = _eliminated(part, root_weight[rows], None if surveyed is None else surveyed[points], ridge)
-        if total is not None:
-            sums = EliminatedPoints(*map(operator.add, vars(total).values(), vars(sums).values()))
-        total = sums
-    assert total is not None
-    return total
-
-
-def chunks_of_points(network: Network, size: int) -> Iterator[tuple[Network, slice, IntArray]]:
-    """Yield networks of about `size` observations, with the rows of their points and of their observations."""
-    order = np.argsort(network.obs_point, kind="stable")
-    last = np.cumsum(np.bincount(network.obs_point, minlength=len(network.point_in_world)))
-    first_point = first = 0
-    while first_point < len(last):
-        next_point = max(int(np.searchsorted(last, first + size, side="right")), first_point + 1)
-        points, rows = slice(first_point, next_point), order[first : last[next_point - 1]]
-        part = replace(
-            network,
-            point_in_world=network.point_in_world[points],
-            obs_point=network.obs_point[rows] - first_point,
-            obs_image=network.obs_image[rows],
-            obs_xy_px=network.obs_xy_px[rows],
-        )
-        yield part, points, rows
-        first_point, first = next_point, int(last[next_point - 1])
-
-
-def _eliminated(
-    network: Network, root_weight: FloatArray, surveyed: FloatArray | None, ridge: float
-) -> EliminatedPoints:
-    n, points = len(network.camera_id), len(network.point_in_world)
-    linearised, scaled = linearise_bundle(network), root_weight[:, None, None]
-    by_pose, by_point = linearised.jacobian_pose * scaled, linearised.jacobian_point * scaled
-    intrinsics = sparse_jacobian(linearised.jacobian_intrinsics * scaled, lens_slots(network), len(network.cameras))
-    normal = np.zeros((points, 3, 3))
-    np.add.at(normal, network.obs_point, np.swapaxes(by_point, 1, 2) @ by_point)
-    if surveyed is not None:
-        normal += surveyed
-    normal += ridge * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-12 * np.eye(3)
-    root = np.linalg.cholesky(normal)
-    inverse_root = np.swapaxes(np.linalg.inv(root), 1, 2)
-    white = by_point @ inverse_root[network.obs_point]
-    transposed = np.swapaxes(by_pose, 1, 2)
-    pose_point = _blocks(transposed @ white, network.obs_image, network.obs_point, (n, points))
-    own = _blocks(transposed @ by_pose, network.obs_image, network.obs_image, (n, n))
-    pose = sparse_jacobian(by_pose, network.obs_image, n)
-    intrinsics_point = intrinsics.T @ sparse_jacobian(white, network.obs_point, points)
-    by_similarity = jacobian_at(network.point_in_world, network.cam_center_in_world.mean(axis=0))
-    moved = (np.swapaxes(root, 1, 2) @ by_similarity).reshape(3 * points, 7)
-    return EliminatedPoints(
-        own - pose_point @ pose_point.T,
-        (pose.T @ intrinsics - pose_point.tocsr() @ intrinsics_point.T).toarray(),
-        (intrinsics.T @ intrinsics - intrinsics_point @ intrinsics_point.T).toarray(),
-        pose_point @ moved,
-        intrinsics_point @ moved,
-        moved.T @ moved,
-    )
-
-
-def _blocks(blocks: FloatArray, row: IntArray, column: IntArray, shape: tuple[int, int]) -> bsr_matrix:
-    """Return the sparse matrix of blocks (M, h, w) at block rows and columns (M,); those at one place add up."""
-    order = np.lexsort((column, row))
-    pointer = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=shape[0]))])
-    height, width = blocks.shape[1:]
-    size = (shape[0] * height, shape[1] * width)
-    matrix = bsr_matrix((blocks[order], column[order], pointer), shape=size)
-    matrix.sum_duplicates()
-    return matrix
 
 
 _COPIES = 4  # information, its factor, the basis, and a Jacobian or a normal matrix of the same size

@@ -4,6 +4,7 @@ EXIF is not used where a table is given. But two receivers that disagree by far 
 inconsistency that nothing later would notice: heights in feet, another zone, exchanged axes, times that are off.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ from scipy.spatial import KDTree
 from pipelines.core.errors import InconsistencyError, InputError
 from pipelines.core.products import Remark
 from pipelines.core.sentences import listed
-from pipelines.core.types import BoolArray, FloatArray
+from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.formats.exif import RTK_FIXED, RTK_FLOAT, PhotoTags
 from pipelines.formats.trajectory_csv import complete
 from pipelines.geodesy.crs import parse_crs
@@ -28,7 +29,7 @@ from pipelines.geodesy.vertical import (
     VerticalDatum,
     impossible_heights,
 )
-from pipelines.ingest.flight_record import ImagePoses, with_defaults
+from pipelines.ingest.flight_record import COMMON_SIGMA_M, ImagePoses, kind_of_receiver, with_defaults
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo
 from pipelines.ingest.remarks import Remarks
@@ -42,6 +43,7 @@ _RECEIVER = {RTK_FIXED: "RTK fixed", RTK_FLOAT: "RTK float"}
 _EXIF_NOTE = "EXIF's altitude is often above a geoid or barometric, and --vertical states its datum"
 _SIGMAS, _LEAST_M = 4.0, 1.0
 _MOST_INCONSISTENT = 1 / 3
+_COMMON_SIGMAS = 3.0  # of a constant difference, which no number of positions explains
 # Another unit shows if heights differ by this many times what σ allow, and that unit leaves this part of a height.
 _EVIDENT, _UNIT_PART = 2.0, 0.05
 _KILOMETRES_M = 2_000.0
@@ -170,6 +172,7 @@ def compare_with_exif(
         table=in_enu[1][:, :2],
         sigma_m=sigma[:, :2],
         time_s=exif.time_s[both],
+        common_m=float(np.hypot(*(_common_sigma(each, both) for each in (poses, exif)))),
     )
     heights_m = np.column_stack([in_table, lla[:, 2]])
     found = (_horizontal(places, path), _heights(places.name, heights_m, apart[:, 2], sigma[:, 2], path))
@@ -191,6 +194,7 @@ class _Places:
     table: FloatArray  # (n, 2)
     sigma_m: FloatArray  # (n, 2)
     time_s: FloatArray  # (n,) NaN where unknown
+    common_m: float  # σ along an axis of the difference of the errors that all positions of a receiver share
 
 
 def _horizontal(places: _Places, path: Path) -> tuple[bool, Remark] | None:
@@ -199,12 +203,36 @@ def _horizontal(places: _Places, path: Path) -> tuple[bool, Remark] | None:
     allowed = np.maximum(_SIGMAS * np.hypot(*places.sigma_m.T), _LEAST_M)
     inconsistent = distance > allowed
     if not inconsistent.any():
-        return None
+        return _constant(places, path)
     if inconsistent.mean() <= _MOST_INCONSISTENT:
         return False, _few(places.name, distance, inconsistent, "positions", path)
     code, cause = _cause(places, float(np.median(distance)), float(np.median(allowed)) / _SIGMAS)
     sentence = f"{int(inconsistent.sum())} of {len(distance)} positions in {path.name} {cause}"
     return True, Remark(code=code, sentence=sentence)
+
+
+def _constant(places: _Places, path: Path) -> tuple[bool, Remark] | None:
+    """Return the caution of positions that each differ by no more than their σ, but all in the same way."""
+    apart = places.table - places.exif
+    shift, count = np.median(apart, axis=0), len(apart)
+    own_m = np.maximum(np.median(places.sigma_m, axis=0), mad_sigma(apart[:, 0] - shift[0]))
+    limit_m = np.maximum(_COMMON_SIGMAS * np.hypot(places.common_m, own_m * (np.pi / 2 / count) ** 0.5), _LEAST_M)
+    if (np.abs(shift) <= limit_m).all():
+        return None
+    sentence = (
+        f"The positions in {path.name} and in EXIF differ by a constant of {shift[0]:+.1f} m east and "
+        f"{shift[1]:+.1f} m north, where σ {places.common_m:.1f} m is expected of what two receivers do not share. "
+        f"Those in {path.name} are used. Is one in another datum, or from a base station with wrong coordinates?"
+    )
+    return False, Remark(code="receivers-apart", sentence=sentence)
+
+
+def _common_sigma(poses: ImagePoses, rows: IntArray) -> float:
+    """Return the horizontal σ of the error that positions of the most usual receiver share."""
+    kinds = Counter(poses.receivers[int(row)] for row in rows)
+    sigma_m = float(np.median(poses.sigma_enu_m[rows, :2].max(axis=1)))
+    own_m = COMMON_SIGMA_M[kind_of_receiver(kinds.most_common(1)[0][0], sigma_m)][0]
+    return float(np.hypot(own_m, poses.common_sigma_m[0]))
 
 
 def _few(names: Sequence[str], apart_m: FloatArray, bad: BoolArray, what: str, path: Path) -> Remark:

@@ -35,6 +35,16 @@ RECEIVER_SIGMA_M = {
     "unknown receiver": (5.0, 10.0),
 }
 RECEIVERS = tuple(RECEIVER_SIGMA_M)
+# σ of the common error horizontal and vertical in metres, by kind of receiver. No file tells it: the σ in files are
+# those of single positions against the base station, not of the base station itself.
+COMMON_SIGMA_M = {
+    "RTK fixed": (0.03, 0.05),
+    "RTK float": (0.3, 0.6),
+    "single-frequency": (1.5, 3.0),
+    "unknown receiver": (2.0, 4.0),
+}
+# Median horizontal σ up to which fixes without a stated solution count as RTK fixed, or as RTK float.
+_FIXED_SIGMA_M, _FLOAT_SIGMA_M = 0.1, 1.0
 _LEAST_GAP_S, _GAP_STEPS, _MOST_BURST = 1.0, 2.5, 10.0
 _HALF_WINDOW_S = 0.5  # of a trajectory, for the velocity at a moment
 
@@ -99,6 +109,19 @@ class FlightRecord:
     camera_of: dict[str, int]
     poses: ImagePoses
     navigation: RecordedNavigation | None
+
+
+def kind_of_receiver(receiver: str, sigma_h_m: float) -> str:
+    """Return the kind of receiver of a session: as recorded, or better where its σ is that of corrected positions.
+
+    Programs that write corrected positions into photographs leave the other tags as they were. σ of decimetres may
+    be those of a float solution or of code corrections, whose common error is that of a plain receiver.
+    """
+    if receiver in ("RTK fixed", "RTK float"):
+        return receiver
+    if sigma_h_m <= _FIXED_SIGMA_M:
+        return "RTK fixed"
+    return "RTK float" if receiver == RECEIVERS[-1] and sigma_h_m <= _FLOAT_SIGMA_M else receiver
 
 
 def with_defaults(

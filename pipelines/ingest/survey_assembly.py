@@ -41,18 +41,8 @@ from pipelines.survey.survey import (
 
 SIGMA_GIMBAL_DEG = 2.0
 SIGMA_TABLE_ATTITUDE_DEG = 1.0
-# σ of the common error horizontal and vertical in metres, by kind of receiver. No file tells it: the σ in files are
-# those of single positions against the base station, not of the base station itself.
-COMMON_SIGMA_M = {
-    "RTK fixed": (0.03, 0.05),
-    "RTK float": (0.3, 0.6),
-    "single-frequency": (1.5, 3.0),
-    "unknown receiver": (2.0, 4.0),
-}
 # Gap in time after which the base station may stand elsewhere, and the satellites do.
 SESSION_GAP_S = 4 * 3600.0
-# Median horizontal σ up to which fixes without a stated solution count as RTK fixed, or as RTK float.
-_FIXED_SIGMA_M, _FLOAT_SIGMA_M = 0.1, 1.0
 
 _LOCAL_CAUTION = (
     "The result is in a local metric frame and has no place on Earth: no image has a position, and there are no "
@@ -343,8 +333,8 @@ def fix_sessions(
         by_time = _by_time(poses.time_s[rows])
         session_of[rows] = len(sessions) + by_time
         for number in np.unique(by_time):
-            kind = _kind(receiver, float(np.median(sigma_h_m[rows[by_time == number]])))
-            horizontal_m, vertical_m = np.hypot(COMMON_SIGMA_M[kind], poses.common_sigma_m).tolist()
+            kind = flight_record.kind_of_receiver(receiver, float(np.median(sigma_h_m[rows[by_time == number]])))
+            horizontal_m, vertical_m = np.hypot(flight_record.COMMON_SIGMA_M[kind], poses.common_sigma_m).tolist()
             h_m, v_m = horizontal_m if given_h is None else given_h, vertical_m if given_v is None else given_v
             source: flight_record.SigmaSource = "default" if given_h is None and given_v is None else "option"
             sessions.append(
@@ -366,7 +356,7 @@ def fix_sessions(
             "for it. State the datum with --vertical.",
         )
     counts = np.bincount(session_of[located], minlength=len(sessions))
-    for kind in COMMON_SIGMA_M:
+    for kind in flight_record.COMMON_SIGMA_M:
         of_kind = sum(
             int(count) for session, count in zip(sessions, counts, strict=True) if session.receiver == kind
         )
@@ -383,23 +373,10 @@ def _by_time(time_s: FloatArray) -> IntArray:
     return session
 
 
-def _kind(receiver: str, sigma_h_m: float) -> str:
-    """Return the kind of receiver of a session: as recorded, or better where its σ is that of corrected positions.
-
-    Programs that write corrected positions into photographs leave the other tags as they were. σ of decimetres may
-    be those of a float solution or of code corrections, whose common error is that of a plain receiver.
-    """
-    if receiver in ("RTK fixed", "RTK float"):
-        return receiver
-    if sigma_h_m <= _FIXED_SIGMA_M:
-        return "RTK fixed"
-    return "RTK float" if receiver == flight_record.RECEIVERS[-1] and sigma_h_m <= _FLOAT_SIGMA_M else receiver
-
-
 def _note_default(
     kind: str, count: int, added_m: tuple[float, float], options: IngestOptions, remarks: Remarks
 ) -> None:
-    horizontal_m, vertical_m = np.round(np.hypot(COMMON_SIGMA_M[kind], added_m), 2).tolist()
+    horizontal_m, vertical_m = np.round(np.hypot(flight_record.COMMON_SIGMA_M[kind], added_m), 2).tolist()
     defaults = {}
     if options.sigma_common_h is None:
         defaults["--sigma-common-h"] = f"{horizontal_m:g} m horizontal"
@@ -428,11 +405,13 @@ def _default_sigmas(
         bool(control) and all(point.sigma_h_m and point.sigma_v_m for point in control)
     )
     attitudes = np.isfinite(poses.enu_from_cam).all(axis=(1, 2)).any() and options.sigma_attitude is None
+    # A gimbal's tags have no σ: one that is set for them is that of a correction by the track.
+    of_file = np.isfinite(poses.sigma_attitude_deg) & (np.array(poses.attitude_source, dtype=object) != "gimbal")
     groups: list[tuple[bool, SigmaGroup]] = [
         ("default" in poses.sigma_source, "fixes"),
         (not points_stated, "control points"),
         ("sigma_mark" not in stated and not _only_targets(control, options), "marks"),
-        (bool(attitudes) and not np.isfinite(poses.sigma_attitude_deg).any(), "attitudes"),
+        (bool(attitudes) and not of_file.any(), "attitudes"),
     ]
     return tuple(group for is_default, group in groups if is_default)
 

@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import connected_components
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.geodesy.enu import lla_from_enu
 from pipelines.geodesy.operations import Operation
-from pipelines.geometry.bundle import Network
+from pipelines.geometry.network import Network
 from pipelines.report.page import Picture, picture_of_png
 from pipelines.report.plots.plans import NamedPlaces, match_plan, overlap_plan, site_plan
 from pipelines.report.views import EvaluatedSurvey

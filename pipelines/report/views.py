@@ -15,10 +15,10 @@ from pipelines.core.files import file_size
 from pipelines.core.stages import BY_NAME, METRICS, RENDERS, REPORT
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
-from pipelines.geometry.bundle import Network, has_positive_depth
 from pipelines.geometry.cameras import project_each
 from pipelines.geometry.footprints import PointSurface
 from pipelines.geometry.intersection import refined_points
+from pipelines.geometry.network import Network, has_positive_depth
 from pipelines.report.options import ReportOptions
 from pipelines.report.page import Picture, limited, picture_of, picture_of_png, read_picture
 from pipelines.report.plots.charts import without_labels

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
-from pipelines.geometry.bundle import Network
 from pipelines.geometry.cameras import ViewPose
+from pipelines.geometry.network import Network
 from pipelines.surface.matching import UNSEEN, Matcher, MatchSettings, StereoView, Winner, WinnerTakesAll
 
 _ROWS = 8  # strips begin and end at multiples of this number

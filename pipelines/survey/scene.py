@@ -19,8 +19,9 @@ from pipelines.core.stages import ADJUSTMENT, MASKS, SIM3, SPARSE
 from pipelines.core.types import Float32Array, FloatArray, IntArray
 from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import read_sparse
-from pipelines.geometry.bundle import BundleInformation, Network, bundle_information
+from pipelines.geometry.bundle import BundleInformation, bundle_information
 from pipelines.geometry.cameras import CameraPoses
+from pipelines.geometry.network import Network
 from pipelines.geometry.rolling_shutter import depths_at, in_rolling_shutter
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel

@@ -101,7 +101,8 @@ class FixLag(Product):
         if self.sigma_along_s:
             return (
                 "The flight does not show whether the positions lag the exposures, as it has no lines in two "
-                f"directions or too few photographs: a lag of ± {self.sigma_along_s:.2f} s is part of their σ "
+                f"directions or too few photographs, or scatters about the SfM model: a lag of "
+                f"± {self.sigma_along_s:.2f} s is part of their σ "
                 "along the motion."
             )
         return f"The positions are those of the exposures: lag {self.lag_s:+.2f} ± {self.sigma_s:.2f} s."

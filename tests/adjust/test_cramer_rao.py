@@ -25,7 +25,7 @@ from scipy.sparse import bsr_matrix, csr_matrix, diags, hstack
 
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import BoolArray, FloatArray, IntArray
-from pipelines.geometry.bundle import (
+from pipelines.geometry.network import (
     EliminatedPoints,
     Network,
     eliminate_points,

@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 import pytest
 
-from pipelines.geometry.bundle import Network
 from pipelines.geometry.cameras import Camera
+from pipelines.geometry.network import Network
 from pipelines.geometry.rotations import omega_phi_kappa_deg, omega_phi_kappa_jacobian
 from tests.raw_bundle import AdjustedBundle, SurveyedPoints, adjust_bundle
 

@@ -23,7 +23,7 @@ from pipelines.adjust.posterior import intersection_jacobian
 from pipelines.adjust.solution import adjusted
 from pipelines.adjust.system import linearised, minimise
 from pipelines.evaluate.check_points import chi2_caution
-from pipelines.geometry.bundle import Network
+from pipelines.geometry.network import Network
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.scene import Scene

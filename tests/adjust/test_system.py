@@ -25,8 +25,8 @@ from pipelines.adjust.terms import (
     Term,
 )
 from pipelines.core.errors import DegenerateGeometryError, InputError
-from pipelines.geometry.bundle import Network
 from pipelines.geometry.cameras import CameraPoses, Lenses, bearings
+from pipelines.geometry.network import Network
 from pipelines.geometry.rotations import exp_so3, log_so3
 from pipelines.geometry.similarity import Similarity, perturbation
 from tests.bundle_scenes import (

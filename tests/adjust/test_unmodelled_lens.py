@@ -17,12 +17,13 @@ import pytest
 
 from pipelines.adjust import solution
 from pipelines.formats.colmap import flatten, load_reconstruction, pycolmap_module, write_sparse
-from pipelines.geometry.bundle import Network, shared_error_factor
+from pipelines.geometry.bundle import shared_error_factor
+from pipelines.geometry.network import Network
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.survey import FixSession, SurveyedPoint
 from tests.scenes import CAMERA, WITH_GCPS, Noise, TrueScene, sparse_model, survey_of
-from tests.statements import state
+from tests.statements import Statement, state
 
 COLUMNS, ROWS, HEIGHT_M, TIES = 6, 5, 60.0, 3400
 CONTROL, CHECKS = 6, 16
@@ -31,11 +32,15 @@ Field = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 @cache
-def block() -> TrueScene:
-    """Nadir lines to and fro with 60 % forward and 38 % side overlap; ground points are control, then checks."""
+def block(*, turns: bool = True) -> TrueScene:
+    """Nadir lines to and fro with 60 % forward and 38 % side overlap; ground points are control, then checks.
+
+    An aircraft that does not turn flies every other line backwards.
+    """
     rng, count = np.random.default_rng(0), COLUMNS * ROWS
     width, height = 1200 / 1020 * HEIGHT_M, 900 / 1020 * HEIGHT_M
     line, along = np.divmod(np.arange(count), ROWS)
+    along = along if turns else np.where(line % 2, ROWS - 1 - along, along)
     center = np.column_stack(
         [
             (line - (COLUMNS - 1) / 2) * 0.62 * width,
@@ -44,7 +49,7 @@ def block() -> TrueScene:
         ]
     )
     center += rng.normal(0, 1.5, center.shape)
-    nose = np.where(line % 2, -1.0, 1.0)[:, None] * [0.0, 1.0, 0.0]
+    nose = np.where(turns & (line % 2 == 1), -1.0, 1.0)[:, None] * [0.0, 1.0, 0.0]
     down = np.broadcast_to([0.0, 0.0, -1.0], nose.shape)
     turned = np.stack([np.cross(-nose, down), -nose, down], axis=-1)
     turned = turned @ exp_so3(rng.normal(0, np.radians(2.0), (count, 3)))
@@ -69,6 +74,8 @@ def field_of(kind: str, rng: np.random.Generator) -> Field:
     focus = 1e-3 * (focus - focus.mean()) / focus.std()
     # Along the nose, and by turns of the body that differ between photographs.
     motion = rng.normal([0.0, 0.5], 0.25, (count, 2))
+    to_and_fro = np.where(np.arange(count) // ROWS % 2, -1.0, 1.0)[:, None] * [0.0, 1.0]
+    to_and_fro = to_and_fro + rng.normal(0.0, 0.15, (count, 2))
 
     def shift(xy_px: np.ndarray, image: np.ndarray) -> np.ndarray:
         away = (xy_px - middle) / focal
@@ -79,6 +86,7 @@ def field_of(kind: str, rng: np.random.Generator) -> Field:
             "k3": radial * r2**3 * away,
             "drifting focus": focus[image][:, None] * (xy_px - middle),
             "rolling shutter": motion[image] * (2.0 * xy_px[:, 1:] / CAMERA.height - 1.0),
+            "rolling shutter to and fro": to_and_fro[image] * (2.0 * xy_px[:, 1:] / CAMERA.height - 1.0),
         }[kind]
 
     return shift
@@ -99,9 +107,9 @@ def adjusted(model: SparseModel) -> SparseModel:
     return flatten(reconstruction)
 
 
-def drawn(kind: str, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the errors (J, 3) of the check points of a draw, and their predicted variances (J, 3)."""
-    scene, rng = block(), np.random.default_rng(seed)
+def drawn(kind: str, seed: int) -> tuple[np.ndarray, np.ndarray, Statement]:
+    """Return the errors (J, 3) of the check points of a draw, predicted variances (J, 3), and what is said."""
+    scene, rng = block(turns="to and fro" not in kind), np.random.default_rng(seed)
     shift = field_of(kind, rng)
     exact = sparse_model(scene, Noise(pixel_px=0.0), rng)
     pixels = exact.obs_xy_px + shift(exact.obs_xy_px, exact.obs_image)
@@ -132,20 +140,25 @@ def drawn(kind: str, seed: int) -> tuple[np.ndarray, np.ndarray]:
         model,
     )
     variance = np.diagonal(statement.cov_in_geo, axis1=1, axis2=2)
-    return statement.position_in_geo - scene.gcp_in_geo[rows], variance
+    return statement.position_in_geo - scene.gcp_in_geo[rows], variance, statement
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("one_thread")
-@pytest.mark.parametrize("kind", ["none", "thin prism", "k3", "drifting focus", "rolling shutter"])
+@pytest.mark.parametrize(
+    "kind", ["none", "thin prism", "k3", "drifting focus", "rolling shutter", "rolling shutter to and fro"]
+)
 def test_sigma_of_check_points_is_true(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(solution, "accuracy_grid", lambda *_: None)
-    errors, variances = map(np.concatenate, zip(*(drawn(kind, seed) for seed in range(4)), strict=True))
-    squared = errors**2
+    errors_of, variances_of, said = zip(*(drawn(kind, seed) for seed in range(4)), strict=True)
+    squared, variances = np.concatenate(errors_of) ** 2, np.concatenate(variances_of)
     horizontal = np.sqrt(squared[:, :2].sum() / variances[:, :2].sum())
     vertical = np.sqrt(squared[:, 2].sum() / variances[:, 2].sum())
     assert 0.7 < horizontal < 1.4
     assert 0.7 < vertical < 1.4
+    # Along parallel lines, nose ahead, the lens takes up the motion, and nothing tells it.
+    unstated = ["rolling-shutter-unstated" in one.codes for one in said]
+    assert unstated == [kind.endswith("to and fro")] * len(said)
 
 
 def observed(count: int, images: int, rng: np.random.Generator) -> Network:

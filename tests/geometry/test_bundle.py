@@ -8,13 +8,8 @@ import numpy as np
 import pytest
 
 from pipelines.core.errors import DegenerateGeometryError
-from pipelines.geometry.bundle import (
-    CorrectionBasis,
-    Network,
-    bundle_information,
-    correction_basis,
-    similarity_modes,
-)
+from pipelines.geometry.bundle import CorrectionBasis, bundle_information, correction_basis, similarity_modes
+from pipelines.geometry.network import Network
 from pipelines.geometry.rotations import exp_so3
 from tests.bundle_scenes import SIGMA_PX, adjuster, exact_network, jacobian, noisy, pixels, readjusted, size, units
 from tests.refusals import numbers, refused

@@ -9,9 +9,9 @@ import pytest
 from scipy.optimize import minimize
 
 from pipelines.geometry import intersection as module
-from pipelines.geometry.bundle import Network
 from pipelines.geometry.cameras import project
 from pipelines.geometry.intersection import refined_points
+from pipelines.geometry.network import Network
 from pipelines.robust.statistics import cauchy_loss
 from tests.bundle_scenes import exact_network, noisy
 

@@ -18,11 +18,11 @@ from pipelines.core.staleness import status
 from pipelines.core.workspace import Workspace
 from pipelines.geodesy.enu import ecef_from_lla
 from pipelines.geodesy.vertical import VerticalDatum, parse_vertical
-from pipelines.ingest.flight_record import RECEIVER_SIGMA_M, RECEIVERS, ImagePoses
+from pipelines.ingest.flight_record import COMMON_SIGMA_M, RECEIVER_SIGMA_M, RECEIVERS, ImagePoses
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.remarks import Remarks
 from pipelines.ingest.stage import survey_and_track
-from pipelines.ingest.survey_assembly import COMMON_SIGMA_M, SESSION_GAP_S, fix_sessions
+from pipelines.ingest.survey_assembly import SESSION_GAP_S, fix_sessions
 from pipelines.survey.survey import FixSession, Survey
 from tests.photos import Exif, dji_xmp, gps_entries, jpeg, write_flight
 from tests.refusals import codes, numbers, said

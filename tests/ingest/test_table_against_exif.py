@@ -121,3 +121,18 @@ def test_a_geoid_between_the_heights_is_a_caution() -> None:
     (caution,) = compared(TRACK - [0.0, 0.0, 52.0]).cautions
     assert caution.code == "heights-apart"
     assert numbers(caution.sentence)[0] == -52.0
+
+
+@pytest.mark.parametrize(("east_m", "north_m"), [(12.0, 0.0), (0.0, -9.0), (-7.0, 7.0)])
+def test_a_constant_shift_beyond_what_receivers_share_is_said(east_m: float, north_m: float) -> None:
+    """Each position is within its σ of 2.5 m and four of them; that all are off alike is none of chance."""
+    noise = np.random.default_rng(0).normal(0, [1.0, 1.0, 3.0], TRACK.shape)
+    (caution,) = compared(TRACK + noise + [east_m, north_m, 0.0]).cautions
+    assert caution.code == "receivers-apart"
+    east, north = (float(part) for part in re.findall(r"([+-]\d+\.\d) m", caution.sentence))
+    assert (east, north) == pytest.approx((east_m, north_m), abs=1.0)
+
+
+def test_a_shift_that_receivers_have_against_each_other_is_not_said() -> None:
+    noise = np.random.default_rng(0).normal(0, [2.5, 2.5, 5.0], TRACK.shape)
+    assert compared(TRACK + noise + [2.0, -1.5, 3.0]).cautions == []

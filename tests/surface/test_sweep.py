@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.geometry.bundle import Network
 from pipelines.geometry.cameras import ViewPose
+from pipelines.geometry.network import Network
 from pipelines.surface.agreement import agreed_depth
 from pipelines.surface.matching import MatchSettings, StereoView
 from pipelines.surface.sweep import (
