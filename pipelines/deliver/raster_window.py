@@ -29,8 +29,9 @@ PAINTED = 128  # alpha of a cell whose colour is known and whose height is not m
 _SOLID = 0.5  # least opacity of a surface
 _ONE_SURFACE_GSD = 4.0  # training pixels: largest spread of the heights of the Gaussians of one surface
 _AVERAGED = 5  # checked cells on a side over which the surface's own noise is averaged
-# Gaussians of the edge of a roof reach over it, and the dilation widens them. Heights are those of Gaussians with less of
-# both, where these hide what lies below: on a simulated flight, roofs are 1.3 training pixels too wide otherwise.
+# Gaussians at the edge of a roof reach over it, and the dilation widens them. Heights are those of Gaussians with
+# less of both, where these hide what lies below: on a simulated flight, roofs are 1.4 training pixels too wide
+# otherwise, and 0.7 with them.
 _SHRINK, _EDGE_DILATION_PX2 = 0.7, 0.05
 _MOST_THROUGH = 0.5  # largest number of views that look through a surface, as a part of those that agree
 # Checked cells: half the width of slivers that are dropped, and of gaps that are closed.

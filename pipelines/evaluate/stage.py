@@ -18,13 +18,14 @@ import numpy as np
 from pipelines.adjust.accuracy_grid import AccuracyGrid, write_csv
 from pipelines.adjust.posterior import Posterior
 from pipelines.adjust.solution import posterior_of
-from pipelines.core.errors import InputError
+from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.figures import WAYS
 from pipelines.core.products import Remark, is_checked, save_json, union
+from pipelines.core.progress import SILENT, Progress
 from pipelines.core.sentences import listed
 from pipelines.core.stages import BY_NAME
 from pipelines.core.types import FloatArray
-from pipelines.core.workspace import StageRun, Summary
+from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.evaluate import check_points
 from pipelines.evaluate.asprs import few_points
 from pipelines.evaluate.coordinates import (
@@ -48,7 +49,7 @@ from pipelines.report.plots.maps import MapCoordinates, MapPoints, SigmaRaster, 
 from pipelines.report.plots.plans import NamedPlaces
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.m3c2 import require_py4dgeo
-from pipelines.surface.measured_area import area_or_none
+from pipelines.surface.measured_area import area_of
 from pipelines.surface.measured_cloud import CloudReader
 from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey.area import Area
@@ -177,7 +178,7 @@ def run(stage: StageRun, options: EvaluateOptions) -> Summary:
     solved = load_solved(stage.workspace, options.similarity)
     crs = None if options.crs is None else report_crs(options.crs, solved.survey)
     posterior = posterior_of(stage.workspace, solved.model, solved.sfm)
-    area = area_or_none(options, solved, stage.workspace, stage.progress)
+    area = area_of_interest(options, solved, stage.workspace, stage.progress)
     if isinstance(solved, TrainedSurvey):
         rendered = _rendered(stage, solved, posterior, options, area)
     else:
@@ -198,6 +199,16 @@ def run(stage: StageRun, options: EvaluateOptions) -> Summary:
     summary = summarise(report)
     wrong = of_wrong_marks(wrong_marks(solved.survey.check_points, solved.sparse))
     return replace(summary, warnings=(*summary.warnings, *wrong))
+
+
+def area_of_interest(
+    options: EvaluateOptions, solved: SolvedSurvey, workspace: Workspace, progress: Progress = SILENT
+) -> Area | None:
+    """Return the area of interest, as `area_of`; None: no ground is seen by enough photographs."""
+    try:
+        return area_of(options, solved, workspace, progress)
+    except DegenerateGeometryError:
+        return None
 
 
 def evaluate(

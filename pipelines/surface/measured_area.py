@@ -12,7 +12,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from pipelines.core.errors import DegenerateGeometryError, InputError
+from pipelines.core.errors import InputError
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import GAUSSIANS, MODEL
 from pipelines.core.types import Float32Array, FloatArray, IntArray
@@ -74,16 +74,6 @@ def area_of(
                 whole, polygon=outline, source=source if stated is None else f"{source} in {whole.source}"
             )
     return replace(whole, measured=ground.share(whole.polygon))
-
-
-def area_or_none(
-    options: FilledAreaOptions, solved: SolvedSurvey, workspace: Workspace, progress: Progress = SILENT
-) -> Area | None:
-    """Return the area of interest, as `area_of`; None: no ground is seen by enough photographs."""
-    try:
-        return area_of(options, solved, workspace, progress)
-    except DegenerateGeometryError:
-        return None
 
 
 def measured_ground(solved: SolvedSurvey, workspace: Workspace, progress: Progress = SILENT) -> MeasuredGround:

@@ -60,7 +60,7 @@ def render_orthographic(
 
     The Gaussians' covariances count by the factor `shrink`.
     """
-    table, ellipses = _tables(splats, width, height, corner, dilation_px2, shrink)
+    table, ellipses = _tables(splats, (width, height), corner, dilation_px2, shrink)
     with KERNEL_LOCK:
         lists = list_tiles(ellipses, np.arange(len(ellipses)), width, height)
         colour, alpha, depth_sum, square_sum, median, _ = blend_tiles(
@@ -75,9 +75,10 @@ def render_orthographic(
 
 
 def _tables(
-    splats: PlanSplats, width: int, height: int, corner: tuple[float, float], dilation_px2: float, shrink: float
+    splats: PlanSplats, size: tuple[int, int], corner: tuple[float, float], dilation_px2: float, shrink: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return the splats (M, SPLAT_WIDTH) and ellipses (M, ELLIPSE_WIDTH) of the part, nearest first."""
+    width, height = size
     xx, yy = (shrink * splats.cov[:, axis, axis] + dilation_px2 for axis in (0, 1))
     level = 2.0 * (np.log(np.maximum(splats.opacity, 1e-300)) - _LOG_ALPHA_MIN)
     x, y = splats.mean[:, 0] - corner[0], splats.mean[:, 1] - corner[1]
