@@ -30,15 +30,14 @@ def evaluated_cameras(workspace: Workspace, *, with_area: bool = True) -> Evalua
         return None
     from pipelines.adjust.solution import posterior_of
     from pipelines.evaluate.options import EvaluateOptions
-    from pipelines.evaluate.stage import evaluate
-    from pipelines.survey.area import hectares_of
+    from pipelines.evaluate.stage import area_of_interest, evaluate
     from pipelines.survey.trained_survey import load_solved
 
     try:
         solved = load_solved(workspace)
         posterior, options = posterior_of(workspace, solved.model, solved.sfm), EvaluateOptions()
-        area_ha = hectares_of(options, solved) if with_area else None
-        return evaluate(solved, posterior, options, area_ha=area_ha)
+        area = area_of_interest(options, solved, workspace) if with_area else None
+        return evaluate(solved, posterior, options, area=area)
     except GeorefError as error:  # The stages have succeeded all the same.
         log.debug("no evaluation of the cameras: %s", error)
         return None

@@ -52,6 +52,7 @@ LATER: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(_LIDAR, ("train",)),
     "seed": ("sfm", "init-sim3", "train"),
     **dict.fromkeys(AreaOptions.model_fields, _IN_AREA),
+    "fill": _IN_AREA[1:],
 }
 OWNERS: dict[str, tuple[str, ...]] = {**dict.fromkeys(IngestOptions.model_fields, ("ingest",)), **LATER}
 DELIVER = click.Option(

@@ -223,7 +223,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         options_place="pipelines.evaluate.options:EvaluateOptions",
         reads=(MEASURED, *SOLVED, APPLIED_RIG),
         product=REPORT,
-        product_version=3,  # with the area of interest
+        product_version=4,  # with the area that is measured
     ),
     StageSpec(
         name="export-ply",

@@ -28,7 +28,7 @@ from pipelines.formats.georef_sidecar import SceneSigma, median_sigma, write_sid
 from pipelines.formats.las import LazWriter
 from pipelines.surface.fusion import SurfaceCloud, fused_squares, fusion_settings
 from pipelines.surface.ground import GroundModel
-from pipelines.survey.area import area_of
+from pipelines.surface.measured_area import area_of
 from pipelines.survey.headline import headline_of
 from pipelines.survey.target_crs import TargetCrs, target_crs
 from pipelines.survey.trained_survey import corners, load_trained, scene_points
@@ -51,7 +51,7 @@ def run(stage: StageRun, options: ExportCloudOptions) -> Summary:
     paths = (laz, laz.with_suffix(".ply")) if options.ply else (laz,)
     views = surface_views(stage, trained, colours=True)
     settings = fusion_settings(views, geo_from_model, options.min_views, options.spacing)
-    area = area_of(options, trained)
+    area = area_of(options, trained, stage.workspace, stage.progress)
     terrain, warnings = ground_below(views, trained, area, options, stage.progress)
     grid, no_sigma = predicted_sigma(stage.workspace, trained)
     squares = fused_squares(views, geo_from_model, settings, stage.progress)

@@ -27,6 +27,7 @@ from pipelines.formats.georef_sidecar import MeshCrsSidecar, MeshFigures, MeshHo
 from pipelines.formats.mesh_files import write_mesh_glb, write_mesh_obj, write_mesh_ply
 from pipelines.geometry.similarity import Similarity
 from pipelines.surface.fusion import fused_squares, fusion_settings, pixel_on_surface_m
+from pipelines.surface.measured_area import area_of
 from pipelines.surface.mesh import (
     Hole,
     RawMesh,
@@ -41,7 +42,7 @@ from pipelines.surface.mesh import (
 from pipelines.surface.poisson import MeasuredPoints, closed_gap_m, poisson_mesh, simplified, surface_sigma_at
 from pipelines.surface.surface_views import SurfaceViews
 from pipelines.surface.texture import TexturedMesh, colours_of, textured
-from pipelines.survey.area import Area, area_of
+from pipelines.survey.area import Area
 from pipelines.survey.headline import headline_of
 from pipelines.survey.target_crs import target_crs
 from pipelines.survey.trained_survey import TrainedSurvey, load_trained
@@ -75,7 +76,8 @@ def run(stage: StageRun, options: ExportMeshOptions) -> Summary:
         middle = geo_from_file.apply(np.zeros((1, 3)))
         target = target_crs(options, trained.survey.origin, middle, trained.survey.vertical)
     views = surface_views(stage, trained, colours=True)
-    pixel_m, area = pixel_on_surface_m(views, trained.geo_from_model), area_of(options, trained)
+    pixel_m = pixel_on_surface_m(views, trained.geo_from_model)
+    area = area_of(options, trained, stage.workspace, progress)
     points = _points(views, trained, area, placement.file_from_geo, options=options, progress=progress)
     surface = _surface(points, area, geo_from_file, options=options, folder=folder, progress=progress)
     whole, simple = surface.whole, surface.simple

@@ -5,8 +5,8 @@ from urllib.parse import urlsplit
 
 from pydantic import AfterValidator, Field
 
-from pipelines.core.options import WRITTEN, ExtraMarker, from_text
-from pipelines.survey.options import AreaOptions, CrsOptions
+from pipelines.core.options import ExtraMarker
+from pipelines.survey.options import CrsOptions, FilledAreaOptions
 
 # The page was tried with this version: the extensions of splats in glTF are younger than those of meshes.
 CESIUM = "https://cesium.com/downloads/cesiumjs/releases/1.145/Build/Cesium/"
@@ -15,7 +15,7 @@ CESIUM = "https://cesium.com/downloads/cesiumjs/releases/1.145/Build/Cesium/"
 Compression = Literal["spz", "none"]
 
 
-class SplatOptions(AreaOptions):
+class SplatOptions(FilledAreaOptions):
     """Options of every file that holds the Gaussians."""
 
     crop: bool = Field(
@@ -77,26 +77,12 @@ class ExportSpzOptions(WebSplatOptions):
     )
 
 
-class TerrainOptions(AreaOptions):
+class TerrainOptions(FilledAreaOptions):
     """Options of everything that tells the ground from what stands on it, in the area of interest."""
 
     terrain: bool = Field(
         True, description="Tell the ground from what stands on it (dtm.tif, contours, classes of the cloud)."
     )
-
-
-def _width(fill: float | Literal["all"]) -> float | Literal["all"]:
-    if fill != "all" and not 0 <= fill < 1e6:
-        raise ValueError("a width in metres, or all")
-    return fill
-
-
-FillWidth = Annotated[
-    float | Literal["all"],
-    from_text(lambda text: text if text == "all" else float(text)),
-    AfterValidator(_width),
-    WRITTEN,
-]
 
 
 class ExportRasterOptions(CrsOptions, TerrainOptions):
@@ -123,12 +109,6 @@ class ExportRasterOptions(CrsOptions, TerrainOptions):
         "no photograph sees has the splat's.",
     )
     source: bool = Field(False, description="Write source.tif: which photograph the detail of each cell is from.")
-    fill: FillWidth | None = Field(
-        None,
-        description="Width in metres up to which holes in the measured surface are filled by interpolation, 0 for "
-        "none; all: the whole area. Without it: all inside a --boundary, else two metres and ten cells, at most "
-        "a tenth of the area.",
-    )
     max_pixels: float = Field(1e9, gt=0, description="Refuse a raster with more cells.")
     hillshade: bool = Field(True, description="Draw hillshade.png and preview.png.")
 
@@ -146,7 +126,7 @@ class ExportCloudOptions(CrsOptions, TerrainOptions):
     ply: bool = Field(False, description="Write the same points as cloud.ply too.")
 
 
-class ExportMeshOptions(CrsOptions, AreaOptions):
+class ExportMeshOptions(CrsOptions, FilledAreaOptions):
     """Options of the export of the surface as a mesh."""
 
     crs: str | None = Field(

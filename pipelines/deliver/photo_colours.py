@@ -24,6 +24,7 @@ from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray,
 from pipelines.deliver.raster_window import RasterSource, places_in_geo
 from pipelines.formats.geotiff import RasterFrame
 from pipelines.geometry.cameras import Pinhole
+from pipelines.splat.exposure import falloff, squared_radius_at
 from pipelines.surface.surface_views import SurfaceView
 from pipelines.survey.photographs import ImageCache, Pinholes
 from pipelines.survey.trained_survey import TrainedSurvey
@@ -40,6 +41,10 @@ _UNKNOWN = 0.05  # of the weight, where the depth map does not tell what a photo
 _DISCOUNT = 1e-3  # of the weight of what has moved: it counts where nothing else is seen
 _CACHE_BYTES = 1 << 30  # of decoded photographs
 _ROWS = 256  # whose places are computed at once
+_SHARPNESS = 64  # power of the weights by which views share the detail
+_TINY = np.float32(1e-30)
+_DARKEST = 0.1  # vignetting that is undone at most
+_SPECK = 5  # cells along the side of the smallest place that something hides
 _BEST = 0.5  # of a block's best weight: photographs below it are not asked for detail there
 
 
@@ -195,7 +200,7 @@ class PhotoColours:
         self, place: Float32Array, views: list[_View], wanted: Float32Array
     ) -> tuple[Float32Array, IntArray]:
         """Return what the best view of each cell shows beyond its broad colour (H, W, 3), and its camera (H, W)."""
-        detail = np.zeros((*place.shape[:2], 3), dtype=np.float32)
+        detail, total = np.zeros((*place.shape[:2], 3), dtype=np.float32), np.zeros(place.shape[:2], np.float32)
         camera = np.full(place.shape[:2], -1, dtype=np.int64)
         best = np.zeros(place.shape[:2], dtype=np.float32)
         highest = wanted.max(axis=0, initial=0.0)
@@ -206,15 +211,23 @@ class PhotoColours:
             if not part.size:
                 continue
             colour, shown, _ = self._colours(view, part)
+            # Hidden specks are noise of the surface: without them, photographs change at fewer places.
+            shown = cv2.morphologyEx(shown, cv2.MORPH_CLOSE, np.ones((_SPECK, _SPECK), dtype=np.uint8))
             blocks = tuple(slice(cells.start // BLOCK, cells.stop // BLOCK) for cells in (rows, columns))
             own = shown * cv2.resize(weight[blocks], shown.shape[::-1], interpolation=cv2.INTER_LINEAR)
-            better = own > best[rows, columns]
-            if not better.any():
+            before = best[rows, columns]
+            better = own > before
+            now = np.where(better, own, before)
+            if not (own > 0).any():
                 continue
-            detail[rows, columns][better] = (colour - _block_means(colour, shown > 0))[better]
+            # Weights by a high power: the best view alone, but for the few cells where two are equally good.
+            kept, added = ((values / np.maximum(now, _TINY)) ** _SHARPNESS for values in (before, own))
+            fine = colour - _block_means(colour, shown > 0)
+            detail[rows, columns] = kept[..., None] * detail[rows, columns] + added[..., None] * fine
+            total[rows, columns] = kept * total[rows, columns] + added
             camera[rows, columns][better] = view.seen.camera
-            best[rows, columns][better] = own[better]
-        return detail, camera
+            best[rows, columns] = now
+        return detail / np.maximum(total, _TINY)[..., None], camera
 
     def _colours(self, view: _View, place: Float32Array) -> tuple[Float32Array, Float32Array, Float32Array]:
         """Return colours (H, W, 3), 0 … 255, of a view at places (H, W, 3), whether it shows them, and weights."""
@@ -225,17 +238,8 @@ class PhotoColours:
         linear, offset = view.colour_of[:, :3].astype(np.float32), view.colour_of[:, 3].astype(np.float32)
         colour = raw.astype(np.float32) @ linear.T + offset
         if view.vignetting:
-            pinhole = view.pinhole
-            corner = max(
-                ((x - pinhole.cx) / pinhole.fx) ** 2 + ((y - pinhole.cy) / pinhole.fy) ** 2
-                for x in (0.0, pinhole.width)
-                for y in (0.0, pinhole.height)
-            )
-            radius2 = (((u - pinhole.cx) / pinhole.fx) ** 2 + ((v - pinhole.cy) / pinhole.fy) ** 2) / corner
-            factor = np.zeros_like(radius2)
-            for coefficient in reversed(view.vignetting):
-                factor = radius2 * (factor + coefficient)
-            colour /= np.maximum(1.0 + factor, 0.1)[..., None]
+            radius2 = squared_radius_at(u, v, view.pinhole, view.pinhole)
+            colour /= np.maximum(falloff(radius2, view.vignetting), _DARKEST)[..., None]
         return np.asarray(colour, dtype=np.float32), np.where(weight > 0, shown, np.float32(0.0)), weight
 
     def _reach(self, view: _View, place: Float32Array, size: int) -> BoolArray:

@@ -25,22 +25,20 @@ from pipelines.deliver.photo_colours import PhotoColours
 from pipelines.deliver.placement import median_values, require_space, scene_sigma
 from pipelines.deliver.raster_mosaic import Mosaic
 from pipelines.deliver.raster_plan import ground_sampling_m, make_frame
-from pipelines.deliver.raster_window import raster_source
+from pipelines.deliver.raster_window import RasterSource, raster_source
 from pipelines.deliver.surface import without_sigma
-from pipelines.formats.georef_sidecar import median_sigma, write_sidecar
+from pipelines.formats.georef_sidecar import CrsSidecar, median_sigma, write_sidecar
 from pipelines.formats.geotiff import RasterFrame, read_reduced
 from pipelines.formats.vector_files import ContourLine, features_text, write_contours_dxf, write_contours_gpkg
-from pipelines.survey.area import area_of
+from pipelines.surface.measured_area import area_of
 from pipelines.survey.headline import headline_of
 from pipelines.survey.scene import photographs
 from pipelines.survey.target_crs import target_crs
-from pipelines.survey.trained_survey import corners, load_trained, scene_points
+from pipelines.survey.trained_survey import TrainedSurvey, corners, load_trained, scene_points
 
 _DETAIL = 1.5  # training pixels over cells, beyond which a raster shows less than its cells promise
 # Bytes of a cell on the disk at most: colours, height, mask and two σ, as measured, whole and final rasters.
 _BYTES_PER_CELL = 74
-# Width of the holes that are filled unless the user says otherwise, and largest share of what is delivered.
-_FILLED_M, _FILLED_CELLS, _MOST_FILLED = 2.0, 10, 0.1
 _PICTURE_PX = 2000
 _COLOURED, _TINT = (0.01, 0.99), 0.55  # quantiles of the heights at the ends of the colours, and their strength
 _SUN_AZIMUTH_DEG, _SUN_ELEVATION_DEG = 315.0, 45.0
@@ -55,46 +53,29 @@ _CONTOUR_PX = 6000  # of the surface that lines are drawn of
 def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
     """Write rasters, pictures and contours, return their figures; a DegenerateGeometryError: no cell was seen."""
     trained = load_trained(stage.workspace)
-    points, (photographs_m, training_m) = scene_points(trained), ground_sampling_m(trained)
+    points, gsd_m = scene_points(trained), ground_sampling_m(trained)
     target = target_crs(options, trained.survey.origin, corners(points), trained.survey.vertical)
-    area = area_of(options, trained)
+    area = area_of(options, trained, stage.workspace, stage.progress)
     polygon = area.in_crs(target)
-    frame = make_frame(polygon.bounds, target, photographs_m, options)
+    frame = make_frame(polygon.bounds, target, gsd_m[0], options)
     size = f"{frame.columns} × {frame.rows} cells"
     needed_bytes = _BYTES_PER_CELL * frame.columns * frame.rows
     require_space(stage.out, needed_bytes, f"rasters of {size}", "give a larger --gsd")
     source, reason, warnings = raster_source(
-        stage, trained, target, frame, area, training_gsd_m=training_m, options=options
+        stage, trained, target, frame, area, training_gsd_m=gsd_m[1], options=options
     )
-    fill_m, most_filled = _filling(options, frame.step_x * target.horizontal_unit_m)
     mosaic = Mosaic(
         stage.out / "parts", frame, target, polygon,
-        fill_m=fill_m, most_filled=most_filled, has_terrain=source.terrain is not None,
+        has_terrain=source.terrain is not None, interpolates=options.fill != 0,
     )  # fmt: skip
     mosaic.render(source, stage.progress)
     if options.colours == "photographs":
-        longest_px = max(max(camera.width, camera.height) for camera in trained.sfm.cameras.values())
-        images = photographs(trained.sfm, trained.survey, stage.workspace, longest_px)
-        mosaic.colour(PhotoColours(trained, source, images), stage.progress)
-        if options.source:
-            mosaic.add_source()
-            replace_text(stage.out / "source.json", json.dumps(["", *trained.sfm.image_name], indent=1))
+        _colour(stage, mosaic, trained, source, with_source=options.source)
     height = mosaic.sample("dsm")
     if not len(height):
         message = f"No cell is seen by {options.min_views} training views or more. Lower --min-views."
         raise DegenerateGeometryError("no-raster-cells", message)
-    sigma = None
-    if not reason:
-        counts = "georeference, cameras and lens; the surface's own noise between training views; interpolation"
-        sigma = scene_sigma(counts, mosaic.sample("sigma_h"), mosaic.sample("sigma_v"))
-    west, south, east, north = frame.bounds
-    bounds = [[west, south, height.min()], [east, north, height.max()]]
-    what = "Heights show" if options.colours == "photographs" else "Heights and colours show"
-    detail = f"{what} no finer detail than the training's pixels of {training_m:.3f} m, whatever the cell size."
-    coarse = (Remark(code="detail-of-training", sentence=detail),) if source.training_px > _DETAIL else ()
-    empty = "The rasters state no σ, and sigma_h.tif and sigma_v.tif are empty"
-    cautions = union(trained.model.cautions, (*coarse, *without_sigma(empty, reason)))
-    sidecar = target.sidecar(bounds, headline_of(stage.workspace), sigma, cautions)
+    sidecar = _sidecar(stage, trained, mosaic, source, height, options=options, no_sigma=reason)
     for path in mosaic.write(stage.out, sidecar, stage.progress):
         write_sidecar(sidecar, path)
     holes = mosaic.interpolated_parts(stage.out / "measured.tif")
@@ -104,46 +85,70 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
     of_ground = options.contours_of == "terrain" and source.terrain is not None
     lines = _write_contours(stage.out, "dtm.tif" if of_ground else "dsm.tif", frame, options.contours)
     measured, interpolated, delivered_ha = mosaic.shares()
-    photographed = mosaic.photographed()
+    values = {
+        "columns": frame.columns,
+        "rows": frame.rows,
+        "gsd": frame.step_x,
+        "gsd_photographs_m": gsd_m[0],
+        "gsd_training_m": gsd_m[1],
+        "crs": target.crs.name,
+        "heights": target.crs.vertical.name,
+        "units": target.crs.units,
+        "bounds": sidecar.bounds,
+        "area_ha": area.hectares,
+        "delivered_ha": delivered_ha,
+        "measured": measured,
+        "interpolated": interpolated,
+        "photographed": mosaic.photographed(),
+        **median_values(sidecar.sigma, "cell"),
+        "contour_lines": lines,
+        "assumed": "; ".join(target.assumed),
+    }
     source.views.close()
     remove(mosaic.folder)
     figure = (
         f"{size} of {frame.step_x:g} {target.crs.units[0]} in {target.crs.name}, {measured:.0%} of "
         f"{delivered_ha:.3g} ha measured, {interpolated:.0%} interpolated"
     )
-    return Summary(
-        figure + median_sigma(sigma, "cells"),
-        {
-            "columns": frame.columns,
-            "rows": frame.rows,
-            "gsd": frame.step_x,
-            "gsd_photographs_m": photographs_m,
-            "gsd_training_m": training_m,
-            "crs": target.crs.name,
-            "heights": target.crs.vertical.name,
-            "units": target.crs.units,
-            "bounds": bounds,
-            "area_ha": area.hectares,
-            "delivered_ha": delivered_ha,
-            "measured": measured,
-            "interpolated": interpolated,
-            "photographed": photographed,
-            **median_values(sigma, "cell"),
-            "contour_lines": lines,
-            "assumed": "; ".join(target.assumed),
-        },
-        warnings,
-        cautions,
-    )
+    return Summary(figure + median_sigma(sidecar.sigma, "cells"), values, warnings, sidecar.cautions)
 
 
-def _filling(options: ExportRasterOptions, cell_m: float) -> tuple[float, float]:
-    """Return the width in metres up to which holes are filled, and the largest share that may be filled."""
-    if options.fill == "all" or (options.fill is None and options.boundary is not None):
-        return math.inf, 1.0
-    if options.fill is not None:
-        return options.fill, 1.0
-    return max(_FILLED_M, _FILLED_CELLS * cell_m), _MOST_FILLED
+def _colour(
+    stage: StageRun, mosaic: Mosaic, trained: TrainedSurvey, source: RasterSource, *, with_source: bool
+) -> None:
+    """Colour the orthophoto by the photographs, and keep on request which photograph each cell is from."""
+    longest_px = max(max(camera.width, camera.height) for camera in trained.sfm.cameras.values())
+    images = photographs(trained.sfm, trained.survey, stage.workspace, longest_px)
+    mosaic.colour(PhotoColours(trained, source, images), stage.progress)
+    if with_source:
+        mosaic.add_source()
+        replace_text(stage.out / "source.json", json.dumps(["", *trained.sfm.image_name], indent=1))
+
+
+def _sidecar(
+    stage: StageRun,
+    trained: TrainedSurvey,
+    mosaic: Mosaic,
+    source: RasterSource,
+    height: FloatArray,
+    *,
+    options: ExportRasterOptions,
+    no_sigma: str,
+) -> CrsSidecar:
+    """Return the sidecar of all rasters, with heights (K,) of their cells; `no_sigma` says why σ is not known."""
+    sigma = None
+    if not no_sigma:
+        counts = "georeference, cameras and lens; the surface's own noise between training views; interpolation"
+        sigma = scene_sigma(counts, mosaic.sample("sigma_h"), mosaic.sample("sigma_v"))
+    west, south, east, north = mosaic.frame.bounds
+    bounds = [[west, south, height.min()], [east, north, height.max()]]
+    what = "Heights show" if options.colours == "photographs" else "Heights and colours show"
+    pixels = f"the training's pixels of {source.training_gsd_m:.3f} m"
+    detail = f"{what} no finer detail than {pixels}, whatever the cell size."
+    coarse = (Remark(code="detail-of-training", sentence=detail),) if source.training_px > _DETAIL else ()
+    empty = "The rasters state no σ, and sigma_h.tif and sigma_v.tif are empty"
+    cautions = union(trained.model.cautions, (*coarse, *without_sigma(empty, no_sigma)))
+    return source.target.sidecar(bounds, headline_of(stage.workspace), sigma, cautions)
 
 
 def _write_contours(folder: Path, heights: str, frame: RasterFrame, interval: float | None) -> int:

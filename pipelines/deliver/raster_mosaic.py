@@ -1,13 +1,11 @@
 """Rasters of the stage, window by window: rendered into parts, made whole inside the area, then put together."""
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import shapely
 from numpy.typing import NDArray
@@ -39,8 +37,7 @@ from pipelines.survey.target_crs import TargetCrs
 _SEEN = ("orthophoto", "dsm", "modelled", "sigma_h", "sigma_v")  # parts of what is measured
 _WINDOW_PX = 1536
 _SAMPLES_PX = 192  # a side of a window
-_OVERVIEW_PX = 4000  # along the longer side, at which islands and the outline are looked for
-_SPIKE_M = 1.0  # width of tongues of the outline that are cut off
+_OVERVIEW_PX = 4000  # along the longer side, at which islands are looked for
 _LEAST_ISLAND = 0.01  # of the largest part of the surface
 _COARSE_PX = 1500  # along the longer side, at which wide holes are filled
 _OUTLINES_PX = 2000  # along the longer side, at which interpolated parts are outlined
@@ -65,10 +62,8 @@ class _Window:
 class Mosaic:
     """Rasters over one frame, and the area (a polygon in their CRS) outside which they are empty.
 
-    Of the area, the measured surface is delivered, and its holes up to the width `fill_m`; infinite: all of it. The
-    width is halved until no larger share than `most_filled` is filled.
-
-    Parts in the folder are kept: `parts` of what is measured, `whole` of the rasters to deliver.
+    They are whole inside it, or, if nothing is to be interpolated, where they are measured. Parts in the folder are
+    kept: `parts` of what is measured, `whole` of the rasters to deliver.
     """
 
     def __init__(
@@ -78,12 +73,11 @@ class Mosaic:
         target: TargetCrs,
         polygon: Any,
         *,
-        fill_m: float,
-        most_filled: float,
         has_terrain: bool,
+        interpolates: bool = True,
     ) -> None:
         self.folder, self.frame, self.target, self.polygon = folder, frame, target, polygon
-        self.fill_m, self._most_filled = fill_m, most_filled
+        self._interpolates = interpolates
         height = f"height above {target.crs.vertical.name}"
         self._kinds = {
             "orthophoto": RasterKind("uint8", _COLOURS),
@@ -171,34 +165,6 @@ class Mosaic:
             np.logical_or.at(seen, _coarse_cells(window, step), alpha == MEASURED)
         return seen
 
-    @cached_property
-    def _outline(self) -> BoolArray | None:
-        """Return which coarse cells are delivered: the measured surface, its holes up to a width, no spikes."""
-        if np.isinf(self.fill_m):
-            return None
-        measured = self._measured()
-        inside = cells_inside(self.polygon, self.frame.resized(*measured.shape[::-1]))
-        measured &= inside
-        cell_m = self._step * self.frame.step_x * self.target.horizontal_unit_m
-        width = self.fill_m
-        while True:
-            found = _without_spikes(_closed(measured, width / cell_m / 2), _SPIKE_M / cell_m / 2) & inside
-            filled = (found & ~measured).sum() / max(found.sum(), 1)
-            if filled <= self._most_filled or width < cell_m:
-                return found
-            width /= 2
-
-    def _inside(self, frame: RasterFrame, first: tuple[int, int]) -> BoolArray:
-        """Return which cells of a part that begins at a row and column are delivered."""
-        inside = cells_inside(self.polygon, frame)
-        if self._outline is None:
-            return inside
-        rows, columns = (
-            (start + np.arange(size)) // self._step
-            for start, size in zip(first, (frame.rows, frame.columns), strict=True)
-        )
-        return np.asarray(inside & self._outline[np.ix_(rows, columns)])
-
     def _drop_islands(self) -> None:
         """Unmeasure the cells of islands: small parts, apart from all other surface, are agreements by chance."""
         step, seen = self._step, self._measured()
@@ -222,15 +188,21 @@ class Mosaic:
     def _seen_around(self, window: _Window) -> SeenCells:
         part, own, frame = self._around(window, REACH)
         sigma_h, sigma_v = (read_cells(self._part(self._seen, name, window))[0] for name in ("sigma_h", "sigma_v"))
+        height, inside = (
+            read_cells(self._seen / "dsm.vrt", part)[0].astype(np.float64),
+            cells_inside(self.polygon, frame),
+        )
+        if not self._interpolates:
+            inside &= np.isfinite(height)
         return SeenCells(
             frame=frame,
             own=own,
-            height=read_cells(self._seen / "dsm.vrt", part)[0].astype(np.float64),
+            height=height,
             rgba=read_cells(self._seen / "orthophoto.vrt", part),
             modelled=read_cells(self._seen / "modelled.vrt", part)[0].astype(np.float64),
             sigma_h_m=sigma_h,
             sigma_v_m=sigma_v,
-            inside=self._inside(frame, (part[0].start, part[1].start)),
+            inside=inside,
         )
 
     def _around(self, window: _Window, margin: int) -> tuple[tuple[slice, slice], tuple[slice, slice], RasterFrame]:
@@ -252,9 +224,6 @@ class Mosaic:
         rgba, _ = read_reduced(self._seen / "orthophoto.vrt", _COARSE_PX)
         rows, columns = height.shape[1:]
         inside = cells_inside(self.polygon, self.frame.resized(columns, rows))
-        if self._outline is not None:
-            size = (columns, rows)
-            inside &= cv2.resize(self._outline.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
         modelled, _ = read_reduced(self._seen / "modelled.vrt", _COARSE_PX)
         cells = fill_cells(height[0], inside, max(rows, columns), modelled[0])
         rgb = np.moveaxis(rgba[:3], 0, 2).reshape(-1, 3)[cells.source]
@@ -272,7 +241,7 @@ class Mosaic:
         inside = measured = interpolated = 0
         for window in self._windows():
             mask = read_cells(self._part(self._whole, "measured", window))[0]
-            inside += int(self._inside(window.frame, (window.row, window.column)).sum())
+            inside += int(cells_inside(self.polygon, window.frame).sum())
             measured += int((mask == MEASURED).sum())
             interpolated += int((mask == INTERPOLATED).sum())
         hectares = inside * self.frame.step_x * self.frame.step_y * self.target.horizontal_unit_m**2 / 1e4
@@ -340,28 +309,6 @@ class Mosaic:
 
     def _part(self, folder: Path, name: str, window: _Window) -> Path:
         return folder / f"{name}_{window.row}_{window.column}.tif"
-
-
-def _closed(cells: BoolArray, radius: float) -> BoolArray:
-    """Return cells with their holes and bays that are narrower than twice a radius in cells."""
-    margin = math.ceil(radius) + 1
-    padded = np.pad(cells, margin)
-    dilated = _distance(~padded) <= radius
-    closed = _distance(dilated) > radius
-    return np.asarray(cells | closed[margin:-margin, margin:-margin])
-
-
-def _without_spikes(cells: BoolArray, radius: float) -> BoolArray:
-    """Return cells without tongues that are narrower than twice a radius in cells."""
-    padded = np.pad(cells, 1)
-    eroded = _distance(padded) > radius
-    opened = _distance(~eroded) <= radius
-    return np.asarray(cells & opened[1:-1, 1:-1])
-
-
-def _distance(cells: BoolArray) -> NDArray[Any]:
-    """Return the distance of each chosen cell to the nearest other one, in cells; 0 of the others."""
-    return cv2.distanceTransform(cells.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
 
 
 def _coarse_cells(window: _Window, step: int) -> tuple[IntArray, IntArray]:

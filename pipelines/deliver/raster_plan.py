@@ -99,12 +99,12 @@ def samples_per_cell(training_px: float) -> int:
     return max(round(1.0 / training_px) | 1, 1)
 
 
-def dilation_cells2(training_px: float) -> float:
-    """Return the variance that rendering adds on the screen, in squared cells: that of the training.
+def dilation_cells2(training_px: float, dilation_px2: float = _DILATION_PX2) -> float:
+    """Return the variance that rendering adds on the screen, in squared cells: that of the training, or another.
 
     What the training saw was blurred by its own pixels. A finer raster must not let holes show between Gaussians.
     """
-    return _DILATION_PX2 * max(training_px, 1.0 / samples_per_cell(training_px)) ** 2
+    return dilation_px2 * max(training_px, 1.0 / samples_per_cell(training_px)) ** 2
 
 
 def plan_splats(

@@ -20,7 +20,8 @@ from pipelines.formats.splat_ply import SplatArrays, read_centres, read_logit_op
 from pipelines.geometry.similarity import Similarity
 from pipelines.splat.gaussians import Gaussians, read_gaussians, transformed
 from pipelines.splat.sh import coefficient_count
-from pipelines.survey.area import Area, area_of
+from pipelines.surface.measured_area import area_of
+from pipelines.survey.area import Area
 from pipelines.survey.block_plan import BlockRecord
 from pipelines.survey.calibrated import load_survey
 from pipelines.survey.headline import headline_of
@@ -52,7 +53,7 @@ def crop_of(workspace: Workspace, options: SplatOptions) -> Crop | None:
     solved = load_cameras(workspace)
     cameras = solved.geo_from_model.apply(solved.poses.cam_center_in_model)
     sky_m = float(cameras[:, 2].max()) if options.keep_sky else np.inf
-    return Crop(area_of(options, solved), solved.geo_from_model, sky_m)
+    return Crop(area_of(options, solved, workspace), solved.geo_from_model, sky_m)
 
 
 @dataclass(frozen=True)

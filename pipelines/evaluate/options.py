@@ -7,11 +7,11 @@ from pydantic import Field
 from pipelines.core.options import ExtraMarker, InputPath
 from pipelines.geodesy.vertical import Vertical
 from pipelines.splat.rasterizer.choice import Backend
-from pipelines.survey.options import AreaOptions, CloudPath
+from pipelines.survey.options import CloudPath, FilledAreaOptions
 from pipelines.survey.report_parts import Alignment
 
 
-class EvaluateOptions(AreaOptions):
+class EvaluateOptions(FilledAreaOptions):
     """Options of the evaluation with test views and check points."""
 
     backend: Backend = Field("auto", description="Rasteriser.")

@@ -18,13 +18,14 @@ import numpy as np
 from pipelines.adjust.accuracy_grid import AccuracyGrid, write_csv
 from pipelines.adjust.posterior import Posterior
 from pipelines.adjust.solution import posterior_of
-from pipelines.core.errors import InputError
+from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.figures import WAYS
 from pipelines.core.products import Remark, is_checked, save_json, union
+from pipelines.core.progress import SILENT, Progress
 from pipelines.core.sentences import listed
 from pipelines.core.stages import BY_NAME
 from pipelines.core.types import FloatArray
-from pipelines.core.workspace import StageRun, Summary
+from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.evaluate import check_points
 from pipelines.evaluate.asprs import few_points
 from pipelines.evaluate.coordinates import (
@@ -48,9 +49,10 @@ from pipelines.report.plots.maps import MapCoordinates, MapPoints, SigmaRaster, 
 from pipelines.report.plots.plans import NamedPlaces
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.m3c2 import require_py4dgeo
+from pipelines.surface.measured_area import area_of
 from pipelines.surface.measured_cloud import CloudReader
 from pipelines.surface.surface_views import ModelRenderer
-from pipelines.survey.area import hectares_of
+from pipelines.survey.area import Area
 from pipelines.survey.headline import headline
 from pipelines.survey.marks import of_wrong_marks, wrong_marks
 from pipelines.survey.options import CloudCrs
@@ -176,9 +178,9 @@ def run(stage: StageRun, options: EvaluateOptions) -> Summary:
     solved = load_solved(stage.workspace, options.similarity)
     crs = None if options.crs is None else report_crs(options.crs, solved.survey)
     posterior = posterior_of(stage.workspace, solved.model, solved.sfm)
-    area_ha = hectares_of(options, solved)
+    area = area_of_interest(options, solved, stage.workspace, stage.progress)
     if isinstance(solved, TrainedSurvey):
-        rendered = _rendered(stage, solved, posterior, options, area_ha)
+        rendered = _rendered(stage, solved, posterior, options, area)
     else:
         rendered = None
         for flag, value in (("--reference", options.reference), ("--lpips-weights", options.lpips_weights)):
@@ -186,7 +188,7 @@ def run(stage: StageRun, options: EvaluateOptions) -> Summary:
                 command = stage.workspace.command_of(BY_NAME["train"])
                 message = f"needs a trained model. Run `{command}` first, or leave the option out."
                 raise InputError("not-trained", message, field=flag)
-    report = evaluate(solved, posterior, options, crs=crs, rendered=rendered, area_ha=area_ha)
+    report = evaluate(solved, posterior, options, crs=crs, rendered=rendered, area=area)
     if posterior.grid is not None:
         write_csv(posterior.grid, solved.survey.origin, stage.out / "accuracy.csv")
         draw_accuracy(posterior.grid, solved, report, crs, stage.out / "accuracy.png")
@@ -199,6 +201,16 @@ def run(stage: StageRun, options: EvaluateOptions) -> Summary:
     return replace(summary, warnings=(*summary.warnings, *wrong))
 
 
+def area_of_interest(
+    options: EvaluateOptions, solved: SolvedSurvey, workspace: Workspace, progress: Progress = SILENT
+) -> Area | None:
+    """Return the area of interest, as `area_of`; None: no ground is seen by enough photographs."""
+    try:
+        return area_of(options, solved, workspace, progress)
+    except DegenerateGeometryError:
+        return None
+
+
 def evaluate(
     solved: SolvedSurvey,
     posterior: Posterior,
@@ -206,7 +218,7 @@ def evaluate(
     *,
     crs: PointCrs | None = None,
     rendered: Rendered | None = None,
-    area_ha: float | None = None,
+    area: Area | None = None,
 ) -> EvaluationReport:
     """Return the report on a solved survey; `crs` lists the check points, without `rendered` nothing is trained.
 
@@ -215,14 +227,15 @@ def evaluate(
     """
     model = solved.model
     log_scale, *_, east, north, up = np.sqrt(np.maximum(np.diag(model.geo_from_model.covariance), 0.0)).tolist()
-    area_km2 = None if area_ha is None else area_ha / 100
+    area_km2 = None if area is None else area.hectares / 100
     triangulated = check_points.triangulated_check_points(solved, posterior, area_km2)
     checkpoints = CheckPoints(triangulated=triangulated, surface=None if rendered is None else rendered.points)
     scene = model.accuracy or AccuracySummary(cells=0, reason="the adjustment states no σ")
     reference = None if rendered is None else rendered.reference
     return EvaluationReport(
         headline=headline(triangulated, scene, model.cautions),
-        area_ha=area_ha,
+        area_ha=None if area is None else area.hectares,
+        area_measured=None if area is None else area.measured,
         photometric=None if rendered is None else rendered.photometric,
         checkpoints=checkpoints,
         cross_validation=check_points.cross_validate(solved) if options.cross_validate else None,
@@ -246,7 +259,7 @@ def evaluate(
 
 
 def _rendered(
-    stage: StageRun, trained: TrainedSurvey, posterior: Posterior, options: EvaluateOptions, area_ha: float | None
+    stage: StageRun, trained: TrainedSurvey, posterior: Posterior, options: EvaluateOptions, area: Area | None
 ) -> Rendered:
     files, progress = None, stage.progress
     if options.reference is not None:  # refused before work starts: a file without a CRS, and a missing library
@@ -264,7 +277,7 @@ def _rendered(
             renderer, files, posterior.grid, options, scratch=scratch, progress=progress
         )
         draw_reference(reference, stage.out)
-    area_km2 = None if area_ha is None else area_ha / 100
+    area_km2 = None if area is None else area.hectares / 100
     points = check_points.check_points_on_surface(renderer, progress, area_km2)
     save_render = partial(write_render, renders)
     test = compare_test_views(renderer, options.lpips_weights, save_render, progress, saved=options.renders)

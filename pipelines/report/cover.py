@@ -44,7 +44,10 @@ def cover_facts(
 ) -> CoverFacts:
     """Return the cover; an InputError: the logo is no PNG or JPEG, or too large."""
     survey, crs, root = evaluated.solved.survey, evaluated.crs, evaluated.workspace.root
-    area_ha = evaluated.report.area_ha
+    report = evaluated.report
+    area = MISSING if report.area_ha is None else f"{number_text(report.area_ha, 2)} ha"
+    if report.area_measured is not None:
+        area += f", {report.area_measured:.0%} of it measured"
     height_m, gsd_m = flying_height_m(evaluated), ground_sampling_m(evaluated)
     previews = {"Orthophoto": ORTHOPHOTO_PREVIEW, "Surface model": HILLSHADE}
     shown = {name: preview(root / product, _PREVIEW_PX) for name, product in previews.items()}
@@ -62,7 +65,7 @@ def cover_facts(
         logo=None if options.logo is None else logo_picture(options.logo),
         views=tuple((name, picture) for name, picture in shown.items() if picture is not None),
         facts=(
-            ("Area", MISSING if area_ha is None else f"{number_text(area_ha, 2)} ha"),
+            ("Area", area),
             ("Photographs", registered),
             ("Taken on", days_of(image.timestamp_s for image in survey.images)),
             ("Camera", "; ".join(cameras) or MISSING),

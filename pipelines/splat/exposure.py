@@ -169,10 +169,15 @@ def with_vignetting(colour: Tensor, radius2: Tensor, coefficients: Tensor) -> Te
 
     `radius2` (H, W) is the squared distance from the optical axis; see `squared_radius`.
     """
-    factor = torch.zeros_like(radius2)
-    for coefficient in reversed(coefficients.unbind()):
+    return colour * falloff(radius2, coefficients.unbind())[..., None]
+
+
+def falloff(radius2: Any, coefficients: Sequence[Any]) -> Any:
+    """Return the vignetting 1 + r²(v₀ + r²(v₁ + …)) of squared radii, a tensor or an array, by its terms."""
+    factor = 0.0 * radius2
+    for coefficient in reversed(coefficients):
         factor = radius2 * (factor + coefficient)
-    return colour * (1.0 + factor)[..., None]
+    return 1.0 + factor
 
 
 @lru_cache(maxsize=_KEPT_RADII)
@@ -183,13 +188,19 @@ def squared_radius(camera: Pinhole, whole: Pinhole, device: torch.device) -> Ten
     is read only.
     """
 
+    x, y = (torch.arange(side, dtype=torch.float64, device=device) + 0.5 for side in (camera.width, camera.height))
+    radius2: Tensor = squared_radius_at(x, y[:, None], camera, whole)
+    return radius2.float()
+
+
+def squared_radius_at(x: Any, y: Any, camera: Pinhole, whole: Pinhole) -> Any:
+    """Return the squared distance of pixels x, y of a camera from the optical axis, as `squared_radius`."""
+
     def squared(of: Pinhole, x: Any, y: Any) -> Any:
         return ((x - of.cx) / of.fx) ** 2 + ((y - of.cy) / of.fy) ** 2
 
     furthest = max(squared(whole, x, y) for x in (0.0, whole.width) for y in (0.0, whole.height))
-    x, y = (torch.arange(side, dtype=torch.float64, device=device) + 0.5 for side in (camera.width, camera.height))
-    radius2: Tensor = squared(camera, x, y[:, None]) / furthest
-    return radius2.float()
+    return squared(camera, x, y) / furthest
 
 
 def fitted_affine(rendered: Tensor, photograph: Tensor, mask: Tensor | None = None) -> Tensor:

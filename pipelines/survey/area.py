@@ -43,6 +43,7 @@ class Area:
     polygon: Polygon | MultiPolygon
     level_m: float
     source: str  # file of the boundary, or whence the area is known
+    measured: float | None = None  # share of it that the training views measure; None: there is no trained model
 
     @property
     def hectares(self) -> float:
@@ -74,27 +75,14 @@ class Overlap:
     cell_m: float
 
 
-def area_of(options: AreaOptions, solved: SolvedSurvey) -> Area:
-    """Return the area of interest.
+def seen_area(solved: SolvedSurvey, scene: FloatArray) -> Area:
+    """Return the ground that enough photographs see, of a survey with points (N, 3) in `geo`.
 
     Raises:
-        InputError: the boundary cannot be read, states no CRS, or lies elsewhere.
-        DegenerateGeometryError: no ground is seen by enough photographs.
+        DegenerateGeometryError: there is none.
     """
-    scene = scene_in_geo(solved)
-    stated = boundary_area(options, scene, solved.survey.origin)
-    if stated is not None:
-        return stated
     level_m = float(np.median(scene[:, 2])) if len(scene) else 0.0
     return Area(_seen_ground(solved, scene), level_m, f"ground that {LEAST_PHOTOGRAPHS} photographs see")
-
-
-def hectares_of(options: AreaOptions, solved: SolvedSurvey) -> float | None:
-    """Return the area of interest in hectares, as `area_of`; None: no ground is seen by enough photographs."""
-    try:
-        return area_of(options, solved).hectares
-    except DegenerateGeometryError:
-        return None
 
 
 def boundary_area(options: AreaOptions, scene: FloatArray, origin: Origin | None) -> Area | None:

@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
-from pipelines.core.options import ExtraMarker, InputMarker, StageOptions
+from pipelines.core.options import WRITTEN, ExtraMarker, InputMarker, StageOptions, from_text
 from pipelines.geodesy.vertical import Vertical, VerticalChoice
 
 BOUNDARY_SUFFIXES = frozenset({".geojson", ".json", ".gpkg", ".kml", ".dxf"})
@@ -51,9 +51,34 @@ class AreaOptions(StageOptions):
     boundary: Annotated[Path, InputMarker(BOUNDARY_SUFFIXES), ExtraMarker("vectors")] | None = Field(
         None,
         description="Polygon of the area of interest: GeoJSON, GeoPackage, KML or DXF. Without it: the ground that "
-        f"at least {LEAST_PHOTOGRAPHS} photographs see.",
+        f"{LEAST_PHOTOGRAPHS} training views measure; before training, that {LEAST_PHOTOGRAPHS} photographs see.",
     )
     boundary_crs: str | None = Field(
         None,
         description="CRS of the boundary, as a DXF needs one: EPSG:32632 or another. It overrules the file's.",
+    )
+
+
+def _width(fill: float | Literal["all"]) -> float | Literal["all"]:
+    if fill != "all" and not 0 <= fill < 1e6:
+        raise ValueError("a width in metres, or all")
+    return fill
+
+
+FillWidth = Annotated[
+    float | Literal["all"],
+    from_text(lambda text: text if text == "all" else float(text)),
+    AfterValidator(_width),
+    WRITTEN,
+]
+
+
+class FilledAreaOptions(AreaOptions):
+    """Options of everything that ends at the area of interest: a boundary, or what is measured."""
+
+    fill: FillWidth | None = Field(
+        None,
+        description="Width in metres up to which holes in the measured surface belong to the area, 0 for none; "
+        f"all: all ground that {LEAST_PHOTOGRAPHS} photographs see. Without it: all inside a --boundary, else two "
+        "metres and ten pixels of the photographs on the ground, at most a tenth of the area.",
     )

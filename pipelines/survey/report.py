@@ -335,6 +335,7 @@ class EvaluationReport(_OptionalKeys):
     format_version: Literal[1] = 1
     headline: Headline
     area_ha: float | None = None  # of interest; None: no ground is seen by enough photographs
+    area_measured: float | None = None  # share of it that the training views measure; None: not trained
     photometric: Photometric | None
     checkpoints: CheckPoints
     cross_validation: CrossValidation | None

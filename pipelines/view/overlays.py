@@ -14,8 +14,8 @@ from pipelines.core.workspace import Workspace
 from pipelines.formats.geotiff import sampled_raster
 from pipelines.formats.vector_files import read_contours, read_regions
 from pipelines.report.plots.plans import nice_number
-from pipelines.survey.area import area_of
-from pipelines.survey.options import AreaOptions, CrsOptions
+from pipelines.surface.measured_area import area_of
+from pipelines.survey.options import CrsOptions, FilledAreaOptions
 from pipelines.survey.report import read_report
 from pipelines.survey.target_crs import TargetCrs, usable_crs
 from pipelines.survey.trained_survey import TrainedSurvey
@@ -45,10 +45,10 @@ def error_arrows(workspace: Workspace, trained: TrainedSurvey, frame: ViewFrame)
     return {"enlarged": enlarged, "arrows": frame.place(np.array(arrows)).tolist()}
 
 
-def boundary_rings(trained: TrainedSurvey, frame: ViewFrame) -> list[list[list[float]]]:
+def boundary_rings(workspace: Workspace, trained: TrainedSurvey, frame: ViewFrame) -> list[list[list[float]]]:
     """Return the rings of the area of interest."""
     try:
-        area = area_of(AreaOptions(), trained)
+        area = area_of(FilledAreaOptions(), trained, workspace)
     except GeorefError:
         return []
     rings = [ring for part in shapely.get_parts(area.polygon) for ring in (part.exterior, *part.interiors)]

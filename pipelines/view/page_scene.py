@@ -46,7 +46,7 @@ def described_scene(workspace: Workspace, model: MeasuringModel, frame: ViewFram
         ],
         "errors": error_arrows(workspace, trained, frame),
         "tie_points": _tie_points(model, frame),
-        "boundary": boundary_rings(trained, frame),
+        "boundary": boundary_rings(workspace, trained, frame),
         "contours": contour_lines(workspace, trained, frame),
         "changes": changed_regions(workspace, trained, frame),
         "rasters": model.rasters(),

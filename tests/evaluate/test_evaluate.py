@@ -310,7 +310,11 @@ def test_cameras_are_evaluated_before_training(evaluated: tuple[Workspace, Outco
     # The adjustment is the same, and so is all that does not show Gaussians.
     for name in ("headline", "accuracy", "fit", "similarity", "cameras", "cautions"):
         assert found[name] == trained[name], name
-    assert found["checkpoints"]["triangulated"] == trained["checkpoints"]["triangulated"]
+    before, after = (report["checkpoints"]["triangulated"] for report in (found, trained))
+    # The area, which tells how many points are needed, is what is measured as soon as there are Gaussians.
+    assert before.pop("asprs")["class_3d"] == after.pop("asprs")["class_3d"]
+    assert before == after
+    assert "area_measured" not in found and trained["area_measured"] <= 1
     folder = untrained.root / "evaluate"
     written = {path.name for path in folder.iterdir()}
     assert {"accuracy.csv", "accuracy.png", "cameras.csv", "points.csv"} <= written and "renders" not in written

@@ -17,7 +17,7 @@ from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import Origin, lla_from_enu
 from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.similarity import Similarity
-from pipelines.survey.area import Area, area_of, boundary_area
+from pipelines.survey.area import Area, boundary_area, scene_in_geo, seen_area
 from pipelines.survey.options import BOUNDARY_SUFFIXES, AreaOptions, CrsOptions
 from pipelines.survey.target_crs import target_crs
 from pipelines.survey.trained_survey import SolvedSurvey
@@ -131,7 +131,8 @@ def test_default_is_the_ground_that_three_photographs_see() -> None:
     A frame is 1200 × 900 px at a focal length of 1020: 47 × 35 m. The smoothing may round the corners.
     """
     centers = np.array([(east, 0.0, 40.0) for east in (-24, -12, 0, 12, 24)])
-    area = area_of(AreaOptions(), solved(centers))
+    survey = solved(centers)
+    area = seen_area(survey, scene_in_geo(survey))
     half = 40 * 600 / 1020, 40 * 450 / 1020
     expected = shapely.box(-half[0], -half[1], half[0], half[1])
     common = area.polygon.intersection(expected).area / area.polygon.union(expected).area
@@ -145,8 +146,9 @@ def test_default_is_the_ground_that_three_photographs_see() -> None:
 
 
 def test_two_photographs_have_no_area() -> None:
+    survey = solved(np.array([(0.0, 0.0, 40.0), (5.0, 0.0, 40.0)]))
     with refused("no-common-ground", DegenerateGeometryError):
-        area_of(AreaOptions(), solved(np.array([(0.0, 0.0, 40.0), (5.0, 0.0, 40.0)])))
+        seen_area(survey, scene_in_geo(survey))
 
 
 def test_an_area_without_extent_contains_nothing() -> None:

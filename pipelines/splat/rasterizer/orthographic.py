@@ -54,9 +54,13 @@ def render_orthographic(
     *,
     corner: tuple[float, float] = (0.0, 0.0),
     dilation_px2: float = 0.3,
+    shrink: float = 1.0,
 ) -> PlanView:
-    """Return the view of a part of the plane, `width` × `height` px from a corner (column, row), from above."""
-    table, ellipses = _tables(splats, width, height, corner, dilation_px2)
+    """Return the view of a part of the plane, `width` × `height` px from a corner (column, row), from above.
+
+    The Gaussians' covariances count by the factor `shrink`.
+    """
+    table, ellipses = _tables(splats, (width, height), corner, dilation_px2, shrink)
     with KERNEL_LOCK:
         lists = list_tiles(ellipses, np.arange(len(ellipses)), width, height)
         colour, alpha, depth_sum, square_sum, median, _ = blend_tiles(
@@ -71,10 +75,11 @@ def render_orthographic(
 
 
 def _tables(
-    splats: PlanSplats, width: int, height: int, corner: tuple[float, float], dilation_px2: float
+    splats: PlanSplats, size: tuple[int, int], corner: tuple[float, float], dilation_px2: float, shrink: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return the splats (M, SPLAT_WIDTH) and ellipses (M, ELLIPSE_WIDTH) of the part, nearest first."""
-    xx, yy = splats.cov[:, 0, 0] + dilation_px2, splats.cov[:, 1, 1] + dilation_px2
+    width, height = size
+    xx, yy = (shrink * splats.cov[:, axis, axis] + dilation_px2 for axis in (0, 1))
     level = 2.0 * (np.log(np.maximum(splats.opacity, 1e-300)) - _LOG_ALPHA_MIN)
     x, y = splats.mean[:, 0] - corner[0], splats.mean[:, 1] - corner[1]
     reach_x, reach_y = (np.sqrt(np.maximum(level, 0.0) * variance) for variance in (xx, yy))
@@ -82,7 +87,7 @@ def _tables(
     visible = np.flatnonzero(inside & (level > 0))
     order = visible[np.argsort(splats.mean[visible, 2], kind="stable")]
     xx, yy, x, y, level = xx[order], yy[order], x[order], y[order], level[order]
-    cov = splats.cov[order]
+    cov = shrink * splats.cov[order]
     xy, xz, yz = cov[:, 0, 1], cov[:, 0, 2], cov[:, 1, 2]
     determinant = xx * yy - xy * xy
     factor_xx = np.sqrt(0.5 * yy / determinant)

@@ -35,8 +35,8 @@ from pipelines.splat.gaussians import Gaussians, transformed, write_gaussians
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from pipelines.splat.sh import sh_from_rgb
-from pipelines.survey.area import area_of
-from pipelines.survey.options import AreaOptions
+from pipelines.surface.measured_area import area_of
+from pipelines.survey.options import FilledAreaOptions
 from pipelines.survey.trained_model import TrainedCamera, TrainedModel
 from pipelines.survey.trained_survey import load_trained
 from tests.refusals import codes, refused
@@ -262,7 +262,7 @@ def test_rasters_are_whole_inside_the_area_and_empty_outside(workspace: Workspac
         np.testing.assert_array_equal(raster.read(4) > 0, known)
     np.testing.assert_array_equal(mask > 0, known)
     trained = load_trained(workspace)
-    area = area_of(AreaOptions(), trained)
+    area = area_of(FilledAreaOptions(fill="all"), trained, workspace)
     assert known.sum() * cell_m2 == pytest.approx(1e4 * area.hectares, rel=0.01)
     # Corners lie beyond the images of all but two cameras, and most of what three see is measured.
     assert known.mean() < 0.95
@@ -385,7 +385,10 @@ def textured(workspace: Workspace, tmp_path_factory: pytest.TempPathFactory) -> 
         exposure = tuple(tuple(gain * float(row == column) for column in range(4)) for row in range(3))
         cameras.append(camera.model_copy(update={"exposure": exposure}))
     save_json(model.model_copy(update={"cameras": tuple(cameras)}), root / MODEL)
-    run_stage(made, BY_NAME["export-raster"], {"crs": UTM, "gsd": GSD, "source": True, "terrain": False})
+    # The model lacks the texture: the photographs confirm little of it.
+    run_stage(
+        made, BY_NAME["export-raster"], {"crs": UTM, "gsd": GSD, "source": True, "terrain": False, "fill": "all"}
+    )
     return made
 
 

@@ -1,0 +1,217 @@
+"""Area of interest: the user's boundary, or the outline of the surface that three training views measure.
+
+One area ends every product: rasters, cloud, mesh, crop of the splat, viewer, and the area that the report states.
+It is a function of the trained model and of two options. What is measured is found once from small depth maps, and
+kept in the cache of the workspace, under a key of the model.
+"""
+
+import hashlib
+import logging
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from pipelines.core.errors import InputError
+from pipelines.core.progress import SILENT, Progress
+from pipelines.core.stages import GAUSSIANS, MODEL
+from pipelines.core.types import Float32Array, FloatArray, IntArray
+from pipelines.core.workspace import Workspace
+from pipelines.geometry.cameras import Pinhole, ViewPose
+from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.splat.surface import measured_depth
+from pipelines.surface.surface_views import SAME_SURFACE, ModelRenderer, photo_consistent
+from pipelines.surface.visibility import DepthViews, Viewpoints, support
+from pipelines.survey.area import Area, boundary_area, depths_of_observations, scene_in_geo, seen_area
+from pipelines.survey.measured_ground import MeasuredGround
+from pipelines.survey.options import LEAST_PHOTOGRAPHS, FilledAreaOptions
+from pipelines.survey.scene import photographs
+from pipelines.survey.trained_survey import SolvedSurvey, TrainedSurvey, load_trained
+
+_LONGEST_PX = 320  # of the depth maps
+_MOST_PIXELS = 1 << 27  # of all depth maps: half a gibibyte
+_CELL_PX = 2.0  # of the depth maps, for a side of a cell
+_MOST_CELLS = 2000  # along the longer side
+_HEIGHTS = 8  # of a cell, the latest ones, of which the median is looked at
+_COARSEST = (
+    2.0  # largest width of a pixel over the median: far ground of oblique photographs is no part of the area
+)
+_MOST_THROUGH = 0.5  # largest number of views that look through a cell, over the number of those that agree
+_SIGMA_PX = 0.25  # of a ray, in pixels of the depth maps
+_LAYOUT = b"measured ground 1"
+log = logging.getLogger(__name__)
+
+
+def area_of(
+    options: FilledAreaOptions, solved: SolvedSurvey, workspace: Workspace, progress: Progress = SILENT
+) -> Area:
+    """Return the area of interest, at which every product ends.
+
+    1. A boundary is taken whole, as is, with `--fill all`, the ground that three photographs see. So is that ground
+       before there is a trained model.
+    2. Otherwise the area is what is measured of it: without spikes and islands, with holes filled up to a width.
+
+    Raises:
+        InputError: the boundary cannot be read, states no CRS, or lies elsewhere; or a photograph cannot be read.
+        DegenerateGeometryError: no ground is seen by enough photographs.
+    """
+    scene = scene_in_geo(solved)
+    stated = boundary_area(options, scene, solved.survey.origin)
+    whole = seen_area(solved, scene) if stated is None else stated
+    if not workspace.has(MODEL):
+        return whole
+    ground = measured_ground(solved, workspace, progress)
+    fill = "all" if options.fill is None and stated is not None else options.fill
+    if fill != "all":
+        outline = ground.outline(whole.polygon, fill)
+        if outline is None:
+            log.warning(
+                "No ground is measured by %d training views: the area is all that is seen.", LEAST_PHOTOGRAPHS
+            )
+        else:
+            source = f"ground that {LEAST_PHOTOGRAPHS} training views measure"
+            whole = replace(
+                whole, polygon=outline, source=source if stated is None else f"{source} in {whole.source}"
+            )
+    return replace(whole, measured=ground.share(whole.polygon))
+
+
+def measured_ground(solved: SolvedSurvey, workspace: Workspace, progress: Progress = SILENT) -> MeasuredGround:
+    """Return the ground that the training views of the trained model measure, from the cache if it is there.
+
+    Raises:
+        InputError: a photograph or a product cannot be read.
+    """
+    path = workspace.cache / "area" / f"{_key(solved, workspace)}.npz"
+    if path.exists():
+        try:
+            return MeasuredGround.load(path)
+        except InputError as error:
+            log.warning("%s; it is made again", error)
+    trained = solved if isinstance(solved, TrainedSurvey) else load_trained(workspace)
+    images = photographs(trained.sfm, trained.survey, workspace, trained.model.max_image_size)
+    renderer = ModelRenderer(trained, images, rasterizer("auto", progress))
+    found = measured_by(renderer, progress)
+    try:
+        found.save(path)
+    except OSError as error:  # found again next time
+        log.warning("%s cannot be written: %s", path, error.strerror)
+    return found
+
+
+def _key(solved: SolvedSurvey, workspace: Workspace) -> str:
+    """Return a hash of all that decides what is measured."""
+    digest = hashlib.sha256(_LAYOUT)
+    digest.update(repr(solved.geo_from_model).encode())
+    for product in (MODEL, GAUSSIANS):
+        with workspace.path(product).open("rb") as handle:
+            digest.update(hashlib.file_digest(handle, "sha256").digest())
+    return digest.hexdigest()[:32]
+
+
+def measured_by(renderer: ModelRenderer, progress: Progress = SILENT) -> MeasuredGround:
+    """Return the ground that the training views of a renderer measure; an InputError: a photograph is unusable.
+
+    1. Depth maps are rendered small; depths count where the photograph confirms the render.
+    2. A cell of the plan has the median height of the views that show it.
+    3. It is measured if three views agree on that height, more than look through it, to a cell's side.
+    """
+    trained = renderer.trained
+    cameras = trained.indices("train")
+    depth_m, focal_px = depths_of_observations(trained)
+    photo_m = float(np.median(depth_m / focal_px)) if len(depth_m) else 1.0
+    longest_px = min(_LONGEST_PX, int((_MOST_PIXELS / max(len(cameras), 1)) ** 0.5))
+    pinholes = tuple(renderer.pinholes.of(index).limited(longest_px) for index in cameras)
+    maps = []
+    with progress.task("measured ground", len(cameras)) as task:
+        for index, pinhole in zip(cameras, pinholes, strict=True):
+            maps.append(_depth(renderer, index, pinhole))
+            task.advance()
+    poses, geo_from_model = trained.poses, trained.geo_from_model
+    rotation, center = poses.cam_from_model[cameras], poses.cam_center_in_model[cameras]
+    widths = [
+        geo_from_model.scale * float(np.median(depth[depth > 0])) / pinhole.fx
+        for depth, pinhole in zip(maps, pinholes, strict=True)
+        if (depth > 0).any()
+    ]
+    if not widths:
+        return MeasuredGround(np.zeros((1, 1), dtype=bool), np.zeros(2), np.array([photo_m, photo_m]))
+    pixel_m = float(np.median(widths))
+    points = []
+    for depth, pinhole, turned, place in zip(maps, pinholes, rotation, center, strict=True):
+        near = (depth > 0) & (geo_from_model.scale * depth / pinhole.fx < _COARSEST * pixel_m)
+        row, column = np.nonzero(near)
+        ray = pinhole.rays(np.stack([column, row], axis=-1) + 0.5)
+        in_model = (depth[row, column].astype(np.float64)[:, None] * ray) @ turned + place
+        points.append(geo_from_model.apply(in_model))
+    cells = _Cells.around(points, _CELL_PX * pixel_m)
+    for seen in points:
+        cells.add(seen)
+    places = cells.places()
+    views = DepthViews.of(Viewpoints(rotation, center, pinholes), np.concatenate([depth.ravel() for depth in maps]))
+    up_in_model = geo_from_model.rotation.T @ [0.0, 0.0, 1.0]
+    found = support(geo_from_model.inverse().apply(places), views, up_in_model, SAME_SURFACE)
+    found = found.scaled(geo_from_model.scale)
+    enough = (found.views >= LEAST_PHOTOGRAPHS) & (found.seen_through <= _MOST_THROUGH * found.views)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        lateral_m = _SIGMA_PX * pixel_m / (found.spread_rad * np.sqrt(found.views))
+        close = found.rms_up_m**2 + lateral_m**2 < cells.cell_m**2
+    return MeasuredGround(cells.grid(enough & close), cells.corner, np.array([cells.cell_m, photo_m]))
+
+
+def _depth(renderer: ModelRenderer, index: int, pinhole: Pinhole) -> Float32Array:
+    """Return the depth (H, W) of a training camera at a small size, 0 where masked or not confirmed."""
+    pose = renderer.pose(index)
+    view = renderer.render(ViewPose(pinhole, pose.cam_from_model, pose.center_in_model), depth=True)
+    depth = measured_depth(view).cpu().numpy().astype(np.float32)
+    rgb = (255 * view.colour.clamp(0, 1)).round().byte().cpu().numpy()
+    size = (pinhole.width, pinhole.height)
+    small = cv2.resize(np.array(renderer.images.image(index)), size, interpolation=cv2.INTER_AREA)
+    depth[~photo_consistent(rgb, small)] = 0
+    if renderer.images.is_masked(index):
+        mask = np.array(renderer.images.mask(index)).astype(np.uint8)
+        depth[cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST) == 0] = 0
+    return depth
+
+
+class _Cells:
+    """Cells of the plan, with the heights that views show in each: the latest `_HEIGHTS`, one a view."""
+
+    def __init__(self, corner: FloatArray, cell_m: float, shape: tuple[int, int]) -> None:
+        self.corner, self.cell_m, self._shape = corner, cell_m, shape
+        self._height = np.full((shape[0] * shape[1], _HEIGHTS), np.nan, dtype=np.float32)
+        self._views = np.zeros(len(self._height), dtype=np.int64)
+
+    @classmethod
+    def around(cls, points: list[FloatArray], cell_m: float) -> "_Cells":
+        """Return empty cells over points (N, 3) of views, of a side of `cell_m` or more."""
+        bounds = np.array([(seen[:, :2].min(axis=0), seen[:, :2].max(axis=0)) for seen in points if len(seen)])
+        low, high = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
+        cell_m = max(cell_m, float((high - low).max()) / _MOST_CELLS)
+        columns, rows = (np.floor((high - low) / cell_m).astype(int) + 1).tolist()
+        return cls(low, cell_m, (rows, columns))
+
+    def add(self, points: FloatArray) -> None:
+        """Add the points (N, 3) that a view shows."""
+        if not len(points):
+            return
+        column, row = np.floor((points[:, :2] - self.corner) / self.cell_m).astype(np.int64).T
+        cell, first = np.unique(row * self._shape[1] + column, return_index=True)
+        self._height[cell, self._views[cell] % _HEIGHTS] = points[first, 2]
+        self._views[cell] += 1
+
+    def places(self) -> FloatArray:
+        """Return the middles (K, 3) of the cells that enough views show, at the median height."""
+        shown = self._shown()
+        row, column = np.divmod(shown, self._shape[1])
+        plan = self.corner + (np.stack([column, row], axis=1) + 0.5) * self.cell_m
+        return np.column_stack([plan, np.nanmedian(self._height[shown], axis=1)])
+
+    def grid(self, chosen: np.ndarray) -> np.ndarray:
+        """Return all cells (R, C), true where the place is chosen."""
+        cells = np.zeros(len(self._height), dtype=bool)
+        cells[self._shown()[chosen]] = True
+        return cells.reshape(self._shape)
+
+    def _shown(self) -> IntArray:
+        return np.flatnonzero(self._views >= LEAST_PHOTOGRAPHS)
