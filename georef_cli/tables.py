@@ -245,6 +245,7 @@ def report(document: EvaluationReport) -> list[Renderable]:
         None
         if crossed is None or crossed.reason is None
         else Group(f"\n[bold]{_CROSSED}[/]", f"not possible: {shown(crossed.reason)}"),
+        *(Group(f"[bold]required accuracy[/] {shown(test.sentence)}") for test in document.tolerances),
         *_against_reference(document.reference),
         _rows("Known distances, metres", _distances(document), DISTANCES),
         _rows("Predicted σ, metres", {} if cameras is None else {"cameras": dict(cameras)}, SIGMA_COLUMNS),

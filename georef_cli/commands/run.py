@@ -50,6 +50,7 @@ LATER: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(_EFFORT, ("train",)),
     "backend": ("train", "evaluate"),
     **dict.fromkeys(_LIDAR, ("train",)),
+    **dict.fromkeys(("tolerance_h", "tolerance_v"), ("evaluate",)),
     "seed": ("sfm", "init-sim3", "train"),
     **dict.fromkeys(AreaOptions.model_fields, _IN_AREA),
 }

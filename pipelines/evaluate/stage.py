@@ -19,14 +19,14 @@ from pipelines.adjust.accuracy_grid import AccuracyGrid, write_csv
 from pipelines.adjust.posterior import Posterior
 from pipelines.adjust.solution import posterior_of
 from pipelines.core.errors import InputError
-from pipelines.core.figures import WAYS
+from pipelines.core.figures import WAYS, Headline, ToleranceTest
 from pipelines.core.products import Remark, is_checked, save_json, union
 from pipelines.core.sentences import listed
 from pipelines.core.stages import BY_NAME
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.evaluate import check_points
-from pipelines.evaluate.asprs import few_points
+from pipelines.evaluate.asprs import few_points, tolerance_test
 from pipelines.evaluate.coordinates import (
     coordinates_in,
     error_array,
@@ -42,6 +42,7 @@ from pipelines.evaluate.reference import (
     compare_with_reference,
     draw_reference,
 )
+from pipelines.evaluate.surface_heights import surface_accuracy, surface_heights
 from pipelines.geodesy.crs import PointCrs
 from pipelines.geodesy.enu import Origin, lla_from_enu
 from pipelines.report.plots.maps import MapCoordinates, MapPoints, SigmaRaster, write_accuracy_map
@@ -65,6 +66,7 @@ from pipelines.survey.report import (
     PhotometricFigures,
     PointResidual,
     SimilaritySigma,
+    SurfaceHeight,
 )
 from pipelines.survey.scene import photographs
 from pipelines.survey.survey import SurveyedPoint
@@ -83,6 +85,8 @@ def summarise(report: EvaluationReport) -> Summary:
         values |= {f"{way}_{name}": getattr(errors, name) for name in figures}
     if report.distances:
         values["distances"] = [distance.model_dump() for distance in report.distances]
+    if report.tolerances:
+        values["tolerances"] = [each.model_dump() for each in report.tolerances]
     key_figure = f"{report.headline.sentence}; {_test_views(test)}"
     return Summary(key_figure, values, _warnings(report), report.cautions)
 
@@ -162,6 +166,7 @@ class Rendered:
 
     photometric: Photometric
     points: CheckPointErrors
+    heights: tuple[SurfaceHeight, ...]
     reference: ComparedReference | None
 
 
@@ -217,11 +222,16 @@ def evaluate(
     log_scale, *_, east, north, up = np.sqrt(np.maximum(np.diag(model.geo_from_model.covariance), 0.0)).tolist()
     area_km2 = None if area_ha is None else area_ha / 100
     triangulated = check_points.triangulated_check_points(solved, posterior, area_km2)
-    checkpoints = CheckPoints(triangulated=triangulated, surface=None if rendered is None else rendered.points)
+    heights = () if rendered is None else rendered.heights
+    checkpoints = CheckPoints(
+        triangulated=triangulated, surface=None if rendered is None else rendered.points, heights=heights
+    )
+    surface = surface_accuracy(heights, solved.survey.check_points)
     scene = model.accuracy or AccuracySummary(cells=0, reason="the adjustment states no σ")
     reference = None if rendered is None else rendered.reference
+    accuracy = headline(triangulated, scene, model.cautions, surface)
     return EvaluationReport(
-        headline=headline(triangulated, scene, model.cautions),
+        headline=accuracy,
         area_ha=area_ha,
         photometric=None if rendered is None else rendered.photometric,
         checkpoints=checkpoints,
@@ -233,6 +243,7 @@ def evaluate(
         coordinates=None if crs is None else coordinates_in(crs, checkpoints, solved.survey),
         reference=None if reference is None else reference.comparison,
         distances=check_points.distance_errors(solved, posterior),
+        tolerances=_tolerances(accuracy, options, area_km2),
         variance_factors=model.variance_factors,
         cautions=union(
             model.cautions,
@@ -242,6 +253,23 @@ def evaluate(
             check_points.dependent_check_points(solved.survey),
             () if reference is None else cautions_of_reference(reference),
         ),
+    )
+
+
+def _tolerances(accuracy: Headline, options: EvaluateOptions, area_km2: float | None) -> tuple[ToleranceTest, ...]:
+    """Return the tests of the required accuracies: of the triangulated points and of the surface."""
+    measured = accuracy if accuracy.kind == "measured" else Headline(kind="unknown")
+    wanted: list[tuple[str, float | None, float | None, int]] = [
+        ("horizontal, of triangulated points", options.tolerance_h, measured.rmse_h_m, measured.check_points),
+        ("vertical, of triangulated points", options.tolerance_v, measured.rmse_v_m, measured.check_points),
+    ]
+    for where, errors in () if accuracy.surface is None else accuracy.surface.parts:
+        name = f"vertical, of the surface {where}".rstrip()
+        wanted.append((name, options.tolerance_v, errors.rmse_v_m, errors.check_points))
+    return tuple(
+        tolerance_test(of, tolerance_m, rmse_m, count, area_km2)
+        for of, tolerance_m, rmse_m, count in wanted
+        if tolerance_m is not None
     )
 
 
@@ -268,4 +296,4 @@ def _rendered(
     points = check_points.check_points_on_surface(renderer, progress, area_km2)
     save_render = partial(write_render, renders)
     test = compare_test_views(renderer, options.lpips_weights, save_render, progress, saved=options.renders)
-    return Rendered(Photometric(test=test), points, reference)
+    return Rendered(Photometric(test=test), points, surface_heights(renderer, progress), reference)
