@@ -99,7 +99,7 @@ class SurfaceAccuracy(Product):
     Attributes:
         ground, raised: at points on the ground, and on roofs and whatever else stands on it; None: there are none.
         anywhere: at points of which neither is known.
-        unseen: number of points at which no surface was measured.
+        unseen: number of points at edges, below other surfaces, or where views do not agree on one.
     """
 
     ground: SurfaceErrors | None = None
@@ -108,12 +108,10 @@ class SurfaceAccuracy(Product):
     unseen: int = 0
 
     @property
-    def parts(self) -> tuple[tuple[str, SurfaceErrors], ...]:
-        """Where the points lie, in words, and their errors."""
-        words = {"on the ground": self.ground, "on roofs and other raised places": self.raised}
-        return tuple(
-            (where, errors) for where, errors in {**words, "": self.anywhere}.items() if errors is not None
-        )
+    def parts(self) -> tuple[tuple[str, str, SurfaceErrors], ...]:
+        """Where the points lie, in words and as the name of the field, and their errors."""
+        words = {"on the ground": "ground", "on roofs and other raised places": "raised", "": "anywhere"}
+        return tuple((where, key, getattr(self, key)) for where, key in words.items() if getattr(self, key))
 
     @property
     def text(self) -> str:
@@ -121,9 +119,11 @@ class SurfaceAccuracy(Product):
         parts = [
             f"V {ACCURACY_V.with_unit(errors.rmse_v_m)} {where}".rstrip()
             + f" ({errors.check_points if number else _checks(errors.check_points)})"
-            for number, (where, errors) in enumerate(self.parts)
+            for number, (where, _, errors) in enumerate(self.parts)
         ]
-        return f"RMSE {', '.join(parts)}" + (f"; no surface at {self.unseen}" if self.unseen else "")
+        return f"RMSE {', '.join(parts)}" + (
+            f"; none at {self.unseen} more, on walls, under roofs or unseen" if self.unseen else ""
+        )
 
 
 class ToleranceTest(Product):

@@ -263,7 +263,7 @@ def _tolerances(accuracy: Headline, options: EvaluateOptions, area_km2: float | 
         ("horizontal, of triangulated points", options.tolerance_h, measured.rmse_h_m, measured.check_points),
         ("vertical, of triangulated points", options.tolerance_v, measured.rmse_v_m, measured.check_points),
     ]
-    for where, errors in () if accuracy.surface is None else accuracy.surface.parts:
+    for where, _, errors in () if accuracy.surface is None else accuracy.surface.parts:
         name = f"vertical, of the surface {where}".rstrip()
         wanted.append((name, options.tolerance_v, errors.rmse_v_m, errors.check_points))
     return tuple(

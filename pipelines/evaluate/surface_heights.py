@@ -7,34 +7,32 @@ wrong in every surface model, mesh and measurement, so that the surface has figu
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 from scipy.spatial import cKDTree
 
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.extras import extra_part
 from pipelines.core.figures import SurfaceAccuracy, SurfaceErrors
 from pipelines.core.progress import Progress
-from pipelines.core.types import BoolArray
-from pipelines.splat.gaussians import rotation_matrices
+from pipelines.core.types import BoolArray, FloatArray
 from pipelines.surface.ground import terrain_of
-from pipelines.surface.picking import Sight, SurfacePoint, SurfaceReader
+from pipelines.surface.plan_heights import heights_in_plan
 from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey.report import SurfaceHeight
 from pipelines.survey.survey import SurveyedPoint
 from pipelines.survey.trained_survey import TrainedSurvey
 
 _RAISED_M = 1.0  # above the ground, from which a check point lies on a roof, a wall or a vehicle
-_GROUND_SPACING_M, _AROUND_M = (
-    0.5,
-    60.0,
-)  # of the points that the ground is found in: the cloth's knots are 1 m apart
-_SOLID = 0.5  # least opacity of a Gaussian that shows the surface
+_STEP_M = 1.0  # of the surface around a point, from which it lies at an edge, and of the surface above a point
+_AROUND_PX, _LEAST_AROUND_M = 3.0, 0.3  # distance at which the surface around is looked at
+_REACH_PX = 1.5  # of a place: the pixels whose mean height it takes
+_NEIGHBOURS, _LEAST_SPACING_M, _LEAST_POINTS = 10, 0.5, 100  # of the tie points that show the ground
 
 
 def surface_heights(renderer: ModelRenderer, progress: Progress) -> tuple[SurfaceHeight, ...]:
     """Return the rendered surface's height above each check point's, in plan at the surveyed place.
 
-    Points under vegetation are left out: the surface there is that of the plants.
+    Left out are points under vegetation, where the surface is that of the plants. Points at an edge, as on a wall,
+    and points that a surface covers, as below a roof, are no places of a DSM: their difference is not stated.
     """
     trained = renderer.trained
     points = [point for point in trained.survey.check_points if point.land_cover != "vegetated"]
@@ -42,23 +40,28 @@ def surface_heights(renderer: ModelRenderer, progress: Progress) -> tuple[Surfac
         return ()
     surveyed = np.array([point.position_in_geo for point in points])
     center = trained.geo_from_model.apply(trained.poses.cam_center_in_model)
-    raised, reader = _raised(trained, points), SurfaceReader(renderer)
-    model_from_geo = trained.geo_from_model.inverse()
-    down = model_from_geo.rotation @ np.array([0.0, 0.0, -1.0])
+    arm_m = np.linalg.norm(center[None] - surveyed[:, None], axis=2)
+    focal_px = np.array([renderer.pinholes.of(camera).fx for camera in range(len(center))])
+    pixel_m = float(np.median((arm_m / focal_px).min(axis=1)))  # of the most detailed view
+    around_m = max(_AROUND_PX * pixel_m, _LEAST_AROUND_M)
+    steps = around_m * np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+    plan = (surveyed[:, None, :2] + steps).reshape(-1, 2)
+    with progress.task("surface at check points") as task:
+        found = heights_in_plan(renderer, plan, float(np.median(surveyed[:, 2])), _REACH_PX * pixel_m)
+        task.advance()
+    height = found.height_m.reshape(len(points), len(steps))
+    difference = height[:, 0] - surveyed[:, 2]
+    at_edge = np.ptp(np.where(np.isfinite(height), height, height[:, :1]), axis=1) > _STEP_M
+    covered = difference > _STEP_M
+    raised = _raised(trained, surveyed)
     rows = []
-    with progress.task("surface at check points", len(points)) as task:
-        for index, point in enumerate(points):
-            start = np.append(surveyed[index, :2], center[:, 2].max())
-            # A pixel of the nearest photograph, as the raster's cells are.
-            arm_m = np.linalg.norm(center - surveyed[index], axis=1)
-            nearest = int(arm_m.argmin())
-            pixel_m = arm_m[nearest] / reader.focal_px(nearest)
-            pixel_rad = pixel_m / max(start[2] - surveyed[index, 2], pixel_m)
-            found = reader.under(Sight(model_from_geo.apply(start[None])[0], down, float(pixel_rad)))
-            up_m = found.position_in_geo[2] - surveyed[index, 2] if isinstance(found, SurfacePoint) else None
-            place = None if raised is None else "raised" if raised[index] else "ground"
-            rows.append(SurfaceHeight(name=point.name, du_m=None if up_m is None else float(up_m), place=place))
-            task.advance()
+    for index, point in enumerate(points):
+        place = None if raised is None else "raised" if raised[index] else "ground"
+        hidden = "edge" if at_edge[index] else "covered" if covered[index] else None
+        known = hidden is None and np.isfinite(difference[index])
+        rows.append(
+            SurfaceHeight(name=point.name, du_m=float(difference[index]) if known else None, place=hidden or place)
+        )
     return tuple(rows)
 
 
@@ -78,28 +81,23 @@ def surface_accuracy(heights: Sequence[SurfaceHeight], points: Sequence[Surveyed
         anywhere=errors(None),
         unseen=sum(row.du_m is None for row in heights),
     )
-    return found if heights and (found.ground or found.raised or found.anywhere) else None
+    return found if found.parts else None
 
 
-def _raised(trained: TrainedSurvey, points: Sequence[SurveyedPoint]) -> BoolArray | None:
-    """Return which points stand above the ground around them; None: the ground is not known."""
-    if extra_part("terrain").found is None:
+def _raised(trained: TrainedSurvey, surveyed: FloatArray) -> BoolArray | None:
+    """Return which places (J, 3) stand above the ground around them; None: the ground is not known.
+
+    The ground is found in the tie points: no Gaussian below it can pull it down.
+    """
+    points = trained.geo_from_model.apply(trained.point_in_model)
+    if extra_part("terrain").found is None or len(points) < _LEAST_POINTS:
         return None
-    place = np.array([point.position_in_geo for point in points])
-    gaussians = trained.gaussians
-    in_geo = trained.geo_from_model.apply(gaussians.means.numpy())
-    low, high = place.min(axis=0)[:2] - _AROUND_M, place.max(axis=0)[:2] + _AROUND_M
-    near = ((in_geo[:, :2] >= low) & (in_geo[:, :2] <= high)).all(axis=1)
-    chosen = np.flatnonzero(near & (torch.sigmoid(gaussians.logit_opacities).numpy() >= _SOLID))
-    _, first = np.unique(np.floor(in_geo[chosen] / _GROUND_SPACING_M), axis=0, return_index=True)
-    chosen = chosen[np.sort(first)]
-    of_chosen = gaussians.select(torch.from_numpy(chosen))
-    axes, thinnest = rotation_matrices(of_chosen.quats_wxyz).numpy(), of_chosen.log_scales.numpy().argmin(axis=1)
-    normal = axes[np.arange(len(chosen)), :, thinnest] @ trained.geo_from_model.rotation.T
+    distance, near = cKDTree(points).query(points, k=_NEIGHBOURS)
+    apart = points[near] - points[near].mean(axis=1, keepdims=True)
+    normal = np.linalg.eigh(np.einsum("nki,nkj->nij", apart, apart))[1][:, :, 0]
     try:
-        spacing_m = float(np.median(cKDTree(in_geo[chosen]).query(in_geo[chosen], k=2)[0][:, 1]))
-        ground = terrain_of(in_geo[chosen], normal, max(spacing_m, _GROUND_SPACING_M))
+        ground = terrain_of(points, normal, max(float(np.median(distance[:, 1])), _LEAST_SPACING_M))
     except DegenerateGeometryError:
         return None
-    above_m = place[:, 2] - ground.interpolated(ground.height, place[:, :2])
+    above_m = surveyed[:, 2] - ground.interpolated(ground.height, surveyed[:, :2])
     return np.asarray(above_m > max(_RAISED_M, ground.limit_m))

@@ -1,5 +1,6 @@
 """Photographs of a survey: adjusted positions with error ellipses, residuals of fixes in time; and its lenses."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,6 +69,7 @@ class CamerasFacts:
     by_time: bool
     bias: tuple[FlightBias, ...]  # of the used fixes; empty without fixes
     outliers: tuple[Outlier, ...]
+    largest_fix: tuple[str, float] | None  # largest residual of a used fix along an axis, in its stated σ
     median_sigma_h_m: float | None
     median_sigma_v_m: float | None
     rows: tuple[CameraRow, ...]
@@ -114,11 +116,21 @@ def cameras_facts(evaluated: EvaluatedSurvey) -> CamerasFacts:
             )
             if left_out
         ),
+        largest_fix=_largest(fixes, stated_m, names),
         median_sigma_h_m=None if sigma_m is None else float(np.median(np.hypot(sigma_m[:, 0], sigma_m[:, 1]))),
         median_sigma_v_m=None if sigma_m is None else float(np.median(sigma_m[:, 2])),
         rows=_rows(evaluated, moved, is_outlier, sigma_m),
         axes=heads_of(evaluated.crs),
     )
+
+
+def _largest(fixes: FixDifferences, stated_m: FloatArray, names: Sequence[str]) -> tuple[str, float] | None:
+    """Return photograph and size of the largest residual of a used fix along an axis, in its stated σ (F, 3)."""
+    used = np.flatnonzero(~fixes.is_outlier)
+    if not len(used):
+        return None
+    ratio = (np.abs(fixes.difference_in_geo[used]) / np.maximum(stated_m[used], 1e-12)).max(axis=1)
+    return names[fixes.camera[used[ratio.argmax()]]], float(ratio.max())
 
 
 def bias_of(fixes: FixDifferences, stated_m: FloatArray) -> tuple[FlightBias, ...]:

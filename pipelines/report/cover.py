@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from pipelines.core.figures import MISSING, Headline, length_text
+from pipelines.core.figures import MISSING, Headline, SurfaceErrors, length_text
 from pipelines.core.sentences import listed
 from pipelines.core.stages import HILLSHADE, ORTHOPHOTO_PREVIEW
 from pipelines.report.cameras import LensesFacts
@@ -36,6 +36,9 @@ class CoverFacts:
     facts: tuple[tuple[str, str], ...]  # name and value
     headline: Headline
     accuracy_note: str
+    surface: tuple[tuple[str, str, SurfaceErrors], ...]  # where, key in the headline, and errors
+    unseen: int  # check points without a surface
+    trained: bool
     without: str  # blunders among the check points, for the figures without them; empty: there are none
 
 
@@ -45,6 +48,7 @@ def cover_facts(
     """Return the cover; an InputError: the logo is no PNG or JPEG, or too large."""
     survey, crs, root = evaluated.solved.survey, evaluated.crs, evaluated.workspace.root
     area_ha = evaluated.report.area_ha
+    surface = evaluated.report.headline.surface
     height_m, gsd_m = flying_height_m(evaluated), ground_sampling_m(evaluated)
     previews = {"Orthophoto": ORTHOPHOTO_PREVIEW, "Surface model": HILLSHADE}
     shown = {name: preview(root / product, _PREVIEW_PX) for name, product in previews.items()}
@@ -74,6 +78,9 @@ def cover_facts(
             ("Heights", crs.crs.vertical.name if crs.origin is None else crs.crs.vertical.described),
         ),
         headline=evaluated.report.headline,
+        surface=() if surface is None else surface.parts,
+        unseen=0 if surface is None else surface.unseen,
+        trained=evaluated.report.test_views is not None,
         accuracy_note=_NOTES[evaluated.report.headline.kind],
         without=listed(evaluated.report.headline.blunders),
     )

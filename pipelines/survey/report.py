@@ -213,12 +213,13 @@ class CheckPointErrors(StatedErrors):
 class SurfaceHeight(Product):
     """Height of the surface straight below or above a check point, minus the surveyed one; None: not measured.
 
-    `place`: on the `ground`, `raised` (roofs, walls), or None where the ground is not known.
+    `place`: on the `ground`, `raised` (roofs), at an `edge` (walls) or `covered` by another surface, both without a
+    difference, or None where the ground is not known.
     """
 
     name: str
     du_m: float | None
-    place: Literal["ground", "raised"] | None
+    place: Literal["ground", "raised", "edge", "covered"] | None
 
 
 class CheckPoints(Product):
