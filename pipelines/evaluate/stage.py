@@ -44,9 +44,10 @@ from pipelines.evaluate.reference import (
 )
 from pipelines.evaluate.surface_heights import surface_accuracy, surface_heights
 from pipelines.geodesy.crs import PointCrs
-from pipelines.geodesy.enu import Origin, lla_from_enu
-from pipelines.report.plots.maps import MapCoordinates, MapPoints, SigmaRaster, write_accuracy_map
-from pipelines.report.plots.plans import NamedPlaces
+from pipelines.geodesy.enu import lla_from_enu
+from pipelines.report.place import map_coordinates
+from pipelines.report.plots.maps import MapPoints, SigmaRaster, write_accuracy_map
+from pipelines.report.plots.plans import MapCoordinates, NamedPlaces
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.m3c2 import require_py4dgeo
 from pipelines.surface.measured_cloud import CloudReader
@@ -54,7 +55,7 @@ from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey.area import hectares_of
 from pipelines.survey.headline import headline
 from pipelines.survey.marks import of_wrong_marks, wrong_marks
-from pipelines.survey.options import CloudCrs
+from pipelines.survey.options import CloudCrs, CrsOptions
 from pipelines.survey.photographs import write_render
 from pipelines.survey.report import (
     AccuracySummary,
@@ -69,7 +70,8 @@ from pipelines.survey.report import (
     SurfaceHeight,
 )
 from pipelines.survey.scene import photographs
-from pipelines.survey.survey import SurveyedPoint
+from pipelines.survey.survey import Survey, SurveyedPoint
+from pipelines.survey.target_crs import TargetCrs, usable_crs
 from pipelines.survey.trained_survey import SolvedSurvey, TrainedSurvey, load_solved
 
 
@@ -125,16 +127,17 @@ def draw_accuracy(
 ) -> None:
     """Write a map of the predicted accuracy, with cameras, control and check points, errors and coordinates.
 
-    The coordinates are in a CRS; None: longitude and latitude.
+    The coordinates are in a CRS; None: in the UTM zone.
     """
     survey = solved.survey
     raster = SigmaRaster(grid.raster(grid.sigma_h_m), grid.raster(grid.sigma_v_m), grid.corner_in_geo, grid.size_m)
+    center = solved.geo_from_model.apply(solved.poses.cam_center_in_model)
     points = MapPoints(
-        cameras=solved.geo_from_model.apply(solved.poses.cam_center_in_model)[:, :2],
+        cameras=center[:, :2],
         control=_named(survey.control_points, report.fit.gcp.points),
         check=_named(survey.check_points, report.checkpoints.triangulated.points),
     )
-    write_accuracy_map(path, raster, points, _coordinates(survey.origin, crs))
+    write_accuracy_map(path, raster, points, _coordinates(survey, crs, center))
 
 
 def _named(points: Sequence[SurveyedPoint], rows: Sequence[PointResidual]) -> NamedPlaces:
@@ -142,22 +145,11 @@ def _named(points: Sequence[SurveyedPoint], rows: Sequence[PointResidual]) -> Na
     return NamedPlaces(place, tuple(point.name for point in points), error_array(rows))
 
 
-def _coordinates(origin: Origin | None, crs: PointCrs | None) -> MapCoordinates | None:
-    """Return the coordinates of places at the height of the origin; None: those of a local frame are its metres."""
-    if origin is None:
-        return None
-
-    served = None if crs is None or crs.is_geocentric else crs
-
-    def coordinates(place: FloatArray) -> FloatArray:
-        lla = lla_from_enu(np.column_stack([place, np.zeros(len(place))]), origin)
-        return lla[:, [1, 0]] if served is None else served.xyz_from_lla(lla)[:, :2]
-
-    if served is None:
-        return MapCoordinates("WGS84", ("longitude", "latitude"), "°", coordinates)
-    names = ("longitude", "latitude") if served.is_geographic else ("easting", "northing")
-    unit = "°" if served.units[0] == "degree" else {"metre": "m"}.get(served.units[0], served.units[0])
-    return MapCoordinates(served.name, names, unit, coordinates)
+def _coordinates(survey: Survey, crs: PointCrs | None, center: FloatArray) -> MapCoordinates:
+    """Return the coordinates on the axes of a map: of a CRS, None: of the UTM zone, as in the report."""
+    if crs is None or crs.is_geocentric or survey.origin is None:
+        return map_coordinates(usable_crs(CrsOptions(), survey.origin, center, survey.vertical))
+    return map_coordinates(TargetCrs(crs, survey.origin, lla_from_enu(center, survey.origin)))
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from pipelines.core.products import is_checked
 from pipelines.core.types import BoolArray, FloatArray, vector3
 from pipelines.geometry.cameras import LENGTHS, Camera, parameter_names, parameters_in
 from pipelines.report.page import Picture, picture_of_png
-from pipelines.report.place import Texts, heads_of, texts_of
+from pipelines.report.place import Texts, heads_of, map_coordinates, texts_of
 from pipelines.report.plots.observations import correlation_matrix, fix_series, residual_field
 from pipelines.report.plots.plans import movement_plan
 from pipelines.report.views import EvaluatedSurvey
@@ -89,6 +89,7 @@ def cameras_facts(evaluated: EvaluatedSurvey) -> CamerasFacts:
         moved[:, :2],
         None if covariance is None else covariance[:, :2, :2],
         is_outlier,
+        map_coordinates(evaluated.crs),
     )
     by_name = {image.name: image.fix for image in solved.survey.images}
     stated = [fix.cov_apart for camera in fixes.camera if (fix := by_name[names[camera]]) is not None]
