@@ -216,10 +216,18 @@ def test_paper_shows_as_many_pictures_as_it_says(browser: Browser, report: Path)
         views = re.findall(r"Views with pictures: (\d+) of (\d+)", text)
         assert [int(number) for number, _ in views] == [page.page.evaluate(visible, ".view")]
         shown[media] = chips
-        for name in ("Place and date", "Name and signature", "What was delivered", "SHA-256", "Triangulated points"):
+        for name in (
+            "Place and date",
+            "Name and signature",
+            "What was delivered",
+            "SHA-256",
+            "Triangulated points",
+        ):
             assert name in text
     assert shown["print"] <= shown["screen"]
-    links = page.page.evaluate("() => [...document.querySelectorAll('a.term')].map((a) => decodeURIComponent(a.hash.slice(1)))")
+    links = page.page.evaluate(
+        "() => [...document.querySelectorAll('a.term')].map((a) => decodeURIComponent(a.hash.slice(1)))"
+    )
     terms = page.page.evaluate("() => [...document.querySelectorAll('.glossary > div')].map((node) => node.id)")
     assert set(links) <= set(terms) and len(set(links)) >= 10
     context.close()

@@ -261,9 +261,7 @@ def test_verdict_on_the_sigma_knows_what_the_check_points_say(code: str | None, 
         ("Measured share", {"delivered": (0.95, 0.61)}, "good", "95 %"),
     ],
 )
-def test_a_verdict_names_what_it_counts(
-    subject: str, changes: dict[str, object], level: str, words: str
-) -> None:
+def test_a_verdict_names_what_it_counts(subject: str, changes: dict[str, object], level: str, words: str) -> None:
     found = {verdict.subject: verdict for verdict in verdicts(report_with(), replace(MEASURED, **changes), ())}
     assert found[subject].level == level
     assert words in f"{found[subject].reading}: {found[subject].reason}"
