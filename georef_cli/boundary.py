@@ -50,7 +50,8 @@ class Exit:
 def exit_of(error: BaseException) -> Exit | None:
     """Return the exit by a known exception; None for one that nobody foresaw."""
     if isinstance(error, click.Abort | KeyboardInterrupt):
-        return Exit(INTERRUPTED, "interrupted", _document("interrupted", "interrupted"))
+        text = "interrupted. What is done is kept: the same command continues."
+        return Exit(INTERRUPTED, text, _document("interrupted", "interrupted"))
     if isinstance(error, click.ClickException):
         text, context, param = io.StringIO(), getattr(error, "ctx", None), getattr(error, "param", None)
         error.show(text)

@@ -1,8 +1,9 @@
 """Base of all commands: the options that each of them takes, before or after its name."""
 
 import inspect
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
+from types import MappingProxyType
 from typing import Any
 
 import click
@@ -17,11 +18,20 @@ _VERBOSITY = tuple(field.name for field in fields(Verbosity))
 class Command(click.Command):
     """Command of the program: its arguments and options, and those that all commands share.
 
-    The indentation of its help is removed.
+    The indentation of its help is removed. `sections` name options by heading, in the order of the help; the others
+    follow below "Further options".
     """
 
-    def __init__(self, name: str, *, help: str, params: Sequence[click.Parameter] = (), **more: Any) -> None:
-        self.own_params = tuple(params)
+    def __init__(
+        self,
+        name: str,
+        *,
+        help: str,
+        params: Sequence[click.Parameter] = (),
+        sections: Mapping[str, Sequence[str]] = MappingProxyType({}),
+        **more: Any,
+    ) -> None:
+        self.own_params, self.sections = tuple(params), sections
         super().__init__(name, help=inspect.cleandoc(help), params=[*params, *shared_options()], **more)
 
     def invoke(self, ctx: click.Context) -> Any:
@@ -31,14 +41,16 @@ class Command(click.Command):
             return super().invoke(ctx)
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the command's own options, and below them those of all commands."""
-        rows = [
-            (param in self.own_params, param.get_help_record(ctx))
-            for param in self.get_params(ctx)
-            if isinstance(param, click.Option)
-        ]
-        for own, title in ((True, "Options"), (False, "Options of all commands")):
-            records = [record for is_own, record in rows if is_own is own and record is not None]
+        """Write the command's own options by section, and below them those of all commands."""
+        given = [param for param in self.get_params(ctx) if isinstance(param, click.Option)]
+        own = {param.name or "": param for param in given if param in self.own_params}
+        groups: dict[str, list[click.Option]] = {
+            title: [own.pop(name) for name in names if name in own] for title, names in self.sections.items()
+        }
+        groups["Further options" if self.sections else "Options"] = list(own.values())
+        groups["Options of all commands"] = [param for param in given if param not in self.own_params]
+        for title, params in groups.items():
+            records = [record for param in params if (record := param.get_help_record(ctx)) is not None]
             if records:
                 with formatter.section(title):
                     formatter.write_dl(records)

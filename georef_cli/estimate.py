@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,15 +18,17 @@ from georef_cli.layout import plain_table, shown
 from georef_cli.output import print_json, print_rich, size
 from georef_cli.tables import Renderable
 from pipelines.core.errors import GeorefError
-from pipelines.core.options import OptionsT, notation, require_available
-from pipelines.core.plan import PlannedStage, photograph_folder, plan
+from pipelines.core.options import OptionsT, flag_name, notation, require_available
+from pipelines.core.plan import OptionOrigin, PlannedStage, photograph_folder, plan
 from pipelines.core.products import load_json
 from pipelines.core.progress import SILENT, Progress
+from pipelines.core.runner import Outcome
 from pipelines.core.sentences import about
 from pipelines.core.stages import SURVEY, StageSpec
 from pipelines.core.staleness import Flags
 from pipelines.core.workspace import Summary, Workspace
 from pipelines.ingest.options import IngestOptions
+from pipelines.jobs import pace
 from pipelines.sfm.options import SfmOptions
 from pipelines.survey.survey import Survey
 from pipelines.train.options import TrainOptions
@@ -35,6 +38,10 @@ if TYPE_CHECKING:
     from pipelines.train.estimate import TrainingEstimate
 
 log = logging.getLogger(__name__)
+
+_FEATURES_BYTES = 2_500_000  # of a photograph in COLMAP's database and model
+_TRAINED_PIXEL_BYTES = 8  # a smaller photograph, its depth map and confidence
+_GAUSSIAN_BYTES = 59 * 4 * 5  # parameters and both moments in the checkpoint, the model, and the PLY
 
 
 @dataclass(frozen=True)
@@ -52,9 +59,36 @@ class RunEstimate:
 
     planned: Sequence[PlannedStage]
     photographs: FoundPhotographs | None  # None: in a bag that was not read yet
-    seconds: Mapping[str, float | None]  # about, by stage, of those that take long
+    seconds: Mapping[str, float | None]  # about, by stage that would run; None: not measured, as on a GPU
+    modelled: Mapping[str, float]  # the same, before this machine's own runs correct it
     reconstruction: ReconstructionEstimate | None  # None where none would run, or before a bag is read
     training: TrainingEstimate | None  # likewise
+
+    @property
+    def total_s(self) -> float | None:
+        """Seconds of the whole run; None: not known, as of a bag that is not read yet or of a training on a GPU."""
+        going = [row.stage for row in self.planned if row.action not in ("keep", "refuse")]
+        known = [seconds for stage in going if (seconds := self.seconds.get(stage)) is not None]
+        return sum(known) if len(known) == len(going) else None
+
+    @property
+    def peak_bytes(self) -> int:
+        """Largest predicted memory of a stage; 0: no stage has an estimate."""
+        return max(
+            (part.peak_bytes for part in (self.reconstruction, self.training) if part is not None), default=0
+        )
+
+    @property
+    def disk_bytes(self) -> int:
+        """Room on the disk that features, smaller photographs, depth maps and checkpoints take, about."""
+        total = 0
+        if self.reconstruction is not None:
+            total += self.reconstruction.photographs * _FEATURES_BYTES
+        if self.training is not None:
+            width, height = self.training.training_px
+            total += self.training.photographs * width * height * _TRAINED_PIXEL_BYTES
+            total += self.training.max_gaussians * _GAUSSIAN_BYTES
+        return total
 
 
 def estimate_run(
@@ -77,6 +111,7 @@ def estimate_run(
         if (train := _to_run(planned, TrainOptions)) is not None:
             training = estimate_training(photographs.count, photo_px, train)
     seconds: dict[str, float | None] = {}
+    modelled: dict[str, float] = {}
     for name, estimate in (("sfm", reconstruction), ("train", training)):
         if estimate is not None and estimate.refusal:
             planned = [
@@ -85,7 +120,16 @@ def estimate_run(
             ]
         elif estimate is not None:
             seconds[name] = estimate.seconds
-    return RunEstimate(planned, photographs, seconds, reconstruction, training)
+            modelled |= {} if estimate.seconds is None else {name: estimate.seconds}
+    if photographs is not None:
+        width, height = photographs.size_px if training is None else training.training_px
+        megapixels = photographs.count * width * height / 1e6
+        for row in planned:
+            rough = pace.modelled_s(row.stage, photographs.count, megapixels)
+            if row.action not in ("keep", "refuse") and rough is not None:
+                modelled[row.stage] = rough
+    seconds |= {name: pace.corrected(name, value) for name, value in modelled.items()}
+    return RunEstimate(planned, photographs, seconds, modelled, reconstruction, training)
 
 
 def checked_inputs(
@@ -143,9 +187,14 @@ def print_dry_run(
     force: bool,
     as_json: bool,
     progress: Progress,
+    given: Mapping[str, Flags] | None = None,
 ) -> None:
-    """Print what a run would do, and what `ingest` would find; a GeorefError: the run would be refused."""
+    """Print what a run would do, and what `ingest` would find; a GeorefError: the run would be refused.
+
+    `given` are the flags of this command line, without those that are remembered; None: `flags`.
+    """
     run = estimate_run(workspace, stages, flags, force=force)
+    run = replace(run, planned=[_with_origins(row, given) for row in run.planned])
     survey = checked_inputs(workspace, run.planned, progress)
     for warning in () if survey is None else survey.warnings:
         log.warning("ingest: %s", warning.sentence, extra={"code": warning.code})
@@ -169,13 +218,47 @@ def print_dry_run(
         parts += ["\n[bold]Reconstruction[/]", *(f"  {shown(text)}" for text in run.reconstruction.sentences())]
     if run.training is not None:
         parts += ["\n[bold]Training[/]", *(f"  {shown(text)}" for text in run.training.sentences())]
+    if run.photographs is not None:
+        time_text = "not measured" if run.total_s is None else f"about {about(run.total_s)}"
+        memory = f"; memory about {size(run.peak_bytes)}" if run.peak_bytes else ""
+        parts.append(f"\n[bold]In all[/]: {time_text}{memory}; disk about {size(run.disk_bytes)}")
+    busy = pace.load_sentence()
+    parts += [f"[yellow]{busy}[/]"] if busy else []
     print_rich(*parts, "\n[dim]Nothing was run. Times are estimates for an idle machine.[/]")
 
 
-def announced_seconds(
+def _with_origins(row: PlannedStage, given: Mapping[str, Flags] | None) -> PlannedStage:
+    """Return a planned stage whose options name their true origin, those that follow from a preset among them."""
+    names = {flag_name(type(row.resolved), name) for name in (given or {}).get(row.stage, {})}
+    origins = [replace(each, origin="command line") if each.flag in names else each for each in row.options]
+    if isinstance(row.resolved, TrainOptions):
+        effort, known = row.resolved.effort, {each.flag for each in origins}
+        for name in ("iterations", "max_image_size", "max_gaussians"):
+            flag = flag_name(TrainOptions, name)
+            if flag not in known:
+                origins.append(OptionOrigin(row.stage, flag, getattr(effort, name), "preset"))
+    return replace(row, options=tuple(origins))
+
+
+def keep_times(run: RunEstimate | None, outcomes: Sequence[Outcome], before: pace.Ticks | None) -> None:
+    """Keep the times of whole stages for the next estimate, unless others used the machine meanwhile."""
+    used = os.times()
+    share = pace.used_by_others(before, used.user + used.system + used.children_user + used.children_system)
+    if run is None or not outcomes:
+        return
+    if pace.is_loaded(share):
+        log.info("run: others used %.0f %% of this machine: its times are not kept for estimates.", 100 * share)
+        return
+    whole = {row.stage for row in run.planned if row.action in ("run", "perhaps")}
+    for outcome in outcomes:
+        if outcome.ran and outcome.stage in whole:
+            pace.learn(outcome.stage, run.modelled.get(outcome.stage), outcome.manifest.duration_s)
+
+
+def announced_estimate(
     workspace: Workspace, stages: tuple[StageSpec, ...], flags: Mapping[str, Flags], *, force: bool
-) -> Mapping[str, float | None]:
-    """Return the estimated seconds of a run's stages that take long; none for a run that will be refused.
+) -> RunEstimate | None:
+    """Return the estimate of a run; None for one that will be refused.
 
     The estimate of the training is logged at the start: not after hours of other stages.
     """
@@ -183,9 +266,20 @@ def announced_seconds(
         run = estimate_run(workspace, stages, flags, force=force)
         for sentence in () if run.training is None else run.training.sentences():
             log.info("train: %s", sentence)
+        busy = pace.load_sentence()
+        if busy:
+            log.info("run: %s", busy)
     except GeorefError:
-        return {}
-    return run.seconds
+        return None
+    return run
+
+
+def announced_seconds(
+    workspace: Workspace, stages: tuple[StageSpec, ...], flags: Mapping[str, Flags], *, force: bool
+) -> Mapping[str, float | None]:
+    """Return the estimated seconds of a run's stages; none for a run that will be refused."""
+    run = announced_estimate(workspace, stages, flags, force=force)
+    return {} if run is None else run.seconds
 
 
 def _document(workspace: Workspace, run: RunEstimate, survey: Summary | None) -> dict[str, Any]:
@@ -213,6 +307,7 @@ def _document(workspace: Workspace, run: RunEstimate, survey: Summary | None) ->
         "photographs": run.photographs and dataclasses.asdict(run.photographs),
         "reconstruction": run.reconstruction and dataclasses.asdict(run.reconstruction),
         "training": run.training and dataclasses.asdict(run.training),
+        "total": {"seconds": run.total_s, "peak_bytes": run.peak_bytes, "disk_bytes": run.disk_bytes},
     }
 
 

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
+from difflib import get_close_matches
 from typing import Any
 
 import click
@@ -100,6 +101,10 @@ class LazyGroup(click.Group):
         seconds = [name.partition(" ")[2] for name in COMMANDS if name.startswith(f"{args[0]} ")]
         if seconds and args[0] not in COMMANDS:
             ctx.fail(f"{PROGRAM} {args[0]} needs one of: {', '.join(seconds)}.")
+        if args[0] not in COMMANDS and not args[0].startswith("-"):
+            near = get_close_matches(args[0], COMMANDS, n=3, cutoff=0.5)
+            hint = f" Did you mean {' or '.join(near)}?" if near else f" `{PROGRAM} --help` lists the commands."
+            ctx.fail(f"No such command {args[0]!r}.{hint}")
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:

@@ -16,7 +16,7 @@ from pipelines.core.plan import OptionOrigin
 from pipelines.core.products import Remark
 from pipelines.core.runner import Outcome
 from pipelines.core.sentences import duration
-from pipelines.core.stages import REPORT
+from pipelines.core.stages import BY_NAME, REPORT
 from pipelines.core.staleness import StageState
 from pipelines.core.workspace import Workspace
 from pipelines.survey.headline import PointLine, point_lines
@@ -159,12 +159,24 @@ def outcome(workspace: Workspace, result: Outcome, *, headline: bool = True) -> 
         table = plain_table("", "", header=False, right=[1])  # Nested values are shown by --json only.
         for name, value in manifest.values.items():
             if isinstance(value, str | int | float) or value is None:
-                table.add_row(shown(name), shown(_number(value)))
+                table.add_row(shown(_words(name)), shown(_number(value)))
         parts.append(table)
         parts += _cameras(manifest.values.get("camera_list", ()))
+    if (file := workspace.root / BY_NAME[result.stage].product).exists():
+        parts.append(f"[bold]file[/] {shown(str(file))}")
     if not result.ran:  # the warnings of a stage that just ran are on stderr already
         parts += [f"[yellow]warning:[/] {shown(warning.sentence)}" for warning in manifest.warnings]
     return parts
+
+
+_UNITS = {"m": "m", "px": "px", "deg": "°", "s": "s", "ha": "ha", "db": "dB", "bytes": "bytes"}
+
+
+def _words(name: str) -> str:
+    """Return the name of a value in words, its unit in brackets: `median_sigma_m` as `median sigma (m)`."""
+    words, _, ending = name.rpartition("_")
+    text = name if not words or ending not in _UNITS else f"{words} ({_UNITS[ending]})"
+    return text.replace("_", " ")
 
 
 def outcomes(results: Sequence[Outcome]) -> Table:
@@ -245,6 +257,7 @@ def report(document: EvaluationReport) -> list[Renderable]:
         None
         if crossed is None or crossed.reason is None
         else Group(f"\n[bold]{_CROSSED}[/]", f"not possible: {shown(crossed.reason)}"),
+        *(Group(f"[bold]required accuracy[/] {shown(test.sentence)}") for test in document.tolerances),
         *_against_reference(document.reference),
         _rows("Known distances, metres", _distances(document), DISTANCES),
         _rows("Predicted σ, metres", {} if cameras is None else {"cameras": dict(cameras)}, SIGMA_COLUMNS),

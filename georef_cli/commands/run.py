@@ -12,7 +12,7 @@ import click
 from georef_cli import boundary, options
 from georef_cli.command import Command
 from georef_cli.display import is_told, progress_for
-from georef_cli.estimate import RunTimeLeft, announced_seconds, print_dry_run
+from georef_cli.estimate import RunTimeLeft, announced_estimate, keep_times, print_dry_run
 from georef_cli.evaluation import evaluated_cameras
 from georef_cli.options import SET, settings
 from georef_cli.output import print_outcomes
@@ -25,6 +25,7 @@ from pipelines.core.stages import BY_NAME, DELIVERABLES, MODEL, PIPELINE, StageS
 from pipelines.core.staleness import must_exist
 from pipelines.core.workspace import Workspace
 from pipelines.ingest.options import IngestOptions
+from pipelines.jobs import pace
 from pipelines.survey.options import AreaOptions, CrsOptions
 
 if TYPE_CHECKING:
@@ -50,6 +51,7 @@ LATER: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(_EFFORT, ("train",)),
     "backend": ("train", "evaluate"),
     **dict.fromkeys(_LIDAR, ("train",)),
+    **dict.fromkeys(("tolerance_h", "tolerance_v"), ("evaluate",)),
     "seed": ("sfm", "init-sim3", "train"),
     **dict.fromkeys(AreaOptions.model_fields, _IN_AREA),
     "fill": _IN_AREA[1:],
@@ -83,10 +85,17 @@ def _run(ctx: click.Context, **values: Any) -> None:
     asked = remembered(workspace.root, [spec.name for spec in stages], flags, forget)
     if values["dry_run"]:
         print_dry_run(
-            workspace, stages, asked, force=force, as_json=values["as_json"], progress=progress_for(ctx.obj)
+            workspace,
+            stages,
+            asked,
+            force=force,
+            as_json=values["as_json"],
+            progress=progress_for(ctx.obj),
+            given=flags,
         )
         return
-    left = RunTimeLeft(announced_seconds(workspace, stages, asked, force=force))
+    before, estimate = pace.ticks(), announced_estimate(workspace, stages, asked, force=force)
+    left = RunTimeLeft({} if estimate is None else estimate.seconds)
     progress = progress_for(ctx.obj)
     # A program that follows several runs shows how many stages of each are done; bars and lines name the stages.
     with (progress if ctx.obj.json_progress else SILENT).task("stages", len(stages)) as done:
@@ -99,6 +108,7 @@ def _run(ctx: click.Context, **values: Any) -> None:
             progress=progress,
             around=lambda spec: _counted(workspace, spec, done, left, trains=trains),
         )
+    keep_times(estimate, outcomes, before)
     solved = evaluated_cameras(workspace) if stages[-1].name == "init-sim3" else None
     print_outcomes(
         workspace, outcomes, _overview(workspace), solved, as_json=values["as_json"], told=is_told(ctx.obj)
@@ -181,6 +191,31 @@ def _flags(
     return flags
 
 
+# Options by section of the help; the ten that most runs need come first.
+SECTIONS: dict[str, tuple[str, ...]] = {
+    "Most runs need": (
+        "images", "trajectory", "vertical", "crs", "gcp", "checkpoints", "preset", "deliver", "dry_run", "last",
+    ),
+    "Which stages": ("first", "rerun_from", "force", "forget", "settings", "as_json"),
+    "Photographs": (
+        "sensor", "bag", "video", "image_topic", "fix_topic", "attitude_topic", "every", "skip_blurred", "focal_px",
+        "rolling_shutter", "masks", "mask", "mask_sky", "copy_images", "test_every",
+    ),
+    "Positions and attitudes": (
+        "geo", "events", "origin", "ground_height", "time_offset", "estimate", "lever_arm", "camera_mount",
+        "boresight", "max_gap", "accept_inconsistency", "max_residual",
+    ),
+    "Their σ": ("sigma_h", "sigma_v", "sigma_common_h", "sigma_common_v", "sigma_attitude"),
+    "Ground points and distances": (
+        "marks", "marks_as_shown", "targets", "distances", "gcp_crs", "check", "vegetated", "sigma_gcp_h",
+        "sigma_gcp_v", "sigma_mark", "sigma_distance",
+    ),
+    "Required accuracy": ("tolerance_h", "tolerance_v"),
+    "Reconstruction and training": (
+        "mapper", "import_model", "triangulate", *_EFFORT, "backend", "seed", *_LIDAR,
+    ),
+    "Area": tuple(AreaOptions.model_fields),
+}  # fmt: skip
 STAGE_NAME = click.Choice([spec.name for spec in PIPELINE])
 
 command = Command(
@@ -199,6 +234,7 @@ command = Command(
         options.JSON,
     ],
     callback=click.pass_context(_run),
+    sections=SECTIONS,
     help="""Run all stages, or some, skipping what is current.
 
         What was interrupted is resumed. Options that a stage was given before are remembered, so that a later

@@ -82,8 +82,79 @@ CELLS = {
 }
 
 
+def _checks(count: int, kind: str = "") -> str:
+    return f"{count} {kind}check point{'s'[: count != 1]}"
+
+
+class SurfaceErrors(Product):
+    """RMSE of the surface's height at some check points, their survey's error included."""
+
+    check_points: int
+    rmse_v_m: float
+
+
+class SurfaceAccuracy(Product):
+    """Accuracy of the surface, as the DSM shows it from above, at check points outside vegetation.
+
+    Attributes:
+        ground, raised: at points on the ground, and on roofs and whatever else stands on it; None: there are none.
+        anywhere: at points of which neither is known.
+        unseen: number of points at edges, below other surfaces, or where views do not agree on one.
+    """
+
+    ground: SurfaceErrors | None = None
+    raised: SurfaceErrors | None = None
+    anywhere: SurfaceErrors | None = None
+    unseen: int = 0
+
+    @property
+    def parts(self) -> tuple[tuple[str, str, SurfaceErrors], ...]:
+        """Where the points lie, in words and as the name of the field, and their errors."""
+        words = {"on the ground": "ground", "on roofs and other raised places": "raised", "": "anywhere"}
+        return tuple((where, key, getattr(self, key)) for where, key in words.items() if getattr(self, key))
+
+    @property
+    def text(self) -> str:
+        """`RMSE V 5.2 cm on the ground (6 check points), V 31.0 cm on roofs and other raised places (3)`."""
+        parts = [
+            f"V {ACCURACY_V.with_unit(errors.rmse_v_m)} {where}".rstrip()
+            + f" ({errors.check_points if number else _checks(errors.check_points)})"
+            for number, (where, _, errors) in enumerate(self.parts)
+        ]
+        return f"RMSE {', '.join(parts)}" + (
+            f"; none at {self.unseen} more, on walls, under roofs or unseen" if self.unseen else ""
+        )
+
+
+class ToleranceTest(Product):
+    """Required accuracy against what check points outside vegetation measure, their survey's error included.
+
+    After the ASPRS standard (`evaluate.asprs`), a product passes if its RMSE is at most what is required, at as
+    many points as the standard demands. `met`: fewer points; `untested`: none.
+    """
+
+    of: str
+    tolerance_m: float
+    rmse_m: float | None
+    check_points: int
+    least_points: int
+    verdict: Literal["pass", "fail", "met", "untested"]
+
+    @property
+    def sentence(self) -> str:
+        """Such as `vertical, triangulated: RMSE 4.2 cm of 5.0 cm at 9 check points: met, no pass: …`."""
+        text = f"{self.of}: required RMSE {length_text(self.tolerance_m)}"
+        if self.verdict == "untested":
+            return f"{text}, not tested: no check point measures it"
+        text += f", measured {length_text(self.rmse_m)} at {_checks(self.check_points)}"
+        few = f"met, but no pass: the standard demands {self.least_points} check points"
+        return f"{text}: {few if self.verdict == 'met' else self.verdict}"
+
+
 class Headline(Product):
-    """The accuracy of a result: the one figure that every table, page and file states of it (docs/accuracy.md).
+    """The accuracy of a result: the figures that every table, page and file states of it (docs/accuracy.md).
+
+    They are two: of points that are triangulated in photographs, and of the surface (`surface`).
 
     Attributes:
         kind: `measured`: of the triangulated check points; `predicted`: of the scene; `unknown`: neither.
@@ -93,6 +164,7 @@ class Headline(Product):
         reason: reason why it is not known; None: it is.
         blunders: names of the check points that the others and σ refute; they count in RMSE and number.
         rmse_h_without_m, rmse_v_without_m: RMSE without the blunders. None: there are none, or no other point.
+        surface: accuracy of the surface; None: no check point measures it.
     """
 
     kind: Literal["measured", "predicted", "unknown"]
@@ -103,17 +175,23 @@ class Headline(Product):
     blunders: tuple[str, ...] = ()
     rmse_h_without_m: float | None = None
     rmse_v_without_m: float | None = None
+    surface: SurfaceAccuracy | None = None
 
     @property
     def text(self) -> str:
-        """Kind and figures, such as `measured at 9 check points: RMSE H 4.2 cm, V 5.1 cm`."""
+        """Both figures: `measured at 9 triangulated check points: RMSE H 4.2 cm, V 5.1 cm; of the surface: …`."""
+        return self.of_points + (f"; of the surface: {self.surface.text}" if self.surface is not None else "")
+
+    @property
+    def of_points(self) -> str:
+        """Kind and figures of the points, as `measured at 9 triangulated check points: RMSE H 4.2 cm, V 5.1 cm`."""
         if self.kind == "unknown":
             return f"not known: {self.reason}"
         vertical = "unknown" if self.rmse_v_m is None else ACCURACY_V.with_unit(self.rmse_v_m)
         figures = f"H {ACCURACY_H.with_unit(self.rmse_h_m)}, V {vertical}"
         if self.kind == "predicted":
             return f"predicted, not measured: σ {figures}"
-        text = f"measured at {self.check_points} check point{'s'[: self.check_points != 1]}: RMSE {figures}"
+        text = f"measured at {_checks(self.check_points, 'triangulated ')}: RMSE {figures}"
         if self.rmse_h_without_m is None:
             return text
         others = f"H {ACCURACY_H.with_unit(self.rmse_h_without_m)}, V {ACCURACY_V.with_unit(self.rmse_v_without_m)}"

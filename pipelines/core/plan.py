@@ -14,7 +14,7 @@ from pipelines.core.stages import BY_NAME, StageSpec
 from pipelines.core.staleness import BY_HAND, Flags
 from pipelines.core.workspace import Workspace
 
-Origin = Literal["default", "georef.toml", "remembered", "command line"]
+Origin = Literal["default", "preset", "georef.toml", "remembered", "command line"]
 Action = Literal["run", "resume", "extend", "keep", "perhaps", "refuse"]
 
 

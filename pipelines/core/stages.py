@@ -235,6 +235,8 @@ PIPELINE: tuple[StageSpec, ...] = (
 )
 
 # What a survey hands over besides the PLY: each is made on request, and none is read by another stage.
+# Files that the report lists, with their hashes.
+DELIVERED = (SPLAT, MEASURABLE_SPLAT, "raster/dsm.tif", CLOUD, MESH, SPZ, TILES, "cameras/cameras.csv")
 DELIVERABLES: tuple[StageSpec, ...] = (
     StageSpec(
         name="export-measurable",
@@ -318,6 +320,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
             *SOLVED,
             APPLIED_RIG,
             *whole_products(RENDERS, ACCURACY_MAP, REFERENCE_MAP, REFERENCE_HISTOGRAM, optional=True),
+            *whole_products(*DELIVERED, optional=True),
             *whole_products(
                 METRICS, LIDAR, LIDAR_MAP, ORTHOPHOTO_PREVIEW, HILLSHADE, CHANGE_FIGURES, optional=True
             ),

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipelines.core.descriptions import DESCRIPTIONS
 from pipelines.core.errors import GeorefError
 from pipelines.core.figures import Headline
 from pipelines.core.products import Remark, load_json
@@ -17,7 +18,6 @@ from pipelines.core.stages import BY_NAME, DELIVERABLES, GAUSSIANS, MODEL, REPOR
 from pipelines.core.staleness import StageState, cautions_by_stage, document_of_cautions, status
 from pipelines.core.types import FloatArray, Vector3, vector3
 from pipelines.core.workspace import Workspace
-from pipelines.deliver.options import DESCRIPTIONS
 from pipelines.deliver.placement import place
 from pipelines.formats.splat_ply import read_centres
 from pipelines.formats.vector_files import Json, feature, polygon

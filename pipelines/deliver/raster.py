@@ -80,8 +80,9 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
         write_sidecar(sidecar, path)
     holes = mosaic.interpolated_parts(stage.out / "measured.tif")
     replace_text(stage.out / "interpolated.geojson", features_text(holes))
+    height_colours = None
     if options.hillshade:
-        _write_pictures(stage.out, target.horizontal_unit_m / target.crs.height_unit_m)
+        height_colours = _write_pictures(stage.out, target.horizontal_unit_m / target.crs.height_unit_m)
     of_ground = options.contours_of == "terrain" and source.terrain is not None
     lines = _write_contours(stage.out, "dtm.tif" if of_ground else "dsm.tif", frame, options.contours)
     measured, interpolated, delivered_ha = mosaic.shares()
@@ -95,6 +96,14 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
         "heights": target.crs.vertical.name,
         "units": target.crs.units,
         "bounds": sidecar.bounds,
+        "map": height_colours
+        and {
+            "names": target.axes,
+            "unit": target.crs.short_units[0],
+            "unit_m": target.horizontal_unit_m,
+            "height_unit": target.crs.short_units[2],
+            "height_colours": height_colours,
+        },
         "area_ha": area.hectares,
         "delivered_ha": delivered_ha,
         "measured": measured,
@@ -162,8 +171,10 @@ def _write_contours(folder: Path, heights: str, frame: RasterFrame, interval: fl
     return len(lines)
 
 
-def _write_pictures(folder: Path, heights_by_plan: float) -> None:
+def _write_pictures(folder: Path, heights_by_plan: float) -> tuple[float, float]:
     """Write `preview.png` and `hillshade.png` of the rasters in a folder, transparent where there is no surface.
+
+    Return the heights at the ends of the hillshade's colours.
 
     Args:
         folder: has `orthophoto.tif` and `dsm.tif`.
@@ -186,6 +197,7 @@ def _write_pictures(folder: Path, heights_by_plan: float) -> None:
     # Pale colours, so that the light can be seen on them.
     shaded = (1 - _TINT + _TINT * colours / 255.0) * grey[..., None]
     cv2.imwrite(str(folder / "hillshade.png"), np.dstack([shaded.astype(np.uint8), alpha]))
+    return float(low), float(high)
 
 
 def _contour_lines(height: FloatArray, frame: RasterFrame, interval: float) -> list[ContourLine]:

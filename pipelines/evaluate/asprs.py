@@ -13,11 +13,12 @@ Edition 2, Version 2 (ASPRS, 2024) demands:
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pipelines.core.figures import length_text
+from pipelines.core.figures import ToleranceTest, length_text
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.robust.statistics import residual_stats
 from pipelines.survey.report import AsprsStatement, ErrorStats, Rmse, TotalRmse, VegetatedAccuracy
@@ -121,6 +122,24 @@ def least_points(area_km2: float | None) -> int:
     """Return the number of check points that the standard demands for a project of an area in km²."""
     further = math.ceil((area_km2 or 0.0) / _AREA_KM2) - 1
     return min(_LEAST_POINTS + _MORE_POINTS * max(further, 0), _MOST_POINTS)
+
+
+def tolerance_test(
+    of: str, tolerance_m: float, rmse_m: float | None, check_points: int, area_km2: float | None
+) -> ToleranceTest:
+    """Return whether an RMSE at check points passes a required one: at most so large, at enough points."""
+    least = least_points(area_km2)
+    verdict: Literal["pass", "fail", "met", "untested"] = "untested"
+    if rmse_m is not None:
+        verdict = "fail" if rmse_m > tolerance_m else "pass" if check_points >= least else "met"
+    return ToleranceTest(
+        of=of,
+        tolerance_m=tolerance_m,
+        rmse_m=rmse_m,
+        check_points=check_points,
+        least_points=least,
+        verdict=verdict,
+    )
 
 
 def few_points(asprs: AsprsStatement) -> str:

@@ -22,6 +22,16 @@ class EvaluateOptions(FilledAreaOptions):
     crs: str | None = Field(
         None, description="List the check points in this CRS too, e.g. EPSG:32632, or EPSG:32632+5773 for heights."
     )
+    tolerance_h: float | None = Field(
+        None,
+        gt=0,
+        description="Required horizontal accuracy, as RMSE in metres: the report says whether it is met.",
+    )
+    tolerance_v: float | None = Field(
+        None,
+        gt=0,
+        description="Required vertical accuracy, as RMSE in metres, of triangulated points and of the surface.",
+    )
     lpips_weights: InputPath | None = Field(
         None, description="NPZ file of LPIPS (VGG) weights; without it LPIPS is null."
     )

@@ -19,7 +19,7 @@ from pipelines.adjust.accuracy_grid import AccuracyGrid, write_csv
 from pipelines.adjust.posterior import Posterior
 from pipelines.adjust.solution import posterior_of
 from pipelines.core.errors import DegenerateGeometryError, InputError
-from pipelines.core.figures import WAYS
+from pipelines.core.figures import WAYS, Headline, ToleranceTest
 from pipelines.core.products import Remark, is_checked, save_json, union
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.sentences import listed
@@ -27,7 +27,7 @@ from pipelines.core.stages import BY_NAME
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.evaluate import check_points
-from pipelines.evaluate.asprs import few_points
+from pipelines.evaluate.asprs import few_points, tolerance_test
 from pipelines.evaluate.coordinates import (
     coordinates_in,
     error_array,
@@ -43,10 +43,12 @@ from pipelines.evaluate.reference import (
     compare_with_reference,
     draw_reference,
 )
+from pipelines.evaluate.surface_heights import surface_accuracy, surface_heights
 from pipelines.geodesy.crs import PointCrs
-from pipelines.geodesy.enu import Origin, lla_from_enu
-from pipelines.report.plots.maps import MapCoordinates, MapPoints, SigmaRaster, write_accuracy_map
-from pipelines.report.plots.plans import NamedPlaces
+from pipelines.geodesy.enu import lla_from_enu
+from pipelines.report.place import map_coordinates
+from pipelines.report.plots.maps import MapPoints, SigmaRaster, write_accuracy_map
+from pipelines.report.plots.plans import MapCoordinates, NamedPlaces
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.m3c2 import require_py4dgeo
 from pipelines.surface.measured_area import area_of
@@ -55,7 +57,7 @@ from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey.area import Area
 from pipelines.survey.headline import headline
 from pipelines.survey.marks import of_wrong_marks, wrong_marks
-from pipelines.survey.options import CloudCrs
+from pipelines.survey.options import CloudCrs, CrsOptions
 from pipelines.survey.photographs import write_render
 from pipelines.survey.report import (
     AccuracySummary,
@@ -67,9 +69,11 @@ from pipelines.survey.report import (
     PhotometricFigures,
     PointResidual,
     SimilaritySigma,
+    SurfaceHeight,
 )
 from pipelines.survey.scene import photographs
-from pipelines.survey.survey import SurveyedPoint
+from pipelines.survey.survey import Survey, SurveyedPoint
+from pipelines.survey.target_crs import TargetCrs, usable_crs
 from pipelines.survey.trained_survey import SolvedSurvey, TrainedSurvey, load_solved
 
 
@@ -85,6 +89,8 @@ def summarise(report: EvaluationReport) -> Summary:
         values |= {f"{way}_{name}": getattr(errors, name) for name in figures}
     if report.distances:
         values["distances"] = [distance.model_dump() for distance in report.distances]
+    if report.tolerances:
+        values["tolerances"] = [each.model_dump() for each in report.tolerances]
     key_figure = f"{report.headline.sentence}; {_test_views(test)}"
     return Summary(key_figure, values, _warnings(report), report.cautions)
 
@@ -123,16 +129,17 @@ def draw_accuracy(
 ) -> None:
     """Write a map of the predicted accuracy, with cameras, control and check points, errors and coordinates.
 
-    The coordinates are in a CRS; None: longitude and latitude.
+    The coordinates are in a CRS; None: in the UTM zone.
     """
     survey = solved.survey
     raster = SigmaRaster(grid.raster(grid.sigma_h_m), grid.raster(grid.sigma_v_m), grid.corner_in_geo, grid.size_m)
+    center = solved.geo_from_model.apply(solved.poses.cam_center_in_model)
     points = MapPoints(
-        cameras=solved.geo_from_model.apply(solved.poses.cam_center_in_model)[:, :2],
+        cameras=center[:, :2],
         control=_named(survey.control_points, report.fit.gcp.points),
         check=_named(survey.check_points, report.checkpoints.triangulated.points),
     )
-    write_accuracy_map(path, raster, points, _coordinates(survey.origin, crs))
+    write_accuracy_map(path, raster, points, _coordinates(survey, crs, center))
 
 
 def _named(points: Sequence[SurveyedPoint], rows: Sequence[PointResidual]) -> NamedPlaces:
@@ -140,22 +147,11 @@ def _named(points: Sequence[SurveyedPoint], rows: Sequence[PointResidual]) -> Na
     return NamedPlaces(place, tuple(point.name for point in points), error_array(rows))
 
 
-def _coordinates(origin: Origin | None, crs: PointCrs | None) -> MapCoordinates | None:
-    """Return the coordinates of places at the height of the origin; None: those of a local frame are its metres."""
-    if origin is None:
-        return None
-
-    served = None if crs is None or crs.is_geocentric else crs
-
-    def coordinates(place: FloatArray) -> FloatArray:
-        lla = lla_from_enu(np.column_stack([place, np.zeros(len(place))]), origin)
-        return lla[:, [1, 0]] if served is None else served.xyz_from_lla(lla)[:, :2]
-
-    if served is None:
-        return MapCoordinates("WGS84", ("longitude", "latitude"), "°", coordinates)
-    names = ("longitude", "latitude") if served.is_geographic else ("easting", "northing")
-    unit = "°" if served.units[0] == "degree" else {"metre": "m"}.get(served.units[0], served.units[0])
-    return MapCoordinates(served.name, names, unit, coordinates)
+def _coordinates(survey: Survey, crs: PointCrs | None, center: FloatArray) -> MapCoordinates:
+    """Return the coordinates on the axes of a map: of a CRS, None: of the UTM zone, as in the report."""
+    if crs is None or crs.is_geocentric or survey.origin is None:
+        return map_coordinates(usable_crs(CrsOptions(), survey.origin, center, survey.vertical))
+    return map_coordinates(TargetCrs(crs, survey.origin, lla_from_enu(center, survey.origin)))
 
 
 @dataclass(frozen=True)
@@ -164,6 +160,7 @@ class Rendered:
 
     photometric: Photometric
     points: CheckPointErrors
+    heights: tuple[SurfaceHeight, ...]
     reference: ComparedReference | None
 
 
@@ -229,11 +226,16 @@ def evaluate(
     log_scale, *_, east, north, up = np.sqrt(np.maximum(np.diag(model.geo_from_model.covariance), 0.0)).tolist()
     area_km2 = None if area is None else area.hectares / 100
     triangulated = check_points.triangulated_check_points(solved, posterior, area_km2)
-    checkpoints = CheckPoints(triangulated=triangulated, surface=None if rendered is None else rendered.points)
+    heights = () if rendered is None else rendered.heights
+    checkpoints = CheckPoints(
+        triangulated=triangulated, surface=None if rendered is None else rendered.points, heights=heights
+    )
+    surface = surface_accuracy(heights, solved.survey.check_points)
     scene = model.accuracy or AccuracySummary(cells=0, reason="the adjustment states no σ")
     reference = None if rendered is None else rendered.reference
+    accuracy = headline(triangulated, scene, model.cautions, surface)
     return EvaluationReport(
-        headline=headline(triangulated, scene, model.cautions),
+        headline=accuracy,
         area_ha=None if area is None else area.hectares,
         area_measured=None if area is None else area.measured,
         photometric=None if rendered is None else rendered.photometric,
@@ -246,6 +248,7 @@ def evaluate(
         coordinates=None if crs is None else coordinates_in(crs, checkpoints, solved.survey),
         reference=None if reference is None else reference.comparison,
         distances=check_points.distance_errors(solved, posterior),
+        tolerances=_tolerances(accuracy, options, area_km2),
         variance_factors=model.variance_factors,
         cautions=union(
             model.cautions,
@@ -255,6 +258,23 @@ def evaluate(
             check_points.dependent_check_points(solved.survey),
             () if reference is None else cautions_of_reference(reference),
         ),
+    )
+
+
+def _tolerances(accuracy: Headline, options: EvaluateOptions, area_km2: float | None) -> tuple[ToleranceTest, ...]:
+    """Return the tests of the required accuracies: of the triangulated points and of the surface."""
+    measured = accuracy if accuracy.kind == "measured" else Headline(kind="unknown")
+    wanted: list[tuple[str, float | None, float | None, int]] = [
+        ("horizontal, of triangulated points", options.tolerance_h, measured.rmse_h_m, measured.check_points),
+        ("vertical, of triangulated points", options.tolerance_v, measured.rmse_v_m, measured.check_points),
+    ]
+    for where, _, errors in () if accuracy.surface is None else accuracy.surface.parts:
+        name = f"vertical, of the surface {where}".rstrip()
+        wanted.append((name, options.tolerance_v, errors.rmse_v_m, errors.check_points))
+    return tuple(
+        tolerance_test(of, tolerance_m, rmse_m, count, area_km2)
+        for of, tolerance_m, rmse_m, count in wanted
+        if tolerance_m is not None
     )
 
 
@@ -281,4 +301,4 @@ def _rendered(
     points = check_points.check_points_on_surface(renderer, progress, area_km2)
     save_render = partial(write_render, renders)
     test = compare_test_views(renderer, options.lpips_weights, save_render, progress, saved=options.renders)
-    return Rendered(Photometric(test=test), points, reference)
+    return Rendered(Photometric(test=test), points, surface_heights(renderer, progress), reference)

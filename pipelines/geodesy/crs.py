@@ -284,6 +284,12 @@ def _inverse(
     return x, y, z
 
 
+def with_authority(text: str) -> str:
+    """Return the text of a CRS; bare numbers, as of `32632` or `32632+5773`, are codes of EPSG."""
+    name = " ".join(text.split())
+    return f"EPSG:{name}" if re.fullmatch(r"\d{4,6}(\+\d{4,6})?", name) else name
+
+
 def parse_crs(
     text: str,
     *,
@@ -302,7 +308,7 @@ def parse_crs(
         InputError: not a CRS, or not one of points on Earth; names the file and line in which it stands, or the
             field or option.
     """
-    name = " ".join(text.split())
+    name = with_authority(text)
     refusal = partial(InputError, path=path, line=line, field=field)
     try:
         crs = _parse(name, refusal)
@@ -318,7 +324,7 @@ def parse_crs(
 def proj_crs(text: str, *, path: Path | str | None = None, field: str | None = None) -> CRS:
     """Return what PROJ makes of the text of a CRS, of points or not; an InputError: none, or it opens files."""
     refusal = partial(InputError, path=path, field=field)
-    name = " ".join(text.split())
+    name = with_authority(text)
     try:
         return _parse(name, refusal)
     except ProjError as error:

@@ -1,5 +1,6 @@
 """Photographs of a survey: adjusted positions with error ellipses, residuals of fixes in time; and its lenses."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,7 +9,7 @@ from pipelines.core.products import is_checked
 from pipelines.core.types import BoolArray, FloatArray, vector3
 from pipelines.geometry.cameras import LENGTHS, Camera, parameter_names, parameters_in
 from pipelines.report.page import Picture, picture_of_png
-from pipelines.report.place import Texts, heads_of, texts_of
+from pipelines.report.place import Texts, heads_of, map_coordinates, texts_of
 from pipelines.report.plots.observations import correlation_matrix, fix_series, residual_field
 from pipelines.report.plots.plans import movement_plan
 from pipelines.report.views import EvaluatedSurvey
@@ -68,6 +69,7 @@ class CamerasFacts:
     by_time: bool
     bias: tuple[FlightBias, ...]  # of the used fixes; empty without fixes
     outliers: tuple[Outlier, ...]
+    largest_fix: tuple[str, float] | None  # largest residual of a used fix along an axis, in its stated σ
     median_sigma_h_m: float | None
     median_sigma_v_m: float | None
     rows: tuple[CameraRow, ...]
@@ -87,6 +89,7 @@ def cameras_facts(evaluated: EvaluatedSurvey) -> CamerasFacts:
         moved[:, :2],
         None if covariance is None else covariance[:, :2, :2],
         is_outlier,
+        map_coordinates(evaluated.crs),
     )
     by_name = {image.name: image.fix for image in solved.survey.images}
     stated = [fix.cov_apart for camera in fixes.camera if (fix := by_name[names[camera]]) is not None]
@@ -114,11 +117,21 @@ def cameras_facts(evaluated: EvaluatedSurvey) -> CamerasFacts:
             )
             if left_out
         ),
+        largest_fix=_largest(fixes, stated_m, names),
         median_sigma_h_m=None if sigma_m is None else float(np.median(np.hypot(sigma_m[:, 0], sigma_m[:, 1]))),
         median_sigma_v_m=None if sigma_m is None else float(np.median(sigma_m[:, 2])),
         rows=_rows(evaluated, moved, is_outlier, sigma_m),
         axes=heads_of(evaluated.crs),
     )
+
+
+def _largest(fixes: FixDifferences, stated_m: FloatArray, names: Sequence[str]) -> tuple[str, float] | None:
+    """Return photograph and size of the largest residual of a used fix along an axis, in its stated σ (F, 3)."""
+    used = np.flatnonzero(~fixes.is_outlier)
+    if not len(used):
+        return None
+    ratio = (np.abs(fixes.difference_in_geo[used]) / np.maximum(stated_m[used], 1e-12)).max(axis=1)
+    return names[fixes.camera[used[ratio.argmax()]]], float(ratio.max())
 
 
 def bias_of(fixes: FixDifferences, stated_m: FloatArray) -> tuple[FlightBias, ...]:

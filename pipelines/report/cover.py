@@ -1,18 +1,32 @@
 """Cover of the report: for whom and by whom, the result from above, and the facts that a client asks for first."""
 
+import contextlib
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
 import numpy as np
 
-from pipelines.core.figures import MISSING, Headline, length_text
+from pipelines.core.errors import GeorefError
+from pipelines.core.figures import MISSING, Headline, SurfaceErrors, length_text
 from pipelines.core.sentences import listed
-from pipelines.core.stages import HILLSHADE, ORTHOPHOTO_PREVIEW
+from pipelines.core.stages import BY_NAME, HILLSHADE, ORTHOPHOTO_PREVIEW
+from pipelines.core.workspace import Workspace
 from pipelines.report.cameras import LensesFacts
 from pipelines.report.options import ReportOptions
-from pipelines.report.page import Picture, count_text, logo_picture, number_text, preview
+from pipelines.report.page import (
+    Picture,
+    count_text,
+    limited,
+    logo_picture,
+    number_text,
+    picture_of_png,
+    preview,
+    read_pixels,
+)
 from pipelines.report.place import OverlapFacts
+from pipelines.report.plots.maps import RasterPlace, raster_map
 from pipelines.report.views import EvaluatedSurvey
 
 _NOTES = {
@@ -36,6 +50,9 @@ class CoverFacts:
     facts: tuple[tuple[str, str], ...]  # name and value
     headline: Headline
     accuracy_note: str
+    surface: tuple[tuple[str, str, SurfaceErrors], ...]  # where, key in the headline, and errors
+    unseen: int  # check points without a surface
+    trained: bool
     without: str  # blunders among the check points, for the figures without them; empty: there are none
 
 
@@ -43,14 +60,14 @@ def cover_facts(
     evaluated: EvaluatedSurvey, overlap: OverlapFacts, lenses: LensesFacts, options: ReportOptions
 ) -> CoverFacts:
     """Return the cover; an InputError: the logo is no PNG or JPEG, or too large."""
-    survey, crs, root = evaluated.solved.survey, evaluated.crs, evaluated.workspace.root
-    report = evaluated.report
+    survey, crs, report = evaluated.solved.survey, evaluated.crs, evaluated.report
     area = MISSING if report.area_ha is None else f"{number_text(report.area_ha, 2)} ha"
     if report.area_measured is not None:
         area += f", {report.area_measured:.0%} of it measured"
+    surface = report.headline.surface
     height_m, gsd_m = flying_height_m(evaluated), ground_sampling_m(evaluated)
     previews = {"Orthophoto": ORTHOPHOTO_PREVIEW, "Surface model": HILLSHADE}
-    shown = {name: preview(root / product, _PREVIEW_PX) for name, product in previews.items()}
+    shown = {name: _raster_picture(evaluated.workspace, name, product) for name, product in previews.items()}
     registered = f"{count_text(lenses.photographs)} of {count_text(len(survey.images))} registered"
     control, check = (count_text(len(points)) for points in (survey.control_points, survey.check_points))
     cameras = [
@@ -77,9 +94,39 @@ def cover_facts(
             ("Heights", crs.crs.vertical.name if crs.origin is None else crs.crs.vertical.described),
         ),
         headline=evaluated.report.headline,
+        surface=() if surface is None else surface.parts,
+        unseen=0 if surface is None else surface.unseen,
+        trained=evaluated.report.test_views is not None,
         accuracy_note=_NOTES[evaluated.report.headline.kind],
         without=listed(evaluated.report.headline.blunders),
     )
+
+
+def _raster_picture(workspace: Workspace, name: str, product: str) -> Picture | None:
+    """Return a raster as a map with coordinates, and of heights with their legend; without its place, as it is."""
+    path = workspace.root / product
+    if not path.is_file():
+        return None
+    manifest = None
+    with contextlib.suppress(GeorefError):  # damaged: the section on processing says so
+        manifest = workspace.manifest(BY_NAME["export-raster"])
+    values = {} if manifest is None else manifest.values
+    drawn = values.get("map")
+    if drawn is None:
+        return preview(path, _PREVIEW_PX)
+    (west, south, _), (east, north, _) = values["bounds"]
+    unit_m = east_m = float(drawn["unit_m"])
+    if drawn["unit"] == "°":
+        east_m *= math.cos(math.radians((south + north) / 2))
+    place = RasterPlace(
+        crs=values["crs"],
+        names=tuple(drawn["names"]),
+        unit=drawn["unit"],
+        bounds=(west, south, east, north),
+        unit_m=(east_m, unit_m),
+    )
+    heights = (*drawn["height_colours"], drawn["height_unit"]) if product == HILLSHADE else None
+    return picture_of_png(raster_map(limited(read_pixels(path), _PREVIEW_PX), place, name, heights))
 
 
 def flying_height_m(evaluated: EvaluatedSurvey) -> float | None:

@@ -105,6 +105,7 @@ def moment(value: datetime | None) -> str:
 FORMS: dict[str, Callable[..., str]] = {
     "accuracy": ACCURACY_H.with_unit,
     "client": without_commands,
+    "file_size": lambda size: f"{size / 1e6:.1f} MB" if size >= 95_000 else f"{size / 1e3:.1f} kB",
     "as_json": partial(json.dumps, allow_nan=False),  # in full, for programs that read the page
     "whole": count_text,
     "decibel": decibel,

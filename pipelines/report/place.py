@@ -11,7 +11,7 @@ from pipelines.geodesy.enu import lla_from_enu
 from pipelines.geodesy.operations import Operation
 from pipelines.geometry.network import Network
 from pipelines.report.page import Picture, picture_of_png
-from pipelines.report.plots.plans import NamedPlaces, match_plan, overlap_plan, site_plan
+from pipelines.report.plots.plans import MapCoordinates, NamedPlaces, match_plan, overlap_plan, site_plan
 from pipelines.report.views import EvaluatedSurvey
 from pipelines.survey.area import overlap_of
 from pipelines.survey.survey import Survey, SurveyedPoint
@@ -24,6 +24,16 @@ def axis_names(crs: TargetCrs) -> Texts:
     """Return the names of the three coordinates, easting or longitude first."""
     first, second = crs.axes
     return first, second, "z" if crs.origin is None else f"height ({crs.crs.vertical.name})"
+
+
+def map_coordinates(crs: TargetCrs) -> MapCoordinates:
+    """Return the coordinates that the axes of a map state, at the height of the origin."""
+    return MapCoordinates(
+        crs.crs.name if crs.origin is not None else "local frame",
+        crs.axes,
+        crs.crs.short_units[0],
+        lambda place: crs.xyz_from_geo(np.column_stack([place, np.zeros(len(place))]))[:, :2],
+    )
 
 
 def heads_of(crs: TargetCrs) -> Texts:
@@ -97,6 +107,7 @@ def place_facts(evaluated: EvaluatedSurvey) -> PlaceFacts:
         named_places(survey.control_points),
         named_places(survey.check_points),
         scene[:: max(1, len(scene) // _MOST_DOTS), :2],
+        map_coordinates(crs),
     )
     return PlaceFacts(
         survey=survey,
@@ -153,16 +164,16 @@ def overlap_facts(evaluated: EvaluatedSurvey) -> OverlapFacts:
     pairs, shared = links_of(evaluated.network)
     strongest = np.argsort(-shared, kind="stable")[:_MOST_LINKS]
     tied, parts = ties_of(len(center), pairs, shared)
-    least = int(tied.argmin())
+    least, coordinates = int(tied.argmin()), map_coordinates(evaluated.crs)
     return OverlapFacts(
         overlap=None
         if raster is None
-        else picture_of_png(overlap_plan(raster.count, raster.corner, raster.cell_m, center)),
+        else picture_of_png(overlap_plan(raster.count, raster.corner, raster.cell_m, center, coordinates)),
         cell_m=None if raster is None else raster.cell_m,
         median=float(np.median(inside)) if len(inside) else None,
         enough_share=float((inside >= ENOUGH_PHOTOGRAPHS).mean()) if len(inside) else None,
         enough=ENOUGH_PHOTOGRAPHS,
-        matches=picture_of_png(match_plan(center, pairs[strongest], shared[strongest])),
+        matches=picture_of_png(match_plan(center, pairs[strongest], shared[strongest], coordinates)),
         links=len(pairs),
         drawn_links=len(strongest),
         tied_points=TIED_POINTS,

@@ -133,10 +133,14 @@ class PointRow:
     coordinates: Texts
     field: str | None  # path of its row in the report of `evaluate`, triangulated; None: it has none
     blunder: bool  # triangulated
+    rejected: bool  # a control point that the solution has left out
     predicted: bool  # the row has predicted σ
     surface_field: str | None  # likewise, on the rendered surface
     rmse_px: float | None  # distance of its marks from the adjusted point; None: it is not measured
     chips: tuple[Chip, ...]
+
+
+_FEW_POINTS = 12  # up to which two chips of each are printed, beyond one
 
 
 @dataclass(frozen=True)
@@ -147,9 +151,14 @@ class PointsFacts:
     heads: Texts
     rows: tuple[PointRow, ...]
     chips: int  # number that is shown
+    each_on_paper: int  # chips of a point that are printed
     marks: int  # number in registered photographs
     side_px: int  # of a chip, in pixels of the photographs
     surface: bool  # points were measured on the rendered surface
+
+    @property
+    def chips_on_paper(self) -> int:
+        return sum(min(len(row.chips), self.each_on_paper) for row in self.rows)
 
 
 def points_facts(
@@ -221,6 +230,7 @@ def _facts(
                 coordinates=coordinates,
                 field=None if at is None else f"{group.field}.{at}",
                 blunder=bool(getattr(row, "blunder", False)),
+                rejected=group.kind == "control" and point.name in evaluated.solved.model.control_outliers,
                 predicted=isinstance(row, PredictedPointError),
                 surface_field=None if surface_at is None else f"checkpoints.surface.points.{surface_at}",
                 rmse_px=float(np.sqrt(squares.mean())) if len(squares) and np.isfinite(squares).all() else None,
@@ -235,6 +245,7 @@ def _facts(
         marks=len(group.rays.point),
         side_px=side_px,
         surface=surface is not None,
+        each_on_paper=2 if len(rows) <= _FEW_POINTS else 1,
     )
 
 

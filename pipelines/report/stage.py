@@ -16,9 +16,10 @@ from pipelines.core.products import Remark, union
 from pipelines.core.stages import REPORT_PAGE
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.report.accuracy import accuracy_facts
-from pipelines.report.cameras import LensesFacts, cameras_facts, lenses_facts
+from pipelines.report.cameras import CamerasFacts, LensesFacts, cameras_facts, lenses_facts
 from pipelines.report.chromium import chromium_path, print_pdf
 from pipelines.report.cover import cover_facts
+from pipelines.report.delivered import delivered_facts, measured_share
 from pipelines.report.options import ReportOptions
 from pipelines.report.page import Page, Section, moment, render_page
 from pipelines.report.place import OverlapFacts, overlap_facts, place_facts
@@ -29,7 +30,7 @@ from pipelines.report.views import EvaluatedSurvey, load_evaluated, training_fac
 from pipelines.survey.trained_model import TrainedModel
 
 _ROOM = __name__.rpartition(".")[0]
-_STEPS = 8
+_STEPS = 9
 
 
 def run(stage: StageRun, options: ReportOptions) -> Summary:
@@ -75,9 +76,11 @@ def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: Stage
         task.advance(note="views")
         record = record_facts(workspace, survey)
         change = change_facts(workspace, record)
+        delivered = delivered_facts(workspace)
+        task.advance(note="delivered files")
         task.advance(note="record")
     what = "3D Gaussian splat" if of_gaussians else "cameras"
-    summary = summary_facts(evaluated, overlap, lenses, record)
+    summary = summary_facts(evaluated, cameras, overlap, lenses, record)
     page = Page(
         title=options.title or f"Survey report: {workspace.root.name}",
         subtitle=f"{what} in a local metric frame, not on Earth, with predicted accuracy"
@@ -87,6 +90,7 @@ def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: Stage
         cover=cover_facts(evaluated, overlap, lenses, options),
         sections=(
             Section("summary", "Summary", "summary.html", summary),
+            Section("delivered", "What was delivered", "delivered.html", delivered),
             Section("accuracy", "Accuracy", "accuracy.html", accuracy),
             Section("check-points", "Check points", "points.html", check),
             Section("control-points", "Control points", "points.html", control),
@@ -99,6 +103,7 @@ def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: Stage
             Section("processing", "Appendix: processing", "record.html", record),
             Section("photographs", "Appendix: photographs", "photographs.html", cameras),
             *training,
+            Section("glossary", "Glossary", "glossary.html", bool(of_gaussians)),
         ),
         document=evaluated.report.model_dump(mode="json"),
     )
@@ -135,9 +140,13 @@ class SummaryFacts:
 
 
 def summary_facts(
-    evaluated: EvaluatedSurvey, overlap: OverlapFacts, lenses: LensesFacts, record: RecordFacts
+    evaluated: EvaluatedSurvey,
+    cameras: CamerasFacts,
+    overlap: OverlapFacts,
+    lenses: LensesFacts,
+    record: RecordFacts,
 ) -> SummaryFacts:
-    """Return the summary of an evaluated survey, of which it needs the facts of three sections."""
+    """Return the summary of an evaluated survey, of which it needs the facts of four sections."""
     survey, report = evaluated.solved.survey, evaluated.report
     cautions = union(evaluated.solved.model.cautions, report.cautions)
     measured = Measured(
@@ -153,6 +162,10 @@ def summary_facts(
         control_outliers=report.fit.gcp.outliers,
         check_points=len(survey.check_points),
         stale=tuple(stage.name for stage in record.stages if stage.state in ("stale", "damaged")),
+        outliers=tuple(outlier.name for outlier in cameras.outliers),
+        rejected=tuple(evaluated.solved.model.control_outliers),
+        largest_fix=cameras.largest_fix,
+        delivered=measured_share(evaluated.workspace),
     )
     return SummaryFacts(
         verdicts=verdicts(report, measured, cautions),

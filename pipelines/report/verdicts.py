@@ -27,6 +27,9 @@ CONTROL_POINTS = (4, 3)
 LEAST_TESTED = 3  # check points, from which `evaluate` tests the predicted σ
 _LEAST_DISTANCES, _DISTANCE_SIGMAS = 3, 3.0
 TEST_PSNR_DB = (22.0, 18.0)
+DELIVERED = (0.9, 0.7)
+_FIX_SIGMAS, _MOST_NAMED = 3.0, 4
+_TOO_LARGE = 0.995  # probability from which the table shows 1.00, which its note calls a σ that is too large
 _COVERAGE_DB = 2.0  # by which covered ground is better, where the lack of coverage is to blame
 
 
@@ -57,6 +60,10 @@ class Measured:
     control_outliers: int
     check_points: int
     stale: tuple[str, ...]  # stages whose product is not current
+    outliers: tuple[str, ...] = ()  # names of the photographs whose fixes were left out
+    rejected: tuple[str, ...] = ()  # names of the control points that were left out
+    largest_fix: tuple[str, float] | None = None  # largest residual of a used fix along an axis, in its stated σ
+    delivered: tuple[float, float] | None = None  # share of the rasters that is measured, and their hectares
 
 
 # What the test of the predicted σ says of the check points' errors, by the code of its caution.
@@ -80,6 +87,7 @@ def verdicts(report: EvaluationReport, measured: Measured, cautions: Sequence[Re
     by_subject: dict[str, _Fields] = {
         "Registered photographs": _registered(measured),
         "Overlap": _overlap(measured),
+        **({} if measured.delivered is None else {"Measured share": _delivered(*measured.delivered)}),
         "Reprojection": _reprojection(measured),
         **({"Known distances": _distances(report.distances)} if is_local else of_place),
         "σ of the measurements": _stated_sigma(report.variance_factors, codes),
@@ -124,6 +132,17 @@ def _overlap(measured: Measured) -> _Fields:
     return level, reading, reason, rule
 
 
+def _delivered(part: float, area_ha: float) -> _Fields:
+    rule = f"good from {share(DELIVERED[0])} of the delivered area, fair from {share(DELIVERED[1])}"
+    level = level_of(part, DELIVERED, more_is_better=True)
+    reason = (
+        "the photographs show almost all that is delivered"
+        if level == "good"
+        else "the rest is interpolated or empty: few views agree there, whatever the overlap; add photographs"
+    )
+    return level, f"{share(part)} of {number_text(area_ha, 2)} ha measured", reason, rule
+
+
 def _reprojection(measured: Measured) -> _Fields:
     rule = f"good up to {REPROJECTION_PX[0]:g} px, fair up to {REPROJECTION_PX[1]:g} px"
     if measured.rmse_px is None:
@@ -144,7 +163,12 @@ def _fixes(measured: Measured) -> _Fields:
         return level, "none", "the control points alone place the survey", rule
     part = measured.fix_outliers / measured.fixes
     level = level_of(part, FIX_OUTLIERS, more_is_better=False)
-    reason = "the section on positions names them" if measured.fix_outliers else "all fixes agree with each other"
+    name, sigmas = measured.largest_fix or ("", 0.0)
+    reason = "all fixes agree with each other within 3 σ"
+    if measured.fix_outliers:
+        reason = f"left out: {_named(measured.outliers)}"
+    elif sigmas > _FIX_SIGMAS:
+        reason = f"none was left out; the largest residual is {sigmas:.1f} of its stated σ ({name})"
     reading = f"{measured.fixes} used or tested, {measured.fix_outliers} outliers"
     return level, reading, reason, rule
 
@@ -161,7 +185,15 @@ def _control(measured: Measured) -> _Fields:
     )
     rule = f"good from {CONTROL_POINTS[0]}, fair from {CONTROL_POINTS[1]} or with none (positions only)"
     reading = f"{count} used, {measured.control_outliers} rejected" if measured.control_outliers else str(count)
+    if measured.rejected:
+        reading += f" ({_named(measured.rejected)})"
     return level, reading, reason, rule
+
+
+def _named(names: Sequence[str]) -> str:
+    """Return names as a list of at most `_MOST_NAMED`, and the number of the others."""
+    shown = listed(names[:_MOST_NAMED])
+    return shown if len(names) <= _MOST_NAMED else f"{shown} and {len(names) - _MOST_NAMED} more"
 
 
 def _distances(distances: Sequence[DistanceError]) -> _Fields:
@@ -203,6 +235,10 @@ def _stated_sigma(factors: tuple[VarianceFactor, ...], codes: Collection[str]) -
         if code in codes:
             reason = f"the photographs agree with these σ, yet check points err {words} than predicted"
             return "fair", passed, reason, rule
+    large = [factor for factor in tested if factor.probability >= _TOO_LARGE and factor.sigma_source == "stated"]
+    if large:
+        names = ", ".join(f"{factor.group} (probability {number_text(factor.probability)})" for factor in large)
+        return "fair", passed, f"these stated σ are larger than the residuals: {names}", rule
     return "good", passed, "the residuals give no reason to doubt these σ", rule
 
 

@@ -125,13 +125,15 @@ class TestView:
 class ViewsFacts:
     """Test views: those with pictures, the worst first; name, and path of the figures, of all.
 
-    `renders` is the number of renders that `evaluate` has saved, `gain` that of the difference.
+    `renders` is the number of renders that `evaluate` has saved, `gain` that of the difference; `most_on_paper`
+    views are printed with pictures.
     """
 
     shown: tuple[TestView, ...]
     rows: tuple[tuple[str, str], ...]
     gain: int
     renders: int
+    most_on_paper: int = 2
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from pipelines.core.errors import GeorefError
-from pipelines.core.figures import Headline
+from pipelines.core.figures import Headline, SurfaceAccuracy
 from pipelines.core.products import Remark, is_checked
 from pipelines.core.stages import REPORT
 from pipelines.core.types import Vector3
@@ -27,11 +27,19 @@ from pipelines.survey.report import (
 NOTHING_CHECKS = "nothing checks the σ of the positions"
 
 
-def headline(triangulated: CheckPointErrors, scene: AccuracySummary, cautions: tuple[Remark, ...]) -> Headline:
-    """Return the accuracy as the triangulated check points outside vegetation measure it, else as σ predict it."""
+def headline(
+    triangulated: CheckPointErrors,
+    scene: AccuracySummary,
+    cautions: tuple[Remark, ...],
+    surface: SurfaceAccuracy | None = None,
+) -> Headline:
+    """Return the accuracy as the triangulated check points outside vegetation measure it, else as σ predict it.
+
+    `surface` is what the check points say of the surface.
+    """
     total = triangulated.with_survey
     if total is None:
-        return predicted(scene, cautions)
+        return predicted(scene, cautions).model_copy(update={"surface": surface})
     count = triangulated.asprs.points
     others = triangulated.with_survey_without_refuted
     return Headline(
@@ -42,6 +50,7 @@ def headline(triangulated: CheckPointErrors, scene: AccuracySummary, cautions: t
         blunders=() if others is None else triangulated.refuted,
         rmse_h_without_m=None if others is None else others.rmse_h_m,
         rmse_v_without_m=None if others is None else others.rmse_v_m,
+        surface=surface,
     )
 
 

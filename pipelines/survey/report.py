@@ -10,7 +10,7 @@ from typing import Any, Literal
 from pydantic import SerializerFunctionWrapHandler, model_serializer
 
 from pipelines.core.errors import InputError
-from pipelines.core.figures import Headline
+from pipelines.core.figures import Headline, ToleranceTest
 from pipelines.core.products import ImageName, Product, Remark, load_json
 from pipelines.core.types import Vector3
 from pipelines.robust.statistics import ResidualStats
@@ -210,14 +210,27 @@ class CheckPointErrors(StatedErrors):
     asprs: AsprsStatement
 
 
-class CheckPoints(Product):
-    """Check points, `triangulated`, and on the rendered `surface` behind their marks.
+class SurfaceHeight(Product):
+    """Height of the surface straight below or above a check point, minus the surveyed one; None: not measured.
 
-    Without training, `surface` is None.
+    `place`: on the `ground`, `raised` (roofs), at an `edge` (walls) or `covered` by another surface, both without a
+    difference, or None where the ground is not known.
+    """
+
+    name: str
+    du_m: float | None
+    place: Literal["ground", "raised", "edge", "covered"] | None
+
+
+class CheckPoints(Product):
+    """Check points, `triangulated`, and on the rendered `surface` behind their marks; its `heights` from above.
+
+    Without training, `surface` is None. Points under vegetation have no height of the surface.
     """
 
     triangulated: CheckPointErrors
     surface: CheckPointErrors | None
+    heights: tuple[SurfaceHeight, ...] = ()
 
     @property
     def by_way(self) -> dict[Literal["triangulated", "surface"], CheckPointErrors]:
@@ -346,6 +359,7 @@ class EvaluationReport(_OptionalKeys):
     coordinates: Coordinates | None = None
     reference: ReferenceComparison | None = None
     distances: tuple[DistanceError, ...] = ()
+    tolerances: tuple[ToleranceTest, ...] = ()
     variance_factors: tuple[VarianceFactor, ...] = ()
     cautions: tuple[Remark, ...] = ()
 

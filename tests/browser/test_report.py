@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -196,6 +197,39 @@ def test_no_table_is_cut_on_paper(browser: Browser, report: Path) -> None:
     # Paper has no folds, and what is folded on the screen is left out.
     folded = "() => [...document.querySelectorAll('.folded, summary')].filter((node) => node.offsetHeight).length"
     assert page.page.evaluate(folded) == 0
+    context.close()
+
+
+def test_paper_shows_as_many_pictures_as_it_says(browser: Browser, report: Path) -> None:
+    """The printed text is counted against what is printed, and the screen's against what is on the screen."""
+    context = browser.new_context(viewport={"width": 689, "height": 900}, offline=True)
+    page = Opened(context.new_page())
+    page.show(report)
+    visible = "(css) => [...document.querySelectorAll(css)].filter((node) => node.offsetParent).length"
+    shown = {}
+    for media in ("screen", "print"):
+        page.page.emulate_media(media=media)
+        text = page.page.evaluate("() => document.body.innerText")
+        said = [int(number) for number in re.findall(r"(\d+) of \d+ marks are shown", text)]
+        chips = page.page.evaluate(visible, "figure.chip")
+        assert chips == sum(said) > 0
+        views = re.findall(r"Views with pictures: (\d+) of (\d+)", text)
+        assert [int(number) for number, _ in views] == [page.page.evaluate(visible, ".view")]
+        shown[media] = chips
+        for name in (
+            "Place and date",
+            "Name and signature",
+            "What was delivered",
+            "SHA-256",
+            "Triangulated points",
+        ):
+            assert name in text
+    assert shown["print"] <= shown["screen"]
+    links = page.page.evaluate(
+        "() => [...document.querySelectorAll('a.term')].map((a) => decodeURIComponent(a.hash.slice(1)))"
+    )
+    terms = page.page.evaluate("() => [...document.querySelectorAll('.glossary > div')].map((node) => node.id)")
+    assert set(links) <= set(terms) and len(set(links)) >= 10
     context.close()
 
 

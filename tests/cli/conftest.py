@@ -9,8 +9,16 @@ import pytest
 
 from georef_cli import boundary
 from georef_cli.main import cli
+from pipelines.jobs import pace
 from tests.cli_runs import Georef, Result
 from tests.killed import make_survey
+
+
+@pytest.fixture(autouse=True)
+def own_pace(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs of tests teach this machine nothing."""
+    folder = tmp_path_factory.mktemp("cache")
+    monkeypatch.setattr(pace, "_file", lambda: folder / "pace.json")
 
 
 @pytest.fixture

@@ -26,7 +26,7 @@ def actions(georef: Georef, *words: object) -> dict[str, str]:
 
 
 def test_before_the_first_run(georef: Georef, tmp_path: Path) -> None:
-    """Photographs of 64×48 px are trained as they are; no time is said for a stage that is quick."""
+    """Photographs of 64×48 px are trained as they are; every stage has a time, and their sum is the total."""
     write_flight(tmp_path / "photos", 5, lat=46.0, lon=7.7)
     words = ("run", tmp_path / "ws", "--images", tmp_path / "photos", "--preset", "smoke", "--dry-run")
     document = georef(*words, "--json").document
@@ -37,10 +37,14 @@ def test_before_the_first_run(georef: Georef, tmp_path: Path) -> None:
     assert (training["iterations"], training["max_gaussians"], training["training_px"]) == (200, 20_000, [64, 48])
     assert training["peak_bytes"] > 100e6
     seconds = {row["stage"]: row["seconds"] for row in document["stages"]}
-    assert seconds["sfm"] > 0 and seconds["train"] > 0 and seconds["evaluate"] is None
+    assert all(value > 0 for value in seconds.values())
+    assert document["total"]["seconds"] == pytest.approx(sum(seconds.values()))
+    assert document["total"]["peak_bytes"] >= training["peak_bytes"] and document["total"]["disk_bytes"] > 1e6
+    origins = {row["flag"]: row["origin"] for row in document["stages"][5]["options"]}
+    assert origins["--preset"] == "command line" and origins["--iterations"] == "preset"
     text = georef(*words).out
     assert "smoke: 200 iterations, 40 a photograph, at most 20000 Gaussians" in text
-    assert "5 of 64×48 px" in text and "Nothing was run" in text
+    assert "5 of 64×48 px" in text and "Nothing was run" in text and "In all: about" in text
 
 
 def test_a_run_begins_with_the_estimate(georef: Georef, tmp_path: Path) -> None:
@@ -169,6 +173,7 @@ class TestOfAWorkspace:
             ("--iterations", "remembered"),
             ("--seed", "georef.toml"),
             ("--max-gaussians", "command line"),
+            ("--max-image-size", "preset"),
         }
         assert row["reason"] == "option max_gaussians, seed changed"
 

@@ -13,6 +13,7 @@ import click
 import pytest
 
 from georef_cli.main import COMMANDS, cli
+from tests.cli_runs import Georef
 
 REPOSITORY = Path(__file__).parents[2]
 DOCUMENTS = [*REPOSITORY.glob("README.md"), *sorted(REPOSITORY.glob("docs/*.md"))]
@@ -74,3 +75,21 @@ def test_commands_document_is_current() -> None:
     )  # fmt: skip
     written = (REPOSITORY / "docs/commands.md").read_text(encoding="utf-8")
     assert made.stdout == written, "run `python docs/make_commands.py` and commit docs/commands.md"
+
+
+def test_the_help_of_run_begins_with_what_most_runs_need(real_georef: Georef) -> None:
+    """Every option stands in one section, and ten stand in the first."""
+    text = real_georef("run", "--help").out
+    head, _, rest = text.partition("Most runs need:")
+    first, _, others = rest.partition("Which stages:")
+    shown = re.findall(r"^  (--[a-z-]+)", first, re.MULTILINE)
+    assert "--images" not in head.split("Examples:")[0] and len(shown) == 10
+    assert not set(shown) & set(re.findall(r"^  (--[a-z-]+)", others, re.MULTILINE))
+    further = text.partition("Further options:")[2].partition("Options of all commands:")[0]
+    assert set(re.findall(r"--[a-z-]+", further)) <= {"--help"}  # a new option gets a section
+
+
+@pytest.mark.parametrize(("typed", "meant"), [("statsu", "status"), ("export-rater", "export-raster")])
+def test_a_mistyped_command_gets_a_suggestion(real_georef: Georef, typed: str, meant: str) -> None:
+    ended = real_georef(typed, "flight")
+    assert ended.code == 2 and f"Did you mean {meant}" in ended.err

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.evaluate.asprs import assess, classes_cm, error_stats, few_points
+from pipelines.evaluate.asprs import assess, classes_cm, error_stats, few_points, tolerance_test
 from tests.refusals import numbers
 
 EXACT = np.zeros((3, 3))
@@ -132,3 +132,21 @@ def test_nothing_measured_is_nothing_stated() -> None:
     assert assessment.stats.rmse_h_m is None
     assert assessment.with_survey is None
     assert assessment.asprs.statement is None
+
+
+@pytest.mark.parametrize(
+    ("rmse_m", "points", "area_km2", "verdict"),
+    [
+        (0.049, 30, None, "pass"),
+        (0.050, 30, 2.0, "pass"),
+        (0.0501, 30, None, "fail"),
+        (0.049, 29, None, "met"),
+        (0.049, 30, 1500.0, "met"),  # so large a project needs 40
+        (0.2, 3, None, "fail"),
+        (None, 0, None, "untested"),
+    ],
+)
+def test_a_required_accuracy_needs_the_rmse_and_the_number(
+    rmse_m: float | None, points: int, area_km2: float | None, verdict: str
+) -> None:
+    assert tolerance_test("vertical", 0.05, rmse_m, points, area_km2).verdict == verdict

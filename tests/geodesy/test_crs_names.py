@@ -62,3 +62,10 @@ def test_nonsense_has_no_proposals() -> None:
     with refused("crs-unknown", InputError) as error:
         parse_crs("qqqq")
     assert "Did you mean" not in error.value.message
+
+
+@pytest.mark.parametrize(
+    ("bare", "named"), [("32632", "EPSG:32632"), ("25832+5783", "EPSG:25832+5783"), ("2056", "EPSG:2056")]
+)
+def test_bare_numbers_are_codes_of_epsg(bare: str, named: str) -> None:
+    assert parse_crs(bare).wkt == parse_crs(named).wkt

@@ -250,6 +250,53 @@ def test_verdict_on_the_sigma_knows_what_the_check_points_say(code: str | None, 
     assert words in found["σ of the measurements"].reason
 
 
+@pytest.mark.parametrize(
+    ("subject", "changes", "level", "words"),
+    [
+        ("Recorded positions", {"largest_fix": ("a.jpg", 2.9)}, "good", "all fixes agree"),
+        ("Recorded positions", {"largest_fix": ("a.jpg", 4.1)}, "good", "4.1 of its stated σ (a.jpg)"),
+        ("Recorded positions", {"fix_outliers": 1, "outliers": ("b.jpg",)}, "good", "left out: b.jpg"),
+        ("Control points", {"control_outliers": 1, "rejected": ("G7",)}, "good", "1 rejected (G7)"),
+        ("Measured share", {"delivered": (0.3, 0.61)}, "poor", "30 % of 0.61 ha measured"),
+        ("Measured share", {"delivered": (0.95, 0.61)}, "good", "95 %"),
+    ],
+)
+def test_a_verdict_names_what_it_counts(subject: str, changes: dict[str, object], level: str, words: str) -> None:
+    found = {verdict.subject: verdict for verdict in verdicts(report_with(), replace(MEASURED, **changes), ())}
+    assert found[subject].level == level
+    assert words in f"{found[subject].reading}: {found[subject].reason}"
+    assert "all fixes agree" not in found["Recorded positions"].reason or "σ (" not in words
+
+
+@pytest.mark.parametrize(("source", "level"), [("stated", "fair"), ("default", "good")])
+def test_a_sigma_that_the_table_calls_too_large_is_not_good(source: str, level: str) -> None:
+    wide = VarianceFactor.model_validate({
+        "group": "marks", "count": 90, "used": 90, "redundancy": 160.0, "estimated": 0.3, "probability": 0.999,
+        "applied": 1.0, "sigma_source": source,
+    })  # fmt: skip
+    report = report_with().model_copy(update={"variance_factors": (wide,)})
+    found = {verdict.subject: verdict for verdict in verdicts(report, MEASURED, ())}["σ of the measurements"]
+    assert found.level == level and ("marks (probability 1.00)" in found.reason) == (level == "fair")
+
+
+def test_the_largest_residual_of_a_fix_is_that_of_its_axis(reported: Reported) -> None:
+    facts, evaluated = cameras_facts(reported.survey), reported.survey
+    fixes = fix_differences(evaluated.solved)
+    stated = {
+        image.name: np.sqrt(np.diag(np.array(image.fix.cov_apart)))
+        for image in evaluated.solved.survey.images
+        if image.fix is not None
+    }
+    names = evaluated.solved.sparse.image_name
+    ratios = {
+        names[camera]: float((np.abs(row) / stated[names[camera]]).max())
+        for camera, row, out in zip(fixes.camera, fixes.difference_in_geo, fixes.is_outlier, strict=True)
+        if not out
+    }
+    name = max(ratios, key=lambda each: ratios[each])
+    assert facts.largest_fix == (name, pytest.approx(ratios[name]))
+
+
 def test_verdicts_are_given_on_what_there_is() -> None:
     subjects = {verdict.subject for verdict in verdicts(report_with(), MEASURED, ())}
     assert not {"Cautions", "State of the products"} & subjects

@@ -5,15 +5,14 @@ They show the predicted accuracy over a scene, and the places where LiDAR and ph
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from pipelines.core.types import FloatArray
+from pipelines.core.types import ByteArray, FloatArray
 from pipelines.report.plots import plans
 from pipelines.report.plots import style as look
 
@@ -23,35 +22,7 @@ if TYPE_CHECKING:
 
 _LONGEST_ARROW = 0.14  # of the longer side of the map
 _OUTLIER = 4.0  # times the median: such an arrow may leave the map
-_METRES_PER_DEGREE = 111_320.0
 _NORTH_LENGTH, _NORTH_LEFT, _NORTH_GAP = 0.28, 0.45, 0.04  # inches: the arrow, its distance from the map's corner
-
-
-@dataclass(frozen=True)
-class MapCoordinates:
-    """Coordinates beside the metres of a map: their names, and those of places (N, 2) east and north."""
-
-    crs: str
-    names: tuple[str, str]
-    unit: str
-    of: Callable[[FloatArray], FloatArray]
-
-
-def write_ticks(axes: Axes, coordinates: MapCoordinates) -> None:
-    """Write a coordinate below each tick, as it is on the lower or left edge of the map."""
-    from matplotlib.ticker import FuncFormatter
-
-    (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
-    # As many decimals as state a coordinate to a hundredth of the map's side, or better.
-    step = min(east - west, north - south) / 100 / (_METRES_PER_DEGREE if coordinates.unit == "°" else 1.0)
-    decimals = max(0, math.ceil(-math.log10(step)))
-
-    def text(value: float, axis: int) -> str:
-        place = np.array([[value, south]] if axis == 0 else [[west, value]])
-        return f"{value:.10g}\n{coordinates.of(place)[0, axis]:.{decimals}f}"
-
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: text(value, 0)))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: text(value, 1)))
 
 
 def exaggeration(lengths_m: FloatArray, side_m: float) -> float | None:
@@ -65,6 +36,19 @@ def exaggeration(lengths_m: FloatArray, side_m: float) -> float | None:
     if longest <= 0:
         return None
     return plans.nice_number(_LONGEST_ARROW * side_m / longest)
+
+
+def draw_scale_bar(axes: Axes) -> None:
+    """Draw a bar of a round length inside the lower right corner of a map, white with a dark rim on any colour."""
+    from matplotlib.patheffects import withStroke
+
+    (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
+    length = plans.nice_number(_SCALE_BAR * (east - west))
+    left, foot = east - 0.04 * (east - west) - length, south + 0.04 * (north - south)
+    rim = [withStroke(linewidth=2, foreground=look.DARK)]
+    axes.plot([left, left + length], [foot, foot], color="white", linewidth=2, path_effects=rim, zorder=9)
+    style: dict[str, Any] = {"fontsize": look.TICK_POINTS, "color": "white", "ha": "left", "va": "bottom"}
+    axes.text(left, foot + 0.015 * (north - south), f"{length:g} m", path_effects=rim, zorder=9, **style)
 
 
 def draw_north(figure: Figure, axes: Axes) -> None:
@@ -92,7 +76,9 @@ _LEGEND_HEIGHT, _HEADING_DEPTH = 0.2, 0.2  # above the lower edge, below the upp
 
 _NARROWEST = 0.4  # shorter side of a map over its longer one
 _MARGIN = 0.04  # of the longer side, around everything that is shown
-_MOST_TICKS = 8  # on the longer side
+_MOST_TICKS = 5  # on the longer side
+_TINT = 0.55  # strength of the colours of heights, as in the hillshade
+_SCALE_BAR = 0.25  # of the width, that the scale bar takes at most
 
 _CAMERAS = {"marker": "X", "linewidths": 0.4, "color": "black", "edgecolors": "white"}
 # Of the sign of a camera in square points: many cameras must not hide the map.
@@ -122,12 +108,12 @@ class MapPoints:
 
 
 def write_accuracy_map(
-    path: Path, raster: SigmaRaster, points: MapPoints, coordinates: MapCoordinates | None = None
+    path: Path, raster: SigmaRaster, points: MapPoints, coordinates: plans.MapCoordinates | None = None
 ) -> None:
     """Draw horizontal and vertical σ side by side, north up, with cameras, control and check points.
 
     Errors of the points are arrows: horizontal ones on the left, vertical ones, up and down, on the right.
-    Coordinates are written below the metres of the axes.
+    The axes have coordinates of a CRS; None: metres of a local frame.
     """
     rows, columns = raster.sigma_h_m.shape
     corners = np.stack([raster.corner_m, raster.corner_m + raster.cell_m * np.array([columns, rows])])
@@ -138,9 +124,6 @@ def write_accuracy_map(
     size = (2 * (_LEFT + width + _RIGHT), _BELOW + height + _ABOVE)
     figure = look.new_figure(size, None)
     figure.suptitle("Predicted accuracy, 1 σ", fontsize=look.HEADING_POINTS, y=1 - _HEADING_DEPTH / size[1])
-    below = ["", ""]
-    if coordinates is not None:
-        below = [f"\n{name} in {coordinates.unit} ({coordinates.crs})" for name in coordinates.names]
     maps = (("σ H", "horizontal", raster.sigma_h_m, (0, 1)), ("σ V", "vertical", raster.sigma_v_m, (2,)))
     for number, (symbol, direction, sigma_m, errors_along) in enumerate(maps):
         left = _LEFT + number * size[0] / 2
@@ -158,16 +141,16 @@ def write_accuracy_map(
         look.label(
             axes,
             f"{symbol}, {direction}{arrows}",
-            x=f"east of the survey's origin in m{below[0]}",
-            y=f"north of the survey's origin in m{below[1]}",
         )
-        if coordinates is not None:
-            write_ticks(axes, coordinates)
+        plans.write_axes(axes, coordinates, (_ticks_on(width), _ticks_on(height)))
         draw_north(figure, axes)
-        axes.locator_params("x", nbins=max(round(_MOST_TICKS * width / _MAP), 2))
-        axes.locator_params("y", nbins=max(round(_MOST_TICKS * height / _MAP), 2))
+        draw_scale_bar(axes)
     look.add_key(figure, 3, loc="center", bbox_to_anchor=(0.5, _LEGEND_HEIGHT / figure.get_figheight()))
     look.write_png(figure, path)
+
+
+def _ticks_on(side: float) -> int:
+    return max(round(_MOST_TICKS * side / _MAP), 2)
 
 
 def _share(
@@ -227,6 +210,61 @@ def _draw_errors(axes: Axes, points: MapPoints, along: tuple[int, ...], side_m: 
         if known.any():
             look.add_arrows(axes, group.place_m[known], (factor or 1.0) * plan_m[known], color=colour, **style)
     return factor
+
+
+_PICTURE = 3.3  # inches: longer side of a raster on the cover
+_PICTURE_DOTS = 220
+
+
+@dataclass(frozen=True)
+class RasterPlace:
+    """Place of a picture: bounds west, south, east, north in a CRS, and metres of its unit along both axes."""
+
+    crs: str
+    names: tuple[str, str]
+    unit: str
+    bounds: tuple[float, float, float, float]
+    unit_m: tuple[float, float]
+
+
+def raster_map(
+    rgba: ByteArray, place: RasterPlace, title: str, heights: tuple[float, float, str] | None = None
+) -> bytes:
+    """Return the picture (H, W, 4) of a raster with coordinates, north arrow and scale bar, as PNG.
+
+    `heights` are those at the ends of the colours (turbo), with their unit: the legend.
+    """
+    from matplotlib import colormaps
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import ListedColormap, Normalize
+
+    west, south, east, north = place.bounds
+    sides_m = np.array([(east - west) * place.unit_m[0], (north - south) * place.unit_m[1]])
+    width, height = (_PICTURE * sides_m / sides_m.max()).tolist()
+    left, right, below, above = 1.0, 1.0 if heights else 0.2, 0.6, 0.45
+    size = (left + width + right, below + height + above)
+    figure = look.new_figure(size, None, dots_per_inch=_PICTURE_DOTS)
+    axes = figure.add_axes((left / size[0], below / size[1], width / size[0], height / size[1]))
+    axes.imshow(rgba, extent=(0.0, sides_m[0], 0.0, sides_m[1]), interpolation="antialiased", aspect="auto")
+    look.label(axes, title)
+    unit_m = np.array(place.unit_m)
+    coordinates = plans.MapCoordinates(
+        place.crs, place.names, place.unit, lambda metres: np.array([west, south]) + metres / unit_m
+    )
+    plans.write_axes(axes, coordinates, (max(round(3 * width / _PICTURE), 2), max(round(5 * height / _PICTURE), 2)))
+    draw_scale_bar(axes)
+    draw_north(figure, axes)
+    if heights is not None:
+        low, high, unit = heights
+        pale = ListedColormap(1 - _TINT + _TINT * colormaps["turbo"](np.linspace(0, 1, 256))[:, :3])
+        bar = figure.add_axes(_share_of(size, (left + width + _BAR_GAP, below, _BAR_WIDTH, height)))
+        scale = ScalarMappable(Normalize(low, high), pale)
+        look.add_scale(figure, scale, f"height in {unit}", cax=bar, extend="both")
+    return look.png_of(figure)
+
+
+def _share_of(size: tuple[float, float], box: tuple[float, float, float, float]) -> tuple[float, ...]:
+    return box[0] / size[0], box[1] / size[1], box[2] / size[0], box[3] / size[1]
 
 
 _COLOUR = {"removed": look.ORANGE, "added": look.BLUE}

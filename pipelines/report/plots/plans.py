@@ -5,10 +5,10 @@ East is to the right and north up, with north arrow, scale bar and names that do
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from math import floor, log10
+from math import ceil, floor, log10
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 LONGER_INCHES = 4.6
-_LEFT, _RIGHT, _BELOW, _ABOVE = 0.85, 0.25, 0.6, 0.4  # around the map, in inches
+_LEFT, _RIGHT, _BELOW, _ABOVE = 0.95, 0.25, 0.6, 0.4  # around the map, in inches
 _LEGEND_ROW = 0.22
 _NARROWEST = 0.45  # shorter side of a map over its longer one
 _MARGIN = 0.06  # of the longer side, around everything that is shown
@@ -31,6 +31,40 @@ _SIGN_DOTS = 4.0  # half the width of a sign
 CHECK_SIGN = {"marker": "o", "s": 24, "linewidths": 0.8, "color": "white", "edgecolors": "black"}
 CONTROL_SIGN = {"marker": "^", "s": 34, "linewidths": 0.8, "color": look.ORANGE, "edgecolors": "black"}
 _BOX = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85}
+
+
+@dataclass(frozen=True)
+class MapCoordinates:
+    """Coordinates of a CRS along the axes of a map: their names, and those of places (N, 2) east and north."""
+
+    crs: str
+    names: tuple[str, str]
+    unit: str
+    of: Callable[[FloatArray], FloatArray]
+
+
+def write_axes(axes: Axes, coordinates: MapCoordinates | None, most: tuple[int, int]) -> None:
+    """Write round coordinates along the lower and the left edge of a map; None: metres of a local frame.
+
+    Where a grid is turned against the map, the ticks are those of the edge.
+    """
+    from matplotlib.ticker import MaxNLocator
+
+    (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
+    if coordinates is None:
+        coordinates = MapCoordinates("local frame", ("x", "y"), "m", lambda place: place)
+    corner = coordinates.of(np.array([[west, south], [east, south], [west, north]]))
+    edges = ((corner[:2, 0], (west, east)), (corner[[0, 2], 1], (south, north)))
+    for index, (axis, (ends, side)) in enumerate(zip((axes.xaxis, axes.yaxis), edges, strict=True)):
+        low, high = sorted(ends.tolist())
+        ticks = MaxNLocator(nbins=most[index], steps=[1, 2, 5, 10]).tick_values(low, high)
+        ticks = ticks[(ticks >= low) & (ticks <= high)]
+        place = np.interp(ticks, [low, high], side if ends[0] <= ends[1] else side[::-1])
+        step = float(np.diff(ticks).min()) if len(ticks) > 1 else high - low or 1.0
+        decimals = max(0, ceil(-log10(step) - 1e-9))
+        axis.set_ticks(place, labels=[f"{value:.{decimals}f}" for value in ticks])
+        text = f"{coordinates.names[index]} in {coordinates.unit} ({coordinates.crs})"
+        axis.set_label_text(text, fontsize=look.LABEL_POINTS)
 
 
 @dataclass(frozen=True)
@@ -63,7 +97,12 @@ def frame_around(
 
 
 def new_plan(
-    frame: PlanFrame, title: str, *, right_inches: float = 0.0, legend_rows: int = 0
+    frame: PlanFrame,
+    title: str,
+    coordinates: MapCoordinates | None = None,
+    *,
+    right_inches: float = 0.0,
+    legend_rows: int = 0,
 ) -> tuple[Figure, Axes]:
     """Return a figure with the axes of a plan, room for a colour bar beside it, and rows of the legend below."""
     width, height = (LONGER_INCHES * (frame.high - frame.low) / frame.longer_m).tolist()
@@ -71,12 +110,13 @@ def new_plan(
     size = (_LEFT + width + _RIGHT + right_inches, below + height + _ABOVE)
     figure = look.new_figure(size, None)
     axes = figure.add_axes((_LEFT / size[0], below / size[1], width / size[0], height / size[1]))
-    look.label(axes, title, x="east of the survey's origin in m", y="north of the survey's origin in m")
+    look.label(axes, title)
     axes.set_xlim(frame.low[0], frame.high[0])
     axes.set_ylim(frame.low[1], frame.high[1])
     axes.set_aspect("equal")
-    axes.ticklabel_format(useOffset=False, style="plain")
-    axes.locator_params("x", nbins=max(round(8 * width / LONGER_INCHES), 3))
+    write_axes(
+        axes, coordinates, (max(round(5 * width / LONGER_INCHES), 2), max(round(7 * height / LONGER_INCHES), 2))
+    )
     return figure, axes
 
 
@@ -195,12 +235,17 @@ class DrawnMovement:
     ellipse_factor: float | None
 
 
-def site_plan(
-    training_m: FloatArray, test_m: FloatArray, control: NamedPlaces, check: NamedPlaces, scene_m: FloatArray
+def site_plan(  # noqa: PLR0917
+    training_m: FloatArray,
+    test_m: FloatArray,
+    control: NamedPlaces,
+    check: NamedPlaces,
+    scene_m: FloatArray,
+    coordinates: MapCoordinates | None = None,
 ) -> bytes:
     """Return the plan of a survey with cameras (n, 2) and points as PNG; the scene (N, 2) is its ground."""
     frame = frame_around(training_m, test_m, control.place_m, check.place_m)
-    figure, axes = new_plan(frame, "Photographs and surveyed points", legend_rows=1)
+    figure, axes = new_plan(frame, "Photographs and surveyed points", coordinates, legend_rows=1)
     axes.scatter(scene_m[:, 0], scene_m[:, 1], s=1.5, color=look.GREY, alpha=0.6, linewidths=0, rasterized=True)
     size = float(np.clip(2600 / max(len(training_m), 1), 7, 24))
     trained: dict[str, Any] = {"marker": "x", "s": size, "color": look.BLUE, "linewidths": 0.9}
@@ -222,7 +267,11 @@ def site_plan(
 
 
 def movement_plan(
-    center_m: FloatArray, moved_m: FloatArray, covariance: FloatArray | None, is_outlier: BoolArray
+    center_m: FloatArray,
+    moved_m: FloatArray,
+    covariance: FloatArray | None,
+    is_outlier: BoolArray,
+    coordinates: MapCoordinates | None = None,
 ) -> DrawnMovement:
     """Return the plan of the cameras with arrows from measured to adjusted positions, and their error ellipses.
 
@@ -232,7 +281,7 @@ def movement_plan(
     from matplotlib.collections import EllipseCollection
 
     frame = frame_around(center_m)
-    figure, axes = new_plan(frame, "Adjusted positions of the photographs", legend_rows=2)
+    figure, axes = new_plan(frame, "Adjusted positions of the photographs", coordinates, legend_rows=2)
     axes.scatter(center_m[:, 0], center_m[:, 1], s=5, color=look.DARK, zorder=3, label="adjusted position")
     known = np.isfinite(moved_m).all(axis=1)
     arrow_factor = ellipse_factor = None
@@ -275,7 +324,13 @@ def movement_plan(
     return DrawnMovement(look.png_of(figure), arrow_factor, ellipse_factor)
 
 
-def overlap_plan(count: IntArray, corner_m: FloatArray, cell_m: float, camera_m: FloatArray) -> bytes:
+def overlap_plan(
+    count: IntArray,
+    corner_m: FloatArray,
+    cell_m: float,
+    camera_m: FloatArray,
+    coordinates: MapCoordinates | None = None,
+) -> bytes:
     """Return the map of the number of photographs that see each cell of the ground, as PNG.
 
     Counts (R, C) are by row from the south and column from the west; −1: no scene. Corner (2,) and cameras (n, 2)
@@ -286,7 +341,7 @@ def overlap_plan(count: IntArray, corner_m: FloatArray, cell_m: float, camera_m:
 
     rows, columns = count.shape
     far = corner_m + cell_m * np.array([columns, rows])
-    figure, axes = new_plan(frame_around(np.stack([corner_m, far])), "Overlap", right_inches=_BAR_ROOM)
+    figure, axes = new_plan(frame_around(np.stack([corner_m, far])), "Overlap", coordinates, right_inches=_BAR_ROOM)
     axes.set_facecolor(look.EMPTY_COLOUR)
     edges = [0, *_OVERLAP_STEPS, max(_OVERLAP_STEPS[-1] + 1, int(count.max()) + 1)]
     image = axes.imshow(
@@ -307,7 +362,9 @@ def overlap_plan(count: IntArray, corner_m: FloatArray, cell_m: float, camera_m:
     return look.png_of(figure)
 
 
-def match_plan(camera_m: FloatArray, pairs: IntArray, shared: IntArray) -> bytes:
+def match_plan(
+    camera_m: FloatArray, pairs: IntArray, shared: IntArray, coordinates: MapCoordinates | None = None
+) -> bytes:
     """Return the graph of the photographs that share points, as PNG: strong links last, dark and thick.
 
     Pairs (P, 2) index the cameras (n, 2); `shared` (P,) is the number of points that both see, at least 1.
@@ -316,7 +373,9 @@ def match_plan(camera_m: FloatArray, pairs: IntArray, shared: IntArray) -> bytes
     from matplotlib.collections import LineCollection
     from matplotlib.colors import LogNorm
 
-    figure, axes = new_plan(frame_around(camera_m), "Photographs that share points", right_inches=_BAR_ROOM)
+    figure, axes = new_plan(
+        frame_around(camera_m), "Photographs that share points", coordinates, right_inches=_BAR_ROOM
+    )
     order = np.argsort(shared, kind="stable")
     most = max(int(shared.max()), 2) if len(shared) else 2
     norm, reversed_map = LogNorm(1, most), colormaps[f"{look.COLOUR_MAP}_r"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import cv2
@@ -11,14 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipelines.report.plots.maps import (
-    MapCoordinates,
     MapPoints,
     SigmaRaster,
     exaggeration,
     write_accuracy_map,
-    write_ticks,
 )
-from pipelines.report.plots.plans import NamedPlaces
+from pipelines.report.plots.plans import MapCoordinates, NamedPlaces, write_axes
 from pipelines.report.plots.style import new_figure
 
 LEAST, LARGEST, EMPTY = (0x44, 0x01, 0x54), (0xFD, 0xE7, 0x25), (0xE8, 0xE8, 0xE8)  # ends of viridis; no scene
@@ -189,20 +188,27 @@ def test_nothing_measured_is_no_arrow() -> None:
     assert exaggeration(np.zeros(3), 100.0) is None
 
 
-def test_ticks_have_the_coordinates_of_the_edges() -> None:
+@pytest.mark.parametrize("turn", [0.1, -0.03, 0.0])
+def test_ticks_are_round_coordinates_of_the_edges(turn: float) -> None:
     """Of a CRS that is turned and shifted against the map, as a grid is away from its meridian."""
-    turned = MapCoordinates(
-        "grid", ("easting", "northing"), "m", lambda p: p @ [[1.0, 0.1], [-0.1, 1.0]] + [500, 900]
-    )
+
+    def grid(place: np.ndarray) -> np.ndarray:
+        return np.asarray(place @ np.array([[1.0, turn], [-turn, 1.0]]) + [500_000, 900])
+
     axes = new_figure((4, 4), None).add_axes((0.1, 0.1, 0.8, 0.8))
     axes.set_xlim(-50, 50)
     axes.set_ylim(-20, 80)
-    write_ticks(axes, turned)
-    assert axes.xaxis.get_major_formatter()(10.0) == "10\n512"  # 10 + 0.1 · 20 + 500 on the lower edge
-    assert axes.yaxis.get_major_formatter()(40.0) == "40\n935"  # 40 − 0.1 · 50 + 900 on the left edge
-    degrees = MapCoordinates("WGS84", ("longitude", "latitude"), "°", lambda p: p / 111_320)
-    write_ticks(axes, degrees)
-    assert axes.xaxis.get_major_formatter()(50.0) == "50\n0.000449"
+    write_axes(axes, MapCoordinates("EPSG:1", ("easting", "northing"), "m", grid), (5, 5))
+    labels = [float(label.get_text()) for label in axes.get_xticklabels()]
+    assert len(labels) >= 3 and all(value % 10 == 0 for value in labels)
+    on_edge = grid(np.column_stack([axes.get_xticks(), np.full(len(labels), -20.0)]))
+    np.testing.assert_allclose(on_edge[:, 0], labels, atol=1e-6)
+    up = grid(np.column_stack([np.full(len(axes.get_yticks()), -50.0), axes.get_yticks()]))[:, 1]
+    np.testing.assert_allclose(up, [float(label.get_text()) for label in axes.get_yticklabels()], atol=1e-6)
+    assert axes.get_xlabel() == "easting in m (EPSG:1)"
+    degrees = MapCoordinates("WGS84", ("longitude", "latitude"), "°", lambda place: 7 + place / 111_320)
+    write_axes(axes, degrees, (4, 4))
+    assert all(re.fullmatch(r"(6\.999|7\.000)\d*", label.get_text()) for label in axes.get_xticklabels())
 
 
 @pytest.mark.filterwarnings("error")
