@@ -116,6 +116,14 @@ def test_models_apart_are_placed_by_positions(on_a_line: bool) -> None:
     assert np.abs(error_m).max() < 4 * SIGMA_M
 
 
+def test_a_second_model_of_the_same_photographs_is_no_part() -> None:
+    """The mapper may begin a second model of photographs that the first one has, too."""
+    truth = true_model()
+    ids = sorted(truth.reg_image_ids())
+    whole, parts = join_parts(pycolmap, [part_of(truth, ids, 1), part_of(truth, ids[3:8], 2)], surveyed(truth))
+    assert (whole.num_reg_images(), parts) == (IMAGES, ())
+
+
 def test_a_model_that_positions_do_not_place_stays_apart() -> None:
     truth = true_model(on_a_line=True)
     ids = sorted(truth.reg_image_ids())
