@@ -74,6 +74,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "filelock": ("pipelines.core",),
     "psutil": ("pipelines.core.machine",),
     "PIL": ("pipelines.formats.exif", "pipelines.formats.exif_writer"),
+    "kornia": ("pipelines.sfm.learned_features",),
     "laspy": ("pipelines.formats",),
     "pillow_heif": ("pipelines.formats.heif",),
     "py4dgeo": ("pipelines.surface.m3c2",),

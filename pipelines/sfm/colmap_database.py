@@ -6,14 +6,17 @@ databases that share one, as those of matches do.
 """
 
 import sqlite3
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pipelines.core.errors import DamagedPartialError, InputError, storage_error
 from pipelines.core.files import remove, replace_file
 from pipelines.core.stages import SURVEY
+from pipelines.core.types import FloatArray, IntArray
 from pipelines.sfm.options import SfmOptions
 from pipelines.survey.survey import CameraPrior, Survey
 
@@ -81,6 +84,63 @@ def copy_rows(source: Path, target: Path, tables: Iterable[str], images: Iterabl
             if storage_error(error) is not None:
                 raise
             raise DamagedPartialError("database-damaged", f"cannot be copied: {error}", path=source) from error
+
+
+def copy_database(source: Path, target: Path) -> None:
+    """Copy a whole database, which another process may have open."""
+    with closing(sqlite3.connect(source)) as original, closing(sqlite3.connect(target)) as copy:
+        original.backup(copy)
+
+
+def add_features(
+    colmap: Any,
+    path: Path,
+    places: Mapping[int, FloatArray],
+    matches: Mapping[tuple[int, int], IntArray],
+) -> None:
+    """Add features without SIFT's descriptors, and their matches, to those in a database.
+
+    Pairs with new matches lose their verified ones: they wait to be verified again, old and new matches together.
+
+    Args:
+        places: (N, 2) pixels of the whole photograph, by the photograph's index in the survey.
+        matches: (M, 2) rows of `places` of each pair of indices.
+    """
+    with colmap.Database.open(path) as database, colmap.DatabaseTransaction(database):
+        begin = {}
+        for index, xy_px in places.items():
+            known = np.asarray(database.read_keypoints(index + 1), dtype=np.float32)
+            columns = known.shape[1] if known.size else 2
+            # Beside the place COLMAP keeps the shape: scale and orientation, or an affine matrix.
+            shape = {2: (), 4: (1.0, 0.0), 6: (1.0, 0.0, 0.0, 1.0)}[columns]
+            new = np.concatenate([xy_px, np.tile(np.array(shape), (len(xy_px), 1))], axis=1).astype(np.float32)
+            begin[index] = len(known)
+            database.update_keypoints(index + 1, np.concatenate([known.reshape(-1, columns), new]))
+        for (a, b), rows in matches.items():
+            before = np.zeros((0, 2), dtype=np.uint32)
+            if database.exists_matches(a + 1, b + 1):
+                before = np.asarray(database.read_matches(a + 1, b + 1), dtype=np.uint32).reshape(-1, 2)
+                database.delete_matches(a + 1, b + 1)
+            if database.exists_two_view_geometry(a + 1, b + 1):
+                database.delete_two_view_geometry(a + 1, b + 1)
+            both = np.concatenate([before, np.add(rows, (begin[a], begin[b])).astype(np.uint32)])
+            database.write_matches(a + 1, b + 1, both)
+
+
+def has_added_features(colmap: Any, path: Path) -> bool:
+    """Return whether a photograph of a database has features that `add_features` has added."""
+    with colmap.Database.open(path) as database:
+        return bool(database.num_keypoints() > database.num_descriptors())
+
+
+def verified_matches(colmap: Any, path: Path) -> dict[tuple[int, int], int]:
+    """Return the numbers of verified matches of the pairs of a database: indices i < j of the survey's images."""
+    found = {}
+    with colmap.Database.open(path) as database:
+        for pair, count in zip(*database.read_two_view_geometry_num_inliers(), strict=True):
+            first, second = sorted(colmap.pair_id_to_image_pair(pair))
+            found[first - 1, second - 1] = int(count)
+    return found
 
 
 def finish_database(draft: Path, final: Path, *, without: Iterable[str] = ()) -> None:

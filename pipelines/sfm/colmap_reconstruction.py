@@ -1,7 +1,6 @@
 """Engine `colmap`: features, matches, mapping, and a final robust adjustment; a large survey in chunks."""
 
 import logging
-from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -16,9 +15,11 @@ from pipelines.sfm.chunks import PLAN, ChunkPlan, join_chunks, remove_chunks, wo
 from pipelines.sfm.colmap_database import require_sound
 from pipelines.sfm.estimate import estimate_reconstruction, why_too_large
 from pipelines.sfm.features import SfmJob, candidate_pairs, extract_features, match_features
-from pipelines.sfm.mapping import map_database, triangulate
+from pipelines.sfm.lens_check import lenses_astray
+from pipelines.sfm.mapping import triangulate
 from pipelines.sfm.options import SfmOptions
 from pipelines.sfm.rolling_shutter import correct_tie_points
+from pipelines.sfm.rounds import align
 from pipelines.survey.survey import Survey
 
 log = logging.getLogger(__name__)
@@ -87,29 +88,36 @@ def reconstruct(colmap: Any, job: SfmJob, progress: Progress) -> Any:
 def map_matches(colmap: Any, job: SfmJob, progress: Progress) -> Any:
     """Return the largest model of a database with features and matches, adjusted; raises as `reconstruct`."""
     colmap.set_random_seed(job.options.seed)
-    models, mapper = map_database(colmap, job, progress)
-    if not models:
+    aligned = align(colmap, job, progress)
+    if not aligned.models:
         raise DegenerateGeometryError(
             "no-matches",
             "No two photographs could be matched: overlap or texture is too low. Try a larger --max-features, or "
             "--pairs exhaustive.",
         )
-    _tell_of_parts([model.num_reg_images() for model in models], len(job.survey.images))
-    fixes = None
+    model, complete, fixes = aligned.models[0], None, None
     if len(job.survey.images) > _DRIFTLESS_UP_TO:
         fixes = {image.name: image.fix.position_in_geo for image in job.survey.images if image.fix is not None}
-    others = partial(triangulate, colmap, database=job.database, progress=progress)
-    _adjust(colmap, job, models[0], fixes=fixes, complete=others if mapper == "global" else None, progress=progress)
-    return models[0]
-
-
-def _tell_of_parts(sizes: Sequence[int], photographs: int) -> None:
-    """Log that the survey fell apart; further models of images that the largest has, too, are no parts."""
-    if len(sizes) > 1 and sizes[0] < photographs:
-        log.warning(
-            "The survey fell apart into %d models of %s images; the largest, with %d of %d photographs, is used.",
-            len(sizes), ", ".join(map(str, sizes)), sizes[0], photographs, extra={"code": "survey-in-parts"},
-        )  # fmt: skip
+    if aligned.mapper == "global":
+        complete = partial(triangulate, colmap, database=job.database, progress=progress)
+    before = {camera_id: camera.params.copy() for camera_id, camera in model.cameras.items()}
+    _adjust(colmap, job, model, fixes=fixes, complete=complete, progress=progress)
+    astray = lenses_astray(model, job.survey)
+    if astray and aligned.lens_held:
+        for camera_id, reason in astray.items():
+            log.warning(
+                "The photographs do not determine the lens of camera %d, which would have %s: it is held.",
+                camera_id, reason, extra={"code": "lens-held"},
+            )  # fmt: skip
+            model.cameras[camera_id].params = before[camera_id]
+        _adjust(colmap, job, model, lens_held=True, progress=progress)
+    else:
+        for camera_id, reason in astray.items():
+            log.warning(
+                "Camera %d was solved with %s. Check --focal-px, or give the lens by --camera.",
+                camera_id, reason, extra={"code": "lens-astray"},
+            )  # fmt: skip
+    return model
 
 
 def _adjust(colmap: Any, job: SfmJob, model: Any, **how: Any) -> None:

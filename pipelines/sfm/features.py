@@ -3,7 +3,8 @@
 Pairs are chosen by positions and viewing directions. COLMAP works in small steps, which survive an interruption.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from pipelines.core.machine import chosen_threads
-from pipelines.core.progress import Progress
+from pipelines.core.progress import Progress, ProgressTask
 from pipelines.core.stages import MASKS
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.formats.image_file import read_bytes, require_unchanged
@@ -161,20 +162,50 @@ def match_features(colmap: Any, job: SfmJob, pairs: IntArray, progress: Progress
     """Match pairs (P, 2) of photographs whose features are in the database, and verify the matches."""
     matching, pairing = colmap.FeatureMatchingOptions(), colmap.ImportedPairingOptions()
     matching.num_threads = chosen_threads(job.options.threads)
-    verification = colmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = job.options.seed
-    verification.ransac.max_num_trials = _MOST_TRIALS
+
+    def match(listing: Path) -> None:
+        pairing.match_list_path = listing
+        colmap.match_image_pairs(job.database, matching, pairing, _verification(colmap, job))
+
+    _by_pairs(colmap, job, pairs, match, progress.task("matching", len(pairs)))
+
+
+def verify_matches(colmap: Any, job: SfmJob, pairs: IntArray, progress: Progress) -> None:
+    """Verify the matches of pairs (P, 2) that are in the database."""
+
+    def verify(listing: Path) -> None:
+        colmap.verify_matches(job.database, listing, _verification(colmap, job))
+
+    _by_pairs(colmap, job, pairs, verify, progress.task("verification", len(pairs)))
+
+
+def _verification(colmap: Any, job: SfmJob) -> Any:
+    options = colmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = job.options.seed
+    options.ransac.max_num_trials = _MOST_TRIALS
+    return options
+
+
+def _by_pairs(
+    colmap: Any,
+    job: SfmJob,
+    pairs: IntArray,
+    work: Callable[[Path], None],
+    shown: AbstractContextManager[ProgressTask],
+) -> None:
+    """Give lists of a few pairs each to a function of COLMAP, which are files.
+
+    COLMAP reads pairs from a text in which a blank ends a name: numbers replace the names while it works.
+    """
     listing = job.database.with_name("pairs.txt")
-    # COLMAP reads pairs from a text in which a blank ends a name: numbers replace the names while it matches.
     names = [image.name for image in job.survey.images]
     rename_images(colmap, job.database, {name: _number(index) for index, name in enumerate(names)})
     try:
-        with progress.task("matching", len(pairs)) as task:
+        with shown as task:
             for step in _steps(pairs, _PAIRS_PER_STEP):
                 lines = (f"{_number(a)} {_number(b)}\n" for a, b in step)
                 listing.write_text("".join(lines), encoding="utf-8")
-                pairing.match_list_path = listing
-                colmap.match_image_pairs(job.database, matching, pairing, verification)
+                work(listing)
                 task.advance(len(step))
     finally:
         _restore_names(colmap, job)

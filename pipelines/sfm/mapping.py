@@ -38,6 +38,7 @@ class MapperRun:
     scratch: Path
     threads: int
     seed: int
+    lens_held: bool = False  # at what the database says, instead of being solved
 
 
 def chosen_mapper(photographs: int, options: SfmOptions) -> MapperName:
@@ -46,7 +47,9 @@ def chosen_mapper(photographs: int, options: SfmOptions) -> MapperName:
     return "incremental" if photographs <= _INCREMENTAL_UP_TO else "global"
 
 
-def map_database(colmap: Any, job: SfmJob, progress: Progress) -> tuple[list[Any], MapperName]:
+def map_database(
+    colmap: Any, job: SfmJob, progress: Progress, *, lens_held: bool = False
+) -> tuple[list[Any], MapperName]:
     """Return the models (`pycolmap.Reconstruction`) of a database with features and matches, the largest first, and
     their mapper.
 
@@ -55,14 +58,14 @@ def map_database(colmap: Any, job: SfmJob, progress: Progress) -> tuple[list[Any
     """
     count = len(job.survey.images)
     mapper = chosen_mapper(count, job.options)
-    models = _models(colmap, mapper, job, progress)
+    models = _models(colmap, mapper, job, progress, lens_held=lens_held)
     if mapper == "global" and job.options.mapper == "auto" and _registered(models) < _REGISTERED * count:
         log.warning(
             "The global mapper registered %d of %d photographs; the incremental mapper follows.",
             _registered(models),
             count,
         )
-        others = _models(colmap, "incremental", job, progress)
+        others = _models(colmap, "incremental", job, progress, lens_held=lens_held)
         if _registered(others) > _registered(models):
             return others, "incremental"
     return models, mapper
@@ -79,10 +82,15 @@ def run_mapper(colmap: Any, mapper: MapperName, run: MapperRun, registered: Call
         options.mapper.track_required_tracks_per_view = _GLOBAL_TRACKS
         options.mapper.skip_retriangulation, options.mapper.ba_num_iterations = True, 1
         options.mapper.bundle_adjustment.ceres.solver_options.max_num_iterations = _GLOBAL_STEPS
+        if run.lens_held:
+            adjustment = options.mapper.bundle_adjustment
+            adjustment.refine_focal_length = adjustment.refine_extra_params = False
         models = colmap.global_mapping(run.database, run.images, run.scratch, options)
     else:
         options = colmap.IncrementalPipelineOptions()
         options.num_threads, options.random_seed, options.min_model_size = run.threads, run.seed, _FEWEST_IMAGES
+        if run.lens_held:
+            options.ba_refine_focal_length = options.ba_refine_extra_params = False
         models = colmap.incremental_mapping(
             run.database, run.images, run.scratch, options, next_image_callback=registered
         )
@@ -90,11 +98,12 @@ def run_mapper(colmap: Any, mapper: MapperName, run: MapperRun, registered: Call
     return [model for *_, model in sorted(size, key=lambda row: row[:2], reverse=True)]
 
 
-def _models(colmap: Any, mapper: MapperName, job: SfmJob, progress: Progress) -> list[Any]:
+def _models(colmap: Any, mapper: MapperName, job: SfmJob, progress: Progress, *, lens_held: bool) -> list[Any]:
     title = "global mapping" if mapper == "global" else "mapping"
+    title += ", lens held" if lens_held else ""
     with progress.task(title, len(job.survey.images)) as task, _scratch(job.database.parent) as scratch:
         threads = chosen_threads(job.options.threads)
-        run = MapperRun(job.database, job.images, scratch, threads, job.options.seed)
+        run = MapperRun(job.database, job.images, scratch, threads, job.options.seed, lens_held)
         models = run_mapper(colmap, mapper, run, lambda: task.advance(1))
         if mapper == "global":
             task.advance(len(job.survey.images))

@@ -30,6 +30,11 @@ class SfmOptions(StageOptions):
         f"{_DOUBLED_BELOW_PX} pixels.",
     )
     max_features: int = Field(5000, ge=200, description="Largest number of features of an image.")
+    features: Literal["auto", "sift", "learned"] = Field(
+        "auto",
+        description="Features beside SIFT's; auto: learned ones for photographs that stay out, if installed; "
+        "learned: for all pairs.",
+    )
     import_model: InputPath | None = Field(
         None, description="Use this COLMAP model instead of reconstructing.", json_schema_extra={"flag": "--import"}
     )

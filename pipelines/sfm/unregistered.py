@@ -15,8 +15,11 @@ _NEEDED = 30  # COLMAP's fewest points by which it adds a photograph
 _MOST_LISTED = 10
 
 
-def unregistered(colmap: Any, database: Path, model: Any) -> tuple[Remark, ...]:
-    """Return the warning that says for each photograph of a database why it is not in a model; none if all are."""
+def unregistered(colmap: Any, database: Path, model: Any, remedy: str = "") -> tuple[Remark, ...]:
+    """Return the warning that says for each photograph of a database why it is not in a model; none if all are.
+
+    `remedy` is a sentence that follows the reasons.
+    """
     inside = {image_id: model.images[image_id] for image_id in model.reg_image_ids()}
     with colmap.Database.open(database) as opened:
         names = {image.image_id: image.name for image in opened.read_all_images()}
@@ -37,7 +40,7 @@ def unregistered(colmap: Any, database: Path, model: Any) -> tuple[Remark, ...]:
         return ()
     reasons = [f"{names[one]}: {_reason(matches[one], shared[one], names)}" for one in lost[:_MOST_LISTED]]
     more = f"; and {len(lost) - _MOST_LISTED} more" if len(lost) > _MOST_LISTED else ""
-    sentence = f"{len(lost)} photographs are not registered. {'; '.join(reasons)}{more}."
+    sentence = f"{len(lost)} photographs are not registered. {'; '.join(reasons)}{more}.{remedy}"
     return (Remark(code="photographs-not-registered", sentence=sentence),)
 
 

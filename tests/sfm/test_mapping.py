@@ -121,13 +121,3 @@ def test_a_survey_that_does_not_fit_is_refused_before_work(monkeypatch: pytest.M
         stage.run(StageRun(workspace, partial), SfmOptions())
     assert numbers(str(error.value))[0] == 900
     assert list(partial.iterdir()) == []
-
-
-@pytest.mark.parametrize(("sizes", "told"), [([60, 4], False), ([50, 8], True), ([60], False)])
-def test_a_survey_fell_apart_only_if_photographs_are_lost(
-    sizes: list[int], told: bool, caplog: pytest.LogCaptureFixture
-) -> None:
-    """The mapper may begin a second model of photographs that the first one has, too."""
-    colmap_reconstruction._tell_of_parts(sizes, 60)
-    assert [record.__dict__["code"] for record in caplog.records] == (["survey-in-parts"] if told else [])
-    assert not told or {50, 60} <= set(numbers(caplog.text))

@@ -1,0 +1,181 @@
+"""Alignment in rounds: what is tried when the first model leaves photographs out, or has a lens that cannot be.
+
+1. The mapper, with the lens free.
+2. Once more with the lens held, at that of a large sound model, else at what the photographs state: a model of few
+   photographs, or of flat ground, finds a lens that fits it alone, and no other photograph fits that.
+3. Learned features for the photographs that stay out, and the mapper again.
+4. Models that stay apart are placed beside the largest by their positions.
+"""
+
+import logging
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipelines.core.progress import Progress
+from pipelines.core.types import IntArray
+from pipelines.sfm.colmap_database import has_added_features, verified_matches
+from pipelines.sfm.features import SfmJob, candidate_pairs
+from pipelines.sfm.learned_weights import missing_for_learned
+from pipelines.sfm.lens_check import lenses_astray
+from pipelines.sfm.mapping import MapperName, map_database
+from pipelines.sfm.parts import Part, join_parts
+from pipelines.survey.survey import Survey
+
+log = logging.getLogger(__name__)
+
+_WHOLE = 0.95  # of the photographs: one model of as many needs no further round
+_FEWEST_FOR_LENS = 10  # photographs of a model whose lens counts for others
+_ENOUGH_MATCHES = 100  # verified ones of a pair: learned features add little to these
+_MOST_LEARNED_PAIRS = 4000  # hours on two cores
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """The models of a round, the largest first, and how they were made."""
+
+    models: list[Any]
+    mapper: MapperName
+    lens_held: bool = False
+    parts: tuple[Part, ...] = ()
+
+    @property
+    def registered(self) -> int:
+        return int(self.models[0].num_reg_images()) if self.models else 0
+
+    def covered(self) -> int:
+        """Return the number of photographs in any of the models."""
+        return len({image_id for model in self.models for image_id in model.reg_image_ids()})
+
+
+def align(colmap: Any, job: SfmJob, progress: Progress) -> Alignment:
+    """Return the models of a database with features and matches after as many rounds as they need.
+
+    The first model is the largest, with those beside it that positions place; none: no two photographs match.
+    """
+    if job.options.features == "learned":
+        _add_learned(colmap, job, candidate_pairs(job.survey, job.options), progress)
+    best = Alignment(*map_database(colmap, job, progress))
+    best = _with_lens_held(colmap, job, best, progress)
+    wanting = best.covered() < len(job.survey.images) and not _whole(best, job.survey)
+    if wanting and job.options.features == "auto" and missing_for_learned() is None:
+        pairs = _pairs_to_add(colmap, job, best)
+        if len(pairs) and _add_learned(colmap, job, pairs, progress):
+            again = Alignment(*map_database(colmap, job, progress, lens_held=best.lens_held), best.lens_held)
+            best = max(best, again, key=_merit)
+    if len(best.models) > 1 and best.registered < len(job.survey.images):
+        _tell_of_parts([model.num_reg_images() for model in best.models], best.registered, len(job.survey.images))
+        largest, parts = join_parts(colmap, best.models, job.survey)
+        _tell_of_joins(parts, best.registered)
+        best = replace(best, models=[largest], parts=parts)
+    return best
+
+
+def _with_lens_held(colmap: Any, job: SfmJob, free: Alignment, progress: Progress) -> Alignment:
+    """Return the better of an alignment and one with the lens held, where the first has a reason to doubt it."""
+    if not free.models:
+        return free
+    astray = lenses_astray(free.models[0], job.survey)
+    if not astray and _whole(free, job.survey):
+        return free
+    if astray:
+        why = "; ".join(f"camera {camera} has {reason}" for camera, reason in astray.items())
+        log.info("The model of %d photographs is solved again with the lens held: %s.", free.registered, why)
+    with _lens_of(colmap, job.database, _sound_lens(free, job.survey)):
+        models, mapper = map_database(colmap, job, progress, lens_held=True)
+    held = Alignment(models, mapper, lens_held=True)
+    if astray and held.covered() >= free.covered():
+        return held
+    # As many photographs with the lens free speak for the free one.
+    return held if _merit(held) > _merit(free) else free
+
+
+def _merit(alignment: Alignment) -> tuple[int, int]:
+    return alignment.registered, alignment.covered()
+
+
+def _whole(alignment: Alignment, survey: Survey) -> bool:
+    return alignment.registered >= _WHOLE * len(survey.images)
+
+
+def _sound_lens(alignment: Alignment, survey: Survey) -> dict[int, Any]:
+    """Return the cameras of the largest model that determines sound ones; none: no model does."""
+    for model in alignment.models:
+        if model.num_reg_images() >= _FEWEST_FOR_LENS and not lenses_astray(model, survey):
+            used = {model.images[image_id].camera_id for image_id in model.reg_image_ids()}
+            return {camera_id: model.cameras[camera_id].params.copy() for camera_id in used}
+    return {}
+
+
+@contextmanager
+def _lens_of(colmap: Any, path: Path, params: Mapping[int, Any]) -> Iterator[None]:
+    """Give cameras in a database other parameters for a while."""
+    with colmap.Database.open(path) as database:
+        stated = {camera.camera_id: camera for camera in database.read_all_cameras() if camera.camera_id in params}
+        before = {camera_id: camera.params.copy() for camera_id, camera in stated.items()}
+        _write_params(database, stated, params)
+    try:
+        yield
+    finally:
+        with colmap.Database.open(path) as database:
+            _write_params(database, stated, before)
+
+
+def _write_params(database: Any, cameras: Mapping[int, Any], params: Mapping[int, Any]) -> None:
+    for camera_id, camera in cameras.items():
+        camera.params = params[camera_id]
+        database.update_camera(camera)
+
+
+def _pairs_to_add(colmap: Any, job: SfmJob, alignment: Alignment) -> IntArray:
+    """Return the pairs (P, 2) that learned features may connect: of photographs apart, with few matches so far."""
+    apart = set(range(len(job.survey.images))) - {i - 1 for i in alignment.models[0].reg_image_ids()}
+    matched = verified_matches(colmap, job.database)
+    candidates = candidate_pairs(job.survey, job.options).tolist()
+    wanted = [
+        (a, b) for a, b in candidates if (a in apart or b in apart) and matched.get((a, b), 0) < _ENOUGH_MATCHES
+    ]
+    return np.array(wanted, dtype=np.int64).reshape(-1, 2)
+
+
+def _add_learned(colmap: Any, job: SfmJob, pairs: IntArray, progress: Progress) -> int:
+    """Add learned features and matches once; the number of pairs that they match."""
+    from pipelines.sfm.learned_features import add_learned  # and torch
+
+    if has_added_features(colmap, job.database):
+        return 1
+    if len(pairs) > _MOST_LEARNED_PAIRS and job.options.features == "auto":
+        log.warning(
+            "%d pairs of photographs wait for learned features, which would take hours; %d at most are matched. "
+            "For all: --features learned.",
+            len(pairs), _MOST_LEARNED_PAIRS, extra={"code": "learned-pairs-limited"},
+        )  # fmt: skip
+        pairs = pairs[np.linspace(0, len(pairs) - 1, _MOST_LEARNED_PAIRS).astype(int)]
+    return add_learned(colmap, job, pairs, progress)
+
+
+def _tell_of_parts(sizes: list[int], largest: int, photographs: int) -> None:
+    log.info(
+        "The survey fell apart into %d models of %s images; the largest has %d of %d photographs.",
+        len(sizes), ", ".join(map(str, sizes)), largest, photographs,
+    )  # fmt: skip
+
+
+def _tell_of_joins(parts: tuple[Part, ...], largest: int) -> None:
+    joined = [part.photographs for part in parts if not part.apart]
+    if joined:
+        log.warning(
+            "The survey consists of %d models that share no photographs, of %s; they are placed beside each other "
+            "by their positions alone. Their places to each other are as accurate as these.",
+            1 + len(joined), ", ".join(map(str, [largest, *joined])), extra={"code": "survey-in-parts"},
+        )  # fmt: skip
+    for part in parts:
+        if part.apart:
+            log.warning(
+                "A model of %d photographs stays apart: %s.",
+                part.photographs, part.apart, extra={"code": "model-apart"},
+            )  # fmt: skip
