@@ -35,6 +35,7 @@ SIZES_MB: dict[Extra | Literal["cuda"], int] = {
     "bags": 22,
     "cluster": 52,
     "heif": 27,
+    "learned": 29,
     "mesh": 4,
     "reference": 150,
     "simulator": 46,
