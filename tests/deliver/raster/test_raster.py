@@ -181,6 +181,22 @@ def test_heights_are_those_of_ground_and_roof(workspace: Workspace) -> None:
         assert np.sqrt(np.mean(off**2)) < 0.1 * GSD
 
 
+def test_roof_ends_at_its_edges(workspace: Workspace) -> None:
+    """Profiles across the tower pass half its height within a cell of its walls; Gaussians reach over them."""
+    along = np.linspace(-0.7, 0.7, 15) * TOWER_M
+    across = np.arange(TOWER_M - 1.0, TOWER_M + 1.0, GSD / 8)
+    off = []
+    for axis in (0, 1):
+        for sign in (-1, 1):
+            places = np.zeros((len(along), len(across), 3))
+            places[..., axis], places[..., 1 - axis] = sign * across, along[:, None]
+            xyz = in_utm(places.reshape(-1, 3), workspace)
+            above = at(workspace.path("raster/dsm.tif"), xyz) - xyz[:, 2]
+            high = above.reshape(len(along), len(across)) > TOWER_HEIGHT_M / 2
+            off += (across[0] + high.sum(axis=1) * GSD / 8 - TOWER_M).tolist()
+    assert np.median(np.abs(off)) <= GSD  # 1.3 cells without shrinking them
+
+
 def test_walls_do_not_lean(workspace: Workspace) -> None:
     """Roof and foot of a wall lie at the same place: a cell beyond it is ground, a cell within it roof."""
     beside = np.linspace(-TOWER_M + 0.5, TOWER_M - 0.5, 12)
