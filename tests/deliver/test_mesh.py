@@ -25,7 +25,16 @@ from pipelines.geodesy.enu import ecef_from_enu, enu_from_ecef
 from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.similarity import Similarity
 from pipelines.surface.fusion import FusionSettings, fused_squares
-from pipelines.surface.mesh import RawMesh, closed, distances, holes_of, vertex_normals, without_islands
+from pipelines.surface.mesh import (
+    RawMesh,
+    closed,
+    compact,
+    distances,
+    edges_of,
+    holes_of,
+    vertex_normals,
+    without_islands,
+)
 from pipelines.surface.poisson import (
     MeasuredPoints,
     certain_points,
@@ -193,6 +202,30 @@ def test_what_one_view_shows_is_left_out(tmp_path: Path) -> None:
     """A plate 16 m above the ground in one of eight maps: the others look through it."""
     points = points_of(surface_views(tmp_path, floater=True))
     assert points.position[:, 2].max() - GEO_FROM_MODEL.translation[2] < BOX_M + PIXEL_M
+
+
+def test_steps_of_a_border_are_no_edges_of_the_simplified_mesh(tmp_path: Path) -> None:
+    """Faces of a level grid that end at a slanted line: few edges along it are left, within a cell of it."""
+    side, slope = 60, 0.37
+    column, row = (axis.ravel() for axis in np.meshgrid(np.arange(side), np.arange(side)))
+    vertices = np.column_stack([column, row, np.zeros(side * side)]).astype(float)
+    first = np.flatnonzero((column < side - 1) & (row < side - 1))
+    faces = np.concatenate(
+        [
+            np.column_stack([first, first + 1, first + side]),
+            np.column_stack([first + 1, first + side + 1, first + side]),
+        ]
+    )
+    below = vertices[:, 1] < 20 + slope * vertices[:, 0]
+    stepped = compact(RawMesh(vertices, faces[below[faces].all(axis=1)]))
+    simple = simplified(stepped, 0.5, tmp_path)
+    assert len(holes_of(simple)) == 0
+    _, before = edges_of(stepped.faces)
+    _, after = edges_of(simple.faces)
+    assert (after == 1).sum() < 0.15 * (before == 1).sum()
+    off = (20 + slope * simple.vertices[:, 0] - simple.vertices[:, 1]) / np.hypot(1, slope)
+    assert off.min() > -0.5  # beyond the line, by a part of a cell
+    assert distances(stepped.vertices, simple, 1.0).max() < 1.5
 
 
 def test_simplification_keeps_its_error(tmp_path: Path) -> None:
