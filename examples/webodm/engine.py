@@ -320,8 +320,9 @@ def run_georef(words: list[str], journal: Journal, progress: Progress) -> tuple[
 def _run_once(words: list[str], journal: Journal, progress: Progress) -> tuple[int, str, dict[str, Any]]:
     """Return the exit code of `georef`, the kind of its error, and its result.
 
-    NodeODM stops a task by SIGTERM to every process of its tree. `georef` then puts its work in order; this process
-    waits for it, and hands the signal on if `georef` has not heard it.
+    NodeODM stops a task by SIGTERM to every process of its tree, and `georef` then puts its work in order. The node
+    takes the exit of this process as that of a task that was restarted meanwhile: it exits at once, and a copy of
+    it waits for `georef`.
     """
     command = [*program(), "--json-progress", *words, "--json"]
     with tempfile.TemporaryFile("w+", encoding="utf-8") as result:
@@ -333,6 +334,8 @@ def _run_once(words: list[str], journal: Journal, progress: Progress) -> tuple[i
         kind = ""
         with _stops_handed_to(process) as stopped:
             for message in _messages(process):
+                if stopped:
+                    continue
                 if stage := progress.take(message):
                     journal.begin(stage)
                 journal.take(message)
@@ -363,11 +366,22 @@ def _messages(process: subprocess.Popen[str]) -> Iterator[dict[str, Any]]:
 
 @contextmanager
 def _stops_handed_to(process: subprocess.Popen[str]) -> Iterator[list[int]]:
-    """Remember signals to stop while the context lasts, and hand them on to a process that goes on all the same."""
+    """Go on in a silent copy of this process after a signal to stop, which is remembered.
+
+    A `georef` that has not heard the signal is sent it.
+    """
     stopped: list[int] = []
 
     def stop(number: int, _frame: FrameType | None) -> None:
+        if stopped:
+            return
+        sys.stdout.flush()
+        if os.fork():
+            os._exit(STOPPED)
         stopped.append(number)
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        for stream in (1, 2):
+            os.dup2(nowhere, stream)
         timer = threading.Timer(PATIENCE_S, process.terminate)
         timer.daemon = True
         timer.start()
