@@ -3,6 +3,7 @@
 A stage's options are derived from its class of options (names, types, meaning, defaults): each is defined once.
 """
 
+import logging
 import types
 from collections.abc import Iterable
 from pathlib import Path
@@ -25,6 +26,8 @@ from pipelines.core.options import (
 )
 from pipelines.core.stages import StageSpec
 from pipelines.core.workspace import Workspace
+
+log = logging.getLogger(__name__)
 
 _BOUNDS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
 FILE, FOLDER = (click.Path(file_okay=is_file, resolve_path=True, path_type=Path) for is_file in (True, False))
@@ -134,12 +137,20 @@ def _default_and_range(info: FieldInfo) -> str:
     return f" [{'; '.join(parts)}]" if parts else ""
 
 
-def settings(texts: Iterable[str], stages: Iterable[StageSpec]) -> dict[str, dict[str, Any]]:
+# A script may give all its runs the same options, and end some of them early.
+NOT_REACHED = "%s is for %s, which this run does not reach: it is not used, and not remembered."
+
+
+def settings(
+    texts: Iterable[str], stages: Iterable[StageSpec], later: Iterable[StageSpec] = ()
+) -> dict[str, dict[str, Any]]:
     """Return the options that texts set, by stage and field, of stages that will run; a click.UsageError: no such.
 
-    A text is `stage.field=value`; the value is one of TOML, or else a plain text. Paths become absolute.
+    A text is `stage.field=value`; the value is one of TOML, or else a plain text. Paths become absolute. Options of
+    `later` stages, which this run does not reach, are named in a warning.
     """
-    by_name = {spec.name: spec for spec in stages}
+    running = [spec.name for spec in stages]
+    by_name = {spec.name: spec for spec in (*stages, *later)}
     found: dict[str, dict[str, Any]] = {}
     for text in texts:
         key, equals, value = text.partition("=")
@@ -149,12 +160,15 @@ def settings(texts: Iterable[str], stages: Iterable[StageSpec]) -> dict[str, dic
                 f"--set: {text!r} has not the form stage.option=value, such as train.sh_degree=1."
             )
         if stage not in by_name:
-            raise click.UsageError(f"--set: {stage!r} is not among the stages to run ({', '.join(by_name)}).")
+            raise click.UsageError(f"--set: {stage!r} is not among the stages to run ({', '.join(running)}).")
         options = by_name[stage].options
         if name not in options.model_fields:
             raise click.UsageError(
                 f"--set: {stage} has no option {name!r}. Its options are {', '.join(options.model_fields)}."
             )
+        if stage not in running:
+            log.warning(NOT_REACHED, f"--set {key}", stage, extra={"code": "option-not-used"})
+            continue
         parsed = _value(value)
         is_path = name in input_markers(options) and isinstance(parsed, str)
         found.setdefault(stage, {})[name] = Path(parsed).absolute() if is_path else parsed

@@ -78,7 +78,7 @@ def _run(ctx: click.Context, **values: Any) -> None:
     if wanted and not trains and not (workspace.root / MODEL).exists():
         raise click.UsageError("--deliver needs a trained model, which this run does not make: leave out --to.")
     stages += wanted
-    flags = _flags(ctx, stages, settings(values["settings"], stages))
+    flags = _flags(ctx, stages, settings(values["settings"], stages, _later(stages)))
     forget, force = _forgotten(values["forget"], stages), values["force"] or values["rerun_from"] is not None
     if stages[0].reads:
         must_exist(workspace)
@@ -169,6 +169,11 @@ def _forgotten(names: Sequence[str], stages: Sequence[StageSpec]) -> dict[str, l
     return by_stage
 
 
+def _later(stages: tuple[StageSpec, ...]) -> tuple[StageSpec, ...]:
+    """Return the stages of the pipeline after the last that runs."""
+    return PIPELINE[PIPELINE.index(stages[-1]) + 1 :] if stages[-1] in PIPELINE else ()
+
+
 def _flags(
     ctx: click.Context, stages: tuple[StageSpec, ...], flags: dict[str, dict[str, Any]]
 ) -> dict[str, dict[str, Any]]:
@@ -181,11 +186,7 @@ def _flags(
             owned = " and ".join(OWNERS[name])
             if last is None or any(PIPELINE.index(BY_NAME[owner]) < last for owner in OWNERS[name]):
                 raise click.UsageError(f"{flag} is for {owned}, which is not among the stages to run.")
-            # A script may give all its runs the same options, and end some of them early.
-            log.warning(
-                "%s is for %s, which this run does not reach: it is not used, and not remembered.",
-                flag, owned, extra={"code": "option-not-used"},
-            )  # fmt: skip
+            log.warning(options.NOT_REACHED, flag, owned, extra={"code": "option-not-used"})
         for owner in owners:
             flags.setdefault(owner, {})[name] = value
     return flags

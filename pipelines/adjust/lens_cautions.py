@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipelines.adjust.fix_patterns import CameraPath
-from pipelines.core.products import Remark
+from pipelines.core.products import NOT_CHECKED, Remark
 from pipelines.core.types import FloatArray
 from pipelines.geometry.cameras import Camera
 from pipelines.geometry.row_motion import RowMotion
@@ -39,17 +39,21 @@ def focal_length_of(survey: Survey, model: SparseModel) -> tuple[Remark, ...]:
         before, now = tags.mean_focal_px, model.camera_of(image).mean_focal_px
         if not 1 / _MOST_FOCAL < now / before < _MOST_FOCAL:
             found[prior.make_model.strip() or f"camera {prior.camera_id}"] = (now, before, prior.focal_source)
-    return tuple(
+    apart = tuple(
         Remark(
             code="focal-length-apart",
             sentence=f"SfM gives {camera} a focal length of {now:.0f} px, where "
             f"{'its tags state' if source == 'exif' else 'the input states'} {before:.0f} px. "
             "No lens is so far off: the SfM model is bent, most likely because too few photographs overlap, or the "
-            "tags belong to another size. Positions and heights of its points are not known by their σ. Leave out "
-            "photographs that connect to few others, add photographs, or state the focal length with --focal-px.",
+            "tags belong to another size. Leave out photographs that connect to few others, add photographs, or "
+            "state the focal length with --focal-px.",
         )
         for camera, (now, before, source) in found.items()
     )
+    unchecked = Remark(
+        code=NOT_CHECKED, sentence="No accuracy is stated: σ describe errors of a model, not a model that is bent."
+    )
+    return (*apart, unchecked) if apart else ()
 
 
 def rolling_shutter_of(

@@ -1,4 +1,4 @@
-"""Boundaries as people draw them: polygons and closed lines of GeoJSON, GeoPackage, KML and DXF files.
+"""Boundaries as people draw them: polygons and closed lines of GeoJSON, GeoPackage, KML, KMZ and DXF files.
 
 GDAL reads GeoPackage and DXF. GeoJSON and KML are read here: GDAL drops rings of KML that are not closed, knows no
 UTF-16, and follows the addresses that both formats may name.
@@ -9,8 +9,11 @@ by its chord; the file then has a remark.
 
 from __future__ import annotations
 
+import io
 import json
 import re
+import zipfile
+import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
@@ -34,6 +37,7 @@ BOUNDARY_FORMATS: dict[str, tuple[bytes, ...]] = {
     ".json": (b"{",),
     ".gpkg": (b"SQLite format 3\0",),
     ".kml": (b"<",),
+    ".kmz": (b"PK\x03\x04",),
     ".dxf": (b"0", b"999", b"AutoCAD Binary DXF"),
 }
 _MARKS = {  # byte order marks, longer ones first
@@ -96,7 +100,7 @@ _Refusal = Callable[..., InputError]
 
 
 def read_boundary(path: Path, *, field: str) -> Boundary:
-    """Read the polygons and the closed lines of a GeoJSON, GeoPackage, KML or DXF file.
+    """Read the polygons and the closed lines of a GeoJSON, GeoPackage, KML, KMZ or DXF file.
 
     Raises:
         InputError: not such a file, too large, damaged, with a coordinate that is no number, or without an area;
@@ -105,8 +109,11 @@ def read_boundary(path: Path, *, field: str) -> Boundary:
     refusal = partial(InputError, path=path, field=field)
     file_size(path, limit_bytes=_MOST_BYTES, kind="boundary", field=field)
     suffix = path.suffix.lower()
-    if suffix in (".geojson", ".json", ".kml"):
-        data = _as_utf8(path.read_bytes(), refusal)
+    if suffix in (".geojson", ".json", ".kml", ".kmz"):
+        data = path.read_bytes()
+        if suffix == ".kmz" and data.startswith(BOUNDARY_FORMATS[suffix]):
+            data, suffix = _unzipped(data, refusal), ".kml"
+        data = _as_utf8(data, refusal)
     else:
         with path.open("rb") as file:
             data = file.read(_DXF_HEADER_BYTES)
@@ -134,8 +141,28 @@ def read_boundary(path: Path, *, field: str) -> Boundary:
 
 
 def _no_boundary(refusal: _Refusal) -> InputError:
-    kinds = "GeoJSON (.geojson), GeoPackage (.gpkg), KML (.kml) or DXF (.dxf)"
+    kinds = "GeoJSON (.geojson), GeoPackage (.gpkg), KML (.kml, .kmz) or DXF (.dxf)"
     return refusal("boundary-format", f"is no boundary file that is known. Give {kinds}.")
+
+
+def _unzipped(data: bytes, refusal: _Refusal) -> bytes:
+    """Return the KML of a KMZ: the first in the order of the archive (OGC 12-007r2). Nothing is written to disk."""
+    unreadable = partial(refusal, "boundary-unreadable")
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            name = next((name for name in archive.namelist() if name.lower().endswith(".kml")), None)
+            if name is None:
+                raise unreadable("is a KMZ without a KML inside. Export it again.")
+            with archive.open(name) as file:
+                document = file.read(_MOST_BYTES + 1)
+    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, OSError, zlib.error) as error:
+        message = f"cannot be unpacked as KMZ: {type(error).__name__} {str(error)[:100]}. Export it again, as KML."
+        raise unreadable(message) from error
+    if len(document) > _MOST_BYTES:
+        raise refusal(
+            "file-too-large", f"unpacks to more than {_MOST_BYTES >> 20} MiB of KML. Draw the boundary alone."
+        )
+    return document
 
 
 def _as_utf8(data: bytes, refusal: _Refusal) -> bytes:

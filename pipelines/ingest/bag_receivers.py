@@ -16,9 +16,10 @@ from pipelines.geodesy.enu import Origin, ecef_from_lla, enu_from_ecef
 from pipelines.ingest.bag_messages import FIX_KINDS, POSITIONS
 
 RECEIVER_TYPES = ("sensor_msgs/msg/NavSatFix", "px4_msgs/msg/SensorGps")
-# σ in metres by kind of fix, of receivers that state none; it only orders them.
+# σ in metres by kind of fix, of receivers that state none; it orders and compares them only.
 _USUAL_SIGMA_M = (2.5, 1.0, 0.5, 0.05)
 _LEAST_SHARE = 0.5
+_SIGMAS, _LEAST_APART_M = 3.0, 1.0  # beyond both, two receivers contradict each other
 
 
 @dataclass
@@ -44,8 +45,13 @@ class _Receiver:
     def kind(self) -> int:
         return int(np.median(self.kinds)) if self.kinds else 0
 
+    @property
+    def known_or_usual_m(self) -> float:
+        """σ as stated, else as usual for the kind of fix."""
+        return self.sigma_m if math.isfinite(self.sigma_m) else _USUAL_SIGMA_M[self.kind]
+
     def rank(self, longest_s: float) -> tuple[bool, int, int, float, int, str]:
-        sigma = self.sigma_m if math.isfinite(self.sigma_m) else _USUAL_SIGMA_M[self.kind]
+        sigma = self.known_or_usual_m
         short = not self.fixes or self.span_s < _LEAST_SHARE * longest_s
         return short, round(math.log2(sigma)), -self.kind, sigma, -len(self.fixes), self.topic.name
 
@@ -55,10 +61,10 @@ class _Receiver:
         return f"{len(self.fixes)} fixes, {FIX_KINDS[self.kind]}, {sigma}"
 
 
-def ranked_receivers(bag: Bag, topics: Sequence[BagTopic]) -> tuple[list[BagTopic], str]:
-    """Return the topics of receivers from the best to the worst, and a sentence on the choice.
+def ranked_receivers(bag: Bag, topics: Sequence[BagTopic]) -> tuple[list[BagTopic], str, str]:
+    """Return the topics of receivers from the best to the worst, a sentence on the choice, and one on a difference.
 
-    Reads all their messages.
+    The last is empty where the σ of the two best explain how far they are apart. Reads all their messages.
     """
     receivers = {topic.name: _Receiver(topic) for topic in topics}
     for message in bag.messages(list(receivers)):
@@ -85,7 +91,20 @@ def ranked_receivers(bag: Bag, topics: Sequence[BagTopic]) -> tuple[list[BagTopi
         f"The positions are from {best.topic.name} ({best.words()}), not {others}.{distance} --fix-topic selects "
         "another topic."
     )
-    return [one.topic for one in order], sentence
+    return [one.topic for one in order], sentence, "" if apart is None else _beyond_sigma(best, second, apart)
+
+
+def _beyond_sigma(best: _Receiver, other: _Receiver, apart_m: tuple[float, float]) -> str:
+    """Return the sentence of receivers that are further apart in plan than their σ allow; empty: none are."""
+    sigma_m = math.hypot(best.known_or_usual_m, other.known_or_usual_m)
+    if apart_m[0] <= max(_SIGMAS * sigma_m, _LEAST_APART_M):
+        return ""
+    return (
+        f"{best.topic.name} and {other.topic.name} are {apart_m[0]:.2f} m apart horizontally (median), where their "
+        f"σ together are {sigma_m:.2g} m: one of them is wrong, in another datum, or elsewhere on the aircraft. "
+        f"{best.topic.name} is used. Compare both with control points (--gcp), or name the right one with "
+        "--fix-topic."
+    )
 
 
 def _apart(best: _Receiver, other: _Receiver) -> tuple[float, float] | None:

@@ -35,13 +35,17 @@ _JUMP_NS = 60_000_000_000
 
 @dataclass(frozen=True)
 class SelectedTopics:
-    """The topics to read, None where the bag has none; `remarks` names those that were not selected."""
+    """The topics to read, None where the bag has none; `remarks` names those that were not selected.
+
+    `receivers_apart`: the sentence on two receivers that are further apart than their σ; empty: none are.
+    """
 
     image: str | None
     info: str | None
     fix: str | None
     attitude: str | None
     remarks: tuple[str, ...]
+    receivers_apart: str = ""
 
 
 def select_topics(bag: Bag, options: IngestOptions) -> SelectedTopics:
@@ -56,12 +60,13 @@ def select_topics(bag: Bag, options: IngestOptions) -> SelectedTopics:
         InputError: a named topic is not there, or is of no type that fits.
     """
     remarks: list[str] = []
+    apart = ""
     images = sorted(_of(bag, (IMAGE, COMPRESSED)), key=lambda topic: _image_rank(bag, topic))
     image = _pick(bag, images, options.image_topic, flag="--image-topic", subject="photographs", remarks=remarks)
     fixes, choice = _by_type(bag, POSITIONS), ""
     receivers = [topic for topic in fixes if topic.type in RECEIVER_TYPES]
     if options.fix_topic is None and len(receivers) > 1:
-        receivers, choice = ranked_receivers(bag, receivers)
+        receivers, choice, apart = ranked_receivers(bag, receivers)
         fixes = receivers + [topic for topic in fixes if topic.type not in RECEIVER_TYPES]
     fix = _pick(
         bag, fixes, options.fix_topic, flag="--fix-topic", subject="positions", remarks=remarks, choice=choice
@@ -72,7 +77,7 @@ def select_topics(bag: Bag, options: IngestOptions) -> SelectedTopics:
     attitude = _pick(
         bag, attitudes, options.attitude_topic, flag="--attitude-topic", subject="attitudes", remarks=remarks
     )
-    return SelectedTopics(image, _info_topic(bag, image), fix, attitude, tuple(remarks))
+    return SelectedTopics(image, _info_topic(bag, image), fix, attitude, tuple(remarks), apart)
 
 
 def _of(bag: Bag, types: Container[str]) -> list[BagTopic]:
@@ -208,6 +213,8 @@ def read_streams(bag: Bag, options: IngestOptions, remarks: Remarks, progress: P
     )
     for remark in topics.remarks:
         remarks.assume("bag-topic-choice", remark)
+    if topics.receivers_apart:
+        remarks.caution("receivers-apart", topics.receivers_apart)
     images, positions, attitudes = (
         None if topic is None else TopicSamples(topic, bag.topics[topic].type, width)
         for topic, width in ((topics.image, 0), (topics.fix, 6), (topics.attitude, 5))

@@ -13,7 +13,7 @@ from pipelines.core.sentences import listed
 from pipelines.core.types import Vector3
 from pipelines.report.page import decibel, number_text, share
 from pipelines.survey.report import CheckPointErrors, DistanceError, EvaluationReport, PhotometricFigures
-from pipelines.survey.report_parts import VarianceFactor
+from pipelines.survey.report_parts import Group, VarianceFactor
 from pipelines.survey.survey import LOCAL_FRAME
 
 Level = Literal["good", "fair", "poor", "unknown"]
@@ -69,6 +69,10 @@ class Measured:
 # What the test of the predicted σ says of the check points' errors, by the code of its caution.
 _OF_CHECK_POINTS = {"prediction-rejected": "more", "prediction-pessimistic": "less"}
 
+_OF_FIXES: tuple[Group, ...] = ("fixes", "horizontal drift", "vertical drift")
+_SCATTER = 2.25  # variance factor, of σ that are larger by one half
+_SMALL = 0.25  # variance factor, below which residuals are less than half of σ
+
 _Fields = tuple[Level, str, str, str]  # of a verdict without its subject, in their order
 
 
@@ -77,7 +81,10 @@ def verdicts(report: EvaluationReport, measured: Measured, cautions: Sequence[Re
     triangulated, on_surface, test = report.checkpoints.triangulated, report.checkpoints.surface, report.test_views
     codes = {caution.code for caution in (*cautions, *report.cautions)}
     is_local = LOCAL_FRAME in codes  # without positions and ground points
-    of_place = {"Recorded positions": _fixes(measured), "Control points": _control(measured)}
+    of_place = {
+        "Recorded positions": _fixes(measured, report.variance_factors),
+        "Control points": _control(measured),
+    }
     of_points = {
         "Check points": _check_points(measured, triangulated),
         "Predicted against measured": _prediction(triangulated, codes),
@@ -156,7 +163,7 @@ def _reprojection(measured: Measured) -> _Fields:
     return level, f"{number_text(measured.rmse_px)} px RMSE", reason, rule
 
 
-def _fixes(measured: Measured) -> _Fields:
+def _fixes(measured: Measured, factors: tuple[VarianceFactor, ...]) -> _Fields:
     rule = f"good up to {share(FIX_OUTLIERS[0])} outliers, fair up to {share(FIX_OUTLIERS[1])}"
     if not measured.fixes:
         level: Level = "fair" if measured.control_points >= CONTROL_POINTS[1] else "unknown"
@@ -169,6 +176,10 @@ def _fixes(measured: Measured) -> _Fields:
         reason = f"left out: {_named(measured.outliers)}"
     elif sigmas > _FIX_SIGMAS:
         reason = f"none was left out; the largest residual is {sigmas:.1f} of its stated σ ({name})"
+    of_fixes = [factor for factor in factors if factor.group in _OF_FIXES and factor.applied > _SCATTER]
+    if of_fixes and level != "poor":
+        scatter = ", ".join(f"{factor.group} {number_text(factor.applied**0.5)} times" for factor in of_fixes)
+        level, reason = "fair", f"they scatter about the SfM model beyond their σ: {scatter}"
     reading = f"{measured.fixes} used or tested, {measured.fix_outliers} outliers"
     return level, reading, reason, rule
 
@@ -239,6 +250,14 @@ def _stated_sigma(factors: tuple[VarianceFactor, ...], codes: Collection[str]) -
     if large:
         names = ", ".join(f"{factor.group} (probability {number_text(factor.probability)})" for factor in large)
         return "fair", passed, f"these stated σ are larger than the residuals: {names}", rule
+    small = [factor.group for factor in tested if factor.estimated is not None and factor.estimated < _SMALL]
+    if small:
+        return (
+            "good",
+            passed,
+            f"none is too small; the residuals are less than half of σ of {', '.join(small)}",
+            rule,
+        )
     return "good", passed, "the residuals give no reason to doubt these σ", rule
 
 

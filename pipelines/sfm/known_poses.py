@@ -37,17 +37,30 @@ def triangulated_from(colmap: Any, imported: Any, job: SfmJob, folder: Path, pro
         extract_features(colmap, job, range(len(job.survey.images)), progress)
         match_features(colmap, job, candidate_pairs(job.survey, job.options), progress)
     model = _with_numbers_of(colmap, imported, job.database)
-    check_matches(flatten(model), _matches(colmap, model, job.database), folder)
+    matches = _matches(colmap, model, job.database)
+    check_matches(flatten(model), matches, folder)
     triangulate(colmap, model, job.database, progress)
     if model.num_points3D() < _LEAST_POINTS:
-        raise DegenerateGeometryError(
-            "no-points-triangulated",
-            f"{model.num_points3D()} points could be triangulated from the imported poses: texture or overlap is "
-            "too low, or the poses are too inaccurate. Reconstruct without --import, or try a larger "
-            "--max-features.",
-        )
+        raise _without_points(model, sum(len(pixels) for pixels, _ in matches.values()), len(matches))
     model.extract_colors_for_all_images(job.images)
     return model
+
+
+def _without_points(model: Any, matches: int, pairs: int) -> DegenerateGeometryError:
+    """Return the error of poses that give hardly a point: the photographs or the poses are the cause."""
+    found = f"{model.num_points3D()} points could be triangulated from the imported poses"
+    if matches < _LEAST_POINTS:
+        return DegenerateGeometryError(
+            "no-matches",
+            f"{found}: {matches} verified matches were found between the {model.num_images()} photographs. They do "
+            "not show the same ground, or it lacks texture; poses play no part in that. Check that the photographs "
+            "overlap, and are those of the model.",
+        )
+    return DegenerateGeometryError(
+        "no-points-triangulated",
+        f"{found}, although {matches} matches were found in {pairs} pairs of photographs: the poses or the focal "
+        "length are too inaccurate. Reconstruct without --import.",
+    )
 
 
 def _with_numbers_of(colmap: Any, imported: Any, database: Path) -> Any:

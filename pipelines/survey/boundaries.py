@@ -104,7 +104,7 @@ def _crs_text(layer: BoundaryLayer, stated: str | None, path: Path, crs_field: s
     if not stated or not of_layer or _are_equal(stated, of_layer):
         return of_layer or stated or ""
     shown = proj_crs(of_layer).name
-    if path.suffix.lower() == ".kml":
+    if path.suffix.lower() in (".kml", ".kmz"):
         log.warning(
             "%s: %s is not used, KML is in WGS84.", path.name, crs_field, extra={"code": "boundary-crs-unused"}
         )

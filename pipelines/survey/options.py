@@ -9,7 +9,7 @@ from pydantic import AfterValidator, Field
 from pipelines.core.options import WRITTEN, ExtraMarker, InputMarker, StageOptions, from_text
 from pipelines.geodesy.vertical import Vertical, VerticalChoice
 
-BOUNDARY_SUFFIXES = frozenset({".geojson", ".json", ".gpkg", ".kml", ".dxf"})
+BOUNDARY_SUFFIXES = frozenset({".geojson", ".json", ".gpkg", ".kml", ".kmz", ".dxf"})
 LEAST_PHOTOGRAPHS = 3  # that see the ground of the area of interest: two do not check each other
 CLOUD_SUFFIXES = frozenset({".las", ".laz", ".ply"})
 NOT_IN_BLOCKS = (
@@ -50,8 +50,9 @@ class AreaOptions(StageOptions):
 
     boundary: Annotated[Path, InputMarker(BOUNDARY_SUFFIXES), ExtraMarker("vectors")] | None = Field(
         None,
-        description="Polygon of the area of interest: GeoJSON, GeoPackage, KML or DXF. Without it: the ground that "
-        f"{LEAST_PHOTOGRAPHS} training views measure; before training, that {LEAST_PHOTOGRAPHS} photographs see.",
+        description="Polygon of the area of interest: GeoJSON, GeoPackage, KML, KMZ or DXF. Without it: the ground "
+        f"that {LEAST_PHOTOGRAPHS} training views measure; before training, that {LEAST_PHOTOGRAPHS} photographs "
+        "see.",
     )
     boundary_crs: str | None = Field(
         None,

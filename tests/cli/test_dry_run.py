@@ -239,3 +239,29 @@ def test_assumptions_and_cautions_are_told_before_anything_runs(real_georef: Geo
     for one in (*found["assumptions"], *found["cautions"]):
         assert one["sentence"][:60] in text
     assert not (tmp_path / "ws").exists()
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--preset", "fast"),
+        ("--iterations", 50),
+        ("--set", "train.sh_degree=1"),
+        ("--set", "evaluate.cross_validate=true"),
+    ],
+)
+def test_options_of_stages_that_a_run_does_not_reach_are_named(
+    real_georef: Georef, tmp_path: Path, words: tuple[object, ...]
+) -> None:
+    write_flight(tmp_path / "photos", 4)
+    run = ("run", tmp_path / "ws", "--images", tmp_path / "photos", "--to", "init-sim3", "--dry-run", *words)
+    found = real_georef(*run)
+    assert found.code == 0
+    assert found.warned == ("option-not-used",)
+
+
+def test_an_option_of_no_stage_that_comes_later_is_refused(real_georef: Georef, tmp_path: Path) -> None:
+    write_flight(tmp_path / "photos", 4)
+    run = ("run", tmp_path / "ws", "--images", tmp_path / "photos", "--to", "init-sim3", "--dry-run")
+    assert real_georef(*run, "--set", "trian.sh_degree=1").code == 2
+    assert real_georef(*run, "--set", "train.sh_degre=1").code == 2

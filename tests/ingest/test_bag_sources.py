@@ -65,6 +65,25 @@ def test_better_receiver_is_taken(ingest: Ingest, good: dict[str, Any], poor: di
     assert f"{math.hypot(*OFF[:2]):.2f} m away horizontally" in said and f"{OFF[2]:+.2f} m in height" in said
 
 
+@pytest.mark.parametrize(
+    ("good", "poor", "is_said"),
+    [
+        ({"status": 2, "sigma": 0.012}, {"status": 0, "sigma": 0.3}, True),  # 2.41 m apart
+        ({"status": 2, "covariance_type": 0}, {"status": 2, "sigma": 0.05}, True),
+        ({"status": 2, "sigma": 0.012}, {"status": 0, "sigma": 2.5}, False),
+        ({"status": 0, "covariance_type": 0}, {"status": 0, "covariance_type": 0}, False),
+    ],
+)
+def test_receivers_further_apart_than_their_sigma_are_a_caution(
+    ingest: Ingest, good: dict[str, Any], poor: dict[str, Any], *, is_said: bool
+) -> None:
+    flight = Flight()
+    survey = ingest([*base(flight), *rtk(flight, **good), *others(flight, "/gps/fix", **poor)])
+    found = [one.sentence for one in survey.cautions if one.code == "receivers-apart"]
+    assert len(found) == is_said
+    assert all(f"{math.hypot(*OFF[:2]):.2f} m apart" in sentence for sentence in found)
+
+
 def test_receiver_of_another_type(ingest: Ingest) -> None:
     """PX4's receiver, fixed by RTK, beside a consumer's NavSatFix, whose type comes first otherwise."""
     flight = Flight()

@@ -297,6 +297,30 @@ def test_the_largest_residual_of_a_fix_is_that_of_its_axis(reported: Reported) -
     assert facts.largest_fix == (name, pytest.approx(ratios[name]))
 
 
+@pytest.mark.parametrize(
+    ("group", "applied", "estimated", "level", "words"),
+    [
+        ("fixes", 12.8, 12.5, "fair", "3.58 times"),
+        ("horizontal drift", 100.0, 100.0, "fair", "10.00 times"),
+        ("fixes", 1.5, 1.5, "good", "agree with each other"),
+        ("fixes", 1.0, 0.06, "good", "agree with each other"),
+    ],
+)
+def test_fixes_that_scatter_beyond_their_sigma_are_not_called_good(
+    group: str, applied: float, estimated: float, level: str, words: str
+) -> None:
+    factor = VarianceFactor.model_validate({
+        "group": group, "count": 28, "used": 28, "redundancy": 75.0, "estimated": estimated, "probability": 0.0,
+        "applied": applied, "sigma_source": "stated",
+    })  # fmt: skip
+    report = report_with().model_copy(update={"variance_factors": (factor,)})
+    found = {verdict.subject: verdict for verdict in verdicts(report, MEASURED, ())}
+    assert found["Recorded positions"].level == level
+    assert words in found["Recorded positions"].reason
+    if estimated < 0.25:
+        assert "less than half of σ of fixes" in found["σ of the measurements"].reason
+
+
 def test_verdicts_are_given_on_what_there_is() -> None:
     subjects = {verdict.subject for verdict in verdicts(report_with(), MEASURED, ())}
     assert not {"Cautions", "State of the products"} & subjects

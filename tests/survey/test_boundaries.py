@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -77,6 +78,39 @@ def test_kml_is_the_same_ground_however_it_is_written(tmp_path: Path, text: str,
     path = tmp_path / "site.kml"
     path.write_bytes(text.encode(encoding))
     assert hectares(path) == pytest.approx(HECTARES, rel=CLOSE)
+
+
+@pytest.mark.parametrize("names", [("doc.kml",), ("files/site.KML", "second.kml"), ("../../../site.kml",)])
+def test_kmz_is_read_where_it_lies(tmp_path: Path, names: tuple[str, ...]) -> None:
+    """The first KML in the archive counts, whatever its name; nothing is unpacked onto the disk."""
+    path = tmp_path / "a" / "b" / "c" / "site.kmz"
+    path.parent.mkdir(parents=True)
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("files/picture.png", b"\x89PNG")
+        for number, name in enumerate(names):
+            archive.writestr(name, kml(polygon(coordinates(SQUARE * (1 + number)))))
+    assert hectares(path) == pytest.approx(HECTARES, rel=CLOSE)
+    assert [one.name for one in tmp_path.rglob("*.*")] == ["site.kmz"]
+
+
+def test_a_kmz_that_is_none_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "site.kmz"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("readme.txt", "no boundary")
+    with refused("boundary-unreadable"):
+        hectares(path)
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("doc.kml", b" " * (65 << 20))  # 65 KiB that unpack to 65 MiB
+    with refused("file-too-large"):
+        hectares(path)
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("doc.kml", kml(polygon(coordinates())))
+    path.write_bytes(path.read_bytes()[:200])
+    with refused("boundary-unreadable"):
+        hectares(path)
+    path.write_text(kml(polygon(coordinates())))
+    with refused("boundary-format"):
+        hectares(path)
 
 
 def test_holes_of_kml_are_no_ground(tmp_path: Path) -> None:
