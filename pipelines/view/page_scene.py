@@ -4,8 +4,10 @@ from typing import Any
 
 import numpy as np
 
+from pipelines.core.sentences import without_commands
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
+from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.report.plots.style import colours_of
 from pipelines.survey.headline import headline_of
 from pipelines.view.measuring import MeasuringModel
@@ -30,7 +32,7 @@ def described_scene(workspace: Workspace, model: MeasuringModel, frame: ViewFram
             "heights": crs.vertical.name if target.origin is None else crs.vertical.described,
             "units": crs.units,
             "axes": target.axes,
-            "assumed": list(target.assumed),
+            "assumed": [without_commands(text) for text in target.assumed if not _is_stated(text, crs.vertical)],
             # Coordinates under the cursor: those of the middle, and how they change along east, north, up.
             "middle": xyz[0].tolist(),
             "by_view": (xyz[1:] - xyz[0]).T.tolist(),
@@ -52,6 +54,11 @@ def described_scene(workspace: Workspace, model: MeasuringModel, frame: ViewFram
         "rasters": model.rasters(),
         "has_sigma": model.posterior is not None and model.posterior.grid is not None,
     }
+
+
+def _is_stated(assumption: str, heights: VerticalDatum) -> bool:
+    """Return whether an assumption is of heights whose datum was stated: none that a reader has to know of."""
+    return heights.stated and heights.name in assumption
 
 
 def accuracy_sentence(workspace: Workspace) -> str:
