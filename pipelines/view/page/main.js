@@ -1,7 +1,7 @@
 // The page: tabs, keys, what is shown, and the photographs that see a place.
 
 import { byId, change, crop, cross, element, get, notice, onState, post, readState, redo, safely, state, undo } from "./base.js";
-import { camera, clicks, fromAbove, home, inView, layers, leavePhotograph, listen, loadScene, look, lookAt, overlayAt, paint, pan, pixelRequest, placeUnder, scene, turn, zoom } from "./scene.js";
+import { camera, clicks, fromAbove, halfSeen, home, inView, layers, leavePhotograph, listen, loadScene, look, lookAt, overlayAt, paint, pan, pixelRequest, placeUnder, scene, turn, zoom } from "./scene.js";
 import * as measure from "./measure.js";
 import * as mark from "./mark.js";
 
@@ -160,7 +160,7 @@ async function begin() {
   byId("strip-on").onchange = (event) => { change({ strip: event.target.checked }); if (place) showSeen(place); };
   byId("clip-on").onchange = (event) => change({ box: event.target.checked ? whole() : null });
   byId("clip-here").onclick = () => {
-    const middle = placeUnder(camera().width / 2, camera().height / 2) ?? state.view.target, half = state.view.distance / 5;
+    const middle = placeUnder(camera().width / 2, camera().height / 2) ?? state.view.target, half = 0.4 * halfSeen();
     change({ box: [...middle.map((v) => v - half), ...middle.map((v) => v + half)] });
   };
   addEventListener("keydown", pressed);

@@ -277,7 +277,14 @@ export function zoom(factor, x, y) {
   const toward = place && factor < 1 ? 1 - distance / view.distance : 0;
   change({ view: { ...view, distance, target: toward ? add(view.target, minus(place, view.target), toward) : view.target } });
 }
-export function lookAt(place, distance = state.view.distance) { leavePhotograph(); change({ view: { ...state.view, target: place, distance } }, { step: true }); }
+// Metres from the middle of the view to its upper edge.
+export const halfSeen = () => state.view.distance * Math.tan(state.view.fov / 2);
+// Looks at a place, from a distance of the usual lens if one is given.
+export function lookAt(place, distance) {
+  leavePhotograph();
+  const { view } = state;
+  change({ view: { ...view, target: place, distance: distance === undefined ? view.distance : away(distance * Math.tan(WIDE / 2), view.fov) } }, { step: true });
+}
 
 export function listen() {
   overlay.addEventListener("pointerdown", (event) => {
