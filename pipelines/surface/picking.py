@@ -192,7 +192,7 @@ class SurfaceReader:
         σ along the line is the RMS difference of these views, which does not fall with their number because their
         errors correlate, and what 0.15 px across their rays are along it.
         """
-        first = self._rendered_distance(sight)
+        first = self.rendered_distance(sight)
         if first is None:
             return NoSurface("nothing of the model lies under this pixel")
         cameras = self._most_detailed(sight.at(first))
@@ -234,7 +234,7 @@ class SurfaceReader:
         cov = near.T @ near / max(len(near) - 1, 1)
         return SurfacePoint(geo_from_model.apply(middle[None])[0], cov, rays.camera[counted])
 
-    def _rendered_distance(self, sight: Sight) -> float | None:
+    def rendered_distance(self, sight: Sight) -> float | None:
         """Return the distance of the surface that a render along the line shows."""
         size, focal = 2 * _HALF_PX + 1, 1.0 / sight.pixel_rad
         pinhole = Pinhole(size, size, focal, focal, size / 2, size / 2)

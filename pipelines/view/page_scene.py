@@ -4,8 +4,10 @@ from typing import Any
 
 import numpy as np
 
+from pipelines.core.sentences import without_commands
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
+from pipelines.geodesy.crs import PointCrs
 from pipelines.report.plots.style import colours_of
 from pipelines.survey.headline import headline_of
 from pipelines.view.measuring import MeasuringModel
@@ -30,7 +32,7 @@ def described_scene(workspace: Workspace, model: MeasuringModel, frame: ViewFram
             "heights": crs.vertical.name if target.origin is None else crs.vertical.described,
             "units": crs.units,
             "axes": target.axes,
-            "assumed": list(target.assumed),
+            "assumed": [without_commands(text) for text in target.assumed if not _is_said(text, crs)],
             # Coordinates under the cursor: those of the middle, and how they change along east, north, up.
             "middle": xyz[0].tolist(),
             "by_view": (xyz[1:] - xyz[0]).T.tolist(),
@@ -54,10 +56,15 @@ def described_scene(workspace: Workspace, model: MeasuringModel, frame: ViewFram
     }
 
 
+def _is_said(assumption: str, crs: PointCrs) -> bool:
+    """Return whether the page says an assumption anyway: the name of the CRS, and heights whose datum was stated."""
+    return crs.name in assumption or (crs.vertical.stated and crs.vertical.name in assumption)
+
+
 def accuracy_sentence(workspace: Workspace) -> str:
     """Return the accuracy of the result; empty where nothing states it."""
     headline = headline_of(workspace)
-    return "" if headline is None else f"The {headline.sentence}."
+    return "" if headline is None else f"Accuracy: {headline.text}."
 
 
 def _camera(model: MeasuringModel, frame: ViewFrame, camera: int) -> Json:

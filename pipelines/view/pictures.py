@@ -57,6 +57,10 @@ class ViewerCamera:
         return Pinhole(self.width, self.height, focal, focal, self.width / 2, self.height / 2)
 
 
+_NEAR = 4.0  # radii of the scene, from which a line of sight begins at most
+_FADED = 2.0, 3.0  # radii between which Gaussians fade away, in views that are no photographs
+
+
 @dataclass(frozen=True)
 class ViewFrame:
     """Frame of the viewer, and the radius of the scene."""
@@ -74,7 +78,18 @@ class ViewFrame:
         """Return the line of sight in `model` through a pixel of a page."""
         pose = self.pose(camera)
         direction = pose.cam_from_model.T @ pose.pinhole.rays(np.array([[x, y]]))[0]
-        return Sight(pose.center_in_model, direction / np.linalg.norm(direction), 1.0 / pose.pinhole.fx)
+        direction, pixel_rad, start = (
+            direction / np.linalg.norm(direction),
+            1.0 / pose.pinhole.fx,
+            pose.center_in_model,
+        )
+        # A view with hardly any perspective stands so far away that shares of its distance are no tolerances.
+        model_from_view = self.view_from_model.inverse()
+        middle, near = model_from_view.apply(np.zeros((1, 3)))[0], _NEAR * self.radius_m * model_from_view.scale
+        away = float(direction @ (middle - start))
+        if away > near:
+            start, pixel_rad = start + (away - near) * direction, pixel_rad * away / near
+        return Sight(start, direction, pixel_rad)
 
     def place(self, point_in_geo: FloatArray) -> FloatArray:
         """Return places (…, 3) in the viewer's frame."""
@@ -155,7 +170,7 @@ class Painter:
         grid: AccuracyGrid | None,
     ) -> None:
         self._trained, self._photographs, self._frame, self._grid = trained, photographs, frame, grid
-        self._renderer_of = lru_cache(2)(lambda box: renderer_of(self._clipped(box)))
+        self._renderer_of = lru_cache(2)(lambda box, faded: renderer_of(self._clipped(box, faded)))
         self._making = threading.Lock()
 
     def paint(self, camera: ViewerCamera, wanted: Wanted) -> PageView:
@@ -166,7 +181,7 @@ class Painter:
         """
         pose = self._frame.pose(camera)
         with self._making:
-            renderer = self._renderer_of(wanted.box)
+            renderer = self._renderer_of(wanted.box, wanted.photograph is None and wanted.box is None)
         render = renderer.render(pose, depth=True)
         depth = measured_depth(render).cpu().numpy() * self._frame.view_from_model.scale
         behind = torch.tensor(wanted.background) - torch.tensor(self._trained.model.background)
@@ -183,10 +198,20 @@ class Painter:
         coarse = cv2.resize(depth.astype(np.float32), small, interpolation=cv2.INTER_NEAREST)
         return PageView(rgb, np.asarray(coarse, dtype=np.float32), scale)
 
-    def _clipped(self, box: Box | None) -> TrainedSurvey:
-        if box is None:
+    def _clipped(self, box: Box | None, faded: bool) -> TrainedSurvey:
+        """Return the survey with the Gaussians in a box, or without those far from the scene."""
+        if box is None and not faded:
             return self._trained
         places = self._frame.view_from_model.apply(self._trained.gaussians.means.double().numpy())
+        if box is None:
+            whole, gone = (factor * self._frame.radius_m for factor in _FADED)
+            share = torch.from_numpy(np.clip((gone - np.linalg.norm(places, axis=1)) / (gone - whole), 1e-6, 1.0))
+            if bool((share == 1).all()):
+                return self._trained
+            opacity = torch.sigmoid(self._trained.gaussians.logit_opacities) * share.float()
+            logit = torch.where(share == 1, self._trained.gaussians.logit_opacities, torch.logit(opacity))
+            shown = replace(self._trained.gaussians, logit_opacities=logit)
+            return replace(self._trained, gaussians=shown)
         inside = ((places >= box[:3]) & (places <= box[3:])).all(axis=1)
         return replace(self._trained, gaussians=self._trained.gaussians.select(torch.from_numpy(inside)))
 
@@ -213,8 +238,10 @@ class Painter:
         low, high = np.quantile(values[known], [0.02, 0.98]).tolist()
         tint = colours_of(values.ravel(), low, high).reshape(*values.shape, 3)
         whole = cv2.resize(np.ascontiguousarray(tint), rgb.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+        is_known = cv2.resize(known.astype(np.uint8), rgb.shape[1::-1], interpolation=cv2.INTER_NEAREST) > 0
         grey = cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2GRAY)[..., None]
-        mixed = np.where((depth > 0)[..., None], _TINT * whole + (1 - _TINT) * grey, rgb)
+        mixed = np.where(is_known[..., None], _TINT * whole + (1 - _TINT) * grey, grey)  # grey: not known
+        mixed = np.where((depth > 0)[..., None], mixed, rgb)
         return np.asarray(mixed, dtype=np.uint8), (low, high)
 
     def _blended(self, rgb: ByteArray, wanted: Wanted, pose: ViewPose) -> ByteArray:

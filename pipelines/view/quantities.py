@@ -161,33 +161,40 @@ _SURFACE_BIAS_PX = 0.02
 def volumes(surface: SampledSurface, base: VolumeBase) -> tuple[Quantity, ...]:
     """Return the volume between surface and base: above, below, and their difference.
 
-    σ is that of the difference: of corners and samples jointly, of the surface as a whole, and of the sampling,
-    which is half the difference between the volumes of the white and of the black samples of the grid, if that is a
-    chequerboard.
+    σ is that of corners and samples jointly, of the surface as a whole, and of the sampling: half the difference
+    between the volumes of the white and of the black samples of the grid, if that is a chequerboard. Of the parts,
+    only samples on their side of the base count.
     """
     area, area_gradient = _area(surface.corners)
     above = surface.samples[:, 2] - base.height_m
-    count, corners = len(above), len(surface.corners.position_in_geo)
-    gradient = np.zeros((corners + len(surface.chosen), 3))
-    gradient[:corners, 2] = -area * base.by_corner.mean(axis=0)
-    gradient[:corners] += area_gradient * float(above.mean())
-    gradient[corners:, 2] = area / len(surface.chosen)
-    of_points = propagated(gradient, surface.cov_in_geo)
-    sigma = None
-    if of_points is not None:
-        of_noise = area / count * float(np.linalg.norm(surface.sigma_up_m))
-        of_whole = area * float(np.hypot(_SURFACE_BIAS_PX * surface.pixel_m, base.sigma_m))
-        columns, rows = (np.unique(axis, return_inverse=True)[1] for axis in np.round(surface.samples[:, :2].T, 3))
-        white = (columns + rows) % 2 == 0
+    columns, rows = (np.unique(axis, return_inverse=True)[1] for axis in np.round(surface.samples[:, :2].T, 3))
+    white = (columns + rows) % 2 == 0
+    corners = len(surface.corners.position_in_geo)
+
+    def quantity(name: str, part: FloatArray, sign: float) -> Quantity:
+        """Return the volume of the samples of which `part` is the share (N,) that counts, with its σ."""
+        heights = sign * above * part
+        value = area * float(heights.mean())
+        gradient = np.zeros((corners + len(surface.chosen), 3))
+        gradient[:corners, 2] = -sign * area * (base.by_corner * part[:, None]).mean(axis=0)
+        gradient[:corners] += area_gradient * float(heights.mean())
+        gradient[corners:, 2] = sign * area / len(surface.chosen) * part[surface.chosen]
+        of_points = propagated(gradient, surface.cov_in_geo)
+        if of_points is None:
+            return Quantity(name, value, None, "m³")
+        of_noise = area / len(above) * float(np.linalg.norm(surface.sigma_up_m * part))
+        of_whole = area * float(part.mean()) * float(np.hypot(_SURFACE_BIAS_PX * surface.pixel_m, base.sigma_m))
         of_sampling = 0.0
         if white.any() and not white.all():
-            of_sampling = area * abs(float(above[white].mean() - above[~white].mean())) / 2
-        sigma = float(np.sqrt(of_points**2 + of_noise**2 + of_whole**2 + of_sampling**2))
-    cut, fill = area * float(np.maximum(above, 0).mean()), area * float(np.maximum(-above, 0).mean())
+            of_sampling = area * abs(float(heights[white].mean() - heights[~white].mean())) / 2
+        return Quantity(
+            name, value, float(np.sqrt(of_points**2 + of_noise**2 + of_whole**2 + of_sampling**2)), "m³"
+        )
+
     return (
-        Quantity("volume above the base", cut, None, "m³"),
-        Quantity("volume below the base", fill, None, "m³"),
-        Quantity("volume", cut - fill, sigma, "m³"),
+        quantity("volume above the base", (above > 0).astype(np.float64), 1.0),
+        quantity("volume below the base", (above < 0).astype(np.float64), -1.0),
+        quantity("volume", np.ones(len(above)), 1.0),
     )
 
 

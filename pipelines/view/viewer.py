@@ -5,7 +5,7 @@ A page has its own state. The viewer has the model, the saved measurements and t
 
 import threading
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import cv2
@@ -41,6 +41,7 @@ from pipelines.view.measuring import ESTIMATE, Fineness, MeasuringModel
 from pipelines.view.options import ViewOptions
 from pipelines.view.page_scene import described_scene
 from pipelines.view.pictures import PageView, Painter, Photographs, frame_of
+from pipelines.view.pointing import pointing_covariance
 from pipelines.view.quantities import Profile, Quantity, distances, length
 from pipelines.view.saved import FOLDER, NamedMeasurement, SavedMeasurements, SavedPoint, new_id
 from pipelines.view.work import Job, Jobs
@@ -140,8 +141,12 @@ class Viewer:
     # Measuring
 
     def pick(self, request: requests.PickRequest) -> Json:
-        """Return the surface under a pixel of a page, or the reason why there is none."""
-        return self._measured(self.model.reader.under(self.frame.sight(request.camera(), request.x, request.y)))
+        """Return the surface under a pixel of a page, with the σ of pointing at it, or why there is none."""
+        found = self.model.reader.under(self.frame.sight(request.camera(), request.x, request.y))
+        if isinstance(found, SurfacePoint):
+            cov = pointing_covariance(self.model.reader, self.frame, request.camera(), (request.x, request.y))
+            found = replace(found, cov_of_surface=found.cov_of_surface + cov)
+        return self._measured(found)
 
     def surveyed(self, name: str) -> Json:
         """Return a surveyed point as its marks show it on the rendered surface, with its surveyed place."""

@@ -6,6 +6,7 @@ import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from urllib.parse import parse_qs, urlparse
 
 import cv2
 import ezdxf
@@ -160,6 +161,9 @@ def test_reload_back_button_and_a_second_page_keep_what_is_shown(
     value, sigma = hill.quantity("distance")
     assert value == pytest.approx(float(np.linalg.norm(on_ground(4, 3) - on_ground(-3, -2))), abs=0.3)
     assert 0 < sigma < 0.3
+    hill.page.locator("#overlay").focus()
+    hill.page.keyboard.press("ArrowLeft")
+    hill.settle()
     hill.page.keyboard.press("t")
     hill.settle()
     other = opened(server, browser)
@@ -171,10 +175,10 @@ def test_reload_back_button_and_a_second_page_keep_what_is_shown(
         hill.page.wait_for_selector("body[data-ready]")
         hill.done()
         assert hill.quantity("distance")[0] == pytest.approx(value)
-        assert re.search(r"view=[^&]*,90,0\.9", hill.page.url)
+        assert re.search(r"view=[^&]*,90,0\.05", hill.page.url)
         expect(hill.page.get_by_role("tab", name="Measure")).to_have_attribute("aria-selected", "true")
         hill.page.go_back()
-        wait(lambda: not re.search(r"view=[^&]*,90,0\.9", hill.page.url))
+        wait(lambda: not re.search(r"view=[^&]*,90,0\.05", hill.page.url))
         assert "kind=area" in other.page.url and "kind=distance" in hill.page.url
         again = browser.new_page()
         again.goto(other.page.url)
@@ -263,7 +267,11 @@ def test_a_place_is_seen_coloured_and_cut_out(hill: Opened) -> None:
     shown = [float(text) for text in re.findall(r"\d+\.\d+", str(cursor.text_content()))]
     np.testing.assert_allclose(shown, true, atol=0.4)
     legend = hill.page.locator("#legend")
-    for colouring, unit in (("sigma", r"\d m σ"), ("views", r"\d photographs"), ("height", r"\d m(?! σ)")):
+    for colouring, unit in (
+        ("sigma", r"predicted σ.*\d m"),
+        ("views", "photographs that see it"),
+        ("height", r"height.*\d m"),
+    ):
         hill.page.select_option("#colouring", colouring)
         # The legend of a picture asked for before may still arrive.
         expect(legend).to_have_text(re.compile(unit), timeout=PATIENCE_MS)
@@ -347,3 +355,72 @@ def test_a_full_disk_is_told_and_nothing_is_stored_twice(
             assert len(read_measurements(folder)) == 1
         finally:
             view.page.close()
+
+
+def test_the_first_view_is_the_area_from_above(hill: Opened) -> None:
+    """North is up, the whole outline is in the picture and fills it, and nothing leans; names do not overlap."""
+    hill.go()
+    rings = np.array([corner for ring in hill.server.viewer.scene()["boundary"] for corner in ring])
+    camera = hill.camera().camera()
+    np.testing.assert_allclose(camera.rotation[2], [0, 0, -1], atol=1e-9)
+    if len(rings):
+        pixels = camera.pinhole().project((rings - camera.position) @ camera.rotation.T)
+        low, high = pixels.min(axis=0), pixels.max(axis=0)
+        assert (low > 0).all() and high[0] < camera.width and high[1] < camera.height
+        assert max((high - low) / (camera.width, camera.height)) > 0.85
+    # Ten metres of height move a place at the rim by less than 3 % of them.
+    foot, top = (
+        camera.pinhole().project(camera.rotation @ (np.array([20.0, 15.0, up]) - camera.position)) for up in (0, 10)
+    )
+    metre_px = camera.pinhole().fx / np.linalg.norm(camera.position - [20.0, 15.0, 0.0])
+    assert np.linalg.norm(np.subtract(top, foot)) < 0.3 * metre_px
+    assert "--" not in str(hill.page.locator("#accuracy").text_content())
+
+
+def test_points_are_dragged_undone_and_done_again(hill: Opened) -> None:
+    hill.go()
+    hill.begin("distance")
+    hill.click_all([on_ground(-8, 2), on_ground(6, 4)])
+    hill.done()
+    before = hill.measured()
+    hill.page.mouse.move(*hill.pixel(on_ground(6, 4)))
+    hill.page.mouse.down()
+    hill.page.mouse.move(*hill.pixel(on_ground(8, 3)), steps=4)
+    hill.page.mouse.move(*hill.pixel(on_ground(9, -3)), steps=4)
+    hill.page.mouse.up()
+    wait(lambda: np.linalg.norm(hill.measured()[1] - before[1]) > 3)
+    moved = hill.measured()
+    np.testing.assert_allclose(moved[1][:2], [9, -3], atol=PIXEL_M)
+    np.testing.assert_array_equal(moved[0], before[0])
+    hill.page.keyboard.press("Control+z")
+    wait(lambda: np.allclose(hill.measured()[1], before[1]))
+    hill.page.keyboard.press("Control+Shift+z")
+    wait(lambda: np.allclose(hill.measured()[1], moved[1]))
+    hill.done()
+    length, sigma = hill.quantity("horizontal distance")
+    assert length == pytest.approx(np.hypot(17, 5), abs=2 * PIXEL_M)
+    pixel_m = (
+        np.linalg.norm(np.diff([hill.camera().camera().position, np.zeros(3)], axis=0))
+        / hill.camera().camera().pinhole().fx
+    )
+    assert sigma > pixel_m  # of two clicks, 0.8 px each along the line
+
+
+def test_what_was_saved_is_shown(hill: Opened) -> None:
+    hill.go()
+    hill.begin("distance")
+    hill.click_all([on_ground(-8, 2), on_ground(6, 4)])
+    hill.done()
+    hill.page.evaluate("() => location.hash")
+    hill.save("wall")
+    wait(lambda: hill.saved.filter(has_text="wall").count() == 1)
+    assert "saved" in parse_qs(urlparse(hill.page.url).fragment)["shown"][0].split(",")
+    hill.tab("See")
+    hill.page.get_by_label("saved measurements").uncheck()
+    hill.tab("Measure")
+    before = hill.camera()
+    hill.saved.filter(has_text="wall").get_by_role("button", name="Show").click()
+    hill.settle()
+    assert "saved" in parse_qs(urlparse(hill.page.url).fragment)["shown"][0].split(",")
+    assert hill.camera().camera().position.tolist() != before.camera().position.tolist()
+    hill.saved.filter(has_text="wall").get_by_role("button", name="Delete").click()

@@ -16,6 +16,8 @@ from pipelines.surface.picking import NoSurface, Sight, SurfacePoint, depth_arou
 from pipelines.survey.marks import mark_rays
 from pipelines.survey.options import CrsOptions
 from pipelines.view.measuring import ESTIMATE, Fineness, MeasuringModel, WantedBase
+from pipelines.view.pictures import ViewerCamera, frame_of
+from pipelines.view.pointing import pointing_covariance
 from pipelines.view.quantities import along_line, distances
 from tests.splat_scenes import ground_height
 from tests.view_scenes import renderer_of
@@ -151,3 +153,35 @@ def test_no_sigma_is_stated_that_nothing_checks(viewed: Workspace, model: Measur
     assert fresh.posterior is None and "nothing checks" in fresh.without_sigma
     with pytest.raises(MissingProductError, match=r"train/adjustment\.npz"):
         MeasuringModel(Workspace(tmp_path), renderer, CrsOptions())
+
+
+@pytest.mark.parametrize("spread", ["normal", "whole pixels"])
+def test_sigma_of_a_click_is_that_of_a_persons_pixel(model: MeasuringModel, spread: str) -> None:
+    """Thirty distances, clicked a pixel beside the place: their error over the σ of pointing alone."""
+    rng, frame = np.random.default_rng(11), frame_of(model.trained)
+    position = np.array([18.0, -42.0, 30.0])
+    forward = -position / np.linalg.norm(position)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    camera = ViewerCamera(rotation, position, 0.9, 640, 400)
+
+    def clicked(pixel: np.ndarray) -> np.ndarray:
+        found = model.reader.under(frame.sight(camera, *pixel))
+        assert isinstance(found, SurfacePoint)
+        return found.position_in_geo
+
+    ratios = []
+    for _ in range(30):
+        places = [on_ground(*rng.uniform(-11, 11, 2)) for _ in range(2)]
+        pixels = [camera.pinhole().project(rotation @ (frame.place(place) - position)) for place in places]
+        off = rng.normal(size=(2, 2)) if spread == "normal" else rng.integers(-1, 2, (2, 2))
+        true = [clicked(np.array(pixel)) for pixel in pixels]
+        wrong = [clicked(np.array(pixel) + by) for pixel, by in zip(pixels, off, strict=True)]
+        along = (true[1] - true[0]) / np.linalg.norm(true[1] - true[0])
+        variance = sum(
+            along @ pointing_covariance(model.reader, frame, camera, tuple(pixel)) @ along for pixel in pixels
+        )
+        error = np.linalg.norm(wrong[1] - wrong[0]) - np.linalg.norm(true[1] - true[0])
+        ratios.append(error / np.sqrt(variance))
+    assert 0.7 < float(np.sqrt(np.mean(np.square(ratios)))) < 1.4

@@ -78,3 +78,24 @@ def volumes_of_chequers(samples: np.ndarray, surface: SampledSurface, base: Volu
     column, row = (np.unique(np.round(samples[:, axis], 3), return_inverse=True)[1] for axis in (0, 1))
     above, white = samples[:, 2] - base.height_m, (column + row) % 2 == 0
     return float(plan_area(surface.corners).value * abs(above[white].mean() - above[~white].mean()) / 2)
+
+
+def test_sigma_of_cut_and_fill_is_that_of_draws() -> None:
+    """Half of a field is cut, half is filled: corners and the surface as a whole err."""
+    rng = np.random.default_rng(5)
+    corners = np.array([[0.0, 0, 0], [10, 0, 0], [10, 10, 0], [0, 10, 0]])
+    grid = grid_in_polygon(corners[:, :2], 0.5)
+    heights = np.where(grid[:, 0] < 5, 0.6, -0.4)
+    samples, chosen = np.column_stack([grid, heights]), np.arange(0, len(grid), 7)
+    joint = np.zeros((3 * (4 + len(chosen)),) * 2)
+    up = np.arange(2, 12, 3)
+    joint[up, up] = 0.03**2  # of the corners' heights
+    surface = SampledSurface(exact(corners, joint[:12, :12]), samples, np.full(len(grid), 0.05), joint, chosen, 0.0)
+    above, below, volume = volumes(surface, rim_base("mean", corners, grid))
+    assert (above.value, below.value, volume.value) == pytest.approx((30.0, 20.0, 10.0))
+    drawn = []
+    for _ in range(400):
+        base = (corners[:, 2] + rng.normal(0, 0.03, 4)).mean()
+        each = samples[:, 2] + rng.normal(0, 0.05, len(samples)) - base
+        drawn.append([100 * np.maximum(each, 0).mean(), 100 * np.maximum(-each, 0).mean(), 100 * each.mean()])
+    np.testing.assert_allclose([above.sigma, below.sigma, volume.sigma], np.std(drawn, axis=0), rtol=0.2)

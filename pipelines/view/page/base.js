@@ -57,7 +57,7 @@ export function question(text) {
 }
 
 // The state of this page is in its address: a reload, another tab and the back button keep it.
-export const state = { tab: "see", photo: null, view: null, shown: new Set(["cameras", "points", "errors"]), colouring: "photographs", share: 1, box: null, light: "", kind: "point", point: "", strip: false };
+export const state = { tab: "see", photo: null, view: null, shown: new Set(["points", "saved"]), colouring: "photographs", share: 1, box: null, light: "", kind: "point", point: "", strip: false };
 const listeners = new Set();
 export const onState = (listener) => listeners.add(listener);
 
@@ -72,7 +72,7 @@ export function readState() {
     tab: ["see", "measure", "mark"].includes(given.get("tab")) ? given.get("tab") : "see",
     photo: photo && /^\d+$/.test(photo) ? Number(photo) : null,
     view: view ? { target: view.slice(0, 3), distance: view[3], heading: view[4], pitch: view[5], fov: view[6] } : state.view,
-    shown: new Set(given.has("shown") ? given.get("shown").split(",").filter(Boolean) : ["cameras", "points", "errors"]),
+    shown: new Set(given.has("shown") ? given.get("shown").split(",").filter(Boolean) : ["points", "saved"]),
     colouring: given.get("colours") ?? "photographs", share: Number(given.get("share") ?? 1), box,
     light: given.get("light") ?? "", kind: given.get("kind") ?? "point", point: given.get("point") ?? "",
     strip: given.has("strip"),
@@ -104,14 +104,27 @@ export function change(values, { step = false } = {}) {
 }
 addEventListener("popstate", () => { readState(); for (const listener of listeners) listener(); });
 
-// Steps that Ctrl-Z undoes, the last one first, apart for each tab.
-const steps = { see: [], measure: [], mark: [] };
-export const did = (tab, name, undo) => { steps[tab].push({ name, undo }); if (steps[tab].length > 100) steps[tab].shift(); };
+// Steps that Ctrl-Z undoes, the last one first, apart for each tab; Ctrl-Shift-Z does them again.
+const steps = { see: [], measure: [], mark: [] }, undone = { see: [], measure: [], mark: [] };
+let again = false;  // a step that is done again keeps those behind it
+export const did = (tab, name, undo, redo) => {
+  steps[tab].push({ name, undo, redo });
+  if (steps[tab].length > 100) steps[tab].shift();
+  if (!again) undone[tab] = [];
+};
+export async function redo(tab = state.tab) {
+  const next = undone[tab].pop();
+  if (!next) return notice("Nothing to do again.");
+  again = true;
+  try { await next.redo(); } finally { again = false; }
+  return notice(`Done again: ${next.name}.`);
+}
 export async function undo(tab = state.tab) {
   const last = steps[tab].at(-1);
   if (!last) return notice("Nothing to undo.");
   await last.undo();
   steps[tab].splice(steps[tab].indexOf(last), 1);
+  if (last.redo) undone[tab].push(last); else undone[tab] = [];
   return notice(`Undone: ${last.name}.`);
 }
 

@@ -1,7 +1,7 @@
 // The page: tabs, keys, what is shown, and the photographs that see a place.
 
-import { byId, change, crop, cross, element, get, notice, onState, post, readState, safely, state, undo } from "./base.js";
-import { camera, clicks, home, inView, layers, leavePhotograph, listen, loadScene, look, lookAt, overlayAt, paint, pan, pixelRequest, placeUnder, scene, turn, zoom } from "./scene.js";
+import { byId, change, crop, cross, element, get, notice, onState, post, readState, redo, safely, state, undo } from "./base.js";
+import { camera, clicks, fromAbove, halfSeen, home, inView, layers, leavePhotograph, listen, loadScene, look, lookAt, overlayAt, paint, pan, pixelRequest, placeUnder, scene, turn, zoom } from "./scene.js";
 import * as measure from "./measure.js";
 import * as mark from "./mark.js";
 
@@ -66,13 +66,13 @@ layers.push((context, pixelOf) => {
 
 const KEYS = [
   ["H", "whole scene", () => change({ photo: null, view: home() }, { step: true })],
-  ["T", "from above, north up", () => { leavePhotograph(); change({ view: { ...state.view, heading: 0, pitch: 90 } }, { step: true }); }],
+  ["T", "from above, north up", () => { leavePhotograph(); change({ view: fromAbove(state.view) }, { step: true }); }],
   ["← → ↑ ↓", "turn; with Shift: move"],
   ["+ −", "closer, further"],
   ["1 2 3", "see, measure, mark"],
   ["Enter", "finish an outline (also: double click)", () => state.tab === "measure" && measure.finish()],
   ["Esc", "new measurement; leave the photograph", () => (state.photo !== null ? leave() : state.tab === "measure" && measure.clear())],
-  ["Ctrl-Z", "undo"],
+  ["Ctrl-Z", "undo; with Shift: do again"],
   ["Space", "measure or look at the middle of the scene"],
   ["N B", "next, previous photograph of a point; N elsewhere: north up", null],
   ["M", "whole photograph", () => mark.whole()],
@@ -85,7 +85,8 @@ const northUp = () => { leavePhotograph(); change({ view: { ...state.view, headi
 
 function pressed(event) {
   if (event.target.closest("input:not([type=checkbox], [type=radio], [type=range]), textarea, dialog[open]")) return;
-  if ((event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z") { event.preventDefault(); safely(() => undo()); return; }
+  if ((event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z") { event.preventDefault(); safely(() => (event.shiftKey ? redo() : undo())); return; }
+  if (event.ctrlKey && event.key.toLowerCase() === "y") { event.preventDefault(); safely(() => redo()); return; }
   if (event.ctrlKey || event.metaKey || event.altKey) return;
   const onControl = event.target.closest("button, select, a, input, summary");
   const arrows = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
@@ -108,7 +109,7 @@ function pressed(event) {
 
 function build() {
   byId("name").textContent = document.title = scene.name;
-  byId("accuracy").textContent = [scene.accuracy, `Coordinates: ${scene.crs.name}; heights: ${scene.crs.heights}.`, ...scene.crs.assumed.map((text) => `Assumed: ${text}.`)].join(" ");
+  byId("accuracy").textContent = [scene.accuracy, `Coordinates: ${scene.crs.name}; heights: ${scene.crs.heights}.`, ...scene.crs.assumed.filter(Boolean).map((text) => `Assumed: ${text}.`)].join(" ");
   for (const [name, title] of Object.entries(OVERLAYS)) {
     const nothing = { errors: !scene.errors, contours: !scene.contours.length, changes: !scene.changes.length, boundary: !scene.boundary.length, "points by σ": !scene.tie_points.sigma }[name];
     const text = name === "errors" && scene.errors ? `${title} × ${scene.errors.enlarged}` : nothing && { contours: `${title} (georef export-raster --contours)`, changes: `${title} (georef change)` }[name] || title;
@@ -159,7 +160,7 @@ async function begin() {
   byId("strip-on").onchange = (event) => { change({ strip: event.target.checked }); if (place) showSeen(place); };
   byId("clip-on").onchange = (event) => change({ box: event.target.checked ? whole() : null });
   byId("clip-here").onclick = () => {
-    const middle = placeUnder(camera().width / 2, camera().height / 2) ?? state.view.target, half = state.view.distance / 5;
+    const middle = placeUnder(camera().width / 2, camera().height / 2) ?? state.view.target, half = 0.4 * halfSeen();
     change({ box: [...middle.map((v) => v - half), ...middle.map((v) => v + half)] });
   };
   addEventListener("keydown", pressed);

@@ -1,8 +1,8 @@
 // The tab Measure: points under clicks, their quantities with σ, profiles, and what is saved.
 
-import { sensible, withSigma } from "./geometry.js";
-import { ask, byId, change, did, element, get, notice, onState, post, safely, state, undo } from "./base.js";
-import { clicks, drawLine, inView, label, layers, lookAt, overlayAt, paint, pixelRequest, scene } from "./scene.js";
+import { minus, norm, rounded, sensible, withSigma } from "./geometry.js";
+import { ask, byId, change, did, element, get, notice, onState, post, redo, safely, state, undo } from "./base.js";
+import { clicks, drawLine, grips, hovers, inView, label, layers, lookAt, overlayAt, paint, pixelOn, pixelRequest, placeUnder, scene } from "./scene.js";
 
 const KINDS = { point: [1, 1], distance: [2, 2], polyline: [2, 1000], profile: [2, 1000], area: [3, 1000], volume: [3, 1000] };
 const CLOSED = new Set(["area", "volume"]);
@@ -30,15 +30,52 @@ function set(points, closed) {
 
 export function step(name, points, closed = false) {
   const before = { kind: state.kind, points: now.points, closed: now.closed };
-  did("measure", name, () => { change({ kind: before.kind }); set(before.points, before.closed); });
+  const after = { kind: state.kind, points, closed };
+  const back = (to) => { change({ kind: to.kind }); set(to.points, to.closed); };
+  did("measure", name, () => back(before), () => { step(name, after.points, after.closed); });
   set(points, closed);
 }
 
 export function addPoint(found, name = "") {
   if (found.reason) { notice(`Nothing measured: ${found.reason}.`, { failed: true }); return; }
+  warnOutside(found);
   const most = KINDS[state.kind][1], kept = now.closed || now.points.length >= most ? [] : now.points;
   step(`point ${kept.length + 1}`, [...kept, { ...found, name }]);
 }
+
+// Outside the area of interest, few photographs see a place.
+function warnOutside({ point }) {
+  const [x, y] = inView(point.position_in_geo);
+  const inside = scene.boundary.reduce((odd, ring) => ring.reduce((now_, [ax, ay], k) => {
+    const [bx, by] = ring[(k + 1) % ring.length];
+    return (ay > y) !== (by > y) && x < (bx - ax) * (y - ay) / (by - ay) + ax ? !now_ : now_;
+  }, odd), false);
+  if (scene.boundary.length && !inside) notice("This point is outside the area of interest: few photographs see it, and its height is less certain than its σ says.");
+}
+
+// A measured point under the pointer is dragged to another place of the surface.
+let dragged = null, cursor = null;
+grips.measure = ({ x, y }) => {
+  const index = now.points.findIndex(({ point }) => { const at = pixelOn(inView(point.position_in_geo)); return at && Math.hypot(at.x - x, at.y - y) < 10; });
+  if (index < 0) return null;
+  return {
+    move: (at) => { dragged = { index, place: placeUnder(at.x, at.y) }; paint(); },
+    drop: (at) => {
+      const request = pixelRequest(at.x, at.y), { points, closed } = now;
+      dragged = null;
+      picking = picking.then(() => safely(async () => {
+        const found = await post("pick", request);
+        if (found.reason) { notice(`The point stays: ${found.reason}.`, { failed: true }); paint(); return; }
+        warnOutside(found);
+        step(`moving of point ${index + 1}`, points.map((each, k) => (k === index ? { ...found, name: "" } : each)), closed);
+      }));
+    },
+  };
+};
+hovers.measure = (at) => {
+  cursor = at && now.points.length && !now.closed && KINDS[state.kind][1] > 1 ? placeUnder(at.x, at.y) : null;
+  if (cursor || now.points.length) paint();
+};
 
 async function compute() {
   const points = now.points.map(({ point }) => point);
@@ -103,19 +140,59 @@ function quantityTable(quantities) {
   }, element("th", {}, name), element("td", {}, withSigma(value, sigma, unit, unit.startsWith("%") ? 0 : 2)))));
 }
 
+let profileAt = null;  // place of the scene under the cursor in the profile
+
+// Round values between two bounds.
+function ticksOf(low, high, about) {
+  const step = rounded(Math.max(high - low, 1e-9) / about) || 1, first = Math.ceil(low / step - 1e-9);
+  return Array.from({ length: Math.max(Math.floor(high / step + 1e-9) - first + 1, 0) }, (_, k) => (first + k) * step);
+}
+
+// Place of the scene at a distance along the line, at the height of the profile.
+function placeAlong(distance, height) {
+  const plan = now.points.map(({ point }) => inView(point.position_in_geo));
+  let left = distance;
+  for (let k = 1; k < plan.length; k += 1) {
+    const leg = Math.hypot(plan[k][0] - plan[k - 1][0], plan[k][1] - plan[k - 1][1]);
+    if (left <= leg || k === plan.length - 1) {
+      const share = leg ? Math.min(left / leg, 1) : 0;
+      const [x, y] = [0, 1].map((j) => plan[k - 1][j] + share * (plan[k][j] - plan[k - 1][j]));
+      return [x, y, (height - scene.crs.middle[2]) / scene.crs.by_view[2][2]];
+    }
+    left -= leg;
+  }
+  return null;
+}
+
 function profileDrawing({ along_m: along, height, sigma_m: sigma }) {
-  const [W, H, left, bottom] = [320, 170, 44, 26], known = height.filter((value) => value !== null);
+  const W = Math.max(byId("view").clientWidth - 32, 280), H = 190, left = 64, bottom = 34;
+  const known = height.filter((value) => value !== null);
   if (!known.length) return element("p", { class: "note" }, "No surface was found along the line.");
   const reach = sigma.map((value) => value ?? 0);
   const low = Math.min(...height.map((value, k) => (value === null ? Infinity : value - reach[k]))), high = Math.max(...height.map((value, k) => (value === null ? -Infinity : value + reach[k])));
-  const span = Math.max(high - low, 0.1), x = (value) => left + value / along.at(-1) * (W - left - 6), y = (value) => 6 + (high - value) / span * (H - bottom - 6);
+  const span = Math.max(high - low, 0.1), x = (value) => left + value / along.at(-1) * (W - left - 10), y = (value) => 8 + (high - value) / span * (H - bottom - 8);
   const runs = [];
   height.forEach((value, k) => { if (value !== null) { if (k && height[k - 1] !== null) runs.at(-1).push(k); else runs.push([k]); } });
   const path = (ks, values) => ks.map((k) => `${x(along[k]).toFixed(1)},${y(values(k)).toFixed(1)}`).join(" ");
   const parts = runs.map((ks) => `<polygon class="band" points="${path(ks, (k) => height[k] + reach[k])} ${path([...ks].reverse(), (k) => height[k] - reach[k])}"/><polyline class="line" points="${path(ks, (k) => height[k])}"/>`);
-  const ticks = [0, 0.5, 1].map((share) => `<line class="axis" x1="${left}" x2="${W - 6}" y1="${y(low + share * span)}" y2="${y(low + share * span)}"/><text x="2" y="${y(low + share * span) + 4}">${(low + share * span).toFixed(2)}</text><text x="${x(share * along.at(-1))}" y="${H - 12}" text-anchor="${["start", "middle", "end"][2 * share]}">${(share * along.at(-1)).toFixed(1)}</text>`);
+  const text = (value, step) => value.toFixed(Math.max(0, -Math.floor(Math.log10(step) + 1e-9)));
+  const up = ticksOf(low, low + span, 4), across = ticksOf(0, along.at(-1), W > 600 ? 10 : 4);
+  const [upStep, acrossStep] = [up, across].map((ticks) => (ticks.length > 1 ? ticks[1] - ticks[0] : 1));
+  const ticks = [
+    ...up.map((value) => `<line class="axis" x1="${left}" x2="${W - 10}" y1="${y(value)}" y2="${y(value)}"/><text x="${left - 6}" y="${y(value) + 4}" text-anchor="end">${text(value, upStep)}</text>`),
+    ...across.map((value) => `<line class="axis" x1="${x(value)}" x2="${x(value)}" y1="8" y2="${H - bottom}"/><text class="along" x="${x(value)}" y="${H - bottom + 13}" text-anchor="middle">${text(value, acrossStep)}</text>`),
+  ];
   const holder = element("div");
-  holder.innerHTML = `<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 ${W} ${H}" role="img" aria-label="Profile with its σ band">${ticks.join("")}${parts.join("")}<text x="${W / 2}" y="${H - 1}" text-anchor="middle">distance (m), height with ± σ</text></svg>`;
+  holder.innerHTML = `<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 ${W} ${H}" role="img" aria-label="Profile with its σ band">${ticks.join("")}${parts.join("")}<text x="${W / 2}" y="${H - 3}" text-anchor="middle">distance along the line in m; height in ${scene.crs.units[2] === "metre" ? "m" : scene.crs.units[2]} with ± σ</text><text class="at" x="${W - 12}" y="18" text-anchor="end"></text></svg>`;
+  const svg = holder.querySelector("svg");
+  svg.addEventListener("pointermove", (event) => {
+    const box = svg.getBoundingClientRect(), wanted = ((event.clientX - box.left) / box.width * W - left) / (W - left - 10) * along.at(-1);
+    const k = along.reduce((best, value, each) => (height[each] !== null && Math.abs(value - wanted) < Math.abs(along[best] - wanted) ? each : best), height.findIndex((value) => value !== null));
+    svg.querySelector(".at").textContent = `${along[k].toFixed(2)} m: ${withSigma(height[k], sigma[k], "", 2)}`;
+    profileAt = placeAlong(along[k], height[k]);
+    paint();
+  });
+  svg.addEventListener("pointerleave", () => { profileAt = null; svg.querySelector(".at").textContent = ""; paint(); });
   return holder;
 }
 
@@ -180,6 +257,7 @@ async function rename(each) {
   if (name) await safely(async () => { saved = await post(`measurements/${each.id}`, { name }); renderSaved(); });
 }
 function show(each) {
+  change({ shown: new Set([...state.shown, "saved"]) });
   const places = each.points.map((point) => inView(point.position_in_geo));
   const middle = [0, 1, 2].map((k) => places.reduce((sum, place) => sum + place[k], 0) / places.length);
   showing = each.id;
@@ -200,7 +278,21 @@ layers.push((context, pixelOf) => {
     });
   };
   if (state.shown.has("saved")) for (const each of saved) draw(each.points.map((point) => inView(point.position_in_geo)), CLOSED.has(each.kind), each.id === showing ? 3 : 1.5, each.points.map((_, k) => (k ? "" : each.name)));
-  draw(now.points.map(({ point }) => inView(point.position_in_geo)), CLOSED.has(state.kind) && (now.closed || now.points.length > 2), 2.5, now.points.map(({ name }, k) => name || `${k + 1}`));
+  const places = now.points.map(({ point }, k) => (dragged?.index === k && dragged.place) || inView(point.position_in_geo));
+  const legs = places.slice(1).map((place, k) => [places[k], place]);
+  if (cursor && places.length) {
+    context.setLineDash([5, 4]);
+    context.strokeStyle = colour; context.lineWidth = 1.5;
+    drawLine(context, pixelOf, [places.at(-1), cursor]);
+    context.setLineDash([]);
+    legs.push([places.at(-1), cursor]);
+  }
+  if (state.kind !== "point") for (const [a, b] of legs) {
+    const [p, q] = [pixelOf(a), pixelOf(b)];
+    if (p && q && Math.hypot(p.x - q.x, p.y - q.y) > 40) label(context, `${norm(minus(b, a)).toFixed(2)} m`, (p.x + q.x) / 2 + 6, (p.y + q.y) / 2 - 4, colour);
+  }
+  if (profileAt) { const at = pixelOf(profileAt); if (at) { context.strokeStyle = colour; context.lineWidth = 2; context.beginPath(); context.arc(at.x, at.y, 7, 0, 7); context.stroke(); } }
+  draw(places, CLOSED.has(state.kind) && (now.closed || now.points.length > 2), 2.5, now.points.map(({ name }, k) => name || `${k + 1}`));
 });
 
 export async function begin() {
@@ -212,6 +304,7 @@ export async function begin() {
   for (const name of ["base-kind", "base-height"]) byId(name).addEventListener("change", () => set(now.points, now.closed));
   byId("finish").onclick = finish;
   byId("back").onclick = () => safely(() => undo("measure"));
+  byId("again").onclick = () => safely(() => redo("measure"));
   byId("clear").onclick = clear;
   byId("cancel").onclick = () => { stop(); render(); notice("Cancelled."); };
   byId("save").addEventListener("submit", (event) => {
@@ -222,6 +315,7 @@ export async function begin() {
       const fresh = saved.find(({ id }) => !before.has(id));
       did("measure", `saving of ${name}`, async () => { saved = await post(`measurements/${fresh.id}`, undefined, "DELETE"); set(points, true); renderSaved(); });
       byId("save-name").value = "";
+      change({ shown: new Set([...state.shown, "saved"]) });
       set([], false); renderSaved(); paint();
       notice(`Saved as ${name}, in view/ of the workspace.`);
     });
@@ -238,7 +332,7 @@ export async function begin() {
 }
 function chooseKind(kind) {
   const before = state.kind, { points, closed } = now;
-  did("measure", `choice of ${kind}`, () => { change({ kind: before }); set(points, closed); });
+  did("measure", `choice of ${kind}`, () => { change({ kind: before }); set(points, closed); }, () => chooseKind(kind));
   change({ kind });
   set([], false);
 }

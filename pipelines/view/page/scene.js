@@ -9,6 +9,7 @@ export let scene = null;  // what the server tells once
 let shown = null;  // of the last picture: camera, depth, scale of false colours
 let wanted = 0, drawing = null, movingPx = 480, stillTimer = null;
 export const layers = [];  // functions that draw over the picture: (context, pixelOf, camera)
+export const grips = {}, hovers = {};  // by tab: what a press takes hold of, and what follows the pointer
 export const clicks = {};  // by tab: what a click does, and whether it is the second of a double click
 
 export async function loadScene() {
@@ -16,7 +17,18 @@ export async function loadScene() {
   if (!state.view) change({ view: home() });
   return scene;
 }
-export const home = () => ({ target: [0, 0, 0], distance: 1.7 * scene.radius_m, heading: 0, pitch: 42, fov: 0.9 });
+// From far above with a narrow lens, nothing leans: as good as orthographic.
+const NARROW = 0.05, WIDE = 0.9, away = (half, fov) => half / Math.tan(fov / 2);
+export const fromAbove = (view) => ({ ...view, heading: 0, pitch: 90, fov: NARROW, distance: away(view.distance * Math.tan(view.fov / 2), NARROW) });
+const inPerspective = (view) => (view.fov > NARROW ? view : { ...view, fov: WIDE, distance: away(view.distance * Math.tan(view.fov / 2), WIDE) });
+// The area of interest from above, else the whole scene.
+export function home() {
+  const corners = scene.boundary.flat(), sides = [0, 1].map((k) => corners.map((corner) => corner[k]));
+  const { clientWidth: width, clientHeight: height } = overlay;
+  const ends = sides.map((values) => (values.length ? [Math.min(...values), Math.max(...values)] : [-scene.radius_m, scene.radius_m]));
+  const half = Math.max((ends[1][1] - ends[1][0]) / 2, (ends[0][1] - ends[0][0]) / 2 * height / Math.max(width, 1));
+  return fromAbove({ target: [(ends[0][0] + ends[0][1]) / 2, (ends[1][0] + ends[1][1]) / 2, 0], distance: away(1.08 * half, WIDE), heading: 0, pitch: 90, fov: WIDE });
+}
 
 export function camera() {
   const { clientWidth: width, clientHeight: height } = overlay;
@@ -88,6 +100,7 @@ export const inView = (inGeo) => minus(inGeo, scene.middle_in_geo);
 // Draws all that lies over the picture, with the picture's own camera.
 export function paint() {
   if (!shown) return;
+  written.length = 0;
   const { clientWidth: width, clientHeight: height } = overlay, ratio = devicePixelRatio;
   if (overlay.width !== Math.round(width * ratio)) Object.assign(overlay, { width: Math.round(width * ratio), height: Math.round(height * ratio) });
   if (overlay.height !== Math.round(height * ratio)) overlay.height = Math.round(height * ratio);
@@ -108,9 +121,10 @@ export function paint() {
   const legend = byId("legend");
   legend.hidden = !shown.scale;
   if (shown.scale) {
-    const unit = { height: "m", sigma: "m σ", views: "photographs" }[shown.colouring] ?? "", digits = { views: 0, sigma: 3 }[shown.colouring] ?? 1;
+    const unit = { height: "m", sigma: "m", views: "" }[shown.colouring] ?? "", digits = { views: 0, sigma: 3 }[shown.colouring] ?? 1;
     const up = shown.colouring === "height" ? scene.crs.middle[2] - scene.middle_in_geo[2] : 0;
-    [legend.firstChild.textContent, legend.lastChild.textContent] = shown.scale.map((value) => `${(value + up).toFixed(digits)} ${unit}`);
+    byId("legend-name").textContent = { height: "height", sigma: "predicted σ", views: "photographs that see it" }[shown.colouring] ?? "";
+    [byId("legend-low").textContent, byId("legend-high").textContent] = shown.scale.map((value) => `${(value + up).toFixed(digits)} ${unit}`);
   }
 }
 
@@ -133,8 +147,13 @@ function line(context, pixelOf, places, closed = false) {
 }
 export const drawLine = line;
 
-export function label(context, text, x, y, colour = css("--ink")) {
+const written = [];  // boxes of the names of this picture
+// Writes a text; a name gives way where another text stands.
+export function label(context, text, x, y, colour = css("--ink"), { givesWay = false } = {}) {
   context.font = "12px system-ui, sans-serif";
+  const box = [x - 2, y - 12, x + context.measureText(text).width + 2, y + 3];
+  if (givesWay && written.some(([l, t, r, b]) => box[0] < r && box[2] > l && box[1] < b && box[3] > t)) return;
+  written.push(box);
   context.lineWidth = 3; context.strokeStyle = css("--paper"); context.strokeText(text, x, y);
   context.fillStyle = colour; context.fillText(text, x, y);
 }
@@ -175,7 +194,7 @@ function drawOverlays(context, pixelOf) {
     context.fillStyle = kind === "control" ? css("--chosen") : css("--ink");
     context.beginPath(); context.arc(pixel.x, pixel.y, 5, 0, 7); context.fill();
     context.strokeStyle = css("--paper"); context.lineWidth = 1.5; context.stroke();
-    label(context, name, pixel.x + 8, pixel.y + 4);
+    label(context, name, pixel.x + 8, pixel.y + 4, css("--ink"), { givesWay: true });
     context.globalAlpha = 1;
   }
 }
@@ -203,6 +222,12 @@ function drawScale(seen) {
   byId("scale-bar").style.width = `${length * metre}px`;
 }
 
+// Pixel of a place in the last picture; null: behind the camera.
+export function pixelOn(place) {
+  const pixel = shown ? project(shown.camera, place) : null;
+  return pixel && pixel.z > 0 ? pixel : null;
+}
+
 // The overlay under a pixel: a camera or a surveyed point; null: none.
 export function overlayAt(x, y) {
   if (!shown || state.photo !== null) return null;
@@ -221,7 +246,7 @@ export const pixelRequest = (x, y) => { const { rotation, position, fov, width, 
 
 // Mouse and fingers. A drag turns around the place under the pointer's first touch; two fingers move and zoom.
 const pointers = new Map();
-let moved = 0, last = null, clicked = { time: -Infinity };
+let moved = 0, last = null, held = null, clicked = { time: -Infinity };
 function pointerAt(event) { const box = overlay.getBoundingClientRect(); return { x: event.clientX - box.left, y: event.clientY - box.top }; }
 
 function leavePhotograph() {
@@ -236,7 +261,7 @@ export { leavePhotograph };
 
 export function turn(heading, pitch) {
   leavePhotograph();
-  const { view } = state;
+  const view = inPerspective(state.view);
   change({ view: { ...view, heading: (view.heading + heading + 540) % 360 - 180, pitch: Math.min(Math.max(view.pitch + pitch, -89.9), 90) } });
 }
 export function pan(dx, dy) {
@@ -248,16 +273,24 @@ export function pan(dx, dy) {
 export function zoom(factor, x, y) {
   leavePhotograph();
   const { view } = state, place = x === undefined ? null : placeUnder(x, y);
-  const distance = Math.min(Math.max(view.distance * factor, 0.002 * scene.radius_m), 40 * scene.radius_m);
+  const distance = Math.min(Math.max(view.distance * factor, 0.002 * scene.radius_m), 40 * scene.radius_m * WIDE / view.fov);
   const toward = place && factor < 1 ? 1 - distance / view.distance : 0;
   change({ view: { ...view, distance, target: toward ? add(view.target, minus(place, view.target), toward) : view.target } });
 }
-export function lookAt(place, distance = state.view.distance) { leavePhotograph(); change({ view: { ...state.view, target: place, distance } }, { step: true }); }
+// Metres from the middle of the view to its upper edge.
+export const halfSeen = () => state.view.distance * Math.tan(state.view.fov / 2);
+// Looks at a place, from a distance of the usual lens if one is given.
+export function lookAt(place, distance) {
+  leavePhotograph();
+  const { view } = state;
+  change({ view: { ...view, target: place, distance: distance === undefined ? view.distance : away(distance * Math.tan(WIDE / 2), view.fov) } }, { step: true });
+}
 
 export function listen() {
   overlay.addEventListener("pointerdown", (event) => {
     overlay.setPointerCapture(event.pointerId); overlay.focus({ preventScroll: true });
     pointers.set(event.pointerId, pointerAt(event)); moved = pointers.size > 1 ? CLICK_PX : 0; last = pointerAt(event);
+    held = pointers.size === 1 && event.button === 0 && !event.shiftKey ? grips[state.tab]?.(last) ?? null : null;
   });
   overlay.addEventListener("pointermove", (event) => {
     const at = pointerAt(event), before = pointers.get(event.pointerId);
@@ -265,6 +298,7 @@ export function listen() {
     pointers.set(event.pointerId, at);
     moved += Math.hypot(at.x - last.x, at.y - last.y); last = at;
     if (moved < CLICK_PX) return;
+    if (held) { held.move(at); return; }
     const [dx, dy] = [at.x - before.x, at.y - before.y];
     if (pointers.size === 2) {
       const other = [...pointers].find(([id]) => id !== event.pointerId)[1];
@@ -276,6 +310,8 @@ export function listen() {
   const released = (event) => {
     const wasClick = pointers.has(event.pointerId) && moved < CLICK_PX && event.type === "pointerup" && event.button === 0;
     pointers.delete(event.pointerId);
+    if (held && moved >= CLICK_PX && event.type === "pointerup") held.drop(pointerAt(event));
+    held = null;
     if (!wasClick) return;
     const at = pointerAt(event), second = event.timeStamp - clicked.time < DOUBLE_MS && Math.hypot(at.x - clicked.x, at.y - clicked.y) < CLICK_PX;
     clicked = second ? { time: -Infinity } : { time: event.timeStamp, ...at };
@@ -285,14 +321,20 @@ export function listen() {
   overlay.addEventListener("pointercancel", released);
   overlay.addEventListener("contextmenu", (event) => event.preventDefault());
   overlay.addEventListener("wheel", (event) => { event.preventDefault(); const at = pointerAt(event); zoom(Math.exp(0.0012 * event.deltaY), at.x, at.y); }, { passive: false });
-  overlay.addEventListener("pointerleave", () => { byId("cursor").textContent = ""; });
+  overlay.addEventListener("pointerleave", () => { byId("cursor").textContent = ""; hovers[state.tab]?.(null); });
   new ResizeObserver(() => look()).observe(overlay);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => look());
-  onState(() => { if (scene) look(); });
+  let before = "";
+  onState(() => {  // what the picture does not show asks for none
+    const { view, photo, share, colouring, box, light } = state, wants = JSON.stringify([view, photo, share, colouring, box, light]);
+    if (scene && wants !== before) look();
+    before = wants;
+  });
 }
 
 // Coordinates under the cursor, in the CRS; they are exact to a pixel of the small depth.
 function hover({ x, y }) {
+  hovers[state.tab]?.({ x, y });
   const place = placeUnder(x, y), output = byId("cursor");
   if (!place) { output.textContent = ""; return; }
   const { crs } = scene, decimals = crs.axes[0] === "longitude" ? [7, 7, 2] : [2, 2, 2];
