@@ -57,7 +57,7 @@ def described_scene(workspace: Workspace, model: MeasuringModel, frame: ViewFram
 
 
 def _is_said(assumption: str, crs: PointCrs) -> bool:
-    """Return whether the page says an assumption anyway: the name of the CRS, and heights whose datum was stated."""
+    """Return whether the page says an assumption anyway: the CRS by name, and heights whose datum was stated."""
     return crs.name in assumption or (crs.vertical.stated and crs.vertical.name in assumption)
 
 
