@@ -30,6 +30,7 @@ from pipelines.deliver.surface import without_sigma
 from pipelines.formats.georef_sidecar import CrsSidecar, median_sigma, write_sidecar
 from pipelines.formats.geotiff import RasterFrame, read_reduced
 from pipelines.formats.vector_files import ContourLine, features_text, write_contours_dxf, write_contours_gpkg
+from pipelines.geometry.relief import sunlight
 from pipelines.surface.measured_area import area_of
 from pipelines.survey.headline import headline_of
 from pipelines.survey.scene import photographs
@@ -41,7 +42,6 @@ _DETAIL = 1.5  # training pixels over cells, beyond which a raster shows less th
 _BYTES_PER_CELL = 74
 _PICTURE_PX = 2000
 _COLOURED, _TINT = (0.01, 0.99), 0.55  # quantiles of the heights at the ends of the colours, and their strength
-_SUN_AZIMUTH_DEG, _SUN_ELEVATION_DEG = 315.0, 45.0
 # Of the contour lines.
 _EVERY_MAJOR = 5
 _LEAST_CELLS = 12.0  # length of the shortest line
@@ -185,11 +185,7 @@ def _write_pictures(folder: Path, heights_by_plan: float) -> tuple[float, float]
     bands, cell = read_reduced(folder / "dsm.tif", _PICTURE_PX)
     height, known = bands[0], np.isfinite(bands[0])
     alpha = np.where(known, 255, 0).astype(np.uint8)
-    # Light of a sun in the north-west on rows from the north.
-    south, east = np.gradient(np.where(known, height, np.nanmedian(height)), cell * heights_by_plan)
-    azimuth, elevation = np.radians(_SUN_AZIMUTH_DEG), np.radians(_SUN_ELEVATION_DEG)
-    sun = np.array([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)])
-    light = (sun[2] - sun[0] * east + sun[1] * south) / np.sqrt(1.0 + east**2 + south**2)
+    light = sunlight(np.where(known, height, np.nanmedian(height)), cell * heights_by_plan)
     grey = np.round(255 * np.clip(light, 0.0, 1.0))
     low, high = np.nanquantile(height, _COLOURED)
     level = np.clip((np.nan_to_num(height, nan=low) - low) / max(high - low, 1e-6), 0.0, 1.0)

@@ -21,6 +21,7 @@ from pyproj.enums import PJType
 from pyproj.exceptions import CRSError, ProjError
 
 from pipelines.core.types import FloatArray
+from pipelines.geodesy.plausible import within_area
 
 _UTM = re.compile(
     r"(?P<datum>.*?)[\s/_,-]*(?<![a-z])UTM[\s/_,-]*(?:zone)?[\s_-]*(?P<zone>\d{1,2})[\s_-]*(?P<side>north|south|[c-hj-np-x])?",
@@ -96,8 +97,7 @@ def _near(name: str) -> list[int]:
 def _holds(code: int, points: FloatArray) -> bool:
     """Return whether all points (N, 3) lie in the area of a system."""
     crs = CRS.from_epsg(code)
-    area = crs.area_of_use
-    if area is None or crs.geodetic_crs is None:
+    if crs.area_of_use is None or crs.geodetic_crs is None:
         return False
     try:
         to_degrees = Transformer.from_crs(crs, crs.geodetic_crs, always_xy=True)
@@ -106,9 +106,7 @@ def _holds(code: int, points: FloatArray) -> bool:
         return False
     if not np.isfinite(lon + lat).all():
         return False
-    width = (area.east - area.west) % 360.0 or 360.0
-    inside = ((lon - area.west) % 360.0 <= width) & (lat >= area.south) & (lat <= area.north)
-    return bool(inside.all())
+    return bool(within_area(crs, lon, lat).all())
 
 
 @cache

@@ -85,7 +85,7 @@ def check_area(crs: CRS, lon: FloatArray, lat: FloatArray, listed: ListedPoints)
     if area is not None:
         bounds = f"{area.south:g} … {area.north:g}° N, {area.west:g} … {area.east:g}° E"
         fault = f"is far outside the area of {listed.crs_name} ({bounds}): the CRS is wrong, or x and y are swapped"
-        listed.require(_within(horizontal_of(crs), lon, lat, _AREA_MARGIN_DEG), "point-outside-area", fault)
+        listed.require(within_area(horizontal_of(crs), lon, lat, _AREA_MARGIN_DEG), "point-outside-area", fault)
 
 
 def _from_greenwich(geodetic: CRS, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -99,7 +99,7 @@ def _look_like_degrees(projected: CRS, points: FloatArray, lon: FloatArray, lat:
     """Return which points (N,) of a projection are as small as degrees, far from where its metres can be."""
     small = (np.abs(points[:, 0]) <= 180.0) & (np.abs(points[:, 1]) <= 90.0)
     if projected.area_of_use is not None:
-        return np.asarray(small & ~_within(projected, lon, lat, 0.0))
+        return np.asarray(small & ~within_area(projected, lon, lat, 0.0))
     conversion = (projected.source_crs or projected if projected.is_bound else projected).coordinate_operation
     false_origin_m = [
         abs(float(parameter.value) * parameter.unit_conversion_factor)
@@ -109,7 +109,8 @@ def _look_like_degrees(projected: CRS, points: FloatArray, lon: FloatArray, lat:
     return small & (max(false_origin_m, default=0.0) > _FALSE_ORIGIN_M)
 
 
-def _within(horizontal: CRS, lon: FloatArray, lat: FloatArray, margin_deg: float) -> BoolArray:
+def within_area(horizontal: CRS, lon: FloatArray, lat: FloatArray, margin_deg: float = 0.0) -> BoolArray:
+    """Return whether places (N,) in degrees lie in the area of use of a CRS or beside it; unknown: all."""
     area = horizontal.area_of_use
     if area is None:
         return np.ones(len(lon), dtype=bool)

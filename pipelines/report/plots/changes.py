@@ -6,10 +6,10 @@ from itertools import pairwise
 import numpy as np
 
 from pipelines.core.types import BoolArray, ByteArray, FloatArray
+from pipelines.geometry.relief import LEVEL_LIGHT, sunlight
 from pipelines.report.plots import style as look
 
 DIVERGING = "RdBu"  # red: lowered, blue: raised
-_SUN_AZIMUTH_DEG, _SUN_ELEVATION_DEG = 315.0, 45.0
 _EXAGGERATION = 2.0
 _LIGHTEST, _DARKEST = 250.0, 70.0  # of the relief
 _STRONG, _FAINT = 0.85, 0.3  # opacity of significant and of other differences
@@ -38,15 +38,8 @@ def change_picture(
 
 def _relief(height_m: FloatArray, cell_m: float) -> FloatArray:
     """Return the grey values (H, W) of heights in the light from the north-west."""
-    if min(height_m.shape) < 2:
-        return np.full(height_m.shape, _LIGHTEST)
-    south, east = np.gradient(_EXAGGERATION * height_m, cell_m)
-    azimuth, elevation = np.radians(_SUN_AZIMUTH_DEG), np.radians(_SUN_ELEVATION_DEG)
-    towards = np.array([np.sin(azimuth), np.cos(azimuth)]) * np.cos(elevation)
-    light = (np.sin(elevation) - east * towards[0] + south * towards[1]) / np.sqrt(1 + east**2 + south**2)
-    level = np.sin(elevation)
-    light = np.where(np.isfinite(light), light, level)
-    bright = np.where(light < level, light / level, 1 + (light - level) / (1 - level)) / 2
+    light = sunlight(_EXAGGERATION * height_m, cell_m)
+    bright = np.where(light < LEVEL_LIGHT, light / LEVEL_LIGHT, 1 + (light - LEVEL_LIGHT) / (1 - LEVEL_LIGHT)) / 2
     return np.asarray(_DARKEST + (_LIGHTEST - _DARKEST) * np.clip(bright, 0, 1) ** 0.7)
 
 
