@@ -30,6 +30,7 @@ log = logging.getLogger(__name__)
 
 _WHOLE = 0.95  # of the photographs: one model of as many needs no further round
 _FEWEST_FOR_LENS = 10  # photographs of a model whose lens counts for others
+_FITS_AS_WELL = 1.25  # reprojection error with the lens held, over that with it free
 _ENOUGH_MATCHES = 100  # verified ones of a pair: learned features add little to these
 _MOST_LEARNED_PAIRS = 4000  # hours on two cores
 
@@ -88,10 +89,15 @@ def _with_lens_held(colmap: Any, job: SfmJob, free: Alignment, progress: Progres
     with _lens_of(colmap, job.database, _sound_lens(free, job.survey)):
         models, mapper = map_database(colmap, job, progress, lens_held=True)
     held = Alignment(models, mapper, lens_held=True)
-    if astray and held.covered() >= free.covered():
+    as_many = held.covered() >= free.covered() and held.registered >= free.registered
+    if astray and as_many and _error_px(held) <= _FITS_AS_WELL * _error_px(free):
         return held
-    # As many photographs with the lens free speak for the free one.
+    # As many photographs, and a better fit, with the lens free speak for the free one: then the tags are wrong.
     return held if _merit(held) > _merit(free) else free
+
+
+def _error_px(alignment: Alignment) -> float:
+    return float(alignment.models[0].compute_mean_reprojection_error())
 
 
 def _merit(alignment: Alignment) -> tuple[int, int]:
