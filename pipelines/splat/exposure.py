@@ -169,7 +169,8 @@ def with_vignetting(colour: Tensor, radius2: Tensor, coefficients: Tensor) -> Te
 
     `radius2` (H, W) is the squared distance from the optical axis; see `squared_radius`.
     """
-    return colour * falloff(radius2, coefficients.unbind())[..., None]
+    shown: Tensor = colour * falloff(radius2, coefficients.unbind())[..., None]
+    return shown
 
 
 def falloff(radius2: Any, coefficients: Sequence[Any]) -> Any:
