@@ -148,14 +148,14 @@ class Styled(QgsProcessingLayerPostProcessorInterface):
 
 
 def _place(node: Any, rank: int) -> Any:
-    """Move a layer's node above those of lower rank that lie directly below it or above, and return it."""
-    parent = node.parent()
-    others = [other for other in parent.children() if other is not node]
-    ranks = [other.layer().customProperty(_RANK) if hasattr(other, "layer") else None for other in others]
-    below = [index for index, value in enumerate(ranks) if value is not None and int(value) <= rank]
-    above = [index for index, value in enumerate(ranks) if value is not None and int(value) > rank]
-    index = below[0] if below else above[-1] + 1 if above else 0
-    moved = node.clone()
+    """Move a layer's node above those of lower rank beside it, and return the moved one."""
+    parent, moved = node.parent(), node.clone()
+    below, above = [], []
+    for index, other in enumerate(parent.children()):
+        value = other.layer().customProperty(_RANK) if hasattr(other, "layer") and other is not node else None
+        if value is not None:
+            (below if int(value) <= rank else above).append(index)
+    # QGIS removes a layer from the project if no node has it: the new node comes first.
+    parent.insertChildNode(below[0] if below else above[-1] + 1 if above else 0, moved)
     parent.removeChildNode(node)
-    parent.insertChildNode(index, moved)
     return moved
