@@ -152,7 +152,8 @@ class Styled(QgsProcessingLayerPostProcessorInterface):
 def _place(node: Any, rank: int) -> Any:
     """Move a layer's node above those of lower rank beside it, and return the moved one."""
     parent, moved = node.parent(), node.clone()
-    below, above = [], []
+    below: list[int] = []
+    above: list[int] = []
     for index, other in enumerate(parent.children()):
         value = other.layer().customProperty(_RANK) if hasattr(other, "layer") and other is not node else None
         if value is not None:
