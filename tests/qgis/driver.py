@@ -70,6 +70,7 @@ def main() -> None:
         except Exception as error:
             document["error"] = str(error)
         document["log"] = feedback.textLog()
+        application.processEvents()  # QGIS puts off the removal of layers that have left the tree
         nodes = project.layerTreeRoot().findLayers()
         document["layers"] = [{**described(node.layer()), "shown": node.isVisible()} for node in nodes]
         done.append(document)

@@ -120,7 +120,8 @@ def done(survey: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, An
     home = folder / "home"
     home.mkdir(mode=0o700)
     environment = {**os.environ, "GEOREF": str(program), "QT_QPA_PLATFORM": "offscreen", "HOME": str(home)}
-    environment |= {"XDG_RUNTIME_DIR": str(home), "PYTHONPATH": "", "PYTHONHASHSEED": "0"}
+    # QGIS names layers after their files, unless these are temporary: those of a user are not.
+    environment |= {"XDG_RUNTIME_DIR": str(home), "TMPDIR": str(home), "PYTHONPATH": ""}
     script = REPOSITORY / "tests/qgis/driver.py"
     command = [qgis_python(), str(script), str(PLUGINS), str(folder / "calls.json")]
     ran = subprocess.run(

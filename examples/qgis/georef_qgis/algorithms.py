@@ -123,6 +123,7 @@ class GeorefAlgorithm(QgsProcessingAlgorithm):
     def load(self, path: str, name: str, title: str, styled: styles.Styled, context: QgsProcessingContext) -> None:
         """Let QGIS load a file as a layer when the algorithm has ended."""
         details = QgsProcessingContext.LayerDetails(title, context.project(), name)
+        details.forceName = True  # QGIS prefers the file's
         details.setPostProcessor(styled)
         context.addLayerToLoadOnCompletion(path, details)
 

@@ -48,8 +48,9 @@ def call(words: Sequence[str], feedback: QgsProcessingFeedback) -> Any:
             )
         except OSError as error:
             raise QgsProcessingException(f"{command[0]} cannot be started: {error}") from error
-        failure = _follow(process, feedback)
-        code = process.wait()
+        with process:
+            failure = _follow(process, feedback)
+        code = process.returncode
         if feedback.isCanceled():
             raise QgsProcessingException("Cancelled. What is done is kept: the next run goes on from there.")
         if code != 0:

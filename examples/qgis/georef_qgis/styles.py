@@ -30,6 +30,7 @@ _HEIGHTS = ("#2d6a4f", "#95a66b", "#e9d8a6", "#a47148", "#f8f9fa")
 _DIFFERENCE = ("#2166ac", "#f7f7f7", "#b2182b")
 _LOWERED, _RAISED = _DIFFERENCE[0], _DIFFERENCE[2]
 _RANK = "georef/rank"  # of a layer among those of a call: a higher one lies above
+_MOST, _SAMPLE = 0.9, 250_000
 _SPREAD = 2.0  # standard deviations around the mean that colours span
 
 
@@ -53,28 +54,29 @@ def _ramp(layer: Any, colours: tuple[str, ...], low: float, high: float) -> None
     layer.setRenderer(renderer)
 
 
-def _range(layer: Any) -> tuple[float, float, float]:
-    """Return the least value, and the mean less and plus two standard deviations within the values, of a raster."""
-    found = layer.dataProvider().bandStatistics(1, QgsRasterBandStats.All, layer.extent(), 250_000)
+def _range(layer: Any) -> tuple[float, float]:
+    """Return the mean less and plus two standard deviations, within the values of a raster."""
+    found = layer.dataProvider().bandStatistics(1, QgsRasterBandStats.All, layer.extent(), _SAMPLE)
     low = max(found.minimumValue, found.mean - _SPREAD * found.stdDev)
     high = min(found.maximumValue, found.mean + _SPREAD * found.stdDev)
-    return found.minimumValue, low, max(high, low + 1e-6)
+    return low, max(high, low + 1e-6)
 
 
 def sigma(layer: Any) -> None:
-    """Style σ: dark where it is small, from zero."""
-    _ramp(layer, _SIGMA, 0.0, _range(layer)[2])
+    """Style σ: dark where it is small, from zero to what nine tenths of the cells stay below."""
+    _, high = layer.dataProvider().cumulativeCut(1, 0.0, _MOST, layer.extent(), _SAMPLE)
+    _ramp(layer, _SIGMA, 0.0, max(high, 1e-6))
 
 
 def heights(layer: Any) -> None:
     """Style heights: green valleys, brown and white tops."""
-    _, low, high = _range(layer)
+    low, high = _range(layer)
     _ramp(layer, _HEIGHTS, low, high)
 
 
 def difference(layer: Any) -> None:
     """Style a difference: lowered blue, raised red, white at zero."""
-    _, low, high = _range(layer)
+    low, high = _range(layer)
     most = max(abs(low), abs(high))
     _ramp(layer, _DIFFERENCE, -most, most)
 
@@ -102,7 +104,7 @@ def contours(layer: Any) -> None:
         root.appendChild(QgsRuleBasedRenderer.Rule(symbol, filterExp=rule, label=text))
     layer.setRenderer(QgsRuleBasedRenderer(root))
     labels = QgsPalLayerSettings()
-    labels.fieldName = """if("major", format_number("height", 1), '')"""
+    labels.fieldName = """if("major", round("height", 2), '')"""
     labels.isExpression = True
     labels.placement = QgsPalLayerSettings.Line
     layer.setLabeling(QgsVectorLayerSimpleLabeling(labels))
@@ -148,14 +150,15 @@ class Styled(QgsProcessingLayerPostProcessorInterface):
 
 
 def _place(node: Any, rank: int) -> Any:
-    """Move a layer's node above those of lower rank that lie directly below it or above, and return it."""
-    parent = node.parent()
-    others = [other for other in parent.children() if other is not node]
-    ranks = [other.layer().customProperty(_RANK) if hasattr(other, "layer") else None for other in others]
-    below = [index for index, value in enumerate(ranks) if value is not None and int(value) <= rank]
-    above = [index for index, value in enumerate(ranks) if value is not None and int(value) > rank]
-    index = below[0] if below else above[-1] + 1 if above else 0
-    moved = node.clone()
+    """Move a layer's node above those of lower rank beside it, and return the moved one."""
+    parent, moved = node.parent(), node.clone()
+    below: list[int] = []
+    above: list[int] = []
+    for index, other in enumerate(parent.children()):
+        value = other.layer().customProperty(_RANK) if hasattr(other, "layer") and other is not node else None
+        if value is not None:
+            (below if int(value) <= rank else above).append(index)
+    # QGIS removes a layer from the project if no node has it: the new node comes first.
+    parent.insertChildNode(below[0] if below else above[-1] + 1 if above else 0, moved)
     parent.removeChildNode(node)
-    parent.insertChildNode(index, moved)
     return moved
