@@ -215,7 +215,7 @@ SECTIONS: dict[str, tuple[str, ...]] = {
     "Reconstruction and training": (
         "mapper", "import_model", "triangulate", *_EFFORT, "backend", "seed", *_LIDAR,
     ),
-    "Area": tuple(AreaOptions.model_fields),
+    "Area": (*AreaOptions.model_fields, "fill"),
 }  # fmt: skip
 STAGE_NAME = click.Choice([spec.name for spec in PIPELINE])
 

@@ -18,7 +18,7 @@ from scipy.ndimage import gaussian_filter
 from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.files import remove, replace_text
 from pipelines.core.products import Remark, union
-from pipelines.core.types import FloatArray
+from pipelines.core.types import BoolArray, FloatArray
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import ExportRasterOptions
 from pipelines.deliver.photo_colours import PhotoColours
@@ -34,7 +34,7 @@ from pipelines.geometry.relief import sunlight
 from pipelines.surface.measured_area import area_of
 from pipelines.survey.headline import headline_of
 from pipelines.survey.scene import photographs
-from pipelines.survey.target_crs import target_crs
+from pipelines.survey.target_crs import TargetCrs, target_crs
 from pipelines.survey.trained_survey import TrainedSurvey, corners, load_trained, scene_points
 
 _DETAIL = 1.5  # training pixels over cells, beyond which a raster shows less than its cells promise
@@ -44,8 +44,9 @@ _PICTURE_PX = 2000
 _COLOURED, _TINT = (0.01, 0.99), 0.55  # quantiles of the heights at the ends of the colours, and their strength
 # Of the contour lines.
 _EVERY_MAJOR = 5
-_LEAST_CELLS = 12.0  # length of the shortest line
+_LEAST_CELLS, _LEAST_INTERVALS = 12.0, 10.0  # length of the shortest line; a ring has twice as much
 _SMOOTHED = 1.5  # cells: σ of the smoothing, without which every stone has its own line
+_SMOOTHED_WITHIN = 5.0  # cells: σ of the smoothing where it moves the height by no more than its own σ
 _MOST_LEVELS = 2_000
 _CONTOUR_PX = 6000  # of the surface that lines are drawn of
 
@@ -84,7 +85,8 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
     if options.hillshade:
         height_colours = _write_pictures(stage.out, target.horizontal_unit_m / target.crs.height_unit_m)
     of_ground = options.contours_of == "terrain" and source.terrain is not None
-    lines = _write_contours(stage.out, "dtm.tif" if of_ground else "dsm.tif", frame, options.contours)
+    names = ("dtm.tif", "sigma_dtm.tif") if of_ground else ("dsm.tif", "sigma_v.tif")
+    lines = _write_contours(stage.out, names, frame, target, options.contours)
     measured, interpolated, delivered_ha = mosaic.shares()
     values = {
         "columns": frame.columns,
@@ -160,12 +162,16 @@ def _sidecar(
     return source.target.sidecar(bounds, headline_of(stage.workspace), sigma, cautions)
 
 
-def _write_contours(folder: Path, heights: str, frame: RasterFrame, interval: float | None) -> int:
-    """Write the contour lines of a raster of the folder, and return their number; None: there are to be none."""
+def _write_contours(
+    folder: Path, names: tuple[str, str], frame: RasterFrame, target: TargetCrs, interval: float | None
+) -> int:
+    """Write the contour lines of a raster of the folder with its σ, and return their number."""
     if not interval:
         return 0
-    height, _ = read_reduced(folder / heights, _CONTOUR_PX)
-    lines = _contour_lines(height[0].astype(np.float64), frame, interval)
+    height, sigma_m = (read_reduced(folder / name, _CONTOUR_PX)[0][0].astype(np.float64) for name in names)
+    within = np.nan_to_num(sigma_m) / target.crs.height_unit_m
+    least = _LEAST_INTERVALS * interval * target.crs.height_unit_m / target.horizontal_unit_m
+    lines = contour_lines(height, within, frame, interval, least)
     write_contours_gpkg(folder / "contours.gpkg", lines, frame.wkt)
     write_contours_dxf(folder / "contours.dxf", lines)
     return len(lines)
@@ -196,13 +202,19 @@ def _write_pictures(folder: Path, heights_by_plan: float) -> tuple[float, float]
     return float(low), float(high)
 
 
-def _contour_lines(height: FloatArray, frame: RasterFrame, interval: float) -> list[ContourLine]:
-    """Return contour lines of a surface, lowest first, no short ones; an InputError: the interval is too small.
+def contour_lines(
+    height: FloatArray, within: FloatArray, frame: RasterFrame, interval: float, least: float
+) -> list[ContourLine]:
+    """Return contour lines of a surface, lowest first, no scraps and no small rings.
+
+    An InputError: the interval is too small.
 
     Args:
         height: (H, W) rows from the north, over the whole frame; NaN: no surface.
+        within: (H, W) by which smoothing may move a height: its σ; 0: not known.
         frame: of the raster, whose cells may be smaller.
         interval: between two lines, in the unit of the heights.
+        least: length of the shortest line in the unit of the plan; a ring has twice as much.
     """
     known = np.isfinite(height)
     if known.sum() < 4:
@@ -218,15 +230,24 @@ def _contour_lines(height: FloatArray, frame: RasterFrame, interval: float) -> l
     step = (east - west) / height.shape[1], (north - south) / height.shape[0]
     x = west + (np.arange(height.shape[1]) + 0.5) * step[0]
     y = north - (np.arange(height.shape[0]) + 0.5) * step[1]
-    weight = gaussian_filter(known.astype(np.float64), _SMOOTHED, mode="constant")
-    total = gaussian_filter(np.where(known, height, 0.0), _SMOOTHED, mode="constant")
-    smooth = np.ma.masked_where(~known, total / np.maximum(weight, 1e-9))
+    fine, broad = (_smoothed(height, known, cells) for cells in (_SMOOTHED, _SMOOTHED_WITHIN))
+    smooth = np.ma.masked_where(~known, np.clip(broad, fine - within, fine + within))
+    least = max(least, _LEAST_CELLS * step[0])
     generator = contourpy.contour_generator(x, y, smooth)
     lines = []
     for level in levels:
         for xy in generator.lines(float(level)):
             points = np.asarray(xy)
             length = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
-            if length >= _LEAST_CELLS * step[0]:
+            is_ring = bool(np.array_equal(points[0], points[-1]))
+            if length >= least * (2 if is_ring else 1):
                 lines.append(ContourLine(float(level), points, round(level / interval) % _EVERY_MAJOR == 0))
     return lines
+
+
+def _smoothed(height: FloatArray, known: BoolArray, cells: float) -> FloatArray:
+    """Return heights (H, W) smoothed by a Gaussian of so many cells, in which unknown cells take no part."""
+    weight = gaussian_filter(known.astype(np.float64), cells, mode="constant")
+    return np.asarray(
+        gaussian_filter(np.where(known, height, 0.0), cells, mode="constant") / np.maximum(weight, 1e-9)
+    )
