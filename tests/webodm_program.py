@@ -86,10 +86,8 @@ def install(folder: Path) -> None:
         return done
 
     # Fake stages use no kernels and take no time: what compiles and estimates would take seconds to load.
-    compilation = ModuleType("pipelines.train.compilation")
-    compilation.start_compilation = lambda: None  # type: ignore[attr-defined]
-    sys.modules[compilation.__name__] = compilation
-    estimate.announced_seconds = lambda *_, **__: {}  # type: ignore[assignment]
+    sys.modules["pipelines.train.compilation"] = no_compilation()
+    estimate.announced_estimate = lambda *_, **__: None  # type: ignore[assignment]
     fakes.install(
         ingest=ingest,
         sfm=sfm,
@@ -99,6 +97,13 @@ def install(folder: Path) -> None:
         export_mesh=mesh,
         export_cameras=cameras,
     )
+
+
+def no_compilation() -> ModuleType:
+    """A module in place of that which compiles kernels."""
+    module = ModuleType("pipelines.train.compilation")
+    module.start_compilation = lambda: None  # type: ignore[attr-defined]
+    return module
 
 
 def _write(path: Path, text: str) -> None:

@@ -172,7 +172,10 @@ def test_the_node_can_read_every_option() -> None:
 def test_georef_takes_what_options_become(
     engine: ModuleType, georef: Georef, project: Path, monkeypatch: pytest.MonkeyPatch, words: str
 ) -> None:
-    monkeypatch.setattr("georef_cli.commands.run.evaluated_cameras", lambda _: None)  # fake stages have none
+    # Fake stages have no cameras, and what compiles and estimates for real ones takes seconds to load.
+    monkeypatch.setattr("georef_cli.commands.run.evaluated_cameras", lambda _: None)
+    monkeypatch.setattr("georef_cli.commands.run.announced_estimate", lambda *_, **__: None)
+    monkeypatch.setitem(sys.modules, "pipelines.train.compilation", truth.no_compilation())
     (project / "gcp/align.laz").write_bytes(b"LASF")
     asked = words.replace("GCP", str(project / "gcp")).split()
     given = engine.config([*asked, "--project-path", str(project.parent), project.name])
@@ -339,6 +342,7 @@ def corners_in_crs(data: bytes) -> np.ndarray[Any, Any]:
     return points @ whole[:3, :3].T + whole[:3, 3] + document["extensions"]["CESIUM_RTC"]["center"]
 
 
+@pytest.mark.slow
 def test_a_stopped_task_leaves_nothing_half_written_and_goes_on(project: Path, node: socket.socket) -> None:
     slow = project.parents[1] / "slow"
     slow.touch()
