@@ -32,17 +32,21 @@ from tests.scenes import Measured, Noise, make_scene, sparse_model, survey_of, w
 REPOSITORY = Path(__file__).parents[1]
 FORBIDDEN = {
     "eval", "exec", "compile", "pickle", "marshal", "shelve", "yaml", "subprocess", "os.system", "os.popen",
-    "torch.load", "torch.save",
+    "torch.save",
 }  # fmt: skip
+# Readers that unpickle unless they are told not to, and how they are told.
+PICKLING = {"np.load": ("allow_pickle", "False"), "numpy.load": ("allow_pickle", "False"),
+            "torch.load": ("weights_only", "True")}  # fmt: skip
 # The files that start a process: this program again, for native code and for jobs; the user's browser; the
-# compilers of the CUDA kernels, which are asked for their versions; and Python, which calls them.
+# compilers of the CUDA kernels, which are asked for their versions; and Python, which calls them, and pip.
 STARTS_ITSELF = REPOSITORY / "pipelines/core/child.py"
 STARTS_JOBS = REPOSITORY / "pipelines/jobs/local.py"
 STARTS_A_BROWSER = REPOSITORY / "pipelines/report/chromium.py"
 STARTS_A_COMPILER = REPOSITORY / "pipelines/splat/rasterizer/cuda_kernels.py"
 ASKS_COMPILERS = REPOSITORY / "pipelines/splat/rasterizer/cuda_parts.py"
 STARTS_WORKERS = REPOSITORY / "pipelines/jobs/dask_task.py"  # by Dask
-STARTERS = (STARTS_ITSELF, STARTS_JOBS, STARTS_A_BROWSER, STARTS_A_COMPILER, ASKS_COMPILERS)
+STARTS_PIP = REPOSITORY / "pipelines/sfm/learned_weights.py"  # for weights, whose hash is known
+STARTERS = (STARTS_ITSELF, STARTS_JOBS, STARTS_A_BROWSER, STARTS_A_COMPILER, ASKS_COMPILERS, STARTS_PIP)
 ESCAPES = ["../secret.jpg", "/etc/passwd", "a/../../secret.jpg", "", "a\nb.jpg", "a\x00b.jpg"]
 
 
@@ -68,10 +72,11 @@ def test_nothing_that_is_read_can_be_executed(package: str) -> None:
             if name == "subprocess" and file in STARTERS:
                 continue
             assert name not in FORBIDDEN, f"{file}:{node.lineno} uses {name}"  # type: ignore[attr-defined]
-            if name in ("np.load", "numpy.load"):
+            if name in PICKLING:
                 assert isinstance(node, ast.Call)
-                pickle = {keyword.arg: ast.unparse(keyword.value) for keyword in node.keywords}
-                assert pickle.get("allow_pickle") == "False", f"{file}:{node.lineno} may unpickle"
+                option, safe = PICKLING[name]
+                said_so = {keyword.arg: ast.unparse(keyword.value) for keyword in node.keywords}
+                assert said_so.get(option) == safe, f"{file}:{node.lineno} may unpickle"
 
 
 @pytest.mark.parametrize(
@@ -80,6 +85,7 @@ def test_nothing_that_is_read_can_be_executed(package: str) -> None:
         (STARTS_ITSELF, "python_command(['-m', __name__,", "python_environment()"),
         (STARTS_JOBS, "python_command([*program,", "python_environment()"),
         (STARTS_A_COMPILER, "python_command(['-c', _COMPILE])", "_environment(draft)"),
+        (STARTS_PIP, "python_command(['-m', 'pip', 'download',", "python_environment()"),
         (ASKS_COMPILERS, "[program, '--version']", None),
         (STARTS_A_BROWSER, "[*command, page.absolute().as_uri()]", None),
     ],

