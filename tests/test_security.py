@@ -46,7 +46,8 @@ STARTS_A_COMPILER = REPOSITORY / "pipelines/splat/rasterizer/cuda_kernels.py"
 ASKS_COMPILERS = REPOSITORY / "pipelines/splat/rasterizer/cuda_parts.py"
 STARTS_WORKERS = REPOSITORY / "pipelines/jobs/dask_task.py"  # by Dask
 STARTS_PIP = REPOSITORY / "pipelines/sfm/learned_weights.py"  # for weights, whose hash is known
-STARTERS = (STARTS_ITSELF, STARTS_JOBS, STARTS_A_BROWSER, STARTS_A_COMPILER, ASKS_COMPILERS, STARTS_PIP)
+ASKS_GIT = REPOSITORY / "pipelines/core/version.py"  # for the commit of its own checkout
+STARTERS = (STARTS_ITSELF, STARTS_JOBS, STARTS_A_BROWSER, STARTS_A_COMPILER, ASKS_COMPILERS, STARTS_PIP, ASKS_GIT)
 ESCAPES = ["../secret.jpg", "/etc/passwd", "a/../../secret.jpg", "", "a\nb.jpg", "a\x00b.jpg"]
 
 
@@ -85,6 +86,7 @@ def test_nothing_that_is_read_can_be_executed(package: str) -> None:
         (STARTS_ITSELF, "python_command(['-m', __name__,", "python_environment()"),
         (STARTS_JOBS, "python_command([*program,", "python_environment()"),
         (STARTS_A_COMPILER, "python_command(['-c', _COMPILE])", "_environment(draft)"),
+        (ASKS_GIT, "['git', '-C', str(checkout), 'describe',", None),
         (STARTS_PIP, "python_command(['-m', 'pip', 'download',", "python_environment()"),
         (ASKS_COMPILERS, "[program, '--version']", None),
         (STARTS_A_BROWSER, "[*command, page.absolute().as_uri()]", None),

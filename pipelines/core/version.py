@@ -20,9 +20,14 @@ def described_commit(checkout: Path) -> str | None:
     """Return the commit of a checkout by the last tag of a release, `-dirty` if files differ; None: it is none."""
     if not (checkout / ".git").exists():
         return None
-    words = ["git", "-C", str(checkout), "describe", "--tags", "--match", "v*", "--always", "--dirty"]
     try:
-        done = subprocess.run(words, check=True, capture_output=True, text=True, encoding="utf-8")
+        done = subprocess.run(
+            ["git", "-C", str(checkout), "describe", "--tags", "--match", "v*", "--always", "--dirty"],
+            check=True,
+            capture_output=True,
+            text=True,
+            encoding="utf-8",
+        )
     except (OSError, subprocess.CalledProcessError):  # no git, or another user's checkout
         return None
     return done.stdout.strip() or None
