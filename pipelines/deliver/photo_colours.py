@@ -212,12 +212,13 @@ class PhotoColours:
                 continue
             colour, shown, _ = self._colours(view, part)
             # Hidden specks are noise of the surface: without them, photographs change at fewer places.
-            shown = cv2.morphologyEx(shown, cv2.MORPH_CLOSE, np.ones((_SPECK, _SPECK), dtype=np.uint8))
+            square = np.ones((_SPECK, _SPECK), dtype=np.uint8)
+            shown = np.asarray(cv2.morphologyEx(shown, cv2.MORPH_CLOSE, square), dtype=np.float32)
             blocks = tuple(slice(cells.start // BLOCK, cells.stop // BLOCK) for cells in (rows, columns))
             own = shown * cv2.resize(weight[blocks], shown.shape[::-1], interpolation=cv2.INTER_LINEAR)
             before = best[rows, columns]
             better = own > before
-            now = np.where(better, own, before)
+            now = np.maximum(own, before)
             if not (own > 0).any():
                 continue
             # Weights by a high power: the best view alone, but for the few cells where two are equally good.
@@ -227,7 +228,7 @@ class PhotoColours:
             total[rows, columns] = kept * total[rows, columns] + added
             camera[rows, columns][better] = view.seen.camera
             best[rows, columns] = now
-        return detail / np.maximum(total, _TINY)[..., None], camera
+        return (detail / np.maximum(total, _TINY)[..., None]).astype(np.float32), camera
 
     def _colours(self, view: _View, place: Float32Array) -> tuple[Float32Array, Float32Array, Float32Array]:
         """Return colours (H, W, 3), 0 … 255, of a view at places (H, W, 3), whether it shows them, and weights."""

@@ -38,7 +38,8 @@ _COARSEST = (
 )
 _MOST_THROUGH = 0.5  # largest number of views that look through a cell, over the number of those that agree
 _SIGMA_PX = 0.25  # of a ray, in pixels of the depth maps
-_LAYOUT = b"measured ground 1"
+_RESOLVED_PX = 1.5  # of the training: largest σ of a measured height
+_LAYOUT = b"measured ground 2"
 log = logging.getLogger(__name__)
 
 
@@ -114,7 +115,7 @@ def measured_by(renderer: ModelRenderer, progress: Progress = SILENT) -> Measure
 
     1. Depth maps are rendered small; depths count where the photograph confirms the render.
     2. A cell of the plan has the median height of the views that show it.
-    3. It is measured if three views agree on that height, more than look through it, to a cell's side.
+    3. It is measured if three views agree on that height, more than look through it, to 1.5 training pixels.
     """
     trained = renderer.trained
     cameras = trained.indices("train")
@@ -137,6 +138,10 @@ def measured_by(renderer: ModelRenderer, progress: Progress = SILENT) -> Measure
     if not widths:
         return MeasuredGround(np.zeros((1, 1), dtype=bool), np.zeros(2), np.array([photo_m, photo_m]))
     pixel_m = float(np.median(widths))
+    reduced = [
+        small.width / renderer.pinholes.of(index).width for index, small in zip(cameras, pinholes, strict=True)
+    ]
+    training_m = pixel_m * float(np.median(reduced))
     points = []
     for depth, pinhole, turned, place in zip(maps, pinholes, rotation, center, strict=True):
         near = (depth > 0) & (geo_from_model.scale * depth / pinhole.fx < _COARSEST * pixel_m)
@@ -155,7 +160,7 @@ def measured_by(renderer: ModelRenderer, progress: Progress = SILENT) -> Measure
     enough = (found.views >= LEAST_PHOTOGRAPHS) & (found.seen_through <= _MOST_THROUGH * found.views)
     with np.errstate(invalid="ignore", divide="ignore"):
         lateral_m = _SIGMA_PX * pixel_m / (found.spread_rad * np.sqrt(found.views))
-        close = found.rms_up_m**2 + lateral_m**2 < cells.cell_m**2
+        close = found.rms_up_m**2 + lateral_m**2 < (_RESOLVED_PX * training_m) ** 2
     return MeasuredGround(cells.grid(enough & close), cells.corner, np.array([cells.cell_m, photo_m]))
 
 
@@ -167,7 +172,7 @@ def _depth(renderer: ModelRenderer, index: int, pinhole: Pinhole) -> Float32Arra
     rgb = (255 * view.colour.clamp(0, 1)).round().byte().cpu().numpy()
     size = (pinhole.width, pinhole.height)
     small = cv2.resize(np.array(renderer.images.image(index)), size, interpolation=cv2.INTER_AREA)
-    depth[~photo_consistent(rgb, small)] = 0
+    depth[~photo_consistent(rgb, np.asarray(small, dtype=np.uint8))] = 0
     if renderer.images.is_masked(index):
         mask = np.array(renderer.images.mask(index)).astype(np.uint8)
         depth[cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST) == 0] = 0

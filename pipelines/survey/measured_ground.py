@@ -55,7 +55,9 @@ class MeasuredGround(ArrayProduct):
         width_m = max(_FILLED_M, _FILLED_PX * self.size_m[1]) if fill is None else fill
         spike = max(_SPIKE_M / self.cell_m, _SPIKE_CELLS) / 2
         while True:
-            found = _without_islands(_without_spikes(_closed(measured, width_m / self.cell_m / 2), spike) & inside)
+            found = _without_islands(
+                _without_spikes(_closed(measured, (width_m / self.cell_m + 1) / 2), spike) & inside
+            )
             filled = (found & ~measured).sum() / max(found.sum(), 1)
             if fill is not None or filled <= _MOST_FILLED or width_m < self.cell_m:
                 break
@@ -98,7 +100,7 @@ def _without_islands(cells: BoolArray) -> BoolArray:
 
 
 def _closed(cells: BoolArray, radius: float) -> BoolArray:
-    """Return cells with their holes and bays that are narrower than twice a radius in cells."""
+    """Return cells with their holes and bays whose cells are no farther from others than a radius."""
     radius = min(radius, float(sum(cells.shape)))
     margin = math.ceil(radius) + 1
     padded = np.pad(cells, margin)
