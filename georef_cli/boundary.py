@@ -50,8 +50,8 @@ class Exit:
 def exit_of(error: BaseException) -> Exit | None:
     """Return the exit by a known exception; None for one that nobody foresaw."""
     if isinstance(error, click.Abort | KeyboardInterrupt):
-        text = "interrupted. What is done is kept: the same command continues."
-        return Exit(INTERRUPTED, text, _document("interrupted", "interrupted"))
+        said = "interrupted. What is done is kept: the same command continues."
+        return Exit(INTERRUPTED, said, _document("interrupted", "interrupted"))
     if isinstance(error, click.ClickException):
         text, context, param = io.StringIO(), getattr(error, "ctx", None), getattr(error, "param", None)
         error.show(text)

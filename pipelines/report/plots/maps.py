@@ -263,7 +263,9 @@ def raster_map(
     return look.png_of(figure)
 
 
-def _share_of(size: tuple[float, float], box: tuple[float, float, float, float]) -> tuple[float, ...]:
+def _share_of(
+    size: tuple[float, float], box: tuple[float, float, float, float]
+) -> tuple[float, float, float, float]:
     return box[0] / size[0], box[1] / size[1], box[2] / size[0], box[3] / size[1]
 
 
