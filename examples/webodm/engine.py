@@ -99,6 +99,8 @@ def run_words(given: argparse.Namespace, project: Path) -> list[str]:
         sets["sfm.max_image_size"] = FEATURE_PIXELS[given.feature_quality]
     if last >= steps.index("openmvs"):
         words.append(f"--preset={preset}")
+        required = {"--tolerance-h": given.tolerance_h, "--tolerance-v": given.tolerance_v}
+        words += [f"{option}={metres}" for option, metres in required.items() if metres > 0]
         if given.boundary:
             words.append(f"--boundary={boundary_file(given.boundary, project)}")
         if given.align:

@@ -172,7 +172,7 @@ def compare_with_exif(
         table=in_enu[1][:, :2],
         sigma_m=sigma[:, :2],
         time_s=exif.time_s[both],
-        common_m=float(np.hypot(*(_common_sigma(each, both) for each in (poses, exif)))),
+        common_m=float(np.hypot(_common_sigma(poses, both), _common_sigma(exif, both))),
     )
     heights_m = np.column_stack([in_table, lla[:, 2]])
     found = (_horizontal(places, path), _heights(places.name, heights_m, apart[:, 2], sigma[:, 2], path))

@@ -76,7 +76,7 @@ def inspect_machine() -> Machine:
         gpus=tuple(Gpu(properties.name, int(properties.total_memory)) for properties in found),
         backends=tuple(_backend(name) for name in BACKENDS),
         extras=tuple(map(extra_part, EXTRAS)),
-        sizes_mb={"core": CORE_MB, **SIZES_MB},
+        sizes_mb={"core": CORE_MB} | {str(name): size for name, size in SIZES_MB.items()},
         cuda_parts=(*running_parts(), *compiling_parts()),
         cuda_kernels=kernels_ready(),
         grid_folders=tuple(map(str, grid_folders())),

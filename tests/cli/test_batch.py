@@ -195,5 +195,8 @@ def test_settings_reach_their_stage(georef: Georef, workspace: Workspace, photos
     requests = read_requests(workspace.root)
     assert requests["sfm"] == {"seed": 4, "mapper": "global"}
     assert requests["ingest"] == {"images": str(photos), "vertical": "ellipsoidal"}
-    assert georef("run", workspace.root, "--to", "sfm", "--set", "train.seed=4").code == 2
+    of_later = georef("run", workspace.root, "--to", "sfm", "--set", "train.seed=4")
+    assert of_later.code == 0 and "train.seed" in of_later.err  # named, and no error: the same command serves both
+    assert "train" not in read_requests(workspace.root)
+    assert georef("run", workspace.root, "--to", "sfm", "--set", "trainer.seed=4").code == 2
     assert georef("run", workspace.root, "--set", "train.sh_degree=9").code == 2

@@ -193,6 +193,9 @@ def test_options_reach_the_stages(engine: ModuleType, project: Path) -> None:
     assert "--preset=standard" in words() and "--preset=high" in words("--pc-quality", "ultra")
     assert "--preset=fast" in words("--fast-orthophoto") and "--preset=smoke" in words("--preset", "smoke")
     assert {"--sigma-h=2.5", "--sigma-v=2.5"} <= set(words("--gps-accuracy", "2.5"))
+    assert "--tolerance-h=0.05" in words("--tolerance-h", "0.05") and not any(
+        "tolerance" in word for word in words()
+    )
     assert "--set=export-spz.crop=true" in words() and "--set=export-spz.crop=true" not in words("--crop", "0")
     assert "--vertical=EGM96; rm -r /" in words("--vertical", "EGM96; rm -r /")  # one word, which georef refuses
     assert not any("rerun" in word for word in words("--rerun-from", "opensfm"))  # nothing was run here

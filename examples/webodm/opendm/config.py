@@ -96,6 +96,19 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "help": "Vertical datum of the heights in the photographs: ellipsoidal, EGM96, EGM2008 or EPSG:n. "
         "Without it: as the photographs state it, or assumed, which the report says. Default: %(default)s",
     },
+    "tolerance-h": {
+        "metavar": "<positive float>",
+        "type": float,
+        "default": 0.0,
+        "help": "Required horizontal accuracy in metres, an RMSE, which the report tests at the check points; 0: none. "
+        "Default: %(default)s",
+    },
+    "tolerance-v": {
+        "metavar": "<positive float>",
+        "type": float,
+        "default": 0.0,
+        "help": "Required vertical accuracy in metres, as tolerance-h. Default: %(default)s",
+    },
     "max-concurrency": {
         "metavar": "<positive integer>",
         "type": int,
