@@ -38,8 +38,8 @@ _COARSEST = (
 )
 _MOST_THROUGH = 0.5  # largest number of views that look through a cell, over the number of those that agree
 _SIGMA_PX = 0.25  # of a ray, in pixels of the depth maps
-_RESOLVED_PX = 1.5  # of the training: largest σ of a measured height
-_LAYOUT = b"measured ground 2"
+_RESOLVED_PX = 1.0  # of the training: largest σ of a measured height, as of the cells of rasters
+_LAYOUT = b"measured ground 3"
 log = logging.getLogger(__name__)
 
 
@@ -115,7 +115,7 @@ def measured_by(renderer: ModelRenderer, progress: Progress = SILENT) -> Measure
 
     1. Depth maps are rendered small; depths count where the photograph confirms the render.
     2. A cell of the plan has the median height of the views that show it.
-    3. It is measured if three views agree on that height, more than look through it, to 1.5 training pixels.
+    3. It is measured if three views agree on that height, more than look through it, to a training pixel.
     """
     trained = renderer.trained
     cameras = trained.indices("train")

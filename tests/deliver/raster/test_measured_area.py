@@ -50,11 +50,12 @@ def test_area_is_what_the_views_measure(workspace: Workspace) -> None:
     assert not found.polygon.intersects(LAKE.buffer(-1.0))  # to a cell or two at its shore
     lost = seen.polygon.difference(found.polygon)
     assert lost.intersection(LAKE).area > 0.8 * LAKE.area
-    assert lost.area < LAKE.area + 0.05 * seen.polygon.area  # the rim, where the third view ends within a cell
+    # The rim, where the rays of three views meet at small angles, and the shore, to a cell.
+    assert lost.area < LAKE.area + 0.08 * seen.polygon.area
     assert found.measured is not None
     assert seen.measured is not None
     assert found.measured > 0.95
-    assert seen.measured == pytest.approx(1 - LAKE.area / seen.polygon.area, abs=0.05)
+    assert seen.measured == pytest.approx(1 - LAKE.area / seen.polygon.area, abs=0.08)
 
 
 def test_painted_ground_is_no_part_of_the_area(workspace: Workspace, tmp_path: Path) -> None:
