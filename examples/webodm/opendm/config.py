@@ -100,7 +100,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "metavar": "<positive float>",
         "type": float,
         "default": 0.0,
-        "help": "Required horizontal accuracy in metres, an RMSE, which the report tests at the check points; 0: none. "
+        "help": "Required horizontal accuracy in metres, an RMSE that the report tests at check points; 0: none. "
         "Default: %(default)s",
     },
     "tolerance-v": {
