@@ -82,8 +82,8 @@ CELLS = {
 }
 
 
-def _checks(count: int, kind: str = "") -> str:
-    return f"{count} {kind}check point{'s'[: count != 1]}"
+def _checks(count: int) -> str:
+    return f"{count} check point{'s'[: count != 1]}"
 
 
 class SurfaceErrors(Product):
@@ -179,19 +179,19 @@ class Headline(Product):
 
     @property
     def text(self) -> str:
-        """Both figures: `measured at 9 triangulated check points: RMSE H 4.2 cm, V 5.1 cm; of the surface: …`."""
+        """Both figures: `measured at 9 check points, triangulated: RMSE H 4.2 cm, V 5.1 cm; of the surface: …`."""
         return self.of_points + (f"; of the surface: {self.surface.text}" if self.surface is not None else "")
 
     @property
     def of_points(self) -> str:
-        """Kind and figures of the points, as `measured at 9 triangulated check points: RMSE H 4.2 cm, V 5.1 cm`."""
+        """Kind and figures of the points: `measured at 9 check points, triangulated: RMSE H 4.2 cm, V 5 cm`."""
         if self.kind == "unknown":
             return f"not known: {self.reason}"
         vertical = "unknown" if self.rmse_v_m is None else ACCURACY_V.with_unit(self.rmse_v_m)
         figures = f"H {ACCURACY_H.with_unit(self.rmse_h_m)}, V {vertical}"
         if self.kind == "predicted":
             return f"predicted, not measured: σ {figures}"
-        text = f"measured at {_checks(self.check_points, 'triangulated ')}: RMSE {figures}"
+        text = f"measured at {_checks(self.check_points)}, triangulated: RMSE {figures}"
         if self.rmse_h_without_m is None:
             return text
         others = f"H {ACCURACY_H.with_unit(self.rmse_h_without_m)}, V {ACCURACY_V.with_unit(self.rmse_v_without_m)}"

@@ -68,7 +68,7 @@ def test_it_is_the_same_everywhere(
     truth = true_headline(flight)
     assert (stated.rmse_h_m, stated.rmse_v_m) == pytest.approx((truth.rmse_h_m, truth.rmse_v_m), rel=1e-12)
     text, figures = truth.text, stated.model_dump(mode="json")
-    assert re.fullmatch(r"measured at 3 triangulated check points: RMSE H \d\.\d cm, V \d\.\d cm", text)
+    assert re.fullmatch(r"measured at 3 check points, triangulated: RMSE H \d\.\d cm, V \d\.\d cm", text)
 
     # In JSON, to the last digit.
     assert real_georef("status", flight.root, "--json").document["accuracy"] == figures
@@ -137,7 +137,8 @@ def test_without_check_points_it_is_predicted_and_called_so() -> None:
     total = TotalRmse(rmse_h_m=0.03, rmse_v_m=0.04, rmse_3d_m=0.05)
     points = check_points_with(count=1, with_survey=total)
     assert (
-        headline(points, scene, UNCHECKED).text == "measured at 1 triangulated check point: RMSE H 3.0 cm, V 4.0 cm"
+        headline(points, scene, UNCHECKED).text
+        == "measured at 1 check point, triangulated: RMSE H 3.0 cm, V 4.0 cm"
     )
 
 
