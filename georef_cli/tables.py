@@ -162,7 +162,8 @@ def outcome(workspace: Workspace, result: Outcome, *, headline: bool = True) -> 
                 table.add_row(shown(_words(name)), shown(_number(value)))
         parts.append(table)
         parts += _cameras(manifest.values.get("camera_list", ()))
-    if (file := workspace.root / BY_NAME[result.stage].product).exists():
+    spec = BY_NAME.get(result.stage)  # None: a part of `blocks`, whose files only they read
+    if spec is not None and (file := workspace.root / spec.product).exists():
         parts.append(f"[bold]file[/] {shown(str(file))}")
     if not result.ran:  # the warnings of a stage that just ran are on stderr already
         parts += [f"[yellow]warning:[/] {shown(warning.sentence)}" for warning in manifest.warnings]
