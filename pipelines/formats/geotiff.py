@@ -149,17 +149,26 @@ def _written(path: Path, frame: RasterFrame, bands: int, bytes_each: int) -> Ite
 
 
 def _require_whole(draft: Path) -> None:
-    """Raise an OSError where GDAL closed a raster without all its tiles: it does not report every full disk."""
+    """Raise an OSError where GDAL closed a raster without all its tiles: it does not report every full disk.
+
+    A tile may be missing, or lie within the file and be empty: what was written after it made the file longer.
+    """
     import rasterio
 
-    size = draft.stat().st_size
+    size, whole = draft.stat().st_size, True
     with rasterio.open(draft, driver="GTiff") as raster:
         tiles = [(place, band) for band in raster.indexes for place, _ in raster.block_windows(band)]
         places = [
             [raster.get_tag_item(f"BLOCK_{what}_{x}_{y}", "TIFF", bidx=band) for what in ("OFFSET", "SIZE")]
             for (y, x), band in tiles
         ]
-    if not all(None not in place and sum(map(int, place)) <= size for place in places):
+        whole = all(None not in place and sum(map(int, place)) <= size for place in places)
+        try:
+            for _, window in raster.block_windows(1) if whole else ():
+                raster.read(window=window)  # each tile has a checksum
+        except rasterio.errors.RasterioIOError:
+            whole = False
+    if not whole:
         raise OSError(errno.EIO, "the raster was not written whole", str(draft))
 
 
