@@ -100,21 +100,21 @@ def map_matches(colmap: Any, job: SfmJob, progress: Progress) -> Any:
         fixes = {image.name: image.fix.position_in_geo for image in job.survey.images if image.fix is not None}
     if aligned.mapper == "global":
         complete = partial(triangulate, colmap, database=job.database, progress=progress)
-    before = {camera_id: camera.params.copy() for camera_id, camera in model.cameras.items()}
+    mapped = type(model)(model) if aligned.lens_held else None
     _adjust(colmap, job, model, fixes=fixes, complete=complete, progress=progress)
     astray = lenses_astray(model, job.survey)
-    if astray and aligned.lens_held:
+    if astray and mapped is not None:
         for camera_id, reason in astray.items():
             log.warning(
                 "The photographs do not determine the lens of camera %d, which would have %s: it is held.",
                 camera_id, reason, extra={"code": "lens-held"},
             )  # fmt: skip
-            model.cameras[camera_id].params = before[camera_id]
-        _adjust(colmap, job, model, lens_held=True, progress=progress)
+        model = mapped
+        _adjust(colmap, job, model, lens_held=True, fixes=fixes, complete=complete, progress=progress)
     else:
         for camera_id, reason in astray.items():
             log.warning(
-                "Camera %d was solved with %s. Check --focal-px, or give the lens by --camera.",
+                "Camera %d was solved with %s. State the focal length by --focal-px.",
                 camera_id, reason, extra={"code": "lens-astray"},
             )  # fmt: skip
     return model
