@@ -12,6 +12,7 @@ from pipelines.core.progress import SILENT
 from pipelines.core.types import Vector3
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.geometry.similarity import umeyama
+from pipelines.sfm import colmap_reconstruction, rounds
 from pipelines.sfm.colmap_database import add_features, has_added_features, verified_matches, write_frame
 from pipelines.sfm.features import SfmJob, verify_matches
 from pipelines.sfm.lens_check import lenses_astray
@@ -19,6 +20,7 @@ from pipelines.sfm.mapping import map_database
 from pipelines.sfm.options import SfmOptions
 from pipelines.sfm.parts import join_parts
 from pipelines.survey.survey import Attitude, Fix, Survey
+from tests.refusals import logged_codes
 from tests.sfm_scenes import survey_of
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -174,15 +176,14 @@ def test_lenses_that_cannot_be(change: dict[str, float], astray: bool) -> None:
     assert bool(lenses_astray(truth, assumed)) == ("k2" in change and astray)
 
 
-def test_added_features_make_a_model(tmp_path: Path) -> None:
-    """Features without descriptors, matched by truth, are verified and mapped like SIFT's."""
-    truth = true_model(8)
+def matched(tmp_path: Path, truth: Any) -> SfmJob:
+    """A database with features without descriptors, matched by truth, beside one of SIFT's that matches nothing."""
     survey = surveyed(truth)
     job = SfmJob(survey, tmp_path, tmp_path / "database.db", SfmOptions(camera_model="SIMPLE_RADIAL", threads=1))
     with pycolmap.Database.open(job.database):
         pass
-    write_frame(pycolmap, job.database, survey, range(8), job.options)
     images = [truth.images[key] for key in sorted(truth.reg_image_ids())]
+    write_frame(pycolmap, job.database, survey, range(len(images)), job.options)
     row_of: list[dict[int, int]] = []
     places = {}
     nothing = pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, np.zeros((1, 128), np.uint8))
@@ -190,13 +191,13 @@ def test_added_features_make_a_model(tmp_path: Path) -> None:
         seen = [point for point in image.points2D if point.has_point3D()]
         row_of.append({point.point3D_id: row for row, point in enumerate(seen)})
         places[index] = np.array([point.xy for point in seen])
-        with pycolmap.Database.open(job.database) as database:  # one of SIFT's features, which matches nothing
+        with pycolmap.Database.open(job.database) as database:
             database.write_keypoints(index + 1, np.array([[5.0, 5.0, 1.0, 0.0, 0.0, 1.0]], np.float32))
             database.write_descriptors(index + 1, nothing)
     assert not has_added_features(pycolmap, job.database)
     matches = {}
-    for a in range(8):
-        for b in range(a + 1, 8):
+    for a in range(len(images)):
+        for b in range(a + 1, len(images)):
             common = sorted(set(row_of[a]) & set(row_of[b]))
             matches[a, b] = np.array([(row_of[a][point], row_of[b][point]) for point in common])
     add_features(pycolmap, job.database, places, matches)
@@ -204,10 +205,31 @@ def test_added_features_make_a_model(tmp_path: Path) -> None:
     verify_matches(pycolmap, job, np.array(sorted(matches)), SILENT)
     found = verified_matches(pycolmap, job.database)
     assert all(found[pair] == len(rows) for pair, rows in matches.items())
+    return job
+
+
+def test_added_features_make_a_model(tmp_path: Path) -> None:
+    """Features without descriptors are verified and mapped like SIFT's."""
+    truth = true_model(8)
+    job = matched(tmp_path, truth)
     models, _ = map_database(pycolmap, job, SILENT, lens_held=True)
     solved = np.array([models[0].images[key].projection_center() for key in sorted(models[0].reg_image_ids())])
-    true = np.array([image.projection_center() for image in images])
+    true = np.array([truth.images[key].projection_center() for key in sorted(truth.reg_image_ids())])
     # Without noise: the error is that of keypoints in float32.
     assert np.abs(umeyama(solved, true).apply(solved) - true).max() < 1e-3
     kept = next(iter(models[0].cameras.values()))
-    assert list(kept.params) == pytest.approx(list(survey.cameras[0].params))
+    assert list(kept.params) == pytest.approx(list(job.survey.cameras[0].params))
+
+
+def test_a_lens_that_is_refused_stays_as_stated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A last adjustment that finds a lens that cannot be is taken back, with the points that fitted it."""
+    job = matched(tmp_path, true_model(8))
+    for module in (rounds, colmap_reconstruction):
+        monkeypatch.setattr(module, "lenses_astray", lambda model, survey: {1: "another focal length"})
+    model = colmap_reconstruction.map_matches(pycolmap, job, SILENT)
+    assert logged_codes(caplog) == ["lens-held"]
+    kept = next(iter(model.cameras.values()))
+    assert list(kept.params) == pytest.approx(list(job.survey.cameras[0].params), abs=1e-9)
+    assert model.compute_mean_reprojection_error() < 1e-2
