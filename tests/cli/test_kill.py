@@ -100,7 +100,7 @@ def test_stopped_by_the_user_and_resumed(survey: Path, whole: Workspace) -> None
         ended = _finish(process)
         assert time.monotonic() - sent < 60  # a few photographs, pairs or iterations, also on a busy machine
         ended.assert_failed(130)
-        assert ended.err.splitlines()[-1] == "interrupted"
+        assert ended.err.splitlines()[-1] == "interrupted. What is done is kept: the same command continues."
         assert not [word for word in NOISE_OF_LIBRARIES if word in ended.err]
         command = ("run", workspace.root)
     assert "100; the same command continues" in ended.err
