@@ -82,6 +82,17 @@ class GeorefAlgorithm(QgsProcessingAlgorithm):
         """Add the parameters."""
         raise NotImplementedError
 
+    def processAlgorithm(
+        self, values: dict[str, Any], context: QgsProcessingContext, feedback: QgsProcessingFeedback
+    ) -> dict[str, Any]:
+        workspace, words = self.call_of(values, context)
+        call(words, feedback)
+        return self.layers(workspace, context)
+
+    def call_of(self, values: dict[str, Any], context: QgsProcessingContext) -> tuple[Path, list[str]]:
+        """Return the workspace that gets the outputs, and the words of the call."""
+        raise NotImplementedError
+
     def add_file(self, name: str, title: str, *, folder: bool = False, optional: bool = False) -> None:
         """Add a parameter that names a file or a folder."""
         kind = QgsProcessingParameterFile.Folder if folder else QgsProcessingParameterFile.File
@@ -145,17 +156,14 @@ class Run(GeorefAlgorithm):
         self.addParameter(QgsProcessingParameterEnum("PRESET", "Effort", PRESETS, defaultValue=2))
         self.add_area()
 
-    def processAlgorithm(
-        self, values: dict[str, Any], context: QgsProcessingContext, feedback: QgsProcessingFeedback
-    ) -> dict[str, Any]:
+    def call_of(self, values: dict[str, Any], context: QgsProcessingContext) -> tuple[Path, list[str]]:
         workspace = Path(self.parameterAsString(values, "WORKSPACE", context))
         words = ["run", str(workspace), f"--images={self.parameterAsFile(values, 'PHOTOS', context)}"]
         words += self.given_file(values, "GCP", "--gcp", context)
         words += self.given_file(values, "TRAJECTORY", "--trajectory", context)
         words += self.given_polygons(values, "BOUNDARY", "--boundary", context)
         words += [f"--preset={PRESETS[self.parameterAsEnum(values, 'PRESET', context)]}", "--deliver=raster"]
-        call(words, feedback)
-        return self.layers(workspace, context)
+        return workspace, words
 
 
 class ExportRaster(GeorefAlgorithm):
@@ -178,9 +186,7 @@ class ExportRaster(GeorefAlgorithm):
         )
         self.add_area()
 
-    def processAlgorithm(
-        self, values: dict[str, Any], context: QgsProcessingContext, feedback: QgsProcessingFeedback
-    ) -> dict[str, Any]:
+    def call_of(self, values: dict[str, Any], context: QgsProcessingContext) -> tuple[Path, list[str]]:
         workspace = Path(self.parameterAsString(values, "WORKSPACE", context))
         words = ["export-raster", str(workspace), "--forget=all"]
         crs = self.parameterAsCrs(values, "CRS", context)
@@ -191,8 +197,7 @@ class ExportRaster(GeorefAlgorithm):
                 words.append(f"--{name.lower()}={number}")
         words.append(f"--contours-of={SURFACES[::-1][self.parameterAsEnum(values, 'CONTOURS_OF', context)]}")
         words += self.given_polygons(values, "BOUNDARY", "--boundary", context)
-        call(words, feedback)
-        return self.layers(workspace, context)
+        return workspace, words
 
 
 class Change(GeorefAlgorithm):
@@ -216,17 +221,14 @@ class Change(GeorefAlgorithm):
             self.addParameter(QgsProcessingParameterVectorLayer(name, title, kinds, optional=True))
         self.addParameter(QgsProcessingParameterBoolean("STABLE_AUTO", "Find unchanged ground", defaultValue=False))
 
-    def processAlgorithm(
-        self, values: dict[str, Any], context: QgsProcessingContext, feedback: QgsProcessingFeedback
-    ) -> dict[str, Any]:
+    def call_of(self, values: dict[str, Any], context: QgsProcessingContext) -> tuple[Path, list[str]]:
         later = Path(self.parameterAsString(values, "LATER", context))
         words = ["change", self.parameterAsString(values, "EARLIER", context), str(later), "--forget=all"]
         words.append(f"--of={SURFACES[self.parameterAsEnum(values, 'OF', context)]}")
         words += self.given_polygons(values, "STABLE", "--stable", context)
         words += self.given_polygons(values, "REGIONS_OF_INTEREST", "--regions", context)
         words += ["--stable-auto"] if self.parameterAsBool(values, "STABLE_AUTO", context) else []
-        call(words, feedback)
-        return self.layers(later, context)
+        return later, words
 
 
 class Info(GeorefAlgorithm):
