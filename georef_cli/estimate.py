@@ -67,7 +67,7 @@ class RunEstimate:
     @property
     def total_s(self) -> float | None:
         """Seconds of the whole run; None: not known, as of a bag that is not read yet or of a training on a GPU."""
-        going = [row.stage for row in self.planned if row.action not in ("keep", "refuse")]
+        going = [row.stage for row in self.planned if row.works]
         known = [seconds for stage in going if (seconds := self.seconds.get(stage)) is not None]
         return sum(known) if len(known) == len(going) else None
 
@@ -100,7 +100,7 @@ def estimate_run(
 
     planned = plan(workspace, stages, flags, force=force)
     for row in planned:
-        if row.action not in ("keep", "refuse"):
+        if row.works:
             require_available(row.resolved)
     photographs = _photographs(workspace, planned)
     reconstruction, training = None, None
@@ -126,7 +126,7 @@ def estimate_run(
         megapixels = photographs.count * width * height / 1e6
         for row in planned:
             rough = pace.modelled_s(row.stage, photographs.count, megapixels)
-            if row.action not in ("keep", "refuse") and rough is not None:
+            if row.works and rough is not None:
                 modelled[row.stage] = rough
     seconds |= {name: pace.corrected(name, value) for name, value in modelled.items()}
     return RunEstimate(planned, photographs, seconds, modelled, reconstruction, training)
@@ -146,7 +146,7 @@ def checked_inputs(
 
 def _to_run(planned: Sequence[PlannedStage], options: type[OptionsT]) -> OptionsT | None:
     """Return the options of a class with which a stage will run; None: it will not."""
-    going = (row.resolved for row in planned if row.action not in ("keep", "refuse"))
+    going = (row.resolved for row in planned if row.works)
     return next((resolved for resolved in going if isinstance(resolved, options)), None)
 
 
@@ -272,14 +272,6 @@ def announced_estimate(
     except GeorefError:
         return None
     return run
-
-
-def announced_seconds(
-    workspace: Workspace, stages: tuple[StageSpec, ...], flags: Mapping[str, Flags], *, force: bool
-) -> Mapping[str, float | None]:
-    """Return the estimated seconds of a run's stages; none for a run that will be refused."""
-    run = announced_estimate(workspace, stages, flags, force=force)
-    return {} if run is None else run.seconds
 
 
 def _document(workspace: Workspace, run: RunEstimate, survey: Summary | None) -> dict[str, Any]:

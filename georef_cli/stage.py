@@ -19,7 +19,7 @@ from rich.console import RenderableType
 from georef_cli import boundary, options
 from georef_cli.command import Command, merged_verbosity
 from georef_cli.display import is_told, progress_for
-from georef_cli.estimate import announced_seconds, print_dry_run
+from georef_cli.estimate import announced_estimate, print_dry_run
 from georef_cli.output import print_outcome
 from pipelines.core import runner
 from pipelines.core.errors import InputError, storage_failures
@@ -121,7 +121,7 @@ class StageCommand(Command):
             check_target(target, self.spec, folder=self._delivers == "folder", overwrite=force)
         flags = self._flags(ctx, values)
         if self.spec.name == "train":
-            announced_seconds(workspace, (self.spec,), flags, force=force)
+            announced_estimate(workspace, (self.spec,), flags, force=force)
         with nullcontext(workspace) if self._delivers is None else _writable(workspace, target) as place:
             with boundary.logged_to_file(place, self.spec):
                 outcome = runner.run_stage(

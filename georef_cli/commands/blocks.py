@@ -12,7 +12,7 @@ from georef_cli import boundary, job_tables, options
 from georef_cli.command import Command
 from georef_cli.display import is_told, progress_for
 from georef_cli.engines import ENGINE, asked_engine
-from georef_cli.estimate import announced_seconds
+from georef_cli.estimate import announced_estimate
 from georef_cli.output import print_json, print_outcome, print_result, print_rich
 from pipelines.core import runner, stages
 from pipelines.core.options import remember, remembered
@@ -110,7 +110,7 @@ def _all(
     workspace = parts.workspace
     if only_merge:
         require_trained(parts, parts.plan())
-    announced_seconds(workspace, (TRAIN,), asked, force=values["force"])
+    announced_estimate(workspace, (TRAIN,), asked, force=values["force"])
     with boundary.logged_to_file(workspace, TRAIN):
         outcome = runner.run_stage(
             workspace,

@@ -63,6 +63,11 @@ class PlannedStage:
     options: tuple[OptionOrigin, ...]
     resolved: StageOptions
 
+    @property
+    def works(self) -> bool:
+        """Whether the stage would do anything, wholly or in part."""
+        return self.action not in ("keep", "refuse")
+
 
 def plan(
     workspace: Workspace, stages: tuple[StageSpec, ...], flags: Mapping[str, Flags], *, force: bool = False
