@@ -14,7 +14,6 @@ import numpy as np
 from pipelines.adjust.fix_patterns import CameraPath
 from pipelines.core.products import NOT_CHECKED, Remark
 from pipelines.core.types import FloatArray
-from pipelines.geometry.cameras import Camera
 from pipelines.geometry.row_motion import RowMotion
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.survey import Survey
@@ -35,8 +34,7 @@ def focal_length_of(survey: Survey, model: SparseModel) -> tuple[Remark, ...]:
         prior = stated.get(camera_of[name])
         if prior is None:
             continue
-        tags = Camera(prior.model, prior.width, prior.height, np.array(prior.params))
-        before, now = tags.mean_focal_px, model.camera_of(image).mean_focal_px
+        before, now = prior.camera.mean_focal_px, model.camera_of(image).mean_focal_px
         if not 1 / _MOST_FOCAL < now / before < _MOST_FOCAL:
             found[prior.make_model.strip() or f"camera {prior.camera_id}"] = (now, before, prior.focal_source)
     apart = tuple(

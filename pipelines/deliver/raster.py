@@ -30,7 +30,7 @@ from pipelines.deliver.surface import without_sigma
 from pipelines.formats.georef_sidecar import CrsSidecar, median_sigma, write_sidecar
 from pipelines.formats.geotiff import RasterFrame, read_reduced
 from pipelines.formats.vector_files import ContourLine, features_text, write_contours_dxf, write_contours_gpkg
-from pipelines.geometry.relief import sunlight
+from pipelines.geometry.relief import pale, sunlight
 from pipelines.surface.measured_area import area_of
 from pipelines.survey.headline import headline_of
 from pipelines.survey.scene import photographs
@@ -41,7 +41,7 @@ _DETAIL = 1.5  # training pixels over cells, beyond which a raster shows less th
 # Bytes of a cell on the disk at most: colours, height, mask and two σ, as measured, whole and final rasters.
 _BYTES_PER_CELL = 74
 _PICTURE_PX = 2000
-_COLOURED, _TINT = (0.01, 0.99), 0.55  # quantiles of the heights at the ends of the colours, and their strength
+_COLOURED = 0.01, 0.99  # quantiles of the heights at the ends of the colours
 # Of the contour lines.
 _EVERY_MAJOR = 5
 _LEAST_CELLS, _LEAST_INTERVALS = 12.0, 10.0  # length of the shortest line; a ring has twice as much
@@ -196,8 +196,7 @@ def _write_pictures(folder: Path, heights_by_plan: float) -> tuple[float, float]
     low, high = np.nanquantile(height, _COLOURED)
     level = np.clip((np.nan_to_num(height, nan=low) - low) / max(high - low, 1e-6), 0.0, 1.0)
     colours = cv2.applyColorMap(np.asarray(255 * level, dtype=np.uint8), cv2.COLORMAP_TURBO)
-    # Pale colours, so that the light can be seen on them.
-    shaded = (1 - _TINT + _TINT * colours / 255.0) * grey[..., None]
+    shaded = pale(np.asarray(colours / 255.0, dtype=np.float64)) * grey[..., None]
     cv2.imwrite(str(folder / "hillshade.png"), np.dstack([shaded.astype(np.uint8), alpha]))
     return float(low), float(high)
 

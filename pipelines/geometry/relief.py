@@ -6,6 +6,7 @@ from pipelines.core.types import FloatArray
 
 _AZIMUTH, _ELEVATION = np.radians(315.0), np.radians(45.0)
 LEVEL_LIGHT = float(np.sin(_ELEVATION))  # of level ground
+_TINT = 0.55  # strength of the colours of heights
 
 
 def sunlight(height: FloatArray, cell: float) -> FloatArray:
@@ -20,3 +21,8 @@ def sunlight(height: FloatArray, cell: float) -> FloatArray:
     towards_east, towards_north = np.array([np.sin(_AZIMUTH), np.cos(_AZIMUTH)]) * np.cos(_ELEVATION)
     light = (LEVEL_LIGHT - towards_east * east + towards_north * south) / np.sqrt(1.0 + east**2 + south**2)
     return np.where(np.isfinite(light), light, LEVEL_LIGHT)
+
+
+def pale(colours: FloatArray) -> FloatArray:
+    """Return colours (…, 3) from 0 to 1 of heights, so pale that light and shade can be seen on them."""
+    return np.asarray(1 - _TINT + _TINT * colours)

@@ -300,8 +300,7 @@ def _lens(
     prior = next((prior for prior in survey.cameras if prior.camera_id == key), None)
     start = None
     if prior is not None:
-        before = Camera(prior.model, prior.width, prior.height, np.array(prior.params))
-        start = parameters_in(before, camera.model)
+        start = parameters_in(prior.camera, camera.model)
     names = parameter_names(camera)
     sigma = None if covariance is None else np.sqrt(np.maximum(np.diag(covariance), 0.0))
     size = (camera.width, camera.height)

@@ -24,8 +24,8 @@ def lenses_astray(model: Any, survey: Survey) -> dict[int, str]:
     astray = {}
     for camera_id in sorted(used & set(priors)):
         solved, prior = model.cameras[camera_id], priors[camera_id]
-        focal_px, stated_px = float(solved.mean_focal_length()), prior.params[0]
         lens = Camera(solved.model_name, int(solved.width), int(solved.height), np.array(solved.params))
+        focal_px, stated_px = lens.mean_focal_px, prior.camera.mean_focal_px
         if prior.focal_source != "assumed" and abs(focal_px / stated_px - 1) > _FURTHEST_FOCAL:
             astray[camera_id] = f"a focal length of {focal_px:.0f} px, where {stated_px:.0f} px are stated"
         elif not _sees_its_rim(lens):

@@ -42,7 +42,6 @@ class Alignment:
     models: list[Any]
     mapper: MapperName
     lens_held: bool = False
-    parts: tuple[Part, ...] = ()
 
     @property
     def registered(self) -> int:
@@ -69,10 +68,10 @@ def align(colmap: Any, job: SfmJob, progress: Progress) -> Alignment:
             again = Alignment(*map_database(colmap, job, progress, lens_held=best.lens_held), best.lens_held)
             best = max(best, again, key=_merit)
     if len(best.models) > 1 and best.registered < len(job.survey.images):
-        _tell_of_parts([model.num_reg_images() for model in best.models], best.registered, len(job.survey.images))
+        _tell_of_parts(best, len(job.survey.images))
         largest, parts = join_parts(colmap, best.models, job.survey)
         _tell_of_joins(parts, best.registered)
-        best = replace(best, models=[largest], parts=parts)
+        best = replace(best, models=[largest])
     return best
 
 
@@ -164,10 +163,11 @@ def _add_learned(colmap: Any, job: SfmJob, pairs: IntArray, progress: Progress) 
     return add_learned(colmap, job, pairs, progress)
 
 
-def _tell_of_parts(sizes: list[int], largest: int, photographs: int) -> None:
+def _tell_of_parts(alignment: Alignment, photographs: int) -> None:
+    sizes = [model.num_reg_images() for model in alignment.models]
     log.info(
         "The survey fell apart into %d models of %s images; the largest has %d of %d photographs.",
-        len(sizes), ", ".join(map(str, sizes)), largest, photographs,
+        len(sizes), ", ".join(map(str, sizes)), alignment.registered, photographs,
     )  # fmt: skip
 
 

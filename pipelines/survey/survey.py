@@ -20,6 +20,7 @@ from pipelines.core.types import Matrix3, Vector3, vector3
 from pipelines.core.validators import image_dir
 from pipelines.geodesy.enu import Origin
 from pipelines.geodesy.vertical import VerticalDatum
+from pipelines.geometry.cameras import Camera
 
 LOCAL_FRAME = "local-frame"  # code of the caution that a survey has no place on Earth
 RigParameter = Literal["time-offset", "boresight", "lever-arm"]
@@ -158,6 +159,11 @@ class CameraPrior(Product):
     serial: str = ""
     sensor: str = ""
     readout_s: float = Field(0.0, ge=0, le=1)  # of a rolling shutter, from the first row to the last; 0: global
+
+    @property
+    def camera(self) -> Camera:
+        """Return the camera that these intrinsics describe."""
+        return Camera(self.model, self.width, self.height, np.array(self.params))
 
 
 class Fix(Product):

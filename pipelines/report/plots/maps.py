@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from pipelines.core.types import ByteArray, FloatArray
+from pipelines.geometry.relief import pale
 from pipelines.report.plots import plans
 from pipelines.report.plots import style as look
 
@@ -77,7 +78,6 @@ _LEGEND_HEIGHT, _HEADING_DEPTH = 0.2, 0.2  # above the lower edge, below the upp
 _NARROWEST = 0.4  # shorter side of a map over its longer one
 _MARGIN = 0.04  # of the longer side, around everything that is shown
 _MOST_TICKS = 5  # on the longer side
-_TINT = 0.55  # strength of the colours of heights, as in the hillshade
 _SCALE_BAR = 0.25  # of the width, that the scale bar takes at most
 
 _CAMERAS = {"marker": "X", "linewidths": 0.4, "color": "black", "edgecolors": "white"}
@@ -256,9 +256,9 @@ def raster_map(
     draw_north(figure, axes)
     if heights is not None:
         low, high, unit = heights
-        pale = ListedColormap(1 - _TINT + _TINT * colormaps["turbo"](np.linspace(0, 1, 256))[:, :3])
+        colours = ListedColormap(pale(colormaps["turbo"](np.linspace(0, 1, 256))[:, :3]))
         bar = figure.add_axes(_share_of(size, (left + width + _BAR_GAP, below, _BAR_WIDTH, height)))
-        scale = ScalarMappable(Normalize(low, high), pale)
+        scale = ScalarMappable(Normalize(low, high), colours)
         look.add_scale(figure, scale, f"height in {unit}", cax=bar, extend="both")
     return look.png_of(figure)
 
