@@ -22,7 +22,7 @@ from typing import IO, TYPE_CHECKING, TextIO
 
 import click
 
-from georef_cli.native_lines import SentLines
+from georef_cli.native_lines import SentLines, native_lines_caught_up
 from georef_cli.verbosity import LineFormatter, SafeFormatter, StderrSender, Verbosity, stderr_sender
 from pipelines.core.errors import GeorefError, InputError, storage_error
 from pipelines.core.progress import AT_END, SIGNALS
@@ -174,8 +174,10 @@ def logged_to_file(workspace: Workspace, spec: StageSpec) -> Iterator[None]:
         try:
             yield
         except BaseException as error:
+            native_lines_caught_up()
             handler.emit_end(error)
             raise
+        native_lines_caught_up()
 
 
 @contextmanager

@@ -8,6 +8,7 @@ of its lines is JSON, whatever a library says.
 import io
 import logging
 import os
+import secrets
 import sys
 import threading
 from collections.abc import Iterator
@@ -22,6 +23,39 @@ _MOST_LINES = 1000  # of a process: thousands of photographs bring forth the sam
 _PATIENCE_S = 1.0  # a process that this one has started may keep the pipe open
 
 log = logging.getLogger(__name__)
+
+
+class _Reader(threading.Thread):
+    """Thread that logs the lines of a pipe until nobody can write into it."""
+
+    def __init__(self, descriptor: int) -> None:
+        super().__init__(daemon=True)
+        self._descriptor = descriptor
+        self._mark = secrets.token_hex(16)
+        self._marked = threading.Event()
+
+    def run(self) -> None:
+        count = 0
+        with os.fdopen(self._descriptor, encoding="utf-8", errors="replace") as lines:
+            for line in lines:
+                if line.strip() == self._mark:
+                    self._marked.set()
+                    continue
+                count += bool(line.strip())
+                if line.strip() and count <= _MOST_LINES:
+                    log.debug("a library wrote: %s", line.strip()[:_MOST_OF_A_LINE])
+                if count == _MOST_LINES:
+                    log.debug("further lines of libraries are not logged")
+
+    def catch_up(self) -> None:
+        """Wait until all lines written so far are logged: a mark behind them has been read."""
+        self._marked.clear()
+        with suppress(OSError):
+            os.write(_STDERR, f"\n{self._mark}\n".encode())
+            self._marked.wait(_PATIENCE_S)
+
+
+_readers: list[_Reader] = []  # one while the context lasts
 
 
 @contextmanager
@@ -41,18 +75,26 @@ def native_lines_logged() -> Iterator[None]:
     os.dup2(writing, _STDERR)
     os.close(writing)
     log.setLevel(logging.DEBUG)  # The logs of the stages have these lines without --verbose too.
-    reader = threading.Thread(target=_log_lines, args=(reading,), daemon=True)
+    reader = _Reader(reading)
     reader.start()
+    _readers.append(reader)
     logging.captureWarnings(True)
     sys.stderr = os.fdopen(kept, "w", encoding=before.encoding, errors=before.errors, buffering=1)
     try:
         yield
     finally:
+        _readers.remove(reader)
         # What native code writes while the process ends is dropped: nobody reads it any more.
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, _STDERR)
         os.close(nowhere)
         reader.join(_PATIENCE_S)
+
+
+def native_lines_caught_up() -> None:
+    """Wait until what native code has written so far is logged, so that a stage's log has its lines."""
+    for reader in _readers:
+        reader.catch_up()
 
 
 def _leads_to_stderr(stream: TextIO) -> bool:
@@ -61,18 +103,6 @@ def _leads_to_stderr(stream: TextIO) -> bool:
         return stream.fileno() == _STDERR
     except (OSError, ValueError):
         return False
-
-
-def _log_lines(descriptor: int) -> None:
-    """Log the lines of a pipe until nobody can write into it."""
-    count = 0
-    with os.fdopen(descriptor, encoding="utf-8", errors="replace") as lines:
-        for line in lines:
-            count += bool(line.strip())
-            if line.strip() and count <= _MOST_LINES:
-                log.debug("a library wrote: %s", line.strip()[:_MOST_OF_A_LINE])
-            if count == _MOST_LINES:
-                log.debug("further lines of libraries are not logged")
 
 
 class SentLines(io.TextIOBase):

@@ -23,6 +23,7 @@ def noisy(stage, options):
     subprocess.run([sys.executable, "-c", glog], check=True)
     warnings.warn("invalid value encountered in divide", RuntimeWarning)
     print("a library of Python", file=sys.stderr)
+    os.write(2, b"many\\n" * 900 + b"the last line before the end\\n")
     {end}
 fakes.install(ingest=noisy)
 from georef_cli.main import main
@@ -53,6 +54,7 @@ def test_every_line_is_json(tmp_path: Path, photos: Path, code: int) -> None:
         assert error["error_kind"] == "defect" and "ZeroDivisionError: a defect" in str(error["text"])
     log = (tmp_path / "ws/logs/ingest.log").read_text("utf-8")
     assert "grfmt_tiff.cpp" in log and "mapper.cc" in log
+    assert "the last line before the end" in log, "the stage's log is complete, however late its lines are read"
 
 
 def test_without_json_they_are_seen_with_verbose_alone(tmp_path: Path, photos: Path) -> None:
