@@ -1,0 +1,61 @@
+"""The benchmark of real flights: its table says what the workspaces say, failures included."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from pathlib import Path
+
+import pytest
+
+from pipelines.core.manifest import Manifest
+from pipelines.core.workspace import Workspace
+from pipelines.survey.report import read_report
+from tests.scripts import REPOSITORY, load_script
+
+real_flights = load_script(REPOSITORY / "examples/flights/real_flights.py")
+
+RUN = real_flights.Run(seconds=90.0, peak_mb=2345.0, error="", at="2026-11-27")
+
+
+def _flight(name: str, **values: str) -> object:
+    return real_flights.Flight(name, "A flight", "https://github.com/a/b", "flight", "a trap", **values)
+
+
+@pytest.mark.slow
+def test_table_and_page_say_what_the_products_say(finished: Workspace, tmp_path: Path) -> None:
+    out = finished.root.parent
+    flight = _flight(finished.root.name)
+    cells = real_flights.row_of(flight, RUN, finished.root).strip("| ").split(" | ")
+    values = Manifest.model_validate_json(finished.path("sfm/manifest.json").read_bytes()).values
+    report = read_report(finished.path("evaluate/report.json"))
+    assert cells[1:4] == [f"{values['registered']} of {values['images']}", "1.5 min", "2.3 GB"]
+    assert cells[4].startswith(report.headline.of_points)
+    assert report.test_views is not None and cells[5] == f"{report.test_views.psnr_covered:.1f} dB"
+    assert re.fullmatch(r"\d+ % of \d+\.\d\d ha", cells[6])
+
+    arguments = argparse.Namespace(preset="smoke", out=out)
+    failed = real_flights.Run(3.0, 100.0, "/home/me/photos/a.jpg: is no photograph", "2026-11-27")
+    page = real_flights.page_of([(flight, RUN), (_flight("gone"), failed)], [_flight("x")], arguments, tmp_path)
+    assert f"| [A flight](#{flight.name}) |" in page and "**Failed**: a.jpg: is no photograph" in page
+    assert re.search(r"\[A flight\]\(#gone\) \| – \|.*\| failed \|", page)
+    assert (tmp_path / f"real_{flight.name}.jpg").stat().st_size > 500
+    assert "## Not run" in page and "/home/" not in page
+    for sentence in real_flights.remarks(real_flights.figures_of(finished.root)):
+        assert real_flights.plain(sentence) in page
+
+
+def test_a_flight_that_fails_is_recorded_with_its_error(tmp_path: Path) -> None:
+    (tmp_path / "data/flight/images").mkdir(parents=True)
+    run = real_flights.run_flight(_flight("empty"), tmp_path / "data", tmp_path / "out", "smoke")
+    assert "images" in run.error and run == real_flights.record_of(tmp_path / "out/empty")
+    assert real_flights.row_of(_flight("empty"), run, tmp_path / "out/empty").endswith("| failed |")
+
+
+def test_the_digest_tells_photographs_apart(tmp_path: Path) -> None:
+    (tmp_path / "a.jpg").write_bytes(b"1")
+    before = real_flights.digest(tmp_path)
+    (tmp_path / "a.jpg").rename(tmp_path / "b.jpg")
+    renamed = real_flights.digest(tmp_path)
+    (tmp_path / "b.jpg").write_bytes(b"2")
+    assert len({before, renamed, real_flights.digest(tmp_path)}) == 3
